@@ -1,8 +1,8 @@
-//! The replay loop: records in, the core stepped, results written, a summary at the end.
+//! The replay loop: reads records, runs the core, writes results, returns a summary.
 //!
-//! Promise: the same logs and configuration give the same result files, byte for byte; a journal gives what the run
-//! that wrote it gave. Plain logs and CSV get the ticks of [`Ticks`]; journals carry their own. Wall time is read
-//! only to pace (`speed`) and to report.
+//! Promise: the same logs and configuration give the same result files, byte for byte; a journal gives the results of the
+//! run that wrote it. Plain logs and CSV get the ticks of [`Ticks`]; journals contain their own. Wall time is used only for
+//! pacing (`speed`) and for reports.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write};
@@ -39,36 +39,36 @@ use rows::{write_estimate, write_estimates_header, write_frame};
 pub use summary::ReplaySummary;
 use summary::{note_event, peak_memory_kib};
 
-/// Records between two looks at the clock for the progress report.
+/// Records between two progress reports.
 const REPORT_EVERY: usize = 4096;
 
-/// Settings of a replay; by default all of it, as fast as possible, with nothing stored.
+/// Settings of a replay. The default replays everything as fast as possible and stores nothing.
 #[derive(Debug, Default)]
 pub struct ReplaySettings {
-    /// Times real time; `None` = as fast as possible.
+    /// Multiple of real time; `None` = as fast as possible.
     pub speed: Option<f64>,
-    /// Records before this are left out.
+    /// Records before this time are skipped.
     pub from: Option<LogTime>,
-    /// Records after this are left out.
+    /// Records after this time are skipped.
     pub until: Option<LogTime>,
-    /// A hole longer than this means that the recorder was asleep, s.
+    /// A longer hole in the log means that the recorder was asleep, s.
     pub sleep_gap_s: f64,
-    /// Whether a snapshot is wanted.
+    /// Whether to take a snapshot.
     pub snapshot: bool,
-    /// When it is taken; `None` = at the end.
+    /// Time of the snapshot; `None` = at the end.
     pub snapshot_at: Option<LogTime>,
-    /// State to start from.
+    /// Initial state.
     pub restore: Option<Snapshot>,
-    /// How old it is; `None` = as the journal says, or else its stamp.
+    /// Age of that state; `None` = according to the journal, else to its stamp.
     pub away: Option<Downtime>,
-    /// Store of state and history, as the daemon writes it.
+    /// Store of state and history, in the daemon's format.
     pub store: Option<Recorder>,
-    /// Names of the interfaces, for the frames that would be sent.
+    /// Names of the interfaces, for frames that would be sent.
     pub interfaces: Vec<String>,
 }
 
 impl ReplaySettings {
-    /// Settings from start to end, as fast as possible, with nothing stored.
+    /// Settings for the whole log, as fast as possible, storing nothing.
     pub fn plain(sleep_gap_s: f64, interfaces: Vec<String>) -> Self {
         Self { sleep_gap_s, interfaces, ..Self::default() }
     }
@@ -77,25 +77,25 @@ impl ReplaySettings {
 /// Called with each input and its outputs.
 pub type OutputWatch = Box<dyn FnMut(&Record, &Outputs)>;
 
-/// Called with outputs before they are emptied.
+/// Called with outputs before they are cleared.
 pub type OutputSink = Box<dyn FnMut(&Outputs)>;
 
-/// Files of the results.
+/// Files and callbacks for the results.
 #[derive(Default)]
 pub struct Sinks {
-    /// CSV, a row per estimate.
+    /// CSV with a row per estimate.
     pub estimates: Option<ResultFile>,
-    /// A JSON document per line and event.
+    /// One JSON line per event.
     pub events: Option<ResultFile>,
-    /// candump lines of the frames that would be sent.
+    /// The frames that would be sent, as candump lines.
     pub frames: Option<ResultFile>,
     /// Called with each input and its outputs.
     pub watch: Option<OutputWatch>,
-    /// Called with all outputs, in their order, those after the last input too.
+    /// Called with all outputs in order, including those after the last input.
     pub outputs: Option<OutputSink>,
 }
 
-/// Reason why a replay ended early.
+/// Why a replay ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum ReplayError {
     /// A log cannot be read further.
@@ -110,7 +110,7 @@ pub enum ReplayError {
     /// State or history cannot be written.
     #[error("{0}")]
     Store(String),
-    /// The time of the snapshot lies beyond the log.
+    /// The log ends before the requested time of the snapshot.
     #[error("no snapshot taken: the log ends at {end_s} s, before the requested time")]
     SnapshotNotReached {
         /// The log's last stamp.
@@ -123,16 +123,16 @@ pub enum ReplayError {
 pub struct ReplayProgress {
     /// Bytes of the logs read.
     pub bytes: u64,
-    /// Frames handed to the core.
+    /// Frames passed to the core.
     pub frames: u64,
-    /// Times real time so far.
+    /// Speed so far, as a multiple of real time.
     pub times_real_time: f64,
 }
 
-/// Replays `source` through a monitor that has had no input; gives the summary and the snapshot, if one was wanted.
+/// Replays `source` through a monitor without earlier input; returns the summary and the snapshot, if requested.
 ///
 /// # Errors
-/// When a log cannot be read, a result cannot be written, or a snapshot does not fit or was not reached.
+/// When a log cannot be read, a result cannot be written, or a snapshot does not fit or its time is not reached.
 pub fn run(
     source: &mut LogSource,
     monitor: Monitor,
@@ -141,7 +141,7 @@ pub fn run(
     report: &mut dyn FnMut(ReplayProgress),
 ) -> Result<(ReplaySummary, Option<Snapshot>), ReplayError> {
     let mut replay = Replay::new(monitor, sinks, settings)?;
-    // Where the replay stops before the end of the log, or is paced, nothing is read beyond the current record.
+    // A replay that is paced or stops before the end of the log must not read beyond the current record.
     let one_by_one = replay.pace.speed.is_some() || replay.window.until.is_some();
     let mut batch = Batch::new(if one_by_one { 1 } else { Batch::MAX });
     let mut unreported: usize = 0;
@@ -165,7 +165,7 @@ fn progress(source: &LogSource, frames: u64, span: &RecordSpan) -> ReplayProgres
     ReplayProgress { bytes, frames, times_real_time: span.times_real_time() }
 }
 
-/// Plays the frames of `source` in their own time; gives how many. `send` blocks or fails.
+/// Sends the frames of `source` at their times; returns their number. `send` may block.
 ///
 /// # Errors
 /// When a log cannot be read or `send` fails.
@@ -210,14 +210,14 @@ struct Replay {
     window: TimeWindow,
     sinks: Sinks,
     settings: ReplaySettings,
-    /// When the snapshot is due, once the first stamp is known.
+    /// Time of the snapshot, once the first stamp is known.
     snapshot_at: Option<Timestamp>,
     snapshot: Option<Snapshot>,
     summary: ReplaySummary,
-    /// Whether a reload of the recorded run was noted.
+    /// Whether a reload of the recorded run has been noted.
     reloaded: bool,
     learned: BTreeMap<CellIndex, RecordedValues>,
-    /// Cell-steps of a restored state; `None` until the first input.
+    /// Cell steps counted in the restored state; `None` until the first input.
     steps_before: Option<u64>,
 }
 
@@ -246,7 +246,7 @@ impl Replay {
         })
     }
 
-    /// One record; `false` when the rest of the log is not wanted.
+    /// Handles one record; `false` = the rest of the log is not needed.
     fn take(&mut self, record: &Record, carries_ticks: bool) -> Result<bool, ReplayError> {
         let time = record.time;
         match self.window.judge(time) {
@@ -278,17 +278,17 @@ impl Replay {
         Ok(true)
     }
 
-    /// Notes the first reload of the recorded run: from there this replay may differ from it.
+    /// Notes the first reload of the recorded run, from which on this replay may differ.
     fn note_reload(&mut self, time: Timestamp) {
         if !std::mem::replace(&mut self.reloaded, true) {
             let at_s = time.secs();
             self.summary.notes.push(format!(
-                "the recorded run changed to another configuration at {at_s:.3} s: from there its results may differ"
+                "the recorded run changed its configuration at {at_s:.3} s; results may differ from there on"
             ));
         }
     }
 
-    /// The first record of all.
+    /// Handles the first record.
     fn begin(&mut self, record: &Record) -> Result<(), ReplayError> {
         let first = self.window.first.unwrap_or(record.time);
         self.snapshot_at = self.settings.snapshot_at.filter(|_| self.settings.snapshot).map(|at| at.resolve(first));
@@ -301,7 +301,7 @@ impl Replay {
             (None, Some(_)) => self
                 .summary
                 .notes
-                .push("the recorded run began from a stored state: without --restore its results differ".to_owned()),
+                .push("the recorded run started from a stored state; without --restore the results differ".to_owned()),
             (None, None) => {}
         }
         Ok(())
@@ -377,7 +377,7 @@ impl Replay {
             store.finish(&self.monitor, end).map_err(ReplayError::Store)?;
         }
         if self.settings.snapshot && self.snapshot.is_none() {
-            // A moment within the last record's tick period was reached as well.
+            // A time within the last record's tick period counts as reached.
             let reached = self.settings.snapshot_at.is_none() || self.snapshot_at == self.span.latest;
             let end_s = self.span.latest.map_or(f64::NAN, Timestamp::secs);
             if !reached {
@@ -407,27 +407,30 @@ impl Replay {
         summary.peak_memory_kib = peak_memory_kib();
         if counts.deleted_segments > 0 {
             summary.notes.push(format!(
-                "the beginning of the journal is missing, {} segments: its results differ from those of the recorded run",
+                "the beginning of the journal is missing, {} segments: results differ from the recorded run",
                 counts.deleted_segments
             ));
         }
         if counts.frames == 0 && !counts.foreign.is_empty() {
             let names: Vec<_> = counts.foreign.keys().map(String::as_str).collect();
             let configured = self.settings.interfaces.join(", ");
-            summary.notes.push(format!("no frame used: the log has {}, configured is {configured}", names.join(", ")));
+            summary.notes.push(format!(
+                "no frames used: the log has interface {}, configured is {configured}",
+                names.join(", ")
+            ));
         }
         Ok((summary, self.snapshot))
     }
 }
 
-/// Voltage readings that reached an estimator, since the monitor's first start.
+/// Voltage readings that reached an estimator since the monitor's first start.
 fn cell_steps(monitor: &Monitor) -> u64 {
     let counts = monitor.statistics();
     counts.voltages.total()
 }
 
 impl Sinks {
-    /// Flushes all files: a paced replay may be watched.
+    /// Flushes all files, because a paced replay may be watched.
     fn flush(&mut self) -> io::Result<()> {
         [&mut self.estimates, &mut self.events, &mut self.frames].into_iter().flatten().try_for_each(Write::flush)
     }

@@ -1,18 +1,18 @@
-//! State and history that survive a restart and a power cut: two state files and a database of the history, in one folder.
+//! State and history that survive a restart and a power cut: two state files and a history database in one folder.
 //!
-//! * Learned results and changes of alarms are on the disk with the state of that moment before they are announced; an
-//!   announcement waits at most 200 ms for that ([`commit_barrier`]). The rows are committed first, then the state
-//!   (`writer`). So after a power cut all that was announced is in both. A cut between the two leaves rows that were not
-//!   announced: the restored state is the one before them, so what still holds is learned or raised again and gets a row of
-//!   its own. A change of the pack between the two is not undone: the history says that the pack of the state is closed, and
-//!   the state is not restored.
-//! * The state is also checkpointed (`checkpoint`), written on stop, and every second to the runtime folder, which is in memory.
-//! * The state is written to two files in turn (`state_files`), and does not depend on the database. Without a good one, the
-//!   capacities in the history are used (`learned`).
-//! * A damaged database is set aside, and a new one begins (`folder`).
-//! * On a full disk a reserve makes room for learned results and alarms (`reserve`).
-//! * The loop never touches the disk: a separate thread does (`writer`).
-//! * The daemon keeps running whatever is wrong with disk, folder or file, and reports it to the core (`store_failed`).
+//! * Learned results and alarm changes are on disk, with the state of that moment, before they are announced; an announcement
+//!   waits at most 200 ms for that ([`commit_barrier`]). The rows are committed first, then the state (`writer`). After a power
+//!   cut, everything that was announced is therefore in both. A cut between the two leaves rows that were not announced: the
+//!   restored state is older than these rows, so whatever still applies is learned or raised again and gets another row. A
+//!   change of the pack between the two is not undone: the history says that the state's pack is closed, and the state is not
+//!   restored.
+//! * The state is also written at checkpoints (`checkpoint`), on stop, and every second to the runtime folder, which is in memory.
+//! * The state is written to two files in turn (`state_files`) and does not depend on the database. If there is no valid state,
+//!   the capacities in the history are used (`learned`).
+//! * A damaged database is set aside and a new one is created (`folder`).
+//! * On a full disk, a reserve provides space for learned results and alarms (`reserve`).
+//! * The loop never accesses the disk; a separate thread does (`writer`).
+//! * Whatever is wrong with disk, folder or file, the daemon keeps running and reports it to the core (`store_failed`).
 
 mod backlog;
 mod checkpoint;
@@ -63,20 +63,20 @@ pub use writer::StoreProgress;
 
 /// State folder of the service.
 const STANDARD_FOLDER: &str = "/var/lib/packwatch";
-/// Period of the state in the runtime folder, s.
+/// Time between states in the runtime folder, s.
 const RUNTIME_PERIOD_S: f64 = 1.0;
-/// Period of checkpoints while no frame comes, s: the state only grows older.
+/// Time between checkpoints while no frame arrives, s; the state does not change then, it only becomes older.
 const QUIET_PERIOD_S: f64 = 3600.0;
 
-/// The folder in which clients look: the service's, or where there is none, that of a daemon started from a shell.
+/// The folder in which clients look: the service's or, if it does not exist, that of a daemon started from a shell.
 pub fn standard_folder() -> PathBuf {
     let service = first_folder("STATE_DIRECTORY").unwrap_or_else(|| PathBuf::from(STANDARD_FOLDER));
     let own = daemon_folder().0;
     if !service.exists() && own.exists() { own } else { service }
 }
 
-/// Default folder of a daemon, and whether systemd created it. One that is started from a shell, as in a tutorial, keeps its state
-/// apart from the service's: in `$XDG_STATE_HOME/packwatch`, by default `~/.local/state/packwatch`.
+/// Default folder of a daemon, and whether systemd created it. A daemon started from a shell keeps its state separate from the
+/// service's: in `$XDG_STATE_HOME/packwatch`, by default `~/.local/state/packwatch`.
 pub fn daemon_folder() -> (PathBuf, bool) {
     if let Some(folder) = first_folder("STATE_DIRECTORY") {
         return (folder, true);
@@ -88,7 +88,7 @@ pub fn daemon_folder() -> (PathBuf, bool) {
 /// Source of the newest stored state.
 pub const STATE_SOURCE: &str = "state file";
 
-/// Source of a state that begins with the capacities in the history.
+/// Source of a state made from the capacities in the history.
 pub const HISTORY_SOURCE: &str = "learned values in the history";
 
 /// A stored state that may be restored.
@@ -98,16 +98,16 @@ pub struct StateCandidate {
     pub snapshot: Snapshot,
     /// Its age.
     pub downtime: Downtime,
-    /// Its place, for the log.
+    /// Where it comes from, for the log.
     pub source: &'static str,
 }
 
-/// The states a store held when it was opened.
+/// The states found in a store when it was opened.
 #[derive(Debug)]
 pub struct StoredStates {
-    /// Stored states, the newest first.
+    /// Stored states, newest first.
     pub states: Vec<StateCandidate>,
-    /// What the history knows of the cells of the connected pack, when there is no good state.
+    /// Learned values of the connected pack's cells in the history, if there is no valid state.
     pub learned: Vec<LearnedCell>,
     /// Whether the store could be read and can be written.
     pub works: bool,
@@ -128,7 +128,7 @@ pub struct Store {
 }
 
 impl Store {
-    /// Opens the store; `None` = it is off, or its database cannot be used.
+    /// Opens the store; `None` = disabled, or its folder cannot be used.
     ///
     /// # Errors
     /// When another daemon uses the folder.
@@ -145,14 +145,14 @@ impl Store {
             Ok(()) => {}
             Err(error) if error.kind() == std::io::ErrorKind::WouldBlock => {
                 return Err(format!(
-                    "{shown}: another packwatch keeps its state there; stop it, or name another folder with --state"
+                    "{shown}: already in use by another packwatch; stop it, or choose another folder with --state"
                 ));
             }
             Err(error) if !is_needed => {
-                tracing::info!(folder = shown, %error, "state is not kept; name a folder with --state to keep it");
+                tracing::info!(folder = shown, %error, "state not kept; give a folder with --state to keep it");
                 return Ok(none(true));
             }
-            Err(_) => {} // logged below, and retried
+            Err(_) => {} // logged below, and tried again
         }
         Self::start(folder, config, vehicle).map_err(|error| format!("{shown}: {error}"))
     }
@@ -175,7 +175,7 @@ impl Store {
             watch::channel(StoreProgress { works: found.works, has_room: true, pack, ..StoreProgress::default() });
         let write_queue = Arc::new(WriteQueue::default());
         if !rows.is_empty() {
-            // They are written with the first state.
+            // These rows are written with the first state.
             write_queue.keep(RowBatch { stamp: now, rows });
         }
         let writer = Writer {
@@ -206,38 +206,38 @@ impl Store {
         Ok((Some(store), found))
     }
 
-    /// Its folder.
+    /// The folder of the store.
     pub fn folder(&self) -> &Path {
         &self.folder
     }
 
-    /// Keeps a stored state that could not be restored for the first start at which it fits; `why` goes into the history.
+    /// Keeps a stored state that could not be restored for the first start at which it fits. `why` is recorded in the history.
     pub fn set_state_aside(&self, why: &str, now: Timestamp) {
-        tracing::error!(error = why, "the stored state is {SET_ASIDE}");
+        tracing::error!(error = why, "stored state {SET_ASIDE}");
         let row = HistoryRow::Own { reason: "state_unfit", detail: format!("{why}; {SET_ASIDE}") };
         self.write_queue.keep(RowBatch { stamp: Stamp::now(now, self.boot), rows: vec![row] });
         self.write_queue.set_aside();
     }
 
-    /// The progress of the writer, with every change.
+    /// The progress of the writer, updated with every change.
     pub fn progress(&self) -> watch::Receiver<StoreProgress> {
         self.progress.clone()
     }
 
-    /// Commits what the events of one input have taught. Returns the ticket that its announcement waits for; `None` = no
+    /// Commits what one input's events have taught. Returns the ticket for which the announcement must wait; `None` = no
     /// wait.
     pub fn learned(&mut self, events: &[Event], monitor: &Monitor, now: Timestamp) -> Option<u64> {
         let rows = match self.history_filter.take(events, self.schedule.has_room(now)) {
             Some(rows) => rows,
-            // Its sender gets an answer when it is stored.
+            // The sender of the command is answered when the change is stored.
             None if events.iter().any(|event| is_command_with_effect(&event.kind)) => self.history_filter.deferred(),
             None => return None,
         };
         Some(self.submit(rows, monitor, now))
     }
 
-    /// Writes the state of the second, and the checkpoint when it is due. `is_fresh`: frames have come since the last
-    /// checkpoint. Returns whether it made a checkpoint.
+    /// Writes the runtime state every second, and a checkpoint when it is due. `is_fresh`: whether frames have arrived since the
+    /// last checkpoint. Returns whether a checkpoint was written.
     pub fn tick(&mut self, monitor: &Monitor, now: Timestamp, is_fresh: bool) -> bool {
         let last = self.runtime_written;
         if let Some(runtime) = &self.runtime
@@ -254,9 +254,9 @@ impl Store {
         true
     }
 
-    /// Writes the last state; waits a bounded time until it is on the disk.
+    /// Writes the last state, and waits a limited time until it is on disk.
     pub fn finish(mut self, monitor: &Monitor, now: Timestamp) {
-        // On a disk that fails it is lost; then only the runtime folder has the last second.
+        // If the disk fails, only the runtime folder has the last second.
         if let Some(runtime) = &self.runtime {
             runtime.put(self.document(monitor, now));
         }
@@ -265,12 +265,12 @@ impl Store {
         self.write_queue.stop();
         let Some(writer) = self.writer.take() else { return };
         if !ends_in_time(&writer) {
-            tracing::error!(limit_s = MAX_FINISH.as_secs(), "the disk does not answer: the last state is not stored");
+            tracing::error!(limit_s = MAX_FINISH.as_secs(), "disk does not respond: last state not stored");
             return;
         }
         let lost = self.write_queue.lost_rows();
         if lost > 0 || !self.progress.borrow().works {
-            tracing::error!(lost_rows = lost, "the last state is not stored");
+            tracing::error!(lost_rows = lost, "last state not stored");
         }
     }
 
@@ -285,7 +285,7 @@ impl Store {
     fn document(&self, monitor: &Monitor, now: Timestamp) -> StateDocument {
         StateDocument {
             format: FORMAT,
-            // The writer counts.
+            // The writer assigns the number.
             number: 0,
             folder: self.folder.to_string_lossy().into_owned(),
             pack: self.progress.borrow().pack,
@@ -301,15 +301,15 @@ fn is_command_with_effect(kind: &EventKind) -> bool {
     matches!(kind, EventKind::Command { command: Command::Acknowledge(_) | Command::Clear(_), changed: 1.., .. })
 }
 
-/// What a folder holds at the start.
+/// The contents of a folder at the start.
 #[derive(Debug)]
 struct OpenedFolder {
     state_files: StateFiles,
-    /// `None` = it cannot be used now.
+    /// `None` = it cannot be used at present.
     database: Option<Database>,
-    /// Rows about the opening, for the history.
+    /// Rows about the opening, to be added to the history.
     rows: Vec<HistoryRow>,
-    /// Number of the connected pack; 0 = not known.
+    /// Number of the connected pack; 0 = unknown.
     pack: i64,
     found: StoredStates,
 }
@@ -325,13 +325,13 @@ impl OpenedFolder {
                 Some(database)
             }
             Err(error) => {
-                tracing::error!(%folder, %error, "the database cannot be used now; packwatch retries");
+                tracing::error!(%folder, %error, "database not usable, retrying");
                 None
             }
         };
         let mut states = candidates([running.filter(|running| running.stamp.same_boot(now)), newest, aside]);
         let newest_pack = states.iter().map(|(state, _)| state.pack).max().unwrap_or(0);
-        // A state of a pack that was replaced must not come back.
+        // The state of a replaced pack must not be restored.
         states.retain(|(state, _)| {
             let is_closed = |database: &Database| database.is_closed(state.pack).unwrap_or(false);
             state.pack == 0 || (state.pack == newest_pack && !database.as_ref().is_some_and(is_closed))
@@ -356,14 +356,14 @@ impl OpenedFolder {
     }
 }
 
-/// A row for the history if the newest rows that the state knows are missing: damage of SQLite's log shows in no other way.
+/// A row for the history if the newest rows known to the state are missing; damage of SQLite's log is not visible otherwise.
 fn lost_rows(state: &StateDocument, database: &Database) -> Option<HistoryRow> {
     let (known, found) = (state.history_rows, database.rows());
     let detail = format!("the history ends with row {found}, the stored state knew {known}");
     (0 < found && found < known).then_some(HistoryRow::Own { reason: "history_cut", detail })
 }
 
-/// Reads the state of the last second of a killed daemon, if it kept its state in this folder.
+/// Reads the runtime state of a killed daemon, if that daemon kept its state in this folder.
 fn running_state(file: &Path, folder: &Path) -> Option<StateDocument> {
     let json = match std::fs::read(file) {
         Ok(json) => json,
@@ -383,7 +383,7 @@ fn running_state(file: &Path, folder: &Path) -> Option<StateDocument> {
     }
 }
 
-/// The states that there are, with their sources: of the running and the stored one the newer first, then the one set aside.
+/// The existing states with their sources: first the newer one of the runtime state and the stored state, last the one set aside.
 fn candidates([running, stored, aside]: [Option<StateDocument>; 3]) -> Vec<(StateDocument, &'static str)> {
     let is_older = |running: &StateDocument, stored: &StateDocument| {
         running.stamp.same_boot(&stored.stamp) && running.stamp.boottime_ns < stored.stamp.boottime_ns

@@ -1,7 +1,7 @@
-//! The doctor's loops: logs replayed, or interfaces listened to, into the core's [`WiringObserver`] and, where the configuration
-//! is good, a [`Monitor`] in addition.
+//! The loops of `packwatch doctor`: pass replayed logs or live interfaces to the core's [`WiringObserver`] and, if the
+//! configuration is valid, also to a [`Monitor`].
 //!
-//! Listening is passive: nothing is sent. An [`Interrupt`] ends both loops early, with a report of what was seen so far.
+//! Listening is passive: nothing is sent. An [`Interrupt`] ends both loops early with a report of what was received so far.
 
 mod survey;
 
@@ -29,21 +29,21 @@ pub use survey::{Survey, survey};
 pub struct CheckProgress {
     /// Bytes of the logs read.
     pub bytes: u64,
-    /// Frames taken.
+    /// Frames handled.
     pub frames: u64,
-    /// Seconds listened, of the record or of real time.
+    /// Seconds covered, of the log or of real time.
     pub seconds: f64,
 }
 
-/// Ends the loops: set by SIGINT and SIGTERM.
+/// Ends the loops; set by SIGINT and SIGTERM.
 #[derive(Debug, Clone, Default)]
 pub struct Interrupt(Arc<AtomicBool>);
 
 impl Interrupt {
-    /// Watches for the signals from now on.
+    /// Starts catching the signals.
     ///
     /// # Errors
-    /// When no signal can be watched for.
+    /// When the signals cannot be caught.
     pub fn watch() -> std::io::Result<Self> {
         let interrupt = Self::default();
         let flag = Arc::clone(&interrupt.0);
@@ -61,7 +61,7 @@ impl Interrupt {
     }
 }
 
-/// The doctor and the monitor.
+/// The observer and the monitor.
 struct Session {
     observer: WiringObserver,
     monitor: Option<Monitor>,
@@ -119,7 +119,7 @@ impl Session {
     }
 }
 
-/// Replays logs; at most `limit_s` of them.
+/// Replays logs, at most `limit_s` of them.
 ///
 /// # Errors
 /// When a log cannot be read.
@@ -177,7 +177,7 @@ struct BusListener {
     look_at: Instant,
 }
 
-/// Listens to the configured interfaces, and to every other CAN interface of this computer, for `duration`.
+/// Listens to the configured interfaces and all other CAN interfaces of this computer for `duration`.
 ///
 /// # Errors
 /// When this kernel has no SocketCAN.
@@ -208,7 +208,7 @@ pub fn listen(
         received.sort_by_key(|record| record.time);
         received.drain(..).for_each(|record| session.feed(&record));
         each(CheckProgress { bytes: 0, frames: session.observer.frames(), seconds: began.elapsed().as_secs_f64() });
-        // A full bus brings 80 frames in that time, the kernel keeps thousands.
+        // A full bus delivers 80 frames in that time; the kernel buffers thousands.
         std::thread::sleep(Duration::from_millis(10));
     }
     session.observer.handle_listened(began.elapsed().as_secs_f64());
@@ -257,7 +257,7 @@ impl BusListener {
     }
 }
 
-/// CAN interfaces of this computer, by name: those a CAN socket can be bound to.
+/// Names of the CAN interfaces of this computer: those to which a CAN socket can be bound, sorted.
 fn can_interfaces(clock: MappedClock) -> Vec<String> {
     let Ok(interfaces) = nix::net::if_::if_nameindex() else { return Vec::new() };
     let names = interfaces.iter().filter_map(|interface| interface.name().to_str().ok());

@@ -176,7 +176,7 @@ fn invalid_source_error_lists_allowed_sources() {
     assert!(refused(1, &unusual).contains("is not a plausible range for lfp-graphite"));
     refused(2, &["model", "show"]);
     assert!(refused(78, &["model", "show", "Cargo.toml"]).contains("Cargo.toml:"));
-    assert!(refused(1, &["model", "show", "--state", "config"]).contains("no history there"));
+    assert!(refused(1, &["model", "show", "--state", "config"]).contains("no history found"));
 }
 
 /// A folder with the log of a one-cell vehicle whose model was learned on board from the label alone: deep swings for

@@ -126,7 +126,7 @@ fn measured_capacities_are_plotted_and_faults_named() {
     fs::write(&table, "time_s,capacity_ah\n1700003000,much\n").expect("written");
     let printed = bad(&["report", "-c", &config(), &log, "--reference", &table, "-o", &place.path("b.html")]);
     assert!(printed.contains("measured.csv:2: column capacity_ah: found \"much\", must be Ah above 0"), "{printed}");
-    assert!(bad(&["report", "-o", &place.path("b.html"), "--state", &place.path("none")]).contains("no history there"));
+    assert!(bad(&["report", "-o", &place.path("b.html"), "--state", &place.path("none")]).contains("no history found"));
     assert!(bad(&["report", "-c", &config(), &log, "-o", &log]).contains("is an input, must not be the output too"));
 }
 

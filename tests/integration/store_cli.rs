@@ -159,7 +159,7 @@ fn replay_rejects_existing_history() {
     let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/measured.toml").display().to_string();
     let before = fs::read(place.database()).expect("read");
     let printed = bad(&["replay", "-c", &config, &log, "--state", &place.state()]);
-    assert!(printed.contains("has a state; a replay needs a state folder of its own"), "{printed}");
+    assert!(printed.contains("already contains a state; a replay needs a new state folder"), "{printed}");
     assert_eq!(fs::read(place.database()).expect("read"), before);
 }
 
@@ -179,17 +179,17 @@ fn pack_change_without_daemon_starts_history() {
     assert!(good(&["history", "--state", &state, "verify"]).contains("none changed"));
     let nowhere = place.path("nowhere");
     let printed = bad(&["reset", "--pack-replaced", "--yes", "--state", &nowhere, "--control", &socket]);
-    assert!(printed.contains("no daemon runs, and there is no history"), "{printed}");
+    assert!(printed.contains("no daemon is running and no history found"), "{printed}");
 }
 
 #[test]
 fn missing_or_foreign_history_is_reported() {
     let place = Place::filled();
     let printed = bad(&["history", "--state", &place.path("nowhere")]);
-    assert!(printed.contains("no history there"), "{printed}");
+    assert!(printed.contains("no history found"), "{printed}");
     let mut bytes = fs::read(place.database()).expect("read");
     bytes[60..64].copy_from_slice(&99_u32.to_be_bytes());
     fs::write(place.database(), bytes).expect("written");
     let printed = bad(&["history", "--state", &place.state()]);
-    assert!(printed.contains("format 99, this program reads 1"), "{printed}");
+    assert!(printed.contains("format 99, must be 1"), "{printed}");
 }

@@ -83,7 +83,7 @@ mod tests {
     }
 
     #[test]
-    fn alarms_pass_when_all_other_lines_are_dropped() {
+    fn alarm_lines_are_never_dropped() {
         let count = Arc::new(AtomicU64::new(0));
         let registry = tracing_subscriber::registry().with(Count(Arc::clone(&count)).with_filter(RateLimit::default()));
         tracing::subscriber::with_default(registry, || {

@@ -8,21 +8,21 @@ use crate::monitor::{Estimate, Monitor};
 use crate::quantity::CellIndex;
 use crate::quantity::catalogue::{Quantity, RecordedValues};
 
-/// A cell at the end.
+/// State of a cell at the end of a replay.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct CellSummary {
-    /// Counted from 0.
+    /// Cell, counted from 0.
     pub cell: u16,
-    /// Fraction.
+    /// SOC, fraction.
     pub soc: f64,
-    /// Fraction.
+    /// Its standard deviation, fraction.
     pub soc_std: f64,
     /// Capacity, usable capacity after the last capacity update, resistance relative to new.
     #[serde(flatten)]
     pub values: RecordedValues,
 }
 
-/// The latest estimate of every cell that has one, with what was learned of it last.
+/// The latest estimate of every cell that has one, combined with its last learned values.
 pub(super) fn summaries(monitor: &Monitor, learned: &BTreeMap<CellIndex, RecordedValues>) -> Vec<CellSummary> {
     let of = |estimate: Estimate| {
         let learned = learned.get(&estimate.cell).copied().unwrap_or_default();

@@ -1,10 +1,10 @@
-//! The times of a replay: the wanted part of the log, the time it covers, and the pace.
+//! The times of a replay: the selected part of the log, the time that it covers, and the pace.
 
 use std::time::{Duration, Instant};
 
 use crate::quantity::Timestamp;
 
-/// A time of the log as the user gives it.
+/// A time in the log, as given by the user.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LogTime {
     /// A stamp on the log's own clock.
@@ -22,11 +22,11 @@ impl LogTime {
     }
 }
 
-/// The wanted part of the log.
+/// The selected part of the log.
 pub(super) struct TimeWindow {
     from: Option<LogTime>,
     pub(super) until: Option<LogTime>,
-    /// The log's first stamp, wanted or not.
+    /// The log's first stamp, inside the window or not.
     pub(super) first: Option<Timestamp>,
 }
 
@@ -53,12 +53,12 @@ impl TimeWindow {
     }
 }
 
-/// The time the log covers, and the time its replay takes.
+/// The time covered by the log, and the time taken by its replay.
 pub(super) struct RecordSpan {
     sleep_gap_ns: i64,
     pub(super) first: Option<Timestamp>,
     pub(super) latest: Option<Timestamp>,
-    /// Nanoseconds, so that the sum of millions of steps is exact.
+    /// In nanoseconds, so that the sum of millions of steps is exact.
     awake_ns: i64,
     pub(super) started: Instant,
 }
@@ -97,7 +97,7 @@ impl RecordSpan {
     }
 }
 
-/// Holds the replay to a multiple of real time by deadlines, so that lateness does not add up.
+/// Paces the replay at a multiple of real time. It uses deadlines, so that delays do not add up.
 pub(super) struct Pace {
     pub(super) speed: Option<f64>,
     anchor: Option<(Instant, Timestamp)>,
@@ -108,7 +108,7 @@ impl Pace {
         Self { speed, anchor: None }
     }
 
-    /// Restarts the pace at the next record: holes and unknown gaps are not waited out.
+    /// Restarts the pace at the next record, so that holes and unknown gaps are skipped.
     pub(super) fn rebase(&mut self) {
         self.anchor = None;
     }
@@ -135,7 +135,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_hole_of_exactly_the_sleep_gap_is_awake_and_a_longer_one_is_not() {
+    fn hole_longer_than_sleep_gap_is_sleep() {
         let mut span = RecordSpan::new(30.0);
         let mut advance = |nanos| span.advance(Timestamp::from_nanos(nanos));
         assert_eq!([0, 30_000_000_000, 60_000_000_001].map(&mut advance), [false, false, true]);

@@ -1,7 +1,7 @@
-//! A monitor that its caller drives with rows of values or frames, and the ticks of a replay between them.
+//! A monitor that the caller feeds with rows of values or frames; the driver adds the ticks of a replay between them.
 //!
-//! In: rows (A, positive = discharge; V; degrees C) or frames, with their times. Out: the monitor's [`Outputs`], which the caller
-//! empties. Promise: the same inputs give the same outputs as `packwatch replay` of a log with them.
+//! In: rows (A, positive = discharge; V; degrees C) or frames, with their times. Out: the monitor's [`Outputs`], which the
+//! caller clears. Promise: the outputs equal those of `packwatch replay` with a log of the same inputs.
 
 use super::reading::RowFrames;
 use crate::can::Frame;
@@ -18,14 +18,14 @@ pub struct MonitorDriver {
     row_frames: RowFrames,
     ticks: Ticks,
     frames: Vec<(BusIndex, Frame)>,
-    /// Outputs since the caller last emptied them.
+    /// Outputs since the caller last cleared them.
     pub out: Outputs,
     /// Values that no frame can carry.
     pub uncarried_values: usize,
 }
 
 impl MonitorDriver {
-    /// A monitor before its first input; a gap of inputs longer than `sleep_gap_s` means that the recorder was asleep, s.
+    /// A monitor before its first input. A gap of more than `sleep_gap_s` (s) means that the recorder was asleep.
     pub fn new(config: MonitorConfig, sleep_gap_s: f64) -> Self {
         Self {
             row_frames: RowFrames::new(&config),
@@ -37,7 +37,7 @@ impl MonitorDriver {
         }
     }
 
-    /// Takes one row: `None` and NaN mean "no value now".
+    /// Handles one row; `None` and NaN mean that there is no value.
     pub fn handle_row(&mut self, time: Timestamp, values: &[(Channel, Option<f64>)]) {
         self.advance(time);
         let mut frames = std::mem::take(&mut self.frames);
@@ -48,20 +48,20 @@ impl MonitorDriver {
         self.frames = frames;
     }
 
-    /// Takes one frame.
+    /// Handles one frame.
     pub fn handle_frame(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
         self.advance(time);
         self.monitor.handle(&Record::frame(time, bus, frame), &mut self.out);
     }
 
-    /// The record continues at `time` after a gap of unknown length.
+    /// Continues at `time` after a gap of unknown length.
     pub fn handle_unknown_gap(&mut self, time: Timestamp) {
         self.ticks.sleep();
         self.send_ticks();
         self.monitor.handle(&Record::unknown_gap(time), &mut self.out);
     }
 
-    /// Ends the record: its last samples become estimates.
+    /// Ends the record; its last samples become estimates.
     pub fn finish(&mut self) {
         self.ticks.sleep();
         self.send_ticks();

@@ -1,23 +1,23 @@
-//! Work on many items by several threads, with the results in the items' order.
+//! Processes many items on several threads and returns the results in the order of the items.
 //!
-//! Promise: the number of threads, not of items, bounds the waiting results: no thread begins an item far beyond the first
-//! one that is not done.
+//! Promise: memory for waiting results is bounded by the number of threads, not of items, because no thread starts an item far
+//! beyond the first unfinished one.
 
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Mutex, PoisonError};
 use std::thread;
 
-/// Items per thread that may be begun beyond the first one not returned, so that a long item does not stop the others soon.
+/// Items per thread that may be started beyond the first unfinished one, so that a long item does not stop the others soon.
 const AHEAD: usize = 4;
 
-/// Items not begun, and where the receivers of their results are queued in the same order.
+/// Items not yet started, and the queue of receivers for results, in the same order.
 struct Schedule<'a, T, R> {
     items: std::slice::Iter<'a, T>,
     results: SyncSender<Receiver<R>>,
 }
 
 impl<'a, T, R> Schedule<'a, T, R> {
-    /// The next item and the place of its result; waits while too many wait before it. `None` = nothing more is wanted.
+    /// The next item and the channel for its result; blocks while too many results wait. `None` = no more results are wanted.
     fn begin(&mut self) -> Option<(&'a T, SyncSender<R>)> {
         let item = self.items.next()?;
         let (result, receiver) = sync_channel(1);
@@ -25,8 +25,8 @@ impl<'a, T, R> Schedule<'a, T, R> {
     }
 }
 
-/// Gives every item to `work` on up to `jobs` threads, and each result to `take` on this one: in the items' order, and as soon
-/// as all before are done. When `take` gives `false` no further item is begun and no result returned.
+/// Passes every item to `work` on up to `jobs` threads, and each result to `take` on this thread, in the order of the items and
+/// as soon as all earlier results are done. After `take` returns `false`, no further item is started and no result passed.
 pub fn in_order<T: Sync, R: Send>(
     items: &[T],
     jobs: usize,
@@ -34,7 +34,7 @@ pub fn in_order<T: Sync, R: Send>(
     mut take: impl FnMut(&T, R) -> bool,
 ) {
     let jobs = jobs.clamp(1, items.len().max(1));
-    // One receiver is out of the queue, being waited for.
+    // One receiver is outside the queue while its result is awaited.
     let (results, queue) = sync_channel(AHEAD * jobs - 1);
     let schedule = Mutex::new(Schedule { items: items.iter(), results });
     let begin = || schedule.lock().unwrap_or_else(PoisonError::into_inner).begin();
@@ -42,12 +42,12 @@ pub fn in_order<T: Sync, R: Send>(
         for _ in 0..jobs {
             scope.spawn(|| {
                 while let Some((item, result)) = begin() {
-                    let _ = result.send(work(item)); // not received when no more results are wanted
+                    let _ = result.send(work(item)); // fails if no more results are wanted
                 }
             });
         }
         let queue = queue; // dropped with this block, so that no thread waits for room in it
-        // A thread that panics drops its place without a result.
+        // A thread that panics drops its channel without a result.
         let _ = items.iter().try_for_each(|item| take(item, queue.recv().ok()?.recv().ok()?).then_some(()));
     });
 }
@@ -59,12 +59,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn results_come_in_the_items_order_whatever_the_threads_do() {
+    fn results_keep_the_order_of_items() {
         let items: Vec<usize> = (0..200).collect();
         for jobs in [0, 1, 3, 500] {
             let mut seen = Vec::new();
             let work = |item: &usize| {
-                // Early items take longest.
+                // Early items take the longest.
                 (0..(200 - item) * 50).for_each(|_| std::hint::spin_loop());
                 item * 2
             };
@@ -78,14 +78,14 @@ mod tests {
     }
 
     #[test]
-    fn no_thread_runs_far_ahead_of_a_slow_item() {
+    fn threads_do_not_run_far_ahead_of_slow_item() {
         let items: Vec<usize> = (0..1000).collect();
         let begun = AtomicUsize::new(0);
         let furthest = AtomicUsize::new(0);
         let work = |item: &usize| {
             begun.fetch_max(*item, Ordering::SeqCst);
             if *item == 0 {
-                // The first item is done when the others can go no further, or never.
+                // Finishes the first item only when the other threads cannot start any more items.
                 while begun.load(Ordering::SeqCst) < 2 * AHEAD - 1 {
                     thread::yield_now();
                 }
@@ -97,7 +97,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_more_is_begun_once_no_result_is_wanted() {
+    fn no_item_starts_after_take_returns_false() {
         let items: Vec<usize> = (0..1000).collect();
         let (begun, mut taken) = (AtomicUsize::new(0), 0);
         in_order(
@@ -115,7 +115,7 @@ mod tests {
 
     #[test]
     #[should_panic(expected = "a scoped thread panicked")]
-    fn a_panic_is_passed_on_and_hangs_no_thread() {
+    fn panic_is_propagated_without_deadlock() {
         in_order(&[1, 2, 3, 4], 2, |item| assert!(*item != 2), |_, ()| true);
     }
 }

@@ -1,4 +1,4 @@
-//! Checks of frames before they are read, for the summary of a replay: end-to-end protection and dropped frames.
+//! Checks of frames before they are decoded (end-to-end protection, dropped frames), for the summary of a replay.
 
 use std::collections::BTreeMap;
 
@@ -8,21 +8,21 @@ use crate::monitor::Monitor;
 use crate::quantity::BusIndex;
 use crate::status::document::{ControllerStatus, MessageFlood};
 
-/// A protected message and how often each status of its check was given.
+/// A protected message and the number of checks with each status.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct ProtectedSummary {
     /// Interface.
     pub interface: String,
-    /// Identifier as candump writes it.
+    /// Identifier in candump notation.
     pub id: String,
-    /// Every status, zeros too.
+    /// Counts by status, including zeros.
     pub counts: BTreeMap<&'static str, u64>,
 }
 
-/// What the checks of one monitor have counted.
+/// Counts of one monitor's checks.
 type Summaries = (Vec<ProtectedSummary>, Vec<MessageFlood>, Vec<ControllerStatus>);
 
-/// The protected messages, the dropped frames and the diagnostic answers of a monitor.
+/// The counts of a monitor's protected messages, dropped frames and diagnostic answers.
 pub(super) fn summaries(monitor: &Monitor, interfaces: &[String]) -> Summaries {
     let name = |bus: BusIndex| interfaces.get(bus.index()).map_or("unknown", String::as_str).to_owned();
     let protected = monitor.protected().map(|of| ProtectedSummary {

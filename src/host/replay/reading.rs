@@ -1,4 +1,4 @@
-//! How logs are read with a configuration: the settings of a reader, completed by what the configuration says.
+//! How to read logs with a configuration: the reader's settings, completed from the configuration.
 
 use std::path::PathBuf;
 
@@ -12,24 +12,24 @@ use crate::monitor::MonitorConfig;
 use crate::quantity::BusIndex;
 use crate::sample::VoltageSource;
 
-/// A hole in a log longer than this means that the recorder was asleep, s, unless another is given.
+/// Default sleep gap: a longer hole in a log means that the recorder was asleep, s.
 pub const SLEEP_GAP_S: f64 = 30.0;
 
-/// How logs are read.
+/// How to read logs.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct LogReading {
-    /// A malformed line ends the reading.
+    /// Whether a malformed line ends the reading.
     pub strict: bool,
-    /// CSV: role to column, see [`CsvOptions::columns`].
+    /// CSV: maps roles to columns, see [`CsvOptions::columns`].
     pub columns: Vec<(String, String)>,
-    /// CSV: positive current is charge.
+    /// CSV: whether positive current is charge.
     pub charge_positive: bool,
-    /// CSV: table with the section's column and `start`.
+    /// CSV: table with the section column and `start`.
     pub start_times: Option<PathBuf>,
 }
 
 impl LogReading {
-    /// The options of a log with this configuration.
+    /// The options for reading a log with this configuration.
     pub fn options(&self, config: &Config) -> LogOptions {
         let sample = &config.monitor.sample;
         LogOptions {
@@ -50,7 +50,7 @@ impl LogReading {
     }
 }
 
-/// Encodes rows of values, which have no frames, as their senders encode them: with protection.
+/// Encodes rows of values as frames, as their senders would, including protection.
 #[derive(Debug)]
 pub struct RowFrames {
     encoder: InputEncoder,
@@ -58,7 +58,7 @@ pub struct RowFrames {
 }
 
 impl RowFrames {
-    /// Of the input signals of this configuration.
+    /// An encoder for the input signals of this configuration.
     pub fn new(config: &MonitorConfig) -> Self {
         Self {
             encoder: InputEncoder::new(&config.input).with_answers(&config.answers),
@@ -66,7 +66,7 @@ impl RowFrames {
         }
     }
 
-    /// Appends the frames that carry `values` (`None` and NaN: no value now); returns how many values no frame can carry.
+    /// Appends the frames that carry `values` (`None` and NaN: no value); returns how many values no frame can carry.
     pub fn encode(&mut self, values: &[(Channel, Option<f64>)], frames: &mut Vec<(BusIndex, Frame)>) -> usize {
         let uncarried = self.encoder.encode(values, frames);
         self.protector.protect(frames);

@@ -1,11 +1,11 @@
-//! Rows of a replay's result files: estimates as CSV, frames as candump lines.
+//! Writes the rows of a replay's result files: estimates as CSV, frames as candump lines.
 
 use std::io::{self, Write};
 
 use crate::io::candump::{self, StampDigits};
 use crate::monitor::{Estimate, Transmit};
 
-/// Columns of the estimates, in their order.
+/// Columns of the estimates, in order.
 pub const ESTIMATE_COLUMNS: [&str; 17] = [
     "time_s",
     "cell",
@@ -26,12 +26,12 @@ pub const ESTIMATE_COLUMNS: [&str; 17] = [
     "temperature_c",
 ];
 
-/// The column names.
+/// Writes the column names.
 pub(super) fn write_estimates_header(out: &mut impl Write) -> io::Result<()> {
     writeln!(out, "{}", ESTIMATE_COLUMNS.join(","))
 }
 
-/// One row; floats in the shortest form that reads back the same, nothing for NaN.
+/// Writes one row: floats in the shortest form that reads back the same, NaN as an empty field.
 pub(super) fn write_estimate(out: &mut impl Write, estimate: &Estimate) -> io::Result<()> {
     let e = estimate;
     let nanos = e.time.nanos();
@@ -57,7 +57,7 @@ fn write_value(out: &mut impl Write, value: f64) -> io::Result<()> {
     if value.is_nan() { out.write_all(b",") } else { write!(out, ",{value:?}") }
 }
 
-/// One candump line.
+/// Writes one candump line.
 pub(super) fn write_frame(out: &mut impl Write, interfaces: &[String], transmit: &Transmit) -> io::Result<()> {
     let interface = interfaces.get(transmit.bus.index()).map_or("unknown", String::as_str);
     candump::write_line(out, transmit.time, StampDigits::Nanos, interface, &transmit.frame)

@@ -13,7 +13,7 @@ use crate::quantity::CellIndex;
 use crate::quantity::catalogue::RecordedValues;
 use crate::status::document::{ControllerStatus, MessageFlood};
 
-/// Raised alarms listed one by one; all are counted.
+/// Most raised alarms that are listed; all are counted.
 const MAX_LISTED_ALARMS: usize = 1000;
 
 /// Summary of a replay.
@@ -24,9 +24,9 @@ pub struct ReplaySummary {
     pub log: LogCounts,
     /// Records outside `from` and `until`.
     pub skipped_records: u64,
-    /// Ticks handed to the core.
+    /// Ticks passed to the core.
     pub ticks: u64,
-    /// Estimates made (counted only when written).
+    /// Estimates (counted only if they are written).
     pub estimates: u64,
     /// Frames that would be sent.
     pub frames_out: u64,
@@ -34,17 +34,17 @@ pub struct ReplaySummary {
     pub bad_readings: u64,
     /// Protected input messages.
     pub protected: Vec<ProtectedSummary>,
-    /// Messages with more frames than the configured rate.
+    /// Messages of which frames were dropped because their rate was too high.
     pub dropped: Vec<MessageFlood>,
     /// Controllers that answer diagnostic requests.
     pub controllers: Vec<ControllerStatus>,
-    /// Events by name, those of alarms by change.
+    /// Number of events by name; alarms by change.
     pub events: BTreeMap<String, u64>,
     /// The first 1,000 alarms raised.
     pub alarms_raised: Vec<Event>,
-    /// The cells at the end.
+    /// State of the cells at the end.
     pub cells: Vec<CellSummary>,
-    /// Learned offset of the current sensor at the end, A: what it reads less the true current, positive = discharge.
+    /// Learned offset of the current sensor at the end, A: reading minus true current, positive = discharge.
     pub current_offset_a: Option<f64>,
     /// Its standard deviation, A.
     pub current_offset_std_a: Option<f64>,
@@ -52,23 +52,23 @@ pub struct ReplaySummary {
     pub first_s: Option<f64>,
     /// Last stamp, s.
     pub last_s: Option<f64>,
-    /// Time awake within the record, s: holes longer than the sleep gap do not count.
+    /// Covered time without holes longer than the sleep gap, s.
     pub awake_s: f64,
     /// Wall time, s.
     pub wall_s: f64,
     /// Awake time over wall time.
     pub times_real_time: f64,
-    /// Frames read, over wall time.
+    /// Frames read per second of wall time.
     pub frames_per_s: f64,
-    /// Voltage readings that reached an estimator, over wall time.
+    /// Voltage readings that reached an estimator, per second of wall time.
     pub cell_steps_per_s: f64,
-    /// Peak resident memory, KiB, where the system reports it.
+    /// Peak resident memory, KiB, if the system reports it.
     pub peak_memory_kib: Option<u64>,
     /// Remarks for the user.
     pub notes: Vec<String>,
 }
 
-/// Counts an event; lists it if it is an alarm raised, and keeps what was learned last of each cell.
+/// Counts an event, lists it if it is a raised alarm, and keeps the last learned values of each cell.
 pub(super) fn note_event(
     summary: &mut ReplaySummary,
     learned: &mut BTreeMap<CellIndex, RecordedValues>,

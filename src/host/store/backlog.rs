@@ -1,16 +1,16 @@
-//! Rows that wait for the disk, in memory and bounded.
+//! Rows that wait for the disk, in limited memory.
 //!
-//! In: batches of rows. Out: the same batches, oldest first. When there is no room, detail is dropped before learned
-//! results: the oldest half-cycles first, then the oldest of the rest. Dropped rows are counted, and the count is written
-//! with the next rows.
+//! In: batches of rows. Out: the same batches, oldest first. If there is no room, details are dropped before learned results:
+//! the oldest half-cycles first, then the oldest other rows. Dropped rows are counted, and the count is written with the next
+//! rows.
 
 use std::collections::VecDeque;
 
 use super::rows::{HistoryRow, RowBatch};
 use super::stamp::Stamp;
 
-/// Rows kept while the disk takes none: half a megabyte of memory, and for a pack of 96 cells some 25 transitions, days
-/// of driving.
+/// Most rows kept while the disk accepts none: half a megabyte of memory; for a pack of 96 cells about 25 transitions, which
+/// are days of driving.
 pub(super) const MAX_ROWS: usize = 5_000;
 
 /// Waiting rows, oldest first.
@@ -19,7 +19,7 @@ pub(super) struct Backlog {
     batches: VecDeque<RowBatch>,
     rows: usize,
     lost: LossCount,
-    /// The losses that the rows taken last report.
+    /// The losses reported by the rows taken last.
     reported: LossCount,
 }
 
@@ -38,7 +38,7 @@ impl Backlog {
         self.shrink();
     }
 
-    /// Takes all rows, with a row that reports earlier losses; `now` is that row's moment.
+    /// Takes all rows, and a row at the moment `now` that reports earlier losses.
     pub(super) fn take(&mut self, now: &Stamp) -> Vec<RowBatch> {
         self.rows = 0;
         let mut batches: Vec<RowBatch> = self.batches.drain(..).collect();
@@ -52,14 +52,14 @@ impl Backlog {
         batches
     }
 
-    /// The rows taken last are on the disk, and so is their report of losses.
+    /// Notes that the rows taken last, including their report of losses, are on disk.
     pub(super) fn commit(&mut self) {
         let LossCount { details, rows } = std::mem::take(&mut self.reported);
         self.lost.details -= details;
         self.lost.rows -= rows;
     }
 
-    /// Returns rows that could not be written to the front. The next rows report their losses again.
+    /// Returns rows that could not be written to the front. The next rows report the losses again.
     pub(super) fn put_back(&mut self, batches: Vec<RowBatch>) {
         self.reported = LossCount::default();
         let is_loss = |row: &HistoryRow| matches!(row, HistoryRow::Own { reason: "rows_lost", .. });
@@ -70,7 +70,7 @@ impl Backlog {
         self.shrink();
     }
 
-    /// Rows lost so far whose loss is not yet reported in the history.
+    /// Lost rows that are not yet reported in the history.
     pub(super) fn lost(&self) -> u64 {
         self.lost.details + self.lost.rows
     }
@@ -114,7 +114,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_detail_is_dropped_first_and_counted() {
+    fn oldest_details_are_dropped_first_and_counted() {
         let mut backlog = Backlog::default();
         backlog.push(batch(vec![alarm(Change::Raised)]));
         for cell in 0..4000 {
@@ -132,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_that_could_not_be_written_are_returned_in_their_order() {
+    fn unwritten_rows_are_returned_in_order() {
         let mut backlog = Backlog::default();
         backlog.push(batch(vec![capacity(1, Some(2.0), 2.0)]));
         let taken = backlog.take(&Stamp::replayed(Timestamp::ZERO));

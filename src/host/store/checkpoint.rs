@@ -1,43 +1,43 @@
-//! Decides when the next checkpoint of the state is due: a checkpoint writes the whole state, and flash wears.
+//! Decides when the next checkpoint of the state is due. A checkpoint writes the whole state, and flash wears.
 //!
-//! In: the bytes of every state that is written, with its time. Every state counts, so alarms that are committed put off the
-//! checkpoints. A pack of 96 cells (70 kB) gets a checkpoint every 7 minutes, one of 12 cells every minute.
+//! In: the size and time of every written state. Every state counts, so committed alarms postpone checkpoints. A pack of 96
+//! cells (70 kB) gets a checkpoint every 7 minutes, a pack of 12 cells every minute.
 
 use crate::quantity::Timestamp;
 
-/// States written in a day, bytes: of the 20 MB that may be written, the history and the file system take the rest.
+/// Bytes of states written per day. Of the 20 MB that may be written, history and file system take the rest.
 const BYTES_PER_DAY: f64 = 15e6;
-/// Written beyond that at once, bytes, when alarms change often after a quiet time.
+/// Bytes that may be written ahead of that rate, when alarms change often after a quiet time.
 const MAX_AHEAD_BYTES: f64 = 3e6;
 
-/// See the module.
+/// The schedule of checkpoints.
 #[derive(Debug)]
 pub(super) struct CheckpointSchedule {
-    /// Least period, s.
+    /// Shortest period, s.
     period_s: f64,
     /// Time of the last state.
     last: Option<Timestamp>,
-    /// Bytes written beyond the daily rate, at that time.
+    /// Bytes written ahead of the daily rate at that time.
     ahead_bytes: f64,
 }
 
 impl CheckpointSchedule {
-    /// One of this least period, s.
+    /// A schedule with this shortest period, s.
     pub(super) fn new(period_s: f64) -> Self {
         Self { period_s, last: None, ahead_bytes: 0.0 }
     }
 
-    /// Whether a checkpoint is due, with a least period of `period_s` where that is longer. The first is a period after the start.
+    /// Whether a checkpoint is due, at least `period_s` after the last state. The first one is due a period after the start.
     pub(super) fn is_due(&mut self, now: Timestamp, period_s: f64) -> bool {
         now.since(*self.last.get_or_insert(now)) >= self.period_s.max(period_s) && self.ahead_at(now) <= 0.0
     }
 
-    /// Whether alarms that change often may be committed at once.
+    /// Whether frequently changing alarms may be committed at once.
     pub(super) fn has_room(&self, now: Timestamp) -> bool {
         self.ahead_at(now) < MAX_AHEAD_BYTES
     }
 
-    /// Notes a state of this size.
+    /// Notes a written state of this size.
     pub(super) fn note_written(&mut self, now: Timestamp, bytes: u64) {
         self.ahead_bytes = self.ahead_at(now) + bytes as f64;
         self.last = Some(now);
@@ -53,7 +53,7 @@ impl CheckpointSchedule {
 mod tests {
     use super::*;
 
-    /// Checkpoints and bytes of a day in which states of this size are committed every so many seconds as well.
+    /// Checkpoints and bytes of a day in which states of this size are also committed every so many seconds.
     fn day(bytes: u64, commit_every_s: Option<u32>) -> (u32, u64) {
         let (mut schedule, mut checkpoints, mut written) = (CheckpointSchedule::new(60.0), 0, 0);
         for second in 0..86_400_u32 {
@@ -69,17 +69,17 @@ mod tests {
     }
 
     #[test]
-    fn a_large_state_is_written_less_often() {
+    fn large_state_is_written_less_often() {
         assert_eq!(day(9_000, None).0, 1439);
         let (checkpoints, written) = day(70_000, None);
         assert!((205..=215).contains(&checkpoints) && written <= 15_100_000, "{checkpoints}, {written} bytes");
     }
 
     #[test]
-    fn commits_of_learned_values_count_and_put_checkpoints_off() {
+    fn commits_postpone_checkpoints() {
         let (checkpoints, written) = day(70_000, Some(3600));
         assert!((180..=190).contains(&checkpoints) && written <= 15_100_000, "{checkpoints}, {written} bytes");
-        // Alarms that flicker.
+        // Flickering alarms.
         let (checkpoints, written) = day(70_000, Some(1));
         assert!(checkpoints == 0 && written <= 18_100_000, "{checkpoints}, {written} bytes");
     }

@@ -1,11 +1,11 @@
-//! Holds frames until the results they announce are on the disk.
+//! Holds frames until the results that they announce are on disk.
 //!
-//! While a commit is under way, every announcing frame ([`Transmit::announces`]) waits: the frames of the input that
-//! taught something, the cyclic frames that would repeat it, and the later packets of a transfer whose first packet
-//! waits. They leave in the order in which they came. The status frame is not held: state of charge and validity must
-//! not grow old, and it carries only the number of raised alarms.
+//! During a commit, every announcing frame ([`Transmit::announces`]) waits: the frames of the input that taught something, the
+//! cyclic frames that would repeat it, and the later packets of a transfer whose first packet waits. They are sent in order.
+//! The status frame is not held, because state of charge and validity must not become old and it only contains the number of
+//! raised alarms.
 //!
-//! No frame waits longer than [`MAX_WAIT`]: an alarm on the bus matters more than an alarm on the disk.
+//! No frame waits longer than [`MAX_WAIT`], because an alarm on the bus is more important than an alarm on disk.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -16,25 +16,25 @@ use crate::monitor::Transmit;
 
 /// Longest wait for the disk.
 const MAX_WAIT: Duration = Duration::from_millis(200);
-/// Frames held at most: the largest pack sends that many in twice that time, with an alarm for each cell. Beyond it, held
-/// frames are released.
+/// Most held frames: the largest pack, with an alarm for each cell, sends that many in twice the longest wait. Beyond this
+/// number, held frames are released.
 const MAX_HELD: usize = 4096;
 
-/// See the module.
+/// Holds announcing frames while commits are running.
 #[derive(Debug, Default)]
 pub struct CommitBarrier {
     held: VecDeque<(u64, Transmit)>,
-    /// Open tickets, each with the end of its wait.
+    /// Open tickets with their deadlines.
     tickets: VecDeque<(u64, Instant)>,
 }
 
 impl CommitBarrier {
-    /// Opens a ticket: from here on announcing frames wait.
+    /// Opens a ticket; from now on announcing frames wait.
     pub fn begin(&mut self, ticket: u64, now: Instant) {
         self.tickets.push_back((ticket, now + MAX_WAIT));
     }
 
-    /// Holds a frame that announces something while a ticket is open; `false` = it may be sent.
+    /// Holds an announcing frame while a ticket is open; `false` = the frame may be sent.
     pub fn hold(&mut self, transmit: &Transmit) -> bool {
         let last = self.tickets.back().filter(|_| transmit.announces);
         self.held.extend(last.map(|(ticket, _)| (*ticket, *transmit)));
@@ -82,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn while_a_ticket_is_open_announcing_frames_wait_and_keep_their_order() {
+    fn announcing_frames_wait_in_order() {
         let now = Instant::now();
         let mut barrier = CommitBarrier::default();
         let (control, data, health) = (0x10, 0x11, 0x12);
@@ -102,7 +102,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_waits_longer_than_the_limit() {
+    fn wait_is_limited() {
         let now = Instant::now();
         let mut barrier = CommitBarrier::default();
         barrier.begin(1, now);

@@ -1,18 +1,18 @@
-//! The database of the history: checked when it is opened, written in transactions.
+//! The history database: checked when it is opened, written in transactions.
 //!
-//! | table | a row is | kept |
+//! | table | contents of a row | kept |
 //! | --- | --- | --- |
 //! | `pack` | a pack that was or is connected | always |
-//! | `moment` | a time of writing: wall clock, inputs' clock, boot, pack | as long as its segment |
-//! | `half_cycle`, `capacity`, `loss_modes`, `remaining_life`, `model`, `alarm`, `reset` | a charge or discharge of one cell, a learned capacity, what a cell has lost, a forecast, a change of the cell model, a change of an alarm, a reset; numbered across the tables | the oldest segments are deleted |
-//! | `segment` | rows of a day, with the end of their hash chain (`segments`) | always |
+//! | `moment` | the time of a commit: wall clock, inputs' clock, boot, pack | as long as its segment |
+//! | `half_cycle`, `capacity`, `loss_modes`, `remaining_life`, `model`, `alarm`, `reset` | a charge or discharge of one cell, a learned capacity, a cell's loss modes, a forecast, a change of the cell model, a change of an alarm, a reset; numbered across the tables | until the segment is deleted, oldest first |
+//! | `segment` | the rows of a day, with the end of their hash chain (`segments`) | always |
 //! | `meta` | one row: the number of segments, the vehicle | |
 //!
 //! Cells count from 0, times are nanoseconds. `PRAGMA user_version` is the format.
 //!
-//! * One file in write-ahead mode with `synchronous=FULL`: a commit that returned survives a power cut, a commit that did
-//!   not return leaves no trace.
-//! * A damaged file and a file that cannot be reached are different errors. A file of another format counts as damaged.
+//! * One file in write-ahead mode with `synchronous=FULL`: a commit that has returned survives a power cut, and a commit that
+//!   has not returned leaves no trace.
+//! * A damaged file and an inaccessible file are different errors. A file with another format counts as damaged.
 
 use std::fs::File;
 use std::path::Path;
@@ -32,9 +32,9 @@ use crate::monitor::{EventKind, LearnedCell};
 
 /// The format that this program reads and writes.
 pub(super) const FORMAT: i32 = 1;
-/// Longest wait of a commit for a reader that locks the database.
+/// Longest wait of a commit for a reader that has locked the database.
 const BUSY_TIMEOUT: Duration = Duration::from_millis(100);
-/// Longest check of the file at the start; damage beyond it is found when that part is read.
+/// Longest check of the file at the start. Damage beyond that is found when that part is read.
 const MAX_CHECK: Duration = Duration::from_secs(2);
 /// The tables other than those of [`HistoryTable`].
 const TABLES: &str = "
@@ -66,10 +66,10 @@ CREATE TABLE segment (
 ) STRICT;
 ";
 
-/// Why the database cannot be used.
+/// Why the database cannot be opened.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(super) enum OpenError {
-    /// The file is not a history, or not any longer.
+    /// The file is not, or no longer, a history.
     #[error("damaged: {0}")]
     Damaged(String),
     /// The disk, the folder or the permissions prevent it.
@@ -83,8 +83,8 @@ impl From<rusqlite::Error> for OpenError {
     }
 }
 
-/// Whether an error means that the file's contents are wrong: every error that neither the disk nor another process
-/// causes. One that is missed would end in a store that is never written again.
+/// Whether an error means that the file's contents are wrong: every error not caused by the disk or another process. If damage
+/// were not recognised, the store would never be written again.
 pub(super) fn is_damage(error: &rusqlite::Error) -> bool {
     match error {
         rusqlite::Error::SqliteFailure(failure, _) => !matches!(
@@ -120,12 +120,12 @@ pub(super) struct Database {
     pack: i64,
 }
 
-/// Bounds of the history: beyond them the oldest segments are deleted.
+/// Limits of the history, beyond which the oldest segments are deleted.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct RowLimits {
-    /// Rows that are kept.
+    /// Most rows kept.
     max_rows: i64,
-    /// Greatest age, years; `None` = any.
+    /// Longest age, years; `None` = unlimited.
     keep_years: Option<f64>,
 }
 
@@ -136,7 +136,7 @@ impl From<&StoreConfig> for RowLimits {
 }
 
 impl Database {
-    /// Opens the file; creates it where it is missing, for the pack of number `pack`, which the stored state knows (0 = not known).
+    /// Opens the file, or creates it if it is missing. `pack` is the pack's number according to the stored state (0 = unknown).
     pub(super) fn open(path: &Path, now: &Stamp, pack: i64) -> Result<Self, OpenError> {
         let mut connection = Connection::open_with_flags(
             path,
@@ -169,7 +169,7 @@ impl Database {
         Ok(Self { connection, segment, pack })
     }
 
-    /// Rows so far.
+    /// Number of rows written so far.
     pub(super) fn rows(&self) -> i64 {
         self.segment.last
     }
@@ -179,18 +179,18 @@ impl Database {
         self.pack
     }
 
-    /// The chain's end: number of rows, hash of the last.
+    /// The chain's end: number of rows and hash of the last row.
     pub(super) fn head(&self) -> (i64, String) {
         (self.segment.last, hex(&self.segment.hash))
     }
 
-    /// Whether another pack was connected after this one. Two values say so: one flipped bit must not make a state look old.
+    /// Whether another pack was connected after this one. Checks two values, so that one flipped bit does not make a state obsolete.
     pub(super) fn is_closed(&self, pack: i64) -> rusqlite::Result<bool> {
         let sql = "SELECT 1 FROM pack WHERE id = ?1 AND closed_ns IS NOT NULL";
         Ok(pack < self.pack && self.connection.prepare(sql)?.exists([pack])?)
     }
 
-    /// Notes which vehicle the history is of, if it is not noted yet.
+    /// Records the vehicle of the history, if it has changed.
     pub(super) fn set_vehicle(&self, of: &VehicleIdentity) -> rusqlite::Result<()> {
         if vehicle(&self.connection)? == *of {
             return Ok(());
@@ -199,7 +199,7 @@ impl Database {
         self.connection.execute("UPDATE meta SET vehicle = ?1 WHERE id = 1", [text]).map(drop)
     }
 
-    /// Writes rows, all or nothing; durable when it returns.
+    /// Writes rows, all or none; they are durable when it returns.
     pub(super) fn commit(&mut self, batches: &[RowBatch]) -> rusqlite::Result<()> {
         let transaction = self.connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
         let (mut segment, mut pack) = (self.segment, self.pack);
@@ -211,7 +211,7 @@ impl Database {
         Ok(())
     }
 
-    /// Deletes the oldest segment if the history is beyond its limits.
+    /// Deletes the oldest segment if the history exceeds its limits.
     pub(super) fn apply(&mut self, limits: &RowLimits, now: &Stamp) -> rusqlite::Result<()> {
         let horizon_ns = limits.keep_years.and_then(|years| now.years_ago_ns(years));
         let transaction = self.connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
@@ -219,12 +219,12 @@ impl Database {
         transaction.commit()
     }
 
-    /// What the history knows of the cells of the connected pack.
+    /// The learned values of the connected pack's cells in the history.
     pub(super) fn learned(&self) -> rusqlite::Result<Vec<LearnedCell>> {
         learned::read(&self.connection, self.pack)
     }
 
-    /// Closes the history of the pack with the last capacity of its weakest cell and opens that of the next pack. Returns the
+    /// Closes the history of the pack with the last capacity of its weakest cell, and opens that of the next pack. Returns the
     /// number of the new pack.
     pub(super) fn replace_pack(&mut self, now: &Stamp) -> rusqlite::Result<i64> {
         let learned = self
@@ -254,7 +254,7 @@ pub(super) fn format(connection: &Connection) -> rusqlite::Result<i32> {
     connection.query_row("PRAGMA user_version", [], |row| row.get(0))
 }
 
-/// The vehicle that the history is of. A text that cannot be read states none.
+/// The vehicle of the history; empty if the stored text cannot be parsed.
 pub(super) fn vehicle(connection: &Connection) -> rusqlite::Result<VehicleIdentity> {
     let text: Option<String> = connection.query_row("SELECT vehicle FROM meta WHERE id = 1", [], |row| row.get(0))?;
     Ok(text.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default())
@@ -277,29 +277,29 @@ fn create(connection: &mut Connection) -> rusqlite::Result<()> {
     transaction.commit()
 }
 
-/// Settings of the connection, and of the file while it is new.
+/// Sets up the connection and, if it is new, the file.
 fn prepare(connection: &Connection) -> rusqlite::Result<()> {
-    // Bytes: a commit changes few of them, and whole pages are written.
+    // Bytes. A small page, because a commit changes few bytes but writes whole pages.
     connection.pragma_update(None, "page_size", 1024)?;
     let mode: String = connection.query_row("PRAGMA journal_mode = WAL", [], |row| row.get(0))?;
     if mode != "wal" {
-        // A file system without shared memory. As safe, but every commit is written and synced twice.
-        tracing::warn!(mode, "the file system does not support a write-ahead log: the database writes more");
+        // File systems without shared memory. As safe, but every commit is written and synced twice.
+        tracing::warn!(mode, "no write-ahead log on this file system: every commit is written twice");
     }
     connection.pragma_update(None, "synchronous", "FULL")?;
     // KiB.
     connection.pragma_update(None, "cache_size", -256)?;
     connection.pragma_update(None, "temp_store", "MEMORY")?;
     connection.pragma_update(None, "cell_size_check", true)?;
-    // At half a megabyte of log, some fifty commits, SQLite copies it into the main file; a log of more than 1 MiB is truncated.
+    // SQLite copies a log of half a megabyte (about fifty commits) into the main file, and truncates a log of more than 1 MiB.
     connection.query_row("PRAGMA journal_size_limit = 1048576", [], |_| Ok(()))?;
     connection.query_row("PRAGMA wal_autocheckpoint = 512", [], |_| Ok(()))
 }
 
-/// Checks the file, for a bounded time.
+/// Checks the file for a limited time.
 fn check(connection: &mut Connection) -> Result<(), OpenError> {
     let started = Instant::now();
-    // Reads the clock every 10,000 steps of SQLite's virtual machine.
+    // The handler runs every 10,000 steps of SQLite's virtual machine.
     connection.progress_handler(10_000, Some(move || started.elapsed() > MAX_CHECK))?;
     let found = connection.query_row("PRAGMA quick_check(1)", [], |row| row.get::<_, String>(0));
     connection.progress_handler(0, None::<fn() -> bool>)?;
@@ -314,7 +314,7 @@ fn check(connection: &mut Connection) -> Result<(), OpenError> {
     }
 }
 
-/// Writes the rows of one moment, and what they change in `pack`.
+/// Writes the rows of one moment, and applies their changes to `pack`.
 fn write_batch(
     transaction: &Transaction<'_>,
     segment: &mut Segment,

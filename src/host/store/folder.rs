@@ -1,4 +1,4 @@
-//! The state folder: locks it for one daemon and opens its database, damaged or not.
+//! The state folder: locks it for one daemon and opens its database, even if it is damaged.
 //!
 //! A damaged database is renamed, reported, and replaced by an empty one.
 
@@ -17,18 +17,18 @@ use crate::io::place::with_suffix;
 pub(super) const DATABASE: &str = "packwatch.db";
 /// Name of the file that a daemon locks while it uses the folder.
 const LOCK: &str = "packwatch.lock";
-/// Suffixes of SQLite's files of a database. The log first: SQLite would take it for the log of the next database.
+/// Suffixes of SQLite's files of a database. The log comes first, because SQLite would use it with the next database.
 const FILES: [&str; 3] = ["-wal", "-shm", ""];
-/// Damaged databases kept; a disk that damages every file must not fill up with them.
+/// Most damaged databases kept, so that a disk that damages every file does not fill up with them.
 const MAX_SET_ASIDE: u32 = 8;
 
-/// See the module.
+/// The state folder.
 #[derive(Debug)]
 pub(super) struct Folder {
     path: PathBuf,
-    /// Locked as long as this lives.
+    /// The lock file; the lock is held as long as this lives.
     lock: Option<File>,
-    /// Damage of the database, which is to be replaced; `None` = no known damage.
+    /// Damage of the database, which must be replaced; `None` = no known damage.
     damage: Option<String>,
 }
 
@@ -39,7 +39,7 @@ impl fmt::Display for Folder {
 }
 
 impl Folder {
-    /// A folder that need not exist yet.
+    /// A folder that may not exist yet.
     pub(super) fn new(path: PathBuf) -> Self {
         Self { path, lock: None, damage: None }
     }
@@ -56,10 +56,10 @@ impl Folder {
         fs::metadata(path).ok().map(|file| file.len() + log)
     }
 
-    /// Creates the folder where it is missing, and locks it for this process.
+    /// Creates the folder if it does not exist, and locks it for this process.
     ///
     /// # Errors
-    /// `WouldBlock` when another process has locked it, else why it cannot be written.
+    /// `WouldBlock` if another process has locked it, else why it cannot be written.
     pub(super) fn lock(&mut self) -> io::Result<()> {
         if self.lock.is_some() {
             return Ok(());
@@ -76,8 +76,8 @@ impl Folder {
         }
     }
 
-    /// Opens the database, or an empty one in place of a damaged one, for the pack that the stored state knows. Returns rows
-    /// about the opening for the history.
+    /// Opens the database, or an empty one instead of a damaged one, for the pack known to the stored state. Returns rows about
+    /// the opening for the history.
     pub(super) fn open(&mut self, now: &Stamp, pack: i64) -> Result<(Database, Vec<HistoryRow>), OpenError> {
         self.lock().map_err(|error| OpenError::Unavailable(format!("{}: {error}", self.path.display())))?;
         let path = self.path.join(DATABASE);
@@ -95,16 +95,16 @@ impl Folder {
         let why = self.damage.take().unwrap_or_default();
         let name = place.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
         let detail = format!("{why}; set aside as {name}; the history starts again");
-        tracing::error!(error = why, set_aside = %place.display(), "the database is damaged: the history starts again");
+        tracing::error!(error = why, set_aside = %place.display(), "database damaged: a new history starts");
         Ok((Database::open(&path, now, pack)?, vec![HistoryRow::Own { reason: "damaged", detail }]))
     }
 
-    /// Notes that the database is damaged: the next opening replaces it.
+    /// Notes that the database is damaged; the next opening replaces it.
     pub(super) fn mark_damaged(&mut self, why: &str) {
         self.damage = Some(why.to_owned());
     }
 
-    /// Moves the database and SQLite's further files to another name.
+    /// Renames the database and SQLite's other files.
     fn set_aside(&self, place: &Path) -> io::Result<()> {
         let path = self.path.join(DATABASE);
         for suffix in FILES {
@@ -125,12 +125,12 @@ impl Folder {
     fn free_place(&self) -> PathBuf {
         let place = |number: u32| self.path.join(format!("{DATABASE}.damaged-{number}"));
         let free = (1..MAX_SET_ASIDE).map(place).find(|place| !place.exists());
-        // All are in use: the latest is replaced; the first is the most useful to a reader.
+        // All names are in use: the last one is replaced, because the first is the most useful to a reader.
         free.unwrap_or_else(|| place(MAX_SET_ASIDE))
     }
 }
 
-/// Whether a folder holds a history or a state.
+/// Whether a folder contains a history or a state.
 pub(super) fn is_used(folder: &Path) -> bool {
     state_files::FILES.into_iter().chain([DATABASE]).any(|name| folder.join(name).exists())
 }

@@ -1,8 +1,7 @@
-//! Selects the events that the history keeps, and those that are committed at once.
+//! Selects the events that are kept in the history, and those that are committed at once.
 //!
-//! An alarm that flickers must not wear out the flash, and must not delay another alarm. In: the events of one input.
-//! Out: rows to commit now, if any. Bounded by token buckets and by the bytes that states take ([`super::checkpoint`]); times are
-//! the events'.
+//! A flickering alarm must not wear out the flash or delay another alarm. In: the events of one input. Out: rows to commit now,
+//! if any. Limits are token buckets and the bytes of written states ([`super::checkpoint`]); times are those of the events.
 
 use std::collections::BTreeMap;
 
@@ -13,21 +12,21 @@ use crate::quantity::catalogue::Quantity;
 use crate::quantity::{CellIndex, Timestamp};
 use crate::token_bucket::{BucketSize, TokenBucket};
 
-/// Capacities of one cell written without condition: two days of an electric car at once, then one an hour. Further ones
-/// (a hybrid that reverses every minute) are written only if they differ: each row takes 100 bytes for years.
+/// Capacities of one cell that are written unconditionally: two days of an electric car at once, then one per hour. Further ones
+/// (of a hybrid that reverses every minute) are written only if they differ, because each row takes 100 bytes for years.
 const CAPACITIES: BucketSize = BucketSize { burst: 64.0, period_s: 3600.0 };
-/// Least change of such a further capacity, in standard deviations.
+/// Smallest change of such a further capacity, in standard deviations.
 const MIN_CHANGE_STD: f64 = 0.25;
-/// Commits reserved for each alarm, and for all filter resets together: other alarms cannot use them up. Further commits are made
-/// while the bytes written allow it. Beyond both, rows wait for a checkpoint, and only the first and the last of each alarm or cell
-/// are kept; the count of occurrences gives the number of the others. A rule that flickers in each of 96 cells at other times causes
-/// 290 commits of some 70 kB on the first day.
+/// Commits reserved for each alarm, and for all filter resets together: other alarms cannot use them up. Further commits depend on
+/// the write budget. Beyond both, rows wait for a checkpoint, and only the first and last row of each alarm or cell are kept; the
+/// occurrence count covers the rest. A rule that flickers in 96 cells at different times causes 290 commits of about 70 kB on the
+/// first day.
 const OWN_COMMITS: BucketSize = BucketSize { burst: 2.0, period_s: 86_400.0 };
-/// Times that waiting rows are written with a checkpoint or with other rows: an hour of checkpoints, then once an hour.
-/// They stay for years, and each time there are two of each alarm.
+/// Writes of waiting rows with a checkpoint or other rows: one hour of checkpoints, then once per hour. Each write adds two rows
+/// per alarm, which are kept for years.
 const CARRIED: BucketSize = BucketSize { burst: 60.0, period_s: 3600.0 };
 
-/// The capacity written last.
+/// The capacity last written.
 #[derive(Debug, Clone, Copy)]
 struct WrittenCapacity {
     capacity_ah: f64,
@@ -35,14 +34,14 @@ struct WrittenCapacity {
     token_bucket: TokenBucket,
 }
 
-/// The remaining life written last: median and standard deviation, cycles; `None` = it was not known.
+/// The remaining life last written: median and standard deviation, cycles; `None` = unknown.
 #[derive(Debug, Clone, Copy)]
 struct WrittenLife {
     cycles: Option<(f64, f64)>,
     token_bucket: TokenBucket,
 }
 
-/// Selects the events that the history keeps.
+/// Selects the events that are kept in the history.
 #[derive(Debug)]
 pub(super) struct HistoryFilter {
     written: BTreeMap<CellIndex, WrittenCapacity>,
@@ -65,8 +64,8 @@ impl Default for HistoryFilter {
 }
 
 impl HistoryFilter {
-    /// The rows to commit with the state now, which may be none, with those that waited; `None` = nothing was learned and no
-    /// alarm changed, or only alarms that come too often, whose rows wait. `has_room`: the bytes written allow a commit.
+    /// The rows to commit with the state now (possibly none), including those that waited. `None` = nothing was learned and no
+    /// alarm changed, or only alarms that change too often; their rows wait. `has_room`: the written bytes allow a commit.
     pub(super) fn take(&mut self, events: &[Event], has_room: bool) -> Option<Vec<HistoryRow>> {
         let now = events.iter().find(|event| is_learned(&event.kind))?.time;
         let learned = || events.iter().map(|event| event.kind).filter(is_learned);
@@ -78,7 +77,7 @@ impl HistoryFilter {
         let mut rows = self.for_checkpoint(now);
         let mut writes_capacity = false;
         for kind in learned() {
-            // What a cell has lost follows from its capacity, whose event comes before.
+            // Loss modes follow from the cell's capacity, whose event comes before.
             let is_worth_writing = match kind {
                 EventKind::LossModes { .. } => writes_capacity,
                 _ => self.is_worth_writing(&kind, now),
@@ -88,7 +87,7 @@ impl HistoryFilter {
             }
             if is_worth_writing {
                 let row = HistoryRow::Event(kind);
-                // Waiting rows of the same alarm come before it.
+                // Waiting rows of the same alarm come first.
                 rows.extend(self.deferred.extract_if(.., |waiting| waiting.repeats(&row)));
                 rows.push(row);
             }
@@ -123,7 +122,7 @@ impl HistoryFilter {
         self.deferred.push(row);
     }
 
-    /// Whether to write a remaining life: beyond the allowance, only one that has changed.
+    /// Whether to write a remaining life; beyond the allowance, only if it has changed.
     fn is_life_worth_writing(&mut self, cycles: Option<(f64, f64)>, now: Timestamp) -> bool {
         let written = &mut self.written_life;
         let has_moved = match (written.cycles, cycles) {
@@ -137,14 +136,14 @@ impl HistoryFilter {
         is_worth_writing
     }
 
-    /// Whether to write an event. A capacity without a measurement and with the same usable part is not written, nor,
-    /// beyond the allowance, one that has hardly changed.
+    /// Whether to write an event. A capacity is not written if it has no measurement and the same usable part, nor, beyond the
+    /// allowance, if it has hardly changed.
     fn is_worth_writing(&mut self, kind: &EventKind, now: Timestamp) -> bool {
         if matches!(kind, EventKind::PackReplaced { .. }) {
             self.written_life.cycles = None;
         }
         if let EventKind::RemainingLife { cycles, cycles_low, .. } = *kind {
-            // Half of the interval's lower part: a little less than a standard deviation.
+            // Half of the interval's lower part is a little less than a standard deviation.
             return self.is_life_worth_writing(
                 cycles.zip(cycles_low).map(|(median, low)| (median, 0.5 * (median - low))),
                 now,
@@ -175,8 +174,8 @@ impl HistoryFilter {
     }
 }
 
-/// Whether an event is durable before it is announced. An alarm whose value was lost or returned does not change what was
-/// announced, and a flickering input causes many of those.
+/// Whether an event must be durable before it is announced. Losing and regaining an alarm's value does not change what was
+/// announced, and a flickering input causes many of these changes.
 fn is_learned(kind: &EventKind) -> bool {
     match kind {
         EventKind::HalfCycle { .. }
@@ -200,7 +199,7 @@ mod tests {
     use super::*;
     use crate::alarm::{Rule, Severity};
 
-    /// Rows that are committed at once although there is no room.
+    /// Number of rows committed at once although there is no room.
     fn take(history_filter: &mut HistoryFilter, seconds: f64, kinds: &[EventKind]) -> Option<usize> {
         let time = Timestamp::from_secs(seconds);
         let events: Vec<Event> = kinds.iter().map(|&kind| Event { time, kind }).collect();
@@ -208,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn a_capacity_is_written_when_there_is_something_new_in_it() {
+    fn capacity_is_written_if_it_has_news() {
         let mut history_filter = HistoryFilter::default();
         assert_eq!(take(&mut history_filter, 0.0, &[capacity(0, Some(2.4), 2.3)]), Some(1));
         assert_eq!(take(&mut history_filter, 0.0, &[capacity(0, None, 2.3)]), Some(0));
@@ -217,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_cell_has_lost_is_written_with_its_capacity() {
+    fn loss_modes_are_written_with_capacity() {
         let mut history_filter = HistoryFilter::default();
         let cells = [capacity(0, Some(2.4), 2.3), loss_modes(0, 0.1), capacity(1, None, 2.3), loss_modes(1, 0.1)];
         assert_eq!(take(&mut history_filter, 0.0, &cells), Some(2));
@@ -225,7 +224,7 @@ mod tests {
     }
 
     #[test]
-    fn every_change_of_the_model_is_written_at_once() {
+    fn every_model_change_is_written() {
         let mut history_filter = HistoryFilter::default();
         for second in 0..200 {
             assert_eq!(take(&mut history_filter, f64::from(second), &[model(Some(2.0))]), Some(1), "{second}");
@@ -233,14 +232,14 @@ mod tests {
     }
 
     #[test]
-    fn a_flickering_input_writes_nothing() {
+    fn flickering_input_writes_nothing() {
         let mut history_filter = HistoryFilter::default();
         assert_eq!(take(&mut history_filter, 0.0, &[alarm(Change::Suppressed), alarm(Change::Resumed)]), None);
         assert_eq!(take(&mut history_filter, 0.0, &[alarm(Change::Raised)]), Some(1));
     }
 
     #[test]
-    fn a_pack_that_reverses_every_minute_writes_only_changes() {
+    fn frequent_reversals_write_only_changes() {
         let mut history_filter = HistoryFilter::default();
         let mut rows = 0;
         for minute in 0..1440 {
@@ -252,7 +251,7 @@ mod tests {
     }
 
     #[test]
-    fn remaining_lives_are_written_until_there_are_many_and_then_when_they_move() {
+    fn frequent_remaining_lives_write_only_changes() {
         let day = |per_minute: f64| {
             let (mut history_filter, mut rows) = (HistoryFilter::default(), 0);
             for minute in 0..1440 {
@@ -262,7 +261,7 @@ mod tests {
             assert!((64 + 22..=64 + 24).contains(&rows), "{rows} rows");
             history_filter
         };
-        // Nothing any more, and slowly less.
+        // Constant, and slowly decreasing.
         day(0.0);
         let mut history_filter = day(0.01);
         assert_eq!(take(&mut history_filter, 86_341.0, &[half_cycle(0), remaining_life(700.0)]), Some(2), "far");
@@ -280,7 +279,7 @@ mod tests {
     }
 
     #[test]
-    fn a_flickering_alarm_is_written_now_and_then_with_its_first_and_last_row() {
+    fn flickering_alarm_keeps_first_and_last_row() {
         let mut history_filter = HistoryFilter::default();
         let (mut commits, mut rows) = (0, 0);
         for second in 0..10 * 86_400 {
@@ -296,7 +295,7 @@ mod tests {
     }
 
     #[test]
-    fn a_misfit_delays_no_other_alarm() {
+    fn flickering_alarm_delays_no_other() {
         let mut history_filter = HistoryFilter::default();
         let of = |of_rule, of_severity, of_cell| {
             let mut kind = alarm(Change::Raised);
@@ -326,7 +325,7 @@ mod tests {
     }
 
     #[test]
-    fn waiting_rows_go_with_a_checkpoint_but_not_with_every_one() {
+    fn waiting_rows_are_written_with_some_checkpoints() {
         let mut history_filter = HistoryFilter::default();
         let mut rows = 0;
         for minute in 0..1440_u32 {

@@ -1,6 +1,6 @@
-//! Reads from the history what was learned of the connected pack, for a start whose stored states are all lost.
+//! Reads the learned values of the connected pack from the history, for a start without any valid stored state.
 //!
-//! In: the rows of `capacity`. Out: for each cell its newest row in a segment that is as it was written.
+//! In: the rows of `capacity`. Out: for each cell its newest row in an intact segment.
 
 use rusqlite::{Connection, Row};
 
@@ -11,10 +11,10 @@ use crate::monitor::LearnedCell;
 use crate::quantity::CellIndex;
 use crate::quantity::catalogue::Quantity;
 
-/// Segments read, the newest: days of use.
+/// Most segments that are read, newest first: days of use.
 const MAX_SEGMENTS: usize = 16;
 
-/// What was learned of the cells of pack `pack`, in their order.
+/// The learned values of the cells of pack `pack`, ordered by cell.
 pub(super) fn read(connection: &Connection, pack: i64) -> rusqlite::Result<Vec<LearnedCell>> {
     let mut statement = connection.prepare(&format!(
         "SELECT r.{} FROM capacity r JOIN moment m ON m.id = r.moment WHERE m.pack = ?1 AND r.seq BETWEEN ?2 AND ?3 ORDER BY r.seq DESC",
@@ -32,7 +32,7 @@ pub(super) fn read(connection: &Connection, pack: i64) -> rusqlite::Result<Vec<L
     Ok(cells)
 }
 
-/// The contents of a row of `capacity`; `None` = it has no capacity.
+/// The learned values in a row of `capacity`; `None` = the row has no capacity.
 fn learned(row: &Row<'_>) -> rusqlite::Result<Option<LearnedCell>> {
     let belief = |quantity: Quantity| -> rusqlite::Result<Option<ScalarGaussian>> {
         let Some(std_key) = quantity.row().std_key else { return Ok(None) };

@@ -1,4 +1,4 @@
-//! Reads a store without changing it: next to a running daemon, after a crash, on a disk that cannot be written.
+//! Reads a store without changing it: next to a running daemon, after a crash, or on a read-only disk.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -15,7 +15,7 @@ use crate::config::VehicleIdentity;
 use crate::io::place::with_suffix;
 use crate::monitor::Snapshot;
 
-/// Largest database that is copied for reading, with its log, bytes: a temporary folder has room for it.
+/// Largest database (with its log) that is copied for reading, bytes; a temporary folder has room for it.
 const MAX_COPY_BYTES: u64 = 256 << 20;
 
 /// A store, open for reading.
@@ -23,7 +23,7 @@ const MAX_COPY_BYTES: u64 = 256 << 20;
 pub struct HistoryReader {
     connection: Connection,
     path: PathBuf,
-    /// Folder of the copy it reads, when the original cannot be read in its place.
+    /// Folder of the copy, if the original cannot be read in place.
     _copy: Option<TemporaryCopy>,
 }
 
@@ -38,12 +38,12 @@ pub struct HistoryQuery {
     pub since_ns: Option<i64>,
     /// Latest wall clock, ns since 1970.
     pub until_ns: Option<i64>,
-    /// Greatest number of rows, the latest ones; `None` = all.
+    /// Most rows, the latest ones; `None` = all.
     pub limit: Option<u32>,
 }
 
 impl HistoryQuery {
-    /// The selected tables, in the order in which they are shown.
+    /// The selected tables, in display order.
     pub fn wanted_kinds(&self) -> impl Iterator<Item = HistoryTable> {
         HistoryTable::ALL.into_iter().filter(|kind| self.kinds.is_empty() || self.kinds.contains(kind))
     }
@@ -52,11 +52,11 @@ impl HistoryQuery {
 /// One row of the history.
 #[derive(Debug, Clone, PartialEq)]
 pub struct HistoryEntry {
-    /// Its table.
+    /// Table of the row.
     pub kind: HistoryTable,
-    /// Its number, counted across the tables.
+    /// Number of the row, counted across the tables.
     pub seq: i64,
-    /// Wall clock at that moment, ns since 1970.
+    /// Wall clock at that time, ns since 1970.
     pub wall_ns: i64,
     /// The inputs' clock, ns.
     pub time_ns: i64,
@@ -68,16 +68,16 @@ pub struct HistoryEntry {
     pub values: Vec<serde_json::Value>,
 }
 
-/// How much of the half-cycles a store holds.
+/// How many half-cycles a store contains.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct HistoryExtent {
-    /// Number of the pack that is connected, from 1; 0 = none yet.
+    /// Number of the connected pack, from 1; 0 = none yet.
     pub pack: i64,
-    /// Half-cycles, of any pack, that the store has.
+    /// Half-cycles of all packs in the store.
     pub half_cycles: i64,
-    /// Half-cycles, of any pack, that the store has deleted because of their number or age.
+    /// Half-cycles of all packs that the store has deleted because of their number or age.
     pub deleted_half_cycles: i64,
-    /// Half-cycles, of any pack, that were written, as the store itself counts them.
+    /// Half-cycles of all packs ever written, as counted by the store.
     pub written_half_cycles: i64,
 }
 
@@ -85,17 +85,17 @@ impl HistoryReader {
     /// Opens the store in a folder.
     ///
     /// # Errors
-    /// When there is none, or it cannot be read; names the file.
+    /// When there is none, or it cannot be read; the error names the file.
     pub fn open(folder: &Path) -> Result<Self, String> {
         let path = folder.join(DATABASE);
         let named = |error: String| format!("{}: {error}", path.display());
         if !path.exists() {
-            return Err(named("no history there; name the folder of the daemon with --state".to_owned()));
+            return Err(named("no history found; give the daemon's state folder with --state".to_owned()));
         }
         let (connection, copy) = open_read_only(&path, MAX_COPY_BYTES).map_err(named)?;
         match database::format(&connection) {
             Ok(database::FORMAT) => Ok(Self { connection, path, _copy: copy }),
-            Ok(format) => Err(named(format!("format {format}, this program reads {}", database::FORMAT))),
+            Ok(format) => Err(named(format!("format {format}, must be {}", database::FORMAT))),
             Err(error) => Err(named(error.to_string())),
         }
     }
@@ -104,7 +104,7 @@ impl HistoryReader {
         format!("{}: {error}", self.path.display())
     }
 
-    /// The vehicle that the history is of, as the daemon was configured last.
+    /// The vehicle of the history, as last configured.
     ///
     /// # Errors
     /// When the file cannot be read.
@@ -112,12 +112,12 @@ impl HistoryReader {
         database::vehicle(&self.connection).map_err(|error| self.named(&error))
     }
 
-    /// How much of the half-cycles the store holds.
+    /// How many half-cycles the store contains.
     ///
     /// # Errors
     /// When the file cannot be read.
     pub fn extent(&self) -> Result<HistoryExtent, String> {
-        // One statement, which a daemon that writes cannot come between.
+        // A single statement, so that a daemon cannot write in between.
         let sql = "SELECT (SELECT coalesce(max(id), 0) FROM pack), (SELECT count(*) FROM half_cycle), coalesce(sum(half_cycles * \
                    deleted), 0), coalesce(sum(half_cycles), 0) FROM segment";
         let extent = self.connection.query_row(sql, [], |row| {
@@ -139,7 +139,7 @@ impl HistoryReader {
         self.at_once(segments::verify)
     }
 
-    /// What contradicts the chain's end as it was noted elsewhere; `None` = nothing.
+    /// What contradicts a chain's end noted elsewhere; `None` = nothing.
     ///
     /// # Errors
     /// When the file cannot be read.
@@ -147,13 +147,13 @@ impl HistoryReader {
         self.at_once(|connection| segments::contradiction(connection, noted))
     }
 
-    /// Reads several times from the file as it is now, whatever a daemon writes meanwhile.
+    /// Reads several times from one snapshot of the file, even while a daemon writes.
     fn at_once<T>(&self, read: impl FnOnce(&Connection) -> rusqlite::Result<T>) -> Result<T, String> {
         let snapshot = self.connection.unchecked_transaction();
         snapshot.and_then(|snapshot| read(&snapshot)).map_err(|error| self.named(&error))
     }
 
-    /// The stored snapshot; `None` = there is none, or it is damaged.
+    /// The stored snapshot; `None` = missing or damaged.
     pub fn snapshot(&self) -> Option<Snapshot> {
         self.state().map(|document| *document.snapshot)
     }
@@ -163,12 +163,12 @@ impl HistoryReader {
         self.state().map(|document| (document.stamp.wall_ns, *document.snapshot))
     }
 
-    /// The newest good state next to the database.
+    /// The newest valid state next to the database.
     pub(super) fn state(&self) -> Option<StateDocument> {
         StateFiles::open(self.path.parent()?).1.newest
     }
 
-    /// The selected rows in the order in which they were written.
+    /// The selected rows, in the order in which they were written.
     ///
     /// # Errors
     /// When the file cannot be read.
@@ -243,8 +243,8 @@ fn json(value: Value) -> serde_json::Value {
     }
 }
 
-/// Opens the database for reading, next to a daemon that writes. On a disk that cannot be written, where SQLite cannot
-/// create its index of the log, opens a copy.
+/// Opens the database for reading, next to a daemon that writes. Opens a copy on a read-only disk, where SQLite cannot create
+/// its index of the log.
 fn open_read_only(path: &Path, max_copy_bytes: u64) -> Result<(Connection, Option<TemporaryCopy>), String> {
     let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
     let open = |path: &Path, flags: OpenFlags| -> rusqlite::Result<Connection> {
@@ -263,12 +263,12 @@ fn open_read_only(path: &Path, max_copy_bytes: u64) -> Result<(Connection, Optio
     }
     let folder = copy_to_temporary(path, max_copy_bytes)
         .map_err(|copying| format!("{error}; and it cannot be copied: {copying}"))?;
-    // A copy can be written: SQLite creates its index there.
+    // The copy is writable, so SQLite can create its index there.
     let opened = open(&folder.0.join(DATABASE), OpenFlags::default());
     opened.map(|connection| (connection, Some(folder))).map_err(|error| error.to_string())
 }
 
-/// A copy of the database, which is removed on drop.
+/// A copy of the database, removed on drop.
 #[derive(Debug)]
 struct TemporaryCopy(PathBuf);
 
@@ -283,7 +283,7 @@ fn copy_to_temporary(path: &Path, max_bytes: u64) -> std::io::Result<TemporaryCo
     let log_bytes = fs::metadata(with_suffix(path, "-wal")).map_or(0, |file| file.len());
     let bytes = fs::metadata(path)?.len() + log_bytes;
     if bytes > max_bytes {
-        return Err(std::io::Error::other(format!("{bytes} bytes, at most {max_bytes} are copied")));
+        return Err(std::io::Error::other(format!("{bytes} bytes, must be at most {max_bytes}")));
     }
     let folder = std::env::temp_dir().join(format!("packwatch-history-{}", std::process::id()));
     fs::create_dir(&folder)?;
@@ -301,13 +301,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_copy_is_limited_and_its_log_counts() {
+    fn copied_size_includes_log_and_is_limited() {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join(DATABASE);
         fs::write(&path, [0; 600]).unwrap();
         fs::write(with_suffix(&path, "-wal"), [0; 500]).unwrap();
         let refused = copy_to_temporary(&path, 1000).unwrap_err().to_string();
-        assert_eq!(refused, "1100 bytes, at most 1000 are copied");
+        assert_eq!(refused, "1100 bytes, must be at most 1000");
         let copy = copy_to_temporary(&path, 1100).unwrap();
         assert!(with_suffix(&copy.0.join(DATABASE), "-wal").exists());
     }

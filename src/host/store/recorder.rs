@@ -1,4 +1,4 @@
-//! The store of a replay: the same files, written synchronously, in bus time.
+//! The store of a replay: the same files as the daemon's, written synchronously and stamped with bus time.
 
 use std::path::Path;
 
@@ -18,7 +18,7 @@ use crate::quantity::Timestamp;
 pub struct Recorder {
     database: Database,
     state_files: StateFiles,
-    /// Locked against other processes.
+    /// The folder, locked against other processes.
     folder: Folder,
     history_filter: HistoryFilter,
     limits: RowLimits,
@@ -26,17 +26,15 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// Creates the store in a folder that has none.
+    /// Creates the store in a folder that contains none.
     ///
     /// # Errors
-    /// When there is one, or it cannot be created: a replay must never get into the history of a real pack.
+    /// When the folder contains one, because a replay must never be written into the history of a real pack, or when it cannot
+    /// be created.
     pub fn create(path: &Path, config: &StoreConfig, vehicle: &VehicleIdentity) -> Result<Self, String> {
         let shown = path.join(DATABASE).display().to_string();
         if folder::is_used(path) {
-            return Err(format!(
-                "{}: has a state; a replay needs a state folder of its own, name a new one",
-                path.display()
-            ));
+            return Err(format!("{}: already contains a state; a replay needs a new state folder", path.display()));
         }
         let mut folder = Folder::new(path.to_owned());
         folder.lock().map_err(|error| format!("{}: {error}", path.display()))?;
@@ -53,7 +51,7 @@ impl Recorder {
         })
     }
 
-    /// Writes the rows of one input's events, and the checkpoint when it is due.
+    /// Writes the rows of one input's events, and the checkpoint if it is due.
     pub fn record(&mut self, events: &[Event], monitor: &Monitor, now: Timestamp) -> Result<(), String> {
         let is_due = self.schedule.is_due(now, 0.0);
         let rows = match self.history_filter.take(events, self.schedule.has_room(now)) {

@@ -1,52 +1,52 @@
-//! Disk space kept for the moment when the disk is full: a file that is shortened, step by step, so that learned results and
-//! alarms can be stored, and made whole again when there is room.
+//! Reserves disk space for the time when the disk is full: a file that is shortened step by step, so that learned results and
+//! alarms can be stored, and is restored when there is room again.
 //!
-//! A step is enough for some commits. States without new rows do not use it: they wait until the disk has room.
+//! One step is enough for several commits. States without new rows do not use the reserve; they wait until the disk has room.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// Its name in the state folder.
+/// Name of the file in the state folder.
 const FILE_NAME: &str = "packwatch.reserve";
-/// Its size, bytes: as much as the write-ahead log may take.
+/// Size of the file, bytes; as much as the write-ahead log may take.
 const BYTES: usize = 1 << 20;
-/// What is released at once: more than a commit writes. Another program that still fills the disk may take the rest of it.
+/// Bytes released at once; more than a commit writes. Another program that still fills the disk may take some of it.
 const STEP_BYTES: usize = 128 << 10;
-/// File that shows whether the disk is full.
+/// File that is written to find out whether the disk is full.
 const PROBE_NAME: &str = "packwatch.probe";
-/// Least time between two attempts to make it.
+/// Shortest time between two attempts to restore the reserve.
 const PAUSE: Duration = Duration::from_secs(15);
 
 /// The reserve of a folder.
 #[derive(Debug)]
 pub(super) struct Reserve {
     folder: PathBuf,
-    /// Bytes of the file.
+    /// Size of the file, bytes.
     left: usize,
     tried: Option<Instant>,
 }
 
 impl Reserve {
-    /// The reserve of a folder, which need not exist yet.
+    /// The reserve of a folder, which may not exist yet.
     pub(super) fn new(folder: &Path) -> Self {
         let found = fs::metadata(folder.join(FILE_NAME)).map_or(0, |file| file.len());
         let left = usize::try_from(found).unwrap_or(BYTES).min(BYTES);
         Self { folder: folder.to_owned(), left, tried: None }
     }
 
-    /// Whether nothing of it is used.
+    /// Whether the reserve is unused.
     pub(super) fn is_whole(&self) -> bool {
         self.left == BYTES
     }
 
-    /// Whether there is space to release.
+    /// Whether there is space left to release.
     pub(super) fn is_usable(&self) -> bool {
         self.left > 0
     }
 
-    /// Makes the file whole again, now and then; on a full disk it stays as it is.
+    /// Restores the file from time to time; on a full disk it stays as it is.
     pub(super) fn restore(&mut self) {
         if self.is_whole() || self.tried.is_some_and(|tried| tried.elapsed() < PAUSE) {
             return;
@@ -55,7 +55,7 @@ impl Reserve {
         self.make();
     }
 
-    /// Makes the file whole.
+    /// Extends the file to its full size.
     pub(super) fn make(&mut self) {
         if self.is_whole() {
             return;
@@ -63,23 +63,23 @@ impl Reserve {
         let path = self.folder.join(FILE_NAME);
         let grown = File::options().create(true).append(true).open(&path).and_then(|file| {
             let grown = write(&file, BYTES - self.left);
-            // A part of it takes room from others.
+            // A partly extended file would only take room from others.
             let kept = grown.as_ref().map_or(Some(self.left), |()| None);
             kept.map_or(Ok(()), |left| file.set_len(left as u64)).and(grown)
         });
         match grown {
             Ok(()) => self.left = BYTES,
-            Err(error) => tracing::warn!(file = %path.display(), %error, "no whole reserve for a full disk"),
+            Err(error) => tracing::warn!(file = %path.display(), %error, "reserve for a full disk not created"),
         }
     }
 
-    /// Frees a step of the space if the disk has none; `false` = the disk has room, or there is nothing to free. SQLite's
-    /// errors do not say it: a full disk also fails to open or to enlarge a file.
+    /// Frees one step if the disk is full; `false` = the disk has room, or there is nothing to free. SQLite's errors are not
+    /// used because they do not distinguish a full disk from a file that cannot be opened or extended.
     pub(super) fn release_if_full(&mut self) -> bool {
         self.is_usable() && self.is_disk_full() && self.release()
     }
 
-    /// Tries to write as much as a step.
+    /// Tries to write as much as one step.
     fn is_disk_full(&self) -> bool {
         let path = self.folder.join(PROBE_NAME);
         let written = File::create(&path).and_then(|file| write(&file, STEP_BYTES));
@@ -91,12 +91,12 @@ impl Reserve {
         self.left = self.left.saturating_sub(STEP_BYTES);
         self.tried = Some(Instant::now());
         let path = self.folder.join(FILE_NAME);
-        // Synced: until the change is in its journal, a file system does not give the space to another file.
+        // Synced, because a file system does not give the space to another file before the change is in its journal.
         let freed = File::options().write(true).open(&path).and_then(|file| {
             file.set_len(self.left as u64)?;
             file.sync_all()
         });
-        tracing::warn!(file = %path.display(), freed = freed.is_ok(), left = self.left, "the disk is full: the reserve is used");
+        tracing::warn!(file = %path.display(), freed = freed.is_ok(), left = self.left, "disk full: using the reserve");
         freed.is_ok()
     }
 }
@@ -113,7 +113,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_reserve_is_made_released_in_steps_and_made_again_later() {
+    fn reserve_is_released_in_steps_and_restored() {
         let folder = tempfile::tempdir().unwrap();
         let mut reserve = Reserve::new(folder.path());
         assert!(!reserve.is_usable() && !reserve.release_if_full(), "nothing to release");

@@ -1,7 +1,7 @@
-//! The tables of the history, and the rows that the core's events make in them.
+//! The tables of the history, and the rows made from the core's events.
 //!
-//! A column of the same name as a field of the event holds that field. Cells count from 0; units are in the names. A
-//! number that is not finite is stored as NULL.
+//! A column with the name of an event's field holds that field. Cells count from 0; units are in the names. A number that is
+//! not finite is stored as NULL.
 
 use std::sync::LazyLock;
 
@@ -16,18 +16,18 @@ use crate::quantity::catalogue::RecordedValues;
 /// One row to write.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum HistoryRow {
-    /// An event of the core: a half-cycle, a capacity, another cell model, an alarm, a filter reset, another pack.
+    /// An event of the core: a half-cycle, a capacity, a new cell model, an alarm, a filter reset, another pack.
     Event(EventKind),
     /// An event of the store itself.
     Own {
-        /// Its name: `damaged`, `state_damaged`, `rows_lost`.
+        /// Name of the event: `damaged`, `state_damaged`, `rows_lost`.
         reason: &'static str,
         /// Details for the reader.
         detail: String,
     },
 }
 
-/// Rows of one moment.
+/// Rows written at one moment.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct RowBatch {
     /// The moment.
@@ -43,20 +43,20 @@ pub enum HistoryTable {
     HalfCycle,
     /// Learned capacities.
     Capacity,
-    /// Lithium and active material that cells have lost.
+    /// Loss modes of the cells.
     LossModes,
     /// Remaining life of the cell whose life ends first.
     RemainingLife,
-    /// Changes of the cell model that is learned on board.
+    /// Changes of the cell model learned on board.
     Model,
     /// Alarms.
     Alarm,
-    /// Resets, other packs, damages.
+    /// Resets, pack changes, damage.
     Reset,
 }
 
 impl HistoryTable {
-    /// All tables, in the order in which they are shown.
+    /// All tables, in display order.
     pub const ALL: [Self; 7] =
         [Self::HalfCycle, Self::Capacity, Self::LossModes, Self::RemainingLife, Self::Model, Self::Alarm, Self::Reset];
     /// Type of a column in the database.
@@ -68,7 +68,7 @@ impl HistoryTable {
         }
     }
 
-    /// Its name in the database, in JSON and in CSV.
+    /// Name in the database, in JSON and in CSV.
     pub const fn name(self) -> &'static str {
         match self {
             Self::HalfCycle => "half_cycle",
@@ -81,7 +81,7 @@ impl HistoryTable {
         }
     }
 
-    /// Its columns, the cell (from 0) first, without the moment and the number.
+    /// Its columns without moment and number; the cell (from 0) comes first.
     pub fn columns(self) -> &'static [&'static str] {
         static CAPACITY: LazyLock<Vec<&str>> = LazyLock::new(|| {
             ["cell", "measured_ah", "measured_std_ah"].into_iter().chain(RecordedValues::keys()).collect()
@@ -122,7 +122,7 @@ impl HistoryTable {
 }
 
 impl HistoryRow {
-    /// Its table and the values of the table's columns; `None` = the history has no row for it.
+    /// The row's table and the values of its columns; `None` = the history has no row for this event.
     pub(super) fn values(&self) -> Option<(HistoryTable, Vec<Value>)> {
         let text = |text: &str| Value::Text(text.to_owned());
         let kind = match self {
@@ -132,7 +132,7 @@ impl HistoryRow {
             }
             Self::Event(kind) => kind,
         };
-        // Columns whose value is not the event's field of that name.
+        // Values of columns that differ from the event's field of that name.
         let (table, own) = match kind {
             EventKind::HalfCycle { .. } => (HistoryTable::HalfCycle, vec![]),
             EventKind::Capacity { .. } => (HistoryTable::Capacity, vec![]),
@@ -142,7 +142,7 @@ impl HistoryRow {
                 (HistoryTable::Model, vec![("taken_back", Value::Integer(i64::from(*is_taken_back)))])
             }
             EventKind::Alarm { .. } => (HistoryTable::Alarm, vec![]),
-            // No threshold watches it any more: it has ended, without a value that decided.
+            // No threshold monitors this alarm any more, so it has ended without a deciding value.
             EventKind::AlarmDropped { .. } => {
                 let no = Value::Integer(0);
                 let own = [("change", text("dropped")), ("state", text("inactive")), ("active", no.clone())];
@@ -163,12 +163,12 @@ impl HistoryRow {
         Some((table, table.columns().iter().map(value).collect()))
     }
 
-    /// Whether it is detail: dropped first when there is no room for all.
+    /// Whether the row is a detail, which is dropped first if there is no room.
     pub(super) const fn is_detail(&self) -> bool {
         matches!(self, Self::Event(EventKind::HalfCycle { .. }))
     }
 
-    /// Whether both rows are about the same alarm, or about the filter of the same cell.
+    /// Whether both rows are about the same alarm, or about the same cell's filter.
     pub(super) fn repeats(&self, other: &Self) -> bool {
         match (self, other) {
             (Self::Event(EventKind::FilterReset { cell }), Self::Event(EventKind::FilterReset { cell: other })) => {
@@ -190,13 +190,13 @@ impl HistoryRow {
         }
     }
 
-    /// Whether another pack begins after it.
+    /// Whether another pack begins after this row.
     pub(super) const fn replaces_pack(&self) -> bool {
         matches!(self, Self::Event(EventKind::PackReplaced { .. }))
     }
 }
 
-/// The source of events that may repeat although nothing was learned.
+/// The subject of events that may repeat although nothing was learned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum EventSubject {
     /// Filter resets, of any cell.
@@ -216,13 +216,13 @@ impl EventSubject {
     }
 }
 
-/// A field of an event as SQLite stores it; what has no form there is NULL.
+/// An event's field as an SQLite value; NULL if it has no equivalent.
 fn sql_value(field: &serde_json::Value) -> Value {
     match field {
         serde_json::Value::Bool(flag) => Value::Integer(i64::from(*flag)),
         serde_json::Value::Number(number) => match number.as_i64() {
             Some(whole) => Value::Integer(whole),
-            // SQLite stores no sign of a zero, which the hash would miss.
+            // SQLite does not store the sign of a zero, but the hash would include it.
             None => number.as_f64().map(|real| real + 0.0).into(),
         },
         serde_json::Value::String(text) => Value::Text(text.clone()),

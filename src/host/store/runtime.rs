@@ -1,7 +1,7 @@
-//! Writes the state to the runtime folder every second, so that a crash of the daemon alone loses at most a second.
+//! Writes the state to the runtime folder every second, so that a crash of the daemon alone loses at most one second.
 //!
-//! The folder is in memory and lives as long as the boot (systemd keeps it over restarts of the service). A separate
-//! thread writes the latest state, so that a slow disk elsewhere does not delay it.
+//! The folder is in memory and exists until the computer restarts (systemd keeps it over restarts of the service). A separate
+//! thread writes the latest state, so that a slow disk does not delay it.
 
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
@@ -13,11 +13,11 @@ use super::state_files::StateDocument;
 /// Name of the file.
 pub(super) const FILE_NAME: &str = "state.json";
 
-/// Writes the state of the second.
+/// Writes the runtime state.
 #[derive(Debug)]
 pub(super) struct RuntimeState {
     latest: Arc<Mutex<Option<StateDocument>>>,
-    /// One word that a state waits; `None` only during the drop.
+    /// Signals that a state is waiting; `None` only during the drop.
     wake: Option<SyncSender<()>>,
     writer: Option<JoinHandle<()>>,
 }
@@ -32,7 +32,7 @@ impl RuntimeState {
         Ok(Self { latest, wake: Some(wake), writer: Some(writer) })
     }
 
-    /// Queues the latest state; it replaces one that still waits.
+    /// Queues the latest state, which replaces a waiting one.
     pub(super) fn put(&self, document: StateDocument) {
         *self.latest.lock().unwrap_or_else(PoisonError::into_inner) = Some(document);
         let _ = self.wake.as_ref().map(|wake| wake.try_send(()));
@@ -42,7 +42,7 @@ impl RuntimeState {
 impl Drop for RuntimeState {
     fn drop(&mut self) {
         self.wake = None;
-        // The folder is in memory: the thread ends within milliseconds.
+        // The folder is in memory, so the thread ends within milliseconds.
         let _ = self.writer.take().map(JoinHandle::join);
     }
 }
@@ -55,7 +55,7 @@ fn write_all(path: &Path, latest: &Mutex<Option<StateDocument>>, woken: &Receive
         if let Err(error) = &written
             && !failing
         {
-            tracing::warn!(path = %path.display(), %error, "state of the second not written");
+            tracing::warn!(path = %path.display(), %error, "runtime state not written");
         }
         failing = written.is_err();
     }

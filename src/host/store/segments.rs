@@ -1,10 +1,10 @@
-//! Segments of the history: the rows of a day, or some 10,000 rows, chained by hash.
+//! Segments of the history: the rows of a day, or about 10,000 rows, chained by hash.
 //!
-//! Every row has a number, counted across the tables. The hash of a segment is the SHA-256 chain over its rows, which begins with
-//! the hash of the segment before. It shows a row that was changed, removed, inserted or moved; the number of segments, stored
-//! separately, shows segments that were cut off at the end. The oldest segments are deleted whole, and keep their hashes, so the
-//! rest still verifies. A person who can write the file can recompute the whole chain; a copy of its end kept elsewhere shows that
-//! too ([`contradiction`]).
+//! Every row has a number, counted across the tables. The hash of a segment is the SHA-256 chain over its rows, starting from
+//! the hash of the segment before. It reveals rows that were changed, removed, inserted or moved. The number of segments, stored
+//! separately, reveals segments cut off at the end. The oldest segments are deleted as a whole but keep their hashes, so the
+//! remaining ones can still be verified. A person who can write the file can recompute the whole chain; a copy of the chain's
+//! end kept elsewhere reveals that too ([`contradiction`]).
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -19,32 +19,32 @@ use super::backlog;
 use super::rows::HistoryTable;
 use super::stamp::{BootId, SANE_WALL_NS, Stamp};
 
-/// A SHA-256.
+/// A SHA-256 hash.
 pub(super) type Hash = [u8; 32];
 
 /// Nanoseconds in a day.
 pub(super) const NS_PER_DAY: i64 = 86_400_000_000_000;
-/// Rows after which a segment ends, with the batch that reaches them: deleting so many takes some 0.1 s.
+/// Rows after which a segment ends (with the batch that reaches them); deleting so many rows takes about 0.1 s.
 const MAX_ROWS: i64 = 10_000;
 
 /// A segment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Segment {
-    /// Its number, from 1; 0 = before the first.
+    /// Number of the segment, from 1; 0 = before the first.
     pub id: i64,
-    /// Its day on the wall clock, since 1970.
+    /// Day on the wall clock, since 1970.
     pub day: i64,
-    /// Number of its first row.
+    /// Number of the first row.
     pub first: i64,
-    /// Number of its last row.
+    /// Number of the last row.
     pub last: i64,
-    /// The moment of its last row.
+    /// Moment of the last row.
     pub last_moment: i64,
-    /// Half-cycles among its rows.
+    /// Number of half-cycles among the rows.
     pub half_cycles: i64,
-    /// Whether its rows were deleted because of their number or age.
+    /// Whether the rows were deleted because of their number or age.
     pub is_deleted: bool,
-    /// Hash of its last row.
+    /// Hash of the last row.
     pub hash: Hash,
 }
 
@@ -52,7 +52,7 @@ pub(super) struct Segment {
 const COLUMNS: &str = "id, day, first, last, last_moment, half_cycles, deleted, hash";
 
 impl Segment {
-    /// What the first segment continues.
+    /// The predecessor of the first segment.
     const START: Self =
         Self { id: 0, day: 0, first: 1, last: 0, last_moment: 0, half_cycles: 0, is_deleted: false, hash: [0; 32] };
 
@@ -121,10 +121,10 @@ impl Segment {
             .map(drop)
     }
 
-    /// The hash of its row `last`, over the rows as they are stored.
+    /// The hash of its row `last`, computed from the stored rows.
     fn hash_to(&self, connection: &Connection, before: &Hash, last: i64) -> rusqlite::Result<Hash> {
         let mut rows: BTreeMap<(i64, HistoryTable), Vec<Value>> = BTreeMap::new();
-        // A damaged number must not fill the memory.
+        // Bounded, so that a damaged number does not fill the memory.
         let last = last.min(self.first.saturating_add(MAX_ROWS + backlog::MAX_ROWS as i64));
         for table in HistoryTable::ALL {
             let sql = format!(
@@ -145,7 +145,7 @@ impl Segment {
     }
 }
 
-/// Hash of a row: of the one before, the table, the number, and every value with its type and length.
+/// Hash of a row: over the hash before it, the table, the number, and every value with its type and length.
 fn link<'v>(before: &Hash, table: HistoryTable, seq: i64, values: impl IntoIterator<Item = &'v Value>) -> Hash {
     let mut hasher = Sha256::new();
     hasher.update(before);
@@ -181,7 +181,7 @@ pub(super) fn hex(hash: &[u8]) -> String {
     hash.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// All segments, oldest first, each after the one before it.
+/// All segments, oldest first, each with the segment before it.
 fn pairs(connection: &Connection) -> rusqlite::Result<Vec<(Segment, Segment)>> {
     let (mut before, mut pairs) = (Segment::START, Vec::new());
     let mut statement = connection.prepare(&format!("SELECT {COLUMNS} FROM segment ORDER BY id"))?;
@@ -193,8 +193,8 @@ fn pairs(connection: &Connection) -> rusqlite::Result<Vec<(Segment, Segment)>> {
     Ok(pairs)
 }
 
-/// Deletes the rows of the oldest segment that has some if there are more than `max_rows` in all, or if it ended before
-/// `horizon_ns` of the wall clock. A segment that was written while the clock was not set is at least as old as those after it.
+/// Deletes the rows of the oldest segment with rows, if there are more than `max_rows` in total or it ended before `horizon_ns`.
+/// A segment written while the wall clock was unset is at least as old as the segments after it.
 pub(super) fn delete_oldest(
     connection: &Connection,
     newest: &Segment,
@@ -223,31 +223,31 @@ pub(super) fn delete_oldest(
     Segment { is_deleted: true, ..oldest }.write(connection)
 }
 
-/// The result of a check.
+/// The result of a verification.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct ChainReport {
-    /// Rows found good before the first segment that is not.
+    /// Valid rows before the first broken segment.
     pub good_rows: i64,
-    /// Rows that were written.
+    /// Rows ever written.
     pub rows: i64,
-    /// Those of them that the store has deleted since.
+    /// Rows that the store has deleted.
     pub deleted_rows: i64,
     /// Hash of the last row, to be noted elsewhere.
     pub head: String,
-    /// The first segment that was changed; `None` = none was.
+    /// The first broken segment; `None` = none.
     pub broken: Option<BrokenSegment>,
 }
 
 /// A segment in which a row was changed, is missing or was inserted.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct BrokenSegment {
-    /// Its number.
+    /// Number of the segment.
     pub segment: i64,
     /// Numbers of its first and last row.
     pub rows: [i64; 2],
-    /// The hash that its rows give.
+    /// The hash computed from its rows.
     pub expected: String,
-    /// What the store has in its place.
+    /// The hash in the store.
     pub found: String,
 }
 
@@ -258,7 +258,7 @@ impl fmt::Display for BrokenSegment {
     }
 }
 
-/// Checks the chain, segment by segment.
+/// Verifies the chain, segment by segment.
 pub(super) fn verify(connection: &Connection) -> rusqlite::Result<ChainReport> {
     let noted: i64 = connection.query_row("SELECT segments FROM meta", [], |row| row.get(0))?;
     let mut report = ChainReport { good_rows: 0, rows: 0, deleted_rows: 0, head: String::new(), broken: None };
@@ -286,7 +286,7 @@ pub(super) fn verify(connection: &Connection) -> rusqlite::Result<ChainReport> {
 fn judge(connection: &Connection, before: &Segment, segment: &Segment) -> rusqlite::Result<Option<BrokenSegment>> {
     let Segment { id, first, last, is_deleted, hash, .. } = *segment;
     let broken = |expected, found| Some(BrokenSegment { segment: id, rows: [first, last], expected, found });
-    // Segments are deleted from the oldest on.
+    // Segments are deleted starting with the oldest.
     let [next, row] = [before.id, before.last].map(|number| number.saturating_add(1));
     if (id, first) != (next, row) || last < first || (is_deleted && !before.is_deleted && before.id > 0) {
         let expected = format!("segment {next} from row {row} on");
@@ -300,7 +300,7 @@ fn judge(connection: &Connection, before: &Segment, segment: &Segment) -> rusqli
     Ok(if expected == hash { None } else { broken(hex(&expected), hex(&hash)) })
 }
 
-/// Compares the number of segments and rows with those in the chain.
+/// Compares the stored numbers of segments and rows with those of the chain.
 fn judge_number(
     connection: &Connection,
     newest: &Segment,
@@ -319,7 +319,7 @@ fn judge_number(
     }))
 }
 
-/// Segments whose rows are as they were written, the newest first, at most `limit`.
+/// Intact segments, newest first, at most `limit`.
 pub(super) fn intact(connection: &Connection, limit: usize) -> rusqlite::Result<Vec<Segment>> {
     let mut intact = Vec::new();
     for (before, segment) in pairs(connection)?.iter().rev().filter(|(_, segment)| !segment.is_deleted).take(limit) {
@@ -328,12 +328,12 @@ pub(super) fn intact(connection: &Connection, limit: usize) -> rusqlite::Result<
     Ok(intact)
 }
 
-/// The chain's end as it was noted elsewhere, written `ROWS:HASH`.
+/// A chain's end that was noted elsewhere, written `ROWS:HASH`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NotedHead {
-    /// Rows at that time.
+    /// Number of rows at that time.
     pub rows: i64,
-    /// Hash of the last, 64 hexadecimal digits.
+    /// Hash of the last row, 64 hexadecimal digits.
     pub hash: String,
 }
 
@@ -350,24 +350,22 @@ impl FromStr for NotedHead {
     }
 }
 
-/// What contradicts the chain's end as it was noted; `None` = nothing.
+/// What contradicts a noted chain's end; `None` = nothing.
 pub(super) fn contradiction(connection: &Connection, noted: &NotedHead) -> rusqlite::Result<Option<String>> {
     let NotedHead { rows, hash } = noted;
     let pairs = pairs(connection)?;
     let Some((before, segment)) = pairs.iter().find(|(_, segment)| (segment.first..=segment.last).contains(rows))
     else {
         return Ok((*rows != 0)
-            .then(|| format!("there is no row {rows}, which was noted: the history was written again or cut off")));
+            .then(|| format!("the noted row {rows} does not exist: the history was rewritten or truncated")));
     };
     if segment.is_deleted && segment.last != *rows {
-        return Ok(Some(format!(
-            "row {rows}, which was noted, was deleted since: it cannot be compared; note a newer end"
-        )));
+        return Ok(Some(format!("the noted row {rows} has been deleted and cannot be compared; note a newer end")));
     }
     let found = if segment.is_deleted { segment.hash } else { segment.hash_to(connection, &before.hash, *rows)? };
     let found = hex(&found);
     Ok((found != *hash)
-        .then(|| format!("row {rows} has the hash {found}, noted was {hash}: the history was written again")))
+        .then(|| format!("row {rows} has the hash {found}, noted was {hash}: the history was rewritten")))
 }
 
 #[cfg(test)]

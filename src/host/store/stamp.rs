@@ -1,11 +1,11 @@
-//! The moment at which a state was stored, on every clock, and its age at a later moment.
+//! The time at which a state was stored, on every clock, and its age at a later time.
 //!
-//! The wall clock of a vehicle computer may show 1970 until it is set, and may step; the boot clock never steps but
-//! restarts with every boot. So both are stored, with the identity of the boot.
+//! The wall clock of a vehicle computer may show 1970 until it is set, and may step. The boot clock never steps but restarts
+//! with every boot. Therefore both are stored, together with the boot's identity.
 //!
-//! Across boots only the wall clock can measure the age, and only if a hardware clock ran while the computer was off.
-//! Without a battery-backed clock, the wall clock continues from its last saved value (systemd saves it at every boot): a
-//! week off looks like seconds, and the time itself does not show it. So the wall clock is trusted only if a hardware
+//! Across boots only the wall clock can measure the age, and only if a hardware clock ran while the computer was off. Without
+//! a battery-backed clock, the wall clock continues from its last saved value (systemd saves it at every boot): a week without
+//! power looks like seconds, and the time itself does not reveal this. The wall clock is therefore trusted only if a hardware
 //! clock agrees with it ([`WallClock`]) or a time server has set it.
 
 use std::fmt;
@@ -17,45 +17,45 @@ use crate::io::clock::Reading;
 use crate::monitor::Downtime;
 use crate::quantity::Timestamp;
 
-/// A wall clock before this (2024-01-01) has not been set.
+/// A wall clock before this time (2024-01-01) has not been set.
 pub(super) const SANE_WALL_NS: i64 = 1_704_067_200_000_000_000;
 
 /// Nanoseconds in a year of 365.25 days.
 const NS_PER_YEAR: f64 = 365.25 * 86_400.0 * 1e9;
 
-/// The kernel's list of hardware clocks; readable in a sandbox that must not call `adjtimex`.
+/// The kernel's list of hardware clocks; readable even in a sandbox that forbids `adjtimex`.
 const HARDWARE_CLOCKS: &str = "/sys/class/rtc";
-/// systemd's time client creates this file when a time server has set the clock in this boot.
+/// systemd's time client creates this file when a time server has set the clock since the boot.
 const SYNCHRONISED: &str = "/run/systemd/timesync/synchronized";
-/// Largest difference of an agreeing hardware clock, s: it counts whole seconds, drifts a few a day, and the wall clock may
-/// have been corrected since the boot.
+/// Largest difference of an agreeing hardware clock, s. It counts whole seconds, drifts a few seconds a day, and the wall clock
+/// may have been corrected since the boot.
 const HARDWARE_TOLERANCE_S: i64 = 60;
 
-/// One boot of one computer, as the kernel names it.
+/// One boot of one computer, as identified by the kernel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(into = "String", try_from = "String")]
 pub struct BootId(pub(super) [u8; 16]);
 
-/// Environment variable with the identity of the boot, where the kernel's file is hidden.
+/// Environment variable with the boot's identity, for sandboxes that hide the kernel's file.
 const BOOT_ID_VARIABLE: &str = "PACKWATCH_BOOT_ID";
 
 impl BootId {
-    /// The kernel gives no identity.
+    /// The kernel reports no identity.
     const UNKNOWN: Self = Self([0; 16]);
-    /// No boot: bus time, from a record.
+    /// Not a boot: bus time of a replayed record.
     pub const REPLAY: Self = Self(*b"packwatch replay");
 
-    /// The present boot.
+    /// The current boot.
     pub fn current() -> Self {
-        // A sandbox without that file (`ProcSubset=pid`) gets it from its unit.
+        // A sandbox without that file (`ProcSubset=pid`) gets the identity from its unit.
         let text = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").ok();
         let kernel = text.and_then(|text| Self::parse(&text));
         let variable = || std::env::var(BOOT_ID_VARIABLE).ok().and_then(|text| Self::parse(&text));
-        // Two unknown boots are never equal.
+        // Two unknown boots never count as equal.
         kernel.or_else(variable).unwrap_or(Self::UNKNOWN)
     }
 
-    /// Reads the kernel's form or that of [`Display`](fmt::Display).
+    /// Parses the kernel's form or that of [`Display`](fmt::Display).
     pub(super) fn parse(text: &str) -> Option<Self> {
         let digits: String = text.chars().filter(|c| *c != '-' && !c.is_whitespace()).collect();
         u128::from_str_radix(&digits, 16).ok().filter(|_| digits.len() == 32).map(|id| Self(id.to_be_bytes()))
@@ -82,38 +82,38 @@ impl fmt::Display for BootId {
     }
 }
 
-/// A moment on every clock.
+/// A time on every clock.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Stamp {
-    /// The wall clock, ns since 1970; may be wrong.
+    /// Wall clock, ns since 1970; may be wrong.
     pub wall_ns: i64,
-    /// The clock of the inputs.
+    /// Clock of the inputs.
     pub time: Timestamp,
-    /// Since this boot, sleep included, ns.
+    /// Time since this boot, including suspend, ns.
     pub boottime_ns: i64,
-    /// Which boot.
+    /// The boot.
     pub boot: BootId,
 }
 
-/// Whether the wall clock measures times across boots.
+/// Whether the wall clock can measure times across boots.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum WallClock {
     /// A hardware clock or a time server confirms it.
     Reliable,
-    /// It may be the value saved before the computer was off.
+    /// It may continue from a value saved before the computer was off.
     Unverified,
 }
 
 impl WallClock {
-    /// Assesses it at the start. A clock that GPS or a time server sets later is too late: the age of the state is
-    /// determined once.
+    /// Assesses the wall clock at the start. GPS or a time server that sets it later is too late, because the age of the state
+    /// is determined once.
     pub(super) fn assess(now: &Stamp) -> Self {
         Self::judge(now, Path::new(HARDWARE_CLOCKS), Path::new(SYNCHRONISED))
     }
 
     fn judge(now: &Stamp, hardware_clocks: &Path, synchronised: &Path) -> Self {
         let wall_s = now.wall_ns / 1_000_000_000;
-        // A hardware clock without a battery counts from its own start, so its value has to agree.
+        // A hardware clock without a battery counts from its own start, so its value must be compared.
         let agrees = |clock: &Path| {
             let text = std::fs::read_to_string(clock.join("since_epoch")).ok();
             let hardware_s = text.and_then(|text| text.trim().parse::<i64>().ok());
@@ -129,13 +129,13 @@ impl WallClock {
 }
 
 impl Stamp {
-    /// Now, with the inputs' clock at `time`.
+    /// The present time, with the inputs' clock at `time`.
     pub(super) fn now(time: Timestamp, boot: BootId) -> Self {
         let Reading { realtime_ns, boottime_ns } = Reading::now();
         Self { wall_ns: realtime_ns, time, boottime_ns, boot }
     }
 
-    /// Bus time of a record: the only clock there is.
+    /// Bus time of a replayed record, which has no other clock.
     pub(super) fn replayed(time: Timestamp) -> Self {
         Self { wall_ns: time.nanos(), time, boottime_ns: time.nanos(), boot: BootId::REPLAY }
     }
@@ -143,16 +143,16 @@ impl Stamp {
     /// The wall clock this many years ago, ns since 1970; `None` = the clock is not confirmed.
     pub(super) fn years_ago_ns(&self, years: f64) -> Option<i64> {
         let is_reliable = self.boot == BootId::REPLAY || WallClock::assess(self) == WallClock::Reliable;
-        // Saturates.
+        // The cast saturates.
         is_reliable.then(|| self.wall_ns.saturating_sub((years * NS_PER_YEAR) as i64))
     }
 
-    /// Whether both belong to one boot that is known.
+    /// Whether both belong to the same known boot.
     pub(super) fn same_boot(&self, other: &Self) -> bool {
         self.boot == other.boot && self.boot != BootId::UNKNOWN
     }
 
-    /// Time from this moment to `now`.
+    /// Time from this stamp to `now`.
     pub(super) fn age(&self, now: &Self, wall: WallClock) -> Downtime {
         let seconds = |from: i64, to: i64| to.saturating_sub(from) as f64 / 1e9;
         if self.same_boot(now) {
@@ -160,7 +160,7 @@ impl Stamp {
         }
         let can_be = now.wall_ns > self.wall_ns && self.wall_ns >= SANE_WALL_NS;
         match wall {
-            // It was stored before this boot, so the age is at least the uptime.
+            // The state was stored before this boot, so its age is at least the uptime.
             WallClock::Reliable if can_be => {
                 Downtime::Seconds(seconds(self.wall_ns, now.wall_ns).max(seconds(0, now.boottime_ns)))
             }
@@ -181,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn within_one_boot_the_wall_clock_is_ignored() {
+    fn wall_clock_is_ignored_within_one_boot() {
         for wall_s in [0, 1_800_000_000, 4_000_000_000] {
             let now = stamp(1, 130, wall_s);
             assert_eq!(stamp(1, 100, 1_800_000_000).age(&now, WallClock::Unverified), Downtime::Seconds(30.0));
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn across_boots_only_a_plausible_wall_clock_counts() {
+    fn only_plausible_wall_clock_counts_across_boots() {
         let stored = stamp(1, 100, 1_800_000_000);
         let age = |stored: Stamp, now: Stamp| stored.age(&now, WallClock::Reliable);
         assert_eq!(age(stored, stamp(2, 5, 1_800_000_600)), Downtime::Seconds(600.0));
@@ -200,20 +200,20 @@ mod tests {
     }
 
     #[test]
-    fn a_state_of_an_earlier_boot_is_at_least_as_old_as_this_one() {
+    fn age_across_boots_is_at_least_uptime() {
         let stored = stamp(1, 100, 1_800_000_000);
         assert_eq!(stored.age(&stamp(2, 3_600, 1_800_000_020), WallClock::Reliable), Downtime::Seconds(3_600.0));
     }
 
     #[test]
-    fn a_saved_clock_does_not_turn_a_week_off_into_seconds() {
+    fn saved_clock_gives_unknown_age() {
         // Without a hardware clock: the time of the last save, 20 s after the last checkpoint.
         let (stored, now) = (stamp(1, 100, 1_800_000_000), stamp(2, 5, 1_800_000_020));
         assert_eq!(stored.age(&now, WallClock::Unverified), Downtime::Unknown);
     }
 
     #[test]
-    fn a_wall_clock_is_reliable_where_hardware_or_a_time_server_agrees() {
+    fn wall_clock_needs_hardware_or_time_server() {
         let folder = tempfile::tempdir().unwrap();
         let (clocks, synchronised) = (folder.path().join("rtc"), folder.path().join("synchronized"));
         let judge = || WallClock::judge(&stamp(2, 5, 1_800_000_020), &clocks, &synchronised);
@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn a_boot_is_read_as_the_kernel_writes_it() {
+    fn boot_id_parses_kernel_notation() {
         let boot = BootId::parse("0f3c1c1e-7f7e-4c39-9a49-0123456789ab\n").unwrap();
         assert_eq!(boot.to_string(), "0f3c1c1e7f7e4c399a490123456789ab");
         assert_eq!(BootId::parse(&boot.to_string()), Some(boot));

@@ -3,13 +3,14 @@
 //! | file | contents |
 //! | --- | --- |
 //! | `state-a.json.zst`, `state-b.json.zst` | the latest state and the one before it |
-//! | `state-aside.json.zst` | a state that could not be restored, for the first start at which it fits |
+//! | `state-aside.json.zst` | a state that could not be restored, kept for the first start at which it fits |
 //!
-//! A file is one zstd frame of JSON and a skippable frame with its SHA-256, so `zstdcat` prints the JSON and every flipped bit is
-//! found. It is written to a temporary name, synced and renamed, and the folder is synced: a state whose write returned survives a
-//! power cut. The newest state is the good file of the highest number.
+//! A file is one zstd frame of JSON and a skippable frame with its SHA-256, so `zstdcat` prints the JSON, and every flipped bit
+//! is detected. The file is written to a temporary name, synced and renamed, and the folder is synced: a state whose write has
+//! returned survives a power cut. The newest state is the valid file with the highest number.
 //!
-//! Numbers are stored to nine digits and six decimals (see [`rounded`]), which halves the files: some 70 kB for a pack of 96 cells.
+//! Numbers are stored with nine digits and six decimals (see [`rounded`]), which halves the size to about 70 kB for a pack of 96
+//! cells.
 
 use std::fs::{self, File};
 use std::io::{self, Read as _, Write as _};
@@ -29,29 +30,29 @@ pub(super) const FORMAT: u32 = 1;
 pub(super) const FILES: [&str; 2] = ["state-a.json.zst", "state-b.json.zst"];
 /// Name of a state that was set aside.
 pub(super) const ASIDE: &str = "state-aside.json.zst";
-/// Name of a file while it is written.
+/// Name of a file while it is being written.
 const PART: &str = "state.json.zst.part";
-/// Words for a state that is set aside.
-pub(super) const SET_ASIDE: &str = "set aside, used at the first start at which it fits";
-/// Compression level: an announcement waits for it. Level 19 saves a sixth and takes fifty times as long.
+/// Log and history text about a state that is set aside.
+pub(super) const SET_ASIDE: &str = "set aside for the first start at which it fits";
+/// Compression level; low, because an announcement waits for the compression. Level 19 saves a sixth and takes fifty times as long.
 const LEVEL: i32 = 1;
-/// Longest JSON, bytes: ten times the state of the largest pack.
+/// Longest JSON, bytes; ten times the state of the largest pack.
 const MAX_JSON_BYTES: u64 = 64 << 20;
-/// Head of the frame with the hash: the magic number of a frame that zstd skips, and its length.
+/// Head of the frame with the hash: the magic number of a skippable zstd frame, and its length.
 const HASH_HEAD: [u8; 8] = [0x50, 0x2A, 0x4D, 0x18, 32, 0, 0, 0];
 
-/// A state, when it was taken, and what it belongs to.
+/// A state, its time, and its folder and pack.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(super) struct StateDocument {
     /// [`FORMAT`].
     pub format: u32,
-    /// Counts the states that were written.
+    /// Number of the state, counting all written states.
     pub number: i64,
-    /// State folder it belongs to: two daemons may share a runtime folder.
+    /// Its state folder, because two daemons may share a runtime folder.
     pub folder: String,
-    /// Number of the pack that was connected; 0 = not known.
+    /// Number of the pack that was connected; 0 = unknown.
     pub pack: i64,
-    /// Rows that the history had.
+    /// Number of rows in the history at that time.
     pub history_rows: i64,
     /// When it was taken.
     pub stamp: Stamp,
@@ -62,14 +63,14 @@ pub(super) struct StateDocument {
 /// Why a state cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum StateFault {
-    /// Its file is not as it was written.
+    /// The file has changed since it was written.
     Damaged(String),
     /// Another version of the program wrote it.
     Unfit(String),
 }
 
 impl StateDocument {
-    /// Reads JSON.
+    /// Parses JSON.
     pub(super) fn parse(json: &[u8]) -> Result<Self, StateFault> {
         #[derive(Deserialize)]
         struct Head {
@@ -78,22 +79,22 @@ impl StateDocument {
         let unfit = |error: serde_json::Error| StateFault::Unfit(format!("not a state: {error}"));
         let Head { format } = serde_json::from_slice(json).map_err(unfit)?;
         if format != FORMAT {
-            return Err(StateFault::Unfit(format!("format {format}, this program reads {FORMAT}")));
+            return Err(StateFault::Unfit(format!("format {format}, must be {FORMAT}")));
         }
         serde_json::from_slice(json).map_err(unfit)
     }
 
-    /// Writes JSON to a temporary name and renames it. Does not sync: the file lies in memory.
+    /// Writes JSON to a temporary name and renames it. Does not sync, because the file is in memory.
     pub(super) fn write_json(&self, path: &Path) -> io::Result<()> {
         let part = path.with_extension("json.part");
         fs::write(&part, serde_json::to_vec(self)?)?;
         fs::rename(&part, path)
     }
 
-    /// The bytes of its file.
+    /// Encodes the contents of its file.
     ///
     /// # Errors
-    /// When it could not be read back: a number that is not finite is written as `null`.
+    /// When the result could not be read back: a number that is not finite is written as `null`.
     fn encode(&self) -> Result<Vec<u8>, String> {
         let mut json = Vec::new();
         self.serialize(&mut serde_json::Serializer::with_formatter(&mut json, Rounding(CompactFormatter)))
@@ -108,7 +109,7 @@ impl StateDocument {
         Ok(file)
     }
 
-    /// Reads the bytes of a file.
+    /// Decodes the contents of a file.
     fn decode(file: &[u8]) -> Result<Self, StateFault> {
         let damaged = |why: &str| StateFault::Damaged(why.to_owned());
         let (frame, hash) = file
@@ -125,7 +126,7 @@ impl StateDocument {
         Self::parse(&json)
     }
 
-    /// Reads a file; `None` = there is none.
+    /// Reads a file; `None` = it does not exist.
     fn read(path: &Path) -> Result<Option<Self>, StateFault> {
         match fs::read(path) {
             Ok(file) => Self::decode(&file).map(Some),
@@ -144,7 +145,7 @@ impl Formatter for Rounding {
     }
 }
 
-/// A number to nine digits, and to six decimals from 1,000 on. Whole numbers (identities) and large ones (times) stay exact.
+/// Rounds a number to nine digits, or to six decimals from 1,000 on. Whole numbers (identities) and large ones (times) stay exact.
 fn rounded(value: f64) -> f64 {
     let text = match value.abs() {
         size if value.fract() == 0.0 || size >= 1e9 => return value,
@@ -154,15 +155,15 @@ fn rounded(value: f64) -> f64 {
     text.parse().unwrap_or(value)
 }
 
-/// The files of a folder, as the next writes continue them.
+/// The state files of a folder, and where the next write continues.
 #[derive(Debug)]
 pub(super) struct StateFiles {
     folder: PathBuf,
-    /// Place in [`FILES`] of the next state.
+    /// Index in [`FILES`] of the next state.
     next: usize,
     /// Number of the latest state.
     number: i64,
-    /// Place of a state that the next write sets aside first.
+    /// Index of a state that the next write first sets aside.
     aside: Option<usize>,
 }
 
@@ -173,17 +174,17 @@ pub(super) struct FoundStates {
     pub newest: Option<StateDocument>,
     /// The state that was set aside.
     pub aside: Option<StateDocument>,
-    /// What is wrong with files, for the history.
+    /// Faults of the files, for the history.
     pub faults: Vec<HistoryRow>,
 }
 
 impl StateFiles {
-    /// Those of a folder, which need not exist yet, and what they hold.
+    /// The state files of a folder, which may not exist yet, and the states that they contain.
     pub(super) fn open(folder: &Path) -> (Self, FoundStates) {
         let mut files = Self { folder: folder.to_owned(), next: 0, number: 0, aside: None };
         let mut found = FoundStates::default();
         let mut report = |reason: &'static str, file: &str, why: String| {
-            tracing::error!(reason, file, error = why, "a stored state is not used");
+            tracing::error!(reason, file, error = why, "stored state not used");
             found.faults.push(HistoryRow::Own { reason, detail: format!("{file}: {why}") });
         };
         for (place, name) in FILES.into_iter().enumerate() {
@@ -205,12 +206,12 @@ impl StateFiles {
         (files, found)
     }
 
-    /// The next write keeps the newest state for the first start at which it fits.
+    /// Makes the next write keep the newest state for the first start at which it fits.
     pub(super) fn set_aside(&mut self) {
         self.aside = Some(1 - self.next);
     }
 
-    /// Writes a state over the older one; durable when it returns. Returns the size of the file.
+    /// Overwrites the older state; durable when it returns. Returns the size of the file.
     pub(super) fn write(&mut self, document: StateDocument) -> Result<u64, String> {
         let named = |name: &str, error: io::Error| format!("{}: {error}", self.folder.join(name).display());
         let file = StateDocument { number: self.number + 1, ..document }.encode()?;
@@ -227,7 +228,7 @@ impl StateFiles {
             .and_then(|()| replace(&part, &path))
             .and_then(|()| File::open(&self.folder)?.sync_all())
             .map_err(|error| {
-                // Frees its space.
+                // Frees the space.
                 let _ = fs::remove_file(&part);
                 named(FILES[self.next], error)
             })?;
@@ -247,7 +248,7 @@ pub(super) fn forget(folder: &Path) -> io::Result<()> {
     File::open(folder)?.sync_all()
 }
 
-/// Renames a file over another, or over a folder of that name.
+/// Renames a file, replacing another file or a folder of that name.
 fn replace(from: &Path, to: &Path) -> io::Result<()> {
     if to.is_dir() {
         fs::remove_dir_all(to)?;

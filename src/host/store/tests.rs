@@ -1,4 +1,4 @@
-//! A real state through the store and back.
+//! The store with real states.
 
 mod flips;
 mod healing;
@@ -23,7 +23,7 @@ fn config() -> Config {
     config::load(&PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../config/measured.toml")).unwrap()
 }
 
-/// The log of a cell that is discharged and charged in turn, a quarter of an hour each.
+/// The log of a cell that is discharged and charged alternately, a quarter of an hour each.
 fn log(config: &Config, folder: &Path) -> LogSource {
     let mut text = String::from("time_s,current_a,voltage_v,temperature_c\n");
     let mut soc: f64 = 0.9;
@@ -80,7 +80,7 @@ fn stored(folder: &Path) -> StateDocument {
 }
 
 #[test]
-fn a_replay_leaves_the_state_in_which_it_ended() {
+fn replay_stores_its_final_state() {
     let folder = tempfile::tempdir().unwrap();
     let state = folder.path().join("state");
     let end = snapshot(None, Some(Recorder::create(&state, &config().store, &VehicleIdentity::default()).unwrap()));
@@ -94,7 +94,7 @@ fn a_replay_leaves_the_state_in_which_it_ended() {
     assert!((near.mean - exact.mean).abs() < 1e-8 && (near.std() - exact.std()).abs() < 1e-8, "{near:?} {exact:?}");
 }
 
-/// A document of a state taken at `boottime_s` of boot `boot`.
+/// The document of a state taken at `boottime_s` of boot `boot`.
 pub(super) fn document(boot: u8, boottime_s: i64, wall_s: i64) -> StateDocument {
     let boot = BootId([boot; 16]);
     let time = Timestamp::from_secs(1.0);
@@ -112,7 +112,7 @@ pub(super) fn document(boot: u8, boottime_s: i64, wall_s: i64) -> StateDocument 
 }
 
 #[test]
-fn the_newer_of_the_two_states_comes_first_with_its_age() {
+fn newer_state_comes_first() {
     let of = |running: Option<StateDocument>, stored: Option<StateDocument>| -> Vec<(&str, i64)> {
         let found = candidates([running, stored, None]);
         found.into_iter().map(|(state, source)| (source, state.stamp.boottime_ns / 1_000_000_000)).collect()
@@ -125,7 +125,7 @@ fn the_newer_of_the_two_states_comes_first_with_its_age() {
 }
 
 #[test]
-fn a_state_of_a_replaced_pack_is_not_restored() {
+fn state_of_replaced_pack_is_not_restored() {
     let place = tempfile::tempdir().unwrap();
     let now = document(1, 100, 1_800_000_000);
     let open = |running: Option<i64>| {
@@ -138,19 +138,19 @@ fn a_state_of_a_replaced_pack_is_not_restored() {
     opened.state_files.write(now.clone()).unwrap();
     drop(opened);
     assert_eq!(open(None).0, [STATE_SOURCE]);
-    // The power is cut after the row of the exchange, before the state.
+    // A power cut after the row of the pack change and before the state.
     open(None).1.database.unwrap().replace_pack(&now.stamp).unwrap();
     assert_eq!(open(None).0.len(), 0);
     assert_eq!(open(Some(1)).0.len(), 0, "nor is the state of the last second");
     assert_eq!(open(Some(2)).0, ["runtime folder"]);
-    // A history that was lost does not bring it back either.
+    // Losing the history does not bring it back either.
     std::fs::remove_file(place.path().join(DATABASE)).unwrap();
     assert_eq!(open(Some(2)).0, ["runtime folder"]);
     assert_eq!(open(Some(0)).0, ["runtime folder", STATE_SOURCE], "a pack that is not known");
 }
 
 #[test]
-fn rows_that_the_history_has_lost_are_reported() {
+fn rows_missing_in_history_are_reported() {
     let place = tempfile::tempdir().unwrap();
     let state = document(1, 100, 1_800_000_000);
     let open = || OpenedFolder::open(&mut Folder::new(place.path().to_owned()), None, &state.stamp);
@@ -192,10 +192,10 @@ fn answer(store: &Store, ticket: u64) -> StoreProgress {
 }
 
 #[test]
-fn a_failing_disk_is_reported_at_once_and_gets_everything_when_it_works() {
+fn failing_disk_gets_everything_when_it_works() {
     let place = tempfile::tempdir().unwrap();
     let state = place.path().join("folder");
-    // A file in place of the folder: nothing can be created there.
+    // A file in place of the folder, so that nothing can be created there.
     std::fs::write(&state, "").unwrap();
     let (store, found) =
         Store::open(&PlaceSetting::At(state.clone()), &config().store, &VehicleIdentity::default()).unwrap();
@@ -223,7 +223,7 @@ fn a_failing_disk_is_reported_at_once_and_gets_everything_when_it_works() {
 }
 
 #[test]
-fn a_disk_that_fails_from_the_start_is_tried_now_and_then_and_not_without_end() {
+fn failing_disk_is_retried_after_pauses() {
     let place = tempfile::tempdir().unwrap();
     let state = place.path().join("folder");
     std::fs::write(&state, "").unwrap();
@@ -237,9 +237,9 @@ fn a_disk_that_fails_from_the_start_is_tried_now_and_then_and_not_without_end() 
         progress.borrow_and_update();
         std::thread::sleep(Duration::from_micros(200));
     }
-    // After 1 s, with 2 s to the next.
+    // After 1 s; the next pause is 2 s.
     assert_eq!((changes, progress.borrow().failures), (1, 1));
-    // Tickets answered meanwhile cause no attempt.
+    // Tickets answered in between cause no attempt.
     let write_queue = Arc::clone(&store.write_queue);
     for _ in 0..3 {
         let ticket = write_queue.submit(None, document(1, 1, 1));
@@ -252,7 +252,7 @@ fn a_disk_that_fails_from_the_start_is_tried_now_and_then_and_not_without_end() 
 }
 
 #[test]
-fn a_database_damaged_under_the_running_writer_is_set_aside_at_the_latest_at_the_next_start() {
+fn database_damaged_while_running_is_set_aside() {
     let place = tempfile::tempdir().unwrap();
     let (store, _) =
         Store::open(&PlaceSetting::At(place.path().to_owned()), &config().store, &VehicleIdentity::default()).unwrap();
@@ -265,7 +265,7 @@ fn a_database_damaged_under_the_running_writer_is_set_aside_at_the_latest_at_the
     };
     let ticket = learn(&mut store, 1.0);
     assert!(answer(&store, ticket).works);
-    // As a broken disk would: pages of nothing, in file and log.
+    // Simulates disk corruption: zero pages in the database and the log.
     for name in ["packwatch.db", "packwatch.db-wal"] {
         let path = place.path().join(name);
         let length = std::fs::metadata(&path).map_or(0, |file| file.len());
@@ -280,7 +280,7 @@ fn a_database_damaged_under_the_running_writer_is_set_aside_at_the_latest_at_the
     let (store, found) =
         Store::open(&PlaceSetting::At(place.path().to_owned()), &config().store, &VehicleIdentity::default()).unwrap();
     let mut store = store.unwrap();
-    // Cached pages may not have been read again: then the start finds the damage.
+    // Cached pages may not have been read again; the next start finds the damage then.
     assert!(!found.works || place.path().join("packwatch.db.damaged-1").exists());
     assert_eq!(found.states.len(), 1, "the state does not depend on it");
     let ticket = learn(&mut store, 10.0);
@@ -304,7 +304,7 @@ fn states(found: &StoredStates) -> Vec<(&'static str, f64)> {
 }
 
 #[test]
-fn on_a_disk_that_fails_the_last_state_is_in_the_runtime_folder() {
+fn failing_disk_leaves_last_state_in_runtime_folder() {
     let place = tempfile::tempdir().unwrap();
     let state = place.path().join("folder");
     std::fs::write(&state, "").unwrap();
@@ -325,7 +325,7 @@ fn reasons(folder: &Path) -> Vec<String> {
 }
 
 #[test]
-fn a_state_that_could_not_be_restored_waits_for_a_start_at_which_it_fits() {
+fn unfit_state_waits_for_matching_start() {
     const ASIDE: &str = "state set aside earlier";
     let place = tempfile::tempdir().unwrap();
     let open = || {
@@ -343,11 +343,11 @@ fn a_state_that_could_not_be_restored_waits_for_a_start_at_which_it_fits() {
     assert_eq!(reasons(place.path()), ["state_unfit"]);
     let (store, found) = open();
     assert_eq!(states(&found), [(STATE_SOURCE, 2.0), (ASIDE, 1.0)]);
-    // It stays, whatever the number of later states.
+    // It stays, however many states are written later.
     finish(store, 3.0);
     let (store, found) = open();
     assert_eq!(states(&found), [(STATE_SOURCE, 3.0), (ASIDE, 1.0)]);
-    // The edit was undone: they change places.
+    // The change was undone: the two states change places.
     store.set_state_aside("snapshot is of 5 cells", Timestamp::from_secs(4.0));
     finish(store, 4.0);
     let (store, found) = open();

@@ -1,8 +1,8 @@
-//! The thread that writes the disk, and what it shares with the loop.
+//! The thread that writes to disk, and the queue that it shares with the loop.
 //!
-//! The loop queues rows and the latest state, and continues. The thread takes everything queued, commits the rows, then writes the
-//! state, and reports up to which ticket everything is on the disk. It retries a failing disk with a growing pause; until then
-//! every ticket is answered at once, as failed. A database that fails does not keep the state from being written.
+//! The loop queues rows and the latest state, and continues. The thread takes everything queued, commits the rows, then writes
+//! the state, and reports up to which ticket everything is on disk. It retries a failing disk after increasing pauses; until
+//! then every ticket is answered at once as failed. A failing database does not prevent the state from being written.
 
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -20,9 +20,9 @@ use super::state_files::{StateDocument, StateFiles};
 use crate::config::VehicleIdentity;
 use crate::quantity::Timestamp;
 
-/// First pause after a failure; it doubles up to the last.
+/// First pause after a failure; each further pause doubles.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
-/// Longest pause: a working disk is found within this.
+/// Longest pause, within which a working disk is detected.
 const LAST_PAUSE: Duration = Duration::from_secs(15);
 
 /// Progress of the writer.
@@ -30,19 +30,19 @@ const LAST_PAUSE: Duration = Duration::from_secs(15);
 pub struct StoreProgress {
     /// Everything up to this ticket was written or has failed.
     pub ticket: u64,
-    /// The last attempt succeeded.
+    /// Whether the last attempt succeeded.
     pub works: bool,
-    /// The disk has room: the reserve is there.
+    /// Whether the disk has room, that is, the reserve is unused.
     pub has_room: bool,
-    /// Size of the database and its log after the last success, bytes; `None` = none so far.
+    /// Size of the database and its log after the last success, bytes; `None` = no success yet.
     pub file_bytes: Option<u64>,
-    /// Commits done.
+    /// Successful commits.
     pub commits: u64,
     /// Attempts that failed.
     pub failures: u64,
-    /// Size of the state that was written last, bytes.
+    /// Size of the last written state, bytes.
     pub state_bytes: u64,
-    /// Number of the connected pack in the history; 0 = not known.
+    /// Number of the connected pack in the history; 0 = unknown.
     pub pack: i64,
 }
 
@@ -57,15 +57,15 @@ pub(super) struct WriteQueue {
 struct QueueState {
     backlog: Backlog,
     state: Option<StateDocument>,
-    /// The next state must not overwrite the stored one.
+    /// Whether the next state must not overwrite the stored one.
     sets_aside: bool,
     ticket: u64,
-    /// The writer has work.
+    /// Whether the writer has work.
     wanted: bool,
     stop: bool,
 }
 
-/// What the writer takes from the queue at once.
+/// Work that the writer takes from the queue at once.
 struct PendingWrite {
     batches: Vec<RowBatch>,
     state: Option<StateDocument>,
@@ -83,7 +83,7 @@ impl WriteQueue {
     pub(super) fn submit(&self, rows: Option<RowBatch>, state: StateDocument) -> u64 {
         let mut queue = self.lock();
         rows.into_iter().for_each(|batch| queue.backlog.push(batch));
-        // A later state contains the earlier ones.
+        // A later state includes the earlier ones.
         queue.state = Some(state);
         queue.ticket += 1;
         queue.wanted = true;
@@ -96,7 +96,7 @@ impl WriteQueue {
         self.lock().backlog.push(rows);
     }
 
-    /// The stored state was not restored: the next one does not overwrite it.
+    /// Notes that the stored state was not restored, so that the next one does not overwrite it.
     pub(super) fn set_aside(&self) {
         self.lock().sets_aside = true;
     }
@@ -108,7 +108,7 @@ impl WriteQueue {
         self.wake.notify_one();
     }
 
-    /// Rows dropped for lack of room whose loss is not yet reported in the history.
+    /// Rows dropped for lack of room that are not yet reported in the history.
     pub(super) fn lost_rows(&self) -> u64 {
         self.lock().backlog.lost()
     }
@@ -125,7 +125,7 @@ impl WriteQueue {
         }
         queue.wanted = false;
         let state = queue.state.take();
-        // Rows are written with their state.
+        // Rows are written together with their state.
         let batches = state.as_ref().map(|state| queue.backlog.take(&state.stamp)).unwrap_or_default();
         let sets_aside = std::mem::take(&mut queue.sets_aside);
         PendingWrite { batches, state, sets_aside, ticket: queue.ticket, stop: queue.stop }
@@ -142,24 +142,24 @@ impl WriteQueue {
 #[derive(Debug)]
 pub(super) struct Writer {
     pub(super) write_queue: Arc<WriteQueue>,
-    /// Which vehicle the history is of.
+    /// Vehicle of the history.
     pub(super) vehicle: VehicleIdentity,
     pub(super) limits: RowLimits,
     pub(super) folder: Folder,
     pub(super) state_files: StateFiles,
-    /// Space for a full disk.
+    /// Reserve for a full disk.
     pub(super) reserve: Reserve,
-    /// The day, UTC since 1970, for which the chain's end is in the log.
+    /// Day (UTC, since 1970) for which the chain's end was logged.
     pub(super) head_day: Option<i64>,
     /// `None` = not open.
     pub(super) database: Option<Database>,
     pub(super) progress: watch::Sender<StoreProgress>,
     pub(super) retry: Retry,
-    /// The daemon has read the folder's states.
+    /// Whether the daemon has read the folder's states.
     pub(super) knows_state: bool,
 }
 
-/// The time of the next attempt after a failure.
+/// Time of the next attempt after a failure.
 #[derive(Debug, Default)]
 pub(super) struct Retry {
     pause: Option<Duration>,
@@ -182,7 +182,7 @@ impl Writer {
     /// Writes until [`WriteQueue::stop`].
     pub(super) fn run(mut self) {
         self.reserve.make();
-        // One that fails is opened again, and then reported.
+        // If this fails, the database is opened again and the failure is reported then.
         self.database = self.database.take().filter(|database| database.set_vehicle(&self.vehicle).is_ok());
         loop {
             let work = self.write_queue.take(self.retry.at);
@@ -207,8 +207,8 @@ impl Writer {
         }
     }
 
-    /// Writes rows and state; what fails waits for the next attempt. Without a state there is nothing to write, but a
-    /// database that could not be opened is opened again.
+    /// Writes rows and state; what fails waits for the next attempt. Without a state there is nothing to write, but a database
+    /// that could not be opened is opened again.
     fn write(
         &mut self,
         mut batches: Vec<RowBatch>,
@@ -226,7 +226,7 @@ impl Writer {
             Ok(()) => {
                 tracing::debug!(took = ?begun.elapsed(), is_learned, "state stored");
                 if self.retry.pause.is_some() {
-                    tracing::info!(folder = %self.folder, "state and history are written again");
+                    tracing::info!(folder = %self.folder, "state and history can be written again");
                 }
                 self.retry = Retry::default();
                 progress.commits += u64::from(state.is_some());
@@ -247,8 +247,8 @@ impl Writer {
         }
     }
 
-    /// As [`Writer::commit`]; what is learned is tried again at once, as often as the reserve gives space, and once without it:
-    /// space may have come back, and a damaged database is set aside at the second attempt.
+    /// Like [`Writer::commit`], but retries learned rows at once: as often as the reserve provides space, and once without it,
+    /// because space may have become free, and because a damaged database is set aside at the second attempt.
     fn commit_urgently(&mut self, batches: &mut Vec<RowBatch>, document: &StateDocument) -> Result<u64, String> {
         let is_learned = !batches.is_empty();
         let mut is_first = true;
@@ -261,14 +261,14 @@ impl Writer {
         }
     }
 
-    /// Commits the rows, which then leave `batches`, and writes the state. Returns the size of the state.
+    /// Commits the rows, removes them from `batches`, and writes the state. Returns the size of the state.
     pub(super) fn commit(&mut self, batches: &mut Vec<RowBatch>, document: &StateDocument) -> Result<u64, String> {
         let rows = self.commit_rows(batches, &document.stamp);
         if rows.is_ok() {
             batches.clear();
             self.write_queue.lock().backlog.commit();
         } else if !self.knows_state {
-            // The existing state has not been read yet: do not overwrite it.
+            // The existing state has not been read yet and must not be overwritten.
             return rows.map(|()| 0);
         }
         let mut document = document.clone();
@@ -284,7 +284,7 @@ impl Writer {
         let database = self.open(now)?;
         let written = if batches.is_empty() { database.apply(&limits, now) } else { database.commit(batches) };
         if let Err(error) = written {
-            // A connection that failed is opened again: its file may have been deleted.
+            // After a failure the connection is opened again, because its file may have been deleted.
             self.database = None;
             if is_damage(&error) {
                 self.folder.mark_damaged(&error.to_string());
@@ -295,7 +295,7 @@ impl Writer {
         Ok(())
     }
 
-    /// Logs the chain's end with each day's first commit: a chain that was written again does not fit it.
+    /// Logs the chain's end with each day's first commit. A rewritten chain does not match it.
     fn log_head(&mut self, now: &Stamp) {
         let day = now.wall_ns.div_euclid(NS_PER_DAY);
         if let Some(database) = &self.database
@@ -305,12 +305,12 @@ impl Writer {
             tracing::info!(
                 rows,
                 hash,
-                "end of the history's chain; to be compared: packwatch history verify --noted ROWS:HASH"
+                "end of the history's chain; compare it with: packwatch history verify --noted ROWS:HASH"
             );
         }
     }
 
-    /// The database, opened where it is not open.
+    /// The database, which is opened if necessary.
     fn open(&mut self, now: &Stamp) -> Result<&mut Database, String> {
         let database = match self.database.take() {
             Some(database) => database,
@@ -327,9 +327,9 @@ impl Writer {
             self.state_files = files;
             rows.extend(found.faults);
             if found.newest.is_some() {
-                // The daemon started without it because the disk came too late. It is kept for the user.
+                // The disk became available after the daemon had started without this state. It is kept for the user.
                 self.state_files.set_aside();
-                tracing::error!(folder = %self.folder, "a stored state was found after the start: set aside, not used");
+                tracing::error!(folder = %self.folder, "stored state found after the start: set aside, not used");
                 rows.push(HistoryRow::Own { reason: "state_too_late", detail: "set aside".to_owned() });
             }
         }

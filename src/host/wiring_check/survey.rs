@@ -1,7 +1,7 @@
-//! The [`Plan`] of the doctor: what a configuration expects of the buses, even if it has faults.
+//! The [`Plan`] of `packwatch doctor`: what a configuration expects from the buses, even if it has faults.
 //!
-//! In: the configuration file. Out: the plan, every fault as [`config::load`](crate::config::load) reports it, and where
-//! each key stands. A configuration of which no signal can be found in a DBC file is refused.
+//! In: the configuration file. Out: the plan, all faults as [`config::load`](crate::config::load) reports them, and the
+//! position of each key. A configuration without any signal in a DBC file is rejected.
 
 mod beside;
 
@@ -20,27 +20,27 @@ use crate::config::{
 use crate::quantity::{CellIndex, Channel, MAX_CELLS};
 use crate::wiring::{InterfacePlan, MessagePlan, OutputPlan, PackPlan, Plan, SignalPlan};
 
-/// Capacity where nothing states one, Ah: a car's cell.
+/// Capacity used if none is stated, Ah: a typical cell of a car.
 const USUAL_AH: f64 = 50.0;
 
-/// The readable part of a configuration, as the doctor needs it.
+/// The readable part of a configuration, as `packwatch doctor` needs it.
 #[derive(Debug)]
 pub struct Survey {
-    /// Expectations of the buses.
+    /// What the configuration expects from the buses.
     pub plan: Plan,
     /// The signals that were found.
     pub input: InputMap,
     /// The diagnostic answers that were found.
     pub answers: Vec<Answer>,
-    /// The whole, when it is good.
+    /// The whole configuration, if it is valid.
     pub config: Option<Config>,
-    /// Every fault; empty when it is good.
+    /// All faults; empty if there are none.
     pub faults: Vec<String>,
     places: BTreeMap<String, TablePlace>,
 }
 
 impl Survey {
-    /// Place of a key (of its table, when it is not written) as `file:line`, and what is written there.
+    /// Position of a key (of its table, if the key is absent) as `file:line`, and its value.
     pub fn locate(&self, table: &str, key: &str) -> Option<(String, Option<String>)> {
         let place = self.places.get(table)?;
         let found = place.found(key).map(str::to_owned);
@@ -48,10 +48,10 @@ impl Survey {
     }
 }
 
-/// Reads what can be read of a configuration.
+/// Reads the readable part of a configuration.
 ///
 /// # Errors
-/// When no interface is configured or no signal can be found: every fault.
+/// When no interface is configured or no signal can be found; returns all faults.
 pub fn survey(path: &Path) -> Result<Survey, ConfigFaults> {
     let partial = PartialConfig::read(path)?;
     let found = partial.signals();
@@ -126,7 +126,7 @@ fn signal_plan(source: &SignalSource<'_>, message: &Message, signal: &Signal, bi
     }
 }
 
-/// Signals that fit the cells' pattern beyond the configured number, one after the other.
+/// Consecutive signals that match the cells' pattern beyond the configured number.
 fn more_cells(raw: &RawTables, databases: &Databases) -> Vec<SignalPlan> {
     let (Some(keys), Some(pack)) = (&raw.cell_voltage, &raw.pack) else { return Vec::new() };
     let source = keys.config();

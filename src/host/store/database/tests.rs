@@ -1,4 +1,4 @@
-//! Commits, packs, and readers beside a writer, on real databases.
+//! Commits, packs, and readers next to a writer, on real databases.
 
 use super::super::folder::DATABASE;
 use super::super::reader::{HistoryQuery, HistoryReader};
@@ -29,10 +29,10 @@ fn filled(folder: &Path) -> Database {
 }
 
 #[test]
-fn a_commit_is_there_after_reopening() {
+fn commit_survives_reopening() {
     let folder = tempfile::tempdir().unwrap();
     let mut database = open(folder.path());
-    // Every kind of row, and a zero that SQLite stores without its sign.
+    // Every kind of row, and a zero, which SQLite stores without its sign.
     let mut kinds =
         vec![half_cycle(0), capacity(0, Some(2.0), 1.9), loss_modes(0, -0.0), remaining_life(90.0), model(None)];
     kinds.extend([alarm(Change::Raised), EventKind::FilterReset { cell: crate::quantity::CellIndex(3) }]);
@@ -45,7 +45,7 @@ fn a_commit_is_there_after_reopening() {
 }
 
 #[test]
-fn a_commit_that_fails_leaves_no_trace() {
+fn failed_commit_leaves_no_trace() {
     let folder = tempfile::tempdir().unwrap();
     let mut database = filled(folder.path());
     let head = database.head();
@@ -59,7 +59,7 @@ fn a_commit_that_fails_leaves_no_trace() {
 }
 
 #[test]
-fn the_identity_of_a_pack_is_in_its_row() {
+fn pack_identity_is_stored_in_pack_row() {
     let folder = tempfile::tempdir().unwrap();
     let mut database = open(folder.path());
     let another = EventKind::PackReplaced { capacity_ah: Some(1.9), capacity_std_ah: Some(0.1) };
@@ -72,7 +72,7 @@ fn the_identity_of_a_pack_is_in_its_row() {
 }
 
 #[test]
-fn another_pack_closes_one_history_and_opens_the_next() {
+fn pack_change_closes_history_and_opens_next() {
     let folder = tempfile::tempdir().unwrap();
     let mut database = filled(folder.path());
     assert!(!database.is_closed(1).unwrap());
@@ -94,7 +94,7 @@ fn another_pack_closes_one_history_and_opens_the_next() {
 }
 
 #[test]
-fn a_history_can_be_read_while_it_is_written() {
+fn history_can_be_read_while_written() {
     let folder = tempfile::tempdir().unwrap();
     let mut database = filled(folder.path());
     let reader = HistoryReader::open(folder.path()).unwrap();

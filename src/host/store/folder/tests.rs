@@ -1,4 +1,4 @@
-//! Folders and databases that are not what they were.
+//! State folders with damaged, foreign or locked contents.
 
 use std::os::unix::fs::FileExt as _;
 
@@ -13,7 +13,7 @@ fn open(place: &Path, pack: i64) -> (Database, Vec<HistoryRow>) {
 }
 
 #[test]
-fn a_damaged_database_is_set_aside_and_a_new_one_begins() {
+fn damaged_database_is_set_aside() {
     let place = tempfile::tempdir().unwrap();
     let (mut database, about) = open(place.path(), 0);
     assert!(about.is_empty());
@@ -37,7 +37,7 @@ fn a_damaged_database_is_set_aside_and_a_new_one_begins() {
 }
 
 #[test]
-fn what_is_not_a_history_is_set_aside_at_most_eight_times() {
+fn at_most_eight_foreign_files_are_set_aside() {
     let place = tempfile::tempdir().unwrap();
     let path = place.path().join(DATABASE);
     let makers: [&dyn Fn(); 4] = [
@@ -59,7 +59,7 @@ fn what_is_not_a_history_is_set_aside_at_most_eight_times() {
 }
 
 #[test]
-fn the_log_of_a_damaged_database_is_moved_with_it() {
+fn log_of_damaged_database_is_moved_too() {
     let place = tempfile::tempdir().unwrap();
     let [old, new] = ["packwatch.db-wal", "packwatch.db.damaged-1-wal"].map(|name| place.path().join(name));
     fs::write(&old, "of the damaged one").unwrap();
@@ -71,14 +71,14 @@ fn the_log_of_a_damaged_database_is_moved_with_it() {
 }
 
 #[test]
-fn a_file_that_a_power_cut_left_empty_is_filled() {
+fn empty_file_after_power_cut_is_filled() {
     let place = tempfile::tempdir().unwrap();
     fs::write(place.path().join(DATABASE), "").unwrap();
     assert!(open(place.path(), 0).1.is_empty());
 }
 
 #[test]
-fn a_folder_belongs_to_one_process() {
+fn folder_is_locked_by_one_process() {
     let place = tempfile::tempdir().unwrap();
     let mut first = Folder::new(place.path().join("made/on the way"));
     first.lock().unwrap();

@@ -1,4 +1,4 @@
-//! Events as the tests of the store write them, and the rows they make.
+//! Events for the tests of the store, and the rows made from them.
 
 use super::*;
 use crate::alarm::{AlarmState, Change, Rule, Severity};
@@ -7,7 +7,7 @@ use crate::monitor::ModelState;
 use crate::quantity::catalogue::{Quantity, RecordedValues};
 use crate::quantity::{CellIndex, Mode};
 
-/// A capacity of a cell, measured or not.
+/// A capacity of a cell, with or without a measurement.
 pub(in crate::store) fn capacity(cell: u16, measured_ah: Option<f64>, usable_ah: f64) -> EventKind {
     EventKind::Capacity {
         cell: CellIndex(cell),
@@ -34,7 +34,7 @@ pub(in crate::store) fn half_cycle(cell: u16) -> EventKind {
     }
 }
 
-/// What a cell has lost.
+/// Loss modes of a cell.
 pub(in crate::store) fn loss_modes(cell: u16, lli: f64) -> EventKind {
     EventKind::LossModes {
         cell: CellIndex(cell),
@@ -47,7 +47,7 @@ pub(in crate::store) fn loss_modes(cell: u16, lli: f64) -> EventKind {
     }
 }
 
-/// What remains of the pack's life, cycles.
+/// A remaining life of the pack, cycles.
 pub(in crate::store) fn remaining_life(cycles: f64) -> EventKind {
     EventKind::RemainingLife {
         cell: Some(CellIndex(2)),
@@ -60,7 +60,7 @@ pub(in crate::store) fn remaining_life(cycles: f64) -> EventKind {
     }
 }
 
-/// A model learned on board, with its capacity; without: the label's is back.
+/// A model learned on board with this capacity; `None` = back to the model from the label.
 pub(in crate::store) fn model(capacity_ah: Option<f64>) -> EventKind {
     EventKind::Model {
         state: capacity_ah.map_or(ModelState::Prior, |_| ModelState::Learning),
@@ -116,7 +116,7 @@ fn every_row_has_a_value_per_column() {
 }
 
 #[test]
-fn what_is_not_known_of_a_model_is_null() {
+fn unknown_model_values_are_null() {
     let text = |word: &str| Value::Text(word.to_owned());
     let values = |kind: EventKind| HistoryRow::Event(kind).values().unwrap();
     let (table, learning) = values(model(Some(2.0)));
@@ -135,7 +135,7 @@ fn what_is_not_known_of_a_model_is_null() {
 }
 
 #[test]
-fn values_have_the_types_of_their_columns() {
+fn values_have_their_columns_types() {
     let text = |word: &str| Value::Text(word.to_owned());
     let values = |kind: EventKind| HistoryRow::Event(kind).values().unwrap().1;
     let expected = [

@@ -1,4 +1,4 @@
-//! Histories of many days: changed, cut off, and beyond their limits.
+//! Histories of many days: changed, truncated, and beyond their limits.
 
 use super::super::database::{Database, RowLimits};
 use super::super::folder::DATABASE;
@@ -13,7 +13,7 @@ use crate::quantity::Timestamp;
 
 const DAY_S: f64 = 86_400.0;
 
-/// Memory where the system has a folder for it: a commit costs several syncs.
+/// A folder in memory if the system has one, because a commit needs several syncs.
 fn place() -> tempfile::TempDir {
     tempfile::tempdir_in("/dev/shm").unwrap_or_else(|_| tempfile::tempdir().unwrap())
 }
@@ -48,7 +48,7 @@ fn number(database: &Database, sql: &str) -> i64 {
 }
 
 #[test]
-fn every_change_of_a_row_is_found_in_its_segment() {
+fn changed_row_breaks_its_segment() {
     let place = place();
     let database = filled(place.path(), 0..20);
     let broken = |change: &str| {
@@ -75,7 +75,7 @@ fn every_change_of_a_row_is_found_in_its_segment() {
     ] {
         assert_eq!(broken(change).map(|(segment, _)| segment), Some(segment), "{change}");
     }
-    // Rows at the end that are cut off, or added behind the chain's back.
+    // Rows cut off at the end, or added without extending the chain.
     let cut = "DELETE FROM segment WHERE id = 20; DELETE FROM capacity WHERE seq > 190; DELETE FROM alarm WHERE seq > 190; \
                DELETE FROM half_cycle WHERE seq > 190";
     assert_eq!(broken(cut), Some((20, [191, 191])));
@@ -84,7 +84,7 @@ fn every_change_of_a_row_is_found_in_its_segment() {
 }
 
 #[test]
-fn beyond_its_limit_a_history_loses_its_oldest_days_and_still_verifies() {
+fn history_beyond_limit_loses_oldest_days() {
     let place = place();
     let mut database = filled(place.path(), 0..1);
     let mut heads = Vec::new();
@@ -104,18 +104,18 @@ fn beyond_its_limit_a_history_loses_its_oldest_days_and_still_verifies() {
     let extent = reader.extent().unwrap();
     assert_eq!((extent.half_cycles, extent.deleted_half_cycles, extent.written_half_cycles), (20, 80, 100));
     assert_eq!(reader.entries(&HistoryQuery::default()).unwrap().len(), 200);
-    // The end of each day that was noted fits, whether its rows are there or not.
+    // The noted end of each day matches, whether its rows still exist or not.
     for (rows, hash) in heads {
         assert_eq!(reader.contradiction(&NotedHead { rows, hash }).unwrap(), None, "{rows}");
         let other = NotedHead { rows, hash: "0".repeat(64) };
-        assert!(reader.contradiction(&other).unwrap().unwrap().contains("written again"), "{rows}");
+        assert!(reader.contradiction(&other).unwrap().unwrap().contains("rewritten"), "{rows}");
     }
     let within = NotedHead { rows: 15, hash: "0".repeat(64) };
-    assert!(reader.contradiction(&within).unwrap().unwrap().contains("was deleted since"));
+    assert!(reader.contradiction(&within).unwrap().unwrap().contains("has been deleted"));
 }
 
 #[test]
-fn an_end_that_was_noted_within_a_day_fits_later() {
+fn end_noted_within_a_day_matches_later() {
     let place = place();
     let mut database = filled(place.path(), 0..3);
     commit(&mut database, 3.0 * DAY_S, &[alarm(Change::Raised)]);
@@ -124,14 +124,14 @@ fn an_end_that_was_noted_within_a_day_fits_later() {
     let noted = format!("{rows}:{hash}").parse::<NotedHead>().unwrap();
     assert_eq!(contradiction(database.connection(), &noted).unwrap(), None);
     let later = NotedHead { rows: rows + 2, ..noted };
-    assert!(contradiction(database.connection(), &later).unwrap().unwrap().contains("no row 33"));
+    assert!(contradiction(database.connection(), &later).unwrap().unwrap().contains("row 33 does not exist"));
     for text in ["", "3", "3:12", ":", "-1:00", &format!("x:{}", later.hash)] {
         assert!(text.parse::<NotedHead>().is_err(), "{text}");
     }
 }
 
 #[test]
-fn rows_beyond_the_horizon_are_deleted() {
+fn rows_beyond_horizon_are_deleted() {
     let place = place();
     let mut database = filled(place.path(), 0..800);
     let now = Stamp::replayed(Timestamp::from_secs(800.0 * DAY_S));
@@ -145,7 +145,7 @@ fn rows_beyond_the_horizon_are_deleted() {
 }
 
 #[test]
-fn a_day_of_unknown_date_is_deleted_with_those_after_it() {
+fn day_of_unknown_date_is_deleted_with_later_days() {
     const WALL_S: f64 = 1.8e9;
     let place = place();
     let mut database = open(place.path());
@@ -166,7 +166,7 @@ fn a_day_of_unknown_date_is_deleted_with_those_after_it() {
 }
 
 #[test]
-fn a_day_of_very_many_rows_has_several_segments() {
+fn day_with_many_rows_has_several_segments() {
     let place = place();
     let mut database = open(place.path());
     let kinds: Vec<EventKind> = (0..1000).map(|cell| capacity(cell, Some(2.0), 1.9)).collect();

@@ -1,4 +1,4 @@
-//! States written and read, damaged and set aside, on real files.
+//! State files: written and read, damaged and set aside, on a real disk.
 
 use super::super::tests::document;
 use super::*;
@@ -23,7 +23,7 @@ fn found(folder: &Path) -> (Option<i64>, Option<i64>, usize) {
 }
 
 #[test]
-fn each_state_overwrites_the_older_file_and_the_newest_is_read() {
+fn states_are_written_alternately_newest_is_read() {
     let place = place();
     assert_eq!(found(place.path()), (None, None, 0));
     for pack in 1..=5 {
@@ -37,7 +37,7 @@ fn each_state_overwrites_the_older_file_and_the_newest_is_read() {
 }
 
 #[test]
-fn every_flipped_bit_of_either_file_is_found_and_leaves_the_other_state() {
+fn flipped_bit_is_detected_other_state_remains() {
     let place = place();
     drop(written(place.path(), [1, 2]));
     for (name, left) in [(FILES[1], 1), (FILES[0], 2)] {
@@ -56,7 +56,7 @@ fn every_flipped_bit_of_either_file_is_found_and_leaves_the_other_state() {
 }
 
 #[test]
-fn a_damaged_file_is_written_next_even_where_a_folder_is_in_its_place() {
+fn damaged_file_is_replaced_next() {
     let place = place();
     drop(written(place.path(), [1, 2]));
     fs::remove_file(place.path().join(FILES[1])).unwrap();
@@ -66,7 +66,7 @@ fn a_damaged_file_is_written_next_even_where_a_folder_is_in_its_place() {
 }
 
 #[test]
-fn a_plain_decompressor_shows_the_json() {
+fn zstd_decompressor_shows_json() {
     let place = place();
     drop(written(place.path(), [4711]));
     let file = File::open(place.path().join(FILES[0])).unwrap();
@@ -76,7 +76,7 @@ fn a_plain_decompressor_shows_the_json() {
 }
 
 #[test]
-fn a_state_that_is_set_aside_stays_whatever_is_written_later() {
+fn state_set_aside_survives_later_writes() {
     let place = place();
     let mut files = written(place.path(), [1, 2]);
     files.set_aside();
@@ -90,7 +90,7 @@ fn a_state_that_is_set_aside_stays_whatever_is_written_later() {
 }
 
 #[test]
-fn a_state_of_another_format_is_set_aside_and_not_overwritten() {
+fn state_with_other_format_is_set_aside() {
     let place = place();
     drop(written(place.path(), [1]));
     let other = StateDocument { format: 1, ..document(1, 100, 1_800_000_000) }.encode().unwrap();
@@ -98,10 +98,7 @@ fn a_state_of_another_format_is_set_aside_and_not_overwritten() {
     let mut file = zstd::bulk::compress(json.replacen("\"format\":1", "\"format\":2", 1).as_bytes(), LEVEL).unwrap();
     let hash = Sha256::digest(&file);
     file.extend([&HASH_HEAD[..], &hash].concat());
-    assert_eq!(
-        StateDocument::decode(&file).unwrap_err(),
-        StateFault::Unfit("format 2, this program reads 1".to_owned())
-    );
+    assert_eq!(StateDocument::decode(&file).unwrap_err(), StateFault::Unfit("format 2, must be 1".to_owned()));
     fs::write(place.path().join(FILES[1]), &file).unwrap();
     assert_eq!(found(place.path()), (Some(1), None, 1));
     drop(written(place.path(), [2]));
@@ -110,7 +107,7 @@ fn a_state_of_another_format_is_set_aside_and_not_overwritten() {
 }
 
 #[test]
-fn numbers_keep_nine_digits_and_six_decimals_and_identities_are_exact() {
+fn rounding_keeps_nine_digits_and_whole_numbers() {
     for (value, stored) in [
         (0.123_456_789_012, 0.123_456_789),
         (-1.234_567_890_12e-30, -1.234_567_89e-30),

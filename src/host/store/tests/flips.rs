@@ -1,13 +1,13 @@
-//! Every single-bit flip of a small store: it is written again, and the learned capacity is alive.
+//! Every single-bit flip of a small store: the store can be written again, and the learned capacity survives.
 //!
-//! The tests take a sample. `PACKWATCH_FLIPS=all` takes every bit, `PACKWATCH_FLIPS=N` every N-th. The counts are printed.
+//! The tests take a sample. `PACKWATCH_FLIPS=all` tests every bit, `PACKWATCH_FLIPS=N` every N-th. The counts are printed.
 
 use super::*;
 
-/// Bits between two flips of the sample: a prime, so that every bit of a byte and every place of a page is met.
+/// Bits between two flips of the sample; a prime, so that every bit of a byte and every place of a page is reached.
 const SAMPLE_STEP: usize = 397;
 
-/// What the flips led to.
+/// Effects of the flips.
 #[derive(Debug, Default)]
 struct FlipCounts {
     flips: usize,
@@ -15,21 +15,21 @@ struct FlipCounts {
     set_aside: usize,
     /// The newest state was not found.
     older: usize,
-    /// The learned capacity was not found, nothing could be written, or it was not there at the next start.
+    /// The learned capacity was not found, nothing could be written, or it was missing at the next start.
     failed: Vec<(&'static str, usize, String)>,
 }
 
-/// The undamaged store: a replayed day of one cell, as a daemon leaves it.
+/// The undamaged store: a replayed day of one cell, as left by a daemon.
 struct Reference {
     files: Vec<(&'static str, Vec<u8>)>,
-    /// The states in the files, the newest first.
+    /// The states in the files, newest first.
     states: [Vec<u8>; 2],
     now: Stamp,
     /// The state that is written after each flip.
     next: StateDocument,
 }
 
-/// Memory where the system has a folder for it: a flip costs several syncs.
+/// A folder in memory if the system has one, because a flip needs several syncs.
 fn place() -> tempfile::TempDir {
     tempfile::tempdir_in("/dev/shm").unwrap_or_else(|_| tempfile::tempdir().unwrap())
 }
@@ -60,7 +60,7 @@ impl Reference {
         });
         std::fs::remove_file(state.join(newest_file.unwrap())).unwrap();
         let states = [json(&newest.snapshot), json(&stored(&state).snapshot)];
-        // As the files hold it.
+        // As stored in the files.
         StateFiles::open(&state).0.write(document(2, 100, 1_900_000_000)).unwrap();
         let next = stored(&state);
         Self { files, states, now: document(2, 200, 1_900_000_100).stamp, next }
@@ -108,7 +108,7 @@ impl Reference {
 }
 
 #[test]
-fn after_any_flipped_bit_the_store_is_written_and_the_learned_capacity_is_alive() {
+fn learned_capacity_survives_any_flipped_bit() {
     let step = match std::env::var("PACKWATCH_FLIPS") {
         Ok(all) if all == "all" => 1,
         Ok(step) => step.parse().unwrap(),

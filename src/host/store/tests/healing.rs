@@ -1,4 +1,4 @@
-//! What is left of a store whose states are lost, and what must not come back.
+//! What a start recovers from a store without states, and what it must not restore.
 
 use super::folder::Folder;
 use super::rows::tests::{alarm, capacity};
@@ -6,7 +6,7 @@ use super::*;
 use crate::alarm::{Change, Selector};
 use crate::monitor::{LearnedCell, Source};
 
-/// A store in a folder of its own, with the state in which its replay ended.
+/// A store in a new folder, and the final state of its replay.
 fn replayed_store() -> (tempfile::TempDir, Snapshot) {
     let place = tempfile::tempdir().unwrap();
     let state = place.path().join("state");
@@ -28,7 +28,7 @@ fn open(place: &Path) -> (Store, StoredStates) {
 }
 
 #[test]
-fn without_a_good_state_a_start_continues_from_the_capacities_in_the_history() {
+fn start_without_state_uses_capacities_in_history() {
     let (place, end) = replayed_store();
     without_states(place.path());
     let (_store, found) = open(place.path());
@@ -45,7 +45,7 @@ fn without_a_good_state_a_start_continues_from_the_capacities_in_the_history() {
 }
 
 #[test]
-fn a_damaged_day_of_the_history_is_not_learned_from() {
+fn damaged_day_of_history_is_not_used() {
     let (place, _) = replayed_store();
     without_states(place.path());
     let mut folder = Folder::new(place.path().join("state"));
@@ -61,7 +61,7 @@ fn a_damaged_day_of_the_history_is_not_learned_from() {
 }
 
 #[test]
-fn learned_values_of_other_cells_or_impossible_ones_change_nothing() {
+fn capacities_of_other_cells_are_not_used() {
     let mut monitor = Monitor::new(config().monitor);
     let before = serde_json::to_string(&monitor.snapshot()).unwrap();
     let of = |cell: u16, mean: f64, std: f64| {
@@ -77,7 +77,7 @@ fn learned_values_of_other_cells_or_impossible_ones_change_nothing() {
 }
 
 #[test]
-fn the_state_of_the_old_pack_does_not_come_back_with_a_lost_history() {
+fn lost_history_does_not_restore_old_pack() {
     let (place, _) = replayed_store();
     let state = place.path().join("state");
     assert_eq!(replace_pack(&state).unwrap(), 2);
@@ -87,7 +87,7 @@ fn the_state_of_the_old_pack_does_not_come_back_with_a_lost_history() {
 }
 
 #[test]
-fn a_command_is_committed_although_its_alarm_flickers() {
+fn command_is_committed_while_alarm_flickers() {
     let place = tempfile::tempdir().unwrap();
     let (store, _) =
         Store::open(&PlaceSetting::At(place.path().to_owned()), &config().store, &VehicleIdentity::default()).unwrap();
@@ -111,7 +111,7 @@ fn a_command_is_committed_although_its_alarm_flickers() {
 }
 
 #[test]
-fn the_end_of_the_chain_is_logged_with_the_first_commit_of_each_day() {
+fn chain_end_is_logged_daily() {
     // 2027-01-15T00:00:00Z.
     const MIDNIGHT_S: i64 = 1_799_971_200;
     let place = tempfile::tempdir().unwrap();

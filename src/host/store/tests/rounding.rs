@@ -1,11 +1,11 @@
-//! Estimates after a power cut: a state that went through its file, where numbers are rounded, with an age from the clocks.
+//! Estimates after a power cut: restored from a state file, whose numbers are rounded, with an age from the clocks.
 
 use nalgebra::DMatrix;
 use serde_json::Value;
 
 use super::*;
 
-/// The state as its file returns it.
+/// The state as read back from its file.
 fn from_the_disk(state: &StateDocument) -> StateDocument {
     let place = tempfile::tempdir().unwrap();
     StateFiles::open(place.path()).0.write(state.clone()).unwrap();
@@ -16,7 +16,7 @@ fn numbers(value: &Value) -> Vec<f64> {
     value.as_array().unwrap().iter().map(|number| number.as_f64().unwrap()).collect()
 }
 
-/// Means and covariance of one filter before and after.
+/// Compares means and covariance of one filter before and after.
 fn compare(before: (&Value, &Value), after: (&Value, &Value), what: &str) {
     let [mean, kept_mean] = [before.0, after.0].map(numbers);
     let [covariance, kept] = [before.1, after.1].map(|rows| {
@@ -35,8 +35,8 @@ fn compare(before: (&Value, &Value), after: (&Value, &Value), what: &str) {
         }
     }
     assert_eq!(kept, kept.transpose(), "{what}");
-    // The least room between it and a covariance that does not factorise, relative to its own size; what is configured
-    // not to be learned has no variance.
+    // The smallest margin to a covariance that cannot be factorised, relative to its size; quantities that are configured not to
+    // be learned have no variance.
     let varied: Vec<usize> = (0..mean.len()).filter(|&i| covariance[(i, i)] > 0.0).collect();
     let scaled = DMatrix::from_fn(varied.len(), varied.len(), |a, b| {
         let (i, j) = (varied[a], varied[b]);
@@ -47,7 +47,7 @@ fn compare(before: (&Value, &Value), after: (&Value, &Value), what: &str) {
 }
 
 #[test]
-fn means_and_covariances_survive_a_power_cut() {
+fn means_and_covariances_survive_power_cut() {
     let taken = |seconds: i64, boottime_s: i64| {
         let snapshot = Box::new(snapshot(Some(seconds), None));
         StateDocument { snapshot, ..document(1, boottime_s, 1_800_000_000 + boottime_s) }
@@ -64,7 +64,7 @@ fn means_and_covariances_survive_a_power_cut() {
         compare((&a["mean"], &a["covariance"]), (&b["mean"], &b["covariance"]), &format!("filter at {seconds} s"));
         let [a, b] = [drift(&before), drift(&after)];
         compare((&a["x"], &a["p"]), (&b["x"], &b["p"]), &format!("capacity at {seconds} s"));
-        // The state is restored, with the age that the clocks give.
+        // The state is restored with the age from the clocks.
         let age_s = (10_000 - seconds) as f64;
         let downtime = back.stamp.age(&now, WallClock::Reliable);
         assert_eq!(downtime, Downtime::Seconds(age_s));

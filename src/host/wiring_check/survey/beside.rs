@@ -1,7 +1,7 @@
-//! Signals of the DBC files that are not configured and can be compared with those that are.
+//! Signals in the DBC files that are not configured but can be compared with configured ones.
 //!
-//! In: the DBC files and the configured signals. Out: signals that are the pack's voltage or a state of charge by their name and
-//! unit, bound to every interface, for a DBC does not state its bus.
+//! In: the DBC files and the configured signals. Out: signals that, according to name and unit, are the pack's voltage or a state
+//! of charge. They are bound to every interface, because a DBC does not state its bus.
 
 use crate::can::dbc::{Message, Signal};
 use crate::can::decode::Binding;
@@ -24,11 +24,11 @@ pub(super) fn signals(raw: &RawTables, databases: &Databases, found: &[ResolvedS
             Some(plan)
         })
     });
-    // On all interfaces together.
+    // The limit applies to all interfaces together.
     bound.take(64).collect()
 }
 
-/// What a signal is by its name and unit; `None` = nothing to compare.
+/// What a signal measures, according to name and unit; `None` = not comparable.
 fn channel_of(raw: &RawTables, message: &Message, signal: &Signal) -> Option<Channel> {
     let label = SignalLabel::new(&message.name, &signal.name, &signal.unit);
     let is = |quantity| !label.says_extreme() && label.score(quantity).is_some_and(|score| score.points >= 3.0);
@@ -43,7 +43,7 @@ fn plan(bus: BusIndex, message: &Message, signal: &Signal, channel: Channel) -> 
     let unit = SignalUnit::parse(&signal.unit);
     let scale = match channel {
         Channel::PackVoltage => unit.map_or(1.0, |unit| unit.factor),
-        // Without a unit, what reaches beyond 1.5 counts percent.
+        // Without a unit, a signal that can exceed 1.5 is in percent.
         _ if unit.is_some() || signal.layout.extent().1 > 1.5 => 0.01,
         _ => 1.0,
     };
@@ -72,7 +72,7 @@ mod tests {
     use crate::config::PartialConfig;
 
     #[test]
-    fn names_and_units_decide_what_is_compared() {
+    fn names_and_units_select_comparable_signals() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config");
         let raw = PartialConfig::read(&folder.join("example.toml")).unwrap().raw;
         let channel = |message: &str, signal: &str, unit: &str| {
