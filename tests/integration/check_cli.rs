@@ -96,7 +96,7 @@ fn json_output_matches_text() {
 }
 
 #[test]
-fn all_faults_are_reported_with_exit_code_78() {
+fn all_faults_are_reported_with_code_78() {
     let folder = tempfile::tempdir().unwrap();
     let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
     write("cell.toml", "format = 1\nname = \"x\"\nrated_capacity_ah = 0\n");

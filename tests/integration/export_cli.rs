@@ -196,7 +196,7 @@ fn columns_page_matches_repository() {
 
 /// Compares with Python's readers, if installed.
 #[test]
-fn python_readers_agree() {
+fn python_readers_agree_with_export() {
     let bench = Bench::new();
     for (format, out) in [("parquet", "p"), ("csv", "c")] {
         bench.run(&["export", "--format", format, "--out", out, "life.log"]).success();

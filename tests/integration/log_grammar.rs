@@ -429,7 +429,7 @@ fn malformed_journal_lines_are_counted() {
 }
 
 #[test]
-fn csv_rows_become_frames_and_bad_fields_are_named() {
+fn csv_rows_become_frames_bad_fields_are_named() {
     let folder = tempfile::tempdir().expect("a folder");
     let text = b"time_s,current_a,voltage_v,temperature_c\n0,1.5,4.0,25\n1.25,,3.9,25\n2,NaN,3.9,25\n3,1,oops,25\n4,1\n5,2,3.8,\n";
     let path = file(folder.path(), "a.csv", text);

@@ -381,7 +381,7 @@ fn half_cycle_before_clock_step_has_duration() {
 }
 
 #[test]
-fn euler_survives_a_night() {
+fn euler_matches_exact_discretisation_after_night() {
     let mut left = Vec::new();
     for rule in [Discretisation::Exact, Discretisation::Euler] {
         let mut c = load("paper.toml");
@@ -428,7 +428,7 @@ fn half_cycle_ending_after_restart_is_learned() {
 }
 
 #[test]
-fn wide_capacity_start() {
+fn wide_initial_capacity_causes_no_filter_reset() {
     let mut c = load("paper.toml");
     c.estimator.initial.capacity_std_ah = 1.5;
     let mut b = Bench::new(c, 0.95);
@@ -453,7 +453,7 @@ fn ticks_continue_after_clock_step_back() {
 }
 
 #[test]
-fn swing_of_the_first_half_cycle() {
+fn first_half_cycle_has_correct_swing() {
     let mut b = Bench::new(load("paper.toml"), 0.9);
     b.run(2.6, 720); // 20 %
     b.run(0.0, 60);

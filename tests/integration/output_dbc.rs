@@ -452,7 +452,7 @@ fn written_dbc_decodes_frames_within_half_step() {
 }
 
 #[test]
-fn dbc_carries_configuration() {
+fn dbc_describes_configured_frames() {
     let Some(python) = python() else { return };
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("written.dbc");

@@ -245,7 +245,7 @@ fn bad_input_error_names_place_and_range() {
 }
 
 #[test]
-fn a_bad_model_or_configuration_is_a_configuration_fault() {
+fn bad_model_is_a_configuration_fault() {
     let bench = Bench::new();
     bench.write_discharge("drive.csv", 0.5, 0.0);
     bench.write("bad.toml", &MODEL.replace("capacity_ah = 2.0", "capacity_ah = -2.0"));

@@ -17,7 +17,7 @@ const TABLES: [&str; 9] = [
     "limits.temperature",
 ];
 
-/// Rounds of readings, enough for most configurations, and for one configuration in [`LONG_ONE_IN`].
+/// Rounds of readings per configuration. One configuration in [`LONG_ONE_IN`] gets [`LONG_ROUNDS`].
 const ROUNDS: usize = 16;
 const LONG_ROUNDS: usize = 80;
 const LONG_ONE_IN: usize = 8;

@@ -47,7 +47,7 @@ pub(crate) fn windowed(life: &Path, to: &Path, seed: u64, by: WindowUnit) {
     writer.flush().unwrap();
 }
 
-/// Position of each row within its record, 0 to 1.
+/// Time (s) or charge moved (A s) from the start of the record to each row.
 fn along(record: &[csv::StringRecord], by: WindowUnit) -> Vec<f64> {
     let number = |row: &csv::StringRecord, column: usize| row[column].parse::<f64>().unwrap();
     let mut along = vec![0.0];
