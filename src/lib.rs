@@ -56,7 +56,7 @@
 //! | the filter's process or measurement noise | `core/cell/estimator/noise.rs` |
 //! | the open-circuit curve of an aged cell, half-cell potentials | `core/cell/aged_ocv.rs`, `core/cell/electrodes.rs`; their fit: `lab/ident/electrodes.rs` |
 //! | the model learned on board | `core/cell/own_model/fit.rs` (fit), `core/monitor/stage/modelling.rs` (when); on another thread: `host/service/live.rs` |
-//! | the signature of a cell fault; when it is reported | `core/cell_faults/difference.rs`, `core/cell_faults/channels.rs`; `core/cell_faults/finding.rs` |
+//! | the signature of a cell fault; when it is reported | `core/cell_faults/difference.rs`, `core/cell_faults/channels.rs`; `core/cell_faults/fault.rs` |
 //! | capacity learned from a half-cycle | `core/health/learner.rs` |
 //! | what is kept of exchanged packs | `core/monitor/stages/pack_memory.rs` |
 //! | contents of the stored state | the stage's state, `core/monitor/snapshot.rs`; its restore: `core/monitor/lifecycle/restore.rs` |
