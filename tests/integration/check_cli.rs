@@ -40,8 +40,8 @@ fn shipped(folder: &str) -> Vec<PathBuf> {
 fn every_shipped_configuration_is_valid() {
     // The uplink's own tests check its settings.
     for file in shipped("config").into_iter().filter(|file| !file.ends_with("uplink.toml")) {
-        let said = good(&["check", file.to_str().unwrap()]);
-        assert!(said.starts_with(&format!("{}: good\n", file.display())), "{said}");
+        let printed = good(&["check", file.to_str().unwrap()]);
+        assert!(printed.starts_with(&format!("{}: good\n", file.display())), "{printed}");
     }
 }
 
@@ -50,9 +50,9 @@ fn every_shipped_configuration_is_valid() {
 fn measured_cell_end_of_life_is_consistent() {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/measured.toml");
     let text = std::fs::read_to_string(&file).unwrap();
-    let said = text.split_once("End of life as the publishers of the data state it: ").unwrap().1;
-    let (percent, said) = said.split_once(" % below the ").unwrap();
-    let rated_ah: f64 = said.split_once(" Ah").unwrap().0.parse().unwrap();
+    let printed = text.split_once("End of life as the publishers of the data state it: ").unwrap().1;
+    let (percent, printed) = printed.split_once(" % below the ").unwrap();
+    let rated_ah: f64 = printed.split_once(" Ah").unwrap().0.parse().unwrap();
     let end_ah = rated_ah * (1.0 - percent.parse::<f64>().unwrap() / 100.0);
 
     let config = packwatch::config::load(&file).unwrap().monitor;
@@ -70,7 +70,7 @@ fn every_shipped_cell_model_is_valid() {
 
 #[test]
 fn valid_file_is_explained() {
-    let said = good(&["check", "config/example.toml"]);
+    let printed = good(&["check", "config/example.toml"]);
     for part in [
         "96 cells in series, each with its own voltage",
         "can0: classic, kernel filter 100 110 120",
@@ -81,7 +81,7 @@ fn valid_file_is_explained() {
         "pack current from -15 to 30 A, stale after 0.5 s",
         "severe when a cell's capacity is below 1.82 Ah (70 % of rated) with a probability above 80 %, cleared at 1.872 Ah",
     ] {
-        assert!(said.contains(part), "{part} in\n{said}");
+        assert!(printed.contains(part), "{part} in\n{printed}");
     }
 }
 
@@ -149,17 +149,20 @@ fn drop_ins_are_merged_with_their_places() {
     assert!(!page.contains("ambient_c = 3"), "{page}");
     let table: toml::Table = page.parse().unwrap();
     assert_eq!(table["pack"]["cells"].as_integer(), Some(1));
-    let said = good(&["check", name]);
+    let printed = good(&["check", name]);
     let head = format!("{name}: good\n  with {name}.d/10-early.toml\n  with {name}.d/20-late.toml\n");
-    assert!(said.starts_with(&head), "{said}");
+    assert!(printed.starts_with(&head), "{printed}");
 }
 
 #[test]
 fn commands_without_key_are_called_unauthenticated() {
     let commands = "[commands]\nenabled = true\ne2e = \"1A\"\ndata_id = 0x321\n";
     let (_folder, file) = with_drop_ins(&[("commands.toml", commands)]);
-    let said = good(&["check", file.to_str().unwrap()]);
-    assert!(said.contains("commands of other ECUs are unauthenticated: every node on the bus can send them"), "{said}");
+    let printed = good(&["check", file.to_str().unwrap()]);
+    assert!(
+        printed.contains("commands of other ECUs are unauthenticated: every node on the bus can send them"),
+        "{printed}"
+    );
 }
 
 #[test]
@@ -212,10 +215,10 @@ fn file_with_warning_is_usable_but_flagged() {
     let text = std::fs::read_to_string(config.join("example.toml")).unwrap();
     let file = folder.path().join("pack.toml");
     std::fs::write(&file, text.replace("strings = 1", "strings = 1\nrated_capacity_ah = 5.2")).unwrap();
-    let said = good(&["check", file.to_str().unwrap()]);
+    let printed = good(&["check", file.to_str().unwrap()]);
     assert!(
-        said.starts_with(&format!("{}: usable, 1 warning\n\nwarnings\n  {}", file.display(), file.display())),
-        "{said}"
+        printed.starts_with(&format!("{}: usable, 1 warning\n\nwarnings\n  {}", file.display(), file.display())),
+        "{printed}"
     );
-    assert!(said.contains("2 cells in parallel are strings = 2 without this key"), "{said}");
+    assert!(printed.contains("2 cells in parallel are strings = 2 without this key"), "{printed}");
 }

@@ -233,15 +233,16 @@ fn unknown_required_value_is_rejected_with_reason() {
     let life = Life::new();
     let (config, state, accidents) = (life.path("pack.toml"), life.path("state"), life.path("accidents.json"));
     let base = ["passport", "-c", &config, "--state", &state];
-    let said = refused(&[&base[..], &["--static", &accidents]].concat());
-    assert_eq!(said.lines().count(), 1, "{said}");
+    let printed = refused(&[&base[..], &["--static", &accidents]].concat());
+    assert_eq!(printed.lines().count(), 1, "{printed}");
     assert!(
-        said.contains("NumberOfFullCycles: required, but not known") && said.contains("--throughput-before-ah, 0"),
-        "{said}"
+        printed.contains("NumberOfFullCycles: required, but not known")
+            && printed.contains("--throughput-before-ah, 0"),
+        "{printed}"
     );
     let out = life.path("passport.json");
-    let said = refused(&[&base[..], &["--throughput-before-ah", "0", "-o", &out]].concat());
-    assert_eq!(said, "InformationOnAccidents: required, and no record holds it: --static gives it\n");
+    let printed = refused(&[&base[..], &["--throughput-before-ah", "0", "-o", &out]].concat());
+    assert_eq!(printed, "InformationOnAccidents: required, and no record holds it: --static gives it\n");
     assert!(!Path::new(&out).exists());
     let given = passport(&with(
         &["-c", &config, "--state", &state].map(str::to_owned),
@@ -261,10 +262,10 @@ fn soce_needs_certified_energy() {
     assert!((0.011..0.0150).contains(&energy_kwh), "{energy_kwh} kWh");
     assert!((soce - 100.0 * energy_kwh / 0.014).abs() < 0.01, "{soce} %");
     let path = life.write("manufacturer.json", &manufacturer());
-    let said =
+    let printed =
         refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--form", "battery-pass", "--static", &path]));
     assert_eq!(
-        said,
+        printed,
         "performance.dynamic.energy.soce: required, but not known: the certified energy is not given (--certified-energy-kwh)\n"
     );
 }
@@ -377,12 +378,12 @@ fn missing_static_members_are_named() {
     assert!(expected.len() > 90, "{} members", expected.len());
     let path = life.write("manufacturer.json", &document);
     let more = ["--form", "battery-pass", "--certified-energy-kwh", "0.014", "--static", &path];
-    let said = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &more));
+    let printed = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &more));
     for path in &expected {
         let line = format!("{path}: required, and no record holds it: --static gives it");
-        assert!(said.lines().any(|one| one == line), "{path} in {said}");
+        assert!(printed.lines().any(|one| one == line), "{path} in {printed}");
     }
-    assert_eq!(said.lines().count(), expected.len(), "only the removed members may be missing: {said}");
+    assert_eq!(printed.lines().count(), expected.len(), "only the removed members may be missing: {printed}");
 }
 
 #[test]
@@ -396,19 +397,19 @@ fn static_part_faults_are_named_by_path() {
     document["performance"]["dynamic"]["stateOfCharge"] = json!({ "value": 50.0 });
     let path = life.write("manufacturer.json", &document);
     let more = ["--form", "battery-pass", "--certified-energy-kwh", "0.014", "--static", &path];
-    let said = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &more));
+    let printed = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &more));
     for expected in [
         "identification.category: found \"car\", must be one of SLI, LMT, EV, industrial, portable, incorporated",
         "metadata.issued: not in the standard, which has version, status",
         "performance.rated.voltage.min: found \"2.7\", must be a number",
         "performance.dynamic.stateOfCharge.value: stated in the static part, but measured",
     ] {
-        assert!(said.contains(expected), "{expected:?} in {said}");
+        assert!(printed.contains(expected), "{expected:?} in {printed}");
     }
-    assert_eq!(said.lines().count(), 4, "{said}");
+    assert_eq!(printed.lines().count(), 4, "{printed}");
     fs::write(&path, "{").expect("written");
-    let said = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--static", &path]));
-    assert!(said.contains("manufacturer.json: ") && said.contains("line 1"), "{said}");
+    let printed = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--static", &path]));
+    assert!(printed.contains("manufacturer.json: ") && printed.contains("line 1"), "{printed}");
 }
 
 #[test]
@@ -420,16 +421,16 @@ fn new_pack_or_undated_record_gives_no_passport() {
     let condition = passport(&args);
     assert_eq!(condition["NumberOfFullCycles"]["NumberOfFullCyclesValue"], 0);
     assert!(condition.get("RemainingCapacity").is_none() && condition.get("RemainingEnergy").is_none(), "{condition}");
-    let said = refused(&[&["passport"], &args[..], &["--form", "battery-pass"]].concat());
+    let printed = refused(&[&["passport"], &args[..], &["--form", "battery-pass"]].concat());
     assert!(
-        said.contains(
+        printed.contains(
             "performance.dynamic.capacity.capacity: required, but not known: nothing has been learned of cell 1 yet"
         ),
-        "{said}"
+        "{printed}"
     );
     let rows = (0..400).map(|second| format!("{second},2.0,3.9,24.0\n")).collect::<String>();
     fs::write(life.path("cell.csv"), format!("time_s,current_a,voltage_v,temperature_c\n{rows}")).expect("written");
-    let said = refused(&[
+    let printed = refused(&[
         "passport",
         "-c",
         &config,
@@ -439,7 +440,7 @@ fn new_pack_or_undated_record_gives_no_passport() {
         "--throughput-before-ah",
         "0",
     ]);
-    assert!(said.contains("the record has no dates"), "{said}");
+    assert!(printed.contains("the record has no dates"), "{printed}");
 }
 
 #[test]
@@ -473,8 +474,11 @@ fn tampered_history_gives_no_passport() {
     database
         .execute("DELETE FROM half_cycle WHERE moment = (SELECT min(moment) FROM half_cycle)", [])
         .expect("deleted");
-    let said = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--static", &accidents]));
-    assert!(said.contains("the history was changed: rows 1 to ") && said.contains("no passport is made"), "{said}");
+    let printed = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--static", &accidents]));
+    assert!(
+        printed.contains("the history was changed: rows 1 to ") && printed.contains("no passport is made"),
+        "{printed}"
+    );
 }
 
 /// Arguments for a passport from logs, for a battery recorded since new.
@@ -493,8 +497,11 @@ fn record_without_current_has_no_sums() {
     // Each current reading is valid for half of the interval to the next.
     life.simulate("sparse.log", "1700000000", &["--cycles", "2", "--period", "10000"]);
     let args = of_logs(&life, &["sparse.log"]);
-    let said = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--throughput-before-ah", "0"]));
-    assert!(said.contains("the current is missing from the record for") && said.contains("--throughput-ah"), "{said}");
+    let printed = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--throughput-before-ah", "0"]));
+    assert!(
+        printed.contains("the current is missing from the record for") && printed.contains("--throughput-ah"),
+        "{printed}"
+    );
     let given = passport(&with(&args, &["--throughput-ah", "400"]));
     assert_eq!(given["NumberOfFullCycles"]["NumberOfFullCyclesValue"], 50);
     assert!(given.get("EnergyThroughput").is_none(), "{given}");
@@ -511,13 +518,13 @@ fn record_with_gap_has_no_sums() {
     let cut: Vec<&str> = text.lines().filter(is_kept).collect();
     fs::write(life.path("cut.log"), cut.join("\n")).expect("written");
     fs::write(life.path("journal.000003.zst"), zstd::encode_all(text.as_bytes(), 1).expect("packed")).expect("written");
-    let said = |log: &str| {
+    let printed = |log: &str| {
         let args = of_logs(&life, &[log]);
         refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--throughput-before-ah", "0"]))
     };
-    let gap = said("cut.log");
+    let gap = printed("cut.log");
     assert!(gap.contains("the record has a gap of ") && gap.contains(" s that began while current flowed"), "{gap}");
-    let beginning = said("journal");
+    let beginning = printed("journal");
     assert!(beginning.contains("the first 2 segments of the journal are missing"), "{beginning}");
     let whole = passport(&with(&of_logs(&life, &["life.log"]), &["--throughput-before-ah", "0"]));
     assert!(whole.get("EnergyThroughput").is_some(), "{whole}");
@@ -548,15 +555,15 @@ fn store_of_other_configuration_is_rejected() {
     let pack = fs::read_to_string(life.path("pack.toml")).expect("a file");
     let model = shipped("config/cells/nasa_b0005.toml");
     let cells = fs::read_to_string(&model).expect("a file");
-    let said = |text: String| {
+    let printed = |text: String| {
         fs::write(life.path("pack.toml"), text).expect("written");
         refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--static", &accidents]))
     };
-    let strings = said(pack.replace("strings = 2", "strings = 4"));
+    let strings = printed(pack.replace("strings = 2", "strings = 4"));
     assert!(strings.contains("the record is of 2 parallel strings, the configuration has 4"), "{strings}");
     let larger = cells.replace("rated_capacity_ah = 2.0", "rated_capacity_ah = 3.0");
     fs::write(life.path("larger.toml"), larger).expect("written");
-    let capacity = said(pack.replace(&format!("{model:?}"), "\"larger.toml\""));
+    let capacity = printed(pack.replace(&format!("{model:?}"), "\"larger.toml\""));
     assert!(capacity.contains("cells of 2 Ah, the configuration has cells of 3 Ah"), "{capacity}");
     assert!(capacity.contains("state: "), "the state folder must be named: {capacity}");
 }
@@ -571,17 +578,17 @@ fn value_from_unset_clock_is_undated() {
     let (config, state) = (life.path("pack.toml"), life.path("state"));
     let stored = ["-c", &config, "--state", &state, "--static", &life.path("accidents.json")].map(str::to_owned);
     for args in [of_logs(&life, &["unset.log", "set.log"]), stored.to_vec()] {
-        let said = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--throughput-before-ah", "0"]));
-        assert!(said.contains("NumberOfFullCycles: required, but not known: its time is not known"), "{said}");
+        let printed = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--throughput-before-ah", "0"]));
+        assert!(printed.contains("NumberOfFullCycles: required, but not known: its time is not known"), "{printed}");
         let given = passport(&with(&args, &["--throughput-ah", "400"]));
         assert!(given.get("RemainingCapacity").is_none() && !given.to_string().contains("\"1970-"), "{given}");
     }
-    let said = |logs: &[&str]| {
+    let printed = |logs: &[&str]| {
         let args = of_logs(&life, logs);
         refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--throughput-ah", "400"]))
     };
-    assert!(said(&["unset.log"]).contains("the record has no dates"));
-    let moved = said(&["set.log", "unset.log"]);
+    assert!(printed(&["unset.log"]).contains("the record has no dates"));
+    let moved = printed(&["set.log", "unset.log"]);
     assert!(moved.contains("a log begins before the end of the previous log"), "{moved}");
 }
 
@@ -639,8 +646,8 @@ fn peers_accept_valid_and_reject_broken_passport() {
     broken["StateOfCharge"].as_object_mut().unwrap().remove("LastUpdate");
     broken.as_object_mut().unwrap().remove("NumberOfFullCycles");
     let broken = life.write("broken.json", &broken);
-    let said = [peer(&["submodel", &broken]), schema("ProductConditionBattery-schema.json", &broken)];
-    assert!(said.into_iter().flatten().all(|faults| faults.contains("LastUpdate") && faults.lines().count() == 2));
+    let printed = [peer(&["submodel", &broken]), schema("ProductConditionBattery-schema.json", &broken)];
+    assert!(printed.into_iter().flatten().all(|faults| faults.contains("LastUpdate") && faults.lines().count() == 2));
 }
 
 #[test]

@@ -70,15 +70,15 @@ fn segmented_journal_replays_like_one_file() {
         let files = ["estimates", "events", "frames"].map(|kind| path(&format!("{kind}-{name}")));
         let mut command = Command::cargo_bin("packwatch").expect("Cargo builds the binary");
         command.args(["replay", "-c"]).arg(&paper).args(logs).args(["--estimates", &files[0], "--events", &files[1]]);
-        let said = stdout_of(&command.args(["--frames", &files[2]]).assert().success());
-        (files.map(|file| fs::read(file).expect("written")), said)
+        let printed = stdout_of(&command.args(["--frames", &files[2]]).assert().success());
+        (files.map(|file| fs::read(file).expect("written")), printed)
     };
     let (whole, _) = results(&[&plain], "plain");
     let each: Vec<&str> = segments.iter().map(String::as_str).collect();
     assert_eq!(results(&[&split], "split").0, whole);
     assert_eq!(results(&each, "each").0, whole);
-    let (late, said) = results(&each[1..], "late");
-    assert!(late != whole && said.contains("the beginning of the journal is missing, 1 segments"), "{said}");
+    let (late, printed) = results(&each[1..], "late");
+    assert!(late != whole && printed.contains("the beginning of the journal is missing, 1 segments"), "{printed}");
 }
 
 #[test]

@@ -248,9 +248,9 @@ fn command_rejects_unreadable_input_with_place() {
     let path = folder.path().join("bad.csv");
     std::fs::write(&path, "date,capacity_ah\n0,2\n5,much\n").unwrap();
     let failed = command(&[path.to_str().unwrap(), "--end-of-life", "1.4"]).failure().code(1);
-    let said = String::from_utf8_lossy(&failed.get_output().stderr).into_owned();
+    let printed = String::from_utf8_lossy(&failed.get_output().stderr).into_owned();
     let wanted = "bad.csv:3: column capacity_ah: found \"much\", must be Ah above 0 or nothing";
-    assert!(said.contains(wanted), "{said}");
+    assert!(printed.contains(wanted), "{printed}");
     command(&[path.to_str().unwrap(), "--end-of-life", "120 %"]).failure().code(2);
     let few = folder.path().join("few.csv");
     std::fs::write(&few, "date,capacity_ah\n0,2\n5,1.9\n").unwrap();

@@ -83,7 +83,7 @@ pub(crate) fn document(fleets: &[Fleet]) -> String {
         .expect("writing to a String cannot fail");
     }
     text += "\n| stated probability | ";
-    fleets.iter().for_each(|fleet| text += &format!("{}: looks | said | true | ", fleet.set.name));
+    fleets.iter().for_each(|fleet| text += &format!("{}: looks | stated | true | ", fleet.set.name));
     text += "\n| --- |";
     fleets.iter().for_each(|_| text += " --- | --- | --- |");
     let columns: Vec<_> = fleets.iter().map(bins).collect();
