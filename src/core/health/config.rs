@@ -1,24 +1,24 @@
-//! Settings of the learning at charge/discharge transitions. `config` checks their ranges.
+//! Settings for learning at charge/discharge transitions. `config` checks their ranges.
 
 /// Classification of the current as charge, rest or discharge.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TransitionConfig {
-    /// |current| (per pack) at and below which the pack rests, A.
+    /// The pack rests while |pack current| is at most this, A.
     pub dead_band_a: f64,
-    /// A mode is left only when the current is this far beyond the dead band's edge, A.
+    /// A new mode is entered only if the current exceeds the dead band by this much, A.
     pub hysteresis_a: f64,
     /// Shortest duration of a mode, s.
     pub min_duration_s: f64,
-    /// Half-cycles with less charge than this fraction of the rated capacity are joined to their neighbours.
+    /// A half-cycle that moves less charge than this fraction of the rated capacity is joined to the next one.
     pub min_swing: f64,
 }
 
 /// Source of a half-cycle's capacity measurement.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum CapacityMethod {
-    /// Charge over the SOC swing by the voltages, with a variance from the swing's uncertainty.
+    /// Charge divided by the SOC swing from the voltages; the variance follows from the swing's uncertainty.
     Swing,
-    /// As in the paper: charge / nominal swing, fixed measurement variance.
+    /// As in the paper: charge divided by a nominal swing, with a fixed measurement variance.
     Nominal {
         /// Assumed swing, fraction (paper: 0.6).
         swing: f64,
@@ -34,23 +34,24 @@ pub struct CapacityConfig {
     pub method: CapacityMethod,
     /// Process noise: standard deviation gained per equivalent full cycle (Swing) or per event (Nominal), Ah.
     pub noise_ah_per_cycle: f64,
-    /// Process noise of rest: standard deviation gained in a day without current (capacity recovers), Ah; at
-    /// most one day counts per half-cycle. Not used by `Nominal`.
+    /// Process noise of rest: standard deviation gained in a day without current (capacity recovers), Ah. At most one
+    /// day counts per half-cycle. Not used by `Nominal`.
     pub noise_ah_per_rest_day: f64,
-    /// Lasting error of the open-circuit curve at the ends of a half-cycle, V; `None` = half of the model's own error there. Not used by
-    /// `Nominal`.
+    /// Lasting error of the open-circuit curve at the ends of a half-cycle, V; `None` = half of the model's own error
+    /// there. Not used by `Nominal`.
     pub end_error_v: Option<f64>,
-    /// Standard deviation of the current sensor's gain: a floor under the capacity's uncertainty, fraction.
+    /// Standard deviation of the current sensor's gain, fraction: a lower bound on the capacity's relative
+    /// uncertainty.
     pub current_gain_std: f64,
-    /// Standard deviation of the current sensor's offset at the start, per cell, A; 0 = not learned. Not used by `Nominal`.
+    /// Initial standard deviation of the current sensor's offset, per cell, A; 0 = not learned. Not used by `Nominal`.
     pub current_offset_std_a: f64,
-    /// Standard deviation of the fade at the start, Ah per full cycle; 0 = not learned. Not used by `Nominal`.
+    /// Initial standard deviation of the fade, Ah per full cycle; 0 = not learned. Not used by `Nominal`.
     pub fade_std_ah_per_cycle: f64,
     /// Process noise of the fade: standard deviation gained per equivalent full cycle, Ah per full cycle.
     pub fade_noise_ah_per_cycle: f64,
 }
 
-/// Recharge period that the alarm rule compares.
+/// Recharge period that the alarm rule uses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RechargeAlarm {
     /// Measured, with the actual charger.
@@ -62,15 +63,15 @@ pub enum RechargeAlarm {
 /// SOC window whose charging time is the recharge period.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RechargeConfig {
-    /// Lower SOC, fraction (0.3).
+    /// Lower SOC, fraction.
     pub from_soc: f64,
-    /// Upper SOC, fraction (0.9).
+    /// Upper SOC, fraction.
     pub to_soc: f64,
     /// Current of the reference charger per cell, A, positive.
     pub reference_current_a: f64,
-    /// Part of the window that a charge must cover to report a normalised period, fraction.
+    /// Part of the window that a charge must cover before its normalised period is reported, fraction.
     pub min_coverage: f64,
-    /// Period that the alarm rule compares.
+    /// Period that the alarm rule uses.
     pub alarm_on: RechargeAlarm,
 }
 
@@ -83,12 +84,13 @@ pub struct UsableConfig {
     pub temperature_c: f64,
     /// Voltage under load at which discharge ends, V.
     pub cutoff_v: f64,
-    /// A charge whose current has fallen to this (per cell, A) at the model's highest voltage ended full: the next usable
-    /// capacity starts from its final SOC. Before the first such charge, from SOC 1.
+    /// Charging current at the end of a full charge, per cell, A. If the current has fallen to this at the model's
+    /// highest voltage, the charge ended full and the next usable capacity starts from its final SOC. Before the first
+    /// full charge it starts from SOC 1.
     pub taper_current_a: f64,
 }
 
-/// Settings of the learning at transitions.
+/// Settings for learning at charge/discharge transitions.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HealthConfig {
     /// Mode detection.

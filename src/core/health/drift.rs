@@ -1,13 +1,14 @@
-//! Slow drifts of a cell: its capacity, and the fade per cycle. A linear Kalman filter with one step per half-cycle.
+//! Slow drifts of a cell: capacity and fade per cycle. A linear Kalman filter with one step per half-cycle.
 //!
-//! State x = [C (Ah), fade (Ah per full cycle)]. Measurement: the capacity by the half-cycle alone
-//! (`ScalarGaussian::information_until`). At the end of a charge of w full cycles: C -= w fade. C walks (the caller's noise).
+//! State x = [C (Ah), fade (Ah per full cycle)]. Measurement: the capacity according to one half-cycle alone
+//! (`ScalarGaussian::information_until`). At the end of a charge of w full cycles, C -= w fade. The capacity also
+//! follows a random walk whose variance the caller gives.
 //!
-//! The measurement's lasting errors ([`super::end_errors`]) are considered, not estimated (Schmidt; Woodbury and Junkins
-//! 2010): beside P stands, per error, what one standard deviation of it makes of x. They count in the gain and in the
-//! published variance, and never average out.
+//! The measurement's lasting errors ([`super::end_errors`]) are considered, not estimated (Schmidt; Woodbury and
+//! Junkins 2010): for each error, the filter keeps the change of x per standard deviation next to P. The lasting
+//! errors enter the gain and the published variance, and never average out.
 //!
-//! Assumed: the fade of a cycle shows from its end on. Inputs are not checked; a stored state is.
+//! Assumed: the fade of a cycle takes effect at the cycle's end. Inputs are not checked; a stored state is.
 
 use serde::{Deserialize, Serialize};
 
@@ -28,12 +29,12 @@ pub struct DriftFilter {
     x: [f64; N],
     /// Covariance without the lasting errors.
     p: [[f64; N]; N],
-    /// Error of the state (true less estimated) by one standard deviation of each lasting error.
+    /// Change of the state's error (true minus estimated) per standard deviation of each lasting error.
     by_end: [[f64; N]; END_ERRORS],
 }
 
 impl DriftFilter {
-    /// A filter that starts from this capacity.
+    /// Creates a filter that starts from `capacity`, Ah.
     pub fn new(config: &CapacityConfig, capacity: ScalarGaussian) -> Self {
         let mut p = [[0.0; N]; N];
         p[C][C] = capacity.variance;
@@ -41,13 +42,13 @@ impl DriftFilter {
         Self { x: [capacity.mean, 0.0], p, by_end: [[0.0; N]; END_ERRORS] }
     }
 
-    /// Capacity, Ah, with the lasting errors in its variance.
+    /// Capacity, Ah; its variance includes the lasting errors.
     pub fn capacity(&self) -> ScalarGaussian {
         let lasting: f64 = self.by_end.iter().map(|column| column[C] * column[C]).sum();
         ScalarGaussian { mean: self.x[C], variance: self.p[C][C] + lasting }
     }
 
-    /// Checks a stored filter; the error is its first impossible number.
+    /// Checks a stored filter; the error is the first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         InvalidState::unless_capacity("a learned capacity", self.x[C])?;
         let all = self.x.iter().chain(self.p.iter().flatten()).chain(self.by_end.iter().flatten());
@@ -57,23 +58,23 @@ impl DriftFilter {
             InvalidState::unless_natural("a variance of a learned capacity's filter", self.p[i][i])?;
             for j in 0..i {
                 let (covariance, most) = (self.p[i][j], (self.p[i][i] * self.p[j][j]).sqrt());
-                // The stored numbers are rounded.
+                // Tolerates the rounding of stored numbers.
                 let fits = covariance.abs() <= most * (1.0 + 1e-5) && (covariance - self.p[j][i]).abs() <= most * 1e-5;
                 InvalidState::unless(
                     fits,
                     "a covariance of a learned capacity's filter",
                     covariance,
-                    "what its variances allow",
+                    "within its variances",
                 )?;
             }
         }
         Ok(())
     }
 
-    /// Updates with the capacity measured by a half-cycle, of which one standard deviation of each lasting error moves
-    /// `effects_ah`.
+    /// Updates with the capacity `z` measured by a half-cycle. `effects_ah`: change of `z` per standard deviation of
+    /// each lasting error.
     pub fn update(&mut self, z: Measurement, effects_ah: &[f64; END_ERRORS]) {
-        // The innovation's error: C's and the measurement's own.
+        // Lasting errors of the innovation: those of C plus those of the measurement.
         let by_end: [f64; END_ERRORS] = std::array::from_fn(|k| self.by_end[k][C] + effects_ah[k]);
         let lasting: f64 = by_end.iter().map(|b| b * b).sum();
         let own_variance = self.p[C][C] + z.variance;
@@ -94,23 +95,23 @@ impl DriftFilter {
         }
     }
 
-    /// Whether a capacity of the model's cell, and numbers that can be stored.
+    /// Whether the capacity is plausible for the model's cell (capacity `cell_ah`) and every number can be stored.
     pub(super) fn is_possible(&self, cell_ah: f64) -> bool {
         bounds::TRUSTED_CAPACITY.has(self.x[C] / cell_ah) && self.check().is_ok()
     }
 
-    /// Widens the capacity to at least a variance, Ah^2: what was measured does not hold.
+    /// Raises the capacity's variance to at least `variance`, Ah^2, after the measurements have been contradicted.
     pub fn doubt(&mut self, variance: f64) {
         self.p[C][C] = self.p[C][C].max(variance);
     }
 
-    /// Raises the capacity to a charge, Ah, that was moved in one half-cycle.
+    /// Raises the capacity to at least `charge_ah`, the charge moved in one half-cycle.
     pub fn at_least(&mut self, charge_ah: f64) {
         self.x[C] = self.x[C].max(charge_ah);
     }
 
-    /// Predicts over a half-cycle of `cycles` full cycles, of which `charged` count as fade; `capacity_variance` is the
-    /// capacity's process noise.
+    /// Predicts over a half-cycle of `cycles` full cycles; `charged` of them cause fade. `capacity_variance`, Ah^2, is
+    /// the capacity's process noise.
     pub fn predict(&mut self, config: &CapacityConfig, cycles: f64, charged: f64, capacity_variance: f64) {
         self.x[C] -= charged * self.x[FADE];
         for j in 0..N {
@@ -141,7 +142,7 @@ mod tests {
         fade_noise_ah_per_cycle: 0.0,
     };
 
-    /// 60 % cycles of a cell that loses `loss_ah` at the end of each charge.
+    /// Runs 60 % cycles of a cell that loses `loss_ah` at the end of each charge.
     fn cycle(config: &CapacityConfig, loss_ah: f64) -> (DriftFilter, f64) {
         let mut drift = DriftFilter::new(config, ScalarGaussian::from_std(2.5, 0.1));
         let mut true_ah = 2.6;
@@ -158,14 +159,14 @@ mod tests {
     }
 
     #[test]
-    fn the_fade_is_learned_and_the_capacity_does_not_lag() {
+    fn constant_fade_is_learned_without_capacity_lag() {
         let (drift, true_ah) = cycle(&CONFIG, 0.03);
         assert!((drift.x[FADE] - 0.05).abs() < 2e-3, "{drift:?}");
         assert!((drift.capacity().mean - true_ah).abs() < 3e-3, "{drift:?}, true {true_ah}");
     }
 
     #[test]
-    fn a_fade_without_prior_variance_is_not_learned() {
+    fn fade_without_prior_variance_is_not_learned() {
         let (drift, _) = cycle(&CapacityConfig { fade_std_ah_per_cycle: 0.0, ..CONFIG }, 0.03);
         assert_eq!(drift.x[FADE], 0.0);
     }
@@ -183,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lasting_error_counts_once_however_often_it_is_measured() {
+    fn lasting_error_does_not_average_out() {
         let lasting = |first_ah: f64| [first_ah, 0.0, 0.0, 0.0, 0.0];
         let measured = |effect_ah: f64| {
             let mut drift = DriftFilter::new(&CONFIG, ScalarGaussian::from_std(2.5, 0.2));
@@ -192,14 +193,14 @@ mod tests {
             }
             drift.capacity()
         };
-        // One deviation of 0.05 Ah and the prior of 0.2 Ah: what one reading without noise would leave.
+        // Expected: the deviation after one noise-free reading with a lasting error of 0.05 Ah and a prior of 0.2 Ah.
         let (kept, expected) = (measured(0.05).std(), 0.05 * 0.2 / f64::hypot(0.05, 0.2));
         assert!((kept - expected).abs() < 1e-3, "{kept} {expected}");
         assert!(measured(0.0).std() < 0.001);
     }
 
     #[test]
-    fn an_error_that_two_swings_show_with_opposite_signs_cancels() {
+    fn lasting_errors_of_opposite_sign_cancel() {
         let mut drift = DriftFilter::new(&CONFIG, ScalarGaussian::from_std(2.5, 0.2));
         for k in 0..200 {
             let error = if k % 2 == 0 { 0.05 } else { -0.05 };
@@ -210,7 +211,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stored_filter_is_read_back_and_one_with_impossible_numbers_rejected() {
+    fn stored_filter_is_restored_unless_numbers_impossible() {
         let (drift, _) = cycle(&CONFIG, 0.03);
         let again: DriftFilter = serde_json::from_value(serde_json::to_value(drift).expect("writes")).expect("reads");
         assert_eq!((again, again.check()), (drift, Ok(())));

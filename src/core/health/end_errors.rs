@@ -1,22 +1,25 @@
-//! Errors of the cell model at the ends of half-cycles. They are the same in every half-cycle that ends there, so many
-//! half-cycles do not average them out.
+//! Errors of the cell model at the ends of half-cycles. Half-cycles with the same ends share them, so averaging over
+//! many half-cycles does not remove them.
 //!
-//! In: a half-cycle's ends. Out: the effect of one standard deviation of each error on its capacity, Ah.
+//! In: a half-cycle's ends. Out: the change of its capacity, Ah, per standard deviation of each error.
 //!
-//! A half-cycle's capacity is charge / (s_high - s_low). An error e (V) of the curve at an end moves its SOC by e / slope, and
-//! the capacity by C / swing times that. The errors are those of the curve at some nodes of the SOC, independent of each
-//! other, and linear between nodes. How large they are follows from the model's own error, which its fit has found; for a
-//! model that states none, the considered offset of the voltage stands for its curve as well.
+//! A half-cycle's capacity is charge / (s_high - s_low). An error e (V) of the open-circuit curve at one end moves the
+//! SOC there by e / slope and the capacity by C / swing times that. The errors are defined at nodes of the SOC, are
+//! independent of each other and are interpolated linearly between the nodes. Their size follows from the error that
+//! the model's fit reports. For a model without a reported error, the voltage offset that the filter considers also
+//! covers the curve.
 
 use super::CapacityConfig;
 use super::half_cycle::HalfCycle;
 use crate::cell::CellModel;
 use crate::quantity::Mode;
 
-/// Number of errors: nodes of the SOC, evenly from empty to full. Curves of real cells err differently a quarter of it apart.
+/// Number of errors: SOC nodes, evenly spaced from empty to full. In real cells, curve errors a quarter of the range
+/// apart differ.
 pub(super) const END_ERRORS: usize = 5;
 
-/// Effect of one standard deviation of each error on the capacity by a half-cycle, Ah; zero when its ends are not known.
+/// Change of a half-cycle's capacity, Ah, per standard deviation of each error; zero if the half-cycle's ends are
+/// unknown.
 pub(super) fn effects_ah(
     model: &CellModel,
     config: &CapacityConfig,
@@ -26,14 +29,15 @@ pub(super) fn effects_ah(
     let mut effects = [0.0; END_ERRORS];
     let Some(ends) = &half_cycle.ends else { return effects };
     let temperature_c = half_cycle.mean_temperature_c.unwrap_or(25.0);
-    // Below a swing of 2 % the measurement has no use.
+    // Limits the effect: below a swing of 2 % the measurement is useless.
     let swing = (half_cycle.charge_ah / capacity_ah).max(0.02);
-    // From a discharge's first end, the fuller one, to its last; a charge the other way round.
+    // A discharge starts at its fuller end, a charge at its emptier end.
     let sign = if half_cycle.mode == Mode::Charge { -1.0 } else { 1.0 };
     for (soc, fuller) in ends.iter().zip([sign, -sign]) {
         let position = model.grid_position(*soc, temperature_c);
         let per_volt = -fuller * capacity_ah / (swing * model.ocv_slope_v(&position, capacity_ah));
-        // Half of the model's own error is the curve's and lasts; the rest, of the currents' history, differs between half-cycles.
+        // Half of the model's own error is attributed to the curve and lasts; the rest depends on the current history
+        // and differs between half-cycles.
         let own_v = || model.voltage_error_v(&position).map_or(0.0, |error_v| 0.5 * error_v);
         let error_v = config.end_error_v.unwrap_or_else(own_v);
         let along = soc.clamp(0.0, 1.0) * (END_ERRORS - 1) as f64;
@@ -76,10 +80,10 @@ mod tests {
     }
 
     #[test]
-    fn an_error_of_the_curve_moves_the_capacity_by_slope_and_swing() {
+    fn curve_error_moves_capacity_by_slope_and_swing() {
         let model = small_model();
         let found = effects_ah(&model, &CONFIG, &discharge(0.9, 1.0, 0.375), 1.8);
-        // Slopes at 25 C, 5/8 between the rows of 0 and 40 C: 1.075 V above 0.5, 1.325 V below. Swing 0.5.
+        // Slopes at 25 C, interpolated 5/8 of the way from 0 to 40 C: 1.075 V above SOC 0.5, 1.325 V below. Swing 0.5.
         let per_volt = 1.8 / 0.5 * 0.004;
         let lower = 0.5 * per_volt / 1.325;
         let expected = [0.0, lower, lower, 0.0, -per_volt / 1.075];
@@ -89,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn a_charge_errs_as_the_discharge_over_the_same_swing() {
+    fn charge_and_discharge_of_equal_swing_have_equal_errors() {
         let model = small_model();
         let down = discharge(0.9, 0.8, 0.3);
         let up = HalfCycle { mode: Mode::Charge, ends: down.ends.map(|[a, b]| [b, a]), ..down };
@@ -97,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn a_tiny_swing_counts_as_the_smallest_one_and_unknown_ends_have_no_effect() {
+    fn tiny_swing_is_limited_and_unknown_ends_have_no_effect() {
         let model = small_model();
         let tiny = effects_ah(&model, &CONFIG, &discharge(0.001, 0.8, 0.8), 1.8);
         let least = effects_ah(&model, &CONFIG, &discharge(0.036, 0.8, 0.8), 1.8);

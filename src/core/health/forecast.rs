@@ -1,32 +1,32 @@
-//! Remaining useful life: use and days until a cell's capacity falls below an end-of-life threshold.
+//! Remaining useful life: use and days until a cell's capacity falls below the end-of-life threshold.
 //!
-//! In: use (equivalent full cycles, days) and learned capacities (Ah) with variances. Out: median and 90 % interval, or the
-//! reason why there is none ([`InsufficientData`]). Readings that are no number or negative are ignored.
+//! In: use (equivalent full cycles, days) and learned capacities (Ah) with variances. Out: median and 90 % interval,
+//! or the reason why there is no forecast ([`InsufficientData`]). Negative and non-finite readings are ignored.
 //!
-//! A linear Kalman filter over the learned capacities, one step per reading, whose cost and memory do not grow with the
-//! history. State x = [level, rate, recovery, first], capacities in parts of a reference capacity:
-//! * level: the capacity that only falls; level -= rate dt, with t the use (equivalent full cycles; days where the
-//!   cycles are unknown);
-//! * rate: loss per unit of use. Its logarithm walks: by `RATE_WALK` per square root of capacity lost (`KNEE_WALK` in the
-//!   knee, see [`knee`]), and by `RATE_WALK_USE` per e-fold of use. Both are relative, so one pair of numbers serves cells
-//!   that live for 50 cycles and for 5,000; in the linear filter they become
+//! A linear Kalman filter over the learned capacities, one step per reading. Cost and memory do not grow with the
+//! history. State x = [level, rate, recovery, first], capacities as fractions of a reference capacity:
+//! * level: the capacity without recovery, which only falls; level -= rate dt, with t the use (equivalent full cycles,
+//!   or days if the cycles are unknown);
+//! * rate: loss per unit of use. Its logarithm follows a random walk: `RATE_WALK` per square root of capacity lost
+//!   (`KNEE_WALK` in the knee, see [`knee`]), and `RATE_WALK_USE` per e-fold of use. Both are relative, so the same
+//!   numbers serve cells that live for 50 cycles and for 5,000. In the linear filter,
 //!   Q = (w1^2 rate dt + w2^2 ln(t1 / t0)) (rate^2 + P_rate);
-//! * recovery: capacity that returns in rest and is used up again (an Ornstein-Uhlenbeck process; measured cells show
-//!   1 to 5 % after days of rest). It correlates successive readings, so that ten readings in one cycle do not count as
-//!   ten;
+//! * recovery: capacity that returns during rest and is used up again (an Ornstein-Uhlenbeck process; measured cells
+//!   show 1 to 5 % after days of rest). It correlates successive readings, so that ten readings within one cycle do
+//!   not count as ten;
 //! * first: the level at the first reading, which later readings refine. The loss since then is first - level.
 //!
-//! A reading is level + recovery + noise; an outlier counts less. The forecast uses the loss as the free variable, not
-//! the time: the use until the level has fallen by L is the integral of 1 / rate over the loss, a sum of lognormals,
-//! approximated by one lognormal of the same mean and variance (see [`distribution`]). The level only falls, so there is no
-//! first-passage problem, and no sampling.
+//! A reading is level + recovery + noise; outliers get less weight. The forecast integrates over the loss, not over
+//! time: the use until the level has fallen by L is the integral of 1 / rate over the loss. This sum of lognormals is
+//! approximated by one lognormal of the same mean and variance (see [`distribution`]). Because the level only falls,
+//! no first-passage problem arises and no sampling is needed.
 //!
-//! Assumed: outside the knee fade has no preferred curvature (it may slow down as well as speed up), so the median is the
-//! present rate held. In the knee, between 10 and 20 % of loss, many cells fade faster and faster: resistance and current
-//! per active area grow with the loss, and lithium plates. The forecast expects it before a reading shows it.
+//! Assumed: outside the knee, fade may slow down as well as speed up, so the median holds the current rate. In the
+//! knee, between 10 and 20 % of loss, fade accelerates in many cells: resistance and current per active area grow with
+//! the loss, and lithium plates. The forecast expects the knee before a reading shows it.
 //!
-//! Deviation: the filter's mean does not follow the expected acceleration, only its variance does. Reason: cells without a
-//! knee (NASA's) would have their rate overestimated after each recovery. Effect: the readings alone say when a knee has
+//! Deviation: the filter's variance follows the expected acceleration, its mean does not. Reason: cells without a knee
+//! (NASA's) would have their rate overestimated after each recovery. Effect: only the readings show that a knee has
 //! begun. `tests/rul.md` lists the alternatives and figures.
 
 mod distribution;
@@ -40,30 +40,31 @@ use crate::filter::bisect;
 use crate::filter::update_states;
 use crate::quantity::InvalidState;
 
-/// Standard deviation of the logarithm of the rate per square root of capacity lost (part of the reference): over a
+/// Standard deviation of the rate's logarithm per square root of capacity lost (fraction of the reference): over a
 /// loss of 10 % the rate changes by a factor of e^0.32 either way.
 const RATE_WALK: f64 = 1.0;
-/// Standard deviation of the logarithm of the rate per square root of an e-fold of use since the first reading.
+/// Standard deviation of the rate's logarithm per square root of an e-fold of use since the first reading.
 const RATE_WALK_USE: f64 = 0.3;
-/// The knee: losses between which fade is expected to accelerate, parts of the reference.
+/// The knee: range of loss in which fade is expected to accelerate, fractions of the reference.
 const KNEE: (f64, f64) = (0.1, 0.2);
-/// Expected growth of the logarithm of the rate in the knee, per part of the reference lost: e^0.9 over the whole knee.
+/// Expected growth of the rate's logarithm in the knee, per fraction of the reference lost: e^0.9 over the whole knee.
 const KNEE_DRIFT: f64 = 9.0;
-/// As `RATE_WALK`, in the knee: e^0.47 either way over the whole knee, so that hardly any knee lies in the interval too.
+/// `RATE_WALK` in the knee: e^0.47 either way over the whole knee, so that the interval also covers cells with hardly
+/// any knee.
 const KNEE_WALK: f64 = 1.5;
-/// Standard deviation of the recovery while the cell is used, part of the reference.
+/// Standard deviation of the recovery while the cell is used, fraction of the reference.
 const RECOVERY_IN_USE: f64 = 0.01;
-/// Standard deviation of the recovery gained by rest, part of the reference.
+/// Standard deviation of the recovery gained by rest, fraction of the reference.
 const RECOVERY_IN_REST: f64 = 0.02;
-/// Time constant of the recovery in rest, days; also of its decay on the axis of days.
+/// Time constant of the recovery during rest, days. On the axis of days, also of its decay.
 const RECOVERY_DAYS: f64 = 1.0;
 const DAY_S: f64 = 86_400.0;
 
-/// Fewest readings of a forecast: two make a rate, the third can contradict it.
+/// Fewest readings of a forecast: two give a rate, the third can contradict it.
 pub const MIN_READINGS: u32 = 3;
-/// Smallest capacity loss of a forecast, in its standard deviations.
+/// Smallest capacity loss of a forecast, in standard deviations of that loss.
 pub const MIN_FADE_DEVIATIONS: f64 = 1.0;
-/// Largest ratio of the interval's upper end to the median, where it reaches further ahead than the use so far.
+/// Largest ratio of the interval's upper end to the median. Not applied while the upper end is below the use so far.
 pub const MAX_SPREAD: f64 = 10.0;
 /// Time constant of the recent rate of use, days.
 const RECENT_DAYS: f64 = 30.0;
@@ -83,14 +84,14 @@ const N: usize = 4;
 pub enum Axis {
     /// Equivalent full cycles.
     Cycles,
-    /// Days: the history does not record cycles. Any day may have been rest.
+    /// Days, if the history does not record cycles. Any day may have been rest.
     Days,
 }
 
-/// Use since the reading before.
+/// Use since the previous reading.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Usage {
-    /// Equivalent full cycles, each twice the rated capacity moved; ignored on the axis of days.
+    /// Equivalent full cycles (charge moved / twice the rated capacity); ignored on the axis of days.
     pub cycles: f64,
     /// Days, rest included.
     pub days: f64,
@@ -103,7 +104,7 @@ pub struct Usage {
 pub struct CapacityReading {
     /// Capacity, Ah.
     pub capacity_ah: f64,
-    /// Variance of this reading alone, Ah^2: independent of the readings before.
+    /// Variance of this reading alone, Ah^2, independent of previous readings.
     pub variance_ah2: f64,
     /// Variance of the error that all readings share (the current sensor's gain), Ah^2; not part of `variance_ah2`.
     pub shared_variance_ah2: f64,
@@ -121,7 +122,7 @@ pub struct Remaining {
     pub high: f64,
 }
 
-/// Remaining useful life; at least one of both is known.
+/// Remaining useful life; at least one of the two is known.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RemainingLife {
@@ -131,7 +132,7 @@ pub struct RemainingLife {
     pub days: Option<Remaining>,
 }
 
-/// Reason why there is no forecast.
+/// Reason why no forecast is given.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "reason")]
 pub enum InsufficientData {
@@ -144,22 +145,20 @@ pub enum InsufficientData {
     /// All readings are from one time.
     #[error("no use between the first reading and the last")]
     Use,
-    /// The fade is not significant against its deviation.
+    /// The fade is not significant compared with its standard deviation.
     #[error(
-        "capacity lost is {:.1} +- {:.1} %, must be {MIN_FADE_DEVIATIONS} times its deviation",
-        // Adding zero makes 0 of -0.
+        "capacity lost is {:.1} +- {:.1} %, must be at least {MIN_FADE_DEVIATIONS} times its standard deviation",
+        // Adding zero turns -0 into 0.
         (1000.0 * lost).round() / 10.0 + 0.0, 100.0 * std
     )]
     Fade {
-        /// Capacity lost, part of the reference.
+        /// Capacity lost, fraction of the reference.
         lost: f64,
         /// Its standard deviation.
         std: f64,
     },
     /// The interval is too wide.
-    #[error(
-        "the median would be {median:.1}, the interval's upper end {high:.1}, may not be more than {MAX_SPREAD} times that"
-    )]
+    #[error("the interval's upper end would be {high:.1}, may be at most {MAX_SPREAD} times the median, {median:.1}")]
     Spread {
         /// 50 % quantile, units of use.
         median: f64,
@@ -168,10 +167,10 @@ pub enum InsufficientData {
     },
 }
 
-/// Capacity at a future use, for charts.
+/// Capacity at a future use.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct FanPoint {
-    /// Use from the last reading on, units of the axis.
+    /// Use after the last reading, in units of the axis.
     pub ahead: f64,
     /// 5 % quantile, Ah.
     pub low_ah: f64,
@@ -181,7 +180,7 @@ pub struct FanPoint {
     pub high_ah: f64,
 }
 
-/// The filter of one cell: two dozen numbers, independent of the length of its history.
+/// The forecast filter of one cell. Its size does not depend on the length of the history.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Forecast {
@@ -198,8 +197,8 @@ pub struct Forecast {
 }
 
 impl Usage {
-    /// Use of a half-cycle that moved `charge_ah` in `duration_s`, `since_before_s` after the one before (from end to end;
-    /// `None` = unknown, then a long rest is assumed).
+    /// Use of a half-cycle that moved `charge_ah` in `duration_s`. `since_before_s`: time from the end of the previous
+    /// half-cycle to the end of this one; `None` = unknown, a long rest is assumed.
     pub fn in_half_cycle(charge_ah: f64, duration_s: f64, since_before_s: Option<f64>, rated_capacity_ah: f64) -> Self {
         let used_days = duration_s / DAY_S;
         let known = since_before_s.map(|seconds| (seconds / DAY_S - used_days).max(0.0));
@@ -214,16 +213,16 @@ impl Usage {
 }
 
 impl Forecast {
-    /// A filter for a cell of this capacity when new, Ah. An approximate value is enough: the knee is expected between 10
-    /// and 20 % below it.
+    /// Creates a filter for a cell with this capacity when new, Ah. An approximate value suffices: it only sets the
+    /// range of the knee, 10 to 20 % below it.
     pub fn new(axis: Axis, reference_ah: f64) -> Self {
         let mut p = [[0.0; N]; N];
-        // The level is as good as unknown, the rate within 2 % a cycle.
+        // Wide priors: the level is practically unknown, the rate lies within 2 % per cycle.
         p[LEVEL][LEVEL] = 1.0;
         p[RATE][RATE] = 0.02 * 0.02;
         let rest = if axis == Axis::Days { RECOVERY_IN_REST } else { 0.0 };
         p[RECOVERY][RECOVERY] = RECOVERY_IN_USE * RECOVERY_IN_USE + rest * rest;
-        // Before the first reading both levels are the same.
+        // Before the first reading, level and first are equal.
         for (i, j) in [(FIRST, FIRST), (FIRST, LEVEL), (LEVEL, FIRST)] {
             p[i][j] = p[LEVEL][LEVEL];
         }
@@ -231,8 +230,8 @@ impl Forecast {
         Self { axis, reference_ah, readings: 0, used: 0.0, x, p, shared_variance: 0.0, recent: [0.0; 2] }
     }
 
-    /// Predicts over use and rest, then updates with the capacity learned at their end, if any. Numbers that are NaN,
-    /// infinite or negative are ignored.
+    /// Predicts over use and rest, then updates with the capacity learned at the end, if any. NaN, infinite and
+    /// negative numbers are ignored.
     pub fn update(&mut self, passed: Usage, reading: Option<CapacityReading>) {
         let natural = |value: f64| if value.is_finite() { value.max(0.0) } else { 0.0 };
         let Usage { cycles, days, rest_days } = passed;
@@ -250,7 +249,7 @@ impl Forecast {
         }
     }
 
-    /// Adds use and days to the exponential window, exactly for a step of any length.
+    /// Adds use and days to the exponential window; exact for any step length.
     fn count_recent(&mut self, passed: &Usage) {
         let ages = passed.days / RECENT_DAYS;
         let kept = libm::exp(-ages);
@@ -274,7 +273,7 @@ impl Forecast {
             InvalidState::unless_natural("a variance of the remaining life", self.p[i][i])?;
             for j in 0..i {
                 let [one, other] = [self.p[i][j], self.p[j][i]];
-                // Rounding may break the symmetry of an estimated covariance.
+                // Rounding may break the symmetry of a covariance.
                 let bound = 1.001 * (self.p[i][i] * self.p[j][j]).sqrt() + 1e-12;
                 let is_sound = one.abs() <= bound && other.abs() <= bound;
                 InvalidState::unless(is_sound, "a covariance of the remaining life", one, "within its variances")?;
@@ -283,7 +282,7 @@ impl Forecast {
         Ok(())
     }
 
-    /// Capacity of the new cell, Ah, as it was given at the beginning.
+    /// Capacity of the new cell, Ah, as passed to [`Self::new`].
     pub fn reference_ah(&self) -> f64 {
         self.reference_ah
     }
@@ -303,14 +302,14 @@ impl Forecast {
         (self.reference_ah * self.x[RATE], self.reference_ah * self.p[RATE][RATE].sqrt())
     }
 
-    /// Remaining use until the level falls below the threshold.
+    /// Remaining use until the level falls below `threshold_ah`.
     ///
     /// # Errors
-    /// While the data are insufficient.
+    /// The reason why no forecast is given.
     pub fn remaining(&self, threshold_ah: f64) -> Result<RemainingLife, InsufficientData> {
         self.check_readings()?;
         let threshold = threshold_ah / self.reference_ah;
-        // With 95 % probability.
+        // Passed with 95 % probability.
         let has_passed = self.x[LEVEL] + 1.645 * self.level_variance().sqrt() < threshold;
         let remaining = if has_passed { Remaining::default() } else { self.time_to(threshold)? };
         let [cycles, days] = self.recent;
@@ -323,22 +322,22 @@ impl Forecast {
         })
     }
 
-    /// Remaining use until the level falls below `threshold`, part of the reference.
+    /// Remaining use until the level falls below `threshold`, fraction of the reference.
     fn time_to(&self, threshold: f64) -> Result<Remaining, InsufficientData> {
         self.check_fade()?;
         let crossing = self.crossing(threshold);
         let [low, median, high] = QUANTILES.map(|quantile| crossing.quantile(quantile));
-        // The lower end says nothing about precision: near the threshold it tends to 0 at any.
+        // The lower end is not checked: near the threshold it tends to 0 at any precision.
         if high > MAX_SPREAD * median && high > self.used {
             return Err(InsufficientData::Spread { median, high });
         }
         Ok(Remaining { low, median, high })
     }
 
-    /// Capacity at `points` future uses, evenly spaced from 0 to `ahead`. Too slow for on-line use.
+    /// Capacity at `points` future uses, evenly spaced from 0 to `ahead`. Too slow for online use.
     ///
     /// # Errors
-    /// While the data are insufficient.
+    /// The reason why no forecast is given.
     pub fn fan(&self, ahead: f64, points: usize) -> Result<Vec<FanPoint>, InsufficientData> {
         self.check_readings()?;
         self.check_fade()?;
@@ -350,10 +349,10 @@ impl Forecast {
         Ok((0..points).map(at).collect())
     }
 
-    /// Predicts: the recovery relaxes, the level falls by the rate, rate and recovery become less certain.
+    /// Predicts: the recovery relaxes, the level falls at the rate, and rate and recovery become less certain.
     fn advance(&mut self, passed: &Usage) {
         let (used, rest_days, relaxation) = match self.axis {
-            // In use the recovery decays by an e-fold in ten cycles.
+            // In use, the recovery decays by an e-fold in ten cycles.
             Axis::Cycles => (passed.cycles, passed.rest_days, 10.0),
             Axis::Days => (passed.days, passed.days, RECOVERY_DAYS),
         };
@@ -369,7 +368,7 @@ impl Forecast {
             row[LEVEL] -= used * row[RATE];
             row[RECOVERY] *= kept;
         }
-        // The rate has walked while the level followed it.
+        // The rate has changed during the step, and the level with it.
         p[RATE][RATE] += walk;
         p[LEVEL][RATE] -= walk * used / 2.0;
         p[RATE][LEVEL] = p[LEVEL][RATE];
@@ -377,7 +376,7 @@ impl Forecast {
         let (in_use, in_rest) = (RECOVERY_IN_USE * RECOVERY_IN_USE, RECOVERY_IN_REST * RECOVERY_IN_REST);
         let recovery = &mut p[RECOVERY][RECOVERY];
         *recovery += in_use * (1.0 - kept * kept);
-        // A second rest adds only the recovery that the first one has not reached.
+        // A second rest adds only recovery that the first rest left out.
         *recovery += (1.0 - libm::exp(-2.0 * rest_days / RECOVERY_DAYS)) * (in_use + in_rest - *recovery).max(0.0);
         self.used += used;
     }
@@ -395,10 +394,10 @@ impl Forecast {
     fn observe(&mut self, reading: &CapacityReading) {
         let scale = self.reference_ah * self.reference_ah;
         let ph: [f64; N] = std::array::from_fn(|i| self.p[i][LEVEL] + self.p[i][RECOVERY]);
-        // A reading errs by 0.3 % beyond its stated variance.
+        // Assumes an error of 0.3 % beyond the reading's stated variance.
         let noise = 0.003 * 0.003 + reading.variance_ah2 / scale;
         let innovation = reading.capacity_ah / self.reference_ah - self.x[LEVEL] - self.x[RECOVERY];
-        // The noise of an outlier is raised until it meets five deviations.
+        // Raises the innovation variance of an outlier until its innovation is five standard deviations.
         let miss = innovation / 5.0;
         let innovation_variance = (ph[LEVEL] + ph[RECOVERY] + noise).max(miss * miss);
         update_states(&mut self.x, &mut self.p, &ph, innovation, innovation_variance);
@@ -420,12 +419,12 @@ impl Forecast {
         if lost < MIN_FADE_DEVIATIONS * std { Err(InsufficientData::Fade { lost, std }) } else { Ok(()) }
     }
 
-    /// Variance of the level, with the error that all readings share.
+    /// Variance of the level, including the error that all readings share.
     fn level_variance(&self) -> f64 {
         self.p[LEVEL][LEVEL] + self.shared_variance
     }
 
-    /// The use until the level passes `threshold`, part of the reference.
+    /// Distribution of the use until the level passes `threshold`, fraction of the reference.
     fn crossing(&self, threshold: f64) -> Crossing {
         Crossing::new(
             [self.x[LEVEL] - threshold, self.x[RATE]],
@@ -435,12 +434,13 @@ impl Forecast {
         )
     }
 
-    /// Capacity lost since the cell was new, part of the reference; the filter's first reading may be an aged cell's.
+    /// Capacity lost since the cell was new, fraction of the reference. The first reading may come from an aged cell.
     fn lost(&self) -> f64 {
         1.0 - self.x[LEVEL]
     }
 
-    /// Quantile of the capacity after `ahead` units of use: the threshold passed by then with that probability.
+    /// Quantile of the capacity after `ahead` units of use: the threshold that has been passed by then with this
+    /// probability.
     fn capacity_ah(&self, ahead: f64, quantile: f64) -> f64 {
         let (level, std) = (self.x[LEVEL], self.level_variance().sqrt());
         let is_below = |threshold_ah: f64| self.crossing(threshold_ah).probability(ahead) < quantile;
@@ -448,12 +448,12 @@ impl Forecast {
     }
 }
 
-/// Part of the knee that lies below this loss, part of the reference.
+/// Part of the knee below this loss, fraction of the reference.
 fn knee(lost: f64) -> f64 {
     lost.clamp(KNEE.0, KNEE.1) - KNEE.0
 }
 
-/// Variance that the logarithm of the rate gains while the loss grows, parts of the reference.
+/// Variance that the rate's logarithm gains between two losses, fractions of the reference.
 fn walk_variance(from: f64, to: f64) -> f64 {
     let in_knee = knee(to) - knee(from);
     RATE_WALK * RATE_WALK * (to - from - in_knee) + KNEE_WALK * KNEE_WALK * in_knee

@@ -1,4 +1,4 @@
-//! What a cell did between two changes of mode.
+//! A half-cycle: the charge or discharge of a cell between two changes of mode.
 
 use crate::filter::ScalarGaussian;
 use crate::quantity::Mode;
@@ -10,17 +10,18 @@ pub struct HalfCycle {
     pub mode: Mode,
     /// Charge moved, Ah, positive.
     pub charge_ah: f64,
-    /// SOC swing, fraction, positive when it agrees with the charge, and its variance (errors of both ends counted as
-    /// independent); `None` when its beginning was not estimated.
+    /// SOC swing, fraction, positive if it agrees with the sign of the charge, with its variance (the errors of the
+    /// two ends count as independent). `None` if the SOC at the start was not estimated.
     pub swing: Option<ScalarGaussian>,
-    /// SOC at its end, fraction.
+    /// SOC at the end, fraction; `None` if it was not estimated.
     pub end_soc: Option<f64>,
-    /// SOC at both ends, fractions; `None` when it was not estimated.
+    /// SOC at start and end, fractions; `None` if the SOC at the end was not estimated. An unknown start counts as the
+    /// end.
     pub ends: Option<[f64; 2]>,
     /// Duration, s.
     pub duration_s: f64,
     /// Mean current, A, positive = discharge.
     pub mean_current_a: f64,
-    /// Mean temperature, degrees C; `None` when there was none.
+    /// Mean temperature, degrees C; `None` without a temperature reading.
     pub mean_temperature_c: Option<f64>,
 }

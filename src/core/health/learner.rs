@@ -1,16 +1,16 @@
-//! Learns from each completed half-cycle of each cell: charge moved, SOC swing, capacity.
+//! Learns from every completed half-cycle of every cell: charge moved, SOC swing, capacity.
 //!
-//! In: samples' times and temperatures, SOC and load of the cells at the ends of half-cycles, charge (A s). Out: half-cycles
+//! In: times and temperatures of samples, SOC of the cells at the ends of half-cycles, charge (A s). Out: half-cycles
 //! and capacity updates (Ah). A half-cycle without an estimated SOC gives no capacity.
 //!
-//! A half-cycle runs from where charge or discharge began to where it ended (both dated by the transition
-//! detector). The capacity filter (paper, section 3.3.4: random walk, one step per half-cycle; with `Swing` also the
-//! fade, [`super::drift`]) gets its measurement by one of two rules:
-//! * `Swing`: the information about the capacity in the voltages since the last half-cycle. The sample-by-sample filter
-//!   carries the capacity with its correlation to the SOC; the measurement is the step from its estimate then to its
-//!   estimate now, `ScalarGaussian::information_until`. Charge / swing with the SOC of that same filter would return the
-//!   capacity that it assumed.
-//! * `Nominal`: the paper's, charge / nominal swing with a fixed variance.
+//! A half-cycle lasts from the beginning of a charge or discharge to its end, both dated by the transition detector.
+//! The capacity filter (paper, section 3.3.4: random walk, one step per half-cycle; with `Swing` also the fade,
+//! [`super::drift`]) gets its measurement in one of two ways:
+//! * `Swing`: the information about the capacity in the voltages since the last half-cycle. The sample-by-sample
+//!   filter estimates the capacity and its correlation with the SOC. The measurement is the step from its previous to
+//!   its current estimate, `ScalarGaussian::information_until`. Charge divided by the swing in that filter's own SOC
+//!   would only return the capacity that the filter assumed.
+//! * `Nominal`: as in the paper, charge divided by a nominal swing, with a fixed variance.
 
 use serde::{Deserialize, Serialize};
 
@@ -24,10 +24,10 @@ use crate::filter::{Measurement, ScalarGaussian};
 use crate::quantity::bounds;
 use crate::quantity::{InvalidState, Mode, Timestamp};
 
-/// Outcome of the capacity filter's step over a half-cycle.
+/// Result of the capacity filter's step over a half-cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CapacityUpdate {
-    /// Measurement by the half-cycle alone; `None` = no information.
+    /// Measurement from this half-cycle alone; `None` = no information.
     pub measurement: Option<Measurement>,
     /// The published capacity; its variance includes the gain error of the current sensor.
     pub capacity: ScalarGaussian,
@@ -42,7 +42,7 @@ struct CellMark {
 }
 
 impl CellMark {
-    /// The SOC; `None` = beyond what a state can hold, as the variance may be when a damaged state is continued.
+    /// The SOC; `None` if its numbers cannot be stored, for example the variance after a damaged state was restored.
     fn storable(soc: Option<ScalarGaussian>) -> Option<ScalarGaussian> {
         soc.filter(|soc| bounds::STORED_SOC.has(soc.mean) && (0.0..=bounds::NUMBER.high).contains(&soc.variance))
     }
@@ -69,19 +69,19 @@ struct Mark {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Learner {
     totals: Vec<CellMark>,
-    /// Beginning of the present half-cycle.
+    /// Start of the current half-cycle.
     start: Option<Mark>,
-    /// Beginning of the mode that may follow.
+    /// Start of the mode that may follow.
     candidate: Option<Mark>,
-    /// Capacity in each sample filter after the last half-cycle's step.
+    /// Capacity in each sample filter after the step of the last half-cycle.
     prior: Vec<ScalarGaussian>,
     /// Capacity in the event filter.
     capacity: Vec<ScalarGaussian>,
     /// Time without current since the last half-cycle, s.
     rest_s: f64,
-    /// Beginning of the present mode.
+    /// Start of the current mode.
     mode_since: Option<Timestamp>,
-    /// Whether `start` is kept because too little charge has moved since.
+    /// Whether `start` is kept because too little charge has moved since then.
     joining: bool,
     /// Whether each cell has a measured capacity.
     learned: Vec<bool>,
@@ -91,13 +91,13 @@ pub struct Learner {
     in_doubt: Vec<usize>,
     /// Offset of the current sensor.
     offset: CurrentOffset,
-    /// Per cell: half-cycles leave the capacity as it is.
+    /// Per cell: whether half-cycles leave the capacity unchanged.
     #[serde(skip)]
     is_held: Vec<bool>,
 }
 
 impl Learner {
-    /// A learner for cells that start from this capacity.
+    /// Creates a learner for cells with these initial capacities.
     pub fn new(config: &CapacityConfig, initial: Vec<ScalarGaussian>) -> Self {
         let cells = initial.len();
         Self {
@@ -110,7 +110,7 @@ impl Learner {
         }
     }
 
-    /// Continues from a capacity that was measured in an earlier run and is already in the cell's filter.
+    /// Restores a cell's capacity that was measured in an earlier run and is already in the cell's filter.
     pub fn relearn(
         &mut self,
         config: &CapacityConfig,
@@ -124,7 +124,7 @@ impl Learner {
         self.learned[cell] = true;
     }
 
-    /// Begins with another cell, which has this capacity: what was learned was of the one before.
+    /// Restarts a cell that was replaced, with `capacity`: the learned values belong to the previous cell.
     pub fn begin(&mut self, config: &CapacityConfig, cell: usize, capacity: ScalarGaussian) {
         self.drift[cell] = DriftFilter::new(config, capacity);
         (self.prior[cell], self.capacity[cell], self.learned[cell]) = (capacity, capacity, false);
@@ -134,7 +134,7 @@ impl Learner {
         }
     }
 
-    /// What is learned, without the half-cycle under way.
+    /// A copy with the learned values only, without the current half-cycle.
     pub fn learned_only(&self) -> Self {
         Self {
             totals: vec![CellMark::default(); self.totals.len()],
@@ -149,9 +149,9 @@ impl Learner {
 
     /// Adds a cell's sample to its totals.
     ///
-    /// `measured_s` and `gap_s` are the times since the sample before with and without a measured current, s; the gap is
-    /// infinite before the first sample and after an unknown gap. Returns whether the candidate's mark lies in that gap:
-    /// the candidate then begins at the cell's SOC after the gap ([`Self::move_mark`]).
+    /// `measured_s` and `gap_s` are the times since the previous sample with and without a measured current, s; the
+    /// gap is infinite before the first sample and after an unknown gap. Returns whether the candidate's mark lies in
+    /// that gap. If so, the candidate starts at the cell's SOC after the gap ([`Self::move_mark`]).
     #[inline]
     pub fn observe(
         &mut self,
@@ -169,19 +169,19 @@ impl Learner {
         gap_s > 0.0 && self.candidate.as_ref().is_some_and(|mark| time.since(mark.time) < gap_s)
     }
 
-    /// Moves the candidate's mark of a cell to its present SOC.
+    /// Sets the SOC at the candidate's mark to the cell's current SOC.
     pub fn move_mark(&mut self, cell: usize, soc: Option<ScalarGaussian>) {
         if let Some(mark) = &mut self.candidate {
             mark.cells[cell].soc = CellMark::storable(soc);
         }
     }
 
-    /// Ends the present half-cycle after all cells have learned from it.
+    /// Ends the current half-cycle after all cells have learned from it.
     pub fn finish(&mut self) {
         self.rest_s = 0.0;
     }
 
-    /// Marks the beginning of a mode that may follow the present one; `soc` gives that of each cell.
+    /// Marks the start of a mode that may follow the current one; `soc` returns the SOC of each cell.
     pub fn mark_candidate(&mut self, time: Timestamp, charge_as: f64, soc: impl Fn(usize) -> Option<ScalarGaussian>) {
         let mut cells = self.candidate.take().map(|mark| mark.cells).unwrap_or_default();
         cells.clone_from(&self.totals);
@@ -189,10 +189,10 @@ impl Learner {
         self.candidate = Some(Mark { time, charge_as, cells });
     }
 
-    /// Completes the mode `from` when the candidate is confirmed.
+    /// Completes the mode `from` after the candidate is confirmed.
     ///
-    /// When the charge moved since the last half-cycle reaches the configured swing, appends each cell's half-cycle to
-    /// `half_cycles` in cell order; a smaller charge or discharge is joined to its successor.
+    /// If the charge moved since the last half-cycle reaches the configured swing, appends each cell's half-cycle to
+    /// `half_cycles` in cell order. A smaller charge or discharge is joined to the next one.
     pub fn complete(
         &mut self,
         config: &TransitionConfig,
@@ -223,7 +223,8 @@ impl Learner {
         }
     }
 
-    /// Whether half-cycles leave the capacity as it is: the model of the cells is not known well enough.
+    /// Sets for which cells half-cycles leave the capacity unchanged, because the cell's model is not known well
+    /// enough.
     pub fn hold(&mut self, is_held: impl Fn(usize) -> bool) {
         self.is_held = (0..self.capacity.len()).map(is_held).collect();
     }
@@ -257,8 +258,9 @@ impl Learner {
         CapacityUpdate { measurement, capacity: self.capacity(cell) }
     }
 
-    /// After a restart of a cell's sample filter: voltages contradicted what it had learned, so its capacity is no more
-    /// certain than a new cell's. The half-cycle at hand teaches no more than that the cell holds what was moved.
+    /// Handles a restart of a cell's sample filter: the voltages contradicted the learned values, so the capacity is
+    /// no more certain than that of a new cell (`new_variance_ah2`). The current half-cycle then only sets a lower
+    /// bound: the cell holds at least the charge that was moved.
     pub fn doubt(
         &mut self,
         config: &CapacityConfig,
@@ -279,8 +281,8 @@ impl Learner {
         self.prior[cell] = estimator.capacity();
     }
 
-    /// Continues with another model of the cell, whose estimator has adopted it: the present half-cycle begins again at `soc`, and
-    /// the capacity at `capacity`, Ah, where that is given, with whether it was learned.
+    /// Handles a change of a cell's model that the estimator has adopted. The current half-cycle restarts at `soc`.
+    /// `capacity`, if given, replaces the capacity (Ah) and the flag that it was learned.
     pub fn adopt(
         &mut self,
         config: &CapacityConfig,
@@ -295,7 +297,7 @@ impl Learner {
         }
         self.prior[cell] = estimator.capacity();
         self.in_doubt.retain(|&other| other != cell);
-        // What a joined half-cycle began with was estimated with the old model.
+        // The SOC at the start of a joined half-cycle was estimated with the old model.
         let soc = CellMark::storable(soc);
         let at_start = soc.filter(|_| !self.joining);
         for (mark, soc) in [(&mut self.start, at_start), (&mut self.candidate, soc)] {
@@ -327,9 +329,9 @@ impl Learner {
         let is_held = self.is_held.get(cell).copied().unwrap_or(false);
         let evidence = self.prior[cell].information_until(&after).filter(|_| !is_in_doubt && !is_held);
         let measurement = evidence.map(|z| {
-            // With the curve of the capacity that comes out: z = C + s (C_curve - C).
+            // The curve depends on the capacity, so solve z = C + s (C_curve - C) for C.
             let weight = 1.0 - after.variance / self.prior[cell].variance;
-            // At most that part of the capacity may come from the capacity of the curve itself.
+            // Limits the share that the curve's own capacity may contribute.
             let by_curve = (estimator.capacity_by_curve() / weight).clamp(-0.8, 0.8);
             let (own, curve_ah) = (1.0 - by_curve, estimator.curve().mean);
             Measurement { value: curve_ah + (z.value - curve_ah) / own, variance: z.variance / (own * own) }
@@ -341,7 +343,7 @@ impl Learner {
         } else if is_in_doubt {
             drift.at_least(half_cycle.charge_ah);
         }
-        // A charge or swing that no such cell can have is not this cell's.
+        // Discard a charge or swing that is impossible for such a cell.
         let is_possible = drift.is_possible(model.capacity_ah);
         if !is_possible {
             *drift = before;
@@ -358,7 +360,7 @@ impl Learner {
         if !drift.is_possible(model.capacity_ah) {
             *drift = learned;
         }
-        // The sample filter continues from the event filter's capacity.
+        // The sample filter continues with the event filter's capacity.
         estimator.restate_capacity(drift.capacity());
         self.prior[cell] = estimator.capacity();
         measurement
@@ -369,13 +371,13 @@ impl Learner {
         self.capacity[cell]
     }
 
-    /// Offset of the current, per cell, A: measured less true.
+    /// Offset of the current, per cell, A: measured minus true.
     #[inline]
     pub fn current_offset(&self) -> &CurrentOffset {
         &self.offset
     }
 
-    /// Offset of the current, to be changed.
+    /// The offset of the current, mutable.
     pub fn current_offset_mut(&mut self) -> &mut CurrentOffset {
         &mut self.offset
     }
@@ -404,12 +406,12 @@ impl Learner {
         marks.flat_map(|mark| &mark.cells).chain(&self.totals).try_for_each(CellMark::check)
     }
 
-    /// Times and charges, As per cell, at which the present half-cycle and the one that may follow began.
+    /// Time and charge (A s per cell) at the start of the current half-cycle and of the candidate.
     pub fn marks(&self) -> impl Iterator<Item = (Timestamp, f64)> + '_ {
         [&self.start, &self.candidate].into_iter().flatten().map(|mark| (mark.time, mark.charge_as))
     }
 
-    /// Moves stored stamps onto another clock.
+    /// Shifts stored timestamps to another clock.
     pub fn rebase(&mut self, by_nanos: i64) {
         for mark in [&mut self.start, &mut self.candidate].into_iter().flatten() {
             mark.time = mark.time.plus_nanos(by_nanos);
@@ -418,7 +420,7 @@ impl Learner {
     }
 }
 
-/// One cell's half-cycle between two marks in which `moved_ah` left it.
+/// One cell's half-cycle between two marks; `moved_ah` is positive for a discharge.
 fn half_cycle(moved_ah: f64, duration_s: f64, a: &CellMark, b: &CellMark) -> HalfCycle {
     let (mode, sign) = if moved_ah > 0.0 { (Mode::Discharge, 1.0) } else { (Mode::Charge, -1.0) };
     let temperature_s = b.temperature_s - a.temperature_s;
@@ -430,7 +432,7 @@ fn half_cycle(moved_ah: f64, duration_s: f64, a: &CellMark, b: &CellMark) -> Hal
             .zip(b.soc)
             .map(|(a, b)| ScalarGaussian { mean: sign * (a.mean - b.mean), variance: a.variance + b.variance }),
         end_soc: b.soc.map(|soc| soc.mean),
-        // An unobserved beginning counts as uncertain as the end.
+        // An unobserved start counts as the end.
         ends: b.soc.map(|end| [a.soc.unwrap_or(end).mean, end.mean]),
         duration_s,
         mean_current_a: moved_ah * 3600.0 / duration_s,

@@ -1,11 +1,12 @@
 //! The offset of the current sensor, which all cells share.
 //!
-//! In: what the voltages of all cells say about it ([`EstimatorBank::offset_evidence`]), and the time passed, s. Out: its
-//! mean and standard deviation, A per cell, measured less true. A cell at rest shows it best: the counted charge drifts away
-//! from the voltage. Readings of exactly zero have none: such a sensor cuts it off.
+//! In: the evidence in the voltages of all cells ([`EstimatorBank::offset_evidence`]) and the elapsed time, s. Out:
+//! mean and standard deviation of the offset, A per cell, measured minus true. Cells at rest show it best, because the
+//! counted charge drifts away from the voltage. Readings of exactly zero are no evidence, because such a sensor
+//! suppresses small currents.
 //!
-//! Source: Friedland (1969), separate estimation of a bias: given a filter that ignores the bias, the innovations are a
-//! measurement of it. Here the filter considers it, and its correction is made at changes of mode.
+//! Source: Friedland (1969), separate estimation of a bias: the innovations of a filter that ignores the bias measure
+//! the bias. Deviation: here the filter considers the bias, and the correction is applied at changes of mode.
 //!
 //! [`EstimatorBank::offset_evidence`]: crate::cell::EstimatorBank::offset_evidence
 
@@ -18,9 +19,9 @@ use crate::quantity::InvalidState;
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CurrentOffset {
-    /// Mean, A per cell: it is subtracted from the current.
+    /// Mean, A per cell; subtracted from the current.
     mean_a: f64,
-    /// Standard deviation relative to the configured one, 0 to 1; `None` = nothing learned yet, 1.
+    /// Standard deviation relative to the configured one, 0 to 1; `None` = nothing learned yet (counts as 1).
     part: Option<f64>,
 }
 
@@ -30,12 +31,12 @@ impl CurrentOffset {
         self.mean_a
     }
 
-    /// Standard deviation, A per cell, with `configured_a` before any evidence.
+    /// Standard deviation, A per cell; `configured_a` before any evidence.
     pub fn std_a(&self, configured_a: f64) -> f64 {
         self.part() * configured_a
     }
 
-    /// What was learned, A per cell; `None` = nothing yet, or the offset is not learned (`configured_a` is 0).
+    /// The learned offset, A per cell; `None` before any evidence, or if learning is off (`configured_a` is 0).
     pub fn learned(&self, configured_a: f64) -> Option<ScalarGaussian> {
         let part = self.part.filter(|_| configured_a > 0.0)?;
         Some(ScalarGaussian::from_std(self.mean_a, part * configured_a))
@@ -45,15 +46,15 @@ impl CurrentOffset {
         self.part.unwrap_or(1.0)
     }
 
-    /// Takes evidence: sums of d^2 / R and d x innovation / R with d the effect of one standard deviation. Returns the
-    /// correction in standard deviations from before.
+    /// Updates with evidence: the sums of d^2 / R and d x innovation / R, with d the effect of one standard deviation.
+    /// Returns the correction in units of the previous standard deviation.
     pub fn update(&mut self, configured_a: f64, (information, score): (f64, f64)) -> f64 {
         let std_a = self.std_a(configured_a);
         if !(information > 0.0 && score.is_finite() && std_a > 0.0) {
             return 0.0;
         }
         let most_a = 5.0 * configured_a;
-        // Evidence beyond three standard deviations is not that of an offset.
+        // Evidence beyond three standard deviations has another cause than an offset.
         let deviations = (score / (1.0 + information)).clamp(-3.0, 3.0);
         let mean_a = (self.mean_a + deviations * std_a).clamp(-most_a, most_a);
         let corrected = (mean_a - self.mean_a) / std_a;
@@ -62,14 +63,15 @@ impl CurrentOffset {
         corrected
     }
 
-    /// Lets the offset drift for a time, s: by a tenth of its first standard deviation in a day, as sensors do with temperature.
+    /// Lets the offset drift for `seconds`: a tenth of its initial standard deviation in a day, as sensors do with
+    /// temperature.
     pub fn drift(&mut self, seconds: f64) {
         if let Some(part) = &mut self.part {
             *part = (*part * *part + 0.1 * 0.1 * seconds.max(0.0) / 86_400.0).sqrt().min(1.0);
         }
     }
 
-    /// Checks a stored offset; the error is its first impossible number.
+    /// Checks a stored offset; the error is the first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         InvalidState::unless_number("the offset of the current", self.mean_a)?;
         let part = self.part();
@@ -87,22 +89,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn evidence_is_weighed_by_the_deviation_and_counts_once() {
+    fn evidence_is_weighted_by_deviation_and_counts_once() {
         let mut offset = CurrentOffset::default();
         assert_eq!((offset.mean_a(), offset.std_a(0.05), offset.learned(0.05)), (0.0, 0.05, None));
-        // Innovations that say one deviation, with three times the prior's information.
+        // Evidence for one deviation, with three times the prior's information.
         let corrected = offset.update(0.05, (3.0, 3.0));
         assert!((corrected - 0.75).abs() < 1e-12 && (offset.mean_a() - 0.0375).abs() < 1e-12, "{offset:?}");
         assert!((offset.std_a(0.05) - 0.025).abs() < 1e-12);
         assert_eq!(offset.learned(0.05), Some(ScalarGaussian::from_std(offset.mean_a(), offset.std_a(0.05))));
         assert_eq!(offset.learned(0.0), None, "no longer configured");
-        // The rest of the way: half a deviation of the present one.
+        // Evidence for the remaining half deviation.
         offset.update(0.05, (99.0, 50.0));
         assert!((offset.mean_a() - 0.05).abs() < 1e-12 && (offset.std_a(0.05) - 0.0025).abs() < 1e-12, "{offset:?}");
     }
 
     #[test]
-    fn no_evidence_no_deviation_and_numbers_that_are_none_change_nothing() {
+    fn invalid_or_missing_evidence_changes_nothing() {
         for evidence in [(0.0, 0.0), (-1.0, 3.0), (f64::NAN, 1.0), (2.0, f64::INFINITY)] {
             let mut offset = CurrentOffset::default();
             assert_eq!((offset.update(0.05, evidence), offset), (0.0, CurrentOffset::default()), "{evidence:?}");
@@ -112,7 +114,7 @@ mod tests {
     }
 
     #[test]
-    fn the_mean_is_bounded_and_the_deviation_returns_with_time() {
+    fn mean_is_bounded_and_deviation_grows_with_time() {
         let mut offset = CurrentOffset::default();
         for _ in 0..100 {
             offset.update(0.05, (1.0, 1e3));

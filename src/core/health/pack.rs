@@ -1,9 +1,9 @@
-//! The pack's values from its cells, by their limits and never by a mean.
+//! Pack values from the limiting cells, never from a mean.
 //!
 //! A series pack stops discharging when its weakest cell is empty and stops charging when its fullest is full:
-//! dischargeable = min_i SOC_i C_i; chargeable = min_i (1 - SOC_i) C_i; pack capacity = their sum;
-//! pack SOC = dischargeable / pack capacity. For one cell these are its own values. Without
-//! cells, or without capacity, there is no pack value.
+//! dischargeable = min_i SOC_i C_i; chargeable = min_i (1 - SOC_i) C_i; pack capacity = their sum; pack SOC =
+//! dischargeable / pack capacity. With one cell, the pack's values are the cell's. Without cells or without capacity,
+//! there are no pack values.
 
 use serde::{Deserialize, Serialize};
 
@@ -33,11 +33,12 @@ pub struct PackState {
     pub capacity_ah: f64,
     /// Standard deviation of the limiting cell's capacity, Ah.
     pub capacity_std_ah: f64,
-    /// The cell that ends a discharge.
+    /// The cell that is empty first.
     pub limiting_cell: CellIndex,
 }
 
-/// Combines the cells; `None` for no cell, and when they leave no capacity (one above full, one below empty).
+/// Combines the cells. Returns `None` without cells, or if the pack has no capacity (one cell above full, another
+/// below empty).
 pub fn combine(cells: impl Iterator<Item = CellShare>) -> Option<PackState> {
     let mut weakest: Option<(f64, CellShare)> = None;
     let mut chargeable_ah = f64::INFINITY;
@@ -66,7 +67,7 @@ impl PackState {
     /// The first impossible number.
     pub fn check(&self) -> Result<(), InvalidState> {
         bounds::STORED_SOC.check("the pack's SOC", self.soc)?;
-        // A pack with an empty and a full cell has none.
+        // The capacity is 0 while one cell is full and another empty.
         let capacity_ah = self.capacity_ah;
         let is_possible = (0.0..=bounds::CAPACITY_AH.high).contains(&capacity_ah);
         InvalidState::unless(is_possible, "the pack's capacity", capacity_ah, "0 to 1e9 Ah")?;
@@ -85,15 +86,15 @@ mod tests {
     }
 
     #[test]
-    fn one_cell_is_its_own_pack() {
+    fn pack_of_one_cell_has_its_values() {
         let pack = combine([share(0, 0.4, 2.5)].into_iter()).expect("one cell");
         assert!((pack.soc - 0.4).abs() < 1e-15);
         assert!((pack.capacity_ah - 2.5).abs() < 1e-15);
     }
 
     #[test]
-    fn the_weakest_cell_limits_discharge_and_the_fullest_charge() {
-        // 1.0 Ah left in cell 1; cell 0 takes only 0.5 Ah more: an unbalanced pack of 1.5 Ah, 2/3 full.
+    fn weakest_cell_limits_discharge_and_fullest_limits_charge() {
+        // Cell 1 has 1.0 Ah left, cell 0 accepts only 0.5 Ah: an unbalanced pack of 1.5 Ah at 2/3.
         let pack = combine([share(0, 0.8, 2.5), share(1, 0.4, 2.5)].into_iter()).expect("two cells");
         assert!((pack.capacity_ah - 1.5).abs() < 1e-12);
         assert!((pack.soc - 1.0 / 1.5).abs() < 1e-12);
@@ -101,7 +102,7 @@ mod tests {
     }
 
     #[test]
-    fn no_cell_is_no_pack() {
+    fn combine_without_cells_returns_none() {
         assert_eq!(combine(std::iter::empty()), None);
     }
 }

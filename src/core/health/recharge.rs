@@ -1,31 +1,30 @@
-//! Recharge period: time of a charge between two SOC values (paper, section 3.3.5), raw and normalised.
+//! Recharge period: duration of a charge between two SOC values (paper, section 3.3.5), raw and normalised.
 //!
-//! In: the estimated SOC with its time, the mode, the learned capacity (Ah). Out: periods, s. A SOC that jumps discards the
-//! charge.
+//! In: the estimated SOC with its time, the mode, the learned capacity (Ah). Out: periods, s. If the SOC jumps, the
+//! caller discards the charge.
 //!
-//! Raw: the time between the two estimated SOC values, when one uninterrupted charge covers the whole window. A strong
-//! charger shortens it as much as a faded cell does.
+//! Raw: the time between the two estimated SOC values, if one uninterrupted charge covers the whole window. A stronger
+//! charger shortens it just as a faded cell does.
 //!
-//! Normalised: the time a reference charger would need for the same window of the same pack,
-//! `t = 3600 (to - from) C / I_ref`, C = the pack's capacity (Ah) as learned up to the end of this charge, I_ref the
-//! reference current per cell (A). Standard deviation: C's, scaled (so the gain error of the current sensor is in it).
+//! Normalised: the time that a reference charger would need for the same window of the same pack,
+//! `t = 3600 (to - from) C / I_ref`, with C the pack's capacity (Ah) learned up to the end of this charge and I_ref the
+//! reference current per cell (A). Its standard deviation is C's, scaled, and so includes the gain error of the current sensor.
 //!
-//! The reason for C instead of the charge moved between the two SOC values: between the crossings the estimated SOC
-//! moves by charge over the assumed capacity, so that charge is the window times the assumption, plus the correction by
-//! the voltages in that time; C contains the same voltages and all earlier ones, weighted by their information. Over the
-//! fleet of `tests/recharge_fleet.rs`, which prints both, C has an error of 0.57 % RMS and the charge moved one of
-//! 0.78 %. C also has a standard deviation and needs no charge that covers the window.
+//! Why C and not the charge moved between the two SOC values: between the crossings, the estimated SOC moves by charge
+//! over the assumed capacity. The charge moved is therefore the window times the assumed capacity, corrected by the
+//! voltages within the window only. C uses these voltages and all earlier ones, weighted by their information. Over
+//! the fleet of `tests/recharge_fleet.rs`, which prints both, the RMS error is 0.57 % for C and 0.78 % for the charge
+//! moved. C also has a standard deviation and does not require a charge that covers the window.
 //!
-//! Assumed: the reference charger holds its current over the whole window, so resistance, temperature
-//! and a tapering charger have no effect. The capacity is that between the open-circuit ends at the reference
-//! temperature, whatever the temperature of the charge: there is no reference temperature to configure. The
-//! charge that a cold or worn cell accepts within a charger's voltage limit is a different quantity (`usable` computes it
-//! for discharges).
+//! Assumed: the reference charger holds its current over the whole window, so resistance, temperature and tapering
+//! have no effect. C is the capacity between the open-circuit ends at the model's reference temperature, whatever the
+//! temperature of the charge; there is no reference temperature to configure. The charge that a cold or worn cell
+//! accepts within a charger's voltage limit is a different quantity (`usable` computes it for discharges).
 //!
-//! Deviation 1: the paper's script counts from the first charging sample, whatever the SOC then. Here a raw period is
-//! recorded only when one uninterrupted charge covers the whole window, so that periods can be compared.
-//! Deviation 2: the normalised period, which the paper does not have. Reported once per charge that covered enough of
-//! the window ([`RechargeConfig::min_coverage`]), at its end: a short charge adds no information.
+//! Deviation 1: the paper's script counts from the first charging sample at any SOC. Here a raw period requires one
+//! uninterrupted charge over the whole window. Reason: periods become comparable.
+//! Deviation 2: the paper has no normalised period. It is reported once, at the end of a charge that covered enough of
+//! the window ([`RechargeConfig::min_coverage`]). Reason: a short charge adds no information.
 
 use serde::{Deserialize, Serialize};
 
@@ -48,14 +47,14 @@ pub struct RechargeTimer {
 /// Outcome of a finished charge.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct ChargeRecord {
-    /// Time over the whole window, s; `None` = no uninterrupted charge covered it.
+    /// Time over the whole window, s; `None` if no uninterrupted charge covered it.
     pub raw_s: Option<f64>,
-    /// Part of the window it covered, 0 to 1.
+    /// Part of the window that the charge covered, 0 to 1.
     pub coverage: f64,
 }
 
 impl RechargeTimer {
-    /// Handles the SOC at `time`; returns the raw period, s, when the charge has just left the window at its top.
+    /// Handles the SOC at `time`. Returns the raw period, s, when the charge has just passed the window's upper end.
     pub fn observe(&mut self, config: &RechargeConfig, time: Timestamp, mode: Mode, soc: f64) -> Option<f64> {
         if mode != Mode::Charge {
             self.interrupt();
@@ -72,12 +71,12 @@ impl RechargeTimer {
         Some(period_s)
     }
 
-    /// Stops timing the present crossing; keeps the period and the range found so far.
+    /// Stops timing the current crossing; keeps the period and the SOC range found so far.
     pub fn interrupt(&mut self) {
         (self.last, self.entered) = (None, None);
     }
 
-    /// Handles a new window: discards the period of the old one, keeps the range of SOC.
+    /// Handles a changed window: discards the period of the old window and keeps the SOC range.
     pub fn change_window(&mut self) {
         self.interrupt();
         self.raw_s = None;
@@ -98,18 +97,18 @@ impl RechargeTimer {
     pub fn check(&self) -> Result<(), InvalidState> {
         let (low, high) = self.range.unwrap_or_default();
         let socs = [self.last.map_or(0.0, |(_, soc)| soc), low, high];
-        bounds::STORED_SOC.check_all("a SOC of the charge under way", socs)?;
-        bounds::TIME_S.check_all("the time of the charge under way", self.raw_s)
+        bounds::STORED_SOC.check_all("a SOC of the current charge", socs)?;
+        bounds::TIME_S.check_all("the time of the current charge", self.raw_s)
     }
 
-    /// Moves stored stamps onto another clock.
+    /// Shifts stored timestamps to another clock.
     pub fn rebase(&mut self, by_nanos: i64) {
         self.last = self.last.map(|(time, soc)| (time.plus_nanos(by_nanos), soc));
         self.entered = self.entered.map(|time| time.plus_nanos(by_nanos));
     }
 }
 
-/// Time that the reference current needs for the window of a pack of `capacity` (Ah), s.
+/// Time, s, that the reference current needs for the window of a pack of `capacity` (Ah).
 pub fn normalised_period(config: &RechargeConfig, capacity: ScalarGaussian) -> ScalarGaussian {
     let seconds_per_ah = 3600.0 * (config.to_soc - config.from_soc) / config.reference_current_a;
     ScalarGaussian {
@@ -136,7 +135,7 @@ mod tests {
         alarm_on: RechargeAlarm::Raw,
     };
 
-    /// 1 % a minute from `from` to `to`, observed every 7 s, then the charge's end.
+    /// Charges at 1 % a minute from `from` to `to`, observed every 7 s.
     fn charge(from: f64, to: f64, mode_at: impl Fn(f64) -> Mode) -> (Option<f64>, ChargeRecord) {
         let mut timer = RechargeTimer::default();
         let mut period_s = None;
@@ -149,33 +148,33 @@ mod tests {
     }
 
     #[test]
-    fn a_charge_that_covers_the_window_is_timed_between_samples() {
+    fn full_window_charge_is_timed_between_samples() {
         let (period_s, charged) = charge(0.1, 1.0, |_| Mode::Charge);
         assert!((period_s.expect("covers it") - 3600.0).abs() < 1e-6);
         assert_eq!(charged, ChargeRecord { raw_s: period_s, coverage: 1.0 });
     }
 
     #[test]
-    fn a_charge_that_starts_inside_the_window_has_only_its_coverage() {
+    fn charge_starting_inside_window_has_only_coverage() {
         let (period_s, charged) = charge(0.45, 1.0, |_| Mode::Charge);
         assert_eq!((period_s, charged.raw_s), (None, None));
         assert!((charged.coverage - 0.75).abs() < 1e-9);
     }
 
     #[test]
-    fn an_interrupted_charge_has_no_raw_period() {
+    fn interrupted_charge_has_no_raw_period() {
         let (period_s, _) = charge(0.1, 1.0, |t| if (2000.0..2020.0).contains(&t) { Mode::Rest } else { Mode::Charge });
         assert_eq!(period_s, None);
     }
 
     #[test]
-    fn a_charge_outside_the_window_covers_nothing() {
+    fn charge_outside_window_covers_nothing() {
         assert_eq!(charge(0.92, 1.0, |_| Mode::Charge).1, ChargeRecord::default());
         assert_eq!(RechargeTimer::default().finish(&CONFIG), ChargeRecord::default());
     }
 
     #[test]
-    fn a_jump_of_the_soc_through_the_window_is_not_a_charge() {
+    fn soc_jump_through_window_is_not_a_charge() {
         let mut timer = RechargeTimer::default();
         for (t, soc) in [(0.0, 0.2), (1.0, 0.31)] {
             timer.observe(&CONFIG, Timestamp::from_secs(t), Mode::Charge, soc);
@@ -186,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn a_finished_charge_leaves_nothing_for_the_next() {
+    fn finished_charge_resets_the_timer() {
         let mut timer = RechargeTimer::default();
         for (t, soc) in [(0.0, 0.2), (1.0, 0.4), (2.0, 0.95)] {
             timer.observe(&CONFIG, Timestamp::from_secs(t), Mode::Charge, soc);
@@ -196,8 +195,8 @@ mod tests {
     }
 
     #[test]
-    fn the_normalised_period_is_the_windows_charge_over_the_reference_current() {
-        // 60 % of 2 Ah at 1.2 A: one hour; 1 % of it uncertain.
+    fn normalised_period_is_window_charge_over_reference_current() {
+        // 60 % of 2 Ah at 1.2 A: one hour, with 1 % uncertainty.
         let period = normalised_period(&CONFIG, ScalarGaussian::from_std(2.0, 0.02));
         assert!((period.mean - 3600.0).abs() < 1e-9 && (period.std() - 36.0).abs() < 1e-9);
     }

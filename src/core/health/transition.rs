@@ -1,7 +1,7 @@
-//! Charge, rest or discharge, from the pack's current: dead band, hysteresis, minimum duration.
+//! Detects charge, rest or discharge from the pack's current: dead band, hysteresis, minimum duration.
 //!
-//! Input: pack current in A (positive = discharge), `None` when it is stale. Output: a change of mode,
-//! reported when the new mode has held for its minimum duration, dated from its beginning.
+//! In: pack current in A (positive = discharge), `None` if stale. Out: a change of mode, reported once the new mode
+//! has held for its minimum duration, with the time at which the new mode began.
 
 use serde::{Deserialize, Serialize};
 
@@ -15,7 +15,7 @@ struct ModeCandidate {
     since: Timestamp,
 }
 
-/// A confirmed change.
+/// A confirmed change of mode.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ModeChange {
     /// Mode left.
@@ -29,13 +29,13 @@ pub struct ModeChange {
 /// Outcome of one observation.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct TransitionOutcome {
-    /// A mode that has held for its minimum duration by this time.
+    /// The mode change confirmed by this time.
     pub change: Option<ModeChange>,
-    /// Whether a new candidate begins here: the caller then marks its state.
+    /// Whether a new candidate begins here; the caller then marks its state.
     pub candidate_begins: bool,
 }
 
-/// The detector.
+/// Detects changes of mode.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct TransitionDetector {
     mode: Mode,
@@ -48,7 +48,7 @@ impl TransitionDetector {
         self.mode
     }
 
-    /// Handles the current at `time`. First confirms a candidate that has held long enough by then.
+    /// Handles the current at `time`. First confirms the candidate if it has held long enough by then.
     pub fn observe(&mut self, config: &TransitionConfig, time: Timestamp, current_a: Option<f64>) -> TransitionOutcome {
         let change = self.poll(config, time);
         let observed = self.classify(config, current_a);
@@ -56,7 +56,8 @@ impl TransitionDetector {
         let mut candidate_begins = false;
         self.candidate = match self.candidate {
             _ if observed == self.mode => None,
-            // A load that ends, then a sensor without readings: one change, dated at the end of the load.
+            // If a load ends and the sensor then has no readings, both count as one change, dated at the end of the
+            // load.
             Some(before) if before.mode == observed || (idle(before.mode) && idle(observed)) => {
                 Some(ModeCandidate { mode: observed, since: before.since })
             }
@@ -68,13 +69,13 @@ impl TransitionDetector {
         TransitionOutcome { change, candidate_begins }
     }
 
-    /// Confirms a candidate that has held long enough by `time`.
+    /// Confirms the candidate if it has held long enough by `time`.
     pub fn poll(&mut self, config: &TransitionConfig, time: Timestamp) -> Option<ModeChange> {
         self.candidate.filter(|candidate| time.since(candidate.since) >= config.min_duration_s)?;
         self.settle()
     }
 
-    /// Confirms the candidate at once, whatever its duration.
+    /// Confirms the candidate regardless of its duration.
     pub fn settle(&mut self) -> Option<ModeChange> {
         let candidate = self.candidate?;
         let from = std::mem::replace(&mut self.mode, candidate.mode);
@@ -82,7 +83,8 @@ impl TransitionDetector {
         Some(ModeChange { from, to: candidate.mode, since: candidate.since })
     }
 
-    /// Mode of a current, given the present mode: entering charge or discharge takes dead band plus hysteresis.
+    /// Mode of a current. Entering charge or discharge takes dead band plus hysteresis; staying takes the dead band
+    /// alone.
     fn classify(&self, config: &TransitionConfig, current_a: Option<f64>) -> Mode {
         let Some(current_a) = current_a else { return Mode::Unknown };
         let enter = config.dead_band_a + config.hysteresis_a;
@@ -96,7 +98,7 @@ impl TransitionDetector {
         }
     }
 
-    /// Moves stored stamps onto another clock.
+    /// Shifts stored timestamps to another clock.
     pub fn rebase(&mut self, by_nanos: i64) {
         if let Some(candidate) = &mut self.candidate {
             candidate.since = candidate.since.plus_nanos(by_nanos);
@@ -117,7 +119,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mode_counts_after_its_minimum_duration_and_is_dated_from_its_beginning() {
+    fn mode_is_confirmed_after_minimum_duration_dated_from_start() {
         let changes =
             run(&[(0.0, Some(1.0)), (1.0, Some(1.0)), (2.0, Some(1.0)), (3.0, Some(-1.0)), (5.5, Some(-1.0))]);
         let modes: Vec<_> = changes.iter().map(|c| (c.from, c.to, c.since.secs())).collect();
@@ -125,13 +127,13 @@ mod tests {
     }
 
     #[test]
-    fn a_short_burst_of_regeneration_is_no_transition() {
+    fn short_regeneration_is_not_a_transition() {
         let changes = run(&[(0.0, Some(1.0)), (2.0, Some(1.0)), (3.0, Some(-5.0)), (4.0, Some(1.0)), (9.0, Some(1.0))]);
         assert_eq!(changes.len(), 1);
     }
 
     #[test]
-    fn current_between_dead_band_and_hysteresis_keeps_the_mode_it_has() {
+    fn current_within_hysteresis_keeps_mode() {
         let mut detector = TransitionDetector::default();
         let mut mode_after = |t, i| {
             detector.observe(&CONFIG, Timestamp::from_secs(t), Some(i));
@@ -147,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stale_current_is_unknown_not_rest() {
+    fn stale_current_gives_unknown_mode() {
         let changes = run(&[(0.0, Some(1.0)), (2.0, Some(1.0)), (3.0, None), (6.0, None)]);
         assert_eq!(changes.last().map(|c| c.to), Some(Mode::Unknown));
     }

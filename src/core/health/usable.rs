@@ -1,26 +1,26 @@
-//! Usable capacity: charge that a full cell delivers at a given current and temperature down to a cut-off voltage under
-//! load. It follows from the capacity and the resistance.
+//! Usable capacity: charge that a full cell delivers at a given current and temperature down to a cut-off voltage
+//! under load. It depends on capacity and resistance.
 //!
-//! In: model, load, SOC at full, capacity (Ah) and resistance ratio. Out: Ah, with variance. A cell whose voltage starts
-//! below the cut-off delivers 0.
+//! In: model, load, SOC when full, capacity (Ah) and resistance ratios. Out: Ah, with variance. A cell that is below
+//! the cut-off from the start delivers 0.
 //!
-//! The discharge is simulated with the circuit's own equations at constant current, from the SOC after
-//! a full charge with relaxed branches, until the voltage falls to the cut-off. Standard deviation by first-order
-//! propagation of (capacity, ln rho) with their covariance.
+//! The discharge is simulated with the circuit's equations at constant current until the voltage falls to the cut-off.
+//! It starts from the SOC after a full charge, with relaxed branches. The standard deviation is propagated to first
+//! order from capacity and ln rho, with their covariance.
 
 use super::UsableConfig;
 use crate::cell::circuit::{BranchAt, aged_terminal_v, soc_after};
 use crate::cell::{CellEstimator, CellModel, Discretisation, EstimatorConfig, MAX_BRANCHES};
 use crate::filter::ScalarGaussian;
 
-/// Largest number of steps of a discharge.
+/// Maximum number of steps of a simulated discharge.
 const MAX_STEPS: u32 = 2000;
 
-/// Steps of the numerical forward derivatives over ln rho and over ln capacity.
+/// Step of the forward differences in ln rho, ln capacity and slow ratio.
 const LOG_STEP: f64 = 0.01;
 
-/// Charge, Ah, that a cell of `capacity_ah` delivers from `full_soc` down to the cut-off, with its resistance ratio and that of its
-/// slowest branch beside the others.
+/// Charge, Ah, that a cell of `capacity_ah` delivers from `full_soc` down to the cut-off. The two ratios are the
+/// cell's resistance ratio and the additional ratio of its slowest branch.
 pub fn usable_ah(
     model: &CellModel,
     config: &UsableConfig,
@@ -52,7 +52,7 @@ pub fn usable_ah(
         }
         let after_v = voltage(next, &branch_v);
         if next <= 0.0 {
-            // Empty above the cut-off: there is no more than the capacity.
+            // The cell is empty before it reaches the cut-off: it delivers all its charge.
             return capacity_ah * full_soc;
         }
         if after_v <= config.cutoff_v {
@@ -64,8 +64,8 @@ pub fn usable_ah(
     step_ah * f64::from(MAX_STEPS)
 }
 
-/// Usable capacity and its variance, Ah. `capacity` is the published estimate, whose variance may exceed
-/// the filter's own.
+/// Usable capacity and its variance, Ah. `capacity` is the published estimate; its variance may exceed the filter's
+/// own.
 pub fn usable_capacity(
     model: &CellModel,
     config: &UsableConfig,
@@ -98,7 +98,7 @@ mod tests {
         UsableConfig { current_a: 0.2, temperature_c: 0.0, cutoff_v: 3.3, taper_current_a: 0.05 };
 
     #[test]
-    fn without_resistance_the_cutoff_is_on_the_open_circuit_curve() {
+    fn usable_capacity_without_resistance_follows_open_circuit_curve() {
         // OCV 3.0 + 1.2 s up to s = 0.5: 3.3 V at s = 0.25, so 75 % of 2 Ah.
         let usable = usable_ah(&small_model(), &CONFIG, 1.0, 2.0, (1e-12, 1.0));
         assert!((usable - 1.5).abs() < 1e-6, "{usable}");
@@ -106,7 +106,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cell_delivers_no_more_than_it_holds() {
+    fn usable_capacity_is_limited_by_charge() {
         let config = UsableConfig { cutoff_v: 1.0, ..CONFIG };
         assert_eq!(usable_ah(&small_model(), &config, 0.9, 2.0, (1.0, 1.0)), 0.9 * 2.0);
     }

@@ -1,35 +1,35 @@
-//! Distribution of the use until a level has fallen by a loss.
+//! Distribution of the use until a level has fallen by a given loss.
 //!
-//! In: mean and covariance of loss and rate (parts of the reference, per unit of use). Out: probabilities and quantiles of
-//! the use. Extreme inputs saturate within [`LOG_RANGE`].
+//! In: mean and covariance of loss and rate (fractions of the reference, per unit of use). Out: probabilities and
+//! quantiles of the use. Extreme inputs saturate within [`LOG_RANGE`].
 //!
-//! Given the loss L and the rate r, the use is T = integral over l from 0 to L of exp(-g(l) - W(l)) / r, with g the growth
-//! that the knee adds to the rate's logarithm and W its walk, a Brownian motion of variance v(l). With m = exp(v / 2 - g):
-//! E T = (1 / r) integral of m(l), and E T^2 = (2 / r^2) integral over l of m(l) (integral over s from 0 to l of
-//! m(s) e^v(s)), both by the midpoint rule; a lognormal of that mean and variance.
-//! The rate, positive, is a lognormal of its truncated normal's mean and variance; the walk with use adds its variance;
-//! the loss is normal. Its part at or below 0 counts as a crossing in the past: T = 0 with that probability. The rest is
-//! divided into slices of equal width; each is a lognormal of its middle loss, with the rate conditional on it and, for
-//! its own width w, an added variance of (w / L)^2 / 12.
+//! Given the loss L and the rate r, the use is T = integral over l from 0 to L of exp(-g(l) - W(l)) / r. g is the
+//! growth that the knee adds to the rate's logarithm, W its walk, a Brownian motion of variance v(l). With
+//! m = exp(v / 2 - g): E T = (1 / r) integral of m(l), and E T^2 = (2 / r^2) integral over l of m(l) (integral over s
+//! from 0 to l of m(s) e^v(s)). Both use the midpoint rule and give a lognormal of that mean and variance.
+//! The rate is positive: a lognormal with the mean and variance of its truncated normal; the walk with use adds its
+//! variance. The loss is normal. A loss of 0 or less is a crossing in the past: T = 0 with that probability. The
+//! remaining range is divided into slices of equal width. Each slice is a lognormal at its middle loss, with the rate
+//! conditional on that loss, and an added variance of (w / L)^2 / 12 for the slice's width w.
 
 use super::{KNEE_DRIFT, RATE_WALK_USE, knee, walk_variance};
 use crate::filter::{bell, bisect, normal_cdf};
 
-/// Slices of the loss.
+/// Number of slices of the loss.
 const SLICES: usize = 10;
-/// Half-width of the sliced range of the loss, deviations; the tails count with the outermost slices.
+/// Half-width of the sliced range of the loss, standard deviations; the outermost slices include the tails.
 const SLICED: f64 = 3.5;
 
-/// Steps of the bisections: from some 20 e-folds to a part in 10^6.
+/// Steps of a bisection: from about 20 e-folds to 1 part in 10^6.
 pub(super) const HALVINGS: u32 = 24;
 
 /// Range of the logarithm of use and rate.
 const LOG_RANGE: (f64, f64) = (-20.0, 40.0);
 
-/// Steps of the integrals over the loss.
+/// Steps of an integral over the loss.
 const STEPS: usize = 16;
 
-/// A slice: its probability, and mean and standard deviation of the logarithm of its use.
+/// A slice: its probability, and mean and standard deviation of its use's logarithm.
 type Slice = (f64, (f64, f64));
 
 /// The distribution of the use until the crossing.
@@ -41,14 +41,15 @@ pub(super) struct Crossing {
 }
 
 impl Crossing {
-    /// From mean [loss to come, rate], covariance [loss, loss and rate, rate], the loss and the use so far.
+    /// `mean`: [remaining loss, rate]; `covariance`: [loss, loss and rate, rate]; `lost` and `used`: loss and use so
+    /// far.
     pub(super) fn new(mean: [f64; 2], covariance: [f64; 3], lost: f64, used: f64) -> Self {
         let [loss_variance, both, rate_variance] = covariance;
-        // With a certain loss all slices are equal.
+        // The minimum keeps a certain loss computable: all slices are then equal.
         let loss_std = loss_variance.max(1e-24).sqrt();
         let by_loss = both / (loss_std * loss_std);
         let left = (rate_variance - by_loss * both).max(0.0);
-        // Deviation from the mean at which the loss is 0.
+        // Deviation from the mean, in standard deviations, at which the loss is 0.
         let zero = -mean[0] / loss_std;
         let from = zero.max(-SLICED);
         let width = (SLICED.max(from + 1.0) - from) / SLICES as f64;
@@ -64,7 +65,7 @@ impl Crossing {
             let (log_rate, log_rate_variance) = positive(mean[1] + by_loss * loss_std * deviation, left);
             let (log_use, walked) = use_of_loss(lost, loss);
             let log_mean = log_use - log_rate;
-            // The rate continues its walk with use; the mean over the walk counts, about half.
+            // The rate keeps walking with use; the use averages over the walk, so about half of its variance counts.
             let ahead = libm::log1p(libm::exp(log_mean.min(LOG_RANGE.1)) / used.max(f64::MIN_POSITIVE));
             let own_width = loss_std * width / loss;
             let variance =
@@ -90,7 +91,7 @@ impl Crossing {
             return 0.0;
         }
         let likely = || self.slices.iter().filter(|(weight, _)| *weight > 0.0);
-        // Six deviations of each slice to either side.
+        // Six standard deviations of each slice on either side.
         let ends = |sign: f64| likely().map(move |(_, (mean, std))| mean + sign * 6.0 * std);
         let least = ends(-1.0).fold(LOG_RANGE.1, f64::min).max(LOG_RANGE.0);
         let most = ends(1.0).fold(least, f64::max).min(LOG_RANGE.1);
@@ -98,13 +99,14 @@ impl Crossing {
     }
 }
 
-/// Mean and variance of the logarithm of a lognormal that has the moments of the normal (mean, variance) above 0.
+/// Mean and variance of the logarithm of a lognormal with the moments of the normal (mean, variance) truncated to
+/// values above 0.
 fn positive(mean: f64, variance: f64) -> (f64, f64) {
     let std = variance.max(1e-24 * mean * mean).sqrt();
     if std == 0.0 {
         return (LOG_RANGE.0, 0.0);
     }
-    // Further below 0 the ratio of density and tail exceeds f64; the rate is then merely small.
+    // Further below 0, the ratio of density to tail exceeds f64's range; the rate is then close to 0 anyway.
     let place = (mean / std).max(-8.0);
     let density = bell(place) / (2.0 * std::f64::consts::PI).sqrt();
     let hazard = density / normal_cdf(place);
@@ -114,10 +116,10 @@ fn positive(mean: f64, variance: f64) -> (f64, f64) {
     (libm::log(first) - 0.5 * log_variance, log_variance)
 }
 
-/// Mean and variance of the logarithm of the use that a further loss takes at rate 1.
+/// Mean and variance of the logarithm of the use that a further loss takes at an initial rate of 1.
 fn use_of_loss(lost: f64, loss: f64) -> (f64, f64) {
     let step = loss / STEPS as f64;
-    // Sums over the losses so far: of m, of m e^v, and of the second moment.
+    // Sums over the loss so far: m, m e^v, and the second moment.
     let (mut mean, mut inner, mut second) = (0.0, 0.0, 0.0);
     for index in 0..STEPS {
         let at = lost + (index as f64 + 0.5) * step;
@@ -138,9 +140,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_moments_of_the_use_agree_with_a_sampled_walk() {
-        // Antithetic pairs of a fixed generator: reproducible, and the first moment nearly exact.
-        // From before the knee to behind it.
+    fn moments_of_use_agree_with_sampled_walk() {
+        // Antithetic pairs of a fixed generator: reproducible, and the first moment is nearly exact. The loss starts
+        // before the knee and ends beyond it.
         let (lost, loss, steps, paths) = (0.05, 0.3, 200, 4000);
         let mut seed = 1_u64;
         let mut uniform = || {
@@ -173,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn a_small_loss_takes_its_use_at_the_present_rate() {
+    fn small_loss_uses_the_current_rate() {
         let (log_mean, log_variance) = use_of_loss(0.3, 1e-9);
         assert!(
             (log_mean - 1e-9_f64.ln()).abs() < 1e-6 && (0.0..1e-6).contains(&log_variance),
@@ -182,13 +184,13 @@ mod tests {
     }
 
     #[test]
-    fn a_loss_takes_less_use_through_the_knee_than_behind_it() {
+    fn loss_in_knee_takes_less_use() {
         let (through, behind) = (use_of_loss(KNEE.0, 0.1).0, use_of_loss(KNEE.1, 0.1).0);
         assert!((through - behind) < -0.2, "{through} {behind}");
     }
 
     #[test]
-    fn a_certain_rate_far_above_zero_keeps_its_moments() {
+    fn certain_positive_rate_keeps_its_moments() {
         let (log_mean, log_variance) = positive(2.0, 0.01);
         assert!(((log_mean + 0.5 * log_variance).exp() - 2.0).abs() < 1e-9);
         let (log_mean, _) = positive(-1.0, 1.0);
@@ -196,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn quantile_and_probability_are_each_others_inverse() {
+    fn quantile_is_inverse_of_probability() {
         let crossing = Crossing::new([0.1, 0.002], [1e-4, -1e-7, 1e-7], 0.1, 50.0);
         for probability in [0.05, 0.5, 0.95] {
             assert!((crossing.probability(crossing.quantile(probability)) - probability).abs() < 1e-6);

@@ -2,7 +2,7 @@
 
 use super::*;
 
-/// Feeds a fade: `capacity(efc)` at every `step` cycles, one cycle a quarter of a day.
+/// Feeds a fade: `capacity(efc)` every `step` cycles; a cycle lasts a quarter of a day.
 fn fed(capacity: impl Fn(f64) -> f64, step: f64, until: f64) -> Forecast {
     let mut forecast = Forecast::new(Axis::Cycles, 2.0);
     let mut efc = 0.0;
@@ -20,11 +20,11 @@ fn passed(cycles: f64) -> Usage {
 }
 
 #[test]
-fn a_straight_fade_is_continued_before_the_knee() {
+fn linear_fade_before_knee_is_extrapolated() {
     let forecast = fed(|efc| 2.0 - 0.001 * efc, 1.0, 100.0);
     let life = forecast.remaining(1.8).expect("enough is known");
     let cycles = life.cycles.expect("cycles are counted");
-    // 1.9 Ah left, 0.1 Ah to go.
+    // 1.9 Ah now, 0.1 Ah above the threshold.
     assert!((cycles.median - 100.0).abs() < 10.0, "{cycles:?}");
     assert!(cycles.low < 100.0 && cycles.high > 100.0 && cycles.high < 8.0 * cycles.low, "{cycles:?}");
     let days = life.days.expect("the rate of use is known");
@@ -32,15 +32,15 @@ fn a_straight_fade_is_continued_before_the_knee() {
 }
 
 #[test]
-fn a_knee_is_expected_and_a_fade_without_one_stays_in_the_interval() {
+fn interval_covers_fade_with_and_without_knee() {
     let forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
     let cycles = forecast.remaining(1.6).expect("enough is known").cycles.expect("cycles are counted");
-    // 1.8 Ah left, 0.2 Ah to go: 100 cycles straight on, 41 at a rate that grows at once to e^0.9 times itself.
+    // 1.8 Ah now, 0.2 Ah above the threshold: 100 cycles at the current rate, 41 if the rate grew by e^0.9 at once.
     assert!((45.0..90.0).contains(&cycles.median) && cycles.low < 45.0 && cycles.high > 100.0, "{cycles:?}");
 }
 
 #[test]
-fn the_same_fade_ten_times_slower_lasts_ten_times_longer() {
+fn tenfold_slower_fade_lasts_tenfold_longer() {
     let fast = fed(|efc| 2.0 - 0.002 * efc, 10.0, 150.0);
     let slow = fed(|efc| 2.0 - 0.0002 * efc, 100.0, 1500.0);
     let median = |forecast: &Forecast| forecast.remaining(1.5).expect("enough").cycles.expect("cycles").median;
@@ -48,7 +48,7 @@ fn the_same_fade_ten_times_slower_lasts_ten_times_longer() {
 }
 
 #[test]
-fn readings_within_one_cycle_count_less_than_separate_ones() {
+fn readings_within_one_cycle_count_less() {
     let noisy = |efc: f64| 2.0 - 0.002 * efc;
     let (few, many) = (fed(noisy, 1.0, 60.0), fed(noisy, 0.05, 60.0));
     let (few_std, many_std) = (few.rate_ah().1, many.rate_ah().1);
@@ -56,7 +56,7 @@ fn readings_within_one_cycle_count_less_than_separate_ones() {
 }
 
 #[test]
-fn a_recovery_after_rest_does_not_end_the_fade() {
+fn recovery_after_rest_keeps_fade_rate() {
     let mut forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 99.0);
     let before = forecast.rate_ah().0;
     let rested = Usage { cycles: 1.0, days: 5.0, rest_days: 4.8 };
@@ -77,13 +77,13 @@ fn few_readings_or_no_fade_give_no_forecast() {
 }
 
 #[test]
-fn below_the_threshold_nothing_remains() {
+fn level_below_threshold_leaves_no_life() {
     let life = fed(|efc| 2.0 - 0.004 * efc, 1.0, 150.0).remaining(1.6).expect("enough is known");
     assert_eq!(life.cycles.map(|cycles| (cycles.low, cycles.median, cycles.high)), Some((0.0, 0.0, 0.0)));
 }
 
 #[test]
-fn a_shared_error_widens_the_interval() {
+fn shared_error_widens_the_interval() {
     let mut forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
     let width = |forecast: &Forecast| {
         let cycles = forecast.remaining(1.7).expect("enough").cycles.expect("cycles");
@@ -96,7 +96,7 @@ fn a_shared_error_widens_the_interval() {
 }
 
 #[test]
-fn the_axis_of_days_gives_days_alone() {
+fn days_axis_gives_days_only() {
     let mut forecast = Forecast::new(Axis::Days, 2.0);
     for day in 0..12 {
         let days = if day == 0 { 0.0 } else { 5.0 };
@@ -106,12 +106,12 @@ fn the_axis_of_days_gives_days_alone() {
     }
     let life = forecast.remaining(1.2).expect("enough is known");
     assert_eq!(life.cycles, None);
-    // 1.45 Ah left, 0.25 Ah to go at 0.01 Ah a day.
+    // 1.45 Ah now, 0.25 Ah above the threshold, at 0.01 Ah a day.
     assert!(life.days.is_some_and(|days| (days.median - 25.0).abs() < 5.0), "{life:?}");
 }
 
 #[test]
-fn use_without_a_reading_counts() {
+fn use_without_reading_shortens_remaining_life() {
     let mut forecast = fed(|efc| 2.0 - 0.001 * efc, 1.0, 100.0);
     let before = forecast.remaining(1.8).expect("enough").cycles.expect("cycles").median;
     (0..50).for_each(|_| forecast.update(passed(1.0), None));
@@ -120,7 +120,7 @@ fn use_without_a_reading_counts() {
 }
 
 #[test]
-fn the_fan_passes_the_threshold_when_the_forecast_says() {
+fn fan_crosses_threshold_at_forecast_median() {
     let forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
     let cycles = forecast.remaining(1.6).expect("enough").cycles.expect("cycles");
     let fan = forecast.fan(2.0 * cycles.median, 3).expect("enough is known");
@@ -130,7 +130,7 @@ fn the_fan_passes_the_threshold_when_the_forecast_says() {
 }
 
 #[test]
-fn a_stored_forecast_is_restored_unchanged() {
+fn stored_forecast_is_restored_unchanged() {
     let forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 37.0);
     let stored = serde_json::to_string(&forecast).expect("writes");
     assert_eq!(serde_json::from_str::<Forecast>(&stored).expect("reads"), forecast);
@@ -138,7 +138,7 @@ fn a_stored_forecast_is_restored_unchanged() {
 }
 
 #[test]
-fn any_readings_leave_a_usable_covariance() {
+fn extreme_readings_keep_covariance_positive() {
     let mut forecast = Forecast::new(Axis::Cycles, 2.0);
     for k in 0..2000_u32 {
         let capacity_ah = [2.0, 0.01, 3.9, f64::NAN, 1.0][(k % 5) as usize];
@@ -150,7 +150,7 @@ fn any_readings_leave_a_usable_covariance() {
 }
 
 #[test]
-fn a_first_reading_without_information_delays_the_forecast_by_one_reading() {
+fn uncertain_first_reading_hardly_delays_forecast() {
     let forecast_after = |first_variance_ah2: f64| {
         let mut forecast = Forecast::new(Axis::Cycles, 2.0);
         let first = (0..200).find(|&efc| {
@@ -167,7 +167,7 @@ fn a_first_reading_without_information_delays_the_forecast_by_one_reading() {
 }
 
 #[test]
-fn a_rest_each_night_does_not_hide_the_fade() {
+fn nightly_rest_does_not_hide_the_fade() {
     let mut forecast = Forecast::new(Axis::Cycles, 2.0);
     for day in 0..400 {
         let passed = Usage { cycles: 0.25, days: 1.0, rest_days: 0.9 };
@@ -176,13 +176,13 @@ fn a_rest_each_night_does_not_hide_the_fade() {
     }
     let recovery_std = forecast.p[RECOVERY][RECOVERY].sqrt();
     assert!(recovery_std < 1.1 * RECOVERY_IN_REST.hypot(RECOVERY_IN_USE), "{recovery_std}");
-    // 1.6 Ah left, 0.1 Ah to go at 0.004 Ah a cycle.
+    // 1.6 Ah now, 0.1 Ah above the threshold, at 0.004 Ah a cycle.
     let cycles = forecast.remaining(1.5).expect("enough is known").cycles.expect("cycles");
     assert!(cycles.low < 25.0 && cycles.high > 25.0 && cycles.median > 15.0 && cycles.median < 35.0, "{cycles:?}");
 }
 
 #[test]
-fn the_forecast_is_continuous_through_the_threshold() {
+fn forecast_is_continuous_through_the_threshold() {
     let mut forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
     let mut before: Option<Remaining> = None;
     for efc in 101..300 {
@@ -201,7 +201,7 @@ fn the_forecast_is_continuous_through_the_threshold() {
 }
 
 #[test]
-fn a_cell_below_the_threshold_is_at_its_end_without_fade() {
+fn cell_below_threshold_without_fade_has_no_life() {
     let forecast = fed(|_| 1.4, 1.0, 30.0);
     let life = forecast.remaining(1.6).expect("known without a fade");
     assert_eq!(life.cycles, Some(Remaining::default()));
@@ -209,7 +209,7 @@ fn a_cell_below_the_threshold_is_at_its_end_without_fade() {
 }
 
 #[test]
-fn the_fan_begins_with_the_interval_of_the_level() {
+fn fan_starts_with_interval_of_level() {
     let forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
     let (level, std) = forecast.level_ah();
     let now = forecast.fan(100.0, 2).expect("enough is known")[0];
@@ -218,14 +218,14 @@ fn the_fan_begins_with_the_interval_of_the_level() {
 }
 
 #[test]
-fn a_long_rest_does_not_count_as_recent_use() {
+fn long_rest_hardly_changes_recent_use() {
     let mut forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
     let rested = Usage { cycles: 0.5, days: 300.0, rest_days: 299.9 };
     forecast.update(rested, Some(CapacityReading { capacity_ah: 1.8, variance_ah2: 1e-4, shared_variance_ah2: 0.0 }));
     (0..20).for_each(|_| forecast.update(passed(1.0), None));
     let life = forecast.remaining(1.5).expect("enough is known");
     let days_per_cycle = life.days.expect("days").median / life.cycles.expect("cycles").median;
-    // 5 days for 20 cycles, and the 25 days a window of 30 still holds of the rest: far from the 300.
+    // 5 days for 20 cycles plus up to 25 days of rest that a window of 30 days still holds: far below 300.
     assert!((0.25..2.0).contains(&days_per_cycle), "{days_per_cycle}");
 }
 
@@ -251,7 +251,7 @@ fn readings_from_one_time_give_no_forecast() {
 }
 
 #[test]
-fn a_nan_changes_nothing_and_a_stored_nan_is_rejected() {
+fn nan_input_is_ignored_and_stored_nan_rejected() {
     let mut forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 50.0);
     let before = forecast.clone();
     let wild = Usage { cycles: f64::INFINITY, days: f64::NAN, rest_days: f64::NAN };

@@ -1,4 +1,4 @@
-//! What half-cycles teach, and what they do not.
+//! Tests of what half-cycles teach.
 
 use super::*;
 use crate::cell::estimator::tests::{config as estimator_config, truth};
@@ -18,7 +18,7 @@ fn config() -> CapacityConfig {
     }
 }
 
-/// An hour's discharge at 1 A whose voltages fall from 4.1 V to 3.5 V.
+/// Discharges for an hour at 1 A while the voltage falls from 4.1 V to 3.5 V.
 fn discharge(estimator: &mut CellEstimator) {
     for k in 0..360 {
         let step = CellStep {
@@ -36,7 +36,7 @@ fn discharge(estimator: &mut CellEstimator) {
 }
 
 #[test]
-fn a_mode_that_begins_in_a_gap_begins_at_the_soc_after_it() {
+fn mode_begun_in_gap_starts_at_soc_after_gap() {
     let transition = TransitionConfig { dead_band_a: 0.05, hysteresis_a: 0.05, min_duration_s: 0.0, min_swing: 0.02 };
     let mut learner = Learner::new(&config(), vec![ScalarGaussian::from_std(2.0, 0.1)]);
     let at = |soc: f64| Some(ScalarGaussian::from_std(soc, 0.01));
@@ -54,7 +54,7 @@ fn a_mode_that_begins_in_a_gap_begins_at_the_soc_after_it() {
 }
 
 #[test]
-fn a_half_cycle_is_measured_by_its_own_information() {
+fn half_cycle_without_new_voltages_measures_nothing() {
     let config = config();
     let mut estimator = CellEstimator::new(&estimator_config());
     let mut learner = Learner::new(&config, vec![estimator.capacity()]);
@@ -64,14 +64,14 @@ fn a_half_cycle_is_measured_by_its_own_information() {
     assert!(!learner.has_learned_all());
     let first = learner.learn(&small_model(), &config, 0, &mut estimator, &moved);
     assert!(first.measurement.is_some() && learner.has_learned_all());
-    // No new measurement: the same voltages must not count a second time.
+    // Without a new measurement, the same voltages must not count again.
     let second = learner.learn(&small_model(), &config, 0, &mut estimator, &moved);
     assert_eq!(second.measurement, None);
     assert_eq!(moved.swing.map(|swing| swing.mean), Some(0.5));
 }
 
 #[test]
-fn the_capacity_of_a_label_that_is_returned_to_is_not_learned() {
+fn capacity_of_readopted_label_is_not_learned() {
     let (config, estimator) = (config(), CellEstimator::new(&estimator_config()));
     let mut learner = Learner::new(&config, vec![estimator.capacity()]);
     let [fitted, label] = [1.8, 2.0].map(|ah| ScalarGaussian::from_std(ah, 0.1));
@@ -84,7 +84,7 @@ fn the_capacity_of_a_label_that_is_returned_to_is_not_learned() {
 }
 
 #[test]
-fn after_a_restart_of_its_filter_a_capacity_is_in_doubt_and_the_half_cycle_teaches_nothing() {
+fn half_cycle_with_filter_restart_measures_nothing() {
     let config = config();
     let mut estimator = CellEstimator::new(&estimator_config());
     let mut learner = Learner::new(&config, vec![estimator.capacity()]);
@@ -101,21 +101,21 @@ fn after_a_restart_of_its_filter_a_capacity_is_in_doubt_and_the_half_cycle_teach
     assert_eq!(learner.capacity(0).mean, sure.mean);
     assert!((learner.capacity(0).variance / new_variance - 1.0).abs() < 1e-9, "{:?}", learner.capacity(0));
     assert!(estimator.capacity().variance >= new_variance * (1.0 - 1e-9), "{:?}", estimator.capacity());
-    // As stored and restored between the restart and the half-cycle's end.
+    // Store and restore between the restart and the end of the half-cycle.
     let text = serde_json::to_string(&learner).expect("writes");
     let mut learner: Learner = serde_json::from_str(&text).expect("reads");
     let in_doubt = learn(&mut learner, &mut estimator);
     assert_eq!((in_doubt.measurement, in_doubt.capacity.mean), (None, sure.mean));
     assert!(learn(&mut learner, &mut estimator).measurement.is_some());
-    // A cell holds at least what was moved at a time.
+    // The capacity is at least the charge moved in one half-cycle.
     learner.doubt(&config, 0, new_variance, &mut estimator);
     let much = HalfCycle { charge_ah: 2.5, ..moved };
     assert_eq!(learner.learn(&small_model(), &config, 0, &mut estimator, &much).capacity.mean, 2.5);
 }
 
-/// The capacity after 1,000 half-cycles between 0.8 and 0.3 at 1 A, with 5 mV too much at the upper end of the curve and too
-/// little at the lower one, less the true one, in standard deviations.
-fn after_a_thousand(config: &CapacityConfig, sensor: SensorErrors) -> f64 {
+/// Error of the learned capacity, in standard deviations, after 1,000 half-cycles between SOC 0.8 and 0.3 at 1 A. The
+/// voltage is up to 5 mV too high at the upper end of the curve and too low at the lower end.
+fn deviations_after_thousand_half_cycles(config: &CapacityConfig, sensor: SensorErrors) -> f64 {
     let model = small_model();
     let mut estimator_config = estimator_config();
     estimator_config.sensor = sensor;
@@ -141,12 +141,13 @@ fn after_a_thousand(config: &CapacityConfig, sensor: SensorErrors) -> f64 {
 }
 
 #[test]
-fn a_thousand_equal_half_cycles_with_the_same_errors_are_one_witness() {
+fn lasting_errors_of_equal_half_cycles_stay_in_interval() {
     let config = CapacityConfig { end_error_v: Some(0.005), noise_ah_per_cycle: 0.001, ..config() };
     let sensor = SensorErrors { voltage_offset_v: 0.004, current_gain: 0.005, ..SensorErrors::NONE };
-    let deviations = after_a_thousand(&config, sensor);
+    let deviations = deviations_after_thousand_half_cycles(&config, sensor);
     assert!(deviations.abs() < 1.96, "{deviations}");
-    // Errors that are taken for noise average out, and the interval is left without the truth.
-    let without = after_a_thousand(&CapacityConfig { end_error_v: Some(0.0), ..config }, SensorErrors::NONE);
+    // If these errors are treated as noise, they average out and the interval excludes the true capacity.
+    let without =
+        deviations_after_thousand_half_cycles(&CapacityConfig { end_error_v: Some(0.0), ..config }, SensorErrors::NONE);
     assert!(without.abs() > 3.0, "{without}");
 }
