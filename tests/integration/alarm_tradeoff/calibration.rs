@@ -2,7 +2,7 @@
 //! against stated standard deviations.
 
 use super::Fleet;
-use super::life::{Life, Look, RATED_AH, THRESHOLD};
+use super::life::{Evaluation, Life, RATED_AH, THRESHOLD};
 
 /// Bin edges of the stated probability.
 pub(crate) const EDGES: [f64; 9] = [0.0, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 0.99, 1.0];
@@ -10,32 +10,33 @@ pub(crate) const EDGES: [f64; 9] = [0.0, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 0.99, 
 const SETTLING: usize = 10;
 
 /// Probability that the true capacity is below the threshold, computed as the rule does.
-pub(crate) fn stated(look: &Look) -> f64 {
-    0.5 * libm::erfc((look.mean_ah - THRESHOLD * RATED_AH) / (look.std_ah * std::f64::consts::SQRT_2))
+pub(crate) fn stated(evaluation: &Evaluation) -> f64 {
+    0.5 * libm::erfc((evaluation.mean_ah - THRESHOLD * RATED_AH) / (evaluation.std_ah * std::f64::consts::SQRT_2))
 }
 
-fn is_beyond(look: &Look) -> bool {
-    look.true_ah < THRESHOLD * RATED_AH
+fn is_beyond(evaluation: &Evaluation) -> bool {
+    evaluation.true_ah < THRESHOLD * RATED_AH
 }
 
-fn looks(lives: &[Life]) -> impl Iterator<Item = &Look> {
-    lives.iter().flat_map(|life| life.looks.iter().skip(SETTLING)).filter(|look| look.is_measured)
+fn evaluations(lives: &[Life]) -> impl Iterator<Item = &Evaluation> {
+    lives.iter().flat_map(|life| life.evaluations.iter().skip(SETTLING)).filter(|evaluation| evaluation.is_measured)
 }
 
-/// For each bin of the stated probability: number of looks, mean stated probability, share truly below the threshold.
+/// For each bin of the stated probability: number of evaluations, mean stated probability, share truly below the threshold.
 pub(crate) fn bins(fleet: &Fleet) -> Vec<(usize, f64, f64)> {
     let bin = |edges: &[f64]| {
         let inside = |p: f64| p >= edges[0] && (p < edges[1] || edges[1] == 1.0);
-        let all: Vec<&Look> = looks(&fleet.ageing).chain(looks(&fleet.healthy)).filter(|l| inside(stated(l))).collect();
+        let all: Vec<&Evaluation> =
+            evaluations(&fleet.ageing).chain(evaluations(&fleet.healthy)).filter(|l| inside(stated(l))).collect();
         let n = all.len() as f64;
-        let said = all.iter().map(|look| stated(look)).sum::<f64>() / n;
-        let true_share = all.iter().filter(|look| is_beyond(look)).count() as f64 / n;
-        (all.len(), said, true_share)
+        let stated_mean = all.iter().map(|evaluation| stated(evaluation)).sum::<f64>() / n;
+        let true_share = all.iter().filter(|evaluation| is_beyond(evaluation)).count() as f64 / n;
+        (all.len(), stated_mean, true_share)
     };
     EDGES.windows(2).map(bin).collect()
 }
 
-/// Capacity errors and their stated standard deviation, over all looks at ageing cells.
+/// Capacity errors and their stated standard deviation, over all evaluations at ageing cells.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Errors {
     /// In percent of rated: mean error, standard deviation of each life's mean error, scatter within a life, stated
@@ -44,7 +45,7 @@ pub(crate) struct Errors {
     pub(crate) between_lives: f64,
     pub(crate) within_life: f64,
     pub(crate) stated: f64,
-    /// Shares of looks within the stated 68 and 95 % intervals.
+    /// Shares of evaluations within the stated 68 and 95 % intervals.
     pub(crate) inside_68: f64,
     pub(crate) inside_95: f64,
 }
@@ -55,10 +56,10 @@ fn mean(values: impl Iterator<Item = f64> + Clone) -> f64 {
 
 /// Capacity errors of a fleet's ageing lives.
 pub(crate) fn errors(fleet: &Fleet) -> Errors {
-    let percent = |look: &Look| 100.0 * (look.mean_ah - look.true_ah) / RATED_AH;
-    let sigmas = |look: &Look| (look.mean_ah - look.true_ah).abs() / look.std_ah;
+    let percent = |evaluation: &Evaluation| 100.0 * (evaluation.mean_ah - evaluation.true_ah) / RATED_AH;
+    let sigmas = |evaluation: &Evaluation| (evaluation.mean_ah - evaluation.true_ah).abs() / evaluation.std_ah;
     let of_life = |life: &Life| {
-        let errors: Vec<f64> = looks(std::slice::from_ref(life)).map(percent).collect();
+        let errors: Vec<f64> = evaluations(std::slice::from_ref(life)).map(percent).collect();
         let middle = mean(errors.iter().copied());
         (middle, mean(errors.iter().map(|error| (error - middle) * (error - middle))))
     };
@@ -66,14 +67,22 @@ pub(crate) fn errors(fleet: &Fleet) -> Errors {
     let middle = mean(lives.iter().map(|life| life.0));
     let share = |limit: f64| {
         mean(
-            looks(&fleet.ageing).map(|look| f64::from(u8::from(sigmas(look) <= limit))).collect::<Vec<_>>().into_iter(),
+            evaluations(&fleet.ageing)
+                .map(|evaluation| f64::from(u8::from(sigmas(evaluation) <= limit)))
+                .collect::<Vec<_>>()
+                .into_iter(),
         )
     };
     Errors {
         mean: middle,
         between_lives: mean(lives.iter().map(|life| (life.0 - middle) * (life.0 - middle))).sqrt(),
         within_life: mean(lives.iter().map(|life| life.1)).sqrt(),
-        stated: mean(looks(&fleet.ageing).map(|look| 100.0 * look.std_ah / RATED_AH).collect::<Vec<_>>().into_iter()),
+        stated: mean(
+            evaluations(&fleet.ageing)
+                .map(|evaluation| 100.0 * evaluation.std_ah / RATED_AH)
+                .collect::<Vec<_>>()
+                .into_iter(),
+        ),
         inside_68: share(1.0),
         inside_95: share(1.96),
     }

@@ -4,7 +4,7 @@
 use packwatch::alarm::{AlarmEngine, Change, Comparison, Observation, Rule, RuleConfig, Severity};
 use packwatch::quantity::CellIndex;
 
-use super::life::{Life, Look, RATED_AH, THRESHOLD};
+use super::life::{Evaluation, Life, RATED_AH, THRESHOLD};
 
 /// The alarm clears this far above the threshold (the default hysteresis).
 const HYSTERESIS: f64 = 0.02;
@@ -42,8 +42,8 @@ pub(crate) const P95: usize = 6;
 /// Outcome of one rule for one life.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct RuleOutcome {
-    /// The look at which the alarm was first raised.
-    pub(crate) first: Option<Look>,
+    /// The evaluation at which the alarm was first raised.
+    pub(crate) first: Option<Evaluation>,
     /// Raises while the truth was above the threshold: by any amount, and by more than 1 % of rated.
     pub(crate) false_raises: u32,
     pub(crate) far_false_raises: u32,
@@ -54,16 +54,16 @@ pub(crate) struct RuleOutcome {
 impl RuleOutcome {
     /// Whether the truth was above the threshold by more than `margin` of rated at the first raise.
     pub(crate) fn is_false(&self, margin: f64) -> bool {
-        self.first.is_some_and(|look| look.true_ah > (THRESHOLD + margin) * RATED_AH)
+        self.first.is_some_and(|evaluation| evaluation.true_ah > (THRESHOLD + margin) * RATED_AH)
     }
 
     /// The first raise, if it came before the end of life.
-    pub(crate) fn in_time(&self, life: &Life) -> Option<Look> {
-        self.first.filter(|look| life.end.is_none_or(|end| look.cycle < end.cycle))
+    pub(crate) fn in_time(&self, life: &Life) -> Option<Evaluation> {
+        self.first.filter(|evaluation| life.end.is_none_or(|end| evaluation.cycle < end.cycle))
     }
 }
 
-/// Alarm change of the rule at each look of a life.
+/// Alarm change of the rule at each evaluation of a life.
 pub(crate) fn changes(rule: &Candidate, life: &Life) -> Vec<Option<Change>> {
     let threshold = THRESHOLD * RATED_AH;
     let config = RuleConfig {
@@ -77,29 +77,29 @@ pub(crate) fn changes(rule: &Candidate, life: &Life) -> Vec<Option<Change>> {
         is_latching: false,
     };
     let mut engine = AlarmEngine::new(vec![config], 1);
-    let mut observe = |look: &Look| {
+    let mut observe = |evaluation: &Evaluation| {
         let mut out = Vec::new();
-        if look.is_measured {
-            let seen = Observation::new(Some(look.mean_ah)).with_std(look.std_ah);
-            engine.observe(look.time, Rule::CapacityLow, Some(CellIndex(0)), &seen, &mut out);
+        if evaluation.is_measured {
+            let seen = Observation::new(Some(evaluation.mean_ah)).with_std(evaluation.std_ah);
+            engine.observe(evaluation.time, Rule::CapacityLow, Some(CellIndex(0)), &seen, &mut out);
         }
         out.first().map(|change| change.change)
     };
-    life.looks.iter().map(&mut observe).collect()
+    life.evaluations.iter().map(&mut observe).collect()
 }
 
 /// Judges a life by a rule.
 pub(crate) fn judge(rule: &Candidate, life: &Life) -> RuleOutcome {
     let mut judged = RuleOutcome::default();
-    for (look, change) in life.looks.iter().zip(changes(rule, life)) {
-        let margin = look.true_ah / RATED_AH - THRESHOLD;
+    for (evaluation, change) in life.evaluations.iter().zip(changes(rule, life)) {
+        let margin = evaluation.true_ah / RATED_AH - THRESHOLD;
         match change {
             Some(Change::Raised) => {
-                judged.first.get_or_insert(*look);
+                judged.first.get_or_insert(*evaluation);
                 judged.false_raises += u32::from(margin > 0.0);
                 judged.far_false_raises += u32::from(margin > 0.01);
             }
-            Some(Change::Cleared) if life.end.is_none_or(|end| look.cycle < end.cycle) => judged.flickers += 1,
+            Some(Change::Cleared) if life.end.is_none_or(|end| evaluation.cycle < end.cycle) => judged.flickers += 1,
             _ => {}
         }
     }

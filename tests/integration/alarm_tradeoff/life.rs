@@ -102,7 +102,7 @@ pub(crate) enum Kind {
 
 /// The Monitor's estimate and the truth after one half-cycle.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Look {
+pub(crate) struct Evaluation {
     pub(crate) time: Timestamp,
     /// Cycles so far (two half-cycles make a cycle).
     pub(crate) cycle: f64,
@@ -127,7 +127,7 @@ pub(crate) struct Place {
 /// The recorded course of a life.
 #[derive(Debug, Clone)]
 pub(crate) struct Life {
-    pub(crate) looks: Vec<Look>,
+    pub(crate) evaluations: Vec<Evaluation>,
     pub(crate) crossing: Option<Place>,
     pub(crate) end: Option<Place>,
     pub(crate) resets: u32,
@@ -307,7 +307,7 @@ impl Rig {
             out: Outputs::default(),
             time: Timestamp::ZERO,
             half_cycles: 0,
-            life: Life { looks: Vec::new(), crossing: None, end: None, resets: 0 },
+            life: Life { evaluations: Vec::new(), crossing: None, end: None, resets: 0 },
         }
     }
 
@@ -392,7 +392,7 @@ impl Rig {
                 EventKind::Capacity { measured_ah, values, .. } => {
                     let (capacity_ah, capacity_std_ah) = values.pair(Quantity::Capacity).expect("an event has it");
                     let (place, true_ah) = (self.place(), self.truth().capacity_ah);
-                    self.life.looks.push(Look {
+                    self.life.evaluations.push(Evaluation {
                         time: event.time,
                         cycle: place.cycle,
                         full_cycles: place.full_cycles,
@@ -409,8 +409,9 @@ impl Rig {
                         Severity::Warning => 1,
                         Severity::Severe => 2,
                     };
-                    let look = self.life.looks.last_mut().expect("an alarm about capacity follows a half-cycle");
-                    look.reported[slot] = Some(change);
+                    let evaluation =
+                        self.life.evaluations.last_mut().expect("an alarm about capacity follows a half-cycle");
+                    evaluation.reported[slot] = Some(change);
                 }
                 EventKind::FilterReset { .. } => self.life.resets += 1,
                 _ => {}

@@ -62,7 +62,8 @@ impl Fleet {
         assert!(self.healthy.iter().all(|life| life.crossing.is_none()), "a healthy cell crossed the threshold");
         for life in self.all() {
             for (severity, rule) in MONITORED.into_iter().enumerate() {
-                let reported: Vec<_> = life.looks.iter().map(|look| look.reported[severity]).collect();
+                let reported: Vec<_> =
+                    life.evaluations.iter().map(|evaluation| evaluation.reported[severity]).collect();
                 assert_eq!(
                     reported,
                     judged::changes(&CANDIDATES[rule], life),
@@ -70,7 +71,8 @@ impl Fleet {
                     CANDIDATES[rule].name
                 );
             }
-            let firsts = CANDIDATES.map(|rule| judge(&rule, life).first.map_or(f64::INFINITY, |look| look.cycle));
+            let firsts =
+                CANDIDATES.map(|rule| judge(&rule, life).first.map_or(f64::INFINITY, |evaluation| evaluation.cycle));
             assert_eq!(firsts[HALF], firsts[MEAN], "p = 0.5 must equal the mean rule");
             let by_level: Vec<f64> =
                 firsts.iter().zip(&CANDIDATES).filter(|(_, rule)| rule.debounce_events == 1).map(|(f, _)| *f).collect();

@@ -23,9 +23,10 @@ fn row(fleet: &Fleet, rule: &Candidate) -> String {
     let judged: Vec<(&Life, RuleOutcome)> = fleet.ageing.iter().map(|life| (life, judge(rule, life))).collect();
     let healthy: Vec<RuleOutcome> = fleet.healthy.iter().map(|life| judge(rule, life)).collect();
     let in_time = || judged.iter().filter_map(|(life, judged)| Some((*life, judged.in_time(life)?)));
-    let lead = in_time().filter_map(|(life, look)| Some(life.end?.cycle - look.cycle)).collect();
-    let full = in_time().filter_map(|(life, look)| Some(life.end?.full_cycles - look.full_cycles)).collect();
-    let delay = in_time().filter_map(|(life, look)| Some(look.cycle - life.crossing?.cycle)).collect();
+    let lead = in_time().filter_map(|(life, evaluation)| Some(life.end?.cycle - evaluation.cycle)).collect();
+    let full =
+        in_time().filter_map(|(life, evaluation)| Some(life.end?.full_cycles - evaluation.full_cycles)).collect();
+    let delay = in_time().filter_map(|(life, evaluation)| Some(evaluation.cycle - life.crossing?.cycle)).collect();
     let count = |all: &[&RuleOutcome], wanted: &dyn Fn(&RuleOutcome) -> bool| all.iter().filter(|j| wanted(j)).count();
     let ageing: Vec<&RuleOutcome> = judged.iter().map(|(_, judged)| judged).collect();
     let healthy: Vec<&RuleOutcome> = healthy.iter().collect();
@@ -83,15 +84,15 @@ pub(crate) fn document(fleets: &[Fleet]) -> String {
         .expect("writing to a String cannot fail");
     }
     text += "\n| stated probability | ";
-    fleets.iter().for_each(|fleet| text += &format!("{}: looks | stated | true | ", fleet.set.name));
+    fleets.iter().for_each(|fleet| text += &format!("{}: evaluations | stated | true | ", fleet.set.name));
     text += "\n| --- |";
     fleets.iter().for_each(|_| text += " --- | --- | --- |");
     let columns: Vec<_> = fleets.iter().map(bins).collect();
     for (index, edges) in EDGES.windows(2).enumerate() {
         write!(text, "\n| {} to {} |", edges[0], edges[1]).expect("writing to a String cannot fail");
         for column in &columns {
-            let (count, said, found) = column[index];
-            write!(text, " {count} | {:.1} % | {:.1} % |", 100.0 * said, 100.0 * found)
+            let (count, stated_mean, found) = column[index];
+            write!(text, " {count} | {:.1} % | {:.1} % |", 100.0 * stated_mean, 100.0 * found)
                 .expect("writing to a String cannot fail");
         }
     }
