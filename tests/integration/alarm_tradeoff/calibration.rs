@@ -22,7 +22,8 @@ fn evaluations(lives: &[Life]) -> impl Iterator<Item = &Evaluation> {
     lives.iter().flat_map(|life| life.evaluations.iter().skip(SETTLING)).filter(|evaluation| evaluation.is_measured)
 }
 
-/// For each bin of the stated probability: number of evaluations, mean stated probability, share truly below the threshold.
+/// For each bin of the stated probability: number of evaluations, mean stated probability, share truly below the
+/// threshold.
 pub(crate) fn bins(fleet: &Fleet) -> Vec<(usize, f64, f64)> {
     let bin = |edges: &[f64]| {
         let inside = |p: f64| p >= edges[0] && (p < edges[1] || edges[1] == 1.0);
