@@ -68,7 +68,7 @@ const RUNTIME_PERIOD_S: f64 = 1.0;
 /// Time between checkpoints while no frame arrives, s; the state does not change then, it only becomes older.
 const QUIET_PERIOD_S: f64 = 3600.0;
 
-/// The folder in which clients look: the service's or, if it does not exist, that of a daemon started from a shell.
+/// The folder in which clients look: the service's or, if it does not exist, the folder of a daemon started from a shell.
 pub fn standard_folder() -> PathBuf {
     let service = first_folder("STATE_DIRECTORY").unwrap_or_else(|| PathBuf::from(STANDARD_FOLDER));
     let own = daemon_folder().0;
@@ -224,7 +224,7 @@ impl Store {
         self.progress.clone()
     }
 
-    /// Commits what one input's events have taught. Returns the ticket for which the announcement must wait; `None` = no
+    /// Commits what was learned from one input's events. Returns the ticket that the announcement must wait for; `None` = no
     /// wait.
     pub fn learned(&mut self, events: &[Event], monitor: &Monitor, now: Timestamp) -> Option<u64> {
         let rows = match self.history_filter.take(events, self.schedule.has_room(now)) {

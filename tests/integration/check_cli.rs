@@ -220,5 +220,5 @@ fn file_with_warning_is_usable_but_flagged() {
         printed.starts_with(&format!("{}: usable, 1 warning\n\nwarnings\n  {}", file.display(), file.display())),
         "{printed}"
     );
-    assert!(printed.contains("2 cells in parallel are strings = 2 without this key"), "{printed}");
+    assert!(printed.contains("for 2 cells in parallel set strings = 2 and remove this key"), "{printed}");
 }

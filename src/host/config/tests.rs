@@ -1,4 +1,4 @@
-//! Files good and bad: the faults are part of the program's face, so they are compared word for word.
+//! Valid and invalid configuration files. Users read the fault messages, so the tests compare them in full.
 
 #![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
 
@@ -86,7 +86,7 @@ fn read_texts(pack: &str, cell: &str, dbc: &str) -> Result<(Config, Description)
     read_merged(pack, cell, dbc, &[])
 }
 
-/// The drop-ins are 1.toml, 2.toml and so on.
+/// The drop-ins are named 1.toml, 2.toml and so on.
 fn read_merged(pack: &str, cell: &str, dbc: &str, drop_ins: &[&str]) -> Result<(Config, Description), Vec<String>> {
     let names: Vec<String> = (1..=drop_ins.len()).map(|number| format!("{number}.toml")).collect();
     let own = include_str!("../../../config/packwatch.dbc");
@@ -109,14 +109,14 @@ fn faults(pack: &str) -> Vec<String> {
     read_texts(pack, CELL, DBC).unwrap_err()
 }
 
-/// The test configuration with `from` replaced, which must be there.
+/// `PACK` with `from`, which it must contain, replaced by `to`.
 fn pack_with(from: &str, to: &str) -> String {
     assert!(PACK.contains(from), "{from}");
     PACK.replacen(from, to, 1)
 }
 
 #[test]
-fn a_good_file_becomes_settings_with_defaults() {
+fn valid_file_gives_settings_and_defaults() {
     let config = good(PACK);
     let monitor = &config.monitor;
     assert_eq!(config.interfaces, [InterfaceConfig { name: "can0".to_owned(), fd: false }]);
@@ -132,7 +132,7 @@ fn a_good_file_becomes_settings_with_defaults() {
 }
 
 #[test]
-fn limits_come_from_the_dbc_in_our_sign_and_the_cell_model() {
+fn limits_are_derived_from_dbc_and_cell_model() {
     let sample = good(PACK).monitor.sample;
     assert_eq!((sample.current.min, sample.current.max), (-500.0, 300.0), "the bus counts charge positive");
     assert_eq!((sample.voltage.min, sample.voltage.max), (1.25, 4.7), "[0|0] in the DBC gives no range");
@@ -142,7 +142,7 @@ fn limits_come_from_the_dbc_in_our_sign_and_the_cell_model() {
 }
 
 #[test]
-fn contactors_have_values_that_mean_open() {
+fn contactor_open_values_are_read() {
     let table = "[input.contactor]\nsignal = \"Cells.Page\"\n";
     let contactor = good(&format!("{PACK}{table}open = [0, 2.5]\n")).monitor.sample.contactor.unwrap();
     assert_eq!((contactor.open, contactor.limits.max_age_s), (vec![0.0, 2.5], 5.0));
@@ -160,7 +160,7 @@ fn contactors_have_values_that_mean_open() {
 }
 
 #[test]
-fn a_total_voltage_means_one_cell_of_a_series() {
+fn pack_voltage_is_divided_by_series_cells() {
     let pack = pack_with(
         "[input.cell_voltage]\nsignal = \"Cells.CellVoltage{n}\"",
         "[input.pack_voltage]\nsignal = \"Status.Total\"",
@@ -179,7 +179,7 @@ fn decoded(config: &Config, id: u16, payload: &[u8]) -> Vec<(Channel, Result<f64
 }
 
 #[test]
-fn readings_have_our_sign_scale_and_cells() {
+fn readings_are_mapped_with_sign_scale_and_cell() {
     let pack = pack_with("\"charge\"", "\"charge\"\nscale = 0.5\nnot_available = [0x7FFF]")
         .replace("Status.Temperature\"", "Status.Temperature\"\noffset = -1");
     let config = good(&pack);
@@ -197,13 +197,13 @@ fn readings_have_our_sign_scale_and_cells() {
 }
 
 #[test]
-fn nothing_is_sent_unless_configured() {
+fn nothing_is_sent_by_default() {
     assert!(good(PACK).monitor.output.is_none());
     assert!(good(&format!("{PACK}[output]\nenabled = false\n[output.status]\nid = 5\n")).monitor.output.is_none());
 }
 
 #[test]
-fn identifiers_and_periods_come_from_the_configuration_or_the_dbc() {
+fn identifiers_and_periods_are_configured_or_from_dbc() {
     let output = good(&format!("{PACK}[output]\n")).monitor.output.unwrap();
     assert_eq!(output.plan.ids(), [0x6B0, 0x6B1, 0x6B2, 0x6B4].map(CanId::Standard));
     assert_eq!((output.buses, output.status_period_s), (vec![BusIndex(0)], 0.1));
@@ -214,7 +214,7 @@ fn identifiers_and_periods_come_from_the_configuration_or_the_dbc() {
 }
 
 #[test]
-fn frame_kinds_and_protection_come_from_the_configuration_and_the_layout_says_so() {
+fn layout_shows_frame_kind_and_protection() {
     let text = "[output.status]\nfd = true\nbrs = true\ne2e = \"5\"\ndata_id = 0x1234\n[output.alarm]\ne2e = \"1C\"\n\
                 data_id = 7\n";
     let pack = pack_with("\"can0\"", "\"can0\"\nfd = true");
@@ -232,7 +232,7 @@ fn frame_kinds_and_protection_come_from_the_configuration_and_the_layout_says_so
 }
 
 #[test]
-fn an_own_output_dbc_is_not_moved_for_a_longer_header() {
+fn longer_header_does_not_shift_custom_output_dbc() {
     let pack = pack_with("\"can0\"", "\"can0\"\nfd = true");
     let text = "[output]\ndbc = \"own.dbc\"\n[output.status]\nfd = true\ne2e = \"5\"\ndata_id = 1\n";
     let fault = "pack.toml:20: output.status.e2e = \"5\", signal PACKWATCH_Status.Soc begins at bit 16, must leave the 24 \
@@ -241,7 +241,7 @@ fn an_own_output_dbc_is_not_moved_for_a_longer_header() {
 }
 
 #[test]
-fn steps_in_ah_are_those_of_the_configured_cell() {
+fn ah_resolution_fits_configured_cell() {
     let cell = CELL.replace("rated_capacity_ah = 2.0", "rated_capacity_ah = 100.0");
     let (config, _) = read_texts(&format!("{PACK}[output]\n"), &cell, DBC).unwrap();
     let layout = config.output_layout.unwrap();
@@ -249,14 +249,14 @@ fn steps_in_ah_are_those_of_the_configured_cell() {
 }
 
 #[test]
-fn an_output_dbc_must_have_the_daemons_messages() {
+fn incomplete_output_dbc_is_rejected() {
     let all = faults(&format!("{PACK}[output]\ndbc = \"twin.dbc\"\n"));
     assert_eq!(all[0], "pack.toml:16: output.dbc = \"twin.dbc\", message PACKWATCH_Status is missing");
     assert_eq!(all.len(), 3);
 }
 
 #[test]
-fn numbers_may_be_hex_or_have_underscores() {
+fn hex_and_underscores_are_accepted_in_numbers() {
     let output =
         "[output.status]\nid = 0x5_00\n[estimator]\nconsistency_window_s = 1_000\nvoltage_noise_v = 2_0.0e-0_1\n";
     let config = good(&format!("{PACK}{output}"));
@@ -265,7 +265,7 @@ fn numbers_may_be_hex_or_have_underscores() {
 }
 
 #[test]
-fn broken_syntax_hides_no_other_fault_and_invents_none() {
+fn syntax_error_does_not_affect_other_faults() {
     let pack = pack_with("cells = 4", "cells = = 4").replace("\"charge\"", "\"in\"").replace("[input]", "[inp");
     let expected = [
         "pack.toml:2: extra `=`, expected nothing",
@@ -282,7 +282,7 @@ fn broken_syntax_hides_no_other_fault_and_invents_none() {
 }
 
 #[test]
-fn with_several_interfaces_each_signal_says_which() {
+fn signal_needs_interface_if_several_exist() {
     let all = faults(&format!("{PACK}[[interface]]\nname = \"can1\"\n"));
     let expected = [
         "pack.toml:8: input.current.interface is not set, must be can0 or can1",
@@ -293,7 +293,7 @@ fn with_several_interfaces_each_signal_says_which() {
 }
 
 #[test]
-fn a_signal_in_two_dbc_files_is_ambiguous() {
+fn signal_in_two_dbc_files_is_ambiguous() {
     let all = faults(&pack_with("[\"pack.dbc\"]", "[\"pack.dbc\", \"twin.dbc\"]"));
     assert_eq!(
         all[0],
@@ -304,7 +304,7 @@ fn a_signal_in_two_dbc_files_is_ambiguous() {
 }
 
 #[test]
-fn faults_of_all_files_are_told_at_once_in_the_order_of_lines() {
+fn faults_of_all_files_are_sorted_by_line() {
     let pack =
         pack_with("cells = 4", "cells = 0\nx = 1").replace("\"charge\"", "\"in\"") + "[recharge]\nto_soc = 0.1\n";
     let cell = CELL.replace("capacity_ah = 1.9", "capacity_ah = 0").replace("[0, 0.5, 1]", "[0, 0.5, 0.5]");
@@ -324,7 +324,7 @@ fn faults_of_all_files_are_told_at_once_in_the_order_of_lines() {
 }
 
 #[test]
-fn text_that_is_not_utf_8_is_refused_with_its_line() {
+fn invalid_utf_8_is_reported_with_line() {
     let read = |_: &Path| Ok(b"[pack]\ncells = \xFF".to_vec());
     assert_eq!(
         load_with(&ConfigFiles::alone(Path::new("pack.toml")), &read).unwrap_err().0,
@@ -333,7 +333,7 @@ fn text_that_is_not_utf_8_is_refused_with_its_line() {
 }
 
 #[test]
-fn vehicle_texts_are_optional_and_short() {
+fn vehicle_strings_are_optional_and_limited() {
     assert_eq!(good(PACK).vehicle, VehicleIdentity::default());
     let config = good(&format!("{PACK}[vehicle]\nid = \"WDB1\"\n"));
     assert_eq!(config.vehicle.to_string(), "WDB1");
@@ -345,7 +345,7 @@ fn vehicle_texts_are_optional_and_short() {
 }
 
 #[test]
-fn defaults_are_stated_and_allowed() {
+fn documented_defaults_are_the_real_ones() {
     use super::schema::{Presence, SECTIONS};
     for info in SECTIONS.iter().chain(super::cell_model::SECTIONS) {
         for key in info.keys.unwrap_or(&[]) {
@@ -373,9 +373,9 @@ fn reference_page_matches_committed_file() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(2000))]
 
-    /// Pieces cut out, doubled, swapped or overwritten: faults or a configuration, never a panic, never an empty list.
+    /// After random deletions and insertions, the result is a configuration or a non-empty list of faults, never a panic.
     #[test]
-    fn any_mutilated_file_gives_faults_or_a_configuration(
+    fn any_corrupted_file_gives_faults_or_configuration(
         edits in prop::collection::vec((0..3_usize, any::<prop::sample::Index>(), 0..24_usize, any::<prop::sample::Index>()), 1..6),
     ) {
         const SCRAPS: [&str; 14] = [

@@ -36,7 +36,7 @@ pub struct ControlServer {
 }
 
 impl ControlServer {
-    /// Opens the socket, whose requests go to `requests`. `None` = there is no socket (logged).
+    /// Opens the socket, whose requests go to `requests`. `None` = it failed (logged).
     ///
     /// # Errors
     /// When another daemon uses it, or a requested socket cannot be created.

@@ -127,7 +127,7 @@ pub enum StampDigits {
 /// Writes one line like `candump -L`, including the line feed.
 ///
 /// # Errors
-/// Those of `out`.
+/// Errors of `out`.
 pub fn write_line(
     out: &mut impl Write,
     time: Timestamp,
@@ -155,7 +155,7 @@ pub fn frame_text(frame: &Frame) -> String {
 /// Writes `(seconds.fraction)`.
 ///
 /// # Errors
-/// Those of `out`.
+/// Errors of `out`.
 pub fn write_stamp(out: &mut impl Write, time: Timestamp, digits: StampDigits) -> io::Result<()> {
     let (sign, nanos) = (if time.nanos() < 0 { "-" } else { "" }, time.nanos().unsigned_abs());
     let (seconds, fraction) = (nanos / 1_000_000_000, nanos % 1_000_000_000);

@@ -20,7 +20,7 @@ use nix::time::{ClockId, clock_gettime};
 
 use crate::quantity::Timestamp;
 
-/// Half of the time for which the smallest hardware offset is remembered, ns. Over it, a quartz 100 ppm off drifts by 1 ms.
+/// Half of the time that the smallest hardware offset is kept, ns. Over it, a quartz 100 ppm off drifts by 1 ms.
 const HARDWARE_WINDOW_NS: i64 = 10_000_000_000;
 
 /// Most readings of the wall clock for one [`Reading`].

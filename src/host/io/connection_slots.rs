@@ -72,7 +72,7 @@ impl<K: PartialEq> ConnectionSlots<K> {
         Self { limits, taken: Vec::new() }
     }
 
-    /// Makes room for a connection of `client`; `false` = there is no room.
+    /// Makes room for a connection of `client`; `false` = not possible.
     pub(crate) fn make_room(&mut self, client: &K, now: Instant) -> bool {
         self.taken.retain(|place| !place.task.is_finished());
         let of_client = self.taken.iter().filter(|place| place.client == *client).count();

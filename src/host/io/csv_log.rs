@@ -128,7 +128,7 @@ pub const BDF_COLUMNS: [(&str, &str, &str); 6] = [
     ("discharged_ah", "Net Capacity / Ah", "net_capacity_ah"),
 ];
 
-/// Finds the columns of samples: those mapped by the user, else ours or those of the Battery Data Format.
+/// Finds the columns of samples: mapped by the user, or else packwatch's names or the Battery Data Format's.
 pub struct SampleColumns<'a> {
     header: &'a Header,
     /// Maps a role to a column; `None` = the user cannot map columns.

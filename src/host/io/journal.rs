@@ -15,7 +15,7 @@
 //! RELOAD (1700000000.600000000)
 //! ```
 //!
-//! `SECURED`: a frame of an authenticated message, with the freshness value for which its authenticator was valid (`-`: not
+//! `SECURED`: a frame of an authenticated message, with the freshness value that made its authenticator valid (`-`: not
 //! valid), so that a replay needs no key. `RELOAD`: from here on another configuration applies, which the journal does not
 //! contain. `RESTORE`: the first line of a run that restored a stored state, with the downtime (`-`: follows from the
 //! stamps). A last line without line feed was torn by a power cut and counts as a bad line, even if it can be parsed.
@@ -122,7 +122,7 @@ impl<W: Write> JournalWriter<W> {
     /// Begins a journal; `interfaces` are the configured names in order.
     ///
     /// # Errors
-    /// Those of `out`.
+    /// Errors of `out`.
     pub fn new(mut out: W, interfaces: Vec<String>) -> io::Result<Self> {
         writeln!(out, "{HEADER}")?;
         Ok(Self { out, interfaces })
@@ -131,7 +131,7 @@ impl<W: Write> JournalWriter<W> {
     /// Records that a stored state was restored and how old it was. Must precede every input.
     ///
     /// # Errors
-    /// Those of the file.
+    /// Errors of the file.
     pub fn restored(&mut self, now: Timestamp, away: Downtime) -> io::Result<()> {
         write_mark(&mut self.out, "RESTORE", now, format_args!(" {away}"))
     }
@@ -139,7 +139,7 @@ impl<W: Write> JournalWriter<W> {
     /// Records that another configuration applies from now on.
     ///
     /// # Errors
-    /// Those of the file.
+    /// Errors of the file.
     pub fn reloaded(&mut self, time: Timestamp) -> io::Result<()> {
         write_mark(&mut self.out, "RELOAD", time, "")
     }
@@ -147,7 +147,7 @@ impl<W: Write> JournalWriter<W> {
     /// Appends one record, as the core receives it.
     ///
     /// # Errors
-    /// Those of the file; an interface that is not configured is invalid input.
+    /// Errors of the file; invalid input for an interface that is not configured.
     pub fn append(&mut self, record: &Record) -> io::Result<()> {
         let time = record.time;
         match &record.kind {
@@ -181,7 +181,7 @@ impl<W: Write> JournalWriter<W> {
     /// Passes everything to the operating system.
     ///
     /// # Errors
-    /// Those of the file.
+    /// Errors of the file.
     pub fn flush(&mut self) -> io::Result<()> {
         self.out.flush()
     }

@@ -114,7 +114,7 @@ struct ReadState {
     fresh: bool,
     /// Whether the time between the records so far and the next one is unknown.
     unknown: bool,
-    /// Whether a file's stamps were moved after those of the previous file.
+    /// Whether a file's stamps were moved to follow the previous file.
     has_moved_stamps: bool,
 }
 
@@ -229,7 +229,7 @@ impl LogSource {
     /// The next records, at least one: those available without reading more of the file. `false` = end of the last log.
     ///
     /// # Errors
-    /// Those of [`next_record`](Self::next_record), after all records before the error were returned.
+    /// Like [`next_record`](Self::next_record), after all records before the error were returned.
     pub fn next_batch(&mut self, batch: &mut Batch) -> Result<bool, LogError> {
         batch.len = 0;
         if let Some(open) = &mut self.current
@@ -390,7 +390,7 @@ impl ReadState {
             Line::Dropped { interface, frames } => {
                 self.counts.dropped_frames = self.counts.dropped_frames.saturating_add(frames);
                 let bus = self.bus(interface)?;
-                // The line has no stamp. It belongs to the frame before it, if there is one.
+                // The line has no stamp. It belongs to the preceding frame, if any.
                 let time = self.latest?.plus_nanos(-self.shift_ns);
                 (!self.fresh).then_some(Record::bus(time, bus, BusEvent::Dropped { frames }))
             }

@@ -75,7 +75,7 @@ impl Drop for ResultFile {
 /// Writes a whole file.
 ///
 /// # Errors
-/// Those of [`ResultFile::create`] and [`ResultFile::finish`].
+/// Like [`ResultFile::create`] and [`ResultFile::finish`].
 pub fn write_file(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let mut file = ResultFile::create(path)?;
     file.write_all(bytes)?;

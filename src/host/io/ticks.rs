@@ -69,7 +69,7 @@ impl Ticks {
     }
 
     /// Ends the log, or starts an unknown gap: the remaining ticks up to the latest record may be popped, and the next
-    /// record wakes the recorder whatever its stamp.
+    /// record wakes the recorder regardless of its stamp.
     pub fn sleep(&mut self) {
         if let Some(latest_ns) = self.latest_ns.take() {
             self.limit_ns = latest_ns.saturating_add(1);
@@ -133,40 +133,40 @@ mod tests {
     }
 
     #[test]
-    fn ticks_are_aligned_and_end_with_the_last_record() {
+    fn ticks_are_aligned_and_end_with_last_record() {
         assert_eq!(ticks_ms(&[3, 45], EVERY), [3, 10, 20, 30, 40]);
         assert_eq!(ticks_ms(&[0, 20], EVERY), [0, 10, 20]);
     }
 
     #[test]
-    fn records_of_one_stamp_come_before_its_tick() {
+    fn records_precede_tick_of_same_time() {
         assert_eq!(ticks_ms(&[10, 10, 10], EVERY), [10]);
     }
 
     #[test]
-    fn into_a_hole_ticks_go_on_for_the_sleep_gap_and_start_again_at_its_end() {
+    fn ticks_stop_after_sleep_gap_and_resume_after_hole() {
         let ticks = ticks_ms(&[0, 15, 40_000_003, 40_000_020], EVERY);
         assert_eq!(ticks, [0, 10, 20, 30, 40, 50, 60, 40_000_003, 40_000_010, 40_000_020]);
     }
 
     #[test]
-    fn a_hole_as_long_as_the_sleep_gap_is_no_sleep() {
+    fn hole_equal_to_sleep_gap_is_not_sleep() {
         assert_eq!(ticks_ms(&[5, 55], EVERY), [5, 10, 20, 30, 40, 50]);
         assert_eq!(ticks_ms(&[5, 66], EVERY), [5, 10, 20, 30, 40, 50, 66]);
     }
 
     #[test]
-    fn a_record_back_in_time_makes_no_tick() {
+    fn earlier_record_causes_no_tick() {
         assert_eq!(ticks_ms(&[20, 5, 20, 25], EVERY), [20]);
     }
 
     #[test]
-    fn a_clock_that_was_set_back_takes_the_grid_along() {
+    fn clock_set_back_moves_the_grid() {
         assert_eq!(ticks_ms(&[9_000_000, 9_000_015, 5_003, 5_025], EVERY), [9_000_000, 9_000_010, 5_003, 5_010, 5_020]);
     }
 
     #[test]
-    fn after_an_unknown_gap_ticks_go_on_at_the_next_record() {
+    fn ticks_resume_with_record_after_unknown_gap() {
         let mut ticks = Ticks::new(10, 30.0);
         ticks.advance(Timestamp::from_nanos(100_000_000));
         while ticks.pop(EVERY).is_some() {}
@@ -188,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn skipping_leaves_the_grid_where_it_was() {
+    fn skipping_keeps_the_grid() {
         let mut ticks = Ticks::new(10, 30.0);
         ticks.advance(Timestamp::from_nanos(3_000_000));
         while ticks.pop(None).is_some() {}

@@ -1,4 +1,4 @@
-//! Unix sockets and their files. A socket file left by a dead daemon is replaced; that of a running daemon is kept.
+//! Unix sockets and their files. A dead daemon's socket file is replaced, a running daemon's is kept.
 
 use std::fs::Permissions;
 use std::io::{self, ErrorKind};
@@ -55,7 +55,7 @@ pub struct SocketFile {
     inode: (u64, u64),
 }
 
-/// Why there is no socket.
+/// Why the socket was not opened.
 #[derive(Debug)]
 pub enum BindError {
     /// Another daemon uses the path.

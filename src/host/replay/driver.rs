@@ -1,7 +1,7 @@
 //! A monitor that the caller feeds with rows of values or frames; the driver adds the ticks of a replay between them.
 //!
 //! In: rows (A, positive = discharge; V; degrees C) or frames, with their times. Out: the monitor's [`Outputs`], which the
-//! caller clears. Promise: the outputs equal those of `packwatch replay` with a log of the same inputs.
+//! caller clears. Promise: `packwatch replay` with a log of the same inputs gives the same outputs.
 
 use super::reading::RowFrames;
 use crate::can::Frame;
@@ -37,7 +37,7 @@ impl MonitorDriver {
         }
     }
 
-    /// Handles one row; `None` and NaN mean that there is no value.
+    /// Handles one row; `None` and NaN mean no value.
     pub fn handle_row(&mut self, time: Timestamp, values: &[(Channel, Option<f64>)]) {
         self.advance(time);
         let mut frames = std::mem::take(&mut self.frames);

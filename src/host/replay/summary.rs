@@ -34,7 +34,7 @@ pub struct ReplaySummary {
     pub bad_readings: u64,
     /// Protected input messages.
     pub protected: Vec<ProtectedSummary>,
-    /// Messages of which frames were dropped because their rate was too high.
+    /// Messages with frames dropped because their rate was too high.
     pub dropped: Vec<MessageFlood>,
     /// Controllers that answer diagnostic requests.
     pub controllers: Vec<ControllerStatus>,

@@ -67,7 +67,7 @@ pub fn check_length(bytes: usize) -> io::Result<()> {
     ))
 }
 
-/// Explains why there is no document, and names the next step.
+/// Explains why no document was received, and names the next step.
 pub fn explain(path: &Path, error: &io::Error) -> String {
     let option = if path == standard_path() { String::new() } else { format!(" --status {}", path.display()) };
     let path = path.display();

@@ -76,7 +76,7 @@ pub struct StatusDocument {
     /// Diagnostic requests of this program; `None` = polling is not configured.
     #[serde(default)]
     pub poll: Option<PollStatus>,
-    /// Input messages of which frames were dropped because their rate was too high.
+    /// Input messages with frames dropped because their rate was too high.
     pub floods: Vec<MessageFlood>,
     /// Unexpected senders on the buses.
     #[serde(default)]
@@ -176,7 +176,7 @@ impl AlarmStatus {
     }
 }
 
-/// Counters. All of them start at 0 with the program (also those of interfaces, protected messages, controllers and floods),
+/// Counters. All of them start at 0 with the program (also the counters of interfaces, protected messages, controllers and floods),
 /// except `lifetime`. A stored count may be a minute old after a power cut, and readers that sum differences need counters that
 /// never decrease.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

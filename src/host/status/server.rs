@@ -66,7 +66,7 @@ pub struct StatusServer {
 }
 
 impl StatusServer {
-    /// Opens the sockets. `None` = there are no sockets (logged).
+    /// Opens the sockets. `None` = it failed (logged).
     ///
     /// # Errors
     /// When another daemon uses them, or requested sockets cannot be created.

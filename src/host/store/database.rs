@@ -36,7 +36,7 @@ pub(super) const FORMAT: i32 = 1;
 const BUSY_TIMEOUT: Duration = Duration::from_millis(100);
 /// Longest check of the file at the start. Damage beyond that is found when that part is read.
 const MAX_CHECK: Duration = Duration::from_secs(2);
-/// The tables other than those of [`HistoryTable`].
+/// The tables that are not in [`HistoryTable`].
 const TABLES: &str = "
 CREATE TABLE meta (id INTEGER PRIMARY KEY CHECK (id = 1), segments INTEGER NOT NULL, vehicle TEXT) STRICT;
 INSERT INTO meta VALUES (1, 0, NULL);
@@ -224,7 +224,7 @@ impl Database {
         learned::read(&self.connection, self.pack)
     }
 
-    /// Closes the history of the pack with the last capacity of its weakest cell, and opens that of the next pack. Returns the
+    /// Closes the history of the pack with the last capacity of its weakest cell, and opens the next pack's. Returns the
     /// number of the new pack.
     pub(super) fn replace_pack(&mut self, now: &Stamp) -> rusqlite::Result<i64> {
         let learned = self

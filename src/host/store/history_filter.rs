@@ -1,7 +1,7 @@
 //! Selects the events that are kept in the history, and those that are committed at once.
 //!
 //! A flickering alarm must not wear out the flash or delay another alarm. In: the events of one input. Out: rows to commit now,
-//! if any. Limits are token buckets and the bytes of written states ([`super::checkpoint`]); times are those of the events.
+//! if any. Limits are token buckets and the bytes of written states ([`super::checkpoint`]); times are taken from the events.
 
 use std::collections::BTreeMap;
 
@@ -199,7 +199,7 @@ mod tests {
     use super::*;
     use crate::alarm::{Rule, Severity};
 
-    /// Number of rows committed at once although there is no room.
+    /// Number of rows committed at once although the write budget is used up.
     fn take(history_filter: &mut HistoryFilter, seconds: f64, kinds: &[EventKind]) -> Option<usize> {
         let time = Timestamp::from_secs(seconds);
         let events: Vec<Event> = kinds.iter().map(|&kind| Event { time, kind }).collect();

@@ -85,7 +85,7 @@ impl HistoryReader {
     /// Opens the store in a folder.
     ///
     /// # Errors
-    /// When there is none, or it cannot be read; the error names the file.
+    /// If it does not exist or cannot be read; the error names the file.
     pub fn open(folder: &Path) -> Result<Self, String> {
         let path = folder.join(DATABASE);
         let named = |error: String| format!("{}: {error}", path.display());

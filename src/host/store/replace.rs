@@ -10,11 +10,11 @@ use super::state_files::{self, StateFiles};
 use crate::io::clock::Reading;
 use crate::quantity::Timestamp;
 
-/// Closes the history of the pack in a state folder, opens that of the next pack, and deletes the state. Returns the number
+/// Closes the history of the pack in a state folder, opens the next pack's, and deletes the state. Returns the number
 /// of the next pack.
 ///
 /// # Errors
-/// When there is no store, a daemon uses it, or it cannot be written; nothing has changed then.
+/// If the folder contains no store, a daemon uses it, or it cannot be written; nothing has changed then.
 pub fn replace_pack(path: &Path) -> Result<i64, String> {
     let file = path.join(DATABASE);
     let named = |error: String| format!("{}: {error}", file.display());

@@ -46,7 +46,7 @@ impl Reserve {
         self.left > 0
     }
 
-    /// Restores the file from time to time; on a full disk it stays as it is.
+    /// Restores the file from time to time, unless the disk is full.
     pub(super) fn restore(&mut self) {
         if self.is_whole() || self.tried.is_some_and(|tried| tried.elapsed() < PAUSE) {
             return;

@@ -163,7 +163,7 @@ impl HistoryRow {
         Some((table, table.columns().iter().map(value).collect()))
     }
 
-    /// Whether the row is a detail, which is dropped first if there is no room.
+    /// Whether the row is a detail, which is dropped first when the backlog is full.
     pub(super) const fn is_detail(&self) -> bool {
         matches!(self, Self::Event(EventKind::HalfCycle { .. }))
     }

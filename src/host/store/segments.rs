@@ -300,7 +300,7 @@ fn judge(connection: &Connection, before: &Segment, segment: &Segment) -> rusqli
     Ok(if expected == hash { None } else { broken(hex(&expected), hex(&hash)) })
 }
 
-/// Compares the stored numbers of segments and rows with those of the chain.
+/// Compares the stored numbers of segments and rows with the chain.
 fn judge_number(
     connection: &Connection,
     newest: &Segment,

@@ -55,7 +55,7 @@ impl BootId {
         kernel.or_else(variable).unwrap_or(Self::UNKNOWN)
     }
 
-    /// Parses the kernel's form or that of [`Display`](fmt::Display).
+    /// Parses the notation of the kernel or of [`Display`](fmt::Display).
     pub(super) fn parse(text: &str) -> Option<Self> {
         let digits: String = text.chars().filter(|c| *c != '-' && !c.is_whitespace()).collect();
         u128::from_str_radix(&digits, 16).ok().filter(|_| digits.len() == 32).map(|id| Self(id.to_be_bytes()))

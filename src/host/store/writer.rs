@@ -149,7 +149,7 @@ pub(super) struct Writer {
     pub(super) state_files: StateFiles,
     /// Reserve for a full disk.
     pub(super) reserve: Reserve,
-    /// Day (UTC, since 1970) for which the chain's end was logged.
+    /// Latest day (UTC, since 1970) whose chain end was logged.
     pub(super) head_day: Option<i64>,
     /// `None` = not open.
     pub(super) database: Option<Database>,

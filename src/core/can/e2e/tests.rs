@@ -60,7 +60,7 @@ fn unprotectable_payload_is_error_and_unchanged() {
             let mut short = vec![0xAA; found];
             assert_eq!(
                 protection.protect(&mut short, 0).unwrap_err().to_string(),
-                format!("payload of {found} bytes, this profile needs {needed} or more")
+                format!("payload of {found} bytes, must be at least {needed} bytes for this profile")
             );
             assert_eq!(short, vec![0xAA; found]);
             assert_eq!(protection.verified_counter(&short), None);

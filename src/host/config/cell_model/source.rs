@@ -40,7 +40,7 @@ pub struct ModelSource {
     pub chemistry: Option<String>,
     /// The measured conditions.
     pub measured: MeasuredRange,
-    /// `[provenance]` of the file; empty if there is none.
+    /// `[provenance]` of the file; empty if not given.
     pub provenance: Table,
     /// For a learned model: the label's model, and what the data covered.
     pub learned: Option<LearnedFrom>,

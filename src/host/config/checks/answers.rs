@@ -1,6 +1,6 @@
 //! `[[input.diagnostic]]`: the controllers that are asked, and the signals in their answers.
 //!
-//! In: the tables of the file. Out: one [`AnswerDefinition`] per table. Its signals look like those of a DBC, so that
+//! In: the tables of the file. Out: one [`AnswerDefinition`] per table. Its signals look like signals of a DBC, so that
 //! `[input.*]` can name them in the same way. Also the [`Answer`]s that the core decodes.
 
 use crate::can::CanId;

@@ -1,6 +1,6 @@
 //! Builds the node's settings from `[j1939]` and `[[alarm]]`: its NAME, and each alarm as a trouble code.
 //!
-//! The node's identifiers must differ from those of inputs and of `[output]`, and no two rules may share a code.
+//! The node's identifiers must differ from the identifiers of inputs and of `[output]`, and no two rules may share a code.
 
 use super::signals::ResolvedSignal;
 use crate::alarm::{Direction, Rule, Severity};

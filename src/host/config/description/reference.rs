@@ -48,7 +48,7 @@ pub(crate) fn value(key: &Key) -> String {
     }
 }
 
-/// The default as code or in words; `required` if there is none.
+/// The default as code or in words; `required` for required keys.
 pub(crate) fn default(key: &Key) -> String {
     match key.presence {
         Presence::Required => "required".to_owned(),

@@ -70,7 +70,7 @@ impl RawTables {
         }
     }
 
-    /// Capacity on the label of one of the pack's own cells, Ah: configured, else that of the cell model.
+    /// Capacity on the label of one of the pack's own cells, Ah: configured, or else from the cell model.
     pub(crate) fn rated_ah(&self, model: Option<&CellModel>) -> Option<f64> {
         let configured = self.pack.as_ref().and_then(|pack| pack.rated_capacity_ah);
         configured.or(model.map(|model| model.rated_capacity_ah))

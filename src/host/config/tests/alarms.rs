@@ -1,9 +1,9 @@
-//! `[[alarm]]` and `[commands]`: what becomes of them, and every fault, word for word.
+//! `[[alarm]]` and `[commands]`: resulting settings and the full text of every fault.
 
 use super::*;
 
 #[test]
-fn a_relative_threshold_is_of_the_rated_capacity() {
+fn relative_threshold_uses_rated_capacity() {
     let alarm = "[[alarm]]\nrule = \"capacity_low\"\nwarning = \"75 %\"\n";
     assert_eq!(good(&format!("{PACK}{alarm}")).monitor.rules[0].threshold, 1.5);
     let rated = pack_with("cells = 4", "cells = 4\nrated_capacity_ah = 4");
@@ -12,7 +12,7 @@ fn a_relative_threshold_is_of_the_rated_capacity() {
 }
 
 #[test]
-fn faults_of_alarms_and_commands() {
+fn alarm_and_command_faults_are_reported() {
     let cases: &[(&str, &str)] = &[
         (
             "[[alarm]]\nrule = \"capacity_low\"\n",
@@ -130,7 +130,7 @@ fn faults_of_alarms_and_commands() {
 }
 
 #[test]
-fn a_sent_frame_has_no_profile_of_few_bits() {
+fn sent_frame_rejects_weak_profiles() {
     let table = "[output.alarm]\nsecoc = \"1\"\ndata_id = 1\n[authentication]\ncredential = \"k\"\n";
     let expected = "pack.toml:16: output.alarm.secoc = \"1\", must be \"fd\" for a frame that is sent";
     assert_eq!(faults(&format!("{PACK}{table}"))[0], expected);

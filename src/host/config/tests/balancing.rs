@@ -1,4 +1,4 @@
-//! Bits that show which cells the BMS bleeds.
+//! `[input.balancing]`: the bits that show which cells the BMS discharges to balance them.
 
 use super::*;
 use crate::can::encode::InputEncoder;
@@ -17,7 +17,7 @@ fn pack(keys: &str) -> String {
 }
 
 #[test]
-fn every_cell_has_its_bit_and_strings_share_the_current() {
+fn each_cell_has_a_bit_and_share_of_current() {
     let two_strings = pack_with("cells = 4", "cells = 4\nstrings = 2");
     let keys = "[input.balancing]\nsignal = \"Bleeding.Bleed{n}\"\nbleed_a = 0.02\n";
     let monitor = read_with(&format!("{two_strings}{keys}")).unwrap().monitor;
@@ -35,7 +35,7 @@ fn every_cell_has_its_bit_and_strings_share_the_current() {
 }
 
 #[test]
-fn faults_of_the_bits() {
+fn balancing_faults_are_reported() {
     let table = [
         (
             pack("signal = \"Bleeding.Bleed{n}\"\n"),

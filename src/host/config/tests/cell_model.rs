@@ -1,9 +1,9 @@
-//! The cell model's file: every fault, word for word.
+//! Cell model files: the full text of every fault.
 
 use super::*;
 
 #[test]
-fn faults_of_a_cell_model() {
+fn cell_model_faults_are_reported() {
     let table: &[(&str, &str, &str)] = &[
         ("format = 1", "format = 2", "cell.toml:1: format = 2, must be 1"),
         ("name = \"test\"\n", "", "cell.toml:1: name is missing, must be a string that is not empty"),
@@ -69,7 +69,7 @@ fn faults_of_a_cell_model() {
 }
 
 #[test]
-fn electrodes_say_how_the_curve_ages() {
+fn electrode_data_determine_curve_ageing() {
     let with = |contents: &str| {
         let keys =
             format!("[electrodes]\npositive = \"nmc811\"\nnegative = \"graphite_siox\"\n{contents}\n[provenance]");
@@ -77,7 +77,7 @@ fn electrodes_say_how_the_curve_ages() {
     };
     let good = "positive_content = [0.8531, 0.2679]\nnegative_content = [0.0335, 0.9107]";
     let model = with(good).expect("a configuration").0.monitor.model;
-    // At SOC 0.5 of a cell that has lost a fifth.
+    // At SOC 0.5 of a cell that has lost 20 % of its capacity.
     let offset_v = |model: &crate::cell::CellModel| {
         let (aged, new) = (0.8 * model.capacity_ah, model.grid_position(0.5, 25.0));
         model.aged_ocv_v(&new, aged) - model.ocv_v(&new)
@@ -112,7 +112,7 @@ fn good_model() -> crate::cell::CellModel {
 }
 
 #[test]
-fn a_written_model_is_read_as_the_same_model() {
+fn written_model_reads_back_unchanged() {
     use crate::cell::{AgeingLaw, Chemistry, Label};
     use crate::config::cell_model::{self, SourcedModel};
     let folder = tempfile::tempdir().expect("a folder");
@@ -139,7 +139,7 @@ fn a_written_model_is_read_as_the_same_model() {
 }
 
 #[test]
-fn a_spread_widens_the_estimator_as_that_of_a_label_and_its_faults_are_named() {
+fn model_spread_widens_estimator_like_label_spread() {
     let spread = |modes: &str| {
         let keys = format!(
             "[spread]\ncurve_v = 0.01\nlog_resistance = 0.45\nslow_branch = 0.5\ncapacity = 0.07\ndrop_sqrt_s = 4.0\n\

@@ -1,4 +1,4 @@
-//! Drop-ins: what they change, and that every fault names the file it is in.
+//! Drop-ins: merged settings, and faults located in the right file.
 
 use super::*;
 
@@ -11,7 +11,7 @@ fn faults_with(drop_ins: &[&str]) -> Vec<String> {
 }
 
 #[test]
-fn keys_of_a_later_file_replace_and_lists_of_tables_grow() {
+fn later_files_replace_keys_and_append_tables() {
     let alarm = |rule: &str| format!("[[alarm]]\nrule = \"{rule}\"\nwarning = 0.2\n");
     let config = good_with(&[
         &format!("[pack]\nambient_c = 10\ncells = 3\n{}", alarm("soc_low")),
@@ -23,7 +23,7 @@ fn keys_of_a_later_file_replace_and_lists_of_tables_grow() {
 }
 
 #[test]
-fn every_fault_names_its_file_and_line() {
+fn fault_names_drop_in_and_line() {
     let all = faults_with(&[
         "\n[pack]\ncells = 0\n[[interface]]\nname = \"can0\"\n",
         "[pack]\n\nstrngs = 2\n[[alarm]]\nrule = \"soc_low\"\n[store]\ncheckpoint_s = 0\n",
@@ -42,14 +42,14 @@ fn every_fault_names_its_file_and_line() {
 }
 
 #[test]
-fn a_drop_in_with_broken_syntax_is_named_and_the_rest_is_checked() {
+fn syntax_error_in_drop_in_does_not_hide_other_faults() {
     let all = faults_with(&["[pack]\ncells = \n", "[store]\ncheckpoint_s = 0\n"]);
     assert!(all.iter().any(|fault| fault.starts_with("1.toml:2: ")), "{all:?}");
     assert!(all.contains(&"2.toml:2: store.checkpoint_s = 0, must be 1 to 3600".to_owned()), "{all:?}");
 }
 
 #[test]
-fn a_table_of_another_kind_is_refused_at_its_file() {
+fn table_of_other_type_is_rejected_at_its_file() {
     let all = faults_with(&["pack = 3\n"]);
     assert_eq!(all, ["1.toml:1: pack = 3, must be one table [pack]"]);
 }

@@ -1,8 +1,8 @@
-//! One wrong key at a time: the whole text of its fault, with place, found and allowed.
+//! One wrong key at a time: the full text of its fault.
 
 use super::*;
 
-/// Each edit of the good file (from, to) and the whole of what is said about it.
+/// Applies each edit (from, to) to `PACK` and compares the one resulting fault.
 fn each_edit_gives(table: &[(&str, &str, &str)]) {
     for (from, to, fault) in table {
         assert_eq!(faults(&pack_with(from, to)), [*fault], "{from} -> {to}");
@@ -10,7 +10,7 @@ fn each_edit_gives(table: &[(&str, &str, &str)]) {
 }
 
 #[test]
-fn single_faults_name_file_line_key_found_and_allowed() {
+fn faults_state_file_line_key_found_and_allowed() {
     let table: &[(&str, &str, &str)] = &[
         ("cells = 4", "cells = 0", "pack.toml:2: pack.cells = 0, must be 1 to 1024"),
         ("cells = 4", "cells = -1", "pack.toml:2: pack.cells = -1, must be 1 to 1024"),
@@ -25,7 +25,7 @@ fn single_faults_name_file_line_key_found_and_allowed() {
         ("cells = 4", "cells = 4\nstring = 1", "pack.toml:3: pack.string is not a known key, did you mean strings"),
         ("cells = 4", "cells = 4\nambient_c = nan", "pack.toml:3: pack.ambient_c = nan, must be -100 to 200"),
         ("cells = 4", "cells = 4\nambient_c = inf", "pack.toml:3: pack.ambient_c = inf, must be -100 to 200"),
-        // The shortest time that the estimator counts is 1 ms.
+        // The estimator's shortest time step is 1 ms.
         (
             "[input]",
             "[estimator]\nmax_information_s = 0.0005\n[input]",
@@ -52,13 +52,13 @@ fn single_faults_name_file_line_key_found_and_allowed() {
             "dbc = []",
             "pack.toml:7: input.dbc = [], must be a list of DBC files if there is no [[input.diagnostic]]",
         ),
-        ("dbc = [\"pack.dbc\"]", "dbc = [\"pack.dbc\", 7]", "pack.toml:7: input.dbc = 7, must be a list of texts"),
+        ("dbc = [\"pack.dbc\"]", "dbc = [\"pack.dbc\", 7]", "pack.toml:7: input.dbc = 7, must be a list of strings"),
     ];
     each_edit_gives(table);
 }
 
 #[test]
-fn single_faults_of_signals_name_what_the_dbc_has() {
+fn signal_faults_state_contents_of_dbc() {
     let table: &[(&str, &str, &str)] = &[
         ("positive = \"charge\"\n", "", "pack.toml:8: input.current.positive is missing, must be charge or discharge"),
         ("\"charge\"", "\"in\"", "pack.toml:10: input.current.positive = \"in\", must be charge or discharge"),
@@ -127,7 +127,7 @@ fn single_faults_of_signals_name_what_the_dbc_has() {
 }
 
 #[test]
-fn single_faults_of_appended_tables() {
+fn faults_of_repeatable_tables_are_reported() {
     let table: &[(&str, &str)] = &[
         ("[pak]\n", "pack.toml:15: pak is not a known key, did you mean pack"),
         ("[recharge]\nto_soc = 0.3\n", "pack.toml:16: recharge.to_soc = 0.3, must be above recharge.from_soc = 0.3"),

@@ -1,9 +1,9 @@
-//! `[j1939]`: what becomes of it, and every fault, word for word.
+//! `[j1939]`: resulting settings and the full text of every fault.
 
 use super::*;
 use crate::can::j1939::{Lamp, NameFields};
 
-/// A node, and alarms of every kind of failure mode. After `PACK`; begins in line 15.
+/// A node. Appended to `PACK`, so it starts at line 15.
 pub(super) const TABLE: &str = r#"[j1939]
 address = 249
 identity_number = 1234
@@ -35,7 +35,7 @@ fn with_key(from: &str, to: &str) -> String {
 }
 
 #[test]
-fn a_table_becomes_a_node_and_each_alarm_a_code() {
+fn table_defines_node_and_alarm_codes() {
     let (config, description) = read_texts(&with(TABLE), CELL, DBC).unwrap();
     let j1939 = config.monitor.j1939.as_ref().unwrap();
     let fields = NameFields {
@@ -61,14 +61,14 @@ fn a_table_becomes_a_node_and_each_alarm_a_code() {
 }
 
 #[test]
-fn without_the_table_or_with_outputs_disabled_there_is_no_node() {
+fn node_needs_table_and_enabled_outputs() {
     assert_eq!(good(PACK).monitor.j1939, None);
     assert_eq!(good(&with(&format!("[output]\nenabled = false\n{TABLE}"))).monitor.j1939, None);
     assert!(good(&with(&format!("[output]\nenabled = true\n{TABLE}"))).monitor.j1939.is_some());
 }
 
 #[test]
-fn numbers_that_do_not_fit_are_refused() {
+fn out_of_range_numbers_are_rejected() {
     for (from, to, fault) in [
         ("address = 249", "address = 254", "pack.toml:16: j1939.address = 254, must be 0 to 253"),
         (
@@ -110,7 +110,7 @@ fn numbers_that_do_not_fit_are_refused() {
 }
 
 #[test]
-fn of_several_interfaces_one_must_be_named() {
+fn node_needs_interface_if_several_exist() {
     let two = |key: &str| {
         let inputs = PACK
             .replace("[input]\n", "[[interface]]\nname = \"can1\"\n[input]\n")
@@ -122,13 +122,13 @@ fn of_several_interfaces_one_must_be_named() {
 }
 
 #[test]
-fn a_number_without_a_node_is_a_fault() {
+fn alarm_code_without_node_is_rejected() {
     let fault = "pack.toml:21: alarm[2].spn = 7000, requires a table [j1939]; without it nothing is sent on J1939";
     assert_eq!(faults(&with("")), [fault]);
 }
 
 #[test]
-fn two_rules_must_not_share_a_code() {
+fn two_rules_with_one_code_are_rejected() {
     let shared = with(TABLE).replace("spn = 7000\n", "").replace("info = 1000\n", "info = 1000\nspn = 520196\n");
     good(&shared); // another failure mode of the same parameter
     let shared = shared.replace("info = 1000", "warning = 1000").replace("spn = 520196", "spn = 520193");
@@ -137,7 +137,7 @@ fn two_rules_must_not_share_a_code() {
 }
 
 #[test]
-fn what_the_node_sends_must_not_be_an_input_or_a_frame_of_ours() {
+fn node_frames_must_not_collide_with_inputs_or_outputs() {
     let dbc = DBC
         .replace("BO_ 256 Status", &format!("BO_ {} Status", 0x8000_0000_u32 | 0x18FE_CAF9))
         .replace("VAL_ 256 Current", &format!("VAL_ {} Current", 0x8000_0000_u32 | 0x18FE_CAF9));

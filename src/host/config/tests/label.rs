@@ -1,4 +1,4 @@
-//! A cell by its label: chemistry, capacity and voltages in `[pack]` instead of a model file.
+//! Cells described by their label: chemistry, capacity and voltages in `[pack]` instead of a model file.
 
 use super::*;
 use crate::cell::Chemistry;
@@ -6,7 +6,7 @@ use crate::cell::Chemistry;
 const FILE: &str = "cell_model = \"cell.toml\"";
 
 #[test]
-fn a_label_gives_a_model_with_the_spread_of_such_cells() {
+fn label_gives_chemistry_model_with_spread() {
     let config = good(&pack_with(FILE, "chemistry = \"nmc811-graphite\"\nrated_capacity_ah = 60"));
     let (monitor, initial) = (&config.monitor, &config.monitor.estimator.initial);
     assert_eq!((monitor.model.rated_capacity_ah, monitor.model.capacity_ah), (60.0, 60.0));
@@ -19,7 +19,7 @@ fn a_label_gives_a_model_with_the_spread_of_such_cells() {
 }
 
 #[test]
-fn keys_of_the_estimator_replace_the_spread_of_a_label() {
+fn estimator_keys_override_label_spread() {
     let text = pack_with(FILE, "chemistry = \"lfp-graphite\"\nrated_capacity_ah = 100\nvoltage_max_v = 3.6");
     let config = good(&format!("{text}[estimator]\ninitial_log_resistance_std = 0.1\nslow_branch_std = 0.05\n"));
     let estimator = &config.monitor.estimator;
@@ -28,7 +28,7 @@ fn keys_of_the_estimator_replace_the_spread_of_a_label() {
 }
 
 #[test]
-fn every_chemistry_is_a_choice() {
+fn every_chemistry_is_accepted() {
     for (chemistry, name) in Chemistry::ALL {
         let config = good(&pack_with(FILE, &format!("chemistry = \"{name}\"\nrated_capacity_ah = 5")));
         assert!(config.monitor.model.name.starts_with(chemistry.name()), "{}", config.monitor.model.name);
@@ -36,7 +36,7 @@ fn every_chemistry_is_a_choice() {
 }
 
 #[test]
-fn what_is_missing_or_does_not_fit_is_named() {
+fn label_faults_are_reported() {
     let of = |keys: &str| faults(&pack_with(FILE, keys));
     assert_eq!(
         of("strings = 1"),

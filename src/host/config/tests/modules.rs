@@ -1,4 +1,4 @@
-//! `[[pack.module]]`: cells of another kind.
+//! `[[pack.module]]`: modules with a different cell model.
 
 use super::*;
 
@@ -9,7 +9,7 @@ fn with_modules(modules: &str) -> String {
 const LFP: &str = "[[pack.module]]\ncells = \"2, 4\"\nchemistry = \"lfp-graphite\"\nrated_capacity_ah = 2.5\n";
 
 #[test]
-fn a_module_has_cells_a_model_and_a_capacity_to_start_from() {
+fn module_has_cells_model_and_initial_capacity() {
     let monitor = good(&with_modules(LFP)).monitor;
     let [module] = monitor.modules.as_slice() else { panic!("{:?}", monitor.modules) };
     assert_eq!(module.cells, [CellIndex(1), CellIndex(3)]);
@@ -23,7 +23,7 @@ fn a_module_has_cells_a_model_and_a_capacity_to_start_from() {
 }
 
 #[test]
-fn the_voltages_of_all_cells_are_possible() {
+fn voltage_limits_cover_all_cells() {
     let low = "[[pack.module]]\ncells = \"1\"\nchemistry = \"nmc-graphite\"\nrated_capacity_ah = 2\n";
     let [alone, beside] = [PACK.to_owned(), with_modules(low)].map(|text| good(&text).monitor.sample.voltage);
     assert!(beside.min <= alone.min && beside.max >= alone.max, "{alone:?} {beside:?}");
@@ -35,7 +35,7 @@ fn the_voltages_of_all_cells_are_possible() {
 }
 
 #[test]
-fn cells_of_another_size_are_doubted() {
+fn other_cell_size_widens_uncertainty() {
     let (config, _) = read_texts(&with_modules(&LFP.replace("2.5", "50")), CELL, DBC).unwrap();
     let line = PACK.lines().count() + 2;
     let expected = format!(
@@ -46,14 +46,14 @@ fn cells_of_another_size_are_doubted() {
 }
 
 #[test]
-fn check_says_which_cells_are_of_another_kind() {
+fn check_lists_module_cells() {
     let (_, description) = read_texts(&with_modules(LFP), CELL, DBC).unwrap();
     let words = description.pack.join("\n");
     assert!(words.contains("cells 2, 4: another type of cell, lfp-graphite"), "{words}");
 }
 
 #[test]
-fn what_is_missing_or_does_not_fit_is_named() {
+fn module_faults_are_reported() {
     let of = |module: &str| faults(&with_modules(&format!("[[pack.module]]\n{module}\n")));
     let line = PACK.lines().count() + 1;
     for (module, at, expected) in [

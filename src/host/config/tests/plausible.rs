@@ -1,4 +1,4 @@
-//! What is written correctly and cannot be meant: every fault and warning, word for word.
+//! Valid syntax with implausible contents: the full text of every fault and warning.
 
 use super::*;
 
@@ -19,7 +19,7 @@ BO_ 272 Cells: 8 A
  SG_ Cell4 m1 : 24|16@1+ (0.001,0) [0|5] "V" A
 "#;
 
-/// 14 lines.
+/// Has 14 lines.
 const PACK: &str = r#"[pack]
 cells = 4
 cell_model = "cell.toml"
@@ -55,12 +55,12 @@ fn warnings(pack: &[(&str, &str)], dbc: &[(&str, &str)]) -> Vec<String> {
 }
 
 #[test]
-fn the_file_as_it_stands_is_good() {
+fn unchanged_file_is_valid() {
     assert_eq!(warnings(&[], &[]), [""; 0]);
 }
 
 #[test]
-fn a_signal_that_ends_behind_its_message_is_a_fault() {
+fn signal_beyond_message_end_is_rejected() {
     let fault = "pack.toml:14: input.temperature[1].signal = \"Status.Temperature\", Status.Temperature ends in byte 7 of \
                  its message, must end within the 6 bytes stated in pack.dbc";
     assert_eq!(faults(&[], &[("32|8@1+ (1,-40)", "41|8@1+ (1,-40)")]), [fault]);
@@ -70,14 +70,14 @@ fn a_signal_that_ends_behind_its_message_is_a_fault() {
 }
 
 #[test]
-fn many_signals_behind_their_message_are_one_fault_that_names_the_byte_order() {
+fn many_signals_beyond_message_end_suggest_byte_order() {
     let fault = "pack.toml:12: input.cell_voltage.signal = \"Cells.Cell{n}\", Cells.Cell2 and 1 other end in byte 9 of \
                  their message, must end within the 8 bytes stated in pack.dbc; with the other byte order (@1) they would";
     assert_eq!(faults(&[], &[("24|16@1+", "48|16@0+")]), [fault]);
 }
 
 #[test]
-fn an_empty_range_is_a_fault_wherever_it_comes_from() {
+fn empty_range_from_any_source_is_rejected() {
     let fault = "pack.toml:12: input.cell_voltage.signal = \"Cells.Cell{n}\", Cells.Cell1 and 3 others in pack.dbc cannot be \
                  read: range is [1.35|0.1], the first must not be above the second";
     assert_eq!(faults(&[], &[("[0|5]", "[1.35|0.1]")]), [fault]);
@@ -103,7 +103,7 @@ fn an_empty_range_is_a_fault_wherever_it_comes_from() {
 }
 
 #[test]
-fn a_range_of_the_dbc_that_is_empty_after_scale_is_a_fault() {
+fn dbc_range_empty_after_scaling_is_rejected() {
     let mv = [("(0.001,0) [0|5] \"V\"", "(0.1,0) [0|5] \"mV\"")];
     let fault = "pack.toml:12: input.cell_voltage.signal = \"Cells.Cell{n}\", the DBC's range is 0 to 0.005 V after scale, \
                  must contain plausible values (set [limits.voltage] to override it)";
@@ -111,7 +111,7 @@ fn a_range_of_the_dbc_that_is_empty_after_scale_is_a_fault() {
 }
 
 #[test]
-fn limits_without_any_voltage_of_the_cell_model_are_a_fault() {
+fn limits_must_include_cell_model_voltages() {
     let keys = "Status.Temperature\"\n[limits.voltage]\nmin_v = 0.1\nmax_v = 1.35\n";
     let fault =
         "pack.toml:17: limits.voltage.max_v = 1.35, allows 0.1 to 1.35 V, must overlap the cell model's 2.5 to 4.2 V";
@@ -119,7 +119,7 @@ fn limits_without_any_voltage_of_the_cell_model_are_a_fault() {
 }
 
 #[test]
-fn a_unit_that_is_not_converted_is_a_fault_with_the_scale_that_fits() {
+fn unconverted_unit_suggests_scale() {
     let table: &[(&str, &str, &[&str])] = &[
         (
             "(0.001,0) [0|5] \"V\"",
@@ -172,7 +172,7 @@ fn a_unit_that_is_not_converted_is_a_fault_with_the_scale_that_fits() {
 }
 
 #[test]
-fn a_reported_state_must_be_a_share() {
+fn reported_soc_must_be_a_fraction() {
     let with_soc = ("[[input.temperature]]", "[input.reported_soc]\nsignal = \"Status.Spare\"\n[[input.temperature]]");
     let spare = |unit: &str| ("(1,0) [0|0] \"\" A\nBO_ 272".to_owned(), format!("(1,0) [0|0] \"{unit}\" A\nBO_ 272"));
     let (from, percent) = spare("%");
@@ -184,7 +184,7 @@ fn a_reported_state_must_be_a_share() {
 }
 
 #[test]
-fn a_written_scale_overrules_the_unit_with_a_warning() {
+fn explicit_scale_overrides_unit_with_warning() {
     let mv = [("(0.001,0) [0|5] \"V\"", "(1,0) [0|0] \"mV\"")];
     assert_eq!(warnings(&[("Cell{n}\"\n", "Cell{n}\"\nscale = 0.001\n")], &mv), [""; 0]);
     let warning =
@@ -202,7 +202,7 @@ fn a_written_scale_overrules_the_unit_with_a_warning() {
 }
 
 #[test]
-fn a_unit_in_which_the_bits_hold_no_value_is_taken_for_wrong() {
+fn unit_without_plausible_values_is_rejected() {
     let mislabelled = [("[0|5] \"V\"", "[0|0] \"mV\"")];
     let warning = "pack.toml:12: input.cell_voltage.signal = \"Cells.Cell{n}\", the unit of Cells.Cell1 is \"mV\", but its bits cannot carry a plausible value in that unit: read as V";
     assert_eq!(warnings(&[], &mislabelled), [warning]);
@@ -211,7 +211,7 @@ fn a_unit_in_which_the_bits_hold_no_value_is_taken_for_wrong() {
 }
 
 #[test]
-fn inputs_that_share_bits_are_a_fault_unless_they_are_on_other_pages() {
+fn inputs_share_bits_only_on_different_multiplexer_pages() {
     let fault = "pack.toml:12: input.cell_voltage.signal = \"Cells.Cell{n}\", Cells.Cell1 and Cells.Cell2 share bits of one message, must not overlap";
     assert_eq!(faults(&[], &[("Cell2 m0 : 24|16", "Cell2 m0 : 16|16")]), [fault]);
     assert_eq!(faults(&[], &[("Cell2 m0 : 24|16", "Cell2 m0 : 8|16")]), [fault], "the same bits");
@@ -224,7 +224,7 @@ fn inputs_that_share_bits_are_a_fault_unless_they_are_on_other_pages() {
 }
 
 #[test]
-fn a_rated_capacity_unlike_the_cell_model_is_a_fault_and_a_smaller_difference_a_warning() {
+fn rated_capacity_must_fit_cell_model() {
     let rated = |ah: &str, strings: &str| {
         vec![("cells = 4".to_owned(), format!("cells = 4\nstrings = {strings}\nrated_capacity_ah = {ah}"))]
     };
@@ -260,7 +260,7 @@ fn a_rated_capacity_unlike_the_cell_model_is_a_fault_and_a_smaller_difference_a_
 }
 
 #[test]
-fn a_missing_interface_is_reported_beside_every_other_fault() {
+fn missing_interface_does_not_hide_other_faults() {
     let second = ("name = \"can0\"", "name = \"can0\"\n[[interface]]\nname = \"can1\"");
     let wanted = "pack.toml:10: input.current.interface is not set, must be can0 or can1";
     for broken in [("positive = \"charge\"\n", ""), ("\"charge\"", "\"in\""), ("signal = \"Status.Current\"\n", "")] {
@@ -276,14 +276,14 @@ fn a_missing_interface_is_reported_beside_every_other_fault() {
 }
 
 #[test]
-fn a_misspelt_signal_is_reported_beside_another_fault_of_its_table() {
+fn misspelt_signal_does_not_hide_faults_of_its_table() {
     let all = faults(&[("positive = \"charge\"\n", ""), ("Status.Current", "Status.Curent")], &[]);
     assert_eq!(all.len(), 2, "{all:#?}");
     assert!(all[1].contains("did you mean Status.Current"), "{all:#?}");
 }
 
 #[test]
-fn a_byte_order_mark_is_read_over_and_utf_16_is_named() {
+fn byte_order_mark_is_skipped_utf_16_rejected() {
     let read_bytes = |dbc: Vec<u8>| {
         let read = |path: &Path| match path.to_str() {
             Some("pack.toml") => Ok(PACK.as_bytes().to_vec()),
@@ -305,7 +305,7 @@ fn a_byte_order_mark_is_read_over_and_utf_16_is_named() {
 }
 
 #[test]
-fn signals_of_an_answer_share_bits_where_the_answer_has_them() {
+fn shared_bits_in_answers_are_rejected() {
     let answer = |keys: &str| {
         format!(
             "{}\n[[input.diagnostic]]\nname = \"Car\"\nrequest = 0x7E4\nresponse = 0x7EC\nservice = 0x22\nidentifier = 1\n\

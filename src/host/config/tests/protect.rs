@@ -1,4 +1,4 @@
-//! `[[input.protected]]`: what becomes of it, and every fault, word for word.
+//! `[[input.protected]]`: resulting settings and the full text of every fault.
 
 use super::*;
 use crate::can::e2e::CheckConfig;
@@ -25,7 +25,7 @@ BA_DEF_DEF_ "GenMsgCycleTime" 0;
 BA_ "GenMsgCycleTime" BO_ 256 100;
 "#;
 
-/// 15 lines.
+/// Has 15 lines.
 const PACK: &str = r#"[pack]
 cells = 2
 cell_model = "cell.toml"
@@ -56,7 +56,7 @@ fn faults(pack: &str) -> Vec<String> {
 }
 
 #[test]
-fn a_table_becomes_a_guard_with_the_cycle_time_of_the_dbc() {
+fn guard_uses_cycle_time_of_dbc() {
     let (config, _) = read(&protected("message = \"Status\"\nprofile = \"1A\"\ndata_id = 0x0123\n")).unwrap();
     let protection = Protection { profile: Profile::P01A, data_id: 0x0123 };
     let guard = GuardConfig {
@@ -76,7 +76,7 @@ fn a_table_becomes_a_guard_with_the_cycle_time_of_the_dbc() {
 }
 
 #[test]
-fn check_says_what_is_protected() {
+fn check_lists_protected_messages() {
     let (_, description) = read(&protected("message = \"Status\"\nprofile = \"1A\"\ndata_id = 0x0123\n")).unwrap();
     assert_eq!(
         description.intake,
@@ -91,7 +91,7 @@ fn check_says_what_is_protected() {
 }
 
 #[test]
-fn faults_name_file_line_key_found_and_allowed() {
+fn protection_faults_are_reported() {
     let table: &[(&str, &str)] = &[
         (
             "message = \"Stats\"\nprofile = \"1A\"\ndata_id = 1\n",
@@ -146,7 +146,7 @@ fn faults_name_file_line_key_found_and_allowed() {
 }
 
 #[test]
-fn the_upper_half_of_byte_1_is_free_for_an_input_in_1a_only() {
+fn profile_1a_leaves_upper_nibble_of_byte_1_free() {
     let pack =
         protected("message = \"Status\"\nprofile = \"1A\"\ndata_id = 1\n").replace("Status.Temp", "Status.Low\" #");
     assert!(read(&pack).is_ok(), "{:?}", read(&pack).err());
@@ -155,7 +155,7 @@ fn the_upper_half_of_byte_1_is_free_for_an_input_in_1a_only() {
 }
 
 #[test]
-fn a_message_too_short_or_too_long_for_the_profile_is_refused() {
+fn message_length_must_fit_profile() {
     let pack = protected("message = \"Short\"\nprofile = \"5\"\ndata_id = 1\n");
     let all = faults(&pack.replace("Status.Temperature", "Short.Temperature"));
     assert_eq!(
@@ -172,7 +172,7 @@ fn a_message_too_short_or_too_long_for_the_profile_is_refused() {
 }
 
 #[test]
-fn with_several_interfaces_the_table_must_say_which() {
+fn table_needs_interface_if_several_exist() {
     let pack = protected("message = \"Status\"\nprofile = \"1A\"\ndata_id = 1\n")
         .replace("[input]", "[[interface]]\nname = \"can1\"\n[input]");
     let pack = pack.replace("positive = \"charge\"", "positive = \"charge\"\ninterface = \"can0\"");
@@ -190,14 +190,14 @@ fn with_several_interfaces_the_table_must_say_which() {
 }
 
 #[test]
-fn a_signal_that_is_not_found_does_not_make_its_protected_message_a_fault_too() {
+fn missing_signal_causes_no_fault_of_its_protection() {
     let pack = protected("message = \"Status\"\nprofile = \"1A\"\ndata_id = 1\n")
         .replace("signal = \"Status.", "signal = \"Stats.");
     assert!(faults(&pack).iter().all(|fault| !fault.contains("protected")), "{:?}", faults(&pack));
 }
 
 #[test]
-fn an_identity_of_the_pack_must_be_protected_or_accepted() {
+fn pack_identity_must_be_protected_or_accepted() {
     let identity = "[input.pack_identity]\nsignal = \"Status.Low\"\n";
     let open = format!("{PACK}{identity}");
     assert_eq!(

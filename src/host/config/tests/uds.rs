@@ -1,11 +1,11 @@
-//! `[[input.diagnostic]]`: what becomes of it, and its faults, word for word.
+//! `[[input.diagnostic]]`: resulting settings and the full text of every fault.
 
 #![allow(clippy::panic, reason = "in a test a panic is the message")]
 
 use super::*;
 use crate::can::uds::{Answer, Service};
 
-/// Cells in two answers, the current in a DBC.
+/// The cells are in two answers, the current is in a DBC file.
 const ANSWERS: &str = r#"
 [[input.diagnostic]]
 name = "Car"
@@ -35,7 +35,7 @@ fn readings(answer: &Answer, data: &[u8]) -> Vec<(Channel, Result<f64, Fault>)> 
 }
 
 #[test]
-fn a_pattern_finds_cells_over_several_answers() {
+fn pattern_matches_cells_across_answers() {
     let config = good(&pack());
     let [first, second] = &config.monitor.answers[..] else { panic!("{:?}", config.monitor.answers) };
     assert_eq!((first.question.service, first.question.identifier), (Service::ByIdentifier, 0x102));
@@ -43,17 +43,17 @@ fn a_pattern_finds_cells_over_several_answers() {
     let data = [0, 0, 0, 0, 180, 0, 255];
     let wanted = [(cell(0), Ok(3.6)), (cell(1), Err(Fault::OutOfRange)), (cell(2), Err(Fault::OutOfRange))];
     assert_eq!(readings(first, &data), wanted, "never clamped");
-    // Ten bits from the fifth bit of the second byte on: 0b0101_101000 = 360.
+    // Ten bits that start at bit 5 of the second byte: 0b0101_101000 = 360.
     assert_eq!(readings(second, &[0xFF, 0b1111_0101, 0b1010_0011]), [(cell(3), Ok(3.6))]);
     assert_eq!(readings(second, &[0, 0xFF, 0xFF]), [(cell(3), Err(Fault::NotAvailable))]);
     assert_eq!(readings(second, &[0, 0xFF]), [(cell(3), Err(Fault::ShortFrame))]);
-    // Requests are received too: they show which answers were asked for.
+    // Requests are received too: they show which answers were requested.
     let ids = [0x100, 0x7E4, 0x7EC].map(CanId::Standard);
     assert_eq!(config.monitor.wanted_ids(BusIndex(0)), ids);
 }
 
 #[test]
-fn check_says_where_such_a_signal_is() {
+fn check_shows_position_in_answer() {
     let (_, description) = read_texts(&pack(), CELL, DBC).unwrap();
     let signal = description.signals.iter().find(|signal| signal.channel == "cell 4 voltage").unwrap();
     assert_eq!((signal.multiplex.as_str(), signal.start_bit), ("answer of 7EC to 22 01 03", 12));
@@ -61,11 +61,11 @@ fn check_says_where_such_a_signal_is() {
 }
 
 #[test]
-fn coarse_steps_of_the_voltages_count_as_noise() {
+fn voltage_resolution_counts_as_noise() {
     let noise = |pack: &str| good(pack).monitor.estimator.voltage.noise_v;
     let (fine, coarse) = (noise(PACK), noise(&pack()));
     assert_eq!(fine, 0.005, "steps of 1 uV are within the noise");
-    // Steps of 20 mV: 5.8 mV rms beside the sensor's 5 mV.
+    // Steps of 20 mV add 5.8 mV rms to the sensor's 5 mV.
     assert!((coarse - 0.005_f64.hypot(0.020 / 12.0_f64.sqrt())).abs() < 1e-12, "{coarse}");
     let (_, description) = read_texts(&pack(), CELL, DBC).unwrap();
     let words = "voltage resolution is 20 mV: rounding counts as noise of 5.8 mV";
@@ -73,7 +73,7 @@ fn coarse_steps_of_the_voltages_count_as_noise() {
 }
 
 #[test]
-fn little_endian_and_extended_addresses() {
+fn little_endian_and_extended_addresses_are_read() {
     let text = ANSWERS
         .replace("bit = 12, length = 10", "bit = 16, length = 16, byte_order = \"little\", signed = true")
         .replace("response = 0x7EC", "response = 0x18DAF1DB\nresponse_extension = 0xF1")
@@ -89,7 +89,7 @@ fn little_endian_and_extended_addresses() {
 }
 
 #[test]
-fn without_a_dbc_the_answers_must_be_there() {
+fn answers_are_required_without_dbc() {
     let all = faults(&pack_with("dbc = [\"pack.dbc\"]\n", ""));
     let missing = "pack.toml:6: input.dbc is not set, must be a list of DBC files if there is no [[input.diagnostic]]";
     assert_eq!(all, [missing]);
@@ -101,7 +101,7 @@ fn without_a_dbc_the_answers_must_be_there() {
 }
 
 #[test]
-fn single_faults_of_answers() {
+fn answer_faults_are_reported() {
     let cases = [
         (
             "service = 0x22",
@@ -178,7 +178,7 @@ fn single_faults_of_answers() {
 }
 
 #[test]
-fn requests_are_sent_only_when_asked_for_and_check_says_which() {
+fn only_configured_requests_are_sent_and_listed() {
     let polled =
         pack().replacen("identifier = 0x0102", "identifier = 0x0102\ndrive_every_s = 2\ncharge_every_s = 10", 1);
     assert_eq!(good(&polled).monitor.poll, None, "off by default");
@@ -206,7 +206,7 @@ fn requests_are_sent_only_when_asked_for_and_check_says_which() {
 }
 
 #[test]
-fn faults_of_polling() {
+fn polling_faults_are_reported() {
     let none = pack() + "[poll]\nenabled = true\n";
     let fault = "pack.toml:34: poll.enabled = true, must be false: no answer in use has drive_every_s, charge_every_s or \
                  parked_every_s";

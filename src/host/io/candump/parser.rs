@@ -223,7 +223,7 @@ impl<'a> Cursor<'a> {
         found
     }
 
-    /// Value of the hex digit at `offset` from here; above 15 if there is none.
+    /// Value of the hex digit at `offset` from here; above 15 if it is not a hex digit.
     fn hex_at(&self, offset: usize) -> u32 {
         self.text.get(self.at + offset).map_or(u32::MAX, |&b| HEX[usize::from(b)])
     }

@@ -366,7 +366,7 @@ impl Link {
         true
     }
 
-    /// Waits while there is no socket, and drops the frames to send.
+    /// Waits without a socket and drops the frames to send.
     async fn wait(&mut self) -> ServiceEnd {
         let until = Instant::now() + self.lengthen_pause();
         loop {

@@ -121,7 +121,7 @@ impl RawSocket {
     /// Like [`RawSocket::open`], but requires the interface to be up; errors contain its name.
     ///
     /// # Errors
-    /// Those of [`RawSocket::open`], and when the interface is down.
+    /// Like [`RawSocket::open`]; also if the interface is down.
     pub(super) fn open_up(interface: &str, fd: bool, filters: &[CanFilter], buffer_bytes: usize) -> io::Result<Self> {
         let opened = Self::open(interface, fd, filters, buffer_bytes);
         let opened = opened.and_then(|socket| socket.take_error()?.map_or(Ok(socket), Err));
@@ -160,7 +160,7 @@ impl RawSocket {
     /// Passes one frame to the kernel.
     ///
     /// # Errors
-    /// `EAGAIN` and `ENOBUFS` if there is no room; `ENETDOWN`, `ENODEV`, `ENXIO` if the interface is down or was removed;
+    /// `EAGAIN` and `ENOBUFS` if the send buffer is full; `ENETDOWN`, `ENODEV`, `ENXIO` if the interface is down or was removed;
     /// `EINVAL` for an FD frame on a classic interface.
     pub(super) fn send(&self, frame: &Frame) -> Result<(), Errno> {
         let mut buffer = [0; FD_BYTES];
@@ -183,7 +183,7 @@ impl AsFd for RawSocket {
 /// The kernel's index of an interface.
 ///
 /// # Errors
-/// `ENODEV` if there is no interface of this name.
+/// `ENODEV` if no interface has this name.
 pub(super) fn index_of(interface: &str) -> io::Result<u32> {
     Ok(nix::net::if_::if_nametoindex(interface)?)
 }

@@ -1,4 +1,4 @@
-//! A sample document for tests: every value is present, except a few that are unknown.
+//! A sample document for tests: all but a few values are known.
 
 use crate::alarm::{Alarm, AlarmState, Rule, Severity};
 use crate::can::poll::PollSilence;
@@ -20,7 +20,7 @@ use crate::status::document::{
     PollStatus, StatusCount, StatusCounters, StatusDocument, StoreStatus, VERSION,
 };
 
-/// The document of a pack. Of several cells, the last one is silent and the one before it is not trusted.
+/// The document of a pack. With several cells, the last sends no data and the last but one is not trusted.
 pub(crate) fn sample(cells: u16) -> StatusDocument {
     let mut latency = Latency::default();
     [40e-6, 80e-6, 80e-6, 300e-6, 3e-3].into_iter().for_each(|seconds| latency.record(seconds));
@@ -154,7 +154,7 @@ fn pack(cells: u16) -> PackView {
     }
 }
 
-/// The values with losses and a remaining life.
+/// Adds loss modes and remaining life to `values`.
 fn with_life<const IS_PACK: bool>(mut values: Values<IS_PACK>, lli: f64, cycles: f64) -> Values<IS_PACK> {
     for (quantity, mean, std) in [
         (Quantity::LithiumLoss, lli, Some(0.012)),

@@ -278,7 +278,7 @@ section! {
 }
 
 section! {
-    /// The load for which usable capacity is reported. Without this table it is not reported.
+    /// The load that defines usable capacity. Without this table, usable capacity is not reported.
     Usable at "usable" gives UsableConfig, |keys, rated_ah: f64| {
         /// Discharge current, per cell.
         current_a: f64, "A", Above(0.0, 1e6), Required;

@@ -42,7 +42,7 @@ section! {
 }
 
 section! {
-    /// An answer to a diagnostic request over ISO-TP, from any tester. Most electric cars report cell voltages only this way. packwatch sends requests only with `[poll]`. The tables `[input.*]` name the signals of an answer like those of a DBC file: `Name.Signal`. The values count as measured when the first frame of the answer arrived.
+    /// An answer to a diagnostic request over ISO-TP, from any tester. Most electric cars report cell voltages only this way. packwatch sends requests only with `[poll]`. The tables `[input.*]` name the signals of an answer like DBC signals: `Name.Signal`. The values count as measured when the first frame of the answer arrived.
     DiagnosticInput at "input.diagnostic" {
         /// Name of the answer, which precedes the dot in `Name.Signal`. Several answers may share a name.
         name: String, "", NotEmpty, Required;
@@ -174,7 +174,7 @@ signal_section! {
         first: u16, "", Between(0.0, 60000.0), Default("1") =>;
         /// Current of a balancing resistor while the bit is 1, at the voltage at which the BMS balances. Parallel strings share it. At most a fifth of the pack's rated capacity per hour (C/5).
         bleed_a: f64, "A", Above(0.0, 1e6), Required =>;
-        /// Longest time for which a value holds. Must be longer than the period at which the BMS sends the signal, also while the vehicle is parked; otherwise the balancing state is unknown for the rest of each period.
+        /// Longest time that a value remains valid. Must be longer than the period at which the BMS sends the signal, also while the vehicle is parked; otherwise the balancing state is unknown for the rest of each period.
         max_age_s: f64, "s", Above(0.0, 1e6), Default("10.0") =>;
         /// `true`: no cell is bled while no values arrive. Set it only if the BMS sends values for as long as it balances and this computer stays awake for as long. `false`: the balancing state during that time is unknown, and leaks are learned from the remaining time only. The state is always unknown while the program does not run.
         only_while_sent: bool, "", Any, Default("false") =>;

@@ -84,7 +84,7 @@ section! {
 section! {
     /// The alarms of a rule. What each rule compares, and the unit of its thresholds:
     /// `capacity_low`, `usable_capacity_low`: capacity per cell, Ah; `recharge_period_low`: recharge period, s; `resistance_high`: resistance relative to a new cell (1 = as new);
-    /// `soc_low`: SOC of the emptiest cell; `cell_imbalance`: SOC of the fullest minus that of the emptiest cell; `bms_disagrees`: SOC or SOH reported by the pack minus the estimate; `input_implausible`: share of bad readings (fractions);
+    /// `soc_low`: SOC of the emptiest cell; `cell_imbalance`: SOC of the fullest cell minus SOC of the emptiest; `bms_disagrees`: SOC or SOH reported by the pack minus the estimate; `input_implausible`: share of bad readings (fractions);
     /// `temperature_high`: the hottest sensor, degrees C; `remaining_life_low`: remaining life, equivalent full cycles;
     /// `input_missing`, `store_failed`, `bus_fault`: how long the fault has lasted, s; `estimate_untrusted`: the mean normalised innovation squared, or the cell model's mismatch on the same scale;
     /// and, for each cell compared with the others, `cell_leak`: self-discharge per day as a fraction of its capacity; `connection_resistance`: additional contact resistance as a fraction of the cell's series resistance at 50 % SOC and 25 degrees C; `channel_faulty`: 1 while the cell's voltage channel is faulty (frozen, offset, doubled or swapped), else 0.
