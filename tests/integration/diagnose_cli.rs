@@ -85,5 +85,5 @@ fn uncompared_pack_is_unknown() {
     let log = text("short.log");
     packwatch(&["simulate", "ev-day", "-c", &config, "-o", &log, "--duration", "20"]);
     let lines = packwatch(&["diagnose", "-c", &config, &log]);
-    assert!(lines.contains("\npack\nusable  unknown: the cells were not compared yet\n"), "{lines}");
+    assert!(lines.contains("\npack\nusable  unknown: the cells have not been compared yet\n"), "{lines}");
 }

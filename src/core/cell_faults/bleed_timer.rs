@@ -1,33 +1,34 @@
-//! Measures for how long the BMS bled one cell, from its balancing bits.
+//! Measures how long the BMS bled one cell, from its balancing bits.
 //!
-//! In: bits with their time and how long each holds; beginnings and ends of rows. Out: of the time between the middles of two rows,
-//! how long the cell was bled, how long nothing is known of that, and how long no bits came. A row shows the charge of its middle, so
-//! half of what was bled in it belongs to the next one; what was bled between two rows, while the buses slept, belongs to the later one.
+//! In: bits with their time and validity; starts and ends of rows. Out: for the time between the middles of two rows,
+//! how long the cell was bled, how long its state was unknown, and how long no bits came. A row shows the charge at
+//! its middle, so half of its bleed time belongs to the next row. Bleed time between two rows, while the buses slept,
+//! belongs to the later row.
 
 use serde::{Deserialize, Serialize};
 
 use crate::quantity::{InvalidState, Timestamp};
 
-/// What the bits of a BMS mean.
+/// Meaning of a BMS's balancing bits.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BalancingConfig {
-    /// Current that a balancing resistor takes out of one cell, A.
+    /// Current that a balancing resistor takes from one cell, A.
     pub bleed_a: f64,
-    /// Longest time for which a bit holds, s.
+    /// Longest validity of a bit, s.
     pub max_age_s: f64,
-    /// No cell is bled while no bits come. Otherwise nothing is known of that time.
+    /// Whether no cell is bled while no bits are sent. Otherwise the state is unknown during that time.
     pub is_only_while_sent: bool,
 }
 
-/// A time, divided by what the bits say, s.
+/// Parts of a time span, s. In the remaining time the cell was not bled.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct BleedTime {
     /// The cell was bled.
     pub(super) bled_s: f64,
-    /// A bit came that cannot be read.
+    /// A bit was received but could not be read.
     pub(super) unknown_s: f64,
-    /// No bit came.
+    /// No bit was received.
     pub(super) silent_s: f64,
 }
 
@@ -45,31 +46,31 @@ impl BleedTime {
     }
 }
 
-/// The latest bit.
+/// The latest balancing bit.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Bit {
-    /// `None` = it could not be read.
+    /// `None` if it could not be read.
     is_bled: Option<bool>,
     holds_until: Timestamp,
 }
 
-/// The time of one cell since the middle of the last row.
+/// Bleed time of one cell since the middle of the last row.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct BleedTimer {
-    /// A bit that could be read has come so far.
+    /// Whether a readable bit has been received.
     pub(super) has_bits: bool,
     bit: Option<Bit>,
     counted_until: Option<Timestamp>,
-    /// From the middle of the last row to the present row, s.
+    /// From the middle of the last row to the start of the current row, s.
     before: BleedTime,
-    /// In the present row, s.
+    /// In the current row, s.
     row: BleedTime,
 }
 
 impl BleedTimer {
-    /// Takes a bit that holds until another time, or the next bit; `None` = it cannot be read.
+    /// Handles a bit that is valid until `holds_until` or the next bit; `None` = it cannot be read.
     pub(super) fn take(&mut self, time: Timestamp, is_bled: Option<bool>, holds_until: Timestamp) {
         self.count(time);
         self.counted_until.get_or_insert(time);
@@ -77,14 +78,14 @@ impl BleedTimer {
         self.bit = Some(Bit { is_bled, holds_until });
     }
 
-    /// Takes that nothing was received from a time to another: the daemon did not run.
+    /// Handles a time in which the daemon did not run and received no bits.
     pub(super) fn note_unheard(&mut self, from: Timestamp, to: Timestamp) {
         if self.has_bits {
             self.take(from, None, to);
         }
     }
 
-    /// Counts the time up to `now`; nothing before the first bit.
+    /// Counts the time up to `now`; counts nothing before the first bit.
     fn count(&mut self, now: Timestamp) {
         if !self.has_bits && self.bit.is_none() {
             return;
@@ -101,25 +102,25 @@ impl BleedTimer {
         self.counted_until = Some(from.max(now));
     }
 
-    /// A row begins, or begins again.
+    /// Starts or restarts a row.
     pub(super) fn begin_row(&mut self, now: Timestamp) {
         self.count(now);
         self.before = self.before.plus(std::mem::take(&mut self.row));
     }
 
-    /// Ends a row: the time since the middle of the row before.
+    /// Ends a row. Returns the bleed time since the middle of the previous row.
     pub(super) fn end_row(&mut self, now: Timestamp) -> BleedTime {
         self.count(now);
         let half = std::mem::take(&mut self.row).half();
         std::mem::replace(&mut self.before, half).plus(half)
     }
 
-    /// The time so far does not count.
+    /// Discards the time so far.
     pub(super) fn forget_time(&mut self) {
         *self = Self { has_bits: self.has_bits, ..Self::default() };
     }
 
-    /// Moves every stamp by `by_nanos`, onto another clock.
+    /// Shifts all timestamps by `by_nanos`, to another clock.
     pub(super) fn rebase(&mut self, by_nanos: i64) {
         self.counted_until = self.counted_until.map(|until| until.plus_nanos(by_nanos));
         self.bit = self.bit.map(|bit| Bit { holds_until: bit.holds_until.plus_nanos(by_nanos), ..bit });
@@ -156,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn half_of_what_is_bled_in_a_row_belongs_to_the_next() {
+    fn half_of_bleed_time_counts_in_next_row() {
         let mut timer = BleedTimer::default();
         (0..100).for_each(|second| take(&mut timer, f64::from(second), second >= 40));
         assert_near(timer.end_row(at(100.0)), bled(30.0));
@@ -166,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_bled_between_two_rows_belongs_to_the_later() {
+    fn bleed_time_between_rows_counts_in_later_row() {
         let mut timer = BleedTimer::default();
         take(&mut timer, 0.0, false);
         timer.end_row(at(0.0));
@@ -178,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_known_behind_the_time_for_which_a_bit_holds_and_of_one_that_cannot_be_read() {
+    fn expired_and_unreadable_bits_count_as_unknown() {
         let mut timer = BleedTimer::default();
         timer.begin_row(at(0.0));
         assert_near(timer.end_row(at(50.0)), bled(0.0));
@@ -197,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn impossible_times_are_refused() {
+    fn impossible_stored_times_are_rejected() {
         for seconds in [-1.0, f64::NAN, f64::INFINITY] {
             let timers = [bled(seconds), BleedTime { silent_s: seconds, ..bled(0.0) }];
             assert!(timers.iter().all(|row| BleedTimer { row: *row, ..BleedTimer::default() }.check().is_err()));

@@ -1,28 +1,28 @@
-//! Voltage channels that show no cell of their own: frozen at one value, or that of another.
+//! Voltage channels that do not show their own cell: frozen at one value, or showing another cell.
 
 use serde::{Deserialize, Serialize};
 
 use super::row::CellSums;
 use crate::quantity::InvalidState;
 
-/// Change of the other cells while a channel stays at one value, V.
+/// A channel is frozen if it does not change while the other cells change by more than this, V.
 const FROZEN_V: f64 = 0.03;
-/// Fewest changes of the voltage in a row for a comparison with other channels, and rows in a row that must agree: with steps of
-/// 2.5 mV two of 96 cells agreed in three.
+/// Fewest voltage changes within a row for a comparison with other channels. Also the number of consecutive rows that
+/// must agree (in `doubled`): with a resolution of 2.5 mV, two of 96 healthy cells agreed in three rows.
 const LEAST_CHANGES: u32 = 10;
 
-/// What is known of one channel.
+/// State of one voltage channel.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct Channel {
-    /// Voltage of the middle cells in the row in which the channel last changed, or in the first one, V.
+    /// Voltage of the middle cells, V, in the row in which the channel last changed (or in the first row).
     middle_v: Option<f64>,
     pub(super) is_frozen: bool,
-    /// The channel whose values it has shown, and in how many rows.
+    /// The channel with the same values, and in how many consecutive rows.
     same_as: Option<(u16, u8)>,
 }
 
 impl Channel {
-    /// Ends a row in which the middle cells had this voltage, V.
+    /// Ends a row in which the middle cells had the voltage `middle_v`, V.
     pub(super) fn end_row(&mut self, sums: &CellSums, middle_v: f64) {
         if sums.changes > 0 {
             (self.middle_v, self.is_frozen) = (Some(middle_v), false);
@@ -32,17 +32,17 @@ impl Channel {
         }
     }
 
-    /// After a hole the voltages have moved unseen, and the channel's perhaps with them.
+    /// Handles a gap in the samples: the voltages, including the channel's, may have changed in it.
     pub(super) fn interrupt(&mut self) {
         self.middle_v = None;
     }
 
-    /// The channel whose values it shows.
+    /// The other channel that shows the same values, if enough rows agree.
     pub(super) fn doubled(&self) -> Option<u16> {
         self.same_as.filter(|(_, rows)| *rows >= 10).map(|(other, _)| other)
     }
 
-    /// Checks the numbers of a stored channel of a pack of this many cells.
+    /// Checks a stored channel of a pack of `cells` cells.
     pub(super) fn check(&self, cells: usize) -> Result<(), InvalidState> {
         InvalidState::unless_numbers("the voltage of a frozen channel's pack", self.middle_v)?;
         let (other, _) = self.same_as.unwrap_or_default();
@@ -55,7 +55,8 @@ impl Channel {
     }
 }
 
-/// Compares the channels of a row: which two have shown the same values throughout. Cells that are all alike are not doubled.
+/// Compares the channels of a row and pairs those with identical values throughout. If the pack's cells are hardly
+/// distinct, none counts as doubled.
 pub(super) fn compare(channels: &mut [Channel], sums: &[CellSums]) {
     let compared = |cell: &usize| sums[*cell].changes >= LEAST_CHANGES;
     let mut order: Vec<usize> = (0..sums.len()).filter(compared).collect();
@@ -94,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    fn a_frozen_channel_is_told_when_the_others_have_moved() {
+    fn channel_is_frozen_after_others_have_moved() {
         let mut channel = Channel::default();
         channel.end_row(&row(&[3.7, 3.71]), 3.70);
         for middle_v in [3.69, 3.68, 3.675] {
@@ -112,7 +113,7 @@ mod tests {
     }
 
     #[test]
-    fn two_channels_with_the_same_values_are_doubled_and_a_pack_of_like_cells_is_not() {
+    fn equal_channels_are_doubled_unless_all_are_alike() {
         let shown = |offset: f64| -> Vec<f64> { (0..30).map(|i| 3.7 + offset + f64::from(i % 7) * 0.001).collect() };
         let mut channels = vec![Channel::default(); 4];
         let one_doubled = [shown(0.0), shown(0.002), shown(0.0), shown(0.005)].map(|v| row(&v));

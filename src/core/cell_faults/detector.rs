@@ -1,7 +1,7 @@
-//! All cells of a pack: rows in, findings out (`judge`).
+//! Detector for all cells of a pack: rows in, findings out (`judge`).
 //!
-//! The errors of a row are round numbers of a circuit model and a usual cell monitor. They were tried on the simulated pack of ten cells
-//! and on the simulator's packs; no measured pack had a part in them.
+//! The errors of a row are rounded values of a circuit model and a typical cell monitor. They were checked on the
+//! simulated pack of ten cells and on the simulator's packs; no measured pack was used to set them.
 
 mod balancing;
 mod judge;
@@ -15,41 +15,42 @@ use super::difference::{CHANNEL, CONTACT, Difference, LEAK, Observation, RESISTA
 use super::fault::{CellFault, CellFaultKind};
 use super::gain::{Gain, Learned};
 use super::row::{CellSums, PackSums};
-use super::temperature::Following;
+use super::temperature::WarmingRatio;
 use crate::cell::CellModel;
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, InvalidState, Timestamp};
 use balancing::Bleed;
 use judge::Population;
 
-/// A row ends when this part of the charge has moved, or after this time, s; at rest after this part of the rest, because it says
-/// the same again. Shorter rows find a contact sooner, but an aged cell is taken for one and exchanged channels are not seen.
+/// A row ends when this part of the charge has moved, or after this time, s. At rest it ends after this part of the
+/// rest so far, because further samples add no information. Shorter rows find a contact sooner, but mistake an aged
+/// cell for a bad contact and miss exchanged channels.
 const ROW_SOC: f64 = 0.02;
 const ROW_S: f64 = 300.0;
 const REST_PART: f64 = 0.5;
-/// Fewest cells with a middle.
+/// Fewest cells for a comparison.
 pub(super) const LEAST_CELLS: usize = 3;
-/// Errors of a row: of the voltage, V; of the drop, fraction; of the SOC on the curve.
+/// Standard deviations of a row's errors: of the voltage, V; of the drop, fraction; of the SOC on the curve.
 const ROW_V: f64 = 0.002;
 const ROW_DROP: f64 = 0.03;
 const ROW_CURVE: f64 = 0.001;
-/// What a cell with another SOC adds, per unit of SOC: error of the curve, V, and of the drop, fraction. And the most that its
-/// resistance may be that of the middle cells.
+/// Additional errors of a cell at another SOC, per unit of SOC difference: of the curve, V, and of the drop, fraction.
+/// And the largest ratio between the model's resistances at the two SOCs.
 const FAR_V: f64 = 0.05;
 const FAR_DROP: f64 = 1.0;
 const MOST_ELSEWHERE: f64 = 3.0;
-/// Error of a resistance by steps, fraction, and of a step's voltage, V.
+/// Standard deviations of a resistance from steps, fraction, and of a step's voltage, V.
 const STEP_PART: f64 = 0.05;
 const STEP_V: f64 = 0.003;
-/// Least sum of squared steps for a resistance, squares of the capacity per hour.
+/// Smallest sum of squared steps for a resistance, in squares of the capacity per hour.
 const LEAST_STEPS: f64 = 0.02;
-/// Most that the mean cell's SOC may differ from what the charge says between two rows.
+/// Largest difference between the change of the mean cell's SOC and the counted charge between two rows.
 const SOC_JUMP: f64 = 0.02;
 const DAY_S: f64 = 86_400.0;
-/// Kinds up to the last one that a cell may have.
+/// Number of kinds that apply to cells: those up to the temperature sensor.
 const CELL_KINDS: usize = CellFaultKind::TemperatureSensor as usize;
 
-/// The cell in the middle of the pack, as the estimators know it at one moment.
+/// Estimates of the cell in the middle of the pack at one moment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeanCell {
     /// SOC, fraction.
@@ -60,30 +61,30 @@ pub struct MeanCell {
     pub drop_v: f64,
     /// Temperature, degrees C.
     pub temperature_c: f64,
-    /// Charge taken out so far, Ah: only differences mean anything.
+    /// Charge taken out so far, Ah. Only differences are used.
     pub charge_ah: f64,
 }
 
-/// One cell.
+/// State of one cell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Watched {
-    /// It is of the pack's own kind; of another cell nothing is known.
+struct WatchedCell {
+    /// Whether the cell is of the pack's main kind. Other cells are not compared.
     #[serde(default = "yes", skip_serializing_if = "Clone::clone")]
     is_compared: bool,
     difference: Difference,
-    /// Its means before rows began to contradict them.
+    /// Means before rows started to contradict them.
     settled: [f64; STATES],
-    /// The same when it last changed at once.
+    /// Means before the last sudden change.
     before_jump: [f64; STATES],
     sums: CellSums,
     channel: Channel,
     #[serde(default, skip_serializing_if = "Bleed::is_unused")]
     bleed: Bleed,
-    temperature: Following,
-    /// Since when each kind is likelier than not.
+    temperature: WarmingRatio,
+    /// Since when each kind has been more likely than not.
     suspected: [Option<Timestamp>; CELL_KINDS],
-    /// When it last changed at once.
+    /// Time of the last sudden change.
     jumped: Option<Timestamp>,
 }
 
@@ -91,8 +92,8 @@ fn yes() -> bool {
     true
 }
 
-impl Watched {
-    /// A cell of which nothing is known.
+impl WatchedCell {
+    /// A cell without any rows yet.
     fn new(is_compared: bool) -> Self {
         Self {
             is_compared,
@@ -102,57 +103,58 @@ impl Watched {
             sums: CellSums::default(),
             channel: Channel::default(),
             bleed: Bleed::default(),
-            temperature: Following::default(),
+            temperature: WarmingRatio::default(),
             suspected: [None; CELL_KINDS],
             jumped: None,
         }
     }
 
-    /// What follows does not hang together with the samples so far.
+    /// Discards the samples of the current row, because the following ones are not contiguous with them.
     fn interrupt(&mut self) {
         self.sums.interrupt();
         self.channel.interrupt();
     }
 }
 
-/// The diagnosis of a pack.
+/// Detector of cell faults of one pack.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CellFaultDetector {
-    cells: Vec<Watched>,
+    cells: Vec<WatchedCell>,
     pack: PackSums,
-    /// Middle, SOC and charge (Ah) of the last row.
+    /// Middle time, SOC and charge (Ah) of the last row.
     last_row: Option<(Timestamp, f64, f64)>,
-    /// Time of rest so far, s.
+    /// Time at rest so far, s.
     rest_s: f64,
     /// Series resistance of the mean cell in this row, ohm.
     ohm: f64,
-    /// The cell with the middle SOC and resistance.
+    /// The cell closest to the median in SOC and resistance.
     middle: usize,
-    /// A BMS may bleed the cells that are above the lowest one.
+    /// Whether a BMS may bleed the cells above the lowest one.
     is_balanced: bool,
-    /// The cell that shows the least charge, where there is no doubt.
+    /// The cell with the lowest charge, if it is unambiguous.
     lowest: Option<usize>,
     gain: Gain,
     findings: Vec<CellFault>,
 }
 
 impl CellFaultDetector {
-    /// As [`Self::new`], in a pack where only some cells are of one kind: only those may be [added](Self::add).
+    /// Creates a detector for a pack in which only the cells `compared` are of one kind. Only those may be
+    /// [added](Self::add).
     pub fn among(cells: usize, compared: &[usize]) -> Self {
         let mut diagnosis = Self::new(if compared.len() < LEAST_CELLS { 0 } else { cells });
         diagnosis.compare_only(compared);
         diagnosis
     }
 
-    /// Compares these cells from now on. What is known of the others, and of those that were not compared before, is forgotten.
+    /// Compares these cells from now on. Resets the other cells, and cells that were not compared before.
     pub fn compare_only(&mut self, compared: &[usize]) {
         for (index, cell) in self.cells.iter_mut().enumerate() {
             let is_compared = compared.contains(&index);
             if is_compared == cell.is_compared {
                 continue;
             }
-            *cell = Watched::new(is_compared);
+            *cell = WatchedCell::new(is_compared);
             self.findings.retain(|found| !found.is_of(CellIndex(index as u16)));
         }
         self.lowest = self.lowest.filter(|lowest| compared.contains(lowest));
@@ -161,10 +163,10 @@ impl CellFaultDetector {
         }
     }
 
-    /// For cells of which nothing is known.
+    /// Creates a detector without history. With fewer than three cells, it is inactive.
     pub fn new(cells: usize) -> Self {
         Self {
-            cells: vec![Watched::new(true); if cells < LEAST_CELLS { 0 } else { cells }],
+            cells: vec![WatchedCell::new(true); if cells < LEAST_CELLS { 0 } else { cells }],
             pack: PackSums::default(),
             last_row: None,
             rest_s: 0.0,
@@ -183,20 +185,20 @@ impl CellFaultDetector {
         !self.cells.is_empty()
     }
 
-    /// What is found, in the order of the cells.
+    /// The findings, in the order of the cells.
     pub fn findings(&self) -> &[CellFault] {
         &self.findings
     }
 
-    /// What is known of a cell's difference; `None` = it is not compared.
+    /// Filter of a cell's difference; `None` if the cell is not compared.
     pub fn difference(&self, cell: CellIndex) -> Option<&Difference> {
         self.cells.get(cell.index()).filter(|cell| cell.is_compared).map(|cell| &cell.difference)
     }
 
-    /// A cell's states less those of the middle of the pack; `None` = the pack is not compared, or has no such cell. A state is
-    /// `None` where nothing is known of it: all of a cell of another kind, the leak of a cell that may be bled.
+    /// A cell's states minus the median of the pack. `None` if the pack is not compared or has no such cell. A state
+    /// is `None` if it is unknown: every state of a cell of another kind, and the leak of a cell that may be bled.
     pub fn relative(&self, cell: CellIndex) -> Option<[Option<ScalarGaussian>; STATES]> {
-        let Watched { is_compared, difference, .. } = self.cells.get(cell.index())?;
+        let WatchedCell { is_compared, difference, .. } = self.cells.get(cell.index())?;
         Some(std::array::from_fn(|state| {
             let middle = self.population(state).middle;
             let ScalarGaussian { mean, variance } = difference.state(state);
@@ -205,18 +207,18 @@ impl CellFaultDetector {
         }))
     }
 
-    /// The cell whose estimate stands for the mean cell in the present row.
+    /// The cell whose estimate represents the mean cell in the current row.
     #[inline]
     pub fn middle(&self) -> usize {
         self.middle
     }
 
-    /// SOC of the mean cell in the last row, and that row's time; `None` = no row yet.
+    /// Time of the last row and SOC of the mean cell in it; `None` before the first row.
     pub(super) fn middle_soc(&self) -> Option<(Timestamp, f64)> {
         self.last_row.map(|(time, soc, _)| (time, soc))
     }
 
-    /// Takes a sample of a cell; `None` = no current is known, and the row ends.
+    /// Adds a sample of a cell. `current_a`: `None` discards the cell's samples in this row.
     #[inline]
     pub fn add(
         &mut self,
@@ -233,7 +235,8 @@ impl CellFaultDetector {
         }
     }
 
-    /// Takes the mean cell after the samples of a moment; whether the row is complete: [`Self::close_row`] then ends it.
+    /// Adds the mean cell after all samples of one moment. Returns whether the row is complete; the caller then ends
+    /// it with [`Self::close_row`].
     pub fn note(&mut self, time: Timestamp, mean: &MeanCell, capacity_ah: f64) -> bool {
         if ![mean.soc, mean.current_a, mean.drop_v, mean.temperature_c, mean.charge_ah].iter().all(|it| it.is_finite())
         {
@@ -244,7 +247,7 @@ impl CellFaultDetector {
         if pack.last.is_some_and(|last| time.since(last) > 60.0) {
             *pack = PackSums::default();
             self.rest_s = 0.0;
-            self.cells.iter_mut().for_each(Watched::interrupt);
+            self.cells.iter_mut().for_each(WatchedCell::interrupt);
         }
         let seconds = pack.last.replace(time).map_or(0.0, |last| time.since(last).max(0.0));
         if pack.begun.is_none() {
@@ -264,7 +267,7 @@ impl CellFaultDetector {
             || time.since(begun) >= ROW_S.max(REST_PART * self.rest_s)
     }
 
-    /// Takes how probable a fault is of a sensor that all cells share, by those who know; the finding when it is new.
+    /// Handles the probability and size of a fault of a sensor that all cells share. Returns the finding if it is new.
     pub fn note_sensor(
         &mut self,
         time: Timestamp,
@@ -278,7 +281,8 @@ impl CellFaultDetector {
         find(&self.findings).filter(|_| !was_known)
     }
 
-    /// Takes what is known of all cells, once a day; the finding when the gain of the current's sensor has newly risen.
+    /// Handles the learned values of all cells, once a day. Returns a finding if the gain of the current sensor has
+    /// newly risen.
     pub fn note_day(
         &mut self,
         time: Timestamp,
@@ -292,8 +296,9 @@ impl CellFaultDetector {
         self.note_sensor(time, CellFaultKind::CurrentGain, probability, size)
     }
 
-    /// Ends a row. `socs`: the cells' SOC as estimated, for the choice of the middle cell. `is_balanced`: fuller cells may be bled
-    /// after a charge. `balancing`: what the bits mean where a BMS shows which cells it bleeds. Returns the findings that are new.
+    /// Ends a row. `socs`: estimated SOC of the cells, to choose the middle cell. `is_balanced`: whether the BMS may
+    /// bleed fuller cells after a charge. `balancing`: meaning of the balancing bits, if the BMS sends them. Returns
+    /// the new findings.
     pub fn close_row(
         &mut self,
         model: &CellModel,
@@ -334,18 +339,19 @@ impl CellFaultDetector {
         self.findings.iter().filter(is_new).copied().collect()
     }
 
-    /// Lets time and charge since the last row pass.
+    /// Predicts all cells over time and charge since the last row.
     fn pass(&mut self, time: Timestamp, row: &Row<'_>) {
         let Some((last, last_soc, last_ah)) = self.last_row.replace((time, row.soc, row.charge_ah)) else { return };
         let counted = (last_ah - row.charge_ah) / row.capacity_ah;
         let estimated = row.soc - last_soc;
-        // A filter that finds its SOC moves no charge.
+        // If the estimated SOC jumped because the filter converged, no charge has moved.
         let change = if (estimated - counted).abs() < SOC_JUMP { estimated } else { counted };
         let days = (time.since(last) / DAY_S).max(0.0);
         self.cells.iter_mut().for_each(|cell| cell.difference.pass(days, change));
     }
 
-    /// Compares every cell with the middle ones, `seconds` after the row before; whether there was something to compare.
+    /// Compares every cell with the middle ones, `seconds` after the previous row. Returns whether there were enough
+    /// cells.
     fn observe(&mut self, time: Timestamp, seconds: f64, row: &Row<'_>) -> bool {
         let voltages_v: Vec<Option<f64>> = self.cells.iter().map(|cell| cell.sums.mean_v()).collect();
         let Some(middle_v) = middle(voltages_v.iter().flatten().copied()) else { return false };
@@ -378,7 +384,7 @@ impl CellFaultDetector {
         true
     }
 
-    /// Compares the series resistances that the steps of the current show.
+    /// Compares the series resistances from the current steps.
     fn observe_steps(&mut self, row: &Row<'_>) {
         let least_a2 = LEAST_STEPS * row.capacity_ah * row.capacity_ah;
         let ohms: Vec<Option<(f64, f64)>> = self.cells.iter().map(|cell| cell.sums.ohm(least_a2)).collect();
@@ -386,11 +392,11 @@ impl CellFaultDetector {
         let (now_ohm, contact_ohm) = (row.ohm(), row.contact_ohm());
         let mut slope = [0.0; STATES];
         (slope[RESISTANCE], slope[CONTACT]) = (now_ohm, contact_ohm);
-        let innovation_ohm = |cell: &Watched, ohm: f64| {
+        let innovation_ohm = |cell: &WatchedCell, ohm: f64| {
             let mean = cell.difference.mean();
             ohm - middle_ohm - slope[RESISTANCE] * mean[RESISTANCE] - slope[CONTACT] * mean[CONTACT]
         };
-        // Cells scatter as their channels' noise makes them: coarse channels by much.
+        // The scatter between cells includes the noise of their channels, which is large for coarse channels.
         let innovations =
             self.cells.iter().zip(&ohms).filter_map(|(cell, ohm)| Some(innovation_ohm(cell, ohm.as_ref()?.0)));
         let scatter_ohm = Population::of(innovations).std;
@@ -415,13 +421,13 @@ impl CellFaultDetector {
         }
     }
 
-    /// Compares the temperatures at the cells with that in the middle of the pack.
+    /// Compares the temperature at each cell with the median of the pack.
     fn observe_temperatures(&mut self, time: Timestamp, seconds: f64) {
         let of_cells: Vec<Option<f64>> = self.cells.iter().map(|cell| cell.sums.mean_c()).collect();
         if of_cells.iter().flatten().count() < LEAST_CELLS {
             return;
         }
-        let warm = |(cell, here_c): (&mut Watched, Option<f64>)| Some(cell.temperature.warming_k(seconds, here_c?));
+        let warm = |(cell, here_c): (&mut WatchedCell, Option<f64>)| Some(cell.temperature.warming_k(seconds, here_c?));
         let warmings_k: Vec<Option<f64>> = self.cells.iter_mut().zip(of_cells).map(warm).collect();
         let middle_k = Population::of(warmings_k.iter().flatten().copied()).middle;
         for (cell, here_k) in self.cells.iter_mut().zip(warmings_k) {
@@ -449,7 +455,7 @@ impl CellFaultDetector {
         }
     }
 
-    /// The charge of the cells is not known any more: a time of unknown length has passed.
+    /// Resets the charge of all cells after a time of unknown length.
     pub fn forget_charge(&mut self) {
         self.interrupt();
         self.last_row = None;
@@ -459,14 +465,14 @@ impl CellFaultDetector {
         }
     }
 
-    /// What follows does not hang together with the samples so far.
+    /// Discards the samples of the current row, because the following ones are not contiguous with them.
     pub fn interrupt(&mut self) {
         self.pack = PackSums::default();
         self.rest_s = 0.0;
-        self.cells.iter_mut().for_each(Watched::interrupt);
+        self.cells.iter_mut().for_each(WatchedCell::interrupt);
     }
 
-    /// Moves every stamp by `by_nanos`, onto another clock.
+    /// Shifts all timestamps by `by_nanos`, to another clock.
     pub fn rebase(&mut self, by_nanos: i64) {
         let moved = |stamp: &mut Timestamp| *stamp = stamp.plus_nanos(by_nanos);
         self.findings.iter_mut().for_each(|found| {
@@ -481,7 +487,7 @@ impl CellFaultDetector {
         }
     }
 
-    /// Checks the numbers of a stored diagnosis of this many cells.
+    /// Checks the numbers of a stored detector for `cells` cells.
     ///
     /// # Errors
     /// The first impossible number.
@@ -519,7 +525,7 @@ impl CellFaultDetector {
     }
 }
 
-/// What all cells of a row share.
+/// Values of a row that all cells share.
 struct Row<'a> {
     model: &'a CellModel,
     capacity_ah: f64,
@@ -531,7 +537,7 @@ struct Row<'a> {
 }
 
 impl Row<'_> {
-    /// Observation of a cell's difference, V, by the means of its states.
+    /// Observation of a cell's difference, V, at the means of its states.
     fn observation(&self, means: &[f64; STATES], difference_v: f64) -> Observation {
         let (model, temperature) = (self.model, self.model.temperature_position(self.temperature_c));
         let at = |soc: f64| model.grid_position_at(&temperature, soc.clamp(0.0, 1.0));
@@ -540,7 +546,7 @@ impl Row<'_> {
         let contact_v = self.current_a * self.contact_ohm();
         let slope = [slope_v, 0.0, -self.drop_v, -contact_v, 1.0, 0.0];
         let curve_v = model.aged_ocv_v(&own, self.capacity_ah) - model.aged_ocv_v(&middle, self.capacity_ah);
-        // Elsewhere on the curve a healthy cell has another resistance.
+        // At another SOC, even a healthy cell has another resistance.
         let elsewhere = (model.r0_ohm(&own) / model.r0_ohm(&middle)).clamp(1.0 / MOST_ELSEWHERE, MOST_ELSEWHERE) - 1.0;
         let expected_v = curve_v - self.drop_v * elsewhere
             + slope[RESISTANCE] * means[RESISTANCE]
@@ -558,13 +564,13 @@ impl Row<'_> {
         self.model.r0_ohm(&self.model.grid_position(self.soc, self.temperature_c))
     }
 
-    /// The same in the middle of the charge at 25 degrees C: the unit of a contact, which follows neither.
+    /// Series resistance at SOC 0.5 and 25 degrees C, ohm: the unit of a contact, which depends on neither.
     fn contact_ohm(&self) -> f64 {
         self.model.r0_ohm(&self.model.grid_position(0.5, 25.0))
     }
 }
 
-/// Mean of the middle half of some values: one cell that is off hardly moves it. `None` = fewer than three.
+/// Mean of the middle half of the values, which one outlier hardly moves. `None` with fewer than three values.
 fn middle(values: impl Iterator<Item = f64>) -> Option<f64> {
     let mut values: Vec<f64> = values.collect();
     if values.len() < LEAST_CELLS {
@@ -574,7 +580,7 @@ fn middle(values: impl Iterator<Item = f64>) -> Option<f64> {
     Some(inner.iter().sum::<f64>() / inner.len() as f64)
 }
 
-/// Sorts values, and takes those that are neither in the lowest nor in the highest quarter.
+/// Sorts the values and returns those in neither the lowest nor the highest quarter.
 fn inner_half<T>(values: &mut [T], by: impl Fn(&T) -> f64) -> &[T] {
     values.sort_by(|a, b| by(a).total_cmp(&by(b)));
     let cut = values.len() / 4;

@@ -1,27 +1,28 @@
-//! The difference of one cell from the middle of its pack, filtered.
+//! Filter of the difference between one cell and the middle of its pack.
 //!
-//! In: its voltage less that of the middle cells, row by row. Out: what explains it. A linear Kalman filter whose observation is
-//! taken at the cell's own SOC. The states differ in what they follow, which is how one is not taken for another:
+//! In: per row, the cell's voltage minus that of the middle cells. Out: the states that explain the difference. A
+//! linear Kalman filter with the observation linearised at the cell's own SOC. The states depend on different
+//! quantities and can therefore be told apart:
 //!
-//! | state | the voltage's difference follows |
+//! | state | effect on the voltage difference |
 //! | --- | --- |
-//! | charge | the slope of the open-circuit curve |
-//! | capacity | the charge moved |
-//! | resistance | the whole voltage drop, so load and temperature, with its delay |
-//! | contact | the current alone, without delay and temperature |
-//! | channel | nothing |
-//! | leak | time |
+//! | charge | follows the slope of the open-circuit curve |
+//! | capacity | follows the charge moved |
+//! | resistance | follows the whole voltage drop, hence load and temperature, with its delay |
+//! | contact | follows the current alone, without delay and temperature |
+//! | channel | constant |
+//! | leak | grows with time |
 //!
-//! Source: the separation in a mean cell and differences is Plett's bar-delta filtering (Battery Management Systems II, section 4.11);
-//! contact resistance of one cell in a vehicle: Zheng et al., J. Power Sources 241 (2013) 181.
+//! Sources: mean cell plus differences is Plett's bar-delta filtering (Battery Management Systems II, section 4.11).
+//! Contact resistance of one cell in a vehicle: Zheng et al., J. Power Sources 241 (2013) 181.
 
 use serde::{Deserialize, Serialize};
 
 use crate::filter::ScalarGaussian;
 use crate::quantity::InvalidState;
 
-/// States: difference of SOC; of capacity, of resistance and of contact resistance (to the mean cell's), fractions; offset of the
-/// voltage channel, V; leak, fraction of the capacity in a day.
+/// States: differences in SOC, in capacity, in resistance and in contact resistance (relative to the mean cell),
+/// fractions; offset of the voltage channel, V; leak, fraction of the capacity per day.
 pub const SOC: usize = 0;
 /// See [`SOC`].
 pub const CAPACITY: usize = 1;
@@ -37,23 +38,24 @@ pub const LEAK: usize = 5;
 pub const STATES: usize = 6;
 const PAIRS: usize = STATES * (STATES + 1) / 2;
 
-/// Standard deviations before the first row. The channel's is that of usual cell monitors.
+/// Standard deviations before the first row. The channel's is typical of cell monitors.
 const FIRST_STD: [f64; STATES] = [0.05, 0.1, 0.2, 0.5, 0.005, 0.05];
-/// Growth of the deviations in a day, and of the charge's per unit of moved SOC.
+/// Growth of the standard deviations per day, and of the charge's per unit of SOC moved.
 const DAILY_STD: [f64; STATES] = [1e-4, 3e-4, 5e-3, 5e-3, 3e-4, 1e-4];
 const MOVED_STD: f64 = 5e-4;
-/// Deviations that are added when a cell has changed at once, alone: its contact, its channel, or itself; but charge goes nowhere
-/// without a current.
+/// Standard deviations added after a sudden change of one cell: its contact, its channel or the cell itself has
+/// changed. The charge gets little, because it cannot change without a current.
 const ALONE_STD: [f64; STATES] = [0.005, 0.05, 0.2, 0.5, 0.04, 0.01];
-/// The same of a cell that is another one: its module has been replaced.
+/// Standard deviations added if the cell has been replaced together with its neighbours.
 const REPLACED_STD: [f64; STATES] = [0.05, 0.1, 0.3, 0.1, 0.005, 0.01];
-/// The same when only its resistance has changed: what ages does so over weeks, so it is a contact.
+/// Standard deviations added if only the resistance has changed. Ageing takes weeks, so it is the contact.
 const RESISTANCE_STD: [f64; STATES] = [0.0, 0.0, 0.01, 0.5, 0.0, 0.0];
-/// Usual loss of a cell that a BMS may bleed, standard deviation, fraction of the capacity in a day, and the time without a row from
-/// which on it may have lost much more, days (`open_charge`). With 0.01 a day, exchanged channels and modules drown in it.
+/// Typical loss of a cell that a BMS may bleed: standard deviation, fraction of the capacity per day. A larger loss,
+/// possible after a time without rows, is handled by `open_charge`. With 0.01 per day, exchanged channels and modules
+/// would go undetected.
 const BLED_PER_DAY: f64 = 0.002;
-/// Innovations, in deviations, beyond which a row counts less (Huber); beyond which it is odd (the mean, the steps); and how many odd ones
-/// in a row are a jump.
+/// Limits of the innovation, in standard deviations: beyond `HUBER` a row counts less; beyond `JUMP` (means) or
+/// `STEPS_JUMP` (steps) it counts as odd. Three consecutive odd rows are a jump.
 const HUBER: f64 = 3.0;
 const JUMP: f64 = 4.0;
 const STEPS_JUMP: f64 = 3.0;
@@ -65,21 +67,22 @@ pub struct Difference {
     mean: [f64; STATES],
     /// Upper triangle, row by row.
     covariance: [f64; PAIRS],
-    /// Rows in a row that deviate to one side, by their means and by their steps.
+    /// Consecutive odd rows, signed by side: by their means and by their steps.
     odd_rows: i8,
     odd_steps: i8,
 }
 
-/// How a cell has changed at once.
+/// Kind of a sudden change.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Jump {
-    /// Alone.
+    /// Of one cell.
     Alone,
-    /// With its neighbours.
+    /// Of a cell and its neighbours.
     Replaced,
 }
 
-/// Counts deviations to one side; whether enough have come in a row, with which the count begins again.
+/// Counts consecutive deviations to one side. Returns whether there are enough for a jump, and then restarts the
+/// count.
 fn count_odd(odd: &mut i8, deviations: f64, limit: f64) -> bool {
     let side = if deviations.abs() < limit { 0 } else { deviations.signum() as i8 };
     *odd = if side == 0 || odd.signum() * side < 0 { side } else { *odd + side };
@@ -90,7 +93,7 @@ fn count_odd(odd: &mut i8, deviations: f64, limit: f64) -> bool {
     is_jump
 }
 
-/// An observation: its value less what is expected of it, its slopes by the states, and the variance of its error.
+/// An observation: value minus expected value, derivatives with respect to the states, and error variance.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Observation {
     pub(super) innovation: f64,
@@ -98,14 +101,14 @@ pub(super) struct Observation {
     pub(super) variance: f64,
 }
 
-/// Place of a pair of states in the triangle.
+/// Index of a pair of states in the triangle.
 const fn pair(i: usize, j: usize) -> usize {
     let (a, b) = if i < j { (i, j) } else { (j, i) };
     a * STATES - a * (a + 1) / 2 + b
 }
 
 impl Difference {
-    /// A cell of which nothing is known.
+    /// A cell without any rows yet.
     pub(super) fn new() -> Self {
         let mut covariance = [0.0; PAIRS];
         for (i, std) in FIRST_STD.iter().enumerate() {
@@ -114,7 +117,7 @@ impl Difference {
         Self { mean: [0.0; STATES], covariance, odd_rows: 0, odd_steps: 0 }
     }
 
-    /// A state with its standard deviation.
+    /// Estimate of a state.
     pub fn state(&self, state: usize) -> ScalarGaussian {
         ScalarGaussian { mean: self.mean[state], variance: self.covariance[pair(state, state)] }
     }
@@ -123,7 +126,7 @@ impl Difference {
         &self.mean
     }
 
-    /// Time and charge pass: days, and the change of the mean cell's SOC.
+    /// Predicts over `days` and a change of the mean cell's SOC.
     pub(super) fn pass(&mut self, days: f64, soc_change: f64) {
         // charge += (1 / (1 + capacity) - 1) * soc_change - leak * days
         let part = 1.0 / (1.0 + self.mean[CAPACITY]).max(0.1);
@@ -147,14 +150,14 @@ impl Difference {
         self.keep_possible();
     }
 
-    /// Removes charge that no sensor of the current sees: SOC, and its variance.
+    /// Removes charge that the current sensor does not see: SOC and its variance.
     pub(super) fn remove_charge(&mut self, soc: f64, variance: f64) {
         self.mean[SOC] -= soc;
         self.covariance[pair(SOC, SOC)] += variance;
         self.keep_possible();
     }
 
-    /// The charge is not known any more.
+    /// Resets the charge to unknown.
     pub(super) fn forget_charge(&mut self) {
         for j in 0..STATES {
             self.covariance[pair(SOC, j)] = 0.0;
@@ -162,12 +165,12 @@ impl Difference {
         self.covariance[pair(SOC, SOC)] = FIRST_STD[SOC] * FIRST_STD[SOC];
     }
 
-    /// What is lost from now on may be bled: nothing is known of a leak.
+    /// Resets the leak because the BMS may bleed the cell from now on.
     pub(super) fn forget_leak(&mut self) {
         self.begin_leak(BLED_PER_DAY);
     }
 
-    /// It is not bled any more: what it loses from now on is a leak.
+    /// Resets the leak because the BMS no longer bleeds the cell: further loss is a leak.
     pub(super) fn watch_leak(&mut self) {
         self.begin_leak(FIRST_STD[LEAK]);
     }
@@ -180,8 +183,8 @@ impl Difference {
         self.covariance[pair(LEAK, LEAK)] = std * std;
     }
 
-    /// Hours have passed unseen in which more may have been lost than is usual: where the row contradicts what is known, the charge
-    /// has changed or the channel: the next drive shows which.
+    /// Handles hours without rows in which the cell may have lost more than usual. If the row contradicts the
+    /// prediction, widens charge and channel; the next drive shows which of them changed.
     pub(super) fn open_charge(&mut self, days: f64, observed: &Observation) {
         if days >= 0.04 && self.deviations(observed).abs() > JUMP {
             let lost = FIRST_STD[LEAK] * days;
@@ -190,7 +193,8 @@ impl Difference {
         }
     }
 
-    /// What its channel shows at rest beside the middle's, V, where the open-circuit curve has this slope, V.
+    /// Expected reading of the channel relative to the middle at rest, V, where the open-circuit curve has slope
+    /// `slope_v`, V.
     pub(super) fn reading_v(&self, slope_v: f64) -> ScalarGaussian {
         let mean = slope_v * self.mean[SOC] + self.mean[CHANNEL];
         let variance = slope_v * slope_v * self.covariance[pair(SOC, SOC)]
@@ -199,12 +203,12 @@ impl Difference {
         ScalarGaussian { mean, variance: variance.max(0.0) }
     }
 
-    /// Innovation in its own standard deviations.
+    /// The innovation in standard deviations.
     pub(super) fn deviations(&self, observed: &Observation) -> f64 {
         observed.innovation / self.by_slope(observed).1.sqrt()
     }
 
-    /// Covariance with the states, and variance of the innovation.
+    /// Covariances of the innovation with the states, and variance of the innovation.
     fn by_slope(&self, observed: &Observation) -> ([f64; STATES], f64) {
         let Observation { slope, variance, .. } = observed;
         let with: [f64; STATES] =
@@ -213,8 +217,8 @@ impl Difference {
         (with, total.max(f64::MIN_POSITIVE))
     }
 
-    /// Takes a row's mean; whether the cell has changed at once: some rows in a row contradict what is known. The row then waits
-    /// for [`Self::open`].
+    /// Updates with a row's mean. Returns whether the cell has changed suddenly: consecutive rows contradict the
+    /// prediction. The row is then left for [`Self::open`].
     pub(super) fn observe(&mut self, observed: &Observation) -> bool {
         let off = self.deviations(observed);
         let is_jump = count_odd(&mut self.odd_rows, off, JUMP);
@@ -224,7 +228,7 @@ impl Difference {
         is_jump
     }
 
-    /// Takes a row's series resistance.
+    /// Updates with a row's series resistance.
     pub(super) fn observe_steps(&mut self, observed: &Observation) {
         let off = self.deviations(observed);
         if count_odd(&mut self.odd_steps, off, STEPS_JUMP) {
@@ -235,13 +239,13 @@ impl Difference {
         }
     }
 
-    /// The cell has changed at once; takes the row that said so.
+    /// Widens the states after a sudden change and updates with the row that showed it.
     pub(super) fn open(&mut self, jump: Jump, observed: &Observation) {
         self.widen_as(jump);
         self.update(observed, 1.0);
     }
 
-    /// The cell may have changed at once.
+    /// Widens the states because the cell may have changed suddenly.
     pub(super) fn widen_as(&mut self, jump: Jump) {
         self.widen(match jump {
             Jump::Alone => &ALONE_STD,
@@ -249,7 +253,7 @@ impl Difference {
         });
     }
 
-    /// Takes an observation whose variance is multiplied so that the innovation counts linearly beyond the limit.
+    /// Updates with the innovation variance multiplied by `beyond`, so that outliers count linearly.
     fn update(&mut self, observed: &Observation, beyond: f64) {
         let (with, total) = self.by_slope(observed);
         let total = total * beyond;
@@ -264,26 +268,26 @@ impl Difference {
         self.keep_possible();
     }
 
-    /// Rounding may leave a variance below nothing. Where a number is none that a cell can have, it was no cell's reading: the filter
-    /// begins again.
+    /// Keeps variances positive despite rounding. Restarts the filter if a number is impossible, because the readings
+    /// then did not come from a cell.
     fn keep_possible(&mut self) {
         for i in 0..STATES {
             let variance = &mut self.covariance[pair(i, i)];
             *variance = variance.max(1e-12);
         }
         let numbers = self.mean.iter().chain(&self.covariance);
-        // A thousand times the cell itself.
+        // A thousand times the cell's own value.
         if !numbers.clone().all(|number| number.abs() <= 1e3) {
             *self = Self::new();
         }
     }
 
-    /// Whether no row contradicts what is known.
+    /// Whether the last row agreed with the prediction.
     pub(super) fn is_settled(&self) -> bool {
         self.odd_rows == 0
     }
 
-    /// Continues with these means.
+    /// Sets the means, and restarts the count of odd rows.
     pub(super) fn settle(&mut self, mean: &[f64; STATES]) {
         (self.mean, self.odd_rows) = (*mean, 0);
     }
@@ -310,7 +314,7 @@ impl Difference {
 mod tests {
     use super::*;
 
-    /// Days of driving and rest of a cell with these differences, as an ideal channel sees it.
+    /// Simulates days of driving and rest of a cell with these differences, seen by an ideal channel.
     fn watched(truth: [f64; STATES], days: usize) -> Difference {
         let (mut filter, mut charge, mut soc) = (Difference::new(), truth[SOC], 0.8);
         for row in 0..days * 60 {
@@ -323,7 +327,7 @@ mod tests {
             soc += change;
             charge += (1.0 / (1.0 + truth[CAPACITY]) - 1.0) * change - truth[LEAK] * passed_days;
             filter.pass(passed_days, change);
-            // A curve that is not straight, a drop whose slow part comes late, a contact.
+            // A curved open-circuit curve, a drop with a slow part, and a contact.
             let slope_v = 0.4 + 12.0 * (soc - 0.5) * (soc - 0.5);
             let drop_v = 3.0 * current + if row % 2 == 0 { 0.02 } else { 0.0 };
             let slope = [slope_v, 0.0, -drop_v, -1.5 * current, 1.0, 0.0];
@@ -335,7 +339,7 @@ mod tests {
     }
 
     #[test]
-    fn each_state_is_found_and_none_is_taken_for_another() {
+    fn each_state_is_found_and_told_apart() {
         let faults = [(CAPACITY, -0.1), (RESISTANCE, 0.2), (CONTACT, 0.2), (CHANNEL, 0.03), (LEAK, 0.002)];
         for (state, size) in faults {
             let mut truth = [0.0; STATES];
@@ -351,7 +355,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_reading_of_a_cell_leaves_a_filter_whose_state_is_accepted() {
+    fn impossible_readings_leave_a_valid_filter() {
         let slopes = [[1e9; STATES], [0.0; STATES], [f64::NAN; STATES], [1e-30, 1.0, -1e12, 3.0, 1.0, f64::INFINITY]];
         for (slope, innovation) in slopes.into_iter().flat_map(|slope| [1e300, -1e9, f64::NAN, 0.0].map(|v| (slope, v)))
         {
@@ -371,7 +375,7 @@ mod tests {
     }
 
     #[test]
-    fn a_sudden_change_is_noted_once_and_followed() {
+    fn sudden_change_is_reported_once_and_followed() {
         let mut filter = watched([0.0; STATES], 5);
         let row = |filter: &Difference| Observation {
             innovation: 0.03 - filter.mean()[SOC] - filter.mean()[CHANNEL],

@@ -1,4 +1,4 @@
-//! What is found, and from when on it is reported.
+//! Kinds of findings, and the limits for reporting and withdrawing them.
 
 use std::fmt;
 
@@ -7,43 +7,44 @@ use serde::{Deserialize, Serialize};
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Timestamp};
 
-/// What is wrong. The number is the one on the wire, never reused.
+/// Kind of a finding. The number is the one on the wire and is never reused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
 pub enum CellFaultKind {
     /// The cell loses charge against the others; fraction of its capacity in a day.
     Leak = 1,
-    /// The contact resistance of its connection is higher than that of the others; fraction of the cell's series resistance.
+    /// The contact resistance of the cell's connection is higher than the others'; fraction of the cell's series
+    /// resistance.
     Contact = 2,
-    /// Its capacity is below that of the others; fraction.
+    /// The cell's capacity is lower than the others'; fraction.
     WeakCell = 3,
-    /// Its resistance is above that of the others, as of an aged cell; fraction.
+    /// The cell's resistance is higher than the others', as in an aged cell; fraction.
     HighResistance = 4,
-    /// Its capacity is above that of the others: a cell of another age; fraction.
+    /// The cell's capacity is higher than the others': a cell of another age; fraction.
     ForeignCell = 5,
-    /// Several cells side by side have changed at once: a replaced module; mean change of their capacity, fraction.
+    /// Neighbouring cells have changed suddenly: a replaced module; mean change of their capacity, fraction.
     Module = 6,
-    /// Its voltage channel is off by a constant; V.
+    /// The cell's voltage channel has a constant offset; V.
     VoltageChannel = 7,
-    /// Its voltage channel stays at one value; the value is 1.
+    /// The cell's voltage channel stays at one value; the value is 1.
     VoltageFrozen = 8,
-    /// Two voltage channels show the values of one cell; the value is 1.
+    /// Two voltage channels show the same cell; the value is 1.
     DoubledChannels = 9,
     /// Two voltage channels have been exchanged; the value is 1.
     SwappedChannels = 10,
-    /// The sensor of the current is off by a constant; part of the rated capacity per hour.
+    /// The current sensor has a constant offset; fraction of the rated capacity per hour.
     CurrentOffset = 11,
-    /// The reading of the current stays at one value; the value is 1.
+    /// The current reading stays at one value; the value is 1.
     CurrentFrozen = 12,
     /// The temperature sensor of these cells does not follow the load; the value is 1.
     TemperatureSensor = 13,
-    /// The gain of the current's sensor has risen; fraction.
+    /// The gain of the current sensor has risen; fraction.
     CurrentGain = 14,
 }
 
 impl CellFaultKind {
-    /// Every kind, in the order of the wire.
+    /// Every kind, in the order of the numbers on the wire.
     pub const ALL: [Self; 14] = [
         Self::Leak,
         Self::Contact,
@@ -61,7 +62,7 @@ impl CellFaultKind {
         Self::CurrentGain,
     ];
 
-    /// As written in events, status and reports.
+    /// Name in events, status and reports.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Leak => "leak",
@@ -81,7 +82,7 @@ impl CellFaultKind {
         }
     }
 
-    /// In words.
+    /// Description for logs and reports.
     pub const fn words(self) -> &'static str {
         match self {
             Self::Leak => "loses charge by itself",
@@ -101,7 +102,7 @@ impl CellFaultKind {
         }
     }
 
-    /// What to do about it.
+    /// What the user should do about it.
     pub const fn advice(self) -> &'static str {
         match self {
             Self::Leak => {
@@ -109,16 +110,16 @@ impl CellFaultKind {
                            over a week, and replace it when the leak grows"
             }
             Self::Contact => "tighten and clean the connections of the cell; a loose one heats under load",
-            Self::WeakCell => "the pack ends with this cell: plan its replacement",
+            Self::WeakCell => "this cell limits the pack: plan its replacement",
             Self::HighResistance => "the cell has aged more than the others: watch its temperature under load",
             Self::ForeignCell => "the cell has been replaced: balance the pack",
-            Self::Module => "modules have been replaced: balance the pack; their history begins again",
+            Self::Module => "modules have been replaced: balance the pack; their history starts anew",
             Self::VoltageChannel => "compare the channel with a voltmeter, and check its sense wire",
-            Self::VoltageFrozen => "the channel shows no cell: check monitor chip and sense wire",
+            Self::VoltageFrozen => "the channel does not show a cell voltage: check monitor chip and sense wire",
             Self::DoubledChannels => "check the wiring of the two channels and the layout of their frames",
             Self::SwappedChannels => "the sense wires or the signals of the two channels are exchanged",
             Self::CurrentOffset => "compare the sensor at rest with an ammeter, and zero it",
-            Self::CurrentFrozen => "the reading is no current: check sensor and sender",
+            Self::CurrentFrozen => "the reading does not follow the current: check sensor and sender",
             Self::CurrentGain => {
                 "compare the sensor under load with an ammeter: all capacities and resistances have changed by its gain"
             }
@@ -126,12 +127,13 @@ impl CellFaultKind {
         }
     }
 
-    /// Whether its two cells are a pair, not the ends of a range.
+    /// Whether the two cells are a pair and not the ends of a range.
     pub const fn is_of_pair(self) -> bool {
         matches!(self, Self::DoubledChannels | Self::SwappedChannels)
     }
 
-    /// Probability below which it is withdrawn. A BMS that bleeds the other cells hides a leak that was seen before.
+    /// Probability below which a finding is withdrawn. For a leak it is lower, because a BMS that bleeds the other
+    /// cells hides a known leak.
     pub(super) const fn withdrawn_below(self) -> f64 {
         match self {
             Self::Leak => 0.01,
@@ -139,17 +141,17 @@ impl CellFaultKind {
         }
     }
 
-    /// Whether it is the measurement that fails, so that nothing is known of the cell.
+    /// Whether the measurement fails, so that nothing is known of the cell.
     pub const fn is_of_channel(self) -> bool {
         matches!(self, Self::VoltageChannel | Self::VoltageFrozen | Self::DoubledChannels)
     }
 
-    /// Whether the voltages that are read as a cell's are not those of that cell.
+    /// Whether the readings under a cell's name are wrong or belong to another cell.
     pub const fn is_channel_fault(self) -> bool {
         self.is_of_channel() || matches!(self, Self::SwappedChannels)
     }
 
-    /// Size beyond which it is one, in the unit of the kind; of those that are so or not, one half.
+    /// Size beyond which the finding applies, in the unit of the kind; 0.5 for kinds that are either present or not.
     pub(super) const fn limit(self) -> f64 {
         match self {
             Self::Leak => LEAK_PER_DAY,
@@ -167,30 +169,30 @@ impl CellFaultKind {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CellFault {
-    /// What.
+    /// Kind of the fault.
     pub kind: CellFaultKind,
-    /// First and last cell of it; of two channels the lower and the upper one; `None` = the pack as a whole.
+    /// First and last cell of a range, or the lower and the upper channel of a pair; `None` = the whole pack.
     pub cells: Option<(CellIndex, CellIndex)>,
-    /// When it was first likelier than not.
+    /// Time since which the fault has been more likely than not.
     pub since: Timestamp,
-    /// When it was first reported.
+    /// Time of the first report.
     pub reported: Timestamp,
-    /// Probability that it is beyond the limit of its kind.
+    /// Probability that the size is beyond the limit of the kind.
     pub probability: f64,
-    /// How large; the unit is that of the kind.
+    /// Size, in the unit of the kind.
     pub size: ScalarGaussian,
 }
 
 impl CellFault {
-    /// Whether it is about the cell.
+    /// Whether the finding concerns the cell.
     pub fn is_of(&self, cell: CellIndex) -> bool {
         let Some((first, last)) = self.cells else { return false };
         if self.kind.is_of_pair() { first == cell || last == cell } else { (first..=last).contains(&cell) }
     }
 }
 
-/// In words, cells counted from 1: `cell 7: loses charge by itself, 18.24 ± 0.43 % of its capacity a day`. The deviation is one standard
-/// deviation.
+/// Writes the finding with cells counted from 1:
+/// `cell 7: loses charge by itself, 18.24 ± 0.43 % of its capacity a day`. The deviation is one standard deviation.
 impl fmt::Display for CellFault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let number = |cell: CellIndex| cell.0 + 1;
@@ -213,9 +215,9 @@ impl fmt::Display for CellFault {
     }
 }
 
-/// Leak beyond which it is one, fraction of the capacity in a day: healthy cells of one pack differ by less than 0.5 % a month.
+/// Leak limit, fraction of the capacity per day. Healthy cells of one pack differ by less than 0.5 % per month.
 pub const LEAK_PER_DAY: f64 = 5e-4;
-/// The same of contact, capacity and resistance, fractions, and of the channel, V.
+/// Limits of contact, capacity and resistance, fractions, and of the channel, V.
 pub const CONTACT: f64 = 0.1;
 /// See [`CONTACT`].
 pub const CAPACITY: f64 = 0.05;
@@ -224,15 +226,17 @@ pub const RESISTANCE: f64 = 0.1;
 /// See [`CONTACT`].
 pub const CHANNEL_V: f64 = 0.015;
 
-/// Offset of the current beyond which its sensor is faulty, part of the rated capacity per hour: SOC runs away by a quarter in a day.
+/// Limit of the current sensor's offset, fraction of the rated capacity per hour: the SOC would drift by a quarter in
+/// a day.
 pub const OFFSET_PER_H: f64 = 0.01;
 
-/// Rise of the current's gain beyond which its sensor is faulty, fraction.
+/// Limit of the rise of the current sensor's gain, fraction.
 pub const GAIN: f64 = 0.02;
 
-/// Probability from which on a finding is reported, and below which it is withdrawn.
+/// A finding is reported from the first probability on and withdrawn below the second.
 pub(super) const REPORTED: f64 = 0.999;
 pub(super) const WITHDRAWN: f64 = 0.5;
 
-/// Least distance from the middle of the pack in robust standard deviations of its cells: cells of one kind differ.
+/// Smallest distance from the median of the pack, in robust standard deviations of its cells, because healthy cells
+/// differ too.
 pub(super) const OUTLIER: f64 = 3.5;

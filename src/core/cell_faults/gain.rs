@@ -1,9 +1,10 @@
-//! A gain of the current sensor that has risen, which all cells share.
+//! Detects that the gain of the current sensor, which all cells share, has risen.
 //!
-//! In: once a day, what the estimators know of the middle of the cells. Out: by how much the gain has risen.
+//! In: once a day, the learned capacity and resistance of all cells. Out: the rise of the gain.
 //!
-//! A sensor that shows `g` times the current makes every resistance `1/g` times as large at once, and every capacity `g` times as large
-//! as they are learned from the new readings. No battery gains capacity while its resistance falls. A gain that falls looks like age: nothing is said.
+//! A sensor that shows `g` times the current scales every resistance by `1/g` at once, and every capacity by `g` as
+//! new readings arrive. No battery gains capacity while its resistance falls. A falling gain looks like ageing and is
+//! not reported.
 
 use serde::{Deserialize, Serialize};
 
@@ -11,43 +12,43 @@ use super::fault::{GAIN, REPORTED};
 use crate::filter::{ScalarGaussian, median, normal_cdf};
 use crate::quantity::{InvalidState, Timestamp};
 
-/// Days that are compared: what takes longer is a season or age.
+/// Number of days that are compared: slower changes are seasons or ageing.
 const DAYS: usize = 10;
 const DAY_S: f64 = 86_400.0;
-/// Time within which the resistances fall, s: what is known of them follows for hours, so that a look may fall in between. And the
-/// most difference of the temperatures then and now, K.
+/// Longest time within which the resistances must fall, s. The estimated resistance follows within hours, so two daily
+/// checks may each see a part of the fall.
 const APART_S: f64 = 2.5 * DAY_S;
-/// Error of a change within these days, fraction.
+/// Standard deviation of a change within these days, fraction.
 const ERROR: f64 = 0.005;
-/// Deviation above which a capacity is not known yet, fraction: what it learns would be a change.
+/// Capacities with a larger relative standard deviation are ignored: their learning would look like a change.
 const KNOWN: f64 = 0.03;
 
-/// The middle of the cells on one day.
+/// Median values of the cells on one day.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Day {
     time: Timestamp,
-    /// Logarithms of the capacity in Ah and of the resistance to the model's.
+    /// Logarithms of the capacity in Ah and of the resistance ratio to the model.
     log_capacity: f64,
     log_resistance: f64,
     /// Degrees C.
     temperature_c: f64,
 }
 
-/// What is known of one cell's capacity and resistance.
+/// Learned capacity and resistance of one cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Learned {
     /// Ah.
     pub capacity_ah: ScalarGaussian,
-    /// Logarithm of the resistance to the model's.
+    /// Logarithm of the resistance ratio to the model.
     pub log_resistance: f64,
 }
 
-/// The last days.
+/// Values of the last days.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Gain {
-    /// When the last day was looked at.
+    /// Time of the last daily check.
     last: Option<Timestamp>,
     days: Vec<Day>,
 }
@@ -58,8 +59,8 @@ impl Gain {
         self.last.is_none_or(|last| !(0.0..DAY_S).contains(&now.since(last)))
     }
 
-    /// Takes the cells of a day; probability that the gain has risen beyond [`GAIN`], and by how much, fraction. The days before a
-    /// rise are kept for as long as it is there.
+    /// Adds a day. Returns the probability that the gain has risen beyond [`GAIN`], and the rise, fraction. While a
+    /// rise is reported, the days before it are kept.
     pub(super) fn take(&mut self, time: Timestamp, temperature_c: f64, cells: &[Learned]) -> (f64, ScalarGaussian) {
         let none = (0.0, ScalarGaussian { mean: 0.0, variance: ERROR * ERROR });
         let part = |cell: &Learned| cell.capacity_ah.std() / cell.capacity_ah.mean;
@@ -93,7 +94,7 @@ impl Gain {
         (probability, size)
     }
 
-    /// Moves every stamp by `by_nanos`, onto another clock.
+    /// Shifts all timestamps by `by_nanos`, to another clock.
     pub(super) fn rebase(&mut self, by_nanos: i64) {
         let stamps = self.days.iter_mut().map(|day| &mut day.time).chain(&mut self.last);
         stamps.for_each(|stamp| *stamp = stamp.plus_nanos(by_nanos));
@@ -108,8 +109,8 @@ impl Gain {
     }
 }
 
-/// Rise of the gain between two days that `now` still shows, fraction: of the fall of the resistance and the rise of the capacity
-/// the smaller one. `None` = the days cannot be compared.
+/// Rise of the gain between two days that `now` still shows, fraction: the smaller of the fall in resistance and the
+/// rise in capacity. `None` if the days cannot be compared.
 fn rise(before: &Day, after: &Day, now: &Day) -> Option<f64> {
     let is_near = |day: &Day| (day.temperature_c - before.temperature_c).abs() <= 5.0;
     let is_next = after.time.since(before.time) <= APART_S;
@@ -121,7 +122,7 @@ fn rise(before: &Day, after: &Day, now: &Day) -> Option<f64> {
 mod tests {
     use super::*;
 
-    /// Probability and size after each day; the gain is this much on it, and the capacity follows by a third a day.
+    /// Probability and size after each day. `gains`: the gain of each day; the capacity follows by a third a day.
     fn after_days(gains: &[f64], temperatures_c: impl Fn(usize) -> f64) -> Vec<(f64, f64)> {
         let (mut watch, mut capacity_ah) = (Gain::default(), 60.0);
         gains
@@ -139,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gain_that_rises_is_found_and_stays_until_it_falls() {
+    fn risen_gain_is_reported_until_it_falls() {
         let gains: Vec<f64> = (0..60).map(|day| if (8..45).contains(&day) { 1.05 } else { 1.0 }).collect();
         let found = after_days(&gains, |_| 25.0);
         let since = found.iter().position(|(probability, _)| *probability >= REPORTED);
@@ -149,14 +150,14 @@ mod tests {
     }
 
     #[test]
-    fn a_fall_of_resistance_that_is_seen_in_two_steps_is_one() {
+    fn fall_of_resistance_in_two_steps_is_found() {
         let gains: Vec<f64> = [1.0; 6].into_iter().chain([1.015]).chain([1.05; 10]).collect();
         let found = after_days(&gains, |_| 25.0);
         assert!(found.last().is_some_and(|(probability, _)| *probability >= REPORTED), "{found:?}");
     }
 
     #[test]
-    fn age_and_seasons_and_a_capacity_that_is_being_learned_are_none() {
+    fn ageing_seasons_and_learning_are_not_a_gain() {
         let falls: Vec<f64> = (0..40).map(|day| if day < 8 { 1.0 } else { 0.9 }).collect();
         assert!(after_days(&falls, |_| 25.0).iter().all(|(probability, _)| *probability < 0.01));
         let slowly: Vec<f64> = (0..60).map(|day| 1.0 + 0.003 * f64::from(day)).collect();
@@ -176,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_that_no_cell_has_leave_a_state_that_is_accepted() {
+    fn impossible_numbers_leave_a_valid_state() {
         let mut watch = Gain::default();
         for (day, number) in [f64::NAN, f64::INFINITY, 0.0, -1.0, 1e300, 60.0].into_iter().enumerate() {
             let cell = Learned { capacity_ah: ScalarGaussian::from_std(number, 0.001), log_resistance: number };

@@ -1,22 +1,22 @@
-//! What the differences between the cells cost their pack: charge lost by imbalance and by the weakest cell, and the limiting cells.
+//! Cost of the differences between cells: charge lost by imbalance and by the weakest cell, and the limiting cells.
 //!
-//! In: each cell's difference from the middle of the pack in SOC, capacity and resistance, the middle cell's SOC and capacity. Out:
-//! [`Imbalance`], in fractions of the mean cell's capacity. A charge ends when the first cell is full, a discharge when the first one
-//! is empty. With a cell's SOC s and capacity C:
+//! In: each cell's difference from the middle of the pack in SOC, capacity and resistance; SOC and capacity of the
+//! middle cell. Out: [`Imbalance`], in fractions of the mean cell's capacity. A charge ends when the first cell is
+//! full, a discharge when the first cell is empty. With a cell's SOC s and capacity C:
 //!
 //! ```text
 //! usable            = min s C + min (1 - s) C
-//! lost by imbalance = min C - usable            what balancing gives back
+//!   lost by imbalance = min C - usable            recoverable by balancing
 //! lost by weakest   = mean C - min C
 //! ```
 //!
-//! Standard deviations are to first order, by the states of the limiting cells. Assumptions: the errors of two cells, and those of a
-//! cell's SOC and capacity, are independent; the middle cell's SOC is exact (its error moves `usable` by its product with the
-//! difference of the two limiting cells' capacities). The smallest of many uncertain values is below the smallest true one: the
-//! losses of a pack whose cells differ by no more than their deviations are too high.
+//! Standard deviations are first-order in the states of the limiting cells. Assumed: the errors of different cells,
+//! and of one cell's SOC and capacity, are independent; the middle cell's SOC is exact (its error moves `usable` by
+//! the error times the capacity difference of the two limiting cells). The minimum of many uncertain values lies below
+//! the true minimum: if the cells differ by no more than their standard deviations, the losses are overestimated.
 //!
-//! A cell with a faulty channel, and one whose difference is not known yet, is left out.
-//! Fewer than three cells, or than half of them: unknown.
+//! Cells with a faulty channel or a still uncertain difference are left out. With fewer than three remaining cells, or
+//! fewer than half of the cells, the imbalance is unknown.
 
 use serde::Serialize;
 
@@ -27,31 +27,32 @@ use crate::cell::CellModel;
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Standard deviations from which on a cell's SOC and capacity are not known: half of those before the first row, or less.
+/// A cell's SOC and capacity are unknown from these standard deviations on: at most half of those before the first
+/// row.
 const UNKNOWN_SOC_STD: f64 = 0.025;
 const UNKNOWN_CAPACITY_STD: f64 = 0.05;
 const OCV_PARTS: u32 = 100;
 
-/// What the differences between the cells cost. Fractions are of the mean cell's capacity.
+/// Cost of the differences between cells. Fractions are of the mean cell's capacity.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Imbalance {
     /// Time of the last comparison.
     pub time: Timestamp,
-    /// Number of cells that are compared.
+    /// Number of compared cells.
     pub cells: usize,
     /// Mean of the cells' capacities, Ah.
     pub mean_ah: ScalarGaussian,
     /// Charge between the first full cell and the first empty cell, fraction.
     pub usable: ScalarGaussian,
-    /// Charge that balancing gives back, fraction.
+    /// Charge that balancing would recover, fraction.
     pub lost_by_imbalance: ScalarGaussian,
-    /// Charge that a pack of mean cells has more than this one balanced, fraction.
+    /// Charge that a balanced pack of mean cells has in addition to this pack, balanced, fraction.
     pub lost_by_weakest: ScalarGaussian,
     /// The cell with the least capacity.
     pub weakest: CellIndex,
-    /// The cell that ends a discharge.
+    /// The cell that is empty first.
     pub discharge_limit: LimitingCell,
-    /// The cell that ends a charge.
+    /// The cell that is full first.
     pub charge_limit: LimitingCell,
     /// Differences of SOC, fraction.
     pub soc: CellSpread,
@@ -59,24 +60,24 @@ pub struct Imbalance {
     pub capacity: CellSpread,
     /// Differences of resistance, fraction of the middle cell's.
     pub resistance: CellSpread,
-    /// Cells that are not compared.
+    /// Cells that are not compared, with the reason.
     pub left_out: Vec<(CellIndex, LeftOut)>,
 }
 
-/// A cell that ends a charge or a discharge.
+/// A cell that is full or empty first.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LimitingCell {
-    /// Which.
+    /// Index of the cell.
     pub cell: CellIndex,
-    /// Its larger cause.
+    /// The larger of the two causes.
     pub reason: LimitReason,
-    /// What it takes or gives less than the mean cell because of its charge, fraction of the mean cell's capacity.
+    /// Charge missing relative to the mean cell because of the cell's SOC, fraction of the mean cell's capacity.
     pub by_charge: f64,
-    /// The same because of its capacity.
+    /// Charge missing relative to the mean cell because of the cell's capacity, fraction of the mean cell's capacity.
     pub by_capacity: f64,
 }
 
-/// Why a cell is the limiting one.
+/// Reason why a cell limits the pack.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum LimitReason {
@@ -86,14 +87,14 @@ pub enum LimitReason {
     MostCharge,
     /// It has less capacity than the others.
     LeastCapacity,
-    /// It loses charge by itself: a finding.
+    /// It has a leak finding.
     Leak,
-    /// Its capacity is below that of the others: a finding.
+    /// It has a weak-cell finding.
     WeakCell,
 }
 
 impl LimitReason {
-    /// In words.
+    /// Text for reports.
     pub const fn words(self) -> &'static str {
         match self {
             Self::LeastCharge => "least charge",
@@ -105,12 +106,12 @@ impl LimitReason {
     }
 }
 
-/// How far the cells differ in one state.
+/// Spread of the cells in one state.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CellSpread {
     /// Standard deviation of the cells' estimates.
     pub std: f64,
-    /// Root mean square of the estimates' own standard deviations: a `std` that is not above it says nothing.
+    /// Root mean square of the estimates' own standard deviations. A `std` below this is not significant.
     pub error: f64,
     /// Cell with the lowest value, and its difference from the middle.
     pub lowest: (CellIndex, f64),
@@ -118,36 +119,36 @@ pub struct CellSpread {
     pub highest: (CellIndex, f64),
 }
 
-/// Why a cell is not compared.
+/// Reason why a cell is not compared.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum LeftOut {
-    /// What is read as its voltage is not that.
+    /// Its voltage reading is wrong or belongs to another cell.
     FaultyChannel,
-    /// Its SOC or capacity beside the others is not known yet.
+    /// Its SOC or capacity relative to the others is still uncertain.
     NotKnown,
 }
 
-/// Why nothing is known of a pack's imbalance.
+/// Reason why a pack's imbalance is unknown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum UnknownImbalance {
-    /// No row has ended since the start, or since a time of unknown length.
-    #[error("the cells were not compared yet")]
+    /// No row has ended since the start, or since a gap of unknown length.
+    #[error("the cells have not been compared yet")]
     NotCompared,
     /// Too few cells can be compared.
-    #[error("{known} of {cells} cells can be compared, must be at least {least}")]
+    #[error("{known} of {cells} cells can be compared, at least {least} are needed")]
     TooFewCells {
         /// Cells that can be compared.
         known: usize,
         /// Cells of the pack.
         cells: usize,
-        /// Fewest that must be.
+        /// Fewest cells required.
         least: usize,
     },
 }
 
 impl Imbalance {
-    /// A fraction of the mean cell's capacity in Ah.
+    /// Converts a fraction of the mean cell's capacity to Ah.
     pub fn ah(&self, part: ScalarGaussian) -> ScalarGaussian {
         let mean = part.mean * self.mean_ah.mean;
         let variance = part.variance * self.mean_ah.mean * self.mean_ah.mean
@@ -158,10 +159,10 @@ impl Imbalance {
 }
 
 impl CellFaultDetector {
-    /// What the differences between the cells cost. `middle_ah`: capacity of the middle cell, Ah.
+    /// Computes the imbalance. `middle_ah`: capacity of the middle cell, Ah.
     ///
     /// # Errors
-    /// Why it is not known.
+    /// The reason why it is unknown.
     pub fn imbalance(&self, middle_ah: ScalarGaussian) -> Result<Imbalance, UnknownImbalance> {
         let (time, middle_soc) = self.middle_soc().ok_or(UnknownImbalance::NotCompared)?;
         let (mut known, mut left_out) = (Vec::new(), Vec::new());
@@ -190,18 +191,18 @@ impl CellFaultDetector {
     }
 }
 
-/// Mean open-circuit voltage from empty to full of a cell that has aged to a capacity, V.
+/// Mean open-circuit voltage, V, from empty to full, of a cell that has aged to `capacity_ah`.
 pub fn mean_ocv_v(model: &CellModel, capacity_ah: f64) -> f64 {
     let soc = |part: u32| (f64::from(part) + 0.5) / f64::from(OCV_PARTS);
     let ocv_v = |part| model.aged_ocv_v(&model.grid_position(soc(part), 25.0), capacity_ah);
     (0..OCV_PARTS).map(ocv_v).sum::<f64>() / f64::from(OCV_PARTS)
 }
 
-/// A cell beside the middle one.
+/// A cell relative to the middle one.
 #[derive(Debug, Clone, Copy)]
 struct ComparedCell {
     cell: CellIndex,
-    /// Differences: of SOC; of capacity and resistance, fractions of the middle cell's.
+    /// Difference in SOC. Differences in capacity and resistance: fractions of the middle cell's.
     soc: ScalarGaussian,
     capacity: ScalarGaussian,
     resistance: ScalarGaussian,
@@ -221,17 +222,17 @@ impl ComparedCell {
         self.middle_soc + self.soc.mean
     }
 
-    /// Charge down to empty, fraction of the middle cell's capacity.
+    /// Charge until empty, fraction of the middle cell's capacity.
     fn dischargeable(&self) -> f64 {
         self.own_soc() * self.capacity()
     }
 
-    /// Charge up to full, fraction of the middle cell's capacity.
+    /// Charge until full, fraction of the middle cell's capacity.
     fn chargeable(&self) -> f64 {
         (1.0 - self.own_soc()) * self.capacity()
     }
 
-    /// The reason by the larger cause.
+    /// The reason that corresponds to the larger cause.
     fn reason(&self, by_charge: f64, by_capacity: f64, charge: LimitReason) -> LimitReason {
         match (by_capacity > by_charge, charge) {
             (true, _) if self.is_weak => LimitReason::WeakCell,
@@ -242,14 +243,14 @@ impl ComparedCell {
     }
 }
 
-/// Of some cells, at least one.
+/// Imbalance of at least one cell.
 fn imbalance(time: Timestamp, cells: &[ComparedCell], middle_ah: ScalarGaussian) -> Imbalance {
     let mean = |value: fn(&ComparedCell) -> f64| cells.iter().map(value).sum::<f64>() / cells.len() as f64;
     let (mean_capacity, each) = (mean(ComparedCell::capacity), 1.0 / cells.len() as f64);
     let weakest = least(cells, ComparedCell::capacity);
     let (first_empty, first_full) = (least(cells, ComparedCell::dischargeable), least(cells, ComparedCell::chargeable));
     let usable = first_empty.dischargeable() + first_full.chargeable();
-    // Slopes by a cell's SOC and capacity.
+    // Derivatives with respect to a cell's SOC and capacity.
     let usable_slopes = |it: &ComparedCell| {
         let (empty, full) = (is(it, first_empty), is(it, first_full));
         [(empty - full) * it.capacity(), empty * it.own_soc() + full * (1.0 - it.own_soc())]
@@ -262,7 +263,7 @@ fn imbalance(time: Timestamp, cells: &[ComparedCell], middle_ah: ScalarGaussian)
         mean: mean / mean_capacity,
         variance: variance / (mean_capacity * mean_capacity),
     };
-    // What a cell takes or gives less = its capacity less + what the other end has more.
+    // Missing charge = missing capacity + the excess at the other end.
     let less = |it: &ComparedCell, other_end: fn(&ComparedCell) -> f64, charge| {
         let by_capacity = (mean_capacity - it.capacity()) / mean_capacity;
         let by_charge = (other_end(it) - mean(other_end)) / mean_capacity;
@@ -288,7 +289,7 @@ fn imbalance(time: Timestamp, cells: &[ComparedCell], middle_ah: ScalarGaussian)
     }
 }
 
-/// The first cell with the least value.
+/// The first cell with the smallest value.
 fn least(cells: &[ComparedCell], value: fn(&ComparedCell) -> f64) -> &ComparedCell {
     cells.iter().fold(&cells[0], |least, it| if value(it) < value(least) { it } else { least })
 }
@@ -328,7 +329,7 @@ mod tests {
 
     const MIDDLE_AH: ScalarGaussian = ScalarGaussian { mean: 50.0, variance: 1.0 };
 
-    /// Ten cells, the middle one at 60 %, of which some have another SOC (difference) and capacity (fraction).
+    /// Ten cells, the middle one at SOC 0.6. `others`: cell, difference in SOC, difference in capacity (fraction).
     fn pack(others: &[(u16, f64, f64)]) -> Vec<ComparedCell> {
         let known = |mean, std| ScalarGaussian::from_std(mean, std);
         let cell = |cell| {
@@ -355,7 +356,7 @@ mod tests {
     }
 
     #[test]
-    fn a_balanced_pack_of_equal_cells_loses_nothing() {
+    fn balanced_pack_of_equal_cells_loses_nothing() {
         let found = of(&pack(&[]));
         assert_near(found.usable.mean, 1.0);
         assert_near(found.lost_by_imbalance.mean, 0.0);
@@ -365,13 +366,13 @@ mod tests {
     }
 
     #[test]
-    fn a_cell_with_less_charge_ends_the_discharge_and_balancing_gives_it_back() {
-        // 0.55 down to its end, 0.4 up to that of the others.
+    fn cell_with_least_charge_limits_discharge() {
+        // 0.55 until this cell is empty, 0.4 until the others are full.
         let found = of(&pack(&[(3, -0.05, 0.0)]));
         assert_near(found.usable.mean, 0.95);
         assert_near(found.lost_by_imbalance.mean, 0.05);
         assert_near(found.lost_by_weakest.mean, 0.0);
-        // Its SOC and that of the first full cell, with their capacities 0.55 and 0.4 of the way.
+        // Errors of this cell and of the first full cell: SOC with weight 1, capacity with weights 0.55 and 0.4.
         let expected: f64 = 2.0 * 0.003f64.powi(2) + (0.55f64.powi(2) + 0.4f64.powi(2)) * 0.006f64.powi(2);
         assert_near(found.usable.variance, expected);
         let LimitingCell { cell, reason, by_charge, by_capacity } = found.discharge_limit;
@@ -382,8 +383,8 @@ mod tests {
     }
 
     #[test]
-    fn a_weak_cell_that_is_full_with_the_others_loses_nothing_by_imbalance() {
-        // 40 % of a mean cell up to full: 0.4 of 0.9, so at SOC 5 / 9.
+    fn weak_cell_full_with_others_loses_nothing_by_imbalance() {
+        // 0.4 of a mean cell until full, with a capacity of 0.9: SOC 5 / 9.
         let found = of(&pack(&[(3, 5.0 / 9.0 - 0.6, -0.1)]));
         assert_near(found.usable.mean, 0.9 / 0.99);
         assert_near(found.lost_by_imbalance.mean, 0.0);
@@ -393,8 +394,8 @@ mod tests {
     }
 
     #[test]
-    fn the_larger_of_two_causes_is_the_reason_unless_a_finding_names_it() {
-        // A tenth weak and 5 points below its place: 0.9 * (5/9 - 0.05) down, 0.4 up.
+    fn limit_reason_is_larger_cause_or_finding() {
+        // Capacity 0.9 and SOC 0.05 below the balanced value: 0.9 * (5/9 - 0.05) until empty, 0.4 until full.
         let mut cells = pack(&[(3, 5.0 / 9.0 - 0.6 - 0.05, -0.1)]);
         let found = of(&cells);
         assert_near(found.usable.mean, (0.5 - 0.045 + 0.4) / 0.99);
@@ -409,18 +410,18 @@ mod tests {
     }
 
     #[test]
-    fn a_cell_with_more_charge_ends_the_charge() {
+    fn cell_with_most_charge_limits_charge() {
         let found = of(&pack(&[(7, 0.04, 0.0)]));
         assert_near(found.lost_by_imbalance.mean, 0.04);
         assert_eq!((found.charge_limit.cell, found.charge_limit.reason), (CellIndex(7), LimitReason::MostCharge));
-        // Empty with the others, a weak cell is full first.
+        // A weak cell that is empty together with the others is full first.
         let found = of(&pack(&[(7, 0.6 / 0.9 - 0.6, -0.1)]));
         assert_near(found.lost_by_imbalance.mean, 0.0);
         assert_eq!((found.charge_limit.cell, found.charge_limit.reason), (CellIndex(7), LimitReason::LeastCapacity));
     }
 
     #[test]
-    fn charge_in_ah_has_the_deviation_of_the_capacity_too() {
+    fn charge_in_ah_includes_capacity_deviation() {
         let found = of(&pack(&[(3, -0.05, 0.0)]));
         let lost = found.ah(found.lost_by_imbalance);
         assert_near(lost.mean, 2.5);
@@ -429,7 +430,7 @@ mod tests {
     }
 
     #[test]
-    fn cells_of_which_nothing_is_known_are_no_healthy_pack() {
+    fn imbalance_without_rows_is_unknown() {
         assert_eq!(CellFaultDetector::new(2).imbalance(MIDDLE_AH), Err(UnknownImbalance::NotCompared));
         assert_eq!(CellFaultDetector::new(12).imbalance(MIDDLE_AH), Err(UnknownImbalance::NotCompared));
     }

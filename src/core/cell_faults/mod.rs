@@ -1,20 +1,20 @@
-//! Which cell is failing, and how: each cell against the others of its pack.
+//! Finds failing cells by comparing each cell with the others of its pack.
 //!
-//! In: samples of the cells of one pack in series, and what the estimators know of the mean cell. Out: [`CellFault`]s. All cells
-//! carry the same current, so what is common to them (model, SOC, sensor of the current) cancels in the differences, and a
-//! cell stands out by a few millivolts. A single cell has no others: nothing is found.
+//! In: samples of the cells of one series pack, and the estimators' values of the mean cell. Out: [`CellFault`]s. All
+//! cells carry the same current, so common errors (model, SOC, current sensor) cancel in the differences, and a cell
+//! stands out by a few millivolts. With fewer than three cells nothing is found.
 //!
 //! | file | purpose |
 //! | --- | --- |
 //! | [`detector`] | all cells: rows in, findings out |
-//! | [`difference`] | the filter of one cell's difference: charge, capacity, resistance, contact, channel, leak |
-//! | [`bleed_timer`] | for how long a cell was bled, by the bits of its BMS |
-//! | `row` | samples of some minutes, summed per cell |
-//! | [`gain`] | the current sensor's gain, by what all cells have in common |
-//! | `channels` | channels that are frozen or doubled |
+//! | [`difference`] | filter of one cell's difference: charge, capacity, resistance, contact, channel, leak |
+//! | [`bleed_timer`] | how long a cell was bled, from the balancing bits of its BMS |
+//! | `row` | samples of a few minutes, summed per cell |
+//! | [`gain`] | gain of the current sensor, from changes that all cells share |
+//! | `channels` | frozen and doubled voltage channels |
 //! | `temperature` | temperature sensors that do not follow the load |
-//! | [`imbalance`] | what the differences cost the pack, and its limiting cells |
-//! | [`fault`] | kinds of findings, and from when on one is reported |
+//! | [`imbalance`] | capacity lost by the differences, and the limiting cells |
+//! | [`fault`] | kinds of findings and the limits for reporting them |
 pub mod bleed_timer;
 pub mod detector;
 pub mod difference;

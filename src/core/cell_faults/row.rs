@@ -1,4 +1,4 @@
-//! A row: the samples of some minutes, summed per cell.
+//! A row: samples of a few minutes, summed per cell.
 
 use serde::{Deserialize, Serialize};
 
@@ -8,22 +8,23 @@ use crate::quantity::Timestamp;
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct CellSums {
     pub(super) count: u32,
-    /// Voltage without the mean cell's ohmic drop at the cell's own current: samples of the cells are of different moments.
+    /// Sum of the voltages plus the mean cell's ohmic drop at the current of each sample, because the cells are
+    /// sampled at different times.
     voltage_v: f64,
-    /// Of the steps from sample to sample: squares of the current, products with the voltage.
+    /// Over the steps between samples: sums of the squared current step and of current step times voltage step.
     steps_a2: f64,
     steps_va: f64,
-    /// Time, voltage and current of the sample before.
+    /// Time, voltage and current of the previous sample.
     last: Option<(Timestamp, f64, f64)>,
     temperature_c: f64,
     temperatures: u32,
-    /// Bits of the voltages in their order, mixed, and how often the voltage has changed.
+    /// Hash of the sequence of voltages, and number of voltage changes.
     pub(super) digest: u64,
     pub(super) changes: u32,
 }
 
 impl CellSums {
-    /// Adds a sample: V, A; `ohm` is the mean cell's series resistance.
+    /// Adds a sample, V and A; `ohm` is the mean cell's series resistance.
     #[inline]
     pub(super) fn add(
         &mut self,
@@ -34,7 +35,7 @@ impl CellSums {
         ohm: f64,
     ) {
         let apart_ns = |before: Timestamp| time.nanos().wrapping_sub(before.nanos());
-        // More of them say the same again.
+        // At most about one sample per second: more add no information.
         if self.last.is_some_and(|(before, ..)| (0..900_000_000).contains(&apart_ns(before))) {
             return;
         }
@@ -65,17 +66,18 @@ impl CellSums {
         (self.temperatures > 0).then(|| self.temperature_c / f64::from(self.temperatures))
     }
 
-    /// Series resistance by the steps, ohm, when their squares are at least `least_a2`; and these.
+    /// Series resistance from the steps, ohm, and the sum of squared current steps; `None` if that sum is below
+    /// `least_a2`.
     pub(super) fn ohm(&self, least_a2: f64) -> Option<(f64, f64)> {
         (self.steps_a2 >= least_a2).then(|| (-self.steps_va / self.steps_a2, self.steps_a2))
     }
 
-    /// Begins the next row.
+    /// Starts the next row.
     pub(super) fn begin(&mut self) {
         *self = Self { last: self.last, ..Self::default() };
     }
 
-    /// What follows does not hang together with the samples so far.
+    /// Discards the samples so far, because the following ones are not contiguous with them.
     pub(super) fn interrupt(&mut self) {
         *self = Self::default();
     }
@@ -96,7 +98,7 @@ pub(super) struct PackSums {
     pub(super) drop_v: f64,
     pub(super) soc: f64,
     pub(super) temperature_c: f64,
-    /// Charge beyond the first, and the first, Ah.
+    /// Sum of the charges minus the first one, and the first one, Ah.
     pub(super) charge_ah: f64,
     pub(super) first_ah: f64,
 }

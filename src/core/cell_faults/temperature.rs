@@ -1,19 +1,20 @@
-//! Temperature sensors that do not follow the load: frozen ones, and ones that have fallen off.
+//! Temperature sensors that do not follow the load: frozen or detached ones.
 //!
-//! In: the temperature at each cell and that in the middle of the pack, row by row. Cells of one sensor show the same, so a faulty
-//! sensor appears as its cells. With one sensor for all cells, or two, nothing is known: none stands out.
+//! In: per row, the temperature at each cell and the median of the pack. Cells that share a sensor show the same
+//! temperature, so a faulty sensor appears as a range of cells. With one or two sensors for all cells, no sensor
+//! stands out.
 
 use serde::{Deserialize, Serialize};
 
-/// Sum of squared warmings from which on a sensor is judged, K^2.
+/// A sensor is judged once the sum of squared warmings reaches this, K^2.
 const LEAST_K2: f64 = 30.0;
-/// Part of the pack's warming below which a sensor does not follow, and above which it does again.
+/// A sensor is detached below this part of the pack's warming, and attached again above `ATTACHED`.
 const DETACHED: f64 = 0.35;
 const ATTACHED: f64 = 0.6;
 
 /// How one cell's temperature follows the pack's.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
-pub(super) struct Following {
+pub(super) struct WarmingRatio {
     /// Slow mean, degrees C.
     slow_c: Option<f64>,
     /// Sums of squares of the pack's warming and of products with the one here, K^2.
@@ -22,18 +23,19 @@ pub(super) struct Following {
     pub(super) is_detached: bool,
 }
 
-impl Following {
-    /// Takes the temperature of a row `seconds` after the one before; the warming, K: an offset of the sensor is none.
+impl WarmingRatio {
+    /// Handles the temperature of a row, `seconds` after the previous one. Returns the warming, K, in which a constant
+    /// sensor offset cancels.
     pub(super) fn warming_k(&mut self, seconds: f64, here_c: f64) -> f64 {
         let slow_c = self.slow_c.get_or_insert(here_c);
-        // Time over which a warming counts as one of the load.
+        // Time constant of a warming by the load.
         *slow_c = here_c + libm::exp(-seconds.max(0.0) / 7200.0) * (*slow_c - here_c);
         here_c - *slow_c
     }
 
-    /// Compares the warming of a row with that in the middle of the pack.
+    /// Compares the warming at a cell with the median warming of the pack in the same row.
     pub(super) fn compare(&mut self, seconds: f64, middle_k: f64, here_k: f64) {
-        // After five days what was seen counts half.
+        // Halves the weight of a row after five days.
         let older = libm::exp2(-seconds.max(0.0) / (5.0 * 86_400.0));
         self.squares_k2 = older * self.squares_k2 + middle_k * middle_k;
         self.products_k2 = older * self.products_k2 + middle_k * here_k;
@@ -52,9 +54,9 @@ impl Following {
 mod tests {
     use super::*;
 
-    /// Two days: the pack warms by 8 K each time; the sensor shows this part of it.
-    fn after_days(part: f64) -> Following {
-        let (mut pack, mut following) = (Following::default(), Following::default());
+    /// Runs two days of a pack that warms by 8 K several times; the sensor shows `part` of it.
+    fn after_days(part: f64) -> WarmingRatio {
+        let (mut pack, mut following) = (WarmingRatio::default(), WarmingRatio::default());
         for row in 0..2 * 288 {
             let warming_k = if row % 72 < 24 { 8.0 * f64::from(row % 72) / 24.0 } else { 0.0 };
             let middle_k = pack.warming_k(300.0, 20.0 + warming_k);
@@ -65,14 +67,14 @@ mod tests {
     }
 
     #[test]
-    fn a_sensor_that_shows_little_of_the_warming_is_detached() {
+    fn sensor_with_little_warming_is_detached() {
         assert!(after_days(0.0).is_detached && after_days(0.2).is_detached);
         assert!(!after_days(0.7).is_detached && !after_days(1.2).is_detached);
     }
 
     #[test]
-    fn a_pack_that_does_not_warm_says_nothing() {
-        let mut following = Following::default();
+    fn pack_without_warming_detaches_no_sensor() {
+        let mut following = WarmingRatio::default();
         (0..1000).for_each(|row| following.compare(300.0, 0.1 * f64::from(row % 2), 0.0));
         assert!(!following.is_detached, "{following:?}");
     }

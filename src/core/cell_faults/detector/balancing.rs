@@ -1,4 +1,4 @@
-//! Balancing taken out of the differences between the cells, where bits show which cells are bled.
+//! Corrects the differences between the cells for balancing, if bits show which cells are bled.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,21 +6,22 @@ use super::{CellFaultDetector, inner_half};
 use crate::cell_faults::bleed_timer::{BalancingConfig, BleedTime, BleedTimer};
 use crate::quantity::{InvalidState, Timestamp};
 
-/// Deviation of what the bits say was bled, part of it: the resistors of one BMS are alike, their current follows the voltage.
+/// Relative standard deviation of the bled charge according to the bits. The resistors of one BMS are alike, but their
+/// current follows the voltage.
 const BLEED_PART: f64 = 0.2;
-/// Most that a cell loses beside the others before it is like them, SOC: a BMS bleeds it down to the lowest.
+/// Largest SOC that a cell loses relative to the others: a BMS bleeds it only down to the lowest cell.
 const MOST_BESIDE: f64 = 0.1;
 
-/// Errors that lie to one side for as long as something lasts: their sum, not their squares, grows.
+/// Correlated errors: while the cause lasts, the errors have the same sign, so they add up linearly, not in squares.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Lasting {
+struct CorrelatedError {
     sum: f64,
 }
 
-impl Lasting {
-    /// What one more row adds to the square of the sum. The sum is bounded, and with it what a row can add; a row in which nothing
-    /// was lost ends it.
+impl CorrelatedError {
+    /// Returns the increase of the squared sum by one more row. The sum, and so the increase, is bounded. A row
+    /// without loss resets the sum.
     fn add(&mut self, part: f64) -> f64 {
         let before = std::mem::take(&mut self.sum);
         let part = part.clamp(-MOST_BESIDE, MOST_BESIDE);
@@ -32,24 +33,24 @@ impl Lasting {
     }
 }
 
-/// What is bled of one cell.
+/// Balancing of one cell.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Bleed {
     pub(super) timer: BleedTimer,
-    /// Beside the middle cells, SOC, while it is bled or they are.
-    bled: Lasting,
-    /// At most, SOC, while it is not known.
-    unseen: Lasting,
+    /// SOC bled relative to the middle cells, while this cell or the middle cells are bled.
+    bled: CorrelatedError,
+    /// Largest SOC that may have been bled while the state was unknown.
+    unseen: CorrelatedError,
 }
 
 impl Bleed {
-    /// Whether no bit has come so far.
+    /// Whether no bit has been received yet.
     pub(super) fn is_unused(&self) -> bool {
         *self == Self::default()
     }
 
-    /// The time so far does not count.
+    /// Discards the time so far.
     pub(super) fn forget_time(&mut self) {
         self.timer.forget_time();
         *self = Self { timer: self.timer, ..Self::default() };
@@ -64,10 +65,10 @@ impl Bleed {
 }
 
 impl CellFaultDetector {
-    /// Takes a bit of the BMS, which holds until `holds_until` or the next one: whether it bleeds a cell; `None` = it cannot be read.
+    /// Handles a balancing bit of a cell, valid until `holds_until` or the next bit; `None` = it cannot be read.
     pub fn handle_balancing(&mut self, cell: usize, time: Timestamp, is_bled: Option<bool>, holds_until: Timestamp) {
         let Some(watched) = self.cells.get(cell) else { return };
-        // What a cell loses beside what the bits show is a leak.
+        // From the first bit on, a loss beyond the bits is a leak.
         let begins = is_bled.is_some() && !watched.bleed.timer.has_bits && self.may_be_bled(cell);
         let watched = &mut self.cells[cell];
         watched.bleed.timer.take(time, is_bled, holds_until);
@@ -76,13 +77,13 @@ impl CellFaultDetector {
         }
     }
 
-    /// Takes that no bit was received from a time to another, because the daemon did not run.
+    /// Handles a time in which the daemon did not run and received no bits.
     pub fn note_unheard(&mut self, from: Timestamp, to: Timestamp) {
         self.cells.iter_mut().for_each(|cell| cell.bleed.timer.note_unheard(from, to));
     }
 
-    /// Removes the charge that was bled since the last row from each cell's difference, less that of the middle cells. `balancing`:
-    /// `None` forgets all bits.
+    /// Subtracts the charge bled since the last row, relative to the middle cells, from each cell's difference. If
+    /// `balancing` is `None`, discards all bits.
     pub(super) fn remove_bled_charge(&mut self, time: Timestamp, capacity_ah: f64, balancing: Option<BalancingConfig>) {
         let Some(balancing) = balancing else {
             return self.cells.iter_mut().for_each(|cell| cell.bleed = Bleed::default());
@@ -94,20 +95,20 @@ impl CellFaultDetector {
             let has_bits = cell.bleed.timer.has_bits;
             let soc = if has_bits { soc_per_s * (time.bled_s - middle_s) } else { 0.0 };
             let silent_s = if balancing.is_only_while_sent { 0.0 } else { time.silent_s };
-            // As without bits: the lowest cell is never bled, and of a cell without bits what the others lost may be its own too.
+            // The lowest cell is never bled. A cell without bits may have lost as much as the middle cells.
             let unseen_s = match has_bits {
                 _ if self.lowest == Some(index) => 0.0,
                 true => time.unknown_s + silent_s,
                 false => middle_s,
             };
             let variance = BLEED_PART * BLEED_PART * cell.bleed.bled.add(soc)
-                // Mean square of a part that is uniform between -1 and 1.
+                // Mean square of a value uniform between -1 and 1.
                 + (1.0 / 3.0) * cell.bleed.unseen.add(soc_per_s * unseen_s);
             cell.difference.remove_charge(soc, variance);
         }
     }
 
-    /// For how long the cells whose voltages are in the middle half were bled, mean, s.
+    /// Mean time, s, for which the cells in the middle half of the voltages were bled.
     fn bled_in_middle_s(&self, times: &[BleedTime]) -> f64 {
         let known = self.cells.iter().zip(times).filter(|(cell, _)| cell.bleed.timer.has_bits);
         let mut by_voltage: Vec<(f64, f64)> =
@@ -129,14 +130,14 @@ mod tests {
         Timestamp::from_secs(seconds)
     }
 
-    /// Three cells of 60 Ah with a bit of 0 at the beginning.
+    /// Three cells of 60 Ah that each received a bit of 0 at time 0.
     fn diagnosis() -> CellFaultDetector {
         let mut diagnosis = CellFaultDetector::new(3);
         (0..3).for_each(|cell| diagnosis.handle_balancing(cell, at(0.0), Some(false), at(10.0)));
         diagnosis
     }
 
-    /// Deviation that a cell's SOC has got by what may have been bled.
+    /// Standard deviation that cell 0's SOC gains from possible bleeding until `end_s`.
     fn lost_std(diagnosis: &mut CellFaultDetector, end_s: f64, balancing: BalancingConfig) -> f64 {
         let variance = |diagnosis: &CellFaultDetector| diagnosis.cells[0].difference.state(SOC).variance;
         let before = variance(diagnosis);
@@ -146,8 +147,8 @@ mod tests {
     }
 
     #[test]
-    fn a_time_without_bits_is_unknown_unless_the_bms_bleeds_only_while_it_sends_and_the_daemon_ran() {
-        // A thousandth of the capacity an hour.
+    fn time_without_bits_is_unknown_unless_configured_otherwise() {
+        // SOC lost in 8 h at 0.06 A / 60 Ah, as a uniform distribution.
         let unknown = 0.008 / 3.0_f64.sqrt();
         let silent = BalancingConfig { is_only_while_sent: false, ..BALANCING };
         let near = |a: f64, b: f64| (a - b).abs() < 0.01 * unknown;
@@ -159,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_bled_is_taken_out_and_known_within_a_fifth() {
+    fn bled_charge_is_removed_with_its_deviation() {
         let mut bled = diagnosis();
         bled.handle_balancing(0, at(10.0), Some(true), at(10.0 + 10.0 * HOUR));
         let std = lost_std(&mut bled, 10.0 + 10.0 * HOUR, BALANCING);
@@ -169,12 +170,12 @@ mod tests {
     }
 
     #[test]
-    fn a_year_unseen_counts_as_the_most_a_cell_loses_and_each_further_hour_as_little() {
+    fn unseen_loss_is_bounded_over_a_year() {
         let mut year = diagnosis();
         let silent = BalancingConfig { is_only_while_sent: false, ..BALANCING };
         let std = lost_std(&mut year, 8760.0 * HOUR, silent);
         assert!((std - MOST_BESIDE / 3.0_f64.sqrt()).abs() < 1e-6, "{std}");
-        // A thousandth of the capacity each, to the same side as before.
+        // Each further hour may lose a thousandth of the capacity, to the same side.
         let mut last = std;
         for row in 1..100 {
             last = lost_std(&mut year, (8760.0 + f64::from(row)) * HOUR, silent);
@@ -185,8 +186,8 @@ mod tests {
     }
 
     #[test]
-    fn errors_to_one_side_add_up_until_nothing_is_added() {
-        let mut lasting = Lasting::default();
+    fn lasting_errors_add_up_until_reset() {
+        let mut lasting = CorrelatedError::default();
         let added = [0.01, 0.01, -0.01, 0.0, 0.02].map(|part| lasting.add(part));
         assert!(added.iter().zip([1.0, 3.0, 0.0, 0.0, 4.0]).all(|(a, b)| (a - 1e-4 * b).abs() < 1e-12), "{added:?}");
         for _ in 0..1000 {

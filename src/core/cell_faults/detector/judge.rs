@@ -1,4 +1,4 @@
-//! What a row has shown of each cell, as findings: from when on one is reported, and when it is withdrawn.
+//! Turns the states of the cells into findings, and decides when a finding is reported and withdrawn.
 
 use super::CellFaultDetector;
 use crate::cell_faults::difference::{self, CHANNEL, CONTACT, Jump, LEAK, RESISTANCE, SOC, STATES};
@@ -6,26 +6,26 @@ use crate::cell_faults::fault::{self, CellFault, CellFaultKind, OUTLIER, REPORTE
 use crate::filter::{ScalarGaussian, normal_cdf};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Time within which the cells of a module are found to have more capacity than the others.
+/// Cells of one module are found to have more capacity than the others within this time, s.
 const SAME_MODULE_S: f64 = 3.0 * DAY_S;
-/// Deviation up to which a size is known, in limits of its kind.
+/// Largest standard deviation of a known size, in limits of its kind.
 const KNOWN_LIMITS: f64 = 2.0;
 
-/// Difference of SOC beyond which a cell is too far from the others for a comparison of resistance and channel.
+/// Difference in SOC beyond which resistance and channel of a cell cannot be compared with the others.
 const TOO_FAR: f64 = 0.1;
 const DAY_S: f64 = 86_400.0;
 
-/// A judgement of one kind.
+/// Judgement of one cell for one kind.
 #[derive(Debug, Clone, Copy)]
-struct Judged {
+struct Judgement {
     kind: CellFaultKind,
     size: ScalarGaussian,
     probability: f64,
-    /// Whether the cell is near enough to the others for it.
+    /// Whether the cell is close enough to the others for this kind.
     is_comparable: bool,
 }
 
-/// Middle and robust standard deviation (median of the absolute deviations) of the cells.
+/// Median and robust standard deviation of the cells (from the median absolute deviation).
 pub(super) struct Population {
     pub(super) middle: f64,
     pub(super) std: f64,
@@ -33,7 +33,7 @@ pub(super) struct Population {
 
 impl Population {
     pub(super) fn of(of_cells: impl Iterator<Item = f64>) -> Self {
-        // As many as may come, at once: of an iterator that leaves some out, `collect` knows only that it may be none.
+        // Allocates once for the upper bound: `collect` would use the lower bound of the size hint, 0 for a filter.
         let mut values: Vec<f64> = Vec::with_capacity(of_cells.size_hint().1.unwrap_or_default());
         values.extend(of_cells);
         values.sort_by(f64::total_cmp);
@@ -53,7 +53,8 @@ impl CellFaultDetector {
         Population::of(compared.map(|cell| cell.difference.state(state).mean))
     }
 
-    /// Judges all cells. `bled_slope_v`: slope of the open-circuit curve where a BMS bleeds, V; `None` = it does not.
+    /// Judges all cells. `bled_slope_v`: slope of the open-circuit curve at the SOC where the BMS bleeds, V; `None` =
+    /// the BMS does not bleed.
     pub(super) fn judge(&mut self, time: Timestamp, bled_slope_v: Option<f64>) {
         self.is_balanced = bled_slope_v.is_some();
         let lowest = bled_slope_v.and_then(|slope_v| self.clearly_lowest(slope_v));
@@ -74,12 +75,12 @@ impl CellFaultDetector {
                 continue;
             }
             let judged = self.judged(index, &populations);
-            // The first channel fault, if any, in the order of `judged`: nothing else is known then.
+            // After a channel fault (the first one in the order of `judged`), nothing else is known of the cell.
             let fault =
                 judged.iter().find(|it| it.kind.is_of_channel() && it.probability >= REPORTED).map(|it| it.kind);
             for it in judged {
                 let probability = if fault.is_some_and(|fault| fault != it.kind) { 0.0 } else { it.probability };
-                let finding = self.take(time, index, &Judged { probability, ..it });
+                let finding = self.take(time, index, &Judgement { probability, ..it });
                 if it.kind == CellFaultKind::ForeignCell {
                     let certain = Some(finding).filter(|it| it.probability >= REPORTED);
                     foreign.push(self.module_of(index).copied().or(certain));
@@ -89,8 +90,8 @@ impl CellFaultDetector {
         self.find_modules(time, &foreign);
     }
 
-    /// Per cell and kind, its size against the middle of the pack, in the unit of the kind; `None` = it cannot be judged: the cell is
-    /// too far from the others, its channel is faulty, or the value is not known well enough yet.
+    /// Size per cell and kind relative to the middle of the pack, in the unit of the kind. `None` if it cannot be
+    /// judged: the cell is too far from the others, its channel is faulty, or the value is still too uncertain.
     pub fn sizes<const N: usize>(&self, kinds: [CellFaultKind; N]) -> Vec<[Option<ScalarGaussian>; N]> {
         let populations = self.populations();
         (0..self.cells.len()).map(|cell| kinds.map(|kind| self.size(cell, kind, &populations))).collect()
@@ -107,7 +108,8 @@ impl CellFaultDetector {
         (judged.is_comparable && is_known && self.has_channel_fault(cell) == Some(false)).then_some(judged.size)
     }
 
-    /// Whether what is read as a cell's voltage is not that; `None` = not compared, or not yet.
+    /// Whether a cell's voltage reading belongs to another cell or is wrong; `None` if the cell is not compared, or
+    /// not yet.
     pub fn has_channel_fault(&self, cell: CellIndex) -> Option<bool> {
         self.cells.get(cell.index()).filter(|cell| cell.is_compared)?;
         let is_found = self.findings.iter().any(|found| found.kind.is_channel_fault() && found.is_of(cell));
@@ -118,8 +120,9 @@ impl CellFaultDetector {
         std::array::from_fn(|state| self.population(state))
     }
 
-    /// The cell whose channel shows less than any other beyond doubt where a BMS bleeds; `None` = none. It is the one cell that
-    /// no BMS bleeds: a BMS goes by the readings, whatever their errors. It stays the one until another shows less.
+    /// The cell whose channel clearly reads lowest at the SOC where a BMS bleeds; `None` if no cell does. No BMS
+    /// bleeds this cell, because a BMS follows its readings, whatever their errors. The cell remains the lowest until
+    /// another one reads lower.
     fn clearly_lowest(&self, slope_v: f64) -> Option<usize> {
         let (mut lowest, mut next): (Option<(usize, ScalarGaussian)>, Option<ScalarGaussian>) = (None, None);
         let compared = self.cells.iter().enumerate().filter(|(_, cell)| cell.is_compared);
@@ -137,16 +140,16 @@ impl CellFaultDetector {
         (next.mean - shown.mean > 2.0 * shown.std().hypot(next.std())).then_some(lowest)
     }
 
-    /// Whether a BMS may take charge out of the cell that no bit shows: where one balances, out of all but the lowest one. A leak that
-    /// was found is still there when the others are bled.
+    /// Whether a BMS may bleed the cell without a bit that shows it: every cell but the lowest one of a balanced pack
+    /// without bits. A cell with a reported leak does not count, because the leak continues while the others are bled.
     pub(super) fn may_be_bled(&self, index: usize) -> bool {
         let is_found = |found: &CellFault| found.kind == CellFaultKind::Leak && found.is_of(CellIndex(index as u16));
         let is_open = self.is_balanced && !self.cells[index].bleed.timer.has_bits;
         is_open && self.lowest != Some(index) && !self.findings.iter().any(is_found)
     }
 
-    /// What one cell may have.
-    fn judged(&self, index: usize, populations: &[Population; STATES]) -> [Judged; 8] {
+    /// Judges one cell for every kind.
+    fn judged(&self, index: usize, populations: &[Population; STATES]) -> [Judgement; 8] {
         let cell = &self.cells[index];
         let beyond = |state: usize, limit: f64, sign: f64| {
             let own = cell.difference.state(state);
@@ -156,7 +159,7 @@ impl CellFaultDetector {
             let stands_out = sign * size.mean >= OUTLIER * population.std;
             (size, if stands_out { probability } else { 0.0 })
         };
-        let of = |kind: CellFaultKind, (size, probability): (ScalarGaussian, f64)| Judged {
+        let of = |kind: CellFaultKind, (size, probability): (ScalarGaussian, f64)| Judgement {
             kind,
             size,
             probability,
@@ -170,17 +173,18 @@ impl CellFaultDetector {
         let channel = if channel[0].1 >= channel[1].1 { channel[0] } else { channel[1] };
         let mut leak = beyond(LEAK, fault::LEAK_PER_DAY, 1.0);
         if self.may_be_bled(index) {
-            // A leak makes it the lowest cell: until then there is none that matters.
+            // A leak would soon make this the lowest cell; until then it does not matter.
             leak = (ScalarGaussian { mean: 0.0, variance: 0.0 }, 0.0);
         } else if !cell.bleed.timer.has_bits && cell.difference.mean()[SOC] >= populations[SOC].middle {
-            // Above the others it is bled until it is like them, or it has been so far.
+            // A cell above the others is bled until it matches them, or has been until now.
             leak = (ScalarGaussian { mean: leak.0.mean.min(0.0), ..leak.0 }, 0.0);
         }
-        // An offset without loss of charge: with a leak the cell's own charge explains the voltage. Nor is it a new cell then.
+        // A channel offset leaves the charge unchanged. With a leak, the cell's own charge explains the voltage, and
+        // the cell is not a new one.
         let unless_leaking =
             |(size, probability): (ScalarGaussian, f64)| (size, if leak.1 >= WITHDRAWN { 0.0 } else { probability });
         let is_comparable = cell.difference.mean()[SOC].abs() < TOO_FAR;
-        let if_near = |kind: CellFaultKind, (size, probability): (ScalarGaussian, f64)| Judged {
+        let if_near = |kind: CellFaultKind, (size, probability): (ScalarGaussian, f64)| Judgement {
             is_comparable,
             ..of(kind, (size, if is_comparable { probability } else { 0.0 }))
         };
@@ -196,9 +200,9 @@ impl CellFaultDetector {
         ]
     }
 
-    /// Takes a judgement into the list, when it has lasted as long as its kind needs; the finding that it is, listed or not.
-    fn take(&mut self, time: Timestamp, index: usize, judged: &Judged) -> CellFault {
-        let Judged { kind, size, probability, .. } = *judged;
+    /// Updates the list with a judgement that has lasted long enough for its kind. Returns the finding, listed or not.
+    fn take(&mut self, time: Timestamp, index: usize, judged: &Judgement) -> CellFault {
+        let Judgement { kind, size, probability, .. } = *judged;
         let cell = &mut self.cells[index];
         let suspected = &mut cell.suspected[kind as usize - 1];
         if probability < WITHDRAWN {
@@ -213,16 +217,16 @@ impl CellFaultDetector {
         let cells = other.map_or((own, own), |other| (own.min(CellIndex(other)), own.max(CellIndex(other))));
         let finding = CellFault { kind, cells: Some(cells), since, reported: time, probability, size };
         let is_in_module = kind == CellFaultKind::ForeignCell && self.module_of(index).is_some();
-        // The upper one of two doubled channels is in the finding of the lower one.
+        // Two doubled channels share one finding, listed under the lower one.
         if cells.0 == own && !is_in_module {
             self.put(finding);
         }
         finding
     }
 
-    /// Whether what is likelier than not since a time has been so for long enough to be reported. Where a BMS balances, nothing is
-    /// known of a leak at first, so anything else that happens looks like one until the cell has been through a cycle. A cell with
-    /// more capacity waits for its neighbours: together they are a module.
+    /// Whether a kind has been likely for long enough to be reported. In a balanced pack the leak is unknown at first,
+    /// so other changes look like a leak until the cell has completed a cycle. A cell with more capacity waits for its
+    /// neighbours, because together they may be a module.
     fn has_lasted(&self, kind: CellFaultKind, since: Timestamp, now: Timestamp) -> bool {
         let settling_s = match kind {
             CellFaultKind::Leak if self.is_balanced => DAY_S,
@@ -232,7 +236,7 @@ impl CellFaultDetector {
         now.since(since) >= settling_s
     }
 
-    /// Puts a finding into the list, in place of an earlier one of its kind and first cell, or takes that out.
+    /// Replaces the finding of the same kind and first cell, or removes it if it is no longer likely.
     pub(super) fn put(&mut self, finding: CellFault) {
         let first = |found: &CellFault| found.cells.map(|cells| cells.0);
         let is_same = |found: &CellFault| found.kind == finding.kind && first(found) == first(&finding);
@@ -250,20 +254,20 @@ impl CellFaultDetector {
         }
     }
 
-    /// Puts a new finding into the list, in the order of the cells.
+    /// Inserts a new finding in the order of the cells.
     pub(super) fn insert(&mut self, finding: CellFault) {
         let at = self.findings.partition_point(|found| (found.cells, found.kind) < (finding.cells, finding.kind));
         self.findings.insert(at, finding);
     }
 
-    /// The module that a cell was found to be of.
+    /// The module finding that includes the cell.
     fn module_of(&self, index: usize) -> Option<&CellFault> {
         let is_of = |found: &&CellFault| found.kind == CellFaultKind::Module && found.is_of(CellIndex(index as u16));
         self.findings.iter().find(is_of)
     }
 
-    /// Joins cells side by side with more capacity than the others, since about the same time, to a replaced module. `foreign`: of
-    /// each cell, its module, or that it certainly has more capacity.
+    /// Joins neighbouring cells with more capacity than the others since about the same time into a replaced module.
+    /// `foreign`: per cell, its module finding or its certain finding of more capacity.
     fn find_modules(&mut self, time: Timestamp, foreign: &[Option<CellFault>]) {
         let is_same_event = |a: &Option<CellFault>, b: &Option<CellFault>| {
             a.zip(*b).is_some_and(|(a, b)| a.since.since(b.since).abs() <= SAME_MODULE_S)
@@ -278,7 +282,7 @@ impl CellFaultDetector {
         }
     }
 
-    /// Puts a module in place of the findings of its cells.
+    /// Replaces the findings of the cells by one module finding.
     fn put_module(&mut self, time: Timestamp, cells: (CellIndex, CellIndex), group: &[Option<CellFault>]) {
         let found = || group.iter().flatten();
         let (count, kind) = (group.len() as f64, CellFaultKind::Module);
@@ -296,7 +300,7 @@ impl CellFaultDetector {
         self.findings.retain(|it| !is_within(it));
         self.insert(CellFault { kind, cells: Some(cells), since, reported, probability: 1.0, size });
         if earlier.is_none() {
-            // Where it ends is not known yet: cells that changed less at once may belong to it.
+            // The module's ends are uncertain: adjacent cells with a smaller change may belong to it.
             let edges = [cells.0.index().checked_sub(1), Some(cells.1.index() + 1)];
             for edge in edges.into_iter().flatten() {
                 self.cells.get_mut(edge).into_iter().for_each(|cell| cell.difference.widen_as(Jump::Replaced));

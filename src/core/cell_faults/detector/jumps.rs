@@ -1,18 +1,18 @@
-//! Cells that have changed at once: exchanged, replaced with their neighbours, or each by itself.
+//! Handles sudden changes: exchanged channels, a replaced module, or single cells.
 
-use super::{CellFaultDetector, Row, Watched};
+use super::{CellFaultDetector, Row, WatchedCell};
 use crate::cell_faults::difference::{Jump, Observation, STATES};
 use crate::cell_faults::fault::{CellFault, CellFaultKind};
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Rows of which the jumps of several cells are one event.
+/// Jumps of several cells within this time are one event, s.
 const SAME_EVENT_S: f64 = 1800.0;
-/// Deviation within which exchanged channels explain each other, V.
+/// Largest innovation, V, with which two exchanged channels explain each other.
 const SWAP_V: f64 = 0.008;
 
 impl CellFaultDetector {
-    /// Cells have changed at once: two have been exchanged, some side by side replaced, or each by itself.
+    /// Handles the cells that have changed suddenly: exchanges two channels, or widens neighbouring or single cells.
     pub(super) fn handle_jumps(
         &mut self,
         time: Timestamp,
@@ -23,7 +23,7 @@ impl CellFaultDetector {
         if jumped.is_empty() {
             return;
         }
-        let is_recent = |cell: &Watched| cell.jumped.is_some_and(|at| time.since(at) <= SAME_EVENT_S);
+        let is_recent = |cell: &WatchedCell| cell.jumped.is_some_and(|at| time.since(at) <= SAME_EVENT_S);
         let recent: Vec<usize> = (0..self.cells.len()).filter(|&cell| is_recent(&self.cells[cell])).collect();
         if let [a, b] = recent[..]
             && let (Some(a_v), Some(b_v)) = (difference_v(a), difference_v(b))
@@ -38,7 +38,7 @@ impl CellFaultDetector {
         }
     }
 
-    /// Exchanges what is known of two cells whose voltages have become each other's; whether they are.
+    /// If two cells' voltages have been exchanged, exchanges their states. Returns whether they were.
     fn exchange_if_swapped(
         &mut self,
         time: Timestamp,

@@ -1,9 +1,9 @@
-//! Cells that are not compared.
+//! Tests of cells that are not compared.
 
 use super::*;
 
 #[test]
-fn of_a_cell_that_is_not_compared_any_more_nothing_is_known() {
+fn cell_no_longer_compared_is_reset() {
     let mut diagnosis = CellFaultDetector::new(6);
     diagnosis.middle = 4;
     diagnosis.lowest = Some(5);

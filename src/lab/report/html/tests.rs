@@ -143,7 +143,7 @@ fn a_life_of_600_half_cycles_of_96_cells_fits_into_five_megabytes_with_everythin
         "Recharge period",
         "Innovation",
         "What would help most",
-        "unknown: the cells were not compared yet",
+        "unknown: the cells have not been compared yet",
     ] {
         assert!(page.contains(part), "no {part}");
     }
