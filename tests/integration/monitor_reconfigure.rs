@@ -208,18 +208,18 @@ fn restart_only_settings_are_rejected_by_name() {
             |config| config.model.branches.push(config.model.branches[0].clone()),
             "pack.cell_model: branches: 2, running with 1: needs a restart",
         ),
-        (|config| config.model.capacity_ah *= 1.1, "pack.cell_model: other frames"),
-        (|config| config.input = Default::default(), "[input]: other frames, signals or tables"),
-        (|config| config.sample.sensor_of_cell.swap(0, 1), "[[input.temperature]]: other"),
-        (|config| config.sample.reported_soc = None, "[input.reported_soc] and [input.reported_soh]: other"),
-        (|config| config.commands = None, "[commands]: other"),
-        (|config| config.estimator.capacity_state = CapacityState::Held, "estimator.capacity_state: other"),
+        (|config| config.model.capacity_ah *= 1.1, "pack.cell_model: changed frames"),
+        (|config| config.input = Default::default(), "[input]: changed frames, signals or tables"),
+        (|config| config.sample.sensor_of_cell.swap(0, 1), "[[input.temperature]]: changed"),
+        (|config| config.sample.reported_soc = None, "[input.reported_soc] and [input.reported_soh]: changed"),
+        (|config| config.commands = None, "[commands]: changed"),
+        (|config| config.estimator.capacity_state = CapacityState::Held, "estimator.capacity_state: changed"),
         (
             |config| {
                 config.j1939 =
                     load("[j1939]\naddress = 249\nidentity_number = 1\nmanufacturer_code = 2047\n").monitor.j1939
             },
-            "[j1939]: other",
+            "[j1939]: changed",
         ),
     ];
     let mut rig = hot();

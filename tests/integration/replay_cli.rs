@@ -191,7 +191,7 @@ fn each_rejects_unsuitable_options_by_name() {
         assert!(refused(&[option, value], 2).contains(option), "{option}");
     }
     assert!(refused(&["-"], 1).contains("standard input"));
-    assert!(refused(&["--events", "-"], 1).contains("must be a folder"));
+    assert!(refused(&["--events", "-"], 1).contains("give a folder"));
     assert!(refused(&[&log], 1).contains("named twice"));
     let inner = folder.path().join("inner");
     fs::create_dir(&inner).expect("made");

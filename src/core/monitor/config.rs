@@ -269,8 +269,8 @@ impl MonitorConfig {
             None => Ok(()),
             Some((key, _)) => Err(ReconfigureError {
                 key,
-                found: "other frames, signals or tables".to_owned(),
-                allowed: "those it was started with".to_owned(),
+                found: "changed frames, signals or tables".to_owned(),
+                allowed: "the original ones".to_owned(),
             }),
         }
     }

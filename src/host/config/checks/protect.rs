@@ -56,7 +56,7 @@ fn check_identity(raw: &RawTables, found: &[ResolvedSignal<'_>], guards: &[Guard
     let open = found.iter().find(|input| input.channel == Channel::PackIdentity && !is_protected(input));
     if let Some(input) = open {
         let what = format!(
-            "must be in a message of [[input.protected]] if accept_unprotected is not true: forged frames of {} would put aside all learned values",
+            "must be in a message of [[input.protected]] if accept_unprotected is not true: forged frames of {} would set aside all learned values",
             input.message.name
         );
         keys.place.fault("signal", &what);

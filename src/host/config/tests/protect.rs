@@ -203,7 +203,7 @@ fn pack_identity_must_be_protected_or_accepted() {
     assert_eq!(
         faults(&open),
         [
-            "pack.toml:17: input.pack_identity.signal = \"Status.Low\", must be in a message of [[input.protected]] if accept_unprotected is not true: forged frames of Status would put aside all learned values"
+            "pack.toml:17: input.pack_identity.signal = \"Status.Low\", must be in a message of [[input.protected]] if accept_unprotected is not true: forged frames of Status would set aside all learned values"
         ]
     );
     assert!(read(&format!("{open}accept_unprotected = true\n")).is_ok());
