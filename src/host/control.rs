@@ -50,7 +50,7 @@ pub fn daemon_path() -> PathBuf {
     runtime_folder().join(FILE_NAME)
 }
 
-/// The default path at which a client looks for the socket.
+/// The socket's default path for clients.
 pub fn standard_path() -> PathBuf {
     client_folder().join(FILE_NAME)
 }

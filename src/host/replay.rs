@@ -278,7 +278,7 @@ impl Replay {
         Ok(true)
     }
 
-    /// Notes the first reload of the recorded run, from which on this replay may differ.
+    /// Notes the first reload of the recorded run: this replay may differ from there on.
     fn note_reload(&mut self, time: Timestamp) {
         if !std::mem::replace(&mut self.reloaded, true) {
             let at_s = time.secs();

@@ -1,9 +1,9 @@
 //! State and history that survive a restart and a power cut: two state files and a history database in one folder.
 //!
-//! * Learned results and alarm changes are on disk, with the state of that moment, before they are announced; an announcement
-//!   waits at most 200 ms for that ([`commit_barrier`]). The rows are committed first, then the state (`writer`). After a power
-//!   cut, everything that was announced is therefore in both. A cut between the two leaves rows that were not announced: the
-//!   restored state is older than these rows, so whatever still applies is learned or raised again and gets another row. A
+//! * Learned results and alarm changes are on disk, with the state of that moment, before they are announced; an announcement waits
+//!   at most 200 ms for that ([`commit_barrier`]). The rows are committed first, then the state (`writer`). After a power cut,
+//!   everything that was announced is therefore in both. A cut between the two leaves rows that were not announced: the restored
+//!   state is older than these rows, so results and alarms that still apply are learned or raised again and get another row. A
 //!   change of the pack between the two is not undone: the history says that the state's pack is closed, and the state is not
 //!   restored.
 //! * The state is also written at checkpoints (`checkpoint`), on stop, and every second to the runtime folder, which is in memory.
@@ -12,7 +12,7 @@
 //! * A damaged database is set aside and a new one is created (`folder`).
 //! * On a full disk, a reserve provides space for learned results and alarms (`reserve`).
 //! * The loop never accesses the disk; a separate thread does (`writer`).
-//! * Whatever is wrong with disk, folder or file, the daemon keeps running and reports it to the core (`store_failed`).
+//! * After any fault of disk, folder or file, the daemon keeps running and reports the fault to the core (`store_failed`).
 
 mod backlog;
 mod checkpoint;
@@ -68,7 +68,7 @@ const RUNTIME_PERIOD_S: f64 = 1.0;
 /// Time between checkpoints while no frame arrives, s; the state does not change then, it only becomes older.
 const QUIET_PERIOD_S: f64 = 3600.0;
 
-/// The folder in which clients look: the service's or, if it does not exist, the folder of a daemon started from a shell.
+/// The default folder for clients: the service's or, if it does not exist, the folder of a daemon started from a shell.
 pub fn standard_folder() -> PathBuf {
     let service = first_folder("STATE_DIRECTORY").unwrap_or_else(|| PathBuf::from(STANDARD_FOLDER));
     let own = daemon_folder().0;
@@ -211,7 +211,7 @@ impl Store {
         &self.folder
     }
 
-    /// Keeps a stored state that could not be restored for the first start at which it fits. `why` is recorded in the history.
+    /// Keeps a stored state that could not be restored, until a start that it fits. `why` is recorded in the history.
     pub fn set_state_aside(&self, why: &str, now: Timestamp) {
         tracing::error!(error = why, "stored state {SET_ASIDE}");
         let row = HistoryRow::Own { reason: "state_unfit", detail: format!("{why}; {SET_ASIDE}") };

@@ -1,4 +1,4 @@
-//! What was written to what is meant: signals looked up in the DBC files, keys that must fit together, settings of the core.
+//! Converts the parsed tables to settings: looks up signals in the DBC files and checks keys that must fit together.
 //!
 //! | file | content |
 //! | --- | --- |

@@ -72,7 +72,7 @@ pub struct LineError {
 }
 
 impl LineError {
-    /// The error and what was found in `line`, the parsed line.
+    /// The error with the text found in `line`, the parsed line.
     pub fn describe(&self, line: &[u8]) -> String {
         const SHOWN: usize = 24;
         let rest = line.get(self.column - 1..).unwrap_or_default();

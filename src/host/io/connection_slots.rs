@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use tokio::task::AbortHandle;
 
-/// Time in which a client may send its request or read its answer before another client takes the slot; far more than a
+/// Time for a client to send its request or read its answer before another client may take the slot; far more than a
 /// working client needs.
 pub(crate) const GRACE: Duration = Duration::from_millis(250);
 

@@ -27,7 +27,7 @@ pub fn write_line(out: &mut impl Write, event: &Event) -> io::Result<()> {
     out.write_all(b"\n")
 }
 
-/// Writes the first line of an event file, which identifies the vehicle; nothing if no vehicle is configured.
+/// Writes the first line of an event file, which identifies the vehicle, if one is configured.
 pub fn write_head(out: &mut impl Write, vehicle: &VehicleIdentity) -> io::Result<()> {
     if !vehicle.is_stated() {
         return Ok(());

@@ -85,7 +85,7 @@ pub fn write_file(path: &Path, bytes: &[u8]) -> io::Result<()> {
 /// Checks, before hours of work, that the result's path can be written and is not one of the inputs.
 ///
 /// # Errors
-/// Names the result and what is wrong with its path.
+/// States the result's path and the fault.
 pub fn check_place<'a>(result: &Path, mut inputs: impl Iterator<Item = &'a PathBuf>) -> Result<(), String> {
     if result == Path::new("-") {
         return Ok(());

@@ -1,4 +1,4 @@
-//! Generates the ticks for logs that contain none: the times between two records at which the core receives a tick.
+//! Generates the ticks for logs without ticks: the times between records when the core receives a tick.
 //!
 //! Live, the driver ticks every [`TICK_PERIOD_MS`](crate::monitor::TICK_PERIOD_MS) while it is awake. A plain log states
 //! only when frames arrived, so this module generates the same ticks at multiples of the period: a tick at T comes after
@@ -6,7 +6,7 @@
 //! daemon on a silent bus (so that a lost input is detected); after that it is assumed to be asleep. The first record,
 //! and the first one after sleep, wake it: one tick at that record's time. There are no ticks after the last record.
 //!
-//! The caller passes the time at which the core next needs a tick ([`Ticks::pop`]'s `due`). Earlier ticks are skipped
+//! The caller passes the time of the core's next necessary tick ([`Ticks::pop`]'s `due`). Earlier ticks are skipped
 //! because they would change nothing.
 
 use crate::monitor::MERGE_TOLERANCE_NS;
@@ -23,7 +23,7 @@ pub struct Ticks {
     limit_ns: i64,
     /// Latest record; `None` before the first and after [`Ticks::sleep`].
     latest_ns: Option<i64>,
-    /// Time at which ticks continue after those before the hole have been popped.
+    /// Time of the first tick after a hole, once the ticks before the hole have been popped.
     wake_ns: Option<i64>,
 }
 

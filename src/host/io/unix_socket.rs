@@ -21,7 +21,7 @@ pub fn runtime_folder() -> PathBuf {
     first_folder("RUNTIME_DIRECTORY").or_else(own).unwrap_or_else(|| PathBuf::from(STANDARD_FOLDER))
 }
 
-/// Default folder in which a client looks for sockets: the service's if it exists, else the user's own.
+/// Default folder of the sockets for clients: the service's if it exists, else the user's own.
 pub fn client_folder() -> PathBuf {
     let standard = PathBuf::from(STANDARD_FOLDER);
     let own = || own_folder().filter(|own| !standard.exists() && own.exists());

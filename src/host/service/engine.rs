@@ -124,8 +124,8 @@ impl Engine {
         })
     }
 
-    /// Handles one record; checks the authenticator of an authenticated frame first. Returns the ticket of the commit for what
-    /// the record changed; `None` = nothing to store, or no store.
+    /// Handles one record; checks the authenticator of an authenticated frame first. Returns the ticket of the commit with the
+    /// record's changes; `None` = nothing to store, or no store.
     pub(super) fn handle(&mut self, record: &Record) -> Option<u64> {
         if let RecordKind::Frame { bus, frame } = &record.kind
             && let Some(check) = self.monitor.mac_check(*bus, frame)

@@ -15,7 +15,7 @@ use crate::quantity::Channel;
 
 /// Longest wait for the first reading, s; the unit's `TimeoutStartSec` is longer.
 pub const MAX_READY_TIMEOUT_S: f64 = 60.0;
-/// Default wait, s: ten times the time in which a bus wakes, and too short to look like a hung start.
+/// Default wait, s: ten times the wake-up time of a bus, and too short to look like a hung start.
 pub const DEFAULT_READY_TIMEOUT_S: f64 = 10.0;
 /// Shortest time between two reports of the line.
 const STATUS_PERIOD: Duration = Duration::from_secs(1);

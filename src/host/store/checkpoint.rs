@@ -53,7 +53,7 @@ impl CheckpointSchedule {
 mod tests {
     use super::*;
 
-    /// Checkpoints and bytes of a day in which states of this size are also committed every so many seconds.
+    /// Checkpoints and bytes of one day, if states of this size are also committed at this interval, s.
     fn day(bytes: u64, commit_every_s: Option<u32>) -> (u32, u64) {
         let (mut schedule, mut checkpoints, mut written) = (CheckpointSchedule::new(60.0), 0, 0);
         for second in 0..86_400_u32 {

@@ -65,7 +65,7 @@ impl Default for HistoryFilter {
 
 impl HistoryFilter {
     /// The rows to commit with the state now (possibly none), including those that waited. `None` = nothing was learned and no
-    /// alarm changed, or only alarms that change too often; their rows wait. `has_room`: the written bytes allow a commit.
+    /// alarm changed, except alarms that change too often; their rows wait. `has_room`: the write budget allows a commit.
     pub(super) fn take(&mut self, events: &[Event], has_room: bool) -> Option<Vec<HistoryRow>> {
         let now = events.iter().find(|event| is_learned(&event.kind))?.time;
         let learned = || events.iter().map(|event| event.kind).filter(is_learned);

@@ -139,7 +139,7 @@ impl HistoryReader {
         self.at_once(segments::verify)
     }
 
-    /// What contradicts a chain's end noted elsewhere; `None` = nothing.
+    /// Why the history contradicts a chain end noted elsewhere; `None` = it does not.
     ///
     /// # Errors
     /// When the file cannot be read.
@@ -168,7 +168,7 @@ impl HistoryReader {
         StateFiles::open(self.path.parent()?).1.newest
     }
 
-    /// The selected rows, in the order in which they were written.
+    /// The selected rows, in the order of writing.
     ///
     /// # Errors
     /// When the file cannot be read.

@@ -196,7 +196,7 @@ impl HistoryRow {
     }
 }
 
-/// The subject of events that may repeat although nothing was learned.
+/// The subject of events that may repeat without anything being learned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum EventSubject {
     /// Filter resets, of any cell.

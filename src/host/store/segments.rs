@@ -282,7 +282,7 @@ pub(super) fn verify(connection: &Connection) -> rusqlite::Result<ChainReport> {
     Ok(report)
 }
 
-/// What is wrong with the segment after `before`; `None` = nothing.
+/// The fault of the segment after `before`; `None` = valid.
 fn judge(connection: &Connection, before: &Segment, segment: &Segment) -> rusqlite::Result<Option<BrokenSegment>> {
     let Segment { id, first, last, is_deleted, hash, .. } = *segment;
     let broken = |expected, found| Some(BrokenSegment { segment: id, rows: [first, last], expected, found });
@@ -350,7 +350,7 @@ impl FromStr for NotedHead {
     }
 }
 
-/// What contradicts a noted chain's end; `None` = nothing.
+/// Why the history contradicts a noted chain end; `None` = it does not.
 pub(super) fn contradiction(connection: &Connection, noted: &NotedHead) -> rusqlite::Result<Option<String>> {
     let NotedHead { rows, hash } = noted;
     let pairs = pairs(connection)?;

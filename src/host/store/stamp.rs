@@ -1,4 +1,4 @@
-//! The time at which a state was stored, on every clock, and its age at a later time.
+//! The time when a state was stored, on every clock, and its age at a later time.
 //!
 //! The wall clock of a vehicle computer may show 1970 until it is set, and may step. The boot clock never steps but restarts
 //! with every boot. Therefore both are stored, together with the boot's identity.

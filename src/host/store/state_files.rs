@@ -3,7 +3,7 @@
 //! | file | contents |
 //! | --- | --- |
 //! | `state-a.json.zst`, `state-b.json.zst` | the latest state and the one before it |
-//! | `state-aside.json.zst` | a state that could not be restored, kept for the first start at which it fits |
+//! | `state-aside.json.zst` | a state that could not be restored, kept until a start that it fits |
 //!
 //! A file is one zstd frame of JSON and a skippable frame with its SHA-256, so `zstdcat` prints the JSON, and every flipped bit
 //! is detected. The file is written to a temporary name, synced and renamed, and the folder is synced: a state whose write has
@@ -206,7 +206,7 @@ impl StateFiles {
         (files, found)
     }
 
-    /// Makes the next write keep the newest state for the first start at which it fits.
+    /// Makes the next write keep the newest state until a start that it fits.
     pub(super) fn set_aside(&mut self) {
         self.aside = Some(1 - self.next);
     }

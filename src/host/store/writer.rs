@@ -1,7 +1,7 @@
 //! The thread that writes to disk, and the queue that it shares with the loop.
 //!
 //! The loop queues rows and the latest state, and continues. The thread takes everything queued, commits the rows, then writes
-//! the state, and reports up to which ticket everything is on disk. It retries a failing disk after increasing pauses; until
+//! the state, and reports the last ticket that is completely on disk. It retries a failing disk after increasing pauses; until
 //! then every ticket is answered at once as failed. A failing database does not prevent the state from being written.
 
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -207,8 +207,8 @@ impl Writer {
         }
     }
 
-    /// Writes rows and state; what fails waits for the next attempt. Without a state there is nothing to write, but a database
-    /// that could not be opened is opened again.
+    /// Writes rows and state; failed writes wait for the next attempt. Without a state nothing is written, but an attempt is made
+    /// to open a database that could not be opened before.
     fn write(
         &mut self,
         mut batches: Vec<RowBatch>,

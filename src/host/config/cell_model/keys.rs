@@ -48,7 +48,7 @@ section! {
 }
 
 section! {
-    /// The conditions in which the cell was measured, written by `packwatch fit` for readers. Beyond these temperatures a fitted model continues with a larger `voltage_error_v`, so that estimates are less certain there.
+    /// The conditions of the cell's measurement, written by `packwatch fit` for readers. Beyond these temperatures a fitted model continues with a larger `voltage_error_v`, so that estimates are less certain there.
     Measured at "measured" {
         /// Lowest and highest temperature.
         temperature_c: Option<Vec<f64>>, "degrees C", within(bounds::TEMPERATURE_C), Optional("unknown");

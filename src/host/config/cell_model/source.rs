@@ -1,4 +1,4 @@
-//! The origin of a cell model (file, label or the vehicle's own data), and the conditions in which the cell was measured.
+//! The origin of a cell model (file, label or the vehicle's own data), and its measurement conditions.
 
 use toml::{Table, Value};
 

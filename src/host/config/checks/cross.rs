@@ -106,7 +106,7 @@ fn balancing(raw: &RawTables, model: Option<&CellModel>) {
     }
 }
 
-/// Checks that there is a file or answer in which to look up signals.
+/// Checks that the configuration has a DBC file or answer with signals.
 fn sources(raw: &RawTables) {
     let Some(input) = raw.input.as_ref().filter(|input| input.dbc.is_empty()) else { return };
     if !raw.broken && !raw.is_written::<DiagnosticInput>() {

@@ -1,8 +1,8 @@
 //! Checks for settings that parse but cannot be intended: signals beyond their message, shared bits, units, empty ranges,
 //! the capacity of another cell.
 //!
-//! In: the tables, the signals found, the cell model. Out: faults for what is certainly wrong, warnings for what is only
-//! unlikely. A configured `scale` or `offset` overrides the DBC's unit.
+//! In: the tables, the signals found, the cell model. Out: faults for certain errors, warnings for unlikely
+//! values. A configured `scale` or `offset` overrides the DBC's unit.
 
 use super::cells::Module;
 use super::signals::{self, ResolvedSignal};
@@ -15,7 +15,7 @@ use crate::config::schema::RawTables;
 use crate::quantity::{Channel, bounds};
 use crate::sample::Limits;
 
-/// Ratio of rated capacities (or its reciprocal) from which the cells count as different: the estimator learns a
+/// Ratio of rated capacities (or its reciprocal) above which the cells count as different: the estimator learns a
 /// resistance up to this many times the model's.
 const OTHER_CELL: f64 = 3.0;
 
@@ -471,7 +471,7 @@ pub(crate) fn rated_capacity(raw: &RawTables, model: Option<&CellModel>) {
     }
 }
 
-/// A hint what a capacity of `ratio` cells may mean.
+/// A hint whether parallel cells explain a capacity of `ratio` cells.
 fn parallel_cells(ratio: f64, strings: u16) -> String {
     // The stated capacities of one cell differ by less than 5 %.
     let is_about = |cells: f64| (ratio / cells - 1.0).abs() <= 0.05;

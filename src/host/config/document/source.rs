@@ -21,7 +21,7 @@ pub type ReadFile<'a> = &'a dyn Fn(&Path) -> std::io::Result<Vec<u8>>;
 pub struct ConfigFiles {
     /// The configuration file.
     pub main: PathBuf,
-    /// Its drop-ins, in the order in which they are merged.
+    /// Its drop-ins, in merge order.
     pub drop_ins: Vec<PathBuf>,
 }
 
@@ -45,7 +45,7 @@ impl ConfigFiles {
         Self { main: main.to_owned(), drop_ins: Vec::new() }
     }
 
-    /// All files, in the order in which they are merged.
+    /// All files, in merge order.
     pub fn all(&self) -> impl Iterator<Item = &Path> {
         std::iter::once(&self.main).chain(&self.drop_ins).map(PathBuf::as_path)
     }
@@ -100,7 +100,7 @@ impl SourceFile {
     }
 }
 
-/// The texts of a configuration, in the order in which they are merged. There is at least one.
+/// The contents of the configuration files (at least one), in merge order.
 #[derive(Debug)]
 pub(crate) struct Sources {
     files: Vec<SourceFile>,

@@ -55,7 +55,7 @@ section! {
         away_use_per_h: f64, "fraction", Between(0.0, 100.0), Default("0.5");
         /// Largest current, per cell, that counts as rest. A larger current next to a gap in the readings may have flowed during the whole gap.
         rest_current_a: Option<f64>, "A", Between(0.0, 1e6), Optional("C/50: the rated capacity over 50 h");
-        /// `true`: a silent bus means zero current. If no current reading arrives for more than 5 s between two voltages of a cell, the cell rested, whatever the current before and after; voltages must therefore arrive more often. `false`: the load before the gap may have continued, or a charger may have been connected.
+        /// `true`: a silent bus means zero current. If no current reading arrives for more than 5 s between two voltages of a cell, the cell rested, regardless of the current before and after; voltages must therefore arrive more often. `false`: the load before the gap may have continued, or a charger may have been connected.
         silence_is_rest: bool, "", Any, Default("false");
         /// Standard deviation of the voltage sensor's noise. If the signal's resolution is coarser, its rounding noise is added (5.8 mV for steps of 20 mV).
         voltage_noise_v: f64, "V", within(bounds::VOLTAGE_NOISE_V), Default("0.005");
@@ -69,7 +69,7 @@ section! {
         drop_error_sqrt_s: f64, "sqrt(s)", DEVIATION, Default("0.3");
         /// Slow error of the cell model under load, relative to the voltage drop caused by the load of the last minutes: standard deviation of its average over one second.
         load_error_sqrt_s: f64, "sqrt(s)", DEVIATION, Default("0.5");
-        /// Time constant with which the error of `load_error_sqrt_s` decays after the load (slow diffusion).
+        /// Time constant of the decay of the `load_error_sqrt_s` error after the load (slow diffusion).
         load_memory_s: f64, "s", Above(0.0, 1e6), Default("1200.0");
         /// Longest time that one voltage reading may represent. Readings further apart carry no additional information.
         max_information_s: f64, "s", Between(0.001, 1e6), Default("100.0");
@@ -220,7 +220,7 @@ section! {
         /// How fast the loss per cycle may change: standard deviation gained per equivalent full cycle.
         fade_noise_ah_per_cycle: Option<f64>, "Ah", DEVIATION, Optional("0.005 % of the rated capacity")
             => fade_noise_ah_per_cycle: keys.fade_noise_ah_per_cycle.unwrap_or(5e-5 * rated_ah);
-        /// Fraction of the rated capacity at which a cell's life ends. The remaining life is forecast up to this point.
+        /// Fraction of the rated capacity that defines a cell's end of life. The remaining life is forecast up to this point.
         end_of_life: f64, "fraction", Above(0.0, 1.0), Default("0.8") =>;
     }
 }
@@ -284,7 +284,7 @@ section! {
         current_a: f64, "A", Above(0.0, 1e6), Required;
         /// Cell temperature.
         temperature_c: f64, "degrees C", TEMPERATURE_C, Required;
-        /// Voltage under load at which the discharge ends.
+        /// Cut-off voltage of the discharge, under load.
         cutoff_v: f64, "V", Above(0.0, 100.0), Required;
         /// A charge is complete when its current, per cell, has dropped to this at the cell model's highest voltage. Usable capacity is counted from the SOC at that moment.
         taper_current_a: Option<f64>, "A", Above(0.0, 1e6), Optional("C/20: the rated capacity over 20 h")

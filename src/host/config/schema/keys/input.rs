@@ -149,7 +149,7 @@ signal_section! {
 }
 
 signal_section! {
-    /// The state of the pack's contactors. While it reads "open", packwatch uses 0 A, whatever the current sensor reports and even if it reports nothing. If the state is unknown (no reading within `max_age_s`), the current sensor's reading is used.
+    /// The state of the pack's contactors. While it reads "open", packwatch uses 0 A, regardless of the current sensor and even if it is silent. If the state is unknown (no reading within `max_age_s`), the current sensor's reading is used.
     ContactorInput at "input.contactor", "any unit" {
         /// Signal values (after the DBC's factor, `scale` and `offset`) that mean open. Every other value means closed.
         open: Vec<f64>, "", NotEmpty, Required =>;
@@ -172,11 +172,11 @@ signal_section! {
     BalancingInput at "input.balancing", "any unit" {
         /// Number that `{n}` has for the first cell.
         first: u16, "", Between(0.0, 60000.0), Default("1") =>;
-        /// Current of a balancing resistor while the bit is 1, at the voltage at which the BMS balances. Parallel strings share it. At most a fifth of the pack's rated capacity per hour (C/5).
+        /// Current of a balancing resistor while the bit is 1, at the BMS's balancing voltage. Parallel strings share it. At most a fifth of the pack's rated capacity per hour (C/5).
         bleed_a: f64, "A", Above(0.0, 1e6), Required =>;
-        /// Longest time that a value remains valid. Must be longer than the period at which the BMS sends the signal, also while the vehicle is parked; otherwise the balancing state is unknown for the rest of each period.
+        /// Longest time that a value remains valid. Must be longer than the BMS's send period, also while the vehicle is parked; otherwise the balancing state is unknown for the rest of each period.
         max_age_s: f64, "s", Above(0.0, 1e6), Default("10.0") =>;
-        /// `true`: no cell is bled while no values arrive. Set it only if the BMS sends values for as long as it balances and this computer stays awake for as long. `false`: the balancing state during that time is unknown, and leaks are learned from the remaining time only. The state is always unknown while the program does not run.
+        /// `true`: while no values arrive, no cell is being balanced. Set it only if the BMS sends values throughout balancing and this computer stays awake throughout. `false`: the balancing state during that time is unknown, and leaks are learned from the remaining time only. The state is always unknown while the program does not run.
         only_while_sent: bool, "", Any, Default("false") =>;
     }
 }

@@ -119,9 +119,9 @@ section! {
     Store at "store" {
         /// Shortest time between checkpoints of the running state. A power cut loses the running state since the last checkpoint (a restart of the service loses one second). Each checkpoint writes the whole state, about 70 kB for a pack of 96 cells. The time is extended so that at most 15 MB are written per day (7 minutes for such a pack).
         checkpoint_s: f64, "s", Between(1.0, 3600.0), Default("60.0");
-        /// Most rows kept in the history: half-cycles, capacities, loss modes, remaining lives, cell models, alarms and resets. Above this number a checkpoint deletes the oldest segment (one day or about 10,000 rows). The default holds one year of ten half-cycles a day for 96 cells in about 100 MB.
+        /// Maximum number of rows in the history: half-cycles, capacities, loss modes, remaining lives, cell models, alarms and resets. Above this number a checkpoint deletes the oldest segment (one day or about 10,000 rows). The default holds one year of ten half-cycles a day for 96 cells in about 100 MB.
         max_rows: u32, "", Between(10_000.0, 1e8), Default("1000000");
-        /// Longest time that rows of the history are kept. A checkpoint deletes older rows one segment at a time. Ages are measured with the computer's clock; nothing is deleted until a hardware clock or time server has confirmed it.
+        /// Maximum age of rows in the history. A checkpoint deletes older rows one segment at a time. Ages are measured with the computer's clock; nothing is deleted until a hardware clock or time server has confirmed it.
         keep_years: Option<f64>, "years", Between(0.1, 100.0), Optional("limited by `max_rows` only");
     }
 }
