@@ -1,12 +1,12 @@
 # Short names for common commands: https://just.systems
 
-cargo_options := "--release --workspace --locked"
+cargo_options := "--workspace --locked"
 
 # List the recipes
 default:
     @just --list
 
-# Build the programs into target/release
+# Build the programs into target/debug
 build:
     cargo build {{ cargo_options }} --bins
 
@@ -32,4 +32,4 @@ docs:
 
 # Show an ageing cell and its alarms, without CAN
 demo:
-    cargo run --release --locked -- demo
+    cargo run --no-default-features --locked -- demo

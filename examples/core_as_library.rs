@@ -1,7 +1,7 @@
 //! The core as a library: records in, events and frames out. It needs no CAN, and reads no clock.
 //!
 //! ```sh
-//! cargo run --release --example core_as_library -- examples/pack/pack.toml examples/pack/drive.log
+//! cargo run --example core_as_library -- examples/pack/pack.toml examples/pack/drive.log
 //! ```
 //!
 //! Out: each event as a line of JSON, then the state of the pack at the end of the log.

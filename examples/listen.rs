@@ -1,8 +1,8 @@
 //! An ECU that listens to packwatch, in Rust: shows the state of charge and keeps the table of alarms.
 //!
 //! ```sh
-//! candump -L vcan0 | cargo run --release --example listen                # a live bus
-//! cargo run --release --example listen -- config/packwatch.dbc <frames.log
+//! candump -L vcan0 | cargo run --example listen                # a live bus
+//! cargo run --example listen -- config/packwatch.dbc <frames.log
 //! ```
 //!
 //! In: lines of candump on standard input. Out: a line for every change. It follows rules 1 to 4 of the contract

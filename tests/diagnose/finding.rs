@@ -1,7 +1,7 @@
 //! The finding that packwatch should report for an injected fault.
 
-use packwatch::cell_faults::CellFaultKind;
-use packwatch::sim::FaultKind;
+use packwatch_core::cell_faults::CellFaultKind;
+use packwatch_core::sim::FaultKind;
 
 /// The expected finding; `None` if packwatch has no finding for this fault.
 pub(crate) fn kind_of(fault: &FaultKind) -> Option<CellFaultKind> {

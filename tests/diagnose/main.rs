@@ -26,8 +26,8 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
 use pack::{Case, FirstFinding, PackBalancing, PackSize};
-use packwatch::monitor::MonitorConfig;
-use packwatch::sim::{Fault, FaultKind, SensorQuality};
+use packwatch_core::monitor::MonitorConfig;
+use packwatch_core::sim::{Fault, FaultKind, SensorQuality};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use score::Score;
@@ -133,7 +133,7 @@ fn main() -> Result<(), String> {
         options.jobs
     );
     if options.writes {
-        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/diagnose.md");
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/diagnose.md");
         std::fs::write(&path, text).map_err(|e| format!("{}: {e}", path.display()))?;
     }
     Ok(())

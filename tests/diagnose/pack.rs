@@ -4,14 +4,14 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::Path;
 
-use packwatch::can::encode::InputEncoder;
-use packwatch::cell_faults::fault::{CHANNEL_V, OFFSET_PER_H};
-use packwatch::cell_faults::{CellFault, CellFaultKind};
-use packwatch::config;
-use packwatch::io::ticks::Ticks;
-use packwatch::monitor::{Monitor, MonitorConfig, Outputs, Record, TICK_PERIOD_MS};
-use packwatch::quantity::{CellIndex, Timestamp};
-use packwatch::sim::{Balancing, Fault, Scenario, SensorQuality, Sensors, Settings, Simulation, Spread, Wiring};
+use packwatch_core::can::encode::InputEncoder;
+use packwatch_core::cell_faults::fault::{CHANNEL_V, OFFSET_PER_H};
+use packwatch_core::cell_faults::{CellFault, CellFaultKind};
+use packwatch_host::config;
+use packwatch_host::io::ticks::Ticks;
+use packwatch_core::monitor::{Monitor, MonitorConfig, Outputs, Record, TICK_PERIOD_MS};
+use packwatch_core::quantity::{CellIndex, Timestamp};
+use packwatch_core::sim::{Balancing, Fault, Scenario, SensorQuality, Sensors, Settings, Simulation, Spread, Wiring};
 
 use crate::finding::kind_of;
 
@@ -110,7 +110,7 @@ fn dbc(cells: u16, sensors: u16) -> String {
 
 /// The repository's example cell model, scaled.
 fn cell_model(capacity_ah: f64) -> Result<String, String> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/cells/example_nmc_2600.toml");
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/cells/example_nmc_2600.toml");
     let text = std::fs::read_to_string(&path).map_err(|e| format!("{}: {e}", path.display()))?;
     let mut model: toml::Table = text.parse().map_err(|e| format!("{}: {e}", path.display()))?;
     let k = capacity_ah / MODEL_AH;

@@ -1,7 +1,7 @@
 //! Compares findings with the injected faults.
 
-use packwatch::quantity::CellIndex;
-use packwatch::sim::FaultKind;
+use packwatch_core::quantity::CellIndex;
+use packwatch_core::sim::FaultKind;
 
 use crate::finding::kind_of;
 use crate::pack::{CELLS_PER_SENSOR, Case, FirstFinding};

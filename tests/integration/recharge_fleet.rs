@@ -4,7 +4,7 @@
 //! voltage), temperature (5 to 40 degrees C), depth and current sensor (20 mA noise, 10 mA offset and 0.5 % gain of
 //! either sign; 5 mV). The normalised period must rank the cells by their true capacity, and its stated interval must
 //! contain the truth. One life has a charger that becomes weaker half-way. Also checks the alarm.
-//! To print the tables: `cargo test --release --test integration recharge_fleet -- --nocapture`.
+//! To print the tables: `cargo test --workspace --test integration recharge_fleet -- --nocapture`.
 
 use std::path::Path;
 

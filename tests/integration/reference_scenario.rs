@@ -5,7 +5,7 @@
 //! Ah, that is eleven and a half such cells in parallel (resistances divided by 30 / 2.6, capacitances multiplied by
 //! it). Sensors as in the paper's scenario: voltage 5 mV; current 20 mA noise + 10 mA offset + 0.5 % gain; 1 s. The
 //! gain error of 0.5 % limits the capacity accuracy of any estimator.
-//! To print the table: `cargo test --release --test integration reference_scenario -- --nocapture`.
+//! To print the table: `cargo test --workspace --test integration reference_scenario -- --nocapture`.
 
 use std::path::Path;
 

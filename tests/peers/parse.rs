@@ -8,12 +8,12 @@
 use std::path::Path;
 use std::time::Instant;
 
-use packwatch::can::dbc::Database;
-use packwatch::can::decode::{Binding, InputMap};
-use packwatch::io::csv_log::CsvOptions;
-use packwatch::io::log::{Batch, LogOptions, LogSource};
-use packwatch::monitor::RecordKind;
-use packwatch::quantity::{BusIndex, CellIndex, Channel};
+use packwatch_core::can::dbc::Database;
+use packwatch_core::can::decode::{Binding, InputMap};
+use packwatch_host::io::csv_log::CsvOptions;
+use packwatch_host::io::log::{Batch, LogOptions, LogSource};
+use packwatch_core::monitor::RecordKind;
+use packwatch_core::quantity::{BusIndex, CellIndex, Channel};
 
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();

@@ -1,6 +1,6 @@
 """Shared by the tests: the program, its configurations, a simulated record, and measured data if available.
 
-PACKWATCH_BIN: the program, default target/release/packwatch. PACKWATCH_DATA: measured data; without it, tests that need it are
+PACKWATCH_BIN: the program, default target/debug/packwatch. PACKWATCH_DATA: measured data; without it, tests that need it are
 skipped.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-BINARY = Path(os.environ.get("PACKWATCH_BIN", ROOT / "target/release/packwatch"))
+BINARY = Path(os.environ.get("PACKWATCH_BIN", ROOT / "target/debug/packwatch"))
 CONFIG = ROOT / "config"
 CELL = CONFIG / "cells/example_nmc_2600.toml"
 START_S = 1_700_000_000

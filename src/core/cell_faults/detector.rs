@@ -572,11 +572,13 @@ impl Row<'_> {
 
 /// Mean of the middle half of the values, which one outlier hardly moves. `None` with fewer than three values.
 fn middle(values: impl Iterator<Item = f64>) -> Option<f64> {
-    let mut values: Vec<f64> = values.collect();
-    if values.len() < LEAST_CELLS {
+    // One allocation: `collect` of a filtered iterator starts small and grows.
+    let mut kept = Vec::with_capacity(values.size_hint().1.unwrap_or_default());
+    kept.extend(values);
+    if kept.len() < LEAST_CELLS {
         return None;
     }
-    let inner = inner_half(&mut values, |value| *value);
+    let inner = inner_half(&mut kept, |value: &f64| *value);
     Some(inner.iter().sum::<f64>() / inner.len() as f64)
 }
 

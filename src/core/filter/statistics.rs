@@ -1,8 +1,10 @@
 //! Statistics of plain numbers.
 
-/// Median of the finite values, of an even number the upper one; `None` without one.
+/// Median of the finite values (the upper of the two middle ones); `None` if there is no finite value.
 pub fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
-    let mut finite: Vec<f64> = values.filter(|value| value.is_finite()).collect();
+    // One allocation: `collect` of a filtered iterator starts small and grows.
+    let mut finite = Vec::with_capacity(values.size_hint().1.unwrap_or_default());
+    finite.extend(values.filter(|value| value.is_finite()));
     let middle = finite.len() / 2;
     if finite.is_empty() {
         return None;

@@ -4,7 +4,7 @@
 //! Monitor. Every rule then judges the Monitor's capacity estimates. The Monitor itself runs three of the rules and
 //! must agree. Each test run judges a few lives. The whole study (200 ageing and 100 healthy lives, each with three
 //! sensor sets) writes `tests/alarm_tradeoff.md` and takes some minutes:
-//! `PACKWATCH_WRITE_TRADEOFF=1 cargo test --release --test integration alarm_tradeoff -- --nocapture`
+//! `PACKWATCH_WRITE_TRADEOFF=1 cargo test --workspace --test integration alarm_tradeoff -- --nocapture`
 
 mod calibration;
 mod dice;

@@ -7,7 +7,7 @@
 //! Measured lives publish the capacity delivered at 2 A, not the capacity between open-circuit voltages. Each peer's
 //! capacity is therefore converted by the product's own usable capacity (same resistance, same full SOC), so that only
 //! the capacities differ.
-//! `cargo test --release --test integration capacity_peers -- --nocapture` prints the tables of tests/candidates.md.
+//! `cargo test --workspace --test integration capacity_peers -- --nocapture` prints the tables of tests/candidates.md.
 
 mod least_squares;
 mod measured;
