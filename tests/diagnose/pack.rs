@@ -7,11 +7,11 @@ use std::path::Path;
 use packwatch_core::can::encode::InputEncoder;
 use packwatch_core::cell_faults::fault::{CHANNEL_V, OFFSET_PER_H};
 use packwatch_core::cell_faults::{CellFault, CellFaultKind};
-use packwatch_host::config;
-use packwatch_host::io::ticks::Ticks;
 use packwatch_core::monitor::{Monitor, MonitorConfig, Outputs, Record, TICK_PERIOD_MS};
 use packwatch_core::quantity::{CellIndex, Timestamp};
 use packwatch_core::sim::{Balancing, Fault, Scenario, SensorQuality, Sensors, Settings, Simulation, Spread, Wiring};
+use packwatch_host::config;
+use packwatch_host::io::ticks::Ticks;
 
 use crate::finding::kind_of;
 

@@ -10,10 +10,10 @@ use std::time::Instant;
 
 use packwatch_core::can::dbc::Database;
 use packwatch_core::can::decode::{Binding, InputMap};
-use packwatch_host::io::csv_log::CsvOptions;
-use packwatch_host::io::log::{Batch, LogOptions, LogSource};
 use packwatch_core::monitor::RecordKind;
 use packwatch_core::quantity::{BusIndex, CellIndex, Channel};
+use packwatch_host::io::csv_log::CsvOptions;
+use packwatch_host::io::log::{Batch, LogOptions, LogSource};
 
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
