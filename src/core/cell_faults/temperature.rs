@@ -12,7 +12,7 @@ const LEAST_K2: f64 = 30.0;
 const DETACHED: f64 = 0.35;
 const ATTACHED: f64 = 0.6;
 
-/// How one cell's temperature follows the pack's.
+/// Warming at one cell relative to the median warming of the pack.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct WarmingRatio {
     /// Slow mean, degrees C.

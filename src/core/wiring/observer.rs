@@ -1,4 +1,4 @@
-//! Takes frames and events, and keeps the statistics that the judgement needs.
+//! Collects frames, events and estimates, and keeps the statistics for the judgement.
 
 use std::collections::BTreeMap;
 
@@ -15,7 +15,7 @@ use crate::can::{CanId, Frame, FrameKind};
 use crate::monitor::{BusEvent, Estimate};
 use crate::quantity::{BusIndex, Channel, Timestamp};
 
-/// Frames of an identifier on an interface.
+/// Frames of one identifier on one interface.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct IdStats {
     pub(crate) count: u64,
@@ -47,7 +47,7 @@ pub(crate) struct ProtectionStats {
     pub(crate) payloads: Vec<Vec<u8>>,
 }
 
-/// Results of the estimator.
+/// Statistics of the estimator's results.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct EstimatorStats {
     pub(crate) estimates: u64,
@@ -68,36 +68,36 @@ enum SignalList {
 pub struct WiringObserver {
     pub(crate) plan: Plan,
     pub(crate) buses: Vec<BusStats>,
-    /// As `plan.signals`.
+    /// In the order of `plan.signals`.
     pub(crate) series: Vec<Series>,
-    /// As `plan.more_cells`.
+    /// In the order of `plan.more_cells`.
     pub(crate) more_cells: Vec<Series>,
-    /// As `plan.beside`.
+    /// In the order of `plan.beside`.
     pub(crate) beside: Vec<Series>,
-    /// Signals by message.
+    /// Indexes of the signals by message.
     by_id: BTreeMap<(BusIndex, CanId), Vec<(SignalList, usize)>>,
-    /// Diagnostic answers with signals.
+    /// Reassembles diagnostic answers with signals.
     listener: Listener,
-    /// Signals by answer.
+    /// Indexes of the signals by diagnostic question.
     by_question: BTreeMap<Question, Vec<(SignalList, usize)>>,
-    /// The current's message on other interfaces.
+    /// The current's message, if it also appears on other interfaces.
     pub(crate) other_currents: BTreeMap<BusIndex, OtherCurrent>,
     guards: Guards,
     pub(crate) protected: BTreeMap<(BusIndex, CanId), ProtectionStats>,
-    /// Over short and long blocks.
+    /// Voltage responses over short and long blocks.
     responses: [VoltageResponse; 2],
     pub(crate) estimator: EstimatorStats,
     /// Time of the latest frame.
     latest: Option<Timestamp>,
-    /// Time between frames without sleep, s.
+    /// Time between frames, without sleep, s.
     pub(crate) awake_s: f64,
-    /// Time on live interfaces, s; `None` = a record, `awake_s` counts.
+    /// Time listened on live interfaces, s; `None` for a recording, where `awake_s` counts.
     listened_s: Option<f64>,
     pub(crate) frames: u64,
 }
 
 impl WiringObserver {
-    /// Before the first frame.
+    /// Creates an observer that has not received a frame.
     pub fn new(plan: Plan) -> Self {
         let mut by_id: BTreeMap<(BusIndex, CanId), Vec<(SignalList, usize)>> = BTreeMap::new();
         let lists = [
@@ -107,7 +107,7 @@ impl WiringObserver {
         ];
         let mut by_question: BTreeMap<Question, Vec<(SignalList, usize)>> = BTreeMap::new();
         for (name, list) in lists {
-            // In the order of channels: the current of a frame before its voltages.
+            // Ordered by channel, so that a frame's current is handled before its voltages.
             let mut order: Vec<usize> = (0..list.len()).collect();
             order.sort_by_key(|&index| list[index].binding.channel);
             for index in order {
@@ -145,18 +145,18 @@ impl WiringObserver {
         }
     }
 
-    /// Adds an interface beyond the configured ones; its number is the next.
+    /// Adds an interface that is not configured; it gets the next number.
     pub fn add_interface(&mut self, name: &str) {
         self.buses.push(BusStats { name: name.to_owned(), ..BusStats::default() });
     }
 
-    /// Takes a frame of any interface.
+    /// Handles a frame from any interface.
     pub fn handle_frame(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
         self.note_time(time);
         self.frames += 1;
         let Some(stats) = self.buses.get_mut(bus.index()) else { return };
         stats.frames += 1;
-        // A vehicle's bus has some hundreds.
+        // Bounds the memory: a vehicle's bus has a few hundred identifiers.
         if stats.ids.len() < 4096 || stats.ids.contains_key(&frame.id()) {
             let stats = stats.ids.entry(frame.id()).or_insert(IdStats { first: time, ..IdStats::default() });
             stats.count += 1;
@@ -171,7 +171,7 @@ impl WiringObserver {
         }
     }
 
-    /// Reads the configured current's message where it comes on another interface.
+    /// Reads the configured current's message if it arrives on another interface.
     fn read_other_current(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
         let is_current = |signal: &&SignalPlan| signal.binding.channel == Channel::Current;
         let Some(signal) = self.plan.signals.iter().find(is_current) else { return };
@@ -202,7 +202,7 @@ impl WiringObserver {
         self.by_id.insert(key, signals);
     }
 
-    /// Reads the signals of an answer that the frame completes.
+    /// Reads the signals of a diagnostic answer that the frame completes.
     fn read_answer(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
         self.listener.losses.clear();
         let FrameOutcome::Whole { answer, data, .. } = self.listener.handle(time, bus, frame) else { return };
@@ -248,28 +248,28 @@ impl WiringObserver {
         }
     }
 
-    /// Ends the blocks and runs of both responses.
+    /// Ends the current blocks and steady runs.
     pub(super) fn end_blocks(&mut self) {
         self.responses.iter_mut().for_each(VoltageResponse::pause);
         self.other_currents.values_mut().for_each(OtherCurrent::pause);
     }
 
-    /// The response over short blocks.
+    /// The voltage response over short blocks.
     pub(super) fn fast_response(&self) -> &VoltageResponse {
         &self.responses[0]
     }
 
-    /// Slope of the pack's voltage over its current, from the blocks that determine it best.
+    /// Slope of the pack's voltage over its current, from the block length that determines it better.
     pub(super) fn slope(&self) -> Option<Slope> {
         best_response(&self.responses).slope()
     }
 
-    /// The slope of one cell, from the same blocks.
+    /// The slope of one cell, from the same block length.
     pub(super) fn slope_of(&self, cell: usize) -> Option<Slope> {
         best_response(&self.responses).slope_of(cell)
     }
 
-    /// Length of those blocks, s.
+    /// The block length used for [`Self::slope`], s.
     pub(super) fn slope_block_s(&self) -> f64 {
         best_response(&self.responses).block_s()
     }
@@ -282,7 +282,7 @@ impl WiringObserver {
     fn note_time(&mut self, time: Timestamp) {
         let last = *self.latest.get_or_insert(time);
         let passed_s = time.since(last);
-        // The buses slept, or the record has a hole.
+        // The buses slept, or the recording has a gap.
         if passed_s > 30.0 {
             self.handle_gap();
         } else {
@@ -291,7 +291,7 @@ impl WiringObserver {
         self.latest = Some(last.max(time));
     }
 
-    /// Takes a time of unknown length without listening.
+    /// Handles a time of unknown length without listening.
     pub fn handle_gap(&mut self) {
         let Self { series, more_cells, beside, .. } = self;
         series.iter_mut().chain(more_cells).chain(beside).for_each(Series::pause);
@@ -300,7 +300,7 @@ impl WiringObserver {
         self.listener.restart();
     }
 
-    /// Takes an event of an interface.
+    /// Handles an event of an interface.
     pub fn handle_bus(&mut self, bus: BusIndex, event: BusEvent) {
         let Some(bus) = self.buses.get_mut(bus.index()) else { return };
         match event {
@@ -316,7 +316,7 @@ impl WiringObserver {
         }
     }
 
-    /// Takes an estimate of the monitor.
+    /// Handles an estimate of the monitor.
     pub fn handle_estimate(&mut self, estimate: &Estimate) {
         if (estimate.innovation_v / estimate.innovation_std_v).powi(2).is_finite() {
             self.estimator.estimates += 1;
@@ -325,12 +325,12 @@ impl WiringObserver {
         }
     }
 
-    /// Seconds listened so far, sleep not counted.
+    /// Time listened so far, without sleep, s.
     pub fn seconds(&self) -> f64 {
         self.listened_s.unwrap_or(self.awake_s)
     }
 
-    /// Takes the time listened to live interfaces, s, whether a frame came or not.
+    /// Sets the time listened on live interfaces, s, with or without frames.
     pub fn handle_listened(&mut self, seconds: f64) {
         self.listened_s = Some(seconds);
     }
@@ -341,7 +341,7 @@ impl WiringObserver {
     }
 }
 
-/// Cells with a voltage of their own, and the change of the current that is no change of load, A.
+/// Number of separately measured voltages, and the largest current change that does not count as a change of load, A.
 fn response_settings(plan: &Plan) -> (usize, f64) {
     let cells = if plan.pack.is_total { 1 } else { usize::from(plan.pack.cells) };
     (cells, 0.01 * (plan.pack.capacity_ah * f64::from(plan.pack.strings.max(1))))

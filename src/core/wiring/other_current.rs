@@ -1,7 +1,7 @@
 //! The configured current's message on another interface.
 //!
-//! Buses of one vehicle use the same identifier for different messages, or carry those of several packs. Read as the configured
-//! current, one of them may be what the voltages follow.
+//! Buses of one vehicle may use the same identifier for different messages, or carry the messages of several packs.
+//! One of these messages, decoded as the configured current, may be the current that the voltages follow.
 
 use super::evidence::Series;
 use super::evidence::Slope;
@@ -18,7 +18,7 @@ pub(crate) struct OtherCurrent {
 }
 
 impl OtherCurrent {
-    /// `cells` voltages follow it, with steps above `tolerance_a`.
+    /// Creates a response with `cells` voltages and steps above `tolerance_a`, A.
     pub(crate) fn new(layout: &SignalLayout, cells: usize, tolerance_a: f64) -> Self {
         let responses = BLOCKS_S.map(|block_s| VoltageResponse::new(cells, tolerance_a, block_s));
         Self { series: Series::new(layout, None), responses }
@@ -29,7 +29,7 @@ impl OtherCurrent {
         self.responses.iter_mut().for_each(|response| response.handle_current(time, current_a));
     }
 
-    /// Over short and long blocks.
+    /// Voltage responses over short and long blocks.
     pub(crate) fn responses_mut(&mut self) -> &mut [VoltageResponse; 2] {
         &mut self.responses
     }
@@ -39,7 +39,7 @@ impl OtherCurrent {
         best_response(&self.responses).slope()
     }
 
-    /// Not listening: what follows says nothing about what was before.
+    /// Ends the blocks and runs before a time without listening.
     pub(crate) fn pause(&mut self) {
         self.series.pause();
         self.responses.iter_mut().for_each(VoltageResponse::pause);

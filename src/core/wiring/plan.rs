@@ -1,4 +1,4 @@
-//! The configuration as far as it can be read: what the doctor expects on the buses.
+//! Plan: the readable parts of the configuration, that is, what the doctor expects on the buses.
 
 use crate::can::CanId;
 use crate::can::decode::Binding;
@@ -8,31 +8,32 @@ use crate::can::uds::Question;
 use crate::cell::CellModel;
 use crate::quantity::{BusIndex, Channel};
 
-/// Everything expected. Parts that are missing in a broken configuration are not judged.
+/// Everything expected on the buses. Parts missing from a broken configuration are not judged.
 #[derive(Debug, Clone, Default)]
 pub struct Plan {
-    /// Configured interfaces in the order of their numbers; frames of others may be received too.
+    /// Configured interfaces in the order of their numbers; frames of other interfaces may be received too.
     pub interfaces: Vec<InterfacePlan>,
     /// Configured signals that were found in a DBC.
     pub signals: Vec<SignalPlan>,
-    /// Signals of the DBC that look like voltages of cells beyond `pack.cells`, by number.
+    /// Signals of the DBC that look like voltages of cells beyond `pack.cells`, in the order of their numbers.
     pub more_cells: Vec<SignalPlan>,
-    /// Signals of the DBC that are not configured and look like the pack's voltage (beside cell voltages) or a state of charge,
-    /// by their channel; one for each interface.
+    /// Signals of the DBC that are not configured but look like the pack's voltage (if cell voltages are configured)
+    /// or a state of charge. Their binding has that channel. One entry per interface.
     pub beside: Vec<SignalPlan>,
     /// The pack.
     pub pack: PackPlan,
-    /// Age from which a current, voltage and temperature is stale, s; `None` = never.
+    /// Age from which a current, voltage or temperature is stale, s; `None` = never.
     pub max_ages_s: [Option<f64>; 3],
-    /// Smallest and largest plausible current, cell voltage and temperature; infinite = any.
+    /// Smallest and largest plausible current, cell voltage and temperature; infinite = unlimited.
     pub limits: [(f64, f64); 3],
     /// Protected messages.
     pub guards: Vec<GuardConfig>,
-    /// Frames that are sent.
+    /// Frames that the daemon sends.
     pub outputs: Vec<OutputPlan>,
     /// Messages that carry configured signals.
     pub messages: Vec<MessagePlan>,
-    /// Values come from a CSV with columns in the program's own units: no sign of a bus is to be changed.
+    /// Whether the values come from a CSV file with columns in the program's own units. If so, no sign is proposed for
+    /// a bus signal.
     pub is_csv: bool,
 }
 
@@ -41,17 +42,17 @@ pub struct Plan {
 pub struct PackPlan {
     /// Cells in series.
     pub cells: u16,
-    /// Only the total voltage is known.
+    /// Whether only the total voltage is measured.
     pub is_total: bool,
     /// Parallel strings.
     pub strings: u16,
-    /// The cell model; `None` = it cannot be read.
+    /// The cell model; `None` if it cannot be read.
     pub model: Option<CellModel>,
     /// Capacity of a cell, Ah: the configured one, else the model's.
     pub capacity_ah: f64,
-    /// Temperature of the surroundings, degrees C.
+    /// Ambient temperature, degrees C.
     pub ambient_c: f64,
-    /// Current up to which the pack counts as resting, A.
+    /// The pack counts as resting up to this current, A.
     pub dead_band_a: f64,
     /// White noise of a voltage reading that the estimator assumes, V.
     pub voltage_noise_v: f64,
@@ -62,35 +63,35 @@ pub struct PackPlan {
 pub struct InterfacePlan {
     /// Kernel name.
     pub name: String,
-    /// FD frames are accepted.
+    /// Whether FD frames are accepted.
     pub fd: bool,
 }
 
 /// One configured signal.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SignalPlan {
-    /// Where it is, what it feeds, and its scale, offset and codes.
+    /// Position, channel, scale, offset and codes.
     pub binding: Binding,
-    /// Its layout as the DBC writes it.
+    /// Layout as written in the DBC.
     pub layout: SignalLayout,
-    /// Where it is in a diagnostic answer; `None` = in a frame.
+    /// Position in a diagnostic answer; `None` for a signal in a frame.
     pub answer: Option<AnswerSource>,
-    /// Table of the configuration, `input.temperature[3]`.
+    /// Table of the configuration, for example `input.temperature[3]`.
     pub table: String,
-    /// Message in the DBC.
+    /// Name of the message in the DBC.
     pub message: String,
     /// `Message.Signal`.
     pub name: String,
     /// Unit in the DBC.
     pub unit: String,
-    /// The configuration's `scale`, for the line to change.
+    /// `scale` in the configuration, used to propose a new value.
     pub scale: f64,
-    /// The configuration's `offset`.
+    /// `offset` in the configuration.
     pub offset: f64,
 }
 
 impl SignalPlan {
-    /// Whether another signal is read, at least in part, from the same bits.
+    /// Whether the other signal is read from some of the same bits.
     pub(super) fn shares_bits(&self, other: &Self) -> bool {
         let (a, b) = (&self.binding, &other.binding);
         let is_together = (a.bus, a.id, &a.mux) == (b.bus, b.id, &b.mux);
@@ -114,9 +115,9 @@ impl SignalPlan {
 /// Position of a signal in a diagnostic answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct AnswerSource {
-    /// What is answered.
+    /// The question that is answered.
     pub question: Question,
-    /// Byte behind the echoed service and identifier with which its layout begins.
+    /// First byte of the signal's layout, counted after the echoed service and identifier.
     pub first_byte: usize,
 }
 
@@ -135,20 +136,20 @@ pub struct MessagePlan {
     pub pages: usize,
 }
 
-/// One frame that is sent.
+/// One frame that the daemon sends.
 #[derive(Debug, Clone, PartialEq)]
 pub struct OutputPlan {
     /// Interfaces.
     pub buses: Vec<BusIndex>,
     /// Identifier.
     pub id: CanId,
-    /// `status`, `health`, `alarm`.
+    /// Name of the frame: `status`, `health` or `alarm`.
     pub name: &'static str,
-    /// Its table and key in the configuration.
+    /// Its table in the configuration.
     pub table: String,
 }
 
-/// Quantity of a signal, as far as the judgement distinguishes them.
+/// Kind of quantity, as far as the judgement distinguishes it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Kind {
     Current,
@@ -183,12 +184,12 @@ impl Kind {
 }
 
 impl Plan {
-    /// The age from which a reading of the channel is stale, s.
+    /// Age from which a reading of the channel is stale, s.
     pub(super) fn max_age_s(&self, channel: Channel) -> f64 {
         self.max_ages_s.get(Kind::of(channel) as usize).copied().flatten().unwrap_or(f64::INFINITY)
     }
 
-    /// Plausible values of the channel, in its unit; `None` = any (limits of 0 and 0 too).
+    /// Plausible values of the channel, in its unit; `None` = unlimited (also for limits of 0 and 0).
     pub(super) fn plausible(&self, channel: Channel) -> Option<(f64, f64)> {
         let (low, high) = *self.limits.get(Kind::of(channel) as usize)?;
         let cells = if channel == Channel::PackVoltage { f64::from(self.pack.cells) } else { 1.0 };

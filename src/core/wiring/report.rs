@@ -1,4 +1,4 @@
-//! The report on a wiring: findings with their evidence, reason and the line to change.
+//! Report on the wiring: findings with evidence, reason and the line to change.
 
 use serde::Serialize;
 
@@ -8,57 +8,57 @@ use serde::Serialize;
 pub enum Severity {
     /// Estimates will be wrong or missing.
     Error,
-    /// Check it.
+    /// The user should check it.
     Warning,
-    /// Worth knowing.
+    /// Useful information.
     Note,
 }
 
-/// Subject of a finding. The order is that of causes: an earlier one can cause a later one.
+/// Subject of a finding. Ordered by cause: an earlier subject can cause a later one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Topic {
     /// The configuration itself.
     Configuration,
-    /// Interface missing, down or silent, or the pack is on another one.
+    /// The interface is missing, down or silent, or the pack is on another one.
     Interface,
-    /// Error frames: bit rate, wiring.
+    /// Error frames: bit rate or wiring.
     BitRate,
-    /// Classic against FD.
+    /// Classic and FD frames confused.
     Fd,
-    /// Standard against extended identifiers.
+    /// Standard and extended identifiers confused.
     IdKind,
     /// Another node sends with the daemon's identifiers.
     Conflict,
-    /// End-to-end checks fail.
+    /// The end-to-end checks fail.
     Protection,
     /// Too many or too few cells.
     CellCount,
-    /// Configured, never received.
+    /// A configured signal was never received.
     Silent,
-    /// One signal in another's place.
+    /// A signal stands in another's place.
     Swapped,
-    /// Byte order, sign of the number, or position of the bits.
+    /// Byte order, sign or position of the bits is wrong.
     Layout,
-    /// Factor or offset.
+    /// Factor or offset is wrong.
     Unit,
-    /// Charge and discharge exchanged.
+    /// Charge and discharge are exchanged.
     CurrentSign,
-    /// Never moves.
+    /// A value never changes.
     Frozen,
     /// The cells do not add up to the pack's voltage.
     PackVoltage,
-    /// Outside the configured limits.
+    /// Readings are outside the configured limits.
     Range,
-    /// One cell is unlike the others.
+    /// One cell or sensor differs from the others.
     Cell,
-    /// Too slow or too uneven.
+    /// Readings come too slowly or too unevenly.
     Period,
-    /// The model is of another cell.
+    /// The cell model belongs to another cell.
     CellModel,
-    /// Not zero at rest.
+    /// The current is not zero at rest.
     CurrentOffset,
-    /// Noisier than configured.
+    /// Voltages are noisier than configured.
     Noise,
     /// Two states of charge on the buses disagree.
     ReportedSoc,
@@ -67,15 +67,15 @@ pub enum Topic {
 /// A line of the configuration to change.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Change {
-    /// Table, `input.current`.
+    /// Name of the table, for example `input.current`.
     pub table: String,
-    /// Key.
+    /// Name of the key.
     pub key: String,
     /// Value proposed, as TOML.
     pub proposed: String,
-    /// File and line; filled in by the caller, which has read the file.
+    /// File and line; set by the caller, which has read the file.
     pub place: Option<String>,
-    /// Present value in the file; `None` = not set.
+    /// Current value in the file; `None` = not set.
     pub now: Option<String>,
 }
 
@@ -86,7 +86,7 @@ pub struct WiringFinding {
     pub severity: Severity,
     /// Subject.
     pub topic: Topic,
-    /// One sentence.
+    /// The finding in one sentence.
     pub title: String,
     /// Evidence: the measured values.
     pub seen: String,
@@ -94,24 +94,24 @@ pub struct WiringFinding {
     pub why: String,
     /// Lines to change.
     pub changes: Vec<Change>,
-    /// What to do in addition, or where no line of the configuration helps.
+    /// What else to do, or what to do if no line of the configuration helps.
     pub advice: Option<String>,
-    /// Titles of findings that are probably its consequences, and are not reported by themselves.
+    /// Titles of findings that are probably consequences of this one and are not listed separately.
     pub consequences: Vec<String>,
 }
 
-/// Result of a diagnosis.
+/// Result of the commissioning check.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct WiringReport {
-    /// Seconds listened; of a record, the time from the first frame to the last without sleep.
+    /// Time listened, s. For a recording: from the first frame to the last, without sleep.
     pub seconds: f64,
     /// Frames seen on all interfaces.
     pub frames: u64,
     /// Most severe first, then causes before effects.
     pub findings: Vec<WiringFinding>,
-    /// What is in order.
+    /// Checks that passed.
     pub fine: Vec<String>,
-    /// What could not be judged, and what to do.
+    /// Checks that were not possible, and what to do.
     pub unjudged: Vec<String>,
 }
 
@@ -140,7 +140,7 @@ impl WiringFinding {
     }
 
     pub(super) fn change_cell_model(&mut self) -> &mut Self {
-        self.change("pack", "cell_model", "the model of the cell that is in the pack")
+        self.change("pack", "cell_model", "the model of the installed cell")
     }
 
     pub(super) fn advice(&mut self, advice: impl Into<String>) -> &mut Self {
@@ -150,7 +150,7 @@ impl WiringFinding {
 }
 
 impl WiringReport {
-    /// Adds a finding in the order of `findings`, and returns it there.
+    /// Inserts a finding in the order of `findings` and returns it.
     pub fn add(&mut self, finding: WiringFinding) -> &mut WiringFinding {
         let key = |f: &WiringFinding| (f.severity, f.topic);
         let at = self.findings.partition_point(|other| key(other) <= key(&finding));
@@ -158,8 +158,8 @@ impl WiringReport {
         &mut self.findings[at]
     }
 
-    /// Moves further findings of a topic, and its consequences, below its first finding, by their titles. What the further
-    /// ones advise is added to its advice.
+    /// Moves further findings on `cause`, and its consequences, below its first finding. Keeps the titles of both and
+    /// the advice of the former.
     pub(super) fn fold(&mut self, cause: Topic, is_consequence: impl Fn(&WiringFinding) -> bool) {
         let Some(first) = self.findings.iter().position(|finding| finding.topic == cause) else { return };
         let is_moved = |finding: &mut WiringFinding| finding.topic == cause || is_consequence(finding);
@@ -185,7 +185,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn consequences_and_further_findings_of_a_cause_are_below_its_first() {
+    fn fold_moves_consequences_below_first_finding() {
         let mut report = WiringReport::default();
         let mut add = |topic, title: &str, advice: &str| {
             report.add(WiringFinding::new(Severity::Error, topic, title)).advice(advice);

@@ -156,5 +156,5 @@ fn missing_answers_are_found() {
          signals = [{ name = \"Cell{n}\", numbers = \"1-12\", bit = 32, length = 16, factor = 0.0001 }]\n",
     );
     let found = format!("{:?}", findings(&broken.report()));
-    assert!(found.contains("cells 1-12: configured, never seen"), "{found}");
+    assert!(found.contains("cells 1-12: configured, never received"), "{found}");
 }

@@ -1,12 +1,13 @@
-//! Cells whose voltages are always the same: one signal in the place of two.
+//! Finds cells whose voltages are always the same: one signal stands in the place of two.
 //!
-//! In: the cells' mean voltages of one block after the other, V. Out: groups of cells that never differed, with the number
-//! of blocks in which they moved. Exact: a copy has the same digits, and two cells in series differ in some of them.
+//! In: the cells' mean voltages, block by block, V. Out: groups of cells that never differed, with the number of
+//! blocks in which they moved. Equality is exact: a copy has the same digits, while two cells in series differ in some
+//! of them.
 
 /// Groups of cells that have not differed so far.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct EqualCells {
-    /// Number of its group, by cell.
+    /// Group number by cell.
     groups: Vec<usize>,
     last_v: Vec<f64>,
     /// Blocks in which a cell moved.
@@ -14,7 +15,7 @@ pub(crate) struct EqualCells {
 }
 
 impl EqualCells {
-    /// Takes the voltages of a block; one in which a cell has none is left out.
+    /// Adds the voltages of a block; ignores a block without a voltage of every cell.
     pub(crate) fn push(&mut self, cells_v: &[f64]) {
         let cells = cells_v.len();
         if cells < 2 || cells_v.iter().any(|v| !v.is_finite()) {
@@ -31,7 +32,7 @@ impl EqualCells {
         self.split();
     }
 
-    /// Separates cells of a group that differ now.
+    /// Splits groups whose cells now differ.
     fn split(&mut self) {
         let key = |cell: &usize| (self.groups[*cell], self.last_v[*cell].to_bits());
         let mut order: Vec<usize> = (0..self.groups.len()).collect();
@@ -43,7 +44,8 @@ impl EqualCells {
         self.groups = groups;
     }
 
-    /// Groups of at least two cells that moved in at least `fewest` blocks, with that number, in the order of the cells.
+    /// Groups of at least two cells that moved in at least `fewest` blocks, with that number of blocks, in the order
+    /// of the cells.
     pub(crate) fn groups(&self, fewest: u32) -> Vec<(Vec<usize>, u32)> {
         let moved = (0..self.groups.len()).filter(|cell| self.changes[*cell] >= fewest);
         let mut found: Vec<(usize, Vec<usize>, u32)> = Vec::new();
@@ -62,11 +64,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn cells_that_never_differ_stay_together() {
+    fn cells_that_never_differ_stay_grouped() {
         let mut cells = EqualCells::default();
         for block in 0..40 {
             let v = 3.7 + 0.001 * f64::from(block % 7);
-            // The third differs once, the fourth never moves, and a block with a gap says nothing.
+            // The third cell differs once, the fourth never moves, and a block with a missing voltage is ignored.
             cells.push(&[v, v, if block == 20 { v + 0.001 } else { v }, 3.7, v]);
             cells.push(&[v, f64::NAN, v, 3.7, v]);
         }

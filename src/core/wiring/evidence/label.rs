@@ -1,14 +1,14 @@
-//! What the name and the unit of a signal say about it.
+//! Evidence about a signal from its name and unit.
 //!
-//! In: message name, signal name and unit as their author wrote them. Out: points for each quantity of a pack, each with its
-//! reason in words, or `None` where the unit is that of another quantity. The points are weights chosen on three cars: a unit and a
-//! name count 2 each, a word of another device or of a limit costs 3.
+//! In: message name, signal name and unit as written by their author. Out: points for each quantity of a pack, each
+//! with its reason in words, or `None` if the unit belongs to another quantity. The points are weights chosen on three
+//! cars: most units and names count 1 to 3, a word of another device or of a limit costs 3.
 
 use serde::Serialize;
 
 use crate::can::unit::{Quantity, SignalUnit};
 
-/// What a signal of a pack may be.
+/// Quantity that a signal of a pack may have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PackQuantity {
@@ -31,14 +31,14 @@ pub enum PackQuantity {
 pub struct Score {
     /// Weight of the evidence; only the order matters.
     pub points: f64,
-    /// Why, in plain words.
+    /// Reasons in plain words.
     pub reasons: Vec<String>,
 }
 
 /// Name and unit of a signal.
 #[derive(Debug, Clone)]
 pub struct SignalLabel {
-    /// Words of the signal's own name, lower case: split at every change of case, at digits and at anything else.
+    /// Words of the signal's name, lower case; split at changes of case, at digits and at other characters.
     words: Vec<String>,
     /// The whole name, lower case.
     name: String,
@@ -52,25 +52,25 @@ enum LabelUnit {
     Known(Quantity),
     /// No unit is stated.
     Missing,
-    /// Stated and not known.
+    /// A unit is stated but not known.
     Other,
 }
 
-// Words in names. A word with `=` must stand by itself, any other may be a part of the name.
+// Words in names. A word with `=` must be a whole word of the name; any other word may be a part of it.
 
-/// Words that place a signal at the traction battery.
+/// Words that indicate the traction battery.
 const PACK: &str = "batt akku pack bms traction hvb =hv accumulator";
-/// Words of other devices and of the 12 V battery.
+/// Words that indicate other devices or the 12 V battery.
 const ELSEWHERE: &str = "12v twelvevolt =lv aux starter dcdc =dc =ac motor inverter invrt phase obc evse ptc heater htr \
     compressor hvac cabin ambient coolant tpms tire front rear link solar pump fan oil igbt fet pcb cpu \
     pilot connector pin inlet outlet capacitor charger plug port climate freezer stator brake trailer \
     screen bus line isolation relay coil contactor cont";
-/// Words of limits and requests: not a measured value.
+/// Words that indicate a limit or request, not a measured value.
 const NO_MEASUREMENT: &str = "limit target request =req avail possible set allowed threshold lifetime cumulative rated nominal =id \
     =num count delta =dev deviation fault offset reserve initial";
 
 impl Score {
-    /// Adds points and their reason if it holds.
+    /// Adds points and their reason if `holds` is true.
     pub fn add(&mut self, points: f64, holds: bool, reason: &str) {
         if holds {
             self.points += points;
@@ -86,7 +86,7 @@ impl PackQuantity {
     pub const ALL: [Self; 6] =
         [Self::Current, Self::PackVoltage, Self::CellVoltage, Self::Temperature, Self::Soc, Self::Soh];
 
-    /// In words.
+    /// Name for reports.
     pub fn name(self) -> &'static str {
         match self {
             Self::Current => "pack current",
@@ -108,7 +108,7 @@ impl PackQuantity {
         }
     }
 
-    /// The quantity of its unit.
+    /// The quantity that its unit measures.
     fn measured(self) -> Quantity {
         match self {
             Self::Current => Quantity::Current,
@@ -120,7 +120,7 @@ impl PackQuantity {
 }
 
 impl SignalLabel {
-    /// Reads names and unit.
+    /// Splits the names into words and parses the unit.
     pub fn new(message: &str, signal: &str, unit: &str) -> Self {
         let unit = match SignalUnit::parse(unit) {
             Some(unit) => LabelUnit::Known(unit.quantity),
@@ -137,7 +137,7 @@ impl SignalLabel {
         Self { words: Vec::new(), name: String::new(), unit: LabelUnit::Known(quantity), is_pack_message: false }
     }
 
-    /// Whether one of the words is there.
+    /// Whether the name contains one of the words.
     fn has(&self, any: &str) -> bool {
         any.split(' ').any(|wanted| match wanted.strip_prefix('=') {
             Some(word) => self.words.iter().any(|own| own == word),
@@ -145,27 +145,27 @@ impl SignalLabel {
         })
     }
 
-    /// Whether the unit is stated and is one of this quantity.
+    /// Whether a unit is stated and belongs to this quantity.
     pub fn has_unit_of(&self, quantity: Quantity) -> bool {
         self.unit == LabelUnit::Known(quantity)
     }
 
-    /// Whether the unit is one of this quantity, or none is stated.
+    /// Whether the unit belongs to this quantity or is not stated.
     pub fn may_measure(&self, quantity: Quantity) -> bool {
         self.has_unit_of(quantity) || self.unit == LabelUnit::Missing
     }
 
-    /// Whether the signal or its message is named like a part of the traction battery.
+    /// Whether the name of the signal or its message indicates the traction battery.
     pub fn is_of_pack(&self) -> bool {
         self.has(PACK) || self.is_pack_message
     }
 
-    /// Whether the name says maximum or minimum.
+    /// Whether the name contains maximum or minimum.
     pub fn says_extreme(&self) -> bool {
         self.has("max min highest lowest")
     }
 
-    /// Whether the name says cell.
+    /// Whether the name contains cell.
     pub fn says_cell(&self) -> bool {
         self.has("cell brick cmu zelle =vc")
     }
@@ -180,7 +180,7 @@ impl SignalLabel {
         self.has("soh stateofhealth state_of_health")
     }
 
-    /// What name and unit say about a quantity; `None` = they exclude it.
+    /// Points for a quantity from name and unit; `None` if they exclude it.
     pub fn score(&self, quantity: PackQuantity) -> Option<Score> {
         let mut score = Score::default();
         let has_unit = self.has_unit_of(quantity.measured());
@@ -197,7 +197,7 @@ impl SignalLabel {
             PackQuantity::Soc => (self.says_soc() && !self.says_soh(), "its name says state of charge"),
             PackQuantity::Soh => (self.says_soh(), "its name says state of health"),
         };
-        // The points of unit and name, and whether the name must say it where a unit is stated too.
+        // Points of unit and name, and whether the name must match even if a unit is stated.
         let (unit_points, name_points, needs_name) = match quantity {
             PackQuantity::Current | PackQuantity::PackVoltage => (2.0, 2.0, false),
             PackQuantity::CellVoltage => (1.0, 2.0, true),
@@ -232,7 +232,7 @@ impl SignalLabel {
     }
 }
 
-/// Splits a name where a reader splits it.
+/// Splits a name at changes of case, at digits and at other characters.
 fn words(name: &str) -> Vec<String> {
     let chars: Vec<char> = name.chars().collect();
     let mut words = vec![String::new()];
@@ -258,7 +258,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_are_split_where_a_reader_splits_them() {
+    fn names_are_split_into_words() {
         for (name, expected) in [
             ("IBatt", &["i", "batt"][..]),
             ("uwe596_6_TAkkuL", &["uwe", "596", "6", "t", "akku", "l"]),
@@ -271,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn words_of_other_devices_are_seen() {
+    fn words_of_other_devices_are_recognised() {
         let label = |name: &str| SignalLabel::new("", name, "");
         assert!(label("Voltage_12V").has(ELSEWHERE) && label("RearMotorCurrent126").has(ELSEWHERE));
         assert!(!label("SmoothBattCurrent132").has(ELSEWHERE) && !label("VBatt").has(ELSEWHERE));
@@ -279,7 +279,7 @@ mod tests {
     }
 
     #[test]
-    fn a_unit_of_another_quantity_excludes_and_a_missing_one_needs_the_name() {
+    fn score_requires_matching_unit_or_name() {
         let points = |signal: &str, unit: &str, quantity| {
             SignalLabel::new("Bms", signal, unit).score(quantity).map(|score| score.points)
         };

@@ -1,9 +1,9 @@
-//! The bits of a signal read with another layout: byte order, start bit, sign of the number.
+//! Reads the bits of a signal with other layouts: byte order, start bit, sign of the number.
 
 use super::sample::Extent;
 use crate::can::signal::{ByteOrder, SignalLayout, SignalPlan, ValueType};
 
-/// Faults of a layout that are looked for, in the order of the alternatives.
+/// Layout faults that are tested, in the order of the alternatives.
 pub(crate) const LAYOUT_FAULTS: [&str; 5] = [
     "wrong byte order",
     "signed and unsigned exchanged",
@@ -23,7 +23,7 @@ pub(crate) struct AlternativeReading {
 }
 
 impl AlternativeReading {
-    /// The readings of a signal's bits with every other layout.
+    /// Readings of a signal's bits with all other layouts.
     pub(super) fn all(layout: &SignalLayout) -> Vec<Self> {
         let other_sign = |layout: SignalLayout| match layout.value_type {
             ValueType::Unsigned => Some(SignalLayout { value_type: ValueType::Signed, ..layout }),
@@ -35,14 +35,14 @@ impl AlternativeReading {
         let others =
             [swapped, other_sign(*layout), swapped.and_then(other_sign), flipped, flipped.and_then(other_sign)];
         let reading = |(fault, layout): (&'static str, Option<SignalLayout>)| {
-            // The stated range belongs to the stated layout.
+            // The stated range applies only to the stated layout.
             let plan = SignalLayout { minimum: 0.0, maximum: 0.0, ..layout? }.plan().ok()?;
             Some(AlternativeReading { fault, layout: layout?, plan, extent: Extent::default() })
         };
         LAYOUT_FAULTS.into_iter().zip(others).filter_map(reading).collect()
     }
 
-    /// Reads the bits.
+    /// Reads the bits of a payload.
     pub(super) fn handle(&mut self, payload: &[u8], scale: f64, offset: f64) {
         if let Ok(physical) = self.plan.physical(payload) {
             self.extent.push(physical * scale + offset);
@@ -50,7 +50,7 @@ impl AlternativeReading {
     }
 }
 
-/// The same start bit with the other byte order: `@0` for `@1` in the DBC; `None` = the signal is within a byte.
+/// The same start bit with the other byte order (`@0` for `@1` in the DBC); `None` if the signal lies within a byte.
 fn order_flipped(layout: &SignalLayout) -> Option<SignalLayout> {
     let byte_order = match layout.byte_order {
         ByteOrder::LittleEndian => ByteOrder::BigEndian,
@@ -59,7 +59,7 @@ fn order_flipped(layout: &SignalLayout) -> Option<SignalLayout> {
     (layout.length_bits > 8).then_some(SignalLayout { byte_order, ..*layout })
 }
 
-/// The same whole bytes in the other order; `None` = the signal does not fill whole bytes, or only one.
+/// The same whole bytes in the other order; `None` if the signal does not fill at least two whole bytes.
 fn byte_swapped(layout: &SignalLayout) -> Option<SignalLayout> {
     let whole = layout.length_bits.is_multiple_of(8) && layout.length_bits > 8;
     let (byte, bit) = (layout.start_bit / 8, layout.start_bit % 8);
@@ -80,7 +80,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn whole_bytes_can_be_read_in_the_other_order() {
+    fn whole_bytes_are_swapped_to_other_order() {
         let layout = SignalLayout {
             start_bit: 16,
             length_bits: 16,

@@ -1,13 +1,13 @@
-//! Frames missing from a cyclic signal.
+//! Counts missing frames of a cyclic signal.
 //!
-//! In: the times between two readings, s. Out: the share of readings that are missing. The cycle is the median of the first
-//! gaps; afterwards a gap of n cycles is n - 1 missing readings, as far as fewer readings came than the time has cycles: late
-//! ones that are caught up with are not missing. A sender without a cycle differs from one that loses frames by its gaps,
-//! which are not multiples.
+//! In: times between two readings, s. Out: the share of missing readings. The cycle is the median of the first gaps.
+//! After that, a gap of n cycles counts as n - 1 missing readings. The total is limited to the elapsed cycles minus
+//! the readings received, so that late readings that a sender catches up with are not missing. The gaps of a sender
+//! without a cycle are not multiples of one value.
 
 use crate::filter::median;
 
-/// Counts of a signal.
+/// Counts of one signal.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct LossCounter {
     first: Vec<f64>,
@@ -15,7 +15,7 @@ pub(crate) struct LossCounter {
     gaps: u32,
     regular: u32,
     missing: u32,
-    /// Sum of the gaps, cycles.
+    /// Sum of the gaps, in cycles.
     elapsed: f64,
 }
 
@@ -38,12 +38,12 @@ impl LossCounter {
         let whole = cycles.round();
         if whole >= 1.0 && (cycles - whole).abs() <= 0.4 {
             self.regular = self.regular.saturating_add(1);
-            // At most 5.
+            // `whole` is at most 5.
             self.missing = self.missing.saturating_add(whole as u32 - 1);
         }
     }
 
-    /// Share of the readings that are missing, and the cycle, s; `None` = too few gaps, or no cycle.
+    /// Share of the missing readings, and the cycle, s; `None` with too few gaps, or without a cycle.
     pub(crate) fn share(&self) -> Option<(f64, f64)> {
         let gaps = f64::from(self.gaps);
         let missing = f64::from(self.missing).min((self.elapsed - gaps).max(0.0));
@@ -63,16 +63,16 @@ mod tests {
     }
 
     #[test]
-    fn every_seventh_frame_missing_is_a_seventh() {
+    fn loss_share_of_every_seventh_frame() {
         let found = share((0..700).map(|n| if n % 6 == 5 { 0.021 } else { 0.0099 }));
         assert!(found.is_some_and(|share| (share - 1.0 / 7.0).abs() < 0.01), "{found:?}");
     }
 
     #[test]
-    fn jitter_pauses_and_senders_without_a_cycle_are_no_loss() {
+    fn jitter_and_pauses_do_not_count_as_loss() {
         let jitter = share((0..700).map(|n| 0.01 + 0.002 * f64::from(n % 3 - 1)));
         assert!(jitter.is_some_and(|share| share < 0.01), "{jitter:?}");
-        // A busy computer sends two frames late, and catches up.
+        // A busy computer sends two frames late and catches up.
         let late = share((0..700).map(|n| match n % 15 {
             7 => 0.03,
             8 | 9 => 0.0001,

@@ -1,9 +1,10 @@
-//! What values, names and bits say about signals: the doctor judges the configured signals with it, `discover` scores candidates.
+//! Evidence about signals from their values, names and bits. The doctor judges the configured signals with it,
+//! `discover` scores candidates.
 //!
 //! | file | purpose |
 //! | --- | --- |
 //! | `label` | names and units: points for each quantity of a pack |
-//! | `series` | one signal: counts, periods, extent, roughness |
+//! | `series` | statistics of one signal: counts, periods, extent, roughness |
 //! | `sample` | extent and thinned sample of a stream |
 //! | `layout` | the same bits read with another byte order, start bit or sign |
 //! | `loss` | frames missing from a cyclic signal |

@@ -1,22 +1,22 @@
 //! How the cells' voltages follow the pack's current.
 //!
-//! In: voltage readings (V per cell) with the pack current (A, positive = discharge) that flowed. They are averaged over
-//! blocks of [`BLOCKS_S`], so that a sensor's delay of a tenth of a second does not matter. Out:
-//! * the largest steps of the current from block to block with the step of each cell's voltage: dV = -R dI;
+//! In: voltage readings (V per cell) and the pack current (A, positive = discharge) at that time. They are averaged
+//! over blocks of [`BLOCKS_S`], so that a sensor delay of a tenth of a second does not matter. Out:
+//! * the largest block-to-block steps of the current, with the step of each cell's voltage: dV = -R dI;
 //! * runs of steady current with the drift of the voltage: dV = -(dOCV/dSOC) I t / C;
 //! * rests: runs with a current near zero.
 //!
-//! The largest steps and longest runs are kept: a choice by current or time alone does not bias the slope.
+//! The largest steps and longest runs are kept: selection by current or time alone does not bias the slope.
 
 use super::equal_cells::EqualCells;
 use super::slope::Slope;
 use crate::filter::median;
 use crate::quantity::Timestamp;
 
-/// Times over which readings are averaged, s: the first for a load that always changes, the second for one that holds for
-/// a while under noisy voltages.
+/// Block lengths over which readings are averaged, s. Short blocks suit a load that changes all the time, long ones a
+/// load that holds for a while with noisy voltages.
 pub(crate) const BLOCKS_S: [f64; 2] = [1.0, 10.0];
-/// Blocks further apart than this do not belong together, s.
+/// Blocks further apart than this are not compared, s.
 const MAX_GAP_S: f64 = 40.0;
 
 /// A step of the current and of the voltages.
@@ -27,7 +27,7 @@ struct CurrentStep {
     cells_v: Vec<f32>,
 }
 
-/// A time of steady current.
+/// A period of steady current.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SteadyRun {
     pub(crate) current_a: f64,
@@ -35,7 +35,7 @@ pub(crate) struct SteadyRun {
     pub(crate) seconds: f64,
     /// Mean voltage of a cell, V.
     pub(crate) voltage_v: f64,
-    /// Drift over that time, V.
+    /// Drift over `seconds`, V.
     pub(crate) drift_v: f64,
     /// Standard deviation of `drift_v`, V.
     pub(crate) drift_std_v: f64,
@@ -61,7 +61,8 @@ struct BlockMean {
     cells_v: Vec<f64>,
 }
 
-/// A run that continues. Its sums count time and voltage from the first evaluated block: small numbers keep their digits.
+/// A run that is still growing. Its sums count time and voltage from the first evaluated block, so that rounding
+/// errors stay small.
 #[derive(Debug, Clone, Copy, Default)]
 struct OpenRun {
     from: Timestamp,
@@ -89,7 +90,7 @@ impl OpenRun {
         self.current_sum += mean.current_a;
         self.blocks += 1;
         let t = mean.time.since(self.from);
-        // The circuit's branches settle.
+        // Skips the time in which the circuit's branches settle.
         if t < 20.0 {
             return;
         }
@@ -100,7 +101,7 @@ impl OpenRun {
         (self.v, self.vv, self.tv) = (self.v + v, self.vv + v * v, self.tv + t * v);
     }
 
-    /// The line through the evaluated part; `None` = too short.
+    /// The line through the evaluated part; `None` if it is too short.
     fn finish(&self) -> Option<SteadyRun> {
         let (n, (first_s, first_v)) = (self.n, self.first?);
         let seconds = self.last.since(self.from) - first_s;
@@ -123,11 +124,11 @@ impl OpenRun {
     }
 }
 
-/// Relation of the voltages to the current, over blocks of one length.
+/// Relation of the voltages to the current, for one block length.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct VoltageResponse {
     block_s: f64,
-    /// Current changes up to this are no change of load, A.
+    /// Current changes up to this do not count as a change of load, A.
     tolerance_a: f64,
     current: Option<(Timestamp, f64)>,
     block: Block,
@@ -139,10 +140,10 @@ pub(crate) struct VoltageResponse {
     pub(crate) equal_cells: EqualCells,
 }
 
-/// The response whose slope is determined better.
+/// The response whose slope is better determined.
 pub(crate) fn best_response([fast, slow]: &[VoltageResponse; 2]) -> &VoltageResponse {
     let certainty = |response: &VoltageResponse| response.slope().map_or(0.0, |slope| slope.certainty());
-    // The short blocks where they suffice: they contain the load and nothing slower.
+    // Short blocks are preferred if they suffice, because they contain the load steps and no slower changes.
     let fast_certainty = certainty(fast);
     if fast_certainty >= 1.0 || fast_certainty >= certainty(slow) { fast } else { slow }
 }
@@ -175,7 +176,7 @@ impl VoltageResponse {
         }
     }
 
-    /// Ends the block and the run: a time without listening follows.
+    /// Ends the block and the run before a time without listening.
     pub(crate) fn pause(&mut self) {
         self.close_block();
         self.close_run();
@@ -205,7 +206,7 @@ impl VoltageResponse {
             before.cells_v.iter().zip(&after.cells_v).map(|(before, after)| (after - before) as f32).collect();
         let voltage_v = median(cells_v.iter().map(|v| f64::from(*v))).unwrap_or(f64::NAN);
         let step = CurrentStep { current_a: after.current_a - before.current_a, voltage_v, cells_v };
-        // A slope from this number is good to a few per cent.
+        // 192 steps determine the slope to a few per cent.
         if self.steps.len() < 192 {
             self.steps.push(step);
             return;
@@ -239,7 +240,7 @@ impl VoltageResponse {
         }
     }
 
-    /// Time over which readings are averaged, s.
+    /// Block length over which readings are averaged, s.
     pub(crate) fn block_s(&self) -> f64 {
         self.block_s
     }
@@ -254,8 +255,8 @@ impl VoltageResponse {
         self.slope_over(|step| step.cells_v.get(cell).map(|v| f64::from(*v)))
     }
 
-    /// Over steps of at least a fifth of the largest: smaller ones are mostly noise. Where these are few, the others show
-    /// how large that noise is.
+    /// Slope over steps of at least a fifth of the largest one, because smaller ones are mostly noise. With fewer than
+    /// five such steps, the smaller ones are included, because they show how large the noise is.
     fn slope_over(&self, voltage_v: impl Fn(&CurrentStep) -> Option<f64>) -> Option<Slope> {
         let largest = self.steps.iter().map(|step| step.current_a.abs()).fold(0.0, f64::max);
         let points = |least_a: f64| {
@@ -266,7 +267,7 @@ impl VoltageResponse {
             return Slope::of(points(0.2 * largest));
         }
         let all: Vec<(f64, f64)> = points(0.0).collect();
-        // Small for this pack: noise, or another unit. Only steps that agree with each other count.
+        // Small for this pack: noise, or a wrong unit. Only steps that agree with each other count.
         if largest < 5.0 * self.tolerance_a { Slope::of(points(0.2 * largest)) } else { Slope::fit(&all) }
     }
 
@@ -281,7 +282,7 @@ impl VoltageResponse {
 mod tests {
     use super::*;
 
-    /// A cell of 3.7 V and 50 mOhm whose current follows `current_a`, once a second.
+    /// Simulates a cell of 3.7 V and 50 mOhm with a current of `current_a`, once a second.
     fn response(seconds: u32, current_a: impl Fn(u32) -> f64) -> VoltageResponse {
         let mut response = VoltageResponse::new(1, 0.05, BLOCKS_S[0]);
         for second in 0..seconds {
@@ -294,7 +295,7 @@ mod tests {
     }
 
     #[test]
-    fn steps_of_the_current_give_the_resistance_with_its_sign() {
+    fn current_steps_give_signed_resistance() {
         let steps = |second: u32| if (second / 7).is_multiple_of(2) { 2.0 } else { -1.0 };
         let slope = response(60, steps).slope().unwrap();
         assert!((slope.ohm - 0.05).abs() < 1e-6 && slope.certainty() > 1.0, "{slope:?}");
@@ -303,7 +304,7 @@ mod tests {
     }
 
     #[test]
-    fn a_current_that_stands_still_gives_a_run_and_no_slope() {
+    fn steady_current_gives_run_without_slope() {
         let steady = response(120, |_| 2.0);
         assert!(steady.slope().is_none_or(|slope| slope.certainty() < 1.0));
         let one_step = response(40, |second| if second < 20 { 0.0 } else { 2.0 }).slope();

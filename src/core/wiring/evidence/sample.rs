@@ -1,7 +1,7 @@
-//! Extent of a stream of values, and a thinned sample of it in bounded memory.
+//! Extent of a stream of values, and a thinned sample of the stream in bounded memory.
 
-/// A sample of a stream: every value at first, then every second, every fourth, ... Samples of one size that take the same number of
-/// values keep those of the same places.
+/// A sample of a stream: at first every value, then every second, every fourth, ... Samples of one size that receive
+/// the same number of values keep the same positions.
 #[derive(Debug, Clone)]
 pub struct ThinnedSample {
     values: Vec<f64>,
@@ -11,7 +11,7 @@ pub struct ThinnedSample {
 }
 
 impl Default for ThinnedSample {
-    /// Quartiles of some hundred values are good to a few per cent.
+    /// 512 values: their quartiles are accurate to a few per cent.
     fn default() -> Self {
         Self::of_at_most(512)
     }
@@ -22,7 +22,7 @@ impl ThinnedSample {
         Self { values: Vec::new(), most, stride: 1, seen: 0 }
     }
 
-    /// The values that are kept, in their order.
+    /// The kept values, in order.
     pub fn kept(&self) -> &[f64] {
         &self.values
     }
@@ -44,7 +44,7 @@ impl ThinnedSample {
         self.seen += 1;
     }
 
-    /// The value below which the share `q` of the values lies; `None` = no value.
+    /// The value below which a share `q` of the values lies; `None` without values.
     pub(crate) fn quantile(&self, q: f64) -> Option<f64> {
         let mut sorted = self.values.clone();
         sorted.sort_by(f64::total_cmp);
@@ -56,7 +56,7 @@ impl ThinnedSample {
         self.quantile(0.5)
     }
 
-    /// Share of the values with a property, 0 without a value.
+    /// Share of the values for which `has` is true; 0 without values.
     pub(crate) fn share(&self, has: impl Fn(f64) -> bool) -> f64 {
         self.values.iter().filter(|value| has(**value)).count() as f64 / self.values.len().max(1) as f64
     }
@@ -71,7 +71,7 @@ impl ThinnedSample {
 #[derive(Debug, Clone, Copy)]
 pub struct Extent {
     pub(crate) count: u64,
-    /// Smallest value; infinite without one.
+    /// Smallest value; infinite without values.
     pub min: f64,
     /// Largest value.
     pub max: f64,
@@ -101,12 +101,12 @@ impl Extent {
         self.max = self.max.max(value);
     }
 
-    /// Mean of the values; NaN without one.
+    /// Mean of the values; NaN without values.
     pub fn mean(&self) -> f64 {
         self.sum / self.count as f64
     }
 
-    /// Largest less smallest value; 0 without one.
+    /// Largest minus smallest value; 0 without values.
     pub fn range(&self) -> f64 {
         (self.max - self.min).max(0.0)
     }
@@ -123,7 +123,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_thinned_sample_keeps_its_quartiles_and_its_size() {
+    fn thinned_sample_keeps_quantiles_and_size() {
         let mut sample = ThinnedSample::default();
         (0..100_000).for_each(|n| sample.push(f64::from(n)));
         assert!(sample.values.len() <= 512);

@@ -1,7 +1,7 @@
-//! Statistics of one signal: counts, periods, extent and roughness of its values, and of its bits with another layout.
+//! Statistics of one signal: counts, periods, extent and roughness of its values, also with other layouts of its bits.
 //!
-//! In: payloads with their time, or values with their time. Values are in the program's unit after the configured scale and offset;
-//! no limit is applied. Memory is bounded: gaps and values are kept as a thinned sample.
+//! In: payloads or values with their time. Values are in the program's unit, after the configured scale and offset; no
+//! limit is applied. Memory is bounded: gaps and values are kept as a thinned sample.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -33,7 +33,7 @@ pub struct Series {
     pub extent: Extent,
     /// A sample of the values.
     pub values: ThinnedSample,
-    /// The times of that sample, s.
+    /// The times of the values in `values`, s.
     pub(super) times_s: ThinnedSample,
     /// Time between two readings, s.
     pub(crate) gaps: ThinnedSample,
@@ -43,19 +43,19 @@ pub struct Series {
     pub(crate) stale_gaps: u64,
     /// Absolute changes from one value to the next.
     pub(crate) changes: ThinnedSample,
-    /// Changes no temperature can make.
+    /// Changes that are too fast for a temperature.
     pub(crate) jumps: u64,
     pub(crate) alternatives: Vec<AlternativeReading>,
     last_time: Option<Timestamp>,
 }
 
 impl Series {
-    /// `plausible`: smallest and largest plausible value; `None` = any.
+    /// Creates an empty series. `plausible`: smallest and largest plausible value; `None` = unlimited.
     pub(crate) fn new(layout: &SignalLayout, plausible: Option<(f64, f64)>) -> Self {
         Self { alternatives: AlternativeReading::all(layout), plausible, ..Self::default() }
     }
 
-    /// Takes a frame that may carry the signal. Returns its value.
+    /// Handles a frame that may carry the signal. Returns its value.
     pub(crate) fn handle(&mut self, time: Timestamp, payload: &[u8], binding: &Binding, max_age_s: f64) -> Option<f64> {
         self.frames += 1;
         let value = match self.value(payload, binding) {
@@ -70,9 +70,9 @@ impl Series {
         Some(value)
     }
 
-    /// The values of a recorded signal with their times, s.
+    /// Series of a recorded signal: values with their times, s.
     pub fn of(readings: impl Iterator<Item = (f64, Result<f64, Fault>)>) -> Self {
-        // Enough for a correlation, few enough for thousands of signals.
+        // Enough for a correlation, small enough for thousands of signals.
         let sample = ThinnedSample::of_at_most(4096);
         let mut series = Self { values: sample.clone(), times_s: sample, ..Self::default() };
         for (time_s, value) in readings {
@@ -90,7 +90,7 @@ impl Series {
         if self.extent.count > 0 {
             let change = (value - self.extent.last).abs();
             self.changes.push(change);
-            // No temperature changes this fast.
+            // Faster than any temperature changes.
             self.jumps += u64::from(change > 2.0 && gap_s.is_some_and(|gap_s| gap_s <= 2.0));
         }
         self.implausible += u64::from(self.plausible.is_some_and(|(low, high)| !(low..=high).contains(&value)));
@@ -106,7 +106,7 @@ impl Series {
             _ => &mut self.unusable.short,
         };
         *count += 1;
-        // With another layout the payload may be long enough.
+        // With another layout, the payload may be long enough.
         if fault == Fault::ShortFrame && binding.holds(payload) == Ok(true) {
             self.read_otherwise(payload, binding);
         }
@@ -117,7 +117,7 @@ impl Series {
         self.alternatives.iter_mut().for_each(|other| other.handle(payload, binding.scale, binding.offset));
     }
 
-    /// The value without the DBC's range; `Ok(None)` = the payload does not carry the signal.
+    /// The value without the DBC's range check; `Ok(None)` if the payload does not carry the signal.
     fn value(&self, payload: &[u8], binding: &Binding) -> Result<Option<f64>, Fault> {
         if !binding.holds(payload)? {
             return Ok(None);
@@ -141,33 +141,34 @@ impl Series {
         gap_s
     }
 
-    /// Not listening: the next gap says nothing.
+    /// Ignores the next gap, because the observer does not listen during it.
     pub(crate) fn pause(&mut self) {
         self.last_time = None;
     }
 
-    /// Readings with a value.
+    /// Number of readings with a value.
     pub fn count(&self) -> u64 {
         self.extent.count
     }
 
-    /// Median time from one reading to the next, s.
+    /// Median time between two readings, s.
     pub fn period_s(&self) -> Option<f64> {
         self.gaps.median()
     }
 
-    /// White part of the noise, from one reading to the next; robust where fewer than half of the readings step.
+    /// Standard deviation of the white noise, from changes between readings; robust if fewer than half of the readings
+    /// step.
     pub(crate) fn noise(&self) -> Option<f64> {
-        // 0.6745 sqrt(2): median of |difference of two normal variables| over their standard deviation.
+        // 0.6745 sqrt(2): median of the absolute difference of two normal variables over their standard deviation.
         Some(self.changes.median()? / (0.6745 * std::f64::consts::SQRT_2))
     }
 
-    /// Readings without a value: outside the range, too short, not available.
+    /// Number of readings without a value: outside the range, too short, or "not available".
     pub fn bad(&self) -> u64 {
         self.invalid() + self.unusable.not_available
     }
 
-    /// Those of them that do not say "not available".
+    /// Number of readings without a value, except "not available".
     pub fn invalid(&self) -> u64 {
         self.unusable.short + self.unusable.not_finite
     }
@@ -177,12 +178,12 @@ impl Series {
         self.extent.range() == 0.0
     }
 
-    /// Different values among the first hundred that are kept.
+    /// Number of different values among the first hundred kept values.
     pub fn distinct(&self) -> usize {
         self.values.kept().iter().take(100).map(|value| value.to_bits()).collect::<BTreeSet<u64>>().len()
     }
 
-    /// Whether it counts: most steps are the same one, other than 0.
+    /// Whether the signal counts: most steps have the same size, other than 0.
     pub fn is_counter(&self) -> bool {
         let values = self.values.kept();
         let mut steps: BTreeMap<u64, usize> = BTreeMap::new();
@@ -193,7 +194,7 @@ impl Series {
         5 * most > 3 * values.len().saturating_sub(1).min(200)
     }
 
-    /// Largest step between neighbours that are kept.
+    /// Largest step between neighbouring kept values.
     pub fn largest_step(&self) -> f64 {
         self.values.kept().windows(2).map(|pair| (pair[1] - pair[0]).abs()).fold(0.0, f64::max)
     }
@@ -202,7 +203,7 @@ impl Series {
 /// The value of a recorded payload, within the DBC's range.
 ///
 /// # Errors
-/// Why there is none.
+/// The reason why the payload has no value.
 pub fn recorded_value(payload: &[u8], binding: &Binding) -> Result<f64, Fault> {
     if is_customary(payload, binding) { Err(Fault::NotAvailable) } else { binding.value(payload) }
 }

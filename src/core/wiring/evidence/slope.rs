@@ -1,7 +1,8 @@
 //! Voltage over current: a slope through the origin with its certainty.
 //!
-//! In: steps of a current (A) with the steps of a voltage (V), from blocks of a stream ([`response`](super::response)) or between the
-//! kept readings of two recorded signals. Out: the resistance with its sign, its standard deviation, and how much it explains.
+//! In: steps of a current (A) and of a voltage (V), from blocks of a stream ([`response`](super::response)) or from
+//! the kept readings of two recorded signals. Out: the resistance with its sign, its standard deviation, and the share
+//! of the voltage's variance that it explains.
 
 use super::series::Series;
 use crate::filter::median;
@@ -9,11 +10,11 @@ use crate::filter::median;
 /// A slope through the origin.
 #[derive(Debug, Clone, Copy)]
 pub struct Slope {
-    /// Steps.
+    /// Number of steps.
     pub points: usize,
     /// -dV/dI, ohm.
     pub ohm: f64,
-    /// Its standard deviation.
+    /// Standard deviation of `ohm`.
     pub(crate) std_ohm: f64,
     /// Share of the voltage's variance explained.
     pub(crate) r2: f64,
@@ -26,7 +27,8 @@ impl Slope {
         self.ohm / self.std_ohm.max(1e-12)
     }
 
-    /// Certainty that the slope is not zero: 1 = enough. A few points can lie on a line by chance.
+    /// Certainty that the slope is not zero: 1 = sufficient. Few points need more, because they can lie on a line by
+    /// chance.
     pub(crate) fn certainty(&self) -> f64 {
         let needed = match self.points {
             0..=4 => 15.0,
@@ -36,20 +38,21 @@ impl Slope {
         self.t().abs() / needed
     }
 
-    /// Correlation of the voltage with the current: negative where a discharge counts positive.
+    /// Correlation of the voltage with the current: negative if a discharge counts as positive.
     pub fn correlation(&self) -> f64 {
         -self.ohm.signum() * self.r2.sqrt()
     }
 
-    /// Correlation times the root of the number of steps: standard deviations from chance.
+    /// Significance of the correlation, in standard deviations of a random one: correlation times the square root of
+    /// the number of steps.
     pub fn strength(&self) -> f64 {
         self.correlation().abs() * (self.points as f64).sqrt()
     }
 
-    /// How a recorded voltage changes with a recorded current, or any signal with another; `None` when they have too little in common.
+    /// Slope of a recorded voltage over a recorded current, or of any two signals; `None` if they share too few steps.
     pub fn between(voltage: &Series, current: &Series) -> Option<Self> {
         let pairs = pairs(voltage, current);
-        // Over a longer time the charge changes too.
+        // Over longer times the charge changes too.
         let near = pairs.windows(2).filter(|pair| pair[1].0 - pair[0].0 <= 15.0);
         let steps: Vec<(f64, f64)> = near.map(|pair| (pair[1].2 - pair[0].2, pair[1].1 - pair[0].1)).collect();
         let moved = steps.iter().filter(|(current_a, _)| *current_a != 0.0).count();
@@ -57,7 +60,7 @@ impl Slope {
         Some(Self { points: moved, ..slope })
     }
 
-    /// Through the points without outliers: a wrong reading must not decide.
+    /// Slope through the points without outliers, so that a wrong reading does not decide.
     pub(super) fn of(points: impl Iterator<Item = (f64, f64)>) -> Option<Self> {
         let all: Vec<(f64, f64)> = points.filter(|(x, y)| y.is_finite() && *x != 0.0).collect();
         let ratio = median(all.iter().map(|(x, y)| y / x))?;
@@ -82,7 +85,7 @@ impl Slope {
         Some(Self {
             points: points.len(),
             ohm: -xy / xx,
-            // Readings have a resolution: a perfect fit of a few steps is not perfect knowledge.
+            // The minimum accounts for the resolution of the readings: few steps may fit perfectly by chance.
             std_ohm: (rest / xx).sqrt().max(1e-7),
             r2,
             largest_a: largest,
@@ -90,7 +93,8 @@ impl Slope {
     }
 }
 
-/// Time (s), voltage and current: of the rarer series each reading, with the nearest of the other, if that is within 0.3 s.
+/// Pairs (time in s, voltage, current): each reading of the slower series with the nearest reading of the other one
+/// within 0.3 s.
 fn pairs(voltage: &Series, current: &Series) -> Vec<(f64, f64, f64)> {
     let period_s = |series: &Series| series.period_s().unwrap_or(0.0);
     if period_s(voltage) < period_s(current) {
@@ -117,13 +121,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_wrong_reading_does_not_decide_the_slope() {
+    fn slope_ignores_a_wrong_reading() {
         let points = (1..20).map(|n| (f64::from(n), if n == 19 { 5.0 } else { -0.05 * f64::from(n) }));
         assert!((Slope::of(points).unwrap().ohm - 0.05).abs() < 1e-6);
     }
 
     #[test]
-    fn recorded_signals_of_different_rates_give_the_resistance() {
+    fn slope_between_signals_of_different_rates() {
         let current = |time_s: f64| (3.0 * time_s).sin() * 40.0;
         let fast = Series::of((0..2000).map(|n| f64::from(n) * 0.01).map(|t| (t, Ok(current(t)))));
         let slow = Series::of((0..100).map(|n| f64::from(n) * 0.2).map(|t| (t + 0.001, Ok(380.0 - 0.1 * current(t)))));

@@ -1,5 +1,5 @@
-//! Signals that are not configured, against those that are: the pack's voltage against the sum of its cells, a second state of
-//! charge against the configured one.
+//! Compares signals that are not configured with configured ones: the pack's voltage with the sum of its cells, a
+//! second state of charge with the configured one.
 
 use super::context::{Judge, SignalSeries, find, warning};
 use super::text::number;
@@ -7,7 +7,7 @@ use crate::quantity::Channel;
 use crate::wiring::plan::Kind;
 use crate::wiring::report::{Severity, Topic};
 
-/// Deviation of the sum of the cells that sensors explain.
+/// Deviation of the sum of the cells that sensor errors explain, fraction.
 const SUM_TOLERANCE: f64 = 0.03;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
@@ -16,14 +16,14 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     states_of_charge(judge);
 }
 
-/// Signals of the DBC beside the configured ones, with their median values.
+/// DBC signals of a channel that are not configured, with their median values.
 fn beside<'d>(judge: &Judge<'d>, channel: Channel) -> Vec<(SignalSeries<'d>, f64)> {
     let all = judge.plan.beside.iter().zip(&judge.observed.beside);
     let wanted = all.filter(|(signal, _)| signal.binding.channel == channel);
     wanted.filter_map(|signal| Some((signal, signal.1.values.median()?))).collect()
 }
 
-/// `is_clear`: every cell is read as it should be. A decimal place shows otherwise too.
+/// `is_clear`: all cells are read correctly. A wrong decimal place is also reported otherwise.
 fn pack_voltage(judge: &mut Judge<'_>, is_clear: bool) {
     let medians_v = judge.signals(Kind::Voltage).into_iter().map(|(_, series)| series.values.median());
     let Some(medians_v) = medians_v.collect::<Option<Vec<f64>>>().filter(|_| !judge.plan.pack.is_total) else { return };
@@ -32,7 +32,7 @@ fn pack_voltage(judge: &mut Judge<'_>, is_clear: bool) {
         return;
     }
     let candidates = beside(judge, Channel::PackVoltage).into_iter();
-    // Others are an auxiliary battery, a link behind open contactors.
+    // Other ratios belong to an auxiliary battery, or to a DC link behind open contactors.
     let candidates = candidates.filter(|(_, pack_v)| (0.2..20.0).contains(&(pack_v / sum_v)));
     let off = |pack_v: f64| (pack_v / sum_v).ln().abs();
     let Some(((signal, _), pack_v)) = candidates.min_by(|a, b| off(a.1).total_cmp(&off(b.1))) else { return };
@@ -46,8 +46,8 @@ fn pack_voltage(judge: &mut Judge<'_>, is_clear: bool) {
         let times = number(10.0_f64.powf(power));
         warning(judge, Topic::PackVoltage, format!("{} is off by {times}", signal.name))
             .seen(format!("the medians of {cells} cells add up to {sum} V; {} is {pack} V", signal.name))
-            .why("the voltages of cells in series add up; a factor of ten is a decimal place of its definition")
-            .advice(format!("divide the factor of {} by {times}, where it is defined", signal.name));
+            .why("the voltages of cells in series add up; a factor of ten is a wrong decimal place in its definition")
+            .advice(format!("divide the factor of {} by {times} in its definition", signal.name));
         return;
     }
     if !is_clear {
@@ -76,7 +76,7 @@ fn states_of_charge(judge: &mut Judge<'_>) {
             judge.fine(format!("{} and {} agree: {own_percent} and {percent} %", own.name, signal.name));
             continue;
         }
-        // A dash that hides a reserve at both ends differs by less.
+        // A dashboard that hides a reserve at both ends differs by less.
         let severity = if difference > 0.1 { Severity::Warning } else { Severity::Note };
         find(judge, severity, Topic::ReportedSoc, format!("{} and {} disagree", own.name, signal.name))
             .seen(format!("the configured state of charge is {own_percent} %, the other one {percent} %"))

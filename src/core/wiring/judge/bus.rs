@@ -1,4 +1,4 @@
-//! Interfaces, identifiers, error frames, foreign senders, end-to-end checks.
+//! Checks interfaces, identifiers, error frames, other senders and end-to-end protection.
 
 use super::context::{Judge, error, find, note, warning};
 use super::text::{count, number, seconds};
@@ -34,11 +34,11 @@ fn messages_of<'d>(judge: &Judge<'d>, bus: BusIndex) -> Vec<&'d MessagePlan> {
     judge.plan.messages.iter().filter(|message| message.bus == bus).collect()
 }
 
-/// The other interface that carries most of the wanted identifiers, with their number.
+/// The other interface with most of the wanted identifiers, and their number.
 fn best_other<'d>(judge: &Judge<'d>, index: usize, wanted: &[&MessagePlan]) -> Option<(&'d BusStats, usize)> {
     let others = judge.observed.buses.iter().enumerate().filter(|(other, _)| *other != index);
     let counted = others.map(|(_, bus)| (bus, wanted.iter().filter(|m| bus.ids.contains_key(&m.id)).count()));
-    // Of several with as many the first.
+    // If several have the same number, the first one counts.
     counted.filter(|(_, count)| *count > 0).rev().max_by_key(|(_, count)| *count)
 }
 
@@ -59,7 +59,7 @@ fn interface(judge: &mut Judge<'_>, index: usize) {
     if let Some((BusStats { name, .. }, found)) = best_other(judge, index, &wanted) {
         error(judge, Topic::Interface, format!("the pack is on {name}, not on {}", bus.name))
             .seen(format!("no frame on {}; {found} of {} configured messages on {name}", bus.name, wanted.len()))
-            .why("the identifiers of the DBC are there, on the other bus")
+            .why("the other bus has the identifiers of the DBC")
             .change(&interface_table(index), "name", format!("{name:?}"));
     } else if bus.error_frames == 0 {
         silent_interface(judge, bus, &interface_table(index));
@@ -72,15 +72,15 @@ fn silent_interface(judge: &mut Judge<'_>, bus: &BusStats, table: &str) {
         (_, true) => ("is down", "bring it up: ip link set NAME up type can bitrate RATE"),
         _ => (
             "is silent",
-            "is the vehicle awake? then check the plug, the bit rate, and that CAN_H and CAN_L are not exchanged",
+            "wake the vehicle; if it is awake, check the plug, the bit rate, and that CAN_H and CAN_L are not exchanged",
         ),
     };
     let busy = judge.observed.buses.iter().filter(|other| other.frames > 0).map(|other| other.name.as_str());
     let busy: Vec<&str> = busy.collect();
     let others = if busy.is_empty() {
-        "no other interface had any".to_owned()
+        "no other interface received frames".to_owned()
     } else {
-        format!("{} had some, none of this pack", busy.join(", "))
+        format!("{} received frames, but none of this pack", busy.join(", "))
     };
     let span = seconds(judge.observed.seconds());
     error(judge, Topic::Interface, format!("{} {state}", bus.name))
@@ -117,7 +117,7 @@ fn error_frames(judge: &mut Judge<'_>, bus: &BusStats) {
         );
 }
 
-/// Messages that came in another form or on another bus.
+/// Finds messages that arrive in another form or on another bus.
 fn messages(judge: &mut Judge<'_>, index: usize) {
     let (bus, wanted) = (&judge.observed.buses[index], messages_of(judge, bus_index(index)));
     let is_fd = |message: &&&MessagePlan| bus.ids.get(&message.id).is_some_and(|stats| stats.fd > 0);
@@ -166,14 +166,14 @@ fn on_other_bus(judge: &mut Judge<'_>, message: &MessagePlan) -> Option<()> {
     tables.dedup();
     let finding = error(judge, Topic::Interface, format!("{name} is on {}, not on {here}", other.name))
         .seen(format!("{frames} of {id} on {}, none on {here}", other.name))
-        .why("the identifier is there, on the other bus (which may use it for another message: look at the values)");
+        .why("the other bus has the identifier (it may use it for another message: check the values)");
     for table in tables {
         finding.change(table, "interface", format!("{:?}", other.name));
     }
     Some(())
 }
 
-/// Another node sends with an identifier of the daemon's frames.
+/// Finds other nodes that send with an identifier of the daemon's frames.
 fn conflicts(judge: &mut Judge<'_>) {
     let buses = &judge.observed.buses;
     for output in &judge.plan.outputs {
@@ -182,7 +182,7 @@ fn conflicts(judge: &mut Judge<'_>) {
             let title = format!("another node sends with {}, the identifier of the {} frame", output.id, output.name);
             warning(judge, Topic::Conflict, title)
                 .seen(format!("{} of {} on {}", count(stats.count, "frame"), output.id, bus.name))
-                .why("two senders of one identifier destroy each other's frames, and receivers take one for the other")
+                .why("two senders of one identifier destroy each other's frames, and receivers confuse them")
                 .change(&output.table, "id", "an identifier that no other node uses")
                 .advice("ignore this if packwatch itself was running at that time");
         }
@@ -197,7 +197,7 @@ fn protection(judge: &mut Judge<'_>) {
         let message = plan.messages.iter().find(|message| (message.bus, message.id) == key);
         let name = message.map_or("commands", |message| message.name.as_str());
         let all = stats.good + stats.bad;
-        // Some are lost at every start.
+        // A few frames are lost at every start.
         if all == 0 || stats.bad as f64 <= 0.05 * all as f64 {
             if stats.good > 0 {
                 judge.fine(format!("{name}: {} of {all} frames pass their end-to-end check", stats.good));
@@ -239,7 +239,7 @@ fn why_failing<'f>(
         Some((profile, id))
     });
     match found {
-        // Its eight bits do not distinguish 256 identifiers.
+        // The eight bits of the checksum do not distinguish all identifiers: 256 of them fit.
         Some((Profile::P01A, id)) => finding
             .why(format!("the checksum is that of profile 1A with another data identifier ({id:#X} and 255 others fit)"))
             .change(table, "data_id", "the number in the sender's documentation"),
@@ -253,7 +253,7 @@ fn why_failing<'f>(
     }
 }
 
-/// Rate and identifiers of every interface with frames.
+/// Lists frame rate and number of identifiers of every interface with frames.
 fn traffic(judge: &mut Judge<'_>) {
     for bus in judge.observed.buses.iter().filter(|bus| bus.frames > 0) {
         let per_s = bus.frames as f64 / judge.observed.seconds().max(1e-3);

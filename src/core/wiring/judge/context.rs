@@ -1,4 +1,4 @@
-//! What all checks share: the received data, the plan, the report so far, and the factors found.
+//! Shared state of all checks: the collected data, the plan, the report so far, and the factors found.
 
 use std::collections::BTreeSet;
 
@@ -11,11 +11,11 @@ use crate::wiring::observer::{BusStats, WiringObserver};
 use crate::wiring::plan::{Kind, Plan, SignalPlan};
 use crate::wiring::report::{Severity, Topic, WiringFinding, WiringReport};
 
-/// A pack's current stays below this many times its capacity.
+/// Largest plausible current of a pack, in multiples of its capacity per hour.
 pub(super) const MAX_C_RATE: f64 = 30.0;
 
-/// A slope's size is judged when the current explains this share of the voltage's changes: below it, noise in the current
-/// makes the slope too small.
+/// Smallest share of the voltage's changes that the current must explain before the size of a slope is judged. Below
+/// it, noise in the current makes the slope too small.
 pub(super) const EXPLAINED: f64 = 0.8;
 
 /// A configured signal with the statistics of its values.
@@ -26,34 +26,35 @@ pub(super) struct Judge<'d> {
     pub(super) observed: &'d WiringObserver,
     pub(super) plan: &'d Plan,
     pub(super) report: WiringReport,
-    /// Messages whose absence is explained.
+    /// Messages whose absence is already explained.
     pub(super) explained: BTreeSet<(BusIndex, CanId)>,
-    /// Factor that converts the voltages as configured to V.
+    /// Factor that converts the configured reading of the voltages to V.
     pub(super) voltage_factor: f64,
-    /// Factor that converts the current as configured to A.
+    /// Factor that converts the configured reading of the current to A.
     pub(super) current_factor: f64,
-    /// A current or voltage is not the configured quantity: how voltages follow the current cannot be judged.
+    /// Whether a current or voltage signal is not the configured quantity, so that the response of the voltages cannot
+    /// be judged.
     pub(super) is_mixed_up: bool,
-    /// Quantities whose bits the DBC places wrongly.
+    /// Kinds of signals whose layout in the DBC is wrong.
     pub(super) wrong_layouts: Vec<Kind>,
 }
 
-/// Adds an error; its texts follow.
+/// Adds an error; the caller adds its texts.
 pub(super) fn error<'j>(judge: &'j mut Judge<'_>, topic: Topic, title: impl Into<String>) -> &'j mut WiringFinding {
     find(judge, Severity::Error, topic, title)
 }
 
-/// Adds a warning; its texts follow.
+/// Adds a warning; the caller adds its texts.
 pub(super) fn warning<'j>(judge: &'j mut Judge<'_>, topic: Topic, title: impl Into<String>) -> &'j mut WiringFinding {
     find(judge, Severity::Warning, topic, title)
 }
 
-/// Adds a note; its texts follow.
+/// Adds a note; the caller adds its texts.
 pub(super) fn note<'j>(judge: &'j mut Judge<'_>, topic: Topic, title: impl Into<String>) -> &'j mut WiringFinding {
     find(judge, Severity::Note, topic, title)
 }
 
-/// Adds a finding; its texts follow.
+/// Adds a finding; the caller adds its texts.
 pub(super) fn find<'j>(
     judge: &'j mut Judge<'_>,
     severity: Severity,
@@ -101,23 +102,23 @@ impl<'d> Judge<'d> {
         self.signals(Kind::Current).first().copied()
     }
 
-    /// Smallest and largest voltage the median cell may have, V.
+    /// Smallest and largest voltage that the median cell may have, V.
     pub(super) fn voltage_band(&self) -> (f64, f64) {
-        // Of the medians over time: a short peak does not move them.
+        // Narrow limits suffice for a median over time, which short peaks do not move.
         self.plan.pack.model.as_ref().map_or((1.2, 4.6), |m| (m.voltage_min_v - 0.15, m.voltage_max_v + 0.08))
     }
 
-    /// Charge of the whole pack, Ah.
+    /// Capacity of the whole pack, Ah.
     pub(super) fn pack_ah(&self) -> f64 {
         self.plan.pack.capacity_ah * f64::from(self.plan.pack.strings.max(1))
     }
 
-    /// Cells that one voltage reading covers.
+    /// Number of cells that one voltage reading covers.
     pub(super) fn cells_per_reading(&self) -> f64 {
         if self.plan.pack.is_total { f64::from(self.plan.pack.cells.max(1)) } else { 1.0 }
     }
 
-    /// Median over the cells of their median voltages as configured, V per cell; `None` = no reading.
+    /// Median over the cells of their median voltages, read as configured, V per cell; `None` without readings.
     pub(super) fn cell_voltage(&self) -> Option<f64> {
         self.median_of(Kind::Voltage, |series| series.values.median()).map(|v| v / self.cells_per_reading())
     }
@@ -127,14 +128,15 @@ impl<'d> Judge<'d> {
         median(self.signals(kind).into_iter().filter_map(|(_, series)| value(series)))
     }
 
-    /// Median of the temperature sensors where it is plausible, degrees C; else the configured surroundings.
+    /// Median of the temperature sensors, degrees C; the configured ambient temperature if the median is not
+    /// plausible.
     pub(super) fn temperature_c(&self) -> f64 {
         let median = self.median_of(Kind::Temperature, |series| series.values.median());
         median.filter(|c| (-40.0..80.0).contains(c)).unwrap_or(self.plan.pack.ambient_c)
     }
 
-    /// The model's resistance over the SOC and temperatures of the log, ohm: the lowest at once, the highest at the end of a
-    /// block of `block_s` after a step.
+    /// Range of the model's resistance over the SOC and temperatures of the recording, ohm: the lowest immediate
+    /// value, and the highest value at the end of a block of `block_s` after a step.
     pub(super) fn model_ohm(&self, model: &CellModel, block_s: f64) -> (f64, f64) {
         let spread = |kind, per: f64, middle: f64| {
             let at = |q| self.median_of(kind, |series| series.values.quantile(q)).map_or(middle, |value| value * per);
@@ -154,7 +156,7 @@ impl<'d> Judge<'d> {
         })
     }
 
-    /// The model's resistance once every branch has settled, at the middle of the log, ohm.
+    /// The model's resistance with all branches settled, at the median of the recording, ohm.
     pub(super) fn settled_ohm(&self, model: &CellModel) -> f64 {
         let voltage_v = self.cell_voltage().unwrap_or(f64::NAN) * self.voltage_factor;
         let temperature_c = self.temperature_c();
@@ -170,7 +172,7 @@ impl<'d> Judge<'d> {
         self.bus(bus).map_or("unknown", |bus| bus.name.as_str())
     }
 
-    /// Another interface that carries the identifier.
+    /// Another interface on which the identifier was received.
     pub(super) fn other_bus(&self, bus: BusIndex, id: CanId) -> Option<&'d BusStats> {
         let buses = self.observed.buses.iter().enumerate();
         buses.filter(|(index, _)| *index != bus.index()).map(|(_, other)| other).find(|b| b.ids.contains_key(&id))

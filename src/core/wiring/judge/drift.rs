@@ -4,7 +4,7 @@ use super::context::Judge;
 use crate::cell::CellModel;
 use crate::wiring::evidence::response::SteadyRun;
 
-/// A drift is trusted from this many standard deviations.
+/// A drift counts if it is at least this many standard deviations.
 const SURE: f64 = 6.0;
 
 /// Voltage drift over all steady runs, per cell.
@@ -13,15 +13,15 @@ pub(super) struct Drift {
     pub(super) seconds: f64,
     /// Sum of the model's drifts, V.
     pub(super) expected_v: f64,
-    /// Measured drift against the expected direction, V.
+    /// Measured drift against the expected direction, V, as an absolute value.
     pub(super) against_v: f64,
-    /// Measured over expected, weighted by the expected.
+    /// Ratio of measured to expected drift, weighted by the expected drift.
     pub(super) ratio: f64,
     pub(super) sigma: f64,
 }
 
 impl Drift {
-    /// Over the runs of the short blocks; `None` without a cell model or a run.
+    /// Drift over the steady runs of the short blocks; `None` without a cell model or without a run.
     pub(super) fn of(judge: &Judge<'_>) -> Option<Self> {
         let model = judge.plan.pack.model.as_ref()?;
         let (mut xx, mut xy, mut variance, mut seconds, mut expected_v) = (0.0, 0.0, 0.0, 0.0, 0.0);

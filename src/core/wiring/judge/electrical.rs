@@ -1,4 +1,4 @@
-//! Sign of the current, and resistance: whether voltages follow the current as the cell model's do.
+//! Checks sign of the current and resistance: whether the voltages follow the current as in the cell model.
 
 use super::context::{EXPLAINED, Judge, error, find, warning};
 use super::drift::Drift;
@@ -9,9 +9,9 @@ use crate::wiring::evidence::Slope;
 use crate::wiring::plan::SignalPlan;
 use crate::wiring::report::{Severity, Topic, WiringFinding};
 
-/// Smallest step of the current that is judged, of the capacity.
+/// Smallest step of the current that is judged, as a fraction of the capacity per hour.
 const SMALLEST_STEP: f64 = 0.02;
-/// A resistance this many times the model's is a finding.
+/// A resistance off by this factor from the model's is a finding.
 const ODD_RATIO: f64 = 2.5;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
@@ -53,7 +53,7 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     }
 }
 
-/// The pack's slope as ohm per cell, after the factors found: the strings share the current.
+/// The pack's slope in ohm per cell, with the factors found applied; the strings share the current.
 fn cell_slope(judge: &Judge<'_>) -> Option<Slope> {
     let slope = judge.observed.slope()?;
     let by = judge.voltage_factor / judge.current_factor * f64::from(judge.plan.pack.strings.max(1));
@@ -83,7 +83,7 @@ fn inverted(judge: &mut Judge<'_>, signal: &SignalPlan, seen: String, why: &str)
     let finding = error(judge, Topic::CurrentSign, "the sign of the current is inverted").seen(seen).why(why);
     if is_csv {
         finding.advice(
-            "the file's columns have the program's own units: replay it with --csv-sign charge (or without, if it was given)",
+            "the file's columns are in the program's units: replay it with --csv-sign charge (or without, if it was given)",
         );
     } else {
         let is_charge = signal.binding.scale < 0.0;
@@ -106,13 +106,13 @@ fn resistance(judge: &mut Judge<'_>, slope: &Slope) {
         number(judge.temperature_c())
     );
     let (ratio, direction, why) = if ohm > slow {
-        (ohm / slow, "higher", "another cell, an old or very cold one, or cells in parallel counted wrongly")
+        (ohm / slow, "higher", "another, an aged or a very cold cell, or a wrong number of parallel cells")
     } else {
-        (fast / ohm, "lower", "another cell, or several in parallel behind one voltage tap")
+        (fast / ohm, "lower", "another cell, or parallel cells behind one voltage tap")
     };
     let configured = judge.plan.pack.strings;
     let strings = likely_strings(configured, ohm, (fast, slow));
-    // Another unit, not another cell.
+    // Such a ratio has its cause in the unit, not in the cell.
     if ratio >= 6.0 {
         current_unit(judge, seen, power_of_ten(ohm / (fast * slow).sqrt()), ratio);
     } else if ratio >= ODD_RATIO || ratio >= 2.0 && strings.is_some_and(|n| n < configured) {
@@ -127,12 +127,12 @@ fn resistance(judge: &mut Judge<'_>, slope: &Slope) {
     }
 }
 
-/// Another number of parallel strings with which the resistance is the model's.
+/// A different number of parallel strings that would explain the resistance.
 fn likely_strings(configured: u16, ohm: f64, (fast, slow): (f64, f64)) -> Option<u16> {
     let by_string = ohm / f64::from(configured);
-    // At most ODD_RATIO x 1024.
+    // At most `ODD_RATIO` x 1024.
     let strings = (((fast * slow).sqrt() / by_string).round() as u16).max(1);
-    // A cell's resistance differs from its model's by less than this factor.
+    // A cell's resistance usually differs from its model's by less than this factor.
     let is_like = (fast / 1.3..=slow * 1.3).contains(&(by_string * f64::from(strings)));
     (is_like && strings != configured).then_some(strings)
 }
@@ -141,7 +141,7 @@ fn power_of_ten(ratio: f64) -> f64 {
     10_f64.powf(ratio.log10().round())
 }
 
-/// The power of ten by which the current is off, by its steps; `None` = unknown, or 1.
+/// The power of ten by which the current is off, from its steps; `None` = unknown, or 1.
 pub(super) fn factor_by_steps(judge: &Judge<'_>) -> Option<f64> {
     let slope = cell_slope(judge)?;
     let (fast, slow) = judge.model_ohm(judge.plan.pack.model.as_ref()?, judge.observed.slope_block_s());
@@ -153,12 +153,12 @@ fn current_unit(judge: &mut Judge<'_>, seen: String, factor: f64, ratio: f64) {
     let Some((signal, _)) = judge.current() else { return };
     judge.current_factor *= factor;
     let severity = if (0.05..20.0).contains(&factor) { Severity::Warning } else { Severity::Error };
-    let why = format!("{} times off: no cell ages or cools this far", number(ratio));
+    let why = format!("{} times off: too much for ageing or cold", number(ratio));
     wrong_unit_or_cell(judge, signal, factor, severity).seen(seen).why(why);
 }
 
-/// A current that is off by `factor`: by its unit, or because the cell is another. Where the DBC says ampere and nothing
-/// is scaled, the reading is probably right and the cell comes first.
+/// Reports a current that is off by `factor`: its unit is wrong, or the cell is another one. If the DBC states ampere
+/// and nothing is scaled, the reading is probably right and the cell is named first.
 pub(super) fn wrong_unit_or_cell<'j>(
     judge: &'j mut Judge<'_>,
     signal: &SignalPlan,

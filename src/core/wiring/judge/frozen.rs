@@ -1,4 +1,4 @@
-//! Signals that stand still while others move, cells that respond unlike the others, and cells with one voltage.
+//! Finds signals that never change while others do, cells that respond differently, and cells with the same voltage.
 
 use super::context::{EXPLAINED, Judge, SignalSeries, error, warning};
 use super::text::{channels, count, milli, number, ranges};
@@ -7,7 +7,7 @@ use crate::wiring::evidence::{Series, Slope};
 use crate::wiring::plan::{Kind, SignalPlan};
 use crate::wiring::report::Topic;
 
-/// Fewest readings to judge a signal by.
+/// Fewest readings for a judgement.
 const FEWEST_READINGS: u64 = 20;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
@@ -33,8 +33,8 @@ fn voltages(judge: &mut Judge<'_>) {
     error(judge, Topic::Frozen, format!("{} never moves", channels(&list)))
         .seen(format!("{} is {value} in all of {readings}", signal.name))
         .why(if is_all { "the current moved, and a voltage must follow it" } else { "the other cells moved" })
-        .change(&signal.table, "signal", "the signal that is measured, not a default or a copy")
-        .advice("or its sender repeats an old value");
+        .change(&signal.table, "signal", "the measured signal, not a default or a copy")
+        .advice("or the sender repeats an old value");
 }
 
 fn pack_current(judge: &mut Judge<'_>, (signal, series): SignalSeries<'_>) {
@@ -48,11 +48,11 @@ fn pack_current(judge: &mut Judge<'_>, (signal, series): SignalSeries<'_>) {
     let readings = count(series.count(), "reading");
     error(judge, Topic::Frozen, "the pack current never moves")
         .seen(format!("{} is {value} A in all of {readings}, while the cells step by up to {step} mV", signal.name))
-        .why("only a current moves voltages this fast")
-        .change(&signal.table, "signal", "the signal of the current that is measured");
+        .why("only a change of current moves voltages this fast")
+        .change(&signal.table, "signal", "the signal of the measured current");
 }
 
-/// Cells with the voltage of another cell: by their bits, and by their values.
+/// Finds cells that show another cell's voltage, by their bits and by their values.
 pub(super) fn check_equal(judge: &mut Judge<'_>) {
     let voltages = judge.signals(Kind::Voltage);
     let mut reported: Vec<Channel> = Vec::new();
@@ -63,16 +63,16 @@ pub(super) fn check_equal(judge: &mut Judge<'_>) {
         reported.extend(pair);
         error(judge, Topic::Swapped, format!("{} read the same bits", channels(&pair)))
             .seen(format!("{} and {} share bits of one message in the DBC", other.name, signal.name))
-            .why("two cells have a voltage each")
+            .why("each cell has its own voltage")
             .change(&signal.table, "signal", "a pattern that gives each cell its own signal")
             .advice("compare the start bits in the DBC with the sender's documentation");
     }
-    // Cells of coarse resolution agree without being one.
+    // With a coarse resolution, different cells often agree.
     let step_v = |(signal, _): &SignalSeries<'_>| (signal.layout.factor * signal.scale).abs() * judge.voltage_factor;
     if voltages.iter().any(|voltage| step_v(voltage) > 0.005) {
         return;
     }
-    // Blocks in which cells must have moved: neighbours of coarse resolution agree for a while.
+    // Only blocks in which the cells moved count, because similar cells may agree for a while.
     let [fast, slow] = judge.observed.responses().each_ref().map(|response| response.equal_cells.groups(25));
     for (cells, blocks) in if fast.is_empty() { slow } else { fast } {
         let is_member = |(signal, _): &&SignalSeries<'_>| matches!(signal.binding.channel, Channel::CellVoltage(cell) if cells.contains(&cell.index()));
@@ -84,13 +84,13 @@ pub(super) fn check_equal(judge: &mut Judge<'_>) {
         }
         error(judge, Topic::Swapped, format!("{} always have the same voltage", channels(&list)))
             .seen(format!("{} and {} moved {blocks} times, each time to the same value", first.0.name, second.0.name))
-            .why("two cells in series differ in some digit: one value stands in the place of both")
+            .why("two cells in series differ at least in the last digit: both signals show the same cell")
             .change(&first.0.table, "signal", "a pattern that gives each cell its own signal")
             .advice("compare the signals in the DBC, and the sender's list of cells");
     }
 }
 
-/// Cells with a voltage that does not follow the current as the others do.
+/// Finds cells whose voltage does not follow the current as the others do.
 pub(super) fn check_response(judge: &mut Judge<'_>) {
     let is_clear = |slope: &Slope| slope.ohm > 0.0 && slope.certainty() >= 1.0 && slope.r2 >= EXPLAINED;
     let Some(common) = judge.observed.slope().filter(is_clear) else { return };
@@ -110,6 +110,6 @@ pub(super) fn check_response(judge: &mut Judge<'_>) {
     let title = format!("cell {} follows the current unlike the others", ranges(&numbers));
     warning(judge, Topic::Cell, title)
         .seen(format!("cell {first} moves {ratio} times as far as the median cell"))
-        .why("a loose connection (more), another signal in its place or an old value repeated (less)")
+        .why("more: a loose connection; less: a wrong signal, or a repeated old value")
         .advice("check the connection of that cell and its signal in the DBC");
 }

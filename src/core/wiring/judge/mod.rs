@@ -1,4 +1,5 @@
-//! Turns everything received into a report, causes first, so that a consequence is not reported as a second fault.
+//! Turns the collected data into a report. Causes are checked first, so that a consequence is not reported as a second
+//! fault.
 //!
 //! | file | checks |
 //! | --- | --- |
@@ -6,14 +7,14 @@
 //! | `other_bus` | the current's message on two interfaces |
 //! | `beside` | pack voltage and states of charge that are not configured |
 //! | `presence` | silent signals, number of cells |
-//! | `swapped` | one signal in another's place |
+//! | `swapped` | signals in another's place |
 //! | `values` | units, byte order, limits |
-//! | `frozen` | signals that stand still, cells that respond unlike the others or have one voltage |
-//! | `electrical` | sign of the current, resistance (from steps, or from the `drift` of steady runs) |
+//! | `frozen` | signals that never change, cells that respond differently, cells with the same voltage |
+//! | `electrical` | sign of the current, resistance (from steps or from the `drift` of steady runs) |
 //! | `model` | open-circuit voltage, current offset, noise, the estimator |
 //! | `timing` | periods |
 //!
-//! All share `context`. A factor found in `values` is applied before `electrical` runs.
+//! All checks share `context`. A factor found in `values` is applied before `electrical` runs.
 
 mod beside;
 mod bus;
@@ -36,7 +37,7 @@ use super::report::{Topic, WiringFinding, WiringReport};
 use context::Judge;
 
 impl WiringObserver {
-    /// Judges everything received.
+    /// Judges all collected data and returns the report.
     pub fn finish(mut self) -> WiringReport {
         self.end_blocks();
         let mut judge = Judge::new(&self);
@@ -54,14 +55,14 @@ impl WiringObserver {
         let awake_s = self.awake_s;
         if self.frames > 0 && awake_s < 5.0 {
             let span = text::seconds(awake_s);
-            judge.unjudged(format!("frames came for only {span}: listen longer to judge periods and cells"));
+            judge.unjudged(format!("only {span} of frames: listen longer so that periods and cells can be judged"));
         }
         fold(&mut judge);
         judge.report
     }
 }
 
-/// Puts the consequences of a wrong layout below its finding.
+/// Moves the consequences of a wrong layout below its finding.
 fn fold(judge: &mut Judge<'_>) {
     const OF_VALUES: [Topic; 8] = [
         Topic::CellCount,
@@ -73,7 +74,7 @@ fn fold(judge: &mut Judge<'_>) {
         Topic::Range,
         Topic::CellModel,
     ];
-    // A wrong temperature explains other temperatures only.
+    // A wrong temperature layout explains only other temperature findings.
     let explains_all = judge.wrong_layouts.iter().any(|kind| *kind != Kind::Temperature);
     if !judge.wrong_layouts.is_empty() {
         let is_consequence = |finding: &WiringFinding| {

@@ -1,4 +1,4 @@
-//! Open-circuit voltage against the cell model, current offset, noise, and the results of the estimator.
+//! Checks open-circuit voltage against the cell model, current offset, noise, and the results of the estimator.
 
 use super::context::{Judge, error, note, warning};
 use super::drift::Drift;
@@ -16,7 +16,7 @@ pub(super) fn check(judge: &mut Judge<'_>, drift: Option<Drift>) {
     noise(judge);
 }
 
-/// Resting voltage, and its slope over charge, against the model's.
+/// Compares the resting voltage and the voltage drift with the model's curve.
 fn open_circuit(judge: &mut Judge<'_>, model: &CellModel, drift: Option<Drift>) {
     let temperature_c = judge.temperature_c();
     let [empty_v, full_v] = [0.0, 1.0].map(|soc| model.ocv_v(&model.grid_position(soc, temperature_c)));
@@ -30,7 +30,7 @@ fn open_circuit(judge: &mut Judge<'_>, model: &CellModel, drift: Option<Drift>) 
         let (off, low, high) = (number(off_v), number(empty_v), number(full_v));
         error(judge, Topic::CellModel, "the resting voltage is not on the cell model's curve")
             .seen(format!("{off} V at rest; {} runs from {low} to {high} V", model.name))
-            .why("a rested cell shows its open-circuit voltage: this is another chemistry, or another number of cells")
+            .why("a rested cell shows its open-circuit voltage: the chemistry or the number of cells is wrong")
             .change("pack", "cell_model", chemistry(off_v));
     } else if let Some(drift) = drift.filter(is_flat) {
         let (span, expected) = (seconds(drift.seconds), milli(drift.expected_v));
@@ -61,14 +61,14 @@ fn is_like_iron_phosphate(judge: &Judge<'_>, model: &CellModel, cell_v: f64) -> 
 
 fn chemistry(voltage_v: f64) -> &'static str {
     match voltage_v {
-        v if v < 2.0 => "the model of the cell that is in the pack",
+        v if v < 2.0 => "the model of the installed cell",
         v if v < 2.95 => "a model of a titanate cell (LTO), if it is one",
         v if v < 3.45 => "a model of an iron-phosphate cell (LFP), if it is one",
         _ => "a model of a nickel-rich or cobalt cell (NMC, NCA, LCO), if it is one",
     }
 }
 
-/// A steady current near zero that is not zero.
+/// Reports a steady current near zero that is not zero.
 fn offset(judge: &mut Judge<'_>) {
     let rests = &judge.observed.fast_response().rests;
     let Some((signal, _)) = judge.current() else { return };
@@ -78,13 +78,13 @@ fn offset(judge: &mut Judge<'_>) {
     if offset_a.abs() <= dead_band_a {
         return judge.fine(format!("current at rest {offset} A, within the dead band of {band} A"));
     }
-    // In the bus's own sign, on top of the offset that is configured.
+    // The proposed offset is in the bus's sign and includes the configured offset.
     let proposed = signal.offset - offset_a * signal.binding.scale.signum();
     let (span, voltage) = (seconds(longest.seconds), number(longest.end_v));
     let title = format!("the current stays at {offset} A while the voltage rests");
     note(judge, Topic::CurrentOffset, title)
         .seen(format!("for {span} at {voltage} V; the pack counts as resting up to {band} A"))
-        .why("either a load draws it, or it is the sensor's offset")
+        .why("either a load draws this current, or it is the sensor's offset")
         .change(&signal.table, "offset", toml(proposed))
         .advice("only if the contactors are open and the current must be zero; otherwise raise transition.dead_band_a");
 }
@@ -98,12 +98,12 @@ fn noise(judge: &mut Judge<'_>) {
         let (measured, configured) = (milli(noise_v), milli(configured_v));
         note(judge, Topic::Noise, "voltages are noisier than configured")
             .seen(format!("about {measured} mV from reading to reading, {configured} mV configured"))
-            .why("the estimate follows noise that is not configured")
+            .why("the estimator trusts such readings too much")
             .change("estimator", "voltage_noise_v", toml((noise_v * 1e4).round() / 1e4));
     }
 }
 
-/// Share of voltages the estimator rejected.
+/// Checks the share of voltages that the estimator rejected.
 pub(super) fn check_estimator(judge: &mut Judge<'_>) {
     const FEWEST: u64 = 200;
     let stats = &judge.observed.estimator;

@@ -1,4 +1,4 @@
-//! The current's message on another interface: which of the two the voltages follow.
+//! Decides which current the voltages follow if the current's message appears on two interfaces.
 
 use super::context::{EXPLAINED, Judge, error, warning};
 use super::text::number;
@@ -17,7 +17,7 @@ pub(super) fn check(judge: &mut Judge<'_>) {
         match (here.is_some_and(|slope| is_clear(&slope)), there) {
             (false, Some(there)) => followed(judge, signal, (*bus, &there), here),
             _ if is_alike(series, &other.series) => {}
-            // Two packs on two buses: the voltages follow both currents.
+            // Two packs on two buses: the voltages seem to follow both currents.
             (true, Some(_)) if has_voltages(judge, *bus) => two_buses(judge, signal, (*bus, other)),
             (true, _) => {}
             (false, None) if has_voltages(judge, *bus) => two_buses(judge, signal, (*bus, other)),
@@ -26,17 +26,17 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     }
 }
 
-/// Whether the voltages are read from an interface.
+/// Whether voltages are read from this interface.
 fn has_voltages(judge: &Judge<'_>, bus: BusIndex) -> bool {
     judge.signals(Kind::Voltage).iter().any(|(signal, _)| signal.binding.bus == bus)
 }
 
-/// Whether voltages follow a current.
+/// Whether the voltages clearly follow a current.
 fn is_clear(slope: &Slope) -> bool {
     slope.certainty() >= 1.0 && slope.r2 >= EXPLAINED
 }
 
-/// Whether a gateway repeats the message: then both have the same extent.
+/// Whether a gateway repeats the message: both series then have the same extent.
 fn is_alike(a: &Series, b: &Series) -> bool {
     let (a, b) = (&a.extent, &b.extent);
     let tolerance = 0.02 * a.range().max(b.range()) + 1e-9;
@@ -58,7 +58,7 @@ fn followed(judge: &mut Judge<'_>, signal: &SignalPlan, (bus, there): (BusIndex,
         .change(&signal.table, "interface", format!("{other:?}"));
 }
 
-/// The current and the voltages come from two interfaces, and both have the current's message.
+/// Reports that current and voltages are read from two interfaces that both have the current's message.
 fn two_buses(judge: &mut Judge<'_>, signal: &SignalPlan, (bus, other): (BusIndex, &OtherCurrent)) {
     let (configured, name) = (judge.interface(signal.binding.bus), judge.interface(bus));
     let (low, high) = (number(other.series.extent.min), number(other.series.extent.max));
@@ -72,7 +72,7 @@ fn two_buses(judge: &mut Judge<'_>, signal: &SignalPlan, (bus, other): (BusIndex
         .advice("compare the resistance and the charge with the pack's; listen under load");
 }
 
-/// The voltages follow neither, or nothing moved.
+/// Reports that the voltages follow neither current, or that nothing moved.
 fn undecided(judge: &mut Judge<'_>, signal: &SignalPlan, (bus, other): (BusIndex, &OtherCurrent)) {
     let (low, high) = (number(other.series.extent.min), number(other.series.extent.max));
     judge.unjudged(format!(

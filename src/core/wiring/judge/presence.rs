@@ -1,4 +1,4 @@
-//! Signals that are configured and have no value, and the number of cells.
+//! Finds configured signals without a value, and checks the number of cells.
 
 use std::collections::BTreeMap;
 
@@ -11,7 +11,7 @@ use crate::wiring::evidence::Series;
 use crate::wiring::plan::{Kind, SignalPlan};
 use crate::wiring::report::{Severity, Topic};
 
-/// Why there is no value.
+/// Reason why a signal has no value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Absence {
     Message,
@@ -19,7 +19,7 @@ enum Absence {
     NotAvailable,
     NotFinite,
     Short,
-    /// Voltages only: always the same code far below any voltage.
+    /// Voltages only: constant and far below any voltage.
     Zero,
 }
 
@@ -53,10 +53,10 @@ fn absence(judge: &Judge<'_>, signal: &SignalPlan, series: &Series) -> Option<Ab
     let last = series.extent.last;
     let is_still = series.extent.changes == 0 && series.count() > 1;
     let median_v = judge.cell_voltage()?.abs();
-    // Packs with fewer cells than their DBC fill the rest with zeros.
+    // If a pack has fewer cells than its DBC, the remaining ones are often zero.
     let is_cell = matches!(signal.binding.channel, Channel::CellVoltage(_));
     let is_unused = is_cell && judge.plan.pack.cells > 1 && last.abs() < 0.05 * median_v;
-    // A pack that is switched off, or another message of that identifier.
+    // The pack is switched off, or the identifier belongs to another message.
     let is_dead = Kind::of(signal.binding.channel) == Kind::Voltage && median_v == 0.0 && last == 0.0;
     (is_still && (is_unused || is_dead)).then_some(Absence::Zero)
 }
@@ -65,8 +65,9 @@ fn cell_number(signal: &SignalPlan) -> Option<u16> {
     if let Channel::CellVoltage(cell) = signal.binding.channel { Some(cell.0) } else { None }
 }
 
-/// Reports fewer cells when exactly the last ones are absent, and returns the signals that are still to be reported.
-/// A dead last module looks the same where there is no message or no value at all: those signals stay in the list.
+/// Reports too many configured cells if exactly the last ones are absent, and returns the signals that are still to be
+/// reported. A dead last module looks the same if its message or its values are missing, so its signals stay in the
+/// list.
 fn fewer_cells<'d>(judge: &mut Judge<'d>, absent: Vec<Absent<'d>>) -> Vec<Absent<'d>> {
     let mut cells: Vec<u16> = absent.iter().filter_map(|(signal, _)| cell_number(signal)).collect();
     cells.sort_unstable();
@@ -100,7 +101,7 @@ fn reason_for_cells(absence: Absence) -> &'static str {
     }
 }
 
-/// One finding per message and reason.
+/// Reports absent signals, one finding per message and reason.
 fn silent(judge: &mut Judge<'_>, absent: &[Absent<'_>]) {
     let mut groups: BTreeMap<(BusIndex, &str, Absence), Vec<&SignalPlan>> = BTreeMap::new();
     for (signal, absence) in absent {
@@ -119,7 +120,7 @@ fn silent(judge: &mut Judge<'_>, absent: &[Absent<'_>]) {
             Some(other) => ("interface", format!("{:?}", other.name)),
             None => ("signal", "the signal that is on the bus".to_owned()),
         };
-        find(judge, severity, Topic::Silent, format!("{what}: configured, never seen"))
+        find(judge, severity, Topic::Silent, format!("{what}: configured, never received"))
             .seen(format!("{message} ({id}) {evidence}"))
             .why(why)
             .change(&signals[0].table, key, proposed)
@@ -131,17 +132,17 @@ fn evidence(judge: &Judge<'_>, absence: Absence, signals: &[&SignalPlan], what: 
     let (bus, id) = (signals[0].binding.bus, signals[0].binding.id);
     match absence {
         Absence::Message => {
-            format!("did not come on {} in {}", judge.interface(bus), seconds(judge.observed.seconds()))
+            format!("was not received on {} in {}", judge.interface(bus), seconds(judge.observed.seconds()))
         }
         Absence::Page => format!("came, but never with the page of {what}"),
-        Absence::NotAvailable => "came, and always said \"signal not available\"".to_owned(),
-        Absence::NotFinite => "came, and never held a number".to_owned(),
+        Absence::NotAvailable => "came, but always with the code for \"signal not available\"".to_owned(),
+        Absence::NotFinite => "came, but never with a number".to_owned(),
         Absence::Short => {
             let longest = judge.bus(bus).and_then(|bus| bus.ids.get(&id)).map_or(0, |stats| stats.len);
             let needed = signals.iter().map(|s| s.binding.plan.bytes_needed()).max().unwrap_or(0);
             format!("has {longest} bytes, {needed} are needed")
         }
-        Absence::Zero => "came, and always holds zero there".to_owned(),
+        Absence::Zero => "came, but this signal is always zero".to_owned(),
     }
 }
 
@@ -159,10 +160,12 @@ fn cause(judge: &Judge<'_>, bus: BusIndex, id: CanId, absence: Absence) -> (&'st
             "the sender knows the signal and has no value",
             "switch the pack on, or name the signal that is used on this vehicle",
         ),
-        Absence::NotFinite => ("the bits are no float", "compare the DBC's value type with the sender's documentation"),
-        Absence::Short => ("the frame ends before the signal", "the DBC is of another version of this sender"),
+        Absence::NotFinite => {
+            ("the bits are not a valid float", "compare the DBC's value type with the sender's documentation")
+        }
+        Absence::Short => ("the frame ends before the signal", "the DBC belongs to another version of this sender"),
         Absence::Zero if judge.cell_voltage() != Some(0.0) => {
-            ("no cell is there", "compare with the pack's own list of cells")
+            ("there is no cell at this position", "compare with the pack's own list of cells")
         }
         Absence::Zero if judge.other_bus(bus, id).is_some() => (
             "another bus has this identifier too, and the same number may be another message on each",
@@ -174,7 +177,7 @@ fn cause(judge: &Judge<'_>, bus: BusIndex, id: CanId, absence: Absence) -> (&'st
     }
 }
 
-/// Signals of further cells that carry data.
+/// Finds signals of further cells that carry data.
 fn more_cells(judge: &mut Judge<'_>) {
     let Some(median_v) = judge.cell_voltage() else { return };
     let plan = judge.plan;
@@ -195,11 +198,11 @@ fn more_cells(judge: &mut Judge<'_>) {
         .change("pack", "cells", cells.to_string());
 }
 
-/// Signals that came as configured.
+/// Lists the signals that are present.
 fn present(judge: &mut Judge<'_>) {
     for kind in [Kind::Current, Kind::Voltage, Kind::Temperature, Kind::Reported] {
         let all = judge.signals(kind);
-        // A bit is no value with a range.
+        // Balancing bits have no range to show.
         let values = all.iter().filter(|(signal, _)| !matches!(signal.binding.channel, Channel::Balancing(_)));
         let present: Vec<&Series> = values.map(|(_, series)| *series).filter(|s| s.count() > 0).collect();
         if present.is_empty() {

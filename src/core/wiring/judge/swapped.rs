@@ -1,4 +1,4 @@
-//! One signal in another's place: by the units of the DBC, and by the values.
+//! Finds signals in another's place, from the units in the DBC and from the values.
 
 use super::context::{Judge, MAX_C_RATE, SignalSeries, error, warning};
 use super::text::{channel, number};
@@ -9,7 +9,7 @@ use crate::wiring::evidence::Series;
 use crate::wiring::plan::{Kind, SignalPlan};
 use crate::wiring::report::Topic;
 
-/// Temperatures a pack in use may have, degrees C.
+/// Plausible temperatures of a pack in use, degrees C.
 const PLAUSIBLE_C: (f64, f64) = (-45.0, 95.0);
 
 pub(super) fn check(judge: &mut Judge<'_>) {
@@ -18,13 +18,13 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     }
 }
 
-/// Signals with values unlike those of all the others.
+/// Finds signals whose values differ from all others of their kind.
 pub(super) fn check_odd(judge: &mut Judge<'_>) {
     odd_cells(judge);
     odd_sensors(judge);
 }
 
-/// Configured signals with a unit of another kind, and that kind.
+/// Configured signals whose unit belongs to another kind, with that kind.
 fn misfits<'d>(judge: &Judge<'d>) -> Vec<(&'d SignalPlan, Kind)> {
     let units = judge.plan.signals.iter().filter_map(|signal| Some((signal, unit_of(&signal.unit)?.0)));
     let is_misfit = |(signal, unit): &(&SignalPlan, Kind)| {
@@ -56,13 +56,13 @@ fn by_unit(judge: &mut Judge<'_>) -> bool {
         };
         error(judge, Topic::Swapped, title)
             .seen(format!("{} has the unit {:?} in the DBC", signal.name, signal.unit))
-            .why(format!("a {} has no such unit", kind.name()))
+            .why(format!("a {} is not measured in this unit", kind.name()))
             .change(&signal.table, "signal", proposed);
     }
     !misfits.is_empty()
 }
 
-/// A current that equals the sum of the cell voltages.
+/// Finds a current that equals the sum of the cell voltages.
 fn pack_voltage_as_current(judge: &mut Judge<'_>) -> bool {
     let (Some((signal, series)), Some(cell_v)) = (judge.current(), judge.cell_voltage()) else { return false };
     let (Some(median), Some((from, to))) = (series.values.median(), series.values.bulk()) else { return false };
@@ -83,7 +83,7 @@ fn pack_voltage_as_current(judge: &mut Judge<'_>) -> bool {
     is_sum
 }
 
-/// Which quantities a signal's values are plausible for.
+/// Quantities for which a signal's values are plausible.
 struct Fit {
     voltage: bool,
     temperature: bool,
@@ -92,7 +92,7 @@ struct Fit {
 
 fn fit(judge: &Judge<'_>, series: &Series) -> Option<Fit> {
     let (low, high) = series.values.bulk()?;
-    // A voltage in a current's place has the current's sign.
+    // A voltage read as the current has the current's configured sign.
     let (low, high) = if high <= 0.0 { (-high, -low) } else { (low, high) };
     let (band, cells) = (judge.voltage_band(), judge.cells_per_reading());
     let is_slow = series.changes.median().unwrap_or(0.0) < 1.0 && high - low < 40.0;
@@ -103,7 +103,8 @@ fn fit(judge: &Judge<'_>, series: &Series) -> Option<Fit> {
     })
 }
 
-/// Current, voltage and temperature of a single cell, each plausible in another's place only.
+/// Finds exchanged signals among current, voltage and temperature of a single cell: each is plausible only in the
+/// other's place.
 fn by_values(judge: &mut Judge<'_>) {
     let voltages = judge.signals(Kind::Voltage);
     let (Some(current), [voltage]) = (judge.current(), voltages.as_slice()) else { return };
@@ -126,18 +127,19 @@ fn by_values(judge: &mut Judge<'_>) {
     let names = [a, b].map(|(signal, _)| channel(signal.binding.channel));
     error(judge, Topic::Swapped, format!("{} are exchanged", names.join(" and ")))
         .seen(format!("{}; {}", extent(a), extent(b)))
-        .why("the values of each are plausible for the other, and not for the configured quantity")
+        .why("each signal's values are plausible only for the other quantity")
         .change(&a.0.table, "signal", format!("{:?}", b.0.name))
         .change(&b.0.table, "signal", format!("{:?}", a.0.name));
 }
 
-/// Whether the temperature jumps as only a current does, and the current stands where a temperature may.
+/// Whether the temperature jumps as only a current does, while the current stays at a value plausible for a
+/// temperature.
 fn is_current_like(temperature: &Series, current: &Series) -> bool {
     let level = current.values.median().unwrap_or(0.0).abs();
     temperature.jumps >= 3 && current.jumps == 0 && (5.0..=60.0).contains(&level)
 }
 
-/// Cells with a value unlike that of all the others.
+/// Finds cells whose value differs from all others.
 fn odd_cells(judge: &mut Judge<'_>) {
     let voltages = judge.signals(Kind::Voltage);
     let Some(median_v) = judge.cell_voltage().filter(|_| voltages.len() >= 4) else { return };
@@ -149,20 +151,20 @@ fn odd_cells(judge: &mut Judge<'_>) {
             continue;
         }
         let is_temperature = (value - median_c).abs() < 8.0 && median_v > 1.0 && median_v < 6.0;
-        let hint = if is_temperature { "; it reads like a temperature" } else { "" };
+        let hint = if is_temperature { "; it looks like a temperature" } else { "" };
         let (name, value, others) = (channel(signal.binding.channel), number(value), number(median_v));
         error(judge, Topic::Cell, format!("{name} is unlike the other cells"))
             .seen(format!("{} reads {value} V, the others {others} V{hint}", signal.name))
-            .why("cells in series do not differ this much: another signal's bits, a broken wire, or a dead cell")
+            .why("cells in series do not differ this much: wrong signal, broken wire, or dead cell")
             .change(&signal.table, "signal", "a pattern that gives each cell its own signal")
             .advice("measure the cell; compare the signal in the DBC with the sender's documentation");
     }
 }
 
-/// Sensors with a value unlike that of all the others.
+/// Finds temperature sensors whose value differs from all others.
 fn odd_sensors(judge: &mut Judge<'_>) {
     let sensors = judge.signals(Kind::Temperature);
-    // Impossible ones were reported with the values.
+    // Sensors with impossible values are reported by `values`.
     let possible = |series: &Series| series.values.median().filter(|_| !is_impossible(series));
     let median_c = judge.median_of(Kind::Temperature, possible);
     let Some(median_c) = median_c.filter(|_| sensors.len() >= 4 && judge.cell_voltage().is_some()) else { return };
@@ -178,7 +180,7 @@ fn odd_sensors(judge: &mut Judge<'_>) {
         let title = format!("temperature {} is unlike the other sensors", sensor.0 + 1);
         warning(judge, Topic::Cell, title)
             .seen(format!("{} reads {value} degrees C{still}, the others {others}", signal.name))
-            .why("one pack does not differ this much: no sensor there, a broken wire, or another unit")
-            .change(&signal.table, "signal", "a sensor that is there");
+            .why("temperatures within a pack do not differ this much: missing sensor, broken wire, or wrong unit")
+            .change(&signal.table, "signal", "the signal of an existing sensor");
     }
 }

@@ -1,16 +1,16 @@
-//! Numbers and channels as text: no more digits than a value carries.
+//! Formats numbers and channels with no more digits than are significant.
 
 use crate::quantity::Channel;
 
-/// Most ranges named one by one.
+/// Maximum number of ranges that are listed.
 const MAX_NAMED: usize = 6;
 
-/// About four digits.
+/// Formats a number with about four digits.
 pub(super) fn number(value: f64) -> String {
     if !value.is_finite() {
         return "unknown".to_owned();
     }
-    // No minus sign before 0.
+    // Avoids "-0".
     let value = if value.abs() < 5e-6 { 0.0 } else { value };
     let size = value.abs();
     let digits = match size {
@@ -25,23 +25,23 @@ pub(super) fn number(value: f64) -> String {
     if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text }
 }
 
-/// A number in thousandths: V in mV, ohm in mOhm.
+/// Formats a number in thousandths: V in mV, ohm in mOhm.
 pub(super) fn milli(value: f64) -> String {
     number(1000.0 * value)
 }
 
-/// A fraction as whole per cent.
+/// A fraction in whole per cent.
 pub(super) fn percent(fraction: f64) -> f64 {
     (100.0 * fraction).round()
 }
 
-/// A float for the configuration: with its point, rounded to ten digits.
+/// Formats a number for the configuration: with a decimal point, rounded to ten digits.
 pub(super) fn toml(value: f64) -> String {
     let rounded: f64 = format!("{value:.9e}").parse().unwrap_or(value);
     format!("{rounded:?}")
 }
 
-/// `100 ms`, `2.5 s`; three digits, because a period jitters.
+/// Formats a time: `100 ms`, `2.5 s`. Three digits suffice, because periods jitter.
 pub(super) fn seconds(value: f64) -> String {
     let three_digits = |value: f64| number(format!("{value:.2e}").parse().unwrap_or(value));
     if value < 0.9995 {
@@ -53,7 +53,7 @@ pub(super) fn seconds(value: f64) -> String {
     }
 }
 
-/// Rising numbers as ranges: `1-3, 7`.
+/// Formats ascending numbers as ranges: `1-3, 7`.
 pub(super) fn ranges(numbers: &[usize]) -> String {
     let mut runs: Vec<(usize, usize)> = Vec::new();
     for &number in numbers {
@@ -67,7 +67,7 @@ pub(super) fn ranges(numbers: &[usize]) -> String {
     named.chain(more).collect::<Vec<_>>().join(", ")
 }
 
-/// A channel; cells and sensors count from 1.
+/// Name of a channel; cells and sensors count from 1.
 pub(super) fn channel(channel: Channel) -> String {
     match channel {
         Channel::Current => "pack current".to_owned(),
@@ -83,7 +83,7 @@ pub(super) fn channel(channel: Channel) -> String {
     }
 }
 
-/// Several channels, cells and sensors as ranges.
+/// Names of several channels; cells and sensors as ranges.
 pub(super) fn channels(all: &[Channel]) -> String {
     let (mut texts, mut cells, mut sensors, mut bled) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for one in all {
@@ -102,7 +102,7 @@ pub(super) fn channels(all: &[Channel]) -> String {
     texts.join(", ")
 }
 
-/// `1 frame`, `2 frames`.
+/// Formats a count: `1 frame`, `2 frames`.
 pub(super) fn count(n: u64, noun: &str) -> String {
     format!("{n} {noun}{}", if n == 1 { "" } else { "s" })
 }

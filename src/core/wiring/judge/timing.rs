@@ -1,4 +1,4 @@
-//! Periods: against the age from which readings are stale, and against the DBC's cycle times.
+//! Compares periods with the age from which readings are stale and with the DBC's cycle times.
 
 use super::context::{Judge, SignalSeries, find, warning};
 use super::text::{count, percent, seconds, toml};
@@ -20,13 +20,13 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     cycle_times(judge);
 }
 
-/// Messages that lose frames: the gaps of each of their signals are multiples of its cycle.
+/// Finds messages that lose frames: the gaps of each of their signals are multiples of its cycle.
 fn lost(judge: &mut Judge<'_>) {
     for message in &judge.plan.messages {
         let signals = judge.plan.signals.iter().zip(&judge.observed.series);
         let of_message = signals.filter(|(s, _)| (s.binding.bus, s.binding.id) == (message.bus, message.id));
         let losses: Vec<(f64, f64)> = of_message.filter_map(|(_, series)| series.loss.share()).collect();
-        // Single frames are lost on every bus.
+        // Single lost frames are normal on every bus.
         let Some(share) = median(losses.iter().map(|(share, _)| *share)).filter(|share| *share >= 0.03) else {
             continue;
         };
@@ -44,7 +44,7 @@ fn lost(judge: &mut Judge<'_>) {
     }
 }
 
-/// The signal with the longest period, of several the one with the longest gap.
+/// The signal with the longest period; among equal ones, the one with the longest gap.
 fn slowest<'d>(all: &[SignalSeries<'d>]) -> Option<(SignalSeries<'d>, f64)> {
     let timed = all.iter().filter_map(|signal| Some((*signal, signal.1.period_s()?)));
     timed.max_by(|a, b| {
@@ -76,13 +76,13 @@ fn stale(judge: &mut Judge<'_>, (table, what): (&str, &str), (signal, series): S
         .change(table, "max_age_s", toml(round_up(proposed_s)));
 }
 
-/// Rounds up to two digits.
+/// Rounds up to two significant digits.
 fn round_up(value: f64) -> f64 {
     let step = 10_f64.powf(value.log10().floor() - 1.0);
     (value / step - 1e-9).ceil() * step
 }
 
-/// Messages slower than the DBC says.
+/// Finds messages that are slower than stated in the DBC.
 fn cycle_times(judge: &mut Judge<'_>) {
     for message in &judge.plan.messages {
         let Some(stats) = judge.bus(message.bus).and_then(|bus| bus.ids.get(&message.id)) else { continue };
@@ -97,7 +97,7 @@ fn cycle_times(judge: &mut Judge<'_>) {
         let (period, span, cycle) = (seconds(period_s), seconds(span_s), seconds(cycle_s));
         warning(judge, Topic::Period, format!("{} comes less often than the DBC says", message.name))
             .seen(format!("every {period} ({} frames in {span}), GenMsgCycleTime is {cycle}", stats.count))
-            .why("frames are lost, a gateway drops some of them, or the DBC is of another version")
+            .why("frames are lost, a gateway drops some of them, or the DBC belongs to another version of the sender")
             .advice("if this period is intended, correct GenMsgCycleTime in the DBC");
     }
 }

@@ -1,9 +1,9 @@
-//! Units of a DBC as the judgement needs them.
+//! Units of a DBC, reduced to the kinds that the judgement distinguishes.
 
 use crate::can::unit::{Quantity, SignalUnit};
 use crate::wiring::plan::Kind;
 
-/// Kind of quantity, factor and offset to the program's unit; `None` for any other unit.
+/// Kind of quantity, with factor and offset to the program's unit; `None` for any other unit.
 pub(super) fn unit_of(text: &str) -> Option<(Kind, f64, f64)> {
     let unit = SignalUnit::parse(text)?;
     let kind = match unit.quantity {

@@ -1,4 +1,4 @@
-//! Units and layouts: values that no pack can have, and the unit or layout that would make them possible.
+//! Checks units and layouts: finds impossible values and the unit or layout that would make them plausible.
 
 use super::context::{Judge, MAX_C_RATE, SignalSeries, error, find};
 use super::electrical;
@@ -11,13 +11,13 @@ use crate::wiring::evidence::{Extent, Series};
 use crate::wiring::plan::{Kind, SignalPlan};
 use crate::wiring::report::{Severity, Topic};
 
-/// Factors by which a unit may be wrong.
+/// Factors by which a unit may be off.
 const UNIT_FACTORS: [f64; 6] = [1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0];
 /// Plausible temperatures, degrees C.
 const PLAUSIBLE_C: std::ops::RangeInclusive<f64> = -40.0..=60.0;
-/// Temperatures that a pack may have for a moment, on fire or in the cold, degrees C.
+/// Possible temperatures of a pack, even on fire or in extreme cold, degrees C.
 const POSSIBLE_C: std::ops::RangeInclusive<f64> = -60.0..=120.0;
-/// Share of implausible readings that is more than a disturbance.
+/// Share of implausible readings above which they are more than disturbances.
 const MANY: f64 = 0.01;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
@@ -30,10 +30,10 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     }
 }
 
-/// A signal and the layout with which its values are possible.
+/// A signal and the layout that makes its values plausible.
 type BetterLayout<'d> = (SignalSeries<'d>, &'d AlternativeReading);
 
-/// The first alternative layout that fits three quarters of the signals, with the first signal it fits.
+/// The first alternative layout that fits three quarters of the signals, with the first signal that it fits.
 fn better_layout<'d>(
     all: &[SignalSeries<'d>],
     fits: impl Fn(SignalSeries<'d>, &AlternativeReading) -> bool,
@@ -49,7 +49,7 @@ fn better_layout<'d>(
     })
 }
 
-/// Whether the alternative reading runs smoothly where the configured one jumps.
+/// Whether the alternative reading is smooth while the configured one jumps.
 fn is_smoother((signal, series): SignalSeries<'_>, other: &AlternativeReading) -> bool {
     let layout = &signal.layout;
     if layout.length_bits < 12 || series.extent.changes < 10 {
@@ -76,7 +76,7 @@ fn wrong_layout(
     let others = if all.len() > 1 { format!(" (and {} others)", all.len() - 1) } else { String::new() };
     error(judge, Topic::Layout, format!("{what}: {} in the DBC", other.fault))
         .seen(format!("{name} reads {here}; with the other layout {there}"))
-        .why("a pack's values do not jump like this, and with the other layout they do not")
+        .why("a pack's values do not jump like this; with the other layout they are smooth")
         .advice(format!("in the DBC: {name}{others} : {}|{}{order}{sign}", layout.start_bit, layout.length_bits));
 }
 
@@ -111,13 +111,13 @@ fn voltages(judge: &mut Judge<'_>) {
         judge.is_mixed_up = true;
         error(judge, Topic::CellModel, "cell voltages do not belong to this cell model")
             .seen(seen)
-            .why(format!("{band}, and no power of ten helps"))
+            .why(format!("{band}, and no power of ten corrects it"))
             .change_cell_model()
             .advice("or the signal is not a cell voltage");
     }
 }
 
-/// The layout with which the voltages are possible, if they are not as configured.
+/// The layout that makes the voltages plausible, if the configured one does not.
 fn better_voltages<'d>(judge: &Judge<'d>, all: &[SignalSeries<'d>]) -> Option<BetterLayout<'d>> {
     let (low, high) = judge.voltage_band();
     let cells = judge.cells_per_reading();
@@ -131,7 +131,7 @@ fn better_voltages<'d>(judge: &Judge<'d>, all: &[SignalSeries<'d>]) -> Option<Be
     })
 }
 
-/// The layout with which the temperatures are possible, if they are not as configured.
+/// The layout that makes the temperatures plausible, if the configured one does not.
 fn better_temperatures<'d>(judge: &Judge<'d>, all: &[SignalSeries<'d>]) -> Option<BetterLayout<'d>> {
     let ambient_c = judge.plan.pack.ambient_c;
     let median_c = judge.median_of(Kind::Temperature, |series| series.values.median());
@@ -142,7 +142,7 @@ fn better_temperatures<'d>(judge: &Judge<'d>, all: &[SignalSeries<'d>]) -> Optio
     })
 }
 
-/// Whether the frames end before the signals of a kind because of the byte order in the DBC.
+/// Whether the frames end before the signals of a kind only because of the byte order in the DBC.
 pub(super) fn is_short_by_layout(judge: &Judge<'_>, kind: Kind) -> bool {
     let all = judge.signals(kind);
     match kind {
@@ -157,7 +157,7 @@ fn above_one(factor: f64) -> String {
     number(if factor < 1.0 { 1.0 / factor } else { factor })
 }
 
-/// A total voltage that the configured number of cells cannot have.
+/// Reports a total voltage that is impossible with the configured number of cells.
 fn pack_count(judge: &mut Judge<'_>, total_v: f64) {
     let plan = judge.plan;
     let pack = &plan.pack;
@@ -166,7 +166,7 @@ fn pack_count(judge: &mut Judge<'_>, total_v: f64) {
     let (total, per_cell) = (number(total_v), number(total_v / f64::from(pack.cells.max(1))));
     error(judge, Topic::CellCount, format!("{} cells cannot make this pack voltage", pack.cells))
         .seen(format!("{total} V in total: {per_cell} V a cell"))
-        .why(format!("cells of this model have {min_v} to {max_v} V: it must be {fewest} to {most} of them"))
+        .why(format!("cells of this model have {min_v} to {max_v} V: {fewest} to {most} cells are possible"))
         .change("pack", "cells", format!("{fewest} to {most}, the number in the pack's documentation"));
 }
 
@@ -198,14 +198,14 @@ fn current(judge: &mut Judge<'_>) {
         });
         judge.current_factor = factor;
         electrical::wrong_unit_or_cell(judge, signal, factor, Severity::Error)
-            .why(format!("that is {} times the pack's capacity in an hour", number(c_rate)))
+            .why(format!("that is {} times the pack's capacity per hour", number(c_rate)))
     } else {
         return;
     };
     finding.seen(format!("{} reads up to {} A", signal.name, number(largest_a)));
 }
 
-/// Wrong units of a temperature: factor, offset, name.
+/// Common wrong units of a temperature: factor, offset, name.
 const TEMPERATURE_UNITS: [(f64, f64, &str); 6] = [
     (1.0, -273.15, "kelvin"),
     (5.0 / 9.0, -160.0 / 9.0, "Fahrenheit"),
@@ -226,7 +226,7 @@ fn temperatures(judge: &mut Judge<'_>) {
         .map(|(factor, offset, name)| (factor, offset, name, median_c * factor + offset))
         .filter(|(.., converted_c)| PLAUSIBLE_C.contains(converted_c))
         .min_by(|a, b| (a.3 - ambient_c).abs().total_cmp(&(b.3 - ambient_c).abs()));
-    // A wrong unit explains more than another bit order, unless the values jump.
+    // A wrong unit is more likely than a wrong layout, unless the values jump.
     let is_steady = all.iter().all(|(_, series)| series.extent.range() < 60.0);
     if let Some(better) = better_temperatures(judge, &all).filter(|_| unit.is_none() || !is_steady) {
         wrong_layout(judge, &all, better, "temperatures");
@@ -237,25 +237,25 @@ fn temperatures(judge: &mut Judge<'_>) {
     }
 }
 
-/// Whether many readings of a sensor are temperatures that no pack has.
+/// Whether many readings of a sensor are impossible temperatures.
 pub(super) fn is_impossible(series: &Series) -> bool {
     series.values.share(|c| !POSSIBLE_C.contains(&c)) > MANY
 }
 
-/// Impossible readings that no unit explains, because the others of the same sensor or of other sensors are possible.
+/// Reports impossible readings that no unit explains, because other readings or other sensors are plausible.
 fn impossible_sensors(judge: &mut Judge<'_>, sensors: &[SignalSeries<'_>], all: usize) {
     let list: Vec<Channel> = sensors.iter().map(|(signal, _)| signal.binding.channel).collect();
     let (signal, series) = sensors[0];
     let (low, high) = (number(series.extent.min), number(series.extent.max));
     let share = percent(series.values.share(|c| !POSSIBLE_C.contains(&c)));
     let others = if sensors.len() < all { "the other sensors are possible" } else { "its other readings are possible" };
-    let finding = error(judge, Topic::Cell, format!("{}: no pack has this temperature", channels(&list)))
+    let finding = error(judge, Topic::Cell, format!("{}: impossible temperature", channels(&list)))
         .seen(format!("{} reads {low} to {high} degrees C; {share} % of its readings are impossible", signal.name))
         .why(format!(
             "{others}: no sensor is there, a wire is broken, or a code for \"not available\" is not configured"
         ));
     for (signal, _) in sensors {
-        finding.change(&signal.table, "signal", "a sensor that is there");
+        finding.change(&signal.table, "signal", "the signal of an existing sensor");
     }
 }
 
@@ -267,16 +267,16 @@ fn wrong_temperature(
 ) {
     let seen = format!("the median sensor reads {} degrees C", number(median_c));
     let Some((factor, offset, name, converted_c)) = unit else {
-        error(judge, Topic::Unit, "temperatures no pack has")
+        error(judge, Topic::Unit, "temperatures impossible for a pack")
             .seen(seen)
-            .why("no common unit makes a temperature of it")
+            .why("no common unit makes it a plausible temperature")
             .change(&all[0].0.table, "signal", "a temperature");
         return;
     };
-    // A pack in danger may have these.
+    // A pack in danger may have such temperatures.
     let (severity, hint) = match (60.0..90.0).contains(&median_c) {
         true => (Severity::Warning, "a pack this hot would be in danger"),
-        false => (Severity::Error, "no pack has that"),
+        false => (Severity::Error, "impossible for a pack"),
     };
     let (converted, ambient) = (number(converted_c), number(judge.plan.pack.ambient_c));
     let finding = find(judge, severity, Topic::Unit, format!("temperatures: {name}?"))
@@ -292,7 +292,8 @@ fn wrong_temperature(
     }
 }
 
-/// Temperatures in another unit by their DBC that the configuration does not convert: 50 degrees F pass for a warm day.
+/// Reports temperatures whose DBC states another unit that the configuration does not convert. Without this check, 50
+/// degrees F would pass for a warm day.
 fn unconverted(judge: &mut Judge<'_>, all: &[SignalSeries<'_>], median_c: f64) -> Option<()> {
     let conversion = |signal: &SignalPlan| {
         let (kind, factor, offset) = unit_of(&signal.unit)?;
@@ -315,7 +316,8 @@ fn unconverted(judge: &mut Judge<'_>, all: &[SignalSeries<'_>], median_c: f64) -
     Some(())
 }
 
-/// Readings the service will reject although nothing else is wrong: limits too tight, or disturbances.
+/// Reports readings that the daemon will reject although nothing else is wrong: the limits are too tight, or there are
+/// disturbances.
 pub(super) fn check_limits(judge: &mut Judge<'_>) {
     if judge.is_mixed_up || judge.has(&[Topic::Unit, Topic::Layout, Topic::Cell, Topic::CellCount]) {
         return;
@@ -335,8 +337,8 @@ pub(super) fn check_limits(judge: &mut Judge<'_>) {
         let high = all.iter().map(|(_, s)| s.extent.max).fold(f64::NEG_INFINITY, f64::max);
         let is_many = implausible as f64 / count.max(1) as f64 > MANY;
         let (severity, why) = match is_many {
-            true => (Severity::Warning, "too many for disturbances: the limit is too tight, and they move no estimate"),
-            false => (Severity::Note, "single readings are disturbances; they move no estimate"),
+            true => (Severity::Warning, "too many for disturbances, so the limit is too tight; estimates ignore them"),
+            false => (Severity::Note, "single readings are disturbances; estimates ignore them"),
         };
         let [from, to, lowest, highest] = [low / cells, high / cells, limits.0, limits.1].map(number);
         let finding = find(judge, severity, Topic::Range, format!("{what} outside the limits"))
