@@ -369,7 +369,7 @@ fn running_state(file: &Path, folder: &Path) -> Option<StateDocument> {
         Ok(json) => json,
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return None,
         Err(error) => {
-            tracing::warn!(file = %file.display(), %error, "state of the last second not read");
+            tracing::warn!(file = %file.display(), %error, "runtime state not read");
             return None;
         }
     };
@@ -377,7 +377,7 @@ fn running_state(file: &Path, folder: &Path) -> Option<StateDocument> {
         Ok(document) if Path::new(&document.folder) == folder => Some(document),
         Ok(_) => None,
         Err(fault) => {
-            tracing::warn!(file = %file.display(), ?fault, "state of the last second not used");
+            tracing::warn!(file = %file.display(), ?fault, "runtime state not used");
             None
         }
     }

@@ -104,7 +104,7 @@ fn show_states_valid_bands_and_priors() {
         assert_eq!(nulls == 0, is_stated, "{source}");
     }
     let page = good(&["model", "show", "--chemistry", "nca-graphite", "--rated", "2.9"]);
-    assert!(page.contains("label alone (prior)") && page.contains("most useful measurements"), "{page}");
+    assert!(page.contains("label only (prior)") && page.contains("most useful measurements"), "{page}");
     let page = good(&["model", "show", PANASONIC]);
     assert!(page.contains("measured") && page.contains("extrapolated") && page.contains("Mendeley"), "{page}");
     let page = good(&["model", "show", "-c", "config/measured.toml"]);

@@ -158,7 +158,7 @@ impl Collector for Metrics {
 fn program(families: &mut Families<'_>, document: &StatusDocument) -> fmt::Result {
     families.info("build", "The program", &label("version", document.program_version.clone()))?;
     if let Some(config) = &document.config {
-        families.info("config", "The configuration it runs with", &label("sha256", config.sha256.clone()))?;
+        families.info("config", "The daemon's configuration", &label("sha256", config.sha256.clone()))?;
     }
     if document.vehicle.is_stated() {
         families.info("vehicle", "The vehicle and its pack, as configured", &document.vehicle.labels())?;
@@ -174,11 +174,11 @@ fn program(families: &mut Families<'_>, document: &StatusDocument) -> fmt::Resul
         (Validity::Untrusted, "untrusted"),
     ];
     let states = states.map(|(state, name)| (label("state", name), flag(document.state == state)));
-    families.gauge("validity", "", "Validity of the estimates, 1 for the present state", states)?;
+    families.gauge("validity", "", "Validity of the estimates, 1 for the current state", states)?;
     let modes =
         [(Mode::Unknown, "unknown"), (Mode::Charge, "charge"), (Mode::Rest, "rest"), (Mode::Discharge, "discharge")];
     let modes = modes.map(|(mode, name)| (label("mode", name), flag(document.pack.mode == mode)));
-    families.gauge("mode", "", "Charge, rest or discharge, 1 for the present mode", modes)
+    families.gauge("mode", "", "Charge, rest or discharge, 1 for the current mode", modes)
 }
 
 fn interfaces(families: &mut Families<'_>, document: &StatusDocument) -> fmt::Result {
@@ -332,7 +332,7 @@ fn core(families: &mut Families<'_>, document: &StatusDocument) -> fmt::Result {
         ("estimator_voltages_gated", "Voltage readings beyond the filter's gate", core.voltages.gated),
         ("estimator_voltages_unmatched", "Voltage readings without a current", core.voltages.without_current),
         ("estimator_resets", "Filters restarted from their voltage", core.filter_resets),
-        ("estimator_trust_lost", "Times an estimate lost its trust", core.trust_lost),
+        ("estimator_trust_lost", "Times an estimate became untrusted", core.trust_lost),
         ("gaps", "Gaps without a measurement", core.gaps),
         ("time_backwards", "Inputs with a time before an earlier input's", document.counters.time_backwards),
         ("mode_changes", "Changes between charge, rest and discharge", core.mode_changes),
@@ -358,7 +358,7 @@ fn service(families: &mut Families<'_>, document: &StatusDocument) -> fmt::Resul
         ("reloads_refused", "Configurations rejected while running", service.reloads_refused),
         ("status_skipped", "Status documents skipped", service.documents_skipped),
         ("status_clients_served", "Clients of the status sockets", clients.served),
-        ("status_clients_refused", "Clients refused, too many at once", clients.refused),
+        ("status_clients_refused", "Clients rejected: too many at once", clients.refused),
         ("status_clients_dropped", "Clients that did not read in time", clients.dropped),
     ];
     rows.into_iter().try_for_each(|(name, help, count)| families.counter(name, help, one(count)))?;

@@ -91,10 +91,11 @@ impl Folder {
             }
         }
         let place = self.free_place();
-        self.set_aside(&place).map_err(|error| OpenError::Unavailable(format!("the damaged database: {error}")))?;
+        self.set_aside(&place)
+            .map_err(|error| OpenError::Unavailable(format!("damaged database not set aside: {error}")))?;
         let why = self.damage.take().unwrap_or_default();
         let name = place.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-        let detail = format!("{why}; set aside as {name}; the history starts again");
+        let detail = format!("{why}; set aside as {name}; a new history starts");
         tracing::error!(error = why, set_aside = %place.display(), "database damaged: a new history starts");
         Ok((Database::open(&path, now, pack)?, vec![HistoryRow::Own { reason: "damaged", detail }]))
     }

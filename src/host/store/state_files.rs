@@ -115,9 +115,9 @@ impl StateDocument {
         let (frame, hash) = file
             .split_last_chunk::<32>()
             .and_then(|(rest, hash)| Some((rest.strip_suffix(&HASH_HEAD)?, hash)))
-            .ok_or_else(|| damaged("it has no hash at its end"))?;
+            .ok_or_else(|| damaged("no hash at the end of the file"))?;
         if Sha256::digest(frame)[..] != *hash {
-            return Err(damaged("its hash differs"));
+            return Err(damaged("the hash does not match"));
         }
         let mut json = Vec::new();
         zstd::Decoder::with_buffer(frame)

@@ -27,7 +27,7 @@ pub struct Statistics {
     pub voltages: VoltageCounts,
     /// Filters that started again from their voltage.
     pub filter_resets: u64,
-    /// Times an estimate lost its trust.
+    /// Times an estimate became untrusted.
     pub trust_lost: u64,
     /// Times without measurement: asleep, not running, or a hole in the record.
     pub gaps: u64,

@@ -30,7 +30,7 @@ pub fn of_view(view: &ModelView<'_>) -> Option<SourcedModel> {
     };
     let own = view.own.and_then(|own| Some(own.cell_model(&label)?.rebased(own.capacity.mean)));
     let origin = match &own {
-        Some(_) => "learned on board from what the vehicle has noted of its own cells, starting from the label",
+        Some(_) => "learned on board from the vehicle's own data, starting from the label",
         None => "chemistry prior of the label",
     };
     let provenance = toml::Table::from_iter([("source".to_owned(), origin.into())]);

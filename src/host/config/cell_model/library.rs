@@ -42,7 +42,7 @@ pub fn list(folder: &Path) -> Result<Vec<LibraryEntry>, String> {
     let mut paths: Vec<PathBuf> = entries.into_iter().map(|entry| entry.path()).collect();
     paths.retain(|path| path.extension().is_some_and(|extension| extension == "toml"));
     if paths.len() > MOST {
-        return Err(named(format!("holds {} files *.toml, must be at most {MOST}", paths.len())));
+        return Err(named(format!("contains {} files *.toml, must be at most {MOST}", paths.len())));
     }
     paths.sort();
     Ok(paths.into_iter().map(|path| LibraryEntry { model: load_sourced(&path), path }).collect())

@@ -13,7 +13,7 @@ const ROUNDED: f64 = 0.01;
 pub fn state_words(state: ModelState) -> &'static str {
     match state {
         ModelState::Given => "cell model file",
-        ModelState::Prior => "label alone (prior): what all cells of this chemistry have in common",
+        ModelState::Prior => "label only (prior): values typical of this chemistry",
         ModelState::Learning => "learning from the vehicle's own data",
         ModelState::Learned => "learned from the vehicle's own data",
         ModelState::Unfit => "unfit: the voltages contradict the chemistry on the label",
@@ -110,7 +110,7 @@ pub enum KnownBy {
     Extrapolated,
     /// The file does not state the measured range.
     NotStated,
-    /// What all cells of the chemistry have in common.
+    /// Typical of the chemistry.
     Prior,
     /// The vehicle's own data.
     Data,

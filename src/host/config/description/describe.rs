@@ -334,7 +334,7 @@ fn alarm(rule: &RuleConfig, monitor: &MonitorConfig) -> String {
         words.push_str(&format!(" for {} s", rule.debounce_s));
     }
     if rule.debounce_events > 1 {
-        words.push_str(&format!(" in {} values one after the other", rule.debounce_events));
+        words.push_str(&format!(" in {} consecutive values", rule.debounce_events));
     }
     words.push_str(&format!(", cleared at {clear}"));
     if rule.is_latching {

@@ -35,7 +35,7 @@ impl ConfigFiles {
         let fault = |what: String| ConfigFaults(vec![format!("{}: {what}", folder.display())]);
         let drop_ins = list(&folder).map_err(|error| fault(format!("cannot be listed: {error}")))?;
         if drop_ins.len() > MAX_DROP_INS {
-            return Err(fault(format!("holds {} drop-ins, must be at most {MAX_DROP_INS}", drop_ins.len())));
+            return Err(fault(format!("contains {} drop-ins, must be at most {MAX_DROP_INS}", drop_ins.len())));
         }
         Ok(Self { main: main.to_owned(), drop_ins })
     }
@@ -210,7 +210,7 @@ mod tests {
             std::fs::write(folder.path().join(format!("pack.toml.d/{number}.toml")), "").expect("written");
         }
         let faults = ConfigFiles::find(&main).expect_err("too many").0;
-        assert!(faults[0].ends_with("pack.toml.d: holds 101 drop-ins, must be at most 100"), "{faults:?}");
+        assert!(faults[0].ends_with("pack.toml.d: contains 101 drop-ins, must be at most 100"), "{faults:?}");
     }
 
     #[test]

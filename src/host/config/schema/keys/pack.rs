@@ -32,7 +32,7 @@ section! {
         strings: u16, "", Between(1.0, 1024.0), Default("1");
         /// Cell model file, relative to this file.
         cell_model: Option<String>, "", NotEmpty, Optional("a model made from `chemistry` and `rated_capacity_ah`");
-        /// Chemistry of a cell without a model file. Estimates start from what all cells of this chemistry have in common, with intervals as wide as these cells differ. "lmo-graphite" means the blend with a layered oxide used in early electric cars. Use "nmc-graphite" if the nickel content is unknown.
+        /// Chemistry of a cell without a model file. Estimates start from values typical of this chemistry, with intervals as wide as these cells differ. "lmo-graphite" means the blend with a layered oxide used in early electric cars. Use "nmc-graphite" if the nickel content is unknown.
         chemistry: Option<Chemistry>, "", Any, Optional("required without `cell_model`");
         /// For cells without a model file: whether the daemon learns their model on board from drives, charges and rests.
         learn_model: bool, "", Any, Default("true");
