@@ -154,7 +154,7 @@ mod tests {
         assert_eq!(value("Not known by data: SOC"), "0 to 100 % (prior)");
         assert_eq!(value("Not known by data: temperature"), "-20 to 50 \u{b0}C (prior)");
         assert_eq!(value("Seen in this record"), "10 % of the SOC (50 to 60 %), 20 to 30 \u{b0}C");
-        assert!(value("State").starts_with("label alone"));
+        assert!(value("State").starts_with("label only"));
         let advice = advice(&context).expect("known");
         assert!(!advice.is_empty() && advice[0].contains("points are then left"), "{advice:?}");
     }
