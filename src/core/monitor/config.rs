@@ -1,6 +1,6 @@
-//! Configuration of a [`Monitor`](super::Monitor), already checked, and comparisons of two of them.
+//! Checked configuration of a [`Monitor`](super::Monitor), and comparisons between two configurations.
 //!
-//! Each stage keeps its part. The whole is assembled again only to compare it with another one.
+//! Each stage keeps its part. The complete configuration is kept only for comparison with a new one.
 
 use crate::alarm::{Rule, RuleConfig, Severity};
 use crate::can::CanId;
@@ -21,97 +21,98 @@ use crate::sample::SampleConfig;
 /// Checked settings of all stages.
 #[derive(Debug, Clone)]
 pub struct MonitorConfig {
-    /// How many interfaces there are.
+    /// Number of interfaces.
     pub interfaces: usize,
     /// Meaning of the input frames.
     pub input: InputMap,
-    /// Diagnostic answers that are read.
+    /// Diagnostic answers that are decoded.
     pub answers: Vec<Answer>,
-    /// Diagnostic requests that are sent; `None` = none.
+    /// Diagnostic requests to send; `None` = none.
     pub poll: Option<PollConfig>,
-    /// Supply voltage from which requests may be sent.
+    /// Supply voltage required before requests are sent.
     pub supply: Option<SupplyConfig>,
     /// Input messages with end-to-end protection.
     pub guards: Vec<GuardConfig>,
-    /// Cycle time of input messages, s, where it is known.
+    /// Cycle times of input messages, s, if known.
     pub cycle_times_s: Vec<(BusIndex, CanId, f64)>,
-    /// Readings in a row that must give another pack identity, where such a signal is among `input`.
+    /// Consecutive readings that must agree on another pack identity, if such a signal is in `input`.
     pub identity_readings: u32,
     /// Limits on the number of frames of one identifier.
     pub flood: FloodConfig,
-    /// Silence of all inputs, at rest, after which the buses sleep, s; `None` = never.
+    /// Silence of all inputs at rest after which the buses count as asleep, s; `None` = never.
     pub asleep_after_s: Option<f64>,
     /// Sample stage.
     pub sample: SampleConfig,
     /// Cell model.
     pub model: CellModel,
-    /// Cells of another kind, with models of their own.
+    /// Cells of another kind, with their own models.
     pub modules: Vec<CellModule>,
-    /// What is on the label of the cells, where their own model is learned; `None` = the model holds.
+    /// Label of the cells, if their model is learned; `None` = the model is given.
     pub label: Option<Label>,
-    /// Whether the BMS lets fuller cells lose charge after a charge.
+    /// Whether the BMS bleeds fuller cells after a charge.
     pub is_balanced: bool,
-    /// What the bits among `input` mean that show which cells are bled; `None` = there are none.
+    /// Meaning of the balancing bits in `input`; `None` = there are no such bits.
     pub balancing: Option<BalancingConfig>,
     /// Estimator.
     pub estimator: EstimatorConfig,
-    /// Learning at transitions.
+    /// Learning at charge/discharge transitions.
     pub health: HealthConfig,
     /// Alarm rules.
     pub rules: Vec<RuleConfig>,
-    /// Sent frames; `None` = the daemon only listens.
+    /// Frames to send; `None` = the daemon only listens.
     pub output: Option<OutputConfig>,
-    /// Commands accepted from the bus; `None` = none.
+    /// Commands accepted from the bus; `None` = no commands are accepted.
     pub commands: Option<CommandConfig>,
-    /// The J1939 node; `None` = there is none.
+    /// The J1939 node; `None` = not configured.
     pub j1939: Option<J1939Config>,
 }
 
-/// What is asked of the supply voltage before requests are sent.
+/// Requirement on the supply voltage before requests are sent.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SupplyConfig {
-    /// Least voltage, V.
+    /// Minimum voltage, V.
     pub minimum_v: f64,
-    /// A reading older than this says nothing, s.
+    /// Readings older than this are ignored, s.
     pub max_age_s: f64,
 }
 
-/// Commands that come from the bus.
+/// Commands from the bus.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CommandConfig {
     /// Interface of the command frames.
     pub bus: BusIndex,
-    /// Their layout. Authenticated frames are judged by the command gate; protection is checked by one of the guards.
+    /// Layout of the command frames. Authenticated frames are checked by the command gate, protected frames by a
+    /// guard.
     pub plan: CommandPlan,
 }
 
-/// The daemon's sent frames.
+/// Frames that the daemon sends.
 #[derive(Debug, Clone, PartialEq)]
 pub struct OutputConfig {
     /// Layouts and identifiers.
     pub plan: OutputPlan,
-    /// Interfaces they are sent on.
+    /// Interfaces on which they are sent.
     pub buses: Vec<BusIndex>,
     /// Period of the status frame, s.
     pub status_period_s: f64,
     /// Period of the health frame (all its pages), s.
     pub health_period_s: f64,
-    /// Period of the alarm frame, s: each raised alarm once in it, as far as the budget of frames allows.
+    /// Period of the alarm frames, s: each raised alarm is sent once per period, within the budget of frames.
     pub alarm_period_s: f64,
     /// Period of the digest (all its pages), s.
     pub digest_period_s: f64,
 }
 
-/// J1939 as configured.
+/// Configuration of the J1939 node.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct J1939Config {
-    /// Interface the node is on.
+    /// Interface of the node.
     pub bus: BusIndex,
-    /// Its name and addresses.
+    /// Name and addresses of the node.
     pub node: NodeConfig,
     /// Trouble code of each threshold of each rule.
     pub alarms: Vec<AlarmCode>,
-    /// Code that is active while a test runs.
+    /// Trouble code that is active while a test runs.
     pub test_code: TroubleCode,
 }
 
@@ -122,35 +123,35 @@ pub struct AlarmCode {
     pub rule: Rule,
     /// The threshold's severity.
     pub severity: Severity,
-    /// Its code, with no occurrence counted.
+    /// The trouble code, with an occurrence count of 0.
     pub code: TroubleCode,
-    /// The lamp it lights.
+    /// The lamp that it lights.
     pub lamp: Lamp,
 }
 
-/// What a new configuration changed.
+/// Effects of a new configuration.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Reconfigured {
-    /// The tables of the file with other settings now, as they are written there.
+    /// Changed tables, as written in the configuration file.
     pub changed: Vec<&'static str>,
-    /// Alarms, raised or past, that ended because no threshold watches them any more.
+    /// Number of raised or past alarms that ended because no threshold watches them any more.
     pub alarms_ended: usize,
 }
 
-/// A setting that cannot change while the program runs.
+/// A setting that cannot be changed while the program runs.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{key}: {found}, running with {allowed}: needs a restart")]
 pub struct ReconfigureError {
-    /// The key, or the table it is in.
+    /// The key or its table.
     pub key: &'static str,
-    /// In the new configuration.
+    /// Value in the new configuration.
     pub found: String,
-    /// As it runs.
+    /// Value in the running configuration.
     pub allowed: String,
 }
 
 impl MonitorConfig {
-    /// Whether every frame of an interface is received: requests are sent there, and only where the bus is awake.
+    /// Whether every frame of an interface is received, because requests are sent there only while the bus is awake.
     pub fn wants_all(&self, bus: BusIndex) -> bool {
         self.poll.as_ref().is_some_and(|poll| poll.requests.iter().any(|it| it.question.controller.bus == bus))
     }
@@ -161,18 +162,19 @@ impl MonitorConfig {
         module.map_or(&self.model, |module| &module.model)
     }
 
-    /// Whether a cell is in no module of another kind.
+    /// Whether a cell belongs to no module of another kind.
     pub fn is_own(&self, cell: CellIndex) -> bool {
         !self.modules.iter().any(|module| module.cells.contains(&cell))
     }
 
-    /// Number of cells that are in no module of another kind.
+    /// Number of cells that belong to no module of another kind.
     pub fn own_cells(&self) -> u32 {
         let in_modules: usize = self.modules.iter().map(|module| module.cells.len()).sum();
         u32::from(self.sample.cells).saturating_sub(u32::try_from(in_modules).unwrap_or(u32::MAX))
     }
 
-    /// Identifiers to be received on an interface, ascending: also those of our own frames, which another sender may use.
+    /// Identifiers to receive on an interface, ascending. Includes those of our own frames, which another node may
+    /// use.
     pub fn wanted_ids(&self, bus: BusIndex) -> Vec<CanId> {
         let mut ids = self.listened_ids(bus);
         ids.extend(self.own_ids().filter(|(other, _)| *other == bus).map(|(_, id)| id));
@@ -181,7 +183,7 @@ impl MonitorConfig {
         ids
     }
 
-    /// Identifiers of the frames of `[output]`, on each of its interfaces.
+    /// Identifiers of the frames of `[output]`, with each of its interfaces.
     pub(crate) fn own_ids(&self) -> impl Iterator<Item = (BusIndex, CanId)> + '_ {
         let of = |output: &OutputConfig| {
             let ids = output.plan.ids();
@@ -190,8 +192,8 @@ impl MonitorConfig {
         self.output.iter().flat_map(of)
     }
 
-    /// Unprotected input messages with the cycle time of their frames, s, where it is known: that of a multiplexed message may be
-    /// that of each page.
+    /// Unprotected input messages with the cycle time of their frames, s, if known. The cycle time of a multiplexed
+    /// message counts as unknown, because it may be that of each page.
     pub(crate) fn unprotected(&self) -> impl Iterator<Item = (BusIndex, CanId, Option<f64>)> + '_ {
         let is_protected = |bus, id| self.guards.iter().any(|guard| (guard.bus, guard.id) == (bus, id));
         let cycle_s = |bus, id| self.cycle_times_s.iter().find(|of| (of.0, of.1) == (bus, id)).map(|of| of.2);
@@ -203,7 +205,7 @@ impl MonitorConfig {
         messages.map(move |(bus, id, _)| (bus, id, cycle_s(bus, id).filter(|_| !has_pages(bus, id))))
     }
 
-    /// Identifiers that are decoded on an interface, ascending.
+    /// Identifiers decoded on an interface, ascending.
     pub fn listened_ids(&self, bus: BusIndex) -> Vec<CanId> {
         let mut ids = self.input.ids(bus);
         ids.extend(uds::wanted(&self.answers).into_iter().filter(|(other, _)| *other == bus).map(|(_, id)| id));
@@ -213,13 +215,13 @@ impl MonitorConfig {
         ids
     }
 
-    /// Extended identifiers to be received in addition, as identifier and mask.
+    /// Further extended identifiers to receive, as identifier and mask.
     pub fn wanted_patterns(&self, bus: BusIndex) -> Vec<(u32, u32)> {
         let node = self.j1939.iter().filter(|j1939| j1939.bus == bus);
         node.flat_map(|j1939| Node::new(&j1939.node).wanted()).collect()
     }
 
-    /// Authentication of the command frame and of all sent frames.
+    /// Authentications of the command frame and of all sent frames.
     pub fn authentications(&self) -> Vec<(LayoutMessage, Authentication)> {
         let sent = self.output.iter().flat_map(|output| output.plan.messages());
         let sent = sent.filter_map(|sent| Some((sent.message, sent.secoc?)));
@@ -239,7 +241,7 @@ impl MonitorConfig {
         if let Some((key, found, allowed)) = counts.into_iter().find(|(_, found, allowed)| found != allowed) {
             return Err(ReconfigureError { key, found: found.to_string(), allowed: allowed.to_string() });
         }
-        // The rated capacity only scales published values.
+        // The rated capacity only scales published values, so it may change.
         let same_model = CellModel { rated_capacity_ah: self.model.rated_capacity_ah, ..new.model.clone() };
         let reported = |sample: &SampleConfig| (sample.reported_soc.is_some(), sample.reported_soh.is_some());
         let is_nominal = |config: &Self| matches!(config.health.capacity.method, CapacityMethod::Nominal { .. });
@@ -275,7 +277,7 @@ impl MonitorConfig {
         }
     }
 
-    /// Whether `new` gives the same estimate for a sample.
+    /// Whether `new` gives the same estimates.
     pub(crate) fn estimates_as(&self, new: &Self) -> bool {
         self.model == new.model
             && self.modules == new.modules
@@ -284,7 +286,7 @@ impl MonitorConfig {
             && self.sample.ambient_c == new.sample.ambient_c
     }
 
-    /// The tables with other settings in `new`.
+    /// The tables whose settings differ in `new`.
     pub(crate) fn changed_tables(&self, new: &Self) -> Vec<&'static str> {
         let (old_sample, new_sample) = (&self.sample, &new.sample);
         let limits = |sample: &SampleConfig| {

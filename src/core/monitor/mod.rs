@@ -1,18 +1,18 @@
-//! The core's face: records in, outputs out. Never reads a clock, a file or a socket, and never logs.
+//! The core: handles records and produces outputs. It never reads a clock, a file or a socket, and never logs.
 //!
-//! Records come in the order in which they happened; the same records give the same outputs, byte for byte. A bad record is an
-//! event and a count, never a panic. The data path, one file per stage:
+//! Records come in the order in which they happened; the same records give the same outputs, byte for byte. A bad
+//! record causes an event and is counted; it never causes a panic. The data path, one file per stage:
 //!
 //! ```text
 //! frame ─▶ intake ─▶ sampling ─▶ estimation ─▶ learning ─▶ alarming ─▶ sending
 //!          readings  samples     estimates     health      alarms      frames
 //! ```
 //!
-//! * `message`: what goes in and out; knows no stage;
-//! * `stage`: the stages; each knows at most those before it;
-//! * `stages`: wires the stages behind the intake, and passes their values to the rules; remembers exchanged packs;
-//! * `snapshot`: what is stored; `lifecycle`: restores it, relearns from a history, reconfigures;
-//! * `clock`, `config`, `view`: go with the whole.
+//! * `message`: inputs and outputs; independent of the stages;
+//! * `stage`: the stages; each knows only stages before it;
+//! * `stages`: connects the stages after the intake, passes their values to the rules, and remembers exchanged packs;
+//! * `snapshot`: the stored state; `lifecycle`: restores it, relearns from a history, reconfigures;
+//! * `clock`, `config`, `view`: time, configuration and current values of the whole monitor.
 
 mod clock;
 mod config;
@@ -54,30 +54,30 @@ pub use stage::modelling::{ModelChange, ModelView};
 pub use stage::sending::MAX_TEST_S;
 pub use stage::statistics::{AlarmCounts, BusStatistics, LearningCounts, Statistics, VoltageCounts};
 
-/// The pure core.
+/// The pure core of packwatch: records in, outputs out.
 #[derive(Debug)]
 pub struct Monitor {
     pub(crate) config: MonitorConfig,
     pub(crate) clock: Clock,
     pub(crate) intake: Intake,
     pub(crate) stages: Stages,
-    /// A stored state that waits for the first input.
+    /// A stored state that is applied at the first input.
     pub(crate) pending: Option<PendingRestore>,
 }
 
-/// The range of stamps.
+/// Range of timestamps.
 const EARLIEST: Timestamp = Timestamp::from_nanos(-LATEST.nanos());
 const LATEST: Timestamp = Timestamp::from_nanos(bounds::STAMP_NS.high as i64);
 
 impl Monitor {
-    /// A monitor without any knowledge of its pack.
+    /// Creates a monitor without any knowledge of its pack.
     pub fn new(config: MonitorConfig) -> Self {
         let (intake, stages) = (Intake::new(&config), Stages::new(&config));
         Self { config, clock: Clock::default(), intake, stages, pending: None }
     }
 
-    /// Handles one record; appends its outputs to `out`. A tick before [`Monitor::next_due`] does nothing at all, so a
-    /// driver may leave it out.
+    /// Handles one record and appends its outputs to `out`. A tick before [`Monitor::next_due`] has no effect, so a
+    /// driver may omit it.
     pub fn handle(&mut self, record: &Record, out: &mut Outputs) {
         if matches!(record.kind, RecordKind::Reload | RecordKind::Restore { .. }) {
             return;
@@ -88,7 +88,7 @@ impl Monitor {
             self.intake.own.note_sent(sent.time, sent.bus, &sent.frame);
         }
         if self.stages.sending.poller.is_some() {
-            // Own requests do not come back from the bus: their answers were asked for all the same.
+            // The bus does not echo our requests, but the listener needs them to recognise their answers.
             for sent in &out.frames[first_frame..] {
                 self.intake.listener.handle(sent.time, sent.bus, &sent.frame);
             }
@@ -97,7 +97,7 @@ impl Monitor {
     }
 
     fn dispatch(&mut self, record: &Record, out: &mut Outputs) {
-        // A stamp beyond this is wrong, and differences of stamps would leave the clock's range.
+        // A timestamp beyond the range is wrong, and differences between timestamps would overflow.
         let time = record.time.clamp(EARLIEST, LATEST);
         if !self.clock.has_started {
             self.start(time, out);
@@ -122,7 +122,7 @@ impl Monitor {
         }
     }
 
-    /// Moves the clock to a frame, and handles it.
+    /// Advances the clock to a frame's time and handles the frame.
     #[inline]
     fn handle_frame_at(
         &mut self,
@@ -147,7 +147,7 @@ impl Monitor {
         }
     }
 
-    /// Takes a frame: its readings to the stages, or its command.
+    /// Handles a frame: passes its readings to the stages, or executes its command.
     fn handle_frame(&mut self, received: ReceivedFrame<'_>, out: &mut Outputs) {
         let Self { config, clock, intake, stages, .. } = self;
         let ReceivedFrame { bus, frame, .. } = received;
@@ -186,8 +186,8 @@ impl Monitor {
         }
     }
 
-    /// Takes a frame of diagnostic requests and answers. The values of an answer are of the moment at which its first frame
-    /// came: the controller has put it together by then, and sends the rest as fast as the tester lets it.
+    /// Handles a frame of diagnostic requests and answers. The values of an answer date from its first frame: by then
+    /// the controller has assembled the answer, and the remaining frames only depend on the tester's flow control.
     fn handle_diagnostic(&mut self, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
         let Self { clock, intake, stages, .. } = self;
         let (now, Intake { listener, moments, controllers, .. }) = (clock.now, &mut *intake);
@@ -209,7 +209,7 @@ impl Monitor {
             FrameOutcome::Whole { controller, answer, data, is_single } => {
                 stages.end_bus_sleep(now, out);
                 let began = moments[controller].take();
-                // Of an answer with the current everything is of one time anyway: that of its end.
+                // If an answer contains the current, all its values count as measured at its end.
                 let is_now = is_single || answer.has(|channel| channel == Channel::Current);
                 let moment = began.filter(|_| !is_now);
                 for reading in answer.readings(data) {
@@ -257,7 +257,7 @@ impl Monitor {
                     stages.sending.claim_address(now, out);
                 }
             }
-            // Frames and gaps are handled before; the rest is for the driver.
+            // Frames and gaps are handled by the caller; the other records are for the driver.
             RecordKind::Frame { .. }
             | RecordKind::SecuredFrame { .. }
             | RecordKind::UnknownGap
@@ -266,8 +266,9 @@ impl Monitor {
         }
     }
 
-    /// How the authenticator of a frame is checked; `None` = the frame is not of an authenticated message. The driver, who has
-    /// the key, passes such a frame as [`RecordKind::SecuredFrame`] instead of [`RecordKind::Frame`], which counts as forged.
+    /// How to check the authenticator of a frame; `None` if the frame does not belong to an authenticated message. The
+    /// driver, which has the key, passes such a frame as [`RecordKind::SecuredFrame`]. Passed as
+    /// [`RecordKind::Frame`], it counts as forged.
     #[inline]
     pub fn mac_check(&self, bus: BusIndex, frame: &Frame) -> Option<MacCheck> {
         let commands = self.config.commands.as_ref()?;
@@ -276,19 +277,20 @@ impl Monitor {
         is_command.then(|| self.intake.gate_of_commands.mac_check(secoc, frame.data()))
     }
 
-    /// The fit of the cells' model that has begun, once. It takes longer than a tick may: a live driver runs it on another thread and
-    /// passes what it finds to [`Self::give_model_fit`]. Without that the monitor runs it when it is due, with the same outcome.
+    /// The model fit that has just started; returned once. A fit takes longer than a tick may. A live driver runs it
+    /// on another thread and passes the findings to [`Self::give_model_fit`]. Otherwise the monitor runs the fit when
+    /// it is due, with the same result.
     pub fn take_model_fit(&mut self) -> Option<FitTask> {
         self.stages.modelling.take_task()
     }
 
-    /// Takes the findings of a fit.
+    /// Receives the findings of a fit.
     pub fn give_model_fit(&mut self, task: FitTask, findings: FitFindings) {
         self.stages.modelling.give(task, findings);
     }
 
-    /// Steps the cells with a waiting sample, without waiting for the others. The core does so itself before anything that
-    /// uses estimates; a driver does after its last input.
+    /// Steps the cells with a waiting sample, without waiting for the other cells. The core does this itself before it
+    /// uses estimates; a driver calls it after its last input.
     pub fn settle(&mut self, out: &mut Outputs) {
         let first_event = out.events.len();
         self.stages.step_waiting(self.clock.now, true, out);
@@ -296,7 +298,7 @@ impl Monitor {
         self.find_due();
     }
 
-    /// When a tick next does something: a driver may leave out earlier ticks, the result is the same.
+    /// Time at which a tick next has an effect. A driver may omit earlier ticks without changing the result.
     #[inline]
     pub fn next_due(&self) -> Option<Timestamp> {
         self.clock.due
@@ -306,13 +308,14 @@ impl Monitor {
         self.clock.due = self.clock.has_started.then(|| self.stages.sending.next_due());
     }
 
-    /// Begins at the time of the first input, with the stored state that waits, if there is one.
+    /// Starts at the time of the first input, from the pending stored state if there is one.
     fn start(&mut self, time: Timestamp, out: &mut Outputs) {
         (self.clock.has_started, self.clock.now) = (true, time);
         self.stages.sending.restart(time);
         let beginning = self.apply_pending(time, out);
         if beginning == Beginning::Continued {
-            // Whether another run continued from the same state cannot be known: its commands must not be accepted again.
+            // Another run may have continued from the same state, so commands that it accepted must not be accepted
+            // again.
             if !self.config.authentications().is_empty() {
                 self.begin_freshness(time);
             }
@@ -324,7 +327,7 @@ impl Monitor {
         let was_brief = beginning != Beginning::RestoredAgeless && away_s <= ASLEEP_S;
         if beginning == Beginning::Restored {
             if away_s > HOUSEKEEPING_S {
-                // Samples from before the downtime belong before it, and say nothing of the present.
+                // Samples from before the downtime must be stepped before it; they say nothing about the present.
                 stages.step_waiting(taken, was_brief, out);
             }
             stages.estimation.bank.change_all(|config, estimator| estimator.note_downtime(config, away_s));
@@ -339,20 +342,20 @@ impl Monitor {
             // Also claims the J1939 address.
             self.handle_unknown_gap(time, out);
         }
-        // After a longer time `advance` finds the gap and claims the address.
+        // After a longer downtime `advance` detects the gap and claims the address.
         if was_brief {
             self.stages.sending.claim_address(time, out);
         }
         self.find_due();
     }
 
-    /// Begins the freshness of commands and sent frames beyond that of any earlier run.
+    /// Starts the freshness of commands and sent frames above the values of any earlier run.
     fn begin_freshness(&mut self, now: Timestamp) {
         self.intake.gate_of_commands.begin(now);
         self.stages.sending.begin_freshness(now);
     }
 
-    /// Moves the clock to the time of an input.
+    /// Advances the clock to the time of an input.
     #[inline]
     fn advance(&mut self, time: Timestamp, out: &mut Outputs) {
         if let Some(jump) = self.clock.advance(time) {
@@ -378,7 +381,7 @@ impl Monitor {
         self.find_due();
     }
 
-    /// Ends what was under way: no input comes until the clock is set again.
+    /// Ends everything in progress, because no input arrives until the clock is set again.
     fn fall_asleep(&mut self, out: &mut Outputs) {
         let now = self.clock.now;
         self.stages.step_waiting(now, true, out);
@@ -389,7 +392,7 @@ impl Monitor {
     /// Continues at `time` after a gap of unknown length.
     fn handle_unknown_gap(&mut self, time: Timestamp, out: &mut Outputs) {
         self.fall_asleep(out);
-        // How long ago a command was rejected is not known any more.
+        // The age of the last rejected command is now unknown.
         self.intake.bad_command_at = None;
         self.stages.begin_unknown_gap(self.clock.now, out);
         self.clock.now = time;

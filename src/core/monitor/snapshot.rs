@@ -1,7 +1,7 @@
-//! The monitor's state as a versioned document: assembled from the stages' parts, checked, and restored.
+//! The monitor's state as a versioned document: assembled from the stages' states, checked, and restored.
 //!
-//! In: a [`Snapshot`], from a store or a file. Out: the monitor that continues from it at its first input, or the number
-//! that is damaged. The JSON form of a snapshot is stored in the field: its names and their order do not change.
+//! In: a [`Snapshot`] from a store or a file. Out: a monitor that continues from it at its first input, or the damaged
+//! number. Snapshots are stored in the field as JSON, so names and order of the fields must not change.
 
 use serde::{Deserialize, Serialize};
 
@@ -21,9 +21,9 @@ use crate::monitor::stages::pack_memory::{PackMemory, StoredCell};
 use crate::quantity::{InvalidState, Timestamp, bounds};
 use crate::sample::{CellSample, SampleConfig};
 
-/// Charge of a stored state that no current moved.
+/// Message for a charge that no current can have moved.
 const CHARGE: &str = "the charge since a cell's latest voltage or half-cycle";
-/// Room for limits of the current that were wider when the charge was counted, and for a clock that was set.
+/// Tolerance for current limits that were wider when the charge was counted, and for a clock that was set.
 const CHARGE_TOLERANCE: f64 = 2.0;
 const CHARGE_TOLERANCE_S: f64 = 1000.0;
 
@@ -36,40 +36,40 @@ pub(crate) const SNAPSHOT_VERSION: u32 = 1;
 pub struct Snapshot {
     /// Layout version.
     pub version: u32,
-    /// When it was taken, on the clock of the inputs.
+    /// Time of the snapshot, on the clock of the inputs.
     pub time: Timestamp,
-    /// The same clock may continue; `false` = it was stored [for a restart](Self::for_restart).
+    /// Whether the same clock may continue; `false` if it was stored [for a restart](Self::for_restart).
     pub(crate) may_continue: bool,
     pub(crate) time_backwards: u64,
     pub(crate) intake: IntakeState,
     pub(crate) sampling: SamplingState,
     pub(crate) estimation: EstimationState,
     pub(crate) cells: Vec<StoredCell>,
-    /// `None` = the model of the cells is given.
+    /// `None` if the cells' model is given.
     pub(crate) modelling: Option<ModellingState>,
     pub(crate) learning: LearningState,
-    /// `None` = the pack is too small for a comparison.
+    /// `None` if the pack is too small for a comparison.
     pub(crate) diagnosis: Option<CellFaultDetector>,
     pub(crate) alarming: StoredAlarming,
     pub(crate) sending: SendingState,
     pub(crate) statistics: Statistics,
-    /// Since when the buses sleep.
+    /// Since when the buses have been asleep.
     pub(crate) asleep_since: Option<Timestamp>,
     pub(crate) packs: PackMemory,
 }
 
-/// Why a snapshot cannot be used.
+/// Reason why a snapshot cannot be used.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum RestoreError {
-    /// Written by another version, or taken with another configuration.
+    /// It was written by another version or with another configuration.
     #[error("{0}")]
     Unfit(String),
-    /// A number in it is impossible: it is damaged.
+    /// A number in it is impossible, so it is damaged.
     #[error("snapshot is damaged: {what}{} = {found:?}, must be {allowed}", .cell.map(|cell| format!(" (cell {cell})")).unwrap_or_default())]
     Number {
-        /// Which number.
+        /// Name of the number.
         what: &'static str,
-        /// Of which cell, counted from 0, where it is of one.
+        /// Cell, counted from 0, if the number belongs to one.
         cell: Option<usize>,
         /// Its value.
         found: f64,
@@ -84,20 +84,20 @@ impl From<InvalidState> for RestoreError {
     }
 }
 
-/// How a monitor began at its first input.
+/// How a monitor started at its first input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Beginning {
     /// Without a stored state.
     New,
-    /// With a state on the same clock: as if the program had not stopped.
+    /// With a state on the same clock, as if the program had not stopped.
     Continued,
-    /// With a state that was taken at the clock's present time.
+    /// With a state of known age.
     Restored,
     /// With a state of unknown age.
     RestoredAgeless,
 }
 
-/// A restore that waits for the first input, which gives the present time.
+/// A restore that waits for the first input, which gives the current time.
 #[derive(Debug)]
 pub(crate) struct PendingRestore {
     pub(crate) snapshot: Box<Snapshot>,
@@ -105,7 +105,8 @@ pub(crate) struct PendingRestore {
 }
 
 impl Snapshot {
-    /// The state without what holds only where the same clock continues: smaller, for a program that will be restarted.
+    /// Drops everything that requires the same clock to continue. The result is smaller and suits a program that will
+    /// be restarted.
     #[must_use]
     pub fn for_restart(self) -> Self {
         let mut restarted = Self { may_continue: false, ..self };
@@ -120,12 +121,12 @@ impl Snapshot {
         restarted
     }
 
-    /// What is known of single cells; `None` = the pack is too small for a comparison.
+    /// State of the cell-fault detector; `None` if the pack is too small for a comparison.
     pub fn diagnosis(&self) -> Option<&CellFaultDetector> {
         self.diagnosis.as_ref()
     }
 
-    /// What the differences between the cells cost the pack; `None` = without a diagnosis.
+    /// Cost of the differences between the cells; `None` without a cell-fault detector.
     pub fn imbalance(&self) -> Option<Result<Imbalance, UnknownImbalance>> {
         let mut capacities: Vec<ScalarGaussian> =
             (0..self.cells.len()).map(|cell| self.learning.learner.capacity(cell)).collect();
@@ -134,33 +135,33 @@ impl Snapshot {
         Some(self.diagnosis.as_ref()?.imbalance(middle))
     }
 
-    /// Half-cycles of all cells and packs since the first start.
+    /// Number of half-cycles of all cells and packs since the first start.
     pub fn half_cycles(&self) -> u64 {
         self.statistics.learning.half_cycles
     }
 
-    /// What each cell of the connected pack has moved.
+    /// Throughput of each cell of the connected pack.
     pub fn throughputs(&self) -> Vec<Throughput> {
         self.cells.iter().map(|cell| cell.health.throughput).collect()
     }
 
-    /// Rated capacity of a cell in the configuration with which its record began, Ah; `None` = there is no cell.
+    /// Rated capacity of a cell when its record started, Ah; `None` without cells.
     pub fn rated_capacity_ah(&self) -> Option<f64> {
         self.cells.first().map(|cell| cell.forecast.reference_ah())
     }
 
-    /// Number of cells that are estimated.
+    /// Number of cells.
     pub fn cells(&self) -> usize {
         self.cells.len()
     }
 
-    /// Parallel strings, and cells in series, of its configuration.
+    /// Number of parallel strings, and number of cells in series.
     pub fn wiring(&self) -> (u16, u16) {
         self.sampling.sampler.wiring()
     }
 
-    /// What is known of the cells' model; `label` is that of the configuration, for a state without a fit. `None` = the state is of a
-    /// model file, or the label is not known.
+    /// State of the cells' model. `label`: the configured label, for a state without a fit. `None` if the model comes
+    /// from a model file, or if the label is unknown.
     ///
     /// # Errors
     /// The first number that is out of range.
@@ -170,7 +171,7 @@ impl Snapshot {
         Ok(stored.stored_view(label))
     }
 
-    /// Whether the waiting samples are of its cells, each of another, and known to have come.
+    /// Whether the waiting samples belong to different cells of the snapshot that have reported in this round.
     pub(crate) fn waiting_fits(&self) -> bool {
         let mut has_come: Vec<bool> = self.cells.iter().map(|cell| cell.updated_in_round).collect();
         let mut is_first = |cell: usize| has_come.get_mut(cell).is_some_and(std::mem::take);
@@ -188,20 +189,20 @@ impl Snapshot {
         self.sampling.sampler.check()?;
         self.intake.commands.check_state()?;
         self.packs.check()?;
-        // Stamps differ by what the clock's range holds.
+        // Limits the timestamps so that their differences do not overflow.
         bounds::STAMP_NS.check("the time of the state, ns", self.time.nanos() as f64)?;
         Ok(self.learning.check()?)
     }
 
-    /// Checks that the charge between a moment of the past and the state is one that the largest plausible current moves.
-    /// Only its differences mean anything, so that each of both numbers alone may be what it likes.
+    /// Checks that the charge moved between past marks and the time of the state is possible with the largest
+    /// plausible current. Only the difference is checked; the absolute charges are arbitrary.
     pub(crate) fn check_charges(&self, config: &SampleConfig) -> Result<(), RestoreError> {
         let (strings, limits) = (f64::from(config.strings.max(1)), &config.current);
         let most_a = limits.min.abs().max(limits.max.abs()) / strings;
-        // A cell's latest voltage has taken in the current that was held until then.
+        // A cell's latest voltage includes the current that was held until then.
         let charge_as = self.sampling.sampler.charge_as(self.time, limits.max_age_s) / strings;
         let check = |time: Timestamp, before_as: f64| {
-            // The next reading replaces a current that was held for so long.
+            // Adds the time for which a current may have been held before the next reading replaced it.
             let passed_s = self.time.since(time).abs() + limits.max_age_s + CHARGE_TOLERANCE_S;
             let moved_as = charge_as - before_as;
             let is_possible = moved_as.abs() <= CHARGE_TOLERANCE * most_a * passed_s;
@@ -213,7 +214,7 @@ impl Snapshot {
         Ok(self.learning.learner.marks().try_for_each(|(time, charge_as)| check(time, charge_as))?)
     }
 
-    /// Moves every stamp by `by_nanos`.
+    /// Shifts all timestamps by `by_nanos`.
     pub(crate) fn rebase(&mut self, by_nanos: i64) {
         self.time = self.time.plus_nanos(by_nanos);
         for consumed in self.cells.iter_mut().filter_map(|cell| cell.consumed.as_mut()) {

@@ -1,7 +1,7 @@
-//! The stages behind the intake, wired: readings → samples → estimates → health → alarms → frames.
+//! Connects the stages after the intake: readings → samples → estimates → health → alarms → frames.
 //!
-//! Each stage owns its configuration and state; this file alone knows their order. Every function takes the time of the
-//! input at hand.
+//! Each stage owns its configuration and state; only this file knows their order. Every function takes the time of the
+//! current input.
 
 pub(crate) mod pack_memory;
 pub(crate) mod watch;
@@ -29,7 +29,7 @@ use crate::health::ModeChange;
 use crate::quantity::{BusIndex, CellIndex, Channel, Mode, Reading, Timestamp};
 use crate::sample::{CellSample, Moment};
 
-/// All stages behind the intake.
+/// All stages after the intake.
 #[derive(Debug)]
 pub(crate) struct Stages {
     pub(crate) sampling: Sampling,
@@ -74,7 +74,7 @@ impl Stages {
         (&mut self.learning, publisher)
     }
 
-    /// Takes a reading.
+    /// Handles a reading.
     #[inline]
     pub(crate) fn handle_reading(&mut self, now: Timestamp, bus: BusIndex, reading: Reading, out: &mut Outputs) {
         match reading.channel {
@@ -92,7 +92,7 @@ impl Stages {
         }
     }
 
-    /// Passes a frame of others to the poller, and what the car does now.
+    /// Passes a received frame and the state of the car to the poller.
     pub(crate) fn poll_after_frame(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
         let state = self.car_state();
         self.sending.poll_with(now, out, |poller, out| {
@@ -101,7 +101,7 @@ impl Stages {
         });
     }
 
-    /// What the car does, by the pack's mode.
+    /// State of the car, from the pack's mode.
     fn car_state(&self) -> CarState {
         match self.learning.mode() {
             Mode::Discharge => CarState::Drive,
@@ -110,7 +110,7 @@ impl Stages {
         }
     }
 
-    /// Takes a reading of a diagnostic answer, whose values may be of an earlier moment.
+    /// Handles a reading of a diagnostic answer, which may have been measured at an earlier `moment`.
     pub(crate) fn handle_answer_reading(
         &mut self,
         now: Timestamp,
@@ -150,7 +150,8 @@ impl Stages {
         out.events.push(Event { time: now, kind: EventKind::PackIdentity { identity } });
     }
 
-    /// Takes a sample: it waits until all cells have one, or its cell reports for the second time.
+    /// Adds a sample to the batch. The batch is stepped when every cell has a sample, or when a cell reports for the
+    /// second time.
     #[inline]
     fn handle_sample(&mut self, now: Timestamp, sample: CellSample, out: &mut Outputs) {
         if !self.estimation.batch.awaits(sample.cell) {
@@ -162,7 +163,7 @@ impl Stages {
         }
     }
 
-    /// Steps the batch, and combines the pack's values.
+    /// Steps the batch and combines the pack's values.
     #[inline(never)]
     fn complete_batch(&mut self, now: Timestamp, out: &mut Outputs) {
         self.step_waiting(now, true, out);
@@ -172,8 +173,8 @@ impl Stages {
         learning.combine_pack(all_fresh, &estimation.bank, &mut Publisher { now, alarming, sending, out });
     }
 
-    /// Steps the cells with a waiting sample, without waiting for the others: before anything that uses estimates.
-    /// `is_current`: the samples are of now, so the rule about innovations takes them.
+    /// Steps the cells with a waiting sample, without waiting for the other cells; called before estimates are used.
+    /// `is_current`: the samples are recent, so their innovations are passed to the rule.
     pub(crate) fn step_waiting(&mut self, now: Timestamp, is_current: bool, out: &mut Outputs) {
         if self.estimation.batch.waiting.is_empty() {
             return;
@@ -198,7 +199,7 @@ impl Stages {
         }
     }
 
-    /// Takes the outcome of a cell's step.
+    /// Handles the result of a cell's step.
     fn handle_step(&mut self, now: Timestamp, sample: &CellSample, out: &mut Outputs) {
         if self.estimation.record(sample) {
             out.events.push(Event { time: now, kind: EventKind::FilterReset { cell: sample.cell } });
@@ -215,7 +216,7 @@ impl Stages {
         self.estimation.estimate(index, self.learning.capacity(index))
     }
 
-    /// Takes the pack current into the mode detector; `None` = stale. A change of mode is learned from.
+    /// Passes the pack current to the mode detector; `None` = stale. Learns at a change of mode.
     fn observe_current(&mut self, now: Timestamp, current_a: Option<f64>, out: &mut Outputs) {
         let Learning { config, state, .. } = &mut self.learning;
         let observed = state.detector.observe(&config.transition, now, current_a);
@@ -239,7 +240,7 @@ impl Stages {
         learning.complete_mode(change, &mut estimation.bank, modelling.teaches_capacity(), &mut publisher);
     }
 
-    /// Fits the model of the cells to what was noted of them, and continues with it.
+    /// Fits the model of the cells to the noted rows and adopts the result.
     fn learn_model(&mut self, now: Timestamp, out: &mut Outputs) {
         self.step_waiting(now, true, out);
         let Self { estimation, modelling, learning, .. } = self;
@@ -314,7 +315,7 @@ impl Stages {
         CommandOutcome { changed, refused }
     }
 
-    /// Records what was learned of the old pack, and forgets it.
+    /// Records the learned values of the old pack and forgets them.
     fn replace_pack(&mut self, now: Timestamp, out: &mut Outputs) {
         let capacity = self.learning.weakest().map(|(_, capacity)| capacity);
         let kind = EventKind::PackReplaced {
@@ -336,14 +337,14 @@ impl Stages {
         self.publisher(now, out).apply(AlarmInput::ForgetLearned);
     }
 
-    /// The pack's values are not known until every cell has a new estimate.
+    /// Marks the pack's values as unknown until every cell has a new estimate.
     fn forget_pack_state(&mut self) {
         self.learning.state.pack = None;
         self.estimation.batch.begin();
     }
 
-    /// Ends what was under way: no input came after `now`. The mode is unknown from there, no period is timed over it, and
-    /// the pack's values wait for a new reading of every cell.
+    /// Ends everything in progress after the last input at `now`. The mode is unknown from then on, no period is timed
+    /// across the gap, and the pack's values require a new reading of every cell.
     pub(crate) fn fall_asleep(&mut self, now: Timestamp, out: &mut Outputs) {
         self.observe_current(now, None, out);
         if self.modelling.is_due() {
@@ -357,14 +358,14 @@ impl Stages {
         self.forget_pack_state();
     }
 
-    /// Continues at `time` after a time asleep.
+    /// Continues at `time` after being asleep.
     pub(crate) fn wake(&mut self, time: Timestamp, out: &mut Outputs) {
         self.sampling.sampler.wake(time);
         self.sending.restart(time);
         self.sending.claim_address(time, out);
     }
 
-    /// Ends what cannot continue over a gap of unknown length that begins at `now`.
+    /// Ends everything that cannot continue across a gap of unknown length that starts at `now`.
     pub(crate) fn begin_unknown_gap(&mut self, now: Timestamp, out: &mut Outputs) {
         self.sending.end_test(now, &self.alarming.engine, out);
         if let Some(change) = self.learning.state.detector.settle() {
@@ -395,10 +396,10 @@ impl Stages {
             }
         }
         if !self.sampling.sampler.voltages_fresh(now) {
-            // A cell without a voltage may be the weakest.
+            // A cell without a fresh voltage may be the weakest.
             self.forget_pack_state();
         }
-        // A current that is not the cells', or not alone on the bus, moves their estimates.
+        // A frozen current, or a message with a second sender, makes the estimates doubtful.
         let is_current_frozen = self.sampling.sampler.is_current_frozen();
         self.estimation.is_current_doubtful = self.sampling.has_second_sender || is_current_frozen;
         self.findings.watch_current(now, is_current_frozen, out);
@@ -461,7 +462,7 @@ impl Stages {
             soc_std: pack.map(|pack| pack.soc_std),
             mode: Some(self.learning.mode()),
             validity: self.validity() as u8,
-            // Without an estimate "no alarm" would be a claim without evidence.
+            // Without an estimate, "no alarm" would be unfounded.
             highest_severity: engine.highest_severity().map(|severity| severity as u8).or(pack.map(|_| 0)),
             active_alarms: Some(u16::try_from(engine.count()).unwrap_or(u16::MAX)),
             limiting_cell: pack.map(|pack| pack.limiting_cell),
@@ -473,7 +474,7 @@ impl Stages {
         }
     }
 
-    /// Judges the silence of all inputs.
+    /// Judges whether the silence of all inputs is a sleep.
     pub(crate) fn silence(&self, now: Timestamp) -> Silence {
         let Some(after_s) = self.sleep.after_s else { return Silence::None };
         if self.sleep.since.is_some() {
@@ -482,7 +483,7 @@ impl Stages {
         let sampler = &self.sampling.sampler;
         let transition = &self.learning.config.transition;
         let rest_a = transition.dead_band_a + transition.hysteresis_a;
-        // Without any reading so far nothing can have fallen asleep: the wiring may be wrong.
+        // Before the first reading the buses cannot have fallen asleep; the wiring may be wrong.
         let Some(silent_s) = sampler.all_silent_s(now, QUIET_S) else { return Silence::None };
         if sampler.latest_current_a(now).is_none_or(|current_a| current_a.abs() > rest_a) {
             return Silence::None;
@@ -490,14 +491,14 @@ impl Stages {
         if silent_s > after_s { Silence::Begins } else { Silence::Quiet }
     }
 
-    /// The buses fall asleep.
+    /// Handles the start of a bus sleep.
     pub(crate) fn begin_bus_sleep(&mut self, now: Timestamp, out: &mut Outputs) {
         self.sleep.since = Some(now);
         self.fall_asleep(now, out);
         out.events.push(Event { time: now, kind: EventKind::BusAsleep { asleep: true, seconds: None } });
     }
 
-    /// A reading came: the buses are awake again.
+    /// Ends the bus sleep after a reading.
     #[cold]
     pub(crate) fn end_bus_sleep(&mut self, now: Timestamp, out: &mut Outputs) {
         let Some(since) = self.sleep.since.take() else { return };
@@ -506,8 +507,8 @@ impl Stages {
         self.sampling.sampler.wake(now);
     }
 
-    /// Whether a reading is one of an input that wakes the buses: any but the supply voltage, which the computer may
-    /// measure itself, and the bits of a BMS that balances while the vehicle is parked.
+    /// Whether a reading of this channel wakes the buses. The supply voltage does not, because the computer may
+    /// measure it itself. Balancing bits do not, because a BMS may balance while the vehicle is parked.
     pub(crate) fn wakes(channel: Channel) -> bool {
         !matches!(channel, Channel::SupplyVoltage | Channel::Balancing(_))
     }

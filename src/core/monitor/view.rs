@@ -1,4 +1,4 @@
-//! The present values of cells and pack for readers: status, tables, reports. `None` = not known (any more).
+//! Current values of cells and pack for readers (status, tables, reports). `None` = not known, or no longer known.
 
 use super::Monitor;
 use super::config::CommandConfig;
@@ -30,7 +30,7 @@ impl Monitor {
         self.clock.now
     }
 
-    /// Inputs with a time before that of an earlier one.
+    /// Number of inputs with a time before that of an earlier input.
     pub fn time_backwards(&self) -> u64 {
         self.clock.time_backwards
     }
@@ -40,18 +40,19 @@ impl Monitor {
         self.intake.protected()
     }
 
-    /// How commands from the bus are read; `None` = none are executed.
+    /// How commands from the bus are decoded; `None` = commands from the bus are not executed.
     pub fn commands(&self) -> Option<&CommandConfig> {
         self.config.commands.as_ref()
     }
 
-    /// The authenticated command message, and how its frames were judged; `None` = commands are not authenticated.
+    /// The authenticated command message and the results of checking its frames; `None` = commands are not
+    /// authenticated.
     pub fn authenticated_commands(&self) -> Option<(BusIndex, CanId, CommandCounts)> {
         let commands = self.config.commands.as_ref().filter(|commands| commands.plan.authentication().is_some())?;
         Some((commands.bus, commands.plan.id(), self.intake.gate_of_commands.counts))
     }
 
-    /// Input messages with dropped frames, because more came than the limit allows.
+    /// Input messages with frames dropped because they exceeded the rate limit.
     pub fn dropped(&self) -> impl Iterator<Item = FloodCount> + '_ {
         self.intake.dropped()
     }
@@ -61,90 +62,91 @@ impl Monitor {
         self.intake.second_senders()
     }
 
-    /// Interfaces on which another sender uses our own identifiers, with the latest of these.
+    /// Interfaces on which another node sends with our identifiers, with the latest such identifier.
     pub fn own_id_uses(&self) -> impl Iterator<Item = (BusIndex, CanId)> + '_ {
         self.intake.own_id_uses()
     }
 
-    /// Whether the current's reading is frozen: the voltages show another load.
+    /// Whether the current's reading is frozen while the voltages show a changing load.
     pub fn is_current_frozen(&self) -> bool {
         self.stages.sampling.sampler.is_current_frozen()
     }
 
-    /// What came from each controller that answers diagnostic requests.
+    /// Counts per controller that answers diagnostic requests.
     pub fn controllers(&self) -> impl Iterator<Item = ControllerCount> + '_ {
         self.intake.controllers()
     }
 
-    /// How well the model of the cells is known.
+    /// State of the cells' model.
     pub fn model(&self) -> ModelView<'_> {
         self.stages.modelling.view()
     }
 
-    /// What is wrong with single cells.
+    /// Faults found in single cells.
     pub fn findings(&self) -> &[CellFault] {
         self.stages.findings.diagnosis.findings()
     }
 
-    /// What is known of a cell's difference from its pack; `None` = the pack is too small for a comparison.
+    /// A cell's difference from its pack; `None` if the cell is not compared.
     pub fn difference(&self, cell: CellIndex) -> Option<&Difference> {
         self.stages.findings.diagnosis.difference(cell)
     }
 
-    /// Why no diagnostic request is sent (`None` = they are), and how many are refused for good; `None` without `[poll]`.
+    /// Reason why no diagnostic request is sent (`None` = they are sent), and number of requests that are refused
+    /// permanently; `None` without `[poll]`.
     pub fn poll(&self) -> Option<(Option<PollSilence>, usize)> {
         self.stages.sending.poller.as_ref().map(|poller| (poller.silence(), poller.refused()))
     }
 
-    /// Since when the buses sleep; `None` = they are awake.
+    /// Since when the buses have been asleep; `None` = they are awake.
     pub fn asleep_since(&self) -> Option<Timestamp> {
         self.stages.sleep.since
     }
 
-    /// Readings by outcome.
+    /// Number of readings by outcome.
     pub fn reading_counts(&self) -> ReadingCounts {
         self.stages.sampling.sampler.reading_counts()
     }
 
-    /// Whether a usable reading has come since the first input. Values of a restored state do not count.
+    /// Whether a usable reading has arrived since the first input. Values of a restored state do not count.
     pub fn has_heard(&self) -> bool {
         self.stages.sampling.has_usable_reading
     }
 
-    /// Configured signals with a last good value that is too old: no reading came, or only bad ones. A signal without any
-    /// reading is lost once it should have come.
+    /// Configured signals whose last good value is too old, because no reading arrived or all were bad. A signal
+    /// without any reading counts from the time at which it should have arrived.
     pub fn lost_inputs(&self) -> impl Iterator<Item = Channel> + '_ {
         let sampler = &self.stages.sampling.sampler;
         sampler.channels().iter().copied().filter(|&channel| sampler.is_lost(channel, self.now()))
     }
 
-    /// The latest good reading of every signal that has had one, however old it is: channel, time, value.
+    /// The latest good reading of every signal that has had one, at any age: channel, time, value.
     pub fn latest_readings(&self) -> impl Iterator<Item = (Channel, Timestamp, f64)> + '_ {
         self.stages.sampling.sampler.latest_readings()
     }
 
-    /// Whether a cell's innovations agree with their covariance, and its model is not another cell's.
+    /// Whether a cell's innovations agree with their covariance and its model fits the cell.
     pub fn is_trusted(&self, cell: CellIndex) -> bool {
         self.stages.estimation.is_trusted(cell.index())
     }
 
-    /// How many signals are configured.
+    /// Number of configured signals.
     pub fn inputs(&self) -> usize {
         self.stages.sampling.sampler.channels().len()
     }
 
-    /// Identity of the connected pack; `None` = no signal is configured, or it has not been read yet.
+    /// Identity of the connected pack; `None` if no such signal is configured or it has not been read yet.
     pub fn pack_identity(&self) -> Option<f64> {
         self.stages.sampling.identity.known
     }
 
-    /// The latest estimate of every cell, for live tables; `None` before its first. Samples since the last
-    /// [`settle`](Self::settle) are not in it.
+    /// The latest estimate of every cell, for live tables; `None` before the first one. Does not include samples since
+    /// the last [`settle`](Self::settle).
     pub fn latest(&self) -> impl Iterator<Item = Option<super::Estimate>> {
         (0..self.stages.estimation.cells()).map(|index| self.stages.estimate(index))
     }
 
-    /// The pack by its limiting cells; `None` before every cell has an estimate.
+    /// Values of the pack, from its limiting cells; `None` before every cell has an estimate.
     pub fn pack(&self) -> Option<&PackState> {
         self.stages.learning.state.pack.as_ref()
     }
@@ -159,23 +161,23 @@ impl Monitor {
         self.stages.learning.state.recharge_period_s
     }
 
-    /// Time the reference charger needs for the window, s, after the last charge that covered enough of it.
+    /// Time, s, that the reference charger needs for the window, after the last charge that covered enough of it.
     pub fn normalised_recharge_period(&self) -> Option<ScalarGaussian> {
         self.stages.learning.state.normalised_recharge
     }
 
-    /// Usable capacity of a cell after its last half-cycle.
+    /// Usable capacity of a cell, Ah, after its last half-cycle.
     pub fn usable_capacity(&self, cell: CellIndex) -> Option<ScalarGaussian> {
         self.stages.learning.cells.get(cell.index())?.usable
     }
 
-    /// Published capacity of a cell.
+    /// Published capacity of a cell, Ah.
     pub fn capacity(&self, cell: CellIndex) -> ScalarGaussian {
         self.stages.learning.capacity(cell.index())
     }
 
-    /// Lithium and active material that a cell has lost; `None` = its capacity was not learned, or the cell model has no
-    /// electrodes down to that capacity.
+    /// Lithium and active material that a cell has lost. `None` if its capacity has not been learned, or if the cell
+    /// model has no electrode data down to that capacity.
     pub fn loss_modes(&self, cell: CellIndex) -> Option<LossModes> {
         let Stages { estimation, learning, .. } = &self.stages;
         let has_learned = learning.state.learner.has_learned(cell.index());
@@ -184,8 +186,8 @@ impl Monitor {
             .and_then(|it| estimation.bank.model(cell.index()).loss_modes(it))
     }
 
-    /// Offset of the current sensor, A of the pack: what it reads less the true current, positive = discharge. `None` =
-    /// nothing learned yet.
+    /// Offset of the pack's current sensor, A: reading minus true current, positive = discharge. `None` before
+    /// anything was learned.
     pub fn current_offset(&self) -> Option<ScalarGaussian> {
         let Stages { sampling, learning, .. } = &self.stages;
         let strings = f64::from(sampling.sampler.config().strings);
@@ -196,17 +198,17 @@ impl Monitor {
     /// Remaining life of a cell until its capacity passes the configured end of life.
     ///
     /// # Errors
-    /// While too little is known.
+    /// The reason why it is unknown.
     pub fn remaining_life(&self, cell: CellIndex) -> Result<RemainingLife, InsufficientData> {
         self.stages.learning.lives.of_cell(cell)
     }
 
-    /// The cell whose life ends first, and when; `None` until every cell's is known.
+    /// The cell with the shortest remaining life, and that life; `None` until every cell's life is known.
     pub fn pack_remaining_life(&self) -> Option<(CellIndex, RemainingLife)> {
         self.stages.learning.lives.of_pack()
     }
 
-    /// The alarm engine, with the raised alarms.
+    /// The alarm engine with the raised alarms.
     pub fn alarms(&self) -> &AlarmEngine {
         &self.stages.alarming.engine
     }
@@ -216,7 +218,7 @@ impl Monitor {
         &self.stages.statistics
     }
 
-    /// Every cell as it is now.
+    /// Current values of every cell.
     pub fn cell_views(&self) -> impl ExactSizeIterator<Item = CellView> + '_ {
         self.stages.estimation.cell_indices().map(|cell| self.cell_view(cell))
     }
@@ -249,7 +251,7 @@ impl Monitor {
         }
     }
 
-    /// Sum of the cells' voltages, while all are fresh.
+    /// Sum of the cells' voltages, V, while all of them are fresh.
     fn pack_voltage_v(&self) -> Option<f64> {
         let sum_v: Option<f64> = self.cell_views().map(|view| view.values.mean(Quantity::Voltage)).sum();
         match self.stages.sampling.sampler.config().voltage_source {
@@ -258,7 +260,7 @@ impl Monitor {
         }
     }
 
-    /// The pack as it is now.
+    /// Current values of the pack.
     pub fn pack_view(&self) -> PackView {
         let Stages { sampling, estimation, learning, .. } = &self.stages;
         let (sampler, now, pack) = (&sampling.sampler, self.now(), self.pack());

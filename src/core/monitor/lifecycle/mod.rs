@@ -1,4 +1,4 @@
-//! From one run to the next: how a monitor continues from a snapshot or from a history, and how it takes another configuration.
+//! Continuation between runs: restores a monitor from a snapshot or a history, and applies a new configuration.
 
 mod reconfigure;
 mod relearn;

@@ -1,12 +1,12 @@
-//! Another configuration for a running monitor.
+//! Applies a new configuration to a running monitor.
 //!
-//! In: a checked configuration. Out: what changed, and the events and frames that follow from it; or why it needs a
-//! restart, with nothing changed. Limits, thresholds, modes, noises and outputs change. Filters, learned values, alarms
-//! with a rule and severity that are still configured, counters and schedules stay, so estimates are the same as without
-//! it as far as the settings behind them are.
+//! In: a checked configuration. Out: the changes, with the resulting events and frames; or the reason why a restart is
+//! needed, with nothing changed. Limits, thresholds, modes, noises and outputs change. Filters, learned values,
+//! counters, schedules and alarms whose rule and severity are still configured are kept, so estimates change only as
+//! far as their settings do.
 //!
-//! A measured value keeps its definition: another recharge window or usable load begins with "not known", except where
-//! the old value can be restated exactly. Initial values concern only unknown cells: they wait for another pack.
+//! A measured value keeps its definition: with another recharge window or usable load it becomes unknown, unless the
+//! old value can be restated exactly. Initial values only affect unknown cells, so they apply from the next pack on.
 
 use crate::alarm::{Observation, Rule};
 use crate::health::HealthConfig;
@@ -17,8 +17,8 @@ use crate::monitor::stage::publisher::Publisher;
 use crate::quantity::Timestamp;
 
 impl Monitor {
-    /// Continues with another configuration, as if between two inputs. `now` is the time of the request: it stamps the
-    /// event, and no time passes.
+    /// Applies a new configuration, as if between two inputs. `now` is the time of the request: it is the time of the
+    /// event, but the clock does not advance.
     ///
     /// # Errors
     /// The first setting that needs a restart; the monitor is unchanged.
@@ -33,7 +33,7 @@ impl Monitor {
         let first_event = out.events.len();
         let at = self.clock.now;
         if !old.estimates_as(&config) {
-            // Earlier samples are judged by the earlier settings.
+            // Earlier samples are stepped with the earlier settings.
             self.stages.step_waiting(at, true, out);
         }
         let changed = old.changed_tables(&config);
@@ -68,7 +68,7 @@ impl Monitor {
         Ok(Reconfigured { changed, alarms_ended })
     }
 
-    /// Forgets values measured by another window or load, before new thresholds are set.
+    /// Forgets values measured with another window or load, before new thresholds are set.
     fn forget_measures(&mut self, old: &HealthConfig, out: &mut Outputs) {
         let now = self.clock.now;
         let cells = self.stages.estimation.cell_indices();

@@ -1,7 +1,7 @@
-//! Begins with what a history has kept of the cells, where the state of the last run is lost.
+//! Restores learned values of the cells from a history if the state of the last run is lost.
 //!
-//! In: capacity (Ah) and resistance (relative to new) of cells, in a monitor without any input. Out: a monitor that knows
-//! them and nothing else; its snapshot is checked like any other when it is restored.
+//! In: capacities (Ah) and resistances (relative to new) of cells, for a monitor without any input. Out: a monitor
+//! that knows only these values. Its snapshot is checked like any other when it is restored.
 
 use crate::filter::ScalarGaussian;
 use crate::health::CapacityMethod;
@@ -10,8 +10,8 @@ use crate::monitor::message::LearnedCell;
 use crate::monitor::stages::Stages;
 
 impl Monitor {
-    /// Sets what was learned of the cells. Returns `false`, and changes nothing, when one of them does not exist or a number
-    /// is impossible: then the history is of another pack.
+    /// Sets the learned values of the cells. Returns `false` and changes nothing if a cell does not exist or a number
+    /// is impossible, because the history then belongs to another pack.
     pub fn relearn(&mut self, learned: &[LearnedCell]) -> bool {
         let Stages { estimation, learning, .. } = &mut self.stages;
         let is_valid =
@@ -29,7 +29,7 @@ impl Monitor {
             let learner = &mut learning.state.learner;
             estimation.bank.change(index, |estimator| {
                 if let Some(ratio) = resistance {
-                    // Of ln x: dx / x.
+                    // Standard deviation of ln x: dx / x.
                     estimator.relearn_resistance(ScalarGaussian::from_std(ratio.mean.ln(), ratio.std() / ratio.mean));
                 }
                 match config.method {

@@ -1,4 +1,4 @@
-//! Takes a snapshot of a monitor, and restores one.
+//! Creates and restores snapshots of a monitor.
 
 use crate::alarm::{AlarmSnapshot, StoredAlarm};
 use crate::cell::CellEstimator;
@@ -15,11 +15,12 @@ use crate::monitor::stages::Stages;
 use crate::monitor::stages::pack_memory::{StoredCell, StoredPack};
 use crate::quantity::Timestamp;
 
-/// A longer time without an input, s, is a break of the program, whatever its stamps: a running one ticks.
+/// Longest time without an input while a program runs, s, because a running program ticks. A longer gap is a restart,
+/// whatever the timestamps say.
 const BREAK_S: f64 = 30.0;
 
 impl Monitor {
-    /// The state, to be stored.
+    /// The state to be stored.
     pub fn snapshot(&self) -> Snapshot {
         if let Some(PendingRestore { snapshot, .. }) = &self.pending {
             return (**snapshot).clone();
@@ -46,15 +47,15 @@ impl Monitor {
         }
     }
 
-    /// Restores a stored state in a monitor without any input yet. The first input gives the present time: the snapshot
-    /// was taken `downtime` before it, its stamps are moved onto the present clock, and the downtime is a gap like any
-    /// other. [`Downtime::AsStamped`] says that the same clock continues: then frames, events and estimates are, byte for byte,
-    /// those of a monitor that had not stopped, unless half a minute is without an input or the state was stored
-    /// [for a restart](Snapshot::for_restart).
+    /// Restores a stored state in a monitor that has not received an input. The first input gives the current time.
+    /// The snapshot was taken `downtime` before it; its timestamps are shifted to the current clock, and the downtime
+    /// counts as a gap. [`Downtime::AsStamped`] means that the same clock continues: frames, events and estimates are
+    /// then, byte for byte, those of a monitor that had not stopped. Exceptions are a downtime of more than half a
+    /// minute and a state that was stored [for a restart](Snapshot::for_restart).
     ///
     /// # Errors
-    /// When the snapshot's version or shape does not fit, or a number in it is impossible. Then none of it is used: one
-    /// damaged number leaves the others in doubt.
+    /// If the snapshot's version or shape does not fit, or a number in it is impossible. Nothing of the snapshot is
+    /// then used, because one damaged number casts doubt on the others.
     pub fn restore(&mut self, snapshot: Snapshot, downtime: Downtime) -> Result<(), RestoreError> {
         if snapshot.version != SNAPSHOT_VERSION {
             let found = snapshot.version;
@@ -83,8 +84,8 @@ impl Monitor {
         Ok(())
     }
 
-    /// Continues from the waiting snapshot, if there is one; the clock then shows when it was taken. The downtime is left
-    /// to the caller.
+    /// Continues from the pending snapshot, if there is one, and sets the clock to the time of the snapshot. The
+    /// caller handles the downtime.
     pub(crate) fn apply_pending(&mut self, now: Timestamp, out: &mut Outputs) -> Beginning {
         let Some(PendingRestore { mut snapshot, downtime }) = self.pending.take() else { return Beginning::New };
         let is_brief = now.since(snapshot.time).abs() <= BREAK_S;
@@ -125,7 +126,7 @@ impl Stages {
         }
     }
 
-    /// Continues from a checked and rebased snapshot.
+    /// Restores a checked and rebased snapshot.
     fn restore(&mut self, snapshot: Snapshot, now: Timestamp, out: &mut Outputs) {
         let is_continued = snapshot.may_continue;
         let has_reported = snapshot.cells.iter().map(|cell| cell.updated_in_round).collect();
@@ -152,7 +153,7 @@ impl Stages {
         self.statistics.restores = self.statistics.restores.saturating_add(1);
     }
 
-    /// Restores the cells' model, filters and learned values of all cells.
+    /// Restores the cells' model, and the filters and learned values of all cells.
     fn restore_learned(
         &mut self,
         cells: &[StoredCell],
@@ -169,7 +170,8 @@ impl Stages {
         learning.state = state;
         for (index, cell) in cells.iter().enumerate() {
             if estimation.is_other_cell(index, &cell.model_check) {
-                // A module that was replaced while the program did not run: what is stored was of the cells before.
+                // The module was replaced while the program did not run, so the stored values belong to the previous
+                // cells.
                 learning.state.learner.begin(&learning.config.capacity, index, estimation.bank.cell(index).capacity());
                 continue;
             }
@@ -186,7 +188,7 @@ impl Stages {
         estimation.bank.set_current_offset_std(learning.state.learner.current_offset().std_a(configured_a));
     }
 
-    /// What is learned of the connected pack, under its number.
+    /// Learned values of the connected pack, with its number.
     pub(crate) fn stored_pack(&self) -> StoredPack {
         let cells = 0..self.estimation.cells();
         let cells = cells.map(|cell| StoredCell { consumed: None, updated_in_round: false, ..self.stored_cell(cell) });
@@ -201,14 +203,14 @@ impl Stages {
         }
     }
 
-    /// Continues with a pack that was connected before, after a time of unknown length.
+    /// Restores a previously connected pack after a time of unknown length.
     pub(crate) fn restore_pack(&mut self, now: Timestamp, pack: StoredPack, out: &mut Outputs) {
         let batch = CellBatch::new(pack.cells.len());
         let is_current_doubtful = self.estimation.is_current_doubtful;
         self.restore_learned(&pack.cells, pack.modelling, pack.learning, batch, is_current_doubtful);
         self.modelling.end_stretch();
         self.estimation.handle_unknown_gap();
-        // Of the time since, no balancing is counted: the charge is forgotten.
+        // Balancing during the absence was not counted, so the charge is forgotten.
         self.findings.restore(pack.diagnosis, Some((now, now)));
         self.findings.diagnosis.forget_charge();
         self.note_faulty_channels();
@@ -219,12 +221,12 @@ impl Stages {
             capacity_std_ah: capacity.as_ref().map(ScalarGaussian::std),
         };
         out.events.push(Event { time: now, kind });
-        // The alarms of the pack that was here ended: these values are new to the rules.
+        // The alarms of the previous pack have ended, so the rules see these values as new.
         self.restate_known(now, false, true, out);
         self.publisher(now, out).publish_alarms();
     }
 
-    /// Restores the stored alarms. Those without a configured threshold end, here and for their receivers on the bus.
+    /// Restores the stored alarms. Alarms without a configured threshold end, also for receivers on the bus.
     fn restore_alarms(&mut self, time: Timestamp, state: &AlarmSnapshot, is_continued: bool, out: &mut Outputs) {
         self.alarming.state.knows_all_valid = false;
         let orphans = self.alarming.engine.restore(state);

@@ -11,20 +11,20 @@ use crate::quantity::BusIndex;
 pub enum Command {
     /// Acknowledge alarms.
     Acknowledge(Selector),
-    /// End latched alarms and forget past ones; learned values stay.
+    /// End latched alarms and forget past ones; learned values are kept.
     Clear(Selector),
     /// Another pack is connected: forget the values learned of the old one.
     PackReplaced,
-    /// Send no diagnostic requests, or send them again.
+    /// Stop or resume diagnostic requests.
     Poll {
-        /// Send none.
+        /// Whether to stop.
         standby: bool,
     },
     /// Send a rule's alarm frame, marked as a test, for a while.
     Test {
-        /// Which rule.
+        /// The rule.
         rule: Rule,
-        /// How long, s.
+        /// Duration, s.
         seconds: f64,
     },
 }

@@ -1,4 +1,4 @@
-//! Events of the [`Monitor`](crate::monitor::Monitor): what the driver logs and the history records.
+//! Events of the [`Monitor`](crate::monitor::Monitor), which the driver logs and the history records.
 
 use serde::{Deserialize, Serialize};
 use strum::IntoStaticStr;
@@ -20,12 +20,12 @@ use crate::cell_faults::CellFault;
 use crate::quantity::catalogue::RecordedValues;
 use crate::quantity::{BusIndex, CellIndex, Fault, Mode, Timestamp};
 
-/// Something worth a line in a log or a history row. Core events go to the driver, which logs them.
+/// Something worth a log line or a history row.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, IntoStaticStr)]
 #[serde(rename_all = "snake_case", tag = "event")]
 #[strum(serialize_all = "snake_case")]
 pub enum EventKind {
-    /// The pack's mode changed; the new mode held for its minimum duration.
+    /// The pack's mode changed; the new mode has held for its minimum duration.
     Mode {
         /// Mode left.
         from: Mode,
@@ -34,56 +34,56 @@ pub enum EventKind {
     },
     /// One half-cycle of one cell is complete.
     HalfCycle {
-        /// Which cell.
+        /// Index of the cell.
         cell: CellIndex,
         /// Charge or discharge.
         mode: Mode,
         /// Charge moved, Ah, positive.
         charge_ah: f64,
-        /// SOC swing, fraction, positive; `None` when its beginning was not estimated.
+        /// SOC swing, fraction, positive; `None` if the start was not estimated.
         swing: Option<f64>,
-        /// Its standard deviation.
+        /// Standard deviation of the swing.
         swing_std: Option<f64>,
         /// Duration, s.
         duration_s: f64,
         /// Mean cell current, A, positive = discharge.
         mean_current_a: f64,
-        /// Mean temperature, degrees C; `None` when no sensor was valid.
+        /// Mean temperature, degrees C; `None` without a valid sensor.
         mean_temperature_c: Option<f64>,
     },
-    /// The capacity filter ran.
+    /// The capacity filter was updated.
     Capacity {
-        /// Which cell.
+        /// Index of the cell.
         cell: CellIndex,
-        /// Measurement by the half-cycle alone, Ah; `None` = it carried no information.
+        /// Measurement from the half-cycle alone, Ah; `None` = no information.
         measured_ah: Option<f64>,
-        /// Its standard deviation, Ah.
+        /// Standard deviation of the measurement, Ah.
         measured_std_ah: Option<f64>,
-        /// The estimates after it.
+        /// The estimates after the update.
         #[serde(flatten)]
         values: RecordedValues,
     },
-    /// What a cell has lost, after a half-cycle, once its capacity was measured; parts of the model's new cell.
+    /// Losses of a cell after a half-cycle, once its capacity has been measured; fractions of the model's new cell.
     LossModes {
-        /// Which cell.
+        /// Index of the cell.
         cell: CellIndex,
         /// Loss of lithium inventory.
         lli: f64,
-        /// Its standard deviation.
+        /// Standard deviation of the lithium loss.
         lli_std: f64,
         /// Loss of active material of the negative electrode.
         lam_ne: f64,
-        /// Its standard deviation.
+        /// Standard deviation of the negative electrode's loss.
         lam_ne_std: f64,
         /// Loss of active material of the positive electrode.
         lam_pe: f64,
-        /// Its standard deviation.
+        /// Standard deviation of the positive electrode's loss.
         lam_pe_std: f64,
     },
-    /// Remaining life after a half-cycle, of the cell whose life ends first. Sent while it is known, and once, without any
-    /// value, when it no longer is.
+    /// Remaining life after a half-cycle, of the cell whose life ends first. Sent while it is known, and once without
+    /// values when it becomes unknown.
     RemainingLife {
-        /// Which cell.
+        /// Index of the cell.
         cell: Option<CellIndex>,
         /// Equivalent full cycles until its capacity passes the end of life, median.
         cycles: Option<f64>,
@@ -91,46 +91,47 @@ pub enum EventKind {
         cycles_low: Option<f64>,
         /// 95 % quantile.
         cycles_high: Option<f64>,
-        /// Days, with the use of the recent past, median.
+        /// Days at the recent rate of use, median.
         days: Option<f64>,
         /// 5 % quantile.
         days_low: Option<f64>,
         /// 95 % quantile.
         days_high: Option<f64>,
     },
-    /// End of a charge that covered the recharge window, or enough of it.
+    /// A charge ended that covered the recharge window, or enough of it.
     RechargePeriod {
-        /// Seconds between the two configured SOC values; `None` = it did not cover the whole window in one go.
+        /// Time between the two configured SOC values, s; `None` if the charge did not cover the whole window without
+        /// interruption.
         seconds: Option<f64>,
-        /// Seconds the reference charger would need; `None` = not every cell's capacity was learned yet, or the
-        /// charge covered too little.
+        /// Time that the reference charger would need, s; `None` if not every cell's capacity has been learned, or if
+        /// the charge covered too little.
         normalised_s: Option<f64>,
-        /// Its standard deviation, s.
+        /// Standard deviation of the normalised period, s.
         normalised_std_s: Option<f64>,
     },
     /// An alarm changed.
     Alarm {
-        /// Which rule.
+        /// The rule.
         rule: Rule,
-        /// Which cell; `None` = the pack.
+        /// Index of the cell; `None` = the pack.
         cell: Option<CellIndex>,
         /// The change.
         change: Change,
-        /// Its state now.
+        /// State of the alarm after the change.
         state: AlarmState,
-        /// Whether it is raised now.
+        /// Whether the alarm is raised now.
         active: bool,
-        /// Its severity.
+        /// Severity of the alarm.
         severity: Severity,
-        /// The value that decided; `None` = unknown.
+        /// The deciding value; `None` = unknown.
         value: Option<f64>,
-        /// Probability that the truth is beyond the threshold; `None` = the value has no standard deviation.
+        /// Probability that the true value is beyond the threshold; `None` if the value has no standard deviation.
         probability: Option<f64>,
-        /// The threshold it is compared with.
+        /// The threshold.
         threshold: f64,
-        /// Times it was raised.
+        /// Number of times the alarm was raised.
         occurrences: u32,
-        /// Whether it has been acknowledged since.
+        /// Whether it has been acknowledged since it was raised.
         acknowledged: bool,
     },
     /// A command was executed.
@@ -140,103 +141,103 @@ pub enum EventKind {
         /// The command.
         #[serde(rename = "request")]
         command: Command,
-        /// Alarms changed.
+        /// Number of changed alarms.
         changed: u32,
-        /// What was refused: alarms that are not healthy, a test without output.
+        /// Number of refused requests: alarms that are not healthy, or a test without output.
         refused: u32,
     },
     /// A command frame was rejected.
     BadCommand {
-        /// Interface it came on.
+        /// Interface that received it.
         bus: BusIndex,
-        /// Its checksum was right.
+        /// Whether its checksum was right.
         intact: bool,
-        /// Why it was rejected.
+        /// Reason for the rejection.
         reason: CommandRefusal,
     },
-    /// A test of a rule's alarm frame began or ended.
+    /// A test of a rule's alarm frame started or ended.
     Test {
-        /// Which rule.
+        /// The rule.
         rule: Rule,
-        /// It began.
+        /// Whether it started.
         running: bool,
     },
-    /// Another pack is connected. Last values learned of the old one, for the records.
+    /// Another pack is connected. Holds the last learned values of the old one, for the records.
     PackReplaced {
-        /// Capacity of its weakest cell, Ah; `None` = nothing was learned.
+        /// Capacity of the old pack's weakest cell, Ah; `None` if nothing was learned.
         capacity_ah: Option<f64>,
-        /// Its standard deviation, Ah.
+        /// Standard deviation of the capacity, Ah.
         capacity_std_ah: Option<f64>,
     },
-    /// A pack that was connected before came back: what was learned of it is restored.
+    /// A previously connected pack returned, and its learned values were restored.
     PackReturned {
-        /// Its number.
+        /// Number of the pack.
         identity: f64,
-        /// Capacity of its weakest cell, Ah; `None` = not of every cell known.
+        /// Capacity of its weakest cell, Ah; `None` if it is not known for every cell.
         capacity_ah: Option<f64>,
-        /// Its standard deviation, Ah.
+        /// Standard deviation of the capacity, Ah.
         capacity_std_ah: Option<f64>,
     },
-    /// Another configuration holds from here on.
+    /// A new configuration applies from here on.
     Reconfigured {
-        /// Alarms, raised or past, that ended because no threshold watches them any more.
+        /// Number of raised or past alarms that ended because no threshold watches them any more.
         alarms_ended: u32,
     },
-    /// A stored state has an alarm that no configured threshold watches any more: it is over.
+    /// A stored alarm ended because no configured threshold watches it any more.
     AlarmDropped {
-        /// Which rule.
+        /// The rule.
         rule: Rule,
-        /// Its severity.
+        /// Severity of the alarm.
         severity: Severity,
-        /// Which cell; `None` = the pack.
+        /// Index of the cell; `None` = the pack.
         cell: Option<CellIndex>,
         /// Whether it was raised.
         active: bool,
-        /// Times it was raised.
+        /// Number of times the alarm was raised.
         occurrences: u32,
     },
-    /// The identity of the connected pack is known, for the first time or after a change.
+    /// The identity of the connected pack became known, for the first time or after a change.
     PackIdentity {
-        /// As the signal says it.
+        /// Value of the identity signal.
         identity: f64,
     },
-    /// Whether files can be written has changed.
+    /// Files can, or cannot, be written any more.
     Store {
-        /// They can.
+        /// Whether they can be written.
         works: bool,
     },
     /// A signal turned bad (reported once per change, then counted).
     SignalBad {
-        /// Which signal.
+        /// The signal.
         channel: Channel,
-        /// Why.
+        /// The fault.
         fault: Fault,
     },
-    /// A signal is good again.
+    /// A signal turned good again.
     SignalGood {
-        /// Which signal.
+        /// The signal.
         channel: Channel,
-        /// Bad readings in between.
+        /// Number of bad readings in between.
         bad_readings: u64,
     },
-    /// A protected message turned from usable to failing, or back (reported on change, then counted). A first frame, and as many
-    /// missing ones as its check allows to be lost, turn nothing.
+    /// A protected message turned from usable to failing, or back (reported on change, then counted). A first frame
+    /// does not count as a change, nor do as many lost frames as its check allows.
     Protection(GuardChange),
-    /// More frames of one identifier come than the limit allows; or no more.
+    /// A message started or stopped exceeding its frame limit.
     Flood(FloodChange),
-    /// A second sender of an unprotected input message was found, or is gone.
+    /// A second sender of an unprotected input message appeared or disappeared.
     SecondSender(SenderChange),
-    /// Another sender uses our own identifiers, or does no more.
+    /// Another node started or stopped using our identifiers.
     OwnIdentifier(OwnIdChange),
     /// Diagnostic messages of a controller were lost (reported at most once a minute, all are counted).
     MessageLoss(MessageLoss),
-    /// Diagnostic requests are sent, or no more.
+    /// The daemon started or stopped sending diagnostic requests.
     Poll(PollChange),
-    /// An interface event.
+    /// An interface reported an event.
     Bus {
-        /// Which interface.
+        /// The interface.
         bus: BusIndex,
-        /// Its report.
+        /// The report.
         what: BusEvent,
     },
     /// The J1939 node's address or its trouble codes changed.
@@ -244,81 +245,82 @@ pub enum EventKind {
         /// The change.
         what: NodeEvent,
     },
-    /// The buses fell silent as a whole while no current flowed, or carry inputs again: the vehicle sleeps.
+    /// The vehicle fell asleep (all buses are silent and no current flows), or woke up (inputs arrive again).
     BusAsleep {
-        /// They sleep from now on.
+        /// Whether it fell asleep.
         asleep: bool,
-        /// How long they slept, s, when they wake.
+        /// Duration of the sleep, s, when it wakes up.
         seconds: Option<f64>,
     },
-    /// Nothing was measured for this long (asleep, or the log has a hole).
+    /// Nothing was measured for this long (computer asleep, or gap in the log).
     Gap {
-        /// Seconds; `None` = unknown.
+        /// Duration, s; `None` = unknown.
         seconds: Option<f64>,
     },
     /// An input's time was before the latest one.
     TimeBackwards {
-        /// By how much, s.
+        /// Size of the step back, s.
         seconds: f64,
     },
-    /// The model of the cells was learned from what the vehicle noted of them; or it turned out that it cannot be.
+    /// The model of the cells was learned from the vehicle's data, or it turned out that it cannot be learned.
     Model {
-        /// How well it is known now.
+        /// State of the model now.
         state: ModelState,
-        /// Capacity of the mean cell, Ah; `None` = nothing was learned.
+        /// Capacity of the mean cell, Ah; `None` if nothing was learned.
         capacity_ah: Option<f64>,
-        /// Its standard deviation, Ah.
+        /// Standard deviation of the capacity, Ah.
         capacity_std_ah: Option<f64>,
         /// Root mean square of the residuals, V.
         residual_v: Option<f64>,
-        /// The chemistry that explains the voltages better than that on the label.
+        /// The chemistry that explains the voltages better than the label's.
         chemistry: Option<Chemistry>,
-        /// The model before was the better one and holds again.
+        /// Whether the previous model was better and is used again.
         is_taken_back: bool,
     },
-    /// A cell stands out from its pack in a way that shows what is wrong with it.
+    /// A cell differs from its pack in a way that indicates a fault.
     Finding(CellFault),
-    /// A cell's filter failed and started again from its voltage.
+    /// A cell's filter failed and was restarted from its voltage.
     FilterReset {
-        /// Which cell.
+        /// Index of the cell.
         cell: CellIndex,
     },
-    /// The estimate of a cell can (not) be trusted.
+    /// A cell's estimate became trusted or untrusted.
     Trust {
-        /// Which cell.
+        /// Index of the cell.
         cell: CellIndex,
-        /// Whether its innovations agree with its covariance, and its model is not another cell's.
+        /// Whether its innovations agree with their covariance and its model fits the cell.
         trusted: bool,
-        /// Mean normalised innovation squared over the window; for a model of another cell its mismatch in the same scale.
+        /// Mean normalised innovation squared over the window; if the model does not fit the cell, the mismatch on the
+        /// same scale.
         mean_nis: f64,
     },
 }
 
 impl EventKind {
-    /// Its name, everywhere: in files of events, in summaries, on the screen.
+    /// Name of the event in event files, summaries and on the screen.
     pub fn name(&self) -> &'static str {
         self.into()
     }
 }
 
-/// How well the model of the cells is known.
+/// State of the cells' model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ModelState {
-    /// That of the label: nothing is learned yet.
+    /// The label's model; nothing has been learned yet.
     Prior,
-    /// Learned in part.
+    /// Partly learned.
     Learning,
-    /// Learned: what is left unknown is small.
+    /// Learned; the remaining uncertainty is small.
     Learned,
-    /// The voltages contradict it: another chemistry explains them better.
+    /// Contradicted by the voltages: another chemistry explains them better.
     Unfit,
-    /// From a model file: nothing is learned.
+    /// Given by a model file; nothing is learned.
     Given,
 }
 
 impl ModelState {
-    /// Its code of the wire.
+    /// Code on the wire.
     pub fn code(self) -> u8 {
         match self {
             Self::Prior => 0,
@@ -330,7 +332,7 @@ impl ModelState {
     }
 }
 
-/// An event and when it happened.
+/// An event with its time.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Event {
     /// Time of the input that caused it.

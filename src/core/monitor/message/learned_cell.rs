@@ -1,9 +1,9 @@
-//! What a history has kept of one cell: it comes in where the state of the last run is lost.
+//! Learned values of one cell from a history, used if the state of the last run is lost.
 
 use crate::filter::ScalarGaussian;
 use crate::quantity::CellIndex;
 
-/// What a history has kept of one cell.
+/// Learned values of one cell from a history.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LearnedCell {
     /// The cell.

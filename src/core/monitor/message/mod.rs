@@ -1,4 +1,5 @@
-//! What goes in and out of the core: records and commands in; events, estimates and frames out. Knows no stage.
+//! Inputs and outputs of the core: records and commands in; events, estimates and frames out. Independent of the
+//! stages.
 
 mod command;
 mod event;

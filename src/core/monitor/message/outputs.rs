@@ -17,24 +17,25 @@ pub struct Transmit {
     pub bus: BusIndex,
     /// The frame.
     pub frame: Frame,
-    /// It announces a learned value or a change of an alarm: true for all health, alarm and J1939 frames, so that frames of
-    /// one identifier, and the parts of one transfer, are all of one kind.
+    /// Whether it announces a learned value or an alarm change. True for all health, alarm and J1939 frames, so that
+    /// all frames of one identifier and all parts of one transfer have the same flag.
     pub announces: bool,
-    /// Authentication: the frame carries its freshness, and zeros in place of the authenticator. `None` = there is none.
+    /// Authentication of the frame, which carries its freshness, and zeros in place of the authenticator; `None` = not
+    /// authenticated.
     pub secured: Option<Secured>,
 }
 
-/// What the authenticator of a sent frame is made from, besides its data and the key.
+/// Inputs of a sent frame's authenticator besides its data and the key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Secured {
     /// Lengths and data id.
     pub authentication: Authentication,
-    /// The whole freshness.
+    /// The complete freshness value.
     pub freshness: u64,
 }
 
 impl Secured {
-    /// The frame with its authenticator; `mac` is AES-128-CMAC.
+    /// Writes the authenticator into a copy of the frame; `mac` is AES-128-CMAC.
     pub fn seal(&self, frame: &Frame, mac: impl FnOnce(&[u8]) -> Mac) -> Frame {
         let mut sealed = *frame;
         if let Some(input) = self.authentication.mac_input(frame.data(), self.freshness) {
@@ -49,11 +50,11 @@ impl Secured {
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
 pub enum Validity {
-    /// No estimate yet, or none any more: a cell's voltage has not come for too long.
+    /// No estimate yet, or no longer: a cell's voltage is overdue.
     Unavailable = 0,
-    /// Inputs fresh, filter consistent.
+    /// Inputs are fresh and the filter is consistent.
     Valid = 1,
-    /// Current or temperature is stale or implausible: the estimate is coasting and its deviation grows.
+    /// Current or temperature is stale or implausible: the estimate is extrapolated and its standard deviation grows.
     Degraded = 2,
     /// The filter's innovations contradict its covariance.
     Untrusted = 3,
@@ -64,33 +65,33 @@ pub enum Validity {
 pub struct Estimate {
     /// Time of the voltage reading.
     pub time: Timestamp,
-    /// Which cell.
+    /// Index of the cell.
     pub cell: CellIndex,
     /// State of charge, fraction.
     pub soc: f64,
-    /// Its standard deviation.
+    /// Standard deviation of the SOC.
     pub soc_std: f64,
     /// Branch voltages, V; NaN beyond the model's branches.
     pub branch_v: [f64; crate::cell::MAX_BRANCHES],
     /// Learned capacity, Ah.
     pub capacity_ah: f64,
-    /// Its standard deviation, Ah.
+    /// Standard deviation of the capacity, Ah.
     pub capacity_std_ah: f64,
     /// Resistance relative to new.
     pub resistance_ratio: f64,
-    /// Its standard deviation.
+    /// Standard deviation of the resistance ratio.
     pub resistance_ratio_std: f64,
     /// Measured minus predicted voltage, V.
     pub innovation_v: f64,
-    /// Its predicted standard deviation, V.
+    /// Predicted standard deviation of the innovation, V.
     pub innovation_std_v: f64,
     /// Whether the reading passed the gate and moved the estimate.
     pub accepted: bool,
-    /// The readings it came from.
+    /// The readings used.
     pub measured: MeasuredValues,
 }
 
-/// The readings that one estimate was made from.
+/// Readings used for one estimate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeasuredValues {
     /// Voltage, V.
@@ -101,31 +102,31 @@ pub struct MeasuredValues {
     pub temperature_c: f64,
 }
 
-/// Outputs of the monitor; the caller empties it. Reused from input to input, so that the
-/// steady state allocates nothing.
+/// Outputs of the monitor. The caller empties and reuses it, so that the steady state does not allocate.
 #[derive(Debug, Default)]
 pub struct Outputs {
     /// Frames to send.
     pub frames: Vec<Transmit>,
     /// Events to log.
     pub events: Vec<Event>,
-    /// Estimates, only when `want_estimates`.
+    /// Estimates, only if `want_estimates`.
     pub estimates: Vec<Estimate>,
     /// Whether the caller wants `estimates`.
     pub want_estimates: bool,
-    /// Inputs of the alarm engine, only when `want_alarm_inputs`; without changes by a restore or another configuration.
+    /// Inputs of the alarm engine, only if `want_alarm_inputs`; without changes due to a restore or a new
+    /// configuration.
     pub alarm_inputs: Vec<(Timestamp, AlarmInput)>,
     /// Whether the caller wants `alarm_inputs`.
     pub want_alarm_inputs: bool,
 }
 
 impl Outputs {
-    /// Whether there is no output.
+    /// Whether all lists are empty.
     pub fn is_empty(&self) -> bool {
         self.events.is_empty() && self.frames.is_empty() && self.estimates.is_empty() && self.alarm_inputs.is_empty()
     }
 
-    /// Empties the lists, keeps their memory.
+    /// Empties the lists and keeps their allocations.
     pub fn clear(&mut self) {
         self.frames.clear();
         self.events.clear();

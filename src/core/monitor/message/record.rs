@@ -1,4 +1,5 @@
-//! Records: what the core handles and what logs and journals hold: frames, ticks, reports of interfaces and files, commands.
+//! Records: inputs of the core, and contents of logs and journals: frames, ticks, reports of interfaces and files,
+//! commands.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,64 +7,66 @@ use super::command::Command;
 use crate::can::Frame;
 use crate::quantity::{BusIndex, Timestamp};
 
-/// A record of what happened, with the driver's time: what a log or a journal holds, and what the core handles.
+/// Something that happened, with the driver's time. Logs and journals hold records, the core handles them.
 ///
-/// Records come in the order in which they happened; a time a little before the latest one ([`MERGE_TOLERANCE_NS`]: buses merge
-/// out of order) is counted and treated as the latest; further back, the clock was set back and how much time passed is unknown.
+/// Records come in the order in which they happened. A time slightly before the latest one (within
+/// [`MERGE_TOLERANCE_NS`], because buses merge out of order) is counted and treated as the latest. Further back, the
+/// clock was set back and the elapsed time is unknown.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Record {
-    /// When.
+    /// Time on the driver's clock.
     pub time: Timestamp,
-    /// What happened.
+    /// Kind of the record.
     pub kind: RecordKind,
 }
 
-/// What happened.
+/// Kind of a record, with its data.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum RecordKind {
     /// A frame was received.
     Frame {
-        /// Interface it came on.
+        /// Interface that received it.
         bus: BusIndex,
         /// The frame.
         frame: Frame,
     },
-    /// A frame of an authenticated message was received, and its authenticator was checked
+    /// A frame of an authenticated message was received and its authenticator was checked
     /// ([`Monitor::mac_check`](crate::monitor::Monitor::mac_check)).
     SecuredFrame {
-        /// Interface it came on.
+        /// Interface that received it.
         bus: BusIndex,
         /// The frame.
         frame: Frame,
-        /// The freshness with which the authenticator is right; `None` = with none.
+        /// The freshness value for which the authenticator is right; `None` = no value fits.
         freshness: Option<u64>,
     },
-    /// Time passed. The driver ticks every [`TICK_PERIOD_MS`] while awake; cyclic frames and time-outs follow from ticks.
+    /// Time passed. The driver ticks every [`TICK_PERIOD_MS`] while awake; cyclic frames and time-outs depend on
+    /// ticks.
     Tick,
-    /// An interface changed or lost something.
+    /// An interface changed its state or lost frames.
     Bus {
-        /// Which interface.
+        /// The interface.
         bus: BusIndex,
         /// Its report.
         event: BusEvent,
     },
-    /// The log continues here, but how much time really passed is unknown (a log without stamps between its parts).
+    /// The record continues after a gap of unknown length (a log without timestamps between its parts).
     UnknownGap,
-    /// A command from this computer. Commands of the bus are frames.
+    /// A command from this computer. Commands from the bus are frames.
     Command {
         /// The command.
         command: Command,
     },
-    /// Whether the files of the learned state and the records can be written.
+    /// The files of the learned state and the records can, or cannot, be written.
     Store {
-        /// They can.
+        /// Whether they can be written.
         works: bool,
     },
-    /// The recorded run changed to another configuration here: for the driver, the core ignores it.
+    /// The recorded run changed its configuration here. For the driver; the core ignores it.
     Reload,
-    /// The recorded run restored a stored state here: for the driver, the core ignores it.
+    /// The recorded run restored a stored state here. For the driver; the core ignores it.
     Restore {
-        /// How old the state was.
+        /// Age of the state.
         away: Downtime,
     },
 }
@@ -75,7 +78,7 @@ impl Record {
         Self { time, kind: RecordKind::Frame { bus, frame: *frame } }
     }
 
-    /// A received frame with the outcome of the check of its authenticator.
+    /// A received frame with the result of checking its authenticator.
     pub const fn secured_frame(time: Timestamp, bus: BusIndex, frame: &Frame, freshness: Option<u64>) -> Self {
         Self { time, kind: RecordKind::SecuredFrame { bus, frame: *frame, freshness } }
     }
@@ -101,7 +104,7 @@ impl Record {
         Self { time, kind: RecordKind::Command { command } }
     }
 
-    /// A report whether files can be written.
+    /// A report on whether files can be written.
     pub const fn store(time: Timestamp, works: bool) -> Self {
         Self { time, kind: RecordKind::Store { works } }
     }
@@ -126,43 +129,43 @@ impl Record {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "bus_event")]
 pub enum BusEvent {
-    /// The interface is there and up; frames may come.
+    /// The interface is up; frames may arrive.
     Up,
     /// The interface exists but is down.
     Down,
     /// The interface does not exist (missing at start, or removed).
     Missing,
-    /// The kernel or a full queue of ours dropped this many frames since the last report.
+    /// The kernel or a full queue of the daemon dropped frames since the last report.
     Dropped {
         /// Frames lost.
         frames: u64,
     },
-    /// An error frame; `class` is the error class mask of the frame's identifier (linux/can/error.h).
+    /// An error frame was received.
     ErrorFrame {
-        /// CAN_ERR_* class bits.
+        /// Error class mask of the frame's identifier (`CAN_ERR_*` in linux/can/error.h).
         class: u32,
     },
-    /// Frames of ours could not be sent (queue full, interface gone).
+    /// Frames of the daemon could not be sent (queue full, interface gone).
     SendFailed {
         /// Frames not sent.
         frames: u64,
     },
 }
 
-/// How long before the first input a stored state was taken ([`Monitor::restore`](crate::monitor::Monitor::restore)).
+/// Time between a stored state and the first input ([`Monitor::restore`](crate::monitor::Monitor::restore)).
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum Downtime {
-    /// As long as the two stamps say. A state that was taken after "now" ([`MERGE_TOLERANCE_NS`] aside) has another clock's
-    /// stamp: then the downtime is unknown.
+    /// The difference between the two timestamps. A state whose timestamp is after "now" by more than
+    /// [`MERGE_TOLERANCE_NS`] was stored on another clock; the downtime is then unknown.
     #[default]
     AsStamped,
     /// This long, s.
     Seconds(f64),
-    /// Unknown: as after [`RecordKind::UnknownGap`].
+    /// Unknown, as after [`RecordKind::UnknownGap`].
     Unknown,
 }
 
-/// As in a journal: seconds, `-` for "as stamped", or `unknown`.
+/// As written in a journal: seconds, `-` for "as stamped", or `unknown`.
 impl std::fmt::Display for Downtime {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
@@ -173,7 +176,7 @@ impl std::fmt::Display for Downtime {
     }
 }
 
-/// A text that is none of the three.
+/// The text is not a downtime.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("must be seconds, 0 or more, or unknown")]
 pub struct DowntimeParseError;
@@ -195,9 +198,9 @@ impl std::str::FromStr for Downtime {
     }
 }
 
-/// Period of the driver's ticks, ms: ten times faster than the fastest sensible cyclic frame needs.
+/// Period of the driver's ticks, ms: a tenth of the shortest sensible period of a cyclic frame.
 pub const TICK_PERIOD_MS: u32 = 10;
 
-/// Steps back in time up to this are frames of several interfaces merged out of order, ns; beyond, the record's
-/// clock was set back.
+/// Largest step back in time that counts as frames of several interfaces merged out of order, ns. Beyond it, the clock
+/// was set back.
 pub const MERGE_TOLERANCE_NS: i64 = 1_000_000_000;

@@ -1,4 +1,4 @@
-//! The present values of cells and pack, for readers: status, tables, reports. `None` = not known (any more).
+//! Current values of cells and pack for readers (status, tables, reports). `None` = not known, or no longer known.
 
 use serde::{Deserialize, Serialize};
 
@@ -8,43 +8,43 @@ use crate::cell::Chemistry;
 use crate::quantity::catalogue::{CellValues, PackValues};
 use crate::quantity::{CellIndex, Mode};
 
-/// One cell.
+/// Current values of one cell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CellView {
-    /// Its number.
+    /// Index of the cell.
     pub cell: CellIndex,
-    /// Its values. Measured ones are known while their readings are fresh, the state of charge and the resistance while the voltage
-    /// is, learned ones once a half-cycle taught something.
+    /// Values of the cell. Measured values are known while their readings are fresh, state of charge and resistance
+    /// while the voltage is fresh, learned values after the first half-cycle with a result.
     #[serde(flatten)]
     pub values: CellValues,
-    /// Why the remaining life is not known.
+    /// Reason why the remaining life is unknown.
     #[serde(default)]
     pub remaining_unknown: Option<String>,
-    /// Whether its innovations agree with their covariance; `None` while there is no SOC.
+    /// Whether the cell's innovations agree with their covariance; `None` without an SOC.
     pub trusted: Option<bool>,
 }
 
-/// The pack, as its limiting cells determine it.
+/// Current values of the pack, from its limiting cells.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct PackView {
     /// Validity of the estimates.
     pub validity: Validity,
     /// Charge, rest or discharge.
     pub mode: Mode,
-    /// The cell that ends a discharge.
+    /// The cell that is empty first.
     pub limiting_cell: Option<CellIndex>,
-    /// The cell with the least capacity, once the capacity of every cell was learned.
+    /// The cell with the least capacity, once every cell's capacity has been learned.
     pub weakest_cell: Option<CellIndex>,
-    /// The cell whose life ends first, once the remaining life of every cell is known.
+    /// The cell with the shortest remaining life, once every cell's remaining life is known.
     #[serde(default)]
     pub shortest_lived_cell: Option<CellIndex>,
-    /// How well the model of the cells is known; `None` in documents of earlier programs.
+    /// State of the cells' model; `None` in documents of earlier versions.
     #[serde(default)]
     pub model_state: Option<ModelState>,
-    /// The chemistry that explains the voltages better than that on the label.
+    /// The chemistry that explains the voltages better than the label's.
     #[serde(default)]
     pub model_fits_better: Option<Chemistry>,
-    /// Its values.
+    /// Values of the pack.
     #[serde(flatten)]
     pub values: PackValues,
 }

@@ -1,4 +1,4 @@
-//! The stages: each has its configuration, its state and its own verbs; none knows which stage comes before or after it.
+//! The stages. Each has its configuration, its state and its methods; no stage knows the data path as a whole.
 
 pub(crate) mod alarming;
 pub(crate) mod estimation;

@@ -1,7 +1,7 @@
-//! The end of the data path: events, alarm values and the frames that follow from them, at the time of one input.
+//! End of the data path: publishes events, alarm values and the resulting frames at the time of one input.
 //!
-//! A stage publishes an event or the value of a rule; what changes in an alarm by it follows at once, as an event, as the
-//! alarm's frame and as J1939 trouble codes.
+//! A stage publishes an event or a rule's value. If an alarm changes, an event, the alarm's frame and J1939 trouble
+//! codes follow immediately.
 
 use super::alarming::Alarming;
 use super::sending::Sending;
@@ -11,7 +11,7 @@ use crate::filter::ScalarGaussian;
 use crate::monitor::message::{Event, EventKind, Outputs};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Alarms, frames and outputs at one moment.
+/// Alarms, frames and outputs at one time.
 pub(crate) struct Publisher<'a> {
     pub(crate) now: Timestamp,
     pub(crate) alarming: &'a mut Alarming,
@@ -25,7 +25,7 @@ impl Publisher<'_> {
         self.out.events.push(Event { time: self.now, kind });
     }
 
-    /// Passes a value to its rule, and publishes what it changes. Values from a faulty channel are ignored.
+    /// Passes a value to its rule and publishes the resulting changes. Ignores values from a faulty channel.
     pub(crate) fn observe(&mut self, rule: Rule, cell: Option<CellIndex>, observation: Observation) {
         if !self.alarming.depends_on_faulty_channel(rule, cell) {
             self.restate(rule, cell, observation);
@@ -46,7 +46,7 @@ impl Publisher<'_> {
         self.alarming.engine.apply(self.now, &input, &mut self.alarming.changes)
     }
 
-    /// Publishes waiting changes of alarms, and sends each changed alarm as it is now.
+    /// Publishes waiting alarm changes, and sends the current state of each changed alarm.
     pub(crate) fn publish_alarms(&mut self) {
         if self.alarming.changes.is_empty() {
             return;
@@ -63,13 +63,13 @@ impl Publisher<'_> {
         self.sending.poll_j1939(self.now, self.out);
     }
 
-    /// Passes the present alarms to the J1939 node.
+    /// Passes the current alarms to the J1939 node.
     pub(crate) fn update_trouble_codes(&mut self) {
         self.sending.update_trouble_codes(self.now, &self.alarming.engine);
     }
 }
 
-/// The value of a rule that was learned now.
+/// The rule value for a newly learned value.
 pub(crate) fn learned(value: ScalarGaussian) -> Observation {
     Observation::new(Some(value.mean)).with_std(value.std())
 }

@@ -1,35 +1,35 @@
 //! Detects that the vehicle is asleep: no current and no traffic on any bus.
 //!
-//! In: the time, and when the latest reading of any input came. Out: whether the inputs may be judged, and two events a
-//! sleep. One silent input among others, and silence under load, are faults and not judged here. While the buses sleep
-//! nothing is missing: no input turns bad, no alarm is raised, and no estimate is valid.
+//! In: the time, and the time of the latest reading of any input. Out: whether the inputs may be judged, and an event
+//! at the start and end of a sleep. A single silent input, or silence under load, is a fault and not handled here.
+//! While the buses sleep, no input turns bad, no alarm is raised, and no estimate is valid.
 
 use crate::monitor::config::MonitorConfig;
 use crate::quantity::Timestamp;
 
-/// Without a reading of any input for this long its inputs are not judged at rest, s: they may all have fallen asleep. Longer
-/// than the pauses between the frames of an awake bus, shorter than the age at which a reading is stale.
+/// After this time without a reading of any input, inputs at rest are not judged, s, because all buses may have fallen
+/// asleep. Longer than the pauses between frames of an awake bus, shorter than the age at which a reading is stale.
 pub(crate) const QUIET_S: f64 = 0.25;
 
-/// Whether the buses sleep.
+/// State of the bus sleep.
 #[derive(Debug)]
 pub(crate) struct BusSleep {
-    /// Silence after which they do, s; `None` = never.
+    /// Silence after which the buses count as asleep, s; `None` = never.
     pub(crate) after_s: Option<f64>,
-    /// Since when.
+    /// Start of the current sleep.
     pub(crate) since: Option<Timestamp>,
 }
 
-/// What the silence of all inputs means.
+/// Meaning of the silence of all inputs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Silence {
-    /// There is none, or current flows: inputs are judged each by its own age.
+    /// Inputs arrive or current flows; each input is judged by its own age.
     None,
-    /// The buses may be about to sleep.
+    /// The buses may be falling asleep.
     Quiet,
-    /// They have just fallen asleep.
+    /// The buses have just fallen asleep.
     Begins,
-    /// They sleep.
+    /// The buses are asleep.
     Lasts,
 }
 
@@ -40,7 +40,7 @@ impl BusSleep {
         Self { after_s: config.asleep_after_s.map(|after_s| after_s.max(oldest_s)), since: None }
     }
 
-    /// Another time-out; a sleep lasts.
+    /// Applies another time-out; a current sleep continues.
     pub(crate) fn reconfigure(&mut self, config: &MonitorConfig) {
         self.after_s = Self::new(config).after_s;
     }

@@ -1,9 +1,11 @@
-//! What was learned of the packs that were connected before, by their number, so that it is known again when one comes back.
+//! Remembers what was learned of previously connected packs, by their number, so that it is available when a pack
+//! returns.
 //!
-//! In: the parts of the state that belong to the connected pack, when readings begin to give another number; the new number,
-//! once it is certain. Out: what is known of that pack. Kept are capacities, resistances, remaining lives, recharge periods and
-//! the offset of the current (a pack often has its own sensor); not the half-cycle under way and not the state of charge, which
-//! the first voltage decides. A pack of which nothing was learned is not kept, so that invented numbers displace none.
+//! In: the parts of the state that belong to the connected pack, stored when readings start to show another number;
+//! the new number once it is confirmed. Out: the stored values of that pack, if any. Stored are capacities,
+//! resistances, remaining lives, recharge periods and the current offset (a pack often has its own sensor). The
+//! current half-cycle and the state of charge are not stored; the first voltage determines the state of charge. A pack
+//! without learned values is not stored, so that bogus numbers do not displace real packs.
 
 use serde::{Deserialize, Serialize};
 
@@ -15,12 +17,13 @@ use crate::monitor::stage::learning::{CellHealth, LearningState, Throughput, che
 use crate::monitor::stage::modelling::ModellingState;
 use crate::quantity::{InvalidState, bounds};
 
-/// Packs kept beside the connected one: more than a vehicle exchanges in turn.
+/// Maximum number of stored packs besides the connected one: more than a vehicle exchanges in turn.
 const MAX_PACKS: usize = 8;
-/// Cells of all of them together, but always one pack: a cell takes 2.6 kB of the stored state.
+/// Maximum number of cells of all stored packs, but at least one pack is stored. A cell takes 2.6 kB of the stored
+/// state.
 const MAX_CELLS: usize = 384;
 
-/// The packs, the one connected least lately first.
+/// Stored packs, least recently connected first.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct PackMemory {
@@ -29,15 +32,15 @@ pub(crate) struct PackMemory {
     aside: Option<Box<StoredPack>>,
 }
 
-/// What was learned of one pack.
+/// Learned values of one pack.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct StoredPack {
     pub(crate) number: f64,
     pub(crate) cells: Vec<StoredCell>,
-    /// What is learned of the cells' model.
+    /// State of the cells' learned model.
     pub(crate) modelling: Option<ModellingState>,
-    /// What is known of single cells.
+    /// State of the cell-fault detector.
     pub(crate) diagnosis: Option<CellFaultDetector>,
     pub(crate) learning: LearningState,
 }
@@ -57,22 +60,22 @@ pub(crate) struct StoredCell {
 }
 
 impl PackMemory {
-    /// Whether the connected pack is put aside.
+    /// Whether the connected pack has been put aside.
     pub(crate) fn has_aside(&self) -> bool {
         self.aside.is_some()
     }
 
-    /// Puts the connected pack aside: its next voltages may be those of another.
+    /// Puts the connected pack aside, because its next voltages may belong to another pack.
     pub(crate) fn put_aside(&mut self, pack: StoredPack) {
         self.aside = Some(Box::new(pack));
     }
 
-    /// The number was that of the connected pack again, or what was learned of it does not hold.
+    /// Drops the pack that was put aside: its number was read again, or its learned values no longer apply.
     pub(crate) fn drop_aside(&mut self) {
         self.aside = None;
     }
 
-    /// Keeps the pack that was put aside, and takes out what is known of `number`.
+    /// Stores the pack that was put aside, and returns and removes the stored pack with `number`.
     pub(crate) fn exchange(&mut self, number: f64) -> Option<StoredPack> {
         let found = self.packs.iter().position(|pack| pack.number == number).map(|place| self.packs.remove(place));
         if let Some(pack) = self.aside.take().filter(|pack| pack.has_learned()) {
@@ -84,7 +87,7 @@ impl PackMemory {
         found
     }
 
-    /// Forgets values that were measured by another window or load.
+    /// Forgets recharge periods or usable capacities that were measured with another window or load.
     pub(crate) fn forget_measures(&mut self, is_other_recharge: bool, is_other_load: bool) {
         for pack in &mut self.packs {
             if is_other_recharge {
@@ -96,7 +99,7 @@ impl PackMemory {
         }
     }
 
-    /// Drops packs of another shape, from a stored state of another configuration.
+    /// Drops packs whose shape does not fit the configuration.
     pub(crate) fn retain(&mut self, fits: impl Fn(&StoredPack) -> bool) {
         self.packs.retain(&fits);
         self.aside.take_if(|pack| !fits(pack));
@@ -124,7 +127,7 @@ impl StoredPack {
 }
 
 impl StoredPack {
-    /// Whether it is a pack of so many cells, each of so many branches.
+    /// Whether the number of cells and their branches fit the bank.
     pub(crate) fn fits(&self, bank: &PackBank) -> bool {
         self.cells.len() == bank.cells()
             && self.learning.learner.fits(bank.cells())
@@ -148,7 +151,8 @@ impl StoredCell {
         bounds::TIME_S.check("the unmeasured time taken in", unmeasured_s)
     }
 
-    /// Whether the filter has the branches of this cell of the bank; a module's may have been replaced.
+    /// Whether the filter has as many branches as this cell of the bank. Cells of a module always fit, because the
+    /// module may have been replaced.
     pub(crate) fn fits(&self, bank: &PackBank, index: usize) -> bool {
         !bank.is_own(index) || CellEstimator::restore(&self.estimator, bank.model(index).branches.len()).is_some()
     }

@@ -1,8 +1,8 @@
-//! The values that rules compare every 0.1 s; learned values go to their rules when they are learned.
+//! Passes current values to their rules every 0.1 s. Learned values are passed when they are learned.
 //!
-//! In: all stages. Out: values for the [alarming](crate::monitor::stage::alarming) stage. A value of which a part is not known is passed
-//! as a bound: it can raise an alarm, but not clear one. Fast path: if the worst value trips no
-//! threshold, the others are only refreshed for display, once a second.
+//! In: all stages. Out: values for the [alarming](crate::monitor::stage::alarming) stage. A value with an unknown part
+//! is passed as a bound: it can raise an alarm but not clear one. Fast path: if the worst value trips no threshold,
+//! the others are only refreshed for display, once a second.
 
 use super::Stages;
 use crate::alarm::{AlarmInput, Observation, Rule};
@@ -16,7 +16,7 @@ use crate::monitor::stage::publisher::learned;
 use crate::quantity::{CellIndex, Channel, Timestamp};
 use crate::sample::CellSample;
 
-/// Rules of a cell whose value is learned.
+/// Rules about learned values of a cell.
 const CELL_LEARNED: [Rule; 5] =
     [Rule::CapacityLow, Rule::UsableCapacityLow, Rule::ResistanceHigh, Rule::CellLeak, Rule::ConnectionResistance];
 
@@ -33,7 +33,7 @@ impl InputObservation {
     }
 }
 
-/// The larger of two values; a bound where one is not known.
+/// The larger of two values; a bound if one of them is unknown.
 fn worst(a: Observation, b: Observation) -> Observation {
     let is_known = |observation: &Observation| observation.value.is_some() && !observation.is_bound;
     Observation {
@@ -49,12 +49,12 @@ fn worst(a: Observation, b: Observation) -> Observation {
 struct SocSpread {
     lowest: ScalarGaussian,
     highest: ScalarGaussian,
-    /// Whether every cell is among them.
+    /// Whether every cell is included.
     is_whole: bool,
 }
 
 impl Stages {
-    /// Passes the values that follow from the inputs, and are not learned at a transition, to their rules.
+    /// Passes values that are not learned at a transition to their rules.
     pub(crate) fn watch(&mut self, now: Timestamp, out: &mut Outputs) {
         let any_lost = self.sampling.sampler.any_lost();
         let worst = self.sampling.sampler.worst_input(now);
@@ -63,7 +63,7 @@ impl Stages {
         self.watch_pack(now, worst.is_some() && !any_lost, out);
     }
 
-    /// Passes the values about interfaces and files to their rules, and publishes all alarms.
+    /// Passes values about interfaces and files to their rules, and publishes all alarms.
     pub(crate) fn watch_computer(&mut self, now: Timestamp, bus_fault: Observation, out: &mut Outputs) {
         let store = self.alarming.state.store.failing(now);
         let mut publisher = self.publisher(now, out);
@@ -75,7 +75,8 @@ impl Stages {
         publisher.update_trouble_codes();
     }
 
-    /// Silence and plausibility of every input: a cell's own voltage counts for the cell, every other input for the pack.
+    /// Checks silence and plausibility of every input. A cell's own voltage counts for the cell, every other input for
+    /// the pack.
     fn watch_inputs(&mut self, now: Timestamp, worst: Option<(f64, f64)>, out: &mut Outputs) {
         let engine = &self.alarming.engine;
         let quiet = |(silence_s, share): (f64, f64)| {
@@ -100,14 +101,14 @@ impl Stages {
         }
         if let Some(mut pack) = pack {
             if has_second_sender {
-                // Which of its readings are the sensor's is not known: none counts as good.
+                // It is unknown which readings come from the sensor, so none counts as good.
                 pack.bad_share = Observation::new(Some(1.0));
             }
             self.observe_input(now, None, pack, out);
         }
     }
 
-    /// Shows the values of the inputs while readings come on every channel and none changes an alarm.
+    /// Refreshes the displayed values of the inputs while no value changes an alarm.
     fn show_inputs(&mut self, now: Timestamp) {
         let (sampler, engine) = (&self.sampling.sampler, &mut self.alarming.engine);
         let (mut longest_s, mut worst_share) = (0.0_f64, 0.0_f64);
@@ -128,10 +129,10 @@ impl Stages {
     fn input_observation(&self, now: Timestamp, channel: Channel) -> InputObservation {
         let sampler = &self.sampling.sampler;
         let silence_s = sampler.silence_s(channel, now);
-        // Without a reading since waking there is neither silence nor its end.
+        // Without a reading since waking, neither silence nor its end can be judged.
         let has_reading = sampler.has_input_since_waking(channel);
         let is_missing = |silence: &f64| self.alarming.missing_after_s.is_some_and(|limit| *silence > limit);
-        // The share before a silence says nothing about what is missing now.
+        // The share of bad readings before a silence says nothing about the present.
         let share = sampler.bad_share(channel).filter(|_| has_reading && !sampler.is_silent(channel, now));
         InputObservation {
             silence_s: Observation::new(silence_s.filter(|silence| has_reading || is_missing(silence))),
@@ -149,7 +150,8 @@ impl Stages {
         publisher.observe(Rule::InputImplausible, cell, input.bad_share);
     }
 
-    /// A learned value holds only while its inputs can renew it: they are not lost, and its channel is not faulty.
+    /// Marks learned values as valid only while their inputs can renew them: no input is lost and the channel is not
+    /// faulty.
     fn watch_learned(&mut self, now: Timestamp, any_lost: bool, out: &mut Outputs) {
         if self.alarming.state.knows_all_valid && !out.want_alarm_inputs && !any_lost {
             return;
@@ -198,7 +200,7 @@ impl Stages {
         publisher.observe(Rule::BmsDisagrees, None, disagreement);
     }
 
-    /// SOC of the emptiest and the fullest of the cells with a fresh estimate and a channel of their own; `None` = no cell has one.
+    /// SOC of the emptiest and the fullest cell with a fresh estimate and a sound channel; `None` if no cell has one.
     fn soc_spread(&self, now: Timestamp, all_fresh: bool) -> Option<SocSpread> {
         let bank = &self.estimation.bank;
         if all_fresh
@@ -210,7 +212,7 @@ impl Stages {
         let (mut spread, mut known): (Option<SocSpread>, usize) = (None, 0);
         for cell in self.estimation.cell_indices() {
             let is_fresh = self.sampling.sampler.is_fresh(self.sampling.voltage_channel(cell), now);
-            // A voltage that came before the first current says nothing yet.
+            // A voltage from before the first current says nothing yet.
             let is_of_cell = !bank.is_carried_over(cell.index()) && !self.alarming.faulty_channels.contains(&cell);
             let is_present = is_fresh && is_of_cell;
             let Some(soc) = bank.soc(cell.index()).filter(|_| is_present) else { continue };
@@ -227,7 +229,7 @@ impl Stages {
         spread.map(|spread| SocSpread { is_whole: known == self.estimation.cells(), ..spread })
     }
 
-    /// The larger of the differences between the pack's own SOC and SOH and the estimated ones.
+    /// The larger of the differences between reported and estimated SOC and SOH.
     fn disagreement(&self, now: Timestamp) -> Observation {
         let config = self.sampling.sampler.config();
         let soc = self.learning.state.pack.map(|pack| ScalarGaussian::from_std(pack.soc, pack.soc_std));
@@ -256,7 +258,7 @@ impl Stages {
         Observation { is_new: true, ..worst }
     }
 
-    /// Whether no cell's innovations can change an alarm or its trust: then they are only shown.
+    /// Whether no cell's innovations can change an alarm or its trust, so that they are only displayed.
     pub(crate) fn are_innovations_quiet(&self, out: &Outputs) -> bool {
         let Estimation { all_trusted, any_mismatched, is_current_doubtful, .. } = self.estimation;
         let is_known_good = all_trusted && !any_mismatched && !is_current_doubtful;
@@ -269,7 +271,7 @@ impl Stages {
         }
     }
 
-    /// Shows innovations that change no alarm, once a second.
+    /// Refreshes the displayed innovations once a second while they change no alarm.
     pub(crate) fn show_innovations(&mut self, now: Timestamp, samples: &[CellSample]) {
         if !take_show_due(&mut self.alarming.state.innovations_shown_at, now) {
             return;
@@ -282,8 +284,8 @@ impl Stages {
         }
     }
 
-    /// Judges whether a cell's innovations agree with its covariance; an event on change. `is_current`: the rule takes
-    /// them, too.
+    /// Judges whether a cell's innovations agree with their covariance; reports a change as an event. `is_current`:
+    /// also passes them to the rule.
     pub(crate) fn judge_trust(&mut self, now: Timestamp, cell: CellIndex, is_current: bool, out: &mut Outputs) {
         let mean_nis = self.estimation.contradiction(cell.index());
         let change = self.estimation.judge_trust(cell);
@@ -298,8 +300,9 @@ impl Stages {
         }
     }
 
-    /// Passes known values to their rules, after a restart as old ones. `was_brief`: the time away was so short that
-    /// measured values still hold, too. `is_new`: the rules have not seen them, those of a pack that came back.
+    /// Passes known values to their rules, after a restart as old ones. `was_brief`: the downtime was short enough
+    /// that measured values still apply. `is_new`: the rules have not seen the values, because they belong to a pack
+    /// that returned.
     pub(crate) fn restate_known(&mut self, now: Timestamp, was_brief: bool, is_new: bool, out: &mut Outputs) {
         let old = |value: ScalarGaussian| Observation { is_new, ..learned(value) };
         for index in self.estimation.cell_indices() {
@@ -333,8 +336,8 @@ impl Stages {
         learning.lives.observe(is_new, &mut publisher);
     }
 
-    /// Passes what a row has shown to the rules about single cells. `is_new`: the rules have not seen it; then the values of a
-    /// cell whose inputs are lost wait for the next row.
+    /// Passes the results of a row to the rules about single cells. `is_new`: the rules have not seen them; values of
+    /// a cell whose inputs are lost are then left for the next row.
     pub(crate) fn publish_diagnosis(&mut self, now: Timestamp, is_new: bool, out: &mut Outputs) {
         self.note_faulty_channels();
         let diagnosis = &self.findings.diagnosis;
@@ -354,7 +357,7 @@ impl Stages {
         }
     }
 
-    /// Takes the cells whose channel is faulty: their other alarms are suppressed.
+    /// Updates the list of cells with a faulty channel, whose other alarms are suppressed.
     pub(crate) fn note_faulty_channels(&mut self) {
         let faulty = self.findings.faulty_channels();
         if faulty != self.alarming.faulty_channels {

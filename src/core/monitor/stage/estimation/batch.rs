@@ -1,12 +1,12 @@
-//! Cells mostly report in turn: their samples wait until each cell has one, and are stepped together.
+//! Collects the samples of cells that report in turn, until every cell has one; they are then stepped together.
 //!
-//! An estimate does not depend on how long its sample waited: a step uses its own sample's time and charge, and no other
-//! cell.
+//! How long a sample waits does not affect its estimate: a step uses only its own sample's time and charge, and no
+//! other cell.
 
 use crate::quantity::CellIndex;
 use crate::sample::CellSample;
 
-/// Which cells have reported since the pack's values were last combined.
+/// Cells that have reported since the pack's values were last combined.
 #[derive(Debug)]
 pub(crate) struct CellBatch {
     /// Samples that wait for their step, in the order of arrival, at most one per cell.
@@ -20,7 +20,7 @@ impl CellBatch {
         Self { waiting: Vec::with_capacity(cells), has_reported: vec![false; cells], reported: 0 }
     }
 
-    /// Continues a stored batch.
+    /// Restores a stored batch.
     pub(crate) fn restore(has_reported: Vec<bool>, waiting: Vec<CellSample>) -> Self {
         let reported = has_reported.iter().filter(|&&reported| reported).count();
         Self { waiting, has_reported, reported }
@@ -36,7 +36,7 @@ impl CellBatch {
         self.has_reported.get(cell.index()) == Some(&false)
     }
 
-    /// Adds a sample that is [awaited](Self::awaits).
+    /// Adds a sample of a cell that has not reported in this batch.
     #[inline]
     pub(crate) fn add(&mut self, sample: CellSample) {
         debug_assert!(!self.has_reported[sample.cell.index()], "a second sample of {:?}", sample.cell);
@@ -50,7 +50,7 @@ impl CellBatch {
         self.reported == self.has_reported.len()
     }
 
-    /// Begins the next batch; the steps of the last are made.
+    /// Starts the next batch, after the samples of the last one have been stepped.
     pub(crate) fn begin(&mut self) {
         debug_assert!(self.waiting.is_empty(), "{} samples without their step", self.waiting.len());
         self.has_reported.fill(false);
