@@ -20,7 +20,7 @@ pub(crate) struct Clock {
     pub(crate) has_started: bool,
     /// Time of the latest input that had an effect.
     pub(crate) now: Timestamp,
-    /// Number of inputs with a time before that of an earlier input.
+    /// Number of inputs with a time before an earlier input's.
     pub(crate) time_backwards: u64,
     /// Time at which a tick next has an effect; `None` = not started.
     pub(crate) due: Option<Timestamp>,

@@ -51,7 +51,7 @@ pub struct MonitorConfig {
     pub label: Option<Label>,
     /// Whether the BMS bleeds fuller cells after a charge.
     pub is_balanced: bool,
-    /// Meaning of the balancing bits in `input`; `None` = there are no such bits.
+    /// Meaning of the balancing bits in `input`; `None` = no such bits.
     pub balancing: Option<BalancingConfig>,
     /// Estimator.
     pub estimator: EstimatorConfig,
@@ -193,7 +193,7 @@ impl MonitorConfig {
     }
 
     /// Unprotected input messages with the cycle time of their frames, s, if known. The cycle time of a multiplexed
-    /// message counts as unknown, because it may be that of each page.
+    /// message counts as unknown, because it may be each page's.
     pub(crate) fn unprotected(&self) -> impl Iterator<Item = (BusIndex, CanId, Option<f64>)> + '_ {
         let is_protected = |bus, id| self.guards.iter().any(|guard| (guard.bus, guard.id) == (bus, id));
         let cycle_s = |bus, id| self.cycle_times_s.iter().find(|of| (of.0, of.1) == (bus, id)).map(|of| of.2);

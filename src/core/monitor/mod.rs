@@ -235,10 +235,10 @@ impl Monitor {
                         stages.begin_bus_sleep(now, out);
                     }
                     stages.sampling.has_second_sender = intake.second_senders().next().is_some();
-                    stages.keep_house(now, intake.bus_fault(now, config.interfaces), silence, out);
+                    stages.run_housekeeping(now, intake.bus_fault(now, config.interfaces), silence, out);
                 }
                 if stages.sending.take_freshness_due(now) {
-                    let freshness = intake.gate_of_commands.announce(now);
+                    let freshness = intake.command_gate.announce(now);
                     stages.sending.send_freshness(now, config.commands.as_ref().map(|of| of.bus), freshness, out);
                 }
                 stages.send_due(now, out);
@@ -274,7 +274,7 @@ impl Monitor {
         let commands = self.config.commands.as_ref()?;
         let secoc = commands.plan.authentication()?;
         let is_command = commands.bus == bus && commands.plan.id() == frame.id();
-        is_command.then(|| self.intake.gate_of_commands.mac_check(secoc, frame.data()))
+        is_command.then(|| self.intake.command_gate.mac_check(secoc, frame.data()))
     }
 
     /// The model fit that has just started; returned once. A fit takes longer than a tick may. A live driver runs it
@@ -308,7 +308,7 @@ impl Monitor {
         self.clock.due = self.clock.has_started.then(|| self.stages.sending.next_due());
     }
 
-    /// Starts at the time of the first input, from the pending stored state if there is one.
+    /// Starts at the time of the first input, from the pending stored state, if any.
     fn start(&mut self, time: Timestamp, out: &mut Outputs) {
         (self.clock.has_started, self.clock.now) = (true, time);
         self.stages.sending.restart(time);
@@ -332,7 +332,7 @@ impl Monitor {
             }
             stages.estimation.bank.change_all(|config, estimator| estimator.note_downtime(config, away_s));
         }
-        self.intake.gate_of_commands.begin(time);
+        self.intake.command_gate.begin(time);
         if beginning == Beginning::New {
             stages.sending.begin_freshness(time);
         } else {
@@ -351,7 +351,7 @@ impl Monitor {
 
     /// Starts the freshness of commands and sent frames above the values of any earlier run.
     fn begin_freshness(&mut self, now: Timestamp) {
-        self.intake.gate_of_commands.begin(now);
+        self.intake.command_gate.begin(now);
         self.stages.sending.begin_freshness(now);
     }
 

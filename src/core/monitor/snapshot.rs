@@ -21,7 +21,7 @@ use crate::monitor::stages::pack_memory::{PackMemory, StoredCell};
 use crate::quantity::{InvalidState, Timestamp, bounds};
 use crate::sample::{CellSample, SampleConfig};
 
-/// Message for a charge that no current can have moved.
+/// Name of the checked charge in an error.
 const CHARGE: &str = "the charge since a cell's latest voltage or half-cycle";
 /// Tolerance for current limits that were wider when the charge was counted, and for a clock that was set.
 const CHARGE_TOLERANCE: f64 = 2.0;
@@ -202,7 +202,7 @@ impl Snapshot {
         // A cell's latest voltage includes the current that was held until then.
         let charge_as = self.sampling.sampler.charge_as(self.time, limits.max_age_s) / strings;
         let check = |time: Timestamp, before_as: f64| {
-            // Adds the time for which a current may have been held before the next reading replaced it.
+            // A current may have been held this long before the next reading replaced it.
             let passed_s = self.time.since(time).abs() + limits.max_age_s + CHARGE_TOLERANCE_S;
             let moved_as = charge_as - before_as;
             let is_possible = moved_as.abs() <= CHARGE_TOLERANCE * most_a * passed_s;

@@ -384,7 +384,13 @@ impl Stages {
     }
 
     /// Checks the ages of the inputs, the mode's minimum duration, and the alarms.
-    pub(crate) fn keep_house(&mut self, now: Timestamp, bus_fault: Observation, silence: Silence, out: &mut Outputs) {
+    pub(crate) fn run_housekeeping(
+        &mut self,
+        now: Timestamp,
+        bus_fault: Observation,
+        silence: Silence,
+        out: &mut Outputs,
+    ) {
         let is_judged = silence == Silence::None;
         if is_judged {
             self.sampling.poll(now, out);

@@ -30,7 +30,7 @@ impl Monitor {
         self.clock.now
     }
 
-    /// Number of inputs with a time before that of an earlier input.
+    /// Number of inputs with a time before an earlier input's.
     pub fn time_backwards(&self) -> u64 {
         self.clock.time_backwards
     }
@@ -49,7 +49,7 @@ impl Monitor {
     /// authenticated.
     pub fn authenticated_commands(&self) -> Option<(BusIndex, CanId, CommandCounts)> {
         let commands = self.config.commands.as_ref().filter(|commands| commands.plan.authentication().is_some())?;
-        Some((commands.bus, commands.plan.id(), self.intake.gate_of_commands.counts))
+        Some((commands.bus, commands.plan.id(), self.intake.command_gate.counts))
     }
 
     /// Input messages with frames dropped because they exceeded the rate limit.

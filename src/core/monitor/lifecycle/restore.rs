@@ -73,8 +73,8 @@ impl Monitor {
         if !fits {
             let (found, branches) = (snapshot.cells.len(), bank.own_model().branches.len());
             return Err(RestoreError::Unfit(format!(
-                "snapshot is of {found} cells, another number of branches, or samples of no cell, the configuration has \
-                 {cells} cells of {branches} branches"
+                "snapshot does not fit: {found} cells (must be {cells}), another number of branches (must be {branches}), or \
+                 samples of unknown cells"
             )));
         }
         snapshot.check()?;
@@ -84,7 +84,7 @@ impl Monitor {
         Ok(())
     }
 
-    /// Continues from the pending snapshot, if there is one, and sets the clock to the time of the snapshot. The
+    /// Continues from the pending snapshot, if any, and sets the clock to the time of the snapshot. The
     /// caller handles the downtime.
     pub(crate) fn apply_pending(&mut self, now: Timestamp, out: &mut Outputs) -> Beginning {
         let Some(PendingRestore { mut snapshot, downtime }) = self.pending.take() else { return Beginning::New };

@@ -347,7 +347,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_event_is_stored_under_its_name() {
+    fn event_is_stored_under_its_name() {
         let kinds = [
             EventKind::J1939 { what: NodeEvent::Claimed { address: 128 } },
             EventKind::FilterReset { cell: CellIndex(0) },

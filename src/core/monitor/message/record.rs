@@ -37,7 +37,7 @@ pub enum RecordKind {
         bus: BusIndex,
         /// The frame.
         frame: Frame,
-        /// The freshness value for which the authenticator is right; `None` = no value fits.
+        /// The freshness value that the authenticator confirms; `None` = no value fits.
         freshness: Option<u64>,
     },
     /// Time passed. The driver ticks every [`TICK_PERIOD_MS`] while awake; cyclic frames and time-outs depend on

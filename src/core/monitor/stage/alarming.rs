@@ -1,4 +1,4 @@
-//! Alarming stage: the alarm engine, and what it needs to know of the rules and of the files.
+//! Alarming stage: the alarm engine, with its knowledge of rules and files.
 //!
 //! In: values of the rules, from the [`Publisher`](super::publisher::Publisher) and the periodic
 //! [`watch`](crate::monitor::stages::watch). Out: raised alarms and their changes.
@@ -9,47 +9,47 @@ use crate::alarm::{AlarmChange, AlarmEngine, AlarmSnapshot, Observation, Rule, R
 use crate::monitor::config::MonitorConfig;
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Values that change no alarm are shown this often, s.
+/// Period for refreshing displayed values that change no alarm, s.
 const SHOW_S: f64 = 1.0;
 
 /// The alarming stage.
 #[derive(Debug)]
 pub(crate) struct Alarming {
     pub(crate) engine: AlarmEngine,
-    /// Silence that the strictest threshold calls missing, s; `None` = no rule does.
+    /// Silence after which the strictest threshold reports an input as missing, s; `None` without such a rule.
     pub(crate) missing_after_s: Option<f64>,
     /// Changes that wait to be published.
     pub(crate) changes: Vec<AlarmChange>,
-    /// Cells whose voltage channel is faulty: nothing is known of them. Follows from the diagnosis.
+    /// Cells whose voltage channel is faulty, so that nothing is known of them. Derived from the cell-fault detector.
     pub(crate) faulty_channels: Vec<CellIndex>,
     pub(crate) state: AlarmingState,
 }
 
-/// What is known of the values that the rules have seen.
+/// State of the comparison of values with the rules.
 #[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct AlarmingState {
-    /// When values of inputs, and innovations, that change no alarm were last shown.
+    /// Time of the last refresh of displayed inputs, and of innovations, that change no alarm.
     pub(crate) inputs_shown_at: Option<Timestamp>,
     pub(crate) innovations_shown_at: Option<Timestamp>,
-    /// The engine knows that every learned value has valid inputs.
+    /// Whether the engine knows that every learned value has valid inputs.
     pub(crate) knows_all_valid: bool,
     pub(crate) store: StoreHealth,
 }
 
-/// What continues of the stage.
+/// Stored state of the stage.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct StoredAlarming {
-    /// Alarms that were raised or are about to be.
+    /// Alarms that are raised or pending.
     pub(crate) alarms: AlarmSnapshot,
-    /// Every alarm, also those at rest, with the latest value; empty in a state for a restart.
+    /// Every alarm with its latest value, including inactive ones; empty in a state for a restart.
     running: Vec<RunningAlarm>,
     state: AlarmingState,
 }
 
 impl StoredAlarming {
-    /// What a program that is started again knows: every value is compared again.
+    /// Drops the latest values, so that every value is compared again.
     pub(crate) fn restart(&mut self) {
         self.running.clear();
         self.state = AlarmingState::default();
@@ -72,18 +72,18 @@ impl Alarming {
         rule.depends_on_cell_voltage() && cell.is_some_and(|cell| self.faulty_channels.contains(&cell))
     }
 
-    /// What continues.
+    /// The state to be stored.
     pub(crate) fn snapshot(&self) -> StoredAlarming {
         StoredAlarming { alarms: self.engine.snapshot(), running: self.engine.running(), state: self.state }
     }
 
-    /// Continues with the latest value of every alarm; those that were raised are restored before.
+    /// Resumes with the latest value of every alarm; raised alarms have already been restored.
     pub(crate) fn resume(&mut self, stored: &StoredAlarming) {
         self.engine.resume(&stored.running);
         self.state = stored.state;
     }
 
-    /// Other rules; returns how many alarms, raised or past, ended by it.
+    /// Applies other rules. Returns the number of raised or past alarms that ended.
     pub(crate) fn reconfigure(&mut self, now: Timestamp, config: &MonitorConfig) -> usize {
         self.missing_after_s = missing_after_s(&config.rules);
         self.state.knows_all_valid = false;
@@ -96,7 +96,7 @@ fn missing_after_s(rules: &[RuleConfig]) -> Option<f64> {
     rules.map(|rule| rule.threshold).min_by(f64::total_cmp)
 }
 
-/// Whether values that change no alarm are to be shown again, last shown at `shown_at`; if so, that becomes `now`.
+/// Whether displayed values were last refreshed long enough ago; if so, sets `shown_at` to `now`.
 pub(crate) fn take_show_due(shown_at: &mut Option<Timestamp>, now: Timestamp) -> bool {
     let is_due = shown_at.is_none_or(|shown_at| now.since(shown_at).abs() >= SHOW_S);
     if is_due {
@@ -105,7 +105,7 @@ pub(crate) fn take_show_due(shown_at: &mut Option<Timestamp>, now: Timestamp) ->
     is_due
 }
 
-/// Whether the files can be written; not known before the driver has reported.
+/// Whether the files can be written; unknown before the driver's first report.
 #[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]
 pub(crate) struct StoreHealth {
     is_known: bool,
@@ -113,7 +113,7 @@ pub(crate) struct StoreHealth {
 }
 
 impl StoreHealth {
-    /// Takes the driver's report; whether it is a change.
+    /// Handles the driver's report. Returns whether it is a change.
     pub(crate) fn handle_report(&mut self, now: Timestamp, works: bool) -> bool {
         let was_failing = self.failing_since.is_some();
         let is_change = !self.is_known || was_failing == works;
@@ -122,7 +122,7 @@ impl StoreHealth {
         is_change
     }
 
-    /// The value of the rule about files: for how long they cannot be written, s; 0 while they can.
+    /// Value of the rule about files: how long they could not be written, s; 0 while they can.
     pub(crate) fn failing(&self, now: Timestamp) -> Observation {
         let failing_s = self.failing_since.map_or(0.0, |since| now.since(since).max(0.0));
         Observation::new(self.is_known.then_some(failing_s))

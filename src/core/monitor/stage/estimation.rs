@@ -1,8 +1,8 @@
-//! Estimation stage: from cell samples to the estimate of every cell.
+//! Estimation stage: computes the estimate of every cell from cell samples.
 //!
-//! In: batches of samples, and what half-cycles have taught ([`Learner`]). Out: one filter step per sample, and whether
-//! each cell's innovations agree with their covariance and its model is its own ([`ModelCheck`]). A sample whose filter fails
-//! resets that filter, no other.
+//! In: batches of samples, and the learned values of half-cycles ([`Learner`]). Out: one filter step per sample;
+//! whether each cell's innovations agree with their covariance; whether its model fits the cell ([`ModelCheck`]). If a
+//! filter fails at a sample, only that filter is reset.
 
 use serde::{Deserialize, Serialize};
 
@@ -22,14 +22,15 @@ use crate::monitor::message::{Estimate, MeasuredValues};
 use crate::quantity::{CellIndex, Timestamp};
 use crate::sample::CellSample;
 
-/// Contradiction score of an estimate that is known to be wrong (multiples of the consistency limit); it trips an alarm at the limit.
+/// Contradiction score of an estimate that is known to be wrong (multiples of the consistency limit); it trips an
+/// alarm at the limit.
 const DOUBT: f64 = 2.0;
 
 /// The estimation stage.
 #[derive(Debug)]
 pub(crate) struct Estimation {
     pub(crate) bank: PackBank,
-    /// Cells of other kinds.
+    /// Modules with cells of another kind.
     modules: Vec<CellModule>,
     pub(crate) batch: CellBatch,
     /// One per cell.
@@ -41,24 +42,25 @@ pub(crate) struct Estimation {
     checks: Vec<ModelCheck>,
     any_check_open: bool,
     pub(crate) any_mismatched: bool,
-    /// The current is contradicted by the voltages.
+    /// Whether the voltages contradict the current.
     pub(crate) is_current_doubtful: bool,
     ambient_c: f64,
-    /// Cells for which the next half-cycle may have begun in the gap before their latest sample.
+    /// Cells whose next half-cycle may have started in the gap before their latest sample.
     after_gap: Vec<usize>,
 }
 
-/// What continues of the stage besides its cells.
+/// Stored state of the stage, without the cells.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct EstimationState {
-    /// Samples without their step.
+    /// Samples that have not been stepped.
     pub(crate) waiting: Vec<CellSample>,
-    /// The current is contradicted by the voltages.
+    /// Whether the voltages contradict the current.
     pub(crate) is_current_doubtful: bool,
 }
 
-/// How far a cell's samples have been used. Kept separate for cache locality: every sample updates it.
+/// How far a cell's samples have been used. Kept apart from the filters for cache locality, because every sample
+/// updates it.
 #[derive(Debug, Clone, Copy, Default)]
 struct CellProgress {
     /// Sampler totals at the last step; `None` before the first.
@@ -96,7 +98,7 @@ impl Estimation {
         }
     }
 
-    /// Other settings for the same cells.
+    /// Applies other settings to the same cells.
     pub(crate) fn reconfigure(&mut self, config: &MonitorConfig, modelling: &Modelling, learner: &Learner) {
         self.modules.clone_from(&config.modules);
         self.use_model(modelling, learner);
@@ -106,7 +108,7 @@ impl Estimation {
         self.ambient_c = config.sample.ambient_c;
     }
 
-    /// The model in force for the same cells.
+    /// Applies the current model to the same cells.
     pub(crate) fn use_model(&mut self, modelling: &Modelling, learner: &Learner) {
         let (model, estimator) = modelling.in_force();
         self.reconfigure_bank(&model, &estimator, learner);
@@ -126,7 +128,7 @@ impl Estimation {
         self.bank.reconfigure(model, &learned(estimator), &modules);
     }
 
-    /// Forgets all cells: another pack is connected.
+    /// Forgets all cells, because another pack is connected.
     pub(crate) fn forget(&mut self, modelling: &Modelling) {
         let (cells, (model, estimator)) = (self.cells(), modelling.in_force());
         self.bank = PackBank::new(&model, &estimator, cells, &self.modules);
@@ -141,7 +143,7 @@ impl Estimation {
         self.note_checks();
     }
 
-    /// Temperature where none is measured, degrees C.
+    /// Temperature used if none is measured, degrees C.
     pub(crate) fn ambient_c(&self) -> f64 {
         self.ambient_c
     }
@@ -151,12 +153,12 @@ impl Estimation {
         self.progress.len()
     }
 
-    /// Every cell.
+    /// Indexes of all cells.
     pub(crate) fn cell_indices(&self) -> impl ExactSizeIterator<Item = CellIndex> + use<> {
         (0..u16::try_from(self.cells()).unwrap_or(u16::MAX)).map(CellIndex)
     }
 
-    /// Steps the filters of all waiting samples; returns these, for [`finish`](Self::finish).
+    /// Steps the filters of all waiting samples. Returns the samples for [`finish`](Self::finish).
     pub(crate) fn step(&mut self, learner: &mut Learner, modelling: &mut Modelling) -> Vec<CellSample> {
         let samples = std::mem::take(&mut self.batch.waiting);
         for sample in &samples {
@@ -174,7 +176,7 @@ impl Estimation {
         samples
     }
 
-    /// Mean SOC of the cells whose model is learned, fraction; without any, half.
+    /// Mean SOC of the cells whose model is learned, fraction; 0.5 without an estimate.
     fn mean_soc(&self) -> f64 {
         let own = self.bank.own_cells().iter();
         let socs = own.filter_map(|&cell| self.bank.filtered_soc(cell)).map(|soc| soc.mean);
@@ -182,7 +184,7 @@ impl Estimation {
         if count > 0.0 { sum / count } else { 0.5 }
     }
 
-    /// Continues with another model. The cells keep their differences from the mean cell.
+    /// Adopts another model. The cells keep their differences from the mean cell.
     pub(crate) fn adopt(&mut self, adoption: &Adoption, learner: &mut Learner, config: &CapacityConfig) {
         let Adoption { model, config: estimator, mean, with_capacity, is_learned } = adoption;
         let (own, bank) = (self.bank.own_cells().to_vec(), &self.bank);
@@ -212,7 +214,7 @@ impl Estimation {
         self.note_checks();
     }
 
-    /// Ends the work on stepped samples.
+    /// Completes the work on stepped samples.
     pub(crate) fn finish(&mut self, mut samples: Vec<CellSample>, learner: &mut Learner) {
         samples.clear();
         self.batch.waiting = samples;
@@ -220,14 +222,14 @@ impl Estimation {
         self.after_gap.drain(..).for_each(|cell| learner.move_mark(cell, bank.filtered_soc(cell)));
     }
 
-    /// The filter step from the sample before to this one.
+    /// The filter step from the previous sample to this one.
     fn next_step(&mut self, sample: &CellSample, learner: &mut Learner) -> CellStep {
         let index = sample.cell.index();
         let (charge, unmeasured) = (sample.charge_as, sample.unmeasured_s);
         let now =
             Consumed { time: sample.time, charge_as: charge, offset_s: sample.offset_s, unmeasured_s: unmeasured };
         let (mut measured_s, mut charge_as, mut offset_s, mut unmeasured_s) = (0.0, 0.0, 0.0, 0.0);
-        // Before the first reading, and after a gap of unknown length, nothing was measured for ever.
+        // Before the first reading, and after a gap of unknown length, the unmeasured time is infinite.
         let mut gap_s = f64::INFINITY;
         if let Some(before) = self.progress[index].consumed.replace(now) {
             charge_as = charge - before.charge_as;
@@ -242,7 +244,7 @@ impl Estimation {
         if learner.observe(index, sample.time, sample.temperature_c, measured_s, gap_s) {
             self.after_gap.push(index);
         }
-        // The part of the current that is the sensor's, not the cell's; a reading of exactly zero has none.
+        // Corrects the current for the sensor's offset; a reading of exactly zero has no offset.
         let offset_a = learner.current_offset().mean_a();
         let corrected = |current_a: f64| if current_a == 0.0 { 0.0 } else { current_a - offset_a };
         CellStep {
@@ -257,7 +259,7 @@ impl Estimation {
         }
     }
 
-    /// Records the sample of a cell's latest step; whether that step reset its filter.
+    /// Records the sample of a cell's latest step. Returns whether that step reset its filter.
     #[inline]
     pub(crate) fn record(&mut self, sample: &CellSample) -> bool {
         self.progress[sample.cell.index()].sample = Some(*sample);
@@ -269,7 +271,7 @@ impl Estimation {
         self.trusted[index]
     }
 
-    /// Takes the evidence about the cells' models that is due.
+    /// Judges the models of the cells whose evidence is due.
     fn check_models(&mut self, samples: &[CellSample]) {
         if !self.any_check_open {
             return;
@@ -300,20 +302,20 @@ impl Estimation {
         self.any_mismatched = self.checks.iter().any(ModelCheck::is_mismatched);
     }
 
-    /// Whether a stored cell with this check was another one than that of its module.
+    /// Whether a cell with this stored check differs from the current cell of its module.
     pub(crate) fn is_other_cell(&self, index: usize, check: &ModelCheck) -> bool {
         let id = || model_id(self.bank.model(index), self.bank.config(index).initial.log_resistance_std);
         !self.bank.is_own(index) && check.is_of_other(id())
     }
 
-    /// The check of a cell's model, for the snapshot.
+    /// The check of a cell's model, to be stored.
     pub(crate) fn model_check(&self, index: usize) -> ModelCheck {
         self.checks[index]
     }
 
-    /// How much a cell contradicts its estimate: the mean normalised innovation squared, or, in the same scale (times the
-    /// consistency limit), the mismatch of a model that is another cell's, or [`DOUBT`]: an estimate that no cell can have, or
-    /// a current that is not the cell's.
+    /// How much a cell contradicts its estimate: the mean normalised innovation squared. If the model does not fit the
+    /// cell, at least the mismatch times the consistency limit. If the estimate is impossible or the current doubtful,
+    /// at least [`DOUBT`] times the limit.
     pub(crate) fn contradiction(&self, index: usize) -> f64 {
         let (mean_nis, check) = (self.bank.mean_nis(index), &self.checks[index]);
         let limit = self.bank.own_config().consistency.limit;
@@ -322,7 +324,7 @@ impl Estimation {
         if mismatch.max(doubt) > 0.0 { mean_nis.max(mismatch.max(doubt) * limit) } else { mean_nis }
     }
 
-    /// Judges a cell's innovations; whether it is trusted, when that has changed.
+    /// Judges a cell's innovations. Returns the new trust if it has changed.
     pub(crate) fn judge_trust(&mut self, cell: CellIndex) -> Option<bool> {
         let is_trusted = self.contradiction(cell.index()) <= self.bank.own_config().consistency.limit;
         if is_trusted == self.trusted[cell.index()] {
@@ -333,7 +335,7 @@ impl Estimation {
         Some(is_trusted)
     }
 
-    /// A gap of unknown length: no charge counts over it.
+    /// Handles a gap of unknown length: charge is not counted across it.
     pub(crate) fn handle_unknown_gap(&mut self) {
         self.bank.change_all(|_, cell| cell.handle_unknown_gap());
         self.progress.iter_mut().for_each(|cell| cell.consumed = None);
@@ -371,18 +373,17 @@ impl Estimation {
         resistance(&self.bank, index)
     }
 
-    /// Totals that a cell's steps have used, for the snapshot.
+    /// Sampler totals that a cell's steps have used, to be stored.
     pub(crate) fn consumed(&self, cell: usize) -> Option<Consumed> {
         self.progress[cell].consumed
     }
 
-    /// What continues besides the cells.
+    /// The state to be stored, without the cells.
     pub(crate) fn snapshot(&self) -> EstimationState {
         EstimationState { waiting: self.batch.waiting.clone(), is_current_doubtful: self.is_current_doubtful }
     }
 
-    /// Continues from stored cells: what their steps have used, whether they are trusted, the checks of their models, and the
-    /// batch.
+    /// Restores stored cells (used totals, trust, model checks) and the batch.
     pub(crate) fn restore(
         &mut self,
         cells: impl Iterator<Item = (Option<Consumed>, bool, ModelCheck)>,
@@ -402,14 +403,14 @@ impl Estimation {
     }
 }
 
-/// Difference of each value from the mean of those that are known; 0 where it is not.
+/// Difference of each value from the mean of the known values; 0 for an unknown value.
 fn differences(values: impl Iterator<Item = Option<f64>> + Clone) -> Vec<f64> {
     let known = values.clone().flatten();
     let mean = known.clone().sum::<f64>() / known.count().max(1) as f64;
     values.map(|value| value.map_or(0.0, |value| value - mean)).collect()
 }
 
-/// Per cell, what identifies its model and the spread expected of its resistance.
+/// Per cell, an identifier of its model and of the expected spread of its resistance.
 fn ids_of_models(bank: &PackBank) -> Vec<u64> {
     let of_kinds: Vec<u64> =
         bank.kinds().map(|(model, config)| model_id(model, config.initial.log_resistance_std)).collect();

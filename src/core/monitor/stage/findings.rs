@@ -1,8 +1,8 @@
-//! Findings stage: from cell samples to findings about single cells.
+//! Findings stage: detects faults of single cells from cell samples.
 //!
-//! In: the samples of all cells with their estimates. Out: an event for each finding that is new ([`EventKind::Finding`]).
-//! It only watches: no estimate and no capacity depends on it. What it finds goes to the rules about single cells when a row of
-//! the diagnosis ends.
+//! In: the samples of all cells with their estimates. Out: an event for each new finding ([`EventKind::Finding`]). The
+//! stage only observes: no estimate and no capacity depends on it. Its results are passed to the rules about single
+//! cells when a row of the detector ends.
 
 use super::estimation::Estimation;
 use super::learning::Learning;
@@ -22,14 +22,14 @@ pub(crate) struct Findings {
     cells: usize,
     /// The cells that are compared: those in no module of another kind.
     compared: Vec<usize>,
-    /// The BMS lets fuller cells lose charge.
+    /// Whether the BMS bleeds fuller cells after a charge.
     is_balanced: bool,
-    /// Where bits show which cells are bled.
+    /// Meaning of the balancing bits, if there are any.
     balancing: Option<BalancingConfig>,
 }
 
 impl Findings {
-    /// `compared`: the cells of the pack's own kind.
+    /// Creates the stage. `compared`: the cells of the pack's own kind.
     pub(crate) fn new(config: &MonitorConfig, compared: &[usize]) -> Self {
         let cells = usize::from(config.sample.cells);
         let (is_balanced, balancing) = (config.is_balanced, config.balancing);
@@ -37,22 +37,22 @@ impl Findings {
         Self { diagnosis: CellFaultDetector::among(cells, &compared), cells, compared, is_balanced, balancing }
     }
 
-    /// Other settings for the same cells.
+    /// Applies other settings to the same cells.
     pub(crate) fn reconfigure(&mut self, config: &MonitorConfig) {
         (self.is_balanced, self.balancing) = (config.is_balanced, config.balancing);
     }
 
-    /// Forgets everything: another pack is connected.
+    /// Forgets everything, because another pack is connected.
     pub(crate) fn forget(&mut self) {
         self.diagnosis = CellFaultDetector::among(self.cells, &self.compared);
     }
 
-    /// The state, to be stored; `None` = the pack is too small for a comparison.
+    /// The state to be stored; `None` if the pack is too small for a comparison.
     pub(crate) fn stored(&self) -> Option<CellFaultDetector> {
         self.diagnosis.is_active().then(|| self.diagnosis.clone())
     }
 
-    /// Continues from a checked state. `away`: from when to when the daemon did not run; `None` = it continues without a break.
+    /// Restores a checked state. `away`: time in which the daemon did not run; `None` = no break.
     pub(crate) fn restore(&mut self, stored: Option<CellFaultDetector>, away: Option<(Timestamp, Timestamp)>) {
         let Some(stored) = stored.filter(|_| self.diagnosis.is_active()) else { return };
         self.diagnosis = stored;
@@ -69,7 +69,7 @@ impl Findings {
         (0..).map(CellIndex).take(self.cells).filter(is_faulty).collect()
     }
 
-    /// Takes a bit that shows whether a cell is bled.
+    /// Handles a balancing bit of a cell.
     pub(crate) fn handle_balancing(&mut self, now: Timestamp, cell: CellIndex, reading: Result<f64, Fault>) {
         if let Some(balancing) = &self.balancing {
             let is_bled = reading.ok().map(|value| value != 0.0);
@@ -77,7 +77,8 @@ impl Findings {
         }
     }
 
-    /// Takes whether the reading of the current is frozen. No row ends without a current: the finding does not wait for one.
+    /// Handles whether the reading of the current is frozen. Reported immediately, because no row ends without a
+    /// current.
     pub(crate) fn watch_current(&mut self, now: Timestamp, is_frozen: bool, out: &mut Outputs) {
         let is_found = || self.diagnosis.findings().iter().any(|found| found.kind == CellFaultKind::CurrentFrozen);
         if self.diagnosis.is_active() && is_frozen != is_found() {
@@ -88,7 +89,7 @@ impl Findings {
         }
     }
 
-    /// Takes samples that have made their step; whether a row ended.
+    /// Handles samples that have been stepped. Returns whether a row ended.
     #[inline]
     pub(crate) fn observe(
         &mut self,
@@ -137,7 +138,7 @@ impl Findings {
     }
 }
 
-/// How probable it is that the current's sensor is off, and by how much, by the learned offset; part of the rated capacity per hour.
+/// Probability that the current sensor is off, and its learned offset as a fraction of the rated capacity per hour.
 fn current_offset(learning: &Learning, rated_ah: f64) -> (f64, ScalarGaussian) {
     let offset = learning.state.learner.current_offset().learned(learning.config.capacity.current_offset_std_a);
     let offset = offset.unwrap_or(ScalarGaussian { mean: 0.0, variance: 1.0 });

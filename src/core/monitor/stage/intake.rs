@@ -1,8 +1,8 @@
-//! Intake stage: from frames to judged readings and commands.
+//! Intake stage: turns frames into judged readings and commands.
 //!
-//! In: frames with their time, events of the interfaces. Out: the readings of an admitted frame, or its command; counts,
-//! and events on change. A frame that fails its end-to-end check keeps its place in the stream: its readings are bad,
-//! not missing. Frames beyond the flood limit are dropped and counted.
+//! In: frames with their time, events of the interfaces. Out: the readings or the command of an admitted frame,
+//! counts, and events on change. If a frame fails its end-to-end check, its readings are bad, not missing. Frames
+//! beyond the flood limit are dropped and counted.
 
 use serde::{Deserialize, Serialize};
 
@@ -26,7 +26,7 @@ use crate::monitor::message::{BusEvent, Command, Event, EventKind, Outputs};
 use crate::quantity::{BusIndex, Fault, Timestamp};
 use crate::sample::Moment;
 
-/// Rejected command frames are reported at most this often, s.
+/// Shortest time between two reports of rejected command frames, s.
 const BAD_COMMAND_S: f64 = 1.0;
 
 /// The intake stage.
@@ -37,28 +37,28 @@ pub(crate) struct Intake {
     pub(crate) senders: SecondSenders,
     pub(crate) own: OwnFrames,
     buses: Buses,
-    /// Authenticated commands.
-    pub(crate) gate_of_commands: CommandGate,
-    /// Controllers in the listener's order.
+    /// Gate of authenticated commands.
+    pub(crate) command_gate: CommandGate,
+    /// Controllers, in the listener's order.
     pub(crate) controllers: Vec<Controller>,
     /// Diagnostic answers.
     pub(crate) listener: Listener,
-    /// When the answer under way of each controller began.
+    /// Start of the answer that each controller is sending.
     pub(crate) moments: Vec<Option<Moment>>,
-    /// When a rejected command frame was last reported.
+    /// Time of the last report of a rejected command frame.
     pub(crate) bad_command_at: Option<Timestamp>,
 }
 
-/// A frame as it came.
+/// A received frame.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ReceivedFrame<'a> {
     pub(crate) bus: BusIndex,
     pub(crate) frame: &'a Frame,
-    /// The freshness with which its authenticator is right; `None` = with none, or not checked.
+    /// The freshness that its authenticator confirms; `None` = no value fits, or it was not checked.
     pub(crate) freshness: Option<u64>,
 }
 
-/// Result of an admitted frame's end-to-end check; `None` = its message is not protected.
+/// Result of an admitted frame's end-to-end check; `None` if its message is not protected.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Admission(Option<Status>);
 
@@ -70,7 +70,7 @@ impl Admission {
     }
 }
 
-/// What continues of the stage: counts, the freshness of commands, faults of interfaces.
+/// Stored state of the stage: counts, freshness of commands, faults of interfaces.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct IntakeState {
@@ -80,18 +80,18 @@ pub(crate) struct IntakeState {
     pub(crate) commands: CommandGate,
     senders: Vec<MessageRate>,
     pub(crate) buses: Buses,
-    /// `None` in a state for a restart: frames are missed.
+    /// `None` in a state for a restart, because frames are missed.
     progress: Option<Box<IntakeProgress>>,
 }
 
 impl IntakeState {
-    /// What a program that is started again knows: partially received answers are gone, their rest will never arrive.
+    /// Drops partially received answers, whose remaining frames will never arrive.
     pub(crate) fn restart(&mut self) {
         self.progress = None;
     }
 }
 
-/// What holds only while frames are received without a break.
+/// State that is valid only while frames are received without a break.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct IntakeProgress {
@@ -103,13 +103,13 @@ pub(crate) struct IntakeProgress {
     own: OwnFramesState,
 }
 
-/// What came from a controller that answers diagnostic requests.
+/// Counts of a controller that answers diagnostic requests.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ControllerCount {
     /// The controller.
     #[serde(flatten)]
     pub controller: Controller,
-    /// What came from it.
+    /// Counts of its answers.
     #[serde(flatten)]
     pub counts: ControllerCounts,
 }
@@ -125,7 +125,7 @@ impl Intake {
             senders: SecondSenders::new(config.unprotected()),
             own: OwnFrames::new(config.own_ids()),
             buses: Buses::default(),
-            gate_of_commands: CommandGate::default(),
+            command_gate: CommandGate::default(),
             moments: vec![None; listener.counts().count()],
             controllers: listener.counts().map(|(controller, _)| controller).collect(),
             listener,
@@ -133,7 +133,7 @@ impl Intake {
         }
     }
 
-    /// Other limits and checks for the same messages: counts, and floods under way, stay.
+    /// Applies other limits and checks to the same messages; counts and current floods are kept.
     pub(crate) fn reconfigure(&mut self, config: &MonitorConfig) {
         let new = Self::new(config);
         self.gate = new.gate.inheriting(&self.gate);
@@ -145,7 +145,7 @@ impl Intake {
         // Diagnostic definitions cannot change here, so partially received messages stay.
     }
 
-    /// Judges a frame: `None` = it is dropped; otherwise the result of its end-to-end check.
+    /// Judges a frame. Returns `None` if it is dropped, otherwise the result of its end-to-end check.
     #[inline]
     pub(crate) fn admit(
         &mut self,
@@ -163,10 +163,10 @@ impl Intake {
         admitted.then_some(Admission(status))
     }
 
-    /// The command of a frame, and its fields as far as they could be read. A rejected one is reported at most once a second.
+    /// The command of a frame, and the fields that could be decoded. A rejection is reported at most once a second.
     ///
     /// # Errors
-    /// Why it is not executed.
+    /// The reason why the command is not executed.
     pub(crate) fn command(
         &mut self,
         now: Timestamp,
@@ -177,7 +177,7 @@ impl Intake {
     ) -> (Option<CommandFields>, Result<Command, CommandRefusal>) {
         let frame = received.frame;
         let refusal = match config.plan.authentication() {
-            Some(secoc) => self.gate_of_commands.judge(now, secoc, frame.data(), received.freshness).err(),
+            Some(secoc) => self.command_gate.judge(now, secoc, frame.data(), received.freshness).err(),
             None => admission.0.and_then(CommandRefusal::of),
         };
         let is_intact = refusal.is_none_or(CommandRefusal::is_intact);
@@ -199,13 +199,13 @@ impl Intake {
         self.guards.next_counter(config.bus, config.plan.id())
     }
 
-    /// Takes an event of an interface.
+    /// Handles an event of an interface.
     pub(crate) fn handle_bus_event(&mut self, now: Timestamp, bus: BusIndex, event: BusEvent, out: &mut Outputs) {
         self.buses.handle_event(now, bus, event);
         out.events.push(Event { time: now, kind: EventKind::Bus { bus, what: event } });
     }
 
-    /// The value of the rule about interfaces: for how long the worst of them has been out of order, s.
+    /// Value of the rule about interfaces: how long the worst interface has been out of order, s.
     pub(crate) fn bus_fault(&self, now: Timestamp, interfaces: usize) -> Observation {
         let (fault_s, is_whole) = self.buses.worst_s(now, interfaces);
         let foreign_s = Some(self.own.longest_s(now)).filter(|seconds| *seconds > 0.0);
@@ -213,7 +213,7 @@ impl Intake {
         Observation::new(longest_s).of_part(!is_whole)
     }
 
-    /// Finds periods without a frame, and floods that are over.
+    /// Detects periods without a frame, and the end of floods.
     pub(crate) fn poll(&mut self, now: Timestamp, out: &mut Outputs) {
         self.guards.poll(now);
         self.gate.poll(now);
@@ -223,19 +223,19 @@ impl Intake {
         self.report(now, out);
     }
 
-    /// Begins again after time asleep or a step of the clock.
+    /// Restarts the checks after being asleep or after a step of the clock.
     pub(crate) fn restart(&mut self, now: Timestamp, out: &mut Outputs) {
         self.guards.restart();
         self.gate.restart();
         self.senders.restart();
         self.own.restart();
         self.listener.restart();
-        self.gate_of_commands.restart(now);
+        self.command_gate.restart(now);
         self.moments.fill(None);
         self.report(now, out);
     }
 
-    /// Per protected message: the count of each status.
+    /// Per protected message, the count of each status.
     pub(crate) fn protected(&self) -> impl Iterator<Item = GuardCounts> + '_ {
         self.guards.counts()
     }
@@ -245,25 +245,25 @@ impl Intake {
         self.gate.counts()
     }
 
-    /// What came from each controller that answers diagnostic requests.
+    /// Counts per controller that answers diagnostic requests.
     pub(crate) fn controllers(&self) -> impl Iterator<Item = ControllerCount> + '_ {
         self.listener.counts().map(|(controller, counts)| ControllerCount { controller, counts })
     }
 
-    /// What continues.
+    /// The state to be stored.
     pub(crate) fn snapshot(&self) -> IntakeState {
         IntakeState {
             protected: self.guards.counts().collect(),
             dropped: self.gate.counts().collect(),
             controllers: self.controllers().collect(),
-            commands: self.gate_of_commands.clone(),
+            commands: self.command_gate.clone(),
             senders: self.senders.snapshot(),
             buses: self.buses.clone(),
             progress: Some(Box::new(self.progress())),
         }
     }
 
-    /// What holds only while frames are received without a break.
+    /// State that is valid only while frames are received without a break.
     fn progress(&self) -> IntakeProgress {
         IntakeProgress {
             protected: self.guards.progress(),
@@ -280,12 +280,12 @@ impl Intake {
         self.senders.doubtful()
     }
 
-    /// Interfaces on which another sender uses our identifiers, and the latest of these.
+    /// Interfaces on which another node uses our identifiers, with the latest such identifier.
     pub(crate) fn own_id_uses(&self) -> impl Iterator<Item = (BusIndex, CanId)> + '_ {
         self.own.uses()
     }
 
-    /// Continues without a break.
+    /// Resumes without a break.
     fn resume(&mut self, stored: &IntakeProgress) {
         self.guards.resume(&stored.protected);
         self.gate.resume(&stored.floods);
@@ -297,12 +297,12 @@ impl Intake {
         self.own.resume(&stored.own);
     }
 
-    /// Continues from a state.
+    /// Restores a stored state.
     pub(crate) fn restore(&mut self, state: IntakeState) {
         self.guards.restore(&state.protected);
         self.gate.restore(&state.dropped);
         self.listener.restore(state.controllers.iter().map(|of| (of.controller, of.counts)));
-        self.gate_of_commands = state.commands;
+        self.command_gate = state.commands;
         self.senders.restore(&state.senders);
         self.buses = state.buses;
         match state.progress {
@@ -334,7 +334,7 @@ impl Intake {
     }
 }
 
-/// A frame's command; `None` = it names a rule or severity that does not exist.
+/// The command of a frame; `None` if it names a rule or severity that does not exist.
 fn command_of(fields: &CommandFields) -> Option<Command> {
     let severity = |code: u8| Severity::ALL.into_iter().find(|severity| *severity as u8 == code);
     let which = Selector {

@@ -1,8 +1,8 @@
-//! Learning stage: from estimates and the pack current to half-cycles, and from these to health values.
+//! Learning stage: turns estimates and the pack current into half-cycles, and half-cycles into health values.
 //!
-//! In: the pack current, the cells' filters, their samples. Out: changes of mode; per half-cycle and cell the capacity,
-//! usable capacity, resistance and remaining life; per charge the recharge period; the pack's state. All of it goes to
-//! the [`Publisher`] as events and alarm values. A half-cycle that teaches nothing changes no value.
+//! In: the pack current, the cells' filters and samples. Out: changes of mode; per half-cycle and cell, capacity,
+//! usable capacity, resistance and remaining life; per charge, the recharge period; the pack's state. All of these are
+//! passed to the [`Publisher`] as events and alarm values. A half-cycle without information changes no value.
 
 use serde::{Deserialize, Serialize};
 
@@ -28,7 +28,7 @@ use crate::quantity::catalogue::{Quantity, RecordedValues};
 use crate::quantity::{CellIndex, InvalidState, Mode, Timestamp, bounds};
 use crate::sample::CellSample;
 
-/// Below the model's highest voltage by this, a charge is in its constant-voltage part, V.
+/// A charge is in its constant-voltage part within this distance from the model's highest voltage, V.
 const TAPER_BAND_V: f64 = 0.03;
 
 /// The learning stage.
@@ -38,19 +38,19 @@ pub(crate) struct Learning {
     pub(crate) state: LearningState,
     pub(crate) cells: Vec<CellHealth>,
     pub(crate) lives: PackLife,
-    /// Half-cycles of the change of mode at hand, kept for their memory.
+    /// Buffer for the half-cycles of the current change of mode; reused to avoid allocations.
     half_cycles: Vec<HalfCycle>,
 }
 
-/// The stage's part of the snapshot, without the cells.
+/// Stored state of the stage, without the cells.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct LearningState {
     pub(crate) detector: TransitionDetector,
     pub(crate) learner: Learner,
-    /// When the last half-cycle taught something; `None` = never, or an unknown time ago.
+    /// Time of the last half-cycle; `None` = never, or at an unknown time.
     pub(crate) learned_at: Option<Timestamp>,
-    /// When the offset of the current was last corrected.
+    /// Time of the last correction of the current offset.
     offset_at: Option<Timestamp>,
     pub(crate) recharge: RechargeTimer,
     pub(crate) recharge_period_s: Option<f64>,
@@ -61,9 +61,9 @@ pub(crate) struct LearningState {
 /// Health of one cell.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub(crate) struct CellHealth {
-    /// SOC that the last full charge left; 1 until there was one.
+    /// SOC after the last full charge; 1 before the first one.
     pub(crate) full_soc: f64,
-    /// Whether the present charge has tapered off at the highest voltage.
+    /// Whether the current charge has tapered off at the highest voltage.
     tapered: bool,
     pub(crate) usable: Option<ScalarGaussian>,
     /// Resistance relative to new after the last discharge.
@@ -71,7 +71,7 @@ pub(crate) struct CellHealth {
     pub(crate) throughput: Throughput,
 }
 
-/// Sums over all half-cycles of a cell; stored as a list in the order of its fields, whose code every state shares.
+/// Sums over all half-cycles of a cell. Stored as an array in the order of the fields.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[serde(from = "[f64; 3]", into = "[f64; 3]")]
 pub struct Throughput {
@@ -96,7 +96,7 @@ impl From<Throughput> for [f64; 3] {
 }
 
 impl Throughput {
-    /// Adds a half-cycle. No time exceeds what a state can hold, whatever jumps the clock makes.
+    /// Adds a half-cycle. The times are limited to what a state can hold, however the clock jumps.
     pub fn add(&mut self, mode: Mode, charge_ah: f64, duration_s: f64) {
         self.charge_ah += charge_ah.max(0.0);
         let time_s = if mode == Mode::Charge { &mut self.charging_s } else { &mut self.discharging_s };
@@ -127,7 +127,7 @@ impl LearningState {
         Self { learner: Learner::new(&config.capacity, initial.collect()), ..Self::default() }
     }
 
-    /// What is learned, without what is under way and without stamps.
+    /// The learned values only, without anything in progress and without timestamps.
     pub(crate) fn learned_only(&self) -> Self {
         Self {
             learner: self.learner.learned_only(),
@@ -137,7 +137,7 @@ impl LearningState {
         }
     }
 
-    /// Moves every stamp by `by_nanos`, onto another clock.
+    /// Shifts all timestamps by `by_nanos`, to another clock.
     pub(crate) fn rebase(&mut self, by_nanos: i64) {
         self.detector.rebase(by_nanos);
         self.learner.rebase(by_nanos);
@@ -159,7 +159,7 @@ impl LearningState {
 }
 
 impl Learning {
-    /// `bank`: the estimators of the cells, new.
+    /// Creates the stage. `bank`: new estimators of the cells.
     pub(crate) fn new(config: &MonitorConfig, bank: &PackBank) -> Self {
         Self {
             config: config.health,
@@ -170,7 +170,7 @@ impl Learning {
         }
     }
 
-    /// Forgets all that was learned; `bank` is that of the new cells.
+    /// Forgets everything learned. `bank`: the estimators of the new cells.
     pub(crate) fn forget(&mut self, bank: &PackBank) {
         self.state = LearningState::new(&self.config, bank);
         self.cells.fill(CellHealth::default());
@@ -187,13 +187,14 @@ impl Learning {
         self.state.learner.capacity(index)
     }
 
-    /// The same where it was learned.
+    /// Published capacity of a cell, if it has been learned.
     pub(crate) fn learned_capacity(&self, index: usize) -> Option<ScalarGaussian> {
         self.state.learner.has_learned(index).then(|| self.capacity(index))
     }
 
-    /// Ends a mode: its half-cycle, if it was one, teaches every cell.
-    /// `teaches_capacity`: the model of the pack's own cells is good enough for that; that of a module is if it is of a file.
+    /// Ends a mode. If it completes a half-cycle, every cell learns from it. `teaches_capacity`: whether the model of
+    /// the pack's own cells is good enough to learn capacities. Cells of a module learn their capacity if their model
+    /// was given.
     pub(crate) fn complete_mode(
         &mut self,
         change: ModeChange,
@@ -204,7 +205,7 @@ impl Learning {
         let teaches = |cell| if bank.is_own(cell) { teaches_capacity } else { bank.has_given_model(cell) };
         self.state.learner.hold(|cell| !teaches(cell));
         to.event(EventKind::Mode { from: change.from, to: change.to });
-        // At a loss of the current nothing new is learned: the evidence waits.
+        // If the current is lost, offset and slow branches are not learned; the evidence is kept.
         if change.to != Mode::Unknown {
             self.learn_offset(bank, to.now);
             bank.learn_slow_branches();
@@ -233,7 +234,8 @@ impl Learning {
         }
     }
 
-    /// Learns the offset of the current sensor from the voltages since the last change of mode, and corrects the cells.
+    /// Learns the offset of the current sensor from the voltages since the last change of mode, and corrects the
+    /// cells.
     fn learn_offset(&mut self, bank: &mut PackBank, now: Timestamp) {
         let configured_a = self.config.capacity.current_offset_std_a;
         let offset = self.state.learner.current_offset_mut();
@@ -245,8 +247,8 @@ impl Learning {
         }
     }
 
-    /// Learns from a cell's half-cycle, `since_before_s` after the one before (`None` = not known); whether its capacity
-    /// was measured.
+    /// Learns from a cell's half-cycle, which ended `since_before_s` after the previous one (`None` = unknown).
+    /// Returns whether its capacity was measured.
     fn learn_cell(
         &mut self,
         index: usize,
@@ -268,7 +270,8 @@ impl Learning {
         if half_cycle.mode == Mode::Charge && health.tapered {
             health.full_soc = half_cycle.end_soc.unwrap_or(health.full_soc);
         }
-        // Discharges restate the usable capacity: a charge leaves the resistance of charging.
+        // Discharges update the usable capacity. A charge only sets the first value, because it leaves the resistance of
+        // charging.
         let is_discharge = half_cycle.mode == Mode::Discharge;
         let is_restated = is_discharge || health.usable.is_none();
         if let Some(usable) = config.usable.as_ref().filter(|_| is_restated) {
@@ -301,7 +304,7 @@ impl Learning {
         update.measurement.is_some()
     }
 
-    /// Takes a stepped sample. A charge that tapers off at the highest voltage leaves a full cell.
+    /// Handles a stepped sample: detects that a charge tapers off at the highest voltage.
     pub(crate) fn handle_sample(&mut self, sample: &CellSample, model: &CellModel) {
         let (Some(usable), Some(current_a)) = (&self.config.usable, sample.current_a) else { return };
         let is_tapering = current_a < 0.0 && -current_a <= usable.taper_current_a;
@@ -310,7 +313,8 @@ impl Learning {
         }
     }
 
-    /// Takes a reset of a cell's filter: its capacity is in doubt, and what the SOC crossed in its jump was not charged.
+    /// Handles a reset of a cell's filter: the capacity becomes doubtful, and the recharge timer restarts, because the
+    /// SOC jumped without charge.
     pub(crate) fn handle_reset(&mut self, cell: CellIndex, bank: &mut PackBank) {
         self.state.recharge = RechargeTimer::default();
         let new_std_ah = bank.config(cell.index()).initial.capacity_std_ah;
@@ -319,8 +323,8 @@ impl Learning {
         bank.put(cell.index(), &estimator);
     }
 
-    /// Combines the cells to the pack; `all_fresh`: every cell's voltage is. A charge that has crossed the recharge window
-    /// gives the raw recharge period.
+    /// Combines the cells into the pack's values. `all_fresh`: whether every cell's voltage is fresh. Records the raw
+    /// recharge period when a charge has crossed the window.
     pub(crate) fn combine_pack(&mut self, all_fresh: bool, bank: &PackBank, to: &mut Publisher<'_>) {
         self.state.pack = if all_fresh { self.combined(bank) } else { None };
         let Some(pack) = self.state.pack else { return };
@@ -333,7 +337,7 @@ impl Learning {
         }
     }
 
-    /// The pack by the latest estimates of its cells, however old they are.
+    /// The pack's values from the latest estimates of its cells, at any age.
     fn combined(&self, bank: &PackBank) -> Option<PackState> {
         let cells = (0..u16::try_from(self.cells.len()).unwrap_or(u16::MAX)).map(CellIndex);
         pack::combine(cells.filter_map(|cell| {
@@ -342,7 +346,8 @@ impl Learning {
         }))
     }
 
-    /// Ends a charge, from which its cells have learned or not: the recharge period, raw and normalised.
+    /// Ends a charge: computes the raw and normalised recharge periods. `has_learned`: whether the cells learned from
+    /// the charge.
     fn finish_charge(&mut self, has_learned: bool, bank: &PackBank, to: &mut Publisher<'_>) {
         let config = &self.config.recharge;
         let charged = self.state.recharge.finish(config);
@@ -369,7 +374,7 @@ impl Learning {
         }
     }
 
-    /// The last recharge period, of the kind that its rule compares.
+    /// The last recharge period, of the kind that the rule uses.
     pub(crate) fn known_recharge_period(&self) -> Option<Observation> {
         match self.config.recharge.alarm_on {
             RechargeAlarm::Raw => self.state.recharge_period_s.map(|seconds| Observation::new(Some(seconds))),
@@ -377,14 +382,15 @@ impl Learning {
         }
     }
 
-    /// Restates the recharge periods for another window or current; without an exact restatement they are unknown.
+    /// Restates the recharge periods for another window or current. A period that cannot be restated exactly becomes
+    /// unknown.
     pub(crate) fn restate_recharge(&mut self, old: &RechargeConfig) {
         let new = &self.config.recharge;
         if (old.from_soc, old.to_soc) != (new.from_soc, new.to_soc) {
             self.state.recharge.change_window();
             self.state.recharge_period_s = None;
         }
-        // Both are the same capacity over another window or current.
+        // Both periods follow from the same capacity, over another window or current.
         let seconds_per_ah = |config: &RechargeConfig| (config.to_soc - config.from_soc) / config.reference_current_a;
         let ratio = seconds_per_ah(new) / seconds_per_ah(old);
         self.state.normalised_recharge = self
@@ -394,13 +400,13 @@ impl Learning {
             .filter(is_period);
     }
 
-    /// The cell with the lowest capacity, and that; `None` until half-cycles have taught something about every cell.
+    /// The cell with the lowest capacity, and that capacity; `None` until every cell's capacity has been learned.
     pub(crate) fn weakest(&self) -> Option<(usize, ScalarGaussian)> {
         let capacities = (0..self.cells.len()).map(|index| (index, self.capacity(index)));
         capacities.min_by(|a, b| a.1.mean.total_cmp(&b.1.mean)).filter(|_| self.state.learner.has_learned_all())
     }
 
-    /// Health of the pack: that of its weakest cell, once half-cycles have taught something about every cell.
+    /// Fields of the health frame: values of the weakest cell, once every cell's capacity has been learned.
     pub(crate) fn health_fields(&self, bank: &PackBank) -> HealthFields {
         let recharge_period_s = self.state.recharge_period_s;
         if !self.state.learner.has_learned_all() {
@@ -472,7 +478,7 @@ fn capacity_event(cell: CellIndex, values: RecordedValues, update: &CapacityUpda
 }
 
 impl CellHealth {
-    /// The values that the history records and readers see.
+    /// The values that are recorded in the history and shown to readers.
     pub(crate) fn recorded(&self, capacity: ScalarGaussian, resistance: ScalarGaussian) -> RecordedValues {
         RecordedValues::default()
             .with(Quantity::Capacity, Some(capacity))

@@ -1,14 +1,14 @@
-//! Modelling stage: a model of the pack's own cells, learned from what the vehicle notes of them.
+//! Modelling stage: learns a model of the pack's own cells from data of the vehicle.
 //!
-//! In: the steps of all cells; the moments at which the vehicle rests or sleeps. Out: another model for the estimators with the
-//! state in which they continue, and what is known of it ([`ModelView`]). Only a pack whose cells are known by their [`Label`] has
-//! one; that of a model file is given.
+//! In: the steps of all cells, and the times at which the vehicle rests or sleeps. Out: a new model for the
+//! estimators, with the state in which they continue, and a [`ModelView`]. A model is learned only for a pack whose
+//! cells are described by a [`Label`]; otherwise the model comes from a file.
 //!
-//! A model is fitted again when the vehicle rests and enough new rows have come, and the estimators change to it there, never while
-//! driving. The fit is a [`FitTask`]: it begins some time before the change, so that a host can run it on another thread. Before the
-//! change the model in force and the one before it are judged on the new rows, which neither has seen: the one that predicts them
-//! worse is not kept. Once a model is settled it is fitted again only where the pack has seen another
-//! temperature or part of the charge; the capacity is then left to the half-cycles.
+//! A new model is fitted when the vehicle rests and enough new rows have come. The estimators change to it during the
+//! rest, never while driving. The fit is a [`FitTask`] that starts some time before the change, so that a host can run
+//! it on another thread. Before the change, the current model and the previous one are compared on the new rows, which
+//! neither has seen, and the worse one is dropped. A settled model is fitted again only if the pack has reached
+//! another range of temperature or charge; the capacity is then left to the half-cycles.
 
 use serde::{Deserialize, Serialize};
 
@@ -22,63 +22,63 @@ use crate::monitor::config::MonitorConfig;
 use crate::monitor::message::{Event, EventKind, ModelState};
 use crate::quantity::{InvalidState, Mode, Timestamp};
 
-/// Fewest new rows for which a fit is made, and least charge that moved in them, part of the rated capacity.
+/// Fewest new rows for a fit, and smallest charge moved in them, fraction of the rated capacity.
 const LEAST_NEW_ROWS: usize = 6;
 const LEAST_NEW_CHARGE: f64 = 0.12;
 
-/// Shortest rest in which a fit begins, s: longer than a red light.
+/// Shortest rest before a fit starts, s: longer than a red light.
 const REST_S: f64 = 120.0;
 
-/// Time from there to the change of the model, s: for a thread of a slow computer.
+/// Time from the start of a fit to the change of the model, s: enough for a thread of a slow computer.
 const FIT_S: f64 = 30.0;
 
-/// Misfit above which a fit is not used: with usual sensors it is up to 0.65; heavy load in the cold, a faulty sensor or another pack
-/// half-way have more.
+/// Largest misfit of a usable fit. With typical sensors it is up to 0.65. Heavy load in the cold, a faulty sensor, or
+/// a pack exchanged in between cause more.
 const MOST_MISFIT: f64 = 0.7;
-/// The same above which the model in force is given up: rows deviate more than they should.
+/// Misfit above which the current model is dropped, because the rows deviate more than they should.
 const HOPELESS_MISFIT: f64 = 1.0;
 
-/// Deviation of the capacity above which a fit is not used, fraction: the label's is 0.1, and where the rows say little of the
-/// capacity they say little of the curve.
+/// Largest relative standard deviation of a usable fit's capacity. The label's is 0.1. Rows that determine the
+/// capacity poorly also determine the curve poorly.
 const MOST_CAPACITY_STD: f64 = 0.05;
 
-/// Most changes of the model that are kept.
+/// Maximum number of stored changes of the model.
 const MAX_CHANGES: usize = 16;
 
-/// A change of the model: when, and what was known after it.
+/// A change of the model: its time, and the state after it.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelChange {
-    /// When.
+    /// Time of the change.
     pub time: Timestamp,
-    /// How well the model is known since.
+    /// State of the model after the change.
     pub state: ModelState,
-    /// Its capacity, Ah; `None` = the label's model.
+    /// Capacity, Ah; `None` = the label's model.
     pub capacity: Option<ScalarGaussian>,
-    /// Root mean square of the rows' residuals, V.
+    /// Root mean square of the residuals of the rows, V.
     pub residual_v: Option<f64>,
-    /// The chemistry that explains the voltages better than that on the label.
+    /// The chemistry that explains the voltages better than the label's.
     pub chemistry: Option<Chemistry>,
-    /// The model before holds again.
+    /// Whether the previous model is used again.
     pub is_taken_back: bool,
 }
 
-/// What is known of the cells' model.
+/// State of the cells' model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ModelView<'a> {
-    /// How well it is known.
+    /// How well the model is known.
     pub state: ModelState,
-    /// On the label; `None` = a model file.
+    /// The label; `None` = a model file is used.
     pub label: Option<Label>,
-    /// What was learned; `None` = nothing yet.
+    /// The learned model; `None` before the first fit.
     pub own: Option<&'a OwnModel>,
-    /// Rows from which it is learned.
+    /// Rows from which the model is learned.
     pub notebook: Option<&'a Notebook>,
-    /// The chemistry that explains the voltages better than that on the label.
+    /// The chemistry that explains the voltages better than the label's.
     pub chemistry: Option<Chemistry>,
-    /// Fits so far, and models taken back because the one before was better.
+    /// Number of fits.
     pub fits: u32,
-    /// Models taken back.
+    /// Number of models dropped because the previous one was better.
     pub taken_back: u32,
     /// The latest changes, oldest first.
     pub changes: &'a [ModelChange],
@@ -88,67 +88,67 @@ pub struct ModelView<'a> {
 #[derive(Debug)]
 pub(crate) struct Modelling {
     label: Option<Label>,
-    /// Of the configuration: the label's.
+    /// The configured model, from the label.
     model: CellModel,
     estimator: EstimatorConfig,
     notebook: NotebookConfig,
     pub(crate) state: ModellingState,
-    /// The fit under way has not been offered to the host.
+    /// Whether the current fit still has to be offered to the host.
     is_offered: bool,
-    /// A task that the host has run.
+    /// A task that the host has run, with its findings.
     given: Option<(FitTask, FitFindings)>,
-    /// Of the latest fit.
+    /// Outcome of the latest fit.
     outcome: FitOutcome,
 }
 
-/// What a fit has changed.
+/// Outcome of a fit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum FitOutcome {
     Nothing,
-    /// The new model is in force.
+    /// The new model is used.
     Adopted,
-    /// The model before is in force again.
+    /// The previous model is used again.
     Returned,
 }
 
-/// The stage's part of the snapshot.
+/// Stored state of the stage.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct ModellingState {
-    /// What was on the label when it was learned.
+    /// The label with which the state was learned.
     label: Option<Label>,
     notebook: Notebook,
-    /// The model in force.
+    /// The current learned model.
     own: Option<OwnModel>,
-    /// The one before; `None` = that of the label.
+    /// The previous model; `None` = the label's.
     before: Option<OwnModel>,
     chemistry: Option<Chemistry>,
     fits: u32,
     taken_back: u32,
     changes: Vec<ModelChange>,
-    /// Since when the pack rests.
+    /// Since when the pack has been resting.
     rest_since: Option<Timestamp>,
-    /// Since when a fit is under way; no row ends meanwhile.
+    /// Start of the current fit; rows are not closed during a fit.
     fit_since: Option<Timestamp>,
-    /// A row is complete.
+    /// Whether a row is complete.
     has_row: bool,
 }
 
-/// Another model for the estimators.
+/// A new model for the estimators.
 #[derive(Debug)]
 pub(crate) struct Adoption {
     pub(crate) model: CellModel,
     pub(crate) config: EstimatorConfig,
     /// State of the mean cell.
     pub(crate) mean: AdoptedState,
-    /// Whether the cells' capacities begin with that of the mean cell.
+    /// Whether the cells' capacities restart from the mean cell's.
     pub(crate) with_capacity: bool,
-    /// Whether the model was learned; if not it is the label's, and nothing is known of the capacity.
+    /// Whether the model was learned. If not, it is the label's, and the capacity is unknown.
     pub(crate) is_learned: bool,
 }
 
 impl ModellingState {
-    /// What is known when the rows before do not continue: after a restart, or of a pack that is not connected.
+    /// Drops everything that requires contiguous rows: after a restart, or for a pack that is not connected.
     pub(crate) fn restart(&mut self) {
         (self.rest_since, self.fit_since, self.has_row) = (None, None, false);
     }
@@ -161,7 +161,7 @@ impl ModellingState {
         InvalidState::unless(count <= most, "the changes of the model", count as f64, "at most 16")
     }
 
-    /// What is known of cells with this label; `None` = of a model file.
+    /// State of the model for cells with this label; `None` = from a model file.
     fn view(&self, label: Option<Label>) -> ModelView<'_> {
         let Self { notebook, own, chemistry, fits, taken_back, changes, .. } = self;
         let state = match (label, own) {
@@ -183,7 +183,7 @@ impl ModellingState {
         }
     }
 
-    /// What a stored state says; the label is that with which it was learned, else `label`. `None` without either.
+    /// State of the stored model. Uses the label with which it was learned, or else `label`; `None` without either.
     pub(crate) fn stored_view(&self, label: Option<Label>) -> Option<ModelView<'_>> {
         let label = self.label.or(label)?;
         Some(self.view(Some(label)))
@@ -209,17 +209,17 @@ impl Modelling {
         }
     }
 
-    /// Other settings for the same cells.
+    /// Applies other settings to the same cells.
     pub(crate) fn reconfigure(&mut self, config: &MonitorConfig) {
         (self.model, self.estimator) = (config.model.clone(), config.estimator);
     }
 
-    /// Forgets what was learned: another pack is connected.
+    /// Forgets the learned model, because another pack is connected.
     pub(crate) fn forget(&mut self) {
         self.state = ModellingState::default();
     }
 
-    /// Continues from a stored state. What was learned with another label is forgotten, its rows are not.
+    /// Restores a stored state. If it was learned with another label, only its rows are kept.
     pub(crate) fn restore(&mut self, state: ModellingState) {
         let Some(label) = &self.label else { return };
         self.state = if state.fits_label(label) {
@@ -229,7 +229,7 @@ impl Modelling {
         };
     }
 
-    /// The model and settings in force.
+    /// The current model and its settings.
     pub(crate) fn in_force(&self) -> (CellModel, EstimatorConfig) {
         let own = self.label.as_ref().zip(self.state.own.as_ref());
         let learned = own.and_then(|(label, own)| {
@@ -240,7 +240,7 @@ impl Modelling {
         learned.unwrap_or_else(|| (self.model.clone(), self.estimator))
     }
 
-    /// Notes a cell's step.
+    /// Adds a cell's step to the notebook.
     #[inline]
     pub(crate) fn note(&mut self, step: &CellStep) {
         if self.label.is_some() {
@@ -254,13 +254,13 @@ impl Modelling {
         self.state.has_row && self.state.fit_since.is_none()
     }
 
-    /// Ends a row, at the mean SOC of the cells.
+    /// Closes a row at the mean SOC of the cells.
     pub(crate) fn close_row(&mut self, soc: f64) {
         self.state.has_row = false;
         self.state.notebook.close_row(&self.notebook, soc);
     }
 
-    /// Takes the pack's mode; whether a fit ends: [`Self::refit`] is due.
+    /// Handles the pack's mode. Returns whether a fit is due to end; the caller then calls [`Self::refit`].
     pub(crate) fn observe_mode(&mut self, now: Timestamp, mode: Mode) -> bool {
         if self.label.is_none() || mode != Mode::Rest {
             (self.state.rest_since, self.state.fit_since) = (None, None);
@@ -277,13 +277,13 @@ impl Modelling {
         false
     }
 
-    /// The fit under way, once: for a host that runs it beside the monitor.
+    /// The current fit, returned once, for a host that runs it on another thread.
     pub(crate) fn take_task(&mut self) -> Option<FitTask> {
         let is_new = std::mem::take(&mut self.is_offered) && self.state.fit_since.is_some();
         is_new.then(|| self.task()).flatten()
     }
 
-    /// Takes the findings of a task. They change nothing but who computes them.
+    /// Receives the findings of a task. They only save the computation; the result is the same.
     pub(crate) fn give(&mut self, task: FitTask, findings: FitFindings) {
         self.given = Some((task, findings));
     }
@@ -293,12 +293,13 @@ impl Modelling {
         Some(FitTask::new(self.label?, notebook, own.as_ref(), before.as_ref()))
     }
 
-    /// Whether half-cycles teach the capacity: while the model is the label's, its errors would be taken for lost capacity.
+    /// Whether half-cycles may learn the capacity. With the label's model, its errors would be mistaken for lost
+    /// capacity.
     pub(crate) fn teaches_capacity(&self) -> bool {
         self.label.is_none() || self.state.own.is_some()
     }
 
-    /// Whether enough is new for another fit.
+    /// Whether there is enough new data for a fit.
     pub(crate) fn is_due(&self) -> bool {
         let ModellingState { notebook, own, chemistry, .. } = &self.state;
         let is_settled = own.as_ref().is_some_and(OwnModel::is_settled) && chemistry.is_none();
@@ -308,7 +309,8 @@ impl Modelling {
             && (!is_settled || notebook.rows_of_new_classes(self.notebook.rated_ah) >= LEAST_NEW_ROWS)
     }
 
-    /// Fits a model to all rows, after those in force were judged on the new ones. `None` = none is to be adopted.
+    /// Compares the current and the previous model on the new rows, then fits a model to all rows. Returns the model
+    /// to adopt, if any.
     pub(crate) fn refit(&mut self) -> Option<Adoption> {
         let label = self.label?;
         if self.state.fit_since.take().is_none() {
@@ -335,7 +337,7 @@ impl Modelling {
             return self.return_to_label().or_else(|| unless_fitted(self));
         }
         let Some(fitted) = fit else { return unless_fitted(self) };
-        // The flat curve of LFP is hidden by its hysteresis, which no row's error holds.
+        // The hysteresis of LFP hides its flat curve and is not part of a row's error.
         let is_flat = label.chemistry == Chemistry::LfpGraphite;
         let is_rough = fitted.misfit > MOST_MISFIT;
         if is_flat || is_rough || fitted.own.capacity.std() > MOST_CAPACITY_STD * fitted.own.capacity.mean {
@@ -353,7 +355,8 @@ impl Modelling {
         Some(Adoption { model, config, mean, with_capacity: !was_settled, is_learned: true })
     }
 
-    /// Returns to the label's model from one that is not settled: the rows contradict it. `None` = it is in force.
+    /// Returns to the label's model if the rows contradict a model that is not settled. `None` if the model does not
+    /// change.
     fn return_to_label(&mut self) -> Option<Adoption> {
         self.state.own.take_if(|own| !own.is_settled())?;
         self.state.before = None;
@@ -362,7 +365,7 @@ impl Modelling {
         Some(self.label_adoption())
     }
 
-    /// The label's model, of whose capacity nothing is known.
+    /// The label's model, with an unknown capacity.
     fn label_adoption(&self) -> Adoption {
         let InitialState { capacity_ah, capacity_std_ah, .. } = self.estimator.initial;
         let capacity = ScalarGaussian::from_std(capacity_ah, capacity_std_ah);
@@ -371,17 +374,18 @@ impl Modelling {
         Adoption { model, config, mean, with_capacity: true, is_learned: false }
     }
 
-    /// Whether the latest fit ended with the model before.
+    /// Whether the latest fit returned to the previous model.
     pub(crate) fn has_returned(&self) -> bool {
         self.outcome == FitOutcome::Returned
     }
 
-    /// The state, to be stored; `None` = nothing is learned here.
+    /// The state to be stored; `None` if the stage does not learn a model.
     pub(crate) fn stored(&self) -> Option<ModellingState> {
         self.label.map(|_| self.state.clone())
     }
 
-    /// Notes what the latest fit has changed, as the event it is; `None` when nothing has. `before` is the state before it.
+    /// Records the change by the latest fit and returns its event; `None` without a change. `before`: the state before
+    /// the fit.
     pub(crate) fn note_change(&mut self, time: Timestamp, before: ModelState) -> Option<Event> {
         let ModelView { state, own, chemistry, .. } = self.view();
         if state == before && self.outcome == FitOutcome::Nothing {
@@ -399,12 +403,12 @@ impl Modelling {
         Some(Event { time, kind })
     }
 
-    /// What is known.
+    /// State of the cells' model.
     pub(crate) fn view(&self) -> ModelView<'_> {
         self.state.view(self.label)
     }
 
-    /// What follows does not hang together with the rows so far.
+    /// Ends the stretch of contiguous rows.
     pub(crate) fn end_stretch(&mut self) {
         (self.state.rest_since, self.state.fit_since) = (None, None);
         if self.label.is_some() {

@@ -1,8 +1,8 @@
-//! Sampling stage: from readings to cell samples, and which pack is connected.
+//! Sampling stage: turns readings into cell samples, and detects which pack is connected.
 //!
-//! In: judged readings. Out: a [`CellSample`] for each good voltage, events on each change of a signal, and the pack's
-//! identity once enough readings in a row agree. Bad readings and single odd identities change nothing. The identity is
-//! kept over restarts, so that a pack changed meanwhile is found.
+//! In: judged readings. Out: a [`CellSample`] for each good voltage, an event for each change of a signal, and the
+//! pack's identity once enough consecutive readings agree. Bad readings and single odd identities change nothing. The
+//! identity is stored, so that a pack exchanged during a downtime is detected.
 
 use serde::{Deserialize, Serialize};
 
@@ -19,13 +19,13 @@ pub(crate) struct Sampling {
     identity_readings: u32,
     /// Whether a usable reading has come since the first input.
     pub(crate) has_usable_reading: bool,
-    /// An input message has a second sender.
+    /// Whether an input message has a second sender.
     pub(crate) has_second_sender: bool,
-    /// Changes of the input at hand, kept for their memory.
+    /// Buffer for the signal changes of the current input; reused to avoid allocations.
     changes: Vec<SignalChange>,
 }
 
-/// What continues of the stage.
+/// Stored state of the stage.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct SamplingState {
@@ -36,23 +36,24 @@ pub(crate) struct SamplingState {
 }
 
 impl SamplingState {
-    /// What a program that is started again knows: signals and pack, but no reading of its own.
+    /// Drops everything that requires readings of this run; signals and pack are kept.
     pub(crate) fn restart(&mut self) {
         self.identity.candidate = None;
         (self.has_usable_reading, self.has_second_sender) = (false, false);
     }
 }
 
-/// The pack's identity as its signal gives it.
+/// Identity of the pack according to its signal.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(crate) struct Identity {
     pub(crate) known: Option<f64>,
-    /// Another number, and how many readings in a row have given it.
+    /// Another number, and how many consecutive readings have given it.
     candidate: Option<(f64, u32)>,
 }
 
 impl Identity {
-    /// Takes a reading; the new number when `readings` in a row have given it.
+    /// Handles a reading. Returns the new number after `readings` consecutive readings, and whether it replaces a
+    /// known one.
     fn observe(&mut self, value: f64, readings: u32) -> Option<(f64, bool)> {
         if self.known == Some(value) {
             self.candidate = None;
@@ -70,7 +71,7 @@ impl Identity {
 }
 
 impl Identity {
-    /// Whether a reading gives another number than that of the connected pack.
+    /// Whether a reading gives another number than the connected pack's; `None` if either is unknown.
     pub(crate) fn is_other(&self, reading: Result<f64, Fault>) -> Option<bool> {
         let value = reading.ok().filter(|value| value.is_finite())?;
         Some(self.known? != value)
@@ -89,7 +90,7 @@ impl Sampling {
         }
     }
 
-    /// What continues.
+    /// The state to be stored.
     pub(crate) fn snapshot(&self) -> SamplingState {
         SamplingState {
             sampler: self.sampler.snapshot(),
@@ -99,20 +100,20 @@ impl Sampling {
         }
     }
 
-    /// Continues from a state whose shape [fits](Sampler::fits).
+    /// Restores a state whose shape [fits](Sampler::fits).
     pub(crate) fn restore(&mut self, state: SamplingState) {
         self.sampler.restore(state.sampler);
         self.identity = state.identity;
         (self.has_usable_reading, self.has_second_sender) = (state.has_usable_reading, state.has_second_sender);
     }
 
-    /// Other limits for the same signals.
+    /// Applies other limits to the same signals.
     pub(crate) fn reconfigure(&mut self, config: &MonitorConfig) {
         self.sampler.reconfigure(&config.sample);
         self.identity_readings = config.identity_readings;
     }
 
-    /// Takes a reading of a signal; the sample it completes, if it is a good voltage.
+    /// Handles a reading of a signal. Returns the sample that a good voltage completes.
     pub(crate) fn handle_reading(&mut self, now: Timestamp, reading: Reading, out: &mut Outputs) -> Option<CellSample> {
         let sample = self.sampler.handle_reading(now, reading, &mut self.changes);
         self.has_usable_reading =
@@ -121,13 +122,13 @@ impl Sampling {
         sample
     }
 
-    /// Takes a reading of the identity signal. Returns another identity, and whether another pack was known before.
+    /// Handles a reading of the identity signal. Returns a new identity, and whether it replaces a known one.
     pub(crate) fn handle_identity(&mut self, reading: Result<f64, Fault>) -> Option<(f64, bool)> {
         let value = reading.ok().filter(|value| value.is_finite())?;
         self.identity.observe(value, self.identity_readings)
     }
 
-    /// Finds signals that have become stale.
+    /// Detects signals that have become stale.
     pub(crate) fn poll(&mut self, now: Timestamp, out: &mut Outputs) {
         self.sampler.poll(now, &mut self.changes);
         self.report(now, out);
@@ -141,7 +142,7 @@ impl Sampling {
         }
     }
 
-    /// Whether the current and a cell's voltage come: the inputs of its estimate.
+    /// Whether the inputs of a cell's estimate, the current and its voltage, are not lost.
     pub(crate) fn inputs_valid(&self, cell: CellIndex, now: Timestamp) -> bool {
         let is_lost = |channel| self.sampler.is_lost(channel, now);
         !is_lost(Channel::Current) && !is_lost(self.voltage_channel(cell))

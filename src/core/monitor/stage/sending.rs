@@ -1,7 +1,7 @@
 //! Sending stage: cyclic frames, alarm frames, replies to commands, tests, and the J1939 node.
 //!
-//! In: fields of the frames from the other stages, alarms, ticks. Out: frames in [`Outputs`]. Missed periods are skipped,
-//! not made up for. Without `[output]` nothing but the J1939 node sends.
+//! In: fields of the frames from the other stages, alarms, ticks. Out: frames in [`Outputs`]. Missed periods are
+//! skipped. Without `[output]`, only the J1939 node sends.
 
 use serde::{Deserialize, Serialize};
 
@@ -24,18 +24,20 @@ use crate::monitor::config::{MonitorConfig, OutputConfig, SupplyConfig};
 use crate::monitor::message::{Event, EventKind, Outputs, Secured, Transmit};
 use crate::quantity::{BusIndex, Fault, Timestamp};
 
-/// Period of a test's frames, s: a consumer that reads once a second receives several.
+/// Period of a test's frames, s: a consumer that reads once a second still receives several.
 const TEST_PERIOD_S: f64 = 0.1;
-/// Longest test, s: a forgotten test ends by itself.
+/// Longest test, s, so that a forgotten test ends.
 pub const MAX_TEST_S: f64 = 600.0;
 
-/// Replies at once after a pause; then one each [`REPLY_DELAY_MS`]. A sender of commands waits for each reply.
+/// Number of immediate replies after a pause; further ones are sent every [`REPLY_DELAY_MS`]. A sender of commands
+/// waits for each reply.
 const REPLY_BURST: i64 = 5;
 const REPLY_DELAY_NS: i64 = REPLY_DELAY_MS as i64 * 1_000_000;
 
-/// Freshness values skipped at a start: three hours of the most frames, sent since the state was stored.
+/// Freshness values skipped at a start: more than the frames of three hours at the highest rate, which may have been
+/// sent since the state was stored.
 const RESTART_FRESHNESS: u64 = 1 << 20;
-/// Least freshness per second of the clock: more than the frames of a second.
+/// Minimum freshness per second of the clock: more than the frames of a second.
 const FRESHNESS_PER_S: u64 = 256;
 
 /// The sending stage.
@@ -43,18 +45,18 @@ const FRESHNESS_PER_S: u64 = 256;
 pub(crate) struct Sending {
     config: Option<OutputConfig>,
     pub(crate) schedule: Schedule,
-    /// A running test of an alarm frame; it ends with the process.
+    /// A running test of an alarm frame; not continued after a restart.
     test: Option<AlarmTest>,
     pub(crate) j1939: Option<J1939>,
     pub(crate) poller: Option<Poller>,
     supply: Option<SupplyConfig>,
-    /// A change of an alarm gave the next tick something to do.
+    /// Whether an alarm change has moved the time of the next due work.
     is_rescheduled: bool,
-    /// Outputs of the poller, kept for their memory.
+    /// Buffer for the poller's outputs; reused to avoid allocations.
     polled: PollOutputs,
 }
 
-/// What continues of the stage.
+/// Stored state of the stage.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct SendingState {
@@ -65,7 +67,7 @@ pub(crate) struct SendingState {
 }
 
 impl SendingState {
-    /// What a program that is started again knows: a test ends with the process, requests and address begin again.
+    /// Drops everything that ends with the process: a test, diagnostic requests and the J1939 address.
     pub(crate) fn restart(&mut self) {
         (self.test, self.poller, self.node) = (None, None, None);
     }
@@ -79,31 +81,31 @@ pub(crate) struct AlarmTest {
     end: Timestamp,
 }
 
-/// When each cyclic piece of work is due next.
+/// Due times of the cyclic work.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub(crate) struct Schedule {
     housekeeping: Timestamp,
     status: Timestamp,
     health: Timestamp,
     alarm: Timestamp,
-    /// Which of the alarms that cannot be judged is next in the cycle.
+    /// Turn of the alarms that cannot be judged.
     alarm_turn: usize,
     digest: Timestamp,
-    /// Which threshold is next in the digest.
+    /// Turn of the thresholds in the digest.
     threshold_turn: usize,
-    /// From when on another reply may be sent.
+    /// Earliest time of the next reply.
     reply: Timestamp,
     pub(crate) alarms: AlarmQueue,
     /// Counters of the frames' end-to-end protection.
     counters: SendCounters,
-    /// When the freshness of commands is announced next.
+    /// Next announcement of the commands' freshness.
     freshness: Timestamp,
-    /// Freshness of the last authenticated frame; one row for all messages.
+    /// Freshness of the last authenticated frame; all messages share one sequence.
     sent_freshness: u64,
 }
 
 impl Schedule {
-    /// Moves stored times onto another clock.
+    /// Shifts stored times to another clock.
     pub(crate) fn rebase(&mut self, by_nanos: i64) {
         for due in self.dues() {
             *due = due.plus_nanos(by_nanos);
@@ -112,13 +114,13 @@ impl Schedule {
         self.alarms.rebase(by_nanos);
     }
 
-    /// When each piece of work is due.
+    /// Due times of all cyclic work.
     fn dues(&mut self) -> [&mut Timestamp; 6] {
         let Self { housekeeping, status, health, alarm, digest, freshness, .. } = self;
         [housekeeping, status, health, alarm, digest, freshness]
     }
 
-    /// Other periods; a shorter one begins now, not when the longer one is over.
+    /// Applies other periods; a shorter period takes effect immediately.
     fn reconfigure(&mut self, now: Timestamp, before: &OutputConfig, after: &OutputConfig) {
         let periods_s =
             |of: &OutputConfig| [of.status_period_s, of.health_period_s, of.alarm_period_s, of.digest_period_s];
@@ -131,13 +133,13 @@ impl Schedule {
     }
 }
 
-/// The interfaces of a frame: all, or that of `bus` alone where something is sent on it.
+/// The interfaces of a frame: only `bus` if frames are sent on it, otherwise all.
 fn buses_of(output: &OutputConfig, bus: Option<BusIndex>) -> impl Iterator<Item = BusIndex> + '_ {
     let only = bus.filter(|bus| output.buses.contains(bus));
     output.buses.iter().copied().filter(move |other| only.is_none_or(|bus| bus == *other))
 }
 
-/// Whether work is due; if so, its next time is set, with missed periods skipped.
+/// Whether work is due. If so, sets its next time; missed periods are skipped.
 fn take_due(due: &mut Timestamp, now: Timestamp, period_s: f64) -> bool {
     if now < *due {
         return false;
@@ -161,7 +163,7 @@ impl Sending {
         }
     }
 
-    /// What continues.
+    /// The state to be stored.
     pub(crate) fn snapshot(&self) -> SendingState {
         SendingState {
             schedule: self.schedule.clone(),
@@ -171,7 +173,8 @@ impl Sending {
         }
     }
 
-    /// Continues what was under way; the schedule is restored before.
+    /// Resumes a test, diagnostic requests and the J1939 node from a stored state; the schedule has already been
+    /// restored.
     pub(crate) fn resume(&mut self, state: &SendingState) {
         self.test = state.test;
         if let (Some(poller), Some(stored)) = (&mut self.poller, &state.poller) {
@@ -182,7 +185,7 @@ impl Sending {
         }
     }
 
-    /// Other cyclic frames. Without any, a running test ends.
+    /// Applies other cyclic frames. Without any, a running test ends.
     pub(crate) fn reconfigure(
         &mut self,
         now: Timestamp,
@@ -201,7 +204,7 @@ impl Sending {
         }
     }
 
-    /// Another J1939 configuration: the same node keeps its address, another one claims it.
+    /// Applies another J1939 configuration. An unchanged node keeps its address, another one claims its own.
     pub(crate) fn reconfigure_j1939(
         &mut self,
         now: Timestamp,
@@ -221,38 +224,39 @@ impl Sending {
         }
     }
 
-    /// Values are compared before anything is sent: after a restart none is known.
+    /// Schedules a comparison of all values before anything is sent, because they are unknown after a restart.
     pub(crate) fn compare_first(&mut self, now: Timestamp) {
         self.schedule.housekeeping = self.schedule.housekeeping.min(now);
     }
 
-    /// Makes everything due now: after a start and after time asleep.
+    /// Makes all cyclic work due now: after a start and after being asleep.
     pub(crate) fn restart(&mut self, now: Timestamp) {
         self.schedule.dues().into_iter().for_each(|due| *due = now);
         self.schedule.reply = self.schedule.reply.min(now);
         self.schedule.alarms.restart(now);
     }
 
-    /// Begins the freshness of authenticated frames beyond all that an earlier process can have sent: a receiver accepts none
-    /// twice. The clock counts where the stored state was lost.
+    /// Starts the freshness of authenticated frames above all values that an earlier process can have sent, because
+    /// receivers accept each value once. If the stored state was lost, the clock gives the value.
     pub(crate) fn begin_freshness(&mut self, now: Timestamp) {
         let by_clock = u64::try_from(now.nanos() / 1_000_000_000).unwrap_or(0).saturating_mul(FRESHNESS_PER_S);
         let sent = &mut self.schedule.sent_freshness;
         *sent = sent.saturating_add(RESTART_FRESHNESS).max(by_clock);
     }
 
-    /// Skips the counters of the frames that an earlier process has sent since its state was stored, or would have sent by
-    /// `now`: for a receiver the frames of the downtime are lost ones, and no counter comes twice.
+    /// Skips the counters of frames that an earlier process has sent since its state was stored, or would have sent by
+    /// `now`. Receivers see the frames of the downtime as lost, and no counter repeats.
     pub(crate) fn skip_counters(&mut self, now: Timestamp, engine: &AlarmEngine) {
         let Some(config) = &self.config else { return };
         let Schedule { status, health, alarm, digest, alarms, counters, .. } = &mut self.schedule;
         let periods = |due: Timestamp, period_s: f64| {
             let periods = (now.since(due) / period_s).floor() + 1.0;
-            // Of a saturating cast: a negative number of periods is none.
+            // The cast saturates: a negative number of periods becomes 0.
             periods.max(0.0) as u64
         };
         let pages = |count: usize| u64::try_from(count).unwrap_or(0);
-        // After a restart all alarms are unknown; those that the earlier process announced as unknown are noted.
+        // After a restart all alarms are unknown; the queue still holds those that the earlier process announced as
+        // unknown.
         let unknown = u64::from(alarms.has_unknown()) * periods(*alarm, config.alarm_period_s);
         alarms.limit(now, config.alarm_period_s);
         for (message, frames) in [
@@ -266,14 +270,14 @@ impl Sending {
                 periods(*digest, config.digest_period_s).saturating_mul(pages(config.plan.digest_pages())),
             ),
             (LayoutMessage::Alarm, alarms.frames_until(now, engine, config.alarm_period_s).saturating_add(unknown)),
-            // A refused command changes nothing that is stored at once: its reply may be one that the stored counter has not seen.
+            // A refused command does not store the state, so its reply's counter may be missing from it.
             (LayoutMessage::Reply, 1),
         ] {
             config.plan.skip(message, frames, counters);
         }
     }
 
-    /// When a tick next does something.
+    /// Time at which a tick next has an effect.
     pub(crate) fn next_due(&self) -> Timestamp {
         let schedule = &self.schedule;
         let sending = self.config.as_ref().map(|config| {
@@ -293,7 +297,7 @@ impl Sending {
         take_due(&mut self.schedule.housekeeping, now, period_s)
     }
 
-    /// Whether status, health and alarm frames and the digest are due; `None` = none is configured.
+    /// Whether status, health and alarm frames and the digest are due; `None` without cyclic frames.
     pub(crate) fn take_frames_due(&mut self, now: Timestamp) -> Option<[bool; 4]> {
         let (config, schedule) = (self.config.as_ref()?, &mut self.schedule);
         Some([
@@ -304,14 +308,14 @@ impl Sending {
         ])
     }
 
-    /// Whether the freshness of commands is to be announced.
+    /// Whether the freshness of commands must be announced.
     pub(crate) fn take_freshness_due(&mut self, now: Timestamp) -> bool {
         let is_sent = |config: &OutputConfig| config.plan.authentication(LayoutMessage::Freshness).is_some();
         let due = &mut self.schedule.freshness;
         self.config.as_ref().is_some_and(is_sent) && take_due(due, now, f64::from(FRESHNESS_PERIOD_MS) / 1000.0)
     }
 
-    /// Announces the freshness of commands that come on `bus`.
+    /// Announces the freshness of commands that are received on `bus`.
     pub(crate) fn send_freshness(&mut self, time: Timestamp, bus: Option<BusIndex>, freshness: u64, out: &mut Outputs) {
         let Some(output) = &self.config else { return };
         let secoc = output.plan.authentication(LayoutMessage::Freshness);
@@ -335,7 +339,7 @@ impl Sending {
         }
     }
 
-    /// Sends one of the alarms that cannot be judged in turn, and notes those that can be judged again.
+    /// Sends the next alarm that cannot be judged, and notes the alarms that can be judged again.
     pub(crate) fn send_unknown_alarm(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
         let turn = self.schedule.alarm_turn;
         self.schedule.alarm_turn = turn.wrapping_add(1);
@@ -345,16 +349,16 @@ impl Sending {
         }
     }
 
-    /// Sends the alarms that are due within the budget.
+    /// Sends the due alarms within the budget.
     pub(crate) fn send_due_alarms(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
         let Some(period_s) = self.config.as_ref().map(|config| config.alarm_period_s) else { return };
-        // Ends with the budget.
+        // The loop ends when the budget is used up.
         while let Some(key) = self.schedule.alarms.take(now, engine, period_s) {
             self.send_key(now, key, engine, out);
         }
     }
 
-    /// Notes that an alarm changed; the caller then calls [`send_changed_alarms`](Self::send_changed_alarms).
+    /// Notes an alarm change; the caller then calls [`send_changed_alarms`](Self::send_changed_alarms).
     pub(crate) fn note_change(&mut self, now: Timestamp, key: AlarmKey) {
         if self.config.is_some() {
             self.schedule.alarms.note_change(now, key);
@@ -362,20 +366,20 @@ impl Sending {
         }
     }
 
-    /// Sends changed alarms as they are now, within the budget; the rest and the repetitions follow.
+    /// Sends the current state of changed alarms within the budget; the rest and the repetitions follow later.
     pub(crate) fn send_changed_alarms(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
         while let Some(key) = self.schedule.alarms.take_changed(now) {
             self.send_key(now, key, engine, out);
         }
     }
 
-    /// Whether something is due at another time than before.
+    /// Whether the time of the next due work has changed.
     #[inline]
     pub(crate) fn take_rescheduled(&mut self) -> bool {
         std::mem::take(&mut self.is_rescheduled)
     }
 
-    /// Sends an alarm as it is now; the state of one that no threshold watches any more is unknown.
+    /// Sends the current state of an alarm; if no threshold watches it any more, as unknown.
     fn send_key(&mut self, now: Timestamp, key: AlarmKey, engine: &AlarmEngine, out: &mut Outputs) {
         let (rule, severity, cell) = key.parts();
         if let Some(alarm) = engine.find(rule, severity, cell) {
@@ -414,7 +418,8 @@ impl Sending {
         }
     }
 
-    /// Sends the reply to a command that came on `bus`, on that interface or, where nothing else is sent on it, on all.
+    /// Sends the reply to a command that was received on `bus`: on that interface if frames are sent on it, otherwise
+    /// on all.
     pub(crate) fn send_reply(&mut self, now: Timestamp, bus: BusIndex, fields: &ReplyFields, out: &mut Outputs) {
         if self.schedule.reply > now || self.config.as_ref().is_none_or(|output| !output.plan.has_reply()) {
             return;
@@ -428,7 +433,7 @@ impl Sending {
         self.send(now, LayoutMessage::Alarm, out, |plan, counters| Some(plan.alarm(fields, counters)));
     }
 
-    /// Sends a frame, if there is one, on every interface.
+    /// Sends a frame, if `encode` returns one, on every interface.
     fn send(
         &mut self,
         time: Timestamp,
@@ -439,7 +444,8 @@ impl Sending {
         self.send_on(time, message, None, out, encode);
     }
 
-    /// Sends a frame, if there is one, as an answer to what came on `bus`; `None` = it is no answer.
+    /// Sends a frame, if `encode` returns one. `bus`: interface of the request that it answers; `None` = not an
+    /// answer.
     fn send_on(
         &mut self,
         time: Timestamp,
@@ -461,8 +467,8 @@ impl Sending {
         out.frames.extend(buses_of(output, bus).map(transmit));
     }
 
-    /// Begins to send a rule's alarm frame marked as a test, in place of a running one; of 0 s, only ends that one.
-    /// `false` = there is no output to send it on.
+    /// Starts to send a rule's alarm frame marked as a test, and ends a running test. With 0 s, only ends it. Returns
+    /// `false` without `[output]`.
     pub(crate) fn start_test(
         &mut self,
         now: Timestamp,
@@ -486,7 +492,7 @@ impl Sending {
         true
     }
 
-    /// Sends the test's frame when it is due, and ends the test in time.
+    /// Sends the test's frame when it is due, and ends the test on time.
     pub(crate) fn continue_test(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
         let Some(test) = &mut self.test else { return };
         if now >= test.end {
@@ -506,13 +512,13 @@ impl Sending {
         self.poll_j1939(now, out);
     }
 
-    /// Sends no value and no threshold, so that no part of a test can be taken for a measurement.
+    /// Sends neither value nor threshold, so that a test cannot be mistaken for a measurement.
     fn send_test(&mut self, now: Timestamp, rule: Rule, state: AlarmState, out: &mut Outputs) {
         let (rule, state) = (rule as u8, Some(state.wire_code()));
         self.send_alarm_fields(now, &AlarmFields { rule, state, test: true, ..AlarmFields::default() }, out);
     }
 
-    /// Does something with the poller, if there is one, and sends what it wants to.
+    /// Runs `act` on the poller, if any, and sends its frames and events.
     pub(crate) fn poll_with(
         &mut self,
         now: Timestamp,
@@ -527,7 +533,7 @@ impl Sending {
         out.events.extend(self.polled.changes.drain(..).map(event));
     }
 
-    /// Takes a reading of the vehicle's supply voltage.
+    /// Handles a reading of the vehicle's supply voltage.
     pub(crate) fn handle_supply(&mut self, now: Timestamp, value: Result<f64, Fault>) {
         if let (Some(poller), Some(supply)) = (&mut self.poller, self.supply) {
             let is_good = value.is_ok_and(|volts| volts >= supply.minimum_v);
@@ -535,28 +541,28 @@ impl Sending {
         }
     }
 
-    /// Claims the J1939 address: at the start, after time asleep, when the interface is up again.
+    /// Claims the J1939 address: at the start, after being asleep, and when the interface is up again.
     pub(crate) fn claim_address(&mut self, now: Timestamp, out: &mut Outputs) {
         if let Some(j1939) = &mut self.j1939 {
             j1939.claim_address(now, out);
         }
     }
 
-    /// Passes a frame to the J1939 node, if it came on the node's interface.
+    /// Passes a frame to the J1939 node; the node ignores other interfaces.
     pub(crate) fn handle_j1939_frame(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
         if let Some(j1939) = &mut self.j1939 {
             j1939.handle_frame(now, bus, frame, out);
         }
     }
 
-    /// Sends what is due from the J1939 node.
+    /// Sends the due frames of the J1939 node.
     pub(crate) fn poll_j1939(&mut self, now: Timestamp, out: &mut Outputs) {
         if let Some(j1939) = &mut self.j1939 {
             j1939.poll(now, out);
         }
     }
 
-    /// Passes the present alarms to the J1939 node.
+    /// Passes the current alarms to the J1939 node.
     pub(crate) fn update_trouble_codes(&mut self, now: Timestamp, engine: &AlarmEngine) {
         if let Some(j1939) = &mut self.j1939 {
             j1939.update_trouble_codes(now, engine, self.test.is_some());

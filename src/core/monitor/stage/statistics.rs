@@ -1,6 +1,6 @@
-//! Plain counts of the core's work for the status socket and its metrics.
+//! Counts of the core's work for the status socket and its metrics.
 //!
-//! Part of the stored state: they continue after a restart of the program. Counts that are kept elsewhere are not here:
+//! The counts are part of the stored state and continue after a restart. Not included are counts kept elsewhere:
 //! readings ([`crate::sample::ReadingCounts`]), checks of protected messages ([`Monitor::protected`](super::Monitor)),
 //! floods ([`Monitor::dropped`](super::Monitor)), steps back in time ([`Monitor::time_backwards`](super::Monitor)).
 
@@ -12,7 +12,7 @@ use crate::cell::StepResult;
 use crate::monitor::message::{BusEvent, Event, EventKind, RecordKind};
 use crate::quantity::BusIndex;
 
-/// Adds to a count; stored counts may be anything.
+/// Adds to a count without overflow, because a stored count may have any value.
 fn add(count: &mut u64, by: u64) {
     *count = count.saturating_add(by);
 }
@@ -20,16 +20,16 @@ fn add(count: &mut u64, by: u64) {
 /// Counts since the first start.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Statistics {
-    /// Per interface, in the order of the configuration; interfaces without input may be missing at the end.
+    /// Counts per interface, in the order of the configuration; interfaces without input may be missing at the end.
     pub buses: Vec<BusStatistics>,
-    /// Voltage readings by their effect.
+    /// Voltage readings by effect.
     #[serde(flatten)]
     pub voltages: VoltageCounts,
-    /// Filters that started again from their voltage.
+    /// Filters that were restarted from their voltage.
     pub filter_resets: u64,
-    /// Times an estimate became untrusted.
+    /// Times an estimate lost its trust.
     pub trust_lost: u64,
-    /// Times without measurement: asleep, not running, or a hole in the record.
+    /// Periods without measurement: computer asleep, program not running, or gap in the record.
     pub gaps: u64,
     /// Changes of mode.
     pub mode_changes: u64,
@@ -46,26 +46,26 @@ pub struct Statistics {
     pub packs_replaced: u64,
     /// Times a stored state was restored.
     pub restores: u64,
-    /// Times the files could not be written (any more).
+    /// Times the files could not be written.
     pub store_failures: u64,
 }
 
 /// Voltage readings by their effect on the estimates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct VoltageCounts {
-    /// Moved an estimate.
+    /// Readings that moved an estimate.
     #[serde(rename = "voltages_used")]
     pub used: u64,
-    /// Beyond the filter's gate: they moved nothing.
+    /// Readings beyond the filter's gate, which were ignored.
     #[serde(rename = "voltages_gated")]
     pub gated: u64,
-    /// Without a current to compare them with.
+    /// Readings without a current to compare them with.
     #[serde(rename = "voltages_without_current")]
     pub without_current: u64,
 }
 
 impl VoltageCounts {
-    /// All of them.
+    /// Sum of all counts.
     pub const fn total(&self) -> u64 {
         self.used + self.gated + self.without_current
     }
@@ -76,9 +76,9 @@ impl VoltageCounts {
 pub struct LearningCounts {
     /// Half-cycles, per cell.
     pub half_cycles: u64,
-    /// Runs of a capacity filter, per cell.
+    /// Updates of a capacity filter, per cell.
     pub capacity_updates: u64,
-    /// Those of them with a measurement.
+    /// Updates with a measurement.
     pub capacity_measurements: u64,
     /// Recharge periods recorded, raw or normalised.
     pub recharge_periods: u64,
@@ -91,7 +91,7 @@ pub struct BusStatistics {
     pub frames: u64,
     /// Error frames.
     pub error_frames: u64,
-    /// Those of them that say bus-off.
+    /// Error frames that report bus-off.
     pub bus_offs: u64,
 }
 
@@ -108,16 +108,16 @@ impl BusStatistics {
 /// Alarms by severity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct AlarmCounts {
-    /// Worth knowing.
+    /// Alarms of severity `info`.
     pub info: u64,
-    /// Plan a visit.
+    /// Alarms of severity `warning`.
     pub warning: u64,
-    /// Act now.
+    /// Alarms of severity `severe`.
     pub severe: u64,
 }
 
 impl AlarmCounts {
-    /// Of one severity.
+    /// Count of one severity.
     pub const fn get(&self, severity: Severity) -> u64 {
         match severity {
             Severity::Info => self.info,
@@ -184,7 +184,7 @@ impl Statistics {
         self.note_events(events);
     }
 
-    /// Counts events without an input.
+    /// Counts events that were not caused by a record.
     pub(crate) fn note_events(&mut self, events: &[Event]) {
         events.iter().for_each(|event| self.note_event(&event.kind));
     }
@@ -209,7 +209,7 @@ impl Statistics {
         }
     }
 
-    /// Counts voltage readings by what they did to their cells' estimates.
+    /// Counts voltage readings by their effect on the cells' estimates.
     pub(crate) fn note_voltages<'a>(&mut self, results: impl Iterator<Item = &'a StepResult>) {
         let (mut all, mut compared, mut used) = (0, 0, 0);
         for StepResult { update, .. } in results {

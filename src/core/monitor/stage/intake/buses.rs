@@ -1,8 +1,8 @@
-//! Whether the interfaces are in order, for the rule about them.
+//! State of the interfaces for the rule about them.
 //!
-//! An interface is out of order while it is down or missing, from bus-off until it is up again or a frame comes, and
-//! while frames of ours cannot be sent. Before its first report it is unknown. A fault lasts over a restart, from when it
-//! began until the interface is reported in order.
+//! An interface is out of order while it is down or missing, from bus-off until it is up again or a frame arrives, and
+//! while frames of the daemon cannot be sent. It is unknown before its first report. A fault continues across a
+//! restart until the interface is reported to be in order.
 
 use serde::{Deserialize, Serialize};
 
@@ -13,7 +13,7 @@ use crate::quantity::{BusIndex, Timestamp};
 pub(crate) const CAN_ERR_BUSOFF: u32 = 0x40;
 const CAN_ERR_RESTARTED: u32 = 0x100;
 
-/// Without another report for this long frames can be sent again, s: four of the drivers' report periods.
+/// Sending counts as working again this long after the last failure report, s: four report periods of the drivers.
 const SEND_RECOVERED_S: f64 = 1.0;
 
 #[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]
@@ -25,14 +25,14 @@ struct BusState {
     unsent: Option<(Timestamp, Timestamp)>,
 }
 
-/// All interfaces with a report.
+/// State of all interfaces that have reported.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub(crate) struct Buses {
     states: Vec<BusState>,
 }
 
 impl Buses {
-    /// Takes a report of an interface.
+    /// Handles a report of an interface.
     pub(crate) fn handle_event(&mut self, now: Timestamp, bus: BusIndex, event: BusEvent) {
         let state = self.state(bus);
         state.is_known = true;
@@ -51,22 +51,22 @@ impl Buses {
         }
     }
 
-    /// A frame came: the interface is not bus-off.
+    /// Handles a received frame, which ends a bus-off.
     #[inline]
     pub(crate) fn handle_frame(&mut self, bus: BusIndex) {
         let state = self.state(bus);
         (state.is_known, state.off_since) = (true, None);
     }
 
-    /// For how long the worst of `interfaces` has been out of order, s; 0 = all that have reported are in order, `None` =
-    /// none has. And whether each has reported.
+    /// How long the worst of `interfaces` has been out of order, s (0 = all that have reported are in order,
+    /// `None` = none has reported), and whether each has reported.
     pub(crate) fn worst_s(&self, now: Timestamp, interfaces: usize) -> (Option<f64>, bool) {
         let known = self.states.iter().filter(|state| state.is_known);
         let worst_s = known.clone().map(|state| state.fault_s(now)).max_by(f64::total_cmp);
         (worst_s, known.count() >= interfaces)
     }
 
-    /// Moves stored stamps onto another clock.
+    /// Shifts stored timestamps to another clock.
     pub(crate) fn rebase(&mut self, by_nanos: i64) {
         let moved = |stamp: Timestamp| stamp.plus_nanos(by_nanos);
         for state in &mut self.states {
@@ -75,8 +75,8 @@ impl Buses {
         }
     }
 
-    /// Continues at `now` with the faults stored at `taken`: whether a fault lasts is not known before the interface is
-    /// reported, nor whether frames can be sent again before a second has passed.
+    /// Continues at `now` with the faults stored at `taken`. Whether a fault continues is unknown until the interface
+    /// reports, and whether frames can be sent again until a second has passed.
     pub(crate) fn restored(mut self, taken: Timestamp, now: Timestamp) -> Self {
         for state in &mut self.states {
             let unsent = state.unsent.filter(|(_, latest)| taken.since(*latest) <= SEND_RECOVERED_S);
@@ -98,7 +98,7 @@ impl BusState {
     fn fault_s(&self, now: Timestamp) -> f64 {
         let unsent = self.unsent.filter(|(_, latest)| now.since(*latest) <= SEND_RECOVERED_S);
         let since = [self.down_since, self.off_since, unsent.map(|(first, _)| first)];
-        // A fault in this very moment lasts already: 0 would say that there is none.
+        // A fault that starts now counts with a minimal duration, because 0 means "no fault".
         since.into_iter().flatten().map(|since| now.since(since).max(1e-9)).fold(0.0, f64::max)
     }
 }
@@ -114,7 +114,7 @@ mod tests {
     }
 
     #[test]
-    fn an_interface_is_out_of_order_from_the_first_report_to_the_last() {
+    fn interface_fault_lasts_from_first_to_last_report() {
         for (fault, end) in [
             (BusEvent::Down, Some(BusEvent::Up)),
             (BusEvent::Missing, Some(BusEvent::Up)),
@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_ends_bus_off_and_other_errors_are_no_fault() {
+    fn frame_ends_bus_off_and_other_errors_are_ignored() {
         let mut buses = Buses::default();
         buses.handle_event(at(0.0), BUS, BusEvent::ErrorFrame { class: 0x40 });
         buses.handle_frame(BUS);

@@ -1,12 +1,12 @@
 //! Decides which authenticated command frames are executed.
 //!
-//! In: a command frame and the freshness with which its authenticator is right, if there is one. Out: whether it is executed, or
-//! why not; the freshness to announce.
+//! In: a command frame, and the freshness that its authenticator confirms, if any. Out: whether the command is
+//! executed, with the reason if not; the freshness to announce.
 //!
-//! A short authenticator can be guessed by trying often. After [`FORGED_BURST`] wrong ones, and then for [`FORGED_PERIOD_NS`]
-//! after each, one right authenticator is not enough: the same command must come again, with another freshness, within
-//! [`REPEAT_NS`]. A genuine sender, who repeats a command that was refused, is served during an attack; a guess must be right
-//! twice.
+//! A short authenticator can be guessed by many attempts. After [`FORGED_BURST`] wrong ones, and then for
+//! [`FORGED_PERIOD_NS`] after each further one, a right authenticator alone is not enough: the same command must be
+//! sent again within [`REPEAT_NS`], with another freshness. A genuine sender repeats a refused command and is served
+//! during an attack; an attacker must guess right twice.
 
 use serde::{Deserialize, Serialize};
 
@@ -14,42 +14,43 @@ use crate::can::encode::{CommandRefusal, FRESHNESS_PERIOD_MS};
 use crate::can::secoc::{Authentication, FreshnessWindow, MacCheck};
 use crate::quantity::{InvalidState, Timestamp};
 
-/// Wrong authenticators at once after a pause.
+/// Number of wrong authenticators tolerated after a pause.
 const FORGED_BURST: i64 = 10;
-/// Then one in this time, ns: one of 24 bits is guessed within a day with a probability of 1 in 1900.
+/// Afterwards, one more is tolerated per this time, ns. The probability of guessing one of 24 bits within a day is
+/// then 1 in 1900.
 const FORGED_PERIOD_NS: i64 = 10_000_000_000;
-/// Longest time between a command and its repetition during an attack, ns. At 2000 guesses a second, the most that the flood
-/// limit admits by default, one of 24 bits and its repetition are right within a day with a probability of 1 in 800.
+/// Longest time between a command and its repetition during an attack, ns. At 2000 guesses a second, the flood limit's
+/// default, the probability of guessing an authenticator of 24 bits and its repetition within a day is 1 in 800.
 const REPEAT_NS: i64 = 1_000_000_000;
 
-/// Without an announcement for this long what was announced is old, ns: two periods, as with announcements.
+/// An announced freshness is outdated this long after its announcement, ns: two announcement periods.
 const STALE_NS: i64 = 2 * FRESHNESS_PERIOD_MS as i64 * 1_000_000;
 
-/// The gate with its counts; all of it is kept over a restart.
+/// The gate with its counts. All of it is stored.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct CommandGate {
     window: FreshnessWindow,
-    /// When the freshness was last announced.
+    /// Time of the last announcement of the freshness.
     announced_at: Timestamp,
-    /// Until when one right authenticator is not enough.
+    /// Until this time, a right authenticator alone is not enough.
     attacked_until: Timestamp,
-    /// A command that must come again, and until when.
+    /// A command that must be repeated, and the time until which it must be.
     unconfirmed: Option<(Timestamp, Vec<u8>)>,
     pub(crate) counts: CommandCounts,
 }
 
-/// Frames of an authenticated command message.
+/// Frames of an authenticated command message, by result.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CommandCounts {
-    /// With a right authenticator and a fresh value.
+    /// Right authenticator and fresh value.
     pub authentic: u64,
-    /// With a wrong authenticator.
+    /// Wrong authenticator.
     pub forged: u64,
-    /// With a freshness that was used before, is too old or was not announced.
+    /// Freshness that was already used, is too old or was not announced.
     pub old: u64,
-    /// With a right authenticator, but to be repeated, because many wrong ones came.
+    /// Right authenticator, but the command must be repeated, because many wrong ones came.
     pub unconfirmed: u64,
 }
 
@@ -66,13 +67,13 @@ impl CommandCounts {
 }
 
 impl CommandGate {
-    /// Begins a run at `now`.
+    /// Starts a run at `now`.
     pub(crate) fn begin(&mut self, now: Timestamp) {
         self.window.begin(now);
         self.announced_at = now;
     }
 
-    /// After time without listening, or a step of the clock.
+    /// Handles a time without listening, or a step of the clock.
     pub(crate) fn restart(&mut self, now: Timestamp) {
         self.window.expire();
         self.attacked_until = self.attacked_until.min(now.plus_nanos(FORGED_PERIOD_NS));
@@ -85,15 +86,15 @@ impl CommandGate {
         self.window.announce()
     }
 
-    /// What the authenticator of a payload is checked with.
+    /// The data needed to check a payload's authenticator.
     pub(crate) fn mac_check(&self, authentication: Authentication, payload: &[u8]) -> MacCheck {
         self.window.check(authentication, payload)
     }
 
-    /// Judges a frame. `verified`: the freshness with which its authenticator is right.
+    /// Judges a frame. `verified`: the freshness that its authenticator confirms.
     ///
     /// # Errors
-    /// Why it is not executed.
+    /// The reason why the command is not executed.
     pub(crate) fn judge(
         &mut self,
         now: Timestamp,
@@ -127,7 +128,7 @@ impl CommandGate {
         verdict
     }
 
-    /// Moves the stored times onto another clock.
+    /// Shifts stored times to another clock.
     pub(crate) fn rebase(&mut self, by_nanos: i64) {
         self.announced_at = self.announced_at.plus_nanos(by_nanos);
         self.attacked_until = self.attacked_until.plus_nanos(by_nanos);

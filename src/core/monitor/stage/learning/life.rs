@@ -1,8 +1,8 @@
-//! Remaining useful life: each cell's forecast is fed by its half-cycles, and the pack's life is its weakest cell's.
+//! Remaining useful life: half-cycles update each cell's forecast, and the shortest life is the pack's.
 //!
-//! A forecast takes what each half-cycle alone says of the capacity, not the learned capacity: learned capacities that
-//! follow each other are mostly the same evidence. The error that all half-cycles share (the current sensor's gain) is the
-//! shared part of the deviation.
+//! A forecast uses the measurement from each half-cycle alone, not the learned capacity, because successive learned
+//! capacities share most of their evidence. The error that all half-cycles share (the current sensor's gain) enters as
+//! the shared variance.
 
 use crate::alarm::{Observation, Rule};
 use crate::cell::{CellModel, PackBank};
@@ -14,7 +14,7 @@ use crate::monitor::message::EventKind;
 use crate::monitor::stage::publisher::Publisher;
 use crate::quantity::CellIndex;
 
-/// Deviations of a normal distribution between its median and its 5 % quantile.
+/// Standard deviations of a normal distribution between its median and its 5 % quantile.
 const LOW_DEVIATIONS: f64 = 1.645;
 
 /// A cell's forecast and its latest result.
@@ -29,13 +29,14 @@ impl CellLife {
         Self::restore(Forecast::new(Axis::Cycles, model.rated_capacity_ah), config)
     }
 
-    /// Continues a stored forecast.
+    /// Restores a stored forecast.
     pub(crate) fn restore(forecast: Forecast, config: &HealthConfig) -> Self {
         let remaining = forecast.remaining(config.end_of_life_ah);
         Self { forecast, remaining }
     }
 
-    /// Takes a half-cycle, so long after the one before (seconds; `None` = not known). `update` is what it taught.
+    /// Updates with a half-cycle that ended `since_before_s` after the previous one (`None` = unknown). `update`: its
+    /// capacity update.
     pub(crate) fn learn(
         &mut self,
         model: &CellModel,
@@ -56,18 +57,18 @@ impl CellLife {
         });
         self.forecast.update(usage, reading);
         if self.forecast.check(Axis::Cycles).is_err() {
-            // Use or readings that no cell can have: it begins again.
+            // Restarts the forecast after impossible use or readings.
             self.forecast = Forecast::new(Axis::Cycles, model.rated_capacity_ah);
         }
         self.restate(config);
     }
 
-    /// Computes the remaining life of the same forecast, for another threshold perhaps.
+    /// Computes the remaining life again, for example for another threshold.
     fn restate(&mut self, config: &HealthConfig) {
         self.remaining = self.forecast.remaining(config.end_of_life_ah);
     }
 
-    /// Equivalent full cycles until the end of life; `None` = not known.
+    /// Equivalent full cycles until the end of life; `None` if unknown.
     fn cycles(&self) -> Option<Remaining> {
         self.remaining.ok().and_then(|life| life.cycles)
     }
@@ -84,18 +85,18 @@ impl PackLife {
         Self { cells: (0..bank.cells()).map(|cell| CellLife::new(bank.model(cell), config)).collect() }
     }
 
-    /// Remaining life of a cell, or why it is not known.
+    /// Remaining life of a cell, or the reason why it is unknown.
     pub(crate) fn of_cell(&self, cell: CellIndex) -> Result<RemainingLife, InsufficientData> {
         self.cells.get(cell.index()).map_or(Err(InsufficientData::Readings { found: 0 }), |cell| cell.remaining)
     }
 
-    /// The cell whose life ends first, and when; `None` until every cell's is known.
+    /// The cell with the shortest remaining life, and that life; `None` until every cell's life is known.
     pub(crate) fn of_pack(&self) -> Option<(CellIndex, RemainingLife)> {
         let all_known = self.cells.iter().all(|cell| cell.cycles().is_some());
         self.shortest().filter(|_| all_known)
     }
 
-    /// The cell whose life ends first, among those whose life is known.
+    /// The cell with the shortest remaining life among those whose life is known.
     fn shortest(&self) -> Option<(CellIndex, RemainingLife)> {
         let median = |cell: &CellLife| cell.cycles().map(|cycles| cycles.median);
         let known = (0..).map(CellIndex).zip(&self.cells).filter_map(|(index, cell)| Some((median(cell)?, index)));
@@ -103,8 +104,8 @@ impl PackLife {
         Some((cell, self.cells[cell.index()].remaining.ok()?))
     }
 
-    /// Publishes the remaining life after a half-cycle: while it is known, and once when it no longer is. `is_new`: some
-    /// cell's capacity was measured.
+    /// Publishes the remaining life after a half-cycle: while it is known, and once when it becomes unknown. `is_new`:
+    /// whether a cell's capacity was measured.
     pub(crate) fn publish(&self, was_known: bool, is_new: bool, to: &mut Publisher<'_>) {
         let life = self.of_pack();
         if was_known || life.is_some() {
@@ -124,7 +125,7 @@ impl PackLife {
         }
     }
 
-    /// Passes the shortest life to its rule: while some cell's life is not known the pack's may be shorter, never longer.
+    /// Passes the shortest life to its rule, as an upper bound while some cell's life is unknown.
     pub(crate) fn observe(&self, is_new: bool, to: &mut Publisher<'_>) {
         let is_bound = self.of_pack().is_none();
         let cycles = self.shortest().and_then(|(_, life)| life.cycles);

@@ -1,11 +1,12 @@
-//! Which alarm is sent next: changes at once and repeated, raised alarms in turn, all within a budget of frames.
+//! Decides which alarm is sent next: changes immediately and repeated, raised alarms in turn, all within a budget of
+//! frames.
 //!
-//! In: changed alarms, the alarm engine, the time. Out: one alarm after the other, worst first. The budget is a token bucket:
-//! [`BURST`] frames at once, then one each [`ALARM_DELAY_MS`]. First frames of changes precede everything, repetitions
-//! follow the frames in turn, which take at most half of the budget.
+//! In: changed alarms, the alarm engine, the time. Out: one alarm at a time, most severe first. The budget is a token
+//! bucket: [`BURST`] frames at once, then one every [`ALARM_DELAY_MS`]. First frames of changes have priority over
+//! frames in turn, which use at most half of the budget. Repetitions come last.
 //!
-//! Deviation from one frame per change: an alarm is sent as it is when its frame leaves. Of two changes while the budget is
-//! used up, the receiver sees the second.
+//! Deviation: a frame shows the alarm's state when it is sent, not at each change. Effect: if an alarm changes twice
+//! while the budget is used up, the receiver sees only the second change.
 
 use std::cmp::Reverse;
 
@@ -15,19 +16,19 @@ use crate::alarm::{Alarm, AlarmEngine, AlarmState, Rule, Severity};
 use crate::can::encode::{ALARM_DELAY_MS, CHANGE_REPETITION_MS, CHANGE_REPETITIONS};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Frames at once after a pause: an event changes the alarms of a few cells, or one rule of each of the pack's modules.
+/// Number of immediate frames after a pause: an event changes the alarms of a few cells, or one rule of each module.
 const BURST: i64 = 20;
-/// Frames in turn are at least this far apart, in units of [`ALARM_DELAY_MS`]: the other half is for changes.
+/// Smallest distance of frames in turn, in units of [`ALARM_DELAY_MS`]: the other half of the budget is for changes.
 const TURN_DELAYS: u32 = 2;
-/// Alarms that are remembered as announced unknown; 17 rules of three severities are 51. Beyond it no more are announced;
-/// the digest shows their rules.
+/// Maximum number of alarms announced as unknown (17 rules of three severities are 51). Beyond it, none is announced,
+/// but the digest shows their rules.
 const MAX_UNKNOWN: usize = 64;
 
 const NANOS_PER_MS: i64 = 1_000_000;
 const DELAY_NS: i64 = ALARM_DELAY_MS as i64 * NANOS_PER_MS;
 const REPETITION_NS: i64 = CHANGE_REPETITION_MS as i64 * NANOS_PER_MS;
 
-/// Identity of an alarm; the order is worst first.
+/// Identity of an alarm; ordered most severe first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub(crate) struct AlarmKey {
     severity: Reverse<Severity>,
@@ -54,13 +55,13 @@ impl AlarmKey {
     }
 }
 
-/// A changed alarm with frames still to be sent.
+/// A changed alarm whose frames have not all been sent.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 struct ChangedAlarm {
     key: AlarmKey,
-    /// Frames still to be sent.
+    /// Number of frames left to send.
     frames: u32,
-    /// When the next one is due.
+    /// Time of the next one.
     due: Timestamp,
 }
 
@@ -70,34 +71,34 @@ impl ChangedAlarm {
     }
 }
 
-/// See the module.
+/// Queue of alarms to send; see the module.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub(crate) struct AlarmQueue {
-    /// Worst first, each alarm once.
+    /// Most severe first; each alarm once.
     changed: Vec<ChangedAlarm>,
-    /// Alarms announced as unknown whose end is still to be announced.
+    /// Alarms that were announced as unknown and are not yet known again.
     unknown: Vec<AlarmKey>,
-    /// The raised alarm that was sent last in turn.
+    /// The raised alarm that was last sent in turn.
     last: Option<AlarmKey>,
-    /// When the next raised alarm is due in turn; `None` = none is raised.
+    /// Time of the next raised alarm in turn; `None` = no alarm is raised.
     turn: Option<Timestamp>,
-    /// From when on the budget has a frame.
+    /// Time from which the budget has a frame.
     free: Timestamp,
 }
 
 impl AlarmQueue {
-    /// Whether alarms are being announced as unknown.
+    /// Whether any alarm is announced as unknown.
     pub(crate) fn has_unknown(&self) -> bool {
         !self.unknown.is_empty()
     }
 
-    /// Time between two frames of one raised alarm while nothing changes, s.
+    /// Time between two frames of one raised alarm without changes, s.
     pub(crate) fn pass_time_s(engine: &AlarmEngine, period_s: f64) -> f64 {
         let count = i64::try_from(engine.count()).unwrap_or(i64::MAX).max(1);
         Timestamp::from_nanos(Self::turn_ns(engine, period_s).saturating_mul(count)).secs()
     }
 
-    /// Time between two frames in turn, ns: all raised alarms in each period, as far as the budget allows.
+    /// Time between two frames in turn, ns: all raised alarms in each period, or slower if the budget requires it.
     fn turn_ns(engine: &AlarmEngine, period_s: f64) -> i64 {
         let period_ns = Timestamp::ZERO.plus_secs(period_s).nanos().max(1);
         let count = i64::try_from(engine.count()).unwrap_or(i64::MAX).max(1);
@@ -105,7 +106,7 @@ impl AlarmQueue {
         period_ns.saturating_add(count - 1).checked_div(count).unwrap_or(period_ns).max(least_ns)
     }
 
-    /// Notes that an alarm changed: it is sent at once and repeated.
+    /// Notes an alarm change, which is sent immediately and repeated.
     pub(crate) fn note_change(&mut self, now: Timestamp, key: AlarmKey) {
         let entry = ChangedAlarm { key, frames: 1 + CHANGE_REPETITIONS, due: now };
         match self.changed.binary_search_by_key(&key, |changed| changed.key) {
@@ -119,7 +120,7 @@ impl AlarmQueue {
         self.take_entry(now, ChangedAlarm::is_first)
     }
 
-    /// The next alarm to be sent; `None` = none is due, or the budget is used up.
+    /// The next alarm to send; `None` if none is due or the budget is used up.
     pub(crate) fn take(&mut self, now: Timestamp, engine: &AlarmEngine, period_s: f64) -> Option<AlarmKey> {
         self.take_changed(now)
             .or_else(|| self.take_turn(now, engine, period_s))
@@ -141,7 +142,7 @@ impl AlarmQueue {
         Some(key)
     }
 
-    /// The raised alarm whose turn it is.
+    /// The raised alarm whose turn has come.
     fn take_turn(&mut self, now: Timestamp, engine: &AlarmEngine, period_s: f64) -> Option<AlarmKey> {
         if engine.count() == 0 {
             self.turn = None;
@@ -162,7 +163,7 @@ impl AlarmQueue {
         Some(next)
     }
 
-    /// An alarm that cannot be judged, in turn, within the budget.
+    /// The next alarm that cannot be judged, within the budget.
     pub(crate) fn take_unknown(&mut self, now: Timestamp, engine: &AlarmEngine, turn: usize) -> Option<Alarm> {
         let alarm = engine.unknown_alarm(turn).filter(|_| self.free <= now)?;
         let key = AlarmKey::of(&alarm);
@@ -176,7 +177,7 @@ impl AlarmQueue {
         Some(alarm)
     }
 
-    /// Notes a change of each alarm that was announced as unknown and is not any more.
+    /// Notes a change of each alarm that was announced as unknown and is known again.
     pub(crate) fn note_known(&mut self, now: Timestamp, engine: &AlarmEngine) {
         let is_open = |key: &AlarmKey| {
             let state = key.find(engine).map(|alarm| alarm.state);
@@ -193,13 +194,13 @@ impl AlarmQueue {
         self.free = self.free.max(now.plus_nanos(-(BURST - 1) * DELAY_NS)).plus_nanos(DELAY_NS);
     }
 
-    /// When something is due next and within the budget; `None` = nothing waits.
+    /// Time at which something is due and within the budget; `None` = nothing waits.
     pub(crate) fn next_due(&self) -> Option<Timestamp> {
         let changed = self.changed.iter().map(|changed| changed.due).min();
         changed.into_iter().chain(self.turn).min().map(|due| due.max(self.free))
     }
 
-    /// Frames that are due up to `now` when nothing changes.
+    /// Number of frames that are due up to `now` without further changes.
     pub(crate) fn frames_until(&self, now: Timestamp, engine: &AlarmEngine, period_s: f64) -> u64 {
         let due = |from: Timestamp, step_ns: i64| {
             let past_ns = now.nanos().saturating_sub(from.nanos());
@@ -210,28 +211,28 @@ impl AlarmQueue {
         repeated.fold(turns, u64::saturating_add)
     }
 
-    /// Nothing is due later than at `now`: after a start, after time asleep, and when the clock was set back.
+    /// Limits all due times to `now`: after a start, after being asleep, and when the clock was set back.
     pub(crate) fn restart(&mut self, now: Timestamp) {
         self.free = self.free.min(now);
         self.turn = self.turn.map(|turn| turn.min(now));
         self.changed.iter_mut().for_each(|changed| changed.due = changed.due.min(now));
     }
 
-    /// Nothing waits longer than it would after a frame at `now`, whatever a stored state says.
+    /// Limits all due times of a stored state to those after a frame at `now`.
     pub(crate) fn limit(&mut self, now: Timestamp, period_s: f64) {
         self.free = self.free.min(now.plus_nanos(DELAY_NS));
         self.turn = self.turn.map(|turn| turn.min(now.plus_secs(period_s)));
         self.changed.iter_mut().for_each(|changed| changed.due = changed.due.min(now.plus_nanos(REPETITION_NS)));
     }
 
-    /// Moves stored times onto another clock.
+    /// Shifts stored times to another clock.
     pub(crate) fn rebase(&mut self, by_nanos: i64) {
         self.free = self.free.plus_nanos(by_nanos);
         self.turn = self.turn.map(|turn| turn.plus_nanos(by_nanos));
         self.changed.iter_mut().for_each(|changed| changed.due = changed.due.plus_nanos(by_nanos));
     }
 
-    /// Nothing is sent any more.
+    /// Empties the queue.
     pub(crate) fn clear(&mut self) {
         *self = Self::default();
     }

@@ -1,6 +1,6 @@
-//! Contents of the digest frame: all raised alarms, the state of every rule, one threshold in turn.
+//! Contents of the digest frame: all raised alarms, the state of every rule, and one threshold in turn.
 //!
-//! In: the alarm engine. Out: [`DigestFields`]. A rule that cannot be judged is never shown as one without alarms.
+//! In: the alarm engine. Out: [`DigestFields`]. A rule that cannot be judged is shown as unknown, never as "no alarm".
 
 use super::alarm_queue::AlarmQueue;
 use crate::alarm::{AlarmEngine, Rule, RuleSummary, Severity};

@@ -1,8 +1,8 @@
-//! The J1939 node in addition to the frames of `[output]`: alarms as trouble codes.
+//! The J1939 node, which sends alarms as trouble codes in addition to the frames of `[output]`.
 //!
-//! In: frames of the node's interface, alarms, ticks. Out: the node's frames and events. If several raised thresholds of
-//! a rule share a parameter number, only the most severe is sent, for any cell. The occurrence count is that of the one of its
-//! alarms that was raised most often.
+//! In: frames of the node's interface, alarms, ticks. Out: the node's frames and events. If several raised thresholds
+//! share a suspect parameter number, only the most severe is sent, for any cell. Its occurrence count is the largest
+//! one among its alarms.
 
 use crate::alarm::AlarmEngine;
 use crate::can::Frame;
@@ -32,7 +32,7 @@ impl J1939 {
         }
     }
 
-    /// Takes other codes for the same node; `false` = it is another node.
+    /// Applies other codes to the same node; returns `false` if the node differs.
     pub(crate) fn reconfigure(&mut self, config: &J1939Config) -> bool {
         let is_same = (self.config.bus, self.config.node) == (config.bus, config.node);
         if is_same {
@@ -50,7 +50,7 @@ impl J1939 {
         self.dispatch_outputs(now, out);
     }
 
-    /// Takes a frame, if it came on the node's interface.
+    /// Handles a frame if it was received on the node's interface.
     pub(crate) fn handle_frame(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
         if bus == self.config.bus {
             self.node.handle_frame(now, frame, &mut self.out);
@@ -63,11 +63,11 @@ impl J1939 {
         self.dispatch_outputs(now, out);
     }
 
-    /// Sets the node's codes to the present alarms: those that are raised, and those that have been.
+    /// Sets the node's active and previously active codes from the current alarms.
     pub(crate) fn update_trouble_codes(&mut self, now: Timestamp, engine: &AlarmEngine, is_test_running: bool) {
         self.active.clear();
         self.previously_active.clear();
-        // Within a rule the gravest threshold comes last.
+        // Within a rule, thresholds are ordered by severity; the most severe comes last.
         for threshold in engine.thresholds().rev() {
             let same = |code: &&AlarmCode| (code.rule, code.severity) == (threshold.rule, threshold.severity);
             let Some(own) = self.config.alarms.iter().find(same) else { continue };
@@ -80,7 +80,7 @@ impl J1939 {
                 self.previously_active.push(code);
             }
         }
-        // The gravest rule that was active comes first: a list that is too long is cut off at its end.
+        // The most severe rule comes first, because a list that is too long is cut off at its end.
         self.previously_active.reverse();
         if is_test_running {
             self.active.push(ActiveCode { code: self.config.test_code, lamp: Lamp::None });

@@ -1,4 +1,4 @@
-//! Order, budget and repetition of alarm frames.
+//! Tests of order, budget and repetition of alarm frames.
 
 use super::*;
 use crate::alarm::{Comparison, Observation, RuleConfig};
@@ -19,7 +19,7 @@ fn config(rule: Rule, severity: Severity) -> RuleConfig {
     }
 }
 
-/// Warnings for cells, and a severe alarm of the pack.
+/// Rules: warnings for cells, and a severe alarm of the pack.
 fn engine() -> AlarmEngine {
     let rules =
         vec![config(Rule::EstimateUntrusted, Severity::Warning), config(Rule::TemperatureHigh, Severity::Severe)];
@@ -40,7 +40,7 @@ fn cell_key(cell: u16) -> AlarmKey {
 
 const PACK_KEY: fn() -> AlarmKey = || AlarmKey::new(Rule::TemperatureHigh, Severity::Severe, None);
 
-/// What is sent from `from_ms` on for so long, tick by tick, with the time of each, ms.
+/// Frames sent tick by tick from `from_ms` on, for `for_ms`, each with its time, ms.
 fn sent(queue: &mut AlarmQueue, engine: &AlarmEngine, from_ms: i64, for_ms: i64) -> Vec<(i64, AlarmKey)> {
     let mut sent = Vec::new();
     for ms in (from_ms..from_ms + for_ms).step_by(10) {
@@ -52,7 +52,7 @@ fn sent(queue: &mut AlarmQueue, engine: &AlarmEngine, from_ms: i64, for_ms: i64)
 }
 
 #[test]
-fn a_change_is_sent_at_once_and_three_times_more() {
+fn change_is_sent_once_and_repeated_three_times() {
     let (mut queue, engine) = (AlarmQueue::default(), engine());
     queue.note_change(Timestamp::ZERO, cell_key(4));
     let times: Vec<i64> = sent(&mut queue, &engine, 0, 5_000).into_iter().map(|(ms, _)| ms).collect();
@@ -61,7 +61,7 @@ fn a_change_is_sent_at_once_and_three_times_more() {
 }
 
 #[test]
-fn another_change_begins_its_repetition_again() {
+fn another_change_restarts_the_repetition() {
     let (mut queue, engine) = (AlarmQueue::default(), engine());
     queue.note_change(Timestamp::ZERO, cell_key(4));
     sent(&mut queue, &engine, 0, 150);
@@ -70,7 +70,7 @@ fn another_change_begins_its_repetition_again() {
 }
 
 #[test]
-fn many_changes_stay_within_the_budget_worst_first() {
+fn many_changes_stay_within_budget_worst_first() {
     let (mut queue, mut engine) = (AlarmQueue::default(), engine());
     raise(&mut engine, CELLS);
     let start = Timestamp::from_secs(10.0);
@@ -91,7 +91,7 @@ fn many_changes_stay_within_the_budget_worst_first() {
 }
 
 #[test]
-fn every_raised_alarm_has_its_turn_within_the_pass_time() {
+fn every_raised_alarm_is_sent_within_pass_time() {
     for raised in [1, 2, 5, 50, 51, 97] {
         let (mut queue, mut engine) = (AlarmQueue::default(), engine());
         raise(&mut engine, raised);
@@ -111,7 +111,7 @@ fn every_raised_alarm_has_its_turn_within_the_pass_time() {
 }
 
 #[test]
-fn what_is_no_longer_unknown_is_announced_and_what_counts_towards_an_alarm_is_not() {
+fn alarm_no_longer_unknown_is_announced() {
     let (mut queue, mut engine) = (AlarmQueue::default(), engine());
     let announced = queue.take_unknown(Timestamp::ZERO, &engine, 1).unwrap();
     assert_eq!((announced.rule, announced.state), (Rule::TemperatureHigh, AlarmState::Unknown));
@@ -124,11 +124,11 @@ fn what_is_no_longer_unknown_is_announced_and_what_counts_towards_an_alarm_is_no
 }
 
 #[test]
-fn unknown_alarms_of_a_large_pack_do_not_fill_the_memory() {
+fn announced_unknown_alarms_are_limited() {
     let (mut queue, mut engine) = (AlarmQueue::default(), engine());
     let mut announced = 0;
     for second in 0..i64::from(CELLS) {
-        // Each time another cell is the first unknown one, and the earlier ones are unknown again later.
+        // Each time another cell is the first unknown one.
         observe(&mut engine, Rule::EstimateUntrusted, Some(u16::try_from(second).unwrap()), Some(1.0));
         announced += u32::from(queue.take_unknown(Timestamp::from_secs(second as f64), &engine, 0).is_some());
     }
@@ -137,7 +137,7 @@ fn unknown_alarms_of_a_large_pack_do_not_fill_the_memory() {
 }
 
 #[test]
-fn frames_until_a_time_are_those_that_are_sent_until_then() {
+fn frames_until_agrees_with_sent_frames() {
     for (raised, changed) in [(0, 0), (0, 3), (3, 0), (7, 2), (97, 1)] {
         let (mut queue, mut engine) = (AlarmQueue::default(), engine());
         raise(&mut engine, raised);
@@ -154,7 +154,7 @@ fn frames_until_a_time_are_those_that_are_sent_until_then() {
 }
 
 #[test]
-fn a_stored_state_with_times_far_ahead_stops_nothing() {
+fn stored_times_far_ahead_do_not_stop_sending() {
     let (mut queue, mut engine) = (AlarmQueue::default(), engine());
     raise(&mut engine, 2);
     sent(&mut queue, &engine, 0, 2_000);
@@ -165,7 +165,7 @@ fn a_stored_state_with_times_far_ahead_stops_nothing() {
 }
 
 #[test]
-fn a_clock_that_is_set_back_stops_nothing() {
+fn clock_set_back_does_not_stop_sending() {
     let (mut queue, mut engine) = (AlarmQueue::default(), engine());
     raise(&mut engine, 2);
     sent(&mut queue, &engine, 1_000_000, 2_000);
