@@ -79,7 +79,7 @@ impl BleedTimer {
     }
 
     /// Handles a time in which the daemon did not run and received no bits.
-    pub(super) fn note_unheard(&mut self, from: Timestamp, to: Timestamp) {
+    pub(super) fn note_missed_bits(&mut self, from: Timestamp, to: Timestamp) {
         if self.has_bits {
             self.take(from, None, to);
         }

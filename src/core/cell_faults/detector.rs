@@ -13,7 +13,7 @@ use super::bleed_timer::BalancingConfig;
 use super::channels::{Channel, compare};
 use super::difference::{CHANNEL, CONTACT, Difference, LEAK, Observation, RESISTANCE, SOC, STATES};
 use super::fault::{CellFault, CellFaultKind};
-use super::gain::{Gain, Learned};
+use super::gain::{CellAgeing, Gain};
 use super::row::{CellSums, PackSums};
 use super::temperature::WarmingRatio;
 use crate::cell::CellModel;
@@ -287,7 +287,7 @@ impl CellFaultDetector {
         &mut self,
         time: Timestamp,
         temperature_c: f64,
-        cells: impl Iterator<Item = Learned>,
+        cells: impl Iterator<Item = CellAgeing>,
     ) -> Option<CellFault> {
         if !self.gain.is_due(time) {
             return None;

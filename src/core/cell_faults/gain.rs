@@ -37,7 +37,7 @@ struct Day {
 
 /// Learned capacity and resistance of one cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Learned {
+pub struct CellAgeing {
     /// Ah.
     pub capacity_ah: ScalarGaussian,
     /// Logarithm of the resistance ratio to the model.
@@ -61,9 +61,9 @@ impl Gain {
 
     /// Adds a day. Returns the probability that the gain has risen beyond [`GAIN`], and the rise, fraction. While a
     /// rise is reported, the days before it are kept.
-    pub(super) fn take(&mut self, time: Timestamp, temperature_c: f64, cells: &[Learned]) -> (f64, ScalarGaussian) {
+    pub(super) fn take(&mut self, time: Timestamp, temperature_c: f64, cells: &[CellAgeing]) -> (f64, ScalarGaussian) {
         let none = (0.0, ScalarGaussian { mean: 0.0, variance: ERROR * ERROR });
-        let part = |cell: &Learned| cell.capacity_ah.std() / cell.capacity_ah.mean;
+        let part = |cell: &CellAgeing| cell.capacity_ah.std() / cell.capacity_ah.mean;
         let is_known = median(cells.iter().map(part)).is_some_and(|part| part <= KNOWN);
         let now = Day {
             time,
@@ -132,7 +132,7 @@ mod tests {
                 let time = Timestamp::from_secs(day as f64 * DAY_S + 60.0 * (day % 2) as f64);
                 capacity_ah += (60.0 * gain - capacity_ah) / 3.0;
                 let capacity_ah = ScalarGaussian::from_std(capacity_ah, 1.0);
-                let cell = Learned { capacity_ah, log_resistance: 0.1 - libm::log(*gain) };
+                let cell = CellAgeing { capacity_ah, log_resistance: 0.1 - libm::log(*gain) };
                 let (probability, size) = watch.take(time, temperatures_c(day), &[cell; 5]);
                 (probability, size.mean)
             })
@@ -167,7 +167,7 @@ mod tests {
         assert!(after_days(&rises, warmer).iter().all(|(probability, _)| *probability < 0.01));
         let mut watch = Gain::default();
         for (day, capacity_ah) in [(0, 60.0), (1, 66.0), (2, 66.0)] {
-            let cell = Learned {
+            let cell = CellAgeing {
                 capacity_ah: ScalarGaussian::from_std(capacity_ah, 3.0),
                 log_resistance: -0.1 * f64::from(day),
             };
@@ -180,7 +180,7 @@ mod tests {
     fn impossible_numbers_leave_a_valid_state() {
         let mut watch = Gain::default();
         for (day, number) in [f64::NAN, f64::INFINITY, 0.0, -1.0, 1e300, 60.0].into_iter().enumerate() {
-            let cell = Learned { capacity_ah: ScalarGaussian::from_std(number, 0.001), log_resistance: number };
+            let cell = CellAgeing { capacity_ah: ScalarGaussian::from_std(number, 0.001), log_resistance: number };
             watch.take(Timestamp::from_secs(-(day as f64) * 1e6), number, &[cell; 3]);
             assert_eq!(watch.check(), Ok(()), "{number}");
         }

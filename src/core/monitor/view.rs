@@ -109,7 +109,7 @@ impl Monitor {
     }
 
     /// Whether a usable reading has arrived since the first input. Values of a restored state do not count.
-    pub fn has_heard(&self) -> bool {
+    pub fn has_usable_reading(&self) -> bool {
         self.stages.sampling.has_usable_reading
     }
 

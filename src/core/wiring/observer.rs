@@ -60,7 +60,7 @@ pub(crate) struct EstimatorStats {
 enum SignalList {
     Configured,
     MoreCells,
-    Beside,
+    Unconfigured,
 }
 
 /// Collects frames, events and estimates; [`WiringObserver::finish`] judges them.
@@ -72,8 +72,8 @@ pub struct WiringObserver {
     pub(crate) series: Vec<Series>,
     /// In the order of `plan.more_cells`.
     pub(crate) more_cells: Vec<Series>,
-    /// In the order of `plan.beside`.
-    pub(crate) beside: Vec<Series>,
+    /// In the order of `plan.unconfigured`.
+    pub(crate) unconfigured: Vec<Series>,
     /// Indexes of the signals by message.
     by_id: BTreeMap<(BusIndex, CanId), Vec<(SignalList, usize)>>,
     /// Reassembles diagnostic answers with signals.
@@ -103,7 +103,7 @@ impl WiringObserver {
         let lists = [
             (SignalList::Configured, &plan.signals),
             (SignalList::MoreCells, &plan.more_cells),
-            (SignalList::Beside, &plan.beside),
+            (SignalList::Unconfigured, &plan.unconfigured),
         ];
         let mut by_question: BTreeMap<Question, Vec<(SignalList, usize)>> = BTreeMap::new();
         for (name, list) in lists {
@@ -130,7 +130,7 @@ impl WiringObserver {
             buses: plan.interfaces.iter().map(bus).collect(),
             series: signals.map(|s| Series::new(&s.layout, plan.plausible(s.binding.channel))).collect(),
             more_cells: plan.more_cells.iter().map(|signal| Series::new(&signal.layout, None)).collect(),
-            beside: plan.beside.iter().map(|signal| Series::new(&signal.layout, None)).collect(),
+            unconfigured: plan.unconfigured.iter().map(|signal| Series::new(&signal.layout, None)).collect(),
             other_currents: BTreeMap::new(),
             by_id,
             guards: Guards::new(plan.guards.clone()),
@@ -214,13 +214,13 @@ impl WiringObserver {
 
     /// Reads signals of a frame's payload or of an answer's data.
     fn read_signals(&mut self, time: Timestamp, wanted: &[(SignalList, usize)], data: &[u8]) {
-        let Self { plan, series, more_cells, beside, responses, other_currents, .. } = self;
+        let Self { plan, series, more_cells, unconfigured, responses, other_currents, .. } = self;
         let cells = f64::from(plan.pack.cells.max(1));
         for &(list, index) in wanted {
             let (signals, series) = match list {
                 SignalList::Configured => (&plan.signals, &mut *series),
                 SignalList::MoreCells => (&plan.more_cells, &mut *more_cells),
-                SignalList::Beside => (&plan.beside, &mut *beside),
+                SignalList::Unconfigured => (&plan.unconfigured, &mut *unconfigured),
             };
             let SignalPlan { binding, answer, .. } = &signals[index];
             let data = data.get(answer.map_or(0, |answer| answer.first_byte)..).unwrap_or_default();
@@ -293,8 +293,8 @@ impl WiringObserver {
 
     /// Handles a time of unknown length without listening.
     pub fn handle_gap(&mut self) {
-        let Self { series, more_cells, beside, .. } = self;
-        series.iter_mut().chain(more_cells).chain(beside).for_each(Series::pause);
+        let Self { series, more_cells, unconfigured, .. } = self;
+        series.iter_mut().chain(more_cells).chain(unconfigured).for_each(Series::pause);
         self.end_blocks();
         self.guards.restart();
         self.listener.restart();

@@ -19,7 +19,7 @@ pub struct Plan {
     pub more_cells: Vec<SignalPlan>,
     /// Signals of the DBC that are not configured but look like the pack's voltage (if cell voltages are configured)
     /// or a state of charge. Their binding has that channel. One entry per interface.
-    pub beside: Vec<SignalPlan>,
+    pub unconfigured: Vec<SignalPlan>,
     /// The pack.
     pub pack: PackPlan,
     /// Age from which a current, voltage or temperature is stale, s; `None` = never.

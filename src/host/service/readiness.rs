@@ -106,7 +106,7 @@ impl Readiness {
     /// Checks the core, and returns the report that is due.
     pub(super) fn poll(&mut self, monitor: &Monitor, now: Instant) -> ManagerUpdate {
         let waited = now.duration_since(self.began);
-        if self.first_after.is_none() && monitor.has_heard() {
+        if self.first_after.is_none() && monitor.has_usable_reading() {
             self.first_after = Some(waited);
             self.is_changed = true;
         }

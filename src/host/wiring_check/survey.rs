@@ -83,7 +83,7 @@ fn plan(partial: &PartialConfig, found: &[ResolvedSignal<'_>]) -> Plan {
     Plan {
         interfaces: raw.interfaces.iter().map(|i| InterfacePlan { name: i.name.clone(), fd: i.fd }).collect(),
         more_cells: more_cells(raw, databases),
-        beside: beside::signals(raw, databases, found),
+        unconfigured: beside::signals(raw, databases, found),
         messages: messages(&in_frames, &signals),
         signals,
         pack: pack_plan,

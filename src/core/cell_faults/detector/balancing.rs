@@ -78,8 +78,8 @@ impl CellFaultDetector {
     }
 
     /// Handles a time in which the daemon did not run and received no bits.
-    pub fn note_unheard(&mut self, from: Timestamp, to: Timestamp) {
-        self.cells.iter_mut().for_each(|cell| cell.bleed.timer.note_unheard(from, to));
+    pub fn note_missed_bits(&mut self, from: Timestamp, to: Timestamp) {
+        self.cells.iter_mut().for_each(|cell| cell.bleed.timer.note_missed_bits(from, to));
     }
 
     /// Subtracts the charge bled since the last row, relative to the middle cells, from each cell's difference. If
@@ -155,7 +155,7 @@ mod tests {
         assert!(near(lost_std(&mut diagnosis(), 8.0 * HOUR, BALANCING), 0.0));
         assert!(near(lost_std(&mut diagnosis(), 8.0 * HOUR, silent), unknown));
         let mut stopped = diagnosis();
-        stopped.note_unheard(at(10.0), at(8.0 * HOUR));
+        stopped.note_missed_bits(at(10.0), at(8.0 * HOUR));
         assert!(near(lost_std(&mut stopped, 8.0 * HOUR, BALANCING), unknown));
     }
 

@@ -7,7 +7,7 @@
 use super::estimation::Estimation;
 use super::learning::Learning;
 use crate::cell_faults::fault::OFFSET_PER_H;
-use crate::cell_faults::gain::Learned;
+use crate::cell_faults::gain::CellAgeing;
 use crate::cell_faults::{BalancingConfig, CellFaultDetector, CellFaultKind, MeanCell};
 use crate::filter::{ScalarGaussian, probability_below};
 use crate::monitor::config::MonitorConfig;
@@ -59,7 +59,7 @@ impl Findings {
         self.diagnosis.compare_only(&self.compared);
         if let Some((from, to)) = away {
             self.diagnosis.interrupt();
-            self.diagnosis.note_unheard(from, to);
+            self.diagnosis.note_missed_bits(from, to);
         }
     }
 
@@ -126,7 +126,7 @@ impl Findings {
             let mut reported = self.diagnosis.close_row(model, capacity_ah, socs, self.is_balanced, self.balancing);
             let (probability, size) = current_offset(learning, model.rated_capacity_ah);
             reported.extend(self.diagnosis.note_sensor(now, CellFaultKind::CurrentOffset, probability, size));
-            let cell = |index: usize| Learned {
+            let cell = |index: usize| CellAgeing {
                 capacity_ah: learning.capacity(index),
                 log_resistance: bank.log_resistance(index).mean,
             };

@@ -5,7 +5,7 @@
 //! | --- | --- |
 //! | `bus` | interfaces, identifiers, error frames, foreign senders, end-to-end protection |
 //! | `other_bus` | the current's message on two interfaces |
-//! | `beside` | pack voltage and states of charge that are not configured |
+//! | `unconfigured` | pack voltage and states of charge that are not configured |
 //! | `presence` | silent signals, number of cells |
 //! | `swapped` | signals in another's place |
 //! | `values` | units, byte order, limits |
@@ -16,7 +16,6 @@
 //!
 //! All checks share `context`. A factor found in `values` is applied before `electrical` runs.
 
-mod beside;
 mod bus;
 mod context;
 mod drift;
@@ -28,6 +27,7 @@ mod presence;
 mod swapped;
 mod text;
 mod timing;
+mod unconfigured;
 mod unit;
 mod values;
 
@@ -50,7 +50,7 @@ impl WiringObserver {
         frozen::check_equal(&mut judge);
         values::check_limits(&mut judge);
         electrical::check(&mut judge);
-        beside::check(&mut judge);
+        unconfigured::check(&mut judge);
         timing::check(&mut judge);
         let awake_s = self.awake_s;
         if self.frames > 0 && awake_s < 5.0 {

@@ -17,8 +17,8 @@ pub(super) fn check(judge: &mut Judge<'_>) {
 }
 
 /// DBC signals of a channel that are not configured, with their median values.
-fn beside<'d>(judge: &Judge<'d>, channel: Channel) -> Vec<(SignalSeries<'d>, f64)> {
-    let all = judge.plan.beside.iter().zip(&judge.observed.beside);
+fn unconfigured<'d>(judge: &Judge<'d>, channel: Channel) -> Vec<(SignalSeries<'d>, f64)> {
+    let all = judge.plan.unconfigured.iter().zip(&judge.observed.unconfigured);
     let wanted = all.filter(|(signal, _)| signal.binding.channel == channel);
     wanted.filter_map(|signal| Some((signal, signal.1.values.median()?))).collect()
 }
@@ -31,7 +31,7 @@ fn pack_voltage(judge: &mut Judge<'_>, is_clear: bool) {
     if sum_v <= 0.0 {
         return;
     }
-    let candidates = beside(judge, Channel::PackVoltage).into_iter();
+    let candidates = unconfigured(judge, Channel::PackVoltage).into_iter();
     // Other ratios belong to an auxiliary battery, or to a DC link behind open contactors.
     let candidates = candidates.filter(|(_, pack_v)| (0.2..20.0).contains(&(pack_v / sum_v)));
     let off = |pack_v: f64| (pack_v / sum_v).ln().abs();
@@ -69,7 +69,7 @@ fn states_of_charge(judge: &mut Judge<'_>) {
     let Some((own, own_soc)) = configured.find_map(|(signal, series)| Some((signal, series.values.median()?))) else {
         return;
     };
-    for ((signal, _), soc) in beside(judge, Channel::ReportedSoc) {
+    for ((signal, _), soc) in unconfigured(judge, Channel::ReportedSoc) {
         let difference = (soc - own_soc).abs();
         let [own_percent, percent] = [own_soc, soc].map(|soc| number((1000.0 * soc).round() / 10.0));
         if difference <= 0.03 {
