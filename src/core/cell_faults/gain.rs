@@ -20,7 +20,8 @@ const DAY_S: f64 = 86_400.0;
 const APART_S: f64 = 2.5 * DAY_S;
 /// Standard deviation of a change within these days, fraction.
 const ERROR: f64 = 0.005;
-/// Capacities with a larger relative standard deviation are ignored: their learning would look like a change.
+/// Largest median relative standard deviation of the capacities on a day that counts. Capacities that are still being
+/// learned change too much.
 const KNOWN: f64 = 0.03;
 
 /// Median values of the cells on one day.

@@ -6,7 +6,7 @@
 //!
 //! ```text
 //! usable            = min s C + min (1 - s) C
-//!   lost by imbalance = min C - usable            recoverable by balancing
+//! lost by imbalance = min C - usable            recoverable by balancing
 //! lost by weakest   = mean C - min C
 //! ```
 //!
@@ -46,7 +46,7 @@ pub struct Imbalance {
     pub usable: ScalarGaussian,
     /// Charge that balancing would recover, fraction.
     pub lost_by_imbalance: ScalarGaussian,
-    /// Charge that a balanced pack of mean cells has in addition to this pack, balanced, fraction.
+    /// Charge by which a pack of mean cells exceeds this pack, both balanced, fraction.
     pub lost_by_weakest: ScalarGaussian,
     /// The cell with the least capacity.
     pub weakest: CellIndex,

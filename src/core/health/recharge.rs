@@ -8,7 +8,8 @@
 //!
 //! Normalised: the time that a reference charger would need for the same window of the same pack,
 //! `t = 3600 (to - from) C / I_ref`, with C the pack's capacity (Ah) learned up to the end of this charge and I_ref the
-//! reference current per cell (A). Its standard deviation is C's, scaled, and so includes the gain error of the current sensor.
+//! reference current per cell (A). Its standard deviation is C's, scaled, and so includes the gain error of the current
+//! sensor.
 //!
 //! Why C and not the charge moved between the two SOC values: between the crossings, the estimated SOC moves by charge
 //! over the assumed capacity. The charge moved is therefore the window times the assumed capacity, corrected by the

@@ -285,7 +285,7 @@ impl Stages {
     ) -> CommandOutcome {
         self.step_waiting(now, true, out);
         if command == Command::PackReplaced {
-            // Regardless of its number: learned values belong to the old pack.
+            // The stored copy belongs to the old pack, regardless of its number.
             self.packs.drop_aside();
         }
         let CommandOutcome { changed, refused } = match command {

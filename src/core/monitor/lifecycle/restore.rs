@@ -73,8 +73,8 @@ impl Monitor {
         if !fits {
             let (found, branches) = (snapshot.cells.len(), bank.own_model().branches.len());
             return Err(RestoreError::Unfit(format!(
-                "snapshot does not fit: {found} cells (must be {cells}), another number of branches (must be {branches}), or \
-                 samples of unknown cells"
+                "snapshot does not fit: {found} cells (must be {cells}), another number of branches (must be \
+                 {branches}), or samples of unknown cells"
             )));
         }
         snapshot.check()?;

@@ -23,7 +23,7 @@ fn unconfigured<'d>(judge: &Judge<'d>, channel: Channel) -> Vec<(SignalSeries<'d
     wanted.filter_map(|signal| Some((signal, signal.1.values.median()?))).collect()
 }
 
-/// `is_clear`: all cells are read correctly. A wrong decimal place is also reported otherwise.
+/// `is_clear`: whether all cells are read correctly. If not, only a wrong decimal place is reported.
 fn pack_voltage(judge: &mut Judge<'_>, is_clear: bool) {
     let medians_v = judge.signals(Kind::Voltage).into_iter().map(|(_, series)| series.values.median());
     let Some(medians_v) = medians_v.collect::<Option<Vec<f64>>>().filter(|_| !judge.plan.pack.is_total) else { return };
