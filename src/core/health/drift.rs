@@ -74,7 +74,7 @@ impl DriftFilter {
     /// Updates with the capacity `z` measured by a half-cycle. `effects_ah`: change of `z` per standard deviation of
     /// each lasting error.
     pub fn update(&mut self, z: Measurement, effects_ah: &[f64; END_ERRORS]) {
-        // Lasting errors of the innovation: those of C plus those of the measurement.
+        // Lasting errors of the innovation: the sum of C's and the measurement's.
         let by_end: [f64; END_ERRORS] = std::array::from_fn(|k| self.by_end[k][C] + effects_ah[k]);
         let lasting: f64 = by_end.iter().map(|b| b * b).sum();
         let own_variance = self.p[C][C] + z.variance;

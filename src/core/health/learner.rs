@@ -223,7 +223,7 @@ impl Learner {
         }
     }
 
-    /// Sets for which cells half-cycles leave the capacity unchanged, because the cell's model is not known well
+    /// Sets the cells whose capacity half-cycles leave unchanged, because the cell's model is not known well
     /// enough.
     pub fn hold(&mut self, is_held: impl Fn(usize) -> bool) {
         self.is_held = (0..self.capacity.len()).map(is_held).collect();
@@ -259,7 +259,7 @@ impl Learner {
     }
 
     /// Handles a restart of a cell's sample filter: the voltages contradicted the learned values, so the capacity is
-    /// no more certain than that of a new cell (`new_variance_ah2`). The current half-cycle then only sets a lower
+    /// no more certain than a new cell's (`new_variance_ah2`). The current half-cycle then only sets a lower
     /// bound: the cell holds at least the charge that was moved.
     pub fn doubt(
         &mut self,

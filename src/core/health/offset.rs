@@ -2,7 +2,7 @@
 //!
 //! In: the evidence in the voltages of all cells ([`EstimatorBank::offset_evidence`]) and the elapsed time, s. Out:
 //! mean and standard deviation of the offset, A per cell, measured minus true. Cells at rest show it best, because the
-//! counted charge drifts away from the voltage. Readings of exactly zero are no evidence, because such a sensor
+//! counted charge drifts away from the voltage. Readings of exactly zero are ignored, because such a sensor
 //! suppresses small currents.
 //!
 //! Source: Friedland (1969), separate estimation of a bias: the innovations of a filter that ignores the bias measure
