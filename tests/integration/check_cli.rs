@@ -50,7 +50,7 @@ fn every_shipped_configuration_is_valid() {
 fn measured_cell_end_of_life_is_consistent() {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/measured.toml");
     let text = std::fs::read_to_string(&file).unwrap();
-    let printed = text.split_once("End of life as the publishers of the data state it: ").unwrap().1;
+    let printed = text.split_once("End of life as stated by the publishers of the data: ").unwrap().1;
     let (percent, printed) = printed.split_once(" % below the ").unwrap();
     let rated_ah: f64 = printed.split_once(" Ah").unwrap().0.parse().unwrap();
     let end_ah = rated_ah * (1.0 - percent.parse::<f64>().unwrap() / 100.0);

@@ -235,7 +235,7 @@ pub static TABLE: [QuantityRow; 23] =
         ),
         Row::estimate(Q::Capacity, ("capacity_ah", "capacity_std_ah"), Unit::AmpereHours, "capacity")
             .pack(
-                "Least learned capacity of a cell, once that of every cell was learned",
+                "Lowest learned capacity of a cell, once the capacity of every cell was learned",
                 ("capacity", "Capacity"),
                 Overlay("Capacity.Learned"),
             )
@@ -274,11 +274,11 @@ pub static TABLE: [QuantityRow; 23] =
             .cell("Resistance relative to new", Some("cell_resistance_ratio"), Overlay("Cells.ResistanceRatio")),
         Row::estimate(Q::LithiumLoss, ("lli", "lli_std"), Unit::Fraction, "lli")
             .pack(
-                "Loss of lithium inventory of the cell with the least capacity, part of a new cell's",
+                "Loss of lithium inventory of the cell with the least capacity, relative to a new cell",
                 ("lithium_loss", "Loss of Lithium Inventory"),
                 Overlay("Loss.LithiumInventory"),
             )
-            .cell("Loss of lithium inventory, part of a new cell's", None, Overlay("Cells.LithiumInventoryLoss")),
+            .cell("Loss of lithium inventory, relative to a new cell", None, Overlay("Cells.LithiumInventoryLoss")),
         Row::estimate(Q::NegativeLoss, ("lam_ne", "lam_ne_std"), Unit::Fraction, "lam_ne")
             .pack(
                 "Loss of active material of the negative electrode of that cell",

@@ -52,25 +52,25 @@ fn shipped(name: &str) -> String {
 fn fewer_cells(cells: usize) -> String {
     let text = shipped("example.toml");
     let (head, rest) = text.split_once("[[input.temperature]]").unwrap();
-    let (_, tail) = rest.split_once("# A message that its sender").unwrap();
+    let (_, tail) = rest.split_once("# If a sender protects").unwrap();
     let sensor = |n: usize| {
         let (first, last) = (8 * n + 1, (8 * n + 8).min(cells));
         format!("[[input.temperature]]\nsignal = \"Temperatures.Temperature{}\"\ncells = \"{first}-{last}\"\n", n + 1)
     };
     let sensors: String = (0..cells.div_ceil(8)).map(sensor).collect();
-    format!("{head}{sensors}\n# A message that its sender{tail}").replace("cells = 96 ", &format!("cells = {cells} "))
+    format!("{head}{sensors}\n# If a sender protects{tail}").replace("cells = 96 ", &format!("cells = {cells} "))
 }
 
 fn total() -> String {
     let text = fewer_cells(96);
     let (head, rest) = text.split_once("[input.cell_voltage]").unwrap();
-    let (_, tail) = rest.split_once("# A message that its sender").unwrap();
+    let (_, tail) = rest.split_once("# If a sender protects").unwrap();
     let inputs = "[input.pack_voltage]\nsignal = \"PackStatus.PackVoltage\"\n\n[[input.temperature]]\nsignal = \"Temperatures.Temperature1\"\n";
     let head = head.replace("[input.cell_voltage]", "");
     // Remove the parts that need individual cell voltages.
     let (before, rest) = tail.split_once("[[alarm]]\nrule = \"cell_imbalance\"").unwrap();
     let (_, after) = rest.split_once("\n[[alarm]]").unwrap();
-    format!("{head}{inputs}\n# A message that its sender{before}[[alarm]]{after}")
+    format!("{head}{inputs}\n# If a sender protects{before}[[alarm]]{after}")
 }
 
 fn protected() -> String {

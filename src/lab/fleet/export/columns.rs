@@ -110,15 +110,15 @@ macro_rules! columns {
 
 /// Of `estimates`.
 pub(super) const ESTIMATES: &[Column<EstimateRow>] = &columns! { EstimateRow;
-    "log" Word "", "name of the log, that of its folder", |row| text(&row.log);
-    "time" Time "UTC", "when the voltage was read", |row| FieldValue::Time(row.estimate.time);
-    "since_start_s" Real "s", "the same since the log's first result", |row| real(row.since_s);
+    "log" Word "", "name of the log and of its folder", |row| text(&row.log);
+    "time" Time "UTC", "time of the voltage reading", |row| FieldValue::Time(row.estimate.time);
+    "since_start_s" Real "s", "time since the log's first result", |row| real(row.since_s);
     "cell" Whole "", "cell, from 0", |row| whole(row.estimate.cell.0);
     "soc" Real "fraction" null, "state of charge", |row| real(row.estimate.soc);
     "soc_std" Real "fraction" null, "its standard deviation", |row| real(row.estimate.soc_std);
     "u1_v" Real "V" null, "voltage of the first RC branch", |row| branch(row, 0);
-    "u2_v" Real "V" null, "of the second, where the model has one", |row| branch(row, 1);
-    "u3_v" Real "V" null, "of the third, where the model has one", |row| branch(row, 2);
+    "u2_v" Real "V" null, "voltage of the second branch, if the model has one", |row| branch(row, 1);
+    "u3_v" Real "V" null, "voltage of the third branch, if the model has one", |row| branch(row, 2);
     "capacity_ah" Real "Ah" null, "learned capacity between the open-circuit voltages", |row| real(row.estimate.capacity_ah);
     "capacity_std_ah" Real "Ah" null, "its standard deviation", |row| real(row.estimate.capacity_std_ah);
     "resistance_ratio" Real "" null, "resistance relative to new", |row| real(row.estimate.resistance_ratio);
@@ -134,14 +134,14 @@ pub(super) const ESTIMATES: &[Column<EstimateRow>] = &columns! { EstimateRow;
 /// Of `half_cycles`: the half-cycle, the recorded quantities after it, what the cell has lost, its remaining life.
 pub(super) static HALF_CYCLES: LazyLock<Vec<Column<HalfCycleRow>>> = LazyLock::new(|| {
     let half_cycle = columns! { HalfCycleRow;
-        "log" Word "", "name of the log, that of its folder", |row| text(&row.log);
-        "time" Time "UTC", "when it was over", |row| FieldValue::Time(row.time);
-        "since_start_s" Real "s", "the same since the log's first result", |row| real(row.since_s);
+        "log" Word "", "name of the log and of its folder", |row| text(&row.log);
+        "time" Time "UTC", "end of the half-cycle", |row| FieldValue::Time(row.time);
+        "since_start_s" Real "s", "time since the log's first result", |row| real(row.since_s);
         "cell" Whole "", "cell, from 0", |row| FieldValue::Whole(row.half.whole("cell"));
         "full_cycles" Real "cycles" null, "equivalent full cycles of the connected pack so far: charge moved over twice the rated capacity", |row| real(row.full_cycles);
         "mode" Word "", "charge or discharge", |row| text(row.half.text("mode"));
         "charge_ah" Real "Ah", "charge moved", |row| number(&row.half, "charge_ah");
-        "swing" Real "fraction" null, "swing of the state of charge, from the voltages", |row| number(&row.half, "swing");
+        "swing" Real "fraction" null, "change of the state of charge, from the voltages", |row| number(&row.half, "swing");
         "swing_std" Real "fraction" null, "its standard deviation", |row| number(&row.half, "swing_std");
         "duration_s" Real "s", "duration", |row| number(&row.half, "duration_s");
         "mean_current_a" Real "A", "mean cell current, positive = discharge", |row| number(&row.half, "mean_current_a");
@@ -150,7 +150,7 @@ pub(super) static HALF_CYCLES: LazyLock<Vec<Column<HalfCycleRow>>> = LazyLock::n
         "measured_std_ah" Real "Ah" null, "its standard deviation", |row| number(&row.capacity, "measured_std_ah");
     };
     let forecast = columns! { HalfCycleRow;
-        "lli" Real "fraction" null, "loss of lithium inventory, part of the model's new cell; null = not learned, or a model without electrodes", |row| loss(row, |it| it.lithium.mean);
+        "lli" Real "fraction" null, "loss of lithium inventory, relative to the model's new cell; null = not learned, or a model without electrodes", |row| loss(row, |it| it.lithium.mean);
         "lli_std" Real "fraction" null, "its standard deviation", |row| loss(row, |it| it.lithium.std());
         "lam_ne" Real "fraction" null, "loss of active material of the negative electrode", |row| loss(row, |it| it.negative.mean);
         "lam_ne_std" Real "fraction" null, "its standard deviation", |row| loss(row, |it| it.negative.std());
@@ -182,17 +182,17 @@ fn recorded(quantity: Quantity) -> impl Iterator<Item = Column<HalfCycleRow>> {
 
 /// Of `alarms`.
 pub(super) const ALARMS: &[Column<AlarmRow>] = &columns! { AlarmRow;
-    "log" Word "", "name of the log, that of its folder", |row| text(&row.log);
-    "time" Time "UTC", "when", |row| FieldValue::Time(row.time);
-    "since_start_s" Real "s", "the same since the log's first result", |row| real(row.since_s);
+    "log" Word "", "name of the log and of its folder", |row| text(&row.log);
+    "time" Time "UTC", "time of the change", |row| FieldValue::Time(row.time);
+    "since_start_s" Real "s", "time since the log's first result", |row| real(row.since_s);
     "cell" Whole "" null, "cell, from 0; null = the pack", |row| FieldValue::Whole(row.alarm.whole("cell"));
     "rule" Word "", "rule of the alarm", |row| text(row.rule.name());
     "severity" Word "", "info, warning or severe", |row| text(row.alarm.text("severity"));
     "change" Word "", "change: raised, cleared, ...", |row| text(row.alarm.text("change"));
     "state" Word "", "its state after the change", |row| text(row.alarm.text("state"));
     "active" Flag "", "whether it is raised after the change", |row| FieldValue::Flag(row.alarm.flag("active"));
-    "value" Real "unit" null, "the value that caused the change", |row| FieldValue::Real(row.alarm.number("value"));
-    "probability" Real "fraction" null, "that the truth is beyond the threshold", |row| FieldValue::Real(row.alarm.number("probability"));
+    "value" Real "unit" null, "value that caused the change", |row| FieldValue::Real(row.alarm.number("value"));
+    "probability" Real "fraction" null, "probability that the true value is beyond the threshold", |row| FieldValue::Real(row.alarm.number("probability"));
     "threshold" Real "unit", "the threshold it is compared with", |row| FieldValue::Real(row.alarm.number("threshold"));
     "unit" Word "", "unit of value and threshold; empty for fractions and ratios", |row| text(row.rule.spec().unit.symbol());
     "occurrences" Whole "", "times it was raised", |row| FieldValue::Whole(row.alarm.whole("occurrences"));
@@ -211,7 +211,7 @@ pub(super) const VEHICLES: &[Column<VehicleRecord>] = &columns! { VehicleRecord;
     "estimates" Whole "", "rows in estimates", |row| rows_in(row, "estimates");
     "rated_ah" Real "Ah" null, "rated capacity of a cell", |row| maybe(row.rated_ah);
     "settings_sha256" Word "" null, "SHA-256 of all settings: configuration, DBC, cell model, options", |row| FieldValue::Word(row.settings_sha256.as_deref().map(Cow::Borrowed));
-    "error" Word "" null, "why it has no rows in the other tables; null = it was replayed", |row| FieldValue::Word(row.error.as_deref().map(Cow::Borrowed));
+    "error" Word "" null, "reason why the other tables have no rows of it; null = it was replayed", |row| FieldValue::Word(row.error.as_deref().map(Cow::Borrowed));
     "notes" Word "" null, "notes on its logs", |row| FieldValue::Word(Some(row.notes.join("; ").into()).filter(|_| !row.notes.is_empty()));
 };
 
@@ -259,8 +259,8 @@ fn days(row: &HalfCycleRow, get: fn(Remaining) -> f64) -> FieldValue<'_> {
 /// The page about the columns, as Markdown.
 pub fn reference() -> String {
     let mut page = String::from(
-        "# Exported tables\n\nWritten by `packwatch export --columns-page`; the files are written from the same definition. A value that is not known is null \
-         (an empty field in CSV). `log` is dictionary-encoded: it takes almost no space, and distinguishes logs in a query over all files.\n",
+        "# Exported tables\n\nWritten by `packwatch export --columns-page`; the exported files use the same definition. An unknown value is null \
+         (an empty field in CSV). `log` is dictionary-encoded: it takes almost no space and identifies the log in a query over all files.\n",
     );
     page += &section(
         "estimates",
