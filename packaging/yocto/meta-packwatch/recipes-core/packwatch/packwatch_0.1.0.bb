@@ -1,13 +1,14 @@
-# The vehicle's program, built from the source tree that this layer lies in (EXTERNALSRC: another tree).
+# The vehicle's program, built from the source tree that contains this layer. To build another tree, set EXTERNALSRC.
 #
-# The list of crates is generated, and not part of the sources: once, and after each change of Cargo.lock,
+# The list of crates is generated and not part of the sources. To write packwatch-crates.inc next to this file, run once, and after each
+# change of Cargo.lock:
 #
 #   bitbake -c update_crates packwatch
 #
-# writes packwatch-crates.inc beside this file. tests/integration/yocto_recipe.rs holds this file to the sources.
+# tests/integration/yocto_recipe.rs compares this file with the sources.
 SUMMARY = "Battery health monitoring over SocketCAN, with alarms as CAN frames"
-DESCRIPTION = "Keeps an estimate of the state of charge of each cell, learns the capacity of each cell, and reports to other ECUs \
-in CAN frames when capacity or recharge period have fallen below a threshold."
+DESCRIPTION = "Estimates the state of charge of each cell, learns its capacity, and sends status, health and alarm frames \
+to other ECUs."
 SECTION = "base"
 LICENSE = "MIT OR Apache-2.0"
 LIC_FILES_CHKSUM = "file://LICENSE-MIT;md5=c4f23983d45446869c7be3f69df2656b \
