@@ -34,7 +34,7 @@ pub(crate) fn quoted(text: &str) -> String {
 }
 
 fn head(out: &mut String, request: &FitRequest, outcome: &FitOutcome) {
-    line(out, "# Written by `packwatch fit`; fit again rather than edit.");
+    line(out, "# Written by `packwatch fit`; do not edit by hand.");
     line(out, "format = 1");
     line(out, &format!("name = {}", quoted(&request.name)));
     line(out, &format!("rated_capacity_ah = {:.4}", request.rated_ah.unwrap_or(outcome.capacity_ah)));
