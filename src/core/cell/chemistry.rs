@@ -131,6 +131,7 @@ struct UsualResistance {
     shape: [f64; 5],
 }
 
+/// SOC of [`UsualResistance::shape`].
 const SHAPE_SOC: [f64; 5] = [0.0, 0.05, 0.1, 0.2, 1.0];
 
 /// Number of resistances: in series, and one per branch.

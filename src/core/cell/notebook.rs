@@ -16,10 +16,11 @@ use crate::quantity::InvalidState;
 
 /// Most rows: with 64 bytes each below 8 kB.
 pub const MAX_ROWS: usize = 120;
-/// Below this SOC, where curves are steep and resistances rise, a row is shorter by a factor.
+/// Below this SOC, fraction, rows and classes are narrower, because curves are steep and resistances rise.
 const LOW_SOC: f64 = 0.15;
+/// Their width there, as a part of the usual one.
 const LOW_SOC_PART: f64 = 0.25;
-/// Classes of SOC and temperature.
+/// Width of a class of rows in SOC, fraction.
 const CLASS_SOC: f64 = 0.1;
 /// Currents below this part of the rated capacity per hour are rest.
 const REST_PER_H: f64 = 0.02;

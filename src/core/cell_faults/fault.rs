@@ -217,13 +217,13 @@ impl fmt::Display for CellFault {
 
 /// Leak limit, fraction of the capacity per day. Healthy cells of one pack differ by less than 0.5 % per month.
 pub const LEAK_PER_DAY: f64 = 5e-4;
-/// Limits of contact, capacity and resistance, fractions, and of the channel, V.
+/// Limit of the contact resistance, fraction of the cell's series resistance.
 pub const CONTACT: f64 = 0.1;
-/// See [`CONTACT`].
+/// Limit of the difference in capacity, fraction.
 pub const CAPACITY: f64 = 0.05;
-/// See [`CONTACT`].
+/// Limit of the difference in resistance, fraction.
 pub const RESISTANCE: f64 = 0.1;
-/// See [`CONTACT`].
+/// Limit of the voltage channel's offset, V.
 pub const CHANNEL_V: f64 = 0.015;
 
 /// Limit of the current sensor's offset, fraction of the rated capacity per hour: the SOC would drift by a quarter in

@@ -14,6 +14,7 @@ const POINTS: u32 = 51;
 const MATERIAL_V: f64 = 0.01;
 /// The same below [`LOW_SOC`], where curves fall steeply.
 const LOW_SOC_V: f64 = 0.03;
+/// Upper end of the steep part of the curves, SOC.
 const LOW_SOC: f64 = 0.05;
 /// Mean and standard deviation of the contents [negative empty, negative full, positive empty, positive full].
 const PRIOR: [(f64, f64); 4] = [(0.02, 0.03), (0.88, 0.12), (0.92, 0.10), (0.32, 0.12)];

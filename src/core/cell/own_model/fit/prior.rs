@@ -8,12 +8,14 @@ use crate::cell::chemistry::{FACTOR_SOC, RESISTANCES, usual_cold_sag_v};
 use crate::cell::own_model::{FACTOR_NODES, SOC_NODES};
 use crate::filter::bell;
 
-/// Deviations of ln(resistance) between cells: common to all parts of one cell, of each part, over SOC; and of the part of its
-/// activation energy. As between the five cells of the chemistry's resistances.
+/// Standard deviation of ln(resistance) between cells that all parts of a cell share. This one and the next three are those of the
+/// five cells of the chemistry's resistances.
 const COMMON_LOG_STD: f64 = 0.35;
+/// Standard deviation of ln(resistance) of each part beyond the shared one.
 const PART_LOG_STD: [f64; RESISTANCES] = [0.3, 0.4, 0.4, 0.5];
+/// Standard deviation of ln(resistance) over the SOC.
 const SHAPE_LOG_STD: f64 = 0.15;
-/// The same of all parts near empty, at the first nodes: where the curve turns steep, diffusion counts as resistance.
+/// Standard deviation of ln(resistance) of all parts at the first nodes, near empty: where the curve turns steep, diffusion counts as resistance.
 const LOW_LOG_STD: [f64; 3] = [0.7, 0.6, 0.5];
 
 /// Information matrix about the label's values; `None` when a covariance has no factor.
