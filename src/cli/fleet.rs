@@ -17,7 +17,8 @@ use crate::lab::error::LabError;
 use crate::lab::fleet::LogAccess;
 use crate::lab::fleet::export::merge::{MergeSummary, merge};
 use crate::lab::fleet::export::{ExportSettings, TableFormat};
-use crate::lab::fleet::vehicles::{self, Outcome, Shard, Vehicle, VehicleRecord};
+use crate::lab::fleet::vehicle::{Vehicle, VehicleRecord};
+use crate::lab::fleet::vehicles::{self, Outcome, Shard};
 use packwatch_host::failure::Failure;
 
 /// Version of the JSON documents.

@@ -11,6 +11,7 @@ mod track;
 pub mod truth;
 mod variant_batch;
 pub mod variants;
+pub mod vehicle;
 pub mod vehicles;
 pub mod whatif;
 

@@ -9,6 +9,7 @@ mod data;
 #[cfg(test)]
 mod examples;
 mod forecast;
+mod format;
 mod html;
 mod limits;
 mod model;

@@ -26,7 +26,8 @@ use rayon::prelude::*;
 
 pub use case::{Case, CaseScore, Start};
 pub use cycles::CycleTable;
-pub use learn::{Learned, learn};
+pub use feed::Learned;
+pub use learn::learn;
 pub use life::{DischargeScore, LifeScore};
 pub use report::ScoreReport;
 pub use request::{ScoreRequest, ScoreRun};

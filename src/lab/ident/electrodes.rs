@@ -7,6 +7,7 @@
 use nalgebra::{Matrix4, Vector4};
 
 use crate::cell::{Electrodes, NegativeMaterial, PositiveMaterial};
+use crate::filter::levenberg_marquardt::{Damping, minimise};
 
 /// Points of the curve that are compared.
 const POINTS: u32 = 51;
@@ -22,6 +23,8 @@ const PRIOR: [(f64, f64); 4] = [(0.02, 0.03), (0.88, 0.12), (0.92, 0.10), (0.32,
 const BOUNDS: [(f64, f64); 4] = [(0.0005, 0.25), (0.4, 0.999), (0.55, 0.9995), (0.005, 0.6)];
 /// Steps of the fit; it settles within 20.
 const STEPS: usize = 60;
+const DAMPING: Damping =
+    Damping { first: 1e-2, fall: 0.3, fall_after_growth: 0.3, growth: 10.0, least: 1e-9, most: f64::INFINITY };
 /// Residual above which no pair is accepted, V: the library does not have the cell's materials. Curves of published cells
 /// fit within 5 mV by their own materials, by others mostly beyond 10 mV. A pair of others within the limit can age better
 /// than by a shift, or worse: the limit is a compromise.
@@ -72,34 +75,25 @@ fn fit_pair(curve: &[(f64, f64)], pair: (PositiveMaterial, NegativeMaterial)) ->
         volts.chain(prior).collect::<Vec<f64>>()
     };
     let cost = |r: &[f64]| r.iter().map(|r| r * r).sum::<f64>();
-    let mut x = Vector4::from(PRIOR.map(|(mean, _)| mean));
-    let mut r = residuals(&x);
-    let mut damping = 1e-2;
-    for _ in 0..STEPS {
-        let columns: Vec<Vec<f64>> = (0..4)
-            .map(|k| {
-                let step = 1e-5;
-                let mut moved = x;
-                moved[k] += step;
-                residuals(&moved).iter().zip(&r).map(|(a, b)| (a - b) / step).collect()
-            })
-            .collect();
+    let start = Vector4::from(PRIOR.map(|(mean, _)| mean));
+    let step = |(x, r): &(Vector4<f64>, Vec<f64>), damping: f64| {
+        let columns: [Vec<f64>; 4] = std::array::from_fn(|k| {
+            let step = 1e-5;
+            let mut moved = *x;
+            moved[k] += step;
+            residuals(&moved).iter().zip(r).map(|(a, b)| (a - b) / step).collect()
+        });
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
         let normal = Matrix4::from_fn(|i, j| dot(&columns[i], &columns[j]) * if i == j { 1.0 + damping } else { 1.0 });
-        let gradient = Vector4::from_fn(|i, _| dot(&columns[i], &r));
-        let Some(inverse) = normal.try_inverse() else { break };
-        let mut next = x - inverse * gradient;
+        let gradient = Vector4::from_fn(|i, _| dot(&columns[i], r));
+        let mut next = x - normal.try_inverse()? * gradient;
         let least = [0.0, 0.0, 0.0, pair.0.least_content()];
         let bounds = next.iter_mut().zip(BOUNDS).zip(least);
         bounds.for_each(|((x, (low, high)), least)| *x = x.clamp(low.max(least), high));
         let trial = residuals(&next);
-        if cost(&trial) < cost(&r) {
-            (x, r) = (next, trial);
-            damping = (damping * 0.3_f64).max(1e-9);
-        } else {
-            damping *= 10.0;
-        }
-    }
+        (cost(&trial) < cost(r)).then_some((next, trial))
+    };
+    let (x, r) = minimise(&DAMPING, STEPS, (start, residuals(&start)), step, |_, _, _| false).best;
     (electrodes(pair, &x), cost(&r))
 }
 

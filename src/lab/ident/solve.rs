@@ -8,22 +8,16 @@
 use nalgebra::{DMatrix, DVector};
 
 use super::pass::NormalEquations;
+use crate::filter::levenberg_marquardt::{self, Damping};
 
 /// Most passes over the data.
 const MAX_PASSES: usize = 60;
 /// Relative fall of the cost below which the fit has converged, twice running.
 const CONVERGED: f64 = 3e-4;
-/// Damping at the start, relative to the curvature's diagonal; it falls and grows by the factors after it.
-const DAMPING_START: f64 = 0.3;
-const DAMPING_FALL: f64 = 0.1;
-/// Fall after a step that had to be damped more first: the limit is near.
-const DAMPING_FALL_NEAR: f64 = 0.6;
-const DAMPING_MIN: f64 = 1e-4;
-const DAMPING_GROWTH: f64 = 8.0;
+/// Damping; a step that first needed more of it lowers it less, because the limit is near.
+const DAMPING: Damping = Damping { first: 0.3, fall: 0.1, fall_after_growth: 0.6, growth: 8.0, least: 1e-4, most: 1e8 };
 /// Damping below which a step is nearly the undamped one.
 const DAMPING_WEAK: f64 = 0.02;
-/// Damping at which no step helps any more.
-const DAMPING_MAX: f64 = 1e8;
 /// Most exchanges of the held set in one step; the rest is clamped to the bounds.
 const MAX_EXCHANGES: usize = 30;
 
@@ -112,43 +106,33 @@ pub fn minimise(
     evaluate: impl Fn(&[f64]) -> NormalEquations,
     mut progress: impl FnMut(usize, f64),
 ) -> Solution {
-    let mut theta = space.inside(start);
-    let mut normal = evaluate(&theta);
-    let (mut damping, mut passes, mut still) = (DAMPING_START, 1, 0);
+    let theta = space.inside(start);
+    let normal = evaluate(&theta);
+    let (mut passes, mut unchanged) = (1, 0);
     progress(passes, normal.cost);
-    'outer: while passes < MAX_PASSES && still < 2 {
-        let y = space.to_steps(&theta);
-        let (h, g) = space.pull_back(&normal);
-        let mut fall_by = DAMPING_FALL;
-        loop {
-            let step = bounded_step(&h, &g, damping, &y, space);
-            let trial = step.map(|step| {
-                let moved: Vec<f64> = y.iter().zip(step.iter()).map(|(y, d)| y + d).collect();
-                space.to_nodes(&moved)
-            });
-            let evaluated = trial.map(|trial| (evaluate(&trial), trial));
-            passes += 1;
-            if let Some((better, trial)) = evaluated.filter(|(trial, _)| trial.cost < normal.cost) {
-                let fall = (normal.cost - better.cost) / normal.cost;
-                // Under strong damping a small fall does not show convergence.
-                still = if fall < CONVERGED && damping <= DAMPING_WEAK { still + 1 } else { 0 };
-                (theta, normal) = (trial, better);
-                damping = (damping * fall_by).max(DAMPING_MIN);
-                progress(passes, normal.cost);
-                break;
-            }
-            damping *= DAMPING_GROWTH;
-            fall_by = DAMPING_FALL_NEAR;
-            if damping > DAMPING_MAX {
-                still = 2;
-                break 'outer;
-            }
-            if passes >= MAX_PASSES {
-                break 'outer;
-            }
+    let step = |(theta, normal): &(Vec<f64>, NormalEquations), damping: f64| {
+        passes += 1;
+        let y = space.to_steps(theta);
+        let (h, g) = space.pull_back(normal);
+        let step = bounded_step(&h, &g, damping, &y, space)?;
+        let moved: Vec<f64> = y.iter().zip(step.iter()).map(|(y, d)| y + d).collect();
+        let trial = space.to_nodes(&moved);
+        let evaluated = evaluate(&trial);
+        let is_better = evaluated.cost < normal.cost;
+        if is_better {
+            progress(passes, evaluated.cost);
         }
-    }
-    Solution { theta, cost: normal.cost, passes, converged: still >= 2 }
+        is_better.then_some((trial, evaluated))
+    };
+    let has_converged = |from: &(_, NormalEquations), to: &(_, NormalEquations), damping: f64| {
+        let fall = (from.1.cost - to.1.cost) / from.1.cost;
+        // Under strong damping a small fall does not show convergence.
+        unchanged = if fall < CONVERGED && damping <= DAMPING_WEAK { unchanged + 1 } else { 0 };
+        unchanged >= 2
+    };
+    let found = levenberg_marquardt::minimise(&DAMPING, MAX_PASSES - 1, (theta, normal), step, has_converged);
+    let (theta, normal) = found.best;
+    Solution { theta, cost: normal.cost, passes: found.steps + 1, converged: found.has_converged }
 }
 
 /// State of a parameter in the bounded step.

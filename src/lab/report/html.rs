@@ -5,7 +5,7 @@ use maud::{DOCTYPE, Markup, PreEscaped, html};
 use super::context::PageContext;
 use super::data::{AlarmRecord, Data, Origin};
 use super::pictures::{self, NOT_STORED};
-use super::{forecast, model, raised, summary};
+use super::{forecast, format, model, raised, summary};
 use crate::chart::{Picture, Size, variables};
 use crate::config::Config;
 use crate::io::stamp::format_utc;
@@ -182,9 +182,9 @@ fn heading(data: &Data, context: &PageContext<'_>) -> Markup {
 /// First and last time of the data, and their distance.
 fn span(data: &Data) -> String {
     let Some((first_s, last_s)) = data.ends_s() else { return "there is no record".to_owned() };
-    let long = summary::length(last_s - first_s);
+    let long = format::length(last_s - first_s);
     match data.is_dated() {
-        true => format!("{} to {} ({long})", summary::moment(data, first_s), summary::moment(data, last_s)),
+        true => format!("{} to {} ({long})", format::moment(data, first_s), format::moment(data, last_s)),
         false => long,
     }
 }
@@ -285,12 +285,12 @@ fn alarms(
     let row = |group: &Vec<&AlarmRecord>| {
         let row = group[0];
         let more = if group.len() > 1 { format!("; {} cells in all", group.len()) } else { String::new() };
-        let when = summary::moment(data, row.time_s);
-        vec![when, row.rule.clone(), row.severity.clone(), row.change.clone(), summary::words(row, "was") + &more]
+        let when = format::moment(data, row.time_s);
+        vec![when, row.rule.clone(), row.severity.clone(), row.change.clone(), format::words(row, "was") + &more]
     };
     let rows = groups.iter().rev().map(row);
     let incidents = data.incidents.iter().rev();
-    let incidents = incidents.map(|(time_s, what)| vec![summary::moment(data, *time_s), what.clone()]);
+    let incidents = incidents.map(|(time_s, what)| vec![format::moment(data, *time_s), what.clone()]);
     let raised = raised::raised(data);
     let now: Vec<Vec<String>> =
         raised::grouped(&raised).iter().map(|group| group.row(data, context, outlook)).collect();
@@ -419,7 +419,7 @@ fn estimator(data: &Data) -> Markup {
     );
     rows.extend(data.current_offset.map(|(mean, std)| {
         ("Offset of the current sensor: reading less true current".to_owned(), {
-            let mean = summary::without_minus_zero(format!("{mean:+.3}"));
+            let mean = format::without_minus_zero(format!("{mean:+.3}"));
             format!("{mean} \u{b1} {std:.3} A")
         })
     }));
@@ -472,7 +472,7 @@ fn settings(config: &Config) -> Vec<(String, String)> {
     ];
     rows.extend(config.monitor.rules.iter().map(|rule| {
         let name = rule.rule.name();
-        (format!("Limit {name} ({})", rule.severity.name()), summary::amount(rule.threshold, name))
+        (format!("Limit {name} ({})", rule.severity.name()), format::amount(rule.threshold, name))
     }));
     rows
 }

@@ -2,7 +2,7 @@
 
 use super::context::PageContext;
 use super::data::Data;
-use crate::alarm::Rule;
+use crate::alarm::{Rule, Severity};
 
 /// The mildest threshold of a rule, as configured, else as its alarms say.
 pub(super) fn threshold(data: &Data, context: &PageContext<'_>, rule: Rule) -> Option<f64> {
@@ -21,8 +21,17 @@ pub(super) fn thresholds(data: &Data, context: &PageContext<'_>, rule: Rule) -> 
             rows.filter_map(|row| Some((row.threshold?, row.severity.clone()))).collect()
         }
     };
-    let rank = |severity: &str| ["info", "warning", "severe"].iter().position(|known| *known == severity);
     all.sort_by(|a, b| rank(&a.1).cmp(&rank(&b.1)).then(a.0.total_cmp(&b.0)));
     all.dedup();
     all
+}
+
+/// Rank of a severity by name, the mildest first.
+pub(super) fn rank(severity: &str) -> usize {
+    Severity::ALL.iter().position(|known| known.name() == severity).unwrap_or(0)
+}
+
+/// The rule of this name.
+pub(super) fn rule(name: &str) -> Option<Rule> {
+    Rule::ALL.into_iter().find(|rule| rule.name() == name)
 }

@@ -2,7 +2,7 @@
 
 use super::context::PageContext;
 use super::data::{Data, ModelRecord};
-use super::summary;
+use super::format;
 use crate::cell::model_bands::CURVE_C;
 use crate::cell::{Coverage, ModelBands, advise};
 use crate::config::cell_model::{KnownBy, SourcedModel, state_words};
@@ -51,7 +51,7 @@ pub(super) fn changes(data: &Data) -> impl Iterator<Item = Vec<String>> {
             (false, better) => format!("{better} fits better"),
         };
         vec![
-            summary::moment(data, *time_s),
+            format::moment(data, *time_s),
             state.clone(),
             capacity_ah.map_or("the label's".to_owned(), |(mean, std)| format!("{mean:.3} \u{b1} {std:.3} Ah")),
             residual_v.map_or(String::new(), |v| format!("{:.1} mV", 1e3 * v)),

@@ -5,9 +5,9 @@ use std::path::Path;
 use super::context::PageContext;
 use super::data::{Data, Origin};
 use super::forecast::{self, Outlook};
+use super::format::{moment, words};
 use super::limits::thresholds;
 use super::series::{self, CellStep};
-use super::summary;
 use super::trace::TraceBin;
 use crate::OF_95;
 use crate::alarm::Rule;
@@ -115,14 +115,10 @@ fn raised(data: &Data, clock: &TimeAxis, rule: Rule) -> Option<Layer> {
         .map(|row| Point {
             x: clock.x(row.time_s),
             y: 0.0,
-            tip: format!("{} {}: {}", moment(data, row.time_s), row.severity, summary::words(row, "was")),
+            tip: format!("{} {}: {}", moment(data, row.time_s), row.severity, words(row, "was")),
         })
         .collect();
     (!points.is_empty()).then(|| Layer::new("alarm raised", Ink::Red, Shape::Moments(points)))
-}
-
-fn moment(data: &Data, time_s: f64) -> String {
-    summary::moment(data, time_s)
 }
 
 /// Bins of a trace as a band and, where cells differ or bins are long, the range within.
@@ -466,7 +462,7 @@ fn span(data: &Data, clock: &TimeAxis, from: &super::data::AlarmRecord, to_s: f6
         from: clock.x(from.time_s),
         to: clock.x(to_s),
         ink: ink_of(&from.severity),
-        tip: format!("{}: {}; {end} {}", moment(data, from.time_s), summary::words(from, "was"), moment(data, to_s)),
+        tip: format!("{}: {}; {end} {}", moment(data, from.time_s), words(from, "was"), moment(data, to_s)),
     }
 }
 

@@ -6,7 +6,9 @@ use std::collections::BTreeMap;
 use super::context::PageContext;
 use super::data::{AlarmRecord, Data};
 use super::forecast::Outlook;
-use super::{series, summary};
+use super::format::{amount, moment};
+use super::limits::{rank, rule};
+use super::series;
 use crate::alarm::{Direction, Rule};
 use crate::health::RechargeAlarm;
 
@@ -53,7 +55,7 @@ pub(super) fn grouped<'a>(raised: &'a [ActiveAlarm<'a>]) -> Vec<AlarmGroup<'a>> 
             None => groups.push(AlarmGroup { alarms: vec![alarm] }),
         }
     }
-    groups.sort_by_key(|group| std::cmp::Reverse(summary::rank(&group.alarms[0].row.severity)));
+    groups.sort_by_key(|group| std::cmp::Reverse(rank(&group.alarms[0].row.severity)));
     groups
 }
 
@@ -63,17 +65,16 @@ impl AlarmGroup<'_> {
         let first = self.alarms[0].row;
         let since_s = self.alarms.iter().map(|alarm| alarm.since_s).fold(f64::INFINITY, f64::min);
         let values = self.alarms.iter().filter_map(|alarm| value(alarm.row, data, context, outlook));
-        let is_below = summary::rule(&first.rule).is_some_and(|rule| rule.spec().direction == Direction::Below);
+        let is_below = rule(&first.rule).is_some_and(|rule| rule.spec().direction == Direction::Below);
         let worst = values.reduce(if is_below { f64::min } else { f64::max });
-        let amount =
-            |value: Option<f64>| value.map_or_else(|| "unknown".to_owned(), |v| summary::amount(v, &first.rule));
+        let known = |value: Option<f64>| value.map_or_else(|| "unknown".to_owned(), |value| amount(value, &first.rule));
         vec![
             first.rule.clone(),
             first.severity.clone(),
             cells(self.alarms.iter().filter_map(|alarm| alarm.row.cell)),
-            summary::moment(data, since_s),
-            amount(worst),
-            amount(first.threshold),
+            moment(data, since_s),
+            known(worst),
+            known(first.threshold),
         ]
     }
 }
@@ -100,7 +101,7 @@ pub(super) fn value(
         Some(cell) => data.learned.iter().rev().filter(|row| row.cell == cell).find_map(|row| Some(pick(row)?.0)),
         None => series::steps(data, pick, high_is_bad).last().map(|step| step.worst.0),
     };
-    match summary::rule(&row.rule)? {
+    match rule(&row.rule)? {
         Rule::CapacityLow => last(series::capacity, false),
         Rule::UsableCapacityLow => last(series::usable, false),
         Rule::ResistanceHigh => last(series::resistance, true),
@@ -120,7 +121,7 @@ pub(super) fn value(
 
 /// Why the estimates are not to be trusted, and whose; `None` = they are.
 pub(super) fn doubt(data: &Data, raised: &[ActiveAlarm<'_>]) -> Option<String> {
-    let alarms = raised.iter().filter(|alarm| summary::rule(&alarm.row.rule) == Some(Rule::EstimateUntrusted));
+    let alarms = raised.iter().filter(|alarm| rule(&alarm.row.rule) == Some(Rule::EstimateUntrusted));
     let mut doubtful: Vec<Option<usize>> = alarms.map(|alarm| alarm.row.cell).collect();
     doubtful.extend(data.untrusted.iter().map(|cell| Some(*cell)));
     doubtful.sort_unstable();

@@ -5,11 +5,11 @@ use std::collections::BTreeSet;
 use super::context::PageContext;
 use super::data::{AlarmRecord, Data, Origin};
 use super::forecast::Outlook;
+use super::format::{length, moment, words};
+use super::limits::{rank, rule};
 use super::raised::{ActiveAlarm, doubt, raised, value};
 use super::{forecast, series};
-use crate::alarm::{Direction, Rule, Severity, Unit};
-use crate::io::stamp::format_utc;
-use crate::quantity::Timestamp;
+use crate::alarm::{Direction, Rule};
 
 /// Condition of the battery.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -141,14 +141,6 @@ fn unknown(data: &Data, context: &PageContext<'_>) -> Option<String> {
     (!knows_limits(data, context)).then(|| "Unknown: no alarm is raised, but this record names no limit.".to_owned())
 }
 
-pub(super) fn rank(severity: &str) -> usize {
-    Severity::ALL.iter().position(|known| known.name() == severity).unwrap_or(0)
-}
-
-pub(super) fn rule(name: &str) -> Option<Rule> {
-    Rule::ALL.into_iter().find(|rule| rule.name() == name)
-}
-
 /// Whether a rule is about the battery, not about its measurement.
 fn is_of_battery(name: &str) -> bool {
     !matches!(
@@ -163,50 +155,6 @@ fn is_of_battery(name: &str) -> bool {
                 | Rule::ChannelFaulty
         )
     )
-}
-
-fn about(name: &str) -> &str {
-    rule(name).map_or(name, |rule| rule.spec().about)
-}
-
-fn unit(name: &str) -> &'static str {
-    rule(name).map_or("", |rule| rule.spec().unit.symbol())
-}
-
-/// A formatted number that is zero, without a sign.
-pub(super) fn without_minus_zero(digits: String) -> String {
-    let is_zero = digits.bytes().all(|byte| matches!(byte, b'-' | b'+' | b'0' | b'.'));
-    if is_zero { digits.trim_start_matches(['-', '+']).to_owned() } else { digits }
-}
-
-/// A length of time in a unit in which it has two digits or more: `90 s`, `45.0 min`, `6.0 h`, `3 days`.
-pub(super) fn length(seconds: f64) -> String {
-    match seconds {
-        s if s < 120.0 => format!("{s:.0} s"),
-        s if s < 7200.0 => format!("{:.1} min", s / 60.0),
-        s if s < 172_800.0 => format!("{:.1} h", s / 3600.0),
-        s => format!("{:.0} days", s / 86_400.0),
-    }
-}
-
-/// Formats a rule's value with its unit, without trailing zeros.
-pub(super) fn amount(value: f64, rule: &str) -> String {
-    let (value, unit) = match self::rule(rule).map(|rule| rule.spec().unit) {
-        Some(Unit::FractionPerDay) => (100.0 * value, "%/d"),
-        _ => (value, unit(rule)),
-    };
-    let digits = without_minus_zero(format!("{value:.3}"));
-    let digits = digits.trim_end_matches('0').trim_end_matches('.');
-    format!("{digits} {}", unit.replace("degrees C", "\u{b0}C")).trim_end().to_owned()
-}
-
-/// "a cell's usable capacity was 1.38 Ah, limit 1.4 Ah (cell 3)", with the verb in its tense.
-pub(super) fn words(row: &AlarmRecord, verb: &str) -> String {
-    let amount = |value: f64| amount(value, &row.rule);
-    let value = row.value.map_or_else(|| "unknown".to_owned(), amount);
-    let limit = row.threshold.map_or_else(|| "unknown".to_owned(), amount);
-    let cell = row.cell.map_or_else(String::new, |cell| format!(" (cell {})", cell + 1));
-    format!("{} {verb} {value}, limit {limit}{cell}", about(&row.rule))
 }
 
 fn how(verdict: Condition, alarm: Option<&ActiveAlarm<'_>>, data: &Data, unknown: Option<String>, why: &str) -> String {
@@ -228,16 +176,6 @@ fn how(verdict: Condition, alarm: Option<&ActiveAlarm<'_>>, data: &Data, unknown
     let changed = data.source.doubt.iter().filter(|_| verdict != Condition::Unknown);
     let changed: String = changed.map(|changed| format!(" But {changed}.")).collect();
     format!("{head}{why}{doubt}{changed}")
-}
-
-/// Formats a time: a date, or the time after the start.
-pub(super) fn moment(data: &Data, time_s: f64) -> String {
-    if data.is_dated() {
-        format_utc(Timestamp::from_secs(time_s)).replace('T', " ").replace('Z', " UTC")
-    } else {
-        let after_s = data.ends_s().map_or(0.0, |(first_s, _)| time_s - first_s);
-        format!("{} after the start of the record", length(after_s))
-    }
 }
 
 fn since(data: &Data, battery: &[&ActiveAlarm<'_>], measuring: &[&ActiveAlarm<'_>]) -> String {
@@ -527,13 +465,5 @@ mod tests {
         }
         let said = of(&data, &PageContext::default(), &Err("too little".into())).how;
         assert!(said.ends_with("Now a cell's usable capacity is 0.9 Ah, limit 1.4 Ah (cell 2)."), "{said}");
-    }
-
-    #[test]
-    fn short_times_have_seconds_and_no_number_is_minus_zero() {
-        assert_eq!([42.0, 600.0, 36_000.0, 1e6].map(length), ["42 s", "10.0 min", "10.0 h", "12 days"]);
-        assert_eq!(amount(-0.0001, "capacity_low"), "0 Ah");
-        assert_eq!(without_minus_zero("-0.000".to_owned()), "0.000");
-        assert_eq!(without_minus_zero("-0.010".to_owned()), "-0.010");
     }
 }

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use serde::Serialize;
 
 use super::cycles::CycleTable;
-use super::feed::Feeder;
+use super::feed::{Feeder, UNKNOWN_GAP_NS};
 use super::life::{LifeRecorder, LifeScore};
 use super::soc::{self, SocSample, SocScore};
 use super::{ScoreJob, ScoreSettings, picture, window};
@@ -15,8 +15,6 @@ use crate::measured::{MeasuredFile, MeasuredPart};
 use crate::monitor::{EventKind, MonitorConfig};
 use crate::quantity::Timestamp;
 
-/// A part whose beginning is unknown is placed this long after the record so far.
-pub(super) const UNKNOWN_GAP_NS: i64 = 1_000_000_000;
 /// Rows between two reports of progress.
 const REPORT_EVERY: usize = 4096;
 /// An initial SOC beyond 0 or 1 by no more than this is limited to that end (a counter that does not start at 0).

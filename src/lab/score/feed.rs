@@ -1,10 +1,24 @@
 //! Feeds rows of a measured file to the monitor: frames as a bus would carry them, and the driver's ticks between them.
 
-use super::learn::Learned;
 use crate::can::decode::SensorIndex;
-use crate::monitor::{Downtime, MonitorConfig, Outputs};
+use crate::filter::ScalarGaussian;
+use crate::monitor::{Downtime, ModelState, MonitorConfig, Outputs, Snapshot};
 use crate::quantity::{CellIndex, Channel, Timestamp};
 use crate::replay::MonitorDriver;
+
+/// Time between the record so far and a part that starts at an unknown time.
+pub(super) const UNKNOWN_GAP_NS: i64 = 1_000_000_000;
+
+/// State of a monitor after the files it has learned from.
+#[derive(Debug, Clone)]
+pub struct Learned {
+    /// The state.
+    pub snapshot: Snapshot,
+    /// How well the cell's model is known.
+    pub model: ModelState,
+    /// Capacity, Ah.
+    pub capacity: ScalarGaussian,
+}
 
 /// A monitor with the encoder and ticks of a replay.
 pub(super) struct Feeder(MonitorDriver);

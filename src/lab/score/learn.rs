@@ -2,24 +2,11 @@
 
 use std::path::PathBuf;
 
-use super::case::UNKNOWN_GAP_NS;
-use super::feed::Feeder;
+use super::feed::{Feeder, Learned, UNKNOWN_GAP_NS};
 use crate::error::LabError;
-use crate::filter::ScalarGaussian;
 use crate::measured::MeasuredFile;
-use crate::monitor::{ModelState, MonitorConfig, Snapshot};
+use crate::monitor::MonitorConfig;
 use crate::quantity::Timestamp;
-
-/// A monitor's state after its first files.
-#[derive(Debug, Clone)]
-pub struct Learned {
-    /// The state.
-    pub snapshot: Snapshot,
-    /// How well the cell's model is known.
-    pub model: ModelState,
-    /// Capacity, Ah.
-    pub capacity: ScalarGaussian,
-}
 
 /// Rows between two calls of `progress`: some milliseconds of work.
 const PROGRESS_ROWS: usize = 4096;

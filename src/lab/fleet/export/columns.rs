@@ -8,7 +8,7 @@ use std::fmt::Write as _;
 use std::sync::LazyLock;
 
 use super::rows::{AlarmRow, EstimateRow, HalfCycleRow};
-use crate::fleet::vehicles::VehicleRecord;
+use crate::fleet::vehicle::VehicleRecord;
 
 use crate::cell::LossModes;
 use crate::fields::Fields;

@@ -11,7 +11,7 @@ use super::TableFormat;
 use super::columns::{ALARMS, ESTIMATES, HALF_CYCLES, VEHICLES};
 use super::table::{TableFile, concatenate};
 use crate::error::LabError;
-use crate::fleet::vehicles::{RECORD, Vehicle, VehicleRecord};
+use crate::fleet::vehicle::{RECORD, Vehicle, VehicleRecord};
 
 /// What was merged.
 #[derive(Debug, Clone, Default, PartialEq, Eq, serde::Serialize)]
