@@ -1,5 +1,7 @@
 //! The one error of offline work: a text with the place, what was found and what is allowed.
 
+use std::path::Path;
+
 use packwatch_host::failure::Failure;
 
 use crate::chart::PlotError;
@@ -54,6 +56,23 @@ impl LabError {
     pub fn of_io(text: String, error: &std::io::Error) -> Self {
         TableError::of_io(text, error).into()
     }
+}
+
+/// Creates a folder for results, with the folders above it.
+pub(crate) fn create_folder(folder: &Path) -> Result<(), LabError> {
+    std::fs::create_dir_all(folder)
+        .map_err(|error| LabError::File(format!("{}: cannot be created: {error}", folder.display())))
+}
+
+/// Rejects the first value that is not allowed.
+pub(crate) fn check_values(
+    name: &str,
+    values: impl IntoIterator<Item = f64>,
+    is_allowed: impl Fn(f64) -> bool,
+    allowed: &str,
+) -> Result<(), LabError> {
+    let found = values.into_iter().find(|value| !is_allowed(*value));
+    found.map_or(Ok(()), |value| Err(LabError::Data(format!("{name} = {value}, must be {allowed}"))))
 }
 
 impl From<std::io::Error> for LabError {

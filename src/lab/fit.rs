@@ -1,8 +1,8 @@
 //! Fits a cell model to measured files: the work of `packwatch fit` without the terminal.
 //!
-//! Input: measured CSVs ([`super::measured`]), slow tests, and the cell's data from the command line. Output: an
-//! [`FitOutcome`] with the model's tables, residuals per file and all values of the written TOML ([`toml`]).
-//! One error names all files whose SOC cannot be determined, with the reasons.
+//! Input: measured CSVs ([`super::measured`]), slow tests, and the cell's data from the command line. Output: a
+//! [`FitOutcome`] with the model's tables, residuals per file, and all values of the written TOML ([`toml`]).
+//! If the SOC of files cannot be determined, one error lists all of them with the reasons.
 
 mod cells;
 mod chemistry;
@@ -18,7 +18,7 @@ mod request;
 mod toml;
 mod verdict;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
@@ -28,44 +28,45 @@ pub use picture::write as write_plot;
 pub use range::MeasuredRange;
 pub use request::{FitRequest, MAX_SOC_NODES};
 pub use toml::text;
-pub(crate) use toml::{quoted, table as toml_table};
+pub(crate) use toml::{list as toml_list, quoted, table as toml_table};
 
 use super::measured::MeasuredFile;
 use crate::cell::{AgedOcv, Thermal};
 use crate::error::LabError;
+use crate::filter::ends;
 use crate::ident::electrodes::{self, FittedElectrodes};
 use crate::ident::error_table::WeightedRecord;
 use crate::ident::fit::{FitSettings, FittedTables, Residual};
 use crate::ident::grid::Grid;
+use crate::ident::parameters::ParameterTables;
 use crate::ident::prior::PriorDeviations;
 use crate::ident::record::{self, Record};
 use crate::ident::{ageing, error_table, fit, thermal};
 
 /// Least share of the SOC range that the data must cover.
 const MIN_SOC_RANGE: f64 = 0.5;
-/// SOC breakpoints when none are given: closer where the OCV bends.
+/// Default SOC breakpoints: closer where the OCV bends.
 const SOC_NODES: [f64; 24] = [
     0.0, 0.025, 0.05, 0.075, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85,
     0.9, 0.95, 0.975, 1.0,
 ];
-/// SOC breakpoints where slow tests give the OCV's shape; more where it bends ([`nodes`]).
+/// SOC breakpoints if slow tests give the shape of the OCV; [`nodes`] adds more where it bends.
 const SLOW_TEST_SOC_NODES: [f64; 15] = [0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0];
 /// SOC breakpoints for an ageing cell's full discharges, whose knee is sharp.
 const AGEING_SOC_NODES: [f64; 25] = [
     0.0, 0.03, 0.045, 0.06, 0.075, 0.09, 0.105, 0.12, 0.14, 0.17, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.85,
     0.9, 0.93, 0.96, 0.98, 1.0,
 ];
-/// Interval above the cut-off whose slope an ageing cell's curve keeps below it, SOC.
+/// SOC interval above the cut-off whose slope an ageing cell's curve keeps below the cut-off.
 const LOW_END_SOC: f64 = 0.03;
 /// Starting time constants by number of branches, s.
 const TAU_S: [&[f64]; 3] = [&[60.0], &[10.0, 150.0], &[5.0, 50.0, 500.0]];
 
-/// Temperature of the half-cell potentials, degrees C.
+/// Temperature at which the electrodes are identified, degrees C.
 const ELECTRODES_C: f64 = 25.0;
 
-/// Shift of an ageing cell's open-circuit curve (see `AgedOcv::of_shift`) unless another is given. A prior, not a result: no
-/// fit of a new cell determines it. 0 = the curve shrinks evenly, 1 = pure loss of lithium. The value was
-/// chosen on two measured whole lives.
+/// Default shift of an ageing cell's open-circuit curve (see `AgedOcv::of_shift`): 0 = the curve shrinks evenly, 1 = pure loss of
+/// lithium. It is a prior, not a result, because no fit of a new cell determines it. The value was chosen on two measured lives.
 pub const AGEING_SHIFT: f64 = 0.5;
 
 /// Progress of the fit, for a progress bar.
@@ -82,14 +83,27 @@ pub enum FitProgress {
 pub struct FileResidual {
     /// Path as given.
     pub path: PathBuf,
-    /// Rows as measured.
+    /// Number of raw rows.
     pub rows: usize,
     /// Seconds of data.
     pub seconds: f64,
-    /// Rows left out as impossible.
+    /// Rows left out because their voltage is impossible.
     pub outliers: usize,
     /// Residual of the model.
     pub residual: Residual,
+}
+
+impl FileResidual {
+    /// Residuals of the records of the file at `path`.
+    fn of(path: &Path, records: &[Record], tables: &ParameterTables) -> Self {
+        Self {
+            path: path.to_owned(),
+            rows: records.iter().map(|record| record.raw_rows).sum(),
+            seconds: records.iter().map(Record::seconds).sum(),
+            outliers: records.iter().map(|record| record.outliers).sum(),
+            residual: fit::judge(records, tables),
+        }
+    }
 }
 
 /// A fitted model with its provenance and quality.
@@ -101,43 +115,43 @@ pub struct FitOutcome {
     pub capacity_ah: f64,
     /// Lowest and highest voltage, V.
     pub voltage_v: (f64, f64),
-    /// Electrodes, unless a shift of the curve is given or none fit.
+    /// Electrodes, unless a shift of the curve is given or no known electrodes fit.
     pub electrodes: Option<FittedElectrodes>,
     /// Thermal parameters where the data determine them.
     pub thermal: Option<Thermal>,
-    /// Standard deviation of the model's error averaged over 100 s, V, in node order.
+    /// Standard deviation of the model's error, averaged over 100 s, V, in node order.
     pub voltage_error_v: Vec<f64>,
-    /// Where the cell was measured.
+    /// Ranges in which the cell was measured.
     pub measured: MeasuredRange,
-    /// Of an ageing cell: residuals of discharges and of charges.
+    /// For an ageing cell: residuals of discharges and of charges.
     pub by_kind: Option<(Residual, Residual)>,
-    /// Per file, slow tests last.
+    /// Residuals per file, slow tests last.
     pub files: Vec<FileResidual>,
     /// The records fitted, in the order of the files; for plots.
     pub records: Vec<Record>,
     /// The file of each record, as an index into `files`.
     pub file_of_record: Vec<usize>,
-    /// Of a fit to logs: what else they say.
+    /// Additional results of a fit to logs.
     pub logs: Option<LogsOutcome>,
     /// Notes and warnings to print.
     pub notes: Vec<String>,
-    /// What the model is good for, to print at the end.
+    /// Accuracy of the model, to print at the end.
     pub verdict: Vec<String>,
 }
 
-/// What logs of a whole pack say beside the model.
+/// Additional results of a fit to logs of a whole pack.
 #[derive(Debug, Clone)]
 pub struct LogsOutcome {
     /// Standard deviation of the capacity, Ah.
     pub capacity_std_ah: f64,
-    /// Every cell beside the mean; none of a pack of few cells.
+    /// Deviation of every cell from the mean cell; empty for a pack of few cells.
     pub cells: Vec<CellDeviation>,
 }
 
 /// Reads and prepares the files, and fits the model.
 ///
 /// # Errors
-/// A request that [`FitRequest::check`] rejects, files that cannot be read or used, and data that do not support a fit: one line each.
+/// [`FitRequest::check`] rejects the request, files cannot be read or used, or the data do not support a fit: one line each.
 pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Result<FitOutcome, LabError> {
     request.check()?;
     let (files, slow) = read_all(request, &mut progress)?;
@@ -157,14 +171,9 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
     let by_kind = request.first_cycles.map(|_| prepared.by_kind(&records, &fitted));
     let all: Vec<&MeasuredFile> = files.iter().chain(&slow).collect();
     let files = by_file(&all, &prepared, &records, &fitted);
-    // The curve of full discharges under load is too coarse.
+    // Full discharges under load give too coarse a curve.
     let has_curve = !prepared.ocv.is_empty() && request.ageing_shift.is_none();
-    let found = if has_curve { electrodes::identify(|soc| fitted.ocv_v(soc, ELECTRODES_C)) } else { None };
-    let rows: Vec<Vec<f64>> = fitted.tables.ocv_v.chunks(fitted.grid.soc.len()).map(<[f64]>::to_vec).collect();
-    let ages = |found: &FittedElectrodes| {
-        AgedOcv::of_electrodes(&found.electrodes, &fitted.grid.soc, prepared.capacity_ah, &rows).is_some()
-    };
-    let electrodes = found.filter(ages);
+    let electrodes = if has_curve { ageing_electrodes(&fitted, prepared.capacity_ah) } else { None };
     let mut outcome = FitOutcome {
         electrodes,
         capacity_ah: prepared.capacity_ah,
@@ -187,9 +196,17 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
     Ok(outcome)
 }
 
-/// Replaces the open-circuit curve of an ageing cell below the cut-off of its discharges, where there are no data, by a straight
-/// line with the slope of [`LOW_END_SOC`] above. A curve that falls to the cut-off's voltage there, or wherever the last rows
-/// under load pull it, is so steep that an aged cell's first rest is beyond every gate.
+/// Electrodes of the fitted curve, if its ageing can be computed from them.
+fn ageing_electrodes(fitted: &FittedTables, capacity_ah: f64) -> Option<FittedElectrodes> {
+    let soc = &fitted.grid.soc;
+    let rows: Vec<Vec<f64>> = fitted.tables.ocv_v.chunks(soc.len()).map(<[f64]>::to_vec).collect();
+    electrodes::identify(|soc| fitted.ocv_v(soc, ELECTRODES_C))
+        .filter(|found| AgedOcv::of_electrodes(&found.electrodes, soc, capacity_ah, &rows).is_some())
+}
+
+/// Extends the open-circuit curve of an ageing cell below the cut-off of its discharges, where there are no data, by a straight
+/// line with the slope of [`LOW_END_SOC`] above the cut-off. A curve that falls to the cut-off voltage there, or as far as the last rows
+/// under load pull it, is so steep that the gates reject the first rest of an aged cell.
 fn continue_low_end(fitted: &mut FittedTables) {
     let soc = &fitted.grid.soc;
     let cut_off = soc.partition_point(|&node| node < ageing::SOC_LEFT);
@@ -207,7 +224,7 @@ fn judged<'a>(records: &'a [Record], file_of_record: &[usize]) -> Vec<WeightedRe
     each.map(|(record, &file)| WeightedRecord { record, file, share: record::share(record) }).collect()
 }
 
-/// Reads the files and the slow tests with one thread per core.
+/// Reads the files and the slow tests on all cores.
 fn read_all(
     request: &FitRequest,
     progress: &mut impl FnMut(FitProgress),
@@ -239,7 +256,7 @@ fn settings(request: &FitRequest, prepared: &prepare::FitInputs) -> FitSettings 
         tau_s,
         voltage_v: prepared.voltage_v,
         ocv: prepared.ocv.clone(),
-        // Least slope of an ageing cell's OCV: relaxation slower than its branch would bend the top of the curve down.
+        // Smallest slope of an ageing cell's OCV: relaxation slower than its branch would bend the top of the curve down.
         min_slope_v: if ageing { [(0.0, 0.2), (0.9, 1.0)].to_vec() } else { vec![] },
         deviations,
     }
@@ -247,8 +264,7 @@ fn settings(request: &FitRequest, prepared: &prepare::FitInputs) -> FitSettings 
 
 fn check_range(records: &[Record]) -> Result<(), LabError> {
     let judged = records.iter().flat_map(|record| &record.rows).filter(|row| row.weight_s > 0.0);
-    let (low, high) =
-        judged.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), row| (low.min(row.soc), high.max(row.soc)));
+    let (low, high) = ends(judged.map(|row| row.soc));
     if high - low >= MIN_SOC_RANGE {
         return Ok(());
     }
@@ -265,13 +281,7 @@ fn by_file(
     let of_file = |(number, file): (usize, &&MeasuredFile)| {
         let own = || prepared.sources.iter().enumerate().filter(move |(_, source)| source.file == number);
         let only: Vec<Record> = own().map(|(i, _)| records[i].clone()).collect();
-        FileResidual {
-            path: file.path.clone(),
-            rows: only.iter().map(|record| record.raw_rows).sum(),
-            seconds: only.iter().map(Record::seconds).sum(),
-            outliers: only.iter().map(|record| record.outliers).sum(),
-            residual: fit::judge(&only, &fitted.tables),
-        }
+        FileResidual::of(&file.path, &only, &fitted.tables)
     };
     files.iter().enumerate().map(of_file).collect()
 }
@@ -282,12 +292,12 @@ fn add_notes(request: &FitRequest, outcome: &mut FitOutcome) {
         outcome.notes.push(format!("electrodes {positive} and {negative}, within {:.1} mV", 1e3 * found.residual_v));
     } else if !request.ocv.is_empty() && request.ageing_shift.is_none() {
         let most_mv = 1e3 * electrodes::MAX_RESIDUAL_V;
-        let what = format!("no known electrodes within {most_mv} mV of a slow test's curve: how it ages is not known");
+        let what = format!("no known electrodes within {most_mv} mV of the slow test's curve: its ageing is unknown");
         outcome.notes.push(what);
     }
     let outliers: usize = outcome.files.iter().map(|file| file.outliers).sum();
     if outliers > 0 {
-        outcome.notes.push(format!("{outliers} rows left out: no voltage this cell can have"));
+        outcome.notes.push(format!("{outliers} rows left out: this cell cannot have their voltage"));
     }
     if !outcome.fit.converged {
         outcome.notes.push(format!("not converged after {} passes", outcome.fit.passes));
@@ -306,11 +316,9 @@ fn add_notes(request: &FitRequest, outcome: &mut FitOutcome) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ident::grid::Grid;
-    use crate::ident::parameters::ParameterTables;
 
     #[test]
-    fn below_the_cut_off_the_curve_keeps_its_slope() {
+    fn curve_keeps_its_slope_below_the_cut_off() {
         let ocv_v = AGEING_SOC_NODES.map(|soc| if soc < 0.045 { 2.0 + soc } else { 3.0 + 10.0 * soc }).to_vec();
         let tables = ParameterTables { ocv_v, r0_ohm: vec![], r_ohm: vec![], tau_s: vec![] };
         let grid = Grid { soc: AGEING_SOC_NODES.to_vec(), temperature_c: vec![25.0] };

@@ -1,8 +1,8 @@
-//! Work over many logs at once: alarms under other settings ([`whatif`]), tables of the results ([`export`]), and those of the vehicles
-//! of a fleet on several machines ([`vehicles`]).
+//! Processes many logs at once: alarms under other settings ([`whatif`]), tables of the results ([`export`]), and the same tables for a
+//! fleet of vehicles on several machines ([`vehicles`]).
 //!
-//! In: a configuration and logs of any form `replay` reads. Each log is replayed by itself, the logs on all cores; a log
-//! that fails is reported and the others continue. Memory is bounded by the results per log, not by its length.
+//! Input: a configuration and logs in any format that `replay` reads. Each log is replayed separately, on all cores; a log that fails is
+//! reported, and the others continue. Memory is bounded by the results per log, not by its length.
 
 pub mod drive;
 pub mod export;
@@ -21,10 +21,10 @@ use rayon::prelude::*;
 
 use crate::error::LabError;
 
-/// Runs `work` for every item on `jobs` threads (`None` = all cores); results in the items' order.
+/// Runs `work` for every item on `jobs` threads (`None` = all cores); returns the results in the order of the items.
 ///
 /// # Errors
-/// When the threads cannot be started.
+/// The threads cannot be started.
 pub fn in_parallel<T: Sync, R: Send>(
     items: &[T],
     jobs: Option<usize>,
@@ -33,6 +33,6 @@ pub fn in_parallel<T: Sync, R: Send>(
     let threads = jobs.unwrap_or(0).min(items.len().max(1));
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
     let pool = pool.map_err(|error| LabError::Data(format!("threads cannot be started: {error}")))?;
-    // One by one: logs differ much in length.
+    // One item at a time, because logs differ much in length.
     Ok(pool.install(|| items.par_iter().enumerate().with_max_len(1).map(|(index, item)| work(index, item)).collect()))
 }

@@ -27,5 +27,10 @@ pub mod single_cell;
 
 pub use packwatch_host::io::result_file::write_file;
 
+/// A file name without the ending of its compression.
+fn without_compression(name: &str) -> &str {
+    [".gz", ".zst"].iter().find_map(|ending| name.strip_suffix(ending)).unwrap_or(name)
+}
+
 /// Half of a normal distribution's 95 % interval, standard deviations.
 const OF_95: f64 = 1.96;

@@ -1,13 +1,13 @@
-//! Scores estimates against truth: measured files through the real monitor, and the errors of its estimates.
+//! Scores estimates against truth: measured files run through the real monitor, and the errors of its estimates.
 //!
-//! Input: files as cyclers write them ([`MeasuredFile`]), a monitor's configuration, and the cases to try: where in the
-//! file the estimator starts, and its initial SOC and capacity. Each row becomes the frame that would have carried it
-//! ([`feed`]), so every stage of the monitor takes part. Output: per file and case the SOC's errors in points (percent of full),
-//! the share of samples whose 95 % interval holds the truth, and for whole lives the same of the usable capacity.
+//! Input: files as cyclers write them ([`MeasuredFile`]), a monitor's configuration, and the cases to try: where in the file the
+//! estimator starts, and its initial SOC and capacity. Each row becomes the frame that would have carried it ([`feed`]), so every stage of
+//! the monitor takes part. Output: per file and case the errors of the SOC in points (percent of full), the share of samples whose 95 %
+//! interval contains the truth, and for whole lives the same for the usable capacity.
 //!
-//! The truth of the SOC is 1 - `discharged_ah` / C with one C for all files; that of the usable capacity is a table of
-//! published capacities. Every estimate counts once (no weighting by time), so a stretch logged at 10 Hz counts more than
-//! a rest logged once a minute. Estimates without a truth, and rows without an estimate, are left out and counted.
+//! The true SOC is 1 - `discharged_ah` / C with one C for all files; the true usable capacity comes from a table of published capacities.
+//! Every estimate counts once, without weighting by time, so a part logged at 10 Hz counts more than a rest logged once a minute.
+//! Estimates without a truth and rows without an estimate are left out and counted.
 
 mod case;
 mod cycles;
@@ -42,32 +42,32 @@ use crate::monitor::MonitorConfig;
 pub struct ScoreSettings {
     /// Configuration of the monitor.
     pub monitor: MonitorConfig,
-    /// Charge from full to empty that the truth of the SOC is stated in, Ah.
+    /// Charge from full to empty that defines the true SOC, Ah.
     pub truth_capacity_ah: f64,
-    /// Part of that charge already taken out where a start in the middle begins, fraction.
+    /// Share of that charge that has been taken out where a start in the middle begins, fraction.
     pub remove: f64,
-    /// Samples earlier than this after the start are left out of the statistics, s.
+    /// Time after the start without statistics, s.
     pub settle_s: f64,
     /// Standard deviation of the initial SOC, fraction; `None` = as in [`ScoreSettings::initial_soc_std`].
     pub soc_std: Option<f64>,
-    /// Standard deviation of the capacity started with, as a fraction of the model's; `None` = the configuration's.
+    /// Standard deviation of the initial capacity, as a fraction of the model's; `None` = as configured.
     pub capacity_std: Option<f64>,
-    /// A gap longer than this means that the recorder was asleep, s.
+    /// A longer gap means that the recorder was asleep, s.
     pub sleep_gap_s: f64,
-    /// First fall of the capacity below this is looked for, Ah.
+    /// Capacity whose first undershoot is reported, Ah.
     pub threshold_ah: f64,
-    /// Discharges before the capacity's statistics begin.
+    /// Number of discharges before the statistics of the capacity.
     pub skip_cycles: usize,
-    /// Smallest and largest part of each half-cycle's charge that is seen; `None` = all of it.
+    /// Smallest and largest share of each half-cycle's charge that is visible; `None` = all of it.
     pub window: Option<(f64, f64)>,
-    /// State after the files that came before each scored one; `None` = each is the first.
+    /// State after the files that preceded each scored one; `None` = each file is the first.
     pub learned: Option<Learned>,
     /// Folder for the plots.
     pub plots: Option<PathBuf>,
 }
 
 impl ScoreSettings {
-    /// Returns the standard deviation of the initial SOC, fraction: the given one, else the size of its error, at least 5
+    /// Returns the standard deviation of the initial SOC, fraction: the configured value, or else the size of its error, at least 5
     /// points.
     pub fn initial_soc_std(&self, error_points: f64) -> f64 {
         self.soc_std.unwrap_or((error_points.abs() / 100.0).max(0.05))
@@ -85,11 +85,11 @@ pub struct ScoreJob {
     pub name: String,
 }
 
-/// Scores every file in every case, files in parallel; in the order of `jobs`, and within a file of `cases`.
-/// `progress` receives the file's index and the share of its work just done (fraction).
+/// Scores every file in every case, files in parallel; the result is in the order of `jobs`, and within a file of `cases`.
+/// `progress` receives the index of the file and the share of its work just done (fraction).
 ///
 /// # Errors
-/// Error of the first file (in order) that cannot be scored.
+/// The error of the first file (in order) that cannot be scored.
 pub fn run(
     jobs: &[ScoreJob],
     cases: &[Case],
@@ -97,7 +97,7 @@ pub fn run(
     progress: &(dyn Fn(usize, f64) + Sync),
 ) -> Result<Vec<CaseScore>, LabError> {
     let score = |(index, job)| score_file(job, cases, settings, &|part| progress(index, part));
-    // One by one: files differ much in length.
+    // One file at a time, because files differ much in length.
     let lists: Vec<_> = jobs.par_iter().enumerate().with_max_len(1).map(score).collect();
     let lists: Result<Vec<_>, _> = lists.into_iter().collect();
     Ok(lists?.into_iter().flatten().collect())

@@ -227,7 +227,7 @@ fn bad_input_error_names_place_and_range() {
     let of = |args: &[&str]| fault(bench.score(args), 1);
     assert!(
         of(&["no_counter.csv"])
-            .contains("no_counter.csv: no column discharged_ah with values, and no table with --cycles")
+            .contains("no_counter.csv: no values in column discharged_ah, and no table with --cycles")
     );
     assert!(of(&["empty.csv"]).contains("empty.csv:1: no column time_s"));
     assert!(of(&["header.csv"]).contains("header.csv: no rows after the header"));
@@ -236,7 +236,7 @@ fn bad_input_error_names_place_and_range() {
         of(&["drive.csv", "--told", "20"]).trim_end(),
         "drive.csv: initial SOC is 100.0 % and +20 points: 120.0 %, must be 0 to 100 %"
     );
-    assert!(of(&["drive.csv", "--start", "middle"]).contains("drive.csv: never down to a SOC of 0.700"));
+    assert!(of(&["drive.csv", "--start", "middle"]).contains("drive.csv: the SOC never falls to 0.700"));
     assert!(of(&["drive.csv", "drive.csv"]).contains("drive.csv: named twice"));
     for wrong in [["--told", "much"], ["--remove", "1.5"], ["--settle", "soon"], ["--window", "0.7,0.4"]] {
         let printed = fault(bench.score(&[&["drive.csv"], &wrong[..]].concat()), 2);

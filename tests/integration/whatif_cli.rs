@@ -132,7 +132,7 @@ fn failed_log_is_reported_and_others_continue() {
     let output = printed.get_output();
     assert!(output.stdout.is_empty(), "no table without results: {output:?}");
     let stderr = String::from_utf8_lossy(&output.stderr);
-    assert!(stderr.contains("holds no record: no frame of the configured interfaces: the log has can9"), "{stderr}");
+    assert!(stderr.contains("contains no record: no frame of the configured interfaces: the log has can9"), "{stderr}");
     let printed = bench.run(&["whatif"], &["--set", "estimator.voltage_noise_v=0.01", "-"]).code(1);
     let stderr = String::from_utf8_lossy(&printed.get_output().stderr).into_owned();
     assert!(stderr.contains("-: standard input can be read only once"), "{stderr}");

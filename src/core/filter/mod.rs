@@ -14,7 +14,7 @@ pub mod unscented;
 pub use bisection::{bisect, crossing};
 pub use interpolation::{interpolate, locate};
 pub use linear::{Measurement, ScalarGaussian, update_states};
-pub use statistics::{bell, median, normal_cdf, probability_below};
+pub use statistics::{bell, ends, median, normal_cdf, probability_below};
 pub use unscented::{CONSIDERED, CONSTANT_ERRORS, FilterError, Gaussian, MeasurementNoise, SigmaPointWeights, Update};
 
 /// x^2.

@@ -12,6 +12,11 @@ pub fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
     Some(*finite.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
+/// Least and largest of the values; infinity and minus infinity without one.
+pub fn ends(values: impl Iterator<Item = f64>) -> (f64, f64) {
+    values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| (low.min(value), high.max(value)))
+}
+
 /// Probability that a standard normal value is below.
 pub fn normal_cdf(value: f64) -> f64 {
     probability_below(value, 1.0)

@@ -1,5 +1,6 @@
 //! Axes: their range, ticks and labels.
 
+use crate::filter::ends;
 use crate::io::stamp::format_utc;
 use crate::quantity::Timestamp;
 
@@ -56,8 +57,7 @@ impl Axis {
         if let Some(range) = self.range {
             return opened(range, 0.0);
         }
-        let none = (f64::INFINITY, f64::NEG_INFINITY);
-        let ends = values.filter(|v| v.is_finite()).fold(none, |(low, high), v| (low.min(v), high.max(v)));
+        let ends = ends(values.filter(|value| value.is_finite()));
         // Room above and below the data, parts of their range.
         opened(ends, if margin { 0.06 } else { 0.0 })
     }

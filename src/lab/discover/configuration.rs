@@ -12,6 +12,7 @@ use super::log_signal::{LogSignal, MessageField, SignalOrigin};
 use super::signals::Descriptions;
 use super::{Candidate, Discovery, PositiveDirection, raw};
 use crate::can::CanId;
+use crate::fit::quoted;
 use crate::import::{DiagnosticSignal, DiagnosticTable, series};
 use crate::wiring::evidence::PackQuantity;
 
@@ -382,11 +383,6 @@ fn guessed_request(response: CanId) -> CanId {
             CanId::Extended(id & !0xFFFF | u32::from(low) << 8 | u32::from(high))
         }
     }
-}
-
-/// A TOML text.
-fn quoted(text: &str) -> String {
-    toml::Value::String(text.to_owned()).to_string()
 }
 
 /// One line of a comment.

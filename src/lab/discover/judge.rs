@@ -9,6 +9,7 @@ use super::log_signal::{LogSignal, SignalOrigin};
 use super::raw;
 use super::{Candidate, PositiveDirection};
 use crate::can::unit::Quantity;
+use crate::filter::ends;
 use crate::quantity::BusIndex;
 use crate::wiring::evidence::{PackQuantity, Score, Series, Slope};
 
@@ -243,9 +244,9 @@ fn cell_group(group: &SignalGroup, signals: &[LogSignal]) -> Option<Evidence> {
         return None;
     }
     let first = &signals[members[0]];
-    let (low, high) = ends(members.iter().map(|index| &signals[*index].series));
-    let means = || members.iter().map(|index| signals[*index].series.extent.mean());
-    let spread = means().fold(f64::MIN, f64::max) - means().fold(f64::MAX, f64::min);
+    let (low, high) = extent(members.iter().map(|index| &signals[*index].series));
+    let (least, largest) = ends(members.iter().map(|index| signals[*index].series.extent.mean()));
+    let spread = largest - least;
     let (together, is_moving) = moves_together(&members, signals);
     let manner = if is_moving { ", that move together" } else { "" };
     let (count, left_out) = (members.len(), group.members.len() - members.len());
@@ -283,7 +284,7 @@ fn temperature_group(group: &SignalGroup, signals: &[LogSignal]) -> Option<Evide
     let first = *found.first().filter(|_| found.len() >= 2)?;
     let mut evidence = temperature(first, &signals[first])?;
     evidence.name.clone_from(&group.pattern);
-    (evidence.low, evidence.high) = ends(found.iter().map(|index| &signals[*index].series));
+    (evidence.low, evidence.high) = extent(found.iter().map(|index| &signals[*index].series));
     let text = format!("{} sensors of {:.1} to {:.1} degC", found.len(), evidence.low, evidence.high);
     evidence.add(1.0, evidence.high - evidence.low <= 25.0, &text);
     evidence.add(1.0, group.pattern.contains("Row"), "");
@@ -383,8 +384,6 @@ fn response(voltage: &LogSignal, current: &LogSignal) -> Option<Slope> {
     (is_plausible && is_significant && correlation >= 0.5).then_some(slope)
 }
 
-fn ends<'a>(series: impl Iterator<Item = &'a Series>) -> (f64, f64) {
-    series.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), one| {
-        (low.min(one.extent.min), high.max(one.extent.max))
-    })
+fn extent<'a>(series: impl Iterator<Item = &'a Series>) -> (f64, f64) {
+    ends(series.flat_map(|one| [one.extent.min, one.extent.max]))
 }

@@ -1,9 +1,9 @@
-//! The cells of a pack beside their mean: capacity, resistance and charge of each, and which does not belong.
+//! Deviations of a pack's cells from their mean: capacity, resistance and charge of each cell, and outliers.
 //!
-//! In: the distance of every cell's voltage from the mean (V) at some rows, and the fitted records of the mean cell. Out: a
-//! [`CellDeviation`] per cell. All cells have one curve and one current sensor, so that errors of the model and of the current are
-//! those of all: the distance is linear in what a cell has of its own,
-//! d = slope (dSOC + (q / C) dlnC - (t / C) leakage) - drop dlnR + offset, and one least-squares solution per cell has it.
+//! Input: the difference between every cell's voltage and the mean (V) at some rows, and the fitted records of the mean cell. Output: a
+//! [`CellDeviation`] per cell. All cells share one curve and one current sensor, so errors of the model and of the current cancel. The
+//! difference d is linear in the cell's deviations:
+//! d = slope (dSOC + (q / C) dlnC - (t / C) leakage) - drop dlnR + offset. One least-squares solution per cell determines them.
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
@@ -13,34 +13,34 @@ use crate::ident::parameters::ParameterTables;
 use crate::ident::pass::residuals;
 use crate::ident::record::Record;
 
-/// Shortest time between two rows of distances, s: they change with the SOC.
+/// Shortest time between two rows of differences, s; differences change only with the SOC.
 const PERIOD_S: f64 = 5.0;
-/// Standard deviations before the fit: ln capacity, ln resistance, the sensor's offset (V), leakage (part of the capacity per h), SOC.
+/// Standard deviations before the fit: ln capacity, ln resistance, sensor offset (V), leakage (share of the capacity per h), SOC.
 const PRIOR: [f64; OWN + 1] = [0.15, 0.4, 0.003, 0.002, 0.15];
-/// What a cell has of its own beside its SOC.
+/// Number of a cell's unknowns in addition to its SOC.
 const OWN: usize = 4;
-/// Deviation of a distance that repeats itself, V, over this time, s.
+/// Error of a difference, V, and its correlation time, s.
 const DISTANCE_V: f64 = 0.002;
 const REPEATS_S: f64 = 50.0;
-/// Fewest cells that can be compared.
+/// Smallest number of cells that are compared.
 const LEAST_CELLS: usize = 4;
-/// A cell does not belong when it is this many robust deviations from the median, as many of its own, and beyond the least
-/// difference that matters: of the capacity, of the resistance, of the residual (V), of the leakage (part of the capacity per h).
+/// An outlier is further from the median than this many robust deviations, than this many of its own standard deviations, and than
+/// the smallest relevant difference: of capacity, of resistance, of the residual (V), of the leakage (share of the capacity per h).
 const SPREADS: f64 = 5.0;
 const OWN_DEVIATIONS: f64 = 3.0;
 const FLOOR: [f64; 4] = [0.03, 0.15, 0.004, 0.0005];
 
-/// Distances of all cells from their mean over one stretch.
+/// Differences of all cells from their mean over one stretch.
 #[derive(Debug, Clone, Default)]
 pub(super) struct CellDistances {
     /// Time, s.
     pub(super) time_s: Vec<f64>,
-    /// Cell by cell for every time, V; NaN = no reading.
+    /// Differences at each time, cell after cell, V; NaN = no reading.
     pub(super) distance_v: Vec<f32>,
 }
 
 impl CellDistances {
-    /// Notes the cells' voltages at a time unless it is within [`PERIOD_S`] of the last; `mean_v`: of all cells.
+    /// Records the cells' voltages and their mean `mean_v`, unless the last entry is less than [`PERIOD_S`] ago.
     pub(super) fn push(&mut self, time_s: f64, mean_v: f64, voltage_v: &[f64]) {
         if voltage_v.len() >= LEAST_CELLS && self.time_s.last().is_none_or(|last_s| time_s - last_s >= PERIOD_S) {
             self.time_s.push(time_s);
@@ -49,22 +49,22 @@ impl CellDistances {
     }
 }
 
-/// One cell beside the mean of all.
+/// Deviation of one cell from the mean cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CellDeviation {
-    /// Capacity relative to the mean cell, and its standard deviation.
+    /// Capacity relative to the mean cell, with its standard deviation.
     pub capacity_ratio: (f64, f64),
-    /// Resistance relative to the mean cell, and its standard deviation.
+    /// Resistance relative to the mean cell, with its standard deviation.
     pub resistance_ratio: (f64, f64),
-    /// Leakage beyond the mean cell's, part of the capacity per h, and its standard deviation.
+    /// Leakage in excess of the mean cell, share of the capacity per h, with its standard deviation.
     pub leakage_per_h: (f64, f64),
-    /// SOC above that of the mean cell at the beginning of the first stretch, fraction.
+    /// SOC minus that of the mean cell at the start of the first stretch, fraction.
     pub soc_offset: f64,
-    /// What these do not explain, root mean square, V.
+    /// Root mean square of the unexplained difference, V.
     pub residual_v: f64,
 }
 
-/// What the distances are multiplied with, at one time.
+/// Coefficients of the unknowns at one time.
 struct Factors {
     stretch: usize,
     weight: f64,
@@ -74,7 +74,7 @@ struct Factors {
     drop_v: f64,
 }
 
-/// The cells; none for fewer than [`LEAST_CELLS`], or where there are no distances.
+/// Deviations of all cells; empty for fewer than [`LEAST_CELLS`] or without differences.
 pub(super) fn fit(
     cells: usize,
     distances: &[&CellDistances],
@@ -98,7 +98,7 @@ pub(super) fn fit(
     (0..cells).into_par_iter().map(|cell| fit_cell(cell, distances.len(), &factors, &all_v)).collect()
 }
 
-/// Factors at the times of the distances: of the nearest row before each.
+/// Coefficients at the times of the differences, from the latest row before each.
 fn factors(
     stretch: usize,
     distances: &CellDistances,
@@ -149,7 +149,7 @@ fn fit_cell(cell: usize, stretches: usize, factors: &[Factors], all_v: &[&[f32]]
             }
         }
     }
-    // A positive prior on the diagonal: the matrix has an inverse.
+    // The prior makes the diagonal positive, so the matrix has an inverse.
     let Some(inverse) = normal.cholesky().map(|factor| factor.inverse()) else { return CellDeviation::unknown() };
     let x = &inverse * right;
     let (mut squares, mut weights) = (0.0, 0.0);
@@ -162,7 +162,7 @@ fn fit_cell(cell: usize, stretches: usize, factors: &[Factors], all_v: &[&[f32]]
         return CellDeviation::unknown();
     }
     let residual_v = (squares / weights).sqrt();
-    // Residuals larger than expected: every row says less.
+    // Larger residuals than expected: every row carries less information.
     let scale = (residual_v / DISTANCE_V).max(1.0);
     let ratio = |i: usize| {
         let ratio = libm::exp(x[i]);
@@ -179,7 +179,7 @@ fn fit_cell(cell: usize, stretches: usize, factors: &[Factors], all_v: &[&[f32]]
 }
 
 impl Factors {
-    /// Indices of the unknowns on which the distance depends, with what they are multiplied with.
+    /// Indices and coefficients of the unknowns on which the difference depends.
     fn terms(&self) -> [(usize, f64); OWN + 1] {
         let soc = (OWN + self.stretch, self.slope_v);
         [(0, self.charge_v), (1, -self.drop_v), (2, 1.0), (3, -self.hours_v), soc]
@@ -187,7 +187,7 @@ impl Factors {
 }
 
 impl CellDeviation {
-    /// Of a cell without readings.
+    /// Deviation of a cell without readings.
     fn unknown() -> Self {
         let unknown = (f64::NAN, f64::INFINITY);
         Self {
@@ -200,7 +200,7 @@ impl CellDeviation {
     }
 }
 
-/// Sentences about the cells: how far they are apart, and each that does not belong. Cells count from 1.
+/// Sentences about the spread of the cells and about each outlier. Cells count from 1.
 pub(super) fn notes(cells: &[CellDeviation]) -> Vec<String> {
     if cells.is_empty() {
         return vec![];
@@ -233,19 +233,19 @@ pub(super) fn notes(cells: &[CellDeviation]) -> Vec<String> {
             ));
         }
         if residual.is_far(cell.residual_v, FLOOR[2]) {
-            what.push(format!("voltage unlike the others', {:.1} mV", 1e3 * cell.residual_v));
+            what.push(format!("voltage differs from the others by {:.1} mV rms", 1e3 * cell.residual_v));
         }
         if cell.capacity_ratio.0.is_nan() {
             what.push("no reading".to_owned());
         }
         if !what.is_empty() {
-            notes.push(format!("cell {number} does not belong: {}", what.join(", ")));
+            notes.push(format!("cell {number} is an outlier: {}", what.join(", ")));
         }
     }
     notes
 }
 
-/// Middle and robust deviation of a quantity over the cells.
+/// Median and robust standard deviation of a quantity over the cells.
 struct Spread {
     median: f64,
     deviation: f64,
@@ -255,7 +255,7 @@ impl Spread {
     fn of(values: impl Iterator<Item = f64> + Clone) -> Self {
         let centre = median(values.clone()).unwrap_or(f64::NAN);
         let distance = median(values.map(|value| (value - centre).abs())).unwrap_or(f64::NAN);
-        // A normal distribution's standard deviation relative to its median distance.
+        // Ratio of a normal distribution's standard deviation to its median distance.
         Self { median: centre, deviation: 1.4826 * distance }
     }
 
@@ -274,7 +274,7 @@ mod tests {
     }
 
     #[test]
-    fn only_a_cell_far_beyond_the_others_does_not_belong() {
+    fn only_cells_far_from_the_others_are_outliers() {
         let mut cells: Vec<CellDeviation> =
             (0..20).map(|k| cell(1.0 + 0.002 * f64::from(k % 5), 1.0 + 0.01 * f64::from(k % 3), 0.001)).collect();
         assert_eq!(notes(&cells).len(), 1, "{:?}", notes(&cells));
@@ -282,17 +282,17 @@ mod tests {
         cells[7] = cell(1.0, 1.5, 0.001);
         cells[9] = cell(1.0, 1.0, 0.02);
         let found = notes(&cells);
-        assert!(found[1].starts_with("cell 4 does not belong: capacity -8."), "{found:?}");
-        assert!(found[2].starts_with("cell 8 does not belong: resistance +4"), "{found:?}");
-        assert!(found[3].starts_with("cell 10 does not belong: voltage unlike the others', 20.0 mV"), "{found:?}");
+        assert!(found[1].starts_with("cell 4 is an outlier: capacity -8."), "{found:?}");
+        assert!(found[2].starts_with("cell 8 is an outlier: resistance +4"), "{found:?}");
+        assert!(found[3].starts_with("cell 10 is an outlier: voltage differs from the others by 20.0 mV"), "{found:?}");
         assert_eq!(found.len(), 4);
-        // A difference that its own uncertainty explains does not count.
+        // A difference within the cell's own uncertainty does not count.
         cells[3].capacity_ratio.1 = 0.05;
         assert_eq!(notes(&cells).len(), 3);
     }
 
     #[test]
-    fn equal_cells_have_a_floor() {
+    fn small_differences_between_equal_cells_are_ignored() {
         let mut cells = vec![cell(1.0, 1.0, 0.0); 8];
         cells[0] = cell(0.98, 1.1, 0.003);
         assert_eq!(notes(&cells).len(), 1);

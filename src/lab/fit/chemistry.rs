@@ -1,17 +1,17 @@
-//! Whether another chemistry than that on the label explains the logs better.
+//! Tests whether another chemistry than the label's explains the logs better.
 //!
-//! In: stretches of the mean cell, the label. Out: the costs of all chemistries on the same rows, those of the service's notebook,
-//! by the service's own fit, and a sentence when another one is clearly better.
+//! Input: stretches of the mean cell, and the label. Output: a sentence if another chemistry is clearly better. All chemistries are
+//! compared on the same rows, by the daemon's own notebook and fit.
 
 use crate::cell::notebook::Row;
 use crate::cell::own_model::fit;
 use crate::cell::{CellModel, CellStep, Chemistry, Label, Notebook, NotebookConfig};
 use crate::ident::MeasuredPart;
 
-/// Difference of the logarithms of the posterior densities from which on another chemistry is the cell's: as in the service.
+/// Difference of the log posterior densities from which on another chemistry is reported; same value as in the daemon.
 const MARGIN: f64 = 12.0;
 
-/// The label a model was made of; `None` = it is of a file.
+/// The label from which a model was derived; `None` = the model comes from a file.
 pub(super) fn label_of(model: &CellModel) -> Option<Label> {
     let of = |chemistry: Chemistry| Label {
         chemistry,
@@ -23,7 +23,7 @@ pub(super) fn label_of(model: &CellModel) -> Option<Label> {
     model.spread.and(labels.into_iter().find(|label| label.model().as_ref() == Some(model)))
 }
 
-/// The rows that the service would note of these stretches, each with its SOC at the beginning, with a sensor without offset.
+/// Rows that the daemon would record of these stretches; each stretch has its initial SOC, and the sensor's offset is removed.
 fn rows<'a>(label: &Label, offset_a: f64, stretches: impl Iterator<Item = (&'a MeasuredPart, f64)>) -> Vec<Row> {
     let config = NotebookConfig::new(1, label.rated_ah);
     let mut notebook = Notebook::default();
@@ -41,7 +41,7 @@ fn rows<'a>(label: &Label, offset_a: f64, stretches: impl Iterator<Item = (&'a M
                 unmeasured_s: 0.0,
                 current_a: Some(part.current_a[k] - offset_a),
                 temperature_c: Some(part.temperature_c[k]).filter(|t| t.is_finite()),
-                // Temperature where a log has none, degrees C.
+                // Assumed temperature of a log without one, degrees C.
                 ambient_c: 25.0,
                 voltage_v: part.voltage_v[k],
             };
@@ -54,9 +54,8 @@ fn rows<'a>(label: &Label, offset_a: f64, stretches: impl Iterator<Item = (&'a M
     notebook.rows().to_vec()
 }
 
-/// What the logs say about the chemistry, of a capacity (Ah) and an offset of the current (A) that a fit has found; `None` = nothing
-/// against that of the label. `error_ratio`: error of a circuit relative to that in the warmth. With it the logarithms of likelihoods
-/// shrink as its square.
+/// Compares the chemistries with the capacity (Ah) and the current offset (A) of a fit; `None` = the label's chemistry is confirmed.
+/// `error_ratio`: error of a circuit relative to its error when warm. Log likelihoods shrink with its square.
 pub(super) fn note<'a>(
     label: &Label,
     (capacity_ah, offset_a): (f64, f64),
@@ -68,7 +67,7 @@ pub(super) fn note<'a>(
         let of = if chemistry == label.chemistry { *label } else { label.with_chemistry(chemistry) };
         Some((chemistry, fit::label_cost(&of.prior()?, &rows, &[capacity_ah])?))
     };
-    // Fewest rows that are compared.
+    // Smallest number of compared rows.
     let Some((_, own)) = cost(label.chemistry).filter(|_| rows.len() >= 12) else {
         return Some(format!("too little charge moved to compare {} with other chemistries", label.chemistry.name()));
     };
@@ -76,7 +75,7 @@ pub(super) fn note<'a>(
     let (best, least) = others.filter_map(cost).min_by(|a, b| a.1.total_cmp(&b.1))?;
     (least < own - MARGIN * error_ratio * error_ratio).then(|| {
         format!(
-            "the voltages are those of {} rather than of {}, which is on the label: ln of the likelihood {:+.0}; fit again with it",
+            "the voltages fit {} better than {}, the chemistry on the label (ln likelihood {:+.0}): fit again with it",
             best.name(),
             label.chemistry.name(),
             own - least

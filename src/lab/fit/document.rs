@@ -1,8 +1,8 @@
-//! The outcome of a fit as a JSON document, beside the model itself.
+//! Result of a fit as a JSON document; the model itself is a separate file.
 
 use super::{FileResidual, FitOutcome};
 
-/// The outcome as JSON; `seconds` it took.
+/// The result as JSON; `seconds`: duration of the fit.
 pub fn document(outcome: &FitOutcome, seconds: f64) -> serde_json::Value {
     let of_file = |file: &FileResidual| {
         let r = &file.residual;

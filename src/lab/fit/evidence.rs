@@ -1,22 +1,22 @@
-//! What logs do not show, in sentences: where a fit stays with the model that it started from.
+//! Sentences about missing information in logs: where a fit keeps the model that it started from.
 //!
-//! In: the mean cell's stretches and fitted records, capacities (Ah). Out: notes.
+//! Input: stretches and fitted records of the mean cell, capacities (Ah). Output: notes.
 
-use crate::filter::median;
+use crate::filter::{ends, median};
 use crate::ident::MeasuredPart;
 use crate::ident::record::Record;
 
-/// A capacity with its standard deviation, Ah, before or after a fit.
+/// Capacity with its standard deviation, Ah, before or after a fit.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Capacity {
     pub(super) mean_ah: f64,
     pub(super) std_ah: f64,
 }
 
-/// The sentences.
+/// Returns the sentences.
 pub(super) fn notes(parts: &[&MeasuredPart], records: &[Record], before: Capacity, after: Capacity) -> Vec<String> {
     let mut notes = Vec::new();
-    // Part of its deviation before the fit that is left of a capacity that the logs do not show.
+    // Remaining share of the capacity's relative deviation above which the logs do not show the capacity.
     let is_unshown = after.std_ah / after.mean_ah > 0.7 * before.std_ah / before.mean_ah;
     if is_unshown {
         notes
@@ -25,11 +25,11 @@ pub(super) fn notes(parts: &[&MeasuredPart], records: &[Record], before: Capacit
     let span = records.iter().map(span).fold(0.0, f64::max);
     if span < 0.3 {
         notes.push(format!(
-            "no log moves more than {:.0} % of the charge: the curve beyond stays that of the model the fit started from",
+            "no log moves more than {:.0} % of the charge: the curve outside this range is that of the model the fit started from",
             100.0 * span
         ));
     }
-    // A current below the capacity over 50 h is rest.
+    // A current below the capacity over 50 h counts as rest.
     let rest_a = after.mean_ah / 50.0;
     let (mut rest_s, mut moved) = (0.0, [0.0; 2]);
     for row in records.iter().flat_map(|record| &record.rows) {
@@ -39,21 +39,18 @@ pub(super) fn notes(parts: &[&MeasuredPart], records: &[Record], before: Capacit
     }
     if rest_s < 300.0 {
         notes.push(
-            "no rest in the logs: the curve and slow resistances are separated by their usual sizes alone".to_owned(),
+            "no rest in the logs: the curve and slow resistances are separated only by their typical sizes".to_owned(),
         );
     }
     for (moved, direction) in moved.iter().zip(["discharge", "charge"]) {
         if *moved < 0.02 {
-            notes.push(format!("no {direction} in the logs: its voltages are a guess"));
+            notes.push(format!("no {direction} in the logs: its voltages are extrapolated"));
         }
     }
-    let (low_c, high_c) = parts
-        .iter()
-        .flat_map(|part| &part.temperature_c)
-        .fold((f64::MAX, f64::MIN), |(low, high), t| (low.min(*t), high.max(*t)));
+    let (low_c, high_c) = ends(parts.iter().flat_map(|part| &part.temperature_c).copied());
     if high_c - low_c < 1e-6 {
         let what =
-            "no temperature in the logs, or one that never changes: the resistances follow it as those of usual cells";
+            "no temperature in the logs, or a constant one: its effect on the resistances is that of typical cells";
         notes.push(what.to_owned());
     }
     let intervals_s = parts.iter().flat_map(|part| part.time_s.windows(2).map(|pair| pair[1] - pair[0]));
@@ -65,19 +62,18 @@ pub(super) fn notes(parts: &[&MeasuredPart], records: &[Record], before: Capacit
     }
     let step_v = step_v(parts);
     if step_v > 0.01 {
-        notes.push(format!("voltages in steps of {:.0} mV: curve and resistances are known less well", 1e3 * step_v));
+        notes.push(format!("voltages in steps of {:.0} mV: curve and resistances are less accurate", 1e3 * step_v));
     }
     notes
 }
 
-/// SOC between the least and the largest of the judged rows.
+/// SOC range of the judged rows.
 fn span(record: &Record) -> f64 {
-    let judged = record.rows.iter().filter(|row| row.weight_s > 0.0).map(|row| row.soc);
-    let (low, high) = judged.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), soc| (low.min(soc), high.max(soc)));
+    let (low, high) = record.judged_ends();
     (high - low).max(0.0)
 }
 
-/// Smallest difference between two voltages, V, that are not equal.
+/// Smallest difference between two unequal voltages, V.
 fn step_v(parts: &[&MeasuredPart]) -> f64 {
     let of_part = |part: &&MeasuredPart| {
         let pairs = part.voltage_v.windows(2).take(2000).map(|pair| (pair[1] - pair[0]).abs());

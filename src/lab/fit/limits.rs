@@ -1,25 +1,25 @@
-//! Voltage limits of a cell by its measured data, each with the row that shows it.
+//! Voltage limits of a cell from its measured data, each with the row that shows it.
 //!
-//! In: measured files, V. Out: lowest and highest voltage, V, and a note for each that names file, row, value and option.
-//! A pulse is no limit: a row counts once the current has kept its direction, or rested, for [`HELD_S`]. Of whole cycles the
-//! ends count: the first row of a discharge below its cut-off, and the voltage at which charges are held.
+//! Input: measured files, V. Output: lowest and highest voltage, V, and a note for each with file, row, value and option.
+//! Pulses do not count as limits: a row counts only after the current has kept its direction, or rested, for [`HELD_S`]. For whole
+//! cycles, the ends count: the first row of a discharge below its cut-off, and the voltage at which charges are held.
 
 use super::FitRequest;
 use crate::error::LabError;
 use crate::measured::{MeasuredFile, MeasuredPart};
 
-/// Voltages below this come from a disconnected sensor, V.
+/// Voltages below this value come from a disconnected sensor, V.
 pub(super) const DISCONNECTED_V: f64 = 0.5;
-/// A current that keeps its direction for less than this is a pulse, s: those of pulse tests last 10 to 18 s.
+/// A current that keeps its direction for a shorter time is a pulse, s; pulse tests use 10 to 18 s.
 const HELD_S: f64 = 30.0;
 /// Current below which a cell rests, as a share of the largest of its part.
 const REST_SHARE: f64 = 0.02;
-/// Part of the rows that are stray values.
+/// One row in this many may be a stray value.
 const STRAY: usize = 10_000;
 /// Error of a reading at a limit, V.
 const READING_V: f64 = 0.005;
 
-/// A reading and where it is.
+/// A reading with its position.
 #[derive(Debug, Clone, Copy)]
 struct Reading<'a> {
     voltage_v: f64,
@@ -34,7 +34,7 @@ impl Reading<'_> {
     }
 }
 
-/// Lowest and highest voltage, V, and the notes on those that the data give.
+/// Lowest and highest voltage, V, with notes on those taken from the data.
 pub(super) fn voltage_limits(
     request: &FitRequest,
     files: &[MeasuredFile],
@@ -50,21 +50,21 @@ pub(super) fn voltage_limits(
     if request.voltage_max_v.is_none() {
         notes.push(format!("voltage_max_v = {high_v} by {}; --voltage-max sets another", high.place()));
         let highest = readings(all(), 0.0).into_iter().rev().nth(strays(all()));
-        // Pulses beyond a limit are mentioned from here, V.
+        // Smallest excess over the limit at which pulses are mentioned, V.
         if let Some(pulse) = highest.filter(|pulse| pulse.voltage_v > high_v + 0.02) {
             notes.push(format!("pulses above voltage_max_v do not count: {}", pulse.place()));
         }
     }
     let (low_v, high_v) = (request.voltage_min_v.unwrap_or(low_v), request.voltage_max_v.unwrap_or(high_v));
     if low_v >= high_v {
-        return Err(LabError::Data(format!("lowest voltage {low_v} V, highest {high_v} V: must be below it")));
+        return Err(LabError::Data(format!("lowest voltage {low_v} V, must be below the highest voltage, {high_v} V")));
     }
     Ok(((low_v, high_v), notes))
 }
 
 type Limit<'a> = (f64, Reading<'a>);
 
-/// The range of the rows that are no pulses, in steps of 10 mV; of all rows where there are pulses only.
+/// Range of the rows outside pulses, in steps of 10 mV; if there are only pulses, of all rows.
 fn held_limits<'a>(files: impl Iterator<Item = &'a MeasuredFile> + Clone) -> Option<(Limit<'a>, Limit<'a>)> {
     let held = readings(files.clone(), HELD_S);
     let all = if held.is_empty() { readings(files, 0.0) } else { held };
@@ -78,7 +78,7 @@ fn strays<'a>(files: impl Iterator<Item = &'a MeasuredFile>) -> usize {
     files.map(MeasuredFile::rows).sum::<usize>() / STRAY
 }
 
-/// Readings by rising voltage whose current has kept its direction for `held_s`.
+/// Readings whose current has kept its direction for `held_s`, by rising voltage.
 fn readings<'a>(files: impl Iterator<Item = &'a MeasuredFile>, held_s: f64) -> Vec<Reading<'a>> {
     let mut all = Vec::new();
     for file in files {
@@ -108,9 +108,9 @@ fn held_rows(part: &MeasuredPart, held_s: f64) -> Vec<usize> {
     (0..part.len()).filter(|k| held(k)).collect()
 }
 
-/// Returns the voltage limits of whole cycles. Every discharge ends with its first row below the cut-off, which comes in
-/// steps of 0.1 V, so the highest of these rows gives the lower limit; discharges that were broken off do not count. Charges
-/// hold their voltage: the median counts.
+/// Returns the voltage limits of whole cycles. A discharge ends with its first row below the cut-off, and cut-offs are multiples of
+/// 0.1 V, so the highest of these rows gives the lower limit; aborted discharges do not count. Charges hold their voltage, so the
+/// median of their highest voltages gives the upper limit.
 fn cycle_limits(files: &[MeasuredFile], first: usize) -> Option<(Limit<'_>, Limit<'_>)> {
     let (mut ends, mut tops) = (Vec::new(), Vec::new());
     for file in files {
@@ -127,7 +127,7 @@ fn cycle_limits(files: &[MeasuredFile], first: usize) -> Option<(Limit<'_>, Limi
     for list in [&mut ends, &mut tops] {
         list.sort_by(|a, b| a.voltage_v.total_cmp(&b.voltage_v));
     }
-    // A discharge that ends further than this above the median end was broken off, V.
+    // A discharge that ends further above the median end was aborted, V.
     let broken_off_v = ends.get(ends.len() / 2)?.voltage_v + 0.3;
     let low = *ends.iter().rfind(|end| end.voltage_v < broken_off_v)?;
     let high = tops.get(tops.len() / 2).copied();
@@ -171,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn pulses_are_no_limits_and_notes_name_row_and_option() {
+    fn pulses_do_not_set_limits() {
         let files = [pulse_test()];
         let (limits, notes) = voltage_limits(&FitRequest::default(), &files, &[]).expect("limits");
         assert_eq!(limits, (2.5, 4.19));
@@ -188,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn cycles_end_at_the_cut_off_and_a_discharge_broken_off_does_not_count() {
+    fn aborted_discharge_does_not_set_the_cut_off() {
         let discharge =
             |key: &str, end_v: f64| part(key, "discharge", [(0.0, 2.0, 4.0), (60.0, 2.0, end_v), (70.0, 0.0, 3.3)]);
         let charge = part("2", "charge", [(0.0, -1.0, 3.8), (60.0, -1.0, 4.208), (90.0, 0.0, 4.1)]);

@@ -1,10 +1,10 @@
-//! Fits a cell model to logs of a whole pack: ordinary drives and charges that begin anywhere.
+//! Fits a cell model to logs of a whole pack: ordinary drives and charges that start anywhere.
 //!
-//! In: a configuration, with a cell model or a label, and logs as the daemon reads them. Out: a [`FitOutcome`] whose tables stay
-//! those of the configured model where the logs show nothing.
+//! Input: a configuration with a cell model or a label, and logs as the daemon reads them. Output: a [`FitOutcome`]; where the logs
+//! contain no information, its tables are those of the configured model.
 //!
-//! Every log goes through the monitor, so that limits, decoding and faults are those of the daemon. The pack's own cells are of one kind:
-//! their mean voltage is fitted, as one cell. A hole in the record begins a new stretch, whose SOC is another unknown.
+//! Every log is replayed through the monitor, so limits, decoding and faults are the daemon's. The pack's own cells are of one kind:
+//! their mean voltage is fitted as one cell. After a gap in the record, a new stretch starts with another unknown SOC.
 
 use std::cell::RefCell;
 use std::path::{Path, PathBuf};
@@ -17,48 +17,49 @@ use super::cells::{self, CellDistances};
 use super::evidence::{self, Capacity};
 use super::prepare::CREDIBLE_BEYOND_V;
 use super::{
-    ELECTRODES_C, FileResidual, FitOutcome, FitProgress, LogsOutcome, MeasuredRange, chemistry, judged, verdict,
+    ELECTRODES_C, FileResidual, FitOutcome, FitProgress, LogsOutcome, MeasuredRange, ageing_electrodes, chemistry,
+    judged, verdict,
 };
-use crate::cell::{AgedOcv, CellModel};
+use crate::cell::CellModel;
 use crate::error::LabError;
 use crate::filter::median;
-use crate::ident::fit::{FitSettings, FittedTables, judge};
+use crate::ident::fit::{FitSettings, FittedTables};
 use crate::ident::grid::{Grid, arrhenius};
 use crate::ident::parameters::ParameterTables;
 use crate::ident::pass::COLD_POWER;
 use crate::ident::prior::PriorDeviations;
 use crate::ident::record::{self, Limits, Record};
 use crate::ident::unanchored::{self, Known, UnanchoredFit, UnanchoredRecord};
-use crate::ident::{MeasuredPart, charge_ah, electrodes, error_table, thermal};
+use crate::ident::{MeasuredPart, charge_ah, error_table, thermal};
 use crate::io::log::{LogOptions, LogSource};
 use crate::monitor::{Estimate, Monitor, MonitorConfig};
 use crate::quantity::CellIndex;
 use crate::replay::{self, OutputWatch, ReplaySettings, Sinks};
 
-/// Rows of the shortest stretch that is used.
+/// Smallest number of rows of a stretch that is used.
 const LEAST_ROWS: usize = 20;
-/// Least standard deviation of the SOC at which a stretch begins.
+/// Smallest standard deviation of the SOC at the start of a stretch.
 const BEGINNING_STD: f64 = 0.02;
-/// A stretch begins full when its open-circuit voltage is at least that of this SOC even with this part of the usual series
-/// resistance; its SOC is then known within this standard deviation.
+/// A stretch starts full if its open-circuit voltage is at least that of this SOC, even with this share of the usual series
+/// resistance; the standard deviation of its SOC is then this value.
 const FULL_SOC: f64 = 0.975;
 const LEAST_RESISTANCE: f64 = 0.4;
 const FULL_STD: f64 = 0.01;
-/// Below this SOC, per unit of Arrhenius' factor above 1 and at most, diffusion limits a cold cell and no circuit has its voltage:
-/// read as a circuit's it is lost capacity. Chosen on Panasonic 18650PF.
+/// Below this SOC, per unit of the Arrhenius factor above 1 up to the maximum, diffusion limits a cold cell. No circuit models this
+/// voltage, which would be mistaken for lost capacity. Chosen on Panasonic 18650PF.
 const KNEE_SOC: f64 = 0.13;
 const MOST_KNEE_SOC: f64 = 0.35;
-/// A cold cell does not settle within a drive: its voltage is that of a SOC that differs by this, per unit of Arrhenius' factor above
-/// 1. Rests of 20 min of Panasonic 18650PF at 10 to -20 degrees C show 0.013 to 0.024; drives have shorter ones.
+/// A cold cell does not settle within a drive: its voltage is off by this SOC, per unit of the Arrhenius factor above 1. Rests of
+/// 20 min of Panasonic 18650PF at 10 to -20 degrees C show 0.013 to 0.024; rests in drives are shorter.
 const COLD_SOC: f64 = 0.03;
-/// Residual of a fit from which on the logs are not of one cell, V, and the power of Arrhenius' factor by which it grows with cold:
-/// fits of the cells of `tests/label` leave 5 to 20 mV in the warmth and 27 mV at 0 degrees C.
+/// Residual above which the logs do not come from one kind of cell, V; it grows with cold by the power of the Arrhenius factor.
+/// Fits of the cells of `tests/label` leave 5 to 20 mV when warm and 27 mV at 0 degrees C.
 const UNFIT_V: f64 = 0.04;
-/// A charge is at its end when the voltage is at most so far below the highest, V, and the current below the rated capacity over
-/// this time, h.
+/// A charge is complete when the voltage is at most this far below the highest, V, and the current is below the rated capacity
+/// over this time, h.
 const HELD_V: f64 = 0.012;
 const FADED_H: f64 = 15.0;
-/// Least error of the configured model's curve, V: smooth over [`CURVE_SOC`], and of each breakpoint alone.
+/// Smallest error of the configured model's curve, V: smooth over [`CURVE_SOC`], and of each breakpoint alone.
 const CURVE_V: (f64, f64) = (0.004, 0.002);
 const CURVE_SOC: f64 = 0.1;
 /// SOC breakpoints of the fitted tables.
@@ -67,39 +68,39 @@ const SOC: [f64; 26] = [
     0.9, 0.93, 0.96, 0.98, 0.99, 1.0,
 ];
 
-/// Logs of a pack, and how they are read.
+/// Logs of a pack, and the settings to read them.
 pub struct LogRequest<'a> {
-    /// Configuration of the monitor; its cell model is where the fit starts from.
+    /// Configuration of the monitor; the fit starts from its cell model.
     pub monitor: &'a MonitorConfig,
     /// Names of the interfaces.
     pub interfaces: Vec<String>,
-    /// A hole longer than this means that the recorder was asleep, s.
+    /// A longer gap means that the recorder was asleep, s.
     pub sleep_gap_s: f64,
-    /// How one log is read.
+    /// Creates the options to read one log.
     pub options: &'a (dyn Fn() -> LogOptions + Sync),
-    /// Logs; each is replayed by itself.
+    /// Logs; each is replayed separately.
     pub logs: Vec<PathBuf>,
 }
 
-/// One stretch of a log without a hole: the mean of all cells.
+/// The mean of all cells over a part of a log without a gap.
 #[derive(Debug, Clone, Default)]
 struct Stretch {
     log: usize,
     part: MeasuredPart,
     cells: CellDistances,
-    /// SOC at its first row with its standard deviation.
+    /// SOC at the first row with its standard deviation.
     beginning: (f64, f64),
 }
 
-/// Puts the cells of a pack together, reading by reading.
+/// Averages the readings of a pack's cells.
 #[derive(Debug, Default)]
 struct MeanCell {
     stretches: Vec<Stretch>,
-    /// Voltage of each cell that is in the sums; NaN = none yet.
+    /// Voltage of each cell in the sums; NaN = not in the sums yet.
     voltage_v: Vec<f64>,
     count: f64,
     sums: [f64; 6],
-    /// The next reading begins another stretch.
+    /// Whether the next reading starts a new stretch.
     begins: bool,
 }
 
@@ -129,7 +130,7 @@ impl MeanCell {
         self.sums.iter_mut().zip(values).for_each(|(sum, value)| *sum += value);
     }
 
-    /// The next reading begins another stretch: an unknown time has passed.
+    /// Starts a new stretch at the next reading, because an unknown time has passed.
     fn end_stretch(&mut self) {
         if self.count > 0.0 {
             self.close();
@@ -145,7 +146,7 @@ impl MeanCell {
             return;
         }
         let last_s = self.stretches.last().and_then(|stretch| stretch.part.time_s.last().copied());
-        // A hole longer than this begins a new stretch, s: more than the interval of any logger, less than a stop.
+        // A longer gap starts a new stretch, s: more than any logger's interval, less than a stop.
         let has_hole = last_s.is_none_or(|last_s| time_s - last_s > 120.0 || time_s < last_s);
         if std::mem::take(&mut self.begins) || has_hole {
             let beginning = (soc, soc_std.hypot(BEGINNING_STD));
@@ -162,7 +163,7 @@ impl MeanCell {
 /// Reads the logs and fits the model.
 ///
 /// # Errors
-/// Logs that cannot be read, and data that do not support a fit: one line each.
+/// The logs cannot be read, or the data do not support a fit: one line each.
 pub fn run(request: &LogRequest<'_>, mut progress: impl FnMut(FitProgress)) -> Result<FitOutcome, LabError> {
     let numbered: Vec<(usize, &PathBuf)> = request.logs.iter().enumerate().collect();
     let read: Result<Vec<_>, LabError> =
@@ -196,7 +197,7 @@ fn fit_stretches(
     let known = known(model, &grid, request.monitor);
     let fit = unanchored::fit(&settings, &known, &records, |pass, cost| progress(FitProgress::Pass(pass, cost)))
         .map_err(LabError::Data)?;
-    // Two packs, or cells of no known kind: what the fit makes of them is of neither.
+    // The logs may come from two packs, or from cells of an unknown kind: the fit describes neither.
     let unfit_v = Some(fit.fitted.total.rmse_v).filter(|rmse_v| *rmse_v > unfit_v(&grid));
     let fit =
         if unfit_v.is_some() { unanchored::prior(&settings, &known, &records).map_err(LabError::Data)? } else { fit };
@@ -212,14 +213,11 @@ fn fit_stretches(
     notes.extend(unfit_v.map(|rmse_v| {
         let rmse_mv = 1e3 * rmse_v;
         format!(
-            "no one cell has these voltages (residual {rmse_mv:.0} mV): the model stays that which the fit started from"
+            "the voltages do not match any single cell (residual {rmse_mv:.0} mV): the model the fit started from is kept"
         )
     }));
     notes.extend(cells::notes(&cells));
-    let found = electrodes::identify(|soc| fit.fitted.ocv_v(soc, ELECTRODES_C));
-    let rows: Vec<Vec<f64>> = fit.fitted.tables.ocv_v.chunks(grid.soc.len()).map(<[f64]>::to_vec).collect();
-    let electrodes =
-        found.filter(|found| AgedOcv::of_electrodes(&found.electrodes, &grid.soc, capacity_ah, &rows).is_some());
+    let electrodes = ageing_electrodes(&fit.fitted, capacity_ah);
     let thermal = thermal::fit(&fit.records, &fit.fitted.tables, capacity_ah * fit.fitted.mean_ocv_v());
     let mut outcome = FitOutcome {
         electrodes,
@@ -241,7 +239,7 @@ fn fit_stretches(
     Ok(outcome)
 }
 
-/// What the logs say of the capacity, what they do not show, and of what chemistry they are.
+/// Notes on the capacity, on missing information in the logs, and on the chemistry.
 fn notes(model: &CellModel, stretches: &[Stretch], fit: &UnanchoredFit, known: &Known) -> Vec<String> {
     let (capacity_ah, std_ah) = (fit.capacity_ah, fit.capacity_std_ah);
     let mut notes = vec![format!(
@@ -260,18 +258,18 @@ fn notes(model: &CellModel, stretches: &[Stretch], fit: &UnanchoredFit, known: &
     notes
 }
 
-/// Residual from which on the logs are not of one cell, V.
+/// Residual above which the logs do not come from one kind of cell, V.
 fn unfit_v(grid: &Grid) -> f64 {
     UNFIT_V * error_ratio(grid)
 }
 
-/// Error of a circuit at the coldest node, relative to that in the warmth.
+/// Error of a circuit at the coldest node, relative to its error when warm.
 fn error_ratio(grid: &Grid) -> f64 {
     let coldest_c = grid.temperature_c.first().copied().unwrap_or(ELECTRODES_C);
     libm::pow(1.0 + colder(coldest_c), COLD_POWER)
 }
 
-/// Error of the voltage of a cold cell that does not settle, V, in node order.
+/// Voltage error of a cold cell that does not settle, V, in node order.
 fn unsettled_v(fitted: &FittedTables) -> Vec<f64> {
     let (soc, columns) = (&fitted.grid.soc, fitted.grid.soc.len());
     let of_node = |node: usize| {
@@ -284,7 +282,7 @@ fn unsettled_v(fitted: &FittedTables) -> Vec<f64> {
     (0..fitted.tables.ocv_v.len()).map(of_node).collect()
 }
 
-/// Arrhenius' factor above 1; 0 in the warmth.
+/// Arrhenius factor minus 1; 0 when warm.
 fn colder(temperature_c: f64) -> f64 {
     (arrhenius(temperature_c) - 1.0).max(0.0)
 }
@@ -293,7 +291,7 @@ fn colder(temperature_c: f64) -> f64 {
 fn stretches(request: &LogRequest<'_>, log: usize, path: &Path) -> Result<Vec<Stretch>, LabError> {
     let mean = Rc::new(RefCell::new(MeanCell::new(usize::from(request.monitor.sample.cells))));
     let watched = Rc::clone(&mean);
-    // The cells of a module of another kind have another curve.
+    // Cells of a module of another kind have another curve.
     let is_own: Vec<bool> =
         (0..request.monitor.sample.cells).map(|cell| request.monitor.is_own(CellIndex(cell))).collect();
     let watch: OutputWatch = Box::new(move |record, out| {
@@ -306,7 +304,7 @@ fn stretches(request: &LogRequest<'_>, log: usize, path: &Path) -> Result<Vec<St
     let sinks = Sinks { watch: Some(watch), ..Sinks::default() };
     let mut source = LogSource::new([path.to_owned()], (request.options)());
     let settings = ReplaySettings::plain(request.sleep_gap_s, request.interfaces.clone());
-    // The model that is fitted does not change on the way.
+    // The fitted model must not change during the replay.
     let monitor = Monitor::new(MonitorConfig { label: None, ..request.monitor.clone() });
     replay::run(&mut source, monitor, sinks, settings, &mut |_| ())
         .map_err(|error| LabError::Data(error.to_string()))?;
@@ -316,7 +314,7 @@ fn stretches(request: &LogRequest<'_>, log: usize, path: &Path) -> Result<Vec<St
     Ok(stretches.into_iter().map(|stretch| Stretch { log, ..stretch }).collect())
 }
 
-/// The stretch as rows of the fit, its SOC the charge taken out, with negative sign, Ah.
+/// Converts a stretch to rows of the fit; their SOC is minus the charge taken out, Ah.
 fn unanchored(stretch: &Stretch, grid: &Grid, model: &CellModel) -> UnanchoredRecord {
     let mut part = stretch.part.clone();
     let first_s = part.time_s[0];
@@ -336,14 +334,14 @@ fn unanchored(stretch: &Stretch, grid: &Grid, model: &CellModel) -> UnanchoredRe
     UnanchoredRecord { record, scale, beginning, full }
 }
 
-/// Whether a stretch begins with a full cell: its open-circuit voltage is that of one even with the least resistance.
+/// Whether a stretch starts with a full cell: its open-circuit voltage is that of a full cell even with the least resistance.
 fn begins_full(part: &MeasuredPart, model: &CellModel) -> bool {
     let (voltage_v, current_a, temperature_c) = (part.voltage_v[0], part.current_a[0], part.temperature_c[0]);
     let drop_v = LEAST_RESISTANCE * model.r0_ohm(&model.grid_position(1.0, temperature_c)) * current_a;
     voltage_v + drop_v >= model.ocv_v(&model.grid_position(FULL_SOC, temperature_c))
 }
 
-/// Voltage below which a cold cell's is not judged, V.
+/// Voltage below which rows of a cold cell are not judged, V.
 fn knee_v(model: &CellModel, current_a: f64, temperature_c: f64) -> f64 {
     let soc = (KNEE_SOC * colder(temperature_c)).min(MOST_KNEE_SOC);
     if soc <= 0.0 {
@@ -353,7 +351,7 @@ fn knee_v(model: &CellModel, current_a: f64, temperature_c: f64) -> f64 {
     model.ocv_v(&position) - model.settled_ohm(&position) * current_a.max(0.0)
 }
 
-/// Charge taken out, Ah, and time, h, where a charge at the highest voltage has faded: the cell is full. The last such row counts.
+/// Charge taken out, Ah, and time, h, of the last row at which the current of a charge at the highest voltage has faded: the cell is full.
 fn full(part: &MeasuredPart, model: &CellModel) -> Option<(f64, f64)> {
     let most_a = model.rated_capacity_ah / FADED_H;
     let is_full = |&k: &usize| {
@@ -362,17 +360,17 @@ fn full(part: &MeasuredPart, model: &CellModel) -> Option<(f64, f64)> {
     (0..part.len()).rev().find(is_full).map(|k| (-part.soc[k], part.time_s[k] / 3600.0))
 }
 
-/// A node per group of temperatures; stretches without a temperature have that of the surroundings.
+/// One node per group of temperatures; stretches without a temperature have the ambient one.
 fn temperature_nodes(stretches: &[Stretch]) -> Vec<f64> {
     let of_stretch = |stretch: &Stretch| median(stretch.part.temperature_c.iter().copied());
     let mut medians: Vec<f64> = stretches.iter().filter_map(of_stretch).collect();
     medians.sort_by(f64::total_cmp);
-    // Temperatures of stretches closer than this share a node, K.
+    // Temperatures of stretches that differ by less share a node, K.
     let groups = medians.chunk_by(|a, b| b - a < 5.0);
     groups.map(|group| (10.0 * group.iter().sum::<f64>() / group.len() as f64).round() / 10.0).collect()
 }
 
-/// What the configured model says before the fit.
+/// Prior knowledge from the configured model.
 fn known(model: &CellModel, grid: &Grid, monitor: &MonitorConfig) -> Known {
     let per_node = |value: &dyn Fn(f64, f64) -> f64| -> Vec<f64> {
         grid.temperature_c
@@ -407,7 +405,7 @@ fn known(model: &CellModel, grid: &Grid, monitor: &MonitorConfig) -> Known {
         curve_row,
         capacity_ah: initial.capacity_ah,
         capacity_std: initial.capacity_std_ah / initial.capacity_ah,
-        // Least standard deviation of the current sensor's offset: the rated capacity over this time, h.
+        // Smallest standard deviation of the current sensor's offset: the rated capacity over this time, h.
         offset_std_a: monitor.estimator.sensor.current_offset_a.max(model.rated_capacity_ah / 1000.0),
     }
 }
@@ -421,13 +419,7 @@ fn files(
     let of_log = |(log, path): (usize, &PathBuf)| {
         let own: Vec<Record> =
             records.iter().zip(file_of_record).filter(|(_, file)| **file == log).map(|(r, _)| r.clone()).collect();
-        FileResidual {
-            path: path.clone(),
-            rows: own.iter().map(|record| record.raw_rows).sum(),
-            seconds: own.iter().map(Record::seconds).sum(),
-            outliers: own.iter().map(|record| record.outliers).sum(),
-            residual: judge(&own, tables),
-        }
+        FileResidual::of(path, &own, tables)
     };
     request.logs.iter().enumerate().map(of_log).collect()
 }

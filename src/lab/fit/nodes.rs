@@ -1,21 +1,21 @@
 //! SOC breakpoints where the open-circuit curve of the slow tests bends.
 //!
-//! In: slow tests (SOC, V). Out: breakpoints, fraction. Between breakpoints a model is linear; a node is added where that misreads
-//! the SOC most, until it misreads it by less than [`MOST_POINTS`] anywhere.
+//! Input: slow tests (SOC, V). Output: breakpoints, fraction. A model is linear between breakpoints. A node is added where this causes
+//! the largest error of the SOC, until the error is below [`MOST_POINTS`] everywhere.
 
 use crate::ident::fit::{MIN_SLOPE_V, OcvCurve};
 use crate::ident::grid::interpolate;
 
-/// Error of the SOC that linear interpolation may cause, fraction.
+/// Largest error of the SOC from linear interpolation, fraction.
 const MOST_POINTS: f64 = 0.005;
-/// Width over which the slope counts, SOC: an estimate moves over a plateau's steps.
+/// Width over which the slope is taken, SOC: an estimate moves across the steps of a plateau.
 const SLOPE_WIDTH: f64 = 0.04;
-/// Least distance of breakpoints. The points looked at are this far apart.
+/// Smallest distance between breakpoints, and between the points tested.
 const LEAST_DISTANCE: f64 = 0.01;
 /// Most breakpoints: the time of a fit grows with their square.
 const MOST_NODES: usize = 31;
 
-/// `first` with nodes where the curves bend.
+/// Adds nodes to `first` where the curves bend.
 pub(super) fn by_curvature(first: &[f64], curves: &[OcvCurve]) -> Vec<f64> {
     let mut nodes = first.to_vec();
     while nodes.len() < MOST_NODES {
@@ -29,13 +29,13 @@ pub(super) fn by_curvature(first: &[f64], curves: &[OcvCurve]) -> Vec<f64> {
     nodes
 }
 
-/// Error of the SOC at `at` when the curves are linear between `nodes`: the largest of the curves, fraction.
+/// Largest error of the SOC over the curves at `at` if the curves are linear between `nodes`, fraction.
 fn misread(curves: &[OcvCurve], nodes: &[f64], at: f64) -> f64 {
     let of_curve = |curve: &OcvCurve| {
         let voltage_v = |soc: f64| interpolate(&curve.soc, &curve.voltage_v, soc);
         let above = nodes.partition_point(|&node| node < at);
         let (low, high) = (nodes[above - 1], nodes[above]);
-        // Below its end a cold test says nothing.
+        // A cold test contains no information below its end.
         if low < curve.soc[0] {
             return 0.0;
         }
@@ -43,7 +43,7 @@ fn misread(curves: &[OcvCurve], nodes: &[f64], at: f64) -> f64 {
         let error_v = (voltage_v(low) + along * (voltage_v(high) - voltage_v(low)) - voltage_v(at)).abs();
         let (from, to) = ((at - 0.5 * SLOPE_WIDTH).max(0.0), (at + 0.5 * SLOPE_WIDTH).min(1.0));
         let slope_v = ((voltage_v(to) - voltage_v(from)) / (to - from)).max(MIN_SLOPE_V);
-        // Error of the voltage below which nothing is added, V: no model is better.
+        // Smallest voltage error for which a node is added, V: no model is more accurate.
         if error_v > 0.001 { error_v / slope_v } else { 0.0 }
     };
     curves.iter().map(of_curve).fold(0.0, f64::max)
@@ -61,7 +61,7 @@ mod tests {
     }
 
     #[test]
-    fn nodes_are_added_where_the_curve_bends_and_nowhere_else() {
+    fn nodes_are_added_only_where_the_curve_bends() {
         let first = [0.0, 0.2, 0.4, 0.6, 0.8, 1.0];
         let nodes = by_curvature(&first, &[stepped()]);
         assert!(nodes.len() > first.len() && nodes.len() < MOST_NODES, "{nodes:?}");
@@ -74,7 +74,7 @@ mod tests {
     }
 
     #[test]
-    fn a_straight_curve_needs_no_more_nodes() {
+    fn straight_curve_needs_no_more_nodes() {
         let curve = OcvCurve { temperature_c: 25.0, soc: vec![0.0, 1.0], voltage_v: vec![3.0, 4.2] };
         assert_eq!(by_curvature(&[0.0, 0.5, 1.0], &[curve]), [0.0, 0.5, 1.0]);
     }

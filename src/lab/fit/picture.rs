@@ -12,12 +12,12 @@ use crate::ident::pass::residuals;
 /// # Errors
 /// The file cannot be written.
 pub fn write(path: &Path, outcome: &FitOutcome) -> Result<(), LabError> {
-    // Most panels: a longer page is not read.
+    // Most panels that a reader can use.
     let panels: Vec<Picture> = (0..outcome.files.len()).take(40).map(|number| panel(outcome, number)).collect();
     Ok(chart::write_stack(path, &panels)?)
 }
 
-/// One file; its stretches follow each other.
+/// Panel of one file; its parts follow each other.
 fn panel(outcome: &FitOutcome, number: usize) -> Picture {
     let file = &outcome.files[number];
     let mut points = Vec::new();

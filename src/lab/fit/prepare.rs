@@ -1,4 +1,4 @@
-//! From measured files to records: voltage limits, capacity, slow tests, SOC, temperature.
+//! Converts measured files to records: voltage limits, capacity, slow tests, SOC, temperature.
 
 use super::FitRequest;
 use super::limits::{DISCONNECTED_V, voltage_limits};
@@ -9,22 +9,22 @@ use crate::ident::grid::Grid;
 use crate::ident::record::{self, Limits, Record};
 use crate::measured::{MeasuredFile, MeasuredPart};
 
-/// Voltages further than this beyond the cell's limits are not credible, V.
+/// Voltages further outside the cell's limits are not credible, V.
 pub(super) const CREDIBLE_BEYOND_V: (f64, f64) = (1.0, 0.3);
-/// Weight of a charge relative to a discharge of an ageing cell: its voltage carries slower relaxation.
+/// Weight of a charge relative to a discharge of an ageing cell: its voltage contains slower relaxation.
 const AGEING_CHARGE_SCALE: f64 = 0.6;
 
-/// One stretch of a file with its SOC, not yet placed in the grid.
+/// A part of a file with its SOC, not yet positioned in the grid.
 pub(super) struct AnchoredPart {
     /// Number of its file.
     pub(super) file: usize,
     part: MeasuredPart,
     judged: Vec<bool>,
-    /// Weight of each second; `None` = by the SOC it covers and the kind of test.
+    /// Weight of each second; `None` = from the covered SOC and the kind of test.
     scale: Option<f64>,
 }
 
-/// Everything the fit needs before the grid is known.
+/// Inputs of the fit that do not depend on the grid.
 pub(super) struct FitInputs {
     pub(super) sources: Vec<AnchoredPart>,
     pub(super) capacity_ah: f64,
@@ -33,11 +33,10 @@ pub(super) struct FitInputs {
     pub(super) notes: Vec<String>,
 }
 
-/// Returns a part without the rows that lack current or voltage or whose time runs backwards; a temperature holds until the
-/// next one.
+/// Removes rows that lack current or voltage or whose time runs backwards; a missing temperature repeats the previous one.
 fn clean(part: &MeasuredPart) -> MeasuredPart {
     let known = part.temperature_c.iter().copied().find(|t| t.is_finite());
-    // Temperature assumed where a file has none, degrees C.
+    // Assumed temperature of a file without one, degrees C.
     let mut temperature_c = known.unwrap_or(25.0);
     let mut clean = MeasuredPart { key: part.key.clone(), kind: part.kind.clone(), ..MeasuredPart::default() };
     for k in 0..part.len() {
@@ -53,7 +52,7 @@ fn clean(part: &MeasuredPart) -> MeasuredPart {
     clean
 }
 
-/// Determines everything but the grid.
+/// Determines all inputs that do not depend on the grid.
 pub(super) fn prepare(
     request: &FitRequest,
     files: &[MeasuredFile],
@@ -65,7 +64,7 @@ pub(super) fn prepare(
     let (voltage_v, mut notes) = voltage_limits(request, files, slow)?;
     let dropped: usize = files.iter().map(|f| f.rows() - f.parts.iter().map(|p| clean(p).len()).sum::<usize>()).sum();
     if dropped > 0 {
-        notes.push(format!("{dropped} rows left out: without current or voltage, or back in time"));
+        notes.push(format!("{dropped} rows left out: current or voltage is missing, or time runs backwards"));
     }
     if let Some(first) = request.first_cycles {
         return ageing_sources(files, first, voltage_v, notes);
@@ -104,7 +103,7 @@ pub(super) fn prepare(
 /// Number of the file, a part of it, and the charge taken out since full at every row, Ah.
 type PartDischarge = (usize, MeasuredPart, Vec<f64>);
 
-/// Returns the charge taken out of every part of every file; reports all files that do not begin full in one error.
+/// Returns the charge taken out of every part of every file; one error lists all files that do not start full.
 fn taken_out(request: &FitRequest, files: &[MeasuredFile], voltage_max_v: f64) -> Result<Vec<PartDischarge>, LabError> {
     let (mut taken, mut refused) = (Vec::new(), Vec::new());
     for (number, file) in files.iter().enumerate() {
@@ -128,7 +127,7 @@ fn rough_capacity(part: &MeasuredPart) -> f64 {
     out.iter().fold(0.0_f64, |most, ah| most.max(*ah))
 }
 
-/// The discharge branch of a slow test.
+/// The discharge of a slow test.
 struct SlowDischarge {
     temperature_c: f64,
     /// Rising.
@@ -163,7 +162,7 @@ fn slow_test(file: &MeasuredFile, voltage_max_v: f64) -> Result<SlowDischarge, L
         }
     }
     let whole_ah = out_ah.iter().fold(0.0_f64, |most, ah| most.max(*ah));
-    // Least share of the capacity that a slow test must discharge.
+    // Smallest share of the capacity that a slow test must discharge.
     if test.out_ah.len() < 10 || test.out_ah[test.out_ah.len() - 1] < 0.5 * whole_ah {
         return Err(fail(format!("its first discharge has {} rows, expected a whole slow one", test.out_ah.len())));
     }
@@ -171,7 +170,7 @@ fn slow_test(file: &MeasuredFile, voltage_max_v: f64) -> Result<SlowDischarge, L
     Ok(test)
 }
 
-/// Returns a slow test's discharge as data in addition to the drives.
+/// Converts the discharge of a slow test to data of the fit.
 fn slow_source(
     file: &MeasuredFile,
     number: usize,
@@ -234,7 +233,7 @@ impl FitInputs {
         };
         let record = |source: &AnchoredPart| Record::prepare(&source.part, &source.judged, grid, &limits);
         let records: Vec<Record> = self.sources.iter().map(record).collect();
-        // Where there are no drives, the tests count in full.
+        // Without drives, the tests count in full.
         let most = records.iter().map(record::share).fold(0.0, f64::max);
         let by_share = |r: &Record| record::weight(r) * record::share(r) / most;
         let scale = self.sources.iter().zip(&records).map(|(s, r)| s.scale.unwrap_or_else(|| by_share(r)));
@@ -252,7 +251,7 @@ impl FitInputs {
         (of_kind(true), of_kind(false))
     }
 
-    /// Returns the temperatures of the files: the coldest decile of each (cells warm under load), close ones joined.
+    /// Returns the temperatures of the files, close ones joined: the coldest decile of each file, because cells warm up under load.
     pub(super) fn temperature_nodes(&self) -> Vec<f64> {
         let coldest = |source: &AnchoredPart| {
             let mut seen = source.part.temperature_c.clone();
@@ -265,7 +264,7 @@ impl FitInputs {
         let mut last = f64::NEG_INFINITY;
         for t in all {
             match nodes.last_mut() {
-                // Temperatures of files closer than this share a node, K.
+                // Temperatures of files that differ by less share a node, K.
                 Some((sum, count)) if t - last < 5.0 => (*sum, *count) = (*sum + t, *count + 1.0),
                 _ => nodes.push((t, 1.0)),
             }

@@ -1,27 +1,28 @@
-//! Where a model was measured, and its tables beyond the measured temperatures.
+//! The measured range of a model, and its tables outside the measured temperatures.
 //!
-//! In: the records of a fit, and the fitted tables. Out: the ranges of temperature (degrees C), current (A) and SOC, and the
-//! tables with one row [`REACH_K`] below and one above the measured temperatures. There the open-circuit curve and the time
-//! constants are those of the nearest row, the resistances follow Arrhenius' law, as between measured temperatures, and the
-//! error of the voltage grows with the distance: the law holds only roughly, and its error is not known.
+//! Input: the records of a fit, and the fitted tables. Output: the ranges of temperature (degrees C), current (A) and SOC, and the
+//! tables with one more row [`REACH_K`] below and one above the measured temperatures. In these rows, the open-circuit curve and the
+//! time constants are those of the nearest measured row, and the resistances follow Arrhenius' law. The voltage error grows with the
+//! distance, because the law is only approximate.
 
 use crate::cell::arrhenius;
+use crate::filter::ends;
 use crate::ident::fit::FittedTables;
 use crate::ident::grid::Grid;
 use crate::ident::parameters::ParameterTables;
 use crate::ident::pass::COLD_POWER;
 use crate::ident::record::Record;
 
-/// Distance of the rows beyond the measured temperatures, K.
+/// Distance of the additional rows from the measured temperatures, K.
 const REACH_K: f64 = 40.0;
-/// Standard deviation of the activation energy of a cell's resistances, J/mol: that of 15 to 35 kJ/mol, all as likely.
+/// Standard deviation of the activation energy of a cell's resistances, J/mol: uniform from 15 to 35 kJ/mol.
 const ENERGY_STD_J_PER_MOL: f64 = 6_000.0;
 /// 0 degrees C in K.
 const ZERO_CELSIUS_K: f64 = 273.15;
-/// Share of the time at either end of the temperatures that does not count: sensors settle, values stray.
+/// Share of the time at either end of the temperature range that does not count: settling sensors and stray values.
 const STRAY: f64 = 0.005;
 
-/// Ranges of the data of a fit.
+/// Ranges of a fit's data.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeasuredRange {
     /// Temperatures, degrees C.
@@ -38,8 +39,6 @@ impl MeasuredRange {
     /// The ranges of the judged rows.
     pub(super) fn of(records: &[Record]) -> Self {
         let rows = || records.iter().flat_map(|record| &record.rows).filter(|row| row.weight_s > 0.0);
-        let ends = |(low, high): (f64, f64), x: f64| (low.min(x), high.max(x));
-        let none = (f64::INFINITY, f64::NEG_INFINITY);
         let mut by_temperature: Vec<(f64, f64)> = rows().map(|row| (row.temperature_c, row.weight_s)).collect();
         by_temperature.sort_by(|a, b| a.0.total_cmp(&b.0));
         let seconds: f64 = by_temperature.iter().map(|(_, weight_s)| weight_s).sum();
@@ -50,9 +49,9 @@ impl MeasuredRange {
         });
         let square: f64 = rows().map(|row| row.weight_s * row.current_a * row.current_a).sum();
         Self {
-            temperature_c: inner.map(|(temperature_c, _)| *temperature_c).fold(none, ends),
-            current_a: rows().map(|row| row.current_a).fold(none, ends),
-            soc: rows().map(|row| row.soc.clamp(0.0, 1.0)).fold(none, ends),
+            temperature_c: ends(inner.map(|(temperature_c, _)| *temperature_c)),
+            current_a: ends(rows().map(|row| row.current_a)),
+            soc: ends(rows().map(|row| row.soc.clamp(0.0, 1.0))),
             rms_a: (square / seconds).sqrt(),
         }
     }
@@ -63,19 +62,19 @@ impl MeasuredRange {
 pub(super) struct ModelTables {
     pub(super) grid: Grid,
     pub(super) tables: ParameterTables,
-    /// Standard deviation of the error averaged over 100 s, V.
+    /// Standard deviation of the error, averaged over 100 s, V.
     pub(super) voltage_error_v: Vec<f64>,
 }
 
 impl ModelTables {
-    /// The fitted tables as they are.
+    /// The fitted tables without additional rows.
     pub(super) fn fitted(fitted: &FittedTables, voltage_error_v: &[f64]) -> Self {
         let (grid, tables) = (fitted.grid.clone(), fitted.tables.clone());
         Self { grid, tables, voltage_error_v: voltage_error_v.to_vec() }
     }
 
-    /// The fitted tables with rows beyond the measured temperatures. `is_scaled`: the resistances of the fit hold at the nodes, beyond
-    /// them by Arrhenius' law; else out to the measured temperatures.
+    /// The fitted tables with rows outside the measured temperatures. If `is_scaled`, the fitted resistances hold only at the nodes, and
+    /// Arrhenius' law applies from there; otherwise they hold out to the measured temperatures.
     pub(super) fn beyond(
         fitted: &FittedTables,
         voltage_error_v: &[f64],
@@ -110,7 +109,7 @@ impl ModelTables {
         all
     }
 
-    /// Adds the values of a fitted row, which hold at `from_c`, for `to_c`.
+    /// Adds a fitted row, which holds at `from_c`, for the temperature `to_c`.
     fn add_row(
         &mut self,
         (fitted, voltage_error_v): (&FittedTables, &[f64]),
@@ -133,12 +132,12 @@ impl ModelTables {
             to_r.extend(r[nodes.clone()].iter().map(|ohm| ohm * factor));
             to_tau.extend(&tau[nodes.clone()]);
         }
-        // The heat does not make a model better than it was measured.
+        // Warmth does not make a model better than measured.
         let colder = factor.max(1.0);
         self.voltage_error_v.extend(nodes.map(|node| {
             let settled_ohm = r_ohm.iter().fold(r0_ohm[node], |sum, r| sum + r[node]);
             let arrhenius_v = log_std * rms_a * settled_ohm * colder;
-            // Errors are limited to this, V: an estimate hardly follows such a voltage.
+            // Upper limit of the errors, V: an estimate hardly follows such a voltage.
             libm::hypot(voltage_error_v[node] * libm::pow(colder, COLD_POWER), arrhenius_v).min(0.5)
         }));
     }
@@ -162,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn resistances_follow_arrhenius_beyond_the_measured_temperatures_and_the_error_grows() {
+    fn resistance_and_error_grow_outside_the_measured_range() {
         let range = MeasuredRange { temperature_c: (22.4, 36.1), current_a: (-5.0, 15.0), soc: (0.0, 1.0), rms_a: 2.0 };
         let all = ModelTables::beyond(&fitted(vec![25.0]), &[0.005; 2], &range, false);
         assert_eq!(all.grid.temperature_c, [-18.0, 22.0, 25.0, 37.0, 77.0]);

@@ -1,51 +1,51 @@
-//! A request for a fit, as the command line and the Python module take it.
+//! A request for a fit, for the command line and the Python module.
 //!
-//! In: files and what is known of the cell. Out: a checked request: [`FitRequest::check`] is the one place of its ranges. Errors name the
-//! argument of the command.
+//! Input: files and known data of the cell. Output: a checked request: only [`FitRequest::check`] defines the allowed ranges. Errors
+//! name the argument of the command.
 
 use std::path::PathBuf;
 
 use crate::cell::MAX_BRANCHES;
-use crate::error::LabError;
+use crate::error::{LabError, check_values as check};
 use crate::quantity::bounds;
 
-/// Most SOC breakpoints: one per per cent. The time of a fit grows with the cube of their number.
+/// Most SOC breakpoints: one per percent. The duration of a fit grows with the cube of their number.
 pub const MAX_SOC_NODES: usize = 101;
 
 /// What to fit.
 #[derive(Debug, Clone, Default)]
 pub struct FitRequest {
-    /// Display name of the cell.
+    /// Name of the cell.
     pub name: String,
     /// Capacity that defines SOC, Ah; `None` = from the slow test or the deepest discharge.
     pub capacity_ah: Option<f64>,
-    /// Label capacity, Ah; `None` = the capacity.
+    /// Capacity on the label, Ah; `None` = the capacity.
     pub rated_ah: Option<f64>,
     /// Lowest voltage under load, V; `None` = from the data.
     pub voltage_min_v: Option<f64>,
     /// Highest voltage under charge, V; `None` = from the data.
     pub voltage_max_v: Option<f64>,
-    /// How far the open-circuit curve shifts with lost capacity; `None` = by the electrodes found in a slow test, without them
-    /// 0, of an ageing cell [`super::AGEING_SHIFT`].
+    /// Shift of the open-circuit curve with lost capacity; `None` = by the electrodes found in a slow test, or without them 0, for an
+    /// ageing cell [`super::AGEING_SHIFT`].
     pub ageing_shift: Option<f64>,
     /// Slow tests.
     pub ocv: Vec<PathBuf>,
-    /// RC branches, 1 to 3; `None` = 2, of an ageing cell 1.
+    /// RC branches, 1 to 3; `None` = 2, for an ageing cell 1.
     pub branches: Option<usize>,
-    /// Starting time constants, s, rising: one per branch; `None` = usual ones.
+    /// Starting time constants, s, rising: one per branch; `None` = defaults.
     pub tau_s: Option<Vec<f64>>,
     /// Temperature breakpoints, degrees C, rising; `None` = from the data.
     pub temperature_c: Option<Vec<f64>>,
-    /// SOC breakpoints, rising from 0 to 1; `None` = a default set.
+    /// SOC breakpoints, rising from 0 to 1; `None` = defaults.
     pub soc: Option<Vec<f64>>,
-    /// Number of first half-cycles of an ageing cell to use, without slow tests and capacity; `None` = not an ageing cell.
+    /// Number of first half-cycles of an ageing cell to use, without slow tests and capacity; `None` = the cell is not ageing.
     pub first_cycles: Option<usize>,
     /// Files to fit, at least one.
     pub files: Vec<PathBuf>,
 }
 
 impl FitRequest {
-    /// Checks every range, and that the arguments fit together.
+    /// Checks the range of every argument, and that the arguments are compatible.
     ///
     /// # Errors
     /// The first argument that is out of its range, with what was found and what is allowed.
@@ -103,7 +103,7 @@ impl FitRequest {
     fn check_nodes(&self) -> Result<(), LabError> {
         if let Some(temperatures_c) = &self.temperature_c {
             let allowed = bounds::TEMPERATURE_C;
-            // Most temperature breakpoints: no data have more.
+            // Most temperature breakpoints; data never have more.
             check_list("--temperatures", temperatures_c, 1..=32)?;
             check("--temperatures", temperatures_c.iter().copied(), |found| allowed.has(found), allowed.allowed)?;
         }
@@ -118,24 +118,13 @@ fn is_above_0(value: f64) -> bool {
     value.is_finite() && value > 0.0
 }
 
-/// Rejects the first value that is not allowed.
-fn check(
-    key: &str,
-    values: impl IntoIterator<Item = f64>,
-    is_allowed: impl Fn(f64) -> bool,
-    allowed: &str,
-) -> Result<(), LabError> {
-    let found = values.into_iter().find(|value| !is_allowed(*value));
-    found.map_or(Ok(()), |value| Err(LabError::Data(format!("{key} = {value}, must be {allowed}"))))
-}
-
-/// Rejects a list of another length, and one that does not rise.
+/// Rejects a list of wrong length or one that does not rise.
 fn check_list(key: &str, list: &[f64], allowed: std::ops::RangeInclusive<usize>) -> Result<(), LabError> {
     if !allowed.contains(&list.len()) {
         let (found, least, most) = (list.len(), allowed.start(), allowed.end());
         return Err(LabError::Data(format!("{key} has {found} values, must have {least} to {most}")));
     }
-    // Not a >= b: a NaN must not pass.
+    // Not a >= b, which would accept NaN.
     let falling = list.array_windows().find(|[a, b]| a.partial_cmp(b) != Some(std::cmp::Ordering::Less));
     falling.map_or(Ok(()), |[a, b]| Err(LabError::Data(format!("{key}: {b} follows {a}, must rise"))))
 }
@@ -149,12 +138,12 @@ mod tests {
     }
 
     #[test]
-    fn a_request_of_files_alone_is_allowed() {
+    fn request_with_only_files_is_allowed() {
         assert_eq!(usual().check(), Ok(()));
     }
 
     #[test]
-    fn every_argument_out_of_range_is_named() {
+    fn every_argument_out_of_range_is_reported() {
         let nan = Some(f64::NAN);
         let list = |values: &[f64]| Some(values.to_vec());
         let cases = [

@@ -1,4 +1,4 @@
-//! Writes the cell model file: tables, thermal parameters, provenance. It holds no date: the same data give the same bytes.
+//! Writes the cell model file: tables, thermal parameters, provenance. The file contains no date, so the same data give the same bytes.
 
 use std::fmt::Write as _;
 
@@ -101,14 +101,14 @@ fn measured(out: &mut String, outcome: &FitOutcome) {
     line(out, &format!("soc = [{:.3}, {:.3}]", range.soc.0, range.soc.1));
 }
 
-/// Returns a file's name with its folder: enough to identify it, nothing of the machine.
+/// Returns the file name with its folder, which identifies the file without revealing the machine.
 fn file_name(path: &std::path::Path) -> String {
     let parts: Vec<_> = path.components().map(|part| part.as_os_str().to_string_lossy().into_owned()).collect();
     parts[parts.len().saturating_sub(2)..].join("/")
 }
 
 fn tables(out: &mut String, request: &FitRequest, outcome: &FitOutcome) {
-    // An ageing cell's model is for that cell in its own conditions: its cycles cannot separate temperature from age.
+    // A model of an ageing cell describes that cell under its own conditions: its cycles cannot separate temperature from age.
     let is_ageing = request.first_cycles.is_some();
     let (fit, errors) = (&outcome.fit, &outcome.voltage_error_v);
     let ModelTables { grid, tables, voltage_error_v } = match is_ageing {
@@ -116,7 +116,6 @@ fn tables(out: &mut String, request: &FitRequest, outcome: &FitOutcome) {
         false => ModelTables::beyond(fit, errors, &outcome.measured, outcome.logs.is_some()),
     };
     let (ocv_v, r0_ohm, branches) = tables.model(grid.soc.len());
-    let list = |values: &[f64]| values.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
     let beyond = if is_ageing { "" } else { ", the first and the last beyond those measured" };
     line(out, &format!("\n# Rows: temperature{beyond}. Columns: SOC.\n[tables]"));
     line(out, &format!("soc = [{}]", list(&grid.soc)));
@@ -133,7 +132,12 @@ fn tables(out: &mut String, request: &FitRequest, outcome: &FitOutcome) {
     }
 }
 
-/// `key = [[..], [..]]` with at least `digits` decimals; smaller numbers keep five figures.
+/// Numbers in a TOML list, without the brackets.
+pub(crate) fn list(values: &[f64]) -> String {
+    values.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
+}
+
+/// `key = [[..], [..]]` with at least `digits` decimals; smaller numbers keep five significant digits.
 pub(crate) fn table(out: &mut String, key: &str, rows: &[Vec<f64>], digits: usize) {
     line(out, &format!("{key} = ["));
     for row in rows {

@@ -1,16 +1,16 @@
-//! What a fitted model is good for, in plain words.
+//! Accuracy of a fitted model, in plain words.
 //!
-//! In: the table of the model's own error (V, for data not fitted), the slopes of its open-circuit curve, the rows it was
-//! fitted on. Out: sentences. The SOC's error is the voltage's over the slope, as root mean square over [`MIDDLE`]: what
-//! voltage alone determines. The count of charge between readings makes it better, an error of the sensors worse.
+//! Input: the model's error table (V, for data outside the fit), the slopes of its open-circuit curve, the fitted rows. Output:
+//! sentences. The error of the SOC is the voltage error over the slope, as root mean square over [`MIDDLE`]: the error if voltage alone
+//! determines the SOC. Counting charge between readings reduces it; sensor errors increase it.
 
 use super::{FitOutcome, MeasuredRange};
 use crate::ident::fit::{FittedTables, MIN_SLOPE_V, SUPPORTED_S};
 
-/// SOC over which errors are averaged: below, curves are so steep that any model is good, and few cells go there.
+/// SOC range over which errors are averaged: below it, curves are so steep that any model is accurate, and few cells go there.
 const MIDDLE: std::ops::RangeInclusive<f64> = 0.1..=0.95;
 
-/// The sentences, for the end of the output.
+/// Returns the sentences, for the end of the output.
 pub(super) fn verdict(outcome: &FitOutcome) -> Vec<String> {
     let FitOutcome { fit, voltage_error_v, .. } = outcome;
     let columns = fit.grid.soc.len();
@@ -26,7 +26,7 @@ pub(super) fn verdict(outcome: &FitOutcome) -> Vec<String> {
     said
 }
 
-/// Error of the SOC by the voltage at every node, points.
+/// Error of a SOC from voltage alone at every node, points.
 fn soc_points(fit: &FittedTables, voltage_error_v: &[f64]) -> Vec<f64> {
     let (soc, columns) = (&fit.grid.soc, fit.grid.soc.len());
     let of_node = |node: usize| {
@@ -44,14 +44,14 @@ fn mean_points(soc: &[f64], points: &[f64]) -> f64 {
     (middle.iter().sum::<f64>() / middle.len().max(1) as f64).sqrt()
 }
 
-/// Points as they are said: halves, at least one half.
+/// Points rounded to halves, at least one half.
 fn rounded(points: f64) -> String {
     let halves = ((2.0 * points).round() / 2.0).max(0.5);
     format!("{halves} {}", if halves == 1.0 { "point" } else { "points" })
 }
 
 fn accuracy(rows: &[(f64, f64)]) -> Vec<String> {
-    // Error of the SOC up to which a temperature counts as good, points.
+    // Largest error of the SOC at which a temperature counts as good, points.
     let (good, poor): (Vec<_>, Vec<_>) = rows.iter().partition(|(_, points)| *points <= 2.0);
     let mut said = Vec::new();
     if let (Some((low_c, _)), Some((high_c, _))) = (good.first(), good.last()) {
@@ -66,14 +66,14 @@ fn accuracy(rows: &[(f64, f64)]) -> Vec<String> {
     said
 }
 
-/// Where the curve of every temperature is too flat for the model's error.
+/// Where the curve is too flat for the model's error at every temperature.
 fn flat(soc: &[f64], points: &[f64], columns: usize) -> Option<String> {
-    // Error of the SOC at one breakpoint from which its voltage is of no use, points.
+    // Error of the SOC at a breakpoint above which its voltage is useless, points.
     let is_flat = |s: &usize| points.iter().skip(*s).step_by(columns).all(|points| *points > 5.0);
     let flat: Vec<String> = (0..columns).filter(is_flat).map(|s| soc[s].to_string()).collect();
     let list = flat.join(", ");
     (!flat.is_empty())
-        .then(|| format!("the curve is too flat for the SOC by voltage near {list}: there the charge is counted"))
+        .then(|| format!("near {list} the curve is too flat to find the SOC from voltage: charge is counted there"))
 }
 
 fn ranges(range: &MeasuredRange) -> String {
@@ -83,8 +83,8 @@ fn ranges(range: &MeasuredRange) -> String {
     let charges = if charge_a < 0.0 { format!("charges up to {:.1} A", -charge_a) } else { "no charge".to_owned() };
     // Adding 0 makes a zero of either sign positive.
     format!(
-        "measured: {:.0} to {:.0} degrees C, discharges up to {discharge_a:.1} A, {charges}, SOC {:.2} to {:.2}; beyond these it is \
-         a guess",
+        "measured: {:.0} to {:.0} degrees C, discharges up to {discharge_a:.1} A, {charges}, SOC {:.2} to {:.2}; outside this range the model \
+         is extrapolated",
         cold_c.round() + 0.0,
         warm_c.round() + 0.0,
         empty + 0.0,
@@ -97,7 +97,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn good_temperatures_are_joined_and_the_others_named() {
+    fn good_temperatures_are_joined_and_others_listed() {
         let rows = [(-20.0, 6.1), (-10.0, 2.9), (0.0, 1.6), (25.0, 0.6), (40.0, 0.3)];
         let expected = [
             "good for SOC to about 1.5 points between 0 and 40 degrees C",
@@ -120,10 +120,10 @@ mod tests {
     }
 
     #[test]
-    fn breakpoints_flat_at_every_temperature_are_named() {
+    fn breakpoints_flat_at_every_temperature_are_listed() {
         let points = [1.0, 9.0, 7.0, 1.0, 6.0, 2.0];
         let found = flat(&[0.0, 0.5, 1.0], &points, 3).expect("one");
-        assert!(found.contains("near 0.5: "), "{found}");
+        assert!(found.starts_with("near 0.5 the curve is too flat"), "{found}");
         assert_eq!(flat(&[0.0, 1.0], &[1.0, 2.0], 2), None);
     }
 }

@@ -1,7 +1,7 @@
 //! Replays one log through one monitor: the loop of `packwatch replay` without its files.
 //!
-//! Input: a log and a monitor without earlier input. Output: the monitor's outputs after each input, passed to a closure.
-//! Promise: the monitor receives the same inputs and ticks as from `packwatch replay`, so the results are the same.
+//! Input: a log and a monitor without earlier input. Output: the monitor's outputs after each input, passed to a closure. The monitor
+//! receives the same inputs and ticks as from `packwatch replay`, so the results are the same.
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
@@ -13,15 +13,15 @@ use crate::io::ticks::Ticks;
 use crate::monitor::{Monitor, Outputs, Record, RecordKind, TICK_PERIOD_MS};
 use crate::quantity::Timestamp;
 
-/// An opened log, and a note for the user on how it is read.
+/// An opened log, with a note for the user on how it is read.
 pub type OpenedLog = (LogSource, Option<String>);
 
 /// How to read logs.
 #[derive(Clone, Copy)]
 pub struct LogAccess<'a> {
-    /// Opens logs, one recording after the other, as they are read with a configuration.
+    /// Opens logs with a configuration and reads one recording after the other.
     pub open: &'a (dyn Fn(&Config, &[PathBuf]) -> OpenedLog + Sync),
-    /// A gap longer than this means that the recorder was asleep, s.
+    /// A longer gap means that the recorder was asleep, s.
     pub sleep_gap_s: f64,
 }
 
@@ -43,7 +43,7 @@ impl DriveSummary {
     }
 }
 
-/// Replays a log. `each` takes the outputs of every input and clears them; `report` receives the bytes read since its last
+/// Replays a log. `each` receives the outputs after every input and must clear them; `report` receives the bytes read since its last
 /// call.
 ///
 /// # Errors
@@ -77,7 +77,7 @@ pub fn drive(
         }
         tick(&mut ticks, &mut monitor, Some(&record))?;
         records += 1;
-        // Records between two reports of progress.
+        // Number of records between two progress reports.
         if records.is_multiple_of(4096) {
             let bytes = source.read_bytes().load(Ordering::Relaxed);
             report(bytes - reported);
@@ -94,13 +94,13 @@ pub fn drive(
 }
 
 impl DriveSummary {
-    /// First and last stamp of `log`.
+    /// Returns the first and last stamp of `log`.
     ///
     /// # Errors
-    /// The log held no record; the error includes the notes.
+    /// The log contains no record; the error includes the notes.
     pub fn span_of(&self, log: &Path) -> Result<(Timestamp, Timestamp), LabError> {
         let why = || self.notes.iter().map(|note| format!(": {note}")).collect::<String>();
-        self.span.ok_or_else(|| LabError::Data(format!("{}: holds no record{}", log.display(), why())))
+        self.span.ok_or_else(|| LabError::Data(format!("{}: contains no record{}", log.display(), why())))
     }
 
     fn note(&mut self, record: &Record) {
@@ -108,8 +108,8 @@ impl DriveSummary {
         let (first, last) = self.span.unwrap_or((time, time));
         self.span = Some((first.min(time), last.max(time)));
         let noted = match record.kind {
-            RecordKind::Restore { .. } => "the recorded run began from a stored state, this one did not",
-            RecordKind::Reload => "the recorded run took another configuration over, this one did not",
+            RecordKind::Restore { .. } => "the recorded run started from a stored state, the replay does not",
+            RecordKind::Reload => "the recorded run loaded another configuration, the replay does not",
             _ => return,
         };
         if !self.notes.iter().any(|note| note == noted) {
@@ -121,7 +121,7 @@ impl DriveSummary {
         self.counts = counts.clone();
         if counts.bad_lines > 0 {
             let first = counts.first_bad_line.as_deref().unwrap_or("");
-            self.notes.push(format!("{} bad lines left out, the first: {first}", counts.bad_lines));
+            self.notes.push(format!("{} bad lines skipped, the first: {first}", counts.bad_lines));
         }
         if counts.unknown_gaps > 0 {
             self.notes

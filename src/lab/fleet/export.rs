@@ -1,9 +1,9 @@
 //! Exports the results of logs as tables: estimates, half-cycles and alarms, in Parquet or CSV.
 //!
 //! Input: a configuration and logs. Output: per log a folder `NAME/` with `estimates`, `half_cycles` and `alarms` (`.parquet` or
-//! `.csv`; columns and units in [`columns`]) and `about.json`, which is written last: where it is, the others are whole.
-//! Promise: a file has its final name only when it is complete; memory is bounded by a row group per table and log,
-//! independent of the length of the log; a log that fails leaves no file and the others continue.
+//! `.csv`; columns and units in [`columns`]) and `about.json`. `about.json` is written last, so if it exists, the tables are complete.
+//! A file gets its final name only when it is complete. Memory is bounded by one row group per table and log, independent of the length
+//! of the log. A log that fails leaves no file, and the others continue.
 
 mod columns;
 pub mod merge;
@@ -22,7 +22,7 @@ use self::table::TableFile;
 use super::drive::{DriveSummary, LogAccess, drive};
 
 use crate::config::Config;
-use crate::error::LabError;
+use crate::error::{LabError, create_folder};
 use crate::fields::Fields;
 use crate::io::stamp;
 use crate::monitor::{Event, EventKind, Monitor, Outputs};
@@ -31,15 +31,15 @@ use crate::status::document::ConfigFile;
 
 pub use columns::reference;
 
-/// What is written last of a log's tables.
+/// File that is written after a log's tables.
 pub(super) const ABOUT: &str = "about.json";
 
-/// Form of the tables.
+/// Format of the tables.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TableFormat {
     /// Apache Parquet, Snappy.
     Parquet,
-    /// Comma-separated values with a heading.
+    /// Comma-separated values with a header line.
     Csv,
 }
 
@@ -57,15 +57,15 @@ impl TableFormat {
 pub struct ExportSettings<'a> {
     /// How to read the logs.
     pub access: LogAccess<'a>,
-    /// Form of the tables.
+    /// Format of the tables.
     pub format: TableFormat,
-    /// Folder for the logs' folders.
+    /// Folder that contains the folders of the logs.
     pub out: PathBuf,
-    /// At most one estimate per cell in each period, s; 0 = every one, `None` = no table of estimates.
+    /// At most one estimate per cell in each period, s; 0 = all estimates, `None` = no table of estimates.
     pub period_s: Option<f64>,
     /// Threads; `None` = all cores.
     pub jobs: Option<usize>,
-    /// How logs are read, in any form that differs where the settings differ.
+    /// Settings for reading logs, as text; two texts differ if the settings differ.
     pub reading: String,
 }
 
@@ -78,16 +78,16 @@ pub struct ExportResult {
     pub folder: PathBuf,
     /// Rows of each table.
     pub rows: BTreeMap<&'static str, u64>,
-    /// From the first stamp to the last, days.
+    /// Time from the first stamp to the last, days.
     pub days: f64,
     /// Notes for the user.
     pub notes: Vec<String>,
 }
 
-/// Exports all logs; returns per log what was written, or the error. `report` receives the bytes read since its last call.
+/// Exports all logs; returns the result or the error of each log. `report` receives the bytes read since its last call.
 ///
 /// # Errors
-/// When no threads can be started.
+/// No threads can be started.
 pub fn run(
     config: &Config,
     logs: &[PathBuf],
@@ -103,7 +103,7 @@ pub fn run(
 /// Exports the logs of one recording.
 ///
 /// # Errors
-/// A log cannot be read or a table not be written; then no table is left.
+/// A log cannot be read or a table cannot be written; then no table is left.
 pub(super) fn export(
     config: &Config,
     logs: &[PathBuf],
@@ -112,8 +112,7 @@ pub(super) fn export(
     report: &dyn Fn(u64),
 ) -> Result<ExportResult, LabError> {
     let folder = settings.out.join(name);
-    std::fs::create_dir_all(&folder)
-        .map_err(|error| LabError::File(format!("{}: cannot be created: {error}", folder.display())))?;
+    create_folder(&folder)?;
     let mut tables = LogTables::create(config, name, &folder, settings)?;
     let out = Outputs { want_estimates: true, ..Outputs::default() };
     let source = (settings.access.open)(config, logs);
@@ -135,8 +134,8 @@ pub(super) fn export(
     Ok(exported)
 }
 
-/// Removes the `about.json` of an earlier export, since its tables are replaced one by one; returns a note when they were
-/// those of another log.
+/// Removes the `about.json` of an earlier export, because its tables are replaced one by one; returns a note if they came from
+/// another log.
 fn remove_about(folder: &Path, log: &Path) -> Result<Option<String>, LabError> {
     let path = folder.join(ABOUT);
     let Ok(text) = std::fs::read(&path) else { return Ok(None) };
@@ -192,8 +191,8 @@ fn write_about(
     Ok(crate::write_file(&exported.folder.join(ABOUT), &serde_json::to_vec_pretty(&document)?)?)
 }
 
-/// Returns a folder name per log: the file's name without endings; where several are equal, with the folder's name before
-/// it or a number after it.
+/// Returns a folder name per log: the file name without endings. If several logs share it, the name of their folder comes before it, or
+/// a number after it.
 pub(super) fn names(logs: &[PathBuf]) -> Vec<String> {
     let text = |name: Option<&std::ffi::OsStr>| name.unwrap_or_default().to_string_lossy().into_owned();
     let short = |log: &PathBuf| {
@@ -201,9 +200,9 @@ pub(super) fn names(logs: &[PathBuf]) -> Vec<String> {
             return "stdin".to_owned();
         }
         let name = text(log.file_name());
-        let name = [".gz", ".zst"].iter().find_map(|ending| name.strip_suffix(ending)).unwrap_or(&name).to_owned();
-        let stem = name.rsplit_once('.').map_or(name.as_str(), |(stem, _)| stem).to_owned();
-        clean(if stem.is_empty() { "log" } else { &stem })
+        let name = crate::without_compression(&name);
+        let stem = name.rsplit_once('.').map_or(name, |(stem, _)| stem);
+        clean(if stem.is_empty() { "log" } else { stem })
     };
     let all: Vec<String> = logs.iter().map(short).collect();
     let mut names: Vec<String> = Vec::with_capacity(all.len());
@@ -237,7 +236,7 @@ struct LogTables {
     periods: Vec<Option<i64>>,
     rated_ah: f64,
     moved_ah: Vec<f64>,
-    /// A half-cycle whose capacity event follows.
+    /// A half-cycle that waits for its capacity event.
     half_cycle: Option<(CellIndex, Fields)>,
 }
 

@@ -1,20 +1,19 @@
-//! Scores one threshold's alarms in one log: lead before the end of life, missed, false.
+//! Scores the alarms of one threshold in one log: lead time before the end of life, missed and false alarms.
 //!
-//! The terms are those of `tests/alarm_tradeoff.md`, for a record that may end before the life does:
+//! The terms are those of `tests/alarm_tradeoff.md`, extended to records that end before the life does:
 //!
-//! * **end of life**: by the truth, the first moment a cell's capacity is below the limit; without a truth, when the weakest
-//!   learned capacity went below it for good, as the end of the record shows it.
-//! * **true raise**: a raise before the end of life, with the end coming within the horizon (if one is given).
-//! * **false alarm**: a raise with which the end of life did not come within the horizon; without a horizon, one in a
-//!   record that has no end of life. Raises at or after the end are neither.
-//! * **open**: a raise less than the horizon before the end of a record that has no end of life: it cannot be judged.
-//! * **lead**: from the first true raise to the end of life, in days and in equivalent full cycles.
+//! * **end of life**: with a truth, the first time at which a cell's capacity is below the limit; without a truth, the time after
+//!   which the weakest learned capacity stayed below the limit until the end of the record.
+//! * **true raise**: a raise before the end of life, at most the horizon before it (if a horizon is given).
+//! * **false alarm**: a raise that is not followed by the end of life within the horizon; without a horizon, any raise in a
+//!   record without an end of life. Raises at or after the end of life are neither true nor false.
+//! * **open**: a raise less than the horizon before the end of a record without an end of life: it cannot be judged.
+//! * **lead**: time from the first true raise to the end of life, in days and in equivalent full cycles.
 //! * **missed**: the end of life came without a true raise before it.
-//! * **false raise**: a raise of `capacity_low` while the true capacity of its cell was above the threshold; only with a
-//!   truth.
+//! * **false raise**: a raise of `capacity_low` while the true capacity of its cell was above the threshold; only with a truth.
 //! * **flickers**: clears before the end of life.
 //!
-//! Only rules about ageing (those whose values are learned) are judged; for the others the raises are counted.
+//! Only rules about ageing (those on learned values) are judged; for other rules the raises are counted.
 
 use serde::Serialize;
 
@@ -35,7 +34,7 @@ pub enum Horizon {
     Days(f64),
 }
 
-/// A log's use, truth and end of life, which its alarms are judged by.
+/// Use, truth and end of life of a log, by which its alarms are judged.
 #[derive(Debug, Clone, Copy)]
 pub struct LogLife<'a> {
     /// Charge moved.
@@ -70,23 +69,23 @@ pub struct FirstRaise {
 pub struct AlarmScore {
     /// The first raise.
     pub first: Option<FirstRaise>,
-    /// Raises, at any time.
+    /// Number of raises, at any time.
     pub raises: usize,
-    /// Lead, days.
+    /// Lead time, days.
     pub lead_days: Option<f64>,
-    /// Lead, equivalent full cycles.
+    /// Lead time, equivalent full cycles.
     pub lead_cycles: Option<f64>,
-    /// The end of life came without a true raise; `None` = it did not come, or the rule is not about ageing.
+    /// The end of life came without a true raise; `None` = it was not reached, or the rule is not about ageing.
     pub missed: Option<bool>,
     /// False alarms; `None` = the rule is not about ageing.
     pub false_alarms: Option<usize>,
-    /// Raises that cannot be judged.
+    /// Number of raises that cannot be judged.
     pub open: Option<usize>,
-    /// Raises while the true capacity was above the threshold; `None` = there is no truth.
+    /// Number of raises while the true capacity was above the threshold; `None` = there is no truth.
     pub false_raises: Option<usize>,
-    /// Clears before the end of life.
+    /// Number of clears before the end of life.
     pub flickers: usize,
-    /// Raises and clears beyond those stored.
+    /// Number of raises and clears beyond those stored.
     pub not_kept: u64,
 }
 
@@ -102,7 +101,7 @@ enum RaiseClass {
 pub fn judge(config: &RuleConfig, history: &AlarmHistory, life: &LogLife<'_>) -> AlarmScore {
     let verdicts: Vec<(RaiseClass, &Raise)> = history.raises.iter().map(|raise| (life.verdict(raise), raise)).collect();
     let count = |wanted| verdicts.iter().filter(|(verdict, _)| *verdict == wanted).count();
-    // Nothing can be missed in a log that began after the end of life.
+    // An alarm cannot be missed in a log that starts after the end of life.
     let is_ageing = config.rule.spec().is_learned && life.end.is_none_or(|end| end > life.span.0);
     let first_true = verdicts.iter().find(|(verdict, _)| *verdict == RaiseClass::True).map(|(_, raise)| raise.time);
     let lead = life.end.zip(first_true).filter(|_| is_ageing);
@@ -171,7 +170,7 @@ mod tests {
         Timestamp::from_secs(day * DAY_S)
     }
 
-    /// One equivalent full cycle a day.
+    /// Use of one equivalent full cycle per day.
     fn track() -> Track {
         let mut track = Track::new(1.0, EndOfLifeSource::Learned);
         for end in 1..=100 {
@@ -219,11 +218,11 @@ mod tests {
     }
 
     #[test]
-    fn lead_runs_from_the_first_true_raise_to_the_end() {
+    fn lead_runs_from_first_true_raise_to_end() {
         let found = judged(&[10.0, 60.0], Some(90.0), None);
         assert_eq!((found.lead_days, found.lead_cycles, found.missed), (Some(80.0), Some(80.0), Some(false)));
         assert_eq!((found.false_alarms, found.flickers, found.raises), (Some(0), 1, 2));
-        // With a horizon of 40 the raise at 10 was false, and lead begins at 60.
+        // With a horizon of 40, the raise at 10 is false, and the lead starts at 60.
         for horizon in [Horizon::Days(40.0), Horizon::Cycles(40.0)] {
             let found = judged(&[10.0, 60.0], Some(90.0), Some(horizon));
             assert_eq!((found.lead_days, found.false_alarms, found.missed), (Some(30.0), Some(1), Some(false)));
@@ -231,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn an_end_without_a_raise_before_it_is_missed() {
+    fn end_without_earlier_raise_is_missed() {
         for raised in [&[][..], &[90.0, 95.0]] {
             let found = judged(raised, Some(90.0), None);
             assert_eq!((found.missed, found.lead_days, found.false_alarms), (Some(true), None, Some(0)), "{raised:?}");
@@ -240,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn without_an_end_a_raise_is_false_or_open() {
+    fn raise_without_end_is_false_or_open() {
         let found = judged(&[10.0, 80.0], None, None);
         assert_eq!((found.false_alarms, found.open, found.missed), (Some(2), Some(0), None));
         let found = judged(&[10.0, 80.0], None, Some(Horizon::Days(40.0)));
@@ -248,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rule_that_is_not_about_ageing_is_only_counted() {
+    fn raises_of_other_rules_are_only_counted() {
         let track = track();
         let life =
             LogLife { track: &track, truth: None, span: (day(0.0), day(100.0)), end: Some(day(90.0)), horizon: None };

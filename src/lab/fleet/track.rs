@@ -1,7 +1,7 @@
-//! Use and wear over a log: charge moved, and the weakest capacity learned.
+//! Use and wear over a log: charge moved, and the weakest learned capacity.
 //!
-//! Input: the monitor's events. Output: equivalent full cycles (charge moved over twice the rated capacity) and learned capacities,
-//! both known at the ends of half-cycles and interpolated between them (charge) or held (capacity).
+//! Input: the monitor's events. Output: equivalent full cycles (charge moved over twice the rated capacity) and learned capacities.
+//! Both are known at the ends of half-cycles; between them, cycles are interpolated and capacities held.
 
 use std::collections::BTreeMap;
 
@@ -10,7 +10,7 @@ use crate::monitor::{Event, EventKind};
 use crate::quantity::catalogue::Quantity;
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Charge moved and capacities learned up to now.
+/// Charge moved and capacities learned so far.
 #[derive(Debug, Clone)]
 pub struct Track {
     rated_ah: f64,
@@ -19,7 +19,7 @@ pub struct Track {
     capacity_ah: BTreeMap<CellIndex, f64>,
     /// Ends of half-cycles: time and equivalent full cycles so far.
     cycles: Vec<(Timestamp, f64)>,
-    /// The weakest learned capacity after each, and its cell.
+    /// After each half-cycle, the weakest learned capacity and its cell.
     weakest: Vec<(Timestamp, f64, CellIndex)>,
 }
 
@@ -50,7 +50,7 @@ impl Track {
         *moved_ah += charge_ah;
         let cycles = *moved_ah / (2.0 * self.rated_ah);
         let most = self.cycles.last().map_or(0.0, |last| last.1);
-        // The cells of a string move the same charge; a cell without estimates for a while has counted less.
+        // The cells of a string move the same charge; a cell that was without estimates for a time has counted less.
         if cycles > most {
             self.cycles.pop_if(|last| last.0 == time);
             self.cycles.push((time, cycles));
@@ -77,24 +77,24 @@ impl Track {
         }
     }
 
-    /// Equivalent full cycles in all.
+    /// Total equivalent full cycles.
     pub fn cycles(&self) -> f64 {
         self.cycles.last().map_or(0.0, |last| last.1)
     }
 
-    /// Which capacity it follows.
+    /// Which learned capacity is tracked.
     pub fn learned(&self) -> EndOfLifeSource {
         self.learned
     }
 
-    /// Returns the time from which the weakest learned capacity stayed below `end_ah` until the end of the log; `None` = it
-    /// is not below at the end, or nothing was learned.
+    /// Returns the time and cell from which the weakest learned capacity stayed below `end_ah` until the end of the log; `None` = it is
+    /// not below at the end, or nothing was learned.
     pub fn stays_below(&self, end_ah: f64) -> Option<(Timestamp, CellIndex)> {
         let below = self.weakest.iter().rev().take_while(|(_, ah, _)| *ah < end_ah).last();
         below.map(|&(time, _, cell)| (time, cell))
     }
 
-    /// The weakest learned capacity at the end, Ah.
+    /// Weakest learned capacity at the end, Ah.
     pub fn last_ah(&self) -> Option<f64> {
         self.weakest.last().map(|last| last.1)
     }
@@ -134,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn cycles_are_charge_over_twice_the_rated_capacity_and_run_between_ends() {
+    fn cycles_are_interpolated_between_half_cycles() {
         let mut track = Track::new(2.0, EndOfLifeSource::Learned);
         track.observe(&[half_cycle(100.0, 0, 2.0), half_cycle(100.0, 1, 1.0), half_cycle(200.0, 0, 1.0)]);
         let at = |time_s| track.cycles_at(Timestamp::from_secs(time_s));
@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn the_end_is_when_the_weakest_cell_falls_below_for_good() {
+    fn end_is_when_weakest_cell_stays_below() {
         let mut track = Track::new(2.0, EndOfLifeSource::LearnedUsable);
         let lives = [(1.0, 0, 1.4), (1.0, 1, 1.6), (2.0, 0, 1.6), (3.0, 1, 1.45), (4.0, 0, 1.55), (5.0, 1, 1.4)];
         track.observe(&lives.map(|(time_s, cell, ah)| learned(time_s, cell, ah)));

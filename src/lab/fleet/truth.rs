@@ -1,9 +1,9 @@
-//! The true capacities of a log, from a CSV next to it.
+//! The true capacities of a log, from a CSV file in the same folder.
 //!
-//! Two forms are known by their columns: with `cell`, as `simulate --truth` writes it (the capacity between the open-circuit
-//! voltages, of every cell), and with `cycle` and `type`, as `score --cycles` takes it (published capacities of discharges of one cell, at the load they were measured with). Next to `NAME.log`,
-//! `NAME.csv`, ... the search finds `NAME.truth.csv`, `NAME_truth.csv`, `NAME_cycles.csv`, and `truth.csv` where the log is the only one
-//! given of its folder; each also `.gz` and `.zst`.
+//! The columns identify the two formats. A table with `cell` is written by `simulate --truth`: capacity between the open-circuit voltages
+//! of every cell. A table with `cycle` and `type` is the one of `score --cycles`: published capacities of one cell's discharges, at their
+//! load. For `NAME.log`, `NAME.csv` etc., the search looks for `NAME.truth.csv`, `NAME_truth.csv` and `NAME_cycles.csv`, and for `truth.csv`
+//! if no other given log is in that folder; each also with `.gz` and `.zst`.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -15,12 +15,12 @@ use crate::io::table::TableError;
 use crate::quantity::{CellIndex, Timestamp};
 use crate::score::CycleTable;
 
-/// Endings of the names looked for.
+/// Endings of the file names searched for.
 const ENDINGS: [&str; 3] = [".truth.csv", "_truth.csv", CYCLES];
 const CYCLES: &str = "_cycles.csv";
 const COMPRESSED: [&str; 3] = ["", ".gz", ".zst"];
 
-/// Which capacity says when a life ends.
+/// Source of the capacity that determines the end of a life.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 pub enum EndOfLifeSource {
     /// The true capacity.
@@ -29,16 +29,16 @@ pub enum EndOfLifeSource {
     /// Published capacities.
     #[serde(rename = "published_capacity")]
     Published,
-    /// The usable capacity learned.
+    /// The learned usable capacity.
     #[serde(rename = "learned_usable_capacity")]
     LearnedUsable,
-    /// The capacity learned.
+    /// The learned capacity.
     #[serde(rename = "learned_capacity")]
     Learned,
 }
 
 impl EndOfLifeSource {
-    /// Words for tables.
+    /// Name for tables.
     pub const fn words(self) -> &'static str {
         match self {
             Self::Truth => "the true capacity",
@@ -52,18 +52,18 @@ impl EndOfLifeSource {
 /// The true capacities of a log.
 #[derive(Debug, Clone)]
 pub struct Truth {
-    /// Which capacity it describes.
+    /// Source of the capacities.
     pub kind: EndOfLifeSource,
-    /// Per cell, in the order of time.
+    /// Capacities per cell, in order of time.
     cells: BTreeMap<CellIndex, Vec<(Timestamp, f64)>>,
     span: (Timestamp, Timestamp),
 }
 
 impl Truth {
-    /// Reads a truth of either form.
+    /// Reads a truth in either format.
     ///
     /// # Errors
-    /// It cannot be read, is of neither form, or a field is wrong: file, line, found, allowed.
+    /// The file cannot be read, has neither format, or a field is wrong: file, line, found, allowed.
     pub fn read(path: &Path) -> Result<Self, TableError> {
         let table = CapacityTable::open_in_order(path)?;
         if table.header().find("cell").is_some() { read_simulated(table) } else { Self::of_table(path) }
@@ -85,20 +85,20 @@ impl Truth {
         self.cells.iter().filter_map(of_cell).min()
     }
 
-    /// Returns the capacity of a cell at `time`: that of the last row before it; `None` = there is none.
+    /// Returns the capacity of a cell in the last row up to `time`; `None` = there is no such row.
     pub fn capacity_ah(&self, cell: CellIndex, time: Timestamp) -> Option<f64> {
         let points = self.cells.get(&cell)?;
         let after = points.partition_point(|(at, _)| *at <= time);
         points.get(after.checked_sub(1)?).map(|(_, ah)| *ah)
     }
 
-    /// Returns its first and last time.
+    /// Returns the first and last time.
     pub fn span(&self) -> (Timestamp, Timestamp) {
         self.span
     }
 }
 
-/// Keeps the rows at which a capacity has changed by more than 0.02 %.
+/// Keeps the rows at which a capacity changed by more than 0.02 %.
 fn read_simulated(mut table: CapacityTable) -> Result<Truth, TableError> {
     let (mut cells, mut span): (BTreeMap<CellIndex, Vec<(Timestamp, f64)>>, _) = (BTreeMap::new(), None);
     while let Some(row) = table.next_row()? {
@@ -116,13 +116,13 @@ fn read_simulated(mut table: CapacityTable) -> Result<Truth, TableError> {
     Ok(Truth { kind: EndOfLifeSource::Truth, cells, span })
 }
 
-/// Finds the truth next to each of the logs, where there is one.
+/// Finds the truth in the folder of each log, if there is one.
 pub fn find_next_to(logs: &[PathBuf]) -> Vec<Option<PathBuf>> {
     let alone = |log: &PathBuf| logs.iter().filter(|other| other.parent() == log.parent()).count() == 1;
     logs.iter().map(|log| find(log, alone(log))).collect()
 }
 
-/// Finds the table of cycles next to a CSV log, which dates the cycles.
+/// Finds the table of cycles that dates the cycles of a CSV log.
 pub fn cycles_next_to(log: &Path) -> Option<PathBuf> {
     let (stem, ending) = stem_of(log)?;
     (ending == "csv").then(|| existing(log, [format!("{stem}{CYCLES}")])).flatten()
@@ -137,14 +137,14 @@ fn find(log: &Path, alone: bool) -> Option<PathBuf> {
     existing(log, names.chain(alone.then(|| "truth.csv".to_owned())))
 }
 
-/// Returns a log's name without its endings, and the ending before that of a compression.
+/// Returns the name of a log without its endings, and the ending before a compression's.
 fn stem_of(log: &Path) -> Option<(&str, &str)> {
     let name = log.file_name()?.to_str()?;
-    let name = COMPRESSED[1..].iter().find_map(|ending| name.strip_suffix(ending)).unwrap_or(name);
+    let name = crate::without_compression(name);
     Some(name.rsplit_once('.').unwrap_or((name, "")))
 }
 
-/// Returns the first of these names, compressed or not, that is a file next to the log.
+/// Returns the first of these names, compressed or not, that is a file in the log's folder.
 fn existing(log: &Path, names: impl IntoIterator<Item = String>) -> Option<PathBuf> {
     let paths =
         names.into_iter().flat_map(|name| COMPRESSED.map(|ending| log.with_file_name(format!("{name}{ending}"))));
@@ -163,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn the_first_cell_below_ends_the_life() {
+    fn first_cell_below_ends_the_life() {
         let truth = read(
             "time_s,cell,soc,capacity_ah\n1,0,0.5,2.0\n1,1,0.5,2.1\n2,0,0.5,1.9\n2,1,0.5,1.7\n3,0,0.5,1.6\n3,1,0.5,1.5\n",
         );
@@ -176,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn a_table_of_published_capacities_is_known_by_its_columns() {
+    fn columns_identify_published_capacities() {
         let truth =
             read("cycle,type,start,capacity_ah_source\n1,discharge,100,1.5\n2,charge,150,\n3,discharge,200,1.3\n");
         let truth = truth.expect("reads");
@@ -185,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fault_names_its_line() {
+    fn fault_names_its_line() {
         assert_eq!(
             read("time_s,cell,capacity_ah\n1,0,x\n").expect_err("bad"),
             "t.csv:2: column capacity_ah: found \"x\", must be Ah above 0 or nothing"
@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn the_truth_is_found_next_to_its_log() {
+    fn truth_is_found_in_the_folder_of_its_log() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = |name: &str| folder.path().join(name);
         for name in ["a.truth.csv", "b_cycles.csv.gz", "truth.csv"] {

@@ -1,22 +1,22 @@
 //! Evaluates the alarms of many settings in one replay.
 //!
-//! Estimates do not depend on alarm thresholds, and the alarms of one threshold do not depend on those of another. So one
-//! monitor's alarm inputs go to further engines, the *lanes*: the n-th different threshold of each rule
-//! and severity is watched in lane n. A grid of five thresholds of one rule by five of another needs five lanes, not
-//! twenty-five, and every setting of the grid finds each of its thresholds in some lane.
+//! Estimates do not depend on alarm thresholds, and the alarms of one threshold do not depend on other thresholds. So the alarm
+//! inputs of one monitor are passed to further engines, the *lanes*: lane n watches the n-th distinct threshold of each rule
+//! and severity. A grid of five thresholds of one rule by five of another needs five lanes instead of twenty-five, and every
+//! threshold of the grid is watched in some lane.
 
 use crate::alarm::{AlarmChange, AlarmEngine, AlarmInput, Change, Rule, RuleConfig, Severity};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Most raises, and most clears, stored of one threshold in one log; further ones are only counted.
+/// Most raises, and most clears, stored per threshold and log; further ones are only counted.
 const MAX_KEPT: usize = 20_000;
 
-/// An alarm was raised.
+/// A raised alarm.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Raise {
-    /// When.
+    /// Time of the raise.
     pub time: Timestamp,
-    /// Which cell; `None` = the pack.
+    /// Cell; `None` = the pack.
     pub cell: Option<CellIndex>,
     /// The value that raised it, in the rule's unit.
     pub value: Option<f64>,
@@ -25,11 +25,11 @@ pub struct Raise {
 /// Raises and clears of one threshold in one log.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct AlarmHistory {
-    /// In the order of time.
+    /// In order of time.
     pub raises: Vec<Raise>,
-    /// In the order of time.
+    /// In order of time.
     pub clears: Vec<Timestamp>,
-    /// Raises and clears beyond those kept.
+    /// Number of raises and clears beyond those stored.
     pub not_kept: u64,
 }
 
@@ -41,19 +41,19 @@ struct BatchThreshold {
     history: AlarmHistory,
 }
 
-/// The thresholds of the settings that share a replay, and the lane of each.
+/// Thresholds of the settings that share a replay, with the lane of each.
 #[derive(Debug, Clone, Default)]
 pub(super) struct VariantBatch {
     watched: Vec<BatchThreshold>,
 }
 
 impl VariantBatch {
-    /// Adds a threshold unless it is there; returns its number.
+    /// Adds a threshold if it is new; returns its number.
     pub(super) fn watch(&mut self, config: &RuleConfig) -> usize {
         if let Some(known) = self.watched.iter().position(|watched| watched.config == *config) {
             return known;
         }
-        let same = |watched: &&BatchThreshold| is_of(watched, config.rule, config.severity);
+        let same = |watched: &&BatchThreshold| has_rule(watched, config.rule, config.severity);
         let lane = self.watched.iter().filter(same).count();
         self.watched.push(BatchThreshold { config: config.clone(), lane, history: AlarmHistory::default() });
         self.watched.len() - 1
@@ -73,8 +73,10 @@ impl VariantBatch {
 
     fn note(&mut self, lane: usize, time: Timestamp, change: &AlarmChange) {
         let alarm = &change.alarm;
-        let found =
-            self.watched.iter_mut().find(|watched| watched.lane == lane && is_of(watched, alarm.rule, alarm.severity));
+        let found = self
+            .watched
+            .iter_mut()
+            .find(|watched| watched.lane == lane && has_rule(watched, alarm.rule, alarm.severity));
         let Some(BatchThreshold { history, .. }) = found else { return };
         match change.change {
             Change::Raised if history.raises.len() < MAX_KEPT => {
@@ -92,20 +94,20 @@ impl VariantBatch {
     }
 }
 
-fn is_of(watched: &BatchThreshold, rule: Rule, severity: Severity) -> bool {
+fn has_rule(watched: &BatchThreshold, rule: Rule, severity: Severity) -> bool {
     (watched.config.rule, watched.config.severity) == (rule, severity)
 }
 
 /// The lanes' engines in one replay.
 #[derive(Debug)]
 pub(super) struct LaneEngines {
-    /// Each with the rules it watches, a bit per wire number.
+    /// Each engine with the rules it watches, one bit per wire number.
     engines: Vec<(AlarmEngine, u32)>,
     changes: Vec<AlarmChange>,
 }
 
 impl LaneEngines {
-    /// Applies the monitor's alarm inputs to all lanes, and records the changes of their alarms.
+    /// Applies the monitor's alarm inputs to all lanes, and records the alarm changes.
     pub(super) fn take(&mut self, inputs: &[(Timestamp, AlarmInput)], batch: &mut VariantBatch) {
         for (time, input) in inputs {
             for (lane, (engine, watches)) in self.engines.iter_mut().enumerate() {
@@ -149,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn a_grid_of_two_rules_needs_as_many_lanes_as_the_longer_list() {
+    fn grid_needs_as_many_lanes_as_the_longer_list() {
         let mut batch = VariantBatch::default();
         for capacity in [1.5, 1.6, 1.7] {
             for soc in [0.1, 0.2] {

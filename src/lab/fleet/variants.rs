@@ -1,13 +1,12 @@
 //! `--set KEY=V1,V2`: other values in a configuration, and the grid of all their combinations.
 //!
-//! Input: the configuration's text and choices. Output: one checked configuration per combination, the one as written first, and
-//! which of them can share a replay: those that differ in `[[alarm]]` tables only (except those of
-//! `input_missing`: its time-outs act before the alarms). A combination that is no valid configuration is left out
-//! and reported.
+//! Input: the text of a configuration, and choices. Output: one checked configuration per combination, the original first, and
+//! which of them can share a replay: those that differ only in `[[alarm]]` tables (except tables of `input_missing`, whose
+//! time-outs act before the alarms). A combination that is not a valid configuration is left out and reported.
 //!
-//! Keys: `RULE.info`, `.warning`, `.severe` (each also with `.set` or `.clear`), `RULE.threshold` for the gravest severity
-//! that the file has, `RULE.probability` for `when = { probability = ... }`, any other key of the rule's `[[alarm]]` tables;
-//! or any dotted key, with `[n]` from 1 for tables written several times.
+//! Keys: `RULE.info`, `.warning`, `.severe` (each also with `.set` or `.clear`), `RULE.threshold` for the most severe level in the
+//! file, `RULE.probability` for `when = { probability = ... }`, and any other key of the rule's `[[alarm]]` tables;
+//! or any dotted key, with `[n]` from 1 for tables that occur several times.
 
 mod target;
 
@@ -48,7 +47,7 @@ impl std::str::FromStr for Choice {
     }
 }
 
-/// At the commas outside of quotes and brackets.
+/// Splits at the commas outside quotes and brackets.
 fn split(text: &str) -> Vec<&str> {
     let (mut parts, mut from, mut depth, mut quote) = (Vec::new(), 0, 0_i32, None);
     for (at, letter) in text.char_indices() {
@@ -68,7 +67,7 @@ fn split(text: &str) -> Vec<&str> {
     parts
 }
 
-/// Parses a value as TOML; anything else is a text (`80 %`, `mean`).
+/// Parses a value as TOML; other text becomes a string (`80 %`, `mean`).
 fn value(text: &str) -> Value {
     let parsed = format!("value = {text}").parse::<Table>().ok();
     parsed.and_then(|mut table| table.remove("value")).unwrap_or_else(|| Value::String(text.to_owned()))
@@ -77,7 +76,7 @@ fn value(text: &str) -> Value {
 /// One combination.
 #[derive(Debug, Clone)]
 pub struct Variant {
-    /// Values set, as written, in the order of the choices; empty = the configuration as it is.
+    /// Values set, as written, in the order of the choices; empty = the original configuration.
     pub values: Vec<String>,
     /// The configuration with these values.
     pub config: Config,
@@ -90,13 +89,13 @@ pub struct Variant {
 pub struct VariantGrid {
     /// The keys, as written.
     pub keys: Vec<String>,
-    /// The configuration as it is, then every combination.
+    /// The original configuration, then every combination.
     pub variants: Vec<Variant>,
-    /// Replays needed per log.
+    /// Number of replays per log.
     pub replays: usize,
-    /// Rules that were named.
+    /// Rules named by the choices.
     pub rules: Vec<Rule>,
-    /// Whether something else was set, too.
+    /// Whether other keys were set.
     pub other_keys: bool,
     /// Notes for the user.
     pub notes: Vec<String>,
@@ -105,7 +104,7 @@ pub struct VariantGrid {
 /// Builds the grid.
 ///
 /// # Errors
-/// When the configuration is faulty, a key names nothing, there are too many combinations, or none of them is valid.
+/// The configuration is faulty, a key is unknown, there are too many combinations, or none of them is valid.
 pub fn grid(path: &Path, choices: &[Choice]) -> Result<VariantGrid, Vec<String>> {
     let plain = config::load(path).map_err(|faults| faults.0)?;
     let root = read(path)?;
@@ -135,7 +134,7 @@ pub fn grid(path: &Path, choices: &[Choice]) -> Result<VariantGrid, Vec<String>>
                 if first_refused.is_empty() {
                     let set: Vec<_> =
                         grid.keys.iter().zip(&combination).map(|(k, (v, _))| format!("{k}={v}")).collect();
-                    // Most faults quoted of one combination.
+                    // At most three faults of one combination are quoted.
                     first_refused = faults.iter().take(3).map(|f| format!("{}: {f}", set.join(" "))).collect();
                 }
             }
@@ -147,12 +146,12 @@ pub fn grid(path: &Path, choices: &[Choice]) -> Result<VariantGrid, Vec<String>>
     }
     if refused > 0 {
         let first = first_refused.join("; ");
-        grid.notes.push(format!("{refused} combinations are no valid configuration and are left out: {first}"));
+        grid.notes.push(format!("{refused} combinations are not valid configurations and are left out: {first}"));
     }
     Ok(grid)
 }
 
-/// Returns the combination's configuration, and the key of its replay.
+/// Returns the configuration of a combination, and the key of its replay.
 fn variant(
     path: &Path,
     root: &Table,
@@ -177,23 +176,23 @@ fn variant(
     Ok((config, replay_key(&root)))
 }
 
-/// The tables of the configuration and its drop-ins.
+/// The merged tables of the configuration and its drop-ins.
 fn read(path: &Path) -> Result<Table, Vec<String>> {
     let text = config::merged(path).map_err(|faults| faults.0)?;
     text.parse::<Table>().map_err(|error| vec![format!("{}: {}", path.display(), error.message())])
 }
 
-/// Returns everything in a configuration that estimates and the values of rules can depend on.
+/// Returns everything in a configuration that can affect estimates and the values of rules.
 fn replay_key(root: &Table) -> String {
     let mut root = root.clone();
     if let Some(Value::Array(alarms)) = root.get_mut("alarm") {
         alarms.retain(|alarm| rule_of(alarm) == Some(Rule::InputMissing.name()));
     }
-    // A table that was parsed can be written; if it could not, no replay would be shared.
+    // A parsed table can always be written; if it could not, no replay would be shared.
     toml::to_string(&root).unwrap_or_else(|error| format!("{error} {root:?}"))
 }
 
-/// Every combination, the last choice changing fastest; none without choices.
+/// Every combination, the last choice changing fastest; empty without choices.
 fn combinations(choices: &[Choice]) -> Result<Vec<Vec<&(String, Value)>>, String> {
     if choices.is_empty() {
         return Ok(Vec::new());

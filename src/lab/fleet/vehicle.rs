@@ -1,4 +1,4 @@
-//! A vehicle of a fleet: its line of the manifest, and the `vehicle.json` in its folder.
+//! A vehicle of a fleet: its line in the manifest, and the `vehicle.json` in its folder.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -14,13 +14,13 @@ pub(super) const RECORD: &str = "vehicle.json";
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Vehicle {
-    /// Its name, which is that of its folder and in the first column of its tables.
+    /// Name of the vehicle, of its folder, and in the first column of its tables.
     pub vehicle: String,
     /// Size of its logs.
     pub bytes: u64,
-    /// Its logs, one recording after the other.
+    /// Its logs, in the order of recording.
     pub logs: Vec<PathBuf>,
-    /// Its configuration; `None` = that of the others.
+    /// Its configuration; `None` = the common one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub config: Option<PathBuf>,
 }
@@ -28,39 +28,39 @@ pub struct Vehicle {
 /// Result of replaying a vehicle: the content of its `vehicle.json`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct VehicleRecord {
-    /// Version of this form.
+    /// Version of the format.
     pub version: u32,
     /// Version of the program.
     pub packwatch: String,
     /// The line of the manifest.
     pub line: Vehicle,
-    /// SHA-256 of all settings: the configuration with its DBC and cell model, and the options of reading; `None` = it cannot be read.
+    /// SHA-256 of all settings (configuration with DBC and cell model, reading options); `None` = the configuration cannot be read.
     pub settings_sha256: Option<String>,
     /// Period of the estimates, s; `None` = no table of estimates.
     pub period_s: Option<f64>,
-    /// Why there are no tables; `None` = there are.
+    /// Why there are no tables; `None` = there are tables.
     pub error: Option<String>,
     /// Rows of each table.
     pub rows: BTreeMap<String, u64>,
-    /// Cells of the pack.
+    /// Number of cells of the pack.
     pub cells: u32,
     /// Rated capacity of a cell, Ah; `None` = the configuration cannot be read.
     pub rated_ah: Option<f64>,
-    /// From the first stamp to the last, days.
+    /// Time from the first stamp to the last, days.
     pub days: f64,
     /// Notes on its logs.
     pub notes: Vec<String>,
 }
 
 impl VehicleRecord {
-    /// Reads it from a vehicle's folder; `None` = the vehicle is not complete.
+    /// Reads the record from a vehicle's folder; `None` = the vehicle is incomplete.
     pub fn read(folder: &Path) -> Option<Self> {
         let text = std::fs::read(folder.join(RECORD)).ok()?;
         serde_json::from_slice(&text).ok().filter(|record: &Self| record.version == VERSION)
     }
 
-    /// Whether `other` would give the same tables.
-    pub(super) fn is_of_same(&self, other: &Self) -> bool {
+    /// Whether the inputs of `other` give the same tables.
+    pub(super) fn has_inputs_of(&self, other: &Self) -> bool {
         let key = |record: &Self| {
             let Self { packwatch, line, settings_sha256, period_s, .. } = record;
             (packwatch.clone(), line.clone(), settings_sha256.clone(), *period_s)

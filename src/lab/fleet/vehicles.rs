@@ -1,14 +1,14 @@
-//! A fleet in parts: the manifest of its vehicles, the vehicles of one part, and their tables.
+//! Replays a fleet in parts: the manifest of its vehicles, the vehicles of one part, and their tables.
 //!
 //! | | in | out |
 //! | --- | --- | --- |
-//! | [`plan`] | logs, and folders of the logs of one vehicle | a vehicle for each, by name |
-//! | [`Shard::choose`] | the vehicles | those of one part; parts of like size, and the same on every machine |
+//! | [`plan`] | logs, and folders that each hold the logs of one vehicle | the vehicles by name |
+//! | [`Shard::choose`] | the vehicles | the vehicles of one part; parts have similar size and are the same on every machine |
 //! | [`run`] | vehicles | a folder for each: tables as [`export`](super::export) writes them, and `vehicle.json` |
 //!
-//! `vehicle.json` is written last: a vehicle that has it, for the same line of the manifest, settings and program, is complete and is
-//! not replayed again. A vehicle that fails has one with the reason, and the others continue. The folder of a vehicle is locked while it is
-//! replayed: a second process waits, and finds it complete.
+//! `vehicle.json` is written last. If it exists for the same manifest line, settings and program, the vehicle is complete and is not
+//! replayed again. For a vehicle that fails, it contains the reason, and the others continue. The folder of a vehicle is locked during
+//! its replay: a second process waits and then finds it complete.
 
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
@@ -23,16 +23,16 @@ use super::vehicle::{RECORD, VERSION, Vehicle, VehicleRecord};
 use crate::config::Config;
 use crate::error::LabError;
 
-/// The file that is locked while a vehicle is replayed.
+/// File that is locked while a vehicle is replayed.
 const LOCK: &str = ".lock";
 /// Most parts of a fleet.
 const MAX_SHARDS: usize = 100_000;
 
-/// Lists the vehicles of `paths` by name: a log is a vehicle, and so is a folder with logs, which are read in the order of their names. Paths
-/// are made absolute: the vehicles may be replayed from other folders.
+/// Lists the vehicles of `paths` by name. A log is a vehicle, and so is a folder with logs, which are read in the order of their names.
+/// Paths are made absolute, because the vehicles may be replayed from other folders.
 ///
 /// # Errors
-/// A path cannot be read, or a folder has no log.
+/// A path cannot be read, or a folder contains no log.
 pub fn plan(paths: &[PathBuf]) -> Result<Vec<Vehicle>, LabError> {
     let names = export::names(paths);
     let vehicle = |(path, vehicle): (&PathBuf, String)| {
@@ -50,7 +50,7 @@ pub fn plan(paths: &[PathBuf]) -> Result<Vec<Vehicle>, LabError> {
     Ok(vehicles)
 }
 
-/// The logs in a folder by name.
+/// Logs in a folder, by name.
 fn logs_in(folder: &Path) -> Result<Vec<PathBuf>, LabError> {
     let failed = |error: std::io::Error| LabError::File(format!("{}: cannot be read: {error}", folder.display()));
     let mut logs = Vec::new();
@@ -63,17 +63,17 @@ fn logs_in(folder: &Path) -> Result<Vec<PathBuf>, LabError> {
     logs.sort();
     if logs.is_empty() {
         return Err(LabError::Data(format!(
-            "{}: no log in this folder, must have .log, .journal or .csv files",
+            "{}: contains no log, must have .log, .journal or .csv files",
             folder.display()
         )));
     }
     Ok(logs)
 }
 
-/// Whether a file is a log by its name, also a compressed one. Truth and cycle tables beside logs are none.
+/// Whether a file, compressed or not, is a log by its name. Truth and cycle tables are not logs.
 fn is_log(name: &OsStr) -> bool {
     let name = name.to_string_lossy();
-    let name = [".gz", ".zst"].iter().find_map(|ending| name.strip_suffix(ending)).unwrap_or(&name);
+    let name = crate::without_compression(&name);
     let is_table = name.ends_with(".truth.csv") || name.ends_with("_cycles.csv");
     !name.starts_with('.') && !is_table && [".log", ".journal", ".csv"].iter().any(|ending| name.ends_with(ending))
 }
@@ -81,7 +81,7 @@ fn is_log(name: &OsStr) -> bool {
 /// The manifest: a JSON document on each line.
 ///
 /// # Errors
-/// A path is no UTF-8.
+/// A path is not valid UTF-8.
 pub fn manifest(vehicles: &[Vehicle]) -> Result<String, LabError> {
     let line = |vehicle: &Vehicle| match serde_json::to_string(vehicle) {
         Ok(line) => Ok(line + "\n"),
@@ -93,7 +93,7 @@ pub fn manifest(vehicles: &[Vehicle]) -> Result<String, LabError> {
 /// Reads a manifest.
 ///
 /// # Errors
-/// The file cannot be read, a line is no vehicle, or two have one name: with the line.
+/// The file cannot be read, a line is not a vehicle, or two lines have the same name; the error names the line.
 pub fn read_manifest(path: &Path) -> Result<Vec<Vehicle>, LabError> {
     let shown = path.display();
     let text = std::fs::read_to_string(path)
@@ -102,32 +102,32 @@ pub fn read_manifest(path: &Path) -> Result<Vec<Vehicle>, LabError> {
     let mut vehicles = Vec::new();
     for (number, line) in (1..).zip(text.lines()).filter(|(_, line)| !line.trim().is_empty()) {
         let vehicle: Vehicle = serde_json::from_str(line)
-            .map_err(|error| LabError::Data(format!("{shown}:{number}: no vehicle: {error}")))?;
+            .map_err(|error| LabError::Data(format!("{shown}:{number}: not a vehicle: {error}")))?;
         let Vehicle { vehicle: name, logs, .. } = &vehicle;
         if name.is_empty() || export::clean(name) != *name {
             let allowed = "must be letters, digits, '.', '_' and '-', not '.' first";
-            return Err(LabError::Data(format!("{shown}:{number}: vehicle \"{name}\", {allowed}")));
+            return Err(LabError::Data(format!("{shown}:{number}: vehicle name \"{name}\", {allowed}")));
         }
         if logs.is_empty() {
             return Err(LabError::Data(format!("{shown}:{number}: vehicle {name} has no logs")));
         }
         if let Some(first) = lines.insert(name.clone(), number) {
-            return Err(LabError::Data(format!("{shown}:{number}: vehicle {name} is in line {first} already")));
+            return Err(LabError::Data(format!("{shown}:{number}: vehicle {name} is already in line {first}")));
         }
         vehicles.push(vehicle);
     }
     if vehicles.is_empty() {
-        return Err(LabError::Data(format!("{shown}: no vehicle")));
+        return Err(LabError::Data(format!("{shown}: contains no vehicle")));
     }
     Ok(vehicles)
 }
 
-/// One of several parts of a fleet, written `i/n`.
+/// One of several parts of a fleet, written `I/N`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Shard {
-    /// Its number, from 1.
+    /// Number of the part, from 1.
     pub number: usize,
-    /// How many there are.
+    /// Number of parts.
     pub of: usize,
 }
 
@@ -144,14 +144,14 @@ impl FromStr for Shard {
 }
 
 impl Shard {
-    /// The vehicles of this part: each goes, the largest first, to the part with the fewest bytes so far.
+    /// Returns the vehicles of this part: the largest vehicle first, each goes to the part with the fewest bytes so far.
     pub fn choose<'v>(&self, vehicles: &'v [Vehicle]) -> Vec<&'v Vehicle> {
         let mut largest: Vec<&Vehicle> = vehicles.iter().collect();
         largest.sort_by(|a, b| b.bytes.cmp(&a.bytes).then_with(|| a.vehicle.cmp(&b.vehicle)));
         let mut sizes = vec![0_u64; self.of];
         largest.retain(|vehicle| {
             let smallest = (0..self.of).min_by_key(|part| sizes[*part]).unwrap_or(0);
-            // An empty log takes some time too.
+            // Even an empty log takes some time.
             sizes[smallest] = sizes[smallest].saturating_add(vehicle.bytes.max(1));
             smallest + 1 == self.number
         });
@@ -159,22 +159,22 @@ impl Shard {
     }
 }
 
-/// How a vehicle came out.
+/// Result of a vehicle's replay.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Outcome {
-    /// It was replayed now.
+    /// Replayed in this run.
     Replayed(VehicleRecord),
-    /// It was complete before.
+    /// Completed in an earlier run.
     Complete(VehicleRecord),
-    /// It has no tables: the reason is in the record.
+    /// Failed without tables; the record contains the reason.
     Failed(VehicleRecord),
 }
 
-/// Replays the vehicles; returns how each came out, in their order. `config_of` reads the configuration of a vehicle, `report` receives the
-/// bytes read since its last call, or those of a vehicle that is complete.
+/// Replays the vehicles; returns the outcomes in the same order. `config_of` reads the configuration of a vehicle. `report` receives
+/// the bytes read since its last call; for a complete vehicle, the bytes of its logs.
 ///
 /// # Errors
-/// When no threads can be started, or a record cannot be written.
+/// No threads can be started, or a record cannot be written.
 pub fn run(
     vehicles: &[&Vehicle],
     config_of: &(dyn Fn(&Vehicle) -> Result<Config, LabError> + Sync),
@@ -213,25 +213,28 @@ fn replay(
     std::fs::create_dir_all(&folder).map_err(|error| named(&folder, &error))?;
     let lock = std::fs::File::create(folder.join(LOCK)).and_then(|file| file.lock().map(|()| file));
     let _lock = lock.map_err(|error| named(&folder.join(LOCK), &error))?;
-    let earlier = VehicleRecord::read(&folder).filter(|earlier| earlier.is_of_same(&record) && earlier.error.is_none());
+    let earlier =
+        VehicleRecord::read(&folder).filter(|earlier| earlier.has_inputs_of(&record) && earlier.error.is_none());
     if let Some(earlier) = earlier {
         report(vehicle.bytes);
         return Ok(Outcome::Complete(earlier));
     }
-    // From here on the folder is not complete.
+    // From here on the folder is incomplete.
     for file in [RECORD, export::ABOUT] {
         match std::fs::remove_file(folder.join(file)) {
             Err(error) if error.kind() != std::io::ErrorKind::NotFound => return Err(named(&folder, &error)),
             _ => {}
         }
     }
-    // A defect of the program in one vehicle does not end the others.
+    // A defect of the program that one vehicle triggers must not end the others.
     let replayed = catch_unwind(AssertUnwindSafe(|| {
         let config = config?;
         export::export(&config, &vehicle.logs, &vehicle.vehicle, settings, report)
     }));
     match replayed.unwrap_or_else(|_| {
-        Err(LabError::Data("the program has a defect here: its message is on standard error".to_owned()))
+        Err(LabError::Data(
+            "packwatch has a bug that this vehicle triggers: see the message on standard error".to_owned(),
+        ))
     }) {
         Ok(exported) => {
             record.rows = exported.rows.iter().map(|(table, rows)| ((*table).to_owned(), *rows)).collect();
@@ -268,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn every_vehicle_is_in_one_part_and_the_parts_are_of_like_size() {
+    fn parts_are_disjoint_and_of_similar_size() {
         let vehicles: Vec<Vehicle> =
             (0..100).map(|n| vehicle(&format!("car{n:02}"), 1000 + 37 * (n * n % 101))).collect();
         for of in [1, 2, 3, 7, 100, 130] {
@@ -280,13 +283,13 @@ mod tests {
             let (least, most) = (sizes.iter().min().unwrap(), sizes.iter().max().unwrap());
             assert!(most - least <= 4700, "no more than the largest vehicle: {sizes:?}");
         }
-        // The order of the manifest is of no importance.
+        // The order of the manifest does not matter.
         let reversed: Vec<Vehicle> = vehicles.iter().rev().cloned().collect();
         assert_eq!(Shard { number: 2, of: 3 }.choose(&vehicles), Shard { number: 2, of: 3 }.choose(&reversed));
     }
 
     #[test]
-    fn a_shard_is_one_of_several() {
+    fn shard_number_must_be_within_its_range() {
         assert_eq!("2/4".parse(), Ok(Shard { number: 2, of: 4 }));
         for text in ["0/4", "5/4", "1", "1/0", "a/b", "1/4/2", "-1/4", "1/9999999999999", ""] {
             assert!(text.parse::<Shard>().is_err(), "{text}");
@@ -294,7 +297,7 @@ mod tests {
     }
 
     #[test]
-    fn a_manifest_reads_back_and_its_faults_name_the_line() {
+    fn manifest_reads_back_and_faults_name_the_line() {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("fleet.jsonl");
         let vehicles = vec![vehicle("a", 1), Vehicle { config: Some("b.toml".into()), ..vehicle("b", 2) }];
@@ -302,12 +305,12 @@ mod tests {
         assert_eq!(read_manifest(&path), Ok(vehicles));
         let line = |name: &str| manifest(&[vehicle(name, 1)]).unwrap();
         for (text, fault) in [
-            (line("a") + "\n" + &line("a"), ":3: vehicle a is in line 1 already"),
-            (line("a/../b"), ":1: vehicle \"a/../b\", must be letters"),
-            (line(".."), ":1: vehicle \"..\", must be letters"),
+            (line("a") + "\n" + &line("a"), ":3: vehicle a is already in line 1"),
+            (line("a/../b"), ":1: vehicle name \"a/../b\", must be letters"),
+            (line(".."), ":1: vehicle name \"..\", must be letters"),
             (line("a").replace("\"a.log\"", ""), ":1: vehicle a has no logs"),
-            (line("a").replace("bytes", "size"), ":1: no vehicle: unknown field `size`"),
-            (String::new(), ": no vehicle"),
+            (line("a").replace("bytes", "size"), ":1: not a vehicle: unknown field `size`"),
+            (String::new(), ": contains no vehicle"),
         ] {
             std::fs::write(&path, &text).unwrap();
             let error = read_manifest(&path).unwrap_err().to_string();
@@ -316,7 +319,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_is_a_vehicle_of_all_its_logs() {
+    fn folder_becomes_one_vehicle_with_all_its_logs() {
         let place = tempfile::tempdir().unwrap();
         let folder = place.path().join("car 1");
         std::fs::create_dir(&folder).unwrap();
@@ -328,7 +331,7 @@ mod tests {
         assert_eq!(vehicles, [Vehicle { vehicle: "car_1".to_owned(), bytes: 10, logs, config: None }]);
         let empty = place.path().join("empty");
         std::fs::create_dir(&empty).unwrap();
-        assert!(plan(&[empty]).unwrap_err().to_string().contains("no log in this folder"));
+        assert!(plan(&[empty]).unwrap_err().to_string().contains("contains no log"));
         assert!(plan(&["missing.log".into()]).unwrap_err().to_string().contains("missing.log: "));
     }
 }

@@ -1,8 +1,8 @@
 //! The alarms of every combination of settings, log by log.
 //!
-//! Input: a [`VariantGrid`], logs, their truths. Output: per log its life and per combination and threshold a [`AlarmScore`]. One replay
-//! per log serves all combinations that differ in alarms only ([`VariantBatch`]); the life (charge moved, learned capacity) is
-//! that of the configuration as it is.
+//! Input: a [`VariantGrid`], logs, and their truths. Output: for each log its life, and an [`AlarmScore`] per combination and threshold.
+//! Combinations that differ only in alarms share one replay per log ([`VariantBatch`]). The life (charge moved, learned capacity) is
+//! that of the original configuration.
 
 use std::path::PathBuf;
 
@@ -25,7 +25,7 @@ use crate::monitor::{Monitor, Outputs};
 pub struct WhatifJob {
     /// The log.
     pub log: PathBuf,
-    /// CSV of its true capacities.
+    /// CSV file of its true capacities.
     pub truth: Option<PathBuf>,
 }
 
@@ -36,7 +36,7 @@ pub struct WhatifSettings<'a> {
     pub access: LogAccess<'a>,
     /// Capacity below which a cell's life is over, Ah.
     pub end_of_life_ah: f64,
-    /// Whether the usable capacity is compared with it, where one is configured.
+    /// Whether the limit applies to the usable capacity, if that is configured.
     pub judges_usable: bool,
     /// Longest time from a true raise to the end of life.
     pub horizon: Option<Horizon>,
@@ -44,20 +44,20 @@ pub struct WhatifSettings<'a> {
     pub jobs: Option<usize>,
 }
 
-/// The end of a life.
+/// End of a life.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct EndOfLife {
     /// Stamp of the log, s.
     pub time_s: f64,
-    /// Days after the log's first stamp.
+    /// Days since the log's first stamp.
     pub days: f64,
     /// Equivalent full cycles so far.
     pub cycles: f64,
-    /// The cell that reached it, counted from 0.
+    /// The cell that reached the end, counted from 0.
     pub cell: u16,
 }
 
-/// One threshold under one combination.
+/// Alarms of one threshold in one combination.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ThresholdScore {
     /// Index of the combination.
@@ -73,7 +73,7 @@ pub struct ThresholdScore {
     pub judged: AlarmScore,
 }
 
-/// One log.
+/// Result of one log.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct LogResult {
     /// The log.
@@ -82,15 +82,15 @@ pub struct LogResult {
     pub truth: Option<PathBuf>,
     /// Source of the end of life.
     pub judged_by: EndOfLifeSource,
-    /// From the first stamp to the last, days.
+    /// Time from the first stamp to the last, days.
     pub days: f64,
     /// Equivalent full cycles.
     pub cycles: f64,
-    /// The weakest learned capacity at the end, Ah.
+    /// Weakest learned capacity at the end, Ah.
     pub learned_ah: Option<f64>,
     /// `None` = not reached.
     pub end_of_life: Option<EndOfLife>,
-    /// Every threshold under every combination.
+    /// Scores of every threshold in every combination.
     pub alarms: Vec<ThresholdScore>,
     /// Notes for the user.
     pub notes: Vec<String>,
@@ -101,35 +101,35 @@ struct ReplayResult {
     driven: DriveSummary,
     track: Track,
     batch: VariantBatch,
-    /// Of the log's first replay only.
+    /// Only read for the log's first replay.
     truth: Option<Truth>,
 }
 
-/// Replays all logs; returns per log its result or error. `report` receives the bytes read since its last call.
+/// Replays all logs; returns the result or error of each log. `report` receives the bytes read since its last call.
 ///
 /// # Errors
-/// When no threads can be started.
+/// No threads can be started.
 pub fn run(
     grid: &VariantGrid,
     jobs: &[WhatifJob],
     settings: &WhatifSettings<'_>,
     report: &(dyn Fn(u64) + Sync),
 ) -> Result<Vec<Result<LogResult, LabError>>, LabError> {
-    // The replays of one log are independent too: a fleet of one log still uses all cores.
+    // The replays of one log are independent too, so even a single log uses all cores.
     let tasks: Vec<(usize, usize)> = (0..jobs.len()).flat_map(|job| (0..grid.replays).map(move |r| (job, r))).collect();
     let replays = super::in_parallel(&tasks, settings.jobs, |_, &(job, number)| {
         replay(grid, number, &jobs[job], settings, report)
     })?;
     let mut replays = replays.into_iter();
     let of_job = |job: &WhatifJob| {
-        // Takes all of them, also after one that failed: the next job's results follow them.
+        // Takes all of them, even after a failed one, because the results of the next job follow.
         let own: Vec<Result<ReplayResult, LabError>> = replays.by_ref().take(grid.replays).collect();
         judge_log(grid, job, own.into_iter().collect::<Result<_, _>>()?, settings)
     };
     Ok(jobs.iter().map(of_job).collect())
 }
 
-/// Returns the thresholds of replay `number`, and per combination the numbers of its thresholds among them.
+/// Returns the thresholds of replay `number`, and for each combination the numbers of its thresholds.
 fn watch(grid: &VariantGrid, number: usize) -> (VariantBatch, Vec<(usize, Vec<usize>)>) {
     let mut batch = VariantBatch::default();
     let own = grid.variants.iter().enumerate().filter(|(_, variant)| variant.replay == number);
@@ -150,7 +150,7 @@ fn replay(
 ) -> Result<ReplayResult, LabError> {
     let variant = grid.variants.iter().find(|variant| variant.replay == number);
     let config: &Config = &variant.ok_or("a replay without a setting")?.config;
-    // Before the replay, which may take hours: a table that cannot be read is reported at once.
+    // Read before the replay, which may take hours, so that an unreadable table is reported immediately.
     let truth = job.truth.as_deref().filter(|_| number == 0).map(Truth::read).transpose()?;
     let monitor = &config.monitor;
     let (mut batch, _) = watch(grid, number);
@@ -189,7 +189,7 @@ fn judge_log(
     let (judged_by, end) = end_of_life(&plain.track, truth, settings.end_of_life_ah);
     let mut notes = plain.driven.notes.clone();
     if end.is_some_and(|(time, _)| time <= span.0) {
-        notes.push("the end of life came before the log began: alarms are not judged by it".to_owned());
+        notes.push("the end of life came before the log started: alarms are not judged by it".to_owned());
     }
     let end = end.filter(|(time, _)| *time <= span.1);
     let mut alarms = Vec::new();

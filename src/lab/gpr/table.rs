@@ -286,20 +286,12 @@ pub(super) fn derived(column: &str, word: &str) -> String {
 /// Formats a column's name and unit: `voltage, V`.
 pub(super) fn label(column: &str) -> String {
     let Some((stem, unit)) = split(column) else { return column.replace('_', " ") };
+    let symbols = ["A", "V", "W", "K", "F", "N", "Ah", "mAh", "mV", "mA", "Wh", "kWh", "kW", "Hz"];
     let unit = match unit {
-        "a" | "v" | "w" | "c" | "k" | "f" | "n" => unit.to_uppercase(),
-        "ah" => "Ah".to_owned(),
-        "mah" => "mAh".to_owned(),
-        "mv" => "mV".to_owned(),
-        "ma" => "mA".to_owned(),
-        "wh" => "Wh".to_owned(),
-        "kwh" => "kWh".to_owned(),
-        "kw" => "kW".to_owned(),
-        "hz" => "Hz".to_owned(),
-        "percent" | "pct" => "%".to_owned(),
-        other => other.to_owned(),
+        "c" => "degrees C",
+        "percent" | "pct" => "%",
+        other => symbols.into_iter().find(|symbol| symbol.to_lowercase() == other).unwrap_or(other),
     };
-    let unit = if unit == "C" { "degrees C".to_owned() } else { unit };
     format!("{}, {unit}", stem.replace('_', " "))
 }
 

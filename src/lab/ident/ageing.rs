@@ -1,28 +1,28 @@
-//! Determines the SOC of the first cycles of an ageing cell: full charges and discharges one after the other, no counter.
+//! Determines the SOC of the first cycles of an ageing cell: full charges alternating with full discharges, without a counter.
 //!
-//! Anchors: SOC 1 at the end of every full charge (the state this charger leaves), and the knee of each discharge (where the voltage
-//! falls fastest comes with so little charge left that the knee is a mark on the SOC axis) at one common SOC. That takes the fade
-//! from cycle to cycle and the charger's own gain error out of the curves. Charge left below the cut-off under load is
-//! assumed to be [`SOC_LEFT`]. Half-cycles before the first discharge have no known beginning and are left out.
+//! Anchors: SOC 1 at the end of every full charge (the state in which this charger leaves the cell), and one common SOC at the knee of
+//! each discharge. At the knee the voltage falls fastest and little charge is left, so the knee marks a point on the SOC axis. The
+//! anchors keep the fade from cycle to cycle and the charger's gain error out of the curves. The charge left below the cut-off under
+//! load is assumed to be [`SOC_LEFT`]. Half-cycles before the first discharge start at an unknown SOC and are left out.
 
 use super::{MeasuredPart, charge_ah};
 use crate::filter::median;
 
 /// SOC left at the cut-off under load when new.
 pub(crate) const SOC_LEFT: f64 = 0.045;
-/// The knee, as a share of the way from the lowest to the highest voltage: 3.0 V for 2.7 to 4.2 V.
+/// Voltage of the knee, as a share of the range from the lowest to the highest voltage: 3.0 V for 2.7 to 4.2 V.
 const KNEE_SHARE: f64 = 0.2;
 /// Current that counts as discharge, as a share of the discharge's median.
 const LOADED_SHARE: f64 = 0.5;
-/// Step of current between rows from which voltage and current were not taken at one instant, A per Ah.
+/// Change of current between two rows above which voltage and current may not belong to the same instant, A per Ah.
 const STEP_PER_AH: f64 = 0.25;
-/// Recovery with the load off after the cut-off is slower than any branch here: not judged below this SOC.
+/// SOC below which rows after the cut-off, with the load off, are not judged: the voltage recovers more slowly than any branch here.
 const RECOVERY_SOC: f64 = 0.5;
 
 /// A half-cycle with its SOC.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AnchoredHalfCycle {
-    /// Index of the half-cycle.
+    /// Corrected for load pulses of the charger, A.
     pub index: usize,
     /// Current without a charger's load pulses, A.
     pub current_a: Vec<f64>,
@@ -32,19 +32,19 @@ pub struct AnchoredHalfCycle {
     pub judged: Vec<bool>,
 }
 
-/// A charge that puts in this much of what was missing has filled the cell; any other is left out.
+/// Charge that a full charge puts in, as a share of the missing charge; other charges are left out.
 const FULL_CHARGE: std::ops::RangeInclusive<f64> = 0.8..=1.25;
 
-/// Marks of one discharge, Ah from its beginning.
+/// Points of one discharge, Ah from its start.
 struct Marks {
     knee_ah: f64,
     cut_off_ah: f64,
 }
 
-/// Capacity (Ah, mean of the discharges) and every half-cycle from the first discharge on, with SOC.
+/// Capacity (Ah, mean of the discharges) and every half-cycle from the first discharge on, with its SOC.
 ///
 /// # Errors
-/// No discharge, or one without a knee.
+/// There is no discharge, or a discharge has no knee.
 pub fn anchor(cycles: &[MeasuredPart], voltage_v: (f64, f64)) -> Result<(f64, Vec<AnchoredHalfCycle>), String> {
     let first = cycles.iter().position(MeasuredPart::is_discharge).ok_or("no discharge among the first cycles")?;
     let knee_v = voltage_v.0 + KNEE_SHARE * (voltage_v.1 - voltage_v.0);
@@ -53,7 +53,10 @@ pub fn anchor(cycles: &[MeasuredPart], voltage_v: (f64, f64)) -> Result<(f64, Ve
         .enumerate()
         .map(|(n, cycle)| {
             marks(cycle, knee_v, voltage_v.0).ok_or_else(|| {
-                format!("discharge number {} does not fall to {knee_v:.2} V under load: its end is no anchor", n + 1)
+                format!(
+                    "discharge number {} does not fall to {knee_v:.2} V under load: its end cannot serve as an anchor",
+                    n + 1
+                )
             })
         })
         .collect::<Result<_, _>>()?;
@@ -74,7 +77,7 @@ pub fn anchor(cycles: &[MeasuredPart], voltage_v: (f64, f64)) -> Result<(f64, Ve
             out_ah.iter().map(|ah| 1.0 - ah * per_ah).collect()
         } else {
             let all_ah = out_ah[out_ah.len() - 1];
-            // An aborted charge, or two samples of one: its end is no full cell.
+            // An aborted charge, or one of only two samples, does not fill the cell.
             if !FULL_CHARGE.contains(&(-all_ah / ((1.0 - left) * capacity_ah))) {
                 continue;
             }
@@ -101,7 +104,7 @@ fn marks(cycle: &MeasuredPart, knee_v: f64, cut_off_v: f64) -> Option<Marks> {
     Some(Marks { knee_ah: crossing(knee_v)?, cut_off_ah: crossing(cut_off_v).unwrap_or(last_ah) })
 }
 
-/// Chargers test themselves with a short load: no charge worth counting, and no trapezoid over seconds.
+/// Ignores the short loads with which chargers test themselves: they move almost no charge, and the rows are seconds apart.
 fn without_load_pulses(cycle: &MeasuredPart, capacity_ah: f64) -> Vec<f64> {
     let pulse = |i: f64| !cycle.is_discharge() && i > STEP_PER_AH * capacity_ah;
     cycle.current_a.iter().map(|&i| if pulse(i) { 0.0 } else { i }).collect()
@@ -127,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn knees_lie_at_one_soc_and_a_charge_ends_full_whatever_its_charger_counts() {
+    fn knees_share_one_soc_and_charges_end_full() {
         let time_s: Vec<f64> = (0..=100).map(|k| 36.0 * f64::from(k)).collect();
         let fall = |k: f64| if k < 90.0 { 4.2 - 0.01 * k } else { 3.3 - 0.06 * (k - 90.0) };
         let voltage_v: Vec<f64> = (0..=100).map(|k| fall(f64::from(k))).collect();
@@ -142,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn an_aborted_charge_is_left_out_and_changes_nothing() {
+    fn aborted_charge_is_left_out() {
         let time_s: Vec<f64> = (0..=100).map(|k| 36.0 * f64::from(k)).collect();
         let voltage_v: Vec<f64> = (0..=100).map(|k| 4.2 - 0.016 * f64::from(k)).collect();
         let half = |kind, current_a| half_cycle(kind, &time_s, &[current_a; 101], &voltage_v);
@@ -158,9 +161,9 @@ mod tests {
     }
 
     #[test]
-    fn a_discharge_without_a_knee_is_refused() {
+    fn discharge_without_knee_is_rejected() {
         let cycle = half_cycle("discharge", &[0.0, 100.0, 200.0], &[2.0; 3], &[4.0, 3.9, 3.8]);
         let error = anchor(&[cycle], (2.7, 4.2)).expect_err("no knee");
-        assert_eq!(error, "discharge number 1 does not fall to 3.00 V under load: its end is no anchor");
+        assert_eq!(error, "discharge number 1 does not fall to 3.00 V under load: its end cannot serve as an anchor");
     }
 }

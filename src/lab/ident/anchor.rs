@@ -1,28 +1,28 @@
-//! Determines the SOC of every raw row by explicit rules; rejects a file whose beginning is unknown.
+//! Determines the SOC of every raw row by explicit rules; rejects a file that starts at an unknown SOC.
 //!
-//! 1. A stretch must begin with a full cell: its first voltage is within [`REST_SAG_V`] of the highest, or within
-//!    [`LOAD_SAG_V`] of it when current flows already.
-//! 2. With the cycler's counter, SOC = 1 - counter / capacity when the counter begins within [`COUNTER_NEAR`] of 0: the
-//!    small value was really taken out. A counter that begins lower was reset before the charge: differences count.
-//!    A counter that begins higher was reset at full, so the cell is no longer full: rejected.
-//! 3. Without a counter the current is integrated from 1.
+//! 1. A part must start with a full cell: its first voltage is within [`REST_SAG_V`] of the highest, or within
+//!    [`LOAD_SAG_V`] of it if current already flows.
+//! 2. With the cycler's counter, SOC = 1 - counter / capacity if the counter starts within [`COUNTER_NEAR`] of 0: that
+//!    small charge was really taken out. A counter that starts lower was reset before the charge: only differences count.
+//!    A counter that starts higher was reset at full, so the cell is no longer full: the part is rejected.
+//! 3. Without a counter, the current is integrated from SOC 1.
 
 use super::{MeasuredPart, charge_ah};
 
-/// A resting full cell is at most this far below the highest voltage, V: relaxation, cold charge that ended early.
+/// Largest voltage of a resting full cell below the highest, V: it relaxes, and a cold charge ends early.
 const REST_SAG_V: f64 = 0.1;
-/// A full cell under load, V.
+/// The same for a full cell under load, V.
 const LOAD_SAG_V: f64 = 0.35;
 /// Current from which a cell is under load, as a share of its capacity per hour.
 const LOAD_SHARE: f64 = 0.02;
-/// A counter that begins within this share of the capacity counts from the full cell.
+/// A counter that starts within this share of the capacity counts from the full cell.
 const COUNTER_NEAR: f64 = 0.003;
 
 impl MeasuredPart {
-    /// Charge taken out since full at every row, Ah.
+    /// Charge taken out since full, for every row, Ah.
     ///
     /// # Errors
-    /// It does not begin full, or its beginning is unknown.
+    /// The part does not start full, or its first SOC is unknown.
     pub fn taken_out_ah(&self, voltage_max_v: f64, capacity_hint_ah: f64) -> Result<Vec<f64>, String> {
         self.begins_full(voltage_max_v, capacity_hint_ah)?;
         if self.discharged_ah[0].is_nan() {
@@ -37,7 +37,7 @@ impl MeasuredPart {
         }
         let zero_ah = if first_ah >= -near_ah { 0.0 } else { first_ah };
         let mut last = first_ah - zero_ah;
-        // An empty field keeps the counter where it was.
+        // An empty field repeats the last counter value.
         let mut hold = |counter: f64| {
             last = if counter.is_nan() { last } else { counter - zero_ah };
             last
@@ -67,14 +67,14 @@ mod tests {
     }
 
     #[test]
-    fn the_counter_is_used_as_it_stands_near_zero_and_by_differences_elsewhere() {
+    fn counter_near_zero_is_used_as_is_otherwise_differences() {
         assert_eq!(taken_out(4.17, 0.1, [0.002, 0.5]), Ok(vec![0.002, 0.5]));
         assert_eq!(taken_out(4.17, 0.1, [-0.5, 0.5]), Ok(vec![0.0, 1.0]));
         assert_eq!(taken_out(3.95, 2.0, [-1.0, 0.5]), Ok(vec![0.0, 1.5]));
     }
 
     #[test]
-    fn a_counter_that_shows_charge_taken_out_is_refused() {
+    fn counter_with_charge_taken_out_is_rejected() {
         let refused = taken_out(4.15, 0.1, [0.12, 0.5]).expect_err("taken before");
         assert!(
             refused.starts_with("discharged_ah begins at 0.12 Ah, expected 0 or below: charge was taken"),
@@ -83,12 +83,12 @@ mod tests {
     }
 
     #[test]
-    fn without_a_counter_the_current_is_integrated_from_full() {
+    fn current_is_integrated_from_full_without_counter() {
         assert_eq!(taken_out(4.2, 1.5, [f64::NAN; 2]), Ok(vec![0.0, 1.5]));
     }
 
     #[test]
-    fn a_beginning_that_is_not_full_is_refused() {
+    fn part_that_does_not_start_full_is_rejected() {
         let refused = taken_out(3.45, 0.0, [0.0, -2.3]).expect_err("not full");
         assert!(refused.starts_with("begins at 3.45 V, expected a full cell (at least 4.10 V)"), "{refused}");
     }

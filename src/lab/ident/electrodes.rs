@@ -1,17 +1,17 @@
-//! Finds the electrodes of a new cell in its open-circuit curve: materials and lithium contents at empty and at full.
+//! Identifies the electrodes of a new cell from its open-circuit curve: materials, and lithium contents at empty and at full.
 //!
-//! In: OCV, V, over SOC, fraction. Out: the pair of materials that fits best, with its residual, V. Each pair is fitted by
-//! damped Gauss-Newton steps over the four contents, with a weak prior of what commercial cells have: a curve without
-//! stages leaves the size of an electrode open. Lee et al., J. Electrochem. Soc. 167 (2020) 090509, on what can be identified.
+//! Input: OCV, V, over SOC, fraction. Output: the pair of materials that fits best, with its residual, V. For each pair, damped
+//! Gauss-Newton steps fit the four contents. A weak prior holds the contents of commercial cells, because a curve without stages
+//! does not determine the size of an electrode. On identifiability: Lee et al., J. Electrochem. Soc. 167 (2020) 090509.
 
 use nalgebra::{Matrix4, Vector4};
 
 use crate::cell::{Electrodes, NegativeMaterial, PositiveMaterial};
 use crate::filter::levenberg_marquardt::{Damping, minimise};
 
-/// Points of the curve that are compared.
+/// Points at which the curves are compared.
 const POINTS: u32 = 51;
-/// Deviation of a half-cell potential from a cell's own, V: materials of one name differ.
+/// Deviation between a library potential and that of a real cell, V: materials of one name differ.
 const MATERIAL_V: f64 = 0.01;
 /// The same below [`LOW_SOC`], where curves fall steeply.
 const LOW_SOC_V: f64 = 0.03;
@@ -21,13 +21,13 @@ const LOW_SOC: f64 = 0.05;
 const PRIOR: [(f64, f64); 4] = [(0.02, 0.03), (0.88, 0.12), (0.92, 0.10), (0.32, 0.12)];
 /// Bounds of the same contents.
 const BOUNDS: [(f64, f64); 4] = [(0.0005, 0.25), (0.4, 0.999), (0.55, 0.9995), (0.005, 0.6)];
-/// Steps of the fit; it settles within 20.
+/// Steps of the fit; it converges within 20.
 const STEPS: usize = 60;
 const DAMPING: Damping =
     Damping { first: 1e-2, fall: 0.3, fall_after_growth: 0.3, growth: 10.0, least: 1e-9, most: f64::INFINITY };
-/// Residual above which no pair is accepted, V: the library does not have the cell's materials. Curves of published cells
-/// fit within 5 mV by their own materials, by others mostly beyond 10 mV. A pair of others within the limit can age better
-/// than by a shift, or worse: the limit is a compromise.
+/// Largest accepted residual, V; above it the library lacks the cell's materials. Curves of published cells fit their own materials
+/// within 5 mV and other materials mostly beyond 10 mV. A pair of wrong materials within the limit can predict ageing better or worse
+/// than a shifted curve, so the limit is a compromise.
 pub const MAX_RESIDUAL_V: f64 = 0.008;
 
 /// The electrodes found.
@@ -39,7 +39,7 @@ pub struct FittedElectrodes {
     pub residual_v: f64,
 }
 
-/// The pair of materials that fits a curve best; `None` when none fits within [`MAX_RESIDUAL_V`].
+/// Pair of materials that fits the curve best; `None` if none fits within [`MAX_RESIDUAL_V`].
 pub fn identify(ocv_v: impl Fn(f64) -> f64) -> Option<FittedElectrodes> {
     let curve: Vec<(f64, f64)> =
         (0..POINTS).map(|k| f64::from(k) / f64::from(POINTS - 1)).map(|soc| (soc, ocv_v(soc))).collect();
@@ -64,7 +64,7 @@ fn electrodes((positive, negative): (PositiveMaterial, NegativeMaterial), conten
     }
 }
 
-/// The best contents of a pair, and its cost.
+/// Best contents of a pair, with their cost.
 fn fit_pair(curve: &[(f64, f64)], pair: (PositiveMaterial, NegativeMaterial)) -> (Electrodes, f64) {
     let residuals = |x: &Vector4<f64>| {
         let cell = electrodes(pair, x);
@@ -102,7 +102,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_cells_own_materials_and_contents_are_found() {
+    fn known_materials_and_contents_are_identified() {
         for (positive, _) in PositiveMaterial::ALL.into_iter().filter(|(p, _)| *p != PositiveMaterial::Lfp) {
             let cell = Electrodes {
                 positive,
@@ -120,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn a_curve_of_no_known_materials_has_no_electrodes() {
+    fn curve_of_unknown_materials_gives_no_electrodes() {
         assert_eq!(identify(|soc| 2.0 + 2.2 * soc), None);
     }
 }

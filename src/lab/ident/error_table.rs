@@ -1,11 +1,10 @@
 //! Error of the fitted model over SOC and temperature: the standard deviation of its voltage error averaged over [`BLOCK_S`].
 //!
-//! Model error repeats itself within minutes, so blocks of 100 s are what counts. A block weighs by the charge that moved in
-//! it, spread over the nodes around it; a node with little charge follows the mean of its temperature. A fit's own residuals understate
-//! the error on a new drive: the variance grows by 1 + 3 / (files that visit the node, a pulse or slow test counting
-//! as 0.3 of one: it holds little information about a drive); an ageing cell's life is one file however
-//! many cycles it has. A temperature without
-//! data takes the nearest one's, scaled by a power of Arrhenius' factor.
+//! Model error repeats itself within minutes, so it is averaged over blocks of 100 s. A block is weighted by the charge moved in
+//! it and shared among the nodes around it; a node with little charge follows the mean of its temperature. The residuals of a fit
+//! understate the error on a new drive, so the variance is multiplied by 1 + 3 / (files that visit the node). A pulse or slow test
+//! counts as 0.3 of a file, because it says little about a drive; the life of an ageing cell counts as one file, however many
+//! cycles it has. A temperature without data takes the errors of the nearest one with data, scaled by a power of the Arrhenius factor.
 
 use std::collections::BTreeMap;
 
@@ -16,13 +15,13 @@ use super::record::Record;
 
 /// Length of a block, s.
 const BLOCK_S: f64 = 100.0;
-/// Errors are limited to this, V.
+/// Upper limit of the errors, V.
 const MOST_V: f64 = 0.1;
-/// Charge, as SOC, with which the mean of a temperature counts at each of its nodes.
+/// Charge, as SOC, with which the mean of a temperature is added to each of its nodes.
 const LEAN_SOC: f64 = 1.0;
-/// Growth of the variance for data not fitted: 1 + this / files.
+/// Growth of the variance on data outside the fit: 1 + this / files.
 const UNSEEN: f64 = 3.0;
-/// A file visits a node when so much charge moved near it, as SOC.
+/// Charge moved near a node from which a file counts as visiting it, as SOC.
 const VISIT_SOC: f64 = 0.005;
 
 /// Sums per node.
@@ -32,18 +31,18 @@ struct NodeSums {
     files: Vec<f64>,
 }
 
-/// A record and where it comes from.
+/// A record and its source.
 #[derive(Debug, Clone, Copy)]
 pub struct WeightedRecord<'a> {
     /// The rows.
     pub record: &'a Record,
-    /// Number of its file: records of one file describe one cell on one day.
+    /// Number of its file: all records of a file describe one cell on one day.
     pub file: usize,
     /// Its weight: 1 for a drive.
     pub share: f64,
 }
 
-/// The table in node order, V.
+/// The error table in node order, V.
 pub fn table(fit: &FittedTables, records: &[WeightedRecord<'_>], capacity_ah: f64) -> Vec<f64> {
     let nodes = fit.grid.nodes();
     let mut sums = NodeSums { square: vec![0.0; nodes], weight: vec![0.0; nodes], files: vec![0.0; nodes] };
@@ -111,7 +110,7 @@ impl ErrorBlock {
     }
 }
 
-/// One temperature's errors; `None` = no data.
+/// Errors of one temperature; `None` = no data.
 fn row(sums: &NodeSums, t: usize, columns: usize) -> Option<Vec<f64>> {
     let range = t * columns..(t + 1) * columns;
     let weight: f64 = sums.weight[range.clone()].iter().sum();
@@ -129,7 +128,7 @@ fn row(sums: &NodeSums, t: usize, columns: usize) -> Option<Vec<f64>> {
     Some(range.map(of_node).collect())
 }
 
-/// Rows without data from the nearest with some.
+/// Fills rows without data from the nearest row with data.
 fn fill(grid: &Grid, rows: &[Option<Vec<f64>>]) -> Vec<f64> {
     let temperatures = &grid.temperature_c;
     let known = || rows.iter().zip(temperatures).filter_map(|(row, &t)| row.as_ref().map(|row| (row, t)));
@@ -151,7 +150,7 @@ mod tests {
     use crate::ident::record::Limits;
 
     #[test]
-    fn a_temperature_without_data_is_as_wrong_as_its_neighbour_and_more_in_the_cold() {
+    fn temperature_without_data_takes_its_scaled_neighbour() {
         let grid = Grid { soc: vec![0.0, 1.0], temperature_c: vec![-20.0, 0.0, 25.0] };
         let found = fill(&grid, &[None, Some(vec![0.01, 0.02]), Some(vec![0.005; 2])]);
         assert!(found[0] > 1.5 * 0.01 && found[1] == 2.0 * found[0], "{found:?}");
@@ -159,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn files_count_and_not_their_records() {
+    fn variance_depends_on_files_not_records() {
         let grid = Grid { soc: vec![0.0, 1.0], temperature_c: vec![25.0] };
         let tables = ParameterTables { ocv_v: vec![3.6; 2], r0_ohm: vec![0.0; 2], r_ohm: vec![], tau_s: vec![] };
         let time_s: Vec<f64> = (0..=3600).map(f64::from).collect();
@@ -183,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn few_files_and_little_charge_make_a_node_less_certain() {
+    fn rarely_visited_node_has_a_larger_error() {
         let sums = NodeSums { square: vec![4e-4, 0.0], weight: vec![4.0, 0.0], files: vec![4.0, 0.0] };
         let row = row(&sums, 0, 2).expect("data");
         assert!((row[0] - 0.01 * 1.75_f64.sqrt()).abs() < 1e-12, "{row:?}");

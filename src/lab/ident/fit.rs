@@ -1,4 +1,4 @@
-//! Runs the whole fit: starting values, prior, passes over all records in parallel, residuals, nodes without data.
+//! Runs a whole fit: starting values, prior, passes over all records in parallel, residuals, nodes without data.
 
 use rayon::prelude::*;
 
@@ -10,16 +10,16 @@ use super::record::Record;
 use super::solve::{Space, minimise};
 use crate::filter::median;
 
-/// Number of groups of records. Groups are summed separately, then in order: the result does not depend on the number of
-/// cores.
+/// Number of groups of records. Each group is summed separately, then the groups are added in order, so that the result does not
+/// depend on the number of cores.
 const GROUPS: usize = 4;
-/// Fewest judged rows a fit may rest on.
+/// Smallest number of judged rows for a fit.
 pub const MIN_ROWS: usize = 50;
-/// Seconds near a node below which no data support it.
+/// A node with fewer seconds of data nearby is reported as unsupported.
 pub const SUPPORTED_S: f64 = 30.0;
-/// Factor within which a time constant stays round its starting value.
+/// A time constant stays within this factor of its starting value.
 const TAU_FACTOR: f64 = 5.0;
-/// Least rise of the OCV, V per unit of SOC.
+/// Smallest rise of the OCV, V per unit of SOC.
 pub const MIN_SLOPE_V: f64 = 0.02;
 /// Steepest rise of the OCV, V per unit of SOC.
 const MAX_SLOPE_V: f64 = 60.0;
@@ -46,11 +46,11 @@ pub struct FitSettings {
     pub tau_s: Vec<f64>,
     /// Lowest and highest voltage under load, V.
     pub voltage_v: (f64, f64),
-    /// Slow tests, by rising temperature; none = the OCV comes from the data alone.
+    /// Slow tests, by rising temperature; empty = the data alone determine the OCV.
     pub ocv: Vec<OcvCurve>,
-    /// Least rise of the OCV, V per unit of SOC, from a SOC on: `(from, slope)`, the last that holds.
+    /// Smallest rise of the OCV, V per unit of SOC, above a SOC: `(from, slope)`; the last that applies wins.
     pub min_slope_v: Vec<(f64, f64)>,
-    /// Smoothness.
+    /// Standard deviations of the prior.
     pub deviations: PriorDeviations,
 }
 
@@ -74,26 +74,25 @@ pub struct FittedTables {
     pub grid: Grid,
     /// Values in node order.
     pub tables: ParameterTables,
-    /// Over all records.
+    /// Residual over all records.
     pub total: Residual,
     /// Seconds of data near each node.
     pub visits_s: Vec<f64>,
     /// Passes over the data.
     pub passes: usize,
-    /// Whether the cost had stopped falling.
+    /// Whether the cost stopped falling.
     pub converged: bool,
 }
 
-/// The equations have no finite value at the start.
-const NOT_FINITE: &str =
-    "the data or the starting values are not finite: two slow tests at one temperature, or a value that is no number";
-/// The current never changes enough to determine a resistance.
+/// Error if the cost is not finite at the starting values.
+const NOT_FINITE: &str = "the data or the starting values are not finite: two slow tests at one temperature, or a value that is not a number";
+/// Error if the current never changes enough to determine a resistance.
 const NO_EXCITATION: &str = "the current does not change: no resistance can be separated from the open-circuit voltage";
 
 /// Fits tables to `records` with weights `scale` per record; `progress` receives the pass number and the cost.
 ///
 /// # Errors
-/// Too few rows, or a current that never changes.
+/// There are too few rows, or the current never changes.
 pub fn fit(
     settings: &FitSettings,
     records: &[Record],
@@ -134,7 +133,7 @@ pub fn fit(
 
 type Group<'a> = Vec<(&'a Record, f64)>;
 
-/// Distributes records over [`GROUPS`], the longest first to the emptiest, so that all groups take about equally long.
+/// Distributes records over [`GROUPS`], each to the emptiest group, the longest first, so that all groups take about equally long.
 fn groups<'a>(records: &'a [Record], scale: &[f64]) -> Vec<Group<'a>> {
     let mut order: Vec<usize> = (0..records.len()).collect();
     order.sort_by_key(|&i| std::cmp::Reverse(records[i].rows.len()));
@@ -157,7 +156,7 @@ fn sum_of_groups(groups: &[Group<'_>], layout: &Layout, theta: &[f64]) -> Normal
         }
         normal
     };
-    // Added in the order of the groups: the sum does not depend on the threads.
+    // Added in the order of the groups, so that the sum does not depend on the threads.
     let sums: Vec<NormalEquations> = groups.par_iter().map(of_group).collect();
     sums.iter().fold(NormalEquations::new(layout.len()), |mut sum, group| {
         sum.add_all(group);
@@ -187,7 +186,7 @@ fn straight_ocv(settings: &FitSettings) -> Vec<f64> {
     settings.grid.soc.iter().map(|s| low + s * (high - low)).collect()
 }
 
-/// OCV at every node from slow tests: linear between their temperatures, the nearest beyond.
+/// OCV at every node from slow tests: linear between their temperatures, the nearest test beyond them.
 pub fn ocv_nodes(grid: &Grid, curves: &[OcvCurve]) -> Vec<f64> {
     let temperatures: Vec<f64> = curves.iter().map(|c| c.temperature_c).collect();
     let at = |t: f64, soc: f64| {
@@ -201,7 +200,7 @@ pub fn ocv_nodes(grid: &Grid, curves: &[OcvCurve]) -> Vec<f64> {
         .collect()
 }
 
-/// A curve's voltage; below the SOC at which a cold test ended, the shape of the next warmer curve continues it.
+/// Voltage of a curve. Below the SOC at which a cold test ended, the next warmer curve continues its shape.
 fn curve_at(curves: &[OcvCurve], which: usize, soc: f64) -> f64 {
     let curve = &curves[which];
     let end = curve.soc[0];
@@ -211,7 +210,7 @@ fn curve_at(curves: &[OcvCurve], which: usize, soc: f64) -> f64 {
     curve.voltage_v[0] + curve_at(curves, which + 1, soc) - curve_at(curves, which + 1, end)
 }
 
-/// Median resistance at 25 degrees C that steps of current show from one row to the next; `None` = there are no steps.
+/// Median resistance at 25 degrees C from steps of the current between rows; `None` = there are no steps.
 fn resistance_of_steps(records: &[Record]) -> Option<f64> {
     let mut found = Vec::new();
     for record in records {
@@ -255,7 +254,7 @@ pub(super) fn space(settings: &FitSettings, layout: &Layout, start: &[f64]) -> S
     Space { low, high, rising }
 }
 
-/// Residual of all records together.
+/// Residual over all records.
 pub fn judge(records: &[Record], tables: &ParameterTables) -> Residual {
     let mut total = ResidualSums::default();
     for record in records {
@@ -288,7 +287,7 @@ impl ResidualSums {
         }
     }
 
-    /// Adds the sums of another stretch.
+    /// Adds the sums of another record.
     pub fn join(&mut self, other: &Self) {
         self.weight += other.weight;
         self.first += other.first;
@@ -311,14 +310,14 @@ impl ResidualSums {
 }
 
 impl FittedTables {
-    /// Returns the nodes that no data support: temperature and SOC.
+    /// Returns temperature and SOC of the nodes that no data support.
     pub fn unsupported(&self) -> Vec<(f64, f64)> {
         let columns = self.grid.soc.len();
         let weak = self.visits_s.iter().enumerate().filter(|(_, seconds)| **seconds < SUPPORTED_S);
         weak.map(|(node, _)| (self.grid.temperature_c[node / columns], self.grid.soc[node % columns])).collect()
     }
 
-    /// Open-circuit voltage over the whole SOC range, mean of the temperatures, V.
+    /// Open-circuit voltage averaged over the SOC range and the temperatures, V.
     pub fn mean_ocv_v(&self) -> f64 {
         let of_row = |row: &[f64]| -> f64 {
             let pairs = row.windows(2).zip(self.grid.soc.windows(2));

@@ -1,10 +1,11 @@
-//! The grid of the tables and the place of a SOC and a temperature in it.
+//! The grid of the tables, and the position of a SOC and a temperature in it.
 //!
-//! The same rules as [`CellModel::grid_position`](crate::cell::CellModel::grid_position): along SOC linear (the OCV continues beyond 0 and 1, everything else
-//! holds its edge value); along temperature the OCV and time constants linear, resistances by Arrhenius' law; outside the
-//! temperature range the nearest edge holds.
+//! Same rules as [`CellModel::grid_position`](crate::cell::CellModel::grid_position). Along SOC everything is linear; beyond 0 and 1
+//! the OCV is extrapolated and other values keep their edge value. Along temperature the OCV and the time constants are linear and
+//! resistances follow Arrhenius' law; beyond the temperature range the nearest edge applies.
 
 pub use crate::cell::arrhenius;
+use crate::filter::{self, locate};
 
 /// Breakpoints of all tables.
 #[derive(Debug, Clone, PartialEq)]
@@ -24,22 +25,22 @@ pub struct GridPoint {
     pub t: usize,
     /// Weight of the upper column, in [0, 1].
     pub along_s: f64,
-    /// The same without the limit, for the OCV.
+    /// The same without limits, for the OCV.
     pub beyond_s: f64,
-    /// Weight of the upper row for the OCV, in [0, 1]; 0 when there is one temperature only.
+    /// Weight of the upper row for the OCV, in [0, 1]; 0 with a single temperature.
     pub along_t: f64,
     /// The same for resistances.
     pub warped_t: f64,
 }
 
-/// Nodes and their weights; the first `len` hold.
+/// Nodes with their weights; the first `len` are valid.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Corners {
     /// Node numbers: temperature row times columns plus column.
     pub node: [usize; 4],
     /// Weights, summing to 1.
     pub weight: [f64; 4],
-    /// How many.
+    /// Number of valid nodes.
     pub len: usize,
 }
 
@@ -49,19 +50,19 @@ impl Corners {
         (0..self.len).map(|i| (self.node[i], self.weight[i]))
     }
 
-    /// The interpolated value of a table in node order.
+    /// Interpolated value of a table in node order.
     pub fn at(&self, values: &[f64]) -> f64 {
         self.iter().map(|(node, weight)| weight * values[node]).sum()
     }
 }
 
 impl Grid {
-    /// Nodes of one table.
+    /// Number of nodes of a table.
     pub fn nodes(&self) -> usize {
         self.soc.len() * self.temperature_c.len()
     }
 
-    /// The place of a SOC and a temperature.
+    /// Position of a SOC and a temperature.
     pub fn place(&self, soc: f64, temperature_c: f64) -> GridPoint {
         let (s, beyond_s) = locate(&self.soc, soc);
         let temperatures = &self.temperature_c;
@@ -111,20 +112,9 @@ impl Grid {
     }
 }
 
-/// Interval of `x` in rising `breakpoints`, and how far along it `x` is (below 0 or above 1 outside).
-pub fn locate(breakpoints: &[f64], x: f64) -> (usize, f64) {
-    let last = breakpoints.len() - 2;
-    let i = breakpoints[1..=last].partition_point(|&b| x >= b);
-    (i, (x - breakpoints[i]) / (breakpoints[i + 1] - breakpoints[i]))
-}
-
-/// Linear interpolation of `y` over rising `x`; outside, the nearest end.
+/// Linear interpolation of `y` over rising `x`; outside the range, the value at the nearest end.
 pub fn interpolate(x: &[f64], y: &[f64], at: f64) -> f64 {
-    if x.len() == 1 {
-        return y[0];
-    }
-    let (i, along) = locate(x, at);
-    y[i] + along.clamp(0.0, 1.0) * (y[i + 1] - y[i])
+    if x.len() == 1 { y[0] } else { filter::interpolate(x, y, at) }
 }
 
 #[cfg(test)]
@@ -132,7 +122,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn corners_sum_to_one_and_resistances_follow_arrhenius_between_nodes() {
+    fn corner_weights_sum_to_one_and_follow_arrhenius() {
         let grid = Grid { soc: vec![0.0, 0.5, 1.0], temperature_c: vec![-20.0, 25.0] };
         let place = grid.place(0.7, 0.0);
         for corners in [grid.ocv_corners(&place), grid.resistance_corners(&place)] {
@@ -144,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn outside_the_grid_only_the_ocv_continues() {
+    fn only_the_ocv_is_extrapolated_outside_the_grid() {
         let grid = Grid { soc: vec![0.0, 0.5, 1.0], temperature_c: vec![25.0] };
         let place = grid.place(1.1, 60.0);
         assert!((grid.ocv_corners(&place).at(&[3.0, 3.6, 4.2]) - 4.32).abs() < 1e-12);

@@ -1,10 +1,10 @@
 //! Fits cell models to measured data (paper, section 3.3.2): pure arithmetic, no files, no printing.
 //!
-//! Data flow: raw rows of one file -> [`anchor`] (SOC of every row) -> [`record`] (coarser rows, places in
-//! the tables, weights) -> [`pass`] (residuals and the exact Jacobian by sensitivity recursion) with [`prior`]
-//! (smoothness) -> [`solve`] (projected Levenberg-Marquardt) -> [`fit`] (the whole, residuals per file, nodes without data).
-//! Records that begin anywhere have no known SOC: [`unanchored`] finds it with the tables.
-//! [`error_table`] estimates the model's error, [`thermal`] fits heat capacity and thermal resistance afterwards.
+//! Data flow: raw rows of one file -> [`anchor`] (SOC of every row) -> [`record`] (coarser rows, positions in
+//! the tables, weights) -> [`pass`] (residuals and their exact Jacobian by sensitivity recursion) with [`prior`]
+//! (smoothness) -> [`solve`] (projected Levenberg-Marquardt) -> [`fit`] (whole fit, residuals per file, nodes without data).
+//! Records that start at an unknown SOC: [`unanchored`] estimates that SOC together with the tables.
+//! Afterwards [`error_table`] estimates the model's error, and [`thermal`] fits heat capacity and thermal resistance.
 
 pub mod ageing;
 pub mod anchor;
@@ -20,34 +20,34 @@ pub mod solve;
 pub mod thermal;
 pub mod unanchored;
 
-/// A stretch of rows over which time runs on.
+/// Consecutive rows with running time.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct MeasuredPart {
-    /// Its key in the part column; empty where there is none.
+    /// Key in the part column; empty without one.
     pub key: String,
-    /// Value of the `type` column in its first row: `charge`, `discharge`; empty where there is none.
+    /// Value of the `type` column in the first row, `charge` or `discharge`; empty without that column.
     pub kind: String,
-    /// Seconds since the part's own beginning.
+    /// Seconds since the start of the part.
     pub time_s: Vec<f64>,
     /// Current, A, positive = discharge.
     pub current_a: Vec<f64>,
     /// Terminal voltage, V.
     pub voltage_v: Vec<f64>,
-    /// Cell temperature, degrees C; NaN where there is none.
+    /// Cell temperature, degrees C; NaN where not measured.
     pub temperature_c: Vec<f64>,
-    /// The cycler's own counter, Ah taken out; NaN where there is none.
+    /// Counter of the cycler, Ah taken out; NaN where not recorded.
     pub discharged_ah: Vec<f64>,
-    /// State of charge, fraction; empty until it is determined.
+    /// State of charge, fraction; empty until determined.
     pub soc: Vec<f64>,
 }
 
 impl MeasuredPart {
-    /// Whether it is a discharge, as far as its column `type` says so.
+    /// Whether the column `type` says that it is a discharge.
     pub(crate) fn is_discharge(&self) -> bool {
         self.kind == "discharge"
     }
 
-    /// Rows.
+    /// Number of rows.
     pub fn len(&self) -> usize {
         self.time_s.len()
     }
@@ -61,18 +61,18 @@ impl MeasuredPart {
         self.discharged_ah.push(discharged_ah);
     }
 
-    /// Charge, Ah, that a discharge took after the load: the tester held the voltage, at its lowest, while the current fell. 0
-    /// without such an end.
+    /// Charge, Ah, that the tester took after the load by holding the lowest voltage while the current fell; 0 if the discharge has no
+    /// such end.
     pub(crate) fn held_ah(&self) -> f64 {
         let Some(last) = self.current_a.iter().rposition(|&current_a| current_a > 0.0) else { return 0.0 };
         let charge_ah = charge_ah(&self.time_s[..=last], &self.current_a[..=last]);
         let half_ah = 0.5 * charge_ah[last];
-        // The current at half of the charge.
+        // Current at half of the charge.
         let load_a = self.current_a[charge_ah.partition_point(|&ah| ah < half_ah).min(last)];
         let lowest_v = self.voltage_v[..=last].iter().copied().fold(f64::INFINITY, f64::min);
         let is_held = |row: usize| {
             let current_a = self.current_a[row];
-            // A tester holds the voltage where the current is below 97 % of the load's, and the voltage within 50 mV of its lowest.
+            // The voltage is held if the current is below 97 % of the load and the voltage within 50 mV of its lowest value.
             current_a > 0.0 && current_a < 0.97 * load_a && self.voltage_v[row] <= lowest_v + 0.05
         };
         let first = (0..=last).rev().take_while(|&row| is_held(row)).last().unwrap_or(last);
@@ -85,7 +85,7 @@ impl MeasuredPart {
     }
 }
 
-/// Charge taken out since the first row at every row, Ah, by the trapezoidal rule; gaps count like any other step.
+/// Charge taken out since the first row, for every row, Ah, by the trapezoidal rule; a gap counts like any other step.
 pub fn charge_ah(time_s: &[f64], current_a: &[f64]) -> Vec<f64> {
     let mut sum = 0.0;
     let mut charges = Vec::with_capacity(time_s.len());
@@ -109,13 +109,13 @@ mod tests {
     }
 
     #[test]
-    fn the_charge_of_a_held_voltage_is_that_after_the_load() {
+    fn held_charge_is_the_charge_after_the_load() {
         let load = [(0.0, 3.0, 3.4), (600.0, 3.02, 3.0), (1200.0, 2.98, 2.6), (1800.0, 3.0, 2.5)];
         assert_eq!(discharge(&load).held_ah(), 0.0);
         let mut held = load.to_vec();
         held.extend([(1900.0, 1.8, 2.502), (2260.0, 0.2, 2.498), (2300.0, 0.0, 2.6)]);
         assert!((discharge(&held).held_ah() - 0.1).abs() < 1e-12, "360 s at 1 A");
-        // A load that varies is not held: its voltage moves.
+        // Under a varying load the voltage moves, so it is not held.
         assert_eq!(
             discharge(&[(0.0, 3.0, 3.4), (600.0, 3.0, 3.2), (1200.0, 1.0, 3.3), (1800.0, 2.0, 3.1)]).held_ah(),
             0.0

@@ -1,19 +1,19 @@
 //! The parameter vector: for every node the OCV (V), ln R0, and ln R and ln tau of each branch.
 //!
-//! Kind by kind, each in node order (temperature row by temperature row). Capacitances follow as C = tau / R at
-//! the nodes.
+//! The kinds follow each other, each in node order (temperature row by temperature row). The capacitance of a node
+//! follows as C = tau / R.
 
 use super::grid::Grid;
 use crate::cell::{Branch, Table};
 
-/// Where each kind of parameter lies in the vector.
+/// Position of each kind of parameter in the vector.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Layout {
-    /// Nodes of one table.
+    /// Number of nodes of a table.
     pub nodes: usize,
-    /// SOC columns.
+    /// Number of SOC columns.
     pub columns: usize,
-    /// RC branches.
+    /// Number of RC branches.
     pub branches: usize,
 }
 
@@ -23,33 +23,33 @@ impl Layout {
         Self { nodes: grid.nodes(), columns: grid.soc.len(), branches }
     }
 
-    /// Parameters in all.
+    /// Number of parameters.
     pub fn len(&self) -> usize {
         self.nodes * (2 + 2 * self.branches)
     }
 
-    /// Whether there are none.
+    /// Whether there are no parameters.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// First ln R0.
+    /// Index of the first ln R0.
     pub fn r0(&self) -> usize {
         self.nodes
     }
 
-    /// First ln R of branch `i`.
+    /// Index of the first ln R of branch `i`.
     pub fn branch_r(&self, i: usize) -> usize {
         self.nodes * (2 + 2 * i)
     }
 
-    /// First ln tau of branch `i`.
+    /// Index of the first ln tau of branch `i`.
     pub fn branch_tau(&self, i: usize) -> usize {
         self.nodes * (3 + 2 * i)
     }
 }
 
-/// The tables a parameter vector stands for, in node order.
+/// Tables that a parameter vector describes, in node order.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ParameterTables {
     /// Open-circuit voltage, V.
@@ -74,7 +74,7 @@ impl ParameterTables {
         }
     }
 
-    /// As tables of a cell model: OCV, R0, branches.
+    /// The tables of a cell model: OCV, R0, branches.
     pub fn model(&self, columns: usize) -> (Table, Table, Vec<Branch>) {
         let table = |values: &[f64]| Table { values: values.chunks(columns).map(<[f64]>::to_vec).collect() };
         let farad = |(r, tau): (&Vec<f64>, &Vec<f64>)| r.iter().zip(tau).map(|(r, tau)| tau / r).collect::<Vec<f64>>();

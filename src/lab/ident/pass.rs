@@ -1,40 +1,40 @@
 //! One pass over the data: residuals, their exact Jacobian, and the normal equations.
 //!
-//! The residual of a row is e = V - (OCV(s,T) - sum U_i - R0(s,T) I). A branch runs exactly over each row's step,
-//! U' = R I + x (U - R I) with x = exp(-dt / tau), and so do its derivatives:
-//! dU' = x dU + (1 - x) I dR + (U - R I) x dt / tau^2 dtau. Derivatives fade with the branch: those below
-//! [`FADED_V`] are dropped, so a row touches a few nodes only and the work per row does not grow with the tables.
-//! Residuals beyond [`HUBER_V`] count linearly (Huber), so that what no circuit explains does not bend the tables.
-//! Where the SOC is not known ([`FreeScale`]), a residual is compared with the error of a circuit at this drop and temperature
-//! ([`circuit_error_v`]): there the capacity must not be read from what the circuit gets wrong in the cold.
+//! The residual of a row is e = V - (OCV(s,T) - sum U_i - R0(s,T) I). A branch is solved exactly over the step of each row,
+//! U' = R I + x (U - R I) with x = exp(-dt / tau), and so are its derivatives:
+//! dU' = x dU + (1 - x) I dR + (U - R I) x dt / tau^2 dtau. Derivatives decay with the branch and are dropped below
+//! [`FADED_V`], so a row touches only a few nodes, and the work per row does not grow with the tables.
+//! Beyond [`HUBER_V`] the cost grows linearly (Huber), so that errors no circuit can explain do not distort the tables.
+//! Where the SOC is unknown ([`FreeScale`]), residuals are compared with the error of a circuit at this voltage drop and temperature
+//! ([`circuit_error_v`]), so that the circuit's error in the cold is not mistaken for lost capacity.
 
 use super::grid::{Corners, Grid, arrhenius};
 use super::parameters::{Layout, ParameterTables};
 use super::record::{FitRow, Record};
 
-/// Derivative, V per unit of a log parameter, below which it is dropped: a thousandth of the voltage's resolution.
+/// Derivative, V per unit of a log parameter, below which it is dropped: a thousandth of the voltage resolution.
 const FADED_V: f64 = 1e-6;
-/// Residual from which on the cost grows linearly, V.
+/// Residual above which the cost grows linearly, V.
 pub const HUBER_V: f64 = 0.05;
-/// Residual whose independent occurrence costs one half, V: the size of a good circuit's model error.
+/// Residual that costs one half if independent, V: the model error of a good circuit.
 const SIGMA_V: f64 = 0.010;
-/// Seconds over which model error repeats itself: one independent residual in this time.
+/// Correlation time of the model error, s: one independent residual per period.
 const REPEATS_S: f64 = 50.0;
-/// The same where the SOC is not known. Of 50 to 500 s, and of the two below, Panasonic 18650PF and a simulated LG M50 have
-/// nearly the same errors of SOC (within 0.1 points on average); EVE, whose curve is flat, needs at least this.
+/// The same where the SOC is unknown. From 50 to 500 s, and for a wide range of the next two constants, the SOC errors of Panasonic
+/// 18650PF and a simulated LG M50 change by less than 0.1 points on average; EVE, with its flat curve, needs at least this value.
 const FREE_REPEATS_S: f64 = 250.0;
-/// Part of the voltage drop by which a circuit is wrong.
+/// Error of a circuit, as a share of the voltage drop.
 const DROP_ERROR: f64 = 0.05;
-/// Power of Arrhenius' factor by which a circuit's error grows with cold.
+/// Power of the Arrhenius factor with which a circuit's error grows in the cold.
 pub const COLD_POWER: f64 = 0.7;
-/// Such errors from which on the cost grows linearly.
+/// The cost grows linearly beyond this many circuit errors.
 const HUBER_ERRORS: f64 = 3.0;
 
-/// Normal equations in the nodes' own parameters.
+/// Normal equations in the node parameters.
 #[derive(Debug, Clone)]
 pub struct NormalEquations {
     n: usize,
-    /// Row-major; a pair's product lies at either of its two places until [`NormalEquations::symmetric`].
+    /// Row-major; the product of a pair is in either of its two places until [`NormalEquations::symmetric`] adds them.
     h: Vec<f64>,
     /// Gradient of the cost.
     pub g: Vec<f64>,
@@ -48,7 +48,7 @@ impl NormalEquations {
         Self { n, h: vec![0.0; n * n], g: vec![0.0; n], cost: 0.0 }
     }
 
-    /// Adds an observation with derivatives `j` of the residual e = measured - model by parameter (`index`), i.e. de/dtheta.
+    /// Adds an observation with derivatives `j` = de/dtheta of the residual e = measured - model by the parameters `index`.
     pub fn add(&mut self, index: &[usize], j: &[f64], residual: f64, weight: f64) {
         for (a, &row) in index.iter().enumerate() {
             let weighted = weight * j[a];
@@ -81,7 +81,7 @@ impl NormalEquations {
     }
 }
 
-/// A branch's voltage and derivatives on the way through a record.
+/// Voltage and derivatives of a branch while it runs through a record.
 struct BranchRun {
     voltage_v: f64,
     by_r: Vec<f64>,
@@ -103,7 +103,7 @@ impl BranchRun {
         }
     }
 
-    /// Over a row's step, without derivatives. Returns the decay and dU'/dtau.
+    /// Advances the voltage by the step of a row, without derivatives. Returns the decay and dU'/dtau.
     fn step_voltage(&mut self, row: &FitRow, r_ohm: &[f64], tau_s: &[f64]) -> (f64, f64) {
         let (r, tau) = (row.resistance.at(r_ohm), row.tau.at(tau_s));
         let settled = r * row.mean_current_a;
@@ -166,8 +166,8 @@ pub fn residuals(record: &Record, tables: &ParameterTables) -> Vec<f64> {
     record.rows.iter().map(of_row).collect()
 }
 
-/// Where the SOC of a record's rows comes from when it is not known: SOC = beginning - (charge - offset x time) / capacity, with
-/// beginning, capacity and the current sensor's offset as parameters.
+/// Unknowns of a record whose SOC is not measured: SOC = beginning - (charge - offset x time) / capacity. The parameters are the SOC
+/// at the beginning, the capacity, and the offset of the current sensor.
 #[derive(Debug, Clone, Copy)]
 pub struct FreeScale<'a> {
     /// Breakpoints.
@@ -178,14 +178,14 @@ pub struct FreeScale<'a> {
     pub offset: usize,
     /// Capacity, Ah.
     pub capacity_ah: f64,
-    /// Index of the record's SOC at its first row.
+    /// Index of the SOC at the record's first row.
     pub beginning: usize,
-    /// Its value.
+    /// SOC at the record's first row.
     pub beginning_soc: f64,
 }
 
 impl FreeScale<'_> {
-    /// Adds the derivatives of a row's residual: the SOC moves the open-circuit voltage, and hardly the resistances.
+    /// Adds the derivatives of a row's residual; only the effect of the SOC on the open-circuit voltage counts.
     fn derivatives(&self, row: &FitRow, tables: &ParameterTables, index: &mut Vec<usize>, j: &mut Vec<f64>) {
         let place = self.grid.place(row.soc, row.temperature_c);
         let columns = self.grid.soc.len();
@@ -202,8 +202,8 @@ impl FreeScale<'_> {
     }
 }
 
-/// Adds a record's residuals and derivatives to `normal`, `scale` times its rows' weights; with `free` also those of the
-/// record's SOC.
+/// Adds residuals and derivatives of a record to `normal`, with its rows' weights times `scale`; with `free`, also the derivatives
+/// by the unknowns of its SOC.
 pub fn accumulate(
     record: &Record,
     scale: f64,
@@ -244,7 +244,7 @@ pub fn accumulate(
     }
 }
 
-/// Derivatives of the residual by every parameter the row feels.
+/// Derivatives of the residual by every parameter that affects the row.
 fn derivatives(
     row: &FitRow,
     layout: &Layout,
@@ -273,13 +273,13 @@ fn derivatives(
     }
 }
 
-/// Error of a circuit's voltage at a drop and a temperature, V.
+/// Voltage error of a circuit at a voltage drop and a temperature, V.
 fn circuit_error_v(drop_v: f64, temperature_c: f64) -> f64 {
     SIGMA_V.hypot(DROP_ERROR * drop_v) * libm::pow(arrhenius(temperature_c).max(1.0), COLD_POWER)
 }
 
-/// Cost of a second of a residual with this error, and the weight of its square in the normal equations. The error grows with the
-/// drop, a parameter's doing, so its logarithm counts.
+/// Cost per second of a residual with this error, and the weight of its square in the normal equations. The cost includes the logarithm
+/// of the error, because the error grows with the drop, which the parameters determine.
 fn free_cost(residual: f64, error_v: f64) -> (f64, f64) {
     let errors = residual.abs() / error_v;
     let (cost, robust) = if errors <= HUBER_ERRORS {
@@ -290,7 +290,7 @@ fn free_cost(residual: f64, error_v: f64) -> (f64, f64) {
     ((cost + libm::log(error_v / SIGMA_V)) / FREE_REPEATS_S, robust / (error_v * error_v * FREE_REPEATS_S))
 }
 
-/// Cost of a residual and the weight its square gets in the normal equations.
+/// Cost of a residual, and the weight of its square in the normal equations.
 fn huber(residual: f64) -> (f64, f64) {
     let size = residual.abs();
     if size <= HUBER_V { (0.5 * residual * residual, 1.0) } else { (HUBER_V * (size - 0.5 * HUBER_V), HUBER_V / size) }

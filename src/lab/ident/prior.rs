@@ -1,7 +1,7 @@
 //! The prior: smooth tables, Arrhenius' law between temperatures, an OCV near that of the slow test.
 //!
-//! Each term is a linear combination of node parameters with a target and a standard deviation. Curvature is the
-//! change of slope at a node times the mean of its two spacings.
+//! Each term is a linear combination of node parameters with a target and a standard deviation. The curvature at a node is the
+//! change of the slope times the mean of its two spacings.
 
 use super::grid::{Grid, arrhenius};
 use super::parameters::Layout;
@@ -10,26 +10,26 @@ use super::pass::NormalEquations;
 /// Standard deviations of the prior's terms.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PriorDeviations {
-    /// Second difference of the OCV over SOC at the nodes' own spacing, V: of the curve itself without a slow test, of
-    /// the correction with one.
+    /// Second difference of the OCV over SOC, scaled to the node spacing, V: of the correction to the slow test, or of the
+    /// curve itself if there is none.
     pub ocv_curvature_v: f64,
-    /// Difference of the OCV (of the correction) between neighbouring temperatures, V.
+    /// Difference of the OCV, or of its correction, between neighbouring temperatures, V.
     pub ocv_by_temperature_v: f64,
-    /// Pull of the OCV to the slow test, V per node; unused without one.
+    /// Deviation of the OCV from the slow test, V per node; unused without a slow test.
     pub ocv_pull_v: f64,
-    /// Second difference of ln R0 over SOC at the nodes' own spacing.
+    /// Second difference of ln R0 over SOC, scaled to the node spacing.
     pub r0_curvature: f64,
     /// Second difference of each ln R.
     pub r_curvature: f64,
     /// Second difference of each ln tau.
     pub tau_curvature: f64,
-    /// Difference of ln R from Arrhenius' law between neighbouring temperatures.
+    /// Deviation of ln R from Arrhenius' law between neighbouring temperatures.
     pub r_by_temperature: f64,
     /// Difference of ln tau between neighbouring temperatures.
     pub tau_by_temperature: f64,
-    /// Distance of ln R from its starting value.
+    /// Deviation of ln R from its starting value.
     pub r_level: f64,
-    /// Distance of ln tau from its starting value.
+    /// Deviation of ln tau from its starting value.
     pub tau_level: f64,
 }
 
@@ -48,8 +48,8 @@ impl PriorDeviations {
         tau_level: 0.7,
     };
 
-    /// With a slow test: a smooth correction of it that fades where there are no drives. Found by leaving out one drive
-    /// after the other of two cells at five and six temperatures.
+    /// With a slow test: a smooth correction that fades where there are no drives. Tuned by leaving out one drive at a time, on
+    /// two cells at five and six temperatures.
     pub const SLOW_TEST: Self = Self {
         ocv_curvature_v: 0.025,
         ocv_by_temperature_v: 0.02,
@@ -61,7 +61,7 @@ impl PriorDeviations {
         ..Self::FREE_OCV
     };
 
-    /// Round a chemistry's resistances: deviations as between five fitted cells (`cell::chemistry`), shared by the nodes of a table.
+    /// Around the resistances of a chemistry: the spread of five fitted cells (`cell::chemistry`), common to the nodes of a table.
     pub const CHEMISTRY: Self = Self {
         ocv_by_temperature_v: 0.006,
         r0_curvature: 0.15,
@@ -74,9 +74,9 @@ impl PriorDeviations {
         ..Self::FREE_OCV
     };
 
-    /// For an ageing cell. Discharges and charges at one current each separate R0 from the branch only at their beginnings:
-    /// R0 hardly bends, the time constant stays. They do not separate the branch from the OCV at the empty end either, where
-    /// both turn steeply: the branch bends as little as drives allow ([`PriorDeviations::SLOW_TEST`]), so that the OCV takes the knee.
+    /// For an ageing cell. With one current per discharge and charge, only their first rows separate R0 from the branch: R0 hardly
+    /// bends, and the time constant stays fixed. The branch cannot be separated from the OCV at the empty end either, where both are
+    /// steep: the branch bends no more than drives allow ([`PriorDeviations::SLOW_TEST`]), so that the knee goes to the OCV.
     pub const AGEING: Self = Self {
         ocv_curvature_v: 0.5,
         r0_curvature: 0.005,
@@ -87,7 +87,7 @@ impl PriorDeviations {
     };
 }
 
-/// One term: sum of factor x parameter = target, within sigma.
+/// One term: the sum of factor x parameter equals the target, within sigma.
 #[derive(Debug, Clone, PartialEq)]
 struct PriorDensity {
     terms: Vec<(usize, f64)>,
@@ -100,7 +100,7 @@ struct PriorDensity {
 pub struct Prior(Vec<PriorDensity>);
 
 impl Prior {
-    /// Creates the prior around the starting values `start`; `slow_test` = the OCV of `start` is a measured one.
+    /// Creates the prior around the starting values `start`; with `slow_test`, their OCV was measured.
     pub fn new(grid: &Grid, layout: &Layout, start: &[f64], slow_test: bool, deviations: &PriorDeviations) -> Self {
         let mut prior = Self(Vec::new());
         let reference = if slow_test { &start[..layout.nodes] } else { &vec![0.0; layout.nodes] };
@@ -127,8 +127,8 @@ impl Prior {
         prior
     }
 
-    /// Creates the prior around known values `start` of resistances and time constants, in shape and in size; the OCV has only its
-    /// differences between temperatures here.
+    /// Creates the prior around known resistances and time constants `start`, in shape and in size; of the OCV, it constrains only the
+    /// differences between temperatures.
     pub fn about(grid: &Grid, layout: &Layout, start: &[f64], deviations: &PriorDeviations) -> Self {
         let mut prior = Self(Vec::new());
         let of = |first: usize| &start[first..first + layout.nodes];
@@ -170,7 +170,7 @@ impl Prior {
         self.0.push(PriorDensity { terms, target, sigma });
     }
 
-    /// Second derivative over SOC as that of `reference`.
+    /// Keeps the second derivative over SOC near that of `reference`.
     fn curvature(&mut self, grid: &Grid, first: usize, reference: &[f64], sigma: f64) {
         let columns = grid.soc.len();
         for row in 0..grid.temperature_c.len() {
@@ -184,7 +184,7 @@ impl Prior {
         }
     }
 
-    /// Difference between neighbouring temperatures as that of `reference`.
+    /// Keeps the difference between neighbouring temperatures near that of `reference`.
     fn by_temperature(&mut self, grid: &Grid, first: usize, reference: &[f64], sigma: f64) {
         let columns = grid.soc.len();
         for row in 1..grid.temperature_c.len() {
@@ -195,7 +195,7 @@ impl Prior {
         }
     }
 
-    /// Near `reference` itself.
+    /// Keeps the values near `reference`.
     fn level(&mut self, first: usize, reference: &[f64], sigma: f64) {
         for at in first..first + reference.len() {
             self.push(vec![(at, 1.0)], first, reference, sigma);
@@ -203,7 +203,7 @@ impl Prior {
     }
 }
 
-/// A value per temperature, for every node.
+/// Repeats a value per temperature for every node.
 pub fn per_node(grid: &Grid, value: impl Fn(f64) -> f64) -> Vec<f64> {
     grid.temperature_c.iter().flat_map(|&t| vec![value(t); grid.soc.len()]).collect()
 }

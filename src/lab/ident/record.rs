@@ -1,41 +1,41 @@
-//! Prepares measured rows for the fit: joins them to blocks, places them in the tables, weights them by time.
+//! Prepares measured rows for the fit: joins them to blocks, positions them in the tables, weights them by time.
 //!
-//! A block collects raw rows until it is [`BLOCK_S`] long. Its last row is kept as it was measured (voltage, current,
-//! temperature, SOC at that instant: the series resistance acts at once); the branches see the mean current of the
-//! block, so no charge is lost. Blocks end early before a current step that follows steady current, so that both sides of a
-//! pulse's edge are kept, and at gaps. Over a gap in which charge was moved that the rows do not show, the branches
-//! start again relaxed.
+//! A block collects raw rows until it is [`BLOCK_S`] long. Its last row is kept as measured (voltage, current, temperature and SOC
+//! at that instant), because the series resistance acts immediately. The branches use the mean current of the block, so no charge is
+//! lost. A block ends early at a gap and before a current step that follows a steady current, so that both sides of a pulse's edge are
+//! kept. If charge moved during a gap without rows, the branches start relaxed after it.
 
 use super::MeasuredPart;
 use super::grid::{Corners, Grid};
+use crate::filter::ends;
 
-/// Longest block, s: time constants of interest are several times longer, drives change about once a second.
+/// Longest block, s: the branches' time constants are several times longer, and drives change about once a second.
 const BLOCK_S: f64 = 1.0;
-/// Current step that ends a block early, as a share of the largest current, when the block before it was steady.
+/// Current step that ends a block early after a steady current, as a share of the largest current.
 const EDGE_SHARE: f64 = 0.1;
-/// A step is an edge to be kept when the current was steady for this long before it, s; in drives it seldom is.
+/// Time for which the current must be steady before an edge, s; drives are rarely steady that long.
 const STEADY_S: f64 = 3.0;
 /// Most seconds that one row represents: rests logged once a minute must not outweigh drives.
 const MAX_WEIGHT_S: f64 = 20.0;
-/// A gap this long may hide charge the rows do not show, s.
+/// Shortest gap that may hide charge, s.
 const GAP_S: f64 = 60.0;
-/// Charge hidden in a gap from which the branches' state is unknown, as SOC.
+/// Hidden charge, as SOC, above which the state of the branches is unknown.
 const HIDDEN_SOC: f64 = 0.002;
-/// After such a gap under current the branches are wrong for this long, s: rows are not judged.
+/// Time after such a gap under current for which rows are not judged, s: the branches are still wrong.
 const UNKNOWN_S: f64 = 600.0;
-/// Current below which a cell counts as resting, as a share of the largest.
+/// Current below which a cell rests, as a share of the largest current.
 const REST_SHARE: f64 = 0.02;
 
 /// One row of the fit.
 #[derive(Debug, Clone, Copy)]
 pub struct FitRow {
-    /// Seconds since the file's beginning.
+    /// Seconds since the file started.
     pub time_s: f64,
-    /// Seconds since the row before it.
+    /// Seconds since the previous row.
     pub dt_s: f64,
-    /// Branches are relaxed at this row, regardless of the rows before.
+    /// The branches are relaxed at this row, regardless of earlier rows.
     pub relaxed: bool,
-    /// Mean current since the row before it, A.
+    /// Mean current since the previous row, A.
     pub mean_current_a: f64,
     /// Current at this instant, A.
     pub current_a: f64,
@@ -45,7 +45,7 @@ pub struct FitRow {
     pub temperature_c: f64,
     /// State of charge.
     pub soc: f64,
-    /// Seconds it represents; 0 = it updates the branches but is not judged.
+    /// Seconds that the row represents; 0 = it advances the branches but is not judged.
     pub weight_s: f64,
     /// Nodes of the OCV.
     pub ocv: Corners,
@@ -55,18 +55,18 @@ pub struct FitRow {
     pub tau: Corners,
 }
 
-/// Rows of one file's stretch.
+/// Rows of one part of a file.
 #[derive(Debug, Clone, Default)]
 pub struct Record {
     /// In time order.
     pub rows: Vec<FitRow>,
-    /// Rows as measured.
+    /// Number of raw rows.
     pub raw_rows: usize,
-    /// Rows whose voltage no cell of this type can have (sensor disconnected), left out.
+    /// Rows left out because no cell of this type can have their voltage (disconnected sensor).
     pub outliers: usize,
 }
 
-/// Limits that a record's rows must keep.
+/// Plausibility limits of a record's rows.
 #[derive(Debug, Clone, Copy)]
 pub struct Limits {
     /// Lowest credible voltage, V.
@@ -78,7 +78,7 @@ pub struct Limits {
 }
 
 impl Record {
-    /// Prepares a stretch. `judged[k]` = false keeps raw row k's current but not its voltage; empty = all are judged.
+    /// Prepares a part. If `judged[k]` is false, only the current of raw row k is used; an empty `judged` judges all rows.
     pub fn prepare(raw: &MeasuredPart, judged: &[bool], grid: &Grid, limits: &Limits) -> Self {
         let largest_a = raw.current_a.iter().fold(0.0_f64, |most, i| most.max(i.abs()));
         let ends = block_ends(raw, largest_a);
@@ -105,20 +105,25 @@ impl Record {
         record
     }
 
+    /// Least and largest SOC of the judged rows.
+    pub fn judged_ends(&self) -> (f64, f64) {
+        ends(self.rows.iter().filter(|row| row.weight_s > 0.0).map(|row| row.soc))
+    }
+
     /// Seconds from the first row to the last.
     pub fn seconds(&self) -> f64 {
         self.rows.iter().map(|row| row.dt_s).sum()
     }
 }
 
-/// Time that a whole discharge counts for, s: the length of a drive. A longer test holds no more information.
+/// Time for which a whole discharge counts, s: the length of a drive. A longer test holds no more information.
 const WHOLE_S: f64 = 8000.0;
-/// Weight of slow and pulse tests relative to drives: the model is made to follow drives.
+/// Weight of slow tests and pulse tests relative to drives: the model should follow drives.
 const TEST_SHARE: f64 = 0.3;
-/// Share of the time in which current flows, and variation of its size relative to its mean, of a drive.
+/// A drive has current for more than this share of the time, and its size varies by more than this share of the mean.
 const DRIVE: (f64, f64) = (0.5, 0.3);
 
-/// 1 for a drive (current flows most of the time, at varying strength), less for rests with pulses and for constant current.
+/// 1 for a drive (varying current most of the time), less for pulse tests with rests and for constant current.
 pub fn share(record: &Record) -> f64 {
     let largest = record.rows.iter().fold(0.0_f64, |most, row| most.max(row.current_a.abs()));
     let (mut all, mut flowing, mut first, mut second) = (0.0, 0.0, 0.0, 0.0);
@@ -135,16 +140,14 @@ pub fn share(record: &Record) -> f64 {
     if flowing > DRIVE.0 * all && variation > DRIVE.1 { 1.0 } else { TEST_SHARE }
 }
 
-/// Returns the weight of a record's second: by the SOC that the record covers, not by its length.
+/// Returns the weight of a second of the record: the record counts by the SOC that it covers, not by its length.
 pub fn weight(record: &Record) -> f64 {
-    let judged = record.rows.iter().filter(|row| row.weight_s > 0.0);
-    let (low, high, seconds) = judged.fold((f64::INFINITY, f64::NEG_INFINITY, 0.0), |(low, high, sum), row| {
-        (f64::min(low, row.soc), f64::max(high, row.soc), sum + row.weight_s)
-    });
+    let (low, high) = record.judged_ends();
+    let seconds: f64 = record.rows.iter().filter(|row| row.weight_s > 0.0).map(|row| row.weight_s).sum();
     if seconds > 0.0 { (high - low) * WHOLE_S / seconds } else { 0.0 }
 }
 
-/// The raw rows at which blocks end; the first row is a block of its own.
+/// Indices of the raw rows that end a block; the first row is a block by itself.
 fn block_ends(raw: &MeasuredPart, largest_a: f64) -> Vec<usize> {
     let (time_s, current_a) = (&raw.time_s, &raw.current_a);
     let (mut ends, mut last, mut last_step_s) = (vec![0], 0, f64::NEG_INFINITY);
@@ -188,7 +191,7 @@ fn block_row(raw: &MeasuredPart, before: usize, end: usize, grid: &Grid) -> FitR
     }
 }
 
-/// Whether the SOC change over a gap differs from the charge that the current at its ends implies.
+/// Whether the SOC change over a gap differs from the charge expected from the current at its ends.
 fn hides_charge(raw: &MeasuredPart, before: usize, end: usize, capacity_ah: f64) -> bool {
     (before + 1..=end).any(|k| {
         let dt_s = raw.time_s[k] - raw.time_s[k - 1];
@@ -197,7 +200,7 @@ fn hides_charge(raw: &MeasuredPart, before: usize, end: usize, capacity_ah: f64)
     })
 }
 
-/// Half the time to both neighbours, at most [`MAX_WEIGHT_S`]; rows marked by a negative weight get none.
+/// Weights each row by half the time to both neighbours, at most [`MAX_WEIGHT_S`]; rows with a negative weight get 0.
 fn weigh(rows: &mut [FitRow]) {
     for k in 0..rows.len() {
         let after_s = rows.get(k + 1).map_or(0.0, |row| row.dt_s);
@@ -224,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn blocks_keep_every_ampere_second_and_both_sides_of_an_edge() {
+    fn blocks_keep_charge_and_both_sides_of_an_edge() {
         let time_s: Vec<f64> = (0..200).map(|k| 0.1 * f64::from(k)).collect();
         let current_a: Vec<f64> = time_s.iter().map(|&t| if t >= 9.95 { 2.0 } else { 0.0 }).collect();
         let soc = vec![0.5; 200];
@@ -238,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn a_disconnected_sensor_is_counted_and_not_judged() {
+    fn disconnected_sensor_is_counted_and_not_judged() {
         let record = prepare(&[0.0, 1.0, 2.0], &[0.1; 3], &[3.6, -0.0006, 3.6], &[0.5; 3]);
         assert_eq!(record.outliers, 1);
         assert_eq!(record.rows[1].weight_s, 0.0);
@@ -246,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gap_that_hides_charge_relaxes_the_branches_and_a_plain_rest_does_not() {
+    fn gap_with_hidden_charge_relaxes_the_branches() {
         let hidden = prepare(&[0.0, 1.0, 7000.0], &[0.0; 3], &[3.6; 3], &[0.5, 0.5, 0.4]);
         assert!(hidden.rows[2].relaxed && hidden.rows[2].weight_s > 0.0);
         let rest = prepare(&[0.0, 1.0, 7000.0], &[0.0; 3], &[3.6; 3], &[0.5; 3]);

@@ -1,9 +1,9 @@
 //! Projected Levenberg-Marquardt on normal equations, with bounds.
 //!
-//! The solver works in steps instead of node values where a block is given as *rising* (the OCV over SOC): first value, then
-//! the rise to each next node. A bound on a rise keeps the curve monotone. The damped quadratic model is minimised
-//! inside the bounds by exchanging the set of parameters held at a bound (block pivoting) with a Cholesky
-//! factorisation of the free ones each time; the step is taken when the true cost falls.
+//! Where a block is *rising* (the OCV over SOC), the solver uses its first value and the rises from node to node instead of node values.
+//! A bound on a rise keeps the curve monotone. The damped quadratic model is minimised within the bounds by block pivoting: the set of
+//! parameters held at a bound changes, and a Cholesky factorisation solves for the free ones each time. A step is taken if it lowers the
+//! true cost.
 
 use nalgebra::{DMatrix, DVector};
 
@@ -12,19 +12,19 @@ use crate::filter::levenberg_marquardt::{self, Damping};
 
 /// Most passes over the data.
 const MAX_PASSES: usize = 60;
-/// Relative fall of the cost below which the fit has converged, twice running.
+/// Relative fall of the cost below which the fit has converged, two steps in a row.
 const CONVERGED: f64 = 3e-4;
 /// Damping; a step that first needed more of it lowers it less, because the limit is near.
 const DAMPING: Damping = Damping { first: 0.3, fall: 0.1, fall_after_growth: 0.6, growth: 8.0, least: 1e-4, most: 1e8 };
 /// Damping below which a step is nearly the undamped one.
 const DAMPING_WEAK: f64 = 0.02;
-/// Most exchanges of the held set in one step; the rest is clamped to the bounds.
+/// Most changes of the held set per step; afterwards the step is clamped to the bounds.
 const MAX_EXCHANGES: usize = 30;
 
 /// Bounds and structure of the parameters.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Space {
-    /// Lowest values; of a rising block: of its first value, then of each rise.
+    /// Lowest values; in a rising block: of the first value, then of each rise.
     pub low: Vec<f64>,
     /// Highest values.
     pub high: Vec<f64>,
@@ -33,7 +33,7 @@ pub struct Space {
 }
 
 impl Space {
-    /// Node values to first value and rises.
+    /// Converts node values to first values and rises.
     fn to_steps(&self, theta: &[f64]) -> Vec<f64> {
         let mut y = theta.to_vec();
         for &(first, len) in &self.rising {
@@ -44,7 +44,7 @@ impl Space {
         y
     }
 
-    /// First value and rises to node values.
+    /// Converts first values and rises to node values.
     fn to_nodes(&self, y: &[f64]) -> Vec<f64> {
         let mut theta = y.to_vec();
         for &(first, len) in &self.rising {
@@ -64,7 +64,7 @@ impl Space {
         self.to_nodes(&y)
     }
 
-    /// Gradient and matrix by first values and rises: every node feels all rises below it.
+    /// Gradient and matrix by first values and rises: a rise affects all nodes above it.
     fn pull_back(&self, normal: &NormalEquations) -> (DMatrix<f64>, DVector<f64>) {
         let n = normal.g.len();
         let mut h = DMatrix::from_vec(n, n, normal.symmetric());
@@ -86,7 +86,7 @@ impl Space {
     }
 }
 
-/// How a fit ended.
+/// Result of a fit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Solution {
     /// Node values.
@@ -95,11 +95,11 @@ pub struct Solution {
     pub cost: f64,
     /// Passes over the data.
     pub passes: usize,
-    /// Whether the cost had stopped falling.
+    /// Whether the cost stopped falling.
     pub converged: bool,
 }
 
-/// Minimises the cost that `evaluate` gives, from `start`; `progress` receives the pass number and the cost.
+/// Minimises the cost of `evaluate` from `start`; `progress` receives the pass number and the cost.
 pub fn minimise(
     space: &Space,
     start: &[f64],
@@ -143,7 +143,7 @@ enum BoundState {
     High,
 }
 
-/// Minimiser of g d + d'(H + damping diag H)d / 2 with low <= y + d <= high; `None` when the matrix cannot be factorised.
+/// Minimises g d + d'(H + damping diag H)d / 2 with low <= y + d <= high; `None` if the matrix cannot be factorised.
 fn bounded_step(h: &DMatrix<f64>, g: &DVector<f64>, damping: f64, y: &[f64], space: &Space) -> Option<DVector<f64>> {
     let n = y.len();
     let mut damped = h.clone();
@@ -189,7 +189,7 @@ fn solve_free(
         };
     }
     let pushed = damped * &*d + g;
-    // Scaled to a unit diagonal: volts and logarithms differ by orders of magnitude.
+    // Scaled to a unit diagonal, because volts and logarithms differ by orders of magnitude.
     let scale: Vec<f64> = free.iter().map(|&k| 1.0 / damped[(k, k)].sqrt()).collect();
     let matrix = DMatrix::from_fn(free.len(), free.len(), |a, b| damped[(free[a], free[b])] * scale[a] * scale[b]);
     let right = DVector::from_fn(free.len(), |a, _| -pushed[free[a]] * scale[a]);
@@ -200,7 +200,7 @@ fn solve_free(
     d.iter().all(|d| d.is_finite()).then_some(())
 }
 
-/// Holds parameters that left their bounds, frees those pushed inwards; returns whether anything changed.
+/// Holds parameters that left their bounds and frees those that the gradient pushes inwards; returns whether anything changed.
 fn exchange(
     damped: &DMatrix<f64>,
     g: &DVector<f64>,
@@ -230,9 +230,9 @@ fn exchange(
 mod tests {
     use super::*;
 
-    /// A straight line through points by first value and rises, each rise at least 0.5.
+    /// Fits a line through points by first value and rises, each rise at least 0.5.
     #[test]
-    fn a_rising_block_stays_rising_and_meets_the_bounded_optimum() {
+    fn rising_block_reaches_the_bounded_optimum() {
         let points = [0.0, 2.0, 1.9, 4.0];
         let evaluate = |theta: &[f64]| {
             let mut normal = NormalEquations::new(4);
@@ -245,7 +245,7 @@ mod tests {
         };
         let space = Space { low: vec![-10.0, 0.5, 0.5, 0.5], high: vec![10.0, 9.0, 9.0, 9.0], rising: vec![(0, 4)] };
         let solution = minimise(&space, &[0.0, 1.0, 2.0, 3.0], evaluate, |_, _| {});
-        // Points 2 and 1.9 move apart to a rise of 0.5 about their middle of 1.95.
+        // Points 2 and 1.9 move apart to a rise of 0.5 around their mean of 1.95.
         for (found, expected) in solution.theta.iter().zip([0.0, 1.7, 2.2, 4.0]) {
             assert!((found - expected).abs() < 1e-6, "{:?}", solution.theta);
         }

@@ -1,26 +1,26 @@
 //! Heat capacity and thermal resistance: C dT/dt = I (OCV - V) - (T - Ta)/R, integrated, by linear least squares.
 //!
-//! The surroundings are taken to be at the temperature a record begins with. That does not hold for every record
-//! (some begin in a cell still warm or cold), so each discharge is fitted alone and the medians of what is credible are
-//! taken. Reversible heat is left out: the values are effective ones of the duty in the data.
+//! The surroundings are assumed to have the temperature at which a record starts. Some records start with a cell that is still
+//! warm or cold, so each discharge is fitted alone, and the medians of the credible results are used. Reversible heat is left out:
+//! the values are effective ones for the duty cycle of the data.
 
 use super::parameters::ParameterTables;
 use super::record::Record;
 use crate::cell::Thermal;
-use crate::filter::median;
+use crate::filter::{ends, median};
 
 /// Ranges of credible values: J/K, K/W.
 const CREDIBLE: [(f64, f64); 2] = [(5.0, 1e5), (0.05, 200.0)];
 
-/// Heat capacity per stored energy of a cell, J/K per Wh: 300 Wh/kg with 0.8 kJ/(kg K) to 80 Wh/kg with 1 kJ/(kg K). A sensor that
-/// sees a share of the warming only (between cell and moving air) gives a capacity too large and a resistance too small by
-/// that share, without a trace in the residuals; this range detects it.
+/// Heat capacity per stored energy of a cell, J/K per Wh: from 300 Wh/kg with 0.8 kJ/(kg K) to 80 Wh/kg with 1 kJ/(kg K). A sensor
+/// between cell and moving air sees only a share of the warming. It gives too large a capacity and too small a resistance, by that share,
+/// without a trace in the residuals; this range detects it.
 const CELL_J_PER_K_WH: (f64, f64) = (2.5, 12.5);
 
-/// Fits both; `energy_wh` = what the cell stores.
+/// Fits both values; `energy_wh` = energy that the cell stores.
 ///
 /// # Errors
-/// No discharge warms enough, or the result is not credible for a cell.
+/// No discharge warms the cell enough, or the result is not credible for a cell.
 pub fn fit(records: &[Record], tables: &ParameterTables, energy_wh: f64) -> Result<Thermal, String> {
     let thermal = medians(records, tables).ok_or("no thermal parameters: no file warms enough to determine them")?;
     let found_j_per_k = thermal.heat_capacity_j_per_k;
@@ -49,7 +49,7 @@ fn of_record(record: &Record, tables: &ParameterTables) -> Option<Thermal> {
     let (mut hh, mut ha, mut aa, mut ht, mut at) = (0.0, 0.0, 0.0, 0.0, 0.0);
     let start_c = record.rows[0].temperature_c;
     let (mut heat, mut above) = (0.0, 0.0);
-    // From where charge moved unseen, what it heated is unknown.
+    // After charge moved without rows, the heat it produced is unknown.
     for row in record.rows.iter().skip(1).take_while(|row| !row.relaxed) {
         let rise = row.temperature_c - start_c;
         heat += row.mean_current_a * (row.ocv.at(&tables.ocv_v) - row.voltage_v) * row.dt_s;
@@ -72,10 +72,9 @@ fn of_record(record: &Record, tables: &ParameterTables) -> Option<Thermal> {
 
 fn warms(record: &Record) -> bool {
     let (Some(first), Some(last)) = (record.rows.first(), record.rows.last()) else { return false };
-    let temperatures = record.rows.iter().map(|row| row.temperature_c);
-    let (low, high) = temperatures.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), t| (low.min(t), high.max(t)));
+    let (low, high) = ends(record.rows.iter().map(|row| row.temperature_c));
     let discharge = last.soc < first.soc;
-    // Cooled by more than 1 K: it began warmer than its surroundings.
+    // Cooling by more than 1 K means that the cell started warmer than its surroundings.
     discharge && high - first.temperature_c >= 2.0 && first.temperature_c - low <= 1.0
 }
 
@@ -87,7 +86,7 @@ mod tests {
     use crate::ident::record::Limits;
 
     #[test]
-    fn known_parameters_are_found_again_in_spite_of_a_record_that_began_cold() {
+    fn known_parameters_are_recovered_despite_a_cold_start() {
         let grid = Grid { soc: vec![0.0, 1.0], temperature_c: vec![25.0] };
         let tables = ParameterTables { ocv_v: vec![3.6, 3.6], r0_ohm: vec![0.1; 2], r_ohm: vec![], tau_s: vec![] };
         let limits = Limits { voltage_low_v: 2.0, voltage_high_v: 5.0, capacity_ah: 2.0 };

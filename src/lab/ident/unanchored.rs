@@ -1,11 +1,11 @@
-//! Fits tables to records whose SOC is not known: ordinary drives and charges that begin anywhere.
+//! Fits tables to records whose SOC is unknown: ordinary drives and charges that start anywhere.
 //!
-//! In: records with the charge taken out since their first row, a prior of the open-circuit curve (V, V^2) and of the
-//! resistances, the label's capacity (Ah). Out: tables, capacity, and the SOC at which each record began.
+//! Input: records with the charge taken out since their first row, priors of the open-circuit curve (V, V^2) and of the
+//! resistances, the label's capacity (Ah). Output: tables, capacity, and the SOC at which each record starts.
 //!
-//! SOC = s_k - (q - o t) / C: the beginning s_k of record k, ln C and the offset o of the current sensor (A) are parameters beside
-//! those of the tables, and all are found together as the most likely ones (maximum a posteriori, Gauss-Newton in [`super::solve`]). What the records do not show stays
-//! as in the prior. Every pass places the rows in the tables again.
+//! SOC = s_k - (q - o t) / C. The SOC s_k at the start of record k, ln C and the offset o of the current sensor (A) are parameters
+//! in addition to those of the tables. All are estimated together (maximum a posteriori, Gauss-Newton in [`super::solve`]). Values that
+//! the records do not show stay at the prior. Every pass positions the rows in the tables again.
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
@@ -18,25 +18,25 @@ use super::prior::Prior;
 use super::record::Record;
 use super::solve::{Solution, Space, minimise};
 
-/// Least and largest SOC of a record's beginning.
+/// Smallest and largest SOC at the start of a record.
 const BEGINNING: (f64, f64) = (-0.05, 1.05);
-/// Largest factor between the capacity and the label's.
+/// Largest factor between the fitted capacity and the label's.
 const CAPACITY_FACTOR: f64 = 1.6;
 
-/// Largest offset of the current, in its standard deviations.
+/// Largest offset of the current, in standard deviations.
 const MOST_OFFSETS: f64 = 4.0;
 
 /// Standard deviation of the SOC at the end of a full charge.
 const FULL_STD: f64 = 0.01;
 
-/// What is known before the fit.
+/// Prior knowledge of a fit.
 #[derive(Debug, Clone)]
 pub struct Known {
-    /// Tables of the parameters in node order: the prior's means.
+    /// Means of the tables' parameters, in node order.
     pub tables: ParameterTables,
-    /// Covariance of the open-circuit voltage between SOC breakpoints, V^2; for the row of temperature `curve_row`.
+    /// Covariance of the open-circuit voltage between SOC breakpoints, V^2, for the temperature row `curve_row`.
     pub curve_covariance: DMatrix<f64>,
-    /// Row of the temperature at which it holds.
+    /// Temperature row of the covariance.
     pub curve_row: usize,
     /// Capacity, Ah.
     pub capacity_ah: f64,
@@ -49,17 +49,17 @@ pub struct Known {
 /// A record with the charge of its rows.
 #[derive(Debug, Clone)]
 pub struct UnanchoredRecord {
-    /// Rows; `soc` of each is the charge taken out since the first row with negative sign, Ah.
+    /// Rows; their `soc` is minus the charge taken out since the first row, Ah.
     pub record: Record,
-    /// Weight of its seconds.
+    /// Weight of a second.
     pub scale: f64,
-    /// SOC at the first row, as far as it is known, with its standard deviation.
+    /// Estimated SOC at the first row, with its standard deviation.
     pub beginning: (f64, f64),
-    /// Charge taken out, Ah, and time since the first row, h, at the moment at which a charge ended with a full cell: SOC 1.
+    /// Charge taken out, Ah, and time since the first row, h, at which a charge ended with a full cell (SOC 1).
     pub full: Option<(f64, f64)>,
 }
 
-/// A fit of tables, capacity and beginnings.
+/// Result of a fit.
 #[derive(Debug, Clone)]
 pub struct UnanchoredFit {
     /// Tables.
@@ -70,13 +70,13 @@ pub struct UnanchoredFit {
     pub capacity_std_ah: f64,
     /// Offset of the current sensor, A: measured less true.
     pub offset_a: f64,
-    /// Standard deviation of the open-circuit voltage that the data leave, V, in node order.
+    /// Remaining standard deviation of the open-circuit voltage, V, in node order.
     pub ocv_std_v: Vec<f64>,
-    /// The records with the SOC found.
+    /// The records with the fitted SOC.
     pub records: Vec<Record>,
 }
 
-/// Rows of the whitened prior of the curve: residual = row . (ocv - mean).
+/// Whitened prior of the curve: residual = row . (ocv - mean).
 struct CurvePriorRows {
     first: usize,
     whitening: DMatrix<f64>,
@@ -105,7 +105,7 @@ impl CurvePriorRows {
     }
 }
 
-/// The unknowns in one vector, those of the tables first, and the cost of their values.
+/// All unknowns in one vector, those of the tables first, and the cost of their values.
 struct Problem<'a> {
     settings: &'a FitSettings,
     known: &'a Known,
@@ -116,7 +116,7 @@ struct Problem<'a> {
 }
 
 impl<'a> Problem<'a> {
-    /// The problem, the values where the search starts, and their bounds.
+    /// Returns the problem, the starting values, and their bounds.
     fn new(
         settings: &'a FitSettings,
         known: &'a Known,
@@ -155,18 +155,18 @@ impl<'a> Problem<'a> {
         self.layout.len() + 1
     }
 
-    /// Index of the SOC at which a record begins.
+    /// Index of the SOC at the start of record `k`.
     fn beginning(&self, k: usize) -> usize {
         self.layout.len() + 2 + k
     }
 
-    /// A record with its SOC.
+    /// Record `k` with its SOC.
     fn placed(&self, theta: &[f64], k: usize) -> Record {
         let of_all = [theta[self.log_capacity()], theta[self.offset()]];
         place(&self.records[k].record, self.settings, theta[self.beginning(k)], of_all)
     }
 
-    /// Cost and its derivatives.
+    /// Cost and derivatives.
     fn evaluate(&self, theta: &[f64]) -> NormalEquations {
         let tables = ParameterTables::new(&self.layout, theta);
         let of_record = |k: usize| {
@@ -183,7 +183,7 @@ impl<'a> Problem<'a> {
             accumulate(&self.placed(theta, k), scale, &self.layout, &tables, Some(&free), &mut normal);
             normal
         };
-        // Added in the order of the records: the sum does not depend on the threads.
+        // Added in the order of the records, so that the sum does not depend on the threads.
         let sums: Vec<NormalEquations> = (0..self.records.len()).into_par_iter().map(of_record).collect();
         let mut normal = NormalEquations::new(theta.len());
         sums.iter().for_each(|sum| normal.add_all(sum));
@@ -193,7 +193,7 @@ impl<'a> Problem<'a> {
         normal
     }
 
-    /// The fit of a solution; `std`: standard deviation of an unknown, of the tables' open-circuit voltages and ln(capacity).
+    /// Converts a solution; `std` returns the standard deviation of an unknown: a table's open-circuit voltage or ln(capacity).
     fn outcome(&self, solution: &Solution, std: impl Fn(usize) -> f64) -> UnanchoredFit {
         let theta = &solution.theta;
         let tables = ParameterTables::new(&self.layout, theta);
@@ -217,7 +217,7 @@ impl<'a> Problem<'a> {
         }
     }
 
-    /// Adds what is known of the capacity, of the offset and of the records' beginnings and ends.
+    /// Adds the priors of the capacity, of the offset, and of the SOC at the records' starts and full charges.
     fn add_capacity_and_beginnings(&self, theta: &[f64], normal: &mut NormalEquations) {
         let (log_capacity, offset) = (self.log_capacity(), self.offset());
         let mut near = |at: usize, mean: f64, std: f64| {
@@ -241,10 +241,10 @@ impl<'a> Problem<'a> {
     }
 }
 
-/// Fits tables, capacity, offset and beginnings; `progress` receives the pass number and the cost.
+/// Fits tables, capacity, offset and the SOC at the records' starts; `progress` receives the pass number and the cost.
 ///
 /// # Errors
-/// Too few rows, or numbers that are not finite.
+/// There are too few rows, or numbers that are not finite.
 pub fn fit(
     settings: &FitSettings,
     known: &Known,
@@ -267,10 +267,10 @@ pub fn fit(
     Ok(problem.outcome(&solution, std))
 }
 
-/// The model that is known, as if the records had said nothing.
+/// Returns the prior model, as if the records contained no information.
 ///
 /// # Errors
-/// A prior without an inverse.
+/// The prior has no inverse.
 pub fn prior(settings: &FitSettings, known: &Known, records: &[UnanchoredRecord]) -> Result<UnanchoredFit, String> {
     let (problem, theta, _) = Problem::new(settings, known, records)?;
     let columns = problem.layout.columns;
@@ -282,7 +282,7 @@ pub fn prior(settings: &FitSettings, known: &Known, records: &[UnanchoredRecord]
     Ok(problem.outcome(&solution, std))
 }
 
-/// The record with its SOC, placed in the tables.
+/// Sets the SOC of a record's rows and positions them in the tables.
 fn place(record: &Record, settings: &FitSettings, beginning_soc: f64, [log_capacity, offset_a]: [f64; 2]) -> Record {
     let grid = &settings.grid;
     let per_ah = libm::exp(-log_capacity);
@@ -293,7 +293,7 @@ fn place(record: &Record, settings: &FitSettings, beginning_soc: f64, [log_capac
         let place = grid.place(row.soc, row.temperature_c);
         (row.ocv, row.resistance, row.tau) =
             (grid.ocv_corners(&place), grid.resistance_corners(&place), grid.tau_corners(&place));
-        // A cell warms up as it is driven: beyond the nodes its resistances follow Arrhenius' law, as between them.
+        // A driven cell warms up. Beyond the nodes its resistances follow Arrhenius' law, as between them.
         let inside_c = row.temperature_c.clamp(coldest_c, warmest_c);
         let factor = arrhenius(row.temperature_c) / arrhenius(inside_c);
         row.resistance.weight.iter_mut().for_each(|weight| *weight *= factor);

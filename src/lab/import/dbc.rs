@@ -11,6 +11,7 @@ use crate::can::dbc::{Database, Message, Signal};
 use crate::can::unit::SignalUnit;
 use crate::discover::groups::groups;
 use crate::error::LabError;
+use crate::fit::quoted;
 use crate::wiring::evidence::{PackQuantity, SignalLabel};
 
 /// A candidate: points and name.
@@ -91,7 +92,7 @@ fn text(file: &str, candidates: &BTreeMap<PackQuantity, Vec<Ranked>>) -> String 
         "# Likely battery signals of {name}, by name, unit and range alone, written by `packwatch import dbc`.\n\
          # `packwatch discover LOG --dbc FILE` judges them by what they do in a log.\n\n\
          [input]\ndbc = [{}]\n",
-        toml::Value::String(file.to_owned())
+        quoted(file)
     );
     let has_cells = candidates
         .get(&PackQuantity::CellVoltage)

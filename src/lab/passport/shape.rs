@@ -1,7 +1,7 @@
 //! The form that a standard asks of a JSON document, and the check of a document against it.
 //!
-//! In: rows of path and kind, one per leaf, e.g. `identification.codes[].key`. A member that may be missing ends in `?`; `[]` is a
-//! list, `{}` a list without duplicates. Out: every fault with its path, and the required members that are missing. A member that
+//! In: rows of path and kind, e.g. `identification.codes[].key|value`. `|` separates members of the same form. A member that may be
+//! missing ends in `?` in the first row that names it; `[]` is a list, `{}` a list without duplicates. Out: every fault with its path, and the required members that are missing. A member that
 //! the standard does not have is a fault too: a misspelt name would go unnoticed.
 
 use std::collections::HashSet;
@@ -80,27 +80,27 @@ impl Shape {
         root
     }
 
-    /// Adds a leaf below this object.
+    /// Adds a leaf below this object, or several where the path has alternatives.
     fn add(&mut self, path: &str, kind: Kind) {
-        let (step, rest) = path.split_once('.').unwrap_or((path, ""));
-        let name = step.trim_end_matches(['[', ']', '{', '}', '?']);
+        let (steps, rest) = path.split_once('.').unwrap_or((path, ""));
         let Self::Object(members) = self else { return };
-        let position = members.iter().position(|member| member.name == name).unwrap_or_else(|| {
-            let inner = if rest.is_empty() { Self::of_kind(kind) } else { Self::Object(Vec::new()) };
-            let shape = if step.ends_with(']') || step.ends_with('}') {
-                Self::List { is_set: step.ends_with('}'), item: Box::new(inner) }
-            } else {
-                inner
-            };
-            members.push(Member { name: name.to_owned(), is_required: !step.contains('?'), shape });
-            members.len() - 1
-        });
-        if rest.is_empty() {
-            return;
-        }
-        match &mut members[position].shape {
-            Self::List { item, .. } => item.add(rest, kind),
-            shape => shape.add(rest, kind),
+        for step in steps.split('|') {
+            let name = step.trim_end_matches(['[', ']', '{', '}', '?']);
+            let position = members.iter().position(|member| member.name == name).unwrap_or_else(|| {
+                let inner = if rest.is_empty() { Self::of_kind(kind) } else { Self::Object(Vec::new()) };
+                let shape = if step.ends_with(']') || step.ends_with('}') {
+                    Self::List { is_set: step.ends_with('}'), item: Box::new(inner) }
+                } else {
+                    inner
+                };
+                members.push(Member { name: name.to_owned(), is_required: !step.contains('?'), shape });
+                members.len() - 1
+            });
+            match &mut members[position].shape {
+                _ if rest.is_empty() => {}
+                Self::List { item, .. } => item.add(rest, kind),
+                shape => shape.add(rest, kind),
+            }
         }
     }
 

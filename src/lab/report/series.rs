@@ -1,6 +1,7 @@
 //! Series over the life of a pack: its worst cell, the range over its cells, every cell in columns of time.
 
 use super::data::{CapacityRecord, Data};
+use crate::filter::ends;
 
 /// Columns of a heat map.
 pub(super) const COLUMNS: usize = 120;
@@ -96,8 +97,7 @@ pub(super) fn columns(data: &Data, pick: ValueSelector) -> Vec<Vec<Option<f64>>>
 pub(super) fn temperatures(data: &Data) -> Vec<(f64, f64, f64)> {
     let rows = data.halves.chunk_by(|a, b| a.time_s == b.time_s);
     rows.filter_map(|rows| {
-        let known = || rows.iter().filter_map(|row| row.mean_temperature_c);
-        let (low, high) = (known().fold(f64::INFINITY, f64::min), known().fold(f64::NEG_INFINITY, f64::max));
+        let (low, high) = ends(rows.iter().filter_map(|row| row.mean_temperature_c));
         (low <= high).then_some((rows[0].time_s, low, high))
     })
     .collect()

@@ -15,39 +15,39 @@ use crate::measured::{MeasuredFile, MeasuredPart};
 use crate::monitor::{EventKind, MonitorConfig};
 use crate::quantity::Timestamp;
 
-/// Rows between two reports of progress.
+/// Number of rows between two progress reports.
 const REPORT_EVERY: usize = 4096;
-/// An initial SOC beyond 0 or 1 by no more than this is limited to that end (a counter that does not start at 0).
+/// An initial SOC outside 0 to 1 by no more than this is clamped (a counter may not start at exactly 0).
 const SOC_SLACK: f64 = 0.005;
 
 /// Where in a file the estimator starts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Start {
-    /// At its first row.
+    /// At the first row.
     Full,
-    /// Where a part of the charge has been taken out; the rows before are dropped.
+    /// Where a share of the charge has been taken out; earlier rows are dropped.
     Middle,
 }
 
 /// How an estimator is started.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Case {
-    /// Where.
+    /// Start of the estimator in the file.
     pub start: Start,
-    /// Error of the initial SOC, points; `None` = none is given: the estimator starts from the first voltage.
+    /// Error of the initial SOC, points; `None` = no initial SOC: the estimator starts from the first voltage.
     #[serde(rename = "told_points")]
     pub soc_error_points: Option<f64>,
-    /// Error of the capacity it starts with, percent of the model's.
+    /// Error of the initial capacity, percent of the model's.
     pub capacity_error_percent: f64,
-    /// Offset of the sensor: added to every measured current before the core sees it, A.
+    /// Offset of the sensor: added to every measured current before the monitor sees it, A.
     pub current_offset_a: f64,
     /// Seed of the windows; `None` = no windows.
     pub seed: Option<u64>,
 }
 
 impl Case {
-    /// The case in words; two of them name an error of the capacity and one of the current.
+    /// The case in words; the two names stand for an error of the capacity and of the current.
     pub fn words(&self, separator: &str, [capacity, current]: [&str; 2]) -> String {
         let mut words = vec![match self.start {
             Start::Full => "full".to_owned(),
@@ -74,30 +74,30 @@ pub struct CaseScore {
     pub case: Case,
     /// Rows fed to the monitor.
     pub rows: usize,
-    /// Values that no frame can carry.
+    /// Number of values that no frame can carry.
     pub uncarried_values: usize,
     /// Number of filter resets.
     pub resets: usize,
-    /// Capacity estimated at the end, Ah; `None` = no estimate.
+    /// Estimated capacity at the end, Ah; `None` = no estimate.
     pub final_capacity_ah: Option<f64>,
-    /// Its standard deviation, Ah.
+    /// Standard deviation of the capacity, Ah.
     pub final_capacity_std_ah: Option<f64>,
-    /// Resistance at the end relative to new; `None` = no estimate.
+    /// Estimated resistance at the end relative to new; `None` = no estimate.
     pub final_resistance_ratio: Option<f64>,
-    /// Its standard deviation.
+    /// Standard deviation of the resistance.
     pub final_resistance_ratio_std: Option<f64>,
-    /// The SOC; `None` = the file has no ampere-hour counter.
+    /// Score of the SOC; `None` = the file has no ampere-hour counter.
     pub soc: Option<SocScore>,
-    /// The usable capacity; `None` = there is no table.
+    /// Score of the usable capacity; `None` = there is no table.
     pub life: Option<LifeScore>,
-    /// The plot.
+    /// Path of the plot.
     pub plot: Option<PathBuf>,
 }
 
-/// Runs `file` through the core.
+/// Runs `file` through the monitor.
 ///
 /// # Errors
-/// The file has no truth, never reaches the start of the case, or the initial SOC is out of range; a plot cannot be written.
+/// The file has no truth or never reaches the start of the case, the initial SOC is out of range, or a plot cannot be written.
 pub(super) fn run(
     job: &ScoreJob,
     file: &MeasuredFile,
@@ -124,11 +124,11 @@ pub(super) fn run(
     run.finish(case)
 }
 
-/// Where a case begins.
+/// First row of a case.
 struct CaseStart {
     part: usize,
     row: usize,
-    /// SOC there, fraction; NaN where there is no counter.
+    /// SOC at that row, fraction; NaN without a counter.
     truth: f64,
 }
 
@@ -143,15 +143,15 @@ impl CaseStart {
         let Some(first) = truths().find(|at| at.truth.is_finite()) else {
             if job.cycles.is_none() {
                 return unfit(
-                    "no column discharged_ah with values, and no table with --cycles: nothing to score against".into(),
+                    "no values in column discharged_ah, and no table with --cycles: nothing to score against".into(),
                 );
             }
             return match (case.start, case.soc_error_points) {
                 (Start::Middle, _) => {
-                    unfit("no column discharged_ah with values: a start in the middle cannot be found".into())
+                    unfit("no values in column discharged_ah: a start in the middle cannot be found".into())
                 }
                 (_, Some(_)) => {
-                    unfit("no column discharged_ah with values: an initial SOC with an error cannot be derived".into())
+                    unfit("no values in column discharged_ah: an initial SOC with an error cannot be derived".into())
                 }
                 _ => Ok(Self { part: 0, row: 0, truth: f64::NAN }),
             };
@@ -162,7 +162,7 @@ impl CaseStart {
             Start::Middle => match truths().find(|at| at.truth <= wanted) {
                 Some(at) => Ok(at),
                 None => unfit(format!(
-                    "never down to a SOC of {:.3}: no start in the middle with --remove {}",
+                    "the SOC never falls to {:.3}: no start in the middle with --remove {}",
                     wanted, settings.remove
                 )),
             },
@@ -170,7 +170,7 @@ impl CaseStart {
     }
 }
 
-/// SOC by the counter, fraction; NaN where it has no value.
+/// SOC by the counter, fraction; NaN where the counter has no value.
 fn truth(part: &MeasuredPart, row: usize, settings: &ScoreSettings) -> f64 {
     1.0 - part.discharged_ah[row] / settings.truth_capacity_ah
 }
@@ -240,7 +240,7 @@ impl<'a> CaseRun<'a> {
         }
     }
 
-    /// Feeds the rows `seen` of one part; `report` receives the number of rows fed.
+    /// Feeds the rows `seen` of a part; `report` receives the number of rows fed.
     fn part(&mut self, part: &MeasuredPart, seen: Range<usize>, report: &mut dyn FnMut(usize)) {
         let Some(&first_s) = part.time_s.get(seen.start).filter(|_| !seen.is_empty()) else { return };
         let known = self.cycles.as_ref().and_then(|table| table.start(&part.key));

@@ -1,4 +1,4 @@
-//! Tables of published capacities: a [`CapacityTable`] with `cycle` and `type`, a line per cycle.
+//! Tables of published capacities: a [`CapacityTable`] with `cycle` and `type`, one line per cycle.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -11,17 +11,17 @@ use crate::quantity::Timestamp;
 /// A discharge of the table.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Discharge {
-    /// When it began.
+    /// Start of the discharge.
     pub(crate) start: Timestamp,
     /// Published capacity, Ah; `None` = not stated.
     pub(crate) capacity_ah: Option<f64>,
 }
 
-/// When each part of a measured file began, and what its discharges delivered.
+/// Start of each part of a measured file, and published capacities of the discharges.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CycleTable {
     starts: HashMap<String, Timestamp>,
-    /// In order of time; discharge number n is the n-th, from 1.
+    /// In order of time; discharge number n is the n-th, counted from 1.
     pub(crate) discharges: Vec<Discharge>,
 }
 
@@ -29,7 +29,7 @@ impl CycleTable {
     /// Reads a table.
     ///
     /// # Errors
-    /// It cannot be read, a column is missing or a field is wrong, with file and line; it names no discharge.
+    /// The file cannot be read, a column is missing, a field is wrong (with file and line), or no discharge has a capacity.
     pub fn read(path: &Path) -> Result<Self, TableError> {
         let mut file = CapacityTable::open(path)?;
         for name in ["cycle", "type"] {
@@ -49,7 +49,7 @@ impl CycleTable {
         Ok(table)
     }
 
-    /// The table for what a load takes down to its cut-off: less the charge that the tester took afterwards at a held voltage.
+    /// Reduces the capacities to the charge down to the load's cut-off, without the charge that the tester took later at a held voltage.
     pub(super) fn at_load(&self, parts: &[MeasuredPart]) -> Self {
         let mut table = self.clone();
         for part in parts.iter().filter(|part| part.is_discharge()) {
@@ -62,12 +62,12 @@ impl CycleTable {
         table
     }
 
-    /// When the part with this key began; `None` = not in the table.
+    /// Start of the part with this key; `None` = not in the table.
     pub(super) fn start(&self, key: &str) -> Option<Timestamp> {
         self.starts.get(key).copied()
     }
 
-    /// Number, from 1, of the latest discharge begun by `time`; 0 = before the first.
+    /// Number, from 1, of the latest discharge that started by `time`; 0 = before the first.
     pub(super) fn number_at(&self, time: Timestamp) -> usize {
         self.discharges.partition_point(|discharge| discharge.start <= time)
     }
@@ -85,7 +85,7 @@ mod tests {
     }
 
     #[test]
-    fn discharges_are_numbered_by_their_time() {
+    fn discharges_are_numbered_by_time() {
         let table = read(
             "cycle,type,start,capacity_ah_source\n0,charge,0,\n1,discharge,100,1.9\n2,impedance,200,\n3,discharge,300,\n",
         );
@@ -97,7 +97,7 @@ mod tests {
     }
 
     #[test]
-    fn charge_at_a_held_voltage_counts_off_and_a_part_beside_the_table_changes_nothing() {
+    fn charge_at_held_voltage_is_subtracted() {
         let table =
             read("cycle,type,start,capacity_ah_source\n1,discharge,100,1.9\n3,discharge,300,0.05\n").expect("reads");
         let part = |key: &str| {
@@ -111,11 +111,11 @@ mod tests {
         };
         let at_load = table.at_load(&[part("1"), part("3"), part("9")]);
         assert!((at_load.discharges[0].capacity_ah.expect("known") - 1.8).abs() < 1e-9, "360 s at 1 A");
-        assert_eq!(at_load.discharges[1].capacity_ah, None, "less than nothing is not stated");
+        assert_eq!(at_load.discharges[1].capacity_ah, None, "a negative capacity counts as not stated");
     }
 
     #[test]
-    fn a_fault_names_its_line_and_what_was_found() {
+    fn fault_names_line_and_value() {
         let fault = read("cycle,type,start,capacity_ah_source\n1,discharge,soon,1.9\n");
         assert_eq!(
             fault,

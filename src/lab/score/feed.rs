@@ -1,4 +1,4 @@
-//! Feeds rows of a measured file to the monitor: frames as a bus would carry them, and the driver's ticks between them.
+//! Feeds rows of a measured file to the monitor: as frames on a bus, with the driver's ticks between them.
 
 use crate::can::decode::SensorIndex;
 use crate::filter::ScalarGaussian;
@@ -24,11 +24,11 @@ pub struct Learned {
 pub(super) struct Feeder(MonitorDriver);
 
 impl Feeder {
-    /// A monitor before its first row, which continues from what it has learned.
+    /// Creates a monitor before its first row, in the state it has learned.
     pub(super) fn new(config: MonitorConfig, sleep_gap_s: f64, learned: Option<&Learned>) -> Self {
         let mut driver = MonitorDriver::new(config, sleep_gap_s);
         if let Some(learned) = learned {
-            // It is of the same configuration.
+            // The state was taken with the same configuration.
             let restored = driver.monitor.restore(learned.snapshot.clone(), Downtime::Unknown);
             debug_assert!(restored.is_ok(), "{restored:?}");
         }
@@ -40,12 +40,12 @@ impl Feeder {
         &mut self.0.out
     }
 
-    /// Values that no frame can carry.
+    /// Number of values that no frame can carry.
     pub(super) fn uncarried(&self) -> usize {
         self.0.uncarried_values
     }
 
-    /// What the monitor has learned.
+    /// State of the monitor.
     pub(super) fn learned(&self) -> Learned {
         let monitor = &self.0.monitor;
         let capacity = monitor.capacity(CellIndex(0));
@@ -62,7 +62,7 @@ impl Feeder {
         self.0.handle_row(time, &values);
     }
 
-    /// The record continues at `time` after a gap of unknown length.
+    /// Continues the record at `time`, after a gap of unknown length.
     pub(super) fn unknown_gap(&mut self, time: Timestamp) {
         self.0.handle_unknown_gap(time);
     }

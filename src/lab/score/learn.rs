@@ -1,4 +1,4 @@
-//! What a vehicle has learned before the scored file: measured files through the monitor, one after the other.
+//! Learns from measured files before the scored file: runs them through the monitor, one after the other.
 
 use std::path::PathBuf;
 
@@ -8,14 +8,14 @@ use crate::measured::MeasuredFile;
 use crate::monitor::MonitorConfig;
 use crate::quantity::Timestamp;
 
-/// Rows between two calls of `progress`: some milliseconds of work.
+/// Number of rows between two calls of `progress`: some milliseconds of work.
 const PROGRESS_ROWS: usize = 4096;
 
-/// Runs `files` through a monitor, with a gap of unknown length between them. `progress` is called at every file and at least every
-/// [`PROGRESS_ROWS`] rows; it may unwind to end the work.
+/// Runs `files` through a monitor, with a gap of unknown length between them. `progress` is called for every file and at least every
+/// [`PROGRESS_ROWS`] rows; it may unwind to abort.
 ///
 /// # Errors
-/// A file that cannot be read.
+/// A file cannot be read.
 pub fn learn(
     files: &[PathBuf],
     config: &MonitorConfig,

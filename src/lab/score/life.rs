@@ -13,32 +13,32 @@ use crate::quantity::catalogue::Quantity;
 /// Estimates after one discharge.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct DischargeScore {
-    /// Counted from 1.
+    /// Number of the discharge, from 1.
     pub number: usize,
     /// Published capacity down to the load's cut-off, Ah; `None` = not stated.
     pub truth_ah: Option<f64>,
     /// Usable capacity at the configured load, Ah.
     pub usable_ah: f64,
-    /// Its standard deviation, Ah.
+    /// Standard deviation of the usable capacity, Ah.
     pub usable_std_ah: f64,
     /// Capacity between the open-circuit voltages, Ah.
     pub capacity_ah: f64,
-    /// Its standard deviation, Ah.
+    /// Standard deviation of the capacity, Ah.
     pub capacity_std_ah: f64,
     /// Resistance relative to new.
     pub resistance_ratio: f64,
-    /// Its standard deviation.
+    /// Standard deviation of the resistance.
     pub resistance_ratio_std: f64,
 }
 
-/// Errors of a life's usable capacities. Statistics are over the discharges after those skipped.
+/// Errors of the usable capacities over a life, without the skipped discharges.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct LifeScore {
-    /// Discharges of the table.
+    /// Number of discharges in the table.
     pub discharges: usize,
-    /// Discharges in the statistics.
+    /// Number of discharges in the statistics.
     pub scored: usize,
-    /// Discharges after those skipped without an estimate or without a published capacity.
+    /// Number of discharges, after those skipped, without an estimate or without a published capacity.
     pub left_out: usize,
     /// Mean |estimate - published|, Ah.
     pub mean_abs_error_ah: f64,
@@ -46,15 +46,15 @@ pub struct LifeScore {
     pub mean_error_ah: f64,
     /// Largest |estimate - published|, Ah.
     pub max_abs_error_ah: f64,
-    /// Share of discharges whose 95 % interval holds the published value, fraction.
+    /// Share of discharges whose 95 % interval contains the published value, fraction.
     pub coverage: f64,
-    /// Mean half-width of that interval, Ah.
+    /// Mean half-width of the interval, Ah.
     pub mean_half_width_ah: f64,
-    /// Threshold of the first fall, Ah.
+    /// Threshold of the two results below, Ah.
     pub threshold_ah: f64,
     /// First discharge (after those skipped) whose estimate is below the threshold.
     pub first_below_estimate: Option<usize>,
-    /// First discharge (after those skipped) whose published capacity is below it.
+    /// First discharge (after those skipped) whose published capacity is below the threshold.
     pub first_below_truth: Option<usize>,
     /// Every discharge with an estimate.
     pub each: Vec<DischargeScore>,
@@ -83,7 +83,7 @@ impl LifeRecorder {
                 let Some(discharge) = number.checked_sub(1).and_then(|index| table.discharges.get(index)) else {
                     return;
                 };
-                // Of a discharge in pieces the last estimate counts.
+                // If a discharge was split, the last estimate counts.
                 self.each.pop_if(|before| before.number == number);
                 self.each.push(DischargeScore {
                     number,
@@ -170,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn capacities_are_compared_with_the_discharge_that_taught_them() {
+    fn estimates_are_compared_with_their_own_discharge() {
         let table = table();
         let mut life = LifeRecorder::default();
         let discharges = [(150.0, 1.3), (250.0, 9.0), (260.0, 1.46), (350.0, 1.39), (450.0, 1.36), (550.0, 1.3)];
@@ -178,7 +178,7 @@ mod tests {
             life.observe(&half_cycle(time_s, Mode::Discharge), &table);
             life.observe(&capacity_event(time_s, usable_ah), &table);
             life.observe(&half_cycle(time_s + 1.0, Mode::Charge), &table);
-            life.observe(&capacity_event(time_s + 1.0, 7.0), &table); // a charge does not measure a discharge
+            life.observe(&capacity_event(time_s + 1.0, 7.0), &table); // a charge is not a discharge
         }
         let score = score(life.each, &table, 1.4, 1);
         assert_eq!((score.discharges, score.scored, score.left_out, score.each.len()), (5, 3, 1, 5));
@@ -186,7 +186,7 @@ mod tests {
         assert!((score.mean_abs_error_ah - 0.02).abs() < 1e-12 && (score.mean_error_ah + 0.04 / 3.0).abs() < 1e-12);
         assert!((score.max_abs_error_ah - 0.03).abs() < 1e-12 && (score.coverage - 1.0 / 3.0).abs() < 1e-12);
         assert!((score.mean_half_width_ah - 0.0196).abs() < 1e-12);
-        // Discharge 1, below the threshold by a wrong start, is skipped.
+        // Discharge 1 is below the threshold because of a wrong start, and is skipped.
         assert_eq!((score.first_below_estimate, score.first_below_truth), (Some(3), Some(4)));
     }
 }

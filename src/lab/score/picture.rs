@@ -1,4 +1,4 @@
-//! Plots of a run: SOC and its error with their 95 % band over time, and a life over its discharges.
+//! Plots of a run: SOC and its error with 95 % band over time, and a life over its discharges.
 
 use std::path::{Path, PathBuf};
 
@@ -8,10 +8,10 @@ use super::soc::SocSample;
 use crate::OF_95;
 use crate::chart::{self, Axis, Chart, Ink, Layer, Picture, PlotError};
 
-/// Words for an error of the capacity and one of the current.
+/// Names for an error of the capacity and of the current.
 const WORDS: [&str; 2] = ["capacity", "current"];
 
-/// Draws the run and gives the file's path.
+/// Draws the run and returns the path of the file.
 pub(super) fn draw(
     folder: &Path,
     name: &str,
@@ -49,7 +49,7 @@ fn soc_panel(title: &str, samples: &[SocSample]) -> Chart {
 }
 
 fn error_panel(samples: &[SocSample]) -> Chart {
-    // Errors before settling would dwarf the rest: the axis follows the second half of the run.
+    // Errors before settling would dwarf the rest, so the axis follows the second half of the run.
     let later = &samples[samples.len() / 2..];
     let reach = later.iter().map(|s| s.error_points().abs().max(s.half_width_points())).fold(1.0, f64::max) * 1.5;
     let inside = move |value: f64| value.clamp(-reach, reach);

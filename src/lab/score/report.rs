@@ -1,4 +1,4 @@
-//! The scores as text: tables for people, one JSON document for programs.
+//! The scores as text tables and as one JSON document.
 
 use std::fmt::Write as _;
 use std::path::PathBuf;
@@ -38,7 +38,7 @@ struct Document<'a> {
     settle_s: f64,
     converged_within_points: f64,
     converged_hold_s: f64,
-    /// What the files of --learn have taught.
+    /// State learned from the files of --learn.
     #[serde(skip_serializing_if = "Option::is_none")]
     learned: Option<LearnedDocument>,
     scores: &'a [CaseScore],
@@ -83,10 +83,10 @@ struct LifeTotal<'a> {
 }
 
 impl ScoreReport {
-    /// One JSON document, with a line feed at its end.
+    /// One JSON document, ending in a line feed.
     ///
     /// # Errors
-    /// Never: every value has a form in JSON.
+    /// Never: every value can be written as JSON.
     pub fn json(&self) -> Result<String, LabError> {
         let document = Document {
             config: self.config.display().to_string(),
@@ -106,7 +106,7 @@ impl ScoreReport {
         Ok(serde_json::to_string_pretty(&document)? + "\n")
     }
 
-    /// Tables for people.
+    /// The scores as text tables.
     pub fn table(&self) -> String {
         let settings = &self.settings;
         let mut out = format!("cell model {}\n", settings.monitor.model.name);
@@ -161,10 +161,10 @@ impl ScoreReport {
         scored.map(|(score, life)| life_row(score, life)).collect()
     }
 
-    /// Adds which values were not fed or not scored.
+    /// Notes which values were not fed or not scored.
     fn add_notes(&self, out: &mut String) {
         let mut note = |text: std::fmt::Arguments<'_>| {
-            // Writing to a text cannot fail.
+            // Writing to a string cannot fail.
             let _ = writeln!(out, "{text}");
         };
         for score in &self.scores {
@@ -226,7 +226,7 @@ impl<'a> LifeTotal<'a> {
     }
 }
 
-/// The files with a score, by name.
+/// Scores of one kind, with the names of their files.
 fn scored<'a, T>(scores: &[&'a CaseScore], of: impl Fn(&'a CaseScore) -> Option<&'a T>) -> Vec<(&'a str, &'a T)> {
     scores.iter().filter_map(|score| Some((score.name.as_str(), of(score)?))).collect()
 }
@@ -239,7 +239,7 @@ fn least<T>(all: &[(&str, &T)], value: impl Fn(&T) -> f64) -> f64 {
     all.iter().map(|(_, score)| value(score)).fold(f64::INFINITY, f64::min)
 }
 
-/// The file with the largest value, and that value.
+/// The file with the largest value, with that value.
 fn worst<'a, T>(all: &[(&'a str, &T)], value: impl Fn(&T) -> f64) -> Option<(&'a str, f64)> {
     all.iter().map(|(name, score)| (*name, value(score))).max_by(|a, b| a.1.total_cmp(&b.1))
 }
@@ -287,7 +287,7 @@ fn life_row(score: &CaseScore, life: &LifeScore) -> Vec<String> {
     ]
 }
 
-/// Formats a finite value, else a dash.
+/// Formats a finite value; others become a dash.
 fn known(value: f64, format: impl Fn(f64) -> String) -> String {
     if value.is_finite() { format(value) } else { "-".to_owned() }
 }

@@ -1,55 +1,55 @@
-//! A request for scores, as the command line and the Python module take it, and the run that it stands for.
+//! A request for scores, for the command line and the Python module, and the run made from it.
 //!
-//! In: files, the cell's configuration, starts of the estimator, settings of the statistics. Out: [`ScoreRun`], with everything read
-//! and checked. Errors name the file or the argument.
+//! Input: files, the configuration of the cell, starts of the estimator, settings of the statistics. Output: [`ScoreRun`], with all
+//! inputs read and checked. Errors name the file or the argument.
 
 use std::path::PathBuf;
 
 use super::{Case, CaseScore, CycleTable, ScoreJob, ScoreReport, ScoreSettings, Start, learn};
 use crate::config::Config;
-use crate::error::{LabError, RequestError};
+use crate::error::{LabError, RequestError, check_values as check, create_folder};
 use crate::health::UsableConfig;
 use crate::io::paths::{check_distinct, short_names};
 use crate::single_cell::CellSource;
 
-/// What to score. Every list makes more cases: each file runs in every combination.
+/// What to score. Each file runs in every combination of the lists.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ScoreRequest {
     /// Measured files.
     pub files: Vec<PathBuf>,
     /// Configuration of the cell.
     pub source: CellSource,
-    /// Files that the monitor has seen before, in this order.
+    /// Files that the monitor has seen before, in order.
     pub learn: Vec<PathBuf>,
     /// Where in each file the estimator starts.
     pub start: Vec<Start>,
-    /// Part of the full charge already taken out where a start in the middle begins.
+    /// Share of the full charge that has been taken out where a start in the middle begins.
     pub remove: f64,
-    /// Errors of the initial SOC, points; `None` = no initial SOC is given.
+    /// Errors of the initial SOC, points; `None` = no initial SOC.
     pub soc_error_points: Vec<Option<f64>>,
     /// Standard deviation of the initial SOC, points.
     pub soc_std_points: Option<f64>,
-    /// Errors of the capacity that the estimator starts with, percent of the model's.
+    /// Errors of the initial capacity, percent of the model's.
     pub capacity_error_percent: Vec<f64>,
-    /// Standard deviation that goes with them, percent.
+    /// Standard deviation of the initial capacity, percent.
     pub capacity_std_percent: Option<f64>,
     /// Offsets of the current sensor, A.
     pub current_offset_a: Vec<f64>,
     /// Time after the start without statistics, s.
     pub settle_s: f64,
-    /// Charge from full to empty that the truth is stated in, Ah; `None` = the model's capacity.
+    /// Charge from full to empty that defines the true SOC, Ah; `None` = the model's capacity.
     pub truth_capacity_ah: Option<f64>,
-    /// A gap longer than this means that the recorder was asleep, s.
+    /// A longer gap means that the recorder was asleep, s.
     pub sleep_gap_s: f64,
-    /// Tables of published capacities, one per file; none where there are none.
+    /// Tables of published capacities, one per file; empty without tables.
     pub cycles: Vec<PathBuf>,
     /// Load of those capacities: A, degrees C, V; `None` = the configuration's `[usable]`.
     pub load: Option<[f64; 3]>,
-    /// The first discharge below this capacity is reported, Ah.
+    /// Capacity whose first undershoot is reported, Ah.
     pub threshold_ah: f64,
-    /// Discharges before the statistics of the capacity begin.
+    /// Number of discharges before the statistics of the capacity.
     pub skip_cycles: usize,
-    /// Least and largest part of each half-cycle's charge that is seen.
+    /// Smallest and largest share of each half-cycle's charge that is visible.
     pub window: Option<(f64, f64)>,
     /// Seeds of the windows.
     pub seeds: Vec<u64>,
@@ -85,7 +85,7 @@ impl Default for ScoreRequest {
     }
 }
 
-/// What a request stands for.
+/// A checked request with its inputs.
 #[derive(Debug)]
 pub struct ScoreRun {
     config: Config,
@@ -95,7 +95,7 @@ pub struct ScoreRun {
 }
 
 impl ScoreRun {
-    /// The files.
+    /// Files with their tables.
     pub fn jobs(&self) -> &[ScoreJob] {
         &self.jobs
     }
@@ -103,12 +103,9 @@ impl ScoreRun {
     /// Scores every file in every case; `progress` as in [`super::run`].
     ///
     /// # Errors
-    /// Error of the first file (in order) that cannot be scored, or the folder of the plots cannot be created.
+    /// The error of the first file (in order) that cannot be scored, or the folder of the plots cannot be created.
     pub fn run(self, progress: &(dyn Fn(usize, f64) + Sync)) -> Result<ScoreReport, LabError> {
-        if let Some(folder) = &self.settings.plots {
-            let created = std::fs::create_dir_all(folder);
-            created.map_err(|error| LabError::File(format!("{}: cannot be created: {error}", folder.display())))?;
-        }
+        self.settings.plots.as_deref().map_or(Ok(()), create_folder)?;
         let scores: Vec<CaseScore> = super::run(&self.jobs, &self.cases, &self.settings, progress)?;
         let Self { config, settings, cases, .. } = self;
         Ok(ScoreReport { config: config.path, settings, cases, scores })
@@ -119,7 +116,7 @@ impl ScoreRequest {
     /// Reads the configuration, the tables and the files to learn from; `progress` as in [`learn`].
     ///
     /// # Errors
-    /// Faults of the configuration; a number out of its range, arguments that do not fit together, a table or a file to learn from that cannot be read.
+    /// The configuration is faulty, a number is out of range, arguments are incompatible, or a table or a file to learn from cannot be read.
     pub fn prepare(&self, progress: &dyn Fn()) -> Result<ScoreRun, RequestError> {
         self.check()?;
         let config = self.source.load()?;
@@ -137,15 +134,13 @@ impl ScoreRequest {
             )));
         }
         if self.source.config.is_none() && self.source.cell.is_none() && self.source.label.is_none() {
-            return Err(
-                "no cell: a configuration, a cell model or a chemistry with rated capacity must be given".into()
-            );
+            return Err("no cell: give a configuration, a cell model, or a chemistry with the rated capacity".into());
         }
         check_distinct(&self.files)?;
         self.check_numbers()
     }
 
-    /// No list without which there is nothing to score is empty.
+    /// Rejects empty lists for which nothing could be scored.
     fn check_lists(&self) -> Result<(), LabError> {
         let lists = [
             ("files", self.files.len()),
@@ -164,7 +159,7 @@ impl ScoreRequest {
         Ok(())
     }
 
-    /// The ranges of the command line's arguments.
+    /// Checks the ranges of the arguments.
     fn check_numbers(&self) -> Result<(), LabError> {
         let above_0 = |value: f64| value > 0.0 && value.is_finite();
         let to_100 = |value: f64| value > 0.0 && value <= 100.0;
@@ -273,15 +268,4 @@ impl ScoreRequest {
         }
         cases
     }
-}
-
-/// Rejects the first value that is not allowed.
-fn check(
-    name: &str,
-    values: impl IntoIterator<Item = f64>,
-    is_allowed: impl Fn(f64) -> bool,
-    allowed: &str,
-) -> Result<(), LabError> {
-    let found = values.into_iter().find(|value| !is_allowed(*value));
-    found.map_or(Ok(()), |value| Err(LabError::Data(format!("{name} = {value}, must be {allowed}"))))
 }

@@ -4,15 +4,15 @@ use serde::Serialize;
 
 use crate::OF_95;
 
-/// An estimate this near the truth is right, points (percent of full).
+/// Largest error of a converged estimate, points (percent of full).
 pub const CONVERGED_POINTS: f64 = 2.0;
-/// It must stay so near for this long, s: a wrong estimate that only crosses the truth has not converged.
+/// Time for which the error must stay that small, s: a wrong estimate that only crosses the truth has not converged.
 pub const CONVERGED_HOLD_S: f64 = 600.0;
 
-/// One estimate with its truth.
+/// An estimate with its truth.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct SocSample {
-    /// Since the start, s.
+    /// Time since the start, s.
     pub(super) time_s: f64,
     /// Fraction.
     pub(super) truth: f64,
@@ -20,12 +20,12 @@ pub(super) struct SocSample {
     pub(super) soc: f64,
     /// Fraction.
     pub(super) soc_std: f64,
-    /// Innovation over its standard deviation, squared; NaN where there was no innovation.
+    /// (Innovation / standard deviation) squared; NaN without an innovation.
     pub(super) nis: f64,
 }
 
 impl SocSample {
-    /// Points.
+    /// Error of the estimate, points.
     pub(super) fn error_points(&self) -> f64 {
         100.0 * (self.soc - self.truth)
     }
@@ -36,12 +36,12 @@ impl SocSample {
     }
 }
 
-/// Errors of a run's SOC. Statistics are over the samples after settling; NaN (JSON: null) where there are none.
+/// Errors of a run's SOC, over the samples after settling; NaN (JSON: null) without samples.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct SocScore {
-    /// Samples in the statistics.
+    /// Number of samples in the statistics.
     pub samples: usize,
-    /// Rows left out: no truth or no estimate.
+    /// Number of rows left out, without truth or without estimate.
     pub left_out_rows: usize,
     /// Error of the first estimate, points.
     pub first_error_points: f64,
@@ -53,29 +53,29 @@ pub struct SocScore {
     pub mean_abs_error_points: f64,
     /// Largest |error|, points.
     pub max_abs_error_points: f64,
-    /// From when on |error| stayed within 2 points for 10 min, s after the start; `None` = never.
+    /// Time from which |error| stayed within 2 points for 10 min, s after the start; `None` = never.
     pub converge_s: Option<f64>,
-    /// Share of samples whose 95 % interval holds the truth, fraction.
+    /// Share of samples whose 95 % interval contains the truth, fraction.
     pub coverage: f64,
-    /// Mean half-width of that interval, points.
+    /// Mean half-width of the interval, points.
     pub mean_half_width_points: f64,
-    /// Mean of (innovation / its standard deviation) squared: at most about 1 when the filter's own statistics hold, and
-    /// far below it at high sample rates, since the filter counts information per second.
+    /// Mean of (innovation / standard deviation) squared: at most about 1 if the filter's own statistics are right, and far below 1 at
+    /// high sample rates, because the filter counts information per second.
     pub mean_normalised_innovation_squared: f64,
 }
 
-/// The mean; NaN of nothing.
+/// The mean; NaN without values.
 pub(super) fn mean(values: impl Iterator<Item = f64>) -> f64 {
     let (sum, count) = values.fold((0.0, 0_u64), |(sum, count), value| (sum + value, count + 1));
     sum / count as f64
 }
 
-/// The largest; NaN of nothing.
+/// The largest value; NaN without values.
 pub(super) fn largest(values: impl Iterator<Item = f64>) -> f64 {
     values.fold(f64::NAN, f64::max)
 }
 
-/// Judges a run whose samples are in order of time.
+/// Scores a run whose samples are in order of time.
 pub(super) fn score(samples: &[SocSample], settle_s: f64, left_out_rows: usize) -> SocScore {
     let settled = &samples[samples.partition_point(|sample| sample.time_s < settle_s)..];
     let errors = || settled.iter().map(SocSample::error_points);
@@ -124,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn statistics_are_those_of_the_samples_after_settling() {
+    fn statistics_cover_samples_after_settling() {
         let score = score(&samples(&[-20.0, 9.0, 3.0, -1.0, -1.0, 1.0]), 20.0, 7);
         assert_eq!((score.samples, score.left_out_rows), (4, 7));
         assert!(near(score.first_error_points, -20.0));
@@ -136,9 +136,9 @@ mod tests {
     }
 
     #[test]
-    fn converged_is_where_the_error_begins_to_stay_small() {
+    fn converged_needs_a_held_small_error() {
         let mut errors = vec![-20.0; 5];
-        errors.extend([1.0; 10]); // crosses the truth for 90 s
+        errors.extend([1.0; 10]); // crosses the truth, within the limit for 90 s
         errors.extend([5.0; 5]);
         errors.extend([1.9; 61]); // 600 s
         assert_eq!(score(&samples(&errors), 0.0, 0).converge_s, Some(200.0));
@@ -147,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn of_no_samples_there_are_no_numbers() {
+    fn score_without_samples_has_no_numbers() {
         let score = score(&samples(&[1.0]), 600.0, 0);
         assert_eq!(score.samples, 0);
         assert!(score.rmse_points.is_nan() && score.coverage.is_nan() && score.max_abs_error_points.is_nan());

@@ -1,8 +1,8 @@
-//! Random windows: each half-cycle is seen only in part, as by a vehicle that starts and stops anywhere.
+//! Random windows: only a part of each half-cycle is visible, as in a vehicle that starts and stops anywhere.
 //!
-//! The window is a share of the charge that the part moves (|current| times time; a charger's long taper would dominate
-//! a share of time), uniform between two bounds, at a uniform place. Rows outside are dropped: the monitor sees a
-//! gap in its record.
+//! The window covers a share of the charge that the part moves (|current| times time; a share of time would be dominated by the long
+//! taper of a charger). Share and position are uniformly distributed. Rows outside the window are dropped: the monitor sees a gap in
+//! its record.
 
 use std::ops::Range;
 
@@ -11,7 +11,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::measured::MeasuredPart;
 
-/// The rows of part number `index` that are seen: never none of a part that has rows.
+/// The visible rows of part number `index`: at least one, unless the part is empty.
 pub(super) fn rows(part: &MeasuredPart, index: usize, seed: u64, (least, most): (f64, f64)) -> Range<usize> {
     let moved = moved_as(part);
     let total = moved.last().copied().unwrap_or(0.0);
@@ -19,7 +19,7 @@ pub(super) fn rows(part: &MeasuredPart, index: usize, seed: u64, (least, most): 
         return 0..part.len();
     }
     let mut generator = ChaCha8Rng::seed_from_u64(seed);
-    // A stream per part: a part more in the file moves no other part's window.
+    // One random stream per part, so that an additional part in the file does not move the windows of the others.
     generator.set_stream(index as u64);
     let share = least + (most - least) * uniform(&mut generator);
     let begin = (1.0 - share) * uniform(&mut generator);
@@ -28,7 +28,7 @@ pub(super) fn rows(part: &MeasuredPart, index: usize, seed: u64, (least, most): 
     first..end.max(first + 1)
 }
 
-/// Charge moved up to each row, A s, either way.
+/// Charge moved up to each row, A s, both directions added.
 fn moved_as(part: &MeasuredPart) -> Vec<f64> {
     let mut total = 0.0;
     let mut before_s = part.time_s.first().copied().unwrap_or(0.0);
@@ -60,7 +60,7 @@ mod tests {
     }
 
     #[test]
-    fn windows_hold_the_share_asked_for_wherever_they_lie() {
+    fn windows_cover_the_requested_share_anywhere() {
         let mut begins = Vec::new();
         for index in 0..400 {
             let rows = rows(&part(), index, 7, (0.4, 0.7));
@@ -72,14 +72,14 @@ mod tests {
     }
 
     #[test]
-    fn a_seed_gives_its_windows_and_another_one_others() {
+    fn seed_determines_the_windows() {
         let of = |seed: u64| (0..20).map(|index| rows(&part(), index, seed, (0.4, 0.7))).collect::<Vec<_>>();
         assert_eq!(of(1), of(1));
         assert_ne!(of(1), of(2));
     }
 
     #[test]
-    fn a_part_without_current_is_seen_whole() {
+    fn part_without_current_is_visible_whole() {
         let rest = MeasuredPart { time_s: vec![0.0, 1.0], current_a: vec![0.0, f64::NAN], ..MeasuredPart::default() };
         assert_eq!(rows(&rest, 0, 1, (0.4, 0.7)), 0..2);
         assert_eq!(rows(&MeasuredPart::default(), 0, 1, (0.4, 0.7)), 0..0);

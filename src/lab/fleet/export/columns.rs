@@ -1,7 +1,7 @@
 //! The columns of the exported tables: name, type, unit, meaning and value.
 //!
-//! The writers, the schema of the Parquet files and the page `docs/src/reference/export.md` all come from these lines. A value that is
-//! not known is null (an empty field in CSV), never NaN. Cells count from 0, current is positive for discharge.
+//! The writers, the schema of the Parquet files and the page `docs/src/reference/export.md` come from these lines. An unknown value is
+//! null (an empty field in CSV), never NaN. Cells count from 0, current is positive for discharge.
 
 use std::borrow::Cow;
 use std::fmt::Write as _;
@@ -19,7 +19,7 @@ use crate::quantity::catalogue::{Part, Quantity, RECORDED};
 /// Type of a column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ColumnType {
-    /// A moment: microseconds since 1970, UTC; in CSV like 2008-04-02T13:08:17.921000Z.
+    /// A time: microseconds since 1970, UTC; in CSV like 2008-04-02T13:08:17.921000Z.
     Time,
     /// A number.
     Real,
@@ -32,7 +32,7 @@ pub(super) enum ColumnType {
 }
 
 impl ColumnType {
-    /// In a Parquet schema.
+    /// Physical and logical type in a Parquet schema.
     pub(super) const fn parquet(self) -> (&'static str, &'static str) {
         match self {
             Self::Time => ("INT64", " (TIMESTAMP(MICROS,true))"),
@@ -54,7 +54,7 @@ impl ColumnType {
     }
 }
 
-/// A value; `None` inside = not known.
+/// A value; `None` inside = unknown.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum FieldValue<'r> {
     Time(Timestamp),
@@ -75,15 +75,15 @@ pub(super) struct Column<R> {
     source: ColumnSource<R>,
 }
 
-/// Where the value of a column comes from.
+/// Source of a column's value.
 enum ColumnSource<R> {
     Value(for<'r> fn(&'r R) -> FieldValue<'r>),
-    /// The number of the column's name in an event.
+    /// The number in an event that has the column's name.
     Field(fn(&R) -> &Fields),
 }
 
 impl<R> Column<R> {
-    /// Its value in a row.
+    /// Value of the column in a row.
     pub(super) fn value<'r>(&self, row: &'r R) -> FieldValue<'r> {
         match self.source {
             ColumnSource::Value(value) => value(row),
@@ -92,7 +92,7 @@ impl<R> Column<R> {
     }
 }
 
-/// Columns: name, kind, unit, `null` where it may be, meaning, value.
+/// Columns: name, kind, unit, `null` if the value is optional, meaning, value.
 macro_rules! columns {
     ($row:ty; $( $name:literal $kind:ident $unit:literal $($null:ident)?, $about:literal, $get:expr; )+) => {
         [$( Column::<$row> {
@@ -108,7 +108,7 @@ macro_rules! columns {
     (@) => { false };
 }
 
-/// Of `estimates`.
+/// Columns of `estimates`.
 pub(super) const ESTIMATES: &[Column<EstimateRow>] = &columns! { EstimateRow;
     "log" Word "", "name of the log and of its folder", |row| text(&row.log);
     "time" Time "UTC", "time of the voltage reading", |row| FieldValue::Time(row.estimate.time);
@@ -131,7 +131,7 @@ pub(super) const ESTIMATES: &[Column<EstimateRow>] = &columns! { EstimateRow;
     "temperature_c" Real "degrees C" null, "temperature used", |row| real(row.estimate.measured.temperature_c);
 };
 
-/// Of `half_cycles`: the half-cycle, the recorded quantities after it, what the cell has lost, its remaining life.
+/// Columns of `half_cycles`: the half-cycle, the recorded quantities after it, the cell's losses, its remaining life.
 pub(super) static HALF_CYCLES: LazyLock<Vec<Column<HalfCycleRow>>> = LazyLock::new(|| {
     let half_cycle = columns! { HalfCycleRow;
         "log" Word "", "name of the log and of its folder", |row| text(&row.log);
@@ -180,7 +180,7 @@ fn recorded(quantity: Quantity) -> impl Iterator<Item = Column<HalfCycleRow>> {
     })
 }
 
-/// Of `alarms`.
+/// Columns of `alarms`.
 pub(super) const ALARMS: &[Column<AlarmRow>] = &columns! { AlarmRow;
     "log" Word "", "name of the log and of its folder", |row| text(&row.log);
     "time" Time "UTC", "time of the change", |row| FieldValue::Time(row.time);
@@ -199,7 +199,7 @@ pub(super) const ALARMS: &[Column<AlarmRow>] = &columns! { AlarmRow;
     "acknowledged" Flag "", "whether it was acknowledged", |row| FieldValue::Flag(row.alarm.flag("acknowledged"));
 };
 
-/// Of `vehicles`, which [`merge`](super::merge) writes.
+/// Columns of `vehicles`, which [`merge`](super::merge) writes.
 pub(super) const VEHICLES: &[Column<VehicleRecord>] = &columns! { VehicleRecord;
     "log" Word "", "name of the vehicle, as in the other tables", |row| text(&row.line.vehicle);
     "logs" Whole "", "its logs", |row| FieldValue::Whole(u32::try_from(row.line.logs.len()).ok());
@@ -256,7 +256,7 @@ fn days(row: &HalfCycleRow, get: fn(Remaining) -> f64) -> FieldValue<'_> {
     maybe(row.remaining.and_then(|life| life.days).map(get))
 }
 
-/// The page about the columns, as Markdown.
+/// The reference page of the columns, as Markdown.
 pub fn reference() -> String {
     let mut page = String::from(
         "# Exported tables\n\nWritten by `packwatch export --columns-page`; the exported files use the same definition. An unknown value is null \
@@ -283,7 +283,7 @@ fn section<R>(name: &str, about: &str, columns: &[Column<R>]) -> String {
     );
     for column in columns {
         let null = if column.optional { "yes" } else { "" };
-        // Writing to a text cannot fail.
+        // Writing to a string cannot fail.
         let _ = writeln!(
             text,
             "| `{}` | {} | {} | {null} | {} |",
@@ -305,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn every_column_has_a_name_of_its_own_and_the_unit_its_name_says() {
+    fn column_names_are_unique_and_state_the_unit() {
         for names in [names(ESTIMATES), names(&HALF_CYCLES), names(ALARMS)] {
             assert!(names.iter().enumerate().all(|(index, name)| !names[..index].contains(name)));
         }

@@ -1,8 +1,8 @@
-//! Puts the vehicles' tables of several runs together: one Parquet file per table, row groups of one vehicle each, the vehicles by name.
+//! Merges the vehicles' tables of several runs: one Parquet file per table, the vehicles by name, each in its own row groups.
 //!
-//! In: folders that [`run`](crate::fleet::vehicles::run) has written. Out: `vehicles.parquet`, a row for each vehicle, also one that
-//! failed, and `half_cycles`, `alarms` and, where they were exported, `estimates.parquet`. Promise: the same bytes, in whatever parts and in
-//! whatever order the vehicles were replayed; column chunks are copied as they are, so memory does not grow with the rows.
+//! Input: folders written by [`run`](crate::fleet::vehicles::run). Output: `vehicles.parquet` with a row for each vehicle, including
+//! those that failed, `half_cycles.parquet`, `alarms.parquet` and, if they were exported, `estimates.parquet`. The bytes do not depend
+//! on how the vehicles were split and in which order they were replayed. Column chunks are copied, so memory does not grow with the rows.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -10,36 +10,35 @@ use std::path::{Path, PathBuf};
 use super::TableFormat;
 use super::columns::{ALARMS, ESTIMATES, HALF_CYCLES, VEHICLES};
 use super::table::{TableFile, concatenate};
-use crate::error::LabError;
+use crate::error::{LabError, create_folder};
 use crate::fleet::vehicle::{RECORD, Vehicle, VehicleRecord};
 
-/// What was merged.
+/// Summary of a merge.
 #[derive(Debug, Clone, Default, PartialEq, Eq, serde::Serialize)]
 pub struct MergeSummary {
-    /// Vehicles, with those that failed.
+    /// Number of vehicles, including those that failed.
     pub vehicles: usize,
-    /// Vehicles without tables, and why.
+    /// Vehicles without tables, with the reasons.
     pub failed: BTreeMap<String, String>,
     /// Rows of each table.
     pub rows: BTreeMap<String, u64>,
 }
 
-/// A vehicle that was replayed, and where its tables are.
+/// A replayed vehicle and the folder of its tables.
 struct VehicleFolder {
     folder: PathBuf,
     record: VehicleRecord,
 }
 
-/// Merges the vehicles in `folders` into `out`. `wanted`: the vehicles that must be there, and no others.
+/// Merges the vehicles in `folders` into `out`. `wanted`: the expected vehicles; others are an error.
 ///
 /// # Errors
-/// A vehicle is missing, is there twice with other contents, or was replayed by another version or with another period of the estimates; a
+/// A vehicle is missing, is found twice with different contents, or was replayed by another version or with another estimate period; a
 /// table cannot be read or written.
 pub fn merge(folders: &[PathBuf], wanted: Option<&[Vehicle]>, out: &Path) -> Result<MergeSummary, LabError> {
     let vehicles = read_all(folders)?;
     check(&vehicles, wanted)?;
-    std::fs::create_dir_all(out)
-        .map_err(|error| LabError::File(format!("{}: cannot be created: {error}", out.display())))?;
+    create_folder(out)?;
     let mut summary = MergeSummary { vehicles: vehicles.len(), ..MergeSummary::default() };
     let metadata = [("packwatch.version", env!("CARGO_PKG_VERSION").to_owned())];
     for table in ["half_cycles", "alarms", "estimates"] {
@@ -77,7 +76,7 @@ fn read_all(folders: &[PathBuf]) -> Result<BTreeMap<String, VehicleFolder>, LabE
                 continue;
             }
             let Some(record) = VehicleRecord::read(&folder) else {
-                let why = "not complete, or by another version: run it again, or remove the folder";
+                let why = "incomplete, or written by another version: run it again, or remove the folder";
                 return Err(LabError::Data(format!("{}: {why}", folder.display())));
             };
             let name = record.line.vehicle.clone();
@@ -94,7 +93,7 @@ fn read_all(folders: &[PathBuf]) -> Result<BTreeMap<String, VehicleFolder>, LabE
     if vehicles.is_empty() {
         let folders: Vec<String> = folders.iter().map(|folder| folder.display().to_string()).collect();
         return Err(LabError::Data(format!(
-            "{}: no vehicle; `packwatch fleet run` writes {RECORD} for each",
+            "{}: no vehicle; `packwatch fleet run` writes {RECORD} for each vehicle",
             folders.join(", ")
         )));
     }
@@ -109,7 +108,7 @@ fn check(vehicles: &BTreeMap<String, VehicleFolder>, wanted: Option<&[Vehicle]>)
         let period =
             period_s.map_or_else(|| "no estimates".to_owned(), |period_s| format!("an estimate each {period_s} s"));
         return Err(LabError::Data(format!(
-            "vehicle {name} is by packwatch {version} with {period}, unlike others: run it again"
+            "vehicle {name} was replayed by packwatch {version} with {period}, unlike others: run it again"
         )));
     }
     let Some(wanted) = wanted else { return Ok(()) };
@@ -119,7 +118,7 @@ fn check(vehicles: &BTreeMap<String, VehicleFolder>, wanted: Option<&[Vehicle]>)
     let missing: Vec<&str> = missing.map(|vehicle| vehicle.vehicle.as_str()).collect();
     if !missing.is_empty() {
         return Err(LabError::Data(format!(
-            "{} of {} vehicles are not replayed: {}",
+            "{} of {} vehicles have not been replayed: {}",
             missing.len(),
             wanted.len(),
             some_of(&missing)

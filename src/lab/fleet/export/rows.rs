@@ -16,7 +16,7 @@ pub(super) struct EstimateRow {
     pub(super) estimate: Estimate,
 }
 
-/// A half-cycle of a cell, the estimates after it, and the cell's remaining life.
+/// A half-cycle of a cell, the estimates after it, and its remaining life.
 pub(super) struct HalfCycleRow {
     pub(super) log: Arc<str>,
     pub(super) time: Timestamp,
@@ -26,9 +26,9 @@ pub(super) struct HalfCycleRow {
     pub(super) half: Fields,
     /// Values of the event `Capacity`.
     pub(super) capacity: Fields,
-    /// `None` = not known.
+    /// `None` = unknown.
     pub(super) losses: Option<LossModes>,
-    /// `None` = too little is known.
+    /// `None` = not enough data.
     pub(super) remaining: Option<RemainingLife>,
 }
 

@@ -1,7 +1,7 @@
-//! Writes a table: rows in, a Parquet or CSV file out.
+//! Writes a table of rows as a Parquet or CSV file.
 //!
-//! Input: rows and the file's metadata. Promise: rows are held in memory for one row group only; the file has its name once it is
-//! complete ([`ResultFile`]); a value that is missing or of another type than its column's is an error, never a wrong file.
+//! Input: rows and the metadata of the file. Memory holds the rows of one row group. The file gets its name once it is complete
+//! ([`ResultFile`]). A missing value, or one of another type than its column, is an error and never written.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -21,7 +21,7 @@ use crate::error::LabError;
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
 
-/// Rows of a row group: some 10 MB of estimates in memory, and enough for an engine to skip by.
+/// Rows of a row group: about 10 MB of estimates in memory, and large enough for an engine to skip row groups.
 const GROUP_ROWS: usize = 65_536;
 
 /// A table of rows `R` being written.
@@ -37,7 +37,7 @@ enum TableWriter {
     Parquet { out: Box<SerializedFileWriter<ResultFile>>, group: Vec<ColumnBuffer>, rows: usize },
 }
 
-/// The values of one column in the row group at hand, and which rows have one.
+/// Values of one column in the current row group, and which rows have one.
 struct ColumnBuffer {
     present: Vec<i16>,
     list: ColumnValues,
@@ -55,7 +55,7 @@ impl<R> TableFile<R> {
     /// Begins a file.
     ///
     /// # Errors
-    /// When it cannot be created; the message names it.
+    /// The file cannot be created; the message names it.
     pub(super) fn create(path: &Path, format: TableFormat, columns: &'static [Column<R>]) -> Result<Self, LabError> {
         let file = ResultFile::create(path)?;
         let writer = match format {
@@ -82,7 +82,7 @@ impl<R> TableFile<R> {
     /// Writes a row.
     ///
     /// # Errors
-    /// When it cannot be written, or a value is not of its column's type.
+    /// The row cannot be written, or a value does not have its column's type.
     pub(super) fn push(&mut self, row: &R) -> Result<(), LabError> {
         self.rows += 1;
         match &mut self.writer {
@@ -95,7 +95,7 @@ impl<R> TableFile<R> {
                 for (column, values) in self.columns.iter().zip(group.iter_mut()) {
                     if !values.push(column.value(row), column.optional) {
                         let (file, name) = (self.path.display(), column.name);
-                        return Err(LabError::Data(format!("{file}: {name} has no value, or one of another type")));
+                        return Err(LabError::Data(format!("{file}: {name} has no value, or a value of another type")));
                     }
                 }
                 *rows += 1;
@@ -108,10 +108,10 @@ impl<R> TableFile<R> {
         }
     }
 
-    /// Completes the file; its rows.
+    /// Completes the file; returns the number of rows.
     ///
     /// # Errors
-    /// When it cannot be written.
+    /// The file cannot be written.
     pub(super) fn finish(self, metadata: &[(&'static str, String)]) -> Result<u64, LabError> {
         let Self { path, columns, rows, writer } = self;
         let file = match writer {
@@ -135,7 +135,7 @@ impl<R> TableFile<R> {
     }
 }
 
-/// Copies the row groups of Parquet files with these columns into one, in their order; its rows.
+/// Copies the row groups of Parquet files with these columns into one file, in order; returns the number of rows.
 ///
 /// # Errors
 /// A file cannot be read or written, or has other columns.
@@ -149,7 +149,7 @@ pub(super) fn concatenate<R>(
     let TableWriter::Parquet { out, .. } = &mut whole.writer else { return Err("a table in Parquet".into()) };
     for part in parts {
         let failed = |error: &dyn std::fmt::Display| {
-            let help = "remove its folder, and replay the vehicle again";
+            let help = "remove its folder and replay the vehicle again";
             LabError::Data(format!("{}: cannot be read: {error}; {help}", part.display()))
         };
         let file = std::fs::File::open(part).map_err(|error| failed(&error))?;
@@ -186,7 +186,7 @@ fn append_group(
     copy.close().map(drop)
 }
 
-/// As Parquet's own language writes it.
+/// The schema in Parquet's own syntax.
 fn schema<R>(columns: &[Column<R>]) -> String {
     let line = |column: &Column<R>| {
         let (physical, logical) = column.kind.parquet();
@@ -196,7 +196,7 @@ fn schema<R>(columns: &[Column<R>]) -> String {
     format!("message packwatch {{ {} }}", columns.iter().map(line).collect::<Vec<_>>().join(" "))
 }
 
-/// Returns the error with the file's name; an error of the operating system already has it.
+/// Returns the error with the name of the file, which an error of the operating system already contains.
 fn named_error(path: &Path, error: &ParquetError) -> LabError {
     let (path, text) = (path.display().to_string(), error.to_string());
     LabError::Data(if text.contains(&path) { text } else { format!("{path}: cannot be written: {text}") })
@@ -205,7 +205,7 @@ fn named_error(path: &Path, error: &ParquetError) -> LabError {
 fn csv_field(field: &FieldValue<'_>) -> String {
     match field {
         FieldValue::Time(time) => stamp::format_utc_micros(*time),
-        // The shortest form that reads back the same.
+        // The shortest text that reads back as the same number.
         FieldValue::Real(value) => value.map(|value| format!("{value:?}")).unwrap_or_default(),
         FieldValue::Whole(value) => value.map(|value| value.to_string()).unwrap_or_default(),
         FieldValue::Flag(value) => value.to_string(),

@@ -1,28 +1,28 @@
-//! Resolves the key of a `--set`, and sets its value in a configuration's table.
+//! Resolves the key of a `--set` choice, and sets its value in a configuration's table.
 
 use toml::{Table, Value};
 
 use super::{Choice, VariantGrid};
 use crate::alarm::Rule;
 
-/// Severities as keys, mildest first.
+/// Severities as keys, the mildest first.
 const SEVERITIES: [&str; 3] = ["info", "warning", "severe"];
-/// The other keys of an `[[alarm]]` that may be set.
+/// Other keys of an `[[alarm]]` table that may be set.
 const ALARM_KEYS: [&str; 8] =
     ["when", "probability", "hysteresis", "debounce_s", "debounce_events", "latched", "spn", "fmi"];
 
 /// Meaning of a key.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Target {
-    /// A threshold of a rule: severity, and `set` or `clear` of it.
+    /// A threshold of a rule: severity, and its `set` or `clear` value.
     Threshold { rule: Rule, severity: &'static str, part: &'static str },
-    /// Another key of all `[[alarm]]` of a rule.
+    /// Another key of all `[[alarm]]` tables of a rule.
     Alarm { rule: Rule, key: &'static str },
     /// Any key.
     Key(Vec<(String, Option<usize>)>),
 }
 
-/// Resolves the choices; records in the grid the rules they name.
+/// Resolves the choices; records the rules they name in the grid.
 pub(super) fn targets(grid: &mut VariantGrid, root: &Table, choices: &[Choice]) -> Result<Vec<Target>, String> {
     let mut targets: Vec<Target> = Vec::new();
     for choice in choices {
@@ -64,7 +64,7 @@ impl Target {
             }
             (_, _, Some(key)) => Ok(Self::Alarm { rule, key }),
             _ => Err(format!(
-                "no {rest:?} of a rule, must be threshold, {} (also with .set or .clear), {}",
+                "found {rest:?} after the rule, must be threshold, {} (also with .set or .clear), {}",
                 SEVERITIES.join(", "),
                 ALARM_KEYS.join(", ")
             )),
@@ -113,7 +113,7 @@ impl Target {
     }
 }
 
-/// Rewords a fault of the configuration about an unknown table: the key may have meant a rule.
+/// Rewords a fault about an unknown table of the configuration, because the key may be a misspelt rule.
 pub(super) fn name_rules(fault: String, targets: &[Target]) -> String {
     let unknown = targets.iter().find_map(|target| match target {
         Target::Key(parts) => {
@@ -126,7 +126,7 @@ pub(super) fn name_rules(fault: String, targets: &[Target]) -> String {
     let near = rules.iter().map(|rule| (strsim::jaro_winkler(name, rule), rule));
     let best = near.max_by(|a, b| a.0.total_cmp(&b.0)).filter(|(similarity, _)| *similarity > 0.8);
     let meant = best.map(|(_, rule)| format!(", did you mean {rule}")).unwrap_or_default();
-    format!("{name} is no table of the configuration and no rule{meant} (rules: {})", rules.join(", "))
+    format!("{name} is not a table of the configuration or a rule{meant} (rules: {})", rules.join(", "))
 }
 
 fn alarms_of(root: &mut Table, rule: Rule) -> impl Iterator<Item = &mut Table> {
@@ -134,13 +134,13 @@ fn alarms_of(root: &mut Table, rule: Rule) -> impl Iterator<Item = &mut Table> {
     alarms.filter(move |alarm| rule_of(alarm) == Some(rule.name())).filter_map(Value::as_table_mut)
 }
 
-/// The gravest severity that a rule has.
+/// The most severe level of a rule in the configuration.
 fn gravest(root: &Table, rule: Rule) -> Result<&'static str, String> {
     let alarms = root.get("alarm").and_then(Value::as_array).into_iter().flatten();
     let of_rule: Vec<&Value> = alarms.filter(|alarm| rule_of(alarm) == Some(rule.name())).collect();
     let has = |severity: &&str| of_rule.iter().any(|alarm| alarm.get(severity).is_some());
     SEVERITIES.into_iter().rev().find(has).ok_or_else(|| {
-        format!("the configuration has no alarm of {}: say {0}.info, {0}.warning or {0}.severe", rule.name())
+        format!("the configuration has no alarm of {}: use {0}.info, {0}.warning or {0}.severe", rule.name())
     })
 }
 
@@ -155,14 +155,16 @@ fn set_threshold(root: &mut Table, rule: Rule, severity: &str, part: &str, value
     }
     let Some(alarm) = alarms_of(root, rule).nth(place) else { return Err(format!("no [[alarm]] of {}", rule.name())) };
     match (alarm.get_mut(severity), part) {
-        // The clear value of the file stays.
+        // The clear value in the file is kept.
         (Some(Value::Table(both)), part) => {
             both.insert(part.to_owned(), value.clone());
         }
         (_, "set") => {
             alarm.insert(severity.to_owned(), value.clone());
         }
-        (None, _) => return Err(format!("{}.{severity} is not set, it has nothing to clear", rule.name())),
+        (None, _) => {
+            return Err(format!("{0}.{severity} is not set: set {0}.{severity} before its clear value", rule.name()));
+        }
         (Some(set), part) => {
             let both = [("set".to_owned(), set.clone()), (part.to_owned(), value.clone())];
             *set = Value::Table(Table::from_iter(both));
@@ -185,13 +187,13 @@ fn set_key(root: &mut Table, parts: &[(String, Option<usize>)], value: &Value) -
                     .ok_or_else(|| format!("{name}[{number}]: the configuration has {count} of them"))?
             }
         };
-        table = next.as_table_mut().ok_or_else(|| format!("{name} is no single table: write {name}[n].{last}"))?;
+        table = next.as_table_mut().ok_or_else(|| format!("{name} is not a single table: write {name}[n].{last}"))?;
     }
     table.insert(last.clone(), value.clone());
     Ok(())
 }
 
-/// Of an `[[alarm]]`.
+/// Rule of an `[[alarm]]` table.
 pub(super) fn rule_of(alarm: &Value) -> Option<&str> {
     alarm.get("rule")?.as_str()
 }

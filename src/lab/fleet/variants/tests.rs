@@ -1,4 +1,4 @@
-//! Values of a grid in a configuration, and rejected keys.
+//! Grid values in a configuration, and rejected keys.
 
 use std::fs;
 use std::path::PathBuf;
@@ -17,7 +17,7 @@ rule = \"input_missing\"
 severe = 5.0
 ";
 
-/// The demo's configuration with the alarms above, in a folder of its own.
+/// The demo's configuration with the alarms above, in its own folder.
 fn written(folder: &tempfile::TempDir) -> PathBuf {
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config");
     let text = fs::read_to_string(shipped.join("demo.toml")).expect("shipped");
@@ -44,7 +44,7 @@ fn threshold(variant: &Variant, severity: Severity) -> (f64, f64) {
 }
 
 #[test]
-fn without_choices_there_is_the_configuration_alone() {
+fn grid_without_choices_is_the_configuration_alone() {
     let grid = made(&[]).expect("good");
     assert_eq!((grid.variants.len(), grid.replays), (1, 1));
 }
@@ -62,47 +62,47 @@ fn thresholds_of_one_rule_share_a_replay() {
 }
 
 #[test]
-fn set_and_clear_are_kept_apart() {
+fn set_and_clear_are_changed_separately() {
     let grid = made(&["capacity_low.info=2.25", "capacity_low.warning.clear=2.1"]).expect("good");
     assert_eq!(threshold(&grid.variants[1], Severity::Info), (2.25, 2.3));
     assert_eq!(threshold(&grid.variants[1], Severity::Warning), (2.0, 2.1));
 }
 
 #[test]
-fn percents_texts_and_tables_are_values() {
+fn percentages_texts_and_tables_are_accepted() {
     let grid = made(&["capacity_low.severe=60 %,70%", "capacity_low.when=mean,{ probability = 0.9 }"]).expect("good");
     assert_eq!(grid.variants.len(), 5);
     assert!((threshold(&grid.variants[1], Severity::Severe).0 - 0.6 * 2.6).abs() < 1e-12);
 }
 
 #[test]
-fn other_keys_and_silence_need_replays_of_their_own() {
+fn other_keys_and_input_missing_need_separate_replays() {
     let grid = made(&["estimator.voltage_noise_v=0.005,0.01", "capacity_low.warning=1.9,1.8"]).expect("good");
-    // The first noise is the default, but not written in the file.
+    // The first noise is the default, which the file does not state.
     assert_eq!((grid.variants.len(), grid.replays, grid.other_keys), (5, 3, true));
     assert_eq!(made(&["input_missing.severe=4.0,6.0"]).expect("good").replays, 3);
 }
 
 #[test]
-fn a_rule_that_is_not_configured_can_be_tried() {
+fn rule_without_alarm_can_be_tried() {
     let grid = made(&["soc_low.warning=0.1"]).expect("good");
     assert!(grid.variants[1].config.monitor.rules.iter().any(|rule| rule.rule == Rule::SocLow));
     let fault = made(&["soc_low.threshold=0.1"]).expect_err("no severity to mean");
-    assert!(fault[0].contains("has no alarm of soc_low: say soc_low.info"), "{fault:?}");
+    assert!(fault[0].contains("has no alarm of soc_low: use soc_low.info"), "{fault:?}");
 }
 
 #[test]
-fn combinations_that_are_no_configuration_are_left_out_and_reported() {
+fn invalid_combinations_are_left_out_and_reported() {
     let grid = made(&["capacity_low.warning=1.9,2.25"]).expect("one is good");
     assert_eq!(grid.variants.len(), 2);
-    assert!(grid.notes[0].starts_with("1 combinations are no valid configuration"), "{:?}", grid.notes);
+    assert!(grid.notes[0].starts_with("1 combinations are not valid configurations"), "{:?}", grid.notes);
     assert!(grid.notes[0].contains("capacity_low.warning=2.25: alarm["), "{:?}", grid.notes);
     let faults = made(&["capacity_low.warning=2.25"]).expect_err("none is good");
     assert!(faults[0].starts_with("capacity_low.warning=2.25: alarm[1].warning"), "{faults:?}");
 }
 
 #[test]
-fn an_unknown_key_is_rejected_with_a_suggestion() {
+fn unknown_key_is_rejected_with_a_suggestion() {
     let faults = |choice: &str| made(&[choice]).expect_err("means nothing").join("; ");
     assert!(faults("capacity_low.treshold=1").contains("must be threshold, info, warning, severe"));
     assert!(
@@ -110,7 +110,7 @@ fn an_unknown_key_is_rejected_with_a_suggestion() {
         "{}",
         faults("capacity_lo.warning=1")
     );
-    assert!(faults("nothing.at_all=1").contains("no rule (rules: capacity_low, "), "{}", faults("nothing.at_all=1"));
+    assert!(faults("nothing.at_all=1").contains("or a rule (rules: capacity_low, "), "{}", faults("nothing.at_all=1"));
     assert!(faults("estimator.nois=1").contains("estimator.nois is not a known key"));
     assert!(faults("interface[3].name=a").contains("the configuration has 1 of them"));
     assert!(faults("capacity_low.warning=a").contains("alarm[1].warning"), "{}", faults("capacity_low.warning=a"));
@@ -121,7 +121,7 @@ fn an_unknown_key_is_rejected_with_a_suggestion() {
 }
 
 #[test]
-fn a_choice_is_a_key_and_values() {
+fn choice_needs_a_key_and_values() {
     for bad in ["", "a.b", "=1", "a.b=", "a.b=1,", "a..b=1", "a.b=1,1"] {
         assert!(bad.parse::<Choice>().is_err(), "{bad:?}");
     }

@@ -1,4 +1,4 @@
-//! The fit against simulated records whose tables are known, and what it refuses.
+//! Fits of simulated records whose tables are known, and requests that a fit rejects.
 
 use super::*;
 use crate::cell::circuit::BranchAt;
@@ -10,13 +10,13 @@ use crate::ident::record::Limits;
 const LIMITS: Limits = Limits { voltage_low_v: 1.0, voltage_high_v: 5.0, capacity_ah: 2.0 };
 const CAPACITY_AH: f64 = 2.0;
 
-/// A cheap reproducible scatter in [-0.5, 0.5].
+/// Reproducible noise in [-0.5, 0.5].
 fn scatter(k: usize) -> f64 {
     let x = (k as f64 * 12.9898).sin() * 43758.5453;
     x - x.floor() - 0.5
 }
 
-/// Current that steps every 40 s, rests, and takes 1.9 Ah in two hours; every second.
+/// Current at 1 Hz that steps every 40 s, rests, and takes 1.9 Ah in two hours.
 fn currents() -> Vec<f64> {
     let level = |k: usize| match (k / 40) % 5 {
         0 => 0.0,
@@ -28,7 +28,7 @@ fn currents() -> Vec<f64> {
     (0..7200).map(|k| level(k) + 0.02 * scatter(k / 40)).collect()
 }
 
-/// A record of `model` at `temperature_c`, with `noise_v` on its voltage.
+/// A record of `model` at `temperature_c`, with `noise_v` on the voltage.
 fn simulate(model: &CellModel, temperature_c: f64, noise_v: f64, grid: &Grid) -> Record {
     let current_a = currents();
     let time_s: Vec<f64> = (0..current_a.len()).map(|k| k as f64).collect();
@@ -56,7 +56,7 @@ fn grid() -> Grid {
     Grid { soc: vec![0.0, 0.1, 0.3, 0.6, 1.0], temperature_c: vec![5.0, 25.0] }
 }
 
-/// Two branches; resistances of size and shape as cells have them.
+/// Cell with two branches and realistic resistances.
 fn truth() -> CellModel {
     let grid = grid();
     let theta = truth_theta(&grid);
@@ -108,10 +108,10 @@ fn settings(grid: Grid) -> FitSettings {
 }
 
 #[test]
-fn the_gradient_is_that_of_finite_differences() {
+fn gradient_agrees_with_finite_differences() {
     let grid = grid();
     let layout = Layout::new(&grid, 2);
-    // Between the temperature nodes, so that all four corners carry; offsets so that residuals are not small.
+    // Between the temperature nodes, so that all four corners contribute; offsets keep the residuals large.
     let record = {
         let mut record = simulate(&truth(), 25.0, 0.005, &grid);
         for row in &mut record.rows {
@@ -146,11 +146,11 @@ fn the_gradient_is_that_of_finite_differences() {
 }
 
 #[test]
-fn known_parameters_come_back_from_noisy_data() {
+fn known_parameters_are_recovered_from_noisy_data() {
     let grid = grid();
     let truth = truth();
     let records: Vec<Record> = [5.0, 25.0].iter().map(|&t| simulate(&truth, t, 0.002, &grid)).collect();
-    // The noise is white here: a second holds more information than one of real data.
+    // The noise is white here, so a second holds more information than a second of real data.
     let fitted = fit(&settings(grid.clone()), &records, &[10.0, 10.0], |_, _| {}).expect("a fit");
     assert!(fitted.converged && fitted.total.rmse_v < 0.002, "{:?}", fitted.total);
     let expected = truth_theta(&grid);
@@ -170,7 +170,7 @@ fn known_parameters_come_back_from_noisy_data() {
 }
 
 #[test]
-fn the_ocv_rises_even_where_the_data_say_it_falls() {
+fn ocv_rises_where_the_data_fall() {
     let grid = grid();
     let mut records = vec![simulate(&truth(), 25.0, 0.0, &grid)];
     for row in &mut records[0].rows {
@@ -184,7 +184,7 @@ fn the_ocv_rises_even_where_the_data_say_it_falls() {
 }
 
 #[test]
-fn nodes_without_data_follow_arrhenius_and_are_named() {
+fn nodes_without_data_follow_arrhenius_and_are_reported() {
     let grid = Grid { temperature_c: vec![-15.0, 5.0, 25.0], ..grid() };
     let records = vec![simulate(&truth(), 25.0, 0.001, &grid)];
     let fitted = fit(&settings(grid), &records, &[1.0], |_, _| {}).expect("a fit");
@@ -198,7 +198,7 @@ fn nodes_without_data_follow_arrhenius_and_are_named() {
 }
 
 #[test]
-fn without_drives_the_correction_of_a_slow_test_fades() {
+fn slow_test_correction_fades_without_drives() {
     let grid = grid();
     let curve = |temperature_c: f64, offset_v: f64| OcvCurve {
         temperature_c,
@@ -215,7 +215,7 @@ fn without_drives_the_correction_of_a_slow_test_fades() {
 }
 
 #[test]
-fn too_few_rows_and_a_current_that_never_changes_are_refused() {
+fn too_few_rows_or_constant_current_is_rejected() {
     let grid = grid();
     let mut record = simulate(&truth(), 25.0, 0.0, &grid);
     record.rows.truncate(20);
@@ -228,7 +228,7 @@ fn too_few_rows_and_a_current_that_never_changes_are_refused() {
 }
 
 #[test]
-fn what_is_no_number_is_refused_and_makes_no_model() {
+fn nan_in_a_slow_test_is_rejected() {
     let grid = grid();
     let record = simulate(&truth(), 25.0, 0.0, &grid);
     let curve = OcvCurve { temperature_c: 25.0, soc: vec![0.0, 1.0], voltage_v: vec![3.0, f64::NAN] };

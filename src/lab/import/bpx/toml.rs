@@ -4,7 +4,7 @@ use super::circuit::Resistances;
 use super::curve::Curve;
 use super::document::BpxCell;
 use super::{BpxSettings, ERROR_OF_DROP, Model};
-use crate::fit::{quoted, toml_table as table};
+use crate::fit::{quoted, toml_list as list, toml_table as table};
 
 /// Returns the whole file.
 pub(super) fn text(
@@ -72,7 +72,6 @@ fn provenance(settings: &BpxSettings, cell: &BpxCell, curve: &Curve<'_>, notes: 
 }
 
 fn tables(out: &mut String, model: &Model) {
-    let list = |values: &[f64]| values.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
     out.push_str(&format!("\n# Rows: temperature. Columns: SOC.\n[tables]\nsoc = [{}]\n", list(&model.curve.soc)));
     out.push_str(&format!("temperature_c = [{}]\n", list(&model.temperature_c)));
     let of = |value: &dyn Fn(&Resistances) -> f64| -> Vec<Vec<f64>> {

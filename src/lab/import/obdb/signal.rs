@@ -14,63 +14,14 @@ const MAX_LISTED_CODES: usize = 8;
 /// Bits of the longest ISO-TP message with a 12-bit length.
 const MAX_BITS: i64 = 4095 * 8;
 
-/// Units of OBDb and ours. Numbers without a unit have an empty one.
-const UNITS: &[(&str, &str)] = &[
-    ("ampereHours", "Ah"),
-    ("amps", "A"),
-    ("bars", "bar"),
-    ("celsius", "degC"),
-    ("centimeters", "cm"),
-    ("coulombs", "C"),
-    ("degrees", "deg"),
-    ("fahrenheit", "degF"),
-    ("feet", "ft"),
-    ("hertz", "Hz"),
-    ("hours", "h"),
-    ("joules", "J"),
-    ("kelvin", "K"),
-    ("kiloampereHours", "kAh"),
-    ("kiloamps", "kA"),
-    ("kilohertz", "kHz"),
-    ("kilojoules", "kJ"),
-    ("kilometers", "km"),
-    ("kilometersPerHour", "km/h"),
-    ("kiloohms", "kOhm"),
-    ("kilopascal", "kPa"),
-    ("kilovolts", "kV"),
-    ("kilowattHours", "kWh"),
-    ("kilowatts", "kW"),
-    ("liters", "l"),
-    ("megahertz", "MHz"),
-    ("megaohms", "MOhm"),
-    ("meters", "m"),
-    ("metersPerSecond", "m/s"),
-    ("metersPerSecondSquared", "m/s2"),
-    ("microohms", "uOhm"),
-    ("miles", "mi"),
-    ("milesPerHour", "mph"),
-    ("milliampereHours", "mAh"),
-    ("milliamps", "mA"),
-    ("millimeters", "mm"),
-    ("milliohms", "mOhm"),
-    ("milliseconds", "ms"),
-    ("millivolts", "mV"),
-    ("milliwatts", "mW"),
-    ("minutes", "min"),
-    ("newtonMeters", "Nm"),
-    ("normal", ""),
-    ("noyes", ""),
-    ("offon", ""),
-    ("ohms", "Ohm"),
-    ("percent", "%"),
-    ("radians", "rad"),
-    ("scalar", ""),
-    ("seconds", "s"),
-    ("unknown", ""),
-    ("volts", "V"),
-    ("watts", "W"),
-    ("yesno", ""),
-];
+/// Units: the name in OBDb, `=`, the symbol here. Numbers without a unit have an empty symbol.
+const UNITS: &str = "ampereHours=Ah amps=A bars=bar celsius=degC centimeters=cm coulombs=C degrees=deg fahrenheit=degF feet=ft \
+    hertz=Hz hours=h joules=J kelvin=K kiloampereHours=kAh kiloamps=kA kilohertz=kHz kilojoules=kJ \
+    kilometers=km kilometersPerHour=km/h kiloohms=kOhm kilopascal=kPa kilovolts=kV kilowattHours=kWh \
+    kilowatts=kW liters=l megahertz=MHz megaohms=MOhm meters=m metersPerSecond=m/s \
+    metersPerSecondSquared=m/s2 microohms=uOhm miles=mi milesPerHour=mph milliampereHours=mAh milliamps=mA \
+    millimeters=mm milliohms=mOhm milliseconds=ms millivolts=mV milliwatts=mW minutes=min newtonMeters=Nm \
+    normal= noyes= offon= ohms=Ohm percent=% radians=rad scalar= seconds=s unknown= volts=V watts=W yesno=";
 
 /// Why a signal is left out.
 type Fault = (ExclusionReason, String);
@@ -91,7 +42,8 @@ pub(super) fn convert(document: &SignalDocument) -> Result<DiagnosticSignal, Fau
     }
     let (bit, length) = place(fmt).map_err(invalid)?;
     let (factor, offset) = scaling(fmt).map_err(invalid)?;
-    let unit = UNITS.iter().find(|known| known.0 == unit).map_or(unit, |known| known.1).to_owned();
+    let mut known = UNITS.split(' ').filter_map(|pair| pair.split_once('='));
+    let unit = known.find(|(theirs, _)| *theirs == unit).map_or(unit, |(_, ours)| ours).to_owned();
     if unit.chars().any(|c| c == '"' || c == '\\' || c.is_control()) {
         return Err(invalid(format!("unit is {unit:?}, must be without quotes and control characters")));
     }

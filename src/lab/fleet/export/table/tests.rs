@@ -1,4 +1,4 @@
-//! Tables as Parquet and CSV readers see them.
+//! Tables as readers of Parquet and CSV see them.
 
 use std::fs;
 
@@ -75,7 +75,7 @@ fn csv_has_the_same_columns_and_empty_fields() {
 }
 
 #[test]
-fn a_table_without_rows_is_a_table() {
+fn table_without_rows_has_all_columns() {
     let (_folder, path) = written(TableFormat::Parquet, 0);
     let reader = SerializedFileReader::new(fs::File::open(path).expect("there")).expect("Parquet");
     assert_eq!(reader.metadata().file_metadata().num_rows(), 0);
