@@ -291,11 +291,11 @@ fn check_report(place: &Place, document: &Value) {
     let advice = document["advice"].as_array().unwrap();
     assert!(!advice.is_empty());
     for page in [from_log, from_store] {
-        assert!(page.contains("How well do I know this battery") && page.contains("from the vehicle's own data"));
-        assert!(page.contains("What was learned of the model") && page.contains(">learning</td>"), "no history");
+        assert!(page.contains("How well the battery is known") && page.contains("from the vehicle's own data"));
+        assert!(page.contains("Learned changes of the model") && page.contains(">learning</td>"), "no history");
         for it in advice {
             let (measurement, left) = (it["measurement"].as_str().unwrap(), it["left_points"].as_f64().unwrap());
-            assert!(page.contains(&format!("<li>{measurement}: {left:.1} points are then left</li>")), "no {it}");
+            assert!(page.contains(&format!("<li>{measurement}: {left:.1} points remain</li>")), "no {it}");
         }
     }
 }

@@ -210,7 +210,7 @@ def test_error_text_omits_origin(tmp_path):
 @pytest.mark.parametrize(
     ("call", "text"),
     [
-        (lambda: pw.score("a.csv"), "no cell: a configuration, a cell model or a chemistry with rated capacity must be given"),
+        (lambda: pw.score("a.csv"), "no cell: give a configuration, a cell model, or a chemistry with the rated capacity"),
         (lambda: pw.score(["a.csv", "a.csv"], cell=CELL), "a.csv: named twice"),
         (lambda: pw.score("a.csv", cell=CELL, start="end"), 'start "end", must be full or middle'),
         (lambda: pw.score("a.csv", cell=CELL, remove=1.5), "remove = 1.5, must be above 0 and below 1"),

@@ -1,4 +1,4 @@
-//! Stores a record of any length in a bounded number of bins: when they are full, neighbours are joined.
+//! Stores a record of any length in a limited number of bins: when they are full, neighbouring bins are joined.
 
 /// Most bins: about two per pixel column of a wide picture.
 const MOST: usize = 2048;
@@ -9,7 +9,7 @@ pub(super) trait Bin: Clone + Default {
     fn join(&mut self, later: &Self);
 }
 
-/// Bins of equal width from the first moment on.
+/// Bins of equal width, starting at the first time.
 #[derive(Debug, Clone)]
 pub(super) struct Bins<B> {
     begin_s: f64,
@@ -22,7 +22,7 @@ impl<B: Bin> Bins<B> {
         Self { begin_s, width_s: 1.0, bins: Vec::new() }
     }
 
-    /// Returns the bin of a time; a time before the first (after a clock was set back) belongs to the first.
+    /// Returns the bin of a time; a time before the first (after a clock was set back) belongs to the first bin.
     pub(super) fn at(&mut self, time_s: f64) -> &mut B {
         let after_s = (time_s - self.begin_s).max(0.0);
         while after_s / self.width_s >= MOST as f64 {
@@ -45,7 +45,7 @@ impl<B: Bin> Bins<B> {
         self.bins = joined.collect();
     }
 
-    /// The bins with the moments of their middles.
+    /// The bins with the times of their centres.
     pub(super) fn iter(&self) -> impl Iterator<Item = (f64, &B)> {
         let middle = |index: usize| self.begin_s + (index as f64 + 0.5) * self.width_s;
         self.bins.iter().enumerate().map(move |(index, bin)| (middle(index), bin))
@@ -71,7 +71,7 @@ mod tests {
     }
 
     #[test]
-    fn a_long_record_stays_small_and_loses_nothing() {
+    fn long_record_stays_small_and_complete() {
         let mut bins = Bins::<Count>::new(1.7e9);
         (0..1_000_000).for_each(|second| bins.at(1.7e9 + f64::from(second)).0 += 1);
         bins.at(0.0).0 += 1;
@@ -80,7 +80,7 @@ mod tests {
     }
 
     #[test]
-    fn a_jump_to_another_century_does_not_take_memory() {
+    fn jump_of_centuries_takes_no_memory() {
         let mut bins = Bins::<Count>::new(0.0);
         bins.at(0.0).0 += 1;
         bins.at(9e9).0 += 1;

@@ -11,24 +11,24 @@ use crate::quantity::CellIndex;
 pub struct PageContext<'a> {
     /// Title of the page.
     pub title: String,
-    /// Thresholds, rated capacity; `None` = not known.
+    /// Source of thresholds and rated capacity; `None` = unknown.
     pub config: Option<&'a Config>,
-    /// The configuration file's text, for the page's end.
+    /// Text of the configuration file, for the end of the page.
     pub config_text: Option<String>,
-    /// The cells' model, as it was at the end of the data; `None` = not known.
+    /// Model of the cells at the end of the data; `None` = unknown.
     pub model: Option<SourcedModel>,
-    /// What is found of single cells; `None` = they were not compared.
+    /// Findings about single cells; `None` = the cells were not compared.
     pub diagnosis: Option<&'a CellFaultDetector>,
-    /// What the differences between the cells cost the pack; `None` = they were not compared.
+    /// Cost of the differences between cells for the pack; `None` = the cells were not compared.
     pub imbalance: Option<Result<Imbalance, UnknownImbalance>>,
     /// Measured or true values.
     pub reference: Reference,
-    /// Lines of the provenance: name and value.
+    /// Lines of the provenance, each with name and value.
     pub provenance: Vec<(String, String)>,
 }
 
 impl PageContext<'_> {
-    /// Rated capacity of a cell, Ah; `None` = without a configuration.
+    /// Rated capacity of a cell, Ah; `None` = there is no configuration.
     pub(super) fn rated_ah(&self, cell: usize) -> Option<f64> {
         let cell = CellIndex(u16::try_from(cell).ok()?);
         self.config.map(|config| config.monitor.model_of(cell).rated_capacity_ah)

@@ -1,6 +1,6 @@
 //! Data of a report, collected from a store's rows or from a replay's events and estimates.
 //!
-//! Times are seconds on the wall clock (a replay: on the log's clock). Cells count from 0.
+//! Times are seconds on the wall clock; in a replay, on the clock of the log. Cells count from 0.
 
 use std::collections::BTreeSet;
 
@@ -15,7 +15,7 @@ use crate::store::{HistoryEntry, HistoryQuery, HistoryReader, HistoryTable};
 /// Origin of the data.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Origin {
-    /// A store's history: what was learned and alarms, no samples.
+    /// A store's history: learned values and alarms, no samples.
     Store,
     /// A replay: everything.
     Replay,
@@ -37,20 +37,20 @@ pub(super) struct HalfCycleRecord {
 pub(super) struct CapacityRecord {
     pub(super) time_s: f64,
     pub(super) cell: usize,
-    /// Capacity by this half-cycle alone, Ah.
+    /// Capacity from this half-cycle alone, Ah.
     pub(super) measured_ah: Option<f64>,
-    /// Its standard deviation, Ah.
+    /// Standard deviation of that capacity, Ah.
     pub(super) measured_std_ah: Option<f64>,
     /// Mean and standard deviation, Ah.
     pub(super) capacity_ah: (f64, f64),
     pub(super) usable_ah: Option<(f64, f64)>,
-    /// Lithium, material of the negative and of the positive electrode lost, fractions.
+    /// Losses of lithium and of the material of the negative and positive electrode, fractions.
     pub(super) losses: Option<[(f64, f64); 3]>,
-    /// Times new.
+    /// Relative to new.
     pub(super) resistance: (f64, f64),
 }
 
-/// A charge that covered the window.
+/// A charge that covered the SOC window.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct RechargeRecord {
     pub(super) time_s: f64,
@@ -72,34 +72,34 @@ pub(super) struct AlarmRecord {
     pub(super) threshold: Option<f64>,
 }
 
-/// A change of the cell model that is learned on board.
+/// A change of the cell model that the monitor learns.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct ModelRecord {
     pub(super) time_s: f64,
-    /// The name of a [`ModelState`](crate::monitor::ModelState).
+    /// Name of a [`ModelState`](crate::monitor::ModelState).
     pub(super) state: String,
-    /// Mean and standard deviation, Ah; `None` = the label's.
+    /// Mean and standard deviation, Ah; `None` = as on the label.
     pub(super) capacity_ah: Option<(f64, f64)>,
     /// Root mean square of the residuals, V.
     pub(super) residual_v: Option<f64>,
-    /// The chemistry that fits better; empty = that of the label fits.
+    /// A chemistry that fits better; empty = the label's chemistry fits.
     pub(super) chemistry: String,
-    /// The model before holds again.
+    /// Whether the previous model applies again.
     pub(super) is_taken_back: bool,
 }
 
 /// Origin and quality of the data.
 #[derive(Debug, Clone)]
 pub struct DataSource {
-    /// Which kind.
+    /// Kind of source.
     pub origin: Origin,
-    /// Pack of the store, from 1, and packs before it.
+    /// Number of the store's pack, from 1.
     pub pack: Option<i64>,
-    /// Why the data may be wrong: a sentence without its full stop.
+    /// Reason for doubt about the data: a sentence without its full stop.
     pub doubt: Option<String>,
 }
 
-/// Everything a report shows.
+/// All data of a report.
 #[derive(Debug)]
 pub struct Data {
     pub(super) source: DataSource,
@@ -108,10 +108,10 @@ pub struct Data {
     pub(super) recharges: Vec<RechargeRecord>,
     pub(super) alarms: Vec<AlarmRecord>,
     pub(super) models: Vec<ModelRecord>,
-    /// Resets, damages, lost trust: time and text.
+    /// Resets, damages and lost trust: time and text.
     pub(super) incidents: Vec<(f64, String)>,
     pub(super) trace: Trace,
-    /// Cells whose estimate is not trusted at the end.
+    /// Cells whose estimate is untrusted at the end.
     pub(super) untrusted: BTreeSet<usize>,
     /// Offset of the current sensor, A: mean and standard deviation.
     pub(super) current_offset: Option<(f64, f64)>,
@@ -120,7 +120,7 @@ pub struct Data {
 }
 
 impl Data {
-    /// Creates data without any record.
+    /// Creates empty data.
     pub fn new(origin: Origin) -> Self {
         Self {
             source: DataSource { origin, pack: None, doubt: None },
@@ -138,10 +138,10 @@ impl Data {
         }
     }
 
-    /// The history of the pack that is connected, the latest of a store.
+    /// Reads the history of the connected pack, the latest of a store.
     ///
     /// # Errors
-    /// When the file cannot be read.
+    /// The file cannot be read.
     pub fn of_store(reader: &HistoryReader) -> Result<Self, String> {
         let mut data = Self::new(Origin::Store);
         let entries = reader.entries(&HistoryQuery::default())?;
@@ -151,12 +151,12 @@ impl Data {
         Ok(data)
     }
 
-    /// Sets why the data may be wrong: a sentence without its full stop.
+    /// Sets the reason for doubt about the data: a sentence without its full stop.
     pub fn doubt(&mut self, why: String) {
         self.source.doubt = Some(why);
     }
 
-    /// Sets the learned offset of the current sensor, A: what it reads less the true current, and the standard deviation.
+    /// Sets the learned offset of the current sensor, A: reading minus true current, and the standard deviation.
     pub fn set_current_offset(&mut self, offset: Option<(f64, f64)>) {
         self.current_offset = offset;
     }
@@ -178,7 +178,7 @@ impl Data {
                 let colon = if detail.is_empty() { "" } else { ": " };
                 self.incidents.push((time_s, format!("{reason}{of}{colon}{detail}")));
             }
-            // The forecast is computed again here.
+            // The forecast is computed again for the report.
             HistoryTable::RemainingLife => {}
         }
     }
@@ -205,7 +205,7 @@ impl Data {
     }
 
     fn take_half_cycle(&mut self, time_s: f64, fields: &Fields) {
-        // The store writes no row of a cell without its number.
+        // The store only writes rows with a cell number.
         let Some(cell) = cell_of(fields) else { return };
         self.halves.push(HalfCycleRecord {
             time_s,
@@ -232,7 +232,7 @@ impl Data {
         });
     }
 
-    /// Adds what a cell has lost to its capacity, which came before.
+    /// Adds the losses of a cell to its capacity of the same time, which came before.
     fn take_losses(&mut self, time_s: f64, fields: &Fields) {
         let Some(cell) = cell_of(fields) else { return };
         let [lithium, negative, positive] =
@@ -279,17 +279,16 @@ impl Data {
         }
         let number = |cell: CellIndex| cell.index() + 1;
         let what = match *kind {
-            EventKind::FilterReset { cell } => format!("filter of cell {} started again", number(cell)),
+            EventKind::FilterReset { cell } => format!("filter of cell {} restarted", number(cell)),
             EventKind::Trust { cell, trusted: false, mean_nis } => {
-                format!(
-                    "estimate of cell {} not to be trusted (innovations {mean_nis:.1} times as expected)",
-                    number(cell)
-                )
+                format!("estimate of cell {} is untrusted (innovations {mean_nis:.1} times as expected)", number(cell))
             }
-            EventKind::Trust { cell, trusted: true, .. } => format!("estimate of cell {} trusted again", number(cell)),
+            EventKind::Trust { cell, trusted: true, .. } => {
+                format!("estimate of cell {} is trusted again", number(cell))
+            }
             EventKind::PackReplaced { .. } => {
                 self.forget_pack();
-                "another pack was connected: what was learned of the one before is not shown".to_owned()
+                "another pack was connected: values learned on the previous one are not shown".to_owned()
             }
             EventKind::TimeBackwards { seconds } => format!("the clock was set back by {seconds:.0} s"),
             _ => return,
@@ -297,7 +296,7 @@ impl Data {
         self.incidents.push((time_s, what));
     }
 
-    /// Like a store's report, a replay's is about the pack that is connected at its end.
+    /// A replay's report, like a store's, describes the pack that is connected at the end.
     fn forget_pack(&mut self) {
         self.halves.clear();
         self.learned.clear();
@@ -317,14 +316,14 @@ impl Data {
         self.last_s = self.last_s.max(time_s);
     }
 
-    /// First and last time, s; `None` = there are no data.
+    /// First and last time, s; `None` = no data.
     pub(super) fn ends_s(&self) -> Option<(f64, f64)> {
         (self.first_s <= self.last_s).then_some((self.first_s, self.last_s))
     }
 
     /// Whether times are dates.
     pub(super) fn is_dated(&self) -> bool {
-        // Stamps from here on are dates, s since 1970; a log that begins earlier counts from its own start.
+        // Later stamps are dates, s since 1970; a log with earlier stamps counts from its own start.
         self.first_s >= 3.0e8
     }
 

@@ -1,7 +1,7 @@
 //! Data for the report's tests: a recording of estimates, and a worn pack that gives every card a value.
 //!
-//! Times in s; cells count from 0. Deviations differ between quantities and between neighbouring cells, so that a test
-//! sees one printed in place of another.
+//! Times in s; cells count from 0. Standard deviations differ between quantities and between neighbouring cells, so that a test
+//! detects one printed in place of another.
 
 use std::path::Path;
 
@@ -11,12 +11,12 @@ use crate::monitor::{Estimate, Event, EventKind, MeasuredValues};
 use crate::quantity::catalogue::{Quantity, RecordedValues};
 use crate::quantity::{CellIndex, Mode, Timestamp};
 
-/// Half-cycles of the worn pack: enough for the remaining life of every cell.
+/// Half-cycles of the worn pack: enough for a remaining life of every cell.
 pub(super) const HALVES: u16 = 60;
-/// End of its first half-cycle, 2023-11-14, and time between the ends.
+/// End of the first half-cycle, 2023-11-14, and time between the ends.
 const FIRST_END_S: f64 = 1.7e9;
 const HALF_CYCLE_S: f64 = 21_600.0;
-/// Estimates of a recording, without the first.
+/// Number of estimates of a recording, without the first.
 const STEPS: u16 = 60;
 
 /// The demo's configuration: cells of 2.6 Ah rated, end of life at 2.08 Ah.
@@ -25,7 +25,7 @@ pub(super) fn config() -> Config {
     config::load(&path).expect("shipped")
 }
 
-/// Evenly spaced estimates of one cell, from `first_s` on.
+/// Evenly spaced estimates of one cell, starting at `first_s`.
 pub(super) fn recording(first_s: f64, length_s: f64) -> Data {
     let mut data = Data::new(Origin::Replay);
     for step in 0..=STEPS {
@@ -49,26 +49,26 @@ pub(super) fn recording(first_s: f64, length_s: f64) -> Data {
     data
 }
 
-/// Standard deviations of what is learned of a cell of the worn pack.
+/// Standard deviations of the learned values of a cell of the worn pack.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct CellStds {
     pub(super) capacity_ah: f64,
     pub(super) usable_ah: f64,
-    /// Times new.
+    /// Relative to new.
     pub(super) resistance: f64,
     /// Lithium, negative and positive electrode, fractions.
     pub(super) losses: [f64; 3],
 }
 
-/// Returns the standard deviations of a cell, the same in every half-cycle.
+/// Returns the standard deviations of a cell, equal in every half-cycle.
 pub(super) fn stds(cell: u16) -> CellStds {
     let own = f64::from(cell % 4);
     let [capacity_ah, usable_ah, resistance] = [0.031, 0.052, 0.073].map(|std| std + 0.001 * own);
     CellStds { capacity_ah, usable_ah, resistance, losses: [0.02, 0.07, 0.12].map(|std| std + 0.01 * own) }
 }
 
-/// A pack at the end of [`HALVES`] half-cycles. Its last cell has the least capacity, the first the least usable capacity
-/// and the greatest resistance; the second has lost most lithium, the third most negative and the first most positive
+/// A pack at the end of [`HALVES`] half-cycles. The last cell has the smallest capacity, the first the smallest usable capacity
+/// and the largest resistance; the second has lost most lithium, the third most of the negative and the first most of the positive
 /// electrode.
 pub(super) fn worn(cells: u16) -> Data {
     let mut data = Data::new(Origin::Replay);
@@ -88,7 +88,7 @@ pub(super) fn worn(cells: u16) -> Data {
     data
 }
 
-/// Seconds since 1970 at the end of a half-cycle of the worn pack.
+/// End of a half-cycle of the worn pack, s since 1970.
 pub(super) fn end_s(half: u16) -> f64 {
     FIRST_END_S + HALF_CYCLE_S * f64::from(half)
 }

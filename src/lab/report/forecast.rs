@@ -1,7 +1,7 @@
-//! The remaining life, computed from the record by the same filter as on board (`health::Forecast`), and its fan.
+//! The remaining life, computed from the record by the monitor's own filter (`health::Forecast`), and its fan.
 //!
-//! A store's rows and a replay's events both hold the filter's inputs, so both give the same result as the monitor. A
-//! record without its beginning gives a wider interval.
+//! A store's rows and a replay's events both contain the filter's inputs, so both give the same result as the monitor. A
+//! record that lacks its beginning gives a wider interval.
 
 use std::collections::BTreeMap;
 
@@ -12,12 +12,12 @@ use crate::alarm::Rule;
 use crate::health::{Axis, CapacityReading, Forecast, InsufficientData, Remaining, RemainingLife, Usage};
 
 const DAY_S: f64 = 86_400.0;
-/// Points of a fan.
+/// Number of points of a fan.
 const POINTS: usize = 60;
-/// Longest fan: medians until the end of life, and lengths of the record.
+/// Limits of the fan's length: multiples of the median time to the end of life, and of the record's length.
 const MAX_MEDIANS: f64 = 2.5;
 const MAX_RECORDS: f64 = 2.0;
-/// Fan length even where the median is near, if the end may come that late, lengths of the record.
+/// Length of the fan if the median is near but the end may come late, as a multiple of the record's length.
 const LEAST_RECORDS: f64 = 0.2;
 
 /// Forecast of the capacity at a time.
@@ -30,30 +30,30 @@ pub(super) struct DatedFanPoint {
     pub(super) high_ah: f64,
 }
 
-/// Forecast for the cell whose life ends first of those whose life is known.
+/// Forecast of the cell whose life ends first, among the cells with a known life.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Outlook {
-    /// Counts from 0.
+    /// Index of the cell, from 0.
     pub(super) cell: usize,
-    /// For the capacity chart; empty = already at its end, or how fast it is used is not known.
+    /// Points for the capacity chart; empty = the end has passed, or the rate of use is unknown.
     pub(super) fan: Vec<DatedFanPoint>,
     /// Capacity at the end of life, Ah.
     pub(super) end_ah: f64,
     pub(super) life: RemainingLife,
-    /// Cells whose life is not known, and why: one of them may end first.
+    /// Reason why the life of other cells is unknown; one of them may end first.
     pub(super) unknown: Option<String>,
 }
 
-/// Capacity at the end of life, Ah: as configured, else the mildest limit of the record's alarms.
+/// Capacity at the end of life, Ah: as configured, or else the mildest limit in the record's alarms.
 pub(super) fn end_of_life_ah(data: &Data, context: &PageContext<'_>) -> Option<f64> {
     let configured = context.config.map(|config| config.monitor.health.end_of_life_ah);
     configured.or_else(|| threshold(data, context, Rule::CapacityLow))
 }
 
-/// The outlook of the cell whose life ends first, or why there is none.
+/// Forecast of the cell whose life ends first, or the reason why there is none.
 pub(super) fn outlook(data: &Data, context: &PageContext<'_>) -> Result<Outlook, String> {
     let end_ah = end_of_life_ah(data, context)
-        .ok_or("the record does not say which capacity is the end of life; a configuration (-c) does")?;
+        .ok_or("the record does not state the capacity at the end of life; a configuration (-c) does")?;
     let cells = cells(data, context);
     let lives: Vec<Result<RemainingLife, InsufficientData>> = cells.iter().map(|cell| cell.remaining(end_ah)).collect();
     let refused = lives.iter().enumerate().find_map(|(cell, life)| Some((cell, life.err()?)));
@@ -70,7 +70,7 @@ pub(super) fn outlook(data: &Data, context: &PageContext<'_>) -> Result<Outlook,
     }
 }
 
-/// Whether the end of life is passed, for all that is known.
+/// Whether the end of life has certainly passed.
 fn is_over(life: &RemainingLife) -> bool {
     life.cycles.or(life.days).is_some_and(|left| left.high <= 0.0)
 }
@@ -87,9 +87,9 @@ fn display(why: InsufficientData) -> String {
     why.to_string().replace("+-", "\u{b1}")
 }
 
-/// Every cell's forecast at the end of the record, fed as `monitor::life` feeds it.
+/// The forecast of every cell at the end of the record, with the same inputs as in `monitor::life`.
 pub(super) fn cells(data: &Data, context: &PageContext<'_>) -> Vec<Forecast> {
-    // Deviation of the current sensor's gain without a configuration: the default of `capacity.current_gain_std`.
+    // Standard deviation of the current sensor's gain without a configuration: the default of `capacity.current_gain_std`.
     let gain_std = context.config.map_or(0.005, |config| config.monitor.health.capacity.current_gain_std);
     let key = |time_s: f64, cell: usize| (time_s.to_bits(), cell);
     let learned: BTreeMap<_, &CapacityRecord> =
@@ -104,7 +104,7 @@ pub(super) fn cells(data: &Data, context: &PageContext<'_>) -> Vec<Forecast> {
         for half in halves {
             let rated_ah = rated_ah(half.cell);
             let usage = Usage::in_half_cycle(half.charge_ah, half.duration_s, since_before_s, rated_ah);
-            // Use without a reading counts too: a store leaves out capacities without new information.
+            // Use without a reading counts too: a store omits capacities without new information.
             let row = learned.get(&key(half.time_s, half.cell));
             cells[half.cell].update(usage, row.and_then(|row| reading(row, gain_std)));
         }
@@ -119,7 +119,7 @@ fn reading(row: &CapacityRecord, gain_std: f64) -> Option<CapacityReading> {
     Some(CapacityReading { capacity_ah, variance_ah2: std_ah * std_ah, shared_variance_ah2: gain_ah * gain_ah })
 }
 
-/// From the last half-cycle until the last moment the end of life may come, within reason.
+/// Points from the last half-cycle to the latest likely end of life, within the limits above.
 fn fan(data: &Data, forecast: &Forecast, life: &RemainingLife) -> Vec<DatedFanPoint> {
     let (Some(cycles), Some(days)) = (life.cycles, life.days) else { return Vec::new() };
     let (Some(first), Some(last)) = (data.halves.first(), data.halves.last()) else { return Vec::new() };
@@ -144,7 +144,7 @@ impl Outlook {
         is_over(&self.life)
     }
 
-    /// Returns "14 cycles"; as in the monitor, a pack's life is unknown until every cell's is known.
+    /// Returns for example "14 cycles"; as in the monitor, the life of a pack is unknown until that of every cell is known.
     pub(super) fn value(&self) -> String {
         match self.life.cycles {
             Some(left) if self.unknown.is_none() => median(left),
@@ -152,7 +152,7 @@ impl Outlook {
         }
     }
 
-    /// Explains it, with the interval and the days.
+    /// Explains the value, with interval and days.
     pub(super) fn note(&self, cells: usize) -> String {
         let cycles = self.life.cycles.map_or_else(String::new, interval);
         if let Some(why) = &self.unknown {
@@ -178,7 +178,7 @@ fn interval(left: Remaining) -> String {
     format!("{} to {} in nine of ten cases", digits(left.low), digits(left.high))
 }
 
-/// Formats with one decimal below ten, else none.
+/// Formats with one decimal below ten, otherwise with none.
 fn digits(value: f64) -> String {
     if value < 9.95 { format!("{value:.1}") } else { format!("{value:.0}") }
 }
@@ -189,7 +189,7 @@ mod tests {
     use crate::report::Origin;
     use crate::report::data::HalfCycleRecord;
 
-    /// Full cycles of three hours each, twice a day, each cell losing its own share of 2 Ah per half-cycle.
+    /// Full cycles of three hours each, twice a day; each cell loses its own share of 2 Ah per half-cycle.
     fn worn(halves: u32, losses: &[f64]) -> Data {
         let mut data = Data::new(Origin::Store);
         for half in 0..halves {
@@ -234,13 +234,13 @@ mod tests {
     }
 
     #[test]
-    fn the_cell_that_fades_fastest_is_reported_with_a_fan_to_its_end() {
+    fn fastest_fading_cell_is_reported_with_a_fan() {
         let mut data = worn(100, &[0.001, 0.0015, 0.001]);
         alarm_at(&mut data, 1.6);
         let outlook = outlook(&data, &PageContext::default()).expect("enough readings");
         assert_eq!((outlook.cell, outlook.end_ah), (1, 1.6));
         let left = outlook.life.cycles.expect("cycles");
-        // 1.7 Ah now, 0.006 Ah a cycle: 17 full cycles in a straight line, fewer with the knee that is expected.
+        // 1.7 Ah now, 0.006 Ah a cycle: 17 full cycles along a straight line, fewer with the expected knee.
         assert!(left.low < 17.0 && left.high > 17.0 && (8.5..17.0).contains(&left.median), "{left:?}");
         let (first, last) = (outlook.fan[0], outlook.fan[POINTS - 1]);
         assert_eq!(first.time_s, data.halves.last().map(|half| half.time_s).expect("halves"));
@@ -252,7 +252,7 @@ mod tests {
     }
 
     #[test]
-    fn too_little_data_is_rejected_with_the_reason() {
+    fn too_little_data_is_rejected_with_a_reason() {
         let mut short = worn(2, &[0.001, 0.001]);
         assert!(outlook(&short, &PageContext::default()).unwrap_err().contains("a configuration (-c) does"));
         alarm_at(&mut short, 1.6);
@@ -269,7 +269,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cell_past_its_end_has_no_life_and_no_fan() {
+    fn cell_past_its_end_has_no_fan() {
         let mut data = worn(100, &[0.0015]);
         alarm_at(&mut data, 1.9);
         let outlook = outlook(&data, &PageContext::default()).expect("known");

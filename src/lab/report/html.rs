@@ -1,4 +1,4 @@
-//! Renders the page: one HTML file that contains its style and pictures; no script, no external resource.
+//! Renders the page: one HTML file that contains its style and pictures, without scripts or external resources.
 
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
@@ -14,7 +14,7 @@ use crate::{cell_fault_pictures, pack_view};
 /// Most rows of a table; the pictures and `packwatch history` show all.
 const MAX_ROWS: usize = 200;
 
-/// The section that the alarms follow.
+/// Section after which the alarms follow.
 const ALARMS_AFTER: &str = "temperature";
 
 /// A section of the page.
@@ -34,24 +34,24 @@ const SECTIONS: [Section; 9] = [
         id: "soc",
         title: "State of charge",
         pictures: &["soc", "soc_recent"],
-        note: "How full the battery was. By the estimator, the light band holds the truth 95 % of the time. Over a long record \
-               each pixel column shows the lowest and the highest value in it.",
+        note: "How full the battery was. According to the estimator, the light band contains the truth 95 % of the time. In a long record \
+               each pixel column shows the lowest and the highest value within it.",
         none: |data| if data.source.origin == Origin::Store { NOT_STORED } else { "unknown: no estimate was made" },
     },
     Section {
         id: "capacity",
         title: "Capacity",
         pictures: &["capacity", "usable_capacity", "losses"],
-        note: "Capacity is the charge between the full and the empty cell at rest; usable capacity is what can be taken out at \
-               a load, and also falls when resistance rises. A pack is as good as its weakest cell. How a loss of capacity divides \
-               into lithium and active material is mostly an assumption, which its interval includes.",
+        note: "Capacity is the charge between the full and the empty cell at rest. Usable capacity is the charge available at a \
+               load; it also falls when the resistance rises. A pack is as good as its weakest cell. How a loss of capacity divides \
+               into lithium and active material is mostly an assumption, which the interval includes.",
         none: |_| "unknown: no charge or discharge has measured the capacity yet",
     },
     Section {
         id: "recharge",
         title: "Recharge period",
         pictures: &["recharge_period"],
-        note: "A worn battery is full sooner. The normalised period is what the reference charger would need, so that a strong \
+        note: "A worn battery is full sooner. The normalised period is the time the reference charger would need, so that a strong \
                charger does not look like a worn battery.",
         none: |_| "unknown: no charge covered enough of the window",
     },
@@ -59,7 +59,7 @@ const SECTIONS: [Section; 9] = [
         id: "resistance",
         title: "Resistance",
         pictures: &["resistance"],
-        note: "Grows with age: the battery gives less power and heats up more.",
+        note: "Grows with age: the battery delivers less power and heats up more.",
         none: |_| "unknown: not learned yet",
     },
     Section {
@@ -73,7 +73,7 @@ const SECTIONS: [Section; 9] = [
         id: "cells",
         title: "Cells",
         pictures: &["cells_capacity", "cells_resistance"],
-        note: "Every row is a cell. A row that differs from its neighbours is the cell to look at.",
+        note: "Every row is a cell. Inspect a cell whose row differs from its neighbours.",
         none: |data| {
             if data.cells() == 1 { "one cell: see above" } else { "unknown: nothing was learned about the cells yet" }
         },
@@ -82,30 +82,30 @@ const SECTIONS: [Section; 9] = [
         id: "findings",
         title: "Which cell is failing",
         pictures: &cell_fault_pictures::NAMES,
-        note: "Every cell beside the middle of its pack: all carry the same current, so what is common to them cancels. A cell whose \
-               bar lies beyond the line is reported when it also stands out from the others.",
+        note: "Each cell relative to the median of its pack: all cells carry the same current, so common effects cancel. A cell whose \
+               bar lies outside the line is reported if it also stands out from the others.",
         none: |data| {
             if data.cells() < 3 {
-                "fewer than three cells: there is no middle to compare with"
+                "fewer than three cells: there is no median to compare with"
             } else {
-                "unknown: no state of the cells is at hand"
+                "unknown: there is no state of the cells"
             }
         },
     },
     Section {
         id: "model",
-        title: "How well do I know this battery",
+        title: "How well the battery is known",
         pictures: &["model_curve", "model_resistance", "model_temperature", "model_soc_error"],
-        note: "The model with which voltages are read as a state of charge. Bands hold a cell of this kind 95 % of the time. \
+        note: "The model that converts voltages to a state of charge. A cell of this kind lies within the bands 95 % of the time. \
                Dashed lines were not measured.",
-        none: |_| "unknown: make this report again with the configuration (-c), which names the cells",
+        none: |_| "unknown: create the report with the configuration (-c), which names the cells",
     },
     Section {
         id: "estimator",
         title: "Health of the estimator",
         pictures: &["innovation", "coverage"],
-        note: "Whether the figures above can be trusted: the innovation is the measured voltage minus the expected one, and 95 % of \
-               them should lie within the interval the filter itself stated.",
+        note: "Whether the figures above can be trusted: the innovation is the measured minus the expected voltage, and 95 % of \
+               the innovations should lie within the interval that the filter itself states.",
         none: |data| if data.source.origin == Origin::Store { NOT_STORED } else { "unknown: no voltage was compared" },
     },
 ];
@@ -179,7 +179,7 @@ fn heading(data: &Data, context: &PageContext<'_>) -> Markup {
     }
 }
 
-/// First and last time of the data, and their distance.
+/// First and last time of the data, and the time between them.
 fn span(data: &Data) -> String {
     let Some((first_s, last_s)) = data.ends_s() else { return "there is no record".to_owned() };
     let long = format::length(last_s - first_s);
@@ -236,12 +236,12 @@ fn section(section: &Section, data: &Data, pictures: &[(String, Picture)]) -> Ma
     }
 }
 
-/// Explains a gap between the end of the estimate and the beginning of the fan.
+/// Explains a gap between the end of the estimate and the start of the fan.
 fn gap(data: &Data, outlook: &forecast::Outlook) -> &'static str {
     let last = data.learned.iter().rev().find(|row| row.cell == outlook.cell);
     match (last, outlook.fan.first()) {
         (Some(last), Some(first)) if (first.median_ah - last.capacity_ah.0).abs() > 2.0 * last.capacity_ah.1 => {
-            " It begins at the capacity of the latest half-cycles alone; the learned capacity still approaches it."
+            " It starts at the capacity of the latest half-cycles alone; the learned capacity still approaches that value."
         }
         _ => "",
     }
@@ -250,13 +250,11 @@ fn gap(data: &Data, outlook: &forecast::Outlook) -> &'static str {
 /// Explains the forecast in the capacity chart, or why there is none.
 fn forecast_note(data: &Data, outlook: &Result<forecast::Outlook, String>) -> Markup {
     let note = match outlook {
-        // The section itself already says that the capacity is unknown.
+        // The section itself already states that the capacity is unknown.
         _ if data.learned.is_empty() => return html! {},
         Err(why) => format!("No forecast of the capacity: {why}."),
-        Ok(outlook) if outlook.is_over() => "No forecast of the capacity: the end of life is passed.".to_owned(),
-        Ok(outlook) if outlook.fan.is_empty() => {
-            "The forecast has no dates: how fast the battery is used up is not known.".to_owned()
-        }
+        Ok(outlook) if outlook.is_over() => "No forecast of the capacity: the end of life has passed.".to_owned(),
+        Ok(outlook) if outlook.fan.is_empty() => "The forecast has no dates: the rate of use is unknown.".to_owned(),
         Ok(outlook) => fan_note(data, outlook),
     };
     let class = if outlook.as_ref().is_ok_and(|outlook| !outlook.fan.is_empty()) { "soft" } else { "none" };
@@ -266,11 +264,11 @@ fn forecast_note(data: &Data, outlook: &Result<forecast::Outlook, String>) -> Ma
 fn fan_note(data: &Data, outlook: &forecast::Outlook) -> String {
     let of_cell = if data.cells() > 1 { format!(" for cell {}", outlook.cell + 1) } else { String::new() };
     let doubt = outlook.unknown.as_ref().map_or_else(String::new, |why| {
-        format!(" It is the shortest life that is known; another cell's may end sooner: {why}.")
+        format!(" It is the shortest known life; another cell's life may end sooner: {why}.")
     });
     format!(
-        "The fan is the forecast{of_cell} at the recent rate of use: in one of two cases the end of life comes before the \
-         dashed line meets it, in nine of ten within the band. It contains no knee that has not shown yet.{}{doubt}",
+        "The fan is the forecast{of_cell} at the recent rate of use: in one of two cases, the end of life comes before the \
+         dashed line meets it; in nine of ten, within the band. It does not include a knee that has not shown yet.{}{doubt}",
         gap(data, outlook)
     )
 }
@@ -312,14 +310,14 @@ fn alarms(
                 (table(&["When", "Rule", "Severity", "Change", "What"], rows, groups.len()))
             }
             @if !data.incidents.is_empty() {
-                h3 { "What else happened" }
+                h3 { "Other events" }
                 (table(&["When", "What"], incidents, data.incidents.len()))
             }
         }
     }
 }
 
-/// Groups what many cells share: the same change of a rule and severity within a second, each of another cell.
+/// Groups alarm changes of many cells: the same change of a rule and severity within a second, each for another cell.
 ///
 /// The groups are in the order of their first change.
 fn alike(alarms: &[AlarmRecord]) -> Vec<Vec<&AlarmRecord>> {
@@ -330,8 +328,8 @@ fn alike(alarms: &[AlarmRecord]) -> Vec<Vec<&AlarmRecord>> {
     };
     let mut groups: Vec<Vec<&AlarmRecord>> = Vec::new();
     for row in alarms {
-        // Alarms of several rules come cell by cell, so the group need not be the latest. But no change of an alarm is
-        // listed before an earlier one of the same alarm.
+        // The alarms of several rules arrive cell by cell, so the matching group need not be the latest. But a change must not be
+        // listed before an earlier change of the same alarm.
         let may_precede = |group: &&mut Vec<&AlarmRecord>| {
             (group[0].time_s - row.time_s).abs() < 1.0 && group.iter().all(|other| !is_same_alarm(other, row))
         };
@@ -343,7 +341,7 @@ fn alike(alarms: &[AlarmRecord]) -> Vec<Vec<&AlarmRecord>> {
     groups
 }
 
-/// A table of the first [`MAX_ROWS`] rows with a note on their total number.
+/// A table of the first [`MAX_ROWS`] rows, with a note on the total number of rows.
 fn table(names: &[&str], rows: impl Iterator<Item = Vec<String>>, count: usize) -> Markup {
     html! {
         div.scroll {
@@ -357,17 +355,17 @@ fn table(names: &[&str], rows: impl Iterator<Item = Vec<String>>, count: usize) 
             }
         }
         @if count > MAX_ROWS {
-            p.soft { "the latest " (MAX_ROWS) " of " (count) "; the others are in the picture" }
+            p.soft { "the latest " (MAX_ROWS) " of " (count) "; the picture shows all" }
         }
     }
 }
 
-/// The figures of the cells' model, and what would make it better.
+/// Findings about single cells, and their cost for the pack.
 fn findings(context: &PageContext<'_>) -> Markup {
     let Some(diagnosis) = context.diagnosis else { return html! {} };
     let found = diagnosis.findings();
     html! {
-        @if found.is_empty() { p { "Nothing was found." } } @else {
+        @if found.is_empty() { p { "No findings." } } @else {
             ul {
                 @for found in found {
                     li { (found.to_string()) ", since " (format_utc(found.since)) ": " (found.kind.advice()) }
@@ -375,7 +373,7 @@ fn findings(context: &PageContext<'_>) -> Markup {
             }
         }
         @if let Some(imbalance) = &context.imbalance {
-            h3 { "What the differences between the cells cost the pack" }
+            h3 { "Cost of the differences between the cells for the pack" }
             (pairs(&pack_view::lines(imbalance, context.model.as_ref().map(|sourced| &sourced.model))))
         }
     }
@@ -387,7 +385,7 @@ fn knowledge(data: &Data, context: &PageContext<'_>) -> Markup {
     html! {
         @if !rows.is_empty() {
             (pairs(&rows))
-            h3 { "What would help most" }
+            h3 { "Measurements that would help most" }
             @match advice.as_deref() {
                 None => { p.none { "unknown: the model states no error; packwatch fit writes a model that does" } }
                 Some([]) => { p.soft { "No single measurement would make the state of charge much more certain." } }
@@ -395,7 +393,7 @@ fn knowledge(data: &Data, context: &PageContext<'_>) -> Markup {
             }
         }
         @if !data.models.is_empty() {
-            h3 { "What was learned of the model" }
+            h3 { "Learned changes of the model" }
             (table(&["When", "State", "Capacity", "Residuals", ""], model::changes(data), data.models.len()))
         }
     }
@@ -410,7 +408,7 @@ fn estimator(data: &Data) -> Markup {
         ("Voltage readings compared".to_owned(), grouped(health.count)),
         ("Within the filter's own 95 % interval".to_owned(), format!("{:.1} %", 100.0 * coverage)),
         ("Mean normalised innovation squared (1 = as expected)".to_owned(), format!("{nis:.2}")),
-        ("Beyond the gate: not used".to_owned(), grouped(health.gated)),
+        ("Rejected by the gate".to_owned(), grouped(health.gated)),
     ];
     rows.extend(
         worst.map(|(cell, share)| {
@@ -418,7 +416,7 @@ fn estimator(data: &Data) -> Markup {
         }),
     );
     rows.extend(data.current_offset.map(|(mean, std)| {
-        ("Offset of the current sensor: reading less true current".to_owned(), {
+        ("Offset of the current sensor: reading minus true current".to_owned(), {
             let mean = format::without_minus_zero(format!("{mean:+.3}"));
             format!("{mean} \u{b1} {std:.3} A")
         })
@@ -426,7 +424,7 @@ fn estimator(data: &Data) -> Markup {
     pairs(&rows)
 }
 
-/// Formats a count with separated thousands.
+/// Formats a count with thousands separators.
 fn grouped(count: u64) -> String {
     let digits = count.to_string();
     let groups: Vec<&[u8]> = digits.as_bytes().rchunks(3).rev().collect();
@@ -452,10 +450,10 @@ fn origin(data: &Data, context: &PageContext<'_>) -> Markup {
     rows.extend(context.config.into_iter().flat_map(settings));
     html! {
         section {
-            h2 #origin { "Where this comes from" }
+            h2 #origin { "Origin of the data" }
             (pairs(&rows))
             @if let Some(text) = &context.config_text {
-                details { summary { "The configuration as it was read" } pre { (text) } }
+                details { summary { "The configuration as read" } pre { (text) } }
             }
         }
     }

@@ -1,10 +1,10 @@
-//! Limits of the alarms: as configured, else as the record's alarms name them.
+//! Limits of the alarms: as configured, or else as in the record's alarms.
 
 use super::context::PageContext;
 use super::data::Data;
 use crate::alarm::{Rule, Severity};
 
-/// The mildest threshold of a rule, as configured, else as its alarms say.
+/// The mildest threshold of a rule, as configured or else as in its alarms.
 pub(super) fn threshold(data: &Data, context: &PageContext<'_>, rule: Rule) -> Option<f64> {
     thresholds(data, context, rule).first().map(|(value, _)| *value)
 }

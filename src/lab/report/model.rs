@@ -1,4 +1,4 @@
-//! How well the cells' model is known: the rows and the advice of the section "How well do I know this battery".
+//! How well the cells' model is known: the rows and the advice of the section "How well the battery is known".
 
 use super::context::PageContext;
 use super::data::{Data, ModelRecord};
@@ -7,12 +7,12 @@ use crate::cell::model_bands::CURVE_C;
 use crate::cell::{Coverage, ModelBands, advise};
 use crate::config::cell_model::{KnownBy, SourcedModel, state_words};
 
-/// SOC and temperatures, degrees C, that are judged.
+/// Number of steps of the SOC range.
 const SOC_STEPS: u32 = 20;
 /// SOC at which resistances are stated.
 const HALF: f64 = 0.5;
 
-/// Names and values; empty = the model is not known.
+/// Rows of name and value; empty = the model is unknown.
 pub(super) fn rows(data: &Data, context: &PageContext<'_>) -> Vec<(String, String)> {
     let Some(sourced) = &context.model else { return Vec::new() };
     let bands = ModelBands::new(&sourced.model);
@@ -21,18 +21,18 @@ pub(super) fn rows(data: &Data, context: &PageContext<'_>) -> Vec<(String, Strin
         ("State", state_words(sourced.source.state).to_owned()),
         ("Open-circuit curve", curve(&bands)),
         ("Resistance at half charge", resistance(sourced, &bands)),
-        ("Capacity", format!("\u{b1} {:.0} % before it is learned of a cell", 100.0 * bands.capacity_std())),
+        ("Capacity", format!("\u{b1} {:.0} % before a cell's own is learned", 100.0 * bands.capacity_std())),
     ];
     if let Some(learned) = &sourced.source.learned {
-        rows.push(("Seen by the data it is learned from", seen(&learned.seen)));
+        rows.push(("Range of the data it is learned from", seen(&learned.seen)));
         let residual = learned.residual_v.map(|v| format!("{} fits, residuals {:.1} mV", learned.fits, 1e3 * v));
         rows.push(("Learning", residual.unwrap_or_else(|| "nothing fitted yet".to_owned())));
         let better = learned.chemistry.map(|better| format!("{}: check the label", better.name()));
         rows.extend(better.map(|better| ("Chemistry that fits better", better)));
     }
-    rows.push(("Seen in this record", seen(&data.trace.seen)));
-    rows.push(("Not known by data: SOC", unknown_soc(sourced)));
-    rows.push(("Not known by data: temperature", unknown_temperatures(sourced)));
+    rows.push(("Range of this record", seen(&data.trace.seen)));
+    rows.push(("SOC without data", unknown_soc(sourced)));
+    rows.push(("Temperature without data", unknown_temperatures(sourced)));
     let points = advise(&bands).map(|(points, _)| format!("about {points:.1} points"));
     rows.push((
         "Expected error of the SOC in use",
@@ -41,12 +41,12 @@ pub(super) fn rows(data: &Data, context: &PageContext<'_>) -> Vec<(String, Strin
     rows.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
 }
 
-/// The changes of the model, the latest first: when, state, capacity, residuals, a note.
+/// Changes of the model, the latest first: when, state, capacity, residuals, note.
 pub(super) fn changes(data: &Data) -> impl Iterator<Item = Vec<String>> {
     data.models.iter().rev().map(|change| {
         let ModelRecord { time_s, state, capacity_ah, residual_v, chemistry, is_taken_back } = change;
         let note = match (is_taken_back, chemistry.as_str()) {
-            (true, _) => "the one before holds again".to_owned(),
+            (true, _) => "the previous model applies again".to_owned(),
             (false, "") => String::new(),
             (false, better) => format!("{better} fits better"),
         };
@@ -60,10 +60,10 @@ pub(super) fn changes(data: &Data) -> impl Iterator<Item = Vec<String>> {
     })
 }
 
-/// The measurements that would help most, as sentences; `None` = not known.
+/// The measurements that would help most, as sentences; `None` = unknown.
 pub(super) fn advice(context: &PageContext<'_>) -> Option<Vec<String>> {
     let (_, advice) = advise(&ModelBands::new(&context.model.as_ref()?.model))?;
-    let sentence = |it: &crate::cell::Advice| format!("{}: {:.1} points are then left", it.measurement, it.left_points);
+    let sentence = |it: &crate::cell::Advice| format!("{}: {:.1} points remain", it.measurement, it.left_points);
     Some(advice.iter().map(sentence).collect())
 }
 
@@ -100,7 +100,7 @@ fn seen(coverage: &Coverage) -> String {
     )
 }
 
-/// "10 to 40 and 60 to 100 %".
+/// Formats ranges like "10 to 40 and 60 to 100 %".
 fn ranges(ranges: &[[f64; 2]], factor: f64, unit: &str) -> String {
     let words = ranges.iter().map(|[low, high]| format!("{:.0} to {:.0}", factor * low, factor * high));
     let words: Vec<String> = words.collect();
@@ -120,7 +120,7 @@ fn unknown_temperatures(sourced: &SourcedModel) -> String {
     )
 }
 
-/// Neighbouring places that are not known by data, in words.
+/// Consecutive places without data, in words.
 fn unknown(places: impl Iterator<Item = (f64, KnownBy)>, factor: f64, unit: &str) -> String {
     let places: Vec<(f64, KnownBy)> = places.collect();
     let is_known = |known_by: &KnownBy| matches!(known_by, KnownBy::Measured | KnownBy::Data);
@@ -144,23 +144,23 @@ mod tests {
     use crate::report::Origin;
 
     #[test]
-    fn a_prior_is_not_known_by_data_and_says_what_would_help() {
+    fn prior_model_lists_missing_data_and_advice() {
         let model = of_label(&Label::usual(Chemistry::NcaGraphite, 2.9));
         let context = PageContext { model, ..PageContext::default() };
         let mut data = Data::new(Origin::Replay);
         data.trace.seen.note(0.55, 21.0);
         let rows = rows(&data, &context);
         let value = |name: &str| rows.iter().find(|row| row.0 == name).map(|row| row.1.clone()).expect("a row");
-        assert_eq!(value("Not known by data: SOC"), "0 to 100 % (prior)");
-        assert_eq!(value("Not known by data: temperature"), "-20 to 50 \u{b0}C (prior)");
-        assert_eq!(value("Seen in this record"), "10 % of the SOC (50 to 60 %), 20 to 30 \u{b0}C");
+        assert_eq!(value("SOC without data"), "0 to 100 % (prior)");
+        assert_eq!(value("Temperature without data"), "-20 to 50 \u{b0}C (prior)");
+        assert_eq!(value("Range of this record"), "10 % of the SOC (50 to 60 %), 20 to 30 \u{b0}C");
         assert!(value("State").starts_with("label only"));
         let advice = advice(&context).expect("known");
-        assert!(!advice.is_empty() && advice[0].contains("points are then left"), "{advice:?}");
+        assert!(!advice.is_empty() && advice[0].contains("points remain"), "{advice:?}");
     }
 
     #[test]
-    fn changes_of_the_model_are_listed_the_latest_first() {
+    fn model_changes_are_listed_latest_first() {
         use crate::monitor::{Event, EventKind, ModelState};
         use crate::quantity::Timestamp;
         let change = |seconds: f64, state, capacity_ah: Option<f64>, chemistry, is_taken_back| {
@@ -177,14 +177,14 @@ mod tests {
         let rows: Vec<String> = changes(&data).map(|row| row.join(" | ")).collect();
         let expected = [
             "2027-01-15 08:02:00 UTC | unfit | the label's |  | lfp-graphite fits better",
-            "2027-01-15 08:01:00 UTC | prior | the label's |  | the one before holds again",
+            "2027-01-15 08:01:00 UTC | prior | the label's |  | the previous model applies again",
             "2027-01-15 08:00:00 UTC | learning | 4.700 \u{b1} 0.050 Ah | 3.4 mV | ",
         ];
         assert_eq!(rows, expected);
     }
 
     #[test]
-    fn places_that_are_not_known_are_joined_with_their_reason() {
+    fn places_without_data_are_joined_by_reason() {
         use KnownBy::{Extrapolated, Measured};
         let places = [(0.0, Measured), (0.5, Measured), (0.6, Extrapolated), (0.8, Extrapolated), (1.0, Measured)];
         assert_eq!(unknown(places.into_iter(), 100.0, "%"), "60 to 80 % (extrapolated)");
@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn without_a_model_nothing_is_said() {
+    fn unknown_model_gives_no_rows() {
         let context = PageContext::default();
         assert!(rows(&Data::new(Origin::Store), &context).is_empty() && advice(&context).is_none());
     }

@@ -16,9 +16,9 @@ use crate::chart::{
 };
 use crate::{cell_fault_pictures, model_pictures};
 
-/// Why a replay-only picture is missing from a report of a store.
+/// Why a picture that needs samples is missing from a report of a store.
 pub(super) const NOT_STORED: &str =
-    "unknown: the history keeps what was learned, not every sample; a report of a replay shows it";
+    "unknown: the history contains learned values but no samples; a report of a replay shows this picture";
 
 /// Writes every picture of the report into a folder, as SVG; returns the number of pictures.
 ///
@@ -88,7 +88,7 @@ impl TimeAxis {
     }
 }
 
-/// A chart with all its words.
+/// A chart with title, description and axis labels.
 fn chart(title: impl Into<String>, about: &str, x: Axis, y: impl Into<Axis>, layers: Vec<Layer>) -> Option<Picture> {
     Some(Picture::Chart(Chart { description: about.to_owned(), ..Chart::new(title, x, y, layers) }))
 }
@@ -108,7 +108,7 @@ fn ink_of(severity: &str) -> Ink {
     }
 }
 
-/// The moments at which alarms of a rule were raised.
+/// The times at which alarms of a rule were raised.
 fn raised(data: &Data, clock: &TimeAxis, rule: Rule) -> Option<Layer> {
     let rows = data.alarms.iter().filter(|row| row.rule == rule.name() && row.change == "raised");
     let points: Vec<Point> = rows
@@ -121,7 +121,7 @@ fn raised(data: &Data, clock: &TimeAxis, rule: Rule) -> Option<Layer> {
     (!points.is_empty()).then(|| Layer::new("alarm raised", Ink::Red, Shape::Moments(points)))
 }
 
-/// Bins of a trace as a band and, where cells differ or bins are long, the range within.
+/// Lowest and highest value of each bin, as a band.
 fn range(
     bins: &[(f64, &TraceBin)],
     clock: &TimeAxis,
@@ -135,11 +135,11 @@ fn range(
     band.collect()
 }
 
-/// Bins with something in them; of a stretch without anything that can be seen, one empty bin, which interrupts a line.
+/// Filled bins; a visible gap keeps one empty bin, which interrupts the line.
 fn filled<'a>(bins: impl Iterator<Item = (f64, &'a TraceBin)>) -> Vec<(f64, &'a TraceBin)> {
     let all: Vec<(f64, &TraceBin)> = bins.collect();
     let width_s = all.windows(2).map(|pair| pair[1].0 - pair[0].0).fold(f64::INFINITY, f64::min).max(1.0);
-    // A gap of this part of the whole interrupts a line, if it is also 100 s and 3 bins long: some sensors are slow.
+    // A gap interrupts a line if it is at least this share of the whole, 100 s and 3 bins long: some sensors are slow.
     let hole = (all.len() / 100).max((100.0 / width_s) as usize).max(3);
     let mut empty = 0;
     let wanted = all.into_iter().filter(|(_, bin)| {
@@ -150,7 +150,7 @@ fn filled<'a>(bins: impl Iterator<Item = (f64, &'a TraceBin)>) -> Vec<(f64, &'a 
     wanted.collect()
 }
 
-/// Low and high of each bin in turn, as one line.
+/// One line through the low and the high value of each bin.
 fn zigzag(band: &[(f64, f64, f64)]) -> Vec<(f64, f64)> {
     band.iter().flat_map(|(x, low, high)| [(*x, *low), (*x, *high)]).collect()
 }
@@ -171,7 +171,7 @@ fn soc(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
 fn soc_recent(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     let moments: Vec<(f64, &TraceBin)> = filled(data.trace.recent.iter().flat_map(|bins| bins.iter()));
     let (first_s, last_s) = data.ends_s()?;
-    // Almost the whole record: the picture before shows it.
+    // If the recent part covers almost the whole record, the picture above shows it.
     if moments.last()?.0 - moments.first()?.0 > 0.9 * (last_s - first_s) {
         return None;
     }
@@ -226,13 +226,13 @@ fn capacity(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -
         let median = fan.iter().map(|p| (clock.x(p.time_s), p.median_ah)).collect();
         layers.push(Layer::new("", Ink::Purple, Shape::Dashed(median)));
     }
-    // Measured capacities are under load and belong to the usable capacity, unless there is none.
+    // Capacities measured under load are drawn with the usable capacity, if there is one.
     if !context.reference.is_loaded || series::steps(data, series::usable, false).is_empty() {
         layers.extend(references(data, &clock, context));
     }
     let limits: Vec<Layer> = levels(data, context, Rule::CapacityLow).collect();
     let end = forecast::end_of_life_ah(data, context).map(Shape::Level);
-    // A limit at the same height would be hidden.
+    // Hidden behind a limit at the same height.
     let end = end.filter(|end| limits.iter().all(|limit| limit.shape != *end));
     layers.extend(end.map(|end| Layer::new("end of life", Ink::Grey, end)));
     layers.extend(limits);
@@ -242,7 +242,7 @@ fn capacity(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -
     chart(title, description, clock.axis, within_reason(&steps, &layers, "capacity, Ah"), layers)
 }
 
-/// Returns an axis over the filtered values with their interval: single half-cycles may lie far outside.
+/// Returns an axis over the filtered values with their interval, because single half-cycles may lie far outside.
 fn within_reason(steps: &[CellStep], layers: &[Layer], label: &str) -> Axis {
     let mut low = steps.iter().map(|s| s.range.0.min(s.worst.0 - OF_95 * s.worst.1)).fold(f64::INFINITY, f64::min);
     let mut high = steps.iter().map(|s| s.range.1.max(s.worst.0 + OF_95 * s.worst.1)).fold(0.0, f64::max);
@@ -275,7 +275,7 @@ fn references(data: &Data, clock: &TimeAxis, context: &PageContext<'_>) -> Optio
     (!points.is_empty()).then(|| Layer::new(words, Ink::Plain, Shape::Points(points)))
 }
 
-/// The true SOC between two moments: of one cell a line, of several the lowest and the highest.
+/// The true SOC between two times: one line for one cell, the lowest and the highest for several.
 fn true_soc(context: &PageContext<'_>, clock: &TimeAxis, (first_s, last_s): (f64, f64)) -> Vec<Layer> {
     let within = context.reference.socs.iter().filter(|row| row.0 >= first_s && row.0 <= last_s);
     let rows: Vec<(f64, f64, f64)> =
@@ -307,7 +307,7 @@ fn usable(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
         format!(" at {} A, {} \u{b0}C, down to {} V", usable.current_a, usable.temperature_c, usable.cutoff_v)
     });
     let title = format!("Usable capacity{load}, over life");
-    let description = "What the weakest cell gives under load, with its 95 % interval, Ah";
+    let description = "Charge that the weakest cell delivers under load, with its 95 % interval, Ah";
     chart(title, description, clock.axis, within_reason(&steps, &layers, "usable capacity, Ah"), layers)
 }
 
@@ -354,7 +354,7 @@ fn recharge(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     };
     let raw: Vec<Point> = data.recharges.iter().filter_map(|row| Some(point(row.time_s, row.raw_s?))).collect();
     if !raw.is_empty() {
-        layers.push(Layer::new("as it was", Ink::Grey, Shape::Points(raw)));
+        layers.push(Layer::new("as measured", Ink::Grey, Shape::Points(raw)));
     }
     let is_stored = data.source.origin == Origin::Store;
     if is_stored {
@@ -380,7 +380,7 @@ fn recharge(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     let window =
         window.map_or(String::new(), |w| format!(" from {:.0} to {:.0} % SOC", 100.0 * w.from_soc, 100.0 * w.to_soc));
     let title = if is_stored { "Duration of each charge".to_owned() } else { format!("Recharge period{window}") };
-    let description = "Minutes a charge took, as it was and as the reference charger would take";
+    let description = "Minutes a charge took, as measured and as the reference charger would take";
     chart(title, description, clock.axis, "minutes", layers)
 }
 
@@ -504,7 +504,7 @@ fn coverage(data: &Data) -> Option<Picture> {
     let clock = TimeAxis::of(data);
     let line = life.iter().filter_map(|(time_s, bin)| Some((clock.x(time_s), 100.0 * bin.health.coverage()?)));
     let line: Vec<(f64, f64)> = line.collect();
-    // From 80 % where nothing lies lower.
+    // From 80 % if no value is lower.
     let lowest = if line.iter().all(|point| point.1 > 80.0) { 80.0 } else { 0.0 };
     let layers = vec![
         Layer::line("within their own 95 % interval", Ink::Blue, line),

@@ -1,5 +1,4 @@
-//! What holds at the end of the record: the alarms that are raised, with their values then, and the cells whose estimate is not
-//! trusted.
+//! The state at the end of the record: raised alarms with their current values, and cells whose estimate is untrusted.
 
 use std::collections::BTreeMap;
 
@@ -12,7 +11,7 @@ use super::series;
 use crate::alarm::{Direction, Rule};
 use crate::health::RechargeAlarm;
 
-/// Cells that a group names; of more, their number follows.
+/// Most cells listed by name in a group; of the rest only the number is stated.
 const MAX_NAMED: usize = 8;
 
 /// An alarm that is raised at the end of the data.
@@ -27,12 +26,12 @@ pub(super) struct AlarmGroup<'a> {
     pub(super) alarms: Vec<&'a ActiveAlarm<'a>>,
 }
 
-/// The alarms that are raised at the end, one of each rule, severity and cell.
+/// Alarms that are raised at the end, one per rule, severity and cell.
 pub(super) fn raised(data: &Data) -> Vec<ActiveAlarm<'_>> {
     let mut last: BTreeMap<(&str, &str, Option<usize>), ActiveAlarm<'_>> = BTreeMap::new();
     for row in &data.alarms {
         let key = (row.rule.as_str(), row.severity.as_str(), row.cell);
-        // The row that raised it holds the value; later rows may hold none.
+        // Only the row that raised it surely contains the value.
         if row.is_active {
             last.entry(key).or_insert(ActiveAlarm { row, since_s: row.time_s });
         } else {
@@ -42,7 +41,7 @@ pub(super) fn raised(data: &Data) -> Vec<ActiveAlarm<'_>> {
     last.into_values().collect()
 }
 
-/// Groups alarms by rule and severity, the highest severity first.
+/// Groups alarms by rule and severity, the most severe first.
 pub(super) fn grouped<'a>(raised: &'a [ActiveAlarm<'a>]) -> Vec<AlarmGroup<'a>> {
     let mut groups: Vec<AlarmGroup<'a>> = Vec::new();
     for alarm in raised {
@@ -60,7 +59,7 @@ pub(super) fn grouped<'a>(raised: &'a [ActiveAlarm<'a>]) -> Vec<AlarmGroup<'a>> 
 }
 
 impl AlarmGroup<'_> {
-    /// One row of a table: rule, severity, whose, since when, worst value at the end, limit.
+    /// One row of a table: rule, severity, cells, since when, worst value at the end, limit.
     pub(super) fn row(&self, data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -> Vec<String> {
         let first = self.alarms[0].row;
         let since_s = self.alarms.iter().map(|alarm| alarm.since_s).fold(f64::INFINITY, f64::min);
@@ -79,7 +78,7 @@ impl AlarmGroup<'_> {
     }
 }
 
-/// Numbers of cells from 1: `cell 3`, `cells 1, 2 and 94 more`, or `pack`.
+/// Formats cell numbers from 1: `cell 3`, `cells 1, 2 and 94 more`, or `pack`.
 pub(super) fn cells(cells: impl Iterator<Item = usize>) -> String {
     let numbers: Vec<String> = cells.map(|cell| (cell + 1).to_string()).collect();
     match numbers.len() {
@@ -90,7 +89,7 @@ pub(super) fn cells(cells: impl Iterator<Item = usize>) -> String {
     }
 }
 
-/// The value that an alarm judges as it is at the end of the record; `None` = the record does not keep it.
+/// Value at the end of the record of the quantity that an alarm judges; `None` = the record does not contain it.
 pub(super) fn value(
     row: &AlarmRecord,
     data: &Data,
@@ -119,7 +118,7 @@ pub(super) fn value(
     }
 }
 
-/// Why the estimates are not to be trusted, and whose; `None` = they are.
+/// Untrusted cells as text; `None` = all estimates are trusted.
 pub(super) fn doubt(data: &Data, raised: &[ActiveAlarm<'_>]) -> Option<String> {
     let alarms = raised.iter().filter(|alarm| rule(&alarm.row.rule) == Some(Rule::EstimateUntrusted));
     let mut doubtful: Vec<Option<usize>> = alarms.map(|alarm| alarm.row.cell).collect();
@@ -171,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn the_value_is_that_of_the_end_and_not_of_the_alarm() {
+    fn value_is_that_of_the_record_end() {
         let data = worn(2);
         let value = |cell| value(&alarm("capacity_low", cell), &data, &PageContext::default(), None);
         assert_eq!((value(Some(1)), value(None), value(Some(7))), (Some(0.352), Some(0.252), None));
@@ -180,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn alarms_that_many_cells_share_are_one_row_with_the_worst_value() {
+    fn alarms_of_many_cells_share_one_row() {
         let mut data = worn(96);
         data.alarms.push(AlarmRecord { severity: "warning".to_owned(), ..alarm("recharge_period_low", None) });
         let raised = raised(&data);
@@ -193,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn doubt_names_the_cells_and_ends_with_them() {
+    fn doubt_lists_untrusted_cells() {
         let mut data = worn(3);
         assert_eq!(doubt(&data, &raised(&data)), None);
         data.untrusted.insert(1);

@@ -1,26 +1,26 @@
-//! Measured or true capacities and SOC from a CSV, to be drawn next to the estimates.
+//! Measured or true capacities and SOC from a CSV file, drawn with the estimates.
 
 use std::path::Path;
 
 use crate::capacity_table::CapacityTable;
 use crate::io::table::TableError;
 
-/// Measured or true values; times in s on the data's clock.
+/// Measured or true values; times in s on the clock of the data.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Reference {
-    /// Moment and Ah; where rows name their cell, of the weakest cell.
+    /// Time and Ah; if rows name their cell, of the weakest cell.
     pub capacities: Vec<(f64, f64)>,
-    /// Whether they were measured under load; else they are those between full and empty.
+    /// Whether capacities were measured under load; otherwise they are between full and empty.
     pub is_loaded: bool,
-    /// Moment, SOC of the lowest and the highest cell, fraction.
+    /// Time, and SOC of the lowest and the highest cell, fraction.
     pub socs: Vec<(f64, f64, f64)>,
 }
 
-/// Reads a [`CapacityTable`]. With a column `cell`, rows of one moment are joined to the weakest cell's capacity and the lowest
+/// Reads a [`CapacityTable`]. With a column `cell`, rows of the same time are joined to the weakest cell's capacity and the lowest
 /// and highest SOC.
 ///
 /// # Errors
-/// The file cannot be read, a column is missing, or a value is no number or out of range; names file and line.
+/// The file cannot be read, a column is missing, or a value is not a number or is out of range; the error names file and line.
 pub fn read(path: &Path) -> Result<Reference, TableError> {
     let mut table = CapacityTable::open(path)?;
     let has_cells = table.header().find("cell").is_some();
@@ -48,12 +48,12 @@ pub fn read(path: &Path) -> Result<Reference, TableError> {
     Ok(reference)
 }
 
-/// Keeps the points at which the capacity has changed by more than 0.02 %, and the last.
+/// Keeps the points at which the capacity changed by more than 0.02 %, and the last.
 fn thin(points: &mut Vec<(f64, f64)>) {
     let last = points.last().copied();
     let mut kept_ah = f64::INFINITY;
     points.retain(|(_, ah)| {
-        // The first is infinitely far from what was kept before it.
+        // The first point is always kept.
         let is_kept = (ah - kept_ah).abs() > 2e-4 * ah;
         kept_ah = if is_kept { *ah } else { kept_ah };
         is_kept
@@ -75,14 +75,14 @@ mod tests {
     }
 
     #[test]
-    fn dates_and_seconds_are_read_and_rows_without_a_capacity_skipped() {
+    fn rows_without_capacity_are_skipped() {
         let rows = of("cycle,start,capacity_ah_source\n0,2008-04-02T13:08:17,\n1,2008-04-02T15:25:41,1.856\n").unwrap();
         assert_eq!((rows.capacities, rows.is_loaded), (vec![(1_207_149_941.0, 1.856)], true));
         assert_eq!(of("time_s,capacity_ah\n20,2\n10,1\n").unwrap().capacities[0].1, 1.0);
     }
 
     #[test]
-    fn the_truth_of_a_pack_becomes_its_weakest_cell_and_its_range() {
+    fn truth_of_a_pack_becomes_weakest_cell_and_range() {
         let text = "time_s,cell,soc,capacity_ah\n1,0,.5,2\n1,1,.6,1.9\n2,0,.4,2\n2,1,.5,1.9\n3,0,.3,2\n3,1,.4,1.8\n4,0,.2,2\n4,1,.3,1.8\n";
         let truth = of(text).unwrap();
         assert_eq!(truth.capacities, [(1.0, 1.9), (3.0, 1.8), (4.0, 1.8)]);
@@ -91,7 +91,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fault_names_its_line() {
+    fn fault_names_its_line() {
         assert!(of("a,b\n1,2\n").unwrap_err().contains("r.csv:1: no column capacity_ah or capacity_ah_source or soc"));
         assert!(
             of("time_s,capacity_ah\n1,2\n2,NaN\n").unwrap_err().contains("r.csv:3: column capacity_ah: found \"NaN\"")

@@ -1,23 +1,23 @@
-//! Series over the life of a pack: its worst cell, the range over its cells, every cell in columns of time.
+//! Series over the life of a pack: its worst cell, the range over its cells, and every cell in columns of time.
 
 use super::data::{CapacityRecord, Data};
 use crate::filter::ends;
 
-/// Columns of a heat map.
+/// Number of columns of a heat map.
 pub(super) const COLUMNS: usize = 120;
 
 /// State of the cells after a half-cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct CellStep {
     pub(super) time_s: f64,
-    /// The worst cell, its mean and standard deviation.
+    /// The worst cell, with its mean and standard deviation.
     pub(super) cell: usize,
     pub(super) worst: (f64, f64),
     /// Lowest and highest mean over the cells.
     pub(super) range: (f64, f64),
 }
 
-/// Selects a value of a row: mean and standard deviation.
+/// Selects a value of a row, with mean and standard deviation.
 pub(super) type ValueSelector = fn(&CapacityRecord) -> Option<(f64, f64)>;
 
 pub(super) fn capacity(row: &CapacityRecord) -> Option<(f64, f64)> {
@@ -28,17 +28,17 @@ pub(super) fn usable(row: &CapacityRecord) -> Option<(f64, f64)> {
     row.usable_ah.filter(|value| value.0.is_finite())
 }
 
-/// Lithium lost, per cent.
+/// Lithium lost, percent.
 pub(super) fn lithium_lost(row: &CapacityRecord) -> Option<(f64, f64)> {
     row.losses.map(|losses| percent(losses[0]))
 }
 
-/// Active material of the negative electrode lost, per cent.
+/// Active material of the negative electrode lost, percent.
 pub(super) fn negative_lost(row: &CapacityRecord) -> Option<(f64, f64)> {
     row.losses.map(|losses| percent(losses[1]))
 }
 
-/// Active material of the positive electrode lost, per cent.
+/// Active material of the positive electrode lost, percent.
 pub(super) fn positive_lost(row: &CapacityRecord) -> Option<(f64, f64)> {
     row.losses.map(|losses| percent(losses[2]))
 }
@@ -51,8 +51,8 @@ pub(super) fn resistance(row: &CapacityRecord) -> Option<(f64, f64)> {
     Some(row.resistance).filter(|value| value.0.is_finite())
 }
 
-/// The worst cell after every transition: the lowest value, or the highest where `high_is_bad`. A cell keeps its value
-/// until it has another.
+/// The worst cell after every half-cycle: the lowest value, or the highest if `high_is_bad`. A cell keeps its value until it gets
+/// another.
 pub(super) fn steps(data: &Data, pick: ValueSelector, high_is_bad: bool) -> Vec<CellStep> {
     let mut cells: Vec<Option<(f64, f64)>> = vec![None; data.cells()];
     let mut steps = Vec::new();
@@ -103,8 +103,8 @@ pub(super) fn temperatures(data: &Data) -> Vec<(f64, f64, f64)> {
     .collect()
 }
 
-/// Equivalent full cycles of the cell that was used most: charge moved over twice the rated capacity; without one over
-/// twice the first learned.
+/// Equivalent full cycles of the most used cell: charge moved over twice the rated capacity, or without one over twice the first
+/// learned capacity.
 pub(super) fn full_cycles(data: &Data, rated_ah: Option<f64>) -> Option<f64> {
     let mut moved_ah = vec![0.0; data.cells()];
     data.halves.iter().for_each(|half| moved_ah[half.cell] += half.charge_ah.max(0.0));
@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn the_weakest_cell_is_followed_and_a_cell_keeps_its_value() {
+    fn weakest_cell_is_followed_and_values_are_held() {
         let steps = steps(&pack(), capacity, false);
         let seen: Vec<_> = steps.iter().map(|step| (step.cell, step.worst.0, step.range.1)).collect();
         assert_eq!(seen, [(1, 1.9, 2.0), (0, 2.0, 2.1), (0, 1.5, 2.1)]);

@@ -1,4 +1,4 @@
-//! The summary at the top: the battery's condition, since when, what to do; "unknown" where nothing is known.
+//! The summary at the top: condition of the battery, since when, what to do; "unknown" where data are missing.
 
 use std::collections::BTreeSet;
 
@@ -22,7 +22,7 @@ pub(super) enum Condition {
 }
 
 impl Condition {
-    /// Class of its colour.
+    /// CSS class of the condition.
     pub(super) const fn class(self) -> &'static str {
         match self {
             Self::Good => "good",
@@ -45,13 +45,13 @@ impl Condition {
     }
 }
 
-/// A number with its name.
+/// A named figure.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Tile {
     pub(super) name: &'static str,
     pub(super) value: String,
     pub(super) note: String,
-    /// Why its estimate is not to be trusted, and whose; `None` = it is, or it is none.
+    /// Untrusted cells behind the estimate; `None` = it is trusted, or the figure is not an estimate.
     pub(super) doubt: Option<String>,
 }
 
@@ -65,7 +65,7 @@ pub(super) struct Summary {
     pub(super) tiles: Vec<Tile>,
 }
 
-/// Makes the summary.
+/// Creates the summary.
 pub(super) fn of(data: &Data, context: &PageContext<'_>, outlook: &Result<Outlook, String>) -> Summary {
     let raised = raised(data);
     let (battery, measuring): (Vec<_>, Vec<_>) = raised.iter().partition(|raised| is_of_battery(&raised.row.rule));
@@ -74,7 +74,7 @@ pub(super) fn of(data: &Data, context: &PageContext<'_>, outlook: &Result<Outloo
     let why = worst.or(measuring.first().copied()).map_or_else(String::new, |alarm| {
         match value(alarm.row, data, context, outlook.as_ref().ok()) {
             Some(now) => format!(" Now {}.", words(&AlarmRecord { value: Some(now), ..alarm.row.clone() }, "is")),
-            None => format!(" When the alarm came, {}.", words(alarm.row, "was")),
+            None => format!(" When the alarm was raised, {}.", words(alarm.row, "was")),
         }
     });
     let verdict = match worst.map(|raised| raised.row.severity.as_str()) {
@@ -95,7 +95,7 @@ pub(super) fn of(data: &Data, context: &PageContext<'_>, outlook: &Result<Outloo
     }
 }
 
-/// The worst of the alarms: of the cells for which a rule has raised the worst severity, the one with the worst value now.
+/// The worst alarm: among the cells for which a rule has raised the worst severity, the cell with the worst value now.
 fn worst<'a>(
     alarms: &[&'a ActiveAlarm<'a>],
     value: impl Fn(&ActiveAlarm<'_>) -> Option<f64>,
@@ -109,7 +109,7 @@ fn worst<'a>(
     alarms.iter().filter(is_like_first).copied().max_by(|a, b| badness(a).total_cmp(&badness(b)))
 }
 
-/// Whether the capacity is below the end of life, independent of the alarms.
+/// Whether the capacity is below the end of life, regardless of alarms.
 fn is_over(data: &Data, context: &PageContext<'_>, outlook: &Result<Outlook, String>) -> bool {
     let least = series::steps(data, series::capacity, false).last().map(|step| step.worst.0);
     let is_below = least.zip(forecast::end_of_life_ah(data, context)).is_some_and(|(least, end)| least < end);
@@ -121,7 +121,7 @@ fn knows_limits(data: &Data, context: &PageContext<'_>) -> bool {
     context.config.is_some() || !data.alarms.is_empty()
 }
 
-/// Returns why this battery cannot be called good, independent of alarms; `None` = it can.
+/// Returns why the battery cannot be called good, regardless of alarms; `None` = it can.
 fn unknown(data: &Data, context: &PageContext<'_>) -> Option<String> {
     let cells = context.config.map_or(0, |config| usize::from(config.monitor.sample.cells)).max(data.cells());
     let measured: BTreeSet<usize> =
@@ -138,10 +138,10 @@ fn unknown(data: &Data, context: &PageContext<'_>) -> Option<String> {
             cells - measured.len()
         ));
     }
-    (!knows_limits(data, context)).then(|| "Unknown: no alarm is raised, but this record names no limit.".to_owned())
+    (!knows_limits(data, context)).then(|| "Unknown: no alarm is raised, but this record states no limit.".to_owned())
 }
 
-/// Whether a rule is about the battery, not about its measurement.
+/// Whether a rule is about the battery itself, not about its measurement.
 fn is_of_battery(name: &str) -> bool {
     !matches!(
         rule(name),
@@ -159,10 +159,10 @@ fn is_of_battery(name: &str) -> bool {
 
 fn how(verdict: Condition, alarm: Option<&ActiveAlarm<'_>>, data: &Data, unknown: Option<String>, why: &str) -> String {
     let head = match verdict {
-        Condition::Good => "Good: no limit is passed.",
-        Condition::Watch if alarm.is_none() => "No limit is passed, but the capacity is below that of the end of life.",
+        Condition::Good => "Good: no limit is exceeded.",
+        Condition::Watch if alarm.is_none() => "No limit is exceeded, but the capacity is below the end of life.",
         Condition::Watch if alarm.is_some_and(|alarm| !is_of_battery(&alarm.row.rule)) => {
-            "The battery passes no limit, but its measurements are faulty."
+            "The battery exceeds no limit, but its measurements are faulty."
         }
         Condition::Watch => "Worth watching.",
         Condition::Plan => "Worn: plan a visit to the workshop.",
@@ -200,10 +200,10 @@ fn what(
         Rule::TemperatureHigh => "Check cooling and load before the next use.",
         Rule::SocLow => "Charge it.",
         Rule::CellImbalance => {
-            "Have the cells balanced; if that does not hold, the weakest cell is the one to look at."
+            "Have the cells balanced; if the imbalance returns, have the weakest cell checked."
         }
         Rule::CellLeak => {
-            "Measure the rest voltage of the named cell over a week; if it falls against the others', replace the cell."
+            "Measure the rest voltage of the named cell over a week; if it falls relative to the others, replace the cell."
         }
         Rule::ConnectionResistance => "Have the connections of the named cell tightened and cleaned.",
         _ if verdict == Condition::Act => "Replace the battery or the named cell, or take it out of service.",
@@ -211,20 +211,18 @@ fn what(
     });
     let measure = measuring.first().map(|raised| match rule(&raised.row.rule) {
         Some(Rule::EstimateUntrusted) => {
-            "Do not rely on these figures before the sensors and the cell model were checked."
+            "Do not rely on these figures before the sensors and the cell model have been checked."
         }
-        Some(Rule::ChannelFaulty) => {
-            "Check the sense wire and the channel of the named cell: its figures are not its own."
-        }
-        Some(Rule::StoreFailed) => "Check the disk of the vehicle computer: what is learned may be lost.",
-        _ => "Check sensors, wiring and bus: some inputs did not come or made no sense.",
+        Some(Rule::ChannelFaulty) => "Check the sense wire and the channel of the named cell: its figures are wrong.",
+        Some(Rule::StoreFailed) => "Check the disk of the vehicle computer: learned values may be lost.",
+        _ => "Check sensors, wiring and bus: some inputs are missing or implausible.",
     });
     match (advice, measure) {
         (None, None) if verdict == Condition::Unknown && !knows_limits => {
-            "Make this report again with the configuration (-c), which defines the limits.".to_owned()
+            "Create the report with the configuration (-c), which defines the limits.".to_owned()
         }
         (None, None) if verdict == Condition::Unknown => {
-            "Use it through a deep discharge and a full charge, then make this report again.".to_owned()
+            "Use the battery through a deep discharge and a full charge, then create the report again.".to_owned()
         }
         (None, None) if verdict == Condition::Watch => "Plan its replacement.".to_owned(),
         (None, None) => "Nothing.".to_owned(),
@@ -252,7 +250,7 @@ fn tiles(
     let health = rated.map(|(step, rated)| format!("{:.0} %", 100.0 * step.worst.0 / rated));
     let health_note = match rated {
         Some((step, rated)) => format!("of {rated} Ah rated{}{}", of_cell(&step), assumed(data, step.cell)),
-        None if context.config.is_none() => "rated capacity not known without -c".to_owned(),
+        None if context.config.is_none() => "rated capacity unknown without -c".to_owned(),
         None => "no capacity learned yet".to_owned(),
     };
     let note = |step: Option<series::CellStep>, none: &str| {
@@ -278,7 +276,7 @@ fn tiles(
             outlook.as_ref().map_or_else(Clone::clone, |outlook| outlook.note(data.cells())),
         ),
     ];
-    // The worst of all cells: one that is not trusted may be it.
+    // The figure is the worst of all cells, and an untrusted cell may be the worst.
     let doubt = doubt(data, raised);
     estimates.iter_mut().filter(|tile| tile.value != "unknown").for_each(|tile| tile.doubt.clone_from(&doubt));
     estimates.extend([
@@ -293,7 +291,7 @@ fn tiles(
     estimates
 }
 
-/// Marks a capacity that no half-cycle of the cell has measured: it is what was configured, as it has aged since.
+/// Marks a capacity that no half-cycle of the cell has measured: the configured value, aged since.
 fn assumed(data: &Data, cell: usize) -> &'static str {
     let is_measured = data.learned.iter().any(|row| row.cell == cell && row.measured_ah.is_some());
     if is_measured { "" } else { "; assumed, not measured yet" }
@@ -311,18 +309,18 @@ fn losses_tile(data: &Data) -> Tile {
     tile("Lithium lost", last(series::lithium_lost).map(figure), note)
 }
 
-/// Returns the tile of the latest recharge period, normalised where it is known, with the first for comparison.
+/// Returns the tile of the latest recharge period, normalised if known, with the first for comparison.
 fn recharge_tile(data: &Data) -> Tile {
     let normalised = || data.recharges.iter().filter_map(|row| row.normalised_s.map(|(mean, _)| mean));
     let raw = || data.recharges.iter().filter_map(|row| row.raw_s);
     let minutes = |seconds: f64| format!("{:.1} min", seconds / 60.0);
     let (first, last, how) = match normalised().next_back() {
         Some(last) => (normalised().next(), Some(last), "normalised; "),
-        None => (raw().next(), raw().next_back(), "as it was; "),
+        None => (raw().next(), raw().next_back(), "as measured; "),
     };
     let note = match (first, data.source.origin) {
         (Some(first), _) => format!("{how}{} at first", minutes(first)),
-        (None, Origin::Store) => "the history does not keep it".to_owned(),
+        (None, Origin::Store) => "not in the history".to_owned(),
         (None, Origin::Replay) => "no charge covered enough of the window".to_owned(),
     };
     tile("Recharge period", last.map(minutes), note)
@@ -355,7 +353,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_known_is_unknown_and_neither_good_nor_bad() {
+    fn summary_without_data_is_unknown() {
         let summary = summary(Vec::new());
         assert_eq!(summary.verdict, Condition::Unknown);
         assert!(summary.tiles.iter().filter(|tile| tile.value == "unknown").count() >= 5, "{:?}", summary.tiles);
@@ -363,7 +361,7 @@ mod tests {
     }
 
     #[test]
-    fn the_worst_raised_alarm_decides_and_one_that_is_over_does_not() {
+    fn worst_raised_alarm_decides_and_cleared_one_does_not() {
         let over = vec![alarm(1.0, "capacity_low", "severe", true), alarm(2.0, "capacity_low", "severe", false)];
         assert_eq!(summary(over.clone()).verdict, Condition::Unknown);
         let mut both = over;
@@ -390,7 +388,7 @@ mod tests {
     }
 
     #[test]
-    fn good_needs_every_cell_and_a_limit_to_be_known() {
+    fn good_needs_every_cell_and_a_limit() {
         let verdict = |rows: &[CapacityRecord], alarms: Vec<AlarmRecord>, doubt: Option<&str>| {
             let mut data = Data::new(Origin::Store);
             (data.learned, data.alarms) = (rows.to_vec(), alarms);
@@ -403,25 +401,25 @@ mod tests {
         assert_eq!(verdict(&[cell(0), cell(1)], vec![limit(1.0)], None).verdict, Condition::Good);
         let no_limit = verdict(&[cell(0), cell(1)], Vec::new(), None);
         assert_eq!(no_limit.verdict, Condition::Unknown);
-        assert!(no_limit.how.contains("names no limit") && no_limit.what.contains("-c"), "{no_limit:?}");
+        assert!(no_limit.how.contains("states no limit") && no_limit.what.contains("-c"), "{no_limit:?}");
         let one_missing = verdict(&[cell(1)], vec![limit(1.0)], None);
         assert_eq!(one_missing.how, "Unknown: nothing has been learned yet about 1 of 2 cells.");
         assert_eq!(verdict(&[cell(0), learned(3.0, 1, None)], vec![limit(1.0)], None).verdict, Condition::Unknown);
-        // Below the end of life, though no alarm was raised so far.
+        // Below the end of life, although no alarm has been raised.
         assert_eq!(verdict(&[cell(0), cell(1)], vec![limit(1.6)], None).verdict, Condition::Watch);
         let changed = verdict(&[cell(0), cell(1)], vec![limit(1.0)], Some("the history was changed"));
         assert_eq!(changed.how, "Unknown: the history was changed.");
     }
 
     #[test]
-    fn a_missing_input_does_not_make_the_battery_bad() {
+    fn missing_input_does_not_make_the_battery_bad() {
         let summary = summary(vec![alarm(1.0, "input_missing", "severe", true)]);
         assert_eq!(summary.verdict, Condition::Unknown);
         assert!(summary.what.contains("Check sensors"), "{}", summary.what);
     }
 
     #[test]
-    fn the_headline_has_the_value_of_now_and_cards_their_doubt_and_assumption() {
+    fn headline_has_current_value_and_cards_have_doubts() {
         let mut data = Data::new(Origin::Replay);
         data.alarms = vec![alarm(1.7e9, "usable_capacity_low", "severe", true)];
         data.learned = vec![CapacityRecord { usable_ah: Some((0.9, 0.01)), ..learned(1.71e9, 2, Some(1.0)) }];
@@ -438,7 +436,7 @@ mod tests {
     }
 
     #[test]
-    fn every_estimate_with_a_value_is_marked_and_no_count_is() {
+    fn only_estimates_are_marked_as_untrusted() {
         let config = examples::config();
         let context = PageContext { config: Some(&config), ..PageContext::default() };
         let mut data = examples::worn(3);
@@ -456,7 +454,7 @@ mod tests {
     }
 
     #[test]
-    fn of_many_cells_the_headline_has_the_worst() {
+    fn headline_has_the_worst_of_many_cells() {
         let mut data = Data::new(Origin::Replay);
         for (cell, usable_ah) in [1.1, 0.9, 1.0].into_iter().enumerate() {
             data.alarms.push(AlarmRecord { cell: Some(cell), ..alarm(1.7e9, "usable_capacity_low", "severe", true) });

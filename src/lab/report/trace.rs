@@ -1,4 +1,4 @@
-//! Summary of a replay's estimates in bins: SOC, temperature and the estimator's consistency.
+//! Summary of a replay's estimates in bins: SOC, temperature, and consistency of the estimator.
 
 use std::collections::VecDeque;
 
@@ -6,7 +6,7 @@ use super::bins::{Bin, Bins};
 use crate::cell::Coverage;
 use crate::monitor::Estimate;
 
-/// The estimates of a stretch of time, of all cells.
+/// The estimates of all cells in a stretch of time.
 #[derive(Debug, Clone)]
 pub(super) struct TraceBin {
     /// Lowest and highest SOC, fraction.
@@ -24,11 +24,11 @@ pub(super) struct TraceBin {
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Consistency {
     pub(super) count: u64,
-    /// Within their own 95 % interval.
+    /// Number within their own 95 % interval.
     pub(super) inside: u64,
-    /// Beyond the gate: not used.
+    /// Number rejected by the gate.
     pub(super) gated: u64,
-    /// Sum of squares of innovation over its standard deviation.
+    /// Sum of (innovation / standard deviation) squared.
     pub(super) squares: f64,
 }
 
@@ -86,7 +86,7 @@ impl Consistency {
         (self.count > 0).then(|| self.inside as f64 / self.count as f64)
     }
 
-    /// Mean normalised innovation squared: 1 where the filter is right about itself.
+    /// Mean normalised innovation squared: 1 if the filter's variance is right.
     pub(super) fn mean_nis(&self) -> Option<f64> {
         (self.count > 0).then(|| self.squares / self.count as f64)
     }
@@ -121,10 +121,10 @@ impl Trace {
         self.cells[cell].add(&Consistency::of(estimate));
     }
 
-    /// Starts the bins of a charge or discharge.
+    /// Starts new bins for a charge or discharge.
     pub(super) fn turn(&mut self, time_s: f64) {
         self.recent.push_back(Bins::new(time_s));
-        // Charges and discharges kept in detail, the last ones, each with the rest after it.
+        // The last charges and discharges are kept in detail, each with the rest after it.
         while self.recent.len() > 6 {
             self.recent.pop_front();
         }

@@ -1,4 +1,4 @@
-//! The size of a page of a long life, the text of a page without data, and the cards and alarms of a worn pack.
+//! The size of the page of a long life, the text of a page without data, and the cards and alarms of a worn pack.
 
 use super::*;
 use crate::alarm::{AlarmState, Change, Rule, Severity};
@@ -11,7 +11,7 @@ use crate::quantity::{CellIndex, Mode, Timestamp};
 use crate::report::examples::{self, HALVES, end_s};
 
 #[test]
-fn a_page_of_nothing_says_unknown_and_fetches_nothing() {
+fn page_without_data_says_unknown_and_fetches_nothing() {
     let context = PageContext { title: "bus <7> & co".into(), ..PageContext::default() };
     let page = page(&Data::new(Origin::Replay), &context);
     assert!(page.contains("<h1>bus &lt;7&gt; &amp; co</h1>") && page.matches("unknown").count() > 8);
@@ -19,10 +19,10 @@ fn a_page_of_nothing_says_unknown_and_fetches_nothing() {
         let found = page.replace("style-src=", "").contains(forbidden);
         assert!(!found, "{forbidden} in the page");
     }
-    assert!(!page.contains("NaN") && !page.contains("inf"), "a number that is none");
+    assert!(!page.contains("NaN") && !page.contains("inf"), "not a number in the text");
 }
 
-/// A pack of 96 cells over 600 half-cycles of three hours, each cell fading at its own pace, with a voltage reading per
+/// A pack of 96 cells over 600 half-cycles of three hours, each cell fading at its own rate, with a voltage reading per
 /// cell every two minutes, and alarms that come and go in every tenth half-cycle.
 fn life() -> Data {
     let mut data = Data::new(Origin::Replay);
@@ -53,7 +53,7 @@ fn moment_s(half: u16, minute: u16) -> f64 {
     1.7e9 + 10_800.0 * f64::from(half) + 60.0 * f64::from(minute)
 }
 
-/// Repeats itself, but not soon.
+/// Noise that does not repeat soon.
 fn noise(a: u16, b: u16) -> f64 {
     (f64::from(a) * 12.9898 + f64::from(b) * 78.233).sin()
 }
@@ -127,7 +127,7 @@ fn change(rule: Rule, cell: u16, active: bool, value: f64) -> EventKind {
 }
 
 #[test]
-fn a_life_of_600_half_cycles_of_96_cells_fits_into_five_megabytes_with_everything_in_it() {
+fn page_of_a_long_life_stays_below_five_megabytes() {
     let model = crate::config::of_label(&Label::usual(Chemistry::Nmc811Graphite, 2.6));
     let diagnosis = CellFaultDetector::new(96);
     let imbalance = Some(Err(UnknownImbalance::NotCompared));
@@ -142,17 +142,17 @@ fn a_life_of_600_half_cycles_of_96_cells_fits_into_five_megabytes_with_everythin
         "Capacity of every cell",
         "Recharge period",
         "Innovation",
-        "What would help most",
+        "Measurements that would help most",
         "unknown: the cells have not been compared yet",
     ] {
         assert!(page.contains(part), "no {part}");
     }
     assert!(!page.contains("class=\"none\""), "a part has no picture");
-    assert!(!page.contains("NaN") && !page.contains("inf\""), "a number that is none");
+    assert!(!page.contains("NaN") && !page.contains("inf\""), "not a number in the text");
 }
 
 #[test]
-fn the_menu_has_the_order_of_the_page() {
+fn menu_follows_the_order_of_the_page() {
     let page = page(&Data::new(Origin::Replay), &PageContext::default());
     let menu: Vec<&str> = page.split("<a href=\"#").skip(1).filter_map(|rest| rest.split('"').next()).collect();
     let headings = page.split("<h2").skip(1).filter_map(|rest| rest.split("id=\"").nth(1)?.split('"').next());
@@ -161,7 +161,7 @@ fn the_menu_has_the_order_of_the_page() {
 }
 
 #[test]
-fn the_pack_of_a_history_stands_under_the_title() {
+fn pack_of_a_history_is_in_the_heading() {
     let mut data = Data::new(Origin::Store);
     data.source.pack = Some(3);
     assert!(page(&data, &PageContext::default()).contains("pack 3 of this history"));
@@ -169,15 +169,15 @@ fn the_pack_of_a_history_stands_under_the_title() {
 
 const PLUS_MINUS: char = '\u{b1}';
 
-/// A card as it stands on the page.
+/// A card of the page.
 struct Card<'a> {
     name: &'a str,
-    /// Its value and its note.
+    /// Value and note.
     text: String,
     doubt: Option<&'a str>,
 }
 
-/// Text between two marks, the first time they are there.
+/// Text between the first two marks.
 fn between<'a>(text: &'a str, from: &str, to: &str) -> Option<&'a str> {
     text.split_once(from)?.1.split(to).next()
 }
@@ -192,7 +192,7 @@ fn cards(page: &str) -> Vec<Card<'_>> {
     tiles.split("<div class=\"tile\">").skip(1).map(card).collect()
 }
 
-/// Rows of the table under a heading, each with its cells.
+/// Rows of the table under a heading, each as a list of its cells.
 fn rows<'a>(page: &'a str, heading: &str) -> Vec<Vec<&'a str>> {
     let body = between(page, &format!("<h3>{heading}</h3>"), "</table>").expect("a table");
     let cells =
@@ -209,7 +209,7 @@ fn trust(cell: u16, trusted: bool) -> Event {
 }
 
 #[test]
-fn every_card_with_an_estimate_is_marked_while_a_cell_is_not_trusted() {
+fn untrusted_cell_marks_every_card_with_an_estimate() {
     let config = examples::config();
     let context = PageContext { config: Some(&config), ..PageContext::default() };
     let mut data = examples::worn(96);
@@ -228,7 +228,7 @@ fn every_card_with_an_estimate_is_marked_while_a_cell_is_not_trusted() {
 }
 
 #[test]
-fn alarms_of_96_cells_are_one_row_of_now_and_one_of_all_changes() {
+fn alarms_of_96_cells_share_one_row() {
     let mut data = examples::worn(96);
     (0..96).for_each(|cell| data.take_event(&at_end(change(Rule::CapacityLow, cell, true, 1.8))));
     let raised = page(&data, &PageContext::default());
@@ -244,15 +244,15 @@ fn alarms_of_96_cells_are_one_row_of_now_and_one_of_all_changes() {
 }
 
 #[test]
-fn alarms_of_two_rules_are_grouped_though_they_come_cell_by_cell() {
+fn alarms_of_two_rules_are_grouped_by_rule() {
     let mut data = examples::worn(96);
     for cell in 0..96 {
-        // As the monitor learns: all of one cell, then the next.
+        // In the order in which the monitor learns: all alarms of one cell, then the next cell.
         for rule in [Rule::CapacityLow, Rule::UsableCapacityLow] {
             data.take_event(&at_end(change(rule, cell, true, 1.8)));
         }
     }
-    // A change of one cell is no other cell's, nor is a later one the same.
+    // Changes must be grouped by cell and by time.
     for (active, value) in [(false, 1.9), (true, 1.7)] {
         data.take_event(&at_end(change(Rule::CapacityLow, 4, active, value)));
     }
@@ -273,7 +273,7 @@ fn alarms_of_two_rules_are_grouped_though_they_come_cell_by_cell() {
     assert_eq!(changes, expected);
 }
 
-/// The number behind every plus-minus sign, and half of its last digit.
+/// Numbers after the plus-minus signs, each with half of its last digit.
 fn deviations(text: &str) -> Vec<(f64, f64)> {
     let number = |rest: &str| {
         let rest = rest.trim_start();
@@ -286,7 +286,7 @@ fn deviations(text: &str) -> Vec<(f64, f64)> {
     text.split(PLUS_MINUS).skip(1).map(number).collect()
 }
 
-/// Whether the numbers behind the plus-minus signs of a text are these standard deviations, rounded to the printed digits.
+/// Whether the numbers after the plus-minus signs of a text are these standard deviations, rounded to the printed digits.
 fn states(text: &str, stds: &[f64]) -> bool {
     let printed = deviations(text);
     let is_same = |((value, half_digit), std): (&(f64, f64), &f64)| (value - std).abs() <= half_digit + 1e-9;
@@ -294,7 +294,7 @@ fn states(text: &str, stds: &[f64]) -> bool {
 }
 
 #[test]
-fn every_plus_minus_on_the_page_is_one_standard_deviation() {
+fn every_plus_minus_is_one_standard_deviation() {
     const STATEMENT: &str = "Every \u{b1} is one standard deviation.";
     let config = examples::config();
     let context = PageContext { config: Some(&config), ..PageContext::default() };
@@ -304,7 +304,7 @@ fn every_plus_minus_on_the_page_is_one_standard_deviation() {
     let page = page(&data, &context);
     assert!(page.contains(STATEMENT));
     let [first, second, third, last] = [0, 1, 2, 3].map(examples::stds);
-    // Of the cell that is worst in it.
+    // The worst cell in each loss.
     let [lithium, negative, positive] = [second.losses[0], third.losses[1], first.losses[2]].map(|std| 100.0 * std);
     for card in cards(&page) {
         let expected = match card.name {
@@ -316,15 +316,15 @@ fn every_plus_minus_on_the_page_is_one_standard_deviation() {
         };
         assert!(states(&card.text, &expected), "{}: {}, not {expected:?}", card.name, card.text);
     }
-    let offset = between(&page, "reading less true current</td><td>", "</td>").expect("a row");
+    let offset = between(&page, "reading minus true current</td><td>", "</td>").expect("a row");
     assert!(states(offset, &[0.034]), "{offset}");
-    // No other: the statement, six on cards, the offset.
+    // No others: the statement, six on cards, the offset.
     assert_eq!(page.matches(PLUS_MINUS).count(), 8);
-    assert!(!page.contains("+-"), "another sign for the same");
+    assert!(!page.contains("+-"), "another plus-minus sign");
 }
 
 #[test]
-fn a_refused_forecast_states_one_standard_deviation_of_the_loss() {
+fn rejected_forecast_states_the_deviation_of_the_loss() {
     let config = examples::config();
     let context = PageContext { config: Some(&config), ..PageContext::default() };
     let mut data = Data::new(Origin::Replay);
@@ -340,5 +340,5 @@ fn a_refused_forecast_states_one_standard_deviation_of_the_loss() {
     assert!(life.text.starts_with("unknown; capacity lost is") && states(&life.text, &[100.0 * std]), "{}", life.text);
     let note = between(&page, "No forecast of the capacity: ", "</p>").expect("a note");
     assert!(states(note, &[100.0 * std]), "{note}");
-    assert!(!page.contains("+-"), "another sign for the same");
+    assert!(!page.contains("+-"), "another plus-minus sign");
 }

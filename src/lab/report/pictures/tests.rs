@@ -1,16 +1,16 @@
-//! The time axis: dates where the record has them, else the time since its start in a unit that suits its length.
+//! The time axis: dates if the record has them, or else the time since its start in a unit that suits its length.
 
 use super::*;
 use crate::chart::Size;
 use crate::report::{examples, page};
 
-/// Texts of a picture that have this class, in order.
+/// Texts of a picture that have a class, in order.
 fn texts<'a>(svg: &'a str, class: &str) -> Vec<&'a str> {
     let start = format!("class=\"{class}\">");
     svg.split(&start).skip(1).filter_map(|rest| rest.split('<').next()).collect()
 }
 
-/// Words of the ticks of the x axis, and its caption, which follows them.
+/// Tick labels of the x axis, and its caption, which follows them.
 fn x_axis(picture: &Picture) -> (Vec<String>, String) {
     let svg = picture.draw(Size::WIDE).0;
     let after_ticks = svg.rsplit("class=\"t m\">").next().expect("ticks");
@@ -18,7 +18,7 @@ fn x_axis(picture: &Picture) -> (Vec<String>, String) {
     (texts(&svg, "t m").into_iter().map(str::to_owned).collect(), caption.expect("a caption"))
 }
 
-/// Axes of all pictures of a recording, which are those of the estimates.
+/// Axes of all pictures of a recording of estimates.
 fn x_axes(data: &Data) -> Vec<(Vec<String>, String)> {
     let pictures = all(data, &PageContext::default());
     let names: Vec<&str> = pictures.iter().map(|(name, _)| name.as_str()).collect();
@@ -27,7 +27,7 @@ fn x_axes(data: &Data) -> Vec<(Vec<String>, String)> {
 }
 
 #[test]
-fn an_undated_recording_of_a_minute_counts_seconds_since_its_start() {
+fn undated_recording_counts_seconds_since_its_start() {
     let data = examples::recording(1000.0, 60.0);
     for (ticks, caption) in x_axes(&data) {
         assert_eq!(ticks, ["0", "10", "20", "30", "40", "50", "60"]);
@@ -38,20 +38,20 @@ fn an_undated_recording_of_a_minute_counts_seconds_since_its_start() {
     let ends = (points[0].0, points[points.len() - 1].0);
     assert!(
         (0.0..=1.0).contains(&ends.0) && (59.0..=61.0).contains(&ends.1),
-        "the values lie under their ticks: {ends:?}"
+        "the values lie at their ticks: {ends:?}"
     );
     assert!(!page(&data, &PageContext::default()).contains("UTC"));
 }
 
 #[test]
-fn a_dated_life_has_ticks_of_dates_in_utc() {
+fn dated_life_has_ticks_of_utc_dates() {
     const DAY_S: f64 = 86_400.0;
     // From 2023-11-14T22:13:20Z.
     for (ticks, caption) in x_axes(&examples::recording(1.7e9, 10.0 * DAY_S)) {
         assert_eq!(ticks, ["11-15", "11-16", "11-17", "11-18", "11-19", "11-20", "11-21", "11-22", "11-23", "11-24"]);
         assert_eq!(caption, "UTC, 2023-11-14 to 2023-11-24");
     }
-    // However short.
+    // Also if it is short.
     for (ticks, caption) in x_axes(&examples::recording(1.7e9, 60.0)) {
         assert_eq!(ticks, ["22:13:30", "22:13:45", "22:14:00", "22:14:15"]);
         assert_eq!(caption, "UTC, 2023-11-14 to 2023-11-14");
@@ -62,7 +62,7 @@ fn a_dated_life_has_ticks_of_dates_in_utc() {
 }
 
 #[test]
-fn the_unit_of_an_undated_axis_suits_its_length() {
+fn unit_of_an_undated_axis_suits_its_length() {
     let cases = [
         (60.0, "s", 60.0),
         (599.0, "s", 599.0),
@@ -83,7 +83,7 @@ fn the_unit_of_an_undated_axis_suits_its_length() {
 }
 
 #[test]
-fn a_part_of_an_undated_record_counts_from_the_start_of_the_whole() {
+fn part_of_an_undated_record_counts_from_its_start() {
     let clock = TimeAxis::between(&examples::recording(1000.0, 7200.0), 8140.0, 8200.0);
     assert_eq!((clock.axis.label.as_str(), clock.axis.range), ("time since the start, s", Some((7140.0, 7200.0))));
     assert_eq!(clock.x(8170.0), 7170.0);
