@@ -2,11 +2,11 @@
 //!
 //! | column | value |
 //! | --- | --- |
-//! | `time_s`, `start`, `date` or `time` | moment: seconds, or like 2008-04-02T13:08:17 |
+//! | `time_s`, `start`, `date` or `time` | time: seconds, or like 2008-04-02T13:08:17 |
 //! | `capacity_ah` or `capacity_ah_source` | Ah, above 0; empty = not measured |
 //! | `soc` | fraction; empty = not measured |
 //! | `cell` | number of the cell, from 0 |
-//! | `cycle`, `type`, `duration_s` | part of a measured file, its kind (`discharge` or another), time of use, s |
+//! | `cycle`, `type`, `duration_s` | part of a measured file, its kind (`discharge` or another), duration of use, s |
 
 use std::borrow::Cow;
 use std::path::Path;
@@ -24,7 +24,7 @@ pub(crate) struct CapacityTable {
     cycle: Option<usize>,
     kind: Option<usize>,
     duration: Option<usize>,
-    /// Time of the last row, where rows must be in order.
+    /// Time of the last row, if rows must be in order.
     last: Option<Timestamp>,
 }
 
@@ -36,7 +36,7 @@ pub(crate) struct CapacityRow<'t> {
     pub(crate) soc: Option<f64>,
     pub(crate) cell: Option<CellIndex>,
     pub(crate) cycle: Cow<'t, str>,
-    /// Whether it is of a discharge, as is every row of a table without types.
+    /// Whether the row belongs to a discharge; true for every row of a table without types.
     pub(crate) is_discharge: bool,
     pub(crate) duration_s: Option<f64>,
 }
@@ -45,7 +45,7 @@ impl CapacityTable {
     /// Opens a table whose rows may have any order.
     ///
     /// # Errors
-    /// The file cannot be read, or lacks a moment, or both capacity and SOC.
+    /// The file cannot be read, or lacks the time, or both capacity and SOC.
     pub(crate) fn open(path: &Path) -> Result<Self, TableError> {
         let table = Table::open(path)?;
         let header = table.header();
@@ -63,12 +63,12 @@ impl CapacityTable {
         })
     }
 
-    /// The same; a row before the row above it is a fault.
+    /// Opens a table whose rows must be in order of time.
     pub(crate) fn open_in_order(path: &Path) -> Result<Self, TableError> {
         Ok(Self { last: Some(Timestamp::from_nanos(i64::MIN)), ..Self::open(path)? })
     }
 
-    /// Name of the file and columns.
+    /// Names of the file and its columns.
     pub(crate) fn header(&self) -> &Header {
         self.table.header()
     }
@@ -76,7 +76,7 @@ impl CapacityTable {
     /// The next row; `None` at the end.
     ///
     /// # Errors
-    /// The file fails, or a field is wrong: file, line, column, found, allowed.
+    /// The file cannot be read, or a field is wrong: file, line, column, found, allowed.
     pub(crate) fn next_row(&mut self) -> Result<Option<CapacityRow<'_>>, TableError> {
         let Some(row) = self.table.next_row()? else { return Ok(None) };
         let time = row.stamp(self.time)?;
@@ -93,7 +93,7 @@ impl CapacityTable {
             line: row.line,
             time,
             capacity_ah: number(self.capacity, f64::MIN_POSITIVE, f64::MAX, "Ah above 0 or nothing")?,
-            // A little beyond full and empty an SOC may be; 0 to 100 would be percent.
+            // The SOC may be slightly outside 0 to 1; values up to 100 would be percent.
             soc: number(self.soc, -0.5, 1.5, "a fraction, 0 to 1")?,
             cell: self.cell.map(|column| cell(&row, column)).transpose()?,
             cycle: self.cycle.map_or_else(Cow::default, |column| row.text(column)),

@@ -1,6 +1,6 @@
-//! Pictures of a diagnosis: each cell's difference from the middle of its pack, one picture per state.
+//! Pictures of a cell fault detector: each cell's difference from the median of its pack, one picture per state.
 //!
-//! A bar is a 95 % interval. Red cells are those of a finding that the picture shows.
+//! A bar is a 95 % interval. Cells with a finding that the picture shows are red.
 
 use crate::cell_faults::difference::{CAPACITY, CHANNEL, CONTACT, LEAK, RESISTANCE, SOC, STATES};
 use crate::cell_faults::fault;
@@ -9,31 +9,31 @@ use crate::chart::{Axis, Chart, Ink, Layer, Picture, Point, Shape};
 use crate::filter::ScalarGaussian;
 use crate::quantity::CellIndex;
 
-/// Half the width of a bar, cells.
+/// Half the width of a bar, in cells.
 const HALF_BAR: f64 = 0.3;
 
-/// A picture.
+/// Description of a picture.
 struct Shown {
     state: usize,
-    /// Of its file.
+    /// Name of its file.
     name: &'static str,
     title: &'static str,
     label: &'static str,
-    /// From the state's unit to the label's.
+    /// Factor from the state's unit to the label's.
     scale: f64,
-    /// From which size on a cell is reported, in the state's unit.
+    /// Sizes from which on a cell is reported, in the state's unit.
     limits: &'static [f64],
-    /// Findings that it shows.
+    /// Kinds of findings that the picture shows.
     kinds: &'static [CellFaultKind],
 }
 
-/// In the order of a report; charge first, because it has no finding of its own.
+/// In the order of a report; charge is first, because it has no finding.
 const SHOWN: [Shown; STATES] = [
     Shown {
         state: SOC,
         name: "difference_soc",
         title: "Charge of the cells",
-        label: "SOC beside the pack's middle, points",
+        label: "SOC relative to the pack's median, points",
         scale: 100.0,
         limits: &[],
         kinds: &[],
@@ -42,7 +42,7 @@ const SHOWN: [Shown; STATES] = [
         state: LEAK,
         name: "difference_leak",
         title: "Loss of charge",
-        label: "loss beside the pack's middle, % of the capacity a day",
+        label: "loss relative to the pack's median, % of the capacity per day",
         scale: 100.0,
         limits: &[fault::LEAK_PER_DAY],
         kinds: &[CellFaultKind::Leak],
@@ -51,7 +51,7 @@ const SHOWN: [Shown; STATES] = [
         state: CONTACT,
         name: "difference_contact",
         title: "Contact resistance",
-        label: "beside the pack's middle, % of the series resistance",
+        label: "relative to the pack's median, % of the series resistance",
         scale: 100.0,
         limits: &[fault::CONTACT],
         kinds: &[CellFaultKind::Contact],
@@ -60,7 +60,7 @@ const SHOWN: [Shown; STATES] = [
         state: CAPACITY,
         name: "difference_capacity",
         title: "Capacity of the cells",
-        label: "beside the pack's middle, %",
+        label: "relative to the pack's median, %",
         scale: 100.0,
         limits: &[fault::CAPACITY, -fault::CAPACITY],
         kinds: &[CellFaultKind::WeakCell, CellFaultKind::ForeignCell, CellFaultKind::Module],
@@ -69,7 +69,7 @@ const SHOWN: [Shown; STATES] = [
         state: RESISTANCE,
         name: "difference_resistance",
         title: "Resistance of the cells",
-        label: "beside the pack's middle, %",
+        label: "relative to the pack's median, %",
         scale: 100.0,
         limits: &[fault::RESISTANCE],
         kinds: &[CellFaultKind::HighResistance],
@@ -78,7 +78,7 @@ const SHOWN: [Shown; STATES] = [
         state: CHANNEL,
         name: "difference_channel",
         title: "Offset of the voltage channels",
-        label: "beside the pack's middle, mV",
+        label: "relative to the pack's median, mV",
         scale: 1e3,
         limits: &[fault::CHANNEL_V, -fault::CHANNEL_V],
         kinds: &[
@@ -101,7 +101,7 @@ pub const NAMES: [&str; STATES] = {
     names
 };
 
-/// Every picture with the name of its file.
+/// All pictures with the names of their files.
 pub fn all(diagnosis: &CellFaultDetector) -> Vec<(String, Picture)> {
     let cells: Vec<[Option<ScalarGaussian>; STATES]> =
         (0..).map(CellIndex).map_while(|cell| diagnosis.relative(cell)).collect();
@@ -112,7 +112,7 @@ fn picture(shown: &Shown, cells: &[[Option<ScalarGaussian>; STATES]], findings: 
     let is_found = |cell: usize| {
         findings.iter().any(|found| shown.kinds.contains(&found.kind) && found.is_of(CellIndex(cell as u16)))
     };
-    // Of each cell its number, value and half its interval.
+    // Number, value and half interval of each cell.
     let shown_of = |wanted: bool| {
         let of_one = move |(cell, states): (usize, &[Option<ScalarGaussian>; STATES])| {
             let size = states[shown.state].filter(|_| is_found(cell) == wanted)?;
@@ -121,7 +121,7 @@ fn picture(shown: &Shown, cells: &[[Option<ScalarGaussian>; STATES]], findings: 
         cells.iter().enumerate().filter_map(of_one).collect::<Vec<_>>()
     };
     let bars = |wanted: bool| {
-        // A hole separates a bar from the next one.
+        // A gap separates a bar from the next one.
         let bar = |(x, y, half): (f64, f64, f64)| {
             [(x - HALF_BAR, y - half, y + half), (x + HALF_BAR, y - half, y + half), (x + HALF_BAR, f64::NAN, f64::NAN)]
         };
@@ -143,11 +143,14 @@ fn picture(shown: &Shown, cells: &[[Option<ScalarGaussian>; STATES]], findings: 
         layers.push(Layer::new("found", Ink::Red, Shape::Points(points(true))));
     }
     let limit = |(i, limit): (usize, &f64)| {
-        Layer::new(if i == 0 { "reported from" } else { "" }, Ink::Amber, Shape::Level(shown.scale * limit))
+        Layer::new(if i == 0 { "limit of a finding" } else { "" }, Ink::Amber, Shape::Level(shown.scale * limit))
     };
     layers.extend(shown.limits.iter().enumerate().map(limit));
-    let description =
-        format!("{} of {} cells, each with its 95 % interval, beside the middle of the pack", shown.title, cells.len());
+    let description = format!(
+        "{} of {} cells, each with its 95 % interval, relative to the median of the pack",
+        shown.title,
+        cells.len()
+    );
     let axis = Axis::number("cell").within(0.0, cells.len() as f64 + 1.0);
     Picture::Chart(Chart { description, ..Chart::new(shown.title, axis, shown.label, layers) })
 }

@@ -1,9 +1,9 @@
 //! Pictures as SVG: lines, bands, points and thresholds over an axis of numbers or dates; bands of states; heat maps.
 //!
-//! One style for all pictures. Input: values in the units that the labels name; a value that is not finite
-//! interrupts a line. Output: SVG whose colours are classes, so that a page or a file sets them, for light and dark
-//! ([`style`]). A long series is cut down to its extremes per pixel column, so that peaks survive and files stay small.
-//! Labels stand above the drawing area, never on the data; `<title>` elements are tool tips without a script.
+//! Input: values in the units that the labels name; a value that is not finite interrupts a line. Output: SVG in one style. Colours are
+//! classes that a page or a file defines, for light and dark ([`style`]). A long series is reduced to its extremes per pixel column, so
+//! that peaks survive and files stay small. Labels are above the drawing area, never on the data; `<title>` elements are tool tips
+//! without a script.
 
 mod axis;
 mod files;
@@ -45,7 +45,7 @@ pub enum Picture {
 }
 
 impl Picture {
-    /// The elements inside an `<svg>`, and the height they take.
+    /// The elements inside an `<svg>`, and their height.
     pub fn draw(&self, size: Size) -> (String, f64) {
         match self {
             Self::Chart(chart) => chart.draw(size),
@@ -72,7 +72,7 @@ impl Picture {
         }
     }
 
-    /// Returns an `<svg>` element for a page; its colours come from the page.
+    /// Returns an `<svg>` element for a page, which defines its colours.
     pub fn inline(&self, size: Size, class: &str) -> String {
         let (body, height) = self.draw(size);
         let (width, title) = (size.width, escape(self.title()));

@@ -1,12 +1,12 @@
-//! Finds the signals of the traction battery in a log: pack current and voltage, cell voltages, temperatures, the battery
+//! Finds the signals of the traction battery in a log: pack current and voltage, cell voltages, temperatures, and the battery
 //! controller's own SOC and SOH.
 //!
-//! In: frames with times; DBC files and definitions of diagnostic answers, if there are any. Out: ranked candidates of each
-//! quantity, each with its reasons in plain words. Answers to diagnostic requests are read, whatever device asked; those that no
-//! definition describes are searched for rows of cell voltages and other fields. Memory is bounded, any frames are accepted.
+//! Input: frames with times; optionally DBC files and definitions of diagnostic answers. Output: ranked candidates for each
+//! quantity, each with its reasons in plain words. Answers to diagnostic requests are read, whichever device sent the request. Answers
+//! without a definition are searched for rows of cell voltages and other fields. Memory is bounded, and any frames are accepted.
 //!
-//! It proposes, the owner decides: names mislead, and a car at rest shows little. The scale of a field without a definition is
-//! a guess from plausible values.
+//! The result is a proposal for the owner to confirm: names mislead, and a car at rest shows little. The scale of a field without a
+//! definition is a guess from plausible values.
 
 mod capture;
 mod configuration;
@@ -34,65 +34,65 @@ use signals::Descriptions;
 
 pub use configuration::{PackConfiguration, PackSettings};
 
-/// What a positive current means.
+/// Meaning of a positive current.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PositiveDirection {
-    /// It charges.
+    /// Charge.
     Charge,
-    /// It discharges.
+    /// Discharge.
     Discharge,
 }
 
-/// A signal, or a numbered group, that may be a quantity.
+/// A signal, or a numbered group of signals, that may carry a quantity.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Candidate {
     /// The quantity.
     pub quantity: PackQuantity,
-    /// 1 = best of its quantity.
+    /// Rank among the candidates of the quantity; 1 = best.
     pub rank: usize,
     /// Interface that carries it.
     pub interface: String,
-    /// `Message.Signal`, for a group with `{n}`.
+    /// `Message.Signal`; with `{n}` for a group.
     pub signal: String,
-    /// Signals of the group; 1 = no group.
+    /// Number of signals of the group; 1 = no group.
     pub signals: usize,
     /// Smallest value in the log, in V, A, degrees Celsius or %.
     pub low: f64,
     /// Largest value.
     pub high: f64,
-    /// Weight of the evidence; only the order matters.
+    /// Weight of the evidence; only the order of candidates matters.
     pub points: f64,
-    /// For a current: what the voltage says about its sign.
+    /// For a current: the direction that the voltage shows.
     pub positive: Option<PositiveDirection>,
-    /// Why, in plain words.
+    /// Reasons, in plain words.
     pub reasons: Vec<String>,
     #[serde(skip)]
     members: Vec<usize>,
 }
 
-/// What was found.
+/// Result of a search.
 #[derive(Debug, Serialize)]
 pub struct Discovery {
     /// Candidates by quantity, best first.
     pub candidates: Vec<Candidate>,
-    /// Frames of the log.
+    /// Number of frames in the log.
     pub frames: u64,
-    /// Frames ignored because there are too many identifiers.
+    /// Number of frames ignored because there were too many identifiers.
     pub ignored_frames: u64,
-    /// Kinds of diagnostic answers in the log.
+    /// Number of kinds of diagnostic answers in the log.
     pub answers: usize,
     /// Length of the log, s.
     pub seconds: f64,
-    /// Signals that have values in the log.
+    /// Number of signals with values in the log.
     pub signals: usize,
-    /// Voltages and currents of the battery that are in the log and never have a value.
+    /// Remarks on described voltages and currents of the battery that never have a valid value in the log.
     pub remarks: Vec<String>,
     #[serde(skip)]
     log_signals: Vec<LogSignal>,
 }
 
-/// Takes a log frame by frame.
+/// Receives a log frame by frame.
 #[derive(Debug, Default)]
 pub struct Discoverer {
     capture: Capture,
@@ -100,7 +100,7 @@ pub struct Discoverer {
 }
 
 impl PositiveDirection {
-    /// As in a configuration.
+    /// Name in a configuration.
     pub fn name(self) -> &'static str {
         match self {
             Self::Charge => "charge",
@@ -124,12 +124,12 @@ impl Discoverer {
         Ok(())
     }
 
-    /// Takes a frame.
+    /// Receives a frame.
     pub fn handle(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
         self.capture.handle(time, bus, frame);
     }
 
-    /// Frames so far.
+    /// Number of frames so far.
     pub fn frames(&self) -> u64 {
         self.capture.frames
     }
@@ -139,7 +139,7 @@ impl Discoverer {
         self.capture.seconds()
     }
 
-    /// Judges what was taken; `interfaces` are the names of the interfaces by number.
+    /// Ranks the candidates; `interfaces` are the names of the interfaces by number.
     pub fn finish(&self, interfaces: &[String]) -> Discovery {
         let (signals, remarks) = signals::signals(&self.capture, &self.descriptions);
         Discovery {
@@ -154,10 +154,10 @@ impl Discoverer {
         }
     }
 
-    /// A configuration of the best candidates of what [`finish`](Self::finish) found.
+    /// A configuration from the best candidates of [`finish`](Self::finish).
     ///
     /// # Errors
-    /// The questions that the log leaves open and the settings do not answer, one a line.
+    /// Questions that neither the log nor the settings answer, one per line.
     pub fn configuration(&self, discovery: &Discovery, settings: &PackSettings) -> Result<PackConfiguration, LabError> {
         let Self { capture, descriptions } = self;
         let writer = Writer { discovery, capture, descriptions, settings };

@@ -1,4 +1,4 @@
-//! The one error of offline work: a text with the place, what was found and what is allowed.
+//! The error of offline work: a text with the place, what was found and what is allowed.
 
 use std::path::Path;
 
@@ -14,23 +14,23 @@ pub enum LabError {
     /// Data or arguments that cannot be used.
     #[error("{0}")]
     Data(String),
-    /// The operating system does not let a file be read or written.
+    /// The operating system cannot read or write a file.
     #[error("{0}")]
     File(String),
 }
 
-/// Why a request for offline work cannot be worked on.
+/// Why a request for offline work was rejected.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum RequestError {
     /// Its configuration is faulty: one line per fault.
     #[error(transparent)]
     Config(#[from] ConfigFaults),
-    /// Something else: a file or an argument.
+    /// Another error: a file or an argument.
     #[error(transparent)]
     Lab(#[from] LabError),
 }
 
-/// Errors that already name their place.
+/// Converts errors that already name their place.
 macro_rules! convert {
     ($variant:ident: $($error:ty),+ $(,)?) => {
         $(impl From<$error> for LabError {
@@ -52,7 +52,7 @@ convert!(
 convert!(File: PlotError);
 
 impl LabError {
-    /// A failed read or write, as [`TableError::of_io`].
+    /// A failed read or write, classified as by [`TableError::of_io`].
     pub fn of_io(text: String, error: &std::io::Error) -> Self {
         TableError::of_io(text, error).into()
     }

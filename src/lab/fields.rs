@@ -1,7 +1,7 @@
 //! The values of an event or of a history row, by name.
 //!
-//! Events and the rows of a store have the same names for the same values. A value that is not known (null, or a number that
-//! is not finite) reads as `None`; numbers keep every bit.
+//! Events and the rows of a store use the same names for the same values. An unknown value (null, or a number that is not finite) reads
+//! as `None`; numbers keep every bit.
 
 use serde_json::{Map, Value};
 
@@ -49,12 +49,12 @@ impl Fields {
         self.pair(row.key, row.std_key?)
     }
 
-    /// A text; empty when there is none.
+    /// A text; empty if it is missing.
     pub(crate) fn text(&self, name: &str) -> &str {
         self.0.get(name).and_then(Value::as_str).unwrap_or_default()
     }
 
-    /// Whether a flag is set; a store keeps flags as 0 and 1.
+    /// Whether a flag is set; a store contains flags as 0 and 1.
     pub(crate) fn flag(&self, name: &str) -> bool {
         self.0.get(name).is_some_and(|value| value.as_bool().unwrap_or_else(|| value.as_f64().unwrap_or(0.0) != 0.0))
     }

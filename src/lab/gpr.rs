@@ -1,8 +1,8 @@
-//! Gaussian process regression on files: tables in, cross-validation, trained models, predictions, forecasts, pictures.
+//! Gaussian process regression on files: tables, cross-validation, trained models, predictions, forecasts, pictures.
 //!
-//! [`ColumnTable`] reads columns of CSV files; [`cross_validate`] makes the paper's experiment; [`TrainedModel`] is a model with the
-//! names of its columns, saved and loaded; [`forecast`] predicts rows to come from rows that were, without inputs of the
-//! future. The arithmetic is [`crate::regress`]. Nothing here prints.
+//! [`ColumnTable`] reads columns of CSV files; [`cross_validate`] runs the paper's experiment; [`TrainedModel`] is a model with the
+//! names of its columns, saved and loaded; [`forecast`] forecasts future rows from past rows, without future inputs.
+//! The arithmetic is in [`crate::regress`]. Nothing here prints.
 
 pub mod forecast;
 mod pictures;
@@ -20,7 +20,7 @@ pub use pictures::{write_cross_validation, write_forecast};
 pub use table::{ColumnSelection, ColumnTable, MissingPolicy, PartColumn};
 pub use trained::{TrainedModel, write_predictions};
 
-/// Cross-validation of one kernel.
+/// Result of the cross-validation of one kernel.
 #[derive(Debug, Clone)]
 pub struct CrossValidation {
     /// The kernel, as text.
@@ -29,13 +29,13 @@ pub struct CrossValidation {
     pub folds: Folds,
     /// Errors over all rows.
     pub score: PredictionScore,
-    /// Time of the whole experiment with this kernel, s.
+    /// Duration of the experiment with this kernel, s.
     pub seconds: f64,
-    /// Most memory the process held meanwhile, KiB; `None` where the system does not say.
+    /// Peak memory of the process during the experiment, KiB; `None` = unknown to the system.
     pub peak_kib: Option<u64>,
 }
 
-/// Inputs (all columns but the last, row after row) and targets (the last).
+/// Inputs (all columns except the last, row by row) and targets (the last column).
 pub fn split(table: &ColumnTable) -> (Vec<f64>, Vec<f64>) {
     let width = table.width();
     let inputs = table.values.chunks_exact(width).flat_map(|row| row[..width - 1].iter().copied()).collect();
@@ -45,7 +45,7 @@ pub fn split(table: &ColumnTable) -> (Vec<f64>, Vec<f64>) {
 /// Cross-validates one kernel on a table whose last column is the output.
 ///
 /// # Errors
-/// Too few rows for the folds, settings out of range, or the watcher stopped it.
+/// There are too few rows for the folds, settings are out of range, or the watcher stopped the work.
 pub fn cross_validate(
     table: &ColumnTable,
     settings: &GprSettings,
@@ -62,7 +62,7 @@ pub fn cross_validate(
     Ok(CrossValidation { kernel: settings.kernel.to_string(), folds, score, seconds, peak_kib: peak_kib() })
 }
 
-/// Writes the cross-validation's prediction of every row, by kernel.
+/// Writes the predictions of every row in cross-validation, by kernel.
 ///
 /// # Errors
 /// The file cannot be written.
@@ -92,18 +92,18 @@ fn write_csv(path: &Path, heads: Vec<String>, rows: impl Iterator<Item = Vec<Str
     Ok(file.finish()?)
 }
 
-/// The interval of a prediction: mean, standard deviation and both ends.
+/// Mean, standard deviation and both ends of a prediction's interval.
 fn interval(p: &Prediction) -> [String; 4] {
     [p.mean, p.measurement_variance.sqrt(), p.low_95, p.high_95].map(|number| number.to_string())
 }
 
-/// Resets the kernel's record of the peak memory, so that the next peak belongs to the next kernel. Where that fails, peaks
+/// Resets the kernel's record of the peak memory, so that the next peak belongs to the next kernel. If this fails, peaks
 /// count from the start of the process and are still upper bounds.
 fn reset_peak() {
     let _ = std::fs::write("/proc/self/clear_refs", "5");
 }
 
-/// The most memory the process held, KiB: VmHWM of /proc/self/status.
+/// Peak memory of the process, KiB: VmHWM of /proc/self/status.
 pub fn peak_kib() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?.trim().strip_suffix("kB")?.trim().parse().ok()

@@ -1,7 +1,7 @@
-//! Foreign descriptions of a car's signals or of a cell, converted to parts of a packwatch configuration.
+//! Converts other descriptions of a car's signals or of a cell to parts of a packwatch configuration.
 //!
-//! In: the text of a file. Out: TOML a person can read and edit, and a list of everything that was left out, with place and
-//! reason. Pure: nothing is read or written here.
+//! Input: the text of a file. Output: TOML that a person can read and edit, and a list of everything that was left out, with place and
+//! reason. Nothing is read or written here.
 
 pub mod bpx;
 pub mod dbc;
@@ -17,47 +17,47 @@ pub(crate) use diagnostic::{DiagnosticSignal, DiagnosticTable, NumberRange};
 /// A converted file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ImportResult {
-    /// The part of a configuration, TOML; the list of exclusions stands at its end as comments.
+    /// The part of a configuration, TOML; comments at its end list the exclusions.
     pub text: String,
-    /// What was left out, in the order of the file.
+    /// Exclusions, in the order of the file.
     pub exclusions: Vec<Exclusion>,
-    /// Fields that are not known and were ignored: place and name.
+    /// Unknown fields that were ignored: place and name.
     pub warnings: Vec<String>,
-    /// Signals converted; a numbered series counts as many.
+    /// Number of converted signals; each signal of a numbered series counts.
     pub signals: usize,
 }
 
-/// One thing that was left out.
+/// A part of the file that was left out.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Exclusion {
     /// Class, for counts.
     pub reason: ExclusionReason,
-    /// Where it is in the file.
+    /// Place in the file.
     pub place: String,
-    /// Found and allowed.
+    /// What was found and what is allowed.
     pub detail: String,
 }
 
-/// Why something was left out.
+/// Why a part of the file was left out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum ExclusionReason {
-    /// The command is of other model years.
+    /// The command belongs to other model years.
     OtherYear,
     /// The command's service is not 0x01, 0x21 or 0x22.
     OtherService,
-    /// The addresses of the command are of no supported form.
+    /// The command's addresses are not supported.
     Address,
-    /// The values are names, no numbers.
+    /// The values are names, not numbers.
     Enumeration,
     /// The value is a text.
     Text,
-    /// Computed from other signals.
+    /// The value is computed from other signals.
     Synthetic,
     /// A field is missing or has an invalid value.
     InvalidField,
-    /// Its bits belong to another signal already.
+    /// Another signal already uses the bits.
     Overlap,
-    /// Another command or signal of this name, or with this request, came before.
+    /// An earlier command or signal has the same name, or the same request.
     Duplicate,
 }
 
@@ -67,8 +67,8 @@ impl fmt::Display for ExclusionReason {
             Self::OtherYear => "command of other model years",
             Self::OtherService => "command of a service that is not supported",
             Self::Address => "command with addresses that are not supported",
-            Self::Enumeration => "enumeration: names, no numbers",
-            Self::Text => "text, no number",
+            Self::Enumeration => "enumeration: names, not numbers",
+            Self::Text => "text, not a number",
             Self::Synthetic => "computed from other signals",
             Self::InvalidField => "missing or invalid field",
             Self::Overlap => "bits of another signal",
@@ -84,7 +84,7 @@ impl fmt::Display for Exclusion {
 }
 
 impl ImportResult {
-    /// How many were left out, by reason.
+    /// Number of exclusions by reason.
     pub fn counts(&self) -> BTreeMap<ExclusionReason, usize> {
         let mut counts = BTreeMap::new();
         for exclusion in &self.exclusions {

@@ -32,5 +32,5 @@ fn without_compression(name: &str) -> &str {
     [".gz", ".zst"].iter().find_map(|ending| name.strip_suffix(ending)).unwrap_or(name)
 }
 
-/// Half of a normal distribution's 95 % interval, standard deviations.
+/// Half of a normal distribution's 95 % interval, in standard deviations.
 const OF_95: f64 = 1.96;

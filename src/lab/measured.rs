@@ -1,10 +1,10 @@
 //! Measured files: CSV (plain, gzip or zstd) of time, current, voltage, temperature and ampere-hours from a cycler.
 //!
-//! Columns by name: `time_s`, `current_a` (positive = discharge), `voltage_v`, and where they exist `temperature_c`,
-//! `discharged_ah` (positive = taken out), `type` or `status`, and a part column (`cycle`, `segment` or `ref`) at each
-//! of whose values the time starts again. An empty field is NaN. A field that is no number is an error with its line.
+//! Columns by name: `time_s`, `current_a` (positive = discharge), `voltage_v`, and optionally `temperature_c`,
+//! `discharged_ah` (positive = taken out), `type` or `status`, and a part column (`cycle`, `segment` or `ref`); the time restarts
+//! at each new value of the part column. An empty field is NaN. A field that is not a number is an error with its line.
 //!
-//! Files of the Battery Data Format are read by its columns ([`BDF_COLUMNS`]); their current and charge change their sign.
+//! Files of the Battery Data Format are read by its columns ([`BDF_COLUMNS`]); the sign of their current and charge is inverted.
 
 use std::path::{Path, PathBuf};
 
@@ -16,15 +16,15 @@ use crate::io::table::{Header, Row, Table, TableError};
 /// One measured file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MeasuredFile {
-    /// Where it was read from.
+    /// Path of the file.
     pub path: PathBuf,
-    /// Its parts in the file's order; one where there is no part column.
+    /// Parts in the order of the file; a single one without part column.
     pub parts: Vec<MeasuredPart>,
-    /// Whether it is of the Battery Data Format.
+    /// Whether the file has the Battery Data Format.
     pub is_bdf: bool,
 }
 
-/// Numbers of the columns.
+/// Indices of the columns.
 struct Columns {
     time: usize,
     current: usize,
@@ -33,7 +33,7 @@ struct Columns {
     discharged: Option<usize>,
     part: Option<usize>,
     kind: Option<usize>,
-    /// Of current and charge: 1, or -1 where positive is charge.
+    /// Sign of current and charge: 1, or -1 if positive means charge.
     sign: f64,
 }
 
@@ -41,7 +41,7 @@ impl MeasuredFile {
     /// Reads a whole file.
     ///
     /// # Errors
-    /// The file cannot be read, a column is missing, a field is no number, or there are no rows: with place and what was found.
+    /// The file cannot be read, a column is missing, a field is not a number, or there are no rows: with place and what was found.
     pub fn read(path: &Path) -> Result<Self, TableError> {
         let mut table = Table::open(path)?;
         let columns = Columns::find(table.header())?;
@@ -55,7 +55,7 @@ impl MeasuredFile {
         Ok(Self { path: path.to_owned(), parts, is_bdf: columns.sign < 0.0 })
     }
 
-    /// Rows of all parts.
+    /// Number of rows of all parts.
     pub fn rows(&self) -> usize {
         self.parts.iter().map(MeasuredPart::len).sum()
     }
@@ -76,12 +76,12 @@ impl Columns {
         })
     }
 
-    /// With our sign; 0 stays a positive 0.
+    /// Converts the sign; 0 stays a positive 0.
     fn signed(&self, value: f64) -> f64 {
         self.sign * value + 0.0
     }
 
-    /// Adds a row to the last part, or to a new one where the key differs.
+    /// Adds a row to the last part, or to a new one if the key differs.
     fn add_row(&self, row: &Row<'_>, parts: &mut Vec<MeasuredPart>) -> Result<(), TableError> {
         let text = |column: Option<usize>| column.map_or_else(Default::default, |column| row.text(column));
         let number = |column: usize| Ok(row.number(column)?.unwrap_or(f64::NAN));
@@ -112,7 +112,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_begin_where_the_key_changes_and_an_empty_field_is_unknown() {
+    fn parts_start_at_new_keys_and_empty_fields_are_nan() {
         let file =
             read("cycle,type,time_s,current_a,voltage_v\n3,charge,0,-1,3.5\n3,charge,1,-1,\n4,discharge,0,2,4\n");
         let file = file.expect("reads");
@@ -122,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn of_the_battery_data_format_positive_current_is_charge_and_the_surface_counts_before_the_ambient() {
+    fn battery_data_format_inverts_signs_and_prefers_surface_temperature() {
         let head = "Test Time / s,Voltage / V,Current / A,Ambient Temperature / degC,Surface Temperature T1 / degC,Cycle Count / 1";
         let file = read(&format!("{head},Net Capacity / Ah\n0,3.5,-2,20,21,1\n1,3.4,1.5,20,,2\n")).expect("reads");
         let part = &file.parts[0];
@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fault_names_its_line_and_what_was_found() {
+    fn fault_names_line_and_value() {
         let found = read("time_s,current_a,voltage_v\n0,1,3.5\n1,x,3.5\n");
         assert_eq!(
             found,

@@ -1,7 +1,8 @@
-//! Pictures of a cell model: open-circuit curve, its slope, resistances over SOC and over temperature, and the error of the SOC that
-//! follows.
+//! Pictures of a cell model: open-circuit curve, its slope, resistances over SOC and over temperature, and the resulting error of the
+//! SOC.
 //!
-//! Bands are 95 % intervals ([`ModelBands`]); a curve whose model states no error has none, and its description says so. Lines are dashed where nothing was measured: beyond the measured range, and for a prior.
+//! Bands are 95 % intervals ([`ModelBands`]). The curve of a model that states no error has no band, and its description says so. Lines
+//! are dashed where nothing was measured: outside the measured range, and for a prior.
 
 use crate::cell::model_bands::CURVE_C;
 use crate::cell::{CellModel, ModelBands};
@@ -10,14 +11,14 @@ use crate::config::cell_model::{KnownBy, SourcedModel};
 
 /// Points of a line over SOC or temperature.
 const POINTS: u32 = 200;
-/// Temperatures of the picture over temperature, as far as the tables go, degrees C.
+/// Temperature range of the picture over temperature, within the tables, degrees C.
 const SHOWN_C: (f64, f64) = (-20.0, 50.0);
-/// A cold temperature beside that of the curve, degrees C.
+/// A cold temperature in addition to that of the curve, degrees C.
 const COLD_C: f64 = 0.0;
-/// SOC below which a curve or a resistance may leave its picture: both rise many times there, percent.
+/// SOC below which a curve or a resistance may leave its picture, percent: both rise steeply there.
 const STEEP_PERCENT: f64 = 12.0;
 
-/// Every picture with the name of its file.
+/// All pictures with the names of their files.
 pub fn all(sourced: &SourcedModel) -> Vec<(String, Picture)> {
     let pictures = [
         ("model_curve", Some(curve(sourced))),
@@ -33,7 +34,7 @@ fn along(low: f64, high: f64) -> impl Iterator<Item = f64> + Clone {
     (0..=POINTS).map(move |k| low + (high - low) * f64::from(k) / f64::from(POINTS))
 }
 
-/// An axis from 0 with room for what the layers have above [`STEEP_PERCENT`].
+/// An axis from 0 with room for the layers above [`STEEP_PERCENT`].
 fn from_0(label: &str, layers: &[Layer]) -> Axis {
     let highest = layers.iter().flat_map(|layer| match &layer.shape {
         Shape::Line(points) | Shape::Dashed(points) => points.clone(),
@@ -52,7 +53,7 @@ fn soc_axis() -> Axis {
     Axis::number("SOC, %").within(0.0, 100.0)
 }
 
-/// A line that is dashed where nothing was measured. Both parts share the point at which they meet.
+/// A line that is dashed where nothing was measured; both parts share the point at which they meet.
 fn line(label: &str, ink: Ink, points: &[(f64, f64)], is_measured: impl Fn(f64) -> bool) -> Vec<Layer> {
     let part = |wanted: bool| -> Vec<(f64, f64)> {
         let near = |k: usize| {
@@ -114,7 +115,7 @@ fn slope(sourced: &SourcedModel) -> Picture {
     )
 }
 
-/// Settled resistance in milliohm with its 95 % interval over `x`, whose place in the model is `place`.
+/// Settled resistance in milliohm with its 95 % interval over `x`; `place` converts `x` to SOC and temperature.
 fn resistance_layers(
     sourced: &SourcedModel,
     (label, ink): (&str, Ink),
@@ -147,7 +148,7 @@ fn resistance_over_soc(sourced: &SourcedModel) -> Picture {
     chart(title, "Settled resistance, milliohm, over SOC", soc_axis(), from_0("m\u{3a9}", &layers), layers)
 }
 
-/// First and last temperature of tables with several.
+/// First and last temperature of tables with several temperatures.
 fn ends_c(model: &CellModel) -> Option<(f64, f64)> {
     match model.temperature_c[..] {
         [low, .., high] => Some((low, high)),
@@ -180,8 +181,8 @@ fn soc_error(model: &CellModel) -> Option<Picture> {
         return None;
     }
     let layers = vec![Layer::line("under load, C/2", Ink::Orange, load), Layer::line("at rest", Ink::Blue, rest)];
-    let title = "Error of the SOC by one voltage, standard deviation at 25 \u{b0}C".to_owned();
-    Some(chart(title, "Error of the SOC that follows from the model's own, points", soc_axis(), "points", layers))
+    let title = "Error of the SOC from one voltage, standard deviation at 25 \u{b0}C".to_owned();
+    Some(chart(title, "Error of the SOC caused by the error of the model, points", soc_axis(), "points", layers))
 }
 
 #[cfg(test)]
@@ -196,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn every_picture_of_a_label_has_a_band_and_no_number_that_is_none() {
+    fn pictures_of_a_label_have_bands_and_finite_numbers() {
         let pictures = all(&prior());
         assert_eq!(pictures.len(), 5);
         for (name, picture) in pictures {
@@ -208,7 +209,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_not_measured_is_dashed() {
+    fn unmeasured_parts_of_a_line_are_dashed() {
         let points: Vec<(f64, f64)> = (0..10).map(|x| (f64::from(x), 1.0)).collect();
         let shapes = |is_measured: fn(f64) -> bool| {
             let of = |layer: Layer| match layer.shape {
@@ -220,12 +221,12 @@ mod tests {
         };
         assert_eq!(shapes(|_| true), [('-', 10)]);
         assert_eq!(shapes(|_| false), [('.', 10)]);
-        // Points 4 to 9 were measured; the dashes reach the first of them.
+        // Points 4 to 9 were measured; the dashed line reaches the first of them.
         assert_eq!(shapes(|x| x > 3.5), [('-', 6), ('.', 5)]);
     }
 
     #[test]
-    fn a_model_that_states_no_error_has_no_band_of_its_curve() {
+    fn curve_of_a_model_without_error_has_no_band() {
         let mut sourced = prior();
         (sourced.model.spread, sourced.model.voltage_error_v) = (None, None);
         let pictures = all(&sourced);

@@ -1,8 +1,8 @@
 //! Battery passports: the part that a vehicle knows, in the forms of two standards.
 //!
-//! A [`Record`] is collected from a store or a replay; a [`Condition`] is determined from it; [`passport`] merges its values with
-//! the manufacturer's part and checks the result. [`details`] has standard deviations and definitions, for which the standards have
-//! no members. A value that is not known is absent; no default takes its place. Nothing here reads a clock: the same inputs give
+//! A [`Record`] is collected from a store or a replay, and a [`Condition`] is determined from it. [`passport`] merges its values with
+//! the manufacturer's part and checks the result. [`details`] contains standard deviations and definitions, for which the standards have
+//! no members. An unknown value is absent; no default replaces it. Nothing here reads a clock, so the same inputs give
 //! the same bytes.
 
 mod condition;

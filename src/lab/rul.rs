@@ -1,13 +1,13 @@
-//! Remaining useful life of measured capacity histories: the forecast at the end, and forecasts made at parts of the life,
+//! Remaining useful life from measured capacity histories: the forecast at the end, and forecasts made at parts of the life,
 //! scored against the truth.
 //!
-//! The forecast is the one on board ([`crate::health::forecast`]), fed reading by reading; a forecast uses no
-//! reading after its moment.
+//! The forecast is the monitor's own ([`crate::health::forecast`]), fed reading by reading; it uses no reading after its
+//! moment.
 //!
-//! Terms: *use* is what the axis counts from the first reading on (discharges where the file lists them, else days). The
-//! *end of life* is where the non-increasing line of least squares through all capacities passes the threshold for good,
-//! between the readings on both sides in proportion: a passing recovery after a rest neither delays
-//! nor hastens it.
+//! Terms: *use* is counted by the axis from the first reading on (discharges if the file lists them, otherwise days). The
+//! *end of life* is the use at which the non-increasing least-squares line through all capacities finally passes the
+//! threshold, interpolated between the readings on both sides. A temporary recovery after a rest neither delays
+//! nor advances it.
 
 mod baseline;
 mod document;
@@ -24,28 +24,28 @@ pub use document::{now_json, scored_json};
 pub use history::{History, MeasuredCapacity};
 pub use truth::end_of_life;
 
-/// An error larger than this part of the life counts as this: one baseline that never ends must not dominate a mean.
+/// Upper limit of an error, as a part of the life: a baseline that never ends must not dominate a mean.
 pub const WORST_ERROR: f64 = 1.0;
 
-/// The capacity at which a cell is at its end.
+/// The capacity at which a life ends.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Threshold {
     /// Ah.
     AmpereHours(f64),
-    /// Part of the history's first reading.
+    /// Part of the first reading of the history.
     OfFirst(f64),
 }
 
 /// A forecast made at a part of the life, and its errors.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ForecastScore {
-    /// Part of the life gone.
+    /// Part of the life that has passed.
     pub at: f64,
-    /// Readings until then.
+    /// Number of readings until then.
     pub readings: usize,
     /// True remaining life, units of use.
     pub truth: f64,
-    /// 5, 50 and 95 % of what was forecast, units of use; `None` = no forecast.
+    /// Forecast quantiles 5, 50 and 95 %, units of use; `None` = no forecast.
     pub forecast: Option<[f64; 3]>,
     /// Why there is no forecast.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -54,15 +54,15 @@ pub struct ForecastScore {
     pub within_alpha: bool,
     /// Whether the truth is in the interval.
     pub covered: bool,
-    /// |median - truth| as a part of the life, [`WORST_ERROR`] at most; that when refused.
+    /// |median - truth| as a part of the life, at most [`WORST_ERROR`], which also counts for a rejected forecast.
     pub error: f64,
     /// Forecast of a straight line through the last points; `None` = it never reaches the threshold.
     pub straight: Option<f64>,
-    /// Its error, as `error`.
+    /// Error of that forecast, as `error`.
     pub straight_error: f64,
-    /// Forecast of a double exponential by least squares; `None` = it never reaches the threshold.
+    /// Forecast of a least-squares double exponential; `None` = it never reaches the threshold.
     pub double_exponential: Option<f64>,
-    /// Its error, as `error`.
+    /// Error of that forecast, as `error`.
     pub double_exponential_error: f64,
 }
 
@@ -71,34 +71,34 @@ pub struct ForecastScore {
 pub struct HistoryScore {
     /// Name of the file.
     pub name: String,
-    /// What counts as use.
+    /// Unit of use.
     pub axis: Axis,
     /// Ah.
     pub threshold_ah: f64,
     /// Use at the end of life; `None` = not reached, so nothing is judged.
     pub end_of_life: Option<f64>,
-    /// Least capacity of the file, Ah.
+    /// Smallest capacity of the file, Ah.
     pub least_capacity_ah: f64,
-    /// In the order of the parts requested.
+    /// In the order of the requested parts.
     pub judged: Vec<ForecastScore>,
 }
 
-/// Over all forecasts of all files.
+/// Totals over all forecasts of all files.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ScoreTotal {
-    /// Forecasts requested.
+    /// Number of requested forecasts.
     pub forecasts: usize,
-    /// Of these, refused.
+    /// Number of rejected forecasts.
     pub refused: usize,
-    /// Part whose interval holds the truth; a refused one does not.
+    /// Share of forecasts whose interval contains the truth; a rejected one does not.
     pub coverage: f64,
-    /// Part whose median is within alpha of the truth; a refused one is not.
+    /// Share of forecasts whose median is within alpha of the truth; a rejected one is not.
     pub within_alpha: f64,
-    /// Mean error, part of the life.
+    /// Mean error, as a part of the life.
     pub mean_error: f64,
-    /// The same of the straight line.
+    /// Mean error of the straight line.
     pub straight_mean_error: f64,
-    /// The same of the double exponential.
+    /// Mean error of the double exponential.
     pub double_exponential_mean_error: f64,
 }
 
@@ -107,15 +107,15 @@ pub struct ScoreTotal {
 pub struct CurrentForecast {
     /// Name of the file.
     pub name: String,
-    /// What counts as use.
+    /// Unit of use.
     pub axis: Axis,
     /// Ah.
     pub threshold_ah: f64,
-    /// Readings.
+    /// Number of readings.
     pub readings: usize,
-    /// Use at the last one.
+    /// Use at the last reading.
     pub used: f64,
-    /// Capacity without recovery by rest, mean and standard deviation, Ah.
+    /// Capacity without recovery during rests, mean and standard deviation, Ah.
     pub level_ah: (f64, f64),
     /// Loss per unit of use, mean and standard deviation, Ah.
     pub rate_ah: (f64, f64),
@@ -129,10 +129,9 @@ pub struct CurrentForecast {
 impl FromStr for Threshold {
     type Err = String;
 
-    /// `1.4`, `1.4 Ah`, `70 %`.
+    /// Parses `1.4`, `1.4 Ah` or `70 %`.
     fn from_str(text: &str) -> Result<Self, String> {
-        let expected =
-            "must be Ah above 0 like 1.4, or per cent of the first capacity, above 0 and below 100, like 70%";
+        let expected = "must be Ah above 0 like 1.4, or percent of the first capacity, above 0 and below 100, like 70%";
         let above_0 = |text: &str| text.trim().parse::<f64>().ok().filter(|value| value.is_finite() && *value > 0.0);
         let found = match text.trim().strip_suffix('%') {
             Some(percent) => {
@@ -145,7 +144,7 @@ impl FromStr for Threshold {
 }
 
 impl Threshold {
-    /// In Ah for this history.
+    /// Capacity in Ah for this history.
     pub fn ampere_hours(self, history: &History) -> f64 {
         match self {
             Self::AmpereHours(ah) => ah,
@@ -154,7 +153,7 @@ impl Threshold {
     }
 }
 
-/// Makes the forecast at the end of the history.
+/// Forecasts at the end of the history.
 pub fn now(history: &History, name: &str, threshold: Threshold) -> CurrentForecast {
     let forecast = fed(history, f64::INFINITY);
     let threshold_ah = threshold.ampere_hours(history);
@@ -172,7 +171,7 @@ pub fn now(history: &History, name: &str, threshold: Threshold) -> CurrentForeca
     }
 }
 
-/// Forecasts at these parts of the life, judged. `progress` is called before each; it may unwind to end the work.
+/// Forecasts at these parts of the life, and judges them. `progress` is called before each; it may unwind to abort.
 pub fn score(
     history: &History,
     name: &str,
@@ -214,7 +213,7 @@ pub fn total(scored: &[HistoryScore]) -> Option<ScoreTotal> {
     })
 }
 
-/// One forecast, made after `at` of the life.
+/// Judges one forecast, made at the part `at` of the life.
 fn judge(history: &History, threshold_ah: f64, end: f64, at: f64, alpha: f64) -> ForecastScore {
     let moment = at * end;
     let truth = end - moment;
@@ -225,7 +224,7 @@ fn judge(history: &History, threshold_ah: f64, end: f64, at: f64, alpha: f64) ->
         Ok(forecast) => (forecast, None),
         Err(why) => (None, Some(why.to_string())),
     };
-    // Counted from the moment, like the forecast; 0 for a line that is already below.
+    // Counted from the moment, like the forecast; 0 for a line that is already below the threshold.
     let ahead = |crossing: Option<f64>| crossing.map(|used| (used - moment).max(0.0));
     let straight = ahead(baseline::straight(&known, threshold_ah));
     let double_exponential = ahead(baseline::double_exponential(&known, threshold_ah));
@@ -260,7 +259,7 @@ fn fed(history: &History, moment: f64) -> Forecast {
     for row in &history.rows {
         let passed = row.since(&before);
         if row.used > moment {
-            // A part of the use until the next reading, without a reading.
+            // Part of the use until the next reading, without that reading.
             let part = (moment - before.used) / (row.used - before.used);
             let (cycles, days, rest_days) = (part * passed.cycles, part * passed.days, part * passed.rest_days);
             forecast.update(Usage { cycles, days, rest_days }, None);

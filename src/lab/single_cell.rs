@@ -1,30 +1,30 @@
-//! The configuration of one measured cell: a given one, or the built-in one with a cell model or a label in its place.
+//! The configuration of one measured cell: a given one, or the built-in one with another cell model or label.
 //!
-//! In: paths, or what is on the label. Out: a checked configuration whose input signals are those of `measured.dbc`, in which
-//! every estimator key has its default unless the given configuration states it. Faults name the file they are in.
+//! Input: paths, or the data of a label. Output: a checked configuration whose input signals are those of `measured.dbc`. Every
+//! estimator key has its default unless the given configuration states it. Faults name their file.
 
 use std::path::{Path, PathBuf};
 
 use crate::config::{self, Config, ConfigFaults, ConfigFiles};
 
-/// The configuration used when none is given, and what it names.
+/// The built-in configuration and the files that it names.
 const BUILT_IN: [(&str, &[u8]); 2] =
     [("score.toml", include_bytes!("score.toml")), ("measured.dbc", include_bytes!("measured.dbc"))];
 
-/// What is on the label of a cell without a model, as in the keys of `[pack]`.
+/// The label of a cell without a model, as in the keys of `[pack]`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LabelKeys {
     /// Chemistry, by its name.
     pub chemistry: String,
-    /// Capacity, Ah; required by the configuration.
+    /// Capacity, Ah; the configuration requires it.
     pub rated_ah: Option<f64>,
-    /// Lowest voltage, V; `None` = usual of the chemistry.
+    /// Lowest voltage, V; `None` = typical for the chemistry.
     pub voltage_min_v: Option<f64>,
-    /// Highest voltage, V; `None` = usual of the chemistry.
+    /// Highest voltage, V; `None` = typical for the chemistry.
     pub voltage_max_v: Option<f64>,
 }
 
-/// Where the configuration of a cell comes from. A label comes first, then the model in place of the configuration's own.
+/// Source of a cell's configuration. A label has priority; otherwise the model replaces that of the configuration.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct CellSource {
     /// Configuration; `None` = the built-in one.
@@ -39,7 +39,7 @@ impl CellSource {
     /// Loads the configuration.
     ///
     /// # Errors
-    /// All faults of the files; no cell of this chemistry has these voltages.
+    /// All faults of the files, or voltages that no cell of this chemistry has.
     pub fn load(&self) -> Result<Config, ConfigFaults> {
         if let Some(label) = &self.label {
             return label.configuration();
@@ -102,6 +102,6 @@ fn named_cell(files: &ConfigFiles, read: config::ReadFile<'_>) -> Result<PathBuf
         let model = table.get("pack")?.get("cell_model")?.as_str()?.to_owned();
         Some(files.main.parent().unwrap_or(Path::new("")).join(model))
     });
-    // Without one, reading the configuration reports the fault.
+    // If it names none, reading the configuration reports the fault.
     Ok(named.unwrap_or_default())
 }

@@ -196,7 +196,7 @@ fn passport_matches_store_and_is_reproducible() {
         details["absent"].as_array().unwrap().iter().find(|one| one["name"] == name).unwrap()["reason"].to_string()
     };
     assert!(why("state_of_certified_energy").contains("--certified-energy-kwh"), "{details}");
-    assert!(why("energy_throughput").contains("a store keeps no voltages"), "{details}");
+    assert!(why("energy_throughput").contains("a store contains no voltages"), "{details}");
     assert_eq!(good(&[&["passport"], &args[..]].concat()), good(&[&["passport"], &args[..]].concat()));
 }
 
@@ -236,13 +236,12 @@ fn unknown_required_value_is_rejected_with_reason() {
     let printed = refused(&[&base[..], &["--static", &accidents]].concat());
     assert_eq!(printed.lines().count(), 1, "{printed}");
     assert!(
-        printed.contains("NumberOfFullCycles: required, but not known")
-            && printed.contains("--throughput-before-ah, 0"),
+        printed.contains("NumberOfFullCycles: required, but unknown") && printed.contains("--throughput-before-ah, 0"),
         "{printed}"
     );
     let out = life.path("passport.json");
     let printed = refused(&[&base[..], &["--throughput-before-ah", "0", "-o", &out]].concat());
-    assert_eq!(printed, "InformationOnAccidents: required, and no record holds it: --static gives it\n");
+    assert_eq!(printed, "InformationOnAccidents: required, but no record contains it: state it with --static\n");
     assert!(!Path::new(&out).exists());
     let given = passport(&with(
         &["-c", &config, "--state", &state].map(str::to_owned),
@@ -266,7 +265,7 @@ fn soce_needs_certified_energy() {
         refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--form", "battery-pass", "--static", &path]));
     assert_eq!(
         printed,
-        "performance.dynamic.energy.soce: required, but not known: the certified energy is not given (--certified-energy-kwh)\n"
+        "performance.dynamic.energy.soce: required, but unknown: the certified energy is not given (--certified-energy-kwh)\n"
     );
 }
 
@@ -380,7 +379,7 @@ fn missing_static_members_are_named() {
     let more = ["--form", "battery-pass", "--certified-energy-kwh", "0.014", "--static", &path];
     let printed = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &more));
     for path in &expected {
-        let line = format!("{path}: required, and no record holds it: --static gives it");
+        let line = format!("{path}: required, but no record contains it: state it with --static");
         assert!(printed.lines().any(|one| one == line), "{path} in {printed}");
     }
     assert_eq!(printed.lines().count(), expected.len(), "only the removed members may be missing: {printed}");
@@ -402,7 +401,7 @@ fn static_part_faults_are_named_by_path() {
         "identification.category: found \"car\", must be one of SLI, LMT, EV, industrial, portable, incorporated",
         "metadata.issued: not in the standard, which has version, status",
         "performance.rated.voltage.min: found \"2.7\", must be a number",
-        "performance.dynamic.stateOfCharge.value: stated in the static part, but measured",
+        "performance.dynamic.stateOfCharge.value: stated in the static part, but also measured",
     ] {
         assert!(printed.contains(expected), "{expected:?} in {printed}");
     }
@@ -424,7 +423,7 @@ fn new_pack_or_undated_record_gives_no_passport() {
     let printed = refused(&[&["passport"], &args[..], &["--form", "battery-pass"]].concat());
     assert!(
         printed.contains(
-            "performance.dynamic.capacity.capacity: required, but not known: nothing has been learned of cell 1 yet"
+            "performance.dynamic.capacity.capacity: required, but unknown: nothing has been learned about cell 1 yet"
         ),
         "{printed}"
     );
@@ -476,7 +475,7 @@ fn tampered_history_gives_no_passport() {
         .expect("deleted");
     let printed = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--static", &accidents]));
     assert!(
-        printed.contains("the history was changed: rows 1 to ") && printed.contains("no passport is made"),
+        printed.contains("the history was changed: rows 1 to ") && printed.contains("does not write a passport"),
         "{printed}"
     );
 }
@@ -523,7 +522,7 @@ fn record_with_gap_has_no_sums() {
         refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--throughput-before-ah", "0"]))
     };
     let gap = printed("cut.log");
-    assert!(gap.contains("the record has a gap of ") && gap.contains(" s that began while current flowed"), "{gap}");
+    assert!(gap.contains("the record has a gap of ") && gap.contains(" s that started while current flowed"), "{gap}");
     let beginning = printed("journal");
     assert!(beginning.contains("the first 2 segments of the journal are missing"), "{beginning}");
     let whole = passport(&with(&of_logs(&life, &["life.log"]), &["--throughput-before-ah", "0"]));
@@ -560,7 +559,7 @@ fn store_of_other_configuration_is_rejected() {
         refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--static", &accidents]))
     };
     let strings = printed(pack.replace("strings = 2", "strings = 4"));
-    assert!(strings.contains("the record is of 2 parallel strings, the configuration has 4"), "{strings}");
+    assert!(strings.contains("the record has 2 parallel strings, the configuration has 4"), "{strings}");
     let larger = cells.replace("rated_capacity_ah = 2.0", "rated_capacity_ah = 3.0");
     fs::write(life.path("larger.toml"), larger).expect("written");
     let capacity = printed(pack.replace(&format!("{model:?}"), "\"larger.toml\""));
@@ -579,7 +578,7 @@ fn value_from_unset_clock_is_undated() {
     let stored = ["-c", &config, "--state", &state, "--static", &life.path("accidents.json")].map(str::to_owned);
     for args in [of_logs(&life, &["unset.log", "set.log"]), stored.to_vec()] {
         let printed = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--throughput-before-ah", "0"]));
-        assert!(printed.contains("NumberOfFullCycles: required, but not known: its time is not known"), "{printed}");
+        assert!(printed.contains("NumberOfFullCycles: required, but unknown: its time is unknown"), "{printed}");
         let given = passport(&with(&args, &["--throughput-ah", "400"]));
         assert!(given.get("RemainingCapacity").is_none() && !given.to_string().contains("\"1970-"), "{given}");
     }

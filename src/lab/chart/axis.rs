@@ -7,7 +7,7 @@ use crate::quantity::Timestamp;
 const MINUTE: f64 = 60.0;
 const HOUR: f64 = 3600.0;
 const DAY: f64 = 86_400.0;
-/// Steps of a date axis below a month: units, s, and how many of them.
+/// Steps of a date axis below a month: unit, s, and counts.
 const STEPS: [(f64, &[f64]); 4] = [
     (1.0, &[1.0, 5.0, 15.0, 30.0]),
     (MINUTE, &[1.0, 5.0, 15.0, 30.0]),
@@ -29,7 +29,7 @@ pub enum Scale {
 /// One axis.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Axis {
-    /// With unit.
+    /// Label with unit.
     pub label: String,
     pub scale: Scale,
     /// Ends; `None` = from the data.
@@ -43,7 +43,7 @@ impl<T: Into<String>> From<T> for Axis {
 }
 
 impl Axis {
-    /// Numbers, as far as the data go.
+    /// An axis of numbers whose range comes from the data.
     pub fn number(label: &str) -> Self {
         label.into()
     }
@@ -52,17 +52,17 @@ impl Axis {
         Self { range: Some((low, high)), ..self }
     }
 
-    /// Ends of the axis for these values, with room at both ends where `margin`; never empty.
+    /// Ends of the axis for these values, with room at both ends if `margin`; never empty.
     pub(super) fn ends(&self, values: impl Iterator<Item = f64>, margin: bool) -> (f64, f64) {
         if let Some(range) = self.range {
             return opened(range, 0.0);
         }
         let ends = ends(values.filter(|value| value.is_finite()));
-        // Room above and below the data, parts of their range.
+        // Room above and below the data, as a part of their range.
         opened(ends, if margin { 0.06 } else { 0.0 })
     }
 
-    /// Positions and words of about `count` ticks.
+    /// Positions and labels of about `count` ticks.
     pub(super) fn ticks(&self, ends: (f64, f64), count: f64) -> Vec<(f64, String)> {
         match self.scale {
             Scale::Number => number_ticks(ends, count),
@@ -70,7 +70,7 @@ impl Axis {
         }
     }
 
-    /// The label; for dates with the days at both ends, for the ticks may be hours.
+    /// The label; for dates with the days at both ends, because the ticks may be hours.
     pub(super) fn caption(&self, ends: (f64, f64)) -> String {
         match self.scale {
             Scale::Number => self.label.clone(),
@@ -79,13 +79,13 @@ impl Axis {
     }
 }
 
-/// A range as an axis needs it: not empty, with room at both ends.
+/// The range of an axis: not empty, with room at both ends.
 fn opened((low, high): (f64, f64), margin: f64) -> (f64, f64) {
     if low > high {
         return (0.0, 1.0);
     }
     let width = high - low;
-    // Too narrow for distinct ticks: some room around the value.
+    // A range too narrow for distinct ticks gets some room around the value.
     let room = if width <= 1e-9 * low.abs().max(1e-3) { 0.5 * low.abs().clamp(1.0, 3600.0) } else { margin * width };
     (low - room, high + room)
 }
@@ -96,11 +96,11 @@ fn number_ticks((low, high): (f64, f64), count: f64) -> Vec<(f64, String)> {
     let step = [1.0, 2.0, 5.0, 10.0].into_iter().find(|m| m * power >= raw).unwrap_or(10.0) * power;
     let decimals = (-step.log10().floor()).max(0.0) as usize;
     let first = (low / step).ceil();
-    // The count is bounded by the step: at most `count` and one.
+    // The step limits the number of ticks to `count` and one.
     (0..=count.ceil() as usize)
         .map(|index| (first + index as f64) * step)
         .take_while(|value| *value <= high + 1e-9 * step)
-        // No "-0".
+        // Avoids "-0".
         .map(|value| if value.abs() < 1e-9 * step { 0.0 } else { value })
         .map(|value| (value, format!("{value:.decimals$}").replace('-', "\u{2212}")))
         .collect()
@@ -123,7 +123,7 @@ fn date_ticks((low, high): (f64, f64), count: f64) -> Vec<(f64, String)> {
 }
 
 fn month_ticks((low, high): (f64, f64), raw: f64) -> Vec<(f64, String)> {
-    // Steps above, months.
+    // Steps in months.
     let step = [1, 2, 3, 6, 12, 24, 60].into_iter().find(|step| *step as f64 * MONTH_S >= raw);
     let step = step.unwrap_or_else(|| 12 * ((raw / (12.0 * MONTH_S)).ceil() as i64));
     let text = format_utc(Timestamp::from_secs(low));
@@ -142,7 +142,7 @@ fn month_ticks((low, high): (f64, f64), raw: f64) -> Vec<(f64, String)> {
         .collect()
 }
 
-/// Formats a time with the precision of the step; midnight is the day that begins.
+/// Formats a time with the precision of the step; midnight is shown as the new day.
 fn moment(time_s: f64, step: f64) -> String {
     let text = format_utc(Timestamp::from_secs(time_s));
     let part = if step >= DAY || (step >= MINUTE && time_s.rem_euclid(DAY) == 0.0) {
@@ -155,7 +155,7 @@ fn moment(time_s: f64, step: f64) -> String {
     text.get(part).unwrap_or_default().to_owned()
 }
 
-/// The day of a moment.
+/// The day of a time.
 pub(super) fn day(time_s: f64) -> String {
     format_utc(Timestamp::from_secs(time_s)).get(..10).unwrap_or_default().to_owned()
 }
@@ -169,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn ticks_are_round_and_have_the_digits_they_need() {
+    fn ticks_are_round_with_the_needed_digits() {
         let axis = Axis::number("Ah");
         assert_eq!(words(&axis.ticks((1.31, 1.92), 4.0)), ["1.4", "1.6", "1.8"]);
         assert_eq!(words(&axis.ticks((-0.2, 0.2), 4.0)), ["\u{2212}0.2", "\u{2212}0.1", "0.0", "0.1", "0.2"]);
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_and_a_constant_still_give_an_axis() {
+    fn empty_and_constant_data_give_an_axis() {
         let axis = Axis::number("");
         assert_eq!(axis.ends([f64::NAN].into_iter(), true), (0.0, 1.0));
         let (low, high) = axis.ends([4.0].into_iter(), true);

@@ -8,7 +8,7 @@ use super::{Picture, Size, escape};
 /// Space around a picture in a file, pixels.
 const MARGIN: f64 = 14.0;
 
-/// Why there is no plot.
+/// Error of a plot that cannot be written.
 #[derive(Debug, thiserror::Error)]
 #[error("{path}: the plot cannot be written: {what}")]
 pub struct PlotError {
@@ -66,7 +66,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_stands_alone_and_a_bad_path_is_reported() {
+    fn file_is_self_contained_and_bad_path_is_reported() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("plot.svg");
         write_stack(&path, &[picture()]).expect("drawn");

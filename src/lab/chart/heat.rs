@@ -1,4 +1,4 @@
-//! Heat maps: a value per row and column of time, as one of nine colours, with its legend.
+//! Heat maps: a value per row and column of time, as one of nine colours, with a legend.
 
 use super::Size;
 use super::axis::Axis;
@@ -6,7 +6,7 @@ use super::plot::{Area, title};
 use super::style::{STEPS, step_class};
 use super::svg::{Svg, short, text_width};
 
-/// Height of a row, pixels, within these bounds.
+/// Smallest and largest height of a row, pixels.
 const ROW: (f64, f64) = (4.0, 20.0);
 
 /// Values over rows (cells, from 1) and columns of equal width.
@@ -14,27 +14,27 @@ const ROW: (f64, f64) = (4.0, 20.0);
 pub struct Heat {
     pub title: String,
     pub description: String,
-    /// With `range`: where the columns begin and end.
+    /// Its `range` is where the columns start and end.
     pub x: Axis,
-    /// What the values are, with unit.
+    /// Meaning of the values, with unit.
     pub label: String,
-    /// Rows of values; `None` = not known.
+    /// Rows of values; `None` = unknown.
     pub rows: Vec<Vec<Option<f64>>>,
-    /// One per row; may be empty.
+    /// Tool tips, one per row; may be empty.
     pub tips: Vec<String>,
     /// Decimals in the legend.
     pub decimals: usize,
 }
 
 impl Heat {
-    /// The elements, and the height they take.
+    /// The elements, and their height.
     pub(super) fn draw(&self, size: Size) -> (String, f64) {
         let mut svg = Svg::default();
         let top = title(&mut svg, &self.title, size.width);
         let values = || self.rows.iter().flatten().flatten().copied().filter(|value| value.is_finite());
         let (low, high) = Axis::default().ends(values(), false);
         let top = self.legend(&mut svg, top, size.width, (low, high));
-        // Height of a picture with as many rows as fit, pixels.
+        // Height available for all rows, pixels.
         let row = (300.0 / self.rows.len().max(1) as f64).clamp(ROW.0, ROW.1).floor();
         let left = text_width(&self.rows.len().to_string(), 11.5) + 12.0;
         let height = row * self.rows.len() as f64;
@@ -58,7 +58,7 @@ impl Heat {
         (svg.0, top + height + 40.0)
     }
 
-    /// One path per step: rectangles over neighbours of the same step.
+    /// One path per colour: rectangles over neighbours of the same colour.
     fn paths(&self, width: f64, row: f64, ends: (f64, f64)) -> Vec<String> {
         let mut paths = vec![String::new(); STEPS.len()];
         for (index, values) in self.rows.iter().enumerate() {
@@ -98,7 +98,7 @@ impl Heat {
     }
 }
 
-/// The step of a value; `None` = not known.
+/// Colour step of a value; `None` = unknown.
 fn step(value: Option<f64>, (low, high): (f64, f64)) -> Option<usize> {
     let part = (value.filter(|value| value.is_finite())? - low) / (high - low);
     Some(((part * STEPS.len() as f64) as usize).min(STEPS.len() - 1))
@@ -109,7 +109,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn unknown_values_have_no_colour_and_neighbours_share_a_rectangle() {
+    fn unknown_values_are_blank_and_neighbours_share_a_rectangle() {
         let rows = vec![vec![Some(1.0), Some(1.0), None, Some(2.0)], vec![Some(f64::NAN), None, Some(1.5), Some(2.0)]];
         let heat = Heat { rows, x: Axis::number("d").within(0.0, 4.0), ..Heat::default() };
         let paths = heat.paths(40.0, 10.0, (1.0, 2.0));
@@ -118,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pack_of_96_cells_over_120_columns_stays_small() {
+    fn heat_map_of_96_cells_stays_small() {
         let row = |cell: usize| (0..120).map(|column| Some((cell * 7 + column * 13) as f64 % 9.0)).collect();
         let heat = Heat { rows: (0..96).map(row).collect(), x: Axis::number("d").within(0.0, 1.0), ..Heat::default() };
         let (text, _) = heat.draw(Size::WIDE);

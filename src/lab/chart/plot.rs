@@ -5,14 +5,14 @@ use super::style::Ink;
 use super::svg::{PathBuilder, Svg, short, text_width};
 use super::{Size, thin};
 
-/// Font size of ticks and legend, pixels, as the style sheet has it.
+/// Font size of ticks and legend, pixels, as in the style sheet.
 const SMALL: f64 = 11.5;
 const ROW: f64 = 18.0;
 const FOOT: f64 = 38.0;
 /// Radius of a point, pixels.
 const DOT: f64 = 2.6;
 
-/// A value to be drawn as a point.
+/// A value drawn as a point.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Point {
     pub x: f64,
@@ -21,26 +21,26 @@ pub struct Point {
     pub tip: String,
 }
 
-/// Shape of a layer; x does not fall.
+/// Shape of a layer; x must not fall.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Shape {
     /// (x, y).
     Line(Vec<(f64, f64)>),
-    /// The same, dashed.
+    /// Dashed line of (x, y).
     Dashed(Vec<(f64, f64)>),
     /// (x, lower, upper).
     Band(Vec<(f64, f64, f64)>),
     Points(Vec<Point>),
-    /// A threshold: the whole width at this y.
+    /// A threshold: a line over the whole width at this y.
     Level(f64),
-    /// Events: lines of the whole height at these x, with tool tips in the points' `tip`.
+    /// Events: lines over the whole height at these x, with tool tips.
     Moments(Vec<Point>),
 }
 
-/// One layer of a chart; later ones are drawn above earlier ones.
+/// One layer of a chart; later layers are drawn above earlier ones.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Layer {
-    /// For the legend; empty = not in it.
+    /// Label in the legend; empty = not in the legend.
     pub label: String,
     pub ink: Ink,
     pub shape: Shape,
@@ -73,7 +73,7 @@ pub struct Chart {
     pub layers: Vec<Layer>,
 }
 
-/// The drawing area: where it lies and what it shows.
+/// The drawing area: its position and the ranges it shows.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Area {
     pub(super) left: f64,
@@ -90,16 +90,16 @@ impl Area {
         self.width * (x - self.x.0) / (self.x.1 - self.x.0)
     }
 
-    /// Pixels from its upper edge.
+    /// Pixels from the area's upper edge.
     fn py(&self, y: f64) -> f64 {
         self.height * (self.y.1 - y) / (self.y.1 - self.y.0)
     }
 
-    /// As many ticks as their words have room for.
+    /// As many ticks as there is room for their labels.
     fn x_ticks(&self, axis: &Axis) -> Vec<(f64, String)> {
         let fits = |ticks: &[(f64, String)]| {
             let widest = ticks.iter().map(|(_, word)| text_width(word, SMALL)).fold(0.0, f64::max);
-            // Room between two words.
+            // Room between two labels.
             ticks.windows(2).all(|pair| self.px(pair[1].0) - self.px(pair[0].0) >= widest + 16.0)
         };
         let counts = (1..=10).rev().map(f64::from);
@@ -126,7 +126,7 @@ impl Chart {
         Self { title: title.into(), description: String::new(), x: x.into(), y: y.into(), layers }
     }
 
-    /// The elements, and the height they take.
+    /// The elements, and their height.
     pub(super) fn draw(&self, size: Size) -> (String, f64) {
         let mut svg = Svg::default();
         let mut top = title(&mut svg, &self.title, size.width);
@@ -136,7 +136,7 @@ impl Chart {
         let height = size.height - 60.0 - FOOT;
         let y_ticks = self.y.ticks(y, height / 28.0);
         let left = y_ticks.iter().map(|(_, word)| text_width(word, SMALL)).fold(16.0, f64::max) + 8.0;
-        // Room at the right, pixels: half of the last tick's words.
+        // Room at the right, pixels: half of the last tick's label.
         let area = Area { left, top, width: size.width - left - 22.0, height, x, y };
         for (y, word) in y_ticks {
             let at = top + area.py(y);
@@ -150,7 +150,7 @@ impl Chart {
         (svg.0, top + height + FOOT)
     }
 
-    /// Draws the label of the y axis and the legend in rows; returns where they end.
+    /// Draws the label of the y axis and the legend in rows; returns their lower edge.
     fn legend(&self, svg: &mut Svg, width: f64, top: f64) -> f64 {
         svg.text(0.0, top + 12.0, "t", &self.y.label);
         let (mut x, mut y) = (text_width(&self.y.label, SMALL) + 18.0, top);
@@ -167,7 +167,7 @@ impl Chart {
     }
 }
 
-/// Draws the title in as many lines as it needs; returns where it ends.
+/// Draws the title in as many lines as it needs; returns their lower edge.
 pub(super) fn title(svg: &mut Svg, text: &str, width: f64) -> f64 {
     let mut y = 0.0;
     for line in wrapped(text, width, 14.5) {
@@ -216,7 +216,7 @@ impl Layer {
         }
     }
 
-    /// Its sign in the legend, 20 pixels wide round `y`.
+    /// Draws the layer's sign in the legend, 20 pixels wide around `y`.
     fn key(&self, svg: &mut Svg, x: f64, y: f64) {
         let line = format!("M{} {}h20", short(x), short(y));
         match &self.shape {
@@ -257,10 +257,10 @@ impl Layer {
 
     fn draw_points(&self, svg: &mut Svg, area: &Area, points: &[Point]) {
         let finite = || points.iter().filter(|point| point.x.is_finite() && point.y.is_finite());
-        // Most points of a layer with a tool tip each; more are dots without.
+        // Most points with a tool tip; larger layers have dots without tool tips.
         if finite().count() <= 400 {
             return finite().for_each(|point| {
-                // A point at the very edge is not cut in half.
+                // A point at the edge is moved inwards, so that it is not cut in half.
                 let x = area.px(point.x);
                 let x = if (-0.5..=area.width + 0.5).contains(&x) { x.clamp(DOT, area.width - DOT) } else { x };
                 svg.circle((x, area.py(point.y)), DOT, &self.ink.fill(), &point.tip);
@@ -311,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn a_hole_interrupts_a_line_and_does_not_stretch_the_axes() {
+    fn gap_interrupts_a_line_and_keeps_the_axes() {
         let points = vec![(0.0, 1.0), (1.0, 2.0), (2.0, f64::NAN), (3.0, 1.0), (f64::INFINITY, 9.0)];
         let layer = Layer::new("SOC & <truth>", Ink::Blue, Shape::Line(points));
         assert_eq!(Axis::default().ends(layer.xs(), false), (0.0, 3.0));
@@ -321,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn every_alarm_is_kept_and_words_are_escaped() {
+    fn every_alarm_is_kept_and_labels_are_escaped() {
         let moments = (0..5000).map(|i| Point { x: f64::from(i), y: 0.0, tip: format!("alarm {i}") }).collect();
         let layers = vec![
             Layer::new("SOC & <truth>", Ink::Blue, Shape::Level(1.0)),
@@ -333,17 +333,17 @@ mod tests {
     }
 
     #[test]
-    fn nothing_to_draw_still_is_a_picture() {
+    fn empty_chart_is_still_a_picture() {
         let (text, _) = chart(Vec::new()).draw(Size::NARROW);
         assert!(text.contains("hours") && !text.contains("NaN"), "{text}");
     }
 
     #[test]
-    fn a_legend_too_long_for_a_row_continues_in_the_next() {
+    fn long_legend_continues_in_the_next_row() {
         let layers = (0..6).map(|i| Layer::new(&format!("a rather long label {i}"), Ink::Blue, Shape::Level(1.0)));
         let chart = chart(layers.collect());
         let more = chart.draw(Size::NARROW).1 - chart.draw(Size { width: 2000.0, ..Size::NARROW }).1;
-        // One next to the axis' name, then two per row.
+        // One label beside the name of the axis, then two per row.
         assert!((more - 3.0 * ROW).abs() < 0.1, "{more} pixels");
     }
 }

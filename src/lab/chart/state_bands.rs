@@ -9,10 +9,10 @@ use super::svg::{Svg, text_width};
 /// Height of a band's name and of its spans, pixels.
 const NAME: f64 = 16.0;
 const BAR: f64 = 12.0;
-/// Narrowest span, pixels: the shortest alarm is still seen.
+/// Smallest width of a span, pixels: the shortest alarm stays visible.
 const LEAST: f64 = 3.0;
 
-/// A state with its beginning and end.
+/// A state with its start and end.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Span {
     pub from: f64,
@@ -29,19 +29,19 @@ pub struct StateBand {
     pub spans: Vec<Span>,
 }
 
-/// Bands one below the other.
+/// Bands, one below the other.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct StateBands {
     pub title: String,
     pub description: String,
     pub x: Axis,
     pub bands: Vec<StateBand>,
-    /// Meaning of the inks.
+    /// Meanings of the inks.
     pub keys: Vec<(Ink, String)>,
 }
 
 impl StateBands {
-    /// The elements, and the height they take.
+    /// The elements, and their height.
     pub(super) fn draw(&self, size: Size) -> (String, f64) {
         let mut svg = Svg::default();
         let mut top = title(&mut svg, &self.title, size.width);
@@ -81,7 +81,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_shortest_alarm_at_the_very_end_is_still_seen() {
+    fn shortest_alarm_at_the_end_is_visible() {
         let span = Span { from: 100.0, to: 100.0, ink: Ink::Red, tip: "severe".into() };
         let band = StateBand { name: "capacity_low".into(), spans: vec![span] };
         let bands = StateBands { x: Axis::number("d").within(0.0, 100.0), bands: vec![band], ..StateBands::default() };

@@ -1,14 +1,14 @@
-//! Colours: classes for strokes, fills and words, and their values in light and dark.
+//! Colours: classes for strokes, fills and text, and their values in light and dark.
 //!
-//! The inks are those of Okabe and Ito, which people with any colour vision can distinguish, lighter on a dark page;
-//! the steps of heat maps are those of cividis (Nuñez, Anderton, Renslow 2018), made for the same readers.
+//! The inks are those of Okabe and Ito, which are distinguishable with any colour vision, lighter on a dark page.
+//! The steps of heat maps are those of cividis (Nuñez, Anderton, Renslow 2018), with the same property.
 
 use std::fmt::Write as _;
 
 /// Colour of a drawn element.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Ink {
-    /// As words: truth, measurement.
+    /// Colour of text: truth, measurement.
     Plain,
     Blue,
     Orange,
@@ -39,7 +39,7 @@ const COLOURS: [(&str, &str, &str); 14] = [
     ("none", "#e6e8ec", "#2a2e36"),
 ];
 
-/// Steps of a heat map from the lowest to the highest.
+/// Steps of a heat map from the lowest to the highest value.
 pub(super) const STEPS: [&str; 9] =
     ["#00224e", "#123570", "#3b496c", "#575d6d", "#707173", "#8a8678", "#a59c74", "#c3b369", "#fee838"];
 
@@ -61,7 +61,7 @@ impl Ink {
         format!("f-{}", self.name())
     }
 
-    /// Class of a see-through fill.
+    /// Class of a translucent fill.
     pub fn band(self) -> String {
         format!("b-{}", self.name())
     }
@@ -72,7 +72,7 @@ pub(super) fn step_class(step: usize) -> String {
     format!("h-{step}")
 }
 
-/// The colours as variables of a page or a file: light, and dark on a screen that prefers it.
+/// The colours as variables of a page or a file: light, and dark if the screen prefers it.
 pub fn variables() -> String {
     let list = |pick: fn(&(&str, &'static str, &'static str)) -> &'static str| {
         COLOURS.iter().fold(String::new(), |text, colour| text + &format!("--{}:{};", colour.0, pick(colour)))
@@ -95,7 +95,7 @@ fn classes() -> String {
     );
     for ink in Ink::ALL {
         let name = ink.name();
-        // A string cannot fail to take text.
+        // Writing to a string cannot fail.
         let _ = write!(
             text,
             ".k-{name}{{stroke:var(--{name})}}.f-{name}{{fill:var(--{name})}}.b-{name}{{fill:var(--{name});fill-opacity:.22}}"

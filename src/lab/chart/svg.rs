@@ -19,16 +19,16 @@ pub fn escape(text: &str) -> String {
     out
 }
 
-/// Width of a text in a font of this size, pixels, roughly.
+/// Approximate width of a text in a font of this size, pixels.
 pub(super) fn text_width(text: &str, size: f64) -> f64 {
-    // Average width of a character, parts of the font size.
+    // Average width of a character, as a part of the font size.
     text.chars().count() as f64 * size * 0.56
 }
 
-/// A coordinate with one decimal, as short as it goes.
+/// A coordinate with at most one decimal.
 pub(super) fn short(value: f64) -> String {
     let tenths = (value * 10.0).round();
-    // Larger than any picture: keeps the text short for any input.
+    // Larger than any picture; keeps the text short for any input.
     let tenths = tenths.clamp(-1e6, 1e6) as i64;
     match (tenths / 10, tenths.abs() % 10) {
         (whole, 0) => whole.to_string(),
@@ -37,7 +37,7 @@ pub(super) fn short(value: f64) -> String {
     }
 }
 
-/// Elements in the order in which they are drawn.
+/// Elements in drawing order.
 #[derive(Debug, Default)]
 pub(super) struct Svg(pub(super) String);
 
@@ -67,7 +67,7 @@ impl Svg {
         self.close("path", tip);
     }
 
-    /// An area that clips what is drawn in it; its origin is its own upper left corner.
+    /// Opens an area that clips its content; its origin is its own upper left corner.
     pub(super) fn open_area(&mut self, (x, y): (f64, f64), (width, height): (f64, f64)) {
         let (x, y, width, height) = (short(x), short(y), short(width), short(height));
         self.push(format_args!(
@@ -90,12 +90,12 @@ impl Svg {
     }
 
     fn push(&mut self, text: std::fmt::Arguments<'_>) {
-        // A string cannot fail to take text.
+        // Writing to a string cannot fail.
         let _ = self.0.write_fmt(text);
     }
 }
 
-/// A path through points: absolute at its beginning, then steps, so that it is short and rounding does not add up.
+/// A path through points: absolute at its start, then relative, which is short; rounding does not accumulate.
 #[derive(Debug, Default)]
 pub(super) struct PathBuilder {
     pub(super) d: String,
@@ -117,7 +117,7 @@ impl PathBuilder {
         self.last = Some(rounded);
     }
 
-    /// A dot, to be drawn by a stroke with round ends.
+    /// A dot, drawn by a stroke with round ends.
     pub(super) fn dot(&mut self, x: f64, y: f64) {
         self.pair('M', (x, y));
         self.d.push_str("h0");
@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn steps_of_a_path_do_not_drift() {
+    fn relative_steps_do_not_accumulate_rounding() {
         let mut path = PathBuilder::default();
         (0..=1000).for_each(|i| path.to(f64::from(i) * 0.333, 0.0));
         let sum: f64 = path.d[1..].split(['l', ' ']).step_by(2).map(|x| x.parse::<f64>().unwrap()).sum();
@@ -152,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn text_cannot_break_out() {
+    fn special_characters_are_escaped() {
         assert_eq!(escape("a<b>&\"\u{1}"), "a&lt;b&gt;&amp;&quot;\u{fffd}");
     }
 }

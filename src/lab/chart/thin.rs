@@ -1,6 +1,6 @@
 //! Reduces long series to the resolution of a picture.
 
-/// First, lowest, highest and last point of each of `bins` bins along x, in their order; a short series as it is.
+/// First, lowest, highest and last point of each of `bins` bins along x, in order; a short series unchanged.
 pub(super) fn line(points: &[(f64, f64)], bins: usize) -> Vec<(f64, f64)> {
     let mut kept = Vec::with_capacity(points.len().min(4 * bins));
     if points.len() <= 4 * bins {
@@ -19,7 +19,7 @@ pub(super) fn line(points: &[(f64, f64)], bins: usize) -> Vec<(f64, f64)> {
     kept
 }
 
-/// Lowest lower and highest upper end of each bin, at the bin's first and last x; a short band as it is.
+/// Lowest lower and highest upper end of each bin, at the bin's first and last x; a short band unchanged.
 pub(super) fn band(points: &[(f64, f64, f64)], bins: usize) -> Vec<(f64, f64, f64)> {
     if points.len() <= 2 * bins {
         return points.to_vec();
@@ -35,12 +35,12 @@ pub(super) fn band(points: &[(f64, f64, f64)], bins: usize) -> Vec<(f64, f64, f6
     kept
 }
 
-/// Which bin an x belongs to; the series does not fall in x.
+/// Bin of an x; the series must not fall in x.
 fn binning(mut xs: impl DoubleEndedIterator<Item = f64>, bins: usize) -> impl Fn(f64) -> f64 {
     let first = xs.next().unwrap_or(0.0);
     let last = xs.next_back().unwrap_or(first);
     let width = ((last - first) / bins.max(1) as f64).max(f64::MIN_POSITIVE);
-    // The last point belongs to the last bin, not to one of its own.
+    // The last point belongs to the last bin, not to an additional one.
     move |x| ((x - first) / width).floor().min(bins.max(1) as f64 - 1.0)
 }
 
@@ -49,7 +49,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_single_peak_survives() {
+    fn single_peak_is_kept() {
         let mut points: Vec<(f64, f64)> = (0..200_000).map(|i| (f64::from(i), 0.0)).collect();
         points[77_777].1 = 5.0;
         points[123_456].1 = -3.0;
@@ -61,7 +61,7 @@ mod tests {
     }
 
     #[test]
-    fn a_band_never_becomes_narrower() {
+    fn band_never_becomes_narrower() {
         let points: Vec<_> = (0..10_000).map(|i| (f64::from(i), -f64::from(i % 7), f64::from(i % 11))).collect();
         let kept = band(&points, 100);
         assert!(kept.len() <= 202);

@@ -1,8 +1,8 @@
-//! Frames and diagnostic answers of a log, as many as memory allows.
+//! Frames and diagnostic answers of a log, within a memory limit.
 //!
-//! All frames are kept while they fit into [`MAX_BYTES`]. Beyond, whole windows of [`WINDOW_S`] are dropped, first every
-//! second one, then three of four, ...: what is left has all identifiers of the same moments, pages of multiplexers included.
-//! Answers are put together from every frame; each kind keeps at most [`MAX_ANSWER_BYTES`], halved in the same way.
+//! All frames are kept until they exceed [`MAX_BYTES`]. Then whole windows of [`WINDOW_S`] are dropped: first every second one, then
+//! three of four, and so on. The remaining data contain all identifiers of the same times, including pages of multiplexers.
+//! Answers are reassembled from all frames; each kind keeps at most [`MAX_ANSWER_BYTES`], halved in the same way.
 
 use std::collections::BTreeMap;
 
@@ -10,15 +10,15 @@ use crate::can::isotp::{Progress, Receiver};
 use crate::can::{CanId, Frame, FrameKind};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// Frames kept, bytes: about two million classic ones.
+/// Most bytes of frames kept: about two million classic frames.
 const MAX_BYTES: usize = 48 << 20;
-/// Answers of one kind kept, bytes: a thousand of 64 bytes.
+/// Most bytes kept per kind of answer: a thousand answers of 64 bytes.
 const MAX_ANSWER_BYTES: usize = 64 << 10;
-/// Length of a window, s: long against the period of a page, short against a drive.
+/// Length of a window, s: long relative to the period of a page, short relative to a drive.
 const WINDOW_S: f64 = 2.0;
-/// Messages (identifiers on an interface) followed; a car has a few hundred, a flood of random identifiers more.
+/// Most messages (identifiers on an interface) kept; a car has a few hundred, a flood of random identifiers more.
 const MAX_MESSAGES: usize = 4096;
-/// First data byte of BMW's answers: extended addressing that needs no definition to be seen.
+/// First data byte of BMW's answers: extended addressing that is recognised without a definition.
 const TESTER: u8 = 0xF1;
 
 /// An identifier on an interface.
@@ -27,14 +27,14 @@ pub(super) type MessageKey = (BusIndex, CanId);
 /// Payloads of one message, with their times.
 #[derive(Debug, Default)]
 pub(super) struct Payloads {
-    /// s since the first frame of the log.
+    /// Time since the first frame of the log, s.
     times: Vec<f64>,
     data: Vec<u8>,
     /// End of each payload in `data`.
     ends: Vec<usize>,
 }
 
-/// Which answer: its sender, service and identifier of the values.
+/// Kind of answer: its sender, service, and identifier of the values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct AnswerKey {
     pub(super) bus: BusIndex,
@@ -44,17 +44,17 @@ pub(super) struct AnswerKey {
     pub(super) identifier: u16,
 }
 
-/// A request: its time, s, its identifier and first byte with extended addressing.
+/// A request: time, s, identifier, and first byte if addressing is extended.
 type HeardRequest = (f64, CanId, Option<u8>);
 
 /// Answers of one kind.
 #[derive(Debug, Default)]
 pub(super) struct Answers {
-    /// Identifier of the requests, and their first byte with extended addressing, if they were heard.
+    /// Identifier of the requests, and their first byte if addressing is extended; `None` = none was heard.
     pub(super) request: Option<(CanId, Option<u8>)>,
-    /// What follows the echoed service and identifier.
+    /// Data after the echoed service and identifier.
     pub(super) payloads: Payloads,
-    /// Answers seen.
+    /// Number of answers seen.
     pub(super) seen: u64,
     stride: u64,
 }
@@ -64,16 +64,16 @@ pub(super) struct Answers {
 pub(super) struct Capture {
     pub(super) messages: BTreeMap<MessageKey, Payloads>,
     pub(super) answers: BTreeMap<AnswerKey, Answers>,
-    /// Frames taken.
+    /// Number of frames received.
     pub(super) frames: u64,
-    /// Frames of messages beyond [`MAX_MESSAGES`].
+    /// Number of frames of messages beyond [`MAX_MESSAGES`].
     pub(super) ignored: u64,
     receivers: BTreeMap<(MessageKey, Option<u8>), Receiver>,
     requests: BTreeMap<(BusIndex, u8, u16), HeardRequest>,
     start: Option<Timestamp>,
     latest_s: f64,
     bytes: usize,
-    /// Every how many windows one is kept, less one as a mask: 0, 1, 3, 7, ...
+    /// One window in every `mask` + 1 is kept; values are 0, 1, 3, 7, ...
     mask: u64,
 }
 
@@ -85,7 +85,7 @@ impl Payloads {
         self.times.iter().copied().zip(ranges)
     }
 
-    /// How many.
+    /// Number of payloads.
     pub(super) fn len(&self) -> usize {
         self.times.len()
     }
@@ -96,7 +96,7 @@ impl Payloads {
         self.ends.push(self.data.len());
     }
 
-    /// Keeps some, by number and time.
+    /// Keeps payloads selected by number and time.
     fn retain(&mut self, mut is_kept: impl FnMut(usize, f64) -> bool) {
         let mut kept = Self::default();
         for (index, (time_s, payload)) in self.iter().enumerate() {
@@ -113,13 +113,13 @@ impl Payloads {
 }
 
 impl Capture {
-    /// Takes a frame.
+    /// Receives a frame.
     pub(super) fn handle(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
         if frame.kind() == FrameKind::Remote {
             return;
         }
         let start = *self.start.get_or_insert(time);
-        // Seconds of a log: exact to a microsecond for centuries.
+        // Seconds since the start of the log: exact to a microsecond for centuries.
         let time_s = time.nanos().saturating_sub(start.nanos()) as f64 * 1e-9;
         self.latest_s = self.latest_s.max(time_s);
         self.frames += 1;
@@ -151,14 +151,14 @@ impl Capture {
     }
 
     fn receive(&mut self, time: Timestamp, time_s: f64, key: MessageKey, data: &[u8]) {
-        // BMW asks from 6F1 with the target in the first byte, and is answered with the tester there.
+        // BMW sends requests from 6F1 with the target in the first byte; the first byte of the answer is the tester.
         let is_extended = |byte: &u8| *byte == TESTER || key.1 == CanId::Standard(0x600 | u16::from(TESTER));
         let extensions = [None, data.first().copied().filter(is_extended)];
         for (index, extension) in extensions.into_iter().enumerate() {
             if index > 0 && extension.is_none() {
                 continue;
             }
-            // Single, first and consecutive frames; everything else is no part of a message.
+            // Single, first and consecutive frames; other frames are not part of a message.
             let control = data.get(usize::from(extension.is_some())).copied().unwrap_or(u8::MAX);
             if control >> 4 > 2 {
                 continue;
@@ -191,7 +191,7 @@ impl Capture {
         // Longest P2* of ISO 14229-2.
         let request = request.filter(|(at, _, _)| time_s - at <= 5.0).map(|(_, id, first)| (*id, *first));
         let key = AnswerKey { bus, response: id, extension, service, identifier: number };
-        // A single frame alone may be any message that begins with these bytes.
+        // A single frame without a request may be any message that starts with these bytes.
         let is_known = self.answers.contains_key(&key) || is_long || request.is_some();
         if is_known && (self.answers.contains_key(&key) || self.answers.len() < 1024) {
             self.answers.entry(key).or_default().push(time_s, request, &rest[length..]);
@@ -214,7 +214,7 @@ impl Answers {
     }
 }
 
-/// Number of the window of a time; negative times (stamps before the first) are in window 0.
+/// Number of the window of a time; negative times (before the first stamp) are in window 0.
 fn window(time_s: f64) -> u64 {
     (time_s / WINDOW_S) as u64
 }

@@ -1,7 +1,7 @@
-//! The best candidates as a configuration, or the questions that keep it from being one.
+//! Writes the best candidates as a configuration, or returns the questions that prevent it.
 //!
-//! What the log decides is written; what it does not (the cell model, which sensor belongs to which cells, limits and alarms)
-//! is listed. The sign of the current and the number of cells are never guessed: without evidence they are questions.
+//! Everything that the log determines is written; the rest (cell model, assignment of sensors to cells, limits and alarms) is listed.
+//! The sign of the current and the number of cells are never guessed: without evidence they become questions.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -16,20 +16,20 @@ use crate::fit::quoted;
 use crate::import::{DiagnosticSignal, DiagnosticTable, series};
 use crate::wiring::evidence::PackQuantity;
 
-/// What the user decides.
+/// Decisions of the user.
 #[derive(Debug, Clone, Default)]
 pub struct PackSettings {
-    /// The log, for the head.
+    /// Name of the log, for the first line.
     pub source: String,
-    /// DBC files as the configuration names them, in the order in which they were added.
+    /// DBC files as named in the configuration, in the order in which they were added.
     pub databases: Vec<String>,
-    /// DBC as the configuration names it, for fields that no given one describes.
+    /// DBC as named in the configuration, for fields that no given DBC describes.
     pub own_database: String,
-    /// Cell model as the configuration names it.
+    /// Cell model as named in the configuration.
     pub cell_model: String,
-    /// Cells in series, for a pack that publishes its total voltage alone.
+    /// Cells in series, for a pack that publishes only its total voltage.
     pub cells: Option<u16>,
-    /// What a positive current means, where the log does not show it.
+    /// Meaning of a positive current, if the log does not show it.
     pub positive: Option<PositiveDirection>,
 }
 
@@ -38,9 +38,9 @@ pub struct PackSettings {
 pub struct PackConfiguration {
     /// TOML.
     pub text: String,
-    /// DBC of the fields that no given DBC describes, for the file that [`PackSettings::own_database`] names.
+    /// DBC of the fields that no given DBC describes; it belongs in the file that [`PackSettings::own_database`] names.
     pub database: Option<String>,
-    /// What the log does not decide.
+    /// Questions that the log does not answer.
     pub open: Vec<String>,
 }
 
@@ -54,7 +54,7 @@ struct Selection<'a> {
     reported: Vec<(&'static str, &'a Candidate)>,
 }
 
-/// Everything the text is made from.
+/// Sources of the text.
 pub(super) struct Writer<'a> {
     pub(super) discovery: &'a Discovery,
     pub(super) capture: &'a Capture,
@@ -63,13 +63,13 @@ pub(super) struct Writer<'a> {
 }
 
 impl Writer<'_> {
-    /// Writes the configuration; `Err` has the questions.
+    /// Writes the configuration.
     pub(super) fn write(&self) -> Result<PackConfiguration, Vec<String>> {
         let selection = self.select()?;
         let mut open = Vec::new();
         if self.is_raw(selection.current) {
             open.push(format!(
-                "the scale of {} is a guess, and capacity follows it: compare with a known current",
+                "the scale of {} is a guess, and the capacity depends on it: compare it with a known current",
                 selection.current.signal
             ));
         }
@@ -78,7 +78,7 @@ impl Writer<'_> {
         self.tables(&selection, &mut text, &mut open);
         self.limits(&selection, &mut text);
         open.push(format!("cell_model = {:?}: is it this cell?", self.settings.cell_model));
-        open.push("alarms, limits of current and temperature: see the reference of keys".to_owned());
+        open.push("which alarms, which limits of current and temperature? see the reference of keys".to_owned());
         let mut known = BTreeSet::new();
         open.retain(|question: &String| known.insert(question.clone()));
         text.push_str("\n# Not decided by the log:\n");
@@ -108,7 +108,7 @@ impl Writer<'_> {
         let mut questions = Vec::new();
         let current = self.best(PackQuantity::Current);
         if current.is_none() {
-            questions.push("which signal is the pack current? the log shows none".to_owned());
+            questions.push("which signal is the pack current? the log shows no candidate".to_owned());
         }
         let positive = self.settings.positive.or(current.and_then(|current| current.positive));
         if let (Some(current), None) = (current, positive) {
@@ -133,14 +133,15 @@ impl Writer<'_> {
                 None
             }
             (None, None, _) => {
-                questions.push("which signal is the voltage? the log shows none of the pack or of cells".to_owned());
+                questions
+                    .push("which signal is the voltage? the log shows none of the pack or of the cells".to_owned());
                 None
             }
         };
         let (Some(current), Some(positive), Some((voltage, cells))) = (current, positive, voltage) else {
             return Err(questions);
         };
-        // A field without a name may be a temperature, and may be anything.
+        // An unnamed field may be a temperature or something else.
         let temperature = self.best(PackQuantity::Temperature).filter(|candidate| !self.is_raw(candidate));
         let soc = self.best(PackQuantity::Soc).map(|candidate| ("reported_soc", candidate));
         let soh = self.best(PackQuantity::Soh).map(|candidate| ("reported_soh", candidate));
@@ -158,7 +159,7 @@ impl Writer<'_> {
         candidate.members.iter().any(is_raw)
     }
 
-    /// Cells of a group whose numbers have no gap.
+    /// Number of cells of a group that is numbered without gaps.
     fn row(&self, group: &Candidate) -> Option<u16> {
         let numbers = self.numbers(group)?;
         let first = *numbers.first()?;
@@ -174,7 +175,7 @@ impl Writer<'_> {
             let name = &self.signal(*index).name;
             let rest = match before {
                 Some((before, _)) => name.strip_prefix(before)?,
-                // Another number comes first: the counted one is the last.
+                // Another number comes first: cells are counted by the last one.
                 None => name.rsplit(|c: char| !c.is_ascii_digit()).find(|text| !text.is_empty())?,
             };
             let digits = rest.bytes().take_while(u8::is_ascii_digit).count();
@@ -245,7 +246,7 @@ impl Writer<'_> {
                 self.input("[[input.temperature]]", temperature, &name, "", text);
                 if temperature.signals > 1 {
                     open.push(format!(
-                        "{} has {} sensors, {name} alone is used: which cells are beside which sensor?",
+                        "{} has {} sensors, only {name} is used: which cells are near which sensor?",
                         temperature.signal, temperature.signals
                     ));
                 }
@@ -274,13 +275,13 @@ impl Writer<'_> {
         let pack_v = self.signal(pack.members[0]).series.extent.mean();
         if (pack_v / sum - 1.0).abs() > 0.05 {
             open.push(format!(
-                "{} is {pack_v:.1} V, the cells are {sum:.1} V together: are all cells there?",
+                "{} is {pack_v:.1} V, but the sum of the cells is {sum:.1} V: are all cells included?",
                 pack.signal
             ));
         }
     }
 
-    /// Tables of definitions with the used signals, and used fields without a definition.
+    /// Tables of definitions reduced to the used signals, and used fields without a definition.
     fn used_tables(
         &self,
         selection: &Selection<'_>,
@@ -309,7 +310,7 @@ impl Writer<'_> {
                     *signal = signal.as_signed();
                     table
                         .remarks
-                        .push(format!("{} is unsigned in the source, its values are of a signed number.", signal.name));
+                        .push(format!("{} is unsigned in the source, but its values are signed.", signal.name));
                 }
             }
             Some(table)
@@ -326,10 +327,10 @@ impl Writer<'_> {
             signals.sort_by_key(|signal| signal.bit);
             let heard = self.capture.answers.get(&key).and_then(|answers| answers.request);
             let request = heard.map_or_else(|| guessed_request(key.response), |(id, _)| id);
-            let mut remarks = vec!["Without a definition: places and scales are from plausible values.".to_owned()];
+            let mut remarks = vec!["Without a definition: positions and scales come from plausible values.".to_owned()];
             if heard.is_none() {
                 remarks.push("No request was heard: its identifier is a guess.".to_owned());
-                open.push(format!("to which identifier is {} asked? 0x{:X} is a guess", key.response, request.raw()));
+                open.push(format!("which identifier requests {}? 0x{:X} is a guess", key.response, request.raw()));
             }
             let first_byte = heard.and_then(|(_, first)| first).unwrap_or_default();
             let table = DiagnosticTable {
@@ -352,7 +353,7 @@ impl Writer<'_> {
         }
     }
 
-    /// Ages that suit the periods of the readings: answers come seldom.
+    /// Writes the largest ages, from the periods of the readings: answers are rare.
     fn limits(&self, selection: &Selection<'_>, text: &mut String) {
         let named = [
             ("current", Some(selection.current)),
@@ -366,7 +367,7 @@ impl Writer<'_> {
                 .iter()
                 .map(|index| self.signal(*index).series.period_s().unwrap_or(0.0))
                 .fold(0.0, f64::max);
-            // At least as long as the defaults of the configuration.
+            // Not below the defaults of the configuration.
             let age_s = (3.0 * period_s).max(2.0).ceil();
             let _ = write!(text, "\n[limits.{name}]\nmax_age_s = {age_s:.1}\n");
         }
@@ -375,9 +376,9 @@ impl Writer<'_> {
 
 fn guessed_request(response: CanId) -> CanId {
     match response {
-        // As ISO 15765-4 fixes it.
+        // As ISO 15765-4 defines it.
         CanId::Standard(id) => CanId::Standard(id.saturating_sub(8)),
-        // Normal fixed addressing: the two addresses change places.
+        // Normal fixed addressing: the two addresses are swapped.
         CanId::Extended(id) => {
             let [low, high, ..] = id.to_le_bytes();
             CanId::Extended(id & !0xFFFF | u32::from(low) << 8 | u32::from(high))
@@ -385,7 +386,7 @@ fn guessed_request(response: CanId) -> CanId {
     }
 }
 
-/// One line of a comment.
+/// Text for one line of a comment.
 fn plain(text: &str) -> String {
     text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect()
 }

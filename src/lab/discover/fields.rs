@@ -1,13 +1,13 @@
-//! Bit fields of messages that no DBC describes: which behave like pack voltage, current or cell voltages.
+//! Finds bit fields that behave like pack voltage, current or cell voltages, in messages that no DBC describes.
 //!
-//! * Voltage: 16 bits at every byte and 12 bits at every half byte, both byte orders, customary scales; the value is one of a
-//!   pack, moves a little, and its last digits are alive.
-//! * Current: the same places, signed; its changes go with those of a voltage as a resistance would have it. The scale is the
-//!   one of the customary ones that gives the most usual resistance: a guess.
-//! * Cells: neighbours of 8, 12 or 16 bits close to one another, at least three in each message or page (first byte), at least
-//!   eight in all.
+//! * Voltage: 16 bits at every byte and 12 bits at every half byte, both byte orders, common scales. The value is that of a
+//!   pack, changes slightly, and its last digits vary.
+//! * Current: the same positions, signed; its changes match those of a voltage across a resistance. Of the common scales, the
+//!   one with the most typical resistance is guessed.
+//! * Cells: neighbouring fields of 8, 12 or 16 bits with similar values, at least three in each message or page (first byte),
+//!   and at least eight in total.
 //!
-//! Temperatures and charge show no behaviour of their own within minutes: they are not looked for.
+//! Temperatures and SOC have no characteristic behaviour within minutes, so they are not searched for.
 
 use std::collections::BTreeSet;
 
@@ -19,20 +19,20 @@ use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 use crate::can::unit::Quantity;
 use crate::wiring::evidence::{Series, Slope};
 
-/// Payloads judged of a message, or of each of its pages.
+/// Most payloads evaluated of a message, or of each of its pages.
 const MAX_PAYLOADS: usize = 1500;
-/// Plausible voltages of a pack, V, and V per code.
+/// Plausible voltages of a pack, V, and scales, V per code.
 const PACK_V: (f64, f64) = (100.0, 950.0);
 const PACK_SCALES: [f64; 5] = [0.1, 0.01, 0.05, 0.25, 0.5];
-/// A per code of a current.
+/// Scales of a current, A per code.
 const CURRENT_SCALES: [f64; 7] = [0.1, 0.01, 0.05, 0.025, 0.25, 0.5, 1.0];
-/// Plausible voltages of a cell, V; cells of a pack are at most so far apart.
+/// Plausible voltages of a cell, V, and largest difference between cells of a pack.
 const CELL_V: (f64, f64) = (2.5, 4.4);
 const MAX_SPREAD_V: f64 = 0.25;
-/// Bits of a cell voltage and V per code.
+/// Number of bits of a cell voltage, with scales, V per code.
 const CELL_FORMS: [(u16, &[f64]); 3] = [(16, &[0.001, 0.0001, 0.002, 0.0005]), (12, &[0.001, 0.002]), (8, &[0.02])];
 
-/// Name of a message without a DBC. Decimal: its digits are then one number.
+/// Name of a message without a DBC. The identifier is decimal, so that its digits form one number.
 pub(super) fn message_name(id: CanId) -> String {
     format!("Message{}", id.raw())
 }
@@ -62,12 +62,12 @@ pub(super) fn signals(capture: &Capture) -> Vec<LogSignal> {
     found
 }
 
-/// Payloads of a message, not more than a judgement needs.
+/// Payloads of a message, as many as the evaluation needs.
 struct Samples<'a> {
     key: MessageKey,
     /// Length of the shortest payload, at most that of a classic frame.
     bytes: usize,
-    /// Values of the first byte where they are pages; otherwise one `None`.
+    /// Values of the first byte if they number pages; otherwise one `None`.
     pages: Vec<Option<u8>>,
     payloads: Vec<(f64, &'a [u8])>,
 }
@@ -77,7 +77,7 @@ impl<'a> Samples<'a> {
         let bytes = payloads.iter().map(|(_, data)| data.len()).min().unwrap_or(0).min(8);
         let pages = pages(payloads);
         let payloads = if pages.len() > 1 {
-            // Thinned evenly, whole pages might be lost.
+            // Even thinning might drop whole pages.
             payloads.iter().take(MAX_PAYLOADS * pages.len()).collect()
         } else {
             payloads.iter().step_by(payloads.len().div_ceil(MAX_PAYLOADS).max(1)).collect()
@@ -96,7 +96,7 @@ fn swing(series: &Series) -> f64 {
     series.extent.range() / series.extent.max
 }
 
-/// Layouts of 16 bits at every byte and 12 bits at every half byte, both byte orders.
+/// Layouts of 16 bits at every byte and of 12 bits at every half byte, in both byte orders.
 fn layouts(bytes: usize, signed: bool) -> Vec<SignalLayout> {
     let last = u16::try_from(8 * bytes).unwrap_or(0);
     let mut found = Vec::new();
@@ -112,7 +112,7 @@ fn layouts(bytes: usize, signed: bool) -> Vec<SignalLayout> {
     found
 }
 
-/// A field by its first bit in the order of the wire: of little-endian fields counted from bit 0 of each byte up.
+/// Layout of a field by its first bit in wire order; for little-endian fields, bits are counted up from bit 0 of each byte.
 fn layout(first: u16, bits: u16, byte_order: ByteOrder, value_type: ValueType, factor: f64) -> SignalLayout {
     let start_bit = match byte_order {
         ByteOrder::LittleEndian => first,
@@ -153,7 +153,7 @@ fn signal(
     LogSignal::unnamed(full_name, key.0, origin, quantity, series)
 }
 
-/// Place of a field in a name: first bit and byte order.
+/// Position of a field in its name: first bit and byte order.
 fn place(layout: &SignalLayout) -> String {
     let order = if layout.byte_order == ByteOrder::LittleEndian { "little" } else { "big" };
     format!("{}bits_at_{}_{order}", layout.length_bits, layout.start_bit)
@@ -163,7 +163,7 @@ fn voltages_of(samples: &Samples<'_>) -> Vec<LogSignal> {
     let mut found = Vec::new();
     for layout in layouts(samples.bytes, false) {
         let codes = samples.values(&layout, None);
-        // A pack voltage moves by less within a log.
+        // The voltage of a pack moves by less within a log.
         let is_alive = codes.bad() == 0 && codes.distinct() >= 5 && swing(&codes) <= 0.35;
         if !is_alive || codes.is_counter() {
             continue;
@@ -186,7 +186,7 @@ fn voltages_of(samples: &Samples<'_>) -> Vec<LogSignal> {
     found
 }
 
-/// The fields whose changes go best with those of a voltage, or of a cell.
+/// The fields whose changes correlate best with those of a voltage, or of a cell.
 fn currents<'a>(messages: impl Iterator<Item = &'a Samples<'a>>, voltages: &[&LogSignal]) -> Vec<LogSignal> {
     let mut found: Vec<(f64, LogSignal)> = Vec::new();
     for samples in messages {
@@ -199,14 +199,14 @@ fn currents<'a>(messages: impl Iterator<Item = &'a Samples<'a>>, voltages: &[&Lo
             let related = others
                 .filter_map(|voltage| Some((Slope::between(&voltage.series, &codes)?, voltage.series.extent.mean())));
             let best = related
-                // Thousands of fields are compared.
+                // Thousands of fields are compared, so the limits are high.
                 .filter(|(slope, _)| slope.correlation().abs() >= 0.6 && slope.strength() >= 7.0)
                 .max_by(|a, b| a.0.correlation().abs().total_cmp(&b.0.correlation().abs()));
             let Some((slope, mean_v)) = best else { continue };
             let distance = |factor: &f64| {
-                // Of a usual pack: 0.1 ohm at 400 V.
+                // Typical pack: 0.1 ohm at 400 V.
                 let unusual = (slope.ohm.abs() / factor / mean_v / 2.5e-4).ln().abs();
-                // The first scale is the most customary one.
+                // The first scale is the most common one.
                 if *factor == CURRENT_SCALES[0] { unusual - 0.25 } else { unusual }
             };
             let factor = CURRENT_SCALES.iter().copied().min_by(|a, b| distance(a).total_cmp(&distance(b)));
@@ -220,7 +220,7 @@ fn currents<'a>(messages: impl Iterator<Item = &'a Samples<'a>>, voltages: &[&Lo
     found.into_iter().take(12).map(|(_, signal)| signal).collect()
 }
 
-/// Whether a field overlaps with a layout of the same message, on whatever interface: gateways repeat messages.
+/// Whether a field overlaps a layout of the same message, on any interface: gateways repeat messages.
 fn shares_bits(field: &LogSignal, id: CanId, layout: &SignalLayout) -> bool {
     matches!(&field.origin, SignalOrigin::Field(own) if own.id == id && own.signal.layout.overlaps(layout))
 }
@@ -235,7 +235,7 @@ impl LogSignal {
     }
 }
 
-/// Rows of neighbours in messages and pages, all of one form, numbered through.
+/// Rows of neighbouring cells in messages and pages, all with one form, numbered consecutively.
 fn cells(messages: &[Samples<'_>]) -> Vec<LogSignal> {
     let mut best: Vec<LogSignal> = Vec::new();
     for (bits, scales) in CELL_FORMS {
@@ -256,7 +256,7 @@ fn cells_of_form(messages: &[Samples<'_>], bits: u16, factor: f64, byte_order: B
     for samples in messages {
         let end = u16::try_from(8 * samples.bytes).unwrap_or(0);
         for page in &samples.pages {
-            // Page, then perhaps a byte of flags.
+            // The page, and possibly a byte of flags.
             let first = if page.is_some() { 8 } else { 0 };
             let starts = (first..first + 16).step_by(if bits == 12 { 4 } else { 8 });
             let rows = starts.map(|start| {
@@ -275,14 +275,14 @@ fn cells_of_form(messages: &[Samples<'_>], bits: u16, factor: f64, byte_order: B
     found
 }
 
-/// Whether a row may be of the same pack as the cells so far.
+/// Whether a row may belong to the same pack as the cells so far.
 fn continues(cells: &[LogSignal], key: MessageKey, row: &[(SignalLayout, Series)]) -> bool {
     cells.first().is_none_or(|first| {
         first.bus == key.0 && (first.series.extent.mean() - row[0].1.extent.mean()).abs() <= MAX_SPREAD_V
     })
 }
 
-/// The pages of a message: the values of its first byte where they count up; otherwise the message as a whole.
+/// Pages of a message: the values of its first byte if they are consecutive; otherwise the message as a whole.
 fn pages(payloads: &Payloads) -> Vec<Option<u8>> {
     let values: BTreeSet<u8> = payloads.iter().filter_map(|(_, data)| data.first().copied()).collect();
     let span = values.first().zip(values.last()).map_or(0, |(first, last)| usize::from(last - first) + 1);
@@ -290,7 +290,7 @@ fn pages(payloads: &Payloads) -> Vec<Option<u8>> {
     if is_counter { values.into_iter().map(Some).collect() } else { vec![None] }
 }
 
-/// The longest run of plausible neighbours that are close together.
+/// The longest run of plausible neighbours with similar values.
 fn row(
     samples: &Samples<'_>,
     page: Option<u8>,
@@ -304,7 +304,7 @@ fn row(
     let row = longest_run(neighbours, |(_, first), (_, next)| {
         (next.extent.mean() - first.extent.mean()).abs() <= MAX_SPREAD_V
     });
-    // Bytes that never change are rather text or constants.
+    // Bytes that never change are more likely text or constants.
     let is_alive = row.iter().any(|(_, series)| !series.is_constant());
     if is_alive { row } else { Vec::new() }
 }
@@ -323,7 +323,7 @@ pub(super) fn database(fields: &[&MessageField]) -> Database {
         signal.conditions = field.page.map(condition).into_iter().collect();
         messages[place].signals.push(signal);
     }
-    let comment = "Found by packwatch discover from values alone: places and scales are guesses".to_owned();
+    let comment = "Found by packwatch discover from values alone: positions and scales are guesses".to_owned();
     Database { nodes: Vec::new(), comment: Some(comment), messages }
 }
 

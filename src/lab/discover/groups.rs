@@ -1,20 +1,20 @@
-//! Signals whose names differ in numbers alone: cells, sensors.
+//! Groups signals whose names differ only in numbers: cells, sensors.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 /// A group.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct SignalGroup {
-    /// Name with `{n}`, and `{m}` for further numbers.
+    /// Name with `{n}` for the counted number, and `{m}` for other varying numbers.
     pub(crate) pattern: String,
-    /// Signals by their number.
+    /// Signals with their numbers.
     pub(crate) members: Vec<(u32, usize)>,
 }
 
-/// A name as one of several: its number among all, and the numbers in it.
+/// A name: its index among all names, and the numbers in it.
 type NumberedName<'a> = (usize, Vec<&'a str>);
 
-/// Groups of at least two names of one partition. The number that differs most is the group's, of several the last.
+/// Groups of at least two names in one partition. The number that varies most counts the group; of several such, the last.
 pub(crate) fn groups(names: &[(String, &str)]) -> Vec<SignalGroup> {
     let mut found: BTreeMap<(&str, Vec<&str>), Vec<NumberedName<'_>>> = BTreeMap::new();
     for (index, (partition, name)) in names.iter().enumerate() {
@@ -63,7 +63,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_number_that_differs_most_counts_the_group() {
+    fn most_varying_number_counts_the_group() {
         let names = ["Page1.Cell01", "Page1.Cell02", "Page2.Cell03", "Page2.Cell04", "Other.Cell", "Page1.Temp7"];
         let names: Vec<(String, &str)> = names.iter().map(|name| (String::new(), *name)).collect();
         let members = vec![(1, 0), (2, 1), (3, 2), (4, 3)];
@@ -71,7 +71,7 @@ mod tests {
     }
 
     #[test]
-    fn names_of_other_partitions_and_doubled_numbers_are_no_group() {
+    fn other_partitions_and_repeated_numbers_form_no_group() {
         let apart = [("can0".to_owned(), "A.Cell1"), ("can1".to_owned(), "A.Cell2")];
         assert_eq!(groups(&apart), []);
         let doubled = [("".to_owned(), "A1.Cell1"), ("".to_owned(), "A2.Cell1"), ("".to_owned(), "A1.Cell2")];

@@ -1,8 +1,8 @@
-//! Which signal is which quantity: points for names and units ([`SignalLabel`](crate::wiring::evidence::SignalLabel)), ranges and
-//! behaviour, each with its reason in words.
+//! Scores which signal is which quantity: points for names and units ([`SignalLabel`](crate::wiring::evidence::SignalLabel)), ranges
+//! and behaviour, each with its reason in words.
 //!
-//! The points are weights of evidence, chosen on three cars: what contradicts a quantity excludes it (range), a unit and a name
-//! count 1 to 3 each, and behaviour that hardly anything else shows (voltage that falls with current, a sum of cells) 3 to 4.
+//! The points are weights of evidence, chosen on three cars. A contradiction excludes a quantity (range); a unit or a name counts 1 to
+//! 3 points; behaviour that hardly any other signal shows (a voltage that falls with current, a sum of cells) counts 3 to 4.
 
 use super::groups::{SignalGroup, groups};
 use super::log_signal::{LogSignal, SignalOrigin};
@@ -16,7 +16,7 @@ use crate::wiring::evidence::{PackQuantity, Score, Series, Slope};
 /// Evidence for one signal or group.
 #[derive(Debug, Clone)]
 pub(super) struct Evidence {
-    /// Numbers of the signals.
+    /// Indices of the signals.
     pub(super) members: Vec<usize>,
     name: String,
     bus: BusIndex,
@@ -24,27 +24,27 @@ pub(super) struct Evidence {
     low: f64,
     high: f64,
     positive: Option<PositiveDirection>,
-    /// A pack voltage that is the sum of cells.
+    /// Whether a pack voltage equals the sum of cells.
     is_sum: bool,
 }
 
 impl Evidence {
-    /// What the label says; `None` = it says another quantity, or the values are outside the range (both ends included).
+    /// Evidence from the label; `None` = it names another quantity, or values are outside the range (ends included).
     fn new(index: usize, signal: &LogSignal, quantity: PackQuantity, range: (f64, f64)) -> Option<Self> {
         let (low, high) = (signal.series.extent.min, signal.series.extent.max);
         let mut score = signal.label.score(quantity).filter(|_| low >= range.0 && high <= range.1)?;
-        // A field without a name is here because of its values.
+        // An unnamed field was selected by its values.
         if signal.is_unnamed() {
             score = Score::default();
         }
-        // Temperatures and charge of a pack hardly change within minutes.
+        // Temperatures and SOC of a pack hardly change within minutes.
         let points = match quantity {
             PackQuantity::Temperature | PackQuantity::Soh => 0.0,
             PackQuantity::Soc => -0.5,
             PackQuantity::Current | PackQuantity::PackVoltage | PackQuantity::CellVoltage => -1.5,
         };
         let is_constant = signal.series.is_constant() && (!signal.is_unnamed() || points == 0.0);
-        score.add(points, is_constant, "it never changes in this log");
+        score.add(points, is_constant, "never changes in this log");
         let (members, name, bus) = (vec![index], signal.name.clone(), signal.bus);
         Some(Self { members, name, bus, score, low, high, positive: None, is_sum: false })
     }
@@ -53,7 +53,7 @@ impl Evidence {
         self.score.add(points, holds, reason);
     }
 
-    /// Whether the values stay within the range of a pack at work.
+    /// Whether the values stay within the range of a pack in use.
     fn is_steady(&self) -> bool {
         self.high - self.low <= 0.35 * self.high
     }
@@ -94,7 +94,7 @@ pub(super) fn candidates(signals: &[LogSignal], interfaces: &[String]) -> Vec<Ca
     all.into_iter().flat_map(|(quantity, evidence)| ranked(quantity, evidence, interfaces)).collect()
 }
 
-/// Only signals of one interface and source form groups. Numbers of an answer's own name are no numbers of cells.
+/// Only signals with the same partition form groups: one interface and one source. Numbers in the name of an answer do not count cells.
 fn partition(signal: &LogSignal) -> String {
     let source = match &signal.origin {
         SignalOrigin::Dbc(_) => String::new(),
@@ -114,7 +114,7 @@ fn sort(evidence: &mut [Evidence]) {
 
 fn ranked(quantity: PackQuantity, mut evidence: Vec<Evidence>, interfaces: &[String]) -> Vec<Candidate> {
     sort(&mut evidence);
-    // A field is there once, with the best of its scales.
+    // A field appears once, with its best scale.
     let mut known = std::collections::BTreeSet::new();
     evidence.retain(|evidence| known.insert((evidence.bus, evidence.name.clone())));
     let good = evidence.into_iter().filter(|evidence| evidence.score.points >= 2.5).take(10);
@@ -139,42 +139,42 @@ fn voltage(index: usize, signal: &LogSignal) -> Option<Evidence> {
     if signal.is_unnamed() {
         return Some(raw_voltage(evidence, signal));
     }
-    evidence.add(1.0, evidence.is_steady(), "range of a pack at work");
+    evidence.add(1.0, evidence.is_steady(), "range of a pack in use");
     evidence.add(-1.0, evidence.high < 60.0, "");
     Some(evidence)
 }
 
-/// A field without a name: what a pack's voltage looks like.
+/// Adds evidence that an unnamed field looks like a pack voltage.
 fn raw_voltage(mut evidence: Evidence, signal: &LogSignal) -> Evidence {
     let (series, low, high) = (&signal.series, evidence.low, evidence.high);
-    evidence.add(2.0, (250.0..=850.0).contains(&series.extent.mean()), "a usual voltage of a pack");
-    evidence.add(1.5, high - low <= 0.05 * high && high > low, "changes by little");
-    evidence.add(1.5, 2 * series.distinct() >= series.values.kept().len().min(100), "its last digits are alive");
-    evidence.add(-1.5, high == low, "it never changes in this log");
+    evidence.add(2.0, (250.0..=850.0).contains(&series.extent.mean()), "typical voltage of a pack");
+    evidence.add(1.5, high - low <= 0.05 * high && high > low, "changes slightly");
+    evidence.add(1.5, 2 * series.distinct() >= series.values.kept().len().min(100), "its last digits vary");
+    evidence.add(-1.5, high == low, "never changes in this log");
     let step = signal.field().map_or(0.0, |field| field.factor);
-    evidence.add(-1.0, step > 0.2, "its steps would be coarse");
+    evidence.add(-1.0, step > 0.2, "coarse steps");
     evidence
 }
 
-/// A field without a name: what a pack's current looks like.
+/// Adds evidence that an unnamed field looks like a pack current.
 fn raw_current(mut evidence: Evidence, signal: &LogSignal) -> Evidence {
     let Some(field) = signal.field() else {
-        // A field of a message is here because it moves with a voltage.
+        // A field of a message was selected because it moves with a voltage.
         evidence.add(1.0, true, "its scale is a guess");
-        // A shorter field may be cut out of a longer one.
+        // A shorter field may be a part of a longer one.
         let is_long = matches!(&signal.origin, SignalOrigin::Field(own) if own.signal.layout.length_bits > 12);
         evidence.add(0.5, is_long, "");
-        evidence.add(1.0, evidence.has_both_signs(), "takes both signs");
+        evidence.add(1.0, evidence.has_both_signs(), "has both signs");
         return evidence;
     };
-    // A number of 24 or 32 bits that needs 16 of them is one on purpose.
+    // A signed field of 24 or 32 bits whose values fit into 16 is sign-extended, so it is a real number.
     let needed = 32_768.0 * field.factor;
     let is_extended = field.length > 16 && evidence.low >= -needed && evidence.high <= needed && evidence.low < 0.0;
-    // The shorter forms are in the longest one.
+    // A longer form contains the shorter ones.
     let points = if field.length == 32 { 3.0 } else { 2.0 };
-    evidence.add(points, is_extended, &format!("a number of {} bits with a sign", field.length));
+    evidence.add(points, is_extended, &format!("a signed number of {} bits", field.length));
     evidence.add(-1.0, evidence.high - evidence.low < 1.0, "hardly moves");
-    evidence.add(1.0, evidence.has_both_signs(), "takes both signs");
+    evidence.add(1.0, evidence.has_both_signs(), "has both signs");
     evidence.add(1.0, evidence.high - evidence.low <= 600.0, "");
     evidence
 }
@@ -185,7 +185,7 @@ impl LogSignal {
         good >= 0.8 * (good + bad)
     }
 
-    /// Whether nothing but its values says what it is.
+    /// Whether the signal is known only by its values.
     fn is_unnamed(&self) -> bool {
         matches!(self.origin, SignalOrigin::Raw(..) | SignalOrigin::Field(_))
     }
@@ -202,7 +202,7 @@ impl LogSignal {
         own == others && spans.is_some_and(|(a, b)| a.0 <= b.1 && b.0 <= a.1)
     }
 
-    /// The field of an answer without a definition.
+    /// Field of an answer without a definition.
     fn field(&self) -> Option<&crate::import::DiagnosticSignal> {
         match &self.origin {
             SignalOrigin::Raw(_, field) => Some(field),
@@ -216,18 +216,18 @@ fn current(index: usize, signal: &LogSignal) -> Option<Evidence> {
     if signal.is_unnamed() {
         return Some(raw_current(evidence, signal));
     }
-    evidence.add(1.0, evidence.has_both_signs(), "takes both signs");
-    evidence.add(0.0, signal.is_read_signed, "its definition says unsigned, its values are of a signed number");
-    evidence.add(-1.5, evidence.low == 0.0 && evidence.high == 0.0, "is 0 all the time");
+    evidence.add(1.0, evidence.has_both_signs(), "has both signs");
+    evidence.add(0.0, signal.is_read_signed, "its definition says unsigned, but its values are signed");
+    evidence.add(-1.5, evidence.low == 0.0 && evidence.high == 0.0, "is always 0");
     Some(evidence)
 }
 
-/// Voltages of one cell, V.
+/// Plausible voltages of one cell, V.
 const CELL_V: (f64, f64) = (1.5, 4.5);
 
 fn single_cell(index: usize, signal: &LogSignal) -> Option<Evidence> {
     let mut evidence = Evidence::new(index, signal, PackQuantity::CellVoltage, CELL_V)?;
-    evidence.add(1.0, signal.label.says_extreme(), "an extreme of the cells, no cell of its own");
+    evidence.add(1.0, signal.label.says_extreme(), "an extreme of the cells, not a single cell");
     Some(evidence)
 }
 
@@ -248,7 +248,7 @@ fn cell_group(group: &SignalGroup, signals: &[LogSignal]) -> Option<Evidence> {
     let (least, largest) = ends(members.iter().map(|index| signals[*index].series.extent.mean()));
     let spread = largest - least;
     let (together, is_moving) = moves_together(&members, signals);
-    let manner = if is_moving { ", that move together" } else { "" };
+    let manner = if is_moving { " that move together" } else { "" };
     let (count, left_out) = (members.len(), group.members.len() - members.len());
     let mut score = Score::default();
     score.add(2.0, true, &format!("{count} values of {low:.3} to {high:.3} V{manner}"));
@@ -259,12 +259,12 @@ fn cell_group(group: &SignalGroup, signals: &[LogSignal]) -> Option<Evidence> {
     score.add(1.0, first.label.has_unit_of(Quantity::Voltage), "unit V");
     score.add(2.0, first.label.says_cell(), "the name says cell");
     score.add(1.0, first.label.is_of_pack(), "");
-    score.add(0.0, left_out > 0, &format!("{left_out} more of this name have no plausible values"));
+    score.add(0.0, left_out > 0, &format!("{left_out} more with this name have no plausible values"));
     let (name, bus) = (group.pattern.clone(), first.bus);
     Some(Evidence { members, name, bus, score, low, high, positive: None, is_sum: false })
 }
 
-/// Mean correlation of the first members' changes with the first one's, and whether there are changes at all.
+/// Mean correlation of the first members' changes with the first member, and whether there are changes.
 fn moves_together(members: &[usize], signals: &[LogSignal]) -> (f64, bool) {
     let first = &signals[members[0]].series;
     let others = members.iter().skip(1).take(8);
@@ -296,14 +296,14 @@ fn temperature(index: usize, signal: &LogSignal) -> Option<Evidence> {
     let mut evidence = Evidence::new(index, signal, PackQuantity::Temperature, (-40.0, 90.0))?;
     evidence.add(1.5, signal.is_unnamed(), "may be a temperature: its scale is a guess");
     evidence.add(1.0, signal.series.largest_step() <= 2.0, "changes slowly");
-    evidence.add(-2.0, evidence.low <= -39.0 || (evidence.low == 0.0 && evidence.high == 0.0), "may be no value");
+    evidence.add(-2.0, evidence.low <= -39.0 || (evidence.low == 0.0 && evidence.high == 0.0), "may mean \"no value\"");
     Some(evidence)
 }
 
 fn soc(index: usize, signal: &LogSignal) -> Option<Evidence> {
     let mut evidence = Evidence::new(index, signal, PackQuantity::Soc, (0.0, 105.0))?;
     evidence.add(1.0, signal.series.largest_step() <= 1.0, "changes slowly");
-    evidence.add(-2.0, evidence.high == 0.0, "is 0 all the time");
+    evidence.add(-2.0, evidence.high == 0.0, "is always 0");
     Some(evidence)
 }
 
@@ -320,9 +320,9 @@ fn compare_sums(voltages: &mut [Evidence], cells: &mut [Evidence], signals: &[Lo
             let mean = signals[voltage.members[0]].series.extent.mean();
             if (mean / sum - 1.0).abs() <= 0.02 {
                 voltage.is_sum = true;
-                voltage.add(4.0, true, &format!("the sum of {} is {sum:.1} V", group.name));
+                voltage.add(4.0, true, &format!("equals the sum of {}, {sum:.1} V", group.name));
                 if !is_found {
-                    group.add(3.0, true, &format!("their sum, {sum:.1} V, is {}", voltage.name));
+                    group.add(3.0, true, &format!("their sum, {sum:.1} V, equals {}", voltage.name));
                 }
                 is_found = true;
             }
@@ -330,15 +330,15 @@ fn compare_sums(voltages: &mut [Evidence], cells: &mut [Evidence], signals: &[Lo
     }
 }
 
-/// Finds for each current the voltage that answers to it best, and the other way round; the direction gives the sign.
-/// A group of cells stands beside the pack voltages with its first cell.
+/// Finds for each current the voltage with the best response, and vice versa; the direction of the response gives the sign.
+/// A group of cells is represented by its first cell.
 fn compare_currents(
     voltages: &mut [Evidence],
     cells: &mut [Evidence],
     currents: &mut [Evidence],
     signals: &[LogSignal],
 ) {
-    // A field without a name is compared only where nothing better is known.
+    // An unnamed field is compared only if no better voltage is known.
     let is_known =
         |voltage: &Evidence| voltage.is_sum || !signals[voltage.members[0]].is_unnamed() || voltage.members.len() > 1;
     let has_known = voltages.iter().chain(cells.iter()).any(is_known);
@@ -347,7 +347,7 @@ fn compare_currents(
         let compared = voltages.iter_mut().take(40).chain(cells.iter_mut().take(5));
         let compared = compared.filter(|voltage| !has_known || is_known(voltage));
         let found = compared.filter_map(|voltage| Some((related(voltage)?, voltage)));
-        // A voltage that is likely by itself is better evidence than one that is not.
+        // A voltage with more evidence of its own is preferred.
         let weight = |slope: Slope, voltage: &Evidence| slope.correlation().abs() + 0.05 * voltage.score.points;
         let best = found.max_by(|a, b| weight(a.0, a.1).total_cmp(&weight(b.0, b.1)));
         let Some((slope, voltage)) = best else { continue };
@@ -371,13 +371,13 @@ fn compare_currents(
     }
 }
 
-/// How a voltage changes with a current, if that is the way of a pack and no coincidence.
+/// Response of a voltage to a current, if it is plausible for a pack and significant.
 fn response(voltage: &LogSignal, current: &LogSignal) -> Option<Slope> {
     let shares_bits = voltage.shares_bits(current);
     let slope = Slope::between(&voltage.series, &current.series).filter(|_| !shares_bits)?;
-    // 400 V have 4 milliohm to 4 ohm.
+    // At 400 V: 4 milliohm to 4 ohm.
     let is_plausible = (1e-5..=1e-2).contains(&(slope.ohm.abs() / voltage.series.extent.mean()));
-    // Many fields without names are compared: some agree by chance.
+    // Among many unnamed fields, some agree by chance.
     let is_raw = voltage.is_unnamed() || current.is_unnamed();
     let correlation = slope.correlation().abs();
     let is_significant = slope.strength() >= if is_raw { 4.0 } else { 2.0 };

@@ -1,4 +1,4 @@
-//! A signal that is in the log, and where it is described.
+//! A signal of the log, and the origin of its description.
 
 use super::capture::AnswerKey;
 use crate::can::CanId;
@@ -8,7 +8,7 @@ use crate::import::DiagnosticSignal;
 use crate::quantity::BusIndex;
 use crate::wiring::evidence::{Series, SignalLabel};
 
-/// A field of a message: its identifier, and the value of the first byte where that is a page.
+/// A field of a message: its identifier, and the value of the first byte if that is a page.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct MessageField {
     pub(super) id: CanId,
@@ -16,38 +16,38 @@ pub(super) struct MessageField {
     pub(super) signal: Signal,
 }
 
-/// Where a signal is described.
+/// Origin of a signal's description.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum SignalOrigin {
-    /// In a DBC file: its number.
+    /// A DBC file, by its number.
     Dbc(usize),
-    /// In a diagnostic answer that a definition describes: number of the table.
+    /// A definition of diagnostic answers, by the number of its table.
     Defined(usize),
-    /// In an answer without a definition.
+    /// None: a field of an answer.
     Raw(AnswerKey, Box<DiagnosticSignal>),
-    /// In a message without a DBC.
+    /// None: a field of a message.
     Field(Box<MessageField>),
 }
 
-/// A signal that is in the log.
+/// A signal of the log.
 #[derive(Debug)]
 pub(super) struct LogSignal {
     /// `Message.Signal`.
     pub(super) name: String,
     pub(super) bus: BusIndex,
     pub(super) origin: SignalOrigin,
-    /// What its names and unit say.
+    /// Meaning of its names and unit.
     pub(super) label: SignalLabel,
-    /// Values in V, A, degrees Celsius, per cent, or as they are.
+    /// Values in V, A, degrees Celsius or percent, otherwise unconverted.
     pub(super) series: Series,
-    /// Its definition says unsigned, its values are of a signed number.
+    /// Whether it is read as signed although its definition says unsigned.
     pub(super) is_read_signed: bool,
-    /// Factor and offset from the description's unit to V, A, degrees Celsius or per cent.
+    /// Factor and offset from the description's unit to V, A, degrees Celsius or percent.
     pub(super) conversion: (f64, f64),
 }
 
 impl LogSignal {
-    /// A field that no description names: places say nothing about a meaning.
+    /// Creates an unnamed field: its label says nothing about the meaning.
     pub(super) fn unnamed(
         name: String,
         bus: BusIndex,
@@ -60,7 +60,7 @@ impl LogSignal {
     }
 }
 
-/// The longest run of neighbours that go with the first of the run, of several the last; `None` ends a run.
+/// The longest run of items that go with the first of the run; of several, the last. `None` ends a run.
 pub(super) fn longest_run<T>(items: impl Iterator<Item = Option<T>>, goes_with: impl Fn(&T, &T) -> bool) -> Vec<T> {
     let (mut best, mut run) = (Vec::new(), Vec::new());
     for item in items.chain([None]) {

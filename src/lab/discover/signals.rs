@@ -1,5 +1,5 @@
-//! Signals of a log with their values: from DBC files, from definitions of diagnostic answers, and from fields of answers that
-//! no definition describes.
+//! Signals of a log with their values: from DBC files, from definitions of diagnostic answers, and fields of answers without a
+//! definition.
 
 use super::capture::{AnswerKey, Answers, Capture, MessageKey, Payloads};
 use super::log_signal::{LogSignal, SignalOrigin};
@@ -11,17 +11,17 @@ use crate::import::{DiagnosticSignal, DiagnosticTable};
 use crate::quantity::{Channel, Fault};
 use crate::wiring::evidence::{Series, SignalLabel, recorded_value};
 
-/// Fewest valid values of a signal; fewer are a coincidence.
+/// Smallest number of valid values of a signal.
 const MIN_VALUES: u64 = 2;
 
-/// Descriptions that the user gave.
+/// Descriptions given by the user.
 #[derive(Debug, Default)]
 pub(super) struct Descriptions {
     pub(super) databases: Vec<Database>,
     pub(super) tables: Vec<DiagnosticTable>,
 }
 
-/// Every signal of the log with values, in a fixed order, and remarks about described ones of the battery without any.
+/// All signals of the log with values, in a fixed order, and remarks on described battery signals without values.
 pub(super) fn signals(capture: &Capture, descriptions: &Descriptions) -> (Vec<LogSignal>, Vec<String>) {
     let mut signals = Vec::new();
     let mut rows = raw::CellRows::default();
@@ -49,16 +49,13 @@ pub(super) fn signals(capture: &Capture, descriptions: &Descriptions) -> (Vec<Lo
     (usable, remarks)
 }
 
-/// What is wrong with a voltage or current of the battery that is in the log and never has a value.
+/// Remark on a voltage or current of the battery that is in the log but never has a valid value.
 fn remark(signal: &LogSignal) -> Option<String> {
     let LogSignal { label, series, .. } = signal;
     let is_wanted = label.has_unit_of(Quantity::Voltage) || label.has_unit_of(Quantity::Current);
     let readings = series.bad();
     (label.is_of_pack() && is_wanted && readings >= MIN_VALUES).then(|| {
-        format!(
-            "{}: all {readings} readings are outside its range or not available: is its definition right?",
-            signal.name
-        )
+        format!("{}: all {readings} readings are out of range or not available: is its definition right?", signal.name)
     })
 }
 
@@ -68,14 +65,14 @@ fn is_answer(table: &DiagnosticTable, key: &AnswerKey) -> bool {
         == (key.response, key.extension, key.service, key.identifier)
 }
 
-/// Factor and offset from a unit to V, A, degrees Celsius or per cent.
+/// Factor and offset from a unit to V, A, degrees Celsius or percent.
 fn conversion(unit: &str) -> (f64, f64) {
     SignalUnit::parse(unit).map_or((1.0, 0.0), |unit| (unit.factor, unit.offset))
 }
 
 fn of_message(key: MessageKey, payloads: &Payloads, file: usize, message: &Message) -> Vec<LogSignal> {
     let of_signal = |signal: &Signal| {
-        // The channel says nothing about the reading.
+        // The channel does not affect the reading.
         let mut binding = Binding::new(key.0, message, signal, Channel::Current).ok()?;
         let conversion = conversion(&signal.unit);
         (binding.scale, binding.offset) = conversion;
@@ -119,8 +116,8 @@ fn of_definition(
     each.collect()
 }
 
-/// Values of a defined signal. A current that its definition calls unsigned is read as a signed number where that brings
-/// values at both ends of its codes together: a few negative amperes look like thousands.
+/// Values of a defined signal. An unsigned current is read as signed if this brings values at both ends of its range together:
+/// read as unsigned, a few negative amperes look like thousands.
 fn values(answers: &Answers, signal: &DiagnosticSignal, conversion: (f64, f64), is_current: bool) -> (Series, bool) {
     let collect = |signal: &DiagnosticSignal| {
         let value = |data: &[u8]| {

@@ -1,4 +1,4 @@
-//! Logs made here: what is found in them, and what is not.
+//! Synthetic logs: found signals, and signals that must not be found.
 
 #![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
 
@@ -22,7 +22,7 @@ BO_ 512 Motor: 8 A
  SG_ LinkVoltage : 16|16@1+ (0.1,0) [0|1000] "V" A
 "#;
 
-/// A load that moves without repeating soon, A.
+/// A load without a short period, A.
 fn load_a(step: i32) -> f64 {
     let x = f64::from(step);
     (80.0 * (x * 0.7).sin() + 40.0 * (x * 0.23).cos()).round()
@@ -45,7 +45,7 @@ fn discover(discoverer: &Discoverer) -> Discovery {
     discoverer.finish(&["can0".to_owned()])
 }
 
-/// A pack whose voltage falls by 0.1 V per A; `sign` is that of the current on the bus.
+/// A pack whose voltage falls by 0.1 V per A; `sign`: sign of the current on the bus.
 fn pack(sign: f64) -> Discoverer {
     let mut discoverer = Discoverer::default();
     discoverer.add_database(Database::parse(DBC).unwrap());
@@ -66,7 +66,7 @@ fn pack(sign: f64) -> Discoverer {
 }
 
 #[test]
-fn the_sign_of_a_current_follows_from_the_voltage() {
+fn voltage_gives_the_sign_of_a_current() {
     for (sign, positive) in [(1.0, PositiveDirection::Discharge), (-1.0, PositiveDirection::Charge)] {
         let discovery = discover(&pack(sign));
         let best = &discovery.candidates[0];
@@ -82,7 +82,7 @@ fn the_sign_of_a_current_follows_from_the_voltage() {
 }
 
 #[test]
-fn a_configuration_needs_the_number_of_cells_and_then_has_all_inputs() {
+fn configuration_needs_cell_count_and_has_all_inputs() {
     let discoverer = pack(1.0);
     let discovery = discover(&discoverer);
     let settings = PackSettings {
@@ -99,7 +99,7 @@ fn a_configuration_needs_the_number_of_cells_and_then_has_all_inputs() {
     assert!(pack.open.iter().any(|question| question.contains("cell_model")), "{:?}", pack.open);
 }
 
-/// A controller as a Leaf's: group 01 with current and pack voltage, group 02 with 96 cells in mV; asked every second.
+/// A controller like a Leaf's: group 01 with current and pack voltage, group 02 with 96 cells in mV, requested every second.
 fn answers(seconds: i32, is_asked: bool) -> Discoverer {
     let mut discoverer = Discoverer::default();
     for step in 0..seconds {
@@ -128,7 +128,7 @@ fn answers(seconds: i32, is_asked: bool) -> Discoverer {
 }
 
 #[test]
-fn cells_current_and_voltage_are_found_in_answers_without_a_definition() {
+fn undefined_answers_reveal_cells_current_and_voltage() {
     let discoverer = answers(60, true);
     let discovery = discover(&discoverer);
     let cells = discovery.candidates.iter().find(|candidate| candidate.quantity == PackQuantity::CellVoltage).unwrap();
@@ -154,7 +154,7 @@ fn cells_current_and_voltage_are_found_in_answers_without_a_definition() {
 }
 
 #[test]
-fn a_request_that_was_not_heard_is_a_guess_that_is_named() {
+fn unheard_request_is_reported_as_a_guess() {
     let discoverer = answers(60, false);
     let settings = PackSettings { cell_model: "cell.toml".to_owned(), ..PackSettings::default() };
     let pack = discoverer.configuration(&discover(&discoverer), &settings).unwrap();
@@ -162,7 +162,7 @@ fn a_request_that_was_not_heard_is_a_guess_that_is_named() {
 }
 
 #[test]
-fn a_definition_that_calls_a_signed_current_unsigned_is_seen() {
+fn signed_current_defined_as_unsigned_is_detected() {
     let text = r#"{"commands": [{"hdr": "7E4", "rax": "7EC", "cmd": {"22": "0101"}, "freq": 1, "signals": [
         {"id": "X_HVBAT_CURR", "name": "", "fmt": {"bix": 0, "len": 16, "max": 6553.5, "div": 10, "unit": "amps"}},
         {"id": "X_HVBAT_DC_VOLT", "name": "", "fmt": {"bix": 32, "len": 16, "max": 100, "min": 50, "unit": "volts"}},
@@ -187,7 +187,7 @@ fn a_definition_that_calls_a_signed_current_unsigned_is_seen() {
     assert!(current.low < -50.0 && current.reasons.iter().any(|reason| reason.contains("unsigned")), "{current:?}");
     assert_eq!(discovery.remarks.len(), 1);
     assert!(
-        discovery.remarks[0].starts_with("X.HVBAT_DC_VOLT: all 60 readings are outside"),
+        discovery.remarks[0].starts_with("X.HVBAT_DC_VOLT: all 60 readings are out of range"),
         "{:?}",
         discovery.remarks
     );
@@ -217,7 +217,7 @@ fn answers_with_extended_addresses_are_read() {
 }
 
 #[test]
-fn memory_is_bounded_and_what_is_left_is_of_the_same_moments() {
+fn memory_is_bounded_and_keeps_the_same_times() {
     let mut capture = Capture::default();
     let mut handle = |n: i64, id: u32| capture.handle(time(n * 10), BusIndex(0), &frame(id, &[1, 2, 3, 4, 5, 6, 7, 8]));
     for n in 0..1_200_000 {
@@ -236,11 +236,11 @@ fn memory_is_bounded_and_what_is_left_is_of_the_same_moments() {
 
 proptest::proptest! {
     #[test]
-    fn no_log_panics(frames in proptest::collection::vec((0_i64..5000, 0_u32..4, proptest::collection::vec(proptest::num::u8::ANY, 0..9)), 0..200)) {
+    fn any_log_is_handled_without_panic(frames in proptest::collection::vec((0_i64..5000, 0_u32..4, proptest::collection::vec(proptest::num::u8::ANY, 0..9)), 0..200)) {
         let mut discoverer = pack(1.0);
         let ids = [0x100, 0x7BB, 0x79B, 0x6F1];
         for (at, id, mut data) in frames {
-            // Frames of messages over several frames are rare among random bytes.
+            // Multi-frame messages are rare among random bytes.
             if let Some(first) = data.first_mut() {
                 *first &= 0x3F;
             }

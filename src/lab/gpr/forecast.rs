@@ -1,15 +1,15 @@
-//! Forecasts future rows from past rows; needs no inputs of the future.
+//! Forecasts future rows from past rows, without future inputs.
 //!
-//! Input: a table of outputs, then other columns, in the order of time, in parts that do not belong together. A *window* at
-//! row t holds what is known then: for every column its value and its last differences ([`ForecastPlan::lags`] values in all). For every
-//! output and every horizon h there is a process of its own (a direct forecast) that predicts the change from t to t + h:
-//! errors of one step do not feed the next, and each horizon has its own noise. Without knowledge the forecast falls
-//! back to the mean change, so to persistence.
+//! Input: a table of outputs, then other columns, in order of time, in independent parts. A *window* at row t contains the data
+//! known then: the value and the last differences of every column ([`ForecastPlan::lags`] values in total). For every output and
+//! every horizon h, a separate process predicts the change from t to t + h (a direct forecast): errors of one step do not feed
+//! the next, and each horizon has its own noise. Without information, the forecast is the mean change, and thus close to
+//! persistence.
 //!
-//! The interval is calibrated on real forecasts: the process is fitted again to the beginning of the training
-//! rows and judged on the block that follows, block after block; its width at each place follows from |error| /
-//! standard deviation of these ([`spread`]). (Rows left out one by one would not do: windows overlap, and each row's
-//! neighbours reveal it.) No row after the origin is used.
+//! The interval is calibrated on real forecasts: the process is fitted again to the first training rows and judged on the
+//! block that follows, block after block. The width of the interval at each place follows from |error| / standard deviation
+//! of these forecasts ([`spread`]). (Leaving out single rows would not work: windows overlap, so its neighbours reveal each row.)
+//! No row after the origin is used.
 
 mod spread;
 mod windows;
@@ -28,13 +28,13 @@ use crate::regress::{
 
 pub use windows::{LagWindows, RowSpacing};
 
-/// Most lagged values of a column.
+/// Most values of a column in a window.
 pub const MAX_LAGS: usize = 200;
 /// Most rows ahead.
 pub const MAX_STEPS: usize = 10_000;
-/// Most horizons with a process of their own; there are no forecasts between them.
+/// Most horizons with a process; there are no forecasts between them.
 pub const MAX_HORIZONS: usize = 10;
-/// Where the blocks for the interval begin and end, parts of the training rows.
+/// Ends of the blocks for the interval, as parts of the training rows.
 const BLOCKS: [f64; 5] = [0.4, 0.55, 0.7, 0.85, 1.0];
 
 /// What to forecast.
@@ -42,13 +42,13 @@ const BLOCKS: [f64; 5] = [0.4, 0.55, 0.7, 0.85, 1.0];
 pub struct ForecastPlan {
     /// Number of the table's first columns to forecast.
     pub outputs: usize,
-    /// Values of each column that a window has, 1 or more.
+    /// Values of each column in a window, 1 or more.
     pub lags: usize,
     /// Rows ahead, 1 or more.
     pub steps: usize,
-    /// Part of the rows that is known: above 0, up to 1.
+    /// Known part of the rows: above 0, up to 1.
     pub origin: f64,
-    /// Most windows a process is fitted to, taken evenly from all there are, at changing phases.
+    /// Most windows to which a process is fitted, taken evenly from all windows, at changing phases.
     pub rows: usize,
     /// Kernel and search.
     pub settings: GprSettings,
@@ -57,9 +57,9 @@ pub struct ForecastPlan {
 /// Forecasts of all outputs.
 #[derive(Debug, Clone)]
 pub struct TableForecast {
-    /// Rows that were known.
+    /// Number of known rows.
     pub origin: usize,
-    /// Row from which the forecast at the origin is made: the last known one that has a window.
+    /// Row of the forecast at the origin: the last known row with a window.
     pub from: usize,
     /// By output.
     pub outputs: Vec<OutputForecast>,
@@ -68,9 +68,9 @@ pub struct TableForecast {
 /// Forecasts of one column.
 #[derive(Debug, Clone)]
 pub struct OutputForecast {
-    /// Its name.
+    /// Name of the column.
     pub name: String,
-    /// Its place in the table.
+    /// Index of the column in the table.
     pub column: usize,
     /// By rows ahead, rising.
     pub horizons: Vec<HorizonForecast>,
@@ -81,27 +81,27 @@ pub struct OutputForecast {
 pub struct HorizonForecast {
     /// Rows ahead.
     pub steps: usize,
-    /// Windows it learned from.
+    /// Number of training windows.
     pub trained: usize,
-    /// Forecasts that the interval's factor comes from.
+    /// Number of forecasts from which the interval's factor was computed.
     pub calibrated: usize,
-    /// Half width of the interval in standard deviations, where errors are as large as on the whole.
+    /// Half width of the interval in standard deviations, where errors are of average size.
     pub factor: f64,
-    /// Time of fit and calibration, s.
+    /// Duration of fit and calibration, s.
     pub fit_s: f64,
     /// Jitter added to diagonals.
     pub jitter: Jitter,
     /// The forecast made at the origin.
     pub at_origin: Prediction,
-    /// Rows after the origin from which forecasts were made, and the forecasts.
+    /// Rows after the origin at which forecasts were made, with the forecasts.
     pub held_out: Vec<(usize, Prediction)>,
-    /// Their errors; `None` when there are no rows after the origin.
+    /// Errors of these forecasts; `None` if there are no rows after the origin.
     pub score: Option<PredictionScore>,
-    /// Root of the mean squared error of persistence (the value stays as it is) over the same rows.
+    /// Root mean squared error of persistence (the value stays constant) over the same rows.
     pub persistence_rmse: Option<f64>,
 }
 
-/// Returns the horizons that get a process: all up to [`MAX_HORIZONS`], else that many with even ratios, including the first
+/// Returns the horizons with a process: all up to [`MAX_HORIZONS`], otherwise that many with constant ratios, including the first
 /// and the last.
 pub fn horizons(steps: usize) -> Vec<usize> {
     if steps <= MAX_HORIZONS {
@@ -114,10 +114,10 @@ pub fn horizons(steps: usize) -> Vec<usize> {
     all
 }
 
-/// Makes the forecasts. `done` receives the number of finished horizons, and of all.
+/// Makes the forecasts. `done` receives the number of finished horizons, and the number of all.
 ///
 /// # Errors
-/// Numbers out of range, too few rows for the lags and steps, or no positive definite matrix.
+/// Numbers are out of range, there are too few rows for the lags and steps, or a matrix is not positive definite.
 pub fn run(
     table: &ColumnTable,
     plan: &ForecastPlan,
@@ -196,14 +196,14 @@ impl HorizonTask<'_> {
         Ok((horizon, model))
     }
 
-    /// Windows that a process needs: more than it has features.
+    /// Smallest number of windows for a process: more than it has features.
     fn fewest(&self) -> usize {
-        // Fewest windows to train on.
+        // Smallest number of training windows.
         (self.windows.width() + 2).max(20)
     }
 
-    /// A process fitted to windows that were over before row `end`, and how many; `None` when these are too few. With
-    /// `fixed` hyperparameters nothing is searched.
+    /// A process fitted to windows that end before row `end`, with their number; `None` if there are too few. With
+    /// `fixed` hyperparameters, there is no search.
     fn fitted(
         &self,
         end: usize,
@@ -223,7 +223,7 @@ impl HorizonTask<'_> {
             (settings.start, settings.max_iterations, settings.restarts) = (fixed.to_vec(), 0, 0);
         } else if !start.is_empty() {
             settings.start = start.to_vec();
-            // Steps of a search that begins where the horizon before it ended.
+            // Most steps of a search that starts at the result of the previous horizon.
             settings.max_iterations = settings.max_iterations.min(20);
             settings.restarts = 0;
         }
@@ -231,14 +231,14 @@ impl HorizonTask<'_> {
         Ok(Some((fit(&rows, &settings, watcher)?, targets.len())))
     }
 
-    /// From forecasts of block after block by what came before it.
+    /// Calibrates the interval on blocks, each forecast by a process fitted to the rows before it.
     fn spread(&self, model: &Model, watcher: &mut ProgressCallback<'_>) -> Result<Spread, LabError> {
         let fixed: Vec<f64> = model.hyperparameters().into_iter().map(|h| h.value).collect();
         let at = |part: f64| ((self.origin as f64) * part).round() as usize;
         let (mut judged, mut features, mut ratios) = (Vec::new(), Vec::new(), Vec::new());
         for ends in BLOCKS.windows(2) {
             let (begin, end) = (at(ends[0]).max(1), at(ends[1]));
-            // The forecast row may lie beyond the block: a block may be shorter than the horizon.
+            // The forecast row may lie beyond the block, because a block may be shorter than the horizon.
             let mut rows = self.windows.between(begin, self.origin, self.steps);
             rows.retain(|row| *row < end);
             // Most windows of a block that are judged for the interval.
@@ -258,7 +258,7 @@ impl HorizonTask<'_> {
         Ok(Spread::new(judged, &features, ratios, self.steps + self.plan.lags))
     }
 
-    /// Forecasts of the value itself from some rows.
+    /// Forecasts of the value at some rows.
     fn predict(&self, model: &Model, rows: &[usize], spread: &Spread) -> Result<Vec<Prediction>, LabError> {
         if rows.is_empty() {
             return Ok(Vec::new());
@@ -287,7 +287,7 @@ impl HorizonTask<'_> {
     }
 }
 
-/// Writes every forecast: that at the origin and those after it, with the measured value where it is known.
+/// Writes every forecast, at the origin and after it, with the measured value if it is known.
 ///
 /// # Errors
 /// The file cannot be written.
@@ -309,11 +309,11 @@ pub fn write(path: &Path, data: &ColumnTable, forecast: &TableForecast) -> Resul
     write_csv(path, heads.map(str::to_owned).to_vec(), rows)
 }
 
-/// Returns at most `most` rows, one from each of as many equal stretches, at a position that differs from stretch to
-/// stretch: a fixed stride would always meet repeating rows, such as those of cycles, at the same phase.
+/// Returns at most `most` rows, one from each of as many equal stretches, at a position that differs between
+/// stretches: a fixed stride would always select repeating rows, such as those of cycles, at the same phase.
 fn chosen(all: &[usize], most: usize) -> Vec<usize> {
     let count = all.len().min(most);
-    // Multiples of the golden ratio: their fractions fill a stretch evenly and never repeat.
+    // Fractions of multiples of the golden ratio fill a stretch evenly and never repeat.
     let place = |k: usize| if count == all.len() { 0.0 } else { (k as f64 * 0.618_033_988_749_894_9).fract() };
     let at = |k: usize| ((k as f64 + place(k)) * all.len() as f64 / count as f64) as usize;
     (0..count).map(|k| all[at(k).min(all.len() - 1)]).collect()
@@ -324,7 +324,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn horizons_are_all_or_spread_evenly_in_ratio() {
+    fn horizons_are_all_or_evenly_spread_in_ratio() {
         assert_eq!(horizons(4), [1, 2, 3, 4]);
         let many = horizons(100);
         assert!(many.len() <= MAX_HORIZONS && many[0] == 1 && many.last() == Some(&100), "{many:?}");
@@ -332,11 +332,11 @@ mod tests {
     }
 
     #[test]
-    fn chosen_rows_are_spread_over_all_and_over_every_phase() {
+    fn chosen_rows_cover_all_stretches_and_phases() {
         let all: Vec<usize> = (100..10_100).collect();
         let some = chosen(&all, 100);
         assert!(some.len() == 100 && some.is_sorted_by(|a, b| a < b) && some[0] == 100 && some[99] >= 10_000);
-        // Rows that repeat every hundred: all tenths of the phase are met about as often.
+        // Rows that repeat every hundred: all tenths of the phase are selected about equally often.
         let mut met = [0; 10];
         some.iter().for_each(|row| met[row % 100 / 10] += 1);
         assert!(met.iter().all(|count| (8..=12).contains(count)), "{met:?}");

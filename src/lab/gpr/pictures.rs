@@ -1,5 +1,5 @@
-//! Pictures of regressions: predicted against measured, a stretch of rows with its interval, the error of every row; of
-//! forecasts: the fan at the origin, error and coverage over the horizon.
+//! Pictures of regressions (predicted against measured, a stretch of rows with its interval, the error of every row) and of
+//! forecasts (the fan at the origin, error and coverage over the horizon).
 
 use std::path::Path;
 
@@ -7,7 +7,7 @@ use super::forecast::{HorizonForecast, OutputForecast, TableForecast};
 use super::{ColumnTable, CrossValidation, table};
 use crate::chart::{self, Axis, Chart, Ink, Layer, Picture, PlotError, Point, Shape};
 
-/// Rows of the stretch that is drawn with its interval: each can be seen.
+/// Number of rows in the stretch that is drawn with its interval: single rows are visible.
 const STRETCH: usize = 150;
 
 /// Draws the cross-validation of every kernel, as SVG.
@@ -28,7 +28,7 @@ pub fn write_cross_validation(folder: &Path, data: &ColumnTable, all: &[CrossVal
 /// Draws the forecasts of every output.
 ///
 /// # Errors
-/// As [`write_cross_validation`].
+/// A file cannot be written.
 pub fn write_forecast(folder: &Path, data: &ColumnTable, forecast: &TableForecast) -> Result<(), PlotError> {
     for output in &forecast.outputs {
         let mut charts = vec![fan(data, forecast, output)];
@@ -45,7 +45,7 @@ fn write_charts(folder: &Path, name: &str, charts: Vec<Chart>) -> Result<(), Plo
     chart::write_stack(&folder.join(format!("{name}.svg")), &pictures)
 }
 
-/// Letters and digits, for a file's name.
+/// Letters and digits, for a file name.
 fn slug(text: &str) -> String {
     let words: Vec<&str> = text.split(|c: char| !c.is_ascii_alphanumeric()).filter(|word| !word.is_empty()).collect();
     let joined = match text.contains('*') {
@@ -110,7 +110,7 @@ fn stretch(validated: &CrossValidation, truth: &[f64], output: &str) -> Chart {
 fn errors(validated: &CrossValidation, truth: &[f64], output: &str) -> Chart {
     let all = || truth.iter().zip(&validated.folds.predictions).enumerate();
     let half = |p: &crate::regress::Prediction| (p.high_95 - p.low_95) / 2.0;
-    // The interval's width wobbles from row to row: its mean over a hundredth of the rows shows its width.
+    // The width of the interval varies from row to row, so it is averaged over a hundredth of the rows.
     let width = (truth.len() / 100).max(1);
     let halves = validated.folds.predictions.chunks(width).enumerate().map(|(k, chunk)| {
         let mean = chunk.iter().map(half).sum::<f64>() / chunk.len() as f64;
@@ -118,7 +118,7 @@ fn errors(validated: &CrossValidation, truth: &[f64], output: &str) -> Chart {
     });
     let layers =
         vec![points("error", Ink::Orange, all().map(|(row, (y, p))| (row as f64 + 1.0, p.mean - y))), band(halves)];
-    let title = "Error of every row (the outermost of many at one place), and the width of the interval";
+    let title = "Error of every row (the largest of many at one place), and the width of the interval";
     Chart::new(
         title,
         "row",
@@ -131,7 +131,7 @@ fn fan(data: &ColumnTable, forecast: &TableForecast, output: &OutputForecast) ->
     let most = output.horizons.last().map_or(1, |horizon| horizon.steps);
     let from = forecast.from;
     let value = |row: usize| data.row(row)[output.column];
-    // Rows before the origin that a fan shows, at least.
+    // Smallest number of rows before the origin in a fan.
     let rows = from.saturating_sub((2 * most).max(60))..(from + most + 1).min(data.len());
     let x = |row: usize| row as f64 - from as f64;
     let at = |horizon: &HorizonForecast| horizon.steps as f64;
@@ -144,7 +144,7 @@ fn fan(data: &ColumnTable, forecast: &TableForecast, output: &OutputForecast) ->
         Layer::line("forecast", Ink::Blue, [(0.0, value(from))].into_iter().chain(mean)),
     ];
     let title = format!("{}: forecast from row {} without any later data", stem(&output.name), from + 1);
-    Chart::new(title, "rows from the origin", table::label(&output.name), layers)
+    Chart::new(title, "rows after the origin", table::label(&output.name), layers)
 }
 
 fn growth(output: &OutputForecast) -> Chart {
@@ -175,11 +175,11 @@ fn coverage(output: &OutputForecast) -> Chart {
         Layer::new("95 %", Ink::Grey, Shape::Level(95.0)),
         Layer::line("forecast", Ink::Blue, output.horizons.iter().filter_map(inside)),
     ];
-    let title = "Part of the measured values inside the 95 % interval";
+    let title = "Share of the measured values inside the 95 % interval";
     Chart::new(title, "rows ahead", Axis::number("inside, %").within(0.0, 100.0), layers)
 }
 
-/// Forecasts of the last horizon against what came, over the rows they are for.
+/// Forecasts of the last horizon and measured values, at the rows they are for.
 fn held_out(data: &ColumnTable, output: &OutputForecast) -> Chart {
     let Some(horizon) = output.horizons.iter().rfind(|h| h.score.is_some()) else { return Chart::default() };
     let for_row = |row: usize| (row + horizon.steps) as f64 + 1.0;

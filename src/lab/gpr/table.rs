@@ -1,26 +1,26 @@
 //! Columns of CSV files by name, for regressions: any column may be an output or an input.
 //!
-//! Input: CSV, plain, gzip or zstd, one heading line; numbers in the requested columns. Output: those columns, row after row,
-//! with the file and line of each row. An empty field or NaN is a missing value: an error with its place, or its row is left
-//! out and counted. Anything else that is no finite number is always an error.
+//! Input: CSV, plain, gzip or zstd, with one header line and numbers in the requested columns. Output: these columns, row by row,
+//! with the file and line of each row. An empty field or NaN is a missing value: either an error with its place, or the row is left
+//! out and counted. Any other field that is not a finite number is always an error.
 
 use std::path::{Path, PathBuf};
 
 use crate::error::LabError;
 use crate::io::table::{PART_COLUMNS, Row, Table as CsvTable, TableError};
 
-/// Endings of column names that are units: `voltage` finds `voltage_v`.
+/// Endings of column names that are units: `voltage` matches `voltage_v`.
 const UNITS: [&str; 36] = [
     "a", "ma", "ah", "mah", "v", "mv", "w", "kw", "wh", "kwh", "c", "k", "f", "s", "ms", "us", "ns", "min", "h", "d",
     "days", "cycles", "hz", "ohm", "mohm", "percent", "pct", "ppm", "kg", "m", "mm", "pa", "bar", "n", "nm", "rpm",
 ];
-/// Most rows of a regression: their numbers take some gigabytes.
+/// Most rows of a regression; they take some gigabytes.
 const MAX_ROWS: usize = 5_000_000;
 
-/// Treatment of a row without a required value.
+/// Treatment of a row with a missing required value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MissingPolicy {
-    /// Reading fails, with file and line.
+    /// An error with file and line.
     Rejected,
     /// The row is left out and counted.
     Skipped,
@@ -29,22 +29,22 @@ pub enum MissingPolicy {
 /// Columns to read.
 #[derive(Debug, Clone)]
 pub struct ColumnSelection<'a> {
-    /// Columns that every row must have, by name, or by name without unit.
+    /// Columns that every row must have, by name with or without unit.
     pub columns: &'a [String],
-    /// Columns that need not be there, nor have a value in every row (NaN then).
+    /// Columns that may be missing, and whose values may be missing (NaN).
     pub optional: &'a [String],
-    /// Treatment of rows without a required value.
+    /// Treatment of rows with a missing required value.
     pub missing: MissingPolicy,
 }
 
 /// The column whose values separate parts.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum PartColumn {
-    /// None: every file is one run of rows.
+    /// No column: every file is one part.
     None,
     /// This one.
     Named(String),
-    /// The first of `cycle`, `segment` and `ref` that is there.
+    /// The first of `cycle`, `segment` and `ref` that exists.
     Default,
 }
 
@@ -63,17 +63,17 @@ impl PartColumn {
 pub struct ColumnTable {
     /// Full names of the columns in the requested order; a missing optional column has its requested name.
     pub names: Vec<String>,
-    /// Values, row after row.
+    /// Values, row by row.
     pub values: Vec<f64>,
     /// Line of each row in its file.
     pub lines: Vec<u64>,
-    /// The files, and the rows up to the end of each.
+    /// The files, each with the number of rows up to its end.
     pub files: Vec<(PathBuf, usize)>,
-    /// Rows left out because a value is missing.
+    /// Number of rows left out because a value is missing.
     pub skipped: usize,
     /// Whether each optional column is in every file.
     pub has: Vec<bool>,
-    /// Row at which each run of rows begins that belong together: files, and values of the part column.
+    /// First row of each part: parts are separated by files and by values of the part column.
     pub parts: Vec<usize>,
 }
 
@@ -81,7 +81,7 @@ impl ColumnTable {
     /// Reads files one after the other.
     ///
     /// # Errors
-    /// A file cannot be read, a column is unknown or ambiguous, a value is missing or no number, there are too many rows:
+    /// A file cannot be read, a column is unknown or ambiguous, a value is missing or not a number, or there are too many rows:
     /// with file, line, column, what was found and what is allowed.
     pub fn read(paths: &[PathBuf], wanted: &ColumnSelection<'_>, part: &PartColumn) -> Result<Self, LabError> {
         let mut table = Self { has: vec![true; wanted.optional.len()], ..Self::default() };
@@ -93,7 +93,7 @@ impl ColumnTable {
         Ok(table)
     }
 
-    /// Ignores a default part column that differs from row to row: it counts the rows.
+    /// Ignores a default part column that differs in every row, because it counts the rows.
     fn ignore_row_counter(&mut self, part: &PartColumn) {
         if *part == PartColumn::Default && self.parts.len() == self.len() {
             let begins = [0].into_iter().chain(self.files.iter().map(|(_, end)| *end));
@@ -102,17 +102,17 @@ impl ColumnTable {
         }
     }
 
-    /// Rows.
+    /// Number of rows.
     pub fn len(&self) -> usize {
         self.lines.len()
     }
 
-    /// Whether there are none.
+    /// Whether there are no rows.
     pub fn is_empty(&self) -> bool {
         self.lines.is_empty()
     }
 
-    /// Columns.
+    /// Number of columns.
     pub fn width(&self) -> usize {
         self.names.len()
     }
@@ -145,7 +145,7 @@ impl ColumnTable {
         Some(row + steps).filter(|later| *later < end)
     }
 
-    /// Every n-th row of each part, the first one included.
+    /// Every n-th row of each part, including the first.
     pub fn every(&self, n: usize) -> Self {
         let mut thin = Self { values: vec![], lines: vec![], files: vec![], parts: vec![], ..self.clone() };
         let mut end_of_file = self.files.iter();
@@ -190,7 +190,7 @@ impl ColumnTable {
         Ok(())
     }
 
-    /// Where the columns are; those of later files must have the names that the first one has.
+    /// Indices of the columns; later files must have the names of the first file.
     fn columns(&mut self, header: &[String], wanted: &ColumnSelection<'_>) -> Result<Vec<Option<usize>>, String> {
         let first = self.names.is_empty();
         let mut columns = Vec::new();
@@ -215,7 +215,7 @@ impl ColumnTable {
     }
 }
 
-/// Returns the values of one row; `None` = it lacks a required value and such rows are skipped.
+/// Returns the values of a row; `None` = a required value is missing, and such rows are skipped.
 fn row_values(
     row: &Row<'_>,
     columns: &[Option<usize>],
@@ -235,7 +235,7 @@ fn row_values(
     Ok(Some(values))
 }
 
-/// A number; NaN where it is missing.
+/// A number; NaN if the field is empty.
 fn number(row: &Row<'_>, column: usize) -> Result<f64, TableError> {
     let text = row.text(column);
     if text.is_empty() {
@@ -245,7 +245,7 @@ fn number(row: &Row<'_>, column: usize) -> Result<f64, TableError> {
     number.ok_or_else(|| row.fault(column, "a finite number"))
 }
 
-/// A column by its name, or by its name without the unit.
+/// Finds a column by its name with or without unit.
 fn find(header: &[String], name: &str) -> Result<usize, String> {
     let all = |fits: &dyn Fn(&str) -> bool| -> Vec<usize> {
         header.iter().enumerate().filter(|(_, column)| fits(column)).map(|(at, _)| at).collect()
@@ -278,7 +278,7 @@ fn split(column: &str) -> Option<(&str, &str)> {
     column.rsplit_once('_').filter(|(stem, unit)| !stem.is_empty() && UNITS.contains(&unit.to_lowercase().as_str()))
 }
 
-/// A name made of a column's name and a word, the unit last: `voltage_mean_v`.
+/// A name made from a column's name and a word, with the unit last: `voltage_mean_v`.
 pub(super) fn derived(column: &str, word: &str) -> String {
     split(column).map_or_else(|| format!("{column}_{word}"), |(stem, unit)| format!("{stem}_{word}_{unit}"))
 }
@@ -312,7 +312,7 @@ mod tests {
     const TEXT: &str = "time_s,voltage_v,voltage_mv\n0,3.5,3500\n1,,3400\n2,nan,3300\n3,3.2,3200\n";
 
     #[test]
-    fn columns_are_found_with_and_without_their_unit() {
+    fn columns_are_found_with_and_without_unit() {
         let table = read(TEXT, &["voltage_mv", "time"], MissingPolicy::Rejected).expect("reads");
         assert_eq!(table.names, ["voltage_mv", "time_s"]);
         assert_eq!((table.row(3), table.lines[3], table.parts.clone()), (&[3200.0, 3.0][..], 5, vec![0]));
@@ -326,7 +326,7 @@ mod tests {
     }
 
     #[test]
-    fn missing_values_are_refused_with_their_line_or_skipped_and_counted() {
+    fn missing_values_are_rejected_or_skipped() {
         let refused = read(TEXT, &["voltage_v"], MissingPolicy::Rejected).expect_err("a hole");
         let expected =
             "cell.csv:3: column voltage_v: found \"\", must be a finite number; --skip-missing leaves such rows out";
@@ -341,7 +341,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_that_a_part_column_counts_belong_together() {
+    fn column_that_counts_rows_makes_no_parts() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("cell.csv");
         let parts = |text: &str, part: &PartColumn| {

@@ -1,6 +1,6 @@
-//! A model with the names of its columns: trained from a table, saved, loaded, applied to other files.
+//! A model with the names of its columns: trained on a table, saved, loaded, applied to other files.
 //!
-//! The file is one line of JSON that names the columns, then the two lines of the model itself (see the arithmetic), which
+//! The file is one line of JSON with the names of the columns, followed by the two lines of the model itself (see [`Model`]), which
 //! have a checksum.
 
 use std::path::Path;
@@ -14,7 +14,7 @@ use crate::regress::{GprSettings, Model, Prediction, ProgressCallback, TrainingR
 
 /// Format name in the first line.
 const FORMAT: &str = "packwatch gpr";
-/// Version written; other versions are rejected.
+/// Version of the format; other versions are rejected.
 const VERSION: u32 = 1;
 /// Largest file read, bytes: enough for the largest model.
 const MAX_BYTES: u64 = 1 << 32;
@@ -24,9 +24,9 @@ const MAX_BYTES: u64 = 1 << 32;
 pub struct TrainedModel {
     /// Column that is predicted.
     pub output: String,
-    /// Columns it is predicted from, in the model's order.
+    /// Columns from which it is predicted, in the order of the model.
     pub inputs: Vec<String>,
-    /// The process.
+    /// The Gaussian process.
     pub model: Model,
 }
 
@@ -43,7 +43,7 @@ impl TrainedModel {
     /// Fits a model to a table whose last column is the output.
     ///
     /// # Errors
-    /// Too few rows, settings out of range, no positive definite matrix, or the watcher stopped it.
+    /// There are too few rows, settings are out of range, a matrix is not positive definite, or the watcher stopped the work.
     pub fn fit(
         table: &ColumnTable,
         settings: &GprSettings,
@@ -56,7 +56,7 @@ impl TrainedModel {
         Ok(Self { output: table.names[width - 1].clone(), inputs: table.names[..width - 1].to_vec(), model })
     }
 
-    /// Writes it.
+    /// Writes the model.
     ///
     /// # Errors
     /// The file cannot be written.
@@ -71,10 +71,10 @@ impl TrainedModel {
         Ok(crate::write_file(path, format!("{names}\n{}", self.model.save()?).as_bytes())?)
     }
 
-    /// Reads a model that works with `threads` threads.
+    /// Reads a model; it uses `threads` threads.
     ///
     /// # Errors
-    /// The file cannot be read, is no such model, is damaged, or is of another version.
+    /// The file cannot be read, is not such a model, is damaged, or has another version.
     pub fn load(path: &Path, threads: usize) -> Result<Self, LabError> {
         let fail = |what: String| LabError::Data(format!("{}: {what}", path.display()));
         let unread = |error: std::io::Error| LabError::of_io(format!("{}: {error}", path.display()), &error);
@@ -84,9 +84,9 @@ impl TrainedModel {
         }
         let text = std::fs::read_to_string(path).map_err(unread)?;
         let (first, rest) =
-            text.split_once('\n').ok_or_else(|| fail("one line only, must be three: no model".into()))?;
+            text.split_once('\n').ok_or_else(|| fail("has one line, must have three: not a model".into()))?;
         let names: ModelHeader =
-            serde_json::from_str(first).map_err(|error| fail(format!("line 1: no model of gpr: {error}")))?;
+            serde_json::from_str(first).map_err(|error| fail(format!("line 1: not a model of gpr: {error}")))?;
         if names.format != FORMAT || names.version != VERSION {
             let found = (&names.format, names.version);
             return Err(fail(format!("line 1: found {found:?}, must be {:?}", (FORMAT, VERSION))));
@@ -94,15 +94,15 @@ impl TrainedModel {
         let model = Model::load(rest, threads).map_err(|fault| fail(format!("from line 2 on: {fault}")))?;
         if model.spec.dimensions != names.inputs.len() {
             let (found, allowed) = (names.inputs.len(), model.spec.dimensions);
-            return Err(fail(format!("line 1: {found} inputs, must be {allowed} as the model has")));
+            return Err(fail(format!("line 1: {found} inputs, must be {allowed} like in the model")));
         }
         Ok(Self { output: names.output, inputs: names.inputs, model })
     }
 
-    /// Predicts every row of a table that begins with the inputs.
+    /// Predicts every row of a table whose first columns are the inputs.
     ///
     /// # Errors
-    /// A covariance matrix that is not positive definite.
+    /// A covariance matrix is not positive definite.
     pub fn predict(&self, table: &ColumnTable) -> Result<Vec<Prediction>, LabError> {
         let d = self.inputs.len();
         let inputs: Vec<f64> = table.values.chunks_exact(table.width()).flat_map(|row| &row[..d]).copied().collect();
@@ -110,7 +110,7 @@ impl TrainedModel {
     }
 }
 
-/// Writes predictions of a table's rows; its last column is the output, NaN where it is unknown.
+/// Writes predictions of a table's rows; the last column is the output, NaN if unknown.
 ///
 /// # Errors
 /// The file cannot be written.

@@ -22,9 +22,9 @@ const RECOVERY_SOC: f64 = 0.5;
 /// A half-cycle with its SOC.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AnchoredHalfCycle {
-    /// Corrected for load pulses of the charger, A.
+    /// Index of the half-cycle.
     pub index: usize,
-    /// Current without a charger's load pulses, A.
+    /// Current without the load pulses of a charger, A.
     pub current_a: Vec<f64>,
     /// SOC of every row.
     pub soc: Vec<f64>,

@@ -1,8 +1,9 @@
-//! A BPX file (Battery Parameter eXchange, JSON) as a cell model.
+//! Converts a BPX file (Battery Parameter eXchange, JSON) to a cell model.
 //!
-//! In: the text of a file of version 0.x or 1.x with the model SPM, SPMe or DFN. Out: the TOML of a cell model, with the open-circuit
-//! curve of both electrodes' potentials (`curve.rs`) and resistances derived from the physical parameters (`circuit.rs`); what was
-//! derived how stands in `[provenance]`. Bad input: every fault with the path inside the JSON, found and allowed. Pure.
+//! Input: the text of a file of version 0.x or 1.x with the model SPM, SPMe or DFN. Output: the TOML of a cell model. Its open-circuit
+//! curve is the difference of the electrodes' potentials (`curve.rs`), its resistances are derived from the physical parameters
+//! (`circuit.rs`), and `[provenance]` states each derivation. On bad input, every fault is reported with its path in the JSON, what was
+//! found and what is allowed.
 //!
 //! Source: BPX standard, Faraday Institution (https://bpxstandard.com).
 
@@ -28,21 +29,21 @@ const FARADAY_C_PER_MOL: f64 = 96_485.332_12;
 /// Gas constant, J/(mol K) (CODATA 2018).
 const GAS_J_PER_MOL_K: f64 = 8.314_462_618;
 
-/// Temperatures of the tables, K from the file's reference temperature.
+/// Temperatures of the tables relative to the file's reference temperature, K.
 const TEMPERATURES_K: [f64; 6] = [-35.0, -25.0, -15.0, 0.0, 15.0, 30.0];
 
-/// Standard deviation of the voltage error at rest and the reference temperature, V: a cell differs from its parameters.
+/// Standard deviation of the voltage error at rest and reference temperature, V: a cell differs from its parameters.
 const ERROR_AT_REST_V: f64 = 0.010;
 
-/// Share of the voltage drop at the nominal capacity in one hour that counts as error: the closed forms hold for small currents.
+/// Share of the voltage drop at a one-hour current that counts as error: the closed forms hold for small currents.
 const ERROR_OF_DROP: f64 = 0.3;
 
 /// What to convert.
 #[derive(Debug, Clone, Default)]
 pub struct BpxSettings {
-    /// Name of the file, for messages and the provenance.
+    /// Name of the file, for messages and provenance.
     pub source: String,
-    /// Name of the cell; without it the title of the file.
+    /// Name of the cell; `None` = the title of the file.
     pub name: Option<String>,
 }
 
@@ -51,11 +52,11 @@ pub struct BpxSettings {
 pub struct BpxImport {
     /// The cell model, TOML.
     pub text: String,
-    /// Assumptions and parts of the file that are not used.
+    /// Assumptions, and parts of the file that are not used.
     pub notes: Vec<String>,
     /// Charge between the cut-offs at the reference temperature, Ah.
     pub capacity_ah: f64,
-    /// Charge on the label, Ah.
+    /// Nominal charge, Ah.
     pub nominal_ah: f64,
 }
 
@@ -71,12 +72,13 @@ struct Model {
 /// Converts the text of a BPX file.
 ///
 /// # Errors
-/// The text is no JSON, or no BPX file that a model can be made of: one line per fault with path, found and allowed.
+/// Not valid JSON, or not a BPX file that can be converted: one line per fault with path, what was found and what is allowed.
 pub fn import(text: &str, settings: &BpxSettings) -> Result<BpxImport, LabError> {
     let source = &settings.source;
     let text = text.strip_prefix('\u{feff}').unwrap_or(text);
-    let root: serde_json::Value = serde_json::from_str(text)
-        .map_err(|error| LabError::Data(format!("{source}:{}:{}: no JSON: {error}", error.line(), error.column())))?;
+    let root: serde_json::Value = serde_json::from_str(text).map_err(|error| {
+        LabError::Data(format!("{source}:{}:{}: not valid JSON: {error}", error.line(), error.column()))
+    })?;
     let failed = |faults: Vec<String>| {
         let lines: Vec<String> = faults.iter().map(|fault| format!("{source}: {fault}")).collect();
         LabError::Data(lines.join("\n"))
@@ -115,13 +117,13 @@ impl Model {
         Ok(Self { temperature_c, curve: table, resistances, voltage_error_v })
     }
 
-    /// Branches of each node, 2 without electrolyte, 3 with it.
+    /// Number of branches of a node, 2 without electrolyte, 3 with it.
     fn branch_count(&self) -> usize {
         self.resistances.first().and_then(|row| row.first()).map_or(0, |of| of.branches.len().min(MAX_BRANCHES))
     }
 }
 
-/// What a person should know of the conversion.
+/// Notes on the conversion for the user.
 fn notes(cell: &BpxCell, curve: &Curve<'_>, model: &Model) -> Vec<String> {
     let mut notes = cell.notes.clone();
     let electrodes = [&cell.negative, &cell.positive];
@@ -132,7 +134,7 @@ fn notes(cell: &BpxCell, curve: &Curve<'_>, model: &Model) -> Vec<String> {
         notes.push("an activation energy is not stated: 25 kJ/mol assumed".to_owned());
     }
     if cell.transport.is_none() {
-        notes.push("SPM: nothing is stated about the electrolyte; its resistance is missing".to_owned());
+        notes.push("SPM: the file does not describe the electrolyte; its resistance is missing".to_owned());
     }
     if cell.heat_capacity_j_per_k.is_none() || cell.thermal_k_per_w.is_none() {
         notes.push("no [thermal]: heat capacity or heat transfer to the surroundings is not stated".to_owned());

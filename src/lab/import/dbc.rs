@@ -1,8 +1,8 @@
-//! A DBC's likely battery signals as the `[input]` part of a configuration: by name, unit and range alone.
+//! Writes the likely battery signals of a DBC as the `[input]` part of a configuration, judged only by name, unit and range.
 //!
-//! In: a parsed DBC and its name. Out: TOML with the best candidate of each input and the next ones as comments. No log is
-//! looked at: what the signals really carry is for `packwatch discover` and the owner to say; so the sign of the current is
-//! left open, and the part is no valid configuration until it is filled in.
+//! Input: a parsed DBC and its name. Output: TOML with the best candidate for each input and the next ones as comments. The values in a
+//! log are judged by `packwatch discover` and the owner. The sign of the current is therefore left open, and the part is not a valid
+//! configuration until it is completed.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -43,33 +43,33 @@ pub fn import(database: &Database, file: &str) -> Result<String, LabError> {
     Ok(text(file, &candidates))
 }
 
-/// What a signal may be, with its points.
+/// The quantities that a signal may carry, with points.
 fn judge(message: &Message, signal: &Signal) -> Vec<(PackQuantity, f64)> {
     let label = SignalLabel::new(&message.name, &signal.name, &signal.unit);
     let largest = largest(signal) * SignalUnit::parse(&signal.unit).map_or(1.0, |unit| unit.factor);
     let points = |quantity| {
         let points = label.score(quantity)?.points;
         let (fits, points) = match quantity {
-            // More than any cell has: the sum of some.
+            // A larger value is a sum of cells.
             PackQuantity::CellVoltage if label.says_extreme() => (largest <= 10.0, points - 1.0),
             PackQuantity::CellVoltage => (largest <= 10.0, points),
             PackQuantity::PackVoltage => (largest > 60.0 && !label.says_cell(), points),
             PackQuantity::Current | PackQuantity::Temperature | PackQuantity::Soc | PackQuantity::Soh => (true, points),
         };
-        // A unit, and a name that says quantity or battery.
+        // Three points: a unit, and a name that contains the quantity or the battery.
         (fits && points >= 3.0 && signal.layout.length_bits >= 4).then_some((quantity, points))
     };
     PackQuantity::ALL.into_iter().filter_map(points).collect()
 }
 
-/// Largest value: the stated one, else the largest of the bits.
+/// Largest value: as stated, or else by the number of bits.
 fn largest(signal: &Signal) -> f64 {
     let layout = &signal.layout;
     let top = 2_f64.powi(i32::from(layout.length_bits)) * layout.factor.abs() + layout.offset;
     if layout.has_range() { layout.maximum.min(top) } else { top }
 }
 
-/// Signals whose names differ in a number as one pattern, before those that stand alone.
+/// Joins signals whose names differ in a number to one pattern, placed before single signals.
 fn with_patterns(cells: Vec<Ranked>) -> Vec<Ranked> {
     let names: Vec<(String, &str)> = cells.iter().map(|(_, name)| (String::new(), name.as_str())).collect();
     let found = groups(&names);
@@ -77,7 +77,7 @@ fn with_patterns(cells: Vec<Ranked>) -> Vec<Ranked> {
     let mut grouped = std::collections::BTreeSet::new();
     for group in found.iter().filter(|group| group.members.len() >= 3) {
         let first = group.members[0].1;
-        // Many alike are what cells look like.
+        // Many similar signals are probably cells.
         ranked.push((cells[first].0 + 4.0, group.pattern.clone()));
         grouped.extend(group.members.iter().map(|member| member.1));
     }
@@ -89,8 +89,8 @@ fn with_patterns(cells: Vec<Ranked>) -> Vec<Ranked> {
 fn text(file: &str, candidates: &BTreeMap<PackQuantity, Vec<Ranked>>) -> String {
     let name: String = file.chars().filter(|c| !c.is_control()).collect();
     let mut text = format!(
-        "# Likely battery signals of {name}, by name, unit and range alone, written by `packwatch import dbc`.\n\
-         # `packwatch discover LOG --dbc FILE` judges them by what they do in a log.\n\n\
+        "# Likely battery signals of {name}, judged only by name, unit and range, written by `packwatch import dbc`.\n\
+         # `packwatch discover LOG --dbc FILE` judges them by their values in a log.\n\n\
          [input]\ndbc = [{}]\n",
         quoted(file)
     );
@@ -98,7 +98,7 @@ fn text(file: &str, candidates: &BTreeMap<PackQuantity, Vec<Ranked>>) -> String 
         .get(&PackQuantity::CellVoltage)
         .is_some_and(|found| found.iter().any(|(_, name)| name.contains("{n}")));
     for (kind, ranked) in candidates {
-        // Only one of the two voltages may be there.
+        // Only one of the two voltages may be active.
         let is_active = match kind {
             PackQuantity::CellVoltage => has_cells,
             PackQuantity::PackVoltage => !has_cells,
@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn the_best_of_each_input_is_written_and_the_others_are_comments() {
+    fn best_candidate_is_written_and_others_are_comments() {
         let text = imported(
             "BO_ 1 HV: 8 A\n SG_ BattCurrent : 0|16@1- (0.1,0) [0|0] \"A\" A\n SG_ BattVoltage : 16|16@1+ (0.1,0) [0|0] \"V\" A\n \
              SG_ MotorCurrent : 32|16@1- (0.1,0) [0|0] \"A\" A\n SG_ SOC : 48|8@1+ (0.5,0) [0|100] \"%\" A\n\
@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn a_dbc_without_a_battery_is_an_error() {
+    fn dbc_without_battery_signals_is_rejected() {
         let fault = imported("BO_ 1 Doors: 8 A\n SG_ Open : 0|8@1+ (1,0) [0|0] \"\" A\n").unwrap_err().to_string();
         assert!(fault.contains("car.dbc: no signal of 1 messages"), "{fault}");
     }

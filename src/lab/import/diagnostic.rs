@@ -1,21 +1,21 @@
-//! `[[input.diagnostic]]` as TOML: one answer with its signals, one signal a line.
+//! `[[input.diagnostic]]` as TOML: one answer with its signals, one signal per line.
 //!
-//! Numbers are written with the shortest decimals that read back equal. Values are in the unit the signal names.
+//! Numbers are written with the shortest decimals that read back as equal. Values have the unit that the signal states.
 
 use std::fmt;
 
 use crate::can::CanId;
 
-/// One `[[input.diagnostic]]`: a request, its answer, the signals in it.
+/// One `[[input.diagnostic]]`: a request, and the signals in its answer.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct DiagnosticTable {
-    /// Before the dot of the signals' names; several tables may share it.
+    /// Part of the signals' names before the dot; several tables may share it.
     pub(crate) name: String,
     /// Identifier of requests.
     pub(crate) request: CanId,
     /// Identifier of answers.
     pub(crate) response: CanId,
-    /// First data byte of requests and of answers, with extended addressing.
+    /// First data byte of requests and of answers, if addressing is extended.
     pub(crate) extension: Option<(u8, u8)>,
     /// 0x01, 0x21 or 0x22.
     pub(crate) service: u8,
@@ -30,11 +30,11 @@ pub(crate) struct DiagnosticTable {
 /// One signal, or a numbered series of equal ones.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct DiagnosticSignal {
-    /// With `{n}` if `numbers` is given.
+    /// Name, with `{n}` if `numbers` is given.
     pub(crate) name: String,
     /// First bit, counted from the most significant bit after the echoed service and identifier.
     pub(crate) bit: u32,
-    /// Bits, 1 to 64.
+    /// Number of bits, 1 to 64.
     pub(crate) length: u32,
     /// Two's complement.
     pub(crate) signed: bool,
@@ -44,13 +44,13 @@ pub(crate) struct DiagnosticSignal {
     pub(crate) factor: f64,
     /// Value of code 0.
     pub(crate) offset: f64,
-    /// May be empty.
+    /// Unit; may be empty.
     pub(crate) unit: String,
     /// Smallest and largest allowed value.
     pub(crate) range: Option<(f64, f64)>,
-    /// Codes that say "not available".
+    /// Codes that mean "not available".
     pub(crate) not_available: Vec<u64>,
-    /// The series.
+    /// Numbers of a series.
     pub(crate) numbers: Option<NumberRange>,
 }
 
@@ -66,14 +66,14 @@ pub(crate) struct NumberRange {
 }
 
 impl DiagnosticTable {
-    /// Signals, each of a series counted.
+    /// Number of signals, including each signal of a series.
     pub(crate) fn signal_count(&self) -> usize {
         self.signals.iter().map(|signal| signal.count() as usize).sum()
     }
 }
 
 impl DiagnosticSignal {
-    /// Signals of the series; 1 without.
+    /// Number of signals of the series; 1 without a series.
     pub(crate) fn count(&self) -> u32 {
         self.numbers.map_or(1, |numbers| numbers.last - numbers.first + 1)
     }
@@ -84,19 +84,19 @@ impl DiagnosticSignal {
         (0..self.count()).map(move |n| (self.bit + n * step, self.bit + n * step + self.length - 1))
     }
 
-    /// One signal of the series, counted from 0.
+    /// A signal of the series, counted from 0.
     pub(crate) fn of_series(&self, index: u32) -> Self {
         let Some(NumberRange { first, step, .. }) = self.numbers else { return self.clone() };
         let name = self.name.replace("{n}", &(first + index).to_string());
         Self { name, bit: self.bit + index * step, numbers: None, ..self.clone() }
     }
 
-    /// The same bits as two's complement, without a range.
+    /// The same bits in two's complement, without a range.
     pub(crate) fn as_signed(&self) -> Self {
         Self { signed: true, range: None, ..self.clone() }
     }
 
-    /// Its value in the data behind the echoed service and identifier; `None` = beyond their end, not available or out of the
+    /// Value in the data after the echoed service and identifier; `None` = the data are too short, or the value is not available or out of
     /// range.
     pub(crate) fn value(&self, data: &[u8]) -> Option<f64> {
         let (first, last) = (self.bit / 8, (self.bit + self.length - 1) / 8);
@@ -108,7 +108,7 @@ impl DiagnosticSignal {
         let unused = 64 - self.length;
         let number = if self.signed { ((code << unused).cast_signed() >> unused) as f64 } else { code as f64 };
         let value = number * self.factor + self.offset;
-        // Half a code: limits are rounded decimals.
+        // Half a code of tolerance, because limits are rounded decimals.
         let room = self.factor.abs() / 2.0;
         let is_inside = self.range.is_none_or(|(low, high)| value >= low - room && value <= high + room);
         (is_inside && !self.not_available.contains(&code)).then_some(value)
@@ -120,7 +120,7 @@ impl DiagnosticSignal {
         if self.signed { (-top / 2.0, top / 2.0 - 1.0) } else { (0.0, top - 1.0) }
     }
 
-    /// Smallest and largest value the bits can hold.
+    /// Smallest and largest value that the bits can represent.
     pub(crate) fn representable(&self) -> (f64, f64) {
         let (low, high) = self.codes();
         let (a, b) = (low * self.factor + self.offset, high * self.factor + self.offset);

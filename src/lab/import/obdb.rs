@@ -1,11 +1,11 @@
-//! An OBDb signal set (one JSON for each car model) as `[[input.diagnostic]]` tables.
+//! Converts an OBDb signal set (one JSON file per car model) to `[[input.diagnostic]]` tables.
 //!
-//! In: the text of the JSON, a model year, a name. Out: TOML, one table for each command in the order of controllers, one
-//! signal a line. The source's licence, CC BY-SA 4.0, holds for the TOML too and stands in its head.
+//! Input: the text of the JSON, a model year, a name. Output: TOML with one table per command, in the order of controllers, and one
+//! signal per line. The licence of the source, CC BY-SA 4.0, also applies to the TOML, which states it.
 //!
-//! Signals are named `NAME.REST`: REST is the `id` without the word that all ids of the file begin with, NAME is that word or
-//! the given name. Bad input: a file that is not such a JSON is an error; a command or signal that cannot be converted is an
-//! [`Exclusion`], the rest is converted; an unknown field is a warning.
+//! Signals are named `NAME.REST`. REST is the `id` without the word with which all ids of the file start; NAME is that word or
+//! the given name. A file that is not such JSON is an error. A command or signal that cannot be converted becomes an
+//! [`Exclusion`], and the rest is converted. An unknown field is a warning.
 
 mod address;
 mod document;
@@ -28,16 +28,16 @@ use document::{CommandDocument, SignalDocument, SignalSetDocument};
 pub struct ObdbSettings {
     /// Name of the file, for messages and the head.
     pub source: String,
-    /// Leave out commands of other model years; without it all are converted.
+    /// Model year; commands of other years are left out. `None` = all commands are converted.
     pub year: Option<i64>,
-    /// Before the dot of every signal's name.
+    /// Name before the dot of every signal.
     pub name: Option<String>,
 }
 
 /// Converts the text of a signal set.
 ///
 /// # Errors
-/// The text is no such JSON, or nothing in it can be converted; the error has place, found and allowed.
+/// The text is not such JSON, or nothing in it can be converted; the error has place, found and allowed.
 pub fn import(text: &str, settings: &ObdbSettings) -> Result<ImportResult, LabError> {
     let (document, converter) = convert(text, settings)?;
     let Converter { tables, exclusions, warnings, .. } = converter;
@@ -51,7 +51,7 @@ pub fn import(text: &str, settings: &ObdbSettings) -> Result<ImportResult, LabEr
     Ok(result)
 }
 
-/// The tables alone.
+/// Only the tables.
 pub(crate) fn tables(text: &str, settings: &ObdbSettings) -> Result<Vec<DiagnosticTable>, LabError> {
     Ok(convert(text, settings)?.1.tables)
 }
@@ -64,7 +64,7 @@ fn convert(text: &str, settings: &ObdbSettings) -> Result<(SignalSetDocument, Co
     }
     let text = text.strip_prefix('\u{feff}').unwrap_or(text);
     let document: SignalSetDocument = serde_json::from_str(text).map_err(|error| {
-        LabError::Data(format!("{source}:{}:{}: no OBDb signal set: {error}", error.line(), error.column()))
+        LabError::Data(format!("{source}:{}:{}: not an OBDb signal set: {error}", error.line(), error.column()))
     })?;
     let mut converter = Converter { year: settings.year, ..Converter::default() };
     converter.convert(&document);
@@ -81,17 +81,17 @@ fn convert(text: &str, settings: &ObdbSettings) -> Result<(SignalSetDocument, Co
     Ok((document, converter))
 }
 
-/// Whether a text can stand in the name of a signal.
+/// Whether a text may be part of a signal's name.
 fn is_name(text: &str) -> bool {
     !text.is_empty() && text.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
 }
 
-/// The tables so far, and what was left out.
+/// The tables so far, and the exclusions.
 #[derive(Debug, Default)]
 struct Converter {
     year: Option<i64>,
     tables: Vec<DiagnosticTable>,
-    /// Signals by id, and requests: the place that defined them.
+    /// Place that defined each signal id and each request.
     known: HashMap<String, String>,
     exclusions: Vec<Exclusion>,
     warnings: Vec<String>,
@@ -129,13 +129,13 @@ impl Converter {
         if let (Some(filter), Some(year)) = (&command.filter, self.year)
             && !filter.contains(year)
         {
-            return Err(exclusion(ExclusionReason::OtherYear, format!("exists {filter}, asked for {year}")));
+            return Err(exclusion(ExclusionReason::OtherYear, format!("valid for {filter}, requested {year}")));
         }
         let Addresses { request, response, extension } =
             Addresses::new(&command.address).map_err(|detail| exclusion(ExclusionReason::Address, detail))?;
         let key = format!("{request} {response} {extension:?} {service:02X} {identifier:04X}");
         if let Some(before) = self.known.get(&key) {
-            let detail = format!("the same request as {before}; --year may choose one of them");
+            let detail = format!("the same request as {before}; --year may select one of them");
             return Err(exclusion(ExclusionReason::Duplicate, detail));
         }
         self.known.insert(key, place.clone());
@@ -149,7 +149,7 @@ impl Converter {
         Ok(())
     }
 
-    /// Signals of one command in the order of their bits, each with bits of its own.
+    /// Signals of one command in the order of their bits, without overlaps.
     fn signals(&mut self, place: &str, values: &[Value]) -> Vec<DiagnosticSignal> {
         let mut signals: Vec<DiagnosticSignal> = Vec::new();
         for (index, value) in values.iter().enumerate() {
@@ -190,7 +190,10 @@ impl Converter {
             return Err((ExclusionReason::Overlap, detail));
         }
         if let Some(before) = self.known.get(&signal.name) {
-            return Err((ExclusionReason::Duplicate, format!("id of {before} already; --year may choose one of them")));
+            return Err((
+                ExclusionReason::Duplicate,
+                format!("id already used by {before}; --year may select one of them"),
+            ));
         }
         self.known.insert(signal.name.clone(), place.to_owned());
         Ok(signal)
@@ -224,22 +227,22 @@ fn request(command: &CommandDocument) -> Result<(u8, u16), (ExclusionReason, Str
     Ok((service, number))
 }
 
-/// What a person should know before polling.
+/// Remarks for a person who wants to poll.
 fn remarks(command: &CommandDocument) -> Vec<String> {
     let mut remarks = Vec::new();
     if let Some(seconds) = command.freq {
-        remarks.push(format!("OBDb asks for it every {seconds} s; drive_every_s = {seconds} would do so with [poll]"));
+        remarks.push(format!("OBDb polls it every {seconds} s; with [poll], use drive_every_s = {seconds}"));
     }
     if let Some(filter) = &command.filter {
         remarks.push(format!("model years: {filter}"));
     }
     if let Some(session) = &command.din {
-        remarks.push(format!("OBDb enters diagnostic session {} before; packwatch never does", session.escape_debug()));
+        remarks.push(format!("OBDb first enters diagnostic session {}; packwatch never does", session.escape_debug()));
     }
     remarks
 }
 
-/// Gives the tables their name, shortens the signals' names, joins numbered ones.
+/// Names the tables, shortens the names of the signals, and joins numbered signals.
 fn rename(tables: &mut [DiagnosticTable], name: Option<&str>) {
     let first_word = |signal: &DiagnosticSignal| signal.name.split_once('_').map(|(word, _)| word.to_owned());
     let words = tables.iter().flat_map(|table| &table.signals).map(first_word);
@@ -271,7 +274,7 @@ fn head(name: &str, settings: &ObdbSettings, document: &SignalSetDocument) -> St
     if let Some(level) = &document.diagnostic_level {
         let _ = writeln!(
             text,
-            "# OBDb asks in diagnostic session {}; packwatch never changes the session.",
+            "# OBDb uses diagnostic session {}; packwatch never changes the session.",
             level.escape_debug()
         );
     }
@@ -284,7 +287,7 @@ fn tail(result: &ImportResult) -> String {
     }
     let mut text = format!("\n# Left out: {}\n", result.exclusions.len());
     for exclusion in &result.exclusions {
-        // Texts of the file must not end the comment.
+        // Text from the file must not end the comment.
         let line: String = exclusion.to_string().chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
         let _ = writeln!(text, "# {line}");
     }

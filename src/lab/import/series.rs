@@ -1,12 +1,12 @@
-//! Signals whose names differ in a number alone, as one line with `{n}`.
+//! Joins signals whose names differ only in a number to one line with `{n}`.
 //!
-//! A series is a run of signals at rising positions of one answer, equal but for one number in their names, which counts by
-//! one, and their bits, which step by one distance. Leading zeros of the number are dropped: `{n}` of a pattern does not count
-//! them.
+//! A series is a run of signals at rising positions of one answer. They are equal except for one number in their names, which counts
+//! by one, and their bits, which have a constant distance. Leading zeros of the number are dropped, because `{n}` in a pattern matches
+//! any number of them.
 
 use crate::import::{DiagnosticSignal, NumberRange};
 
-/// A name around one of its numbers.
+/// A name, split around one of its numbers.
 #[derive(Debug, PartialEq, Eq)]
 struct NumberedName<'a> {
     before: &'a str,
@@ -14,7 +14,7 @@ struct NumberedName<'a> {
     after: &'a str,
 }
 
-/// Joins what belongs to one series; `signals` are in the order of their bits.
+/// Joins the signals of each series; `signals` are in the order of their bits.
 pub(crate) fn join(signals: Vec<DiagnosticSignal>) -> Vec<DiagnosticSignal> {
     let mut joined: Vec<DiagnosticSignal> = Vec::new();
     let mut rest = signals.as_slice();
@@ -31,7 +31,7 @@ pub(crate) fn join(signals: Vec<DiagnosticSignal>) -> Vec<DiagnosticSignal> {
     joined
 }
 
-/// The series that begins with the first of `signals`, and its length.
+/// The series that starts with the first of `signals`, and its length.
 fn series(name: &NumberedName<'_>, signals: &[DiagnosticSignal]) -> (DiagnosticSignal, usize) {
     let first = &signals[0];
     let step = signals.get(1).map_or(0, |second| second.bit.saturating_sub(first.bit));
@@ -51,7 +51,7 @@ fn series(name: &NumberedName<'_>, signals: &[DiagnosticSignal]) -> (DiagnosticS
     (joined, length)
 }
 
-/// The name around each of its numbers.
+/// The name, split around each of its numbers.
 fn numbered(name: &str) -> Vec<NumberedName<'_>> {
     let mut found = Vec::new();
     let mut at = 0;

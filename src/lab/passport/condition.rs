@@ -1,7 +1,7 @@
-//! The condition of a battery as a passport states it: every value with its time and standard deviation, or why it is not known.
+//! The condition of a battery for a passport: every value with its time and standard deviation, or the reason why it is unknown.
 //!
-//! In: a [`Record`], the configuration, the cell model in force, and what only people know ([`Terms`]). A value is known when it
-//! was measured or learned; a configured start value, an estimate that is not trusted and a sum with missing parts are not.
+//! Input: a [`Record`], the configuration, the current cell model, and data that only people know ([`Terms`]). Measured and learned
+//! values are known; a configured start value, an untrusted estimate and an incomplete sum are not.
 
 use super::energy::Discharge;
 use super::field::Field;
@@ -12,18 +12,18 @@ use crate::config::Config;
 use crate::monitor::{Downtime, ModelState, Monitor, Outputs, Snapshot};
 use crate::quantity::{CellIndex, Channel, Timestamp, catalogue};
 
-/// Stamps before 2001-01-01, s since 1970, are no dates. A clock that was not set begins in 1970, 1980 or 2000; a log that counts from its
-/// start is shorter than 30 years.
+/// Stamps before 2001-01-01, s since 1970, are not dates. A clock that was not set starts in 1970, 1980 or 2000; a log that counts from
+/// its start is shorter than 30 years.
 const FIRST_DATE_S: f64 = 978_307_200.0;
-/// Largest difference between two statements about the new battery, fraction: they may be rounded.
+/// Largest difference between two values of the new battery, fraction: they may be rounded.
 pub(super) const RATED_TOLERANCE: f64 = 0.01;
 
-/// What no record holds, from the command line. `None` = not given.
+/// Data from the command line that no record contains; `None` = not given.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Terms {
-    /// Charge that the battery had moved before the record began, Ah; 0 = it was recorded since new.
+    /// Charge moved before the record started, Ah; 0 = recorded since new.
     pub moved_before_ah: Option<f64>,
-    /// Charge that the battery has moved in all, Ah, as its own counter says: instead of the record's sum.
+    /// Total charge moved, Ah, from the battery's own counter; replaces the sum of the record.
     pub moved_ah: Option<f64>,
     /// Usable energy at the certification, kWh.
     pub certified_kwh: Option<f64>,
@@ -32,25 +32,25 @@ pub struct Terms {
 /// A known value.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Quantity {
-    /// The value, in the unit of its field.
+    /// Value in the unit of its field.
     pub value: f64,
-    /// Its standard deviation; `None` = not known.
+    /// Standard deviation; `None` = unknown.
     pub std: Option<f64>,
-    /// When it was determined.
+    /// Time at which the value was determined.
     pub time: Timestamp,
 }
 
-/// A value, or why it is not known.
+/// A value, or the reason why it is unknown.
 pub type Known = Result<Quantity, String>;
 
-/// All values of a passport that packwatch can know.
+/// All values of a passport that packwatch can determine.
 #[derive(Debug)]
 pub struct Condition {
     values: Vec<(Field, Known)>,
     rated: Rated,
 }
 
-/// What the configuration and the command line say of the new battery: a passport that says otherwise is of another one.
+/// The new battery according to configuration and command line; a passport with other values belongs to another battery.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Rated {
     /// Capacity, Ah.
@@ -63,7 +63,7 @@ impl Condition {
     /// Determines all values.
     ///
     /// # Errors
-    /// Without a state, with one that does not fit the configuration, or one without a date.
+    /// There is no state, it has no date, or it does not fit the configuration.
     pub fn new(record: &Record, config: &Config, model: &CellModel, terms: &Terms) -> Result<Self, String> {
         let battery = Battery::new(record, config, model)?;
         let moved = battery.moved_ah(terms);
@@ -72,13 +72,13 @@ impl Condition {
         Ok(Self { values: values.to_vec(), rated })
     }
 
-    /// Values made for a test.
+    /// Creates values for a test.
     #[cfg(test)]
     pub(super) fn of(values: Vec<(Field, Known)>, rated: Rated) -> Self {
         Self { values, rated }
     }
 
-    /// What the new battery was.
+    /// The new battery.
     pub(super) fn rated(&self) -> Rated {
         self.rated
     }
@@ -94,21 +94,21 @@ fn is_date(time: Timestamp) -> bool {
     time.secs() >= FIRST_DATE_S
 }
 
-/// A value with a real time.
+/// Returns the value if its time is a date.
 fn dated(quantity: Quantity) -> Known {
     if is_date(quantity.time) {
         return Ok(quantity);
     }
-    Err("its time is not known: the clock was not set when it was measured".to_owned())
+    Err("its time is unknown: the clock was not set when it was measured".to_owned())
 }
 
-/// Checks that a state was taken with this configuration of the pack. What a state of an earlier program does not say is not checked.
+/// Checks that a state was taken with this configuration of the pack, as far as the state shows.
 fn check_origin(state: &Snapshot, config: &Config) -> Result<(), String> {
     let sample = &config.monitor.sample;
     if let Some(module) = config.monitor.modules.first() {
         let name = &module.model.name;
         return Err(format!(
-            "a pack with modules of other cells ({name}) has no passport: its values are of one kind of cell"
+            "a pack with modules of other cells ({name}) has no passport: its values describe one kind of cell"
         ));
     }
     let (strings, series) = state.wiring();
@@ -118,7 +118,7 @@ fn check_origin(state: &Snapshot, config: &Config) -> Result<(), String> {
         ("cells in series", usize::from(series), usize::from(sample.series())),
     ];
     if let Some((name, found, configured)) = counts.into_iter().find(|(_, found, configured)| found != configured) {
-        return Err(format!("the record is of {found} {name}, the configuration has {configured}"));
+        return Err(format!("the record has {found} {name}, the configuration has {configured}"));
     }
     let configured_ah = config.monitor.model.rated_capacity_ah;
     let other = |found: &f64| (found - configured_ah).abs() > RATED_TOLERANCE * configured_ah;
@@ -130,14 +130,14 @@ fn check_origin(state: &Snapshot, config: &Config) -> Result<(), String> {
     }
 }
 
-/// The sources of the values.
+/// Sources of the values.
 struct Battery<'a> {
     record: &'a Record,
     config: &'a Config,
     model: &'a CellModel,
-    /// The state, restored at the time when it was taken.
+    /// The state, restored at the time at which it was taken.
     monitor: Monitor,
-    /// Wall clock less the clock of the inputs, ns.
+    /// Wall clock minus the clock of the inputs, ns.
     offset_ns: i64,
     series: f64,
     strings: f64,
@@ -146,7 +146,7 @@ struct Battery<'a> {
 impl<'a> Battery<'a> {
     fn new(record: &'a Record, config: &'a Config, model: &'a CellModel) -> Result<Self, String> {
         let Some((at_ns, snapshot)) = &record.state else {
-            return Err("no state: the record has no reading, or its state is damaged".to_owned());
+            return Err("no state: the record contains no reading, or its state is damaged".to_owned());
         };
         if !is_date(Timestamp::from_nanos(*at_ns)) {
             return Err(
@@ -202,7 +202,7 @@ impl<'a> Battery<'a> {
         time.plus_nanos(self.offset_ns)
     }
 
-    /// Charge moved in all.
+    /// Total charge moved.
     fn moved_ah(&self, terms: &Terms) -> Known {
         let now = self.wall(self.monitor.now());
         if let Some(value) = terms.moved_ah {
@@ -212,7 +212,7 @@ impl<'a> Battery<'a> {
             return Err(format!("{gap}; --throughput-ah gives the battery's own counter"));
         }
         let Some(before_ah) = terms.moved_before_ah else {
-            return Err("the charge that the battery had moved before the record began is not given (--throughput-before-ah, 0 \
+            return Err("the charge moved before the record started is not given (--throughput-before-ah, 0 \
                         for a battery recorded since new)"
                 .to_owned());
         };
@@ -227,15 +227,15 @@ impl<'a> Battery<'a> {
 
     fn moved_kwh(&self, terms: &Terms) -> Known {
         let Some(energy) = &self.record.energy else {
-            return Err("a store keeps no voltages to integrate; a replay of the logs does".to_owned());
+            return Err("a store contains no voltages to integrate; a replay of the logs does".to_owned());
         };
         if let Some(gap) = self.record.gap.as_deref().or(energy.gap()) {
             return Err(gap.to_owned());
         }
         if terms.moved_before_ah != Some(0.0) {
-            return Err("the record does not begin with the new battery (--throughput-before-ah 0)".to_owned());
+            return Err("the record does not start with the new battery (--throughput-before-ah 0)".to_owned());
         }
-        // One estimated cell stands for all where only the pack's total is measured.
+        // If only the pack's total is measured, one estimated cell represents all cells.
         let cells = self.series / f64::from(self.config.monitor.sample.cells);
         let value = 1e-3 * self.strings * cells * energy.energy_wh;
         let std = Some(self.config.monitor.health.capacity.current_gain_std * value);
@@ -243,7 +243,7 @@ impl<'a> Battery<'a> {
         Ok(Quantity { value, std, time })
     }
 
-    /// Fails, with the cell, where an estimate is not trusted.
+    /// Fails, naming the cell, if an estimate is untrusted.
     fn check_trust(&self) -> Result<(), String> {
         let mut cells = (0..self.config.monitor.sample.cells).map(CellIndex);
         match cells.find(|&cell| !self.monitor.is_trusted(cell)) {
@@ -258,13 +258,13 @@ impl<'a> Battery<'a> {
         self.check_trust()?;
         let is_voltage = |channel: Channel| matches!(channel, Channel::CellVoltage(_) | Channel::PackVoltage);
         let voltages = self.monitor.latest_readings().filter(|(channel, ..)| is_voltage(*channel));
-        // The pack is known as of its oldest voltage.
+        // The pack is known at the time of its oldest voltage.
         let oldest = voltages.map(|(_, time, _)| time).min();
         match (self.monitor.pack(), oldest) {
             (Some(pack), Some(time)) => {
                 Ok(Quantity { value: 100.0 * pack.soc, std: Some(100.0 * pack.soc_std), time: self.wall(time) })
             }
-            _ => Err("not every cell has an estimate yet: their voltages have not all come".to_owned()),
+            _ => Err("some cells have no estimate yet: their voltages have not been received".to_owned()),
         }
     }
 
@@ -272,11 +272,11 @@ impl<'a> Battery<'a> {
         let is_sensor = |channel: Channel| matches!(channel, Channel::Temperature(_));
         let readings = self.monitor.latest_readings().filter(|(channel, ..)| is_sensor(*channel));
         let hottest = readings.max_by(|a, b| a.2.total_cmp(&b.2));
-        let (_, time, value) = hottest.ok_or("no temperature sensor has given a good reading")?;
+        let (_, time, value) = hottest.ok_or("no temperature sensor has given a valid reading")?;
         Ok(Quantity { value, std: None, time: self.wall(time) })
     }
 
-    /// What was learned of every cell.
+    /// Learned values of every cell.
     fn learned(&self) -> Result<Vec<(usize, Learned)>, String> {
         self.check_trust()?;
         let of_cell = |index: usize| {
@@ -287,7 +287,7 @@ impl<'a> Battery<'a> {
                 .is_some_and(|view| view.values.get(catalogue::Quantity::Capacity).is_some());
             let learned = self.record.cells.get(index).and_then(|cell: &CellRecord| cell.learned);
             learned.filter(|_| has_learned).map(|learned| (index, learned)).ok_or_else(|| {
-                format!("nothing has been learned of cell {} yet: it needs a deep charge or discharge", index + 1)
+                format!("nothing has been learned about cell {} yet: it needs a deep charge or discharge", index + 1)
             })
         };
         (0..usize::from(self.config.monitor.sample.cells)).map(of_cell).collect()
@@ -300,7 +300,7 @@ impl<'a> Battery<'a> {
         Ok(Quantity { value: *mean, std: Some(*std), time: Timestamp::from_nanos(*at_ns) }.times(self.strings))
     }
 
-    /// Resistance over new of the cell with the highest.
+    /// Resistance, relative to new, of the cell with the highest.
     fn worst_resistance(&self) -> Known {
         let learned = self.learned()?;
         let worst = learned.iter().max_by(|a, b| a.1.resistance.0.total_cmp(&b.1.resistance.0));
@@ -308,7 +308,7 @@ impl<'a> Battery<'a> {
         Ok(Quantity { value: *mean, std: Some(*std), time: Timestamp::from_nanos(*at_ns) })
     }
 
-    /// Mean of the cells' resistances over new. Their errors share the model's: the deviation is their mean too.
+    /// Mean of the cells' resistances relative to new. Their errors share the model's, so the deviation is a mean too.
     fn mean_resistance(&self) -> Known {
         let learned = self.learned()?;
         let count = learned.len() as f64;
@@ -322,14 +322,14 @@ impl<'a> Battery<'a> {
     fn new_ohm(&self) -> Result<f64, String> {
         match self.monitor.model().state {
             ModelState::Given | ModelState::Learned => Ok(self.model.r0_ohm(&self.model.grid_position(0.5, 25.0))),
-            ModelState::Prior | ModelState::Learning | ModelState::Unfit => {
-                Err("the resistance of a new cell is not known: no model file, and its own model is not learned yet"
-                    .to_owned())
-            }
+            ModelState::Prior | ModelState::Learning | ModelState::Unfit => Err(
+                "the resistance of a new cell is unknown: there is no model file, and its own model is not learned yet"
+                    .to_owned(),
+            ),
         }
     }
 
-    /// Energy of a discharge from full at the configured load until the weakest cell is empty.
+    /// Energy of a discharge from full, at the configured load, until the weakest cell is empty.
     fn energy_kwh(&self) -> Known {
         let Some(load) = &self.config.monitor.health.usable else {
             return Err("no load is configured ([usable], the load of the certification)".to_owned());
@@ -337,7 +337,7 @@ impl<'a> Battery<'a> {
         self.new_ohm()?;
         let learned = self.learned()?;
         let usable = learned.iter().map(|(_, learned)| learned.usable).collect::<Option<Vec<_>>>();
-        let usable = usable.ok_or("the usable capacity of a cell is not known: it needs a discharge")?;
+        let usable = usable.ok_or("the usable capacity of a cell is unknown: it needs a discharge")?;
         let weakest = usable.iter().min_by(|a, b| a.1.0.total_cmp(&b.1.0));
         let (at_ns, (charge_ah, std_ah)) = *weakest.ok_or("the pack has no cells")?;
         let of_cell = |(_, cell): &(usize, Learned)| {
@@ -345,7 +345,7 @@ impl<'a> Battery<'a> {
         };
         let energy_wh = learned.iter().map(of_cell).sum::<f64>() / learned.len() as f64;
         let value = 1e-3 * energy_wh * self.series * self.strings;
-        // The charge carries the uncertainty: the mean voltage is known to about a per cent.
+        // The charge dominates the uncertainty: the mean voltage is accurate to about one percent.
         let std = (charge_ah > 0.0).then(|| value * std_ah / charge_ah);
         Ok(Quantity { value, std, time: Timestamp::from_nanos(at_ns) })
     }
@@ -356,7 +356,7 @@ impl Quantity {
         Self { value: factor * self.value, std: self.std.map(|std| factor * std), ..self }
     }
 
-    /// A ratio to new as a gain in per cent.
+    /// Converts a ratio to new to an increase in percent.
     fn increase(self) -> Self {
         Self { value: 100.0 * (self.value - 1.0), std: self.std.map(|std| 100.0 * std), ..self }
     }

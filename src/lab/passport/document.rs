@@ -1,7 +1,7 @@
-//! The passport as JSON: the manufacturer's part with the known values merged in, checked against the form of its standard.
+//! The passport as JSON: the manufacturer's part merged with the known values, checked against the form of its standard.
 //!
-//! In: a [`Condition`] and the manufacturer's part. Out: the passport, and the [details](details) that the standards have no members
-//! for. A value has one source: a static part that states a measured value is refused. The same inputs give the same bytes.
+//! Input: a [`Condition`] and the manufacturer's part. Output: the passport, and the [details](details) for which the standards have no
+//! members. A value has one source: a static part that states a measured value is rejected. The same inputs give the same bytes.
 
 use serde_json::{Map, Value, json};
 
@@ -13,10 +13,10 @@ use super::standards;
 use crate::config::VehicleIdentity;
 use crate::io::stamp::format_utc;
 
-/// Merges the known values into the manufacturer's part and checks the whole.
+/// Merges the known values into the manufacturer's part and checks the result.
 ///
 /// # Errors
-/// Every fault of the static part by its path, and every required value that is missing, with the reason; one per line.
+/// Every fault of the static part with its path, and every missing required value with the reason; one per line.
 pub fn passport(standard: Standard, condition: &Condition, manufacturer: Value) -> Result<Value, Vec<String>> {
     let Value::Object(mut root) = manufacturer else {
         return Err(vec!["static part: must be an object".to_owned()]);
@@ -39,7 +39,7 @@ pub fn passport(standard: Standard, condition: &Condition, manufacturer: Value) 
     if faults.is_empty() { Ok(document) } else { Err(faults) }
 }
 
-/// Every value with its unit, definition, standard deviation and time, and why values are absent.
+/// Every value with its unit, definition, standard deviation and time, and the reasons for absent values.
 pub fn details(standard: Standard, condition: &Condition, vehicle: &VehicleIdentity) -> Value {
     let (mut values, mut absent) = (Vec::new(), Vec::new());
     for field in Field::ALL {
@@ -74,31 +74,31 @@ fn places(standard: Standard) -> impl Iterator<Item = (Field, Place)> {
     Field::ALL.into_iter().filter_map(move |field| Some((field, field.place(standard)?)))
 }
 
-/// Whether a path leads to a group, or is it.
+/// Whether a path leads to a group or equals it.
 fn is_above(path: &str, group: &str) -> bool {
     group.strip_prefix(path).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
 }
 
-/// Puts a measured value below `group`.
+/// Inserts a measured value below `group`.
 fn insert(root: &mut Map<String, Value>, group: &str, name: &str, value: Value) -> Result<(), String> {
     let mut object = root;
     for step in group.split('.') {
         let next = object.entry(step).or_insert_with(|| Value::Object(Map::new()));
-        // Something else in its place is a fault of the form.
+        // The check of the form reports other values in this place.
         let Some(next) = next.as_object_mut() else { return Ok(()) };
         object = next;
     }
     if object.contains_key(name) {
         let path = joined(group, name);
         return Err(format!(
-            "{path}: stated in the static part, but measured ({value}): leave it out of the static part"
+            "{path}: stated in the static part, but also measured ({value}): remove it from the static part"
         ));
     }
     object.insert(name.to_owned(), value);
     Ok(())
 }
 
-/// Faults of a static part of another battery. Only Catena-X states the rated values.
+/// Faults of a static part that belongs to another battery. Only Catena-X states the rated values.
 fn other_battery(rated: Rated, document: &Value) -> impl Iterator<Item = String> {
     let both = [
         ("capacity", rated.capacity_ah, "Ah by the configuration (cell model and strings)"),
@@ -107,15 +107,15 @@ fn other_battery(rated: Rated, document: &Value) -> impl Iterator<Item = String>
     both.into_iter().filter_map(|(name, known, source)| {
         let (known, stated) = (known?, document.pointer(&format!("/performance/rated/{name}/value"))?.as_f64()?);
         let is_other = (stated - known).abs() > RATED_TOLERANCE * known.abs();
-        is_other.then(|| format!("performance.rated.{name}.value: found {stated}, but it is {known} {source}"))
+        is_other.then(|| format!("performance.rated.{name}.value: found {stated}, must be {known} {source}"))
     })
 }
 
 fn missing_fault(standard: Standard, condition: &Condition, path: &str) -> String {
     let of_field = places(standard).find(|(_, place)| is_above(path, place.group) || is_above(place.group, path));
     match of_field.map(|(field, _)| condition.get(field)) {
-        Some(Err(why)) => format!("{path}: required, but not known: {why}"),
-        _ => format!("{path}: required, and no record holds it: --static gives it"),
+        Some(Err(why)) => format!("{path}: required, but unknown: {why}"),
+        _ => format!("{path}: required, but no record contains it: state it with --static"),
     }
 }
 
@@ -138,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn values_stand_in_their_places_with_their_times() {
+    fn values_are_in_their_places_with_times() {
         let built =
             passport(Standard::ProductCondition, &condition(&[]), json!({ "InformationOnAccidents": [] })).unwrap();
         let cycles = json!({ "NumberOfFullCyclesValue": 12, "LastUpdate": "2023-11-14T22:13:20Z" });
@@ -148,26 +148,26 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_value_is_absent_and_a_required_one_refuses() {
+    fn unknown_required_value_is_rejected() {
         let accidents = || json!({ "InformationOnAccidents": ["report-1"] });
         let absent = [Field::StateOfCertifiedEnergy, Field::EnergyThroughput];
         let built = passport(Standard::ProductCondition, &condition(&absent), accidents()).unwrap();
         assert!(built.get("StateOfCertifiedEnergy").is_none() && built.get("EnergyThroughput").is_none(), "{built}");
         let refused =
             passport(Standard::ProductCondition, &condition(&[Field::StateOfCharge]), accidents()).unwrap_err();
-        assert_eq!(refused, ["StateOfCharge: required, but not known: no reading"]);
+        assert_eq!(refused, ["StateOfCharge: required, but unknown: no reading"]);
         let refused = passport(Standard::ProductCondition, &condition(&[]), json!({})).unwrap_err();
-        assert_eq!(refused, ["InformationOnAccidents: required, and no record holds it: --static gives it"]);
+        assert_eq!(refused, ["InformationOnAccidents: required, but no record contains it: state it with --static"]);
     }
 
     #[test]
-    fn a_value_has_one_source() {
+    fn measured_value_in_the_static_part_is_rejected() {
         let stated = json!({ "InformationOnAccidents": [], "StateOfCharge": { "StateOfChargeValue": 50 } });
         let refused = passport(Standard::ProductCondition, &condition(&[]), stated).unwrap_err();
         assert_eq!(
             refused,
             [
-                "StateOfCharge.StateOfChargeValue: stated in the static part, but measured (12.75): leave it out of the static part"
+                "StateOfCharge.StateOfChargeValue: stated in the static part, but also measured (12.75): remove it from the static part"
             ]
         );
         let temperatures =
@@ -177,31 +177,34 @@ mod tests {
     }
 
     #[test]
-    fn a_battery_pass_without_a_static_part_names_what_is_missing_once() {
+    fn missing_parts_of_a_battery_pass_are_listed_once() {
         let refused =
             passport(Standard::BatteryPass, &condition(&[Field::StateOfCertifiedEnergy]), json!({})).unwrap_err();
         let has = |line: &str| refused.iter().any(|fault| fault == line);
-        assert!(has("materials: required, and no record holds it: --static gives it"), "{refused:?}");
-        assert!(has("performance.dynamic.energy.soce: required, but not known: no reading"), "{refused:?}");
-        assert!(has("performance.dynamic.power: required, and no record holds it: --static gives it"), "{refused:?}");
+        assert!(has("materials: required, but no record contains it: state it with --static"), "{refused:?}");
+        assert!(has("performance.dynamic.energy.soce: required, but unknown: no reading"), "{refused:?}");
+        assert!(
+            has("performance.dynamic.power: required, but no record contains it: state it with --static"),
+            "{refused:?}"
+        );
         assert!(!refused.iter().any(|fault| fault.contains("fullCycles")), "{refused:?}");
     }
 
     #[test]
-    fn a_static_part_of_another_battery_is_refused() {
+    fn static_part_of_another_battery_is_rejected() {
         let faults = |capacity: f64, energy: f64| {
             let rated = json!({ "capacity": { "value": capacity }, "energy": { "value": energy } });
             let stated = json!({ "performance": { "rated": rated } });
             let refused = passport(Standard::BatteryPass, &condition(&[]), stated).unwrap_err();
-            refused.into_iter().filter(|fault| fault.contains("but it is")).collect::<Vec<String>>()
+            refused.into_iter().filter(|fault| fault.contains(": found ")).collect::<Vec<String>>()
         };
         assert_eq!(faults(3.97, 0.0141), Vec::<String>::new(), "rounded");
         let both = faults(60.0, 22.0);
         assert_eq!(
             both[0],
-            "performance.rated.capacity.value: found 60, but it is 4 Ah by the configuration (cell model and strings)"
+            "performance.rated.capacity.value: found 60, must be 4 Ah by the configuration (cell model and strings)"
         );
-        assert_eq!(both[1], "performance.rated.energy.value: found 22, but it is 0.014 kWh by --certified-energy-kwh");
+        assert_eq!(both[1], "performance.rated.energy.value: found 22, must be 0.014 kWh by --certified-energy-kwh");
     }
 
     #[test]

@@ -1,33 +1,33 @@
 //! Energy of a discharge at the configured load.
 //!
-//! In: a cell's model, load, capacity (Ah) and resistance ratio. Out: Wh until a charge (Ah) has been delivered. The voltage under
-//! load is that of the usable capacity ([`usable_ah`]): the charge q(v) that a discharge delivers down to each voltage v is a table,
-//! and the energy is the sum of v dq over it. What lies beyond the table is delivered at the cut-off voltage.
+//! Input: a cell's model, load, capacity (Ah) and resistance ratio. Output: Wh until a charge (Ah) has been delivered. The voltage under
+//! load follows from the usable capacity ([`usable_ah`]): a table holds the charge q(v) that a discharge delivers down to each voltage v,
+//! and the energy is the sum of v dq over it. Charge beyond the table is delivered at the cut-off voltage.
 
 use crate::cell::CellModel;
 use crate::health::UsableConfig;
 use crate::health::usable::usable_ah;
 
-/// Voltages of the table: some 8 mV apart in a lithium-ion cell.
+/// Number of voltages of the table: about 8 mV apart in a lithium-ion cell.
 const VOLTAGES: u32 = 200;
 
 /// A full cell at the configured load.
 #[derive(Debug)]
 pub(super) struct Discharge {
-    /// Voltage, V, and the charge delivered down to it, Ah: voltages fall.
+    /// Voltage, V, falling, and the charge delivered down to it, Ah.
     points: Vec<(f64, f64)>,
     cutoff_v: f64,
 }
 
 impl Discharge {
-    /// The discharge of a cell of this capacity, Ah, and resistance relative to new.
+    /// Discharges a cell of this capacity, Ah, and resistance relative to new.
     pub(super) fn new(model: &CellModel, load: &UsableConfig, capacity_ah: f64, resistance_ratio: f64) -> Self {
         let top_v = model.voltage_max_v.max(load.cutoff_v);
         let voltage_v = |step: u32| top_v - (top_v - load.cutoff_v) * f64::from(step) / f64::from(VOLTAGES);
         let point = |step: u32| {
             let cutoff_v = voltage_v(step);
             let load = UsableConfig { cutoff_v, ..*load };
-            // The slowest branch as new: it moves the mean voltage by millivolts.
+            // The slowest branch is taken as new: it changes the mean voltage by millivolts.
             (cutoff_v, usable_ah(model, &load, 1.0, capacity_ah, (resistance_ratio, 1.0)))
         };
         Self { points: (0..=VOLTAGES).map(point).collect(), cutoff_v: load.cutoff_v }
@@ -83,17 +83,17 @@ mod tests {
         assert!((discharge.energy_wh(1.0) - 3.9).abs() < 0.01, "{}", discharge.energy_wh(1.0));
         assert!(
             (discharge.energy_wh(2.1) - 7.5).abs() < 0.01,
-            "beyond the table at the cut-off: {}",
+            "at the cut-off voltage beyond the table: {}",
             discharge.energy_wh(2.1)
         );
     }
 
     #[test]
-    fn resistance_takes_its_part() {
+    fn resistance_reduces_the_energy() {
         let load = UsableConfig { current_a: 2.0, temperature_c: 25.0, cutoff_v: 3.0, taper_current_a: 0.05 };
         let mut model = model();
         model.r0_ohm = Table { values: vec![vec![0.05; 2]] };
-        // 0.1 V less at 2 A, and the last 0.1 V of the curve cannot be used.
+        // 0.1 V less at 2 A, and the last 0.1 V of the curve is unusable.
         let charge_ah = 2.0 * (1.0 - 0.1 / 1.2);
         let energy_wh = Discharge::new(&model, &load, 2.0, 1.0).energy_wh(charge_ah);
         assert!((energy_wh - charge_ah * (3.0 + 4.1) / 2.0).abs() < 0.01, "{energy_wh}");

@@ -1,6 +1,6 @@
-//! The values of a battery passport that packwatch can know: name, unit, definition and place in each standard.
+//! The values of a battery passport that packwatch can determine: name, unit, definition and place in each standard.
 //!
-//! This table decides what is written and where; `docs/src/lab/passport.md` explains it.
+//! This table decides what is written where; `docs/src/lab/passport.md` explains it.
 
 use serde_json::Value;
 
@@ -14,7 +14,7 @@ pub enum Standard {
 }
 
 impl Standard {
-    /// Its name, with the version.
+    /// Name of the standard, with the version.
     pub const fn name(self) -> &'static str {
         match self {
             Self::ProductCondition => {
@@ -40,7 +40,7 @@ pub enum Field {
     Temperature,
     /// Capacity, Ah.
     RemainingCapacity,
-    /// Capacity lost, % of the rated.
+    /// Capacity lost, % of the rated capacity.
     CapacityFade,
     /// Resistance increase of the cell with the largest, % of the new cell's.
     CellResistanceIncrease,
@@ -52,11 +52,11 @@ pub enum Field {
     PackResistance,
     /// Energy of a full discharge, kWh.
     RemainingEnergy,
-    /// That energy, % of the certified.
+    /// Energy of a full discharge, % of the certified energy.
     StateOfCertifiedEnergy,
 }
 
-/// Place of a value in the JSON: names of the members that lead to the number, and to its time.
+/// Place of a value in the JSON: member names that lead to the number and to its time.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Place {
     /// Members above both.
@@ -78,7 +78,7 @@ impl Place {
 }
 
 impl Field {
-    /// All values, in the order in which they are listed.
+    /// All values, in the order of lists.
     pub const ALL: [Self; 13] = [
         Self::FullCycles,
         Self::CapacityThroughput,
@@ -95,7 +95,7 @@ impl Field {
         Self::StateOfCertifiedEnergy,
     ];
 
-    /// Its name, its unit and what it is.
+    /// Name, unit and definition.
     pub(super) const fn meaning(self) -> (&'static str, &'static str, &'static str) {
         match self {
             Self::FullCycles => (
@@ -142,7 +142,7 @@ impl Field {
         }
     }
 
-    /// Its place in a passport; `None` = the standard has none.
+    /// Place in a passport; `None` = the standard has no place for the value.
     pub(super) const fn place(self, standard: Standard) -> Option<Place> {
         let (idta, catena_x) = match self {
             Self::FullCycles => {
@@ -182,17 +182,17 @@ impl Field {
         }
     }
 
-    /// The number as the passports have it: both standards count whole cycles.
+    /// The number for a passport: both standards count whole cycles.
     pub(super) fn number(self, value: f64) -> Value {
         match self {
-            // Whole and below 2^53: exact.
+            // Whole numbers below 2^53 are exact.
             Self::FullCycles => Value::from(value.floor().max(0.0) as u64),
             _ => Value::from(rounded(value)),
         }
     }
 }
 
-/// To seven digits, far below every deviation; a zero is positive.
+/// Rounds to seven digits, far below every standard deviation; a zero is positive.
 pub(super) fn rounded(value: f64) -> f64 {
     format!("{value:.6e}").parse().unwrap_or(value) + 0.0
 }
@@ -202,7 +202,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn cycles_are_whole_and_other_numbers_have_seven_digits() {
+    fn cycles_are_whole_and_others_have_seven_digits() {
         assert_eq!(Field::FullCycles.number(12.97), Value::from(12));
         assert_eq!(Field::StateOfCharge.number(12.971_234_56), Value::from(12.971_23));
         assert_eq!(rounded(0.004_460_274_12), 0.004_460_274);
@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn every_value_has_a_place_in_at_least_one_standard_and_no_two_share_one() {
+    fn every_value_has_a_unique_place() {
         for standard in [Standard::ProductCondition, Standard::BatteryPass] {
             let mut groups: Vec<&str> =
                 Field::ALL.iter().filter_map(|field| field.place(standard)).map(|place| place.group).collect();

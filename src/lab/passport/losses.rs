@@ -1,44 +1,44 @@
-//! Charge that a replay did not see: times for which the current is not known.
+//! Charge that a replay did not see: times with unknown current.
 //!
-//! In: events and estimates of a replay, in order. Out: lost seconds, or the first gap whose charge has no bound. A replay reports
+//! Input: events and estimates of a replay, in order. Output: lost seconds, or the first gap with unlimited charge. A replay reports
 //! a missing current in these ways:
 //!
 //! | report | charge |
 //! | --- | --- |
-//! | the current's signal turns bad or stale | lost until it is good again, less the time for which a reading may be used |
+//! | the current's signal turns bad or stale | lost until it is good again, except for the time for which a reading may be used |
 //! | the buses fall asleep | none: the core reports it only while no current flows |
-//! | a gap: nothing was recorded | none if the buses slept or the last current was that of a pack at rest; otherwise not known |
+//! | a gap: nothing was recorded | none if the buses slept or the last current was that of a resting pack; otherwise unknown |
 //!
-//! Assumption: a pack that rests when the recording stops rests until it continues. Use that was not recorded at all, from rest to
-//! rest, leaves no trace here.
+//! Assumption: a pack that rests when the recording stops rests until it continues. Use that starts and ends with a rest and was not
+//! recorded cannot be detected.
 
 use crate::monitor::{Estimate, Event, EventKind};
 use crate::quantity::{Channel, Fault, Timestamp};
 
-/// How a replay's current and voltages are read.
+/// Limits for the readings of a replay's current and voltages.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct ReadingLimits {
-    /// For how long a reading of the current may be used, s.
+    /// Time for which a reading of the current may be used, s.
     pub current_age_s: f64,
-    /// The same of a voltage, s.
+    /// Time for which a reading of a voltage may be used, s.
     pub voltage_age_s: f64,
-    /// Current of a pack at rest, A per string.
+    /// Largest current of a resting pack, A per string.
     pub rest_a: f64,
 }
 
-/// What was lost so far.
+/// Losses so far.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Losses {
     limits: ReadingLimits,
     /// Latest known current, A per string.
     current_a: Option<f64>,
-    /// From when the current is lost.
+    /// Start of the current loss.
     lost_since: Option<Timestamp>,
     is_asleep: bool,
     /// End of the latest time in which nothing was recorded and no charge moved.
     paused_until: Option<Timestamp>,
     lost_s: f64,
-    /// The first gap whose charge has no bound.
+    /// The first gap with unlimited charge.
     gap: Option<String>,
 }
 
@@ -47,7 +47,7 @@ impl Losses {
         Self { limits, ..Self::default() }
     }
 
-    /// Forgets what was lost: another pack is connected. A loss that has not ended counts from now.
+    /// Discards earlier losses, because another pack was connected. A loss that has not ended counts from now.
     pub(super) fn restart(&mut self, now: Timestamp) {
         self.lost_since = self.lost_since.map(|since| since.max(now));
         (self.lost_s, self.gap) = (0.0, None);
@@ -63,7 +63,7 @@ impl Losses {
     pub(super) fn take_event(&mut self, event: &Event) {
         match event.kind {
             EventKind::SignalBad { channel: Channel::Current, fault } => {
-                // A stale reading was used until now, the one before a bad reading may be used from now on.
+                // A stale reading was used until now; the last one before a bad reading may be used from now on.
                 let held_s = if fault == Fault::Stale { 0.0 } else { self.limits.current_age_s };
                 self.lost_since.get_or_insert(event.time.plus_secs(held_s));
             }
@@ -75,19 +75,21 @@ impl Losses {
             EventKind::Gap { seconds } => {
                 let length = seconds.map_or_else(|| "an unknown time".to_owned(), |seconds| format!("{seconds:.0} s"));
                 self.gap.get_or_insert_with(|| {
-                    format!("the record has a gap of {length} that began while current flowed, or was not known")
+                    format!(
+                        "the record has a gap of {length} that started while current flowed, or its current is unknown"
+                    )
                 });
             }
             _ => {}
         }
     }
 
-    /// Whether a pack at rest has this current, A per string.
+    /// Whether a resting pack may have this current, A per string.
     pub(super) fn is_rest(&self, current_a: f64) -> bool {
         current_a.abs() <= self.limits.rest_a
     }
 
-    /// Whether nothing was recorded, and no charge moved, in a part of the time since then.
+    /// Whether nothing was recorded and no charge moved in a part of the time since `from`.
     pub(super) fn has_paused_since(&self, from: Timestamp) -> bool {
         self.paused_until.is_some_and(|until| until > from)
     }
@@ -102,7 +104,7 @@ impl Losses {
         }
     }
 
-    /// Why the charge of the record, which ends at `end` and has charges and discharges of `used_s`, is not known; `None` = it is.
+    /// Why the charge of the record is unknown; `None` = it is known. The record ends at `end` and has charges and discharges of `used_s`.
     pub(super) fn finish(&mut self, end: Timestamp, used_s: f64) -> Option<String> {
         self.end_loss(end);
         let lost_s = self.lost_s;
@@ -111,9 +113,9 @@ impl Losses {
     }
 }
 
-/// Whether so much of a time, s, is lost that its sum is not known.
+/// Whether the lost share of a time, s, is so large that its sum is unknown.
 pub(super) fn is_too_much(lost_s: f64, used_s: f64) -> bool {
-    // Largest part of the time of charges and discharges for which the current may be lost: far below the deviation of a current
+    // Largest share of the time of charges and discharges without current: far below the deviation of a current
     // sensor's gain, and enough for single lost frames.
     lost_s > 1e-3 * used_s
 }
@@ -141,7 +143,7 @@ mod tests {
     const GOOD: EventKind = EventKind::SignalGood { channel: Channel::Current, bad_readings: 1 };
 
     #[test]
-    fn a_gap_at_rest_or_asleep_moves_no_charge_and_one_under_load_does() {
+    fn gap_under_load_loses_charge() {
         let gap = EventKind::Gap { seconds: Some(600.0) };
         assert_eq!(finished(0.05, &[(10.0, gap)]), None);
         let said = finished(5.0, &[(10.0, gap)]).expect("a gap");
@@ -152,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lost_current_counts_beyond_the_age_of_its_last_reading() {
+    fn lost_current_counts_beyond_its_age_limit() {
         assert_eq!(finished(5.0, &[(10.0, bad(Fault::OutOfRange)), (12.5, GOOD)]), None, "half a second of an hour");
         assert!(finished(5.0, &[(10.0, bad(Fault::OutOfRange)), (16.0, GOOD)]).is_some());
         assert!(finished(0.0, &[(10.0, bad(Fault::Stale)), (14.0, GOOD)]).is_some(), "the bus lives");
@@ -160,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn another_pack_begins_with_nothing_lost() {
+    fn another_pack_starts_without_losses() {
         let mut losses = Losses::new(LIMITS);
         let at = Timestamp::from_secs;
         losses.take_event(&Event { time: at(1.0), kind: bad(Fault::Stale) });

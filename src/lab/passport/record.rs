@@ -1,8 +1,8 @@
-//! Record of the connected pack, from a store or a replay: sums of half-cycles, energy, the latest learned values, the last state.
+//! Record of the connected pack, from a store or a replay: sums of half-cycles, energy, latest learned values, last state.
 //!
-//! Times are nanoseconds since 1970: the wall clock of a store, the log's clock of a replay. Rows of a store and events of a replay have
-//! the same names for the same values, so both give the same sums. Energy needs every voltage: a store has none. Where a part of a sum is
-//! missing, [`Record::gap`] has the reason.
+//! Times are nanoseconds since 1970, on the wall clock of a store or the log's clock of a replay. Rows of a store and events of a replay
+//! use the same names, so both give the same sums. Energy needs every voltage, which a store does not contain. If a part of a
+//! sum is missing, [`Record::gap`] states the reason.
 
 use super::losses::{Losses, ReadingLimits, is_too_much};
 use crate::fields::Fields;
@@ -11,15 +11,15 @@ use crate::quantity::catalogue::Quantity;
 use crate::quantity::{Mode, Timestamp};
 use crate::store::{HistoryEntry, HistoryExtent, HistoryQuery, HistoryReader, HistoryTable};
 
-/// Latest values learned of a cell, with standard deviations.
+/// Latest learned values of a cell, with standard deviations.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Learned {
     pub(super) at_ns: i64,
     /// Ah.
     pub(super) capacity: (f64, f64),
-    /// Ah, with its own time: of the latest half-cycle that gave one; `None` = no load is configured.
+    /// Ah, with its own time: from the latest half-cycle that gave one; `None` = no load is configured.
     pub(super) usable: Option<(i64, (f64, f64))>,
-    /// Over new.
+    /// Relative to new.
     pub(super) resistance: (f64, f64),
 }
 
@@ -28,7 +28,7 @@ pub(super) struct Learned {
 pub(super) struct CellRecord {
     pub(super) moved: Throughput,
     pub(super) learned: Option<Learned>,
-    /// Of a replay: the last reading of voltage and current.
+    /// In a replay: the last reading of voltage and current.
     power: Option<Power>,
 }
 
@@ -36,64 +36,64 @@ pub(super) struct CellRecord {
 #[derive(Debug, Clone, Copy)]
 struct Power {
     time: Timestamp,
-    /// Without its sign, W.
+    /// Absolute power, W.
     power_w: f64,
     /// Whether the pack rests.
     is_rest: bool,
 }
 
-/// Energy of a replay: the integral of the power of all cells of one string.
+/// Energy of a replay: integral of the power of all cells of one string.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Energy {
     /// Both directions added, Wh.
     pub(super) energy_wh: f64,
-    /// Time of its last part.
+    /// Time of the last part.
     pub(super) until: Option<Timestamp>,
-    /// Time that it covers, s, all cells added.
+    /// Integrated time, s, all cells added.
     counted_s: f64,
     /// Time in use without a voltage, s, all cells added.
     lost_s: f64,
 }
 
 impl Energy {
-    /// Why it is not known; `None` = it is.
+    /// Why the energy is unknown; `None` = it is known.
     pub(super) fn gap(&self) -> Option<&'static str> {
         is_too_much(self.lost_s, self.counted_s).then_some("voltages are missing from the record while current flowed")
     }
 }
 
-/// Everything that a passport is made from, besides the configuration.
+/// Sources of a passport, besides the configuration.
 #[derive(Debug, Default)]
 pub struct Record {
     pub(super) cells: Vec<CellRecord>,
-    /// End of the last half-cycle; a clock that was set may have been later before.
+    /// End of the last half-cycle; not the latest time if the clock was set back.
     pub(super) moved_until_ns: Option<i64>,
-    /// Why charge is missing from the half-cycles.
+    /// Why the half-cycles lack charge.
     pub(super) gap: Option<String>,
-    /// `None` = not known: a store.
+    /// `None` = unknown: the record comes from a store.
     pub(super) energy: Option<Energy>,
     limits: ReadingLimits,
-    /// Of a replay.
+    /// Losses of a replay.
     losses: Losses,
-    /// The last state and its time, which its own clock calls `snapshot.time`.
+    /// The last state, with its time on the record's clock.
     pub(super) state: Option<(i64, Box<Snapshot>)>,
 }
 
 impl Record {
-    /// A replay's record, without any event yet.
+    /// Creates the record of a replay, without any event.
     pub fn of_replay(limits: ReadingLimits) -> Self {
         Self { energy: Some(Energy::default()), limits, losses: Losses::new(limits), ..Self::default() }
     }
 
-    /// The connected pack's record in a store.
+    /// Reads the record of the connected pack from a store.
     ///
     /// # Errors
-    /// When the file cannot be read, or its chained rows were changed.
+    /// The file cannot be read, or its chained rows were changed.
     pub fn of_store(reader: &HistoryReader) -> Result<Self, String> {
         if let Some(broken) = reader.verify()?.broken {
-            return Err(format!("the history was changed: {broken}, no passport is made of it"));
+            return Err(format!("the history was changed: {broken}; packwatch does not write a passport from it"));
         }
-        // The state before the rows: a daemon may add some in between.
+        // Read the state before the rows: a daemon may add rows in between.
         let state = reader.dated_snapshot().map(|(at, state)| (at, Box::new(state)));
         let extent = reader.extent()?;
         let mut record = Self { state, ..Self::default() };
@@ -108,8 +108,8 @@ impl Record {
         Ok(record)
     }
 
-    /// Compares the half-cycles of a store with what was counted when they were written.
-    /// The state's own sums stand for rows that the store deleted, if the state is as old as the rows.
+    /// Compares the half-cycles of a store with the number counted when they were written.
+    /// If the state is as old as the rows, its sums replace rows that the store deleted.
     fn note_missing_rows(&mut self, extent: &HistoryExtent) {
         let HistoryExtent { half_cycles, deleted_half_cycles: deleted, written_half_cycles, .. } = *extent;
         let counted = self.snapshot().map_or(0, Snapshot::half_cycles);
@@ -132,7 +132,7 @@ impl Record {
         }
     }
 
-    /// Notes why charge is missing; the first reason counts.
+    /// Records why charge is missing; the first reason counts.
     pub fn note_gap(&mut self, reason: String) {
         self.gap.get_or_insert(reason);
     }
@@ -143,15 +143,15 @@ impl Record {
             HistoryTable::HalfCycle => self.take_half_cycle(entry.wall_ns, &fields),
             HistoryTable::Capacity => self.take_capacity(entry.wall_ns, &fields),
             HistoryTable::Reset if matches!(fields.text("reason"), "damaged" | "rows_lost") => {
-                self.gap.get_or_insert_with(|| "the store was damaged, or had no room: rows may be missing".to_owned());
+                self.gap.get_or_insert_with(|| "the store was damaged or full: rows may be missing".to_owned());
             }
             _ => {}
         }
     }
 
-    /// Takes outputs of a replay, in their order.
+    /// Receives the outputs of a replay, in order.
     pub fn take(&mut self, out: &Outputs) {
-        // An event may be a gap: the estimates before it say what current flowed, those of its time come after it.
+        // An event may be a gap: earlier estimates show the current that flowed before it; estimates of its time follow it.
         let mut estimates = out.estimates.iter().peekable();
         for event in &out.events {
             while let Some(estimate) = estimates.next_if(|estimate| estimate.time < event.time) {
@@ -162,7 +162,7 @@ impl Record {
         estimates.for_each(|estimate| self.take_estimate(estimate));
     }
 
-    /// Takes an event of a replay.
+    /// Receives an event of a replay.
     fn take_event(&mut self, event: &Event) {
         let at_ns = event.time.nanos();
         self.losses.take_event(event);
@@ -174,13 +174,13 @@ impl Record {
                 *self = Self { losses: std::mem::take(&mut self.losses), ..Self::of_replay(self.limits) };
             }
             EventKind::PackReturned { .. } => {
-                self.note_gap("the pack was connected before, and what it moved then is not added".to_owned());
+                self.note_gap("the pack was connected before, and its earlier charge is not included".to_owned());
             }
             _ => {}
         }
     }
 
-    /// Takes an estimate of a replay: the energy since the cell's one before.
+    /// Receives an estimate of a replay: adds the energy since the cell's previous one.
     fn take_estimate(&mut self, estimate: &Estimate) {
         self.losses.take_estimate(estimate);
         let longest_s = self.limits.voltage_age_s;
@@ -200,7 +200,7 @@ impl Record {
         }
     }
 
-    /// Takes the state at the end of a replay.
+    /// Receives the state at the end of a replay.
     pub fn finish(&mut self, state: Snapshot) {
         let Throughput { charging_s, discharging_s, .. } = self.fullest();
         if let Some(reason) = self.losses.finish(state.time, charging_s + discharging_s) {
@@ -241,14 +241,14 @@ impl Record {
         cell.learned = Some(Learned { at_ns, capacity, usable, resistance });
     }
 
-    /// Charge that the pack of so many strings has moved, Ah, and the difference between the durations of discharges and charges, h.
-    /// Of the cell that has moved most: a row that another cell lacks does not lower it.
+    /// Charge moved by a pack of so many strings, Ah, and the difference between the durations of discharges and charges, h.
+    /// Taken from the cell that moved most, so that a missing row of another cell does not reduce it.
     pub(super) fn moved(&self, strings: f64) -> (f64, f64) {
         let most = self.fullest();
         (strings * most.charge_ah, (most.discharging_s - most.charging_s).abs() / 3600.0)
     }
 
-    /// Sums of the cell that has moved most.
+    /// Sums of the cell that moved most.
     fn fullest(&self) -> Throughput {
         let sums = self.cells.iter().map(|cell| cell.moved);
         sums.max_by(|a, b| a.charge_ah.total_cmp(&b.charge_ah)).unwrap_or_default()
@@ -296,7 +296,7 @@ mod tests {
     }
 
     #[test]
-    fn half_cycles_of_both_directions_add_up_and_the_fullest_record_counts() {
+    fn half_cycles_add_up_and_fullest_cell_counts() {
         let mut record = Record::of_replay(LIMITS);
         for event in [
             half_cycle(10.0, 0, Mode::Charge, 1.0),
@@ -309,13 +309,13 @@ mod tests {
         assert_eq!(record.moved_until_ns, Some(20_000_000_000));
         let replaced = EventKind::PackReplaced { capacity_ah: None, capacity_std_ah: None };
         record.take_event(&Event { time: Timestamp::from_secs(30.0), kind: replaced });
-        assert_eq!((record.moved(1.0), record.moved_until_ns), ((0.0, 0.0), None), "another pack begins at nothing");
+        assert_eq!((record.moved(1.0), record.moved_until_ns), ((0.0, 0.0), None), "another pack starts at 0");
     }
 
     #[test]
-    fn energy_counts_both_directions_and_no_gap() {
+    fn energy_counts_both_directions_but_no_gaps() {
         let mut record = Record::of_replay(LIMITS);
-        // 7.2 W for 50 s, and the same in the other direction; two minutes of nothing between them; a voltage without a current.
+        // 7.2 W for 50 s in each direction, two minutes without data between them, and a voltage without a current.
         for (time_s, current_a) in
             [(0.0, 2.0), (50.0, 2.0), (180.0, -2.0), (230.0, -2.0), (250.0, f64::NAN), (260.0, 2.0)]
         {
@@ -328,7 +328,7 @@ mod tests {
     }
 
     #[test]
-    fn a_voltage_that_comes_late_at_rest_leaves_the_energy_known() {
+    fn late_voltage_at_rest_keeps_the_energy_known() {
         let mut record = Record::of_replay(LIMITS);
         for (time_s, current_a) in [(0.0, 2.0), (50.0, 0.0), (5000.0, 0.0), (5050.0, 2.0)] {
             record.take_estimate(&estimate(time_s, 3.6, current_a));
@@ -337,7 +337,7 @@ mod tests {
     }
 
     #[test]
-    fn the_current_before_a_gap_decides_not_the_first_one_after_it() {
+    fn current_before_a_gap_decides() {
         let gap = Event { time: Timestamp::from_secs(5000.0), kind: EventKind::Gap { seconds: Some(4000.0) } };
         for (before_a, after_a, is_known) in [(0.0, 2.0, true), (2.0, 0.0, false)] {
             let mut record = Record::of_replay(LIMITS);
@@ -349,7 +349,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_that_the_store_did_not_delete_itself_are_missed() {
+    fn rows_missing_from_the_store_are_detected() {
         let gap = |half_cycles, deleted_half_cycles, written_half_cycles| {
             let mut record = Record::default();
             let extent = HistoryExtent { pack: 1, half_cycles, deleted_half_cycles, written_half_cycles };

@@ -9,12 +9,12 @@ use std::ops::Range;
 
 use serde_json::{Map, Value};
 
-/// What a leaf holds.
+/// Content of a leaf.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Kind {
     /// Any text.
     Text,
-    /// A text with a character in it.
+    /// A text that is not empty.
     Identifier,
     /// Any number.
     Number,
@@ -24,9 +24,9 @@ pub(super) enum Kind {
     Flag,
     /// yyyy-mm-dd, a day of the calendar.
     Date,
-    /// Date and time, with or without a time zone.
+    /// Date and time, with or without time zone.
     Time,
-    /// A UUID, also as a URN.
+    /// A UUID, possibly as a URN.
     Uuid,
     /// A business partner number: these letters and twelve characters.
     Partner(&'static str),
@@ -64,14 +64,14 @@ pub(super) struct Member {
 /// Result of a check.
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct Verdict {
-    /// What is wrong, each with its path.
+    /// Faults, each with its path.
     pub(super) faults: Vec<String>,
     /// Paths of required members that are missing.
     pub(super) missing: Vec<String>,
 }
 
 impl Shape {
-    /// The form that these rows describe.
+    /// Creates the form that these rows describe.
     pub(super) fn of_rows(rows: &[(&str, Kind)]) -> Self {
         let mut root = Self::Object(Vec::new());
         for (path, kind) in rows {
@@ -114,8 +114,8 @@ impl Shape {
         }
     }
 
-    /// Checks a document. A missing object counts as one missing member; where `is_opened` holds for its path, its own required
-    /// members count instead.
+    /// Checks a document. A missing object counts as one missing member, unless `is_opened` holds for its path: then its own required
+    /// members count.
     pub(super) fn check(&self, document: &Value, is_opened: &dyn Fn(&str) -> bool) -> Verdict {
         let mut verdict = Verdict::default();
         self.check_at("", document, is_opened, &mut verdict);
@@ -139,7 +139,7 @@ impl Shape {
                     for (index, one) in list.iter().enumerate() {
                         item.check_at(&format!("{path}[{index}]"), one, is_opened, verdict);
                         if *is_set && !seen.insert(one) {
-                            verdict.faults.push(format!("{path}[{index}]: found twice, must be there once"));
+                            verdict.faults.push(format!("{path}[{index}]: found twice, must occur once"));
                         }
                     }
                 }
@@ -182,7 +182,7 @@ fn named(path: &str) -> &str {
     if path.is_empty() { "the document" } else { path }
 }
 
-/// What a value of the wrong type is; a long one is not printed.
+/// Short description of a value of the wrong type.
 fn short(value: &Value) -> String {
     match value {
         Value::Object(_) => "an object".to_owned(),
@@ -192,7 +192,7 @@ fn short(value: &Value) -> String {
 }
 
 impl Kind {
-    /// What is allowed; `None` = the value is.
+    /// The allowed values; `None` = the value is allowed.
     fn refuses(self, value: &Value) -> Option<String> {
         let number = |is_good: &dyn Fn(f64) -> bool| value.as_f64().is_some_and(is_good);
         let text = |is_good: &dyn Fn(&str) -> bool| value.as_str().is_some_and(is_good);
@@ -205,8 +205,8 @@ impl Kind {
                 (number(&|number| (low..=high).contains(&number)), allowed)
             }
             Self::Flag => (value.is_boolean(), "true or false".to_owned()),
-            Self::Date => (text(&is_date), "a date as 2026-01-31".to_owned()),
-            Self::Time => (text(&is_time), "a time as 2026-01-31T12:00:00Z".to_owned()),
+            Self::Date => (text(&is_date), "a date like 2026-01-31".to_owned()),
+            Self::Time => (text(&is_time), "a time like 2026-01-31T12:00:00Z".to_owned()),
             Self::Uuid => (text(&is_uuid), "a UUID, with or without urn:uuid: in front".to_owned()),
             Self::Partner(letters) => {
                 (text(&|text| is_partner(text, letters)), format!("{letters} and twelve letters or digits"))
@@ -216,20 +216,20 @@ impl Kind {
                 let is_key = |text: &str| all.contains(&text) || text.strip_prefix("customKey:").is_some_and(is_word);
                 (text(&is_key), format!("one of {}, customKey:WORD", all.join(", ")))
             }
-            // Never leaves.
+            // Not used for leaves.
             Self::Documents | Self::Facilities | Self::Reading => (true, String::new()),
         };
         (!is_good).then_some(allowed)
     }
 }
 
-/// Whether the text has this form: `0` stands for a digit, all else for itself.
+/// Whether the text has this form: `0` stands for a digit, other characters for themselves.
 fn has_form(text: &str, form: &str) -> bool {
     let fits = |(byte, expected): (u8, u8)| if expected == b'0' { byte.is_ascii_digit() } else { byte == expected };
     text.len() == form.len() && text.bytes().zip(form.bytes()).all(fits)
 }
 
-/// A day of the calendar, years of four digits.
+/// Whether the text is a calendar day, with a year of four digits.
 fn is_date(text: &str) -> bool {
     if !has_form(text, "0000-00-00") {
         return false;
@@ -245,7 +245,7 @@ fn is_date(text: &str) -> bool {
     (1..=days).contains(&day)
 }
 
-/// Date and clock; seconds with or without parts; `Z`, an offset or nothing behind.
+/// Whether the text is date and time; seconds may have decimals, the zone is `Z`, an offset or missing.
 fn is_time(text: &str) -> bool {
     let Some((date, clock)) = text.split_once('T') else { return false };
     let zone_at = clock.find(['Z', '+', '-']).unwrap_or(clock.len());
@@ -261,7 +261,7 @@ fn is_time(text: &str) -> bool {
         && is_zone(zone)
 }
 
-/// Nothing, `Z`, or an offset of at most 14 hours, as XML Schema has it.
+/// Whether the zone is empty, `Z`, or an offset of at most 14 hours, as in XML Schema.
 fn is_zone(zone: &str) -> bool {
     let is_offset = |offset: &str| {
         let (hours, minutes) = (number_in(offset, 0..2), number_in(offset, 3..5));
@@ -270,7 +270,7 @@ fn is_zone(zone: &str) -> bool {
     matches!(zone, "" | "Z") || zone.strip_prefix(['+', '-']).is_some_and(is_offset)
 }
 
-/// The number that these digits are; 0 for other characters.
+/// The number in these digits; 0 for other characters.
 fn number_in(text: &str, digits: Range<usize>) -> u32 {
     text.get(digits).and_then(|digits| digits.parse().ok()).unwrap_or(0)
 }
@@ -313,7 +313,7 @@ mod tests {
     }
 
     #[test]
-    fn a_good_document_has_no_fault() {
+    fn valid_document_has_no_fault() {
         let paper = json!({ "content": "", "contentType": "URL", "header": "x" });
         let document = json!({
             "name": "a", "size": { "unit": "mm", "width": 100 }, "keys": ["a", "b"], "papers": [paper], "made": [{ "on": "2026-01-31" }],
@@ -323,7 +323,7 @@ mod tests {
     }
 
     #[test]
-    fn each_fault_names_its_path_and_what_is_allowed() {
+    fn faults_name_path_and_allowed_values() {
         let paper = json!({ "content": 1, "contentType": "URL", "heading": "x" });
         let document = json!({
             "name": "", "size": { "unit": "cm", "width": 101 }, "keys": ["a", "a"], "papers": [paper], "made": [{ "on": "31.1.2026" }],
@@ -336,10 +336,10 @@ mod tests {
                 "name: found \"\", must be a text that is not empty",
                 "size.width: found 101, must be 0 to 100",
                 "size.unit: found \"cm\", must be one of mm, m",
-                "keys[1]: found twice, must be there once",
+                "keys[1]: found twice, must occur once",
                 "papers[0].content: found 1, must be a text",
                 "papers[0].heading: not in the standard, which has content, contentType, header",
-                "made[0].on: found \"31.1.2026\", must be a date as 2026-01-31",
+                "made[0].on: found \"31.1.2026\", must be a date like 2026-01-31",
                 "use.cycles: found 3, must be an object",
             ]
         );
@@ -348,24 +348,24 @@ mod tests {
     }
 
     #[test]
-    fn a_missing_object_is_named_once_and_an_opened_one_by_its_members() {
+    fn missing_object_is_listed_once_unless_opened() {
         assert_eq!(check(&json!({})).missing, ["name", "size", "papers", "use.cycles"]);
     }
 
     #[test]
-    fn a_long_list_is_checked_for_duplicates_in_one_pass() {
+    fn duplicates_in_a_long_list_are_found_in_one_pass() {
         let mut keys: Vec<String> = (0..200_000).map(|number| number.to_string()).collect();
         keys.push("17".to_owned());
         let document = json!({ "name": "a", "size": { "unit": "mm" }, "keys": keys, "papers": [], "use": { "cycles": {
             "value": 1, "time": "2026-01-31T12:00:00Z" } } });
-        // Every pair compared takes minutes.
+        // Comparing every pair would take minutes.
         let start = std::time::Instant::now();
-        assert_eq!(check(&document).faults, ["keys[200000]: found twice, must be there once"]);
+        assert_eq!(check(&document).faults, ["keys[200000]: found twice, must occur once"]);
         assert!(start.elapsed().as_secs() < 10, "{:?}", start.elapsed());
     }
 
     #[test]
-    fn texts_of_a_form_are_checked_whole() {
+    fn formatted_texts_are_checked_completely() {
         let refused = |kind: Kind, texts: &[&str]| texts.iter().all(|text| kind.refuses(&json!(text)).is_some());
         let taken = |kind: Kind, texts: &[&str]| texts.iter().all(|text| kind.refuses(&json!(text)).is_none());
         assert!(taken(Kind::Time, &["2008-04-02T13:08:17Z", "2008-04-02T13:08:17", "2008-04-02T13:08:17.25-05:30"]));

@@ -1,7 +1,7 @@
-//! The two standards as rows of path and kind, written from their aspect models.
+//! The two standards as rows of path and kind, derived from their aspect models.
 //!
 //! Sources: IDTA 02035-5 "Digital Battery Passport, Part 5: Product Condition" 1.0.1 (aspect model `product_condition`), and Catena-X
-//! `io.catenax.battery.battery_pass` 6.0.0. Units are those of the aspect models; [`super::field`] has them.
+//! `io.catenax.battery.battery_pass` 6.0.0. Units are those of the aspect models; see [`super::field`].
 
 use super::field::Standard;
 use super::shape::{Kind, Shape};
@@ -231,7 +231,7 @@ const BATTERY_PASS: &[(&str, Kind)] = &[
     ("handling.applicable", Flag),
 ];
 
-/// The form that a standard asks for.
+/// The form of a standard.
 pub(super) fn shape(standard: Standard) -> Shape {
     Shape::of_rows(match standard {
         Standard::ProductCondition => PRODUCT_CONDITION,

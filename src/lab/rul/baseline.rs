@@ -1,18 +1,18 @@
-//! Baselines that forecasts are compared with: a straight line through the last points, and a double exponential of least
-//! squares.
+//! Baselines for comparison with forecasts: a straight line through the last points, and a least-squares double
+//! exponential.
 //!
 //! Input: points of [use, capacity]. Output: the use at which the curve first passes the threshold.
 
-/// Steps it is followed in.
+/// Number of steps in which the curve is followed.
 const STEPS: u32 = 20_000;
-/// First step of that search, and the step at which it ends.
+/// First step of the search, and the step at which it ends.
 const SEARCH: (f64, f64) = (0.5, 1e-4);
-/// Exponents beyond this are not tried: e-folds over the use so far.
+/// Largest exponents: e-folds over the use so far.
 const STEEPEST: f64 = 50.0;
 
-/// Straight line of least squares through the last points; `None` = it does not fall.
+/// Least-squares line through the last points; `None` = it does not fall.
 pub(super) fn straight(points: &[[f64; 2]], threshold: f64) -> Option<f64> {
-    // The straight line goes through this part of the points, the last ones.
+    // Part of the points, the last ones, through which the line goes.
     let wanted = ((0.3 * points.len() as f64) as usize).max(5);
     let last = &points[points.len().saturating_sub(wanted)..];
     let count = last.len() as f64;
@@ -26,19 +26,19 @@ pub(super) fn straight(points: &[[f64; 2]], threshold: f64) -> Option<f64> {
     (slope < 0.0).then(|| used + (threshold - capacity) / slope)
 }
 
-/// C = a e^(b t) + c e^(d t): for given exponents a and c are linear, the exponents are searched for.
+/// C = a e^(b t) + c e^(d t): a and c are linear for given exponents, which are searched.
 pub(super) fn double_exponential(points: &[[f64; 2]], threshold: f64) -> Option<f64> {
     let scale = points.last()?[0];
     if points.len() < 4 || scale <= 0.0 {
         return None;
     }
     let fit = |exponents: [f64; 2]| linear(points, scale, exponents);
-    // Starts of the search for the exponents, e-folds over the use so far: both falling, one rising, nearly straight.
+    // Starting exponents, e-folds over the use so far: both falling, one rising, nearly straight.
     let found =
         [[-0.1, 0.5], [-0.2, -2.0], [-0.05, 3.0], [-0.5, 0.05]].into_iter().filter_map(|start| search(start, &fit));
     let (_, [a, c], [b, d]) = found.min_by(|x, y| x.0.total_cmp(&y.0))?;
     let capacity = |used: f64| a * (b * used / scale).exp() + c * (d * used / scale).exp();
-    // A curve is followed until 20 times the use so far.
+    // The curve is followed until 20 times the use so far.
     let step = 19.0 * scale / f64::from(STEPS);
     (0..=STEPS).map(|index| scale + step * f64::from(index)).find(|&used| capacity(used) < threshold)
 }
@@ -46,12 +46,12 @@ pub(super) fn double_exponential(points: &[[f64; 2]], threshold: f64) -> Option<
 /// Sum of squares, factors, exponents.
 type ExponentialFit = (f64, [f64; 2], [f64; 2]);
 
-/// Pattern search: takes a better neighbour and doubles the step, else halves the step.
+/// Pattern search: moves to a better neighbour and doubles the step, or else halves the step.
 fn search(start: [f64; 2], fit: &dyn Fn([f64; 2]) -> Option<ExponentialFit>) -> Option<ExponentialFit> {
     let neighbours: [[f64; 2]; 8] =
         [[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]];
     let (mut best, mut step) = (fit(start)?, SEARCH.0);
-    // Most moves of that search: a search that needs more creeps along a flat valley.
+    // Most moves of the search: one that needs more creeps along a flat valley.
     for _ in 0..400 {
         if step < SEARCH.1 {
             break;
@@ -65,7 +65,7 @@ fn search(start: [f64; 2], fit: &dyn Fn([f64; 2]) -> Option<ExponentialFit>) -> 
     Some(best)
 }
 
-/// The factors that fit best with these exponents; `None` = they cannot be distinguished.
+/// The best factors for these exponents; `None` = they cannot be separated.
 fn linear(points: &[[f64; 2]], scale: f64, exponents: [f64; 2]) -> Option<ExponentialFit> {
     let at = |used: f64| exponents.map(|exponent| (exponent * used / scale).exp());
     let (mut xx, mut xy, mut yy, mut xc, mut yc) = (0.0, 0.0, 0.0, 0.0, 0.0);
@@ -78,8 +78,7 @@ fn linear(points: &[[f64; 2]], scale: f64, exponents: [f64; 2]) -> Option<Expone
         yc += y * capacity;
     }
     let determinant = xx * yy - xy * xy;
-    // Not above covers NaN too.
-    // A determinant below this share of its terms: both exponentials coincide.
+    // Too small a determinant, as a share of its terms: both exponentials coincide. The comparison also covers NaN.
     if !matches!(determinant.partial_cmp(&(1e-12 * xx * yy)), Some(std::cmp::Ordering::Greater)) {
         return None;
     }
@@ -97,7 +96,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_line_goes_through_the_last_points_alone() {
+    fn line_uses_only_the_last_points() {
         let points: Vec<[f64; 2]> =
             (0..20).map(f64::from).map(|t| [t, if t < 10.0 { 9.0 } else { 4.0 - 0.1 * t }]).collect();
         assert!((straight(&points, 1.0).expect("falls") - 30.0).abs() < 1e-9);
@@ -105,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn a_double_exponential_is_found_again() {
+    fn double_exponential_is_recovered() {
         let capacity = |t: f64| 2.0 * (-0.003 * t).exp() - 0.01 * (0.02 * t).exp();
         let points: Vec<[f64; 2]> = (0..140).map(f64::from).map(|t| [t, capacity(t)]).collect();
         let crossing = double_exponential(&points, 1.0).expect("falls");
@@ -113,7 +112,7 @@ mod tests {
     }
 
     #[test]
-    fn one_that_levels_off_never_gets_there() {
+    fn curve_that_levels_off_never_reaches_the_threshold() {
         let points: Vec<[f64; 2]> = (0..100).map(f64::from).map(|t| [t, 1.5 + 0.5 * (-0.1 * t).exp()]).collect();
         assert_eq!(double_exponential(&points, 1.0), None);
     }

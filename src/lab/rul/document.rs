@@ -1,4 +1,4 @@
-//! Forecasts as one JSON document, with a line feed at its end.
+//! Forecasts as one JSON document, ending in a line feed.
 
 use serde::Serialize;
 
@@ -29,7 +29,7 @@ struct ScoredDocument<'a> {
 /// Forecasts at the end of the histories.
 ///
 /// # Errors
-/// Never: every value has a form in JSON.
+/// Never: every value can be written as JSON.
 pub fn now_json(forecasts: &[CurrentForecast]) -> Result<String, LabError> {
     pretty(&NowDocument { version: VERSION, interval: INTERVAL, forecasts })
 }
@@ -37,7 +37,7 @@ pub fn now_json(forecasts: &[CurrentForecast]) -> Result<String, LabError> {
 /// Scored forecasts.
 ///
 /// # Errors
-/// Never: every value has a form in JSON.
+/// Never: every value can be written as JSON.
 pub fn scored_json(files: &[HistoryScore], alpha: f64) -> Result<String, LabError> {
     pretty(&ScoredDocument { version: VERSION, interval: INTERVAL, alpha, files, total: total(files) })
 }

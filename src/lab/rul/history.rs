@@ -1,7 +1,7 @@
 //! Capacity histories: a [`CapacityTable`] in order of time.
 //!
-//! Where it has `type`, only discharges are readings, and each of them counts as a full cycle; without it the file holds no use, and
-//! days count. `duration_s` is time of use between two readings; the remaining time was rest.
+//! With a column `type`, only discharges are readings, and each counts as a full cycle. Without it, the file does not contain the use,
+//! so days are counted. `duration_s` is the time of use between two readings; the remaining time counts as rest.
 
 use std::path::Path;
 
@@ -15,13 +15,13 @@ use crate::quantity::Timestamp;
 pub struct MeasuredCapacity {
     /// Line of the file.
     pub line: u64,
-    /// Units of the history's axis since the first reading.
+    /// Use since the first reading, units of the history's axis.
     pub used: f64,
-    /// Full cycles since the first reading; 0 where they are not counted.
+    /// Full cycles since the first reading; 0 if they are not counted.
     pub cycles: f64,
     /// Days since the first reading.
     pub days: f64,
-    /// Days of these without current.
+    /// Days without current since the first reading.
     pub rest_days: f64,
     /// Ah.
     pub capacity_ah: f64,
@@ -30,13 +30,13 @@ pub struct MeasuredCapacity {
 /// A cell's capacities over its life.
 #[derive(Debug, Clone, PartialEq)]
 pub struct History {
-    /// What counts as use.
+    /// Unit of use.
     pub axis: Axis,
     /// In order of time, at least one.
     pub rows: Vec<MeasuredCapacity>,
 }
 
-/// Use counted over the lines read so far.
+/// Use over the lines read so far.
 #[derive(Default)]
 struct UseCounter {
     first: Option<Timestamp>,
@@ -63,7 +63,7 @@ impl History {
     /// Reads a file.
     ///
     /// # Errors
-    /// It cannot be read or a field is wrong, with file, line, column, what was found and what is allowed.
+    /// The file cannot be read or a field is wrong, with file, line, column, what was found and what is allowed.
     pub fn read(path: &Path) -> Result<Self, TableError> {
         let mut table = CapacityTable::open_in_order(path)?;
         let axis = if table.header().find("type").is_some() { Axis::Cycles } else { Axis::Days };
@@ -77,7 +77,7 @@ impl History {
         Ok(Self { axis, rows })
     }
 
-    /// Ah.
+    /// First capacity, Ah.
     pub fn first_capacity_ah(&self) -> f64 {
         self.rows.first().map_or(f64::NAN, |row| row.capacity_ah)
     }
@@ -96,7 +96,7 @@ impl UseCounter {
         reading
     }
 
-    /// Counts the time since the line before: time that the line before did not use was rest.
+    /// Counts the time since the previous line: time that the previous line did not use was rest.
     fn pass(&mut self, time: Timestamp) {
         if let Some(last) = self.last {
             self.rest_days += (time.since(last) / 86_400.0 - self.used_days).max(0.0);
@@ -140,14 +140,14 @@ mod tests {
     }
 
     #[test]
-    fn without_a_type_days_count() {
+    fn days_are_counted_without_types() {
         let history = read("ref,date,capacity_ah\n1,2014-01-06T12:00:00,2.1\n2,2014-01-11T00:00:00,2.0\n");
         let history = history.expect("reads");
         assert_eq!((history.axis, history.rows[1].used, history.rows[1].cycles), (Axis::Days, 4.5, 0.0));
     }
 
     #[test]
-    fn a_fault_names_line_column_what_was_found_and_what_is_allowed() {
+    fn fault_names_line_column_found_and_allowed() {
         let head = "date,capacity_ah\n";
         for (rows, fault) in [
             ("0,2.1\n1,x\n", "cell.csv:3: column capacity_ah: found \"x\", must be Ah above 0 or nothing"),

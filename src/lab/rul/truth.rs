@@ -1,8 +1,8 @@
-//! End of a life: where the non-increasing line of least squares through its capacities passes the threshold.
+//! End of a life: where the non-increasing least-squares line through its capacities passes the threshold.
 
 use super::History;
 
-/// Use at which the capacity passes the threshold for good; `None` = it does not, or was below it from the first reading.
+/// Use at which the capacity finally passes the threshold; `None` = it does not, or it was below from the first reading on.
 pub fn end_of_life(history: &History, threshold_ah: f64) -> Option<f64> {
     let capacities: Vec<f64> = history.rows.iter().map(|row| row.capacity_ah).collect();
     let line = non_increasing(&capacities);
@@ -15,7 +15,7 @@ pub fn end_of_life(history: &History, threshold_ah: f64) -> Option<f64> {
     Some(before.used + (after.used - before.used) * (before.capacity_ah - threshold_ah) / drop)
 }
 
-/// The non-increasing sequence with the least sum of squared differences: neighbours that rise are joined to their mean.
+/// The non-increasing sequence with the smallest sum of squared differences: rising neighbours are replaced by their mean.
 fn non_increasing(values: &[f64]) -> Vec<f64> {
     let mut blocks: Vec<(f64, usize)> = Vec::with_capacity(values.len());
     for &value in values {
@@ -48,20 +48,20 @@ mod tests {
     }
 
     #[test]
-    fn the_end_lies_between_the_readings_on_both_sides() {
+    fn end_is_interpolated_between_readings() {
         assert_eq!(end_of_life(&history(&[2.0, 1.8, 1.6, 1.2]), 1.5), Some(2.25));
         assert_eq!(end_of_life(&history(&[2.0, 1.8, 1.6]), 1.5), None);
         assert_eq!(end_of_life(&history(&[1.4, 1.3]), 1.5), None);
     }
 
     #[test]
-    fn a_dip_that_recovers_is_no_end_and_a_passing_recovery_does_not_undo_one() {
+    fn temporary_dip_or_recovery_does_not_move_the_end() {
         assert_eq!(end_of_life(&history(&[2.0, 1.45, 1.8, 1.7, 1.6, 1.4]), 1.5), Some(4.5));
         assert_eq!(end_of_life(&history(&[2.0, 1.6, 1.4, 1.3, 1.52, 1.2]), 1.5), Some(1.5));
     }
 
     #[test]
-    fn rising_neighbours_are_joined_to_their_mean() {
+    fn rising_neighbours_are_replaced_by_their_mean() {
         assert_eq!(non_increasing(&[3.0, 1.0, 2.0, 0.5]), [3.0, 1.5, 1.5, 0.5]);
         assert_eq!(non_increasing(&[1.0, 2.0, 3.0]), [2.0; 3]);
     }

@@ -1,18 +1,18 @@
-//! Calibrates the width of an interval, place by place, from judged forecasts.
+//! Calibrates the local width of an interval from judged forecasts.
 //!
-//! The errors of a cell's voltage are tiny while it is charged at constant voltage and large where a discharge ends: one
-//! factor for all would be right on average and wrong everywhere. So the spread at a window is the mean ratio |error| /
-//! standard deviation of the judged windows nearest to it, shrunk towards and relative to that of all; the factor is the
-//! 95 % quantile of ratio / spread over all judged windows, each with a spread computed without it and the windows that
-//! overlap it. Half the interval is factor x spread x standard deviation.
+//! The errors of a cell's voltage are tiny during a charge at constant voltage and large at the end of a discharge: one common
+//! factor would be right on average and wrong everywhere. So the spread at a window is the mean ratio |error| / standard
+//! deviation of the nearest judged windows, shrunk towards the mean ratio of all and relative to it. The factor is the 95 %
+//! quantile of ratio / spread over all judged windows; the spread of each is computed without it and the windows that overlap
+//! it. Half the interval is factor x spread x standard deviation.
 
 use crate::regress::GAUSSIAN;
 
-/// Nearest judged windows that determine the spread at a place.
+/// Number of nearest judged windows that determine the spread at a window.
 const NEAR: usize = 20;
-/// Weight of the mean of all among them, in windows.
+/// Weight of the overall mean among them, in windows.
 const SHRINKAGE: f64 = 4.0;
-/// With fewer judged windows the interval is as wide everywhere, and at least the Gaussian one.
+/// With fewer judged windows, the interval has the same width everywhere, at least the Gaussian one.
 const FEWEST: usize = 100;
 
 /// Judged windows.
@@ -20,19 +20,19 @@ const FEWEST: usize = 100;
 pub(super) struct Spread {
     pub(super) factor: f64,
     width: usize,
-    /// Rows of the windows, rising, and their ratios.
+    /// Rows of the windows, rising, with their ratios.
     rows: Vec<usize>,
     ratios: Vec<f64>,
     /// Mean ratio.
     mean: f64,
-    /// Windows in units of `units`.
+    /// Windows, scaled by `units`.
     windows: Vec<f64>,
     /// Standard deviation of every feature.
     units: Vec<f64>,
 }
 
 impl Spread {
-    /// From judged windows: their rows (rising), features and ratios. Windows less than `overlap` rows apart share rows.
+    /// Calibrates on judged windows: their rows (rising), features and ratios. Windows less than `overlap` rows apart share rows.
     pub(super) fn new(rows: Vec<usize>, features: &[f64], ratios: Vec<f64>, overlap: usize) -> Self {
         let count = rows.len();
         let width = features.len().checked_div(count).unwrap_or(0);
@@ -48,12 +48,12 @@ impl Spread {
         spread
     }
 
-    /// Judged windows.
+    /// Number of judged windows.
     pub(super) fn count(&self) -> usize {
         self.rows.len()
     }
 
-    /// Half of the interval at a window, standard deviations.
+    /// Half of the interval at a window, in standard deviations.
     pub(super) fn half_width(&self, features: &[f64]) -> f64 {
         if self.rows.len() < FEWEST {
             return self.factor;
@@ -85,7 +85,7 @@ fn scaled(features: &[f64], units: &[f64]) -> Vec<f64> {
     features.iter().enumerate().map(|(at, value)| value / units[at % units.len()]).collect()
 }
 
-/// 1 where the values do not differ.
+/// Standard deviation of the values; 1 if they do not differ.
 fn deviation<'a>(values: impl Iterator<Item = &'a f64> + Clone) -> f64 {
     let count = values.clone().count() as f64;
     let mean = values.clone().sum::<f64>() / count;
@@ -93,8 +93,8 @@ fn deviation<'a>(values: impl Iterator<Item = &'a f64> + Clone) -> f64 {
     if deviation > 1e-12 * mean.abs() { deviation } else { 1.0 }
 }
 
-/// The 95 % quantile, with the correction for few; never below the Gaussian one when these are few: chance could
-/// otherwise make it narrow.
+/// The 95 % quantile, corrected for small samples. With few ratios it is never below the Gaussian one, because chance could
+/// otherwise make the interval too narrow.
 fn factor(mut ratios: Vec<f64>) -> f64 {
     ratios.sort_by(f64::total_cmp);
     let rank = ((ratios.len() + 1) as f64 * 0.95).ceil() as usize;
@@ -110,7 +110,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_factor_is_a_quantile_and_never_narrow_for_lack_of_forecasts() {
+    fn factor_is_a_quantile_and_never_too_narrow() {
         let of =
             |ratios: Vec<f64>| Spread::new((0..ratios.len()).collect(), &vec![0.0; ratios.len()], ratios, 1).factor;
         assert_eq!(of((1..=99).map(|k| f64::from(k) / 10.0).collect()), 9.5);
@@ -122,7 +122,7 @@ mod tests {
 
     #[test]
     fn intervals_are_wide_where_errors_were_large() {
-        // Two regimes; in the second, one window of ten, errors are ten times as large.
+        // Two regimes: in the second, one window of ten, errors are ten times larger.
         let large = |k: usize| k % 10 == 3;
         let ratio = |k: usize| (k * 7919 % 1000) as f64 / 1000.0 * if large(k) { 10.0 } else { 1.0 };
         let features: Vec<f64> = (0..2000).flat_map(|k| [if large(k) { 5.0 } else { 0.0 }, (k % 7) as f64]).collect();

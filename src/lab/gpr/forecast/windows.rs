@@ -1,4 +1,4 @@
-//! Lag windows: values and differences of the rows up to a row, and which rows have them.
+//! Lag windows: values and differences of the rows up to a row, and the rows that have them.
 
 use super::super::ColumnTable;
 
@@ -8,7 +8,7 @@ pub struct LagWindows<'a> {
     table: &'a ColumnTable,
     columns: usize,
     lags: usize,
-    /// First and one past the last row of the part of each row.
+    /// For each row, the first row of its part, and one past the last.
     part: Vec<(usize, usize)>,
 }
 
@@ -17,12 +17,12 @@ pub struct LagWindows<'a> {
 pub struct RowSpacing {
     /// Median, in the unit of the time column.
     pub median: f64,
-    /// 5 % and 95 % of the steps are below.
+    /// 5 % and 95 % quantiles of the steps.
     pub range: (f64, f64),
 }
 
 impl RowSpacing {
-    /// Of a column of the table, within its parts; `None` when there are no steps or no times.
+    /// Steps of a column of the table, within its parts; `None` if there are no steps or no times.
     pub fn of(table: &ColumnTable, column: usize) -> Option<Self> {
         let times: Vec<f64> = table.column(column).collect();
         let steps = (1..times.len()).filter(|row| table.parts.binary_search(row).is_err());
@@ -33,7 +33,7 @@ impl RowSpacing {
         Some(Self { median: at(0.5)?, range: (at(0.05)?, at(0.95)?) })
     }
 
-    /// Whether nine of ten steps are within a tenth of the median.
+    /// Whether nine of ten steps are within 10 % of the median.
     pub fn even(&self) -> bool {
         let near = |step: f64| (step - self.median).abs() <= 0.1 * self.median.abs();
         near(self.range.0) && near(self.range.1)
@@ -41,7 +41,7 @@ impl RowSpacing {
 }
 
 impl<'a> LagWindows<'a> {
-    /// Creates windows over the table's required columns with `lags` values of each.
+    /// Creates windows over the required columns of the table, with `lags` values of each.
     pub fn new(table: &'a ColumnTable, lags: usize) -> Self {
         let ends = table.parts.iter().skip(1).copied().chain([table.len()]);
         let spans = table.parts.iter().copied().zip(ends);
@@ -49,12 +49,12 @@ impl<'a> LagWindows<'a> {
         Self { table, columns: table.width() - table.has.len(), lags, part }
     }
 
-    /// Numbers of a window.
+    /// Number of values in a window.
     pub fn width(&self) -> usize {
         self.columns * self.lags
     }
 
-    /// Rows from `begin` on that have a window and a row `steps` ahead in their part and before `end`.
+    /// Rows from `begin` on that have a window, and a row `steps` ahead in their part and before `end`.
     pub fn between(&self, begin: usize, end: usize, steps: usize) -> Vec<usize> {
         let fits = |row: &usize| {
             let (first, last) = self.part[*row];
@@ -68,7 +68,7 @@ impl<'a> LagWindows<'a> {
         (0..end.min(self.part.len())).rev().find(|row| *row + 1 >= self.part[*row].0 + self.lags)
     }
 
-    /// A value.
+    /// Value of a column in a row.
     pub fn value(&self, row: usize, column: usize) -> f64 {
         self.table.row(row)[column]
     }
@@ -78,7 +78,7 @@ impl<'a> LagWindows<'a> {
         self.value(row + steps, column) - self.value(row, column)
     }
 
-    /// Windows of rows, one after the other: of every column the value, then the differences, the youngest first.
+    /// Windows of rows, one after the other: for every column the value, then the differences, the latest first.
     pub fn features(&self, rows: &[usize]) -> Vec<f64> {
         let mut all = Vec::with_capacity(rows.len() * self.width());
         for &row in rows {
@@ -107,7 +107,7 @@ mod tests {
     }
 
     #[test]
-    fn windows_hold_the_past_and_do_not_cross_parts() {
+    fn windows_contain_the_past_within_a_part() {
         let table = table();
         let windows = LagWindows::new(&table, 3);
         assert_eq!(windows.features(&[4]), [16.0, 7.0, 5.0, 40.0, 10.0, 10.0]);

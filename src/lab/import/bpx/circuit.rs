@@ -1,4 +1,4 @@
-//! Resistances and branches of a BPX cell by the closed forms of its equations for small currents.
+//! Resistances and branches of a BPX cell by closed forms of its equations for small currents.
 //!
 //! | part | resistance | time constant | source |
 //! | --- | --- | --- | --- |
@@ -8,9 +8,9 @@
 //! | concentration of the electrolyte | `2 R T (1 - t)^2 / (F^2 A c) (L_n / 3 D_n + L_s / D_s + L_p / 3 D_p)` | `sum(L / D) sum(e L) / pi^2` | the same; slowest mode of a layer without exchange at its ends |
 //! | diffusion in a particle, each electrode | `abs(dU/dx) r / (5 D F c_max S)` | `r^2 / 35 D` | sphere under constant flux; first moment of its step response |
 //!
-//! `S` is the surface of all particles, `A` the area of all electrode pairs, `k`, `D` of a layer are the electrolyte's times the layer's
-//! transport efficiency. Each property follows Arrhenius' law of its activation energy; one without follows that of
-//! [`USUAL_J_PER_MOL`]. Deviation: BPX has no double layer, so charge transfer has no time constant. Effect: none after some 0.1 s.
+//! `S` is the surface of all particles, `A` the area of all electrode pairs; `k` and `D` of a layer are the electrolyte's times the layer's
+//! transport efficiency. Each property follows Arrhenius' law with its activation energy, or with [`USUAL_J_PER_MOL`] if none is stated.
+//! Deviation: BPX has no double layer, so charge transfer has no time constant. Effect: none after about 0.1 s.
 
 use super::curve::Curve;
 use super::document::{BpxCell, Electrode, Layer, Transport};
@@ -18,10 +18,10 @@ use super::{FARADAY_C_PER_MOL, GAS_J_PER_MOL_K};
 use crate::cell::model::ACTIVATION_ENERGY_J_PER_MOL as USUAL_J_PER_MOL;
 use crate::quantity::bounds::{Bounds, CAPACITANCE_F, RESISTANCE_OHM};
 
-/// Distance over which the slope of a potential is taken, lithium content: a table's noise must not be read as slope.
+/// Distance over which the slope of a potential is taken, lithium content: the noise of a table must not count as slope.
 const SLOPE_STEP: f64 = 0.005;
 
-/// Least resistance, ohm, and least time constant, s: a flat potential gives none, a model must have one.
+/// Smallest resistance, ohm, and smallest time constant, s: a flat potential gives 0, but a model needs a positive value.
 const LEAST: f64 = 1e-7;
 
 /// Resistances and time constants at one SOC and temperature.
@@ -33,12 +33,12 @@ pub(super) struct Resistances {
 }
 
 impl Resistances {
-    /// All resistances together, ohm.
+    /// Sum of all resistances, ohm.
     pub(super) fn settled_ohm(&self) -> f64 {
         self.r0_ohm + self.branches.iter().map(|branch| branch.0).sum::<f64>()
     }
 
-    /// What no cell has, found and allowed; `None` = nothing.
+    /// A value that no cell has, with what is allowed; `None` = all values are possible.
     pub(super) fn fault(&self) -> Option<String> {
         let resistances = std::iter::once(self.r0_ohm).chain(self.branches.iter().map(|branch| branch.0));
         let capacitances = self.branches.iter().map(|(r_ohm, tau_s)| tau_s / r_ohm);
@@ -52,7 +52,7 @@ impl Resistances {
     }
 }
 
-/// Resistances at a SOC and a temperature, K: the electrolyte's branch where the file has one, then the electrodes'.
+/// Resistances at a SOC and a temperature, K: the electrolyte's branch if the file describes it, then the electrodes'.
 pub(super) fn resistances(cell: &BpxCell, curve: &Curve<'_>, soc: f64, temperature_k: f64) -> Resistances {
     let (x, y) = curve.contents(soc);
     let at = |energy: Option<f64>| arrhenius(energy, cell.reference_k, temperature_k);
@@ -78,12 +78,12 @@ pub(super) fn resistances(cell: &BpxCell, curve: &Curve<'_>, soc: f64, temperatu
     Resistances { r0_ohm: at_least(r0_ohm), branches: branches.collect() }
 }
 
-/// At least [`LEAST`]; what is negative or no number stays unknown.
+/// At least [`LEAST`]; a negative value or NaN becomes NaN.
 fn at_least(value: f64) -> f64 {
     if value >= 0.0 { value.max(LEAST) } else { f64::NAN }
 }
 
-/// A property at a temperature, relative to that at the reference.
+/// A property at a temperature, relative to its value at the reference temperature.
 fn arrhenius(j_per_mol: Option<f64>, reference_k: f64, temperature_k: f64) -> f64 {
     let energy = j_per_mol.unwrap_or(USUAL_J_PER_MOL);
     libm::exp(energy / GAS_J_PER_MOL_K * (1.0 / reference_k - 1.0 / temperature_k))
@@ -107,7 +107,7 @@ fn particle(electrode: &Electrode, area_m2: f64, content: f64, diffusivity: f64)
     (slope_v / (FARADAY_C_PER_MOL * mol_per_s), radius_m * radius_m / (35.0 * diffusivity))
 }
 
-/// Sum over the layers of thickness over a property times the transport efficiency; electrodes count a third.
+/// Sum over the layers of thickness / (property x transport efficiency); electrodes count one third.
 fn path(layers: &[Layer; 3], property: f64) -> f64 {
     let of = |layer: &Layer| layer.thickness_m / (property * layer.transport_efficiency);
     of(&layers[0]) / 3.0 + of(&layers[1]) + of(&layers[2]) / 3.0

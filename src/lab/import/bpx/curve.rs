@@ -1,21 +1,21 @@
-//! The open-circuit voltage of a BPX cell over SOC, and what charge lies between its cut-offs.
+//! The open-circuit voltage of a BPX cell over SOC, and the charge between its cut-offs.
 //!
 //! `u(soc, T) = u_p(y) - u_n(x) + (T - T_ref) (du_p/dT(y) - du_n/dT(x))` with the lithium contents `x` (negative) and `y` (positive).
-//! The cyclable lithium is that of a full cell as the file states it: negative at its maximum, positive at its minimum. SOC 1 is where
-//! the voltage at the reference temperature is the upper cut-off, SOC 0 where it is the lower one; this is what PyBaMM's ElectrodeSOH
-//! computes (Mohtat et al., J. Power Sources 427 (2019) 101, eqs. 5 to 8). Units: V, Ah, K.
+//! The cyclable lithium is that of a full cell in the file: negative at its maximum, positive at its minimum. At the reference
+//! temperature, the voltage is the upper cut-off at SOC 1 and the lower one at SOC 0, as in PyBaMM's ElectrodeSOH
+//! (Mohtat et al., J. Power Sources 427 (2019) 101, eqs. 5 to 8). Units: V, Ah, K.
 
 use super::FARADAY_C_PER_MOL;
 use super::document::{BpxCell, Electrode};
 use crate::filter::bisect;
 
-/// Least rise of the open-circuit voltage from one breakpoint to the next, V; one that falls is raised.
+/// Smallest rise of the open-circuit voltage between breakpoints, V; a voltage that falls is raised.
 const LEAST_RISE_V: f64 = 2e-5;
 
-/// Points between two breakpoints at which the interpolation is compared.
+/// Number of points between two breakpoints at which the interpolation is checked.
 const PROBES: usize = 15;
 
-/// Electrodes of a full and of an empty cell.
+/// Lithium contents of a full and of an empty cell.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Curve<'a> {
     cell: &'a BpxCell,
@@ -33,7 +33,7 @@ pub(super) struct CurveTable {
     pub(super) soc: Vec<f64>,
     /// One row per temperature, V.
     pub(super) ocv_v: Vec<Vec<f64>>,
-    /// Most that a voltage was raised so that each row rises, V.
+    /// Largest amount by which a voltage was raised so that each row rises, V.
     pub(super) raised_v: f64,
 }
 
@@ -49,7 +49,7 @@ impl<'a> Curve<'a> {
     /// Finds the lithium contents at the cut-offs.
     ///
     /// # Errors
-    /// The voltage does not reach a cut-off: path, found, allowed, one per cut-off.
+    /// The voltage does not reach a cut-off: path, found, allowed; one fault per cut-off.
     pub(super) fn new(cell: &'a BpxCell) -> Result<Self, Vec<String>> {
         let (n, p) = (&cell.negative, &cell.positive);
         let [q_n, q_p] = [n, p].map(|electrode| electrode.capacity_ah(cell.area_m2));
@@ -59,25 +59,26 @@ impl<'a> Curve<'a> {
         let ends = (((lithium_ah - q_p) / q_n).max(0.0) + 1e-9, (lithium_ah / q_n).min(1.0) - 1e-9);
         let mut faults = Vec::new();
         let mut content = |key: &str, cut_off_v: f64| {
-            // From the full end, so that a bend of a potential beyond the other end is not met.
+            // Search from the full end, so that a bend of a potential beyond the other end is not found.
             let [full, empty] = [n.stoichiometry[1], n.stoichiometry[0]].map(|x| x.clamp(ends.0, ends.1));
             let near = if key == "Upper" { full } else { empty };
             let (low, high) = bracket(near, ends, |x| voltage_v(x) < cut_off_v);
-            // To 1e-15.
+            // Accurate to 1e-15.
             let x = bisect((low, high), 50, |x| voltage_v(x) < cut_off_v).1;
             let reached_v = voltage_v(x);
             let is_reached = (reached_v - cut_off_v).abs() < 1e-3;
             if !is_reached {
                 faults.push(format!(
                     "Parameterisation.Cell.{key} voltage cut-off [V]: {cut_off_v}, must be reached by the open-circuit voltage, \
-                     which comes to {reached_v:.3} V there"
+                     which is {reached_v:.3} V there"
                 ));
             }
             x
         };
         let [full, empty] = [content("Upper", cell.voltage_max_v), content("Lower", cell.voltage_min_v)];
         if faults.is_empty() && full <= empty {
-            faults.push("Parameterisation: the open-circuit voltage falls with charge, must rise".to_owned());
+            faults
+                .push("Parameterisation: the open-circuit voltage falls as the cell is charged, must rise".to_owned());
         }
         match faults.is_empty() {
             true => Ok(Self {
@@ -104,10 +105,10 @@ impl<'a> Curve<'a> {
         p.ocp_v.at(y) - n.ocp_v.at(x) + warmer_k * (p.entropic.at(y) - n.entropic.at(x))
     }
 
-    /// The curve at breakpoints of its own choice.
+    /// The curve at suitable breakpoints.
     ///
     /// # Errors
-    /// A potential is no finite number somewhere.
+    /// A potential is not a finite number somewhere.
     pub(super) fn table(&self, temperature_k: &[f64]) -> Result<CurveTable, Vec<String>> {
         let mut table = CurveTable { soc: self.nodes(), ocv_v: Vec::new(), raised_v: 0.0 };
         for &kelvin in temperature_k {
@@ -125,7 +126,7 @@ impl<'a> Curve<'a> {
         Ok(table)
     }
 
-    /// SOC breakpoints: an interval with the largest error of a straight line is halved until none is above the limit.
+    /// SOC breakpoints: the interval with the largest error of a straight line is halved until no error exceeds the limit.
     fn nodes(&self) -> Vec<f64> {
         let mut nodes: Vec<f64> = (0..=10).map(|k| f64::from(k) / 10.0).collect();
         let mut errors: Vec<f64> = nodes.windows(2).map(|ends| self.line_error_v(ends[0], ends[1])).collect();
@@ -152,7 +153,7 @@ impl<'a> Curve<'a> {
     }
 }
 
-/// An interval around `near` in which the answer turns from yes to no; the whole of `ends` if there is none.
+/// An interval around `near` in which the predicate changes from true to false; `ends` if there is none.
 fn bracket(near: f64, ends: (f64, f64), is_below: impl Fn(f64) -> bool) -> (f64, f64) {
     let mut step = 1e-4;
     while step < 1.0 {
@@ -165,7 +166,7 @@ fn bracket(near: f64, ends: (f64, f64), is_below: impl Fn(f64) -> bool) -> (f64,
     ends
 }
 
-/// The row with each value at least [`LEAST_RISE_V`] above the one before.
+/// The row with each value at least [`LEAST_RISE_V`] above the previous one.
 fn rising(row: &[f64], raised_v: &mut f64) -> Vec<f64> {
     let mut least_v = f64::NEG_INFINITY;
     let mut raise = |voltage_v: f64| {

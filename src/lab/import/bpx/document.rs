@@ -1,21 +1,21 @@
-//! The parameters of a BPX file that a cell model needs, read from its JSON.
+//! Reads the parameters for a cell model from the JSON of a BPX file.
 //!
-//! In: the JSON, versions 0.x and 1.x, models SPM, SPMe and DFN. Out: [`BpxCell`], in the file's SI units. Every fault is noted with the
-//! path inside the JSON, what was found and what is allowed; reading continues after a fault, so that all come at once.
+//! Input: the JSON, versions 0.x and 1.x, models SPM, SPMe and DFN. Output: [`BpxCell`], in the file's SI units. Every fault is recorded
+//! with its path in the JSON, what was found and what is allowed. Reading continues after a fault, so that all faults are reported.
 
 use serde_json::{Map, Value};
 
 use super::function::{Function, found};
 
-/// Reference temperature of a file that does not state it, K.
+/// Reference temperature if the file does not state it, K.
 const USUAL_TEMPERATURE_K: f64 = 298.15;
 
-/// What a cell model needs of a BPX file.
+/// Parameters of a BPX file for a cell model.
 #[derive(Debug, Clone)]
 pub(super) struct BpxCell {
     /// Title of the file.
     pub(super) title: Option<String>,
-    /// References of the file, or else its description.
+    /// References of the file, or its description.
     pub(super) references: Option<String>,
     /// Version of the format.
     pub(super) version: String,
@@ -29,13 +29,13 @@ pub(super) struct BpxCell {
     pub(super) area_m2: f64,
     pub(super) negative: Electrode,
     pub(super) positive: Electrode,
-    /// Not in an SPM.
+    /// `None` for an SPM.
     pub(super) transport: Option<Transport>,
-    /// Heat capacity, J/K, where density, volume and specific heat capacity are stated.
+    /// Heat capacity, J/K, if density, volume and specific heat capacity are stated.
     pub(super) heat_capacity_j_per_k: Option<f64>,
-    /// Thermal resistance to the surroundings, K/W, where a heat transfer coefficient and the surface are stated.
+    /// Thermal resistance to the surroundings, K/W, if heat transfer coefficient and surface are stated.
     pub(super) thermal_k_per_w: Option<f64>,
-    /// What a person should know of the reading.
+    /// Notes on the conversion for the user.
     pub(super) notes: Vec<String>,
 }
 
@@ -50,7 +50,7 @@ pub(super) struct Electrode {
     /// Lowest and highest lithium content.
     pub(super) stoichiometry: [f64; 2],
     pub(super) ocp_v: Function,
-    /// V/K; 0 where it is not stated.
+    /// V/K; 0 if not stated.
     pub(super) entropic: Function,
     /// m2/s.
     pub(super) diffusivity: Function,
@@ -60,11 +60,11 @@ pub(super) struct Electrode {
     pub(super) reaction_j_per_mol: Option<f64>,
 }
 
-/// Electrolyte and conduction: negative electrode, separator, positive electrode.
+/// Electrolyte and conduction of negative electrode, separator, positive electrode.
 #[derive(Debug, Clone)]
 pub(super) struct Transport {
     pub(super) layers: [Layer; 3],
-    /// Conductivity of either electrode's solid, S/m: negative, positive.
+    /// Conductivity of the solid of the negative and positive electrode, S/m.
     pub(super) solid_s_per_m: [f64; 2],
     /// Mol/m3.
     pub(super) concentration: f64,
@@ -77,7 +77,7 @@ pub(super) struct Transport {
     pub(super) diffusivity_j_per_mol: Option<f64>,
 }
 
-/// One layer that holds electrolyte.
+/// A layer that contains electrolyte.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Layer {
     pub(super) thickness_m: f64,
@@ -85,7 +85,7 @@ pub(super) struct Layer {
     pub(super) transport_efficiency: f64,
 }
 
-/// Allowed values of a number: above the first, up to and with the second.
+/// Allowed values of a number: above the first, at most the second.
 type Above = (f64, f64);
 
 const POSITIVE: Above = (0.0, f64::MAX);
@@ -104,7 +104,7 @@ pub(super) fn read(root: &Value) -> Result<BpxCell, Vec<String>> {
     }
 }
 
-/// An object of the JSON with its path; one that is missing is noted once, and its keys are not.
+/// An object of the JSON with its path; a missing object is reported once, without its keys.
 struct Section<'a> {
     path: String,
     keys: Option<&'a Map<String, Value>>,
@@ -123,12 +123,12 @@ impl<'a> Section<'a> {
         self.keys?.get(key).filter(|value| !value.is_null())
     }
 
-    /// An object below that may be missing.
+    /// An object below this one that may be missing.
     fn optional(&self, key: &str) -> Self {
         Self { path: self.place(key), keys: self.get(key).and_then(Value::as_object) }
     }
 
-    /// An object below.
+    /// An object below this one.
     fn below(&self, key: &str, faults: &mut Vec<String>) -> Self {
         let below = self.optional(key);
         if self.keys.is_some() && below.keys.is_none() {
@@ -157,7 +157,7 @@ impl<'a> Section<'a> {
         number
     }
 
-    /// A number; NaN where it is missing or invalid, which is noted.
+    /// A number; NaN if it is missing or invalid, which is reported.
     fn number(&self, key: &str, range: Above, faults: &mut Vec<String>) -> f64 {
         self.require(key, "a number", faults);
         self.optional_number(key, range, faults).unwrap_or(f64::NAN)
@@ -169,9 +169,9 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// An activation energy, J/mol; 0 is as good as none.
+    /// An activation energy, J/mol; 0 counts as not stated.
     fn energy(&self, key: &str, faults: &mut Vec<String>) -> Option<f64> {
-        // 0 counts as not stated.
+        // The range includes 0.
         self.optional_number(key, (-f64::MIN_POSITIVE, 1e6), faults).filter(|energy| *energy > 0.0)
     }
 
@@ -186,10 +186,10 @@ impl<'a> Section<'a> {
         self.optional_function(key, faults).unwrap_or(Function::Constant(f64::NAN))
     }
 
-    /// The whole file; `None` if it is of a kind that is not read.
+    /// The whole cell; `None` if the file is of another kind.
     fn cell(&self, faults: &mut Vec<String>) -> Option<BpxCell> {
         if self.keys.is_none() {
-            faults.push("the file has no object at its top, must be BPX".to_owned());
+            faults.push("the file does not contain a JSON object, must be BPX".to_owned());
             return None;
         }
         let header = self.below("Header", faults);
@@ -295,7 +295,7 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// Electrolyte, layers and solids; `self` is the parameterisation.
+    /// Reads electrolyte, layers and solids; `self` is the parameterisation.
     fn transport(&self, state: &Section<'_>, faults: &mut Vec<String>) -> Transport {
         let electrolyte = self.below("Electrolyte", faults);
         let separator = self.below("Separator", faults);
@@ -334,7 +334,7 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// A function's value, which must be positive.
+    /// Value of a function, which must be positive.
     fn value_at(&self, key: &str, x: f64, faults: &mut Vec<String>) -> f64 {
         let before = faults.len();
         let value = self.function(key, faults).at(x);

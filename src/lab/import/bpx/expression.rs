@@ -1,13 +1,13 @@
-//! Expressions of one variable `x` as a BPX file writes them: a part of Python's grammar, evaluated without Python.
+//! Expressions of one variable `x` as in BPX files: a subset of Python's grammar, evaluated without Python.
 //!
-//! In: a text with numbers, `x`, `+ - * / **`, signs, parentheses and the functions of [`FUNCTIONS`]. Out: a program for a stack,
-//! evaluated through `libm`, so that the same text gives the same bytes on every machine. As in Python `**` binds stronger than a sign
-//! before it (`-x**2` is `-(x**2)`) and groups from the right. Bad input: an error with the column, what was found and what is allowed.
+//! Input: a text with numbers, `x`, `+ - * / **`, signs, parentheses and the functions of [`FUNCTIONS`]. Output: a program for a stack
+//! machine, evaluated with `libm`, so that the same text gives the same bytes on every machine. As in Python, `**` binds more tightly
+//! than a sign before it (`-x**2` is `-(x**2)`) and is right-associative. A fault states the column, what was found and what is allowed.
 
-/// Longest text, bytes; the longest known potential has 500.
+/// Longest text, bytes; the longest known potential has 500 bytes.
 const MAX_BYTES: usize = 20_000;
 
-/// Deepest nesting of parentheses, functions, signs and powers; a deeper one would exhaust the parser's stack.
+/// Deepest nesting of parentheses, functions, signs and powers; deeper nesting would exhaust the parser's stack.
 const MAX_DEPTH: usize = 64;
 
 type Function = fn(f64) -> f64;
@@ -29,7 +29,7 @@ const FUNCTIONS: [(&str, Function); 13] = [
     ("abs", libm::fabs),
 ];
 
-/// One step of the program: pushes a value or replaces the topmost ones.
+/// One step of the program: pushes a value, or replaces the topmost values.
 #[derive(Debug, Clone, Copy)]
 enum Step {
     Number(f64),
@@ -51,7 +51,7 @@ impl Expression {
     /// Parses a text.
     ///
     /// # Errors
-    /// Column from 1, found and allowed.
+    /// The column from 1, what was found and what is allowed.
     pub(super) fn parse(text: &str) -> Result<Self, String> {
         if text.len() > MAX_BYTES {
             return Err(format!("has {} bytes, must be at most {MAX_BYTES}", text.len()));
@@ -64,7 +64,7 @@ impl Expression {
         }
     }
 
-    /// The value at `x`; NaN or infinite where the expression is.
+    /// Value at `x`; NaN or infinite if the expression is.
     pub(super) fn at(&self, x: f64) -> f64 {
         let mut stack = Vec::with_capacity(16);
         for step in &self.0 {
@@ -84,7 +84,7 @@ impl Expression {
     }
 }
 
-/// The topmost value; the parser writes no program that empties the stack.
+/// The topmost value; a parsed program never empties the stack.
 fn pop(stack: &mut Vec<f64>) -> f64 {
     stack.pop().unwrap_or(f64::NAN)
 }
@@ -112,13 +112,13 @@ impl Parser<'_> {
         &self.text[self.at..]
     }
 
-    /// The next character that is no white space.
+    /// The next character that is not white space.
     fn peek(&mut self) -> Option<char> {
         self.at = self.text.len() - self.rest().trim_start().len();
         self.rest().chars().next()
     }
 
-    /// Takes `token` if it comes next.
+    /// Consumes `token` if it comes next.
     fn accept(&mut self, token: &str) -> bool {
         let is_next = self.peek().is_some() && self.rest().starts_with(token);
         if is_next {
@@ -132,7 +132,7 @@ impl Parser<'_> {
         format!("column {}: {found}, must be {allowed}", self.text[..self.at].chars().count() + 1)
     }
 
-    /// The name, or else the one character, that comes next.
+    /// The next name, or else the next character.
     fn word(&self) -> &str {
         let rest = self.rest();
         let is_name = |c: char| c.is_alphanumeric() || c == '_';
@@ -245,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn values_are_those_of_python() {
+    fn values_agree_with_python() {
         for (text, x, expected) in [
             ("-x**2", 3.0, -9.0),
             ("2**3**2", 0.0, 512.0),
@@ -264,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fault_has_column_found_and_allowed() {
+    fn fault_states_column_found_and_allowed() {
         for (text, place) in [
             ("1 + y", "column 5: \"y\", must be x or one of exp"),
             ("1 +", "column 4: the end, must be a number"),
@@ -282,7 +282,7 @@ mod tests {
     }
 
     #[test]
-    fn deep_nesting_is_refused() {
+    fn deep_nesting_is_rejected() {
         assert!(Expression::parse(&"(".repeat(10_000)).unwrap_err().contains("nested at most"));
         assert!(Expression::parse(&"-".repeat(10_000)).unwrap_err().contains("nested at most"));
         assert!(Expression::parse(&"x + ".repeat(10_000)).unwrap_err().contains("bytes"));
@@ -292,7 +292,7 @@ mod tests {
 
     proptest::proptest! {
         #[test]
-        fn any_text_parses_or_is_refused(text in "[-+*/() x.0-9eyéx]{0,40}") {
+        fn any_text_is_parsed_or_rejected(text in "[-+*/() x.0-9eyéx]{0,40}") {
             if let Ok(expression) = Expression::parse(&text) {
                 let _ = expression.at(0.5);
             }

@@ -1,13 +1,13 @@
-//! A parameter of a BPX file that may depend on one variable: a number, an expression of `x`, or a table.
+//! A parameter of a BPX file that may depend on a variable: a number, an expression of `x`, or a table.
 
 use serde_json::Value;
 
 use super::expression::Expression;
 
-/// Most points of a table; measured potentials have some thousand.
+/// Most points of a table; measured potentials have a few thousand.
 const MAX_POINTS: usize = 100_000;
 
-/// Path below a JSON value (empty, or with a point in front), and found and allowed.
+/// Path below a JSON value (empty, or starting with a dot), and what was found and is allowed.
 type Fault = (String, String);
 
 /// A function of stoichiometry or concentration.
@@ -15,7 +15,7 @@ type Fault = (String, String);
 pub(super) enum Function {
     Constant(f64),
     Expression(Expression),
-    /// Points with rising `x`; linear between and beyond them, as PyBaMM reads them.
+    /// Points with rising `x`; linear between and outside them, as in PyBaMM.
     Table(Vec<(f64, f64)>),
 }
 
@@ -23,7 +23,7 @@ impl Function {
     /// Reads a JSON value.
     ///
     /// # Errors
-    /// Path below the value (empty, or with a point in front), and found and allowed, one each fault.
+    /// Path below the value (empty, or starting with a dot), what was found and what is allowed; one entry per fault.
     pub(super) fn read(value: &Value) -> Result<Self, Vec<Fault>> {
         let fault = |text: String| vec![(String::new(), text)];
         match value {
@@ -37,7 +37,7 @@ impl Function {
         }
     }
 
-    /// The value at `x`.
+    /// Value at `x`.
     pub(super) fn at(&self, x: f64) -> f64 {
         match self {
             Self::Constant(value) => *value,
@@ -50,13 +50,13 @@ impl Function {
         }
     }
 
-    /// Slope at `x` over a distance `h` to either side.
+    /// Slope at `x`, from `h` below to `h` above it.
     pub(super) fn slope(&self, x: f64, h: f64) -> f64 {
         (self.at(x + h) - self.at(x - h)) / (2.0 * h)
     }
 }
 
-/// A JSON value in a message: short.
+/// Short form of a JSON value for a message.
 pub(super) fn found(value: &Value) -> String {
     match value {
         Value::Null => "null".to_owned(),
@@ -102,7 +102,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_table_is_sorted_and_linear_within_and_beyond() {
+    fn table_is_sorted_and_linear_everywhere() {
         let table = Function::read(&json!({"x": [1, 0, 3], "y": [10, 0, 30]})).unwrap();
         for x in [-1.0, 0.0, 0.5, 1.0, 2.0, 4.0] {
             assert!((table.at(x) - 10.0 * x).abs() < 1e-12, "{x}");

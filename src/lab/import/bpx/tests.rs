@@ -1,4 +1,4 @@
-//! The conversion of small BPX texts of our own, whose curve and resistances are known in closed form.
+//! Conversion of small BPX texts whose curve and resistances are known in closed form.
 
 #![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
 
@@ -67,8 +67,8 @@ fn electrode_ah() -> f64 {
 }
 
 #[test]
-fn straight_potentials_give_a_straight_curve_between_the_cut_offs() {
-    // Equal electrodes: x + y = 1.1. 4.5 V: x = 0.8, 3.3 V: x = 0.2, whatever the stated minimum of x.
+fn straight_potentials_give_a_straight_curve() {
+    // Equal electrodes: x + y = 1.1. 4.5 V: x = 0.8, 3.3 V: x = 0.2, regardless of the stated minimum of x.
     let model = model_of(&straight());
     assert!((model.capacity_ah - 0.6 * electrode_ah()).abs() < 1e-4, "{}", model.capacity_ah);
     for soc in [0.0, 0.13, 0.5, 0.99, 1.0] {
@@ -78,7 +78,7 @@ fn straight_potentials_give_a_straight_curve_between_the_cut_offs() {
 }
 
 #[test]
-fn a_table_and_its_expression_give_the_same_model() {
+fn table_and_expression_give_the_same_model() {
     let mut value = straight();
     value["Parameterisation"]["Negative electrode"]["OCP [V]"] = json!({"x": [1, 0], "y": [0, 1]});
     let [a, b] = [&straight(), &value].map(model_of);
@@ -89,7 +89,7 @@ fn a_table_and_its_expression_give_the_same_model() {
 }
 
 #[test]
-fn entropic_change_moves_the_curve_over_temperature() {
+fn entropic_change_shifts_the_curve_with_temperature() {
     let mut value = straight();
     value["Parameterisation"]["Positive electrode"]["Entropic change coefficient [V.K-1]"] = json!(2e-4);
     value["Parameterisation"]["Negative electrode"]["Entropic change coefficient [V.K-1]"] = json!("-1e-4 * x");
@@ -100,7 +100,7 @@ fn entropic_change_moves_the_curve_over_temperature() {
 }
 
 #[test]
-fn resistances_of_a_single_particle_are_the_closed_forms() {
+fn single_particle_resistances_match_the_closed_forms() {
     let model = model_of(&straight());
     // SOC 0.5: x = 0.5, y = 0.6; surface of either electrode 3e5 * 1e-4 * 0.2 = 6 m2.
     let position = model.grid_position(0.5, 25.0);
@@ -116,7 +116,7 @@ fn resistances_of_a_single_particle_are_the_closed_forms() {
         assert!((model.branch_r_ohm(branch, &position) / diffusion - 1.0).abs() < 1e-3);
         assert!((model.branch_tau_s(branch, &position) / (25e-12 / 35e-14) - 1.0).abs() < 1e-3);
     }
-    // Colder by 15 K, which is a row of the table: Arrhenius' law of 40 kJ/mol, and R T / F.
+    // 15 K colder, a row of the table: Arrhenius' law with 40 kJ/mol, and R T / F.
     let colder = model.r0_ohm(&model.grid_position(0.5, 10.0)) / model.r0_ohm(&position);
     let law = (40_000.0 / GAS_J_PER_MOL_K * (1.0 / 283.15 - 1.0 / 298.15)).exp() * 283.15 / 298.15;
     assert!((colder / law - 1.0).abs() < 1e-3, "{colder} {law}");
@@ -137,7 +137,7 @@ fn electrolyte_adds_conduction_and_a_branch() {
 }
 
 #[test]
-fn the_model_states_its_assumptions_and_a_wide_error() {
+fn model_states_assumptions_and_a_wide_error() {
     let result = import_value(&full()).unwrap();
     assert!(result.notes.iter().any(|note| note.contains("25 kJ/mol")), "{:?}", result.notes);
     assert!(import_value(&straight()).unwrap().notes.iter().any(|note| note.starts_with("SPM")));
@@ -147,7 +147,7 @@ fn the_model_states_its_assumptions_and_a_wide_error() {
 }
 
 #[test]
-fn every_fault_has_path_found_and_allowed_all_at_once() {
+fn all_faults_are_reported_with_their_paths() {
     let mut value = full();
     let parameters = &mut value["Parameterisation"];
     parameters["Cell"]["Nominal cell capacity [A.h]"] = json!(-1);
@@ -171,7 +171,7 @@ fn every_fault_has_path_found_and_allowed_all_at_once() {
 }
 
 #[test]
-fn what_no_model_can_be_made_of_is_refused() {
+fn unsuitable_files_are_rejected() {
     for (path, key, found, text) in [
         ("/Header", "Model", json!("Partial"), "Header.Model: \"Partial\", must be \"SPM\""),
         ("/Header", "BPX", json!("2.0"), "Header.BPX: \"2.0\", must be a version 0.x or 1.x"),
@@ -201,11 +201,11 @@ fn what_no_model_can_be_made_of_is_refused() {
     let error = import_value(&value).unwrap_err().to_string();
     assert!(error.contains("at SOC 0 and") && error.contains("ohm, must be 1e-9 to 1000 ohm"), "{error}");
     assert!(import_value(&json!([])).unwrap_err().to_string().contains("must be BPX"));
-    assert!(import("{", &BpxSettings::default()).unwrap_err().to_string().contains("no JSON"));
+    assert!(import("{", &BpxSettings::default()).unwrap_err().to_string().contains("not valid JSON"));
 }
 
 #[test]
-fn a_version_that_is_a_number_and_a_state_section_are_read() {
+fn numeric_version_and_state_section_are_read() {
     let mut value = full();
     value["Header"]["BPX"] = json!(1.1);
     value["Parameterisation"]["Electrolyte"].as_object_mut().unwrap().remove("Initial concentration [mol.m-3]");

@@ -1,4 +1,4 @@
-//! OBDb's addresses as CAN identifiers of requests and answers.
+//! Converts OBDb addresses to the CAN identifiers of requests and answers.
 //!
 //! | `hdr` | request | answer |
 //! | --- | --- | --- |
@@ -6,7 +6,7 @@
 //! | the same with `eax` | first data byte `eax` | first data byte `tst`, without it the low byte of `hdr` (6F1: F1) |
 //! | 4 digits, `TTAA` | 29 bits, `pri` (18) `TTAA` `tst` (F1) | `pri` DA `tst` `rax`; without it AA, for TT = DA only (ISO 15765-2, normal fixed) |
 //!
-//! Anything else is refused with the reason.
+//! Any other form is rejected with the reason.
 
 use super::document::AddressDocument;
 use crate::can::CanId;
@@ -19,12 +19,12 @@ const PHYSICAL: u32 = 0xDA;
 pub(super) struct Addresses {
     pub(super) request: CanId,
     pub(super) response: CanId,
-    /// First data byte of requests and of answers.
+    /// First data byte of requests and of answers, if addressing is extended.
     pub(super) extension: Option<(u8, u8)>,
 }
 
 impl Addresses {
-    /// Converts; `Err` says what was found and what is allowed.
+    /// Converts an address; the error states what was found and what is allowed.
     pub(super) fn new(document: &AddressDocument) -> Result<Self, String> {
         if let Some(protocol) = document.proto.as_deref().filter(|name| !name.starts_with("15765-4")) {
             return Err(format!("proto is {protocol}, must be 15765-4 (CAN)"));
@@ -41,7 +41,7 @@ fn standard(document: &AddressDocument) -> Result<Addresses, String> {
     let request = hexadecimal("hdr", &document.hdr)?;
     let response = match &document.rax {
         Some(rax) => hexadecimal("rax", rax)?,
-        // As ISO 15765-4 fixes it.
+        // As ISO 15765-4 defines it.
         None if (0x7E0..=0x7E7).contains(&request) => request + 8,
         None => return Err(format!("hdr is {} without rax, must be 7E0 to 7E7 for that", document.hdr)),
     };
@@ -63,7 +63,7 @@ fn extended(document: &AddressDocument) -> Result<Addresses, String> {
     let priority = byte("pri", document.pri.as_ref())?.map_or(0x18, u32::from);
     let tester = byte("tst", document.tst.as_ref())?.map_or(0xF1, u32::from);
     let sender = match &document.rax {
-        // Longer forms write more of the identifier; the last byte is the controller's address.
+        // Longer forms contain more of the identifier; the last byte is the address of the controller.
         Some(rax) => hexadecimal("rax", rax)? & 0xFF,
         None if middle >> 8 == PHYSICAL => middle & 0xFF,
         None => return Err(format!("hdr is {} without rax, must be DA and the address for that", document.hdr)),
@@ -103,7 +103,7 @@ mod tests {
     }
 
     #[test]
-    fn identifiers_of_11_bits() {
+    fn eleven_bit_identifiers_are_converted() {
         let none = None;
         assert_eq!(addresses([Some("79B"), Some("7BB"), none, none, none, none]), Ok((0x79B, 0x7BB, None)));
         assert_eq!(addresses([Some("7E4"), none, none, none, none, none]), Ok((0x7E4, 0x7EC, None)));
@@ -112,7 +112,7 @@ mod tests {
     }
 
     #[test]
-    fn identifiers_of_29_bits() {
+    fn twenty_nine_bit_identifiers_are_converted() {
         let none = None;
         let honda = addresses([Some("DA01"), Some("01"), none, none, none, none]);
         assert_eq!(honda, Ok((0x98DA_01F1, 0x98DA_F101, None)));
@@ -122,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn other_forms_are_refused_with_what_is_allowed() {
+    fn other_forms_are_rejected_with_allowed_ones() {
         let none = None;
         for (fields, part) in [
             ([Some("7DF"), none, none, none, none, none], "7E0 to 7E7"),

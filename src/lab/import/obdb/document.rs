@@ -1,5 +1,5 @@
-//! The JSON of an OBDb signal set (github.com/OBDb/.schemas, `signals.json`): the fields that are used, and those that are
-//! known and have no meaning here. Each command and signal is read by itself, so that one that is wrong does not hide the others.
+//! The JSON of an OBDb signal set (github.com/OBDb/.schemas, `signals.json`): used fields, and known fields without effect here. Each
+//! command and signal is read separately, so that a faulty one does not hide the others.
 
 use std::collections::BTreeMap;
 
@@ -25,7 +25,7 @@ pub(super) struct CommandDocument {
     pub(super) address: AddressDocument,
     pub(super) cmd: BTreeMap<String, String>,
     pub(super) freq: Option<f64>,
-    /// Diagnostic session the controller must be in.
+    /// Diagnostic session that the controller must be in.
     pub(super) din: Option<String>,
     pub(super) filter: Option<YearFilter>,
     pub(super) signals: Vec<Value>,
@@ -33,24 +33,24 @@ pub(super) struct CommandDocument {
     pub(super) rest: BTreeMap<String, Value>,
 }
 
-/// Addresses, hexadecimal texts.
+/// Addresses as hexadecimal texts.
 #[derive(Debug, Default, Deserialize)]
 pub(super) struct AddressDocument {
-    /// 3 digits: 11-bit identifier; 4: the middle of a 29-bit one.
+    /// 3 digits: 11-bit identifier; 4 digits: the middle of a 29-bit identifier.
     pub(super) hdr: String,
-    /// Of answers.
+    /// Address of answers.
     pub(super) rax: Option<String>,
     /// Extended address: first data byte of requests.
     pub(super) eax: Option<String>,
     /// First byte of a 29-bit identifier.
     pub(super) pri: Option<String>,
-    /// The tester's address.
+    /// Address of the tester.
     pub(super) tst: Option<String>,
     /// Protocol.
     pub(super) proto: Option<String>,
 }
 
-/// Model years of a command: the range or one of the single years; `from` after `to` excludes the years between them.
+/// Model years of a command: the range, or one of the single years. If `from` is after `to`, the years between them are excluded.
 #[derive(Debug, Deserialize)]
 pub(super) struct YearFilter {
     from: Option<i64>,
@@ -88,9 +88,9 @@ pub(super) struct FormatDocument {
     #[serde(default = "one")]
     pub(super) div: f64,
     pub(super) unit: Option<String>,
-    /// Values at or below it are not available.
+    /// Values up to this one are not available.
     pub(super) nullmin: Option<f64>,
-    /// Values at or above it are not available.
+    /// Values from this one on are not available.
     pub(super) nullmax: Option<f64>,
     pub(super) map: Option<Value>,
     #[serde(flatten)]

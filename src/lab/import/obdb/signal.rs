@@ -1,15 +1,15 @@
-//! One OBDb signal as a signal of a diagnostic input: position, scaling, range, unit.
+//! Converts an OBDb signal to a signal of a diagnostic input: position, scaling, range, unit.
 //!
-//! * factor = `mul` / `div`, offset = `add`; `min` is 0 where it is not given, as in OBDb's own decoder. That decoder moves
-//!   a value outside `min` to `max` onto the limit; here such a value is a bad reading. No range where `max` is not above `min`.
-//! * `nullmin`, `nullmax`: values at or beyond them are not available. The codes are listed when they are few, otherwise the
-//!   range ends before them.
-//! * Temperatures in degrees Fahrenheit and every other unit keep their unit: nothing is converted.
+//! * factor = `mul` / `div`, offset = `add`; `min` defaults to 0, as in OBDb's own decoder. That decoder clamps values to `min` and
+//!   `max`; here, a value outside them is a bad reading. There is no range if `max` is not above `min`.
+//! * `nullmin`, `nullmax`: values at or outside them are not available. Few codes are listed; otherwise the range ends before
+//!   them.
+//! * All units are kept, also degrees Fahrenheit: nothing is converted.
 
 use super::document::{FormatDocument, SignalDocument};
 use crate::import::{DiagnosticSignal, ExclusionReason};
 
-/// Most codes listed as "not available"; longer lists are no longer read by a person.
+/// Most codes listed as "not available"; a person does not read a longer list.
 const MAX_LISTED_CODES: usize = 8;
 /// Bits of the longest ISO-TP message with a 12-bit length.
 const MAX_BITS: i64 = 4095 * 8;
@@ -89,7 +89,7 @@ fn scaling(fmt: &FormatDocument) -> Result<(f64, f64), String> {
     Ok((factor, fmt.add))
 }
 
-/// Adds the allowed range and the codes that say "not available".
+/// Adds the allowed range and the codes that mean "not available".
 fn limit(signal: &mut DiagnosticSignal, fmt: &FormatDocument) -> Result<(), String> {
     let max = fmt.max.ok_or("max is missing, must be given for a number")?;
     let mut range = if max > fmt.min { (fmt.min, max) } else { signal.representable() };
@@ -106,13 +106,13 @@ fn limit(signal: &mut DiagnosticSignal, fmt: &FormatDocument) -> Result<(), Stri
     }
     signal.not_available = codes.unwrap_or_default();
     let (low, high) = signal.representable();
-    // The file's decimals are rounded.
+    // Tolerance for the rounded decimals of the file.
     let room = 1e-6 * signal.factor.abs();
     signal.range = (low < range.0 - room || high > range.1 + room).then_some(range);
     Ok(())
 }
 
-/// Codes (the signal's bits) whose value is not available; `None` when they are too many.
+/// Codes (bits of the signal) whose value is not available; `None` if there are too many.
 fn listed_codes(signal: &DiagnosticSignal, is_null: impl Fn(f64) -> bool) -> Option<Vec<u64>> {
     let (low, high) = signal.codes();
     let value = |code: f64| code * signal.factor + signal.offset;

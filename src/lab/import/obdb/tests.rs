@@ -1,4 +1,4 @@
-//! The conversion on small signal sets of our own.
+//! Conversion of small signal sets.
 
 #![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
 
@@ -47,7 +47,7 @@ fn cells_of_several_answers_become_one_pattern() {
 }
 
 #[test]
-fn a_series_ends_where_its_step_or_its_form_changes() {
+fn series_ends_where_step_or_form_changes() {
     let signals = [
         signal("A_T1", r#""bix": 0, "len": 8, "max": 255, "unit": "celsius""#),
         signal("A_T2", r#""bix": 8, "len": 8, "max": 255, "unit": "celsius""#),
@@ -63,7 +63,7 @@ fn a_series_ends_where_its_step_or_its_form_changes() {
 }
 
 #[test]
-fn ranges_and_absent_values_are_kept() {
+fn ranges_and_unavailable_values_are_kept() {
     let signals = [
         signal("A_FLAG", r#""bix": 7, "len": 1, "max": 1, "unit": "offon""#),
         signal("A_SOC", r#""bix": 8, "len": 24, "max": 100, "div": 8192, "add": -17, "unit": "percent""#),
@@ -93,7 +93,7 @@ fn ranges_and_absent_values_are_kept() {
 }
 
 #[test]
-fn commands_of_other_years_are_left_out_and_those_under_test_stay() {
+fn commands_of_other_years_are_left_out() {
     let commands = [
         command(r#""cmd": {"22": "0001"}, "dbgfilter": {"to": 2001, "from": 2040}"#, &signal("A_ONE", VOLT)),
         command(r#""cmd": {"22": "0002"}, "filter": {"to": 2019}"#, &signal("A_TWO", VOLT)),
@@ -111,7 +111,7 @@ fn commands_of_other_years_are_left_out_and_those_under_test_stay() {
 }
 
 #[test]
-fn what_cannot_be_converted_is_named_and_the_rest_stays() {
+fn unconvertible_parts_are_listed_and_the_rest_is_kept() {
     let first = [
         signal("A_GOOD", VOLT),
         signal("A_OVERLAP", r#""bix": 12, "len": 8, "max": 255, "unit": "volts""#),
@@ -169,7 +169,7 @@ fn what_cannot_be_converted_is_named_and_the_rest_stays() {
 }
 
 #[test]
-fn other_texts_are_errors_with_their_place() {
+fn unsuitable_texts_are_rejected_with_their_place() {
     let fault = |text: &str| {
         import(text, &ObdbSettings { source: "own.json".to_owned(), ..ObdbSettings::default() })
             .unwrap_err()
@@ -188,7 +188,7 @@ fn other_texts_are_errors_with_their_place() {
 }
 
 #[test]
-fn a_file_without_a_common_word_keeps_whole_names() {
+fn names_are_kept_without_a_common_word() {
     let commands = [
         command(r#""cmd": {"22": "0001"}"#, &signal("A_ONE", VOLT)),
         command(r#""cmd": {"22": "0002"}"#, &signal("B_TWO", VOLT)),
@@ -199,7 +199,7 @@ fn a_file_without_a_common_word_keeps_whole_names() {
 
 proptest::proptest! {
     #[test]
-    fn no_text_panics_and_every_result_is_toml(fmt in "(\"(bix|len|max|min|mul|div|add|nullmin|nullmax|unit)\": (-?[0-9]{1,5}|\"[a-z]{1,9}\"|true|1e300),){0,9}") {
+    fn any_format_gives_valid_toml(fmt in "(\"(bix|len|max|min|mul|div|add|nullmin|nullmax|unit)\": (-?[0-9]{1,5}|\"[a-z]{1,9}\"|true|1e300),){0,9}") {
         let fmt = format!("{fmt}\"sign\": false");
         let text = format!(r#"{{"commands": [{}]}}"#, command(r#""cmd": {"22": "0001"}"#, &signal("A_ONE", &fmt)));
         if let Ok(result) = import(&text, &ObdbSettings::default()) {
