@@ -13,7 +13,7 @@ use crate::config::cell_model::{KnownBy, SourcedModel};
 const POINTS: u32 = 200;
 /// Temperature range of the picture over temperature, within the tables, degrees C.
 const SHOWN_C: (f64, f64) = (-20.0, 50.0);
-/// A cold temperature in addition to that of the curve, degrees C.
+/// A cold temperature in addition to the curve's, degrees C.
 const COLD_C: f64 = 0.0;
 /// SOC below which a curve or a resistance may leave its picture, percent: both rise steeply there.
 const STEEP_PERCENT: f64 = 12.0;

@@ -1,6 +1,6 @@
 //! The cost of differences between cells for their pack, in words: name and value of each line.
 //!
-//! Cells count from 1. Every "±" is one standard deviation. Ah and kWh are those of one string.
+//! Cells count from 1. Every "±" is one standard deviation. Ah and kWh refer to one string.
 
 use crate::cell::CellModel;
 use crate::cell_faults::imbalance::{CellSpread, LeftOut, LimitingCell, mean_ocv_v};
@@ -8,7 +8,7 @@ use crate::cell_faults::{Imbalance, UnknownImbalance};
 use crate::filter::ScalarGaussian;
 use crate::quantity::CellIndex;
 
-/// The lines; without a `model`, there is no energy.
+/// The lines; without a `model`, energies are missing.
 pub fn lines(imbalance: &Result<Imbalance, UnknownImbalance>, model: Option<&CellModel>) -> Vec<(String, String)> {
     let pack = match imbalance {
         Ok(pack) => pack,

@@ -155,7 +155,7 @@ impl Threshold {
 
 /// Forecasts at the end of the history.
 pub fn now(history: &History, name: &str, threshold: Threshold) -> CurrentForecast {
-    let forecast = fed(history, f64::INFINITY);
+    let forecast = forecast_until(history, f64::INFINITY);
     let threshold_ah = threshold.ampere_hours(history);
     let remaining = forecast.remaining(threshold_ah);
     CurrentForecast {
@@ -219,7 +219,7 @@ fn judge(history: &History, threshold_ah: f64, end: f64, at: f64, alpha: f64) ->
     let truth = end - moment;
     let known: Vec<[f64; 2]> =
         history.rows.iter().take_while(|row| row.used <= moment).map(|row| [row.used, row.capacity_ah]).collect();
-    let result = fed(history, moment).remaining(threshold_ah).map(|life| quantiles(history.axis, &life));
+    let result = forecast_until(history, moment).remaining(threshold_ah).map(|life| quantiles(history.axis, &life));
     let (forecast, refused) = match result {
         Ok(forecast) => (forecast, None),
         Err(why) => (None, Some(why.to_string())),
@@ -253,7 +253,7 @@ fn quantiles(axis: Axis, life: &RemainingLife) -> Option<[f64; 3]> {
 }
 
 /// Returns the filter after all readings until `moment`, units of use.
-fn fed(history: &History, moment: f64) -> Forecast {
+fn forecast_until(history: &History, moment: f64) -> Forecast {
     let mut forecast = Forecast::new(history.axis, history.first_capacity_ah());
     let mut before = MeasuredCapacity::default();
     for row in &history.rows {

@@ -1,6 +1,6 @@
 //! The configuration of one measured cell: a given one, or the built-in one with another cell model or label.
 //!
-//! Input: paths, or the data of a label. Output: a checked configuration whose input signals are those of `measured.dbc`. Every
+//! Input: paths, or the data of a label. Output: a checked configuration with the input signals of `measured.dbc`. Every
 //! estimator key has its default unless the given configuration states it. Faults name their file.
 
 use std::path::{Path, PathBuf};
@@ -24,7 +24,7 @@ pub struct LabelKeys {
     pub voltage_max_v: Option<f64>,
 }
 
-/// Source of a cell's configuration. A label has priority; otherwise the model replaces that of the configuration.
+/// Source of a cell's configuration. A label has priority; otherwise the model replaces the configuration's.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct CellSource {
     /// Configuration; `None` = the built-in one.

@@ -55,11 +55,11 @@ impl Axis {
     /// Ends of the axis for these values, with room at both ends if `margin`; never empty.
     pub(super) fn ends(&self, values: impl Iterator<Item = f64>, margin: bool) -> (f64, f64) {
         if let Some(range) = self.range {
-            return opened(range, 0.0);
+            return widened(range, 0.0);
         }
         let ends = ends(values.filter(|value| value.is_finite()));
         // Room above and below the data, as a part of their range.
-        opened(ends, if margin { 0.06 } else { 0.0 })
+        widened(ends, if margin { 0.06 } else { 0.0 })
     }
 
     /// Positions and labels of about `count` ticks.
@@ -80,7 +80,7 @@ impl Axis {
 }
 
 /// The range of an axis: not empty, with room at both ends.
-fn opened((low, high): (f64, f64), margin: f64) -> (f64, f64) {
+fn widened((low, high): (f64, f64), margin: f64) -> (f64, f64) {
     if low > high {
         return (0.0, 1.0);
     }

@@ -343,7 +343,7 @@ mod tests {
         let layers = (0..6).map(|i| Layer::new(&format!("a rather long label {i}"), Ink::Blue, Shape::Level(1.0)));
         let chart = chart(layers.collect());
         let more = chart.draw(Size::NARROW).1 - chart.draw(Size { width: 2000.0, ..Size::NARROW }).1;
-        // One label beside the name of the axis, then two per row.
+        // One label next to the name of the axis, then two per row.
         assert!((more - 3.0 * ROW).abs() < 0.1, "{more} pixels");
     }
 }

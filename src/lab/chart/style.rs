@@ -1,7 +1,7 @@
 //! Colours: classes for strokes, fills and text, and their values in light and dark.
 //!
-//! The inks are those of Okabe and Ito, which are distinguishable with any colour vision, lighter on a dark page.
-//! The steps of heat maps are those of cividis (Nuñez, Anderton, Renslow 2018), with the same property.
+//! The inks are from Okabe and Ito: distinguishable with any colour vision, lighter on a dark page.
+//! The steps of heat maps are from cividis (Nuñez, Anderton, Renslow 2018), with the same property.
 
 use std::fmt::Write as _;
 

@@ -1,8 +1,8 @@
 //! Finds bit fields that behave like pack voltage, current or cell voltages, in messages that no DBC describes.
 //!
-//! * Voltage: 16 bits at every byte and 12 bits at every half byte, both byte orders, common scales. The value is that of a
-//!   pack, changes slightly, and its last digits vary.
-//! * Current: the same positions, signed; its changes match those of a voltage across a resistance. Of the common scales, the
+//! * Voltage: 16 bits at every byte and 12 bits at every half byte, both byte orders, common scales. The value is
+//!   plausible for a pack, changes slightly, and its last digits vary.
+//! * Current: the same positions, signed; its changes match the changes of a voltage across a resistance. Of the common scales, the
 //!   one with the most typical resistance is guessed.
 //! * Cells: neighbouring fields of 8, 12 or 16 bits with similar values, at least three in each message or page (first byte),
 //!   and at least eight in total.
@@ -65,7 +65,7 @@ pub(super) fn signals(capture: &Capture) -> Vec<LogSignal> {
 /// Payloads of a message, as many as the evaluation needs.
 struct Samples<'a> {
     key: MessageKey,
-    /// Length of the shortest payload, at most that of a classic frame.
+    /// Length of the shortest payload, at most 8.
     bytes: usize,
     /// Values of the first byte if they number pages; otherwise one `None`.
     pages: Vec<Option<u8>>,
@@ -186,7 +186,7 @@ fn voltages_of(samples: &Samples<'_>) -> Vec<LogSignal> {
     found
 }
 
-/// The fields whose changes correlate best with those of a voltage, or of a cell.
+/// The fields whose changes correlate best with the changes of a pack or cell voltage.
 fn currents<'a>(messages: impl Iterator<Item = &'a Samples<'a>>, voltages: &[&LogSignal]) -> Vec<LogSignal> {
     let mut found: Vec<(f64, LogSignal)> = Vec::new();
     for samples in messages {

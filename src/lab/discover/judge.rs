@@ -347,7 +347,7 @@ fn compare_currents(
         let compared = voltages.iter_mut().take(40).chain(cells.iter_mut().take(5));
         let compared = compared.filter(|voltage| !has_known || is_known(voltage));
         let found = compared.filter_map(|voltage| Some((related(voltage)?, voltage)));
-        // A voltage with more evidence of its own is preferred.
+        // A voltage with more evidence is preferred.
         let weight = |slope: Slope, voltage: &Evidence| slope.correlation().abs() + 0.05 * voltage.score.points;
         let best = found.max_by(|a, b| weight(a.0, a.1).total_cmp(&weight(b.0, b.1)));
         let Some((slope, voltage)) = best else { continue };

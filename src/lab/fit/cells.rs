@@ -58,7 +58,7 @@ pub struct CellDeviation {
     pub resistance_ratio: (f64, f64),
     /// Leakage in excess of the mean cell, share of the capacity per h, with its standard deviation.
     pub leakage_per_h: (f64, f64),
-    /// SOC minus that of the mean cell at the start of the first stretch, fraction.
+    /// SOC minus the mean cell's SOC at the start of the first stretch, fraction.
     pub soc_offset: f64,
     /// Root mean square of the unexplained difference, V.
     pub residual_v: f64,

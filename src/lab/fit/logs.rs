@@ -1,7 +1,7 @@
 //! Fits a cell model to logs of a whole pack: ordinary drives and charges that start anywhere.
 //!
 //! Input: a configuration with a cell model or a label, and logs as the daemon reads them. Output: a [`FitOutcome`]; where the logs
-//! contain no information, its tables are those of the configured model.
+//! contain no information, its tables stay as in the configured model.
 //!
 //! Every log is replayed through the monitor, so limits, decoding and faults are the daemon's. The pack's own cells are of one kind:
 //! their mean voltage is fitted as one cell. After a gap in the record, a new stretch starts with another unknown SOC.
@@ -40,7 +40,7 @@ use crate::replay::{self, OutputWatch, ReplaySettings, Sinks};
 const LEAST_ROWS: usize = 20;
 /// Smallest standard deviation of the SOC at the start of a stretch.
 const BEGINNING_STD: f64 = 0.02;
-/// A stretch starts full if its open-circuit voltage is at least that of this SOC, even with this share of the usual series
+/// A stretch starts full if its open-circuit voltage is at least the voltage at this SOC, even with this share of the usual series
 /// resistance; the standard deviation of its SOC is then this value.
 const FULL_SOC: f64 = 0.975;
 const LEAST_RESISTANCE: f64 = 0.4;
@@ -334,7 +334,7 @@ fn unanchored(stretch: &Stretch, grid: &Grid, model: &CellModel) -> UnanchoredRe
     UnanchoredRecord { record, scale, beginning, full }
 }
 
-/// Whether a stretch starts with a full cell: its open-circuit voltage is that of a full cell even with the least resistance.
+/// Whether a stretch starts with a full cell: it has the open-circuit voltage of a full cell even with the least resistance.
 fn begins_full(part: &MeasuredPart, model: &CellModel) -> bool {
     let (voltage_v, current_a, temperature_c) = (part.voltage_v[0], part.current_a[0], part.temperature_c[0]);
     let drop_v = LEAST_RESISTANCE * model.r0_ohm(&model.grid_position(1.0, temperature_c)) * current_a;

@@ -2,7 +2,7 @@
 //!
 //! Input: the records of a fit, and the fitted tables. Output: the ranges of temperature (degrees C), current (A) and SOC, and the
 //! tables with one more row [`REACH_K`] below and one above the measured temperatures. In these rows, the open-circuit curve and the
-//! time constants are those of the nearest measured row, and the resistances follow Arrhenius' law. The voltage error grows with the
+//! time constants repeat the nearest measured row, and the resistances follow Arrhenius' law. The voltage error grows with the
 //! distance, because the law is only approximate.
 
 use crate::cell::arrhenius;

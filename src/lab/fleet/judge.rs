@@ -1,6 +1,6 @@
 //! Scores the alarms of one threshold in one log: lead time before the end of life, missed and false alarms.
 //!
-//! The terms are those of `tests/alarm_tradeoff.md`, extended to records that end before the life does:
+//! The terms come from `tests/alarm_tradeoff.md`, extended to records that end before the life does:
 //!
 //! * **end of life**: with a truth, the first time at which a cell's capacity is below the limit; without a truth, the time after
 //!   which the weakest learned capacity stayed below the limit until the end of the record.
@@ -81,7 +81,7 @@ pub struct AlarmScore {
     pub false_alarms: Option<usize>,
     /// Number of raises that cannot be judged.
     pub open: Option<usize>,
-    /// Number of raises while the true capacity was above the threshold; `None` = there is no truth.
+    /// Number of raises while the true capacity was above the threshold; `None` = no truth.
     pub false_raises: Option<usize>,
     /// Number of clears before the end of life.
     pub flickers: usize,

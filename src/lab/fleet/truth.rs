@@ -85,7 +85,7 @@ impl Truth {
         self.cells.iter().filter_map(of_cell).min()
     }
 
-    /// Returns the capacity of a cell in the last row up to `time`; `None` = there is no such row.
+    /// Returns the capacity of a cell in the last row up to `time`; `None` = no such row.
     pub fn capacity_ah(&self, cell: CellIndex, time: Timestamp) -> Option<f64> {
         let points = self.cells.get(&cell)?;
         let after = points.partition_point(|(at, _)| *at <= time);
@@ -116,7 +116,7 @@ fn read_simulated(mut table: CapacityTable) -> Result<Truth, TableError> {
     Ok(Truth { kind: EndOfLifeSource::Truth, cells, span })
 }
 
-/// Finds the truth in the folder of each log, if there is one.
+/// Finds the truth in the folder of each log, if it exists.
 pub fn find_next_to(logs: &[PathBuf]) -> Vec<Option<PathBuf>> {
     let alone = |log: &PathBuf| logs.iter().filter(|other| other.parent() == log.parent()).count() == 1;
     logs.iter().map(|log| find(log, alone(log))).collect()

@@ -1,8 +1,8 @@
 //! The alarms of every combination of settings, log by log.
 //!
 //! Input: a [`VariantGrid`], logs, and their truths. Output: for each log its life, and an [`AlarmScore`] per combination and threshold.
-//! Combinations that differ only in alarms share one replay per log ([`VariantBatch`]). The life (charge moved, learned capacity) is
-//! that of the original configuration.
+//! Combinations that differ only in alarms share one replay per log ([`VariantBatch`]). The life (charge moved, learned capacity)
+//! comes from the original configuration.
 
 use std::path::PathBuf;
 

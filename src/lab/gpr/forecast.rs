@@ -95,7 +95,7 @@ pub struct HorizonForecast {
     pub at_origin: Prediction,
     /// Rows after the origin at which forecasts were made, with the forecasts.
     pub held_out: Vec<(usize, Prediction)>,
-    /// Errors of these forecasts; `None` if there are no rows after the origin.
+    /// Errors of these forecasts; `None` without rows after the origin.
     pub score: Option<PredictionScore>,
     /// Root mean squared error of persistence (the value stays constant) over the same rows.
     pub persistence_rmse: Option<f64>,
@@ -203,7 +203,7 @@ impl HorizonTask<'_> {
     }
 
     /// A process fitted to windows that end before row `end`, with their number; `None` if there are too few. With
-    /// `fixed` hyperparameters, there is no search.
+    /// `fixed` hyperparameters, nothing is searched.
     fn fitted(
         &self,
         end: usize,
@@ -310,7 +310,7 @@ pub fn write(path: &Path, data: &ColumnTable, forecast: &TableForecast) -> Resul
 }
 
 /// Returns at most `most` rows, one from each of as many equal stretches, at a position that differs between
-/// stretches: a fixed stride would always select repeating rows, such as those of cycles, at the same phase.
+/// stretches: a fixed stride would always select repeating rows, for example of cycles, at the same phase.
 fn chosen(all: &[usize], most: usize) -> Vec<usize> {
     let count = all.len().min(most);
     // Fractions of multiples of the golden ratio fill a stretch evenly and never repeat.

@@ -107,7 +107,7 @@ impl ColumnTable {
         self.lines.len()
     }
 
-    /// Whether there are no rows.
+    /// Whether the table is empty.
     pub fn is_empty(&self) -> bool {
         self.lines.is_empty()
     }

@@ -11,7 +11,7 @@ use crate::filter::levenberg_marquardt::{Damping, minimise};
 
 /// Points at which the curves are compared.
 const POINTS: u32 = 51;
-/// Deviation between a library potential and that of a real cell, V: materials of one name differ.
+/// Deviation of a real cell from a library potential, V: materials of one name differ.
 const MATERIAL_V: f64 = 0.01;
 /// The same below [`LOW_SOC`], where curves fall steeply.
 const LOW_SOC_V: f64 = 0.03;

@@ -210,7 +210,7 @@ fn curve_at(curves: &[OcvCurve], which: usize, soc: f64) -> f64 {
     curve.voltage_v[0] + curve_at(curves, which + 1, soc) - curve_at(curves, which + 1, end)
 }
 
-/// Median resistance at 25 degrees C from steps of the current between rows; `None` = there are no steps.
+/// Median resistance at 25 degrees C from steps of the current between rows; `None` = no steps.
 fn resistance_of_steps(records: &[Record]) -> Option<f64> {
     let mut found = Vec::new();
     for record in records {

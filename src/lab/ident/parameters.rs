@@ -28,7 +28,7 @@ impl Layout {
         self.nodes * (2 + 2 * self.branches)
     }
 
-    /// Whether there are no parameters.
+    /// Whether the vector is empty.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }

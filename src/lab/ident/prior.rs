@@ -1,4 +1,4 @@
-//! The prior: smooth tables, Arrhenius' law between temperatures, an OCV near that of the slow test.
+//! The prior: smooth tables, Arrhenius' law between temperatures, an OCV near the slow test.
 //!
 //! Each term is a linear combination of node parameters with a target and a standard deviation. The curvature at a node is the
 //! change of the slope times the mean of its two spacings.
@@ -10,8 +10,8 @@ use super::pass::NormalEquations;
 /// Standard deviations of the prior's terms.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PriorDeviations {
-    /// Second difference of the OCV over SOC, scaled to the node spacing, V: of the correction to the slow test, or of the
-    /// curve itself if there is none.
+    /// Second difference of the OCV over SOC, scaled to the node spacing, V: of the correction to the slow test, or without
+    /// one of the curve itself.
     pub ocv_curvature_v: f64,
     /// Difference of the OCV, or of its correction, between neighbouring temperatures, V.
     pub ocv_by_temperature_v: f64,
@@ -48,7 +48,7 @@ impl PriorDeviations {
         tau_level: 0.7,
     };
 
-    /// With a slow test: a smooth correction that fades where there are no drives. Tuned by leaving out one drive at a time, on
+    /// With a slow test: a smooth correction that fades away from the drives. Tuned by leaving out one drive at a time, on
     /// two cells at five and six temperatures.
     pub const SLOW_TEST: Self = Self {
         ocv_curvature_v: 0.025,
@@ -170,7 +170,7 @@ impl Prior {
         self.0.push(PriorDensity { terms, target, sigma });
     }
 
-    /// Keeps the second derivative over SOC near that of `reference`.
+    /// Keeps the second derivative over SOC as in `reference`.
     fn curvature(&mut self, grid: &Grid, first: usize, reference: &[f64], sigma: f64) {
         let columns = grid.soc.len();
         for row in 0..grid.temperature_c.len() {
@@ -184,7 +184,7 @@ impl Prior {
         }
     }
 
-    /// Keeps the difference between neighbouring temperatures near that of `reference`.
+    /// Keeps the difference between neighbouring temperatures as in `reference`.
     fn by_temperature(&mut self, grid: &Grid, first: usize, reference: &[f64], sigma: f64) {
         let columns = grid.soc.len();
         for row in 1..grid.temperature_c.len() {

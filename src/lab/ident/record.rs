@@ -13,7 +13,7 @@ use crate::filter::ends;
 const BLOCK_S: f64 = 1.0;
 /// Current step that ends a block early after a steady current, as a share of the largest current.
 const EDGE_SHARE: f64 = 0.1;
-/// Time for which the current must be steady before an edge, s; drives are rarely steady that long.
+/// Time with steady current before an edge, s; drives are rarely steady that long.
 const STEADY_S: f64 = 3.0;
 /// Most seconds that one row represents: rests logged once a minute must not outweigh drives.
 const MAX_WEIGHT_S: f64 = 20.0;
@@ -21,7 +21,7 @@ const MAX_WEIGHT_S: f64 = 20.0;
 const GAP_S: f64 = 60.0;
 /// Hidden charge, as SOC, above which the state of the branches is unknown.
 const HIDDEN_SOC: f64 = 0.002;
-/// Time after such a gap under current for which rows are not judged, s: the branches are still wrong.
+/// Time without judged rows after such a gap under current, s: the branches are still wrong.
 const UNKNOWN_S: f64 = 600.0;
 /// Current below which a cell rests, as a share of the largest current.
 const REST_SHARE: f64 = 0.02;
@@ -116,7 +116,7 @@ impl Record {
     }
 }
 
-/// Time for which a whole discharge counts, s: the length of a drive. A longer test holds no more information.
+/// Time that a whole discharge counts, s: the length of a drive. A longer test holds no more information.
 const WHOLE_S: f64 = 8000.0;
 /// Weight of slow tests and pulse tests relative to drives: the model should follow drives.
 const TEST_SHARE: f64 = 0.3;

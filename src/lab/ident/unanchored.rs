@@ -4,7 +4,7 @@
 //! resistances, the label's capacity (Ah). Output: tables, capacity, and the SOC at which each record starts.
 //!
 //! SOC = s_k - (q - o t) / C. The SOC s_k at the start of record k, ln C and the offset o of the current sensor (A) are parameters
-//! in addition to those of the tables. All are estimated together (maximum a posteriori, Gauss-Newton in [`super::solve`]). Values that
+//! besides the tables. All are estimated together (maximum a posteriori, Gauss-Newton in [`super::solve`]). Values that
 //! the records do not show stay at the prior. Every pass positions the rows in the tables again.
 
 use nalgebra::{DMatrix, DVector};
@@ -105,7 +105,7 @@ impl CurvePriorRows {
     }
 }
 
-/// All unknowns in one vector, those of the tables first, and the cost of their values.
+/// All unknowns in one vector, the tables first, and the cost of their values.
 struct Problem<'a> {
     settings: &'a FitSettings,
     known: &'a Known,

@@ -5,9 +5,9 @@
 //!
 //! | report | charge |
 //! | --- | --- |
-//! | the current's signal turns bad or stale | lost until it is good again, except for the time for which a reading may be used |
+//! | the current's signal turns bad or stale | lost until it is good again, except while the last reading may be used |
 //! | the buses fall asleep | none: the core reports it only while no current flows |
-//! | a gap: nothing was recorded | none if the buses slept or the last current was that of a resting pack; otherwise unknown |
+//! | a gap: nothing was recorded | none if the buses slept or the pack rested before; otherwise unknown |
 //!
 //! Assumption: a pack that rests when the recording stops rests until it continues. Use that starts and ends with a rest and was not
 //! recorded cannot be detected.
@@ -18,9 +18,9 @@ use crate::quantity::{Channel, Fault, Timestamp};
 /// Limits for the readings of a replay's current and voltages.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct ReadingLimits {
-    /// Time for which a reading of the current may be used, s.
+    /// Longest use of a current reading, s.
     pub current_age_s: f64,
-    /// Time for which a reading of a voltage may be used, s.
+    /// Longest use of a voltage reading, s.
     pub voltage_age_s: f64,
     /// Largest current of a resting pack, A per string.
     pub rest_a: f64,

@@ -144,7 +144,7 @@ impl Outlook {
         is_over(&self.life)
     }
 
-    /// Returns for example "14 cycles"; as in the monitor, the life of a pack is unknown until that of every cell is known.
+    /// Returns for example "14 cycles"; as in the monitor, the life of a pack is unknown until every cell's life is known.
     pub(super) fn value(&self) -> String {
         match self.life.cycles {
             Some(left) if self.unknown.is_none() => median(left),

@@ -1,4 +1,4 @@
-//! Formats times, lengths of time and values of alarm rules.
+//! Formats times, durations, values of alarm rules, and alarms.
 
 use super::data::{AlarmRecord, Data};
 use super::limits::rule;
@@ -14,13 +14,13 @@ fn unit(name: &str) -> &'static str {
     rule(name).map_or("", |rule| rule.spec().unit.symbol())
 }
 
-/// A formatted number that is zero, without a sign.
+/// Removes the sign of a formatted number that is zero.
 pub(super) fn without_minus_zero(digits: String) -> String {
     let is_zero = digits.bytes().all(|byte| matches!(byte, b'-' | b'+' | b'0' | b'.'));
     if is_zero { digits.trim_start_matches(['-', '+']).to_owned() } else { digits }
 }
 
-/// A length of time in a unit in which it has two digits or more: `90 s`, `45.0 min`, `6.0 h`, `3 days`.
+/// Formats a duration in a unit in which it has two digits or more: `90 s`, `45.0 min`, `6.0 h`, `3 days`.
 pub(super) fn length(seconds: f64) -> String {
     match seconds {
         s if s < 120.0 => format!("{s:.0} s"),
@@ -41,8 +41,8 @@ pub(super) fn amount(value: f64, rule: &str) -> String {
     format!("{digits} {}", unit.replace("degrees C", "\u{b0}C")).trim_end().to_owned()
 }
 
-/// "a cell's usable capacity was 1.38 Ah, limit 1.4 Ah (cell 3)", with the verb in its tense.
-pub(super) fn words(row: &AlarmRecord, verb: &str) -> String {
+/// Formats an alarm like "a cell's usable capacity was 1.38 Ah, limit 1.4 Ah (cell 3)"; `verb` is "is" or "was".
+pub(super) fn alarm_text(row: &AlarmRecord, verb: &str) -> String {
     let amount = |value: f64| amount(value, &row.rule);
     let value = row.value.map_or_else(|| "unknown".to_owned(), amount);
     let limit = row.threshold.map_or_else(|| "unknown".to_owned(), amount);
@@ -50,7 +50,7 @@ pub(super) fn words(row: &AlarmRecord, verb: &str) -> String {
     format!("{} {verb} {value}, limit {limit}{cell}", about(&row.rule))
 }
 
-/// Formats a time: a date, or the time after the start.
+/// Formats a time as a date, or as the time since the start of an undated record.
 pub(super) fn moment(data: &Data, time_s: f64) -> String {
     if data.is_dated() {
         format_utc(Timestamp::from_secs(time_s)).replace('T', " ").replace('Z', " UTC")
@@ -65,7 +65,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn short_times_have_seconds_and_no_number_is_minus_zero() {
+    fn durations_have_suitable_units_and_zero_has_no_sign() {
         assert_eq!([42.0, 600.0, 36_000.0, 1e6].map(length), ["42 s", "10.0 min", "10.0 h", "12 days"]);
         assert_eq!(amount(-0.0001, "capacity_low"), "0 Ah");
         assert_eq!(without_minus_zero("-0.000".to_owned()), "0.000");

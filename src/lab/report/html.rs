@@ -194,10 +194,10 @@ fn verdict(summary: &summary::Summary) -> Markup {
         section class={ "verdict " (summary.verdict.class()) } aria-label="Summary" {
             div.sign aria-hidden="true" { (summary.verdict.sign()) }
             div {
-                p.head { (summary.how) }
+                p.head { (summary.headline) }
                 dl {
                     dt { "Since when" } dd { (summary.since) }
-                    dt { "What to do" } dd { (summary.what) }
+                    dt { "What to do" } dd { (summary.advice) }
                 }
             }
         }
@@ -279,12 +279,12 @@ fn alarms(
     outlook: Option<&forecast::Outlook>,
     pictures: &[(String, Picture)],
 ) -> Markup {
-    let groups = alike(&data.alarms);
+    let groups = group_alike(&data.alarms);
     let row = |group: &Vec<&AlarmRecord>| {
         let row = group[0];
         let more = if group.len() > 1 { format!("; {} cells in all", group.len()) } else { String::new() };
         let when = format::moment(data, row.time_s);
-        vec![when, row.rule.clone(), row.severity.clone(), row.change.clone(), format::words(row, "was") + &more]
+        vec![when, row.rule.clone(), row.severity.clone(), row.change.clone(), format::alarm_text(row, "was") + &more]
     };
     let rows = groups.iter().rev().map(row);
     let incidents = data.incidents.iter().rev();
@@ -320,7 +320,7 @@ fn alarms(
 /// Groups alarm changes of many cells: the same change of a rule and severity within a second, each for another cell.
 ///
 /// The groups are in the order of their first change.
-fn alike(alarms: &[AlarmRecord]) -> Vec<Vec<&AlarmRecord>> {
+fn group_alike(alarms: &[AlarmRecord]) -> Vec<Vec<&AlarmRecord>> {
     let is_same_limit = |a: &AlarmRecord, b: &AlarmRecord| (&a.rule, &a.severity) == (&b.rule, &b.severity);
     let is_same_alarm = |a: &AlarmRecord, b: &AlarmRecord| a.cell == b.cell && is_same_limit(a, b);
     let is_same_change = |a: &AlarmRecord, b: &AlarmRecord| {

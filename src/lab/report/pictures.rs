@@ -5,7 +5,7 @@ use std::path::Path;
 use super::context::PageContext;
 use super::data::{Data, Origin};
 use super::forecast::{self, Outlook};
-use super::format::{moment, words};
+use super::format::{alarm_text, moment};
 use super::limits::thresholds;
 use super::series::{self, CellStep};
 use super::trace::TraceBin;
@@ -115,7 +115,7 @@ fn raised(data: &Data, clock: &TimeAxis, rule: Rule) -> Option<Layer> {
         .map(|row| Point {
             x: clock.x(row.time_s),
             y: 0.0,
-            tip: format!("{} {}: {}", moment(data, row.time_s), row.severity, words(row, "was")),
+            tip: format!("{} {}: {}", moment(data, row.time_s), row.severity, alarm_text(row, "was")),
         })
         .collect();
     (!points.is_empty()).then(|| Layer::new("alarm raised", Ink::Red, Shape::Moments(points)))
@@ -462,7 +462,7 @@ fn span(data: &Data, clock: &TimeAxis, from: &super::data::AlarmRecord, to_s: f6
         from: clock.x(from.time_s),
         to: clock.x(to_s),
         ink: ink_of(&from.severity),
-        tip: format!("{}: {}; {end} {}", moment(data, from.time_s), words(from, "was"), moment(data, to_s)),
+        tip: format!("{}: {}; {end} {}", moment(data, from.time_s), alarm_text(from, "was"), moment(data, to_s)),
     }
 }
 

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use super::context::PageContext;
 use super::data::{AlarmRecord, Data, Origin};
 use super::forecast::Outlook;
-use super::format::{length, moment, words};
+use super::format::{alarm_text, length, moment};
 use super::limits::{rank, rule};
 use super::raised::{ActiveAlarm, doubt, raised, value};
 use super::{forecast, series};
@@ -59,22 +59,22 @@ pub(super) struct Tile {
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Summary {
     pub(super) verdict: Condition,
-    pub(super) how: String,
+    pub(super) headline: String,
     pub(super) since: String,
-    pub(super) what: String,
+    pub(super) advice: String,
     pub(super) tiles: Vec<Tile>,
 }
 
 /// Creates the summary.
 pub(super) fn of(data: &Data, context: &PageContext<'_>, outlook: &Result<Outlook, String>) -> Summary {
     let raised = raised(data);
-    let (battery, measuring): (Vec<_>, Vec<_>) = raised.iter().partition(|raised| is_of_battery(&raised.row.rule));
+    let (battery, measuring): (Vec<_>, Vec<_>) = raised.iter().partition(|raised| concerns_battery(&raised.row.rule));
     let worst = worst(&battery, |alarm| value(alarm.row, data, context, outlook.as_ref().ok()));
     let unknown = unknown(data, context);
     let why = worst.or(measuring.first().copied()).map_or_else(String::new, |alarm| {
         match value(alarm.row, data, context, outlook.as_ref().ok()) {
-            Some(now) => format!(" Now {}.", words(&AlarmRecord { value: Some(now), ..alarm.row.clone() }, "is")),
-            None => format!(" When the alarm was raised, {}.", words(alarm.row, "was")),
+            Some(now) => format!(" Now {}.", alarm_text(&AlarmRecord { value: Some(now), ..alarm.row.clone() }, "is")),
+            None => format!(" When the alarm was raised, {}.", alarm_text(alarm.row, "was")),
         }
     });
     let verdict = match worst.map(|raised| raised.row.severity.as_str()) {
@@ -88,9 +88,9 @@ pub(super) fn of(data: &Data, context: &PageContext<'_>, outlook: &Result<Outloo
     };
     Summary {
         verdict,
-        how: how(verdict, worst.or(measuring.first().copied()), data, unknown, &why),
+        headline: headline(verdict, worst.or(measuring.first().copied()), data, unknown, &why),
         since: since(data, &battery, &measuring),
-        what: what(verdict, worst, &measuring, knows_limits(data, context)),
+        advice: advice_text(verdict, worst, &measuring, knows_limits(data, context)),
         tiles: tiles(data, context, outlook, &raised),
     }
 }
@@ -142,7 +142,7 @@ fn unknown(data: &Data, context: &PageContext<'_>) -> Option<String> {
 }
 
 /// Whether a rule is about the battery itself, not about its measurement.
-fn is_of_battery(name: &str) -> bool {
+fn concerns_battery(name: &str) -> bool {
     !matches!(
         rule(name),
         Some(
@@ -157,11 +157,17 @@ fn is_of_battery(name: &str) -> bool {
     )
 }
 
-fn how(verdict: Condition, alarm: Option<&ActiveAlarm<'_>>, data: &Data, unknown: Option<String>, why: &str) -> String {
+fn headline(
+    verdict: Condition,
+    alarm: Option<&ActiveAlarm<'_>>,
+    data: &Data,
+    unknown: Option<String>,
+    why: &str,
+) -> String {
     let head = match verdict {
         Condition::Good => "Good: no limit is exceeded.",
         Condition::Watch if alarm.is_none() => "No limit is exceeded, but the capacity is below the end of life.",
-        Condition::Watch if alarm.is_some_and(|alarm| !is_of_battery(&alarm.row.rule)) => {
+        Condition::Watch if alarm.is_some_and(|alarm| !concerns_battery(&alarm.row.rule)) => {
             "The battery exceeds no limit, but its measurements are faulty."
         }
         Condition::Watch => "Worth watching.",
@@ -190,7 +196,7 @@ fn since(data: &Data, battery: &[&ActiveAlarm<'_>], measuring: &[&ActiveAlarm<'_
     }
 }
 
-fn what(
+fn advice_text(
     verdict: Condition,
     worst: Option<&ActiveAlarm<'_>>,
     measuring: &[&ActiveAlarm<'_>],
@@ -368,7 +374,11 @@ mod tests {
         both.push(alarm(3.0e8, "usable_capacity_low", "warning", true));
         let plan = summary(both.clone());
         assert_eq!(plan.verdict, Condition::Plan);
-        assert!(plan.how.contains("a cell's usable capacity was 1.38 Ah, limit 1.4 Ah (cell 3)"), "{}", plan.how);
+        assert!(
+            plan.headline.contains("a cell's usable capacity was 1.38 Ah, limit 1.4 Ah (cell 3)"),
+            "{}",
+            plan.headline
+        );
         both.push(alarm(4.0e8, "resistance_high", "severe", true));
         assert_eq!(summary(both).verdict, Condition::Act);
     }
@@ -401,21 +411,21 @@ mod tests {
         assert_eq!(verdict(&[cell(0), cell(1)], vec![limit(1.0)], None).verdict, Condition::Good);
         let no_limit = verdict(&[cell(0), cell(1)], Vec::new(), None);
         assert_eq!(no_limit.verdict, Condition::Unknown);
-        assert!(no_limit.how.contains("states no limit") && no_limit.what.contains("-c"), "{no_limit:?}");
+        assert!(no_limit.headline.contains("states no limit") && no_limit.advice.contains("-c"), "{no_limit:?}");
         let one_missing = verdict(&[cell(1)], vec![limit(1.0)], None);
-        assert_eq!(one_missing.how, "Unknown: nothing has been learned yet about 1 of 2 cells.");
+        assert_eq!(one_missing.headline, "Unknown: nothing has been learned yet about 1 of 2 cells.");
         assert_eq!(verdict(&[cell(0), learned(3.0, 1, None)], vec![limit(1.0)], None).verdict, Condition::Unknown);
         // Below the end of life, although no alarm has been raised.
         assert_eq!(verdict(&[cell(0), cell(1)], vec![limit(1.6)], None).verdict, Condition::Watch);
         let changed = verdict(&[cell(0), cell(1)], vec![limit(1.0)], Some("the history was changed"));
-        assert_eq!(changed.how, "Unknown: the history was changed.");
+        assert_eq!(changed.headline, "Unknown: the history was changed.");
     }
 
     #[test]
     fn missing_input_does_not_make_the_battery_bad() {
         let summary = summary(vec![alarm(1.0, "input_missing", "severe", true)]);
         assert_eq!(summary.verdict, Condition::Unknown);
-        assert!(summary.what.contains("Check sensors"), "{}", summary.what);
+        assert!(summary.advice.contains("Check sensors"), "{}", summary.advice);
     }
 
     #[test]
@@ -425,7 +435,10 @@ mod tests {
         data.learned = vec![CapacityRecord { usable_ah: Some((0.9, 0.01)), ..learned(1.71e9, 2, Some(1.0)) }];
         let of = |data: &Data| of(data, &PageContext::default(), &Err("too little".into()));
         let said = of(&data);
-        assert_eq!(said.how, "Past its limit: act now. Now a cell's usable capacity is 0.9 Ah, limit 1.4 Ah (cell 3).");
+        assert_eq!(
+            said.headline,
+            "Past its limit: act now. Now a cell's usable capacity is 0.9 Ah, limit 1.4 Ah (cell 3)."
+        );
         let capacity = |summary: &Summary| summary.tiles.iter().find(|tile| tile.name == "Capacity").cloned().unwrap();
         assert_eq!((capacity(&said).note.as_str(), capacity(&said).doubt), ("\u{b1} 0.010, cell 3", None));
         data.learned = vec![learned(1.71e9, 2, None)];
@@ -461,7 +474,7 @@ mod tests {
             let usable_ah = Some((usable_ah, 0.01));
             data.learned.push(CapacityRecord { usable_ah, ..learned(1.71e9, cell, Some(1.0)) });
         }
-        let said = of(&data, &PageContext::default(), &Err("too little".into())).how;
+        let said = of(&data, &PageContext::default(), &Err("too little".into())).headline;
         assert!(said.ends_with("Now a cell's usable capacity is 0.9 Ah, limit 1.4 Ah (cell 2)."), "{said}");
     }
 }

@@ -88,7 +88,7 @@ pub struct CaseScore {
     pub final_resistance_ratio_std: Option<f64>,
     /// Score of the SOC; `None` = the file has no ampere-hour counter.
     pub soc: Option<SocScore>,
-    /// Score of the usable capacity; `None` = there is no table.
+    /// Score of the usable capacity; `None` = no table.
     pub life: Option<LifeScore>,
     /// Path of the plot.
     pub plot: Option<PathBuf>,

@@ -140,7 +140,7 @@ impl ScoreRequest {
         self.check_numbers()
     }
 
-    /// Rejects empty lists for which nothing could be scored.
+    /// Rejects empty lists, which would score nothing.
     fn check_lists(&self) -> Result<(), LabError> {
         let lists = [
             ("files", self.files.len()),

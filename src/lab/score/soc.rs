@@ -6,7 +6,7 @@ use crate::OF_95;
 
 /// Largest error of a converged estimate, points (percent of full).
 pub const CONVERGED_POINTS: f64 = 2.0;
-/// Time for which the error must stay that small, s: a wrong estimate that only crosses the truth has not converged.
+/// The error must stay that small for this time, s: a wrong estimate that only crosses the truth has not converged.
 pub const CONVERGED_HOLD_S: f64 = 600.0;
 
 /// An estimate with its truth.

@@ -121,19 +121,23 @@ fn check(vehicles: &BTreeMap<String, VehicleFolder>, wanted: Option<&[Vehicle]>)
             "{} of {} vehicles have not been replayed: {}",
             missing.len(),
             wanted.len(),
-            some_of(&missing)
+            first_names(&missing)
         )));
     }
     let named: BTreeSet<&str> = wanted.iter().map(|vehicle| vehicle.vehicle.as_str()).collect();
     let others: Vec<&str> = vehicles.keys().map(String::as_str).filter(|name| !named.contains(name)).collect();
     if !others.is_empty() {
-        return Err(LabError::Data(format!("{} vehicles are not in the manifest: {}", others.len(), some_of(&others))));
+        return Err(LabError::Data(format!(
+            "{} vehicles are not in the manifest: {}",
+            others.len(),
+            first_names(&others)
+        )));
     }
     Ok(())
 }
 
 /// The first few names.
-fn some_of(names: &[&str]) -> String {
+fn first_names(names: &[&str]) -> String {
     let shown: usize = 8;
     let more = if names.len() > shown { ", ..." } else { "" };
     names[..names.len().min(shown)].join(", ") + more

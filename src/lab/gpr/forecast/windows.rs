@@ -22,7 +22,7 @@ pub struct RowSpacing {
 }
 
 impl RowSpacing {
-    /// Steps of a column of the table, within its parts; `None` if there are no steps or no times.
+    /// Steps of a column of the table, within its parts; `None` without steps or times.
     pub fn of(table: &ColumnTable, column: usize) -> Option<Self> {
         let times: Vec<f64> = table.column(column).collect();
         let steps = (1..times.len()).filter(|row| table.parts.binary_search(row).is_err());

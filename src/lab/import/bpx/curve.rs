@@ -1,7 +1,7 @@
 //! The open-circuit voltage of a BPX cell over SOC, and the charge between its cut-offs.
 //!
 //! `u(soc, T) = u_p(y) - u_n(x) + (T - T_ref) (du_p/dT(y) - du_n/dT(x))` with the lithium contents `x` (negative) and `y` (positive).
-//! The cyclable lithium is that of a full cell in the file: negative at its maximum, positive at its minimum. At the reference
+//! The cyclable lithium follows from a full cell in the file: negative at its maximum, positive at its minimum. At the reference
 //! temperature, the voltage is the upper cut-off at SOC 1 and the lower one at SOC 0, as in PyBaMM's ElectrodeSOH
 //! (Mohtat et al., J. Power Sources 427 (2019) 101, eqs. 5 to 8). Units: V, Ah, K.
 
@@ -153,7 +153,7 @@ impl<'a> Curve<'a> {
     }
 }
 
-/// An interval around `near` in which the predicate changes from true to false; `ends` if there is none.
+/// An interval around `near` in which the predicate changes from true to false; `ends` without such an interval.
 fn bracket(near: f64, ends: (f64, f64), is_below: impl Fn(f64) -> bool) -> (f64, f64) {
     let mut step = 1e-4;
     while step < 1.0 {

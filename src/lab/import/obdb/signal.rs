@@ -1,7 +1,7 @@
 //! Converts an OBDb signal to a signal of a diagnostic input: position, scaling, range, unit.
 //!
 //! * factor = `mul` / `div`, offset = `add`; `min` defaults to 0, as in OBDb's own decoder. That decoder clamps values to `min` and
-//!   `max`; here, a value outside them is a bad reading. There is no range if `max` is not above `min`.
+//!   `max`; here, a value outside them is a bad reading. Without a `max` above `min`, the range is unlimited.
 //! * `nullmin`, `nullmax`: values at or outside them are not available. Few codes are listed; otherwise the range ends before
 //!   them.
 //! * All units are kept, also degrees Fahrenheit: nothing is converted.
