@@ -19,8 +19,10 @@ pub(super) fn notes(parts: &[&MeasuredPart], records: &[Record], before: Capacit
     // Remaining share of the capacity's relative deviation above which the logs do not show the capacity.
     let is_unshown = after.std_ah / after.mean_ah > 0.7 * before.std_ah / before.mean_ah;
     if is_unshown {
-        notes
-            .push("the logs do not show the capacity: it stays near that of the model the fit started from".to_owned());
+        notes.push(
+            "the logs do not show the capacity: it stays near the value in the model that the fit started from"
+                .to_owned(),
+        );
     }
     let span = records.iter().map(span).fold(0.0, f64::max);
     if span < 0.3 {

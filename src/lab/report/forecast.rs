@@ -80,7 +80,7 @@ fn unknown_lives(lives: &[Result<RemainingLife, InsufficientData>], cell: usize,
         return display(why);
     }
     let unknown = lives.iter().filter(|life| life.is_err()).count();
-    format!("not known of {unknown} of {} cells (cell {}: {})", lives.len(), cell + 1, display(why))
+    format!("unknown for {unknown} of {} cells (cell {}: {})", lives.len(), cell + 1, display(why))
 }
 
 fn display(why: InsufficientData) -> String {
@@ -257,12 +257,12 @@ mod tests {
         assert!(outlook(&short, &PageContext::default()).unwrap_err().contains("a configuration (-c) does"));
         alarm_at(&mut short, 1.6);
         let why = outlook(&short, &PageContext::default()).unwrap_err();
-        assert_eq!(why, "not known of 2 of 2 cells (cell 1: 2 capacity readings, needs 3)");
+        assert_eq!(why, "unknown for 2 of 2 cells (cell 1: 2 capacity readings, needs 3)");
         let mut mixed = worn(100, &[0.001, 0.0]);
         alarm_at(&mut mixed, 1.6);
         let outlook_of_one = outlook(&mixed, &PageContext::default()).expect("of one cell");
         assert_eq!((outlook_of_one.cell, outlook_of_one.value().as_str()), (0, "unknown"));
-        assert!(outlook_of_one.note(2).starts_with("not known of 1 of 2 cells (cell 2: capacity lost is"));
+        assert!(outlook_of_one.note(2).starts_with("unknown for 1 of 2 cells (cell 2: capacity lost is"));
         let mut flat = worn(100, &[0.0]);
         alarm_at(&mut flat, 1.6);
         assert!(outlook(&flat, &PageContext::default()).unwrap_err().starts_with("capacity lost is"));
