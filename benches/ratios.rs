@@ -11,9 +11,9 @@ use packwatch_host::config::Config;
 
 mod common;
 
-/// Number of turns in which each form is timed.
+/// Number of rounds. Each round times every form once.
 const ROUNDS: usize = 15;
-/// Rounds of a pack per turn.
+/// Steps of all cells per round.
 const STEPS: u32 = 2000;
 const CELLS: usize = 96;
 
@@ -36,7 +36,7 @@ fn main() {
         times[times.len() / 2]
     });
     println!("estimator step, 4 states, tables of 14 SOC x 3 temperatures ({rounds} rounds, medians)");
-    println!("form                                  ns/step   of plain  bar");
+    println!("form                                  ns/step  vs. plain  limit");
     println!("plain nalgebra, one cell            {plain_ns:>9.1}       1.00");
     println!("plain nalgebra, one of 96           {plain_pack_ns:>9.1}       {:.2}", plain_pack_ns / plain_ns);
     println!("bank, one cell                      {single_ns:>9.1}       {:.3}  0.5", single_ns / plain_ns);

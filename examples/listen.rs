@@ -16,7 +16,7 @@ use std::io::{self, BufRead, Write};
 use packwatch::can::dbc::{Database, Message, Signal};
 use packwatch::can::{CanId, Frame};
 
-/// Without a status frame for this time, all values are unknown, s.
+/// If no status frame arrives for this time, all values are unknown, s.
 const STATUS_TIMEOUT_S: f64 = 0.3;
 /// An alarm that is not repeated within this number of passes is over.
 const PASSES: f64 = 7.0;
@@ -55,7 +55,7 @@ struct Listener {
     database: Database,
     /// Time of the latest frame of each raised alarm.
     alarms: BTreeMap<Key, f64>,
-    /// As the digest states it; before the first, the cycle time of the alarm frame.
+    /// Duration of a pass according to the latest digest; before the first digest, the cycle time of the alarm frame.
     pass_time_s: f64,
     status_at_s: Option<f64>,
     validity: String,

@@ -1,6 +1,6 @@
 //! `packwatch acknowledge`, `clear`, `pack-replaced` and `poll`: commands to the running daemon.
 //!
-//! They succeed if something changed or nothing had to change. An error names every refused alarm and the reason.
+//! They succeed unless the daemon refuses something. The error message then lists refused alarms with their reasons.
 
 use std::fmt::Write as _;
 

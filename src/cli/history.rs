@@ -189,7 +189,7 @@ fn describe(entry: &HistoryEntry) -> String {
     filled(words, &value)
 }
 
-/// Fills in fields: `{name:2}` is a number with two decimals, `{name%1}` one in percent, `{name}` a text.
+/// Fills in fields: `{name:2}` is a number with two decimals, `{name%1}` a percentage with one decimal, `{name}` a string.
 fn filled<'v>(words: &str, value: &impl Fn(&str) -> &'v Value) -> String {
     let mut parts = words.split('{');
     let mut text = parts.next().unwrap_or_default().to_owned();

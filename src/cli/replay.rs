@@ -106,7 +106,7 @@ fn create(path: Option<&Path>) -> io::Result<Option<ResultFile>> {
     path.map(ResultFile::create).transpose()
 }
 
-/// Creates a file of events; it begins with the vehicle, as the one of `run`.
+/// Creates an event file. Like the event file of `run`, it begins with the vehicle's identity.
 fn events_file(path: Option<&Path>, config: &Config) -> io::Result<Option<ResultFile>> {
     let mut file = create(path)?;
     if let Some(file) = &mut file {

@@ -27,13 +27,13 @@ impl Timestamp {
     /// The clock's origin.
     pub const ZERO: Self = Self(0);
 
-    /// From nanoseconds since the clock's origin.
+    /// Creates a time stamp from nanoseconds since the clock's origin.
     pub const fn from_nanos(nanos: i64) -> Self {
         Self(nanos)
     }
 
-    /// From seconds since the clock's origin, rounded to the nearest nanosecond. Saturates at the ends of the range
-    /// (292 years). NaN gives the origin.
+    /// Creates a time stamp from seconds since the clock's origin, rounded to the nearest nanosecond. Saturates at the
+    /// ends of the range (292 years). NaN gives the origin.
     pub fn from_secs(seconds: f64) -> Self {
         // Convert whole seconds separately: a float's 53 bits cannot hold nanoseconds since 1970.
         let whole = seconds.floor();
@@ -125,7 +125,7 @@ pub const MAX_CELLS: usize = 1024;
 pub struct CellIndex(pub u16);
 
 impl CellIndex {
-    /// As an index into per-cell arrays.
+    /// Returns the index into per-cell arrays.
     pub const fn index(self) -> usize {
         self.0 as usize
     }
@@ -137,7 +137,7 @@ impl CellIndex {
 pub struct BusIndex(pub u8);
 
 impl BusIndex {
-    /// As an index into per-interface arrays.
+    /// Returns the index into per-interface arrays.
     pub const fn index(self) -> usize {
         self.0 as usize
     }
@@ -149,7 +149,7 @@ impl BusIndex {
 pub struct SensorIndex(pub u16);
 
 impl SensorIndex {
-    /// As an index into per-sensor arrays.
+    /// Returns the index into per-sensor arrays.
     pub const fn index(self) -> usize {
         self.0 as usize
     }

@@ -76,7 +76,11 @@ pub(crate) fn bytes(name: &str, values: &Bound<'_, PyAny>) -> PyResult<Bytes> {
 
 /// Checks that an array has as many rows as another.
 pub(crate) fn check_rows(name: &str, rows: usize, of: &str, expected: usize) -> PyResult<()> {
-    if rows == expected { Ok(()) } else { Err(data(format!("{name} has {rows} rows, must have {expected} as {of}"))) }
+    if rows == expected {
+        Ok(())
+    } else {
+        Err(data(format!("{name} has {rows} rows, must have {expected}, like {of}")))
+    }
 }
 
 /// Converts to a contiguous float64 array; masked values become NaN. `name` is used in errors.
@@ -123,7 +127,7 @@ fn is_masked(array: &Bound<'_, PyAny>) -> PyResult<bool> {
     array.py().import("numpy.ma")?.call_method1("isMaskedArray", (array,))?.extract()
 }
 
-/// Rejects arrays of texts, times, complex numbers or records, because NumPy and pandas silently convert some of them to reals.
+/// Rejects arrays of strings, times, complex numbers or records, because NumPy and pandas silently convert some of them to reals.
 fn check_numbers(name: &str, array: &Bound<'_, PyAny>) -> PyResult<()> {
     let dtype = array.getattr("dtype")?;
     let kind: String = dtype.getattr("kind")?.extract()?;

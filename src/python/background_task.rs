@@ -46,7 +46,7 @@ pub(crate) struct Progress<'a> {
 }
 
 impl Progress<'_> {
-    /// Without a bar.
+    /// Progress that is not shown.
     pub(crate) fn hidden() -> Self {
         Self { is_shown: false, total: None, unit: "" }
     }

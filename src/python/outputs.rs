@@ -53,7 +53,7 @@ pub(crate) struct Wanted {
 }
 
 impl Wanted {
-    /// From a period in seconds.
+    /// Creates a selection from a period in seconds.
     pub(crate) fn new(period_s: Option<f64>) -> PyResult<Self> {
         let allowed = |period_s: f64| (0.0..=1e9).contains(&period_s);
         match period_s {

@@ -11,7 +11,7 @@ use crate::arguments::{List, of_json};
 use crate::background_task::{self, BackgroundTask, Progress};
 use crate::error::{data, of_library};
 
-/// An end of life: Ah, or a text such as "70 %".
+/// An end of life: Ah, or a string such as "70 %".
 #[derive(FromPyObject)]
 pub(crate) enum EndOfLife {
     AmpereHours(f64),

@@ -92,7 +92,7 @@ fn compare(python: &OsString, path: &Path, strict: bool) -> Tally {
     let signals: usize = db.messages.iter().map(|message| message.signals.len()).sum();
     let counted = ask(python, path, &["count"], &[]);
     assert_eq!(counted, [format!("{} {signals}", db.messages.len())], "messages and signals");
-    // A message that cannot exist (no bytes) has no signal. Every other signal is in one of the two lists.
+    // Every signal must be in one of the two maps.
     assert_eq!(tally.per_signal.len() + tally.short.len(), signals, "a signal was never present");
     for (name, count) in tally.per_signal.iter().chain(&tally.short) {
         assert!(*count >= PAYLOADS, "{name} was present only {count} times");
@@ -142,7 +142,7 @@ fn tesla_dbc_signals_decode_as_cantools() {
     let past: BTreeSet<String> = ask(&python, &path, &["short"], &[]).into_iter().collect();
     assert_eq!(tally.short.keys().cloned().collect::<BTreeSet<_>>(), past, "signals that reach past their message");
     assert!(!past.is_empty() && tally.per_signal.len() > 3000);
-    eprintln!("extend past their message, always a short frame: {past:?}");
+    eprintln!("signals that extend past their message, so that every frame is too short: {past:?}");
 }
 
 #[test]

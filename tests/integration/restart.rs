@@ -1,8 +1,9 @@
 //! Cost of a restart: compares a run that is killed, or loses power, with an uninterrupted run.
 //!
-//! Input: days of the simulated electric car, with an awake rest after which the bus falls asleep. The state is stored
-//! every second, as the daemon does. At random times a second monitor starts from a state of some age, misses the
-//! frames of the downtime, and then receives the same frames. The test prints the results and checks their limits.
+//! Input: days of the simulated electric car. After each drive the car rests with the bus awake, then the bus falls
+//! asleep. The state is stored every second, as the daemon does. At random times a second monitor starts from an older
+//! state, misses the frames of the downtime, and then receives the same frames as the first. The test prints the results
+//! and checks their limits.
 
 use std::collections::VecDeque;
 use std::path::Path;
@@ -17,7 +18,7 @@ use packwatch::sim::{Pack, Scenario, Settings, Simulation, Wiring};
 
 /// Number of cells: enough for a spread, few enough for many cases.
 const CELLS: u16 = 8;
-/// Awake rest after each drive, s.
+/// Rest with the bus awake after each drive, s.
 const REST_S: u32 = 900;
 /// Half-width of the 95 % interval of a normal distribution, in standard deviations.
 const SIGMAS: f64 = 1.96;
@@ -225,7 +226,7 @@ fn start_waiting(
         let mut live = Live::restored(config, state.snapshot);
         live.give(Record::tick(time));
         active.push(Case {
-            // The downtime ends a mode, so a complete half-cycle may be learned from at once.
+            // The downtime may complete a half-cycle, and the monitor then learns from it immediately.
             kept_learned: learned(&live.monitor) == state.learned
                 || live.out.events.iter().any(|event| matches!(event.kind, EventKind::Capacity { .. })),
             live,
@@ -318,8 +319,8 @@ fn interval_after_power_cut_covers_loss() {
     assert!(cases.iter().all(|case| case.kept_learned));
 }
 
-/// A drive, then `hours` of downtime in which `used` of the charge is removed, then a rest. Returns error and deviation
-/// of each cell after each reading.
+/// A drive, then `hours` of downtime in which the fraction `used` of the capacity is discharged, then a rest. Returns
+/// error and deviation of each cell after each reading.
 fn drive_after_downtime(config: &MonitorConfig, hours: f64, used: f64, seed: u64) -> Vec<(f64, f64)> {
     let encoder = InputEncoder::new(&config.input);
     let (mut live, mut noise, mut frames) = (Live::new(config), Draw(seed), Vec::new());

@@ -246,7 +246,7 @@ def test_error_text_omits_origin(tmp_path):
         (lambda: pw.fit("a.csv", "x", capacity_ah=0.0), "--capacity = 0, must be a finite number above 0"),
         (lambda: pw.fit("a.csv", "x", first_cycles=0), "--first-cycles = 0, must be 1 or more"),
         (lambda: pw.fit("a.csv", "x", capacity_ah=2.0, first_cycles=3), "--capacity must not be given together with --first-cycles"),
-        (lambda: pw.gp.fit([[1.0]], [1.0, 2.0]), "output has 2 rows, must have 1 as inputs"),
+        (lambda: pw.gp.fit([[1.0]], [1.0, 2.0]), "output has 2 rows, must have 1, like inputs"),
         (lambda: pw.gp.fit([[1.0]], [[1.0, 2.0]]), "output has 2 columns, must have 1"),
         (lambda: pw.gp.fit([[1.0]], [1.0], basis="cubic"), 'basis "cubic", must be zero, constant or linear'),
         (lambda: pw.CellModel.of_label("lead", 60.0), 'chemistry "lead", must be one of'),

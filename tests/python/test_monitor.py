@@ -194,8 +194,8 @@ def test_label_alone_is_sufficient(record):
     ("call", "text"),
     [
         (lambda m: m.rows([0.0, np.nan], [1, 1], [4, 4]), "time_s[1] = NaN, must be a finite number"),
-        (lambda m: m.rows([0.0, 1.0], [1], [4, 4]), "current_a has 1 rows, must have 2 as time_s"),
-        (lambda m: m.rows([0.0], [1], [4], [25, 26]), "temperature_c has 2 rows, must have 1 as time_s"),
+        (lambda m: m.rows([0.0, 1.0], [1], [4, 4]), "current_a has 1 rows, must have 2, like time_s"),
+        (lambda m: m.rows([0.0], [1], [4], [25, 26]), "temperature_c has 2 rows, must have 1, like time_s"),
         (lambda m: m.rows([[[0.0]]], [1], [4]), "time_s has 3 dimensions, must have 1 or 2"),
         (lambda m: m.rows(["x"], [1], [4]), "time_s is an array of <U1, must be an array of numbers"),
         (lambda m: m.rows(["1.0"], [1], [4]), "time_s is an array of <U3, must be an array of numbers"),

@@ -7,7 +7,7 @@ set -euo pipefail
 tmp=$(mktemp -d)
 declare -A pids=()
 # shellcheck disable=SC2034  # for the tests
-exit_status='' # of the process that `stop` or `wait_exit` ended
+exit_status='' # exit status of the last process that `stop` or `wait_exit` waited for
 
 at_exit() {
     local status=$? name
@@ -94,8 +94,8 @@ iface_delete() { ip link delete dev "$1"; }
 iface_up() { ip link set dev "$1" up; }
 iface_down() { ip link set dev "$1" down; }
 
-# receiving IFACE COUNT: whether the kernel lists at least COUNT filters of open sockets on IFACE ("any": sockets not bound to
-# one).
+# receiving IFACE COUNT: whether the kernel lists at least COUNT receive filters on IFACE ("any": filters of sockets that are not
+# bound to an interface).
 # A frame sent before its receiver is listed is lost, and candump does not print anything when it is ready:
 #   start dump candump -L vcan0; wait_for 5 "receiver on vcan0" receiving vcan0 1
 receiving() {

@@ -333,7 +333,7 @@ impl AlarmEngine {
         self.rules.iter().flat_map(of_rule).collect()
     }
 
-    /// Restores alarms with their values. Ignores alarms that no threshold watches.
+    /// Restores alarms with their values. Ignores alarms without a configured threshold.
     pub fn resume(&mut self, alarms: &[RunningAlarm]) {
         for RunningAlarm { alarm, is_known, observation, probability } in alarms {
             let Some((index, slot)) = self.locate(alarm.rule, alarm.severity, alarm.cell) else { continue };

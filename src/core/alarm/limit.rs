@@ -54,7 +54,7 @@ pub struct RuleConfig {
 /// A rule's value at one moment.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Observation {
-    /// In the rule's unit; `None` or not finite = unknown.
+    /// The value in the rule's unit; `None` or not finite = unknown.
     pub value: Option<f64>,
     /// Its standard deviation, in the same unit; `None` = unknown.
     pub std: Option<f64>,
@@ -86,11 +86,11 @@ impl Observation {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum LimitCheck {
-    /// On the bad side of the threshold.
+    /// The value is on the bad side of the set threshold.
     Beyond,
-    /// Neither beyond nor healthy.
+    /// The value is between the set and the clear threshold.
     Between,
-    /// At the clear threshold or better.
+    /// The value is at the clear threshold or better.
     Healthy,
     /// No usable value.
     Unknown,

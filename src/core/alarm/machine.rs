@@ -89,7 +89,7 @@ pub enum Change {
     Cleared,
     /// Acknowledged by a command.
     Acknowledged,
-    /// History forgotten: by a command, after a pack exchange, or because no threshold watches the alarm any longer.
+    /// History forgotten: by a command, after a pack exchange, or because the alarm no longer has a threshold.
     Forgotten,
 }
 

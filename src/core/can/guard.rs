@@ -1,11 +1,12 @@
 //! Checks the protected input messages: status, counts and changes per message.
 //!
-//! In: frames with their time and interface, in order of arrival, and the time alone ([`Guards::poll`]). Out: the
-//! [`Status`] of each frame, counts per message, and a [`GuardChange`] when a message turns from usable to failing or
-//! back; the checks in between are only counted. If a message's cycle time is known, each period without a frame counts
-//! as one NONEWDATA. The first is counted one and a half periods after the last frame (half a period allows for
-//! jitter), then one per period. Missing frames up to the number that the check allows to be lost cause no change: the
-//! next frame will be usable, and a sender with jitter would otherwise fill the log.
+//! In: frames with their time and interface, in order of arrival; between frames, the current time
+//! ([`Guards::poll`]). Out: the [`Status`] of each frame, counts per message, and a [`GuardChange`] when a message
+//! starts to fail its check or becomes usable again; the checks in between are only counted. If a message's cycle time
+//! is known, each period without a frame counts as one NONEWDATA. The first is counted one and a half periods after the
+//! last frame (half a period allows for jitter), then one per period. Missing frames up to the number that the check
+//! allows to be lost cause no change: the next frame will be usable, and a sender with jitter would otherwise fill the
+//! log.
 //!
 //! Time without listening is not the sender's fault: after sleep, a restart of the program or a clock step, the
 //! receivers wait for a first frame again ([`Guards::restart`]). For the same reason, a restarted program restores the
@@ -18,7 +19,7 @@ use crate::can::e2e::{CheckConfig, Receiver, Status, StatusCounts};
 use crate::can::{CanId, Frame, FrameKind};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// Number of periods after the last frame at which a frame counts as missed; then one more each period.
+/// Number of periods after the last frame at which a frame counts as missed. Each further period counts one more.
 const MISSED_AFTER_PERIODS: f64 = 1.5;
 
 /// Configuration of one protected message.
@@ -32,7 +33,7 @@ pub struct GuardConfig {
     pub cycle_time_s: Option<f64>,
 }
 
-/// Reports that a message turned from usable to failing, or back.
+/// Reports that a message started to fail its check, or became usable again.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct GuardChange {
     pub bus: BusIndex,
@@ -41,8 +42,8 @@ pub struct GuardChange {
     pub status: Status,
     /// Whether the message is usable now.
     pub usable: bool,
-    /// Checks without a usable frame since the message was last usable: so far if it fails, in total if it is usable
-    /// again.
+    /// Number of checks without a usable frame since the message was last usable: the count so far while it fails, the
+    /// total when it becomes usable again.
     pub count: u64,
 }
 

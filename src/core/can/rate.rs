@@ -1,7 +1,7 @@
 //! Detects a second sender of an unprotected input message by comparing the frame rate with the message's cycle time.
 //!
-//! In: time and identifier of each frame, whether its current contradicts the neighbouring frames, the time alone
-//! ([`SecondSenders::poll`]). Out: a [`SenderChange`] when a second sender is found and when it is gone.
+//! In: time and identifier of each frame, and whether its current contradicts the neighbouring frames; between frames,
+//! the current time ([`SecondSenders::poll`]). Out: a [`SenderChange`] when a second sender is found and when it is gone.
 //!
 //! Frames are counted in windows of [`WINDOW_NS`]. A second sender is found if [`WINDOWS`] consecutive windows have
 //! more than [`EXCESS`] times the expected number of frames, and if there is a second sign: either many intervals are
@@ -11,11 +11,11 @@
 //! with its rate and do not count. The expected number is the highest steady rate so far, or the rate from the DBC's
 //! cycle time if it is higher. The learned rate is stored, so that a second sender is also found after a restart.
 //!
-//! Second senders that are not found:
-//! * one of a message with fewer than [`LEAST_PER_S`] frames a second, if it is as slow as the first sender;
-//! * one of a message without a current, if the message always arrives in bursts or the second sender is more than
-//!   twenty times as fast;
-//! * one that is present before the rate is known, if its currents do not differ.
+//! A second sender is not found in these cases:
+//! * the message has fewer than [`LEAST_PER_S`] frames a second, and the second sender is as slow as the first;
+//! * the message contains no current, and it always arrives in bursts or the second sender is more than twenty times as
+//!   fast;
+//! * the second sender is present before the rate is known, and its currents do not differ from the first sender's.
 //!
 //! A message with end-to-end protection does not need this check: the counters of two senders do not fit.
 

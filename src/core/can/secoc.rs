@@ -45,10 +45,10 @@ pub enum Profile {
     /// AUTOSAR profile 3.
     #[serde(rename = "3")]
     P3,
-    /// For CAN FD frames.
+    /// Profile for CAN FD frames.
     #[serde(rename = "fd")]
     Fd,
-    /// For the frame that announces the freshness of commands.
+    /// Profile of the frame that announces the freshness of commands.
     #[serde(rename = "announcement")]
     Announcement,
 }

@@ -63,9 +63,9 @@ pub(super) struct BleedTimer {
     pub(super) has_bits: bool,
     bit: Option<Bit>,
     counted_until: Option<Timestamp>,
-    /// From the middle of the last row to the start of the current row, s.
+    /// Bleed time from the middle of the last row to the start of the current row, s.
     before: BleedTime,
-    /// In the current row, s.
+    /// Bleed time in the current row, s.
     row: BleedTime,
 }
 

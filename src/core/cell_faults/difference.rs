@@ -75,9 +75,9 @@ pub struct Difference {
 /// Kind of a sudden change.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Jump {
-    /// Of one cell.
+    /// One cell changed.
     Alone,
-    /// Of a cell and its neighbours.
+    /// A cell and its neighbours changed.
     Replaced,
 }
 

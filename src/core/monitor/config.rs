@@ -134,7 +134,7 @@ pub struct AlarmCode {
 pub struct Reconfigured {
     /// Changed tables, as written in the configuration file.
     pub changed: Vec<&'static str>,
-    /// Number of raised or past alarms that ended because no threshold watches them any more.
+    /// Number of raised or past alarms that ended because the new configuration has no threshold for them.
     pub alarms_ended: usize,
 }
 

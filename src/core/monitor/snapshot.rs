@@ -87,13 +87,13 @@ impl From<InvalidState> for RestoreError {
 /// How a monitor started at its first input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Beginning {
-    /// Without a stored state.
+    /// It had no stored state.
     New,
-    /// With a state on the same clock, as if the program had not stopped.
+    /// It continued from a state on the same clock, as if the program had not stopped.
     Continued,
-    /// With a state of known age.
+    /// It restored a state of known age.
     Restored,
-    /// With a state of unknown age.
+    /// It restored a state of unknown age.
     RestoredAgeless,
 }
 

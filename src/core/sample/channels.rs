@@ -1,4 +1,4 @@
-//! Properties of each channel: its limits, its slot, and the clock of its stuck check.
+//! The channels in use, the limits of each channel, and the clock of its stuck check.
 
 use super::charge::ChargeTotals;
 use super::config::{Limits, SampleConfig, VoltageSource};

@@ -8,7 +8,8 @@ use rand::Rng;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-/// Use of a stream of random numbers. Its number affects results, so it is never reused.
+/// What a stream of random numbers is used for. The number of a stream affects results, so it never changes and is never
+/// given to another use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Stream {
     Spread,
@@ -45,7 +46,7 @@ impl Noise {
 
     /// Creates the stream for the constant errors of a sensor whose noise uses `stream`.
     pub(crate) fn of_channel(seed: u64, stream: Stream) -> Self {
-        // First stream number for constant errors; the numbers of the noise streams are all lower.
+        // Constant errors use stream numbers from 0x10_0000; all noise streams have lower numbers.
         Self::of_number(seed, 0x10_0000 + stream.number())
     }
 

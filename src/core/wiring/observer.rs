@@ -68,11 +68,11 @@ enum SignalList {
 pub struct WiringObserver {
     pub(crate) plan: Plan,
     pub(crate) buses: Vec<BusStats>,
-    /// In the order of `plan.signals`.
+    /// Evidence of each signal, in the order of `plan.signals`.
     pub(crate) series: Vec<Series>,
-    /// In the order of `plan.more_cells`.
+    /// Evidence of each signal, in the order of `plan.more_cells`.
     pub(crate) more_cells: Vec<Series>,
-    /// In the order of `plan.unconfigured`.
+    /// Evidence of each signal, in the order of `plan.unconfigured`.
     pub(crate) unconfigured: Vec<Series>,
     /// Indexes of the signals by message.
     by_id: BTreeMap<(BusIndex, CanId), Vec<(SignalList, usize)>>,

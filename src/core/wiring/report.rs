@@ -36,7 +36,7 @@ pub enum Topic {
     CellCount,
     /// A configured signal was never received.
     Silent,
-    /// A signal stands in another's place.
+    /// A signal is configured in place of another.
     Swapped,
     /// Byte order, sign or position of the bits is wrong.
     Layout,

@@ -134,7 +134,7 @@ fn valid_file_gives_settings_and_defaults() {
 #[test]
 fn limits_are_derived_from_dbc_and_cell_model() {
     let sample = good(PACK).monitor.sample;
-    assert_eq!((sample.current.min, sample.current.max), (-500.0, 300.0), "the bus counts charge positive");
+    assert_eq!((sample.current.min, sample.current.max), (-500.0, 300.0), "charge is positive on the bus");
     assert_eq!((sample.voltage.min, sample.voltage.max), (1.25, 4.7), "[0|0] in the DBC gives no range");
     assert_eq!((sample.temperature.min, sample.temperature.max), (-40.0, 100.0));
     let sample = good(&format!("{PACK}[limits.current]\nmax_charge_a = 20\n")).monitor.sample;
@@ -167,7 +167,7 @@ fn pack_voltage_is_divided_by_series_cells() {
     );
     let sample = good(&pack).monitor.sample;
     assert_eq!((sample.cells, sample.voltage_source), (1, VoltageSource::PackTotal { series: 4 }));
-    assert_eq!(sample.voltage.max, 4.7, "100 V by four cells is more than the cell model allows");
+    assert_eq!(sample.voltage.max, 4.7, "100 V divided by four cells exceeds the cell model's limit");
     assert_eq!(sample.sensor_of_cell, [Some(SensorIndex(0))]);
 }
 
@@ -188,7 +188,11 @@ fn readings_are_mapped_with_sign_scale_and_cell() {
     assert_eq!(status, [(Channel::Current, Ok(-5.0)), (temperature, Ok(24.0))]);
     for code in [[0xFF, 0x7F], [0x00, 0x80]] {
         let status = decoded(&config, 0x100, &[code[0], code[1], 0, 0, 65, 0, 0, 0]);
-        assert_eq!(status[0], (Channel::Current, Err(Fault::NotAvailable)), "configured, or in the DBC's value table");
+        assert_eq!(
+            status[0],
+            (Channel::Current, Err(Fault::NotAvailable)),
+            "this code is configured, or listed in the DBC's value table"
+        );
     }
     let second_page = decoded(&config, 0x110, &[1, 0xE8, 0x03, 0xD0, 0x07, 0, 0, 0]);
     let (cell_3, cell_4) = (Channel::CellVoltage(CellIndex(2)), Channel::CellVoltage(CellIndex(3)));
@@ -227,7 +231,7 @@ fn layout_shows_frame_kind_and_protection() {
     let protections: Vec<_> = plan.messages().map(|sent| sent.protection).collect();
     assert_eq!(protections, [wanted(Profile::P05, 0x1234), None, wanted(Profile::P01C, 7), None]);
     let layout = config.output_layout.unwrap();
-    assert_eq!(layout.messages.len(), 4, "no command is taken");
+    assert_eq!(layout.messages.len(), 4, "no command frame is configured");
     assert_eq!(OutputPlan::new(&Database::parse(&layout.to_dbc()).unwrap()).unwrap(), plan);
 }
 

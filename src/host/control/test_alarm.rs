@@ -169,7 +169,7 @@ pub fn run(
 /// Opens a socket per interface before the daemon sends anything.
 fn open(config: &Config) -> Result<Vec<MonitoredChannel>, String> {
     let path = config.path.display();
-    let nothing = || format!("{path}: no frames are sent, must have an enabled table [output]");
+    let nothing = || format!("{path}: the daemon sends no frames; an alarm test requires an enabled table [output]");
     let output = config.monitor.output.as_ref().ok_or_else(nothing)?;
     let layout = config.output_layout.as_ref().ok_or_else(nothing)?;
     let message = layout.message(crate::can::encode::LayoutMessage::Alarm.message()).ok_or_else(nothing)?;

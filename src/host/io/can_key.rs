@@ -38,7 +38,7 @@ impl CanKey {
         match source {
             KeySource::Credential(name) => {
                 let folder = credentials.map(PathBuf::from).ok_or_else(|| {
-                    format!("key of [authentication]: credential {name} cannot be read: $CREDENTIALS_DIRECTORY is not set, must be started with LoadCredential={name}:PATH")
+                    format!("key of [authentication]: credential {name} cannot be read: $CREDENTIALS_DIRECTORY is not set; start the daemon with LoadCredential={name}:PATH")
                 })?;
                 Self::read(&folder.join(name), false)
             }

@@ -81,9 +81,9 @@ pub(super) fn nanos(time: TimeSpec) -> i64 {
 /// Stamps that the kernel gave a frame, ns on their own clocks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct KernelStamps {
-    /// On CLOCK_REALTIME.
+    /// Stamp on CLOCK_REALTIME.
     pub software_ns: Option<i64>,
-    /// On the adapter's clock.
+    /// Stamp on the adapter's clock.
     pub hardware_ns: Option<i64>,
 }
 

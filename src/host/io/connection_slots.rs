@@ -1,9 +1,9 @@
 //! Limits a server's connections, in total and per client. A new connection replaces the one that has been idle longest, so
 //! that silent and slow clients cannot keep others out.
 //!
-//! A connection is idle while the client has to act: to send a request, or to read the answer. A connection whose request is
-//! being processed is never closed, and an idle one not within [`GRACE`] of becoming idle. If all slots are taken by such
-//! connections, a new one is rejected.
+//! A connection is idle while the client has to act: to send a request, or to read the answer. A connection is never closed
+//! while its request is being processed, or within [`GRACE`] of becoming idle. If all slots are taken by such connections, a
+//! new connection is rejected.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -14,12 +14,12 @@ use tokio::task::AbortHandle;
 /// working client needs.
 pub(crate) const GRACE: Duration = Duration::from_millis(250);
 
-/// Most connections at once.
+/// Limits on simultaneous connections.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SlotLimits {
-    /// Of all clients together.
+    /// Most connections of all clients together.
     pub total: usize,
-    /// Of each client.
+    /// Most connections of one client.
     pub per_client: usize,
 }
 

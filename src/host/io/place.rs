@@ -14,7 +14,7 @@ pub enum PlaceSetting {
 }
 
 impl PlaceSetting {
-    /// From the command line's value: a path, or `none`.
+    /// Converts the command line's value: a path, or `none`.
     pub fn from_path(path: Option<PathBuf>) -> Self {
         match path {
             None => Self::Standard,

@@ -20,7 +20,8 @@ pub fn write(path: &Path, snapshot: &Snapshot) -> io::Result<()> {
 /// Reads a stored state.
 ///
 /// # Errors
-/// When the file cannot be read or is not a snapshot: file, line and reason.
+/// When the file cannot be read or is not a snapshot. The message names the file and the reason, and the line if the
+/// content is invalid.
 pub fn read(path: &Path) -> Result<Snapshot, String> {
     let bytes = std::fs::read(path).map_err(|error| format!("{}: cannot be read: {error}", path.display()))?;
     serde_json::from_slice(&bytes)

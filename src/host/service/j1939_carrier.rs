@@ -1,10 +1,10 @@
-//! Logs what carries J1939: packwatch itself, frame by frame, so that a replay produces the same frames. The log line also
-//! states whether the kernel's J1939 stack is loaded, for users who look for the node there.
+//! Logs that packwatch runs its own J1939 stack on raw CAN. It does not use the kernel's stack, so that a replay produces the
+//! same frames. The log line also states whether the kernel's stack is loaded, for users who look for the node there.
 
-/// Logs one line. A kernel that loads its stack on first use does not list it before that.
+/// Logs one line. A kernel that loads its stack on first use lists the stack only after that use.
 pub(super) fn log_kernel_stack() {
     let kernel_stack = stack_state(std::fs::read_to_string("/proc/net/protocols").ok().as_deref());
-    tracing::info!(kernel_stack, "J1939 carried by packwatch itself over raw CAN");
+    tracing::info!(kernel_stack, "J1939 runs in packwatch over raw CAN, not in the kernel");
 }
 
 /// The stack's state according to the kernel's list of protocols; `None` = the list could not be read.
@@ -27,7 +27,7 @@ mod tests {
         assert_eq!(stack_state(Some(list)), "not loaded");
         let with_stack = format!("{list}CAN_J1939  896      1      -1   NI       0   no   can_j1939   n  n\n");
         assert_eq!(stack_state(Some(&with_stack)), "loaded");
-        assert_eq!(stack_state(Some("PACKET 1 can_j1939\n")), "not loaded", "only a protocol of that name");
+        assert_eq!(stack_state(Some("PACKET 1 can_j1939\n")), "not loaded", "a module name alone does not count");
         assert_eq!(stack_state(None), "unknown");
     }
 }

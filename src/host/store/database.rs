@@ -69,7 +69,7 @@ CREATE TABLE segment (
 /// Why the database cannot be opened.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(super) enum OpenError {
-    /// The file is not, or no longer, a history.
+    /// The file is not a history, or is damaged so that it no longer is one.
     #[error("damaged: {0}")]
     Damaged(String),
     /// The disk, the folder or the permissions prevent it.

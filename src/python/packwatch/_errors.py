@@ -1,4 +1,4 @@
-"""Exceptions of packwatch. Each has the text of the command line."""
+"""Exceptions of packwatch. Each carries the error message that the command line prints."""
 
 
 class PackwatchError(Exception):

@@ -23,9 +23,9 @@ pub(crate) const STANDARD_BRANCH: &str = "Vehicle.Powertrain.TractionBattery";
 /// Where a signal is defined.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Origin {
-    /// In VSS, below [`STANDARD_BRANCH`].
+    /// Defined in VSS, below [`STANDARD_BRANCH`].
     Standard,
-    /// In the overlay, below the configured branch.
+    /// Defined in the overlay, below the configured branch.
     Overlay,
 }
 
@@ -38,7 +38,7 @@ pub(crate) struct Signal {
     pub(crate) data_type: DataType,
     /// Name of the unit in VSS 5 and 6.
     pub(crate) unit: Option<&'static str>,
-    /// For the overlay and the manual.
+    /// Description for the overlay and the manual.
     pub(crate) description: Cow<'static, str>,
     /// Fields of the status document that it is derived from.
     pub(crate) fields: Cow<'static, str>,

@@ -1,4 +1,4 @@
-//! The state of the view: the document, the page, the selected cell. Pure: updates and keys in, fields out.
+//! The state of the view: the document, the page, the selected cell. It changes only by updates and keys, and does no I/O.
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
@@ -51,7 +51,7 @@ impl Page {
     }
 }
 
-/// Quantities of the cell map, in the order of the key `v`.
+/// Quantities that the cell map can show. The key `v` switches to the next one.
 pub(super) const MAPPED: [(Quantity, &str); 2] = [(Quantity::Soc, "SOC"), (Quantity::Voltage, "voltage")];
 
 /// A cell's values in one document, one per quantity.
@@ -64,7 +64,7 @@ pub(super) struct App {
     pub(super) has_colour: bool,
     /// The latest document, unless stale.
     pub(super) document: Option<StatusDocument>,
-    /// Time of the last document and the reason of the loss, while no fresh document is available.
+    /// While no fresh document is available: time of the last document, and why it was lost.
     pub(super) lost: Option<(Option<Timestamp>, String)>,
     /// Time of the latest document.
     received_at: Option<Timestamp>,
@@ -161,7 +161,7 @@ impl App {
                 let last = self.history.len().saturating_sub(1);
                 self.selected = moved(self.selected, key, self.row_cells, self.page_lines * self.row_cells, last);
             }
-            // Drawing caps it at the number of lines.
+            // The drawing code limits `scroll` to the number of lines.
             _ => self.scroll = moved(self.scroll, key, 1, self.page_lines, usize::MAX / 2),
         }
     }

@@ -39,7 +39,7 @@ pub struct ThresholdFields {
     pub rule: u8,
     /// Wire code: 1 info, 2 warning, 3 severe.
     pub severity: u8,
-    /// In the rule's internal unit.
+    /// The threshold, in the rule's internal unit.
     pub threshold: f64,
 }
 

@@ -125,7 +125,7 @@ impl LayoutMessage {
 /// End-to-end protection of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum E2eSetting {
-    /// As in the base; the built-in base has no protection.
+    /// The protection of the base; the built-in base has none.
     #[default]
     AsBase,
     /// No protection.

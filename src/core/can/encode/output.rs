@@ -134,9 +134,9 @@ pub struct AlarmFields {
     pub acknowledged: bool,
     /// The cell; `None` = the whole pack.
     pub cell: Option<CellIndex>,
-    /// In the rule's internal unit.
+    /// The value, in the rule's internal unit.
     pub value: Option<f64>,
-    /// In the rule's internal unit.
+    /// The threshold, in the rule's internal unit.
     pub threshold: Option<f64>,
 }
 

@@ -85,7 +85,7 @@ pub enum EventKind {
     RemainingLife {
         /// Index of the cell.
         cell: Option<CellIndex>,
-        /// Equivalent full cycles until its capacity passes the end of life, median.
+        /// Equivalent full cycles until its capacity falls to its end-of-life value, median.
         cycles: Option<f64>,
         /// 5 % quantile.
         cycles_low: Option<f64>,
@@ -98,7 +98,7 @@ pub enum EventKind {
         /// 95 % quantile.
         days_high: Option<f64>,
     },
-    /// A charge ended that covered the recharge window, or enough of it.
+    /// A charge has ended. It covered the recharge window, or enough of the window.
     RechargePeriod {
         /// Time between the two configured SOC values, s; `None` if the charge did not cover the whole window without
         /// interruption.
@@ -143,7 +143,8 @@ pub enum EventKind {
         command: Command,
         /// Number of changed alarms.
         changed: u32,
-        /// Number of refused requests: alarms that are not healthy, or a test without output.
+        /// Number of refusals: alarms that cannot be cleared because their values are not healthy, a poll command
+        /// without configured requests, or a test without configured output.
         refused: u32,
     },
     /// A command frame was rejected.
@@ -180,10 +181,10 @@ pub enum EventKind {
     },
     /// A new configuration applies from here on.
     Reconfigured {
-        /// Number of raised or past alarms that ended because no threshold watches them any more.
+        /// Number of raised or past alarms that ended because the new configuration has no threshold for them.
         alarms_ended: u32,
     },
-    /// A stored alarm ended because no configured threshold watches it any more.
+    /// A stored alarm ended because the configuration has no threshold for it any more.
     AlarmDropped {
         /// The rule.
         rule: Rule,
@@ -201,7 +202,7 @@ pub enum EventKind {
         /// Value of the identity signal.
         identity: f64,
     },
-    /// Files can, or cannot, be written any more.
+    /// Writing the files of the learned state and the records started to fail, or works again.
     Store {
         /// Whether they can be written.
         works: bool,
@@ -220,8 +221,8 @@ pub enum EventKind {
         /// Number of bad readings in between.
         bad_readings: u64,
     },
-    /// A protected message turned from usable to failing, or back (reported on change, then counted). A first frame
-    /// does not count as a change, nor do as many lost frames as its check allows.
+    /// A protected message started to fail its check, or became usable again (reported on change, then counted). The
+    /// first frame is not a change. Lost frames are a change only if there are more than the check allows.
     Protection(GuardChange),
     /// A message started or stopped exceeding its frame limit.
     Flood(FloodChange),

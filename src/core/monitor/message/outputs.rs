@@ -20,12 +20,12 @@ pub struct Transmit {
     /// Whether it announces a learned value or an alarm change. True for all health, alarm and J1939 frames, so that
     /// all frames of one identifier and all parts of one transfer have the same flag.
     pub announces: bool,
-    /// Authentication of the frame, which carries its freshness, and zeros in place of the authenticator; `None` = not
-    /// authenticated.
+    /// How to authenticate the frame; `None` = not authenticated. The frame already contains its freshness, and zeros in
+    /// place of the authenticator.
     pub secured: Option<Secured>,
 }
 
-/// Inputs of a sent frame's authenticator besides its data and the key.
+/// What the authenticator of a sent frame is computed from, in addition to the frame's data and the key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Secured {
     /// Lengths and data id.
@@ -50,7 +50,7 @@ impl Secured {
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
 pub enum Validity {
-    /// No estimate yet, or no longer: a cell's voltage is overdue.
+    /// No estimate yet, or none any more because a cell's voltage is overdue.
     Unavailable = 0,
     /// Inputs are fresh and the filter is consistent.
     Valid = 1,

@@ -57,7 +57,7 @@ pub enum RecordKind {
         /// The command.
         command: Command,
     },
-    /// The files of the learned state and the records can, or cannot, be written.
+    /// Writing the files of the learned state and the records started to fail, or works again.
     Store {
         /// Whether they can be written.
         works: bool,
@@ -165,7 +165,7 @@ pub enum Downtime {
     Unknown,
 }
 
-/// As written in a journal: seconds, `-` for "as stamped", or `unknown`.
+/// Formats the downtime as in a journal: seconds, `-` for "as stamped", or `unknown`.
 impl std::fmt::Display for Downtime {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {

@@ -1,4 +1,4 @@
-//! Current values of cells and pack for readers (status, tables, reports). `None` = not known, or no longer known.
+//! Current values of cells and pack for readers (status, tables, reports). `None` = not known yet, or no longer known.
 
 use serde::{Deserialize, Serialize};
 

@@ -379,7 +379,7 @@ impl Sending {
         std::mem::take(&mut self.is_rescheduled)
     }
 
-    /// Sends the current state of an alarm; if no threshold watches it any more, as unknown.
+    /// Sends the current state of an alarm. If the alarm no longer has a threshold, sends its state as unknown.
     fn send_key(&mut self, now: Timestamp, key: AlarmKey, engine: &AlarmEngine, out: &mut Outputs) {
         let (rule, severity, cell) = key.parts();
         if let Some(alarm) = engine.find(rule, severity, cell) {

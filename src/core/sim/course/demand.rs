@@ -1,4 +1,4 @@
-//! What a course demands: a current until the next sample, sleep, or the end.
+//! What a course demands next: a current that flows until the next sample, a time asleep, or the end of the course.
 
 /// Next demand of a scenario.
 #[derive(Debug, Clone, Copy, PartialEq)]

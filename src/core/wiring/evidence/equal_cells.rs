@@ -1,4 +1,4 @@
-//! Finds cells whose voltages are always the same: one signal stands in the place of two.
+//! Finds cells whose voltages are always the same: one signal is configured for two cells, or a cell's value is copied.
 //!
 //! In: the cells' mean voltages, block by block, V. Out: groups of cells that never differed, with the number of
 //! blocks in which they moved. Equality is exact: a copy has the same digits, while two cells in series differ in some

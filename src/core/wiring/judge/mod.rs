@@ -7,7 +7,7 @@
 //! | `other_bus` | the current's message on two interfaces |
 //! | `unconfigured` | pack voltage and states of charge that are not configured |
 //! | `presence` | silent signals, number of cells |
-//! | `swapped` | signals in another's place |
+//! | `swapped` | swapped signals |
 //! | `values` | units, byte order, limits |
 //! | `frozen` | signals that never change, cells that respond differently, cells with the same voltage |
 //! | `electrical` | sign of the current, resistance (from steps or from the `drift` of steady runs) |

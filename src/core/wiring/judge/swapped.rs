@@ -1,4 +1,4 @@
-//! Finds signals in another's place, from the units in the DBC and from the values.
+//! Finds swapped signals from the units in the DBC and from the values, for example a voltage configured as the current.
 
 use super::context::{Judge, MAX_C_RATE, SignalSeries, error, warning};
 use super::text::{channel, number};
@@ -103,8 +103,8 @@ fn fit(judge: &Judge<'_>, series: &Series) -> Option<Fit> {
     })
 }
 
-/// Finds exchanged signals among current, voltage and temperature of a single cell: each is plausible only in the
-/// other's place.
+/// Finds exchanged signals among current, voltage and temperature of a single cell: the values of each
+/// are plausible only for the other quantity.
 fn by_values(judge: &mut Judge<'_>) {
     let voltages = judge.signals(Kind::Voltage);
     let (Some(current), [voltage]) = (judge.current(), voltages.as_slice()) else { return };

@@ -42,7 +42,7 @@ pub struct ModelSource {
     pub measured: MeasuredRange,
     /// `[provenance]` of the file; empty if not given.
     pub provenance: Table,
-    /// For a learned model: the label's model, and what the data covered.
+    /// If the model was learned: the label's model, and what the data covered.
     pub learned: Option<LearnedFrom>,
 }
 
@@ -142,7 +142,8 @@ impl SourcedModel {
         self.by_prior(&std).unwrap_or_else(|| self.source.by_range(self.source.measured.temperature_c, temperature_c))
     }
 
-    /// For a model from a label: data, if they have reduced the standard deviation clearly below the label's.
+    /// If the model was learned from a label: `Data` if the data have reduced the standard deviation clearly below the
+    /// label's, else `Prior`. `None` if it was not.
     fn by_prior(&self, std: &dyn Fn(&CellModel) -> Option<f64>) -> Option<KnownBy> {
         let learned = self.source.learned.as_ref()?;
         let (left, before) = (std(&self.model)?, std(&learned.prior)?);

@@ -17,7 +17,7 @@ pub(crate) struct RatedCell {
 }
 
 impl RatedCell {
-    /// From the rated capacity and the recharge window.
+    /// Computes the values from the rated capacity and the recharge window.
     pub(crate) fn new(capacity_ah: f64, recharge: &Recharge) -> Self {
         let recharge = recharge.config(capacity_ah);
         let window = recharge.to_soc - recharge.from_soc;

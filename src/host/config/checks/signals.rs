@@ -71,7 +71,7 @@ pub(crate) struct ResolvedSignal<'d> {
     pub signal: &'d Signal,
     /// Its position, if it is in a diagnostic answer.
     pub answer: Option<AnswerPlace<'d>>,
-    /// Factor from the DBC's unit and sign to ours; negative if the bus counts charge positive.
+    /// Factor from the DBC's unit and sign to ours; negative if charge is positive on the bus.
     pub scale: f64,
     /// Offset in our unit and sign, added after the scale.
     pub offset: f64,

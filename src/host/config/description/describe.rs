@@ -96,7 +96,7 @@ pub struct SignalUse {
     pub offset: f64,
     /// DBC unit.
     pub unit: String,
-    /// Factor from the DBC's unit and sign to ours (positive = discharge); negative if the bus counts charge positive.
+    /// Factor from the DBC's unit and sign to ours (positive = discharge); negative if charge is positive on the bus.
     pub scale: f64,
     /// Offset in our unit and sign, added after the scale.
     pub added: f64,

@@ -73,9 +73,9 @@ pub(crate) fn in_range<T>(value: &Spanned<DeValue<'_>>, found: Option<T>) -> Res
 
 /// A type that a key may have.
 pub(crate) trait Setting: Sized {
-    /// The type in words.
+    /// Description of the type for fault messages, such as "a number".
     const KIND: &'static str;
-    /// A list of the type, in words.
+    /// Description of a list of this type.
     const LIST_KIND: &'static str = "a list";
     /// The allowed words, if the type is a choice.
     const CHOICES: &'static [&'static str] = &[];
@@ -96,7 +96,7 @@ pub(crate) trait Setting: Sized {
 pub(crate) enum Presence {
     /// The absence is a fault.
     Required,
-    /// Nothing; the text is the default in words, or the condition that requires the key.
+    /// The absence is allowed. The text describes the default, or the condition that requires the key.
     Optional(&'static str),
     /// This TOML text is read instead.
     Default(&'static str),

@@ -9,7 +9,7 @@ use crate::alarm::Comparison;
 /// A threshold value: in the rule's unit, or relative.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Level {
-    /// In the rule's unit.
+    /// A value in the rule's unit.
     Absolute(f64),
     /// A fraction of a new cell's value, from a string like "80 %".
     Relative(f64),

@@ -137,7 +137,7 @@ impl LineParser {
     fn other_stamp(&mut self, mut cursor: Cursor<'_>) -> Result<(Timestamp, usize), LineError> {
         let time = cursor.stamp()?;
         let (text, second_ns) = (cursor.text, time.nanos() - time.nanos().rem_euclid(1_000_000_000));
-        // Only stamps of ten digits, and only if any fraction of the second fits too.
+        // Remember only stamps of ten digits, and only if adding a fraction of a second cannot overflow.
         if text.get(11) == Some(&b'.') && text.get(1) != Some(&b'-') && second_ns.checked_add(1_000_000_000).is_some() {
             (self.head, self.second_ns) = ([word(text, 0), word(text, 4)], second_ns);
         }
@@ -400,7 +400,7 @@ impl<'a> Cursor<'a> {
         self.expect(Frame::fd_padded(id, flags & 1 != 0, flags & 2 != 0, len, &data), "at most 64 bytes")
     }
 
-    /// Bytes of two hex digits, optionally separated by dots, up to the room in `data`.
+    /// Bytes of two hex digits, optionally separated by dots, until `data` is full.
     fn bytes(&mut self, data: &mut [u8]) -> Result<usize, LineError> {
         let mut len = 0;
         while len < data.len() {
@@ -440,7 +440,7 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// The direction that `-x` adds, then only blanks. Returns whether the frame was sent by the recording machine.
+    /// Parses the direction that `candump -x` appends, and blanks. Returns whether the frame was sent by the recording machine.
     fn suffix(&mut self) -> Result<bool, LineError> {
         let blank = |b: Option<u8>| matches!(b, None | Some(b' ' | b'\r' | b'\t'));
         if !blank(self.peek()) {

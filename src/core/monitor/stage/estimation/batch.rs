@@ -1,7 +1,8 @@
-//! Collects the samples of cells that report in turn, until every cell has one; they are then stepped together.
+//! Collects the samples of cells that report one after another. Once every cell has reported, all samples are stepped
+//! together.
 //!
-//! How long a sample waits does not affect its estimate: a step uses only its own sample's time and charge, and no
-//! other cell.
+//! How long a sample waits does not affect its estimate: a step uses only its own sample's time and charge, and
+//! no data of other cells.
 
 use crate::quantity::CellIndex;
 use crate::sample::CellSample;
