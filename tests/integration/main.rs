@@ -7,7 +7,7 @@
     clippy::unwrap_used,
     clippy::print_stdout,
     clippy::print_stderr,
-    reason = "in a test a panic is the message, and tables and skipped comparisons are printed"
+    reason = "tests may panic, and tables and skipped comparisons are printed"
 )]
 
 mod alarm_noise;

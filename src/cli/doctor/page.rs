@@ -153,7 +153,7 @@ fn wrapped(text: &str, width: usize, indent: usize) -> String {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+#[allow(clippy::unwrap_used, reason = "tests may panic")]
 mod tests {
     use super::*;
     use crate::wiring::Topic;

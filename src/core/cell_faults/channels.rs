@@ -105,11 +105,11 @@ mod tests {
         channel.end_row(&row(&[3.71, 3.71]), 3.66);
         assert!(channel.is_frozen);
         channel.end_row(&row(&[3.71, 3.70]), 3.66);
-        assert!(!channel.is_frozen, "it lives again");
+        assert!(!channel.is_frozen, "the channel changes again");
         channel.interrupt();
         channel.end_row(&row(&[3.71, 3.71]), 3.60);
         channel.end_row(&row(&[3.71, 3.71]), 3.61);
-        assert!(!channel.is_frozen, "the others have moved in a hole of the record");
+        assert!(!channel.is_frozen, "the others have moved during a gap in the record");
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Valid and invalid configuration files. Users read the fault messages, so the tests compare them in full.
 
-#![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+#![allow(clippy::unwrap_used, reason = "tests may panic")]
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};

@@ -104,7 +104,7 @@ impl Lines {
     #[inline]
     pub(super) fn take_lines(&mut self, len: usize, count: u64) {
         debug_assert_eq!(memchr::memchr_iter(b'\n', &self.unread()[..len]).count() as u64, count, "whole lines");
-        debug_assert!(len == 0 || self.unread()[len - 1] == b'\n', "the last is whole too");
+        debug_assert!(len == 0 || self.unread()[len - 1] == b'\n', "the last line is complete too");
         self.start += len;
         self.number += count;
     }

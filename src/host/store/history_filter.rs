@@ -290,7 +290,10 @@ mod tests {
         }
         assert!((11..=12).contains(&commits) && rows < 40, "{commits} commits, {rows} rows");
         let event = Event { time: Timestamp::from_secs(864_000.0), kind: alarm(Change::Raised) };
-        assert!(history_filter.take(&[event], true).is_some_and(|rows| rows.len() == 3), "with room, and what waited");
+        assert!(
+            history_filter.take(&[event], true).is_some_and(|rows| rows.len() == 3),
+            "the new rows and those that waited"
+        );
         assert!(history_filter.deferred().is_empty());
     }
 

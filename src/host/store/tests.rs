@@ -141,7 +141,7 @@ fn state_of_replaced_pack_is_not_restored() {
     // A power cut after the row of the pack change and before the state.
     open(None).1.database.unwrap().replace_pack(&now.stamp).unwrap();
     assert_eq!(open(None).0.len(), 0);
-    assert_eq!(open(Some(1)).0.len(), 0, "nor is the state of the last second");
+    assert_eq!(open(Some(1)).0.len(), 0, "the runtime state of the old pack is not restored either");
     assert_eq!(open(Some(2)).0, ["runtime folder"]);
     // Losing the history does not bring it back either.
     std::fs::remove_file(place.path().join(DATABASE)).unwrap();

@@ -160,7 +160,7 @@ fn digest_shows_unjudged_rule_as_unknown() {
     let soc = "[[alarm]]\nrule = \"soc_low\"\nwarning = \"5 %\"\n";
     let mut rig = Rig::new(&format!("{HOT}{soc}"));
     rig.heat(60.0, 6);
-    assert_eq!([9, 8, 1].map(|number| rule(&rig, number)), [2, 0, 5], "warning, judged without alarm, not watched");
+    assert_eq!([9, 8, 1].map(|number| rule(&rig, number)), [2, 0, 5], "warning; evaluated without alarm; no threshold");
     rig.restart(Downtime::Seconds(60.0));
     rig.frames.clear();
     rig.tick();
@@ -191,7 +191,7 @@ fn digest_shows_rule_states_and_thresholds() {
     let mut rig = Rig::new(&format!("{HOT}[[alarm]]\nrule = \"store_failed\"\nsevere = 1\n"));
     rig.seconds(3);
     let rule = |rig: &Rig, number: u32| rig.digest(1, 20 + 3 * (number - 1), 3);
-    assert_eq!((rule(&rig, 9), rule(&rig, 13), rule(&rig, 1)), (0, 4, 5), "judged, unknown, not watched");
+    assert_eq!((rule(&rig, 9), rule(&rig, 13), rule(&rig, 1)), (0, 4, 5), "evaluated; unknown; no threshold");
     rig.give(Record::store(rig.now(), true));
     rig.heat(60.0, 3);
     assert_eq!((rule(&rig, 9), rule(&rig, 13)), (2, 0));

@@ -1,6 +1,6 @@
 //! Test vectors, and properties of arbitrary payloads.
 
-#![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+#![allow(clippy::unwrap_used, reason = "tests may panic")]
 
 use proptest::prelude::*;
 

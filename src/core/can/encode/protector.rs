@@ -52,7 +52,7 @@ impl InputProtector {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+    #![allow(clippy::unwrap_used, reason = "tests may panic")]
 
     use super::*;
     use crate::can::e2e::{CheckConfig, Profile, Status};

@@ -1,6 +1,6 @@
 //! Messages that fail and recover, missing frames, and the effects of a restart.
 
-#![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+#![allow(clippy::unwrap_used, reason = "tests may panic")]
 
 use super::*;
 use crate::can::e2e::{Profile, Protection};

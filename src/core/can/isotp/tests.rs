@@ -1,6 +1,6 @@
 //! ISO-TP: reassembly, a fault for every kind of damage, and arbitrary frames without a panic.
 
-#![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+#![allow(clippy::unwrap_used, reason = "tests may panic")]
 
 use proptest::prelude::*;
 

@@ -318,7 +318,7 @@ mod tests {
         assert!(!show(&mut codes, 10, false));
         assert!(!show(&mut codes, 1009, true));
         assert!(show(&mut codes, 1010, true));
-        assert!(!show(&mut codes, 1011, false), "unknown is sent without a wait");
+        assert!(!show(&mut codes, 1011, false), "unknown is sent without delay");
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Polling: due times of requests, the current before voltages, standby and silence.
 
-#![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+#![allow(clippy::unwrap_used, reason = "tests may panic")]
 
 use proptest::prelude::*;
 
@@ -117,7 +117,7 @@ fn requests_keep_period_and_responses_get_flow_control() {
     let mut bench = Bench::new(vec![request(1, 1.0), request(2, 3.0)]);
     bench.run(6050);
     let of = |id: u16| bench.requests().iter().filter(|(_, other)| *other == id).map(|(ms, _)| *ms).collect::<Vec<_>>();
-    assert_eq!(of(1), [100, 1100, 2100, 3100, 4100, 5100], "in its rhythm from the first frame on");
+    assert_eq!(of(1), [100, 1100, 2100, 3100, 4100, 5100], "periodic from the first frame on");
     assert_eq!(of(2), [200, 3200], "after the other request, at ten requests a second");
     assert_eq!(bench.sent[..2], [(100, vec![3, 0x22, 0, 1, 0, 0, 0, 0]), (100, vec![0x30, 0, 0, 0, 0, 0, 0, 0])]);
 }

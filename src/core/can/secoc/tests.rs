@@ -1,6 +1,6 @@
 //! Layout of the trailer, and which freshness is accepted when.
 
-#![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+#![allow(clippy::unwrap_used, reason = "tests may panic")]
 
 use proptest::prelude::*;
 

@@ -1,6 +1,6 @@
 //! Diagnostic responses: reassembly, negative responses, counts, and losses.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "in a test a panic is the message")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests may panic")]
 
 use super::*;
 use crate::can::dbc::{FrameFormat, Message, Signal};

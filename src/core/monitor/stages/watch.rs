@@ -212,7 +212,7 @@ impl Stages {
         let (mut spread, mut known): (Option<SocSpread>, usize) = (None, 0);
         for cell in self.estimation.cell_indices() {
             let is_fresh = self.sampling.sampler.is_fresh(self.sampling.voltage_channel(cell), now);
-            // A voltage from before the first current says nothing yet.
+            // A voltage received before the first current cannot be used yet.
             let is_of_cell = !bank.is_carried_over(cell.index()) && !self.alarming.faulty_channels.contains(&cell);
             let is_present = is_fresh && is_of_cell;
             let Some(soc) = bank.soc(cell.index()).filter(|_| is_present) else { continue };

@@ -75,7 +75,7 @@ fn byte_swapped(layout: &SignalLayout) -> Option<SignalLayout> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+#[allow(clippy::unwrap_used, reason = "tests may panic")]
 mod tests {
     use super::*;
 

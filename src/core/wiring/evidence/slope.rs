@@ -116,7 +116,7 @@ fn pairs(voltage: &Series, current: &Series) -> Vec<(f64, f64, f64)> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+#[allow(clippy::unwrap_used, reason = "tests may panic")]
 mod tests {
     use super::*;
 

@@ -112,7 +112,7 @@ fn resistance(judge: &mut Judge<'_>, slope: &Slope) {
     };
     let configured = judge.plan.pack.strings;
     let strings = likely_strings(configured, ohm, (fast, slow));
-    // Such a ratio has its cause in the unit, not in the cell.
+    // Such a ratio is caused by a wrong unit, not by the cell.
     if ratio >= 6.0 {
         current_unit(judge, seen, power_of_ten(ohm / (fast * slow).sqrt()), ratio);
     } else if ratio >= ODD_RATIO || ratio >= 2.0 && strings.is_some_and(|n| n < configured) {

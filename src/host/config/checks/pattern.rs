@@ -66,7 +66,7 @@ fn fits(pieces: &[PatternPiece], name: &str, cell: Option<u32>) -> Option<Option
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+#[allow(clippy::unwrap_used, reason = "tests may panic")]
 mod tests {
     use super::*;
 

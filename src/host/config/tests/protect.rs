@@ -66,7 +66,7 @@ fn guard_uses_cycle_time_of_dbc() {
         cycle_time_s: Some(0.1),
     };
     assert_eq!(config.monitor.guards, [guard], "the defaults are those of the check");
-    assert_eq!(config.monitor.flood, crate::can::flood::FloodConfig::default(), "and so is the bound on frames");
+    assert_eq!(config.monitor.flood, crate::can::flood::FloodConfig::default(), "the frame limit has its default");
     let keys = "max_delta_counter = 3\nmax_repeated = 2\nsync_counter = 4\n";
     let (config, _) =
         read(&protected(&format!("message = \"Status\"\nprofile = \"1C\"\ndata_id = 7\n{keys}"))).unwrap();

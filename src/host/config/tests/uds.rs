@@ -1,6 +1,6 @@
 //! `[[input.diagnostic]]`: resulting settings and the full text of every fault.
 
-#![allow(clippy::panic, reason = "in a test a panic is the message")]
+#![allow(clippy::panic, reason = "tests may panic")]
 
 use super::*;
 use crate::can::uds::{Answer, Service};

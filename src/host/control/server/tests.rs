@@ -70,7 +70,7 @@ fn requests_are_answered_in_order() {
         client.write_all(b"rubbish\n").await.unwrap();
         assert!(line(&mut client).await.contains("not a JSON document"));
         client.write_all(REPLACED.to_line().as_bytes()).await.unwrap();
-        assert!(line(&mut client).await.contains("\"changed\":4"), "not served after rubbish");
+        assert!(line(&mut client).await.contains("\"changed\":4"), "not served after an invalid request");
     });
 }
 
@@ -125,7 +125,7 @@ fn client_that_never_reads_is_dropped() {
                 Ok(_) | Err(_) => {}
             }
             client.write_all(REPLACED.to_line().as_bytes()).await.unwrap();
-            assert!(line(&mut client).await.contains("\"ok\":true"), "not served next to a silent one");
+            assert!(line(&mut client).await.contains("\"ok\":true"), "not served while another client is silent");
             served += 1;
         }
         assert!(served > 0);

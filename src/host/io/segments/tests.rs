@@ -1,6 +1,6 @@
 //! Segments: written and read back.
 
-#![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+#![allow(clippy::unwrap_used, reason = "tests may panic")]
 
 use super::*;
 
@@ -101,7 +101,7 @@ fn torn_segment_is_readable_to_last_flush() {
     let mut found = vec![0; lines.len()];
     decoder.read_exact(&mut found).unwrap();
     assert_eq!(found, lines.as_bytes());
-    assert!(decoder.read(&mut [0; 8]).is_err(), "the end is missing, and that is seen");
+    assert!(decoder.read(&mut [0; 8]).is_err(), "the missing end is detected");
 }
 
 #[test]

@@ -89,5 +89,5 @@ fn promtool_accepts_metrics() {
         assert!(is_good && said.is_empty(), "{said}");
     }
     let (is_good, said) = promtool("# TYPE bad_total gauge\nbad_total 1\n").unwrap();
-    assert!(!is_good && !said.is_empty(), "promtool says nothing of a bad name");
+    assert!(!is_good && !said.is_empty(), "promtool does not report a bad name");
 }

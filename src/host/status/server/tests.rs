@@ -119,7 +119,7 @@ fn client_that_never_reads_is_dropped() {
     until("both are dropped", || {
         pid += 1;
         offer(&server, 1024, pid);
-        assert!(parse(&rest(connect(&path))).is_ok(), "not served next to a silent one");
+        assert!(parse(&rest(connect(&path))).is_ok(), "not served while another client is silent");
         server.clients().dropped == 2
     });
     drop(deaf);

@@ -159,8 +159,8 @@ fn day_of_unknown_date_is_deleted_with_later_days() {
         delete_oldest(database.connection(), &newest, i64::MAX, Some(horizon_s as i64 * 1_000_000_000)).unwrap();
         number(database, "SELECT count(*) FROM half_cycle")
     };
-    assert_eq!(kept_at(&database, WALL_S), 4, "of unknown age, perhaps new");
-    assert_eq!(kept_at(&database, WALL_S + 1.0), 3, "older than one that is too old");
+    assert_eq!(kept_at(&database, WALL_S), 4, "a segment of unknown age may be new and is kept");
+    assert_eq!(kept_at(&database, WALL_S + 1.0), 3, "the segment precedes one that is too old");
     assert_eq!(kept_at(&database, WALL_S + 1.0), 2);
     assert_eq!(kept_at(&database, WALL_S + 1.0), 2);
 }

@@ -139,7 +139,7 @@ fn chain_end_is_logged_daily() {
         let noted = format!("{}:{}", word("rows="), word("hash=")).parse().unwrap();
         assert_eq!(word("rows="), "3");
         let reader = reader::HistoryReader::open(place.path()).unwrap();
-        assert_eq!(reader.contradiction(&noted), Ok(None), "what is logged is what verify --noted takes");
+        assert_eq!(reader.contradiction(&noted), Ok(None), "verify --noted accepts the logged chain end");
         assert!(logged(86_400).contains("rows=5 "), "the next day");
     });
 }

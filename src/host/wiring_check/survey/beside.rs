@@ -63,7 +63,7 @@ fn plan(bus: BusIndex, message: &Message, signal: &Signal, channel: Channel) -> 
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+#[allow(clippy::unwrap_used, reason = "tests may panic")]
 mod tests {
     use std::path::Path;
 

@@ -1,6 +1,6 @@
 //! Every pair of state and event, and realistic sequences of frames.
 
-#![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+#![allow(clippy::unwrap_used, reason = "tests may panic")]
 
 use super::*;
 
