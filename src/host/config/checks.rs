@@ -4,7 +4,8 @@
 //! | --- | --- |
 //! | `pattern`, `answers`, `signals` | look up signals in the DBC files and diagnostic answers |
 //! | `cross`, `alarm`, `cells` | keys that depend on each other, and the cell models |
-//! | `input_tables`, `plausible` | checks of faulty tables as far as possible; values that are allowed but implausible |
+//! | `input_tables` | checks that work even on faulty tables |
+//! | `plausible` | values that are allowed but implausible |
 //! | `protect`, `output`, `commands`, `j1939`, `polling` | frames that are checked, sent or requested |
 //! | `monitor` | the settings of the core |
 

@@ -1,9 +1,8 @@
-//! The TOML configuration: read, merged and checked. All faults are reported at once, with file, line, key, found and allowed.
+//! Reads, merges and checks the TOML configuration. All faults are reported at once, each with file, line, key, found value and allowed values.
 //!
-//! In: the configuration file, its drop-ins and the files they name (DBC files, cell models). Out: [`Config`], consistent
-//! settings for the other modules, or [`ConfigFaults`], one line per fault.
+//! In: the configuration file, its drop-ins and the files they name (DBC files, cell models). Out: [`Config`], consistent settings for the other modules, or [`ConfigFaults`], one line per fault. In this module, to "note" a fault means to add it to the list of faults and to continue.
 //!
-//! Six layers. Each uses only the layers above it in this table, and none uses this file.
+//! The module has six layers. Each layer uses only the layers above it in this table, and none uses this file.
 //!
 //! | layer | content |
 //! | --- | --- |
@@ -21,8 +20,9 @@
 //! 2. Add the field to the algorithm's parameters.
 //! 3. Run `packwatch check --reference > docs/src/reference/keys.md`; a test compares the two.
 //!
-//! Reading, default, range check, fault texts, reference and manual page follow from the declaration. A check that
-//! involves several keys belongs in `checks/cross`. A new table also needs a line in `schema/tables`.
+//! From the declaration follow how the key is read, its default, range check and fault texts, and its text in the
+//! reference and the manual page. A check that involves several keys belongs in `checks/cross`. A new table also needs
+//! a line in `schema/tables`.
 
 pub mod cell_model;
 mod checks;

@@ -88,13 +88,13 @@ section! {
     SpreadKeys at "spread" gives ModelSpread, |keys| {
         /// Constant error of the open-circuit curve, in addition to `curve_modes_v`.
         curve_v: f64, "V", Between(0.0, 1.0), Required;
-        /// ln(resistance relative to the model).
+        /// Natural logarithm of the resistance relative to the model.
         log_resistance: f64, "", Between(0.0, 5.0), Required;
         /// Resistance of the slowest branch relative to the other resistances.
         slow_branch: f64, "fraction", Between(0.0, 5.0), Required;
         /// Capacity.
         capacity: f64, "fraction", Between(0.0, 1.0), Required;
-        /// Voltage drop: relative error of its average over one second.
+        /// Relative error of the voltage drop, averaged over one second.
         drop_sqrt_s: f64, "", Between(0.0, 100.0), Required;
         /// Two modes of the open-circuit curve's error, one value per `tables.soc`.
         curve_modes_v: Vec<Vec<f64>>, "V", Between(-1.0, 1.0), Required =>;

@@ -1,4 +1,4 @@
-//! The model of a cell without a model file: made from its label, or learned on board from that.
+//! The model of a cell without a model file: made from its label, or learned on board with that model as the start.
 
 use super::source::{LearnedFrom, MeasuredRange, ModelSource, SourcedModel};
 use crate::cell::{Coverage, Label};

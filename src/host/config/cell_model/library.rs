@@ -6,7 +6,7 @@ use super::read::load_sourced;
 use super::source::SourcedModel;
 use crate::config::document::ConfigFaults;
 
-/// Most model files in a folder.
+/// Largest number of model files in a folder.
 const MOST: usize = 1000;
 
 /// A model file in a folder.
@@ -18,10 +18,10 @@ pub struct LibraryEntry {
     pub model: Result<SourcedModel, ConfigFaults>,
 }
 
-/// The usual folders that exist; `program` is the program's own file.
+/// Those of the usual folders that exist. `program` is the path of the program's executable.
 pub fn usual_folders(program: Option<&Path>) -> Vec<PathBuf> {
     let shipped = program.and_then(Path::parent).map(|folder| folder.join("../share/packwatch/cells"));
-    // Without "..".
+    // Resolves the ".." in the path.
     let shipped = shipped.and_then(|folder| folder.canonicalize().ok());
     ["config/cells", "cells", "/etc/packwatch/cells"]
         .iter()
@@ -34,7 +34,7 @@ pub fn usual_folders(program: Option<&Path>) -> Vec<PathBuf> {
 /// The models of a folder: its files `*.toml`, sorted by name.
 ///
 /// # Errors
-/// When the folder cannot be listed, or has too many files.
+/// Fails if the folder cannot be listed or has too many files.
 pub fn list(folder: &Path) -> Result<Vec<LibraryEntry>, String> {
     let named = |what: String| format!("{}: {what}", folder.display());
     let entries = std::fs::read_dir(folder).and_then(|entries| entries.collect::<std::io::Result<Vec<_>>>());

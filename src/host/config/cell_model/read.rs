@@ -12,7 +12,7 @@ use crate::monitor::ModelState;
 /// Reads and checks a cell model file.
 ///
 /// # Errors
-/// Every fault found, one line each.
+/// Returns every fault found, one line each.
 pub fn load(path: &Path) -> Result<CellModel, ConfigFaults> {
     load_sourced(path).map(|sourced| sourced.model)
 }
@@ -20,7 +20,7 @@ pub fn load(path: &Path) -> Result<CellModel, ConfigFaults> {
 /// Like [`load`], and also returns the origin of the model.
 ///
 /// # Errors
-/// Every fault found, one line each.
+/// Returns every fault found, one line each.
 pub fn load_sourced(path: &Path) -> Result<SourcedModel, ConfigFaults> {
     let faults = Faults::default();
     let model = load_with(path, &read_file, &faults);
@@ -86,7 +86,7 @@ pub(crate) fn load_with(path: &Path, read: ReadFile<'_>, faults: &Faults) -> Opt
     Some(SourcedModel { model, source })
 }
 
-/// The notes for readers; empty if there are none. Faults were noted when the file was parsed.
+/// The table `[provenance]`; empty if the file has none. Its faults were noted when the file was parsed.
 fn provenance(path: &Path, read: ReadFile<'_>) -> toml::Table {
     let text = read(path).ok().and_then(|bytes| String::from_utf8(bytes).ok()).unwrap_or_default();
     let notes = text.parse::<toml::Table>().ok().and_then(|mut table| table.remove("provenance"));

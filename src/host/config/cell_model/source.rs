@@ -20,7 +20,7 @@ pub fn state_words(state: ModelState) -> &'static str {
     }
 }
 
-/// The measured conditions, lowest and highest; `None` = unknown.
+/// The lowest and highest measured conditions; `None` = unknown.
 #[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize)]
 pub struct MeasuredRange {
     /// Degrees C.
@@ -34,7 +34,7 @@ pub struct MeasuredRange {
 /// The origin of a cell model.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModelSource {
-    /// How well it is known.
+    /// How well the model is known.
     pub state: ModelState,
     /// Chemistry, for readers.
     pub chemistry: Option<String>,
@@ -42,7 +42,7 @@ pub struct ModelSource {
     pub measured: MeasuredRange,
     /// `[provenance]` of the file; empty if not given.
     pub provenance: Table,
-    /// If the model was learned: the label's model, and what the data covered.
+    /// For a learned model: the label's model, and the conditions that the data covered.
     pub learned: Option<LearnedFrom>,
 }
 
@@ -51,15 +51,15 @@ pub struct ModelSource {
 pub struct LearnedFrom {
     /// The model made from the label.
     pub prior: Box<CellModel>,
-    /// The conditions covered by the rows in the notebook.
+    /// The conditions covered by the data that the fits use.
     pub seen: Coverage,
     /// Root mean square of the residuals, V; `None` = nothing is learned yet.
     pub residual_v: Option<f64>,
     /// The chemistry that explains the voltages better than the one on the label.
     pub chemistry: Option<Chemistry>,
-    /// Fits so far.
+    /// Number of fits.
     pub fits: u32,
-    /// The latest changes, oldest first.
+    /// The latest changes of the model, oldest first.
     pub changes: Vec<ModelChange>,
 }
 
@@ -96,7 +96,7 @@ impl ModelSource {
 pub struct SourcedModel {
     /// The model.
     pub model: CellModel,
-    /// Where it comes from.
+    /// The origin of the model.
     pub source: ModelSource,
 }
 
@@ -142,8 +142,8 @@ impl SourcedModel {
         self.by_prior(&std).unwrap_or_else(|| self.source.by_range(self.source.measured.temperature_c, temperature_c))
     }
 
-    /// If the model was learned from a label: `Data` if the data have reduced the standard deviation clearly below the
-    /// label's, else `Prior`. `None` if it was not.
+    /// The basis of a part of a model learned from a label; `None` for other models. The basis is `Data` if the data
+    /// have reduced the standard deviation clearly below the label's, else `Prior`.
     fn by_prior(&self, std: &dyn Fn(&CellModel) -> Option<f64>) -> Option<KnownBy> {
         let learned = self.source.learned.as_ref()?;
         let (left, before) = (std(&self.model)?, std(&learned.prior)?);
@@ -151,7 +151,8 @@ impl SourcedModel {
         Some(if left <= 0.7 * before { KnownBy::Data } else { KnownBy::Prior })
     }
 
-    /// Root mean square of the model's voltage error over SOC at the temperature of its curve, V; `None` = not stated.
+    /// Root mean square of the model's voltage error over SOC, at the temperature of its open-circuit curve, V. `None`
+    /// = the model states no error.
     pub fn error_v(&self) -> Option<f64> {
         let errors =
             self.model.soc.iter().map(|&soc| self.model.voltage_error_v(&self.model.grid_position(soc, CURVE_C)));
@@ -165,7 +166,7 @@ impl ModelSource {
         match (self.state, range) {
             (ModelState::Prior | ModelState::Unfit, None) => KnownBy::Prior,
             (_, None) => KnownBy::NotStated,
-            // The ends are written with few digits.
+            // Files state the ends of the range with few digits.
             (_, Some([low, high])) if (low - ROUNDED..=high + ROUNDED).contains(&value) => KnownBy::Measured,
             (_, Some(_)) => KnownBy::Extrapolated,
         }

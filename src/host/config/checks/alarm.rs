@@ -24,7 +24,7 @@ impl RatedCell {
         Self { capacity_ah, recharge_period_s: 3600.0 * window * capacity_ah / recharge.reference_current_a }
     }
 
-    /// The value that is 100 % for a rule; `None` if percentages are not defined for it.
+    /// The value that corresponds to 100 % for a rule; `None` if percentages are not defined for this rule.
     fn whole(&self, rule: Rule) -> Option<f64> {
         match (rule, rule.spec().unit) {
             (_, Unit::AmpereHours) => Some(self.capacity_ah),
@@ -58,7 +58,7 @@ impl Alarm {
         match threshold.clear {
             Some(clear) => rated.value(self.rule, clear),
             // These values are durations of a fault: they are 0 only after the fault has ended.
-            None if lasts_only_while_there(self.rule) => Some(0.0),
+            None if value_is_fault_duration(self.rule) => Some(0.0),
             None => {
                 let hysteresis = self.hysteresis.unwrap_or(0.02 * set.abs());
                 Some(set - beyond_sign(self.rule) * hysteresis)
@@ -86,7 +86,7 @@ impl Alarm {
 }
 
 /// Whether the rule's value is the duration of a fault, so that only 0 means "no fault".
-fn lasts_only_while_there(rule: Rule) -> bool {
+fn value_is_fault_duration(rule: Rule) -> bool {
     matches!(rule, Rule::BusFault | Rule::StoreFailed)
 }
 
@@ -122,7 +122,7 @@ pub(crate) fn check(raw: &RawTables, rated: Option<&RatedCell>) {
     }
 }
 
-/// Reports what a rule requires and the file does not contain.
+/// Notes whatever a rule requires but the file does not contain.
 fn check_needs(alarm: &Alarm, raw: &RawTables) {
     let cells = raw.pack.as_ref().map_or(2, |pack| if raw.is_pack_total() { 1 } else { pack.cells });
     let is_reported = raw.is_written::<ReportedSocInput>() || raw.is_written::<ReportedSohInput>();
@@ -178,10 +178,10 @@ fn check_thresholds(alarm: &Alarm, rated: &RatedCell) {
     }
 }
 
-/// Notes an alarm that no value can clear; it would stay raised for ever.
+/// Notes a threshold whose alarm no value can clear. Such an alarm would stay raised for ever.
 fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, threshold: &Threshold) {
     let written = if threshold.clear.is_some() { key } else { "hysteresis" };
-    if lasts_only_while_there(alarm.rule) {
+    if value_is_fault_duration(alarm.rule) {
         if alarm.hysteresis.is_some() || threshold.clear.is_some_and(|clear| clear != Level::Absolute(0.0)) {
             alarm.place.fault(written, "must not be given: the alarm clears when the fault has ended");
         }
@@ -193,14 +193,14 @@ fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, thresh
         Unit::AmpereHours | Unit::Seconds | Unit::Ratio | Unit::Cycles => (0.0, f64::INFINITY),
         Unit::Celsius => return,
     };
-    let is_within = (0.0..=high).contains(&set); // otherwise the threshold is already faulty or never reached
+    let is_within = (0.0..=high).contains(&set); // otherwise it is already a fault, or no value reaches it
     if is_within && !(low..=high).contains(&clear) {
         let range = if high.is_finite() { format!("{low} to {high}") } else { format!("{low} or more") };
         alarm.place.fault(written, format!("must clear {key} at {range}, not at {clear}"));
     }
 }
 
-/// Notes a percentage written without its sign; such a threshold is always or never exceeded.
+/// Notes a percentage without its percent sign. Such a threshold is always or never exceeded.
 fn check_unit(alarm: &Alarm, key: &str, set: f64) {
     let is_fraction = matches!(alarm.rule.spec().unit, Unit::Fraction | Unit::FractionPerDay);
     if is_fraction && !(0.0..=1.0).contains(&set) {

@@ -1,7 +1,7 @@
-//! `[[input.diagnostic]]`: the controllers that are asked, and the signals in their answers.
+//! `[[input.diagnostic]]`: the diagnostic requests and answers, and the signals in the answers.
 //!
-//! In: the tables of the file. Out: one [`AnswerDefinition`] per table. Its signals look like signals of a DBC, so that
-//! `[input.*]` can name them in the same way. Also the [`Answer`]s that the core decodes.
+//! In: the tables of the file. Out: one [`AnswerDefinition`] per table. The signals of a definition look like signals
+//! of a DBC, so that `[input.*]` can name them in the same way. Also out: the [`Answer`]s that the core decodes.
 
 use crate::can::CanId;
 use crate::can::dbc::{FrameFormat, Message, Signal};
@@ -16,17 +16,17 @@ use crate::wiring::AnswerSource;
 /// One configured answer.
 #[derive(Debug)]
 pub(crate) struct AnswerDefinition {
-    /// Its table, `input.diagnostic[2]`.
+    /// Path of the table that defines it, such as `input.diagnostic[2]`.
     pub table: String,
-    /// Identifier of requests and their first byte.
+    /// CAN identifier of the requests and, with extended addressing, their first byte.
     request: (CanId, Option<u8>),
-    /// Identifier of answers and their first byte.
+    /// CAN identifier of the answers and, with extended addressing, their first byte.
     response: (CanId, Option<u8>),
     service: Service,
     identifier: u16,
     /// Time between requests in each [`CarState`](crate::can::poll::CarState), s.
     pub every_s: [Option<f64>; 3],
-    /// Its signals; each layout begins at the signal's first byte.
+    /// The signals of the answer; each layout begins at the first byte of its signal.
     pub message: Message,
     /// The first byte of each signal, counted after the echoed service and identifier.
     first_bytes: Vec<usize>,
@@ -42,7 +42,7 @@ pub(crate) struct AnswerPlace<'d> {
 }
 
 impl AnswerDefinition {
-    /// The question that it answers on an interface.
+    /// The question on interface `bus` that this answer belongs to.
     pub(crate) fn question(&self, bus: BusIndex) -> Question {
         let (request, request_extension) = self.request;
         let (response, response_extension) = self.response;

@@ -9,7 +9,7 @@ use crate::config::schema::RawTables;
 use crate::config::schema::keys::Output;
 use crate::monitor::{CommandConfig, OutputConfig};
 
-/// The plan that decodes commands, and the guard that checks them if they are not authenticated; `None` = commands are
+/// The plan that decodes commands, and the guard that checks commands without authentication. `None` = commands are
 /// off, or faults are noted.
 pub(crate) fn commands(
     raw: &RawTables,

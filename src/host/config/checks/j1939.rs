@@ -1,4 +1,4 @@
-//! Builds the node's settings from `[j1939]` and `[[alarm]]`: its NAME, and each alarm as a trouble code.
+//! Builds the settings of the J1939 node from `[j1939]` and `[[alarm]]`: its NAME, and the trouble code of each alarm.
 //!
 //! The node's identifiers must differ from the identifiers of inputs and of `[output]`, and no two rules may share a code.
 
@@ -29,7 +29,7 @@ pub(crate) fn node(
     let bus = raw.one_bus(keys.interface.as_deref(), &keys.place);
     let node = NodeConfig { name: name(keys)?, address: address(keys)? };
     check_ids(keys, &node, bus?, output, found);
-    // 31: condition exists.
+    // FMI 31 means "condition exists".
     let test_code = TroubleCode::new(keys.test_spn, 31, 0);
     let test_code = test_code.map_err(|error| keys.place.fault("test_spn", error)).ok()?;
     Some(J1939Config { bus: bus?, node, alarms: alarms?, test_code }).filter(|_| !raw.is_output_disabled())
@@ -84,8 +84,8 @@ fn codes(alarms: &[Alarm]) -> Option<Vec<AlarmCode>> {
 }
 
 fn code(alarm: &Alarm, severity: Severity) -> Option<AlarmCode> {
-    // The rule has the same number in alarm frames.
-    // Unverified (from memory of J1939-73): 520192 is the first manufacturer-assignable number.
+    // Alarm frames use the same number for the rule. Unverified (from memory of J1939-73): 520192 is the first
+    // manufacturer-assignable number.
     let spn = alarm.spn.unwrap_or(520_192 + u32::from(alarm.rule as u8));
     let fmi = alarm.fmi.unwrap_or_else(|| failure_mode(alarm.rule, severity));
     match TroubleCode::new(spn, fmi, 0) {
@@ -97,7 +97,7 @@ fn code(alarm: &Alarm, severity: Severity) -> Option<AlarmCode> {
     }
 }
 
-/// Failure mode identifiers of J1939-73, appendix A.
+/// The default failure mode identifier of an alarm, from J1939-73, appendix A.
 fn failure_mode(rule: Rule, severity: Severity) -> u8 {
     match rule {
         // Abnormal update rate; received network data in error; data erratic, intermittent or incorrect; condition exists.

@@ -21,7 +21,7 @@ use crate::quantity::{BusIndex, SensorIndex};
 use crate::sample::{ContactorConfig, Limits, SampleConfig, VoltageSource};
 
 /// The settings of the core and the layout of the sent frames; `None` if a table is missing or faulty (noted).
-/// `inputs_whole`: whether every configured signal was found.
+/// `inputs_whole` states whether every configured signal was found.
 pub(crate) fn monitor(
     raw: &RawTables,
     signals: &[ResolvedSignal<'_>],

@@ -66,7 +66,8 @@ pub(crate) fn output(
         Some(name) => Some(read_dbc(&beside(config, name), read, &raw.faults)?),
         None => None,
     };
-    // A missing cell model is already a fault. Any capacity then serves to find further faults of the layout.
+    // If the cell model is missing, this fault is already noted. Any capacity is then good enough to find further
+    // faults of the layout.
     let rated_capacity_ah = raw.rated_ah(model).unwrap_or(1.0);
     let base = own.as_ref().map_or(LayoutBase::BuiltIn { rated_capacity_ah }, LayoutBase::Own);
     let refuse = |fault: &SettingFault| {

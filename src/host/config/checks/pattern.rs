@@ -15,7 +15,7 @@ enum PatternPiece {
 pub(crate) struct Pattern(Vec<PatternPiece>);
 
 impl Pattern {
-    /// Parses a pattern. The error says what it must be.
+    /// Parses a pattern. The error describes what a pattern must be.
     pub(crate) fn parse(text: &str) -> Result<Self, String> {
         let mut pieces = Vec::new();
         let mut rest = text;

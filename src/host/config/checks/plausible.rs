@@ -1,5 +1,4 @@
-//! Checks for settings that parse but cannot be intended: signals beyond their message, shared bits, units, empty ranges,
-//! the capacity of another cell.
+//! Checks for settings that parse but cannot be intended: signals that extend beyond their message or share bits, wrong units, empty ranges, and the capacity of another cell.
 //!
 //! In: the tables, the signals found, the cell model. Out: faults for certain errors, warnings for unlikely
 //! values. A configured `scale` or `offset` overrides the DBC's unit.
@@ -141,8 +140,10 @@ fn ends(place: &TablePlace, signals: &[&ResolvedSignal<'_>]) {
     if let Some((order, layout)) = other_order(&signal.layout)
         && layout.end_byte() <= u32::from(len)
     {
-        what +=
-            &format!("; with the other byte order ({order}) {} would", if beyond.len() == 1 { "it" } else { "they" });
+        what += &format!(
+            "; with the other byte order ({order}) {} would fit",
+            if beyond.len() == 1 { "it" } else { "they" }
+        );
     }
     place.fault("signal", &what);
 }
@@ -274,7 +275,8 @@ fn other_quantity(place: &TablePlace, found: Quantity, (name, unit, wanted): (&s
     }
 }
 
-/// `is_held`: the bits can carry a plausible value in that unit; otherwise the DBC's unit is wrong.
+/// Checks the conversion from the DBC's unit. If `is_held`, the bits can carry a plausible value in that unit;
+/// otherwise the DBC's unit is wrong.
 fn conversion(
     place: &TablePlace,
     (resolved, unit, is_held): (&ResolvedSignal<'_>, SignalUnit, bool),
@@ -360,7 +362,7 @@ pub(crate) fn ranges(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Optio
 }
 
 impl AllowedRange<'_> {
-    /// Whether the range allows anything; notes a fault if not.
+    /// Returns whether the range allows any value, and notes a fault if it does not.
     fn check(&self) -> bool {
         let AllowedRange { place, keys: [low_key, high_key], limits, dbc, unit, input } = self;
         let origin = if *unit == "V" { "of the DBC or the cell model" } else { "of the DBC" };

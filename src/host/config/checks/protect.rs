@@ -9,8 +9,7 @@ use crate::config::schema::did_you_mean;
 use crate::config::schema::keys::ProtectedInput;
 use crate::quantity::{BusIndex, Channel};
 
-/// The guards of the protected messages; faults are noted. `inputs_whole`: whether every configured signal was found. If
-/// so, a message that is not found has a wrong name.
+/// The guards of the protected messages; faults are noted. `inputs_whole` states whether every configured signal was found. If it is true, a message that is not found has a wrong name.
 pub(crate) fn guards(raw: &RawTables, found: &[ResolvedSignal<'_>], inputs_whole: bool) -> Vec<GuardConfig> {
     let mut guards: Vec<(GuardConfig, &ProtectedInput)> = Vec::new();
     for keys in &raw.protected {
@@ -109,7 +108,7 @@ fn check_layout(keys: &ProtectedInput, inputs: &[&ResolvedSignal<'_>]) {
             if signal.layout.touches(profile.header_mask()) && !noted.contains(&signal.name.as_str()) {
                 noted.push(&signal.name);
                 let what = format!(
-                    "must not overlap {}, which profile \"{}\" writes: {}.{} does",
+                    "must not overlap {}, which profile \"{}\" uses: {}.{} does",
                     header_words(profile.header_mask()),
                     profile.name(),
                     input.message.name,

@@ -18,10 +18,10 @@ use crate::config::schema::did_you_mean;
 use crate::config::schema::keys::{DiagnosticInput, PositiveCurrent, SignalSource};
 use crate::quantity::{BusIndex, CellIndex, Channel};
 
-/// Most cell numbers named in one fault.
+/// Largest number of cell numbers listed in one fault.
 const MAX_NAMED_CELLS: usize = 8;
 
-/// Longest identity, bits: the largest integers that a reading represents exactly.
+/// Largest length of a pack identity, bits. A reading represents integers of up to this length exactly.
 const MAX_IDENTITY_BITS: u16 = 53;
 
 /// The DBC files and diagnostic answers of a configuration.
@@ -36,11 +36,11 @@ pub(crate) struct Databases {
 pub(crate) struct NamedSignal<'d> {
     /// DBC file, or table of the answer.
     pub file: &'d str,
-    /// Its message.
+    /// The message that contains the signal.
     pub message: &'d Message,
     /// The signal.
     pub signal: &'d Signal,
-    /// Its position, if it is in a diagnostic answer.
+    /// Position of the signal in its answer; `None` if it is in a DBC file.
     pub answer: Option<AnswerPlace<'d>>,
 }
 
@@ -65,21 +65,21 @@ pub(crate) struct ResolvedSignal<'d> {
     pub bus: BusIndex,
     /// DBC file or table of the answer.
     pub file: &'d str,
-    /// Its message.
+    /// The message that contains the signal.
     pub message: &'d Message,
     /// The signal.
     pub signal: &'d Signal,
-    /// Its position, if it is in a diagnostic answer.
+    /// Position of the signal in its answer; `None` if it is in a DBC file.
     pub answer: Option<AnswerPlace<'d>>,
-    /// Factor from the DBC's unit and sign to ours; negative if charge is positive on the bus.
+    /// Factor from the DBC's unit and sign to packwatch's. It is negative if charge is positive on the bus.
     pub scale: f64,
-    /// Offset in our unit and sign, added after the scale.
+    /// Offset in packwatch's unit and sign, added after the scale.
     pub offset: f64,
-    /// Raw codes that mean "not available", the configuration's and the DBC's.
+    /// Raw codes that mean "not available", from the configuration and the DBC.
     pub not_available: Vec<u64>,
 }
 
-/// Ranges and resolution stated by the DBC, in our units and sign; infinite if not stated.
+/// Ranges and resolution stated by the DBC, in packwatch's units and sign. Ranges that are not stated are infinite.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct DbcRanges {
     /// Pack current, A, positive = discharge.
@@ -96,7 +96,7 @@ pub(crate) struct DbcRanges {
 pub(crate) const UNLIMITED: (f64, f64) = (f64::NEG_INFINITY, f64::INFINITY);
 
 impl Databases {
-    /// Reads the files and answers; `None` if there are none or one is unusable (noted): names cannot be looked up then.
+    /// Reads the DBC files and the answers. Returns `None` if there are none, or if one is unusable (noted), because signals cannot be looked up in that case.
     pub(crate) fn load(config: &Path, raw: &RawTables, read: ReadFile<'_>) -> Option<Self> {
         let mut files = Vec::new();
         for name in raw.input.as_ref().map_or(&[][..], |input| &input.dbc) {
@@ -163,7 +163,7 @@ pub(crate) fn check_name(raw: &RawTables, databases: &Databases, source: &Signal
     }
 }
 
-/// Factor from the bus's sign of the current to ours.
+/// Factor from the sign of the current on the bus to packwatch's sign.
 fn current_sign(raw: &RawTables) -> f64 {
     match raw.current.as_ref().map(|keys| keys.positive) {
         Some(PositiveCurrent::Charge) => -1.0,
@@ -198,7 +198,7 @@ impl<'d> Search<'_, 'd> {
         source.place.fault("signal", &(what + &hint));
     }
 
-    /// Looks up the signals of all cells by a pattern; `first` is the first cell's number in it.
+    /// Looks up the signals of all cells by a pattern. `first` is the number of the first cell in the signal names.
     fn cells(&mut self, source: &SignalSource<'_>, first: u16, channel: fn(CellIndex) -> Channel) {
         let Some(pack) = &self.raw.pack else { return };
         let cells = pack.cells;
@@ -311,7 +311,7 @@ fn list(numbers: &[u32]) -> String {
 }
 
 impl ResolvedSignal<'_> {
-    /// The signal's binding for the decoder. Its range stays open: the sample stage checks plausibility.
+    /// The signal's binding for the decoder. The binding has no range because the sample stage checks plausibility.
     pub(crate) fn binding(&self) -> Result<Binding, LayoutFault> {
         let mut binding = Binding::new(self.bus, self.message, self.signal, self.channel)?;
         binding.scale = self.scale;
@@ -320,7 +320,7 @@ impl ResolvedSignal<'_> {
         Ok(binding)
     }
 
-    /// Distance between neighbouring values, in our unit; 0 for IEEE floats.
+    /// Distance between neighbouring values, in packwatch's unit; 0 for IEEE floats.
     fn step(&self) -> f64 {
         match self.signal.layout.value_type {
             ValueType::Unsigned | ValueType::Signed => (self.signal.layout.factor * self.scale).abs(),
@@ -328,7 +328,7 @@ impl ResolvedSignal<'_> {
         }
     }
 
-    /// The DBC's range in our unit and sign; infinite if the DBC states none.
+    /// The DBC's range in packwatch's unit and sign; infinite if the DBC states no range.
     pub(crate) fn range(&self) -> (f64, f64) {
         let layout = &self.signal.layout;
         if !layout.has_range() {

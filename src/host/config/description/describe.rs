@@ -26,7 +26,7 @@ pub struct Description {
     pub file: String,
     /// Values that are allowed but unlikely, one line each.
     pub warnings: Vec<String>,
-    /// Its drop-ins, in merge order.
+    /// The drop-ins of the configuration file, in merge order.
     pub drop_ins: Vec<String>,
     /// The vehicle.
     pub vehicle: VehicleIdentity,
@@ -46,7 +46,7 @@ pub struct Description {
     pub outputs: Vec<OutputUse>,
     /// Alarms, in sentences.
     pub alarms: Vec<String>,
-    /// The diagnostic requests that are sent, in sentences; empty = none.
+    /// The diagnostic requests that are sent, in sentences; empty = no requests are sent.
     pub polling: Vec<String>,
     /// The J1939 node and its codes, in sentences; empty = no node.
     pub j1939: Vec<String>,
@@ -80,9 +80,9 @@ pub struct SignalUse {
     pub message: String,
     /// Signal name.
     pub signal: String,
-    /// Where the signal is: `Page = 3` in a multiplexed frame, `answer of 7EC to 22 01 01` in an answer; empty = in every frame.
+    /// Condition for the signal: `Page = 3` in a multiplexed frame, `answer of 7EC to 22 01 01` in a diagnostic answer. Empty = the signal is in every frame.
     pub multiplex: String,
-    /// DBC start bit; in an answer the first bit, counted after the echoed service and identifier.
+    /// DBC start bit. In a diagnostic answer: the first bit, counted after the echoed service and identifier.
     pub start_bit: usize,
     /// Length, bits.
     pub length_bits: u16,
@@ -96,11 +96,12 @@ pub struct SignalUse {
     pub offset: f64,
     /// DBC unit.
     pub unit: String,
-    /// Factor from the DBC's unit and sign to ours (positive = discharge); negative if charge is positive on the bus.
+    /// Factor from the DBC's unit and sign to packwatch's (positive = discharge). It is negative if charge is positive
+    /// on the bus.
     pub scale: f64,
-    /// Offset in our unit and sign, added after the scale.
+    /// Offset in packwatch's unit and sign, added after the scale.
     pub added: f64,
-    /// Smallest and largest value stated by the DBC, in our unit and sign.
+    /// Smallest and largest value stated by the DBC, in packwatch's unit and sign.
     pub range: Option<[f64; 2]>,
     /// Raw codes that mean "not available", hex.
     pub not_available: Vec<String>,
@@ -111,7 +112,7 @@ pub struct SignalUse {
 /// Reads and checks a configuration and describes it.
 ///
 /// # Errors
-/// Every fault found, not only the first.
+/// Returns every fault found, not only the first.
 pub fn describe(path: &Path) -> Result<Description, ConfigFaults> {
     describe_with(&ConfigFiles::find(path)?, &read_file).map(|(_, description)| description)
 }
@@ -119,7 +120,7 @@ pub fn describe(path: &Path) -> Result<Description, ConfigFaults> {
 /// Like [`describe`], but reads files with `read` and also returns the configuration.
 ///
 /// # Errors
-/// Every fault found, not only the first.
+/// Returns every fault found, not only the first.
 pub fn describe_with(files: &ConfigFiles, read: ReadFile<'_>) -> Result<(Config, Description), ConfigFaults> {
     read_and(files, read, |raw, config, found| description(files, raw, config, found))
 }
@@ -343,7 +344,7 @@ fn alarm(rule: &RuleConfig, monitor: &MonitorConfig) -> String {
     words
 }
 
-/// A value of a rule with its unit, fractions as percent.
+/// A value of a rule with its unit. Fractions are shown as percentages.
 fn amount(value: f64, unit: Unit) -> String {
     match unit {
         Unit::Fraction => format!("{} %", round(100.0 * value)),

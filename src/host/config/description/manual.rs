@@ -6,7 +6,7 @@ use super::reference;
 use crate::config::cell_model;
 use crate::config::schema::{Key, SECTIONS, SectionInfo};
 
-/// The page, as roff.
+/// Returns the page as roff.
 pub fn manual() -> String {
     let mut page = format!(
         ".TH PACKWATCH.TOML 5 \"\" \"packwatch {}\" \"packwatch\"\n\

@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use crate::config::cell_model;
 use crate::config::schema::{Key, Presence, SECTIONS, SectionInfo};
 
-/// The page, as Markdown; `docs/src/reference/keys.md` is exactly this.
+/// Returns the page as Markdown. `docs/src/reference/keys.md` has exactly this text.
 pub fn reference() -> String {
     let mut page = String::from(
         "# Configuration keys\n\n\
@@ -39,7 +39,7 @@ fn row(key: &Key) -> String {
     format!("| `{}` | {value} | {} | {default} | {} |\n", key.name, key.unit, key.about.trim())
 }
 
-/// Allowed values.
+/// The allowed values of a key in words.
 pub(crate) fn value(key: &Key) -> String {
     match (key.choices.is_empty(), key.range()) {
         (false, choices) => choices.replace(" | ", ", "),

@@ -21,7 +21,7 @@ pub struct OutputUse {
     pub id: String,
     /// Interfaces.
     pub interfaces: Vec<String>,
-    /// Period, ms; `None` = sent on an event only.
+    /// Period, ms; `None` = the frame is sent only on events.
     pub period_ms: Option<f64>,
     /// `classic`, `FD`, `FD with bit rate switch`.
     pub kind: &'static str,
@@ -90,7 +90,7 @@ pub(crate) fn intake(config: &Config, found: &[ResolvedSignal<'_>]) -> Vec<Strin
             None => "missing frames are not counted, because the DBC has no cycle time".to_owned(),
         };
         words.push(format!(
-            "{name} ({} on {interface}): end-to-end protected, profile {}, data id {data_id:#06X}, up to {} lost in a row are allowed, {missed}",
+            "{name} ({} on {interface}): end-to-end protected, profile {}, data id {data_id:#06X}, up to {} lost frames in a row are allowed, {missed}",
             guard.id,
             profile.name(),
             guard.check.max_delta_counter_init,

@@ -1,4 +1,4 @@
-//! Everything found wrong in the files of a configuration, with file and line.
+//! The list of faults in the files of a configuration, each with file and line.
 //!
 //! A fault reads `FILE:LINE: KEY = FOUND, must be ALLOWED`. Checking continues after a fault, so all faults are found.
 
@@ -37,7 +37,7 @@ impl fmt::Display for SourceLine {
     }
 }
 
-/// Faults and warnings found so far, in files of any kind. Clones share one list.
+/// The list of faults and warnings in files of any kind. Clones share one list.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Faults(Rc<RefCell<Notes>>);
 
@@ -78,7 +78,7 @@ impl Faults {
         ConfigFaults(lines(&self.0.borrow().faults))
     }
 
-    /// The warnings, in the same form.
+    /// The warnings, formatted and sorted like the faults.
     pub(crate) fn warning_lines(&self) -> Vec<String> {
         lines(&self.0.borrow().warnings)
     }

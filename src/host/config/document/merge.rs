@@ -10,7 +10,7 @@ use super::source::{SourceFile, Sources};
 
 /// Longest quotation in a fault, characters: enough to recognise the text, short enough for one line.
 const MAX_QUOTE: usize = 48;
-/// Most syntax faults that are listed one by one; a file with more is probably not TOML.
+/// Largest number of syntax faults that are listed one by one. A file with more faults is probably not TOML.
 const MAX_SYNTAX_FAULTS: usize = 10;
 
 /// The tables of a configuration: one file, or a file and its drop-ins merged.
@@ -18,7 +18,7 @@ const MAX_SYNTAX_FAULTS: usize = 10;
 pub(crate) struct Document<'t> {
     /// The main file, as the user named it.
     pub file: String,
-    /// Whether the syntax is broken somewhere. A missing key may then be in the broken part.
+    /// Whether the syntax is broken somewhere. If so, a missing key may be in the broken part.
     pub broken: bool,
     /// Where faults are noted.
     pub faults: Faults,
@@ -82,7 +82,7 @@ impl<'t> Document<'t> {
         shorten(&words.join(" "))
     }
 
-    /// The found text of a fault at `span`, which is within `value`.
+    /// The text that a fault at `span` quotes as the found value; `span` lies within `value`.
     pub(crate) fn found(&self, value: &Spanned<DeValue<'_>>, span: &Range<usize>) -> String {
         let is_inline = self.written(&value.span()).starts_with('{');
         if value.get_ref().is_table() && !is_inline { "a table".to_owned() } else { self.quote(span) }
@@ -112,8 +112,8 @@ fn note_syntax(source: &SourceFile, errors: &[toml::de::Error], faults: &Faults)
     }
 }
 
-/// Merges `over` into `under`: tables are merged key by key, lists of tables are appended, any other value replaces. An
-/// empty list also replaces, so that a drop-in can remove the tables before it.
+/// Merges `over` into `under`. Tables are merged key by key, lists of tables are appended, and any other value replaces
+/// the earlier value. An empty list also replaces the earlier list, so that a drop-in can remove tables.
 fn merge<'t>(under: &mut DeTable<'t>, over: DeTable<'t>) {
     for (key, new) in over {
         let Some((old_key, mut old)) = under.remove_entry(&key) else {

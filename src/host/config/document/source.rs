@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use super::faults::{ConfigFaults, Faults, SourceLine};
 
-/// Most drop-ins of one file; each changes part of a file of about 30 tables.
+/// Largest number of drop-ins of one file. One per table is enough, and a file has about 30 tables.
 const MAX_DROP_INS: usize = 100;
 
 /// Reads the bytes of a file: from disk or, in the demo and in tests, from memory.
@@ -21,7 +21,7 @@ pub type ReadFile<'a> = &'a dyn Fn(&Path) -> std::io::Result<Vec<u8>>;
 pub struct ConfigFiles {
     /// The configuration file.
     pub main: PathBuf,
-    /// Its drop-ins, in merge order.
+    /// The drop-ins of the configuration file, in merge order.
     pub drop_ins: Vec<PathBuf>,
 }
 
@@ -29,7 +29,7 @@ impl ConfigFiles {
     /// Finds the drop-ins of `main`: the files `main.d/*.toml`, sorted by name, except those whose name begins with a dot.
     ///
     /// # Errors
-    /// When the folder cannot be listed or has too many drop-ins.
+    /// Fails if the folder cannot be listed or has too many drop-ins.
     pub fn find(main: &Path) -> Result<Self, ConfigFaults> {
         let folder = drop_in_folder(main);
         let fault = |what: String| ConfigFaults(vec![format!("{}: {what}", folder.display())]);
@@ -155,7 +155,7 @@ impl Sources {
     }
 }
 
-/// `named`, relative to the folder of `path`.
+/// Resolves `named` relative to the folder of `path`.
 pub(crate) fn beside(path: &Path, named: &str) -> PathBuf {
     path.parent().unwrap_or(Path::new("")).join(named)
 }
@@ -218,8 +218,8 @@ mod tests {
         let texts = [("a", "x = 1\ny = 2\n"), ("b", "\u{feff}"), ("c", "z = 3\n\nw = 4")];
         let sources = Sources::new(texts.map(|(name, text)| (name.to_owned(), text.to_owned())).into());
         for (written, line) in [("y = 2", "a:2"), ("z", "c:1"), ("w = 4", "c:3")] {
-            let file = sources.files().iter().find(|file| file.placed.contains(written)).expect("there");
-            let start = file.placed.find(written).expect("there");
+            let file = sources.files().iter().find(|file| file.placed.contains(written)).expect("the text exists");
+            let start = file.placed.find(written).expect("the text exists");
             let span = start..start + written.len();
             assert_eq!((sources.written(&span), sources.line(&span).to_string()), (written, line.to_owned()));
         }

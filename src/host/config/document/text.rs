@@ -14,7 +14,7 @@ use super::source::{ConfigFiles, ReadFile, Sources, read_file};
 /// checked.
 ///
 /// # Errors
-/// When a file cannot be read or is not TOML: every such fault.
+/// Fails if a file cannot be read or is not TOML, and returns every such fault.
 pub fn merged(path: &Path) -> Result<String, ConfigFaults> {
     merged_with(&ConfigFiles::find(path)?, &read_file)
 }
@@ -22,7 +22,7 @@ pub fn merged(path: &Path) -> Result<String, ConfigFaults> {
 /// Like [`merged`], but reads files with `read`.
 ///
 /// # Errors
-/// When a file cannot be read or is not TOML: every such fault.
+/// Fails if a file cannot be read or is not TOML, and returns every such fault.
 pub fn merged_with(files: &ConfigFiles, read: ReadFile<'_>) -> Result<String, ConfigFaults> {
     let faults = Faults::default();
     let sources = Sources::read(files, read, &faults);
@@ -30,7 +30,7 @@ pub fn merged_with(files: &ConfigFiles, read: ReadFile<'_>) -> Result<String, Co
     text.filter(|_| faults.is_empty()).ok_or_else(|| faults.lines())
 }
 
-/// The text, in the order of the files. Parsing it gives the same tables.
+/// The merged tables as TOML, in the order of the files. Parsing this text gives the same tables.
 fn text(document: &Document<'_>) -> String {
     let mut page = String::new();
     table(document, "", document.root(), &mut page);
@@ -54,7 +54,7 @@ fn table(document: &Document<'_>, path: &str, table: &DeTable<'_>, page: &mut St
     }
 }
 
-/// The table, or the list of tables, at `path`.
+/// Writes the table, or the list of tables, at `path`.
 fn tables_at(document: &Document<'_>, path: &str, value: &Spanned<DeValue<'_>>, page: &mut String) {
     let (items, header) = match value.get_ref() {
         DeValue::Array(items) => (items.iter().collect(), format!("[[{path}]]")),

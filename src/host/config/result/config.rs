@@ -14,11 +14,11 @@ use crate::quantity::BusIndex;
 pub struct Config {
     /// The configuration file.
     pub path: PathBuf,
-    /// CAN interfaces; a `BusIndex` counts in this order.
+    /// CAN interfaces. A `BusIndex` is an index into this list.
     pub interfaces: Vec<InterfaceConfig>,
     /// Settings of the core.
     pub monitor: MonitorConfig,
-    /// The origin of the cell model in these settings.
+    /// The origin of the cell model in `monitor`.
     pub model_source: ModelSource,
     /// Layout of the sent frames, for receivers; `None` = nothing is sent.
     pub output_layout: Option<Database>,

@@ -26,16 +26,16 @@ pub(crate) struct PartialConfig {
 }
 
 impl PartialConfig {
-    /// Reads what can be read.
+    /// Reads the parts that can be read.
     ///
     /// # Errors
-    /// When the file or a DBC file cannot be read: every fault found.
+    /// Fails if the file or a DBC file cannot be read, and returns every fault found.
     pub(crate) fn read(path: &Path) -> Result<Self, ConfigFaults> {
         let (config, faults) = match load(path) {
             Ok(config) => (Some(config), Vec::new()),
             Err(faults) => (None, faults.0),
         };
-        // The second reading finds the same faults again.
+        // The second reading finds the same faults again, so it gets a list that is not used.
         let again = Faults::default();
         let read = || {
             let sources = Sources::read(&ConfigFiles::find(path).ok()?, &read_file, &again)?;

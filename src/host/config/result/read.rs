@@ -14,7 +14,7 @@ use crate::config::schema::RawTables;
 /// the configuration file).
 ///
 /// # Errors
-/// Every fault found, not only the first.
+/// Returns every fault found, not only the first.
 pub fn load(path: &Path) -> Result<Config, ConfigFaults> {
     load_with(&ConfigFiles::find(path)?, &read_file)
 }
@@ -22,7 +22,7 @@ pub fn load(path: &Path) -> Result<Config, ConfigFaults> {
 /// Like [`load`], but reads files with `read`.
 ///
 /// # Errors
-/// Every fault found, not only the first.
+/// Returns every fault found, not only the first.
 pub fn load_with(files: &ConfigFiles, read: ReadFile<'_>) -> Result<Config, ConfigFaults> {
     read_and(files, read, |_, _, _| ()).map(|(config, ())| config)
 }
@@ -30,7 +30,7 @@ pub fn load_with(files: &ConfigFiles, read: ReadFile<'_>) -> Result<Config, Conf
 /// Like [`load_with`], and also returns the result of `then` for the tables, the configuration and the signals found.
 ///
 /// # Errors
-/// Every fault found, not only the first.
+/// Returns every fault found, not only the first.
 pub(crate) fn read_and<T>(
     files: &ConfigFiles,
     read: ReadFile<'_>,
@@ -39,8 +39,11 @@ pub(crate) fn read_and<T>(
     let faults = Faults::default();
     match read_config(files, read, &faults, then) {
         Some(good) if faults.is_empty() => Ok(good),
-        // If a part is missing without a fault, packwatch itself has a bug; that must not be silent.
-        None if faults.is_empty() => Err(ConfigFaults(vec![format!("{}: not usable", files.main.display())])),
+        // If a part is missing although no fault was noted, packwatch itself has a bug. Report it instead of hiding it.
+        None if faults.is_empty() => Err(ConfigFaults(vec![format!(
+            "{}: cannot be used, but no fault was found: this is a bug in packwatch",
+            files.main.display()
+        )])),
         _ => Err(faults.lines()),
     }
 }

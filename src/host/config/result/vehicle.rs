@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// The vehicle and the pack, as their users name them. `None` = not given.
+/// The names that users give the vehicle and the pack. `None` = not given.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct VehicleIdentity {
     /// Name of the vehicle.
@@ -19,7 +19,7 @@ pub struct VehicleIdentity {
 }
 
 impl VehicleIdentity {
-    /// Whether anything is given.
+    /// Whether at least one name is given.
     pub fn is_stated(&self) -> bool {
         *self != Self::default()
     }
@@ -31,7 +31,7 @@ impl VehicleIdentity {
     }
 }
 
-/// `Bus 12 (WDB9634031L123456), pack front`; empty if nothing is given.
+/// Shows the names as `Bus 12 (WDB9634031L123456), pack front`; empty if no name is given.
 impl fmt::Display for VehicleIdentity {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let vehicle = match (&self.name, &self.id) {

@@ -55,9 +55,9 @@ impl fmt::Display for ValueRange {
 /// Why and where a value is rejected.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum ValueFault {
-    /// Wrong type.
+    /// The value has the wrong type.
     Type(Range<usize>),
-    /// Right type, but out of range.
+    /// The value has the right type but is out of range.
     Range(Range<usize>),
 }
 
@@ -98,24 +98,24 @@ pub(crate) enum Presence {
     Required,
     /// The absence is allowed. The text describes the default, or the condition that requires the key.
     Optional(&'static str),
-    /// This TOML text is read instead.
+    /// If the key is absent, this TOML text is read as its value.
     Default(&'static str),
 }
 
 /// One key.
 #[derive(Debug)]
 pub(crate) struct Key {
-    /// Name in the file.
+    /// Name of the key in the file.
     pub name: &'static str,
-    /// Meaning.
+    /// Meaning of the key, as printed in the reference page.
     pub about: &'static str,
-    /// Unit, or empty.
+    /// Unit of the value; empty if it has none.
     pub unit: &'static str,
-    /// Type in words.
+    /// Type of the value in words.
     pub kind: &'static str,
     /// Allowed words, if the key is a choice.
     pub choices: &'static [&'static str],
-    /// Range.
+    /// Allowed range of the value.
     pub allowed: ValueRange,
     /// What happens if the key is absent.
     pub presence: Presence,
@@ -153,16 +153,16 @@ impl Key {
 /// Reads the keys of one table.
 pub(crate) struct TableReader<'a> {
     pub document: &'a Document<'a>,
-    /// Whether the table may be incomplete; missing keys are then not reported.
+    /// Whether the table may be incomplete. If so, missing keys are not reported.
     pub broken: bool,
-    /// `None` = the table is absent.
+    /// The table; `None` = the file does not contain it.
     pub table: Option<&'a DeTable<'a>>,
-    /// Place in the file.
+    /// Place of the table in the file.
     pub place: TablePlace,
 }
 
 impl TableReader<'_> {
-    /// The value of `key`, or its default; `None` if it is faulty (the fault is noted).
+    /// Returns the value of `key` or its default. Returns `None` and notes a fault if the value is faulty.
     pub(crate) fn setting<T: Setting>(&self, key: &Key) -> Option<T> {
         let Some(value) = self.table.and_then(|table| table.get(key.name)) else {
             return self.absent(key);

@@ -1,8 +1,6 @@
 //! Every key of the configuration file, declared once with meaning, type, unit, range and default.
 //!
-//! These declarations drive the reading, every fault's "must be", the reference page (`docs/src/reference/keys.md`), the
-//! manual page and, in a table that `gives` the parameters of an algorithm, those parameters. How to add a key: see
-//! [`config`](super::super).
+//! Keys are read, checked and documented from these declarations: in fault messages ("must be"), in the reference page (`docs/src/reference/keys.md`) and in the manual page. If a table `gives` the parameters of an algorithm, its declaration also builds them. [`config`](super::super) explains how to add a key.
 
 mod algorithms;
 mod choices;

@@ -12,8 +12,7 @@ use crate::config::document::{Document, SourceLine};
 /// Reads the declared tables of one document.
 pub(crate) struct SchemaReader<'a> {
     document: &'a Document<'a>,
-    /// Whether syntax or tables are broken somewhere. A key that was not found may then still exist, so none is reported
-    /// as missing.
+    /// Whether syntax or tables are broken somewhere. If so, a key that was not found may still exist, so no key is reported as missing.
     pub broken: bool,
 }
 
@@ -25,7 +24,8 @@ impl<'a> SchemaReader<'a> {
         walk
     }
 
-    /// A table that is always read. If it is absent, its required keys are missing.
+    /// Reads a table that occurs once. If the file does not contain it, its defaults apply and its required keys are
+    /// noted as missing.
     pub(crate) fn one<S: Section>(&self) -> Option<S> {
         if S::PATH.is_empty() {
             let root = self.document.root();
@@ -40,12 +40,12 @@ impl<'a> SchemaReader<'a> {
         }
     }
 
-    /// A table that may be absent.
+    /// Reads a table that may be absent.
     pub(crate) fn optional<S: Section>(&self) -> Option<S> {
         self.document.find(S::PATH).and_then(|_| self.one())
     }
 
-    /// A repeatable table; faulty ones are noted and left out.
+    /// Reads every table of a repeatable section. Faulty tables are noted and left out.
     pub(crate) fn many<S: Section>(&self) -> Vec<S> {
         let Some(DeValue::Array(items)) = self.document.find(S::PATH).map(Spanned::get_ref) else {
             return Vec::new();
@@ -69,7 +69,7 @@ impl<'a> SchemaReader<'a> {
         }
     }
 
-    /// Line of the parent of `path`, for faults of a table that is absent.
+    /// Line of the parent table of `path`, for faults about an absent table.
     fn line_above(&self, path: &str) -> SourceLine {
         let above = path.rsplit_once('.').and_then(|(above, _)| self.document.find(above));
         above.map_or_else(|| self.document.first_line(), |value| self.document.line(&value.span()))
@@ -81,8 +81,8 @@ impl<'a> SchemaReader<'a> {
         S::read(&TableReader { document: self.document, broken: self.broken, table, place })
     }
 
-    /// Notes every key of `table` that `known` does not have. `schema` is the table's path in the schema, `shown` the
-    /// path in faults (with the number of a repeated table).
+    /// Notes every key of `table` that `known` does not contain. `schema` is the table's path in the schema, `shown`
+    /// the path in faults (with the number of a repeated table).
     fn refuse_unknown(&mut self, schema: &str, shown: &str, table: &'a DeTable<'a>, known: &[SectionInfo]) {
         let here = known.iter().find(|info| info.path == schema);
         if here.is_some_and(|info| info.keys.is_none()) {
@@ -102,7 +102,7 @@ impl<'a> SchemaReader<'a> {
         }
     }
 
-    /// The value where the schema has a table.
+    /// Checks a value for which the schema expects a table.
     fn table_below(&mut self, schema: &str, shown: &str, value: &'a Spanned<DeValue<'a>>, known: &[SectionInfo]) {
         let line = self.document.line(&value.span());
         let many = known.iter().any(|info| info.path == schema && info.many);
@@ -131,7 +131,7 @@ impl<'a> SchemaReader<'a> {
     }
 }
 
-/// The names that continue `path` towards a known table.
+/// The names of the next path element below `path` that lead to a known table.
 fn tables_below<'k>(path: &str, known: &'k [SectionInfo]) -> BTreeSet<&'k str> {
     let below = |info: &'k SectionInfo| match path {
         "" => Some(info.path),
@@ -145,7 +145,7 @@ fn join(path: &str, key: &str) -> String {
     if path.is_empty() { key.to_owned() } else { format!("{path}.{key}") }
 }
 
-/// `, did you mean X` for the nearest of `names`, or nothing when none is near.
+/// Returns `, did you mean X` for the most similar of `names`, or an empty text if no name is similar enough.
 pub(crate) fn did_you_mean<'n>(found: &str, names: impl Iterator<Item = &'n str>) -> String {
     /// Jaro-Winkler similarity below which a hint confuses more than it helps.
     const NEAR: f64 = 0.8;

@@ -1,4 +1,5 @@
-//! Declares tables and keys: one line of [`section!`] gives a key's type, reading, faults and reference text.
+//! Declares tables and keys: one line of [`section!`] defines a key's type, how it is read, its fault messages and its
+//! reference text.
 //!
 //! [`section!`] declares a table of a file and, if the table `gives` a parameter struct, builds that struct from the keys.
 //! [`tables!`] lists the tables of a file. [`SchemaReader`] reads the declared tables from a document and notes every
@@ -17,7 +18,7 @@ pub(crate) trait Section: Sized {
     const ABOUT: &'static str;
     /// The keys of the table.
     const KEYS: &'static [Key];
-    /// Reads the table; `None` if a key is bad (noted in the faults).
+    /// Reads the table. Returns `None` and notes a fault if a key is bad.
     fn read(table: &TableReader<'_>) -> Option<Self>;
 }
 
@@ -30,7 +31,7 @@ pub(crate) struct SectionInfo {
     pub many: bool,
     /// Purpose of the table.
     pub about: &'static str,
-    /// The keys of the table; `None` = any key is allowed (notes for readers).
+    /// The keys of the table; `None` = any key is allowed (a table of notes for people).
     pub keys: Option<&'static [Key]>,
 }
 
@@ -50,7 +51,7 @@ impl SectionInfo {
         Self { path: S::PATH, many: true, about: S::ABOUT, keys: Some(S::KEYS) }
     }
 
-    /// A table for readers; the program ignores it.
+    /// A table of notes for people who read the file; the program ignores it.
     pub(crate) const fn notes(path: &'static str, about: &'static str) -> Self {
         Self { path, many: false, about, keys: None }
     }
@@ -117,7 +118,7 @@ macro_rules! section {
     }) => {
         $(#[doc = $about])+
         #[derive(Debug, Clone)]
-        #[allow(dead_code, reason = "some keys are for people only, and not every table is checked again at its place")]
+        #[allow(dead_code, reason = "some keys are only for people, and the places of some tables are not used by later checks")]
         pub(crate) struct $name {
             /// Place in the file.
             pub place: $crate::config::document::TablePlace,
@@ -169,7 +170,7 @@ macro_rules! tables {
             pub file: String,
             /// Where faults are noted.
             pub faults: $crate::config::document::Faults,
-            /// Whether the file's syntax or a table is broken. A table that was not found may then still exist.
+            /// Whether the file's syntax or a table is broken. If so, a table that was not found may still exist.
             pub broken: bool,
             /// How often each table is present, including faulty ones.
             written: std::collections::BTreeMap<&'static str, usize>,

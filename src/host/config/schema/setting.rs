@@ -7,7 +7,7 @@ use toml::de::{DeInteger, DeValue};
 
 use super::key::{Setting, ValueFault, ValueRange, in_range, typed};
 
-/// Most numbers in a sequence; more than any pack has cells.
+/// Largest number of entries in a sequence; no pack has more cells.
 const MAX_ROW: usize = 2048;
 
 impl<T: Setting> Setting for Option<T> {

@@ -13,7 +13,7 @@ use crate::config::document::TablePlace;
 use crate::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
 
 tables! {
-    /// The tables of a file; `None` = absent, or faulty (noted).
+    /// The tables of a file; `None` = absent, or faulty (the fault is noted).
     RawTables, SECTIONS {
         vehicle: one Vehicle,
         pack: one Pack,
@@ -57,12 +57,12 @@ tables! {
 }
 
 impl RawTables {
-    /// Whether every `[[interface]]` that is written is in `interfaces`; otherwise names cannot be judged.
+    /// Whether `interfaces` contains every `[[interface]]` of the file. If not, interface names cannot be checked.
     pub(crate) fn has_all_interfaces(&self) -> bool {
         !self.broken && self.interfaces.len() == self.count::<Interface>()
     }
 
-    /// Notes `text` about a table; about the file, where it could not be read.
+    /// Notes `text` about the table at `place`, or about the whole file if the table could not be read.
     pub(crate) fn note(&self, place: Option<&TablePlace>, text: &str) {
         match place {
             Some(place) => self.faults.add_at(&place.at, text),
@@ -70,7 +70,7 @@ impl RawTables {
         }
     }
 
-    /// Capacity on the label of one of the pack's own cells, Ah: configured, or else from the cell model.
+    /// Rated capacity of one of the pack's own cells, Ah: from the configuration, else from the cell model.
     pub(crate) fn rated_ah(&self, model: Option<&CellModel>) -> Option<f64> {
         let configured = self.pack.as_ref().and_then(|pack| pack.rated_capacity_ah);
         configured.or(model.map(|model| model.rated_capacity_ah))
@@ -86,7 +86,8 @@ impl RawTables {
         self.output.as_ref().is_some_and(|output| !output.enabled)
     }
 
-    /// The interface of this name, the first one without a name; `None` = not there (noted by the cross checks).
+    /// The interface with this name, or the first interface if no name is given. `None` = there is no such interface
+    /// (the cross checks note it).
     pub(crate) fn bus_of(&self, interface: Option<&str>) -> Option<BusIndex> {
         let index = match interface {
             Some(name) => self.interfaces.iter().position(|interface| interface.name == name)?,
@@ -95,7 +96,8 @@ impl RawTables {
         u8::try_from(index).ok().map(BusIndex)
     }
 
-    /// The interface of a table that belongs to one; `None` = it is not there, or must be named (noted).
+    /// The interface of a table that must use exactly one. Returns `None` and notes a fault if the name is unknown, or
+    /// if it is missing although there are several interfaces.
     pub(crate) fn one_bus(&self, interface: Option<&str>, place: &TablePlace) -> Option<BusIndex> {
         let is_clear = interface.is_some() || self.interfaces.len() <= 1;
         let bus = self.bus_of(interface).filter(|_| is_clear);
@@ -105,17 +107,17 @@ impl RawTables {
         bus
     }
 
-    /// Names of the interfaces, as a fault lists them.
+    /// Names of the interfaces, joined by "or" for fault messages.
     pub(crate) fn interface_names(&self) -> String {
         let names: Vec<&str> = self.interfaces.iter().map(|interface| interface.name.as_str()).collect();
         names.join(" or ")
     }
 
-    /// Notes an FD frame on interfaces without FD, at the key `fd` of its table.
+    /// Notes, at the key `fd` of a frame's table, each interface of the frame that has no FD.
     pub(crate) fn check_fd(&self, place: &TablePlace, buses: &[BusIndex]) {
         let interfaces = buses.iter().filter_map(|bus| self.interfaces.get(bus.index()));
         for interface in interfaces.filter(|interface| !interface.fd) {
-            place.fault("fd", format!("must have fd = true on interface {} too", interface.name));
+            place.fault("fd", format!("requires fd = true on interface {}", interface.name));
         }
     }
 
@@ -135,7 +137,8 @@ impl RawTables {
         }
     }
 
-    /// All configured signals, `[input.cell_voltage]` and `[input.balancing]` once, for the first cell.
+    /// All configured signals. `[input.cell_voltage]` and `[input.balancing]` appear once, as channels of the first
+    /// cell.
     pub(crate) fn sources(&self) -> impl Iterator<Item = (Channel, SignalSource<'_>)> {
         let sensors = (0..).take(self.temperatures.len()).map(|index| Channel::Temperature(SensorIndex(index)));
         let others = [

@@ -1,4 +1,4 @@
-//! Thresholds of alarms as written in the file (`2.08`, `"80 %"`, `{ set = ..., clear = ... }`), and `when`.
+//! Thresholds of alarms as written in the file (`2.08`, `"80 %"`, `{ set = ..., clear = ... }`), and the key `when`.
 
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
@@ -6,7 +6,7 @@ use toml::de::{DeTable, DeValue};
 use super::key::{Setting, ValueFault, ValueRange, in_range, typed};
 use crate::alarm::Comparison;
 
-/// A threshold value: in the rule's unit, or relative.
+/// A threshold value: absolute, or relative to a new cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Level {
     /// A value in the rule's unit.
@@ -15,11 +15,11 @@ pub(crate) enum Level {
     Relative(f64),
 }
 
-/// `2.08`, `"80 %"`, or `{ set = ..., clear = ... }` with either.
+/// A threshold as written: `2.08`, `"80 %"`, or `{ set = ..., clear = ... }` with such values.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Threshold {
     pub set: Level,
-    /// `None` = follows from the hysteresis.
+    /// Value at which the alarm clears; `None` = computed from the hysteresis.
     pub clear: Option<Level>,
 }
 

@@ -177,10 +177,7 @@ fn faults_of_repeatable_tables_are_reported() {
             "pack.toml:16: output.health.e2e = \"5\", must have fd = true here and on the interface: the header of \
              profile 5 makes the message 12 bytes long; 1A and 1C fit classic frames",
         ),
-        (
-            "[output.health]\nfd = true\n",
-            "pack.toml:16: output.health.fd = true, must have fd = true on interface can0 too",
-        ),
+        ("[output.health]\nfd = true\n", "pack.toml:16: output.health.fd = true, requires fd = true on interface can0"),
         (
             "[output.health]\nbrs = true\n",
             "pack.toml:16: output.health.brs = true, must have fd = true: classic frames have one bit rate",

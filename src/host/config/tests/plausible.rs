@@ -19,7 +19,7 @@ BO_ 272 Cells: 8 A
  SG_ Cell4 m1 : 24|16@1+ (0.001,0) [0|5] "V" A
 "#;
 
-/// Has 14 lines.
+/// A valid configuration of 14 lines.
 const PACK: &str = r#"[pack]
 cells = 4
 cell_model = "cell.toml"
@@ -47,7 +47,7 @@ fn read(pack: &[(&str, &str)], dbc: &[(&str, &str)]) -> Result<(Config, Descript
 }
 
 fn faults(pack: &[(&str, &str)], dbc: &[(&str, &str)]) -> Vec<String> {
-    read(pack, dbc).expect_err("is good")
+    read(pack, dbc).expect_err("the configuration must have a fault")
 }
 
 fn warnings(pack: &[(&str, &str)], dbc: &[(&str, &str)]) -> Vec<String> {
@@ -72,7 +72,7 @@ fn signal_beyond_message_end_is_rejected() {
 #[test]
 fn many_signals_beyond_message_end_suggest_byte_order() {
     let fault = "pack.toml:12: input.cell_voltage.signal = \"Cells.Cell{n}\", Cells.Cell2 and 1 other end in byte 9 of \
-                 their message, must end within the 8 bytes stated in pack.dbc; with the other byte order (@1) they would";
+                 their message, must end within the 8 bytes stated in pack.dbc; with the other byte order (@1) they would fit";
     assert_eq!(faults(&[], &[("24|16@1+", "48|16@0+")]), [fault]);
 }
 
@@ -214,7 +214,7 @@ fn unit_without_plausible_values_is_rejected() {
 fn inputs_share_bits_only_on_different_multiplexer_pages() {
     let fault = "pack.toml:12: input.cell_voltage.signal = \"Cells.Cell{n}\", Cells.Cell1 and Cells.Cell2 share bits of one message, must not overlap";
     assert_eq!(faults(&[], &[("Cell2 m0 : 24|16", "Cell2 m0 : 16|16")]), [fault]);
-    assert_eq!(faults(&[], &[("Cell2 m0 : 24|16", "Cell2 m0 : 8|16")]), [fault], "the same bits");
+    assert_eq!(faults(&[], &[("Cell2 m0 : 24|16", "Cell2 m0 : 8|16")]), [fault], "both signals use the same bits");
     let across = "pack.toml:14: input.temperature[1].signal = \"Status.Temperature\", Status.Current and \
                   Status.Temperature share bits of one message, must not overlap";
     assert_eq!(faults(&[], &[("32|8@1+ (1,-40)", "15|8@0+ (1,-40)")]), [across]);
@@ -296,7 +296,7 @@ fn byte_order_mark_is_skipped_utf_16_rejected() {
     let marked = |bytes: &[u8]| [b"\xEF\xBB\xBF", bytes].concat();
     assert_eq!(read_bytes(marked(DBC.as_bytes())), Ok(()));
     let latin_1: Vec<u8> = DBC.replace("degC", "\u{b0}C").chars().map(|c| c as u8).collect();
-    assert_eq!(read_bytes(marked(&latin_1)), Ok(()), "a mark before Latin-1");
+    assert_eq!(read_bytes(marked(&latin_1)), Ok(()), "a byte order mark before Latin-1 text is skipped");
     let utf_16: Vec<u8> = "\u{feff}".chars().chain(DBC.chars()).flat_map(|c| (c as u16).to_le_bytes()).collect();
     let fault = "pack.dbc:1: is UTF-16 text, must be UTF-8 or Latin-1: save it in that encoding";
     for text in [utf_16.clone(), utf_16[2..].to_vec()] {
@@ -313,7 +313,7 @@ fn shared_bits_in_answers_are_rejected() {
             PACK.replace("Cells.Cell{n}", "Car.Cell{n}")
         )
     };
-    assert!(read_texts(&answer(""), CELL, DBC).is_ok(), "each begins at the first bit of its own byte");
+    assert!(read_texts(&answer(""), CELL, DBC).is_ok(), "each signal begins at the first bit of its own byte");
     let fault = "pack.toml:12: input.cell_voltage.signal = \"Car.Cell{n}\", Car.Cell1 and Car.Cell2 (and 2 other pairs) share bits of one message, must not overlap";
     assert_eq!(read_texts(&answer(", step = 4"), CELL, DBC).unwrap_err(), [fault]);
     let unit = "pack.toml:11: input.cell_voltage.scale is not set, must be 0.001: the unit of Car.Cell1 is \"mV\" (set 1.0 if the DBC is wrong and the unit is V)";

@@ -25,7 +25,7 @@ BA_DEF_DEF_ "GenMsgCycleTime" 0;
 BA_ "GenMsgCycleTime" BO_ 256 100;
 "#;
 
-/// Has 15 lines.
+/// A valid configuration of 15 lines.
 const PACK: &str = r#"[pack]
 cells = 2
 cell_model = "cell.toml"
@@ -83,7 +83,7 @@ fn check_lists_protected_messages() {
         [
             "at most 2000 frames a second of one identifier, a tenth of them at once",
             "commands of other ECUs are not executed",
-            "Status (100 on can0): end-to-end protected, profile 1A, data id 0x0123, up to 1 lost in a row are allowed, a missing frame is counted every 100 ms"
+            "Status (100 on can0): end-to-end protected, profile 1A, data id 0x0123, up to 1 lost frames in a row are allowed, a missing frame is counted every 100 ms"
         ]
     );
     let (_, description) = read(PACK).unwrap();
@@ -127,11 +127,11 @@ fn protection_faults_are_reported() {
         ),
         (
             "message = \"Status\"\nprofile = \"5\"\ndata_id = 1\n",
-            "pack.toml:18: input.protected[1].profile = \"5\", inputs must not overlap bytes 0 to 2, which profile \"5\" writes: Status.Current does",
+            "pack.toml:18: input.protected[1].profile = \"5\", inputs must not overlap bytes 0 to 2, which profile \"5\" uses: Status.Current does",
         ),
         (
             "message = \"Cells\"\nprofile = \"1C\"\ndata_id = 1\n",
-            "pack.toml:18: input.protected[1].profile = \"1C\", inputs must not overlap bytes 0 and 1, which profile \"1C\" writes: Cells.Page does",
+            "pack.toml:18: input.protected[1].profile = \"1C\", inputs must not overlap bytes 0 and 1, which profile \"1C\" uses: Cells.Page does",
         ),
         (
             "message = \"Status\"\nprofile = \"1A\"\ndata_id = 1\n[[input.protected]]\nmessage = \"Status\"\nprofile = \"1A\"\ndata_id = 2\n",
@@ -151,7 +151,7 @@ fn profile_1a_leaves_upper_nibble_of_byte_1_free() {
         protected("message = \"Status\"\nprofile = \"1A\"\ndata_id = 1\n").replace("Status.Temp", "Status.Low\" #");
     assert!(read(&pack).is_ok(), "{:?}", read(&pack).err());
     let fault = &faults(&pack.replace("\"1A\"", "\"1C\""))[0];
-    assert!(fault.ends_with("which profile \"1C\" writes: Status.Low does"), "{fault}");
+    assert!(fault.ends_with("which profile \"1C\" uses: Status.Low does"), "{fault}");
 }
 
 #[test]
@@ -190,7 +190,7 @@ fn table_needs_interface_if_several_exist() {
 }
 
 #[test]
-fn missing_signal_causes_no_fault_of_its_protection() {
+fn missing_signal_causes_no_protection_fault() {
     let pack = protected("message = \"Status\"\nprofile = \"1A\"\ndata_id = 1\n")
         .replace("signal = \"Status.", "signal = \"Stats.");
     assert!(faults(&pack).iter().all(|fault| !fault.contains("protected")), "{:?}", faults(&pack));

@@ -42,7 +42,7 @@ fn pattern_matches_cells_across_answers() {
     let cell = |index| Channel::CellVoltage(CellIndex(index));
     let data = [0, 0, 0, 0, 180, 0, 255];
     let wanted = [(cell(0), Ok(3.6)), (cell(1), Err(Fault::OutOfRange)), (cell(2), Err(Fault::OutOfRange))];
-    assert_eq!(readings(first, &data), wanted, "never clamped");
+    assert_eq!(readings(first, &data), wanted, "values are never clamped");
     // Ten bits that start at bit 5 of the second byte: 0b0101_101000 = 360.
     assert_eq!(readings(second, &[0xFF, 0b1111_0101, 0b1010_0011]), [(cell(3), Ok(3.6))]);
     assert_eq!(readings(second, &[0, 0xFF, 0xFF]), [(cell(3), Err(Fault::NotAvailable))]);
@@ -187,7 +187,7 @@ fn only_configured_requests_are_sent_and_listed() {
     let poll = config.monitor.poll.clone().unwrap();
     let [request] = &poll.requests[..] else { panic!("{poll:?}") };
     assert_eq!((request.every_s, request.has_voltages), ([Some(2.0), Some(10.0), None], true));
-    assert!(config.monitor.wants_all(BusIndex(0)), "to know whether the bus sleeps");
+    assert!(config.monitor.wants_all(BusIndex(0)), "all frames are needed to detect whether the bus sleeps");
     let words = [
         "can0: asks 7E4 for 22 01 02 every 2 s while driving, every 10 s while charging",
         "at most 10 requests a second, one at a time; nothing else can be sent to a controller",

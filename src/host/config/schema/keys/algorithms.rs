@@ -14,8 +14,7 @@ use crate::filter::ScalarGaussian;
 use crate::health::{CapacityConfig, CapacityMethod, RechargeAlarm, RechargeConfig, TransitionConfig, UsableConfig};
 use crate::quantity::bounds;
 
-/// Standard deviation of the capacity that a cell may have lost before its first half-cycle, as a fraction of a new cell's
-/// capacity. Until then the cell is assumed to have a new cell's open-circuit curve.
+/// Standard deviation of the capacity that a cell may have lost before its first half-cycle, as a fraction of a new cell's capacity. Until the first half-cycle, the cell is assumed to have a new cell's open-circuit curve.
 const FIRST_LOSS_STD: f64 = 0.03;
 
 section! {
@@ -45,23 +44,23 @@ section! {
         charge_noise_per_sqrt_soc: f64, "fraction/sqrt(SOC)", DEVIATION, Default("3e-3");
         /// Process noise of the branch voltages.
         branch_noise_v_per_sqrt_s: f64, "V/sqrt(s)", DEVIATION, Default("1e-3");
-        /// Process noise of ln(resistance). It covers ageing, and deviations of the resistance from the tables in the cold or within minutes of driving.
+        /// Process noise of ln(resistance). It covers ageing. It also covers deviations of the resistance from the tables in the cold, and its changes within minutes of driving.
         log_resistance_noise_per_sqrt_s: f64, "1/sqrt(s)", DEVIATION, Default("1e-3");
         /// Process noise of the SOC while no current is measured (vehicle asleep).
         gap_noise_per_sqrt_s: f64, "fraction/sqrt(s)", DEVIATION, Default("1.5e-5");
-        /// Self-discharge of a cell in a month. The standard deviation of the SOC grows by it while nothing is measured (asleep or not running).
+        /// Self-discharge of a cell in a month. While nothing is measured (asleep or not running), the standard deviation of the SOC grows at this rate.
         self_discharge_per_month: f64, "fraction", Between(0.0, 1.0), Default("0.03");
-        /// Charge or discharge that is possible per hour while the program does not run. The first voltage after the downtime shows whether it happened; until then the standard deviation of the SOC covers it. 0: the cells are certainly not used.
+        /// Largest charge or discharge per hour, as a fraction of the capacity, that is possible while the program does not run. The standard deviation of the SOC covers this change until the first voltage after the downtime shows what happened. 0: the cells are certainly not used.
         away_use_per_h: f64, "fraction", Between(0.0, 100.0), Default("0.5");
         /// Largest current, per cell, that counts as rest. A larger current next to a gap in the readings may have flowed during the whole gap.
         rest_current_a: Option<f64>, "A", Between(0.0, 1e6), Optional("C/50: the rated capacity over 50 h");
-        /// `true`: a silent bus means zero current. If no current reading arrives for more than 5 s between two voltages of a cell, the cell rested, regardless of the current before and after; voltages must therefore arrive more often. `false`: the load before the gap may have continued, or a charger may have been connected.
+        /// `true`: a silent bus means zero current. If no current reading arrives for more than 5 s between two voltages of a cell, the cell rested during that time, regardless of the current before and after. Voltages must therefore arrive more often than that. `false`: the load before the gap may have continued, or a charger may have been connected.
         silence_is_rest: bool, "", Any, Default("false");
         /// Standard deviation of the voltage sensor's noise. If the signal's resolution is coarser, its rounding noise is added (5.8 mV for steps of 20 mV).
         voltage_noise_v: f64, "V", within(bounds::VOLTAGE_NOISE_V), Default("0.005");
         /// Standard deviation of the voltage offset: sensor offset plus the constant error of the model's open-circuit curve. It never averages out. A cell model's `spread.curve_v` is added.
         voltage_offset_std_v: f64, "V", DEVIATION, Default("0.004");
-        /// Standard deviation of the slowest branch's resistance relative to the model: diffusion differs between cells and ages independently of the other resistances. Learned if the model has several branches.
+        /// Standard deviation of the slowest branch's resistance relative to the model: diffusion differs between cells and ages independently of the other resistances. If the model has several branches, the filter learns this resistance.
         slow_branch_std: Option<f64>, "fraction", DEVIATION, Optional("the cell model's `spread.slow_branch`, else 0.2 (0.1 with one branch)");
         /// Slow error of the cell model: standard deviation of its average over one second. More samples per second do not reduce it. A cell model's `voltage_error_v` replaces this key.
         model_error_v_sqrt_s: f64, "V sqrt(s)", DEVIATION, Default("0.15");
@@ -69,7 +68,7 @@ section! {
         drop_error_sqrt_s: f64, "sqrt(s)", DEVIATION, Default("0.3");
         /// Slow error of the cell model under load, relative to the voltage drop caused by the load of the last minutes: standard deviation of its average over one second.
         load_error_sqrt_s: f64, "sqrt(s)", DEVIATION, Default("0.5");
-        /// Time constant of the decay of the `load_error_sqrt_s` error after the load (slow diffusion).
+        /// Time constant with which the error of `load_error_sqrt_s` decays after a load (slow diffusion).
         load_memory_s: f64, "s", Above(0.0, 1e6), Default("1200.0");
         /// Longest time that one voltage reading may represent. Readings further apart carry no additional information.
         max_information_s: f64, "s", Between(0.001, 1e6), Default("100.0");
@@ -77,7 +76,7 @@ section! {
         gate_sigma: f64, "", Above(0.0, 1e6), Default("5.0");
         /// Standard deviation of the cell model's error in a single reading, used by the gate and the consistency monitor.
         gate_model_error_v: f64, "V", Between(0.0, 10.0), Default("0.06");
-        /// The same error, expressed along the open-circuit curve.
+        /// Standard deviation of the same error, expressed as an error of SOC on the open-circuit curve.
         gate_soc_error: f64, "fraction", Between(0.0, 1.0), Default("0.02");
         /// If every reading has been outside the gate for this long, the filter restarts from the voltage.
         lost_after_s: f64, "s", Above(0.0, 1e9), Default("30.0");
@@ -178,7 +177,7 @@ section! {
             => hysteresis_a: keys.hysteresis_a.unwrap_or(0.5 * keys.dead_band_a(pack_ah));
         /// A new mode must last this long before it is accepted.
         min_duration_s: f64, "s", Between(0.0, 1e6), Default("10.0");
-        /// A charge or discharge smaller than this fraction of the rated capacity is merged with the following ones until their sum reaches it. For method "nominal", choose most of `nominal_swing`, so that a pause does not split a half-cycle.
+        /// A charge or discharge smaller than this fraction of the rated capacity is merged with the following ones until their sum reaches it. For method "nominal", set it slightly below `nominal_swing`, so that a pause does not split a half-cycle.
         min_swing: f64, "fraction", Between(0.0, 1.0), Default("0.02");
     }
 }
@@ -193,7 +192,7 @@ impl Transition {
 section! {
     /// The capacity filter. It runs at each transition.
     Capacity at "capacity" gives CapacityConfig, |keys, rated_ah: f64| {
-        /// "swing": charge over the SOC swing found from the voltages, with a variance from the swing's uncertainty. "nominal": charge over a nominal swing, as in the paper.
+        /// "swing": capacity = charge / SOC swing. The swing follows from the voltages, and the variance from the uncertainty of the swing. "nominal": capacity = charge / `nominal_swing`, as in the paper.
         method: MethodKey, "", Any, Default("\"swing\"") => method: keys.method();
         /// Swing assumed by method "nominal".
         nominal_swing: f64, "fraction", Above(0.0, 1.0), Default("0.6") =>;
@@ -205,13 +204,13 @@ section! {
         /// Standard deviation gained per day of rest, because some capacity recovers at rest ("swing" only).
         noise_ah_per_rest_day: Option<f64>, "Ah", DEVIATION, Optional("1 % of the rated capacity")
             => noise_ah_per_rest_day: keys.noise_ah_per_rest_day.unwrap_or(0.01 * rated_ah);
-        /// Error of the cell model's open-circuit curve at the ends of a half-cycle ("swing" only). It is the same in every half-cycle that ends there, so it never averages out.
+        /// Error of the cell model's open-circuit curve at the ends of a half-cycle ("swing" only). All half-cycles that end at the same SOC have the same error, so it never averages out.
         end_error_v: Option<f64>, "V", DEVIATION, Optional("half of the error stated by the cell model, else 0");
         /// Standard deviation of the cell model's `ocv_ageing_shift`, that is, how uncertain the ageing of the open-circuit curve is ("swing" only). A cell model with `[electrodes]` states its own.
         ageing_shift_error: f64, "", DEVIATION, Default("0.3") =>;
         /// Standard deviation of the current sensor's gain error. No capacity is more accurate than this.
         current_gain_std: f64, "fraction", Between(0.0, 1.0), Default("0.005");
-        /// Standard deviation of the current sensor's offset, per cell. The offset is learned from the charge that the voltages do not confirm, mainly at rest, and is subtracted from the current ("swing" only; 0 = none). A reading of exactly zero is used without the offset.
+        /// Standard deviation of the current sensor's offset, per cell. The offset is learned from the charge that the voltages do not confirm, mainly at rest, and is subtracted from the current ("swing" only; 0 = none). The offset is not subtracted from a reading of exactly zero.
         current_offset_std_a: Option<f64>, "A", DEVIATION, Optional("C/100: the rated capacity over 100 h")
             => current_offset_std_a: keys.current_offset_std_a(rated_ah);
         /// Initial standard deviation of the capacity lost per full cycle. The loss is learned, and predicted at the end of each charge ("swing" only; 0 = not learned). Cells that lose several percent per cycle need a larger value.

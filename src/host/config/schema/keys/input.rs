@@ -1,4 +1,4 @@
-//! The tables of what is read from the buses: `[input]` and the signal tables below it.
+//! The tables that describe what is read from the buses: `[input]` and the signal tables below it.
 
 use super::choices::{PositiveCurrent, WireOrder};
 use crate::can::e2e::Profile;
@@ -14,15 +14,15 @@ section! {
     Input at "input" {
         /// DBC files that describe the signals named below, relative to this file. Not required if all signals are in the answers of `[[input.diagnostic]]`.
         dbc: Vec<String>, "", Any, Default("[]");
-        /// If all inputs are silent for this long and no current flows, the vehicle counts as asleep: this is not a fault, raises no alarm and is recorded as two events (asleep, awake). Must be at least the largest `max_age_s` of current and voltages (`[limits.*]`). 0: never asleep; the silent inputs of a parked vehicle are then missing.
+        /// If all inputs are silent for this long and no current flows, the vehicle counts as asleep. Sleep is not a fault and raises no alarm; its beginning and its end are recorded as events (asleep, awake). Must be at least the largest `max_age_s` of current and voltages (`[limits.*]`). 0: the vehicle never counts as asleep, so the silent inputs of a parked vehicle are reported as missing.
         asleep_after_s: f64, "s", Between(0.0, 86_400.0), Default("5.0");
-        /// Most frames per second of one identifier on one interface that are processed; a tenth of them may arrive at once. Further frames are dropped, counted and reported, so that a faulty sender cannot starve the others. The default is twice the rate of the fastest sensible sender (one frame per millisecond) and half of what fits on a 500 kbit/s bus.
+        /// Largest number of frames per second that are processed for one identifier on one interface. A tenth of this number may arrive at once. Further frames are dropped, counted and reported, so that a faulty sender cannot displace the others. The default is twice the rate of the fastest sensible sender (one frame per millisecond), and half of what fits on a 500 kbit/s bus.
         max_frames_per_s: u32, "frames/s", Between(10.0, 1e6), Default("2000");
     }
 }
 
 section! {
-    /// An input message that its sender protects end to end (AUTOSAR). If a frame fails its check (damaged, repeated, out of sequence, belonging to another message, or the first one after a start), its readings are bad. Each outcome is counted; a change between good and bad is reported.
+    /// An input message that its sender protects end to end (AUTOSAR). A frame fails its check if it is damaged, repeated, out of sequence, the first frame after a start, or if it belongs to another message. The readings of such a frame are bad. Each outcome is counted; a change between good and bad is reported.
     ProtectedInput at "input.protected" {
         /// Name of the message in its DBC file. At least one of its signals must be an input.
         message: String, "", NotEmpty, Required;
@@ -32,17 +32,17 @@ section! {
         profile: Profile, "", Any, Required;
         /// Data identifier agreed with the sender; at most 0xFFF for "1C".
         data_id: u16, "", Between(0.0, 65535.0), Required;
-        /// Frames that may be lost between two good ones. Each further check without a good frame allows one more. At most 14 for profile 1.
+        /// Number of frames that may be lost between two good frames. Each further check without a good frame allows one more lost frame. At most 14 for profile 1.
         max_delta_counter: u8, "frames", Between(0.0, 255.0), Default("1");
-        /// After this many repeated or missing frames in a row, the sender must establish its sequence again (`sync_counter`); 14 = never.
+        /// After this many consecutive repeated or missing frames, the sender must establish its sequence again (see `sync_counter`). 14 = never.
         max_repeated: u8, "frames", Between(0.0, 14.0), Default("14");
-        /// Frames in sequence that establish it again after too large a jump of the counter; their readings are used. 0 = none required. Profile 1 then keeps its old counter after a jump (the sender restarted) until the sender's counter reaches it, which takes at most 14 frames.
+        /// Number of frames in sequence that establish the sender's sequence again after its counter has jumped too far. The readings of these frames are used. 0 = no such frames are required. In that case, profile 1 keeps its old counter after a jump (for example after a restart of the sender) until the sender's counter reaches it, which takes at most 14 frames.
         sync_counter: u8, "frames", Between(0.0, 14.0), Default("0");
     }
 }
 
 section! {
-    /// An answer to a diagnostic request over ISO-TP, from any tester. Most electric cars report cell voltages only this way. packwatch sends requests only with `[poll]`. The tables `[input.*]` name the signals of an answer like DBC signals: `Name.Signal`. The values count as measured when the first frame of the answer arrived.
+    /// An answer to a diagnostic request over ISO-TP, from any tester. Most electric cars report cell voltages only this way. packwatch sends requests only with `[poll]`. The tables `[input.*]` name the signals of an answer like DBC signals: `Name.Signal`. The values have the time at which the first frame of the answer arrived.
     DiagnosticInput at "input.diagnostic" {
         /// Name of the answer, which precedes the dot in `Name.Signal`. Several answers may share a name.
         name: String, "", NotEmpty, Required;
@@ -78,9 +78,9 @@ section! {
         bit: u32, "bits", Between(0.0, 8.0 * 65_535.0), Required;
         /// Length.
         length: u16, "bits", Between(1.0, 64.0), Required;
-        /// Whether the codes are two's complement.
+        /// Whether the codes are signed (two's complement).
         signed: bool, "", Any, Default("false");
-        /// Which byte comes first: the most significant ("big") or the least significant one ("little", for whole bytes).
+        /// Which byte comes first: the most significant ("big") or the least significant ("little", only for signals of whole bytes).
         byte_order: WireOrder, "", Any, Default("\"big\"");
         /// Value of one step of the code.
         factor: f64, "unit", Between(-1e9, 1e9), Default("1.0");
@@ -94,7 +94,7 @@ section! {
         maximum: Option<f64>, "unit", Any, Optional("not checked");
         /// Codes that mean "not available".
         not_available: Vec<u64>, "", Any, Default("[]");
-        /// Numbers of a sequence, which replace `{n}` in the name.
+        /// Range of numbers that replace `{n}` in the name; each number declares one signal.
         numbers: Option<NumberRange>, "", Any, Optional("one signal");
         /// Distance between the first bits of consecutive signals of a sequence.
         step: Option<u32>, "bits", Between(1.0, 8.0 * 65_535.0), Optional("`length`");
@@ -107,7 +107,7 @@ macro_rules! signal_section {
         section! {
             $(#[doc = $about])+
             $name at $path gives SignalSource<'_>, |keys| {
-                /// `Message.Signal` of one of the DBC files, or `Name.Signal` of a diagnostic answer. In `[input.cell_voltage]` and `[input.balancing]` a pattern (see there).
+                /// `Message.Signal` of one of the DBC files, or `Name.Signal` of a diagnostic answer. In `[input.cell_voltage]` and `[input.balancing]` it is a pattern (see those tables).
                 signal: String, "", NotEmpty, Required => signal: &keys.signal;
                 /// Interface that carries the signal.
                 interface: Option<String>, "", NotEmpty, Optional("the only interface; required with several") => interface: keys.interface.as_deref();
@@ -132,9 +132,9 @@ pub(crate) struct SignalSource<'a> {
     pub signal: &'a str,
     /// Interface name, if given.
     pub interface: Option<&'a str>,
-    /// Factor from the DBC's unit to ours.
+    /// Factor from the DBC's unit to packwatch's unit.
     pub scale: f64,
-    /// Offset in our unit, added after the scale.
+    /// Offset in packwatch's unit, added after `scale`.
     pub offset: f64,
     /// Raw codes that mean "not available".
     pub not_available: &'a [u64],
@@ -168,13 +168,13 @@ signal_section! {
 }
 
 signal_section! {
-    /// One signal per cell that shows whether the BMS bleeds the cell. With it, leaks can be learned for all cells. `signal` is a pattern as in `[input.cell_voltage]`. A value other than 0 (after the DBC's factor, `scale` and `offset`) means that the cell is bled; for an inverted bit set `offset = -1.0`. A value holds until the next one, for at most `max_age_s`. Frames that carry only these signals do not wake sleeping buses. Requires `pack.balancing = true`.
+    /// One signal per cell that shows whether the BMS bleeds the cell. With this input, the leaks of all cells can be learned. `signal` is a pattern as in `[input.cell_voltage]`. A value other than 0 (after the DBC's factor, `scale` and `offset`) means that the cell is bled; for an inverted bit set `offset = -1.0`. A value is valid until the next value arrives, but for at most `max_age_s`. Frames that carry only these signals do not wake sleeping buses. Requires `pack.balancing = true`.
     BalancingInput at "input.balancing", "any unit" {
         /// Number that `{n}` has for the first cell.
         first: u16, "", Between(0.0, 60000.0), Default("1") =>;
         /// Current of a balancing resistor while the bit is 1, at the BMS's balancing voltage. Parallel strings share it. At most a fifth of the pack's rated capacity per hour (C/5).
         bleed_a: f64, "A", Above(0.0, 1e6), Required =>;
-        /// Longest time that a value remains valid. Must be longer than the BMS's send period, also while the vehicle is parked; otherwise the balancing state is unknown for the rest of each period.
+        /// Longest time for which a value is valid. Must be longer than the BMS's send period, including its send period while the vehicle is parked. If it is shorter, the balancing state is unknown for the rest of each period.
         max_age_s: f64, "s", Above(0.0, 1e6), Default("10.0") =>;
         /// `true`: while no values arrive, no cell is being balanced. Set it only if the BMS sends values throughout balancing and this computer stays awake throughout. `false`: the balancing state during that time is unknown, and leaks are learned from the remaining time only. The state is always unknown while the program does not run.
         only_while_sent: bool, "", Any, Default("false") =>;
@@ -189,7 +189,7 @@ signal_section! {
 signal_section! {
     /// A temperature sensor.
     TemperatureInput at "input.temperature", "degrees C per unit of the DBC" {
-        /// Cells that this sensor serves.
+        /// Cells whose temperature this sensor measures.
         cells: Option<CellRanges>, "", Any, Optional("all cells") =>;
     }
 }
@@ -225,7 +225,7 @@ signal_section! {
     PackIdentityInput at "input.pack_identity", "any unit" {
         /// Consecutive readings that must show the same new value.
         readings: u32, "", Between(1.0, 10000.0), Default("10") =>;
-        /// Whether a signal without end-to-end protection is accepted; if `false`, the message must be listed in `[[input.protected]]`. Without protection, a few forged or damaged frames are enough to put all learned values aside until the correct number returns, and to end the current half-cycle. Diagnostic answers have no such protection.
+        /// Whether a signal without end-to-end protection is accepted; if `false`, the message must be listed in `[[input.protected]]`. If the message is unprotected, a few forged or damaged frames can end the current half-cycle and set all learned values aside until the correct number returns. Diagnostic answers are never protected.
         accept_unprotected: bool, "", Any, Default("false") =>;
     }
 }

@@ -1,4 +1,4 @@
-//! The tables of plausible readings, `[limits.*]`: the [`Limits`] of the sample stage.
+//! The tables of plausible readings, `[limits.*]`. They give the [`Limits`] of the sample stage.
 
 use super::choices::TEMPERATURE_C;
 use crate::cell::CellModel;
@@ -18,7 +18,7 @@ section! {
             => min: keys.max_charge_a.map_or(found.0.max(bounds::CURRENT_A.low), |limit| -limit);
         /// Fastest plausible change.
         max_rate_a_per_s: Option<f64>, "A/s", Above(0.0, 1e9), Optional("not checked") => max_rate_per_s: keys.max_rate_a_per_s;
-        /// A reading that has not changed at all for this long is stuck; the current of a parked pack may be constant.
+        /// A reading that has not changed at all for this long is stuck. Allow for parked packs, whose current may be constant.
         stuck_after_s: Option<f64>, "s", Above(0.0, 1e9), Optional("not checked");
         /// A reading older than this is stale: estimates continue without it, are marked, and become less certain.
         max_age_s: f64, "s", Above(0.0, 1e6), Default("1.0");

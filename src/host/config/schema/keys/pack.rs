@@ -32,7 +32,7 @@ section! {
         strings: u16, "", Between(1.0, 1024.0), Default("1");
         /// Cell model file, relative to this file.
         cell_model: Option<String>, "", NotEmpty, Optional("a model made from `chemistry` and `rated_capacity_ah`");
-        /// Chemistry of a cell without a model file. Estimates start from values typical of this chemistry, with intervals as wide as these cells differ. "lmo-graphite" means the blend with a layered oxide used in early electric cars. Use "nmc-graphite" if the nickel content is unknown.
+        /// Chemistry of a cell without a model file. Estimates start from values typical of this chemistry, and their intervals cover the differences between such cells. "lmo-graphite" means the blend with a layered oxide used in early electric cars. Use "nmc-graphite" if the nickel content is unknown.
         chemistry: Option<Chemistry>, "", Any, Optional("required without `cell_model`");
         /// For cells without a model file: whether the daemon learns their model on board from drives, charges and rests.
         learn_model: bool, "", Any, Default("true");
@@ -82,16 +82,16 @@ section! {
 }
 
 section! {
-    /// The alarms of a rule. What each rule compares, and the unit of its thresholds:
-    /// `capacity_low`, `usable_capacity_low`: capacity per cell, Ah; `recharge_period_low`: recharge period, s; `resistance_high`: resistance relative to a new cell (1 = as new);
-    /// `soc_low`: SOC of the emptiest cell; `cell_imbalance`: SOC of the fullest cell minus SOC of the emptiest; `bms_disagrees`: SOC or SOH reported by the pack minus the estimate; `input_implausible`: share of bad readings (fractions);
-    /// `temperature_high`: the hottest sensor, degrees C; `remaining_life_low`: remaining life, equivalent full cycles;
-    /// `input_missing`, `store_failed`, `bus_fault`: how long the fault has lasted, s; `estimate_untrusted`: the mean normalised innovation squared, or the cell model's mismatch on the same scale;
-    /// and, for each cell compared with the others, `cell_leak`: self-discharge per day as a fraction of its capacity; `connection_resistance`: additional contact resistance as a fraction of the cell's series resistance at 50 % SOC and 25 degrees C; `channel_faulty`: 1 while the cell's voltage channel is faulty (frozen, offset, doubled or swapped), else 0.
+    /// The alarms of a rule. The rules compare these values, in these units:
+    /// `capacity_low`, `usable_capacity_low`: capacity per cell, Ah. `recharge_period_low`: recharge period, s. `resistance_high`: resistance relative to a new cell (1 = as new).
+    /// `soc_low`: SOC of the emptiest cell, fraction. `cell_imbalance`: SOC of the fullest cell minus SOC of the emptiest cell, fraction. `bms_disagrees`: SOC or SOH reported by the pack minus the estimate, fraction. `input_implausible`: share of bad readings, fraction.
+    /// `temperature_high`: temperature of the hottest sensor, degrees C. `remaining_life_low`: remaining life, equivalent full cycles.
+    /// `input_missing`, `store_failed`, `bus_fault`: how long the fault has lasted, s. `estimate_untrusted`: the mean normalised innovation squared, or the cell model's mismatch on the same scale.
+    /// Three rules compare each cell with the other cells. `cell_leak`: self-discharge per day as a fraction of the cell's capacity. `connection_resistance`: additional contact resistance as a fraction of the cell's series resistance at 50 % SOC and 25 degrees C. `channel_faulty`: 1 while the cell's voltage channel is faulty (frozen, offset, doubled or swapped), else 0.
     Alarm at "alarm" {
         /// What the alarm compares.
         rule: Rule, "", Any, Required;
-        /// Threshold of severity "info". The alarm is raised when the value is below it (rules `*_low`) or above it (all others). Either a number in the rule's unit, or a string like "80 %": percent of the rated capacity, of the period in which the reference charger charges it, of a new cell's resistance, or of 1 for fractions. With `{ set = ..., clear = ... }` the alarm clears at `clear`. At least one of `info`, `warning` and `severe` is required, and each severity may be set once per rule.
+        /// Threshold of severity "info". The alarm is raised when the value is below it (rules `*_low`) or above it (all others). A number is in the rule's unit. A string like "80 %" is relative to the value of a new cell: its rated capacity, its recharge period with the reference charger, or its resistance. For fractions, 100 % is 1. With `{ set = ..., clear = ... }` the alarm clears at `clear`. At least one of `info`, `warning` and `severe` is required, and each severity may be set once per rule.
         info: Option<Threshold>, "the rule's", Between(-1e9, 1e9), Optional("no such alarm");
         /// Threshold of severity "warning", written like `info`.
         warning: Option<Threshold>, "the rule's", Between(-1e9, 1e9), Optional("no such alarm");
@@ -99,7 +99,7 @@ section! {
         severe: Option<Threshold>, "the rule's", Between(-1e9, 1e9), Optional("no such alarm");
         /// If the threshold has no `clear`, the alarm clears when the value is back on the healthy side by this much. An alarm on a learned value also waits until the true value is on the healthy side with a probability of 95 %.
         hysteresis: Option<f64>, "the rule's", Between(0.0, 1e9), Optional("2 % of the threshold");
-        /// What is compared with the threshold. "mean": the value itself. `{ probability = 0.95 }`: the alarm is raised when the true value is beyond the threshold with more than this probability. It clears when the probability of being beyond the clear threshold is at most this, and at most 0.5. A probability above 0.5 raises the alarm later and with fewer false alarms; one below 0.5 raises it earlier.
+        /// What is compared with the threshold. "mean": the value itself. `{ probability = 0.95 }`: the alarm is raised when the true value is beyond the threshold with more than this probability. It clears when the probability of being beyond the clear threshold is at most the smaller of this and 0.5. A probability above 0.5 raises the alarm later and with fewer false alarms; one below 0.5 raises it earlier.
         when: Comparison, "", Any, Default("\"mean\"");
         /// The value must be beyond the threshold for this long before the alarm is raised, and healthy for this long before it clears.
         debounce_s: f64, "s", Between(0.0, 1e9), Default("0.0");
@@ -109,7 +109,7 @@ section! {
         latched: bool, "", Any, Default("false");
         /// J1939: suspect parameter number.
         spn: Option<u32>, "", Between(1.0, 524_287.0), Optional("520192 (manufacturer-assignable) plus the rule's number");
-        /// J1939: failure mode identifier. By default a low value has 17, 18 or 1 (info, warning, severe), a high value 15, 16 or 0. Independent of severity are 9 (missing input), 2 (implausible input, disagreeing pack, faulty channel), 19 (bus fault) and 31 (untrusted estimate, failed store).
+        /// J1939: failure mode identifier. The defaults for info, warning and severe are 17, 18 and 1 for a low value, and 15, 16 and 0 for a high value. Some rules have one default for all severities: 9 (missing input), 2 (implausible input, disagreeing pack, faulty channel), 19 (bus fault) and 31 (untrusted estimate, failed store).
         fmi: Option<u8>, "", Between(0.0, 31.0), Optional("by rule and severity");
     }
 }
@@ -117,11 +117,11 @@ section! {
 section! {
     /// State and history on disk (`run --state`). Learned values are stored as soon as they are reported, independently of these keys.
     Store at "store" {
-        /// Shortest time between checkpoints of the running state. A power cut loses the running state since the last checkpoint (a restart of the service loses one second). Each checkpoint writes the whole state, about 70 kB for a pack of 96 cells. The time is extended so that at most 15 MB are written per day (7 minutes for such a pack).
+        /// Shortest time between checkpoints of the running state. A power cut loses all changes since the last checkpoint; a restart of the service loses one second. Each checkpoint writes the whole state, about 70 kB for a pack of 96 cells. The time is extended so that at most 15 MB are written per day (7 minutes for such a pack).
         checkpoint_s: f64, "s", Between(1.0, 3600.0), Default("60.0");
         /// Maximum number of rows in the history: half-cycles, capacities, loss modes, remaining lives, cell models, alarms and resets. Above this number a checkpoint deletes the oldest segment (one day or about 10,000 rows). The default holds one year of ten half-cycles a day for 96 cells in about 100 MB.
         max_rows: u32, "", Between(10_000.0, 1e8), Default("1000000");
-        /// Maximum age of rows in the history. A checkpoint deletes older rows one segment at a time. Ages are measured with the computer's clock; nothing is deleted until a hardware clock or time server has confirmed it.
+        /// Maximum age of rows in the history. A checkpoint deletes older rows one segment at a time. Ages are measured with the computer's clock. Until a hardware clock or a time server has confirmed this clock, nothing is deleted for its age.
         keep_years: Option<f64>, "years", Between(0.1, 100.0), Optional("limited by `max_rows` only");
     }
 }

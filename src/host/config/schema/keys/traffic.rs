@@ -9,18 +9,18 @@ use crate::config::schema::section::section;
 
 section! {
     /// Diagnostic requests that packwatch sends, for the answers of `[[input.diagnostic]]` that have a period. Off by default, because polling can disturb a car (warning lamps, a car that does not fall asleep, an empty 12 V battery). Try it in a parked car first.
-    /// packwatch sends only the services that an answer can have (0x22, 0x21, 0x01), one request at a time. It sends nothing for one minute after a request of another tester, while the bus sleeps (no foreign frame for two seconds), while the supply voltage is low (`[input.supply_voltage]`), and after `packwatch poll standby`. If a controller rejects a request permanently (0x11, 0x31, 0x33), it is not sent again; after other failures it is sent less and less often. All frames of a polled interface are received, and recorded by `--record`.
+    /// packwatch sends only the services that an answer can have (0x22, 0x21, 0x01), one request at a time. It sends nothing for one minute after a request of another tester, while the bus sleeps (no foreign frame for two seconds), while the supply voltage is low (`[input.supply_voltage]`), and after `packwatch poll standby`. If a controller rejects a request permanently (0x11, 0x31, 0x33), packwatch does not send this request again. After other failures, packwatch sends the request less and less often. All frames of a polled interface are received, and recorded by `--record`.
     Poll at "poll" {
         /// Whether requests are sent.
         enabled: bool, "", Any, Default("false");
-        /// Most requests per second, for all answers together.
+        /// Largest number of requests per second, for all answers together.
         max_requests_per_s: f64, "1/s", Between(0.01, 100.0), Default("10.0");
     }
 }
 
 section! {
     /// A J1939 node in addition to the frames of `[output]`. It claims an address and sends alarms as trouble codes: in DM1 once a second and on every change, in DM2 on request.
-    /// If several raised alarms of a rule share a parameter number, only the most severe is sent. Rule and severity determine the failure mode; severity determines the lamp (info: protect, warning: amber, severe: red). Without this table there is no node; with `output.enabled = false` it is silent too.
+    /// If several raised alarms of a rule share a parameter number, only the most severe is sent. Rule and severity determine the failure mode; severity determines the lamp (info: protect, warning: amber, severe: red). Without this table there is no node. With `output.enabled = false`, the node is silent too.
     /// The NAME identifies the node. If two nodes claim the same address, the one with the smaller NAME keeps it and the other stops sending.
     J1939 at "j1939" {
         /// Interface that the node uses.
@@ -63,23 +63,23 @@ section! {
 /// The keys that all tables of sent frames share.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct FrameKeys<'a> {
-    /// Place in the file.
+    /// Place of the table in the file.
     pub place: &'a TablePlace,
-    /// Identifier.
+    /// CAN identifier; `None` = the DBC's.
     pub id: Option<u32>,
     /// Whether the identifier has 29 bits.
     pub extended: bool,
-    /// Classic or FD.
+    /// Whether the frame is sent as CAN FD; `None` = as in the DBC.
     pub fd: Option<bool>,
-    /// Bit rate switch.
+    /// Whether an FD frame switches the bit rate; `None` = as in the DBC.
     pub brs: Option<bool>,
-    /// Period.
+    /// Period, ms; `None` = the DBC's.
     pub period_ms: Option<u32>,
-    /// Protection.
+    /// End-to-end protection; `None` = not given.
     pub e2e: Option<E2eKey>,
-    /// Authentication.
+    /// SecOC authentication; `None` = not given.
     pub secoc: Option<secoc::Profile>,
-    /// Data id of both.
+    /// Data id for protection and authentication.
     pub data_id: Option<u16>,
 }
 
@@ -121,7 +121,7 @@ frame_section! {
 }
 
 frame_section! {
-    /// The alarm frame: sent at once on a change, then three times 100 ms apart; also, each raised alarm is sent once per period. At most 100 frames per second (20 at once after a pause).
+    /// The alarm frame. It is sent at once on a change, then three times 100 ms apart. In addition, each raised alarm is sent once per period. At most 100 frames per second (20 at once after a pause).
     OutputAlarm at "output.alarm"
 }
 
@@ -141,7 +141,7 @@ frame_section! {
 }
 
 section! {
-    /// The key of all authenticated frames: 16 bytes, raw or as 32 hex digits, in a systemd credential or in a file. It is read at the start, which fails without it, and is never written anywhere.
+    /// The key of all authenticated frames: 16 bytes, raw or as 32 hex digits, in a systemd credential or in a file. packwatch reads the key when it starts, refuses to start without the key, and never writes it anywhere.
     Authentication at "authentication" {
         /// Name of the credential: a file in `$CREDENTIALS_DIRECTORY` (`LoadCredential=NAME:PATH` in the unit).
         credential: Option<String>, "", NotEmpty, Optional("required without `key_file`");
@@ -169,7 +169,7 @@ section! {
         secoc: Option<secoc::Profile>, "", Any, Optional("none");
         /// Data identifier for protection or authentication.
         data_id: Option<u16>, "", Between(0.0, 65535.0), Optional("required with `e2e` or `secoc`");
-        /// Frames that may be lost between two commands.
+        /// Number of frames that may be lost between two commands.
         max_delta_counter: u8, "frames", Between(1.0, 14.0), Default("1") =>;
     } and { place: &keys.place, brs: None, period_ms: None }
 }
