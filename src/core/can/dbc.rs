@@ -37,7 +37,7 @@ pub struct DbcError {
 pub struct Database {
     /// `BU_`: the nodes on the bus.
     pub nodes: Vec<String>,
-    /// `CM_` of the database.
+    /// `CM_` without an object: comment on the whole database.
     pub comment: Option<String>,
     pub messages: Vec<Message>,
 }
@@ -55,7 +55,7 @@ pub enum FrameFormat {
     },
 }
 
-/// How a message is repeated after an event; `None` = not stated.
+/// How a message is repeated after an event; `None` = not stated in the DBC.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Repetition {
     /// `GenMsgNrOfRepetition`: number of frames after the first.

@@ -16,7 +16,8 @@ use crate::quantity::{BusIndex, Fault};
 
 pub use crate::quantity::{Channel, Reading, SensorIndex};
 
-/// Condition on one multiplexor for a bound signal: the selector's code must lie in one of the ranges (ends included).
+/// Condition for the presence of a bound signal: the code of one multiplexor (the selector) must lie in one of the
+/// ranges, ends included.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MuxTest {
     /// The selector.
@@ -46,7 +47,7 @@ pub struct Binding {
     /// Applied after the DBC's factor and offset: value x scale + offset. For a bus that counts charging positive, the
     /// scale of the current is -1.
     pub scale: f64,
-    /// See `scale`.
+    /// Added after `scale`, in the program's unit.
     pub offset: f64,
     /// Raw codes (the signal's bits) that mean "not available".
     pub not_available: Vec<u64>,
@@ -96,7 +97,7 @@ impl Binding {
     /// Decodes the value, in the program's unit and sign.
     ///
     /// # Errors
-    /// The reason why the value is not usable.
+    /// The fault that makes the value unusable.
     pub fn value(&self, payload: &[u8]) -> Result<f64, Fault> {
         if !self.not_available.is_empty() && self.not_available.contains(&self.plan.raw(payload)?) {
             return Err(Fault::NotAvailable);
@@ -131,8 +132,9 @@ impl InputMap {
         }
     }
 
-    /// Every configured message by interface and identifier, with its number of signal groups. A group contains signals
-    /// that are present together: usually one group per multiplexer page, sometimes more; 1 without pages.
+    /// Every configured message: interface, identifier and number of signal groups. The signals of a group are always
+    /// present together. A message without multiplexer pages has one group; other messages have at least one group per
+    /// page.
     pub fn messages(&self) -> impl Iterator<Item = (BusIndex, CanId, usize)> + '_ {
         self.messages.messages()
     }

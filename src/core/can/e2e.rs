@@ -1,8 +1,9 @@
 //! AUTOSAR end-to-end protection: Profile 1 (variants A and C) and Profile 5, for senders and receivers.
 //!
-//! A protected payload starts with a header: a CRC over an agreed data identifier and the rest of the payload, and a
-//! counter that increases by one with each frame. The header lets the receiver detect payloads that are damaged,
-//! repeated, lost or from another message. It does not stop an attacker, who can compute a CRC, too.
+//! A protected payload starts with a header: a CRC and a counter. The CRC covers the rest of the payload and a data
+//! identifier, on which sender and receiver agree. The counter increases by one with each frame. The header lets the
+//! receiver detect payloads that are damaged, repeated, lost or from another message. It does not stop an attacker,
+//! because anybody can compute a CRC.
 //!
 //! | profile | bytes of the header | CRC | counter |
 //! | --- | --- | --- | --- |
@@ -16,19 +17,19 @@
 //! A payload shorter than the header is an error when sending and a wrong CRC when receiving. Source: AUTOSAR "SWS E2E
 //! Library", as implemented by two test peers and four open-source receivers; vectors in the tests.
 //!
-//! Deviation 1: in AUTOSAR, the check of profile 5 has no statuses SYNC and INITIAL; the state machine above it
-//! provides them. Here, profile 5 uses the receiver of profile 1 with the counter modulo 256, so that both profiles
-//! have the same statuses and counts. Effect: the first frame of profile 5 is INITIAL and not used, where AUTOSAR's
-//! check alone might return OK; and the allowed step grows while frames are missing. As in AUTOSAR's check of profile
-//! 5, the sequence continues from a counter that jumped too far: a sender that restarted costs one frame, not a round
-//! of 256.
-//! Deviation 2: the setting for repetitions (`max_no_new_or_repeated_data`) ends at 14 for both profiles, and 14 means
-//! "any number".
-//! Deviation 3: AUTOSAR calls its check once a period, with or without a frame. Here it is called once per frame and,
-//! if the period is known, once for each period without a frame. If the period is unknown, the allowed step grows with
-//! bad frames only.
-//! Deviation 4: in AUTOSAR, the counter 15 of profile 1, which no sender may use, has no status (the check returns an
-//! error). Here it is [`Status::WrongCrc`], because no valid sender creates such a payload.
+//! * Deviation 1: in AUTOSAR, the check of profile 5 has no statuses SYNC and INITIAL; the state machine above it
+//!   provides them. Here, profile 5 uses the receiver of profile 1 with the counter modulo 256, so that both profiles
+//!   have the same statuses and counts. Effect: the first frame of profile 5 is INITIAL and not used, where AUTOSAR's
+//!   check alone might return OK. The allowed step grows while frames are missing. As in AUTOSAR's check of profile 5,
+//!   the sequence continues from a counter that jumped too far. Therefore, a restart of the sender costs one frame
+//!   instead of up to 256.
+//! * Deviation 2: the largest value of the setting for repetitions (`max_no_new_or_repeated_data`) is 14 for both
+//!   profiles, and 14 means "any number".
+//! * Deviation 3: AUTOSAR calls its check once a period, with or without a frame. Here it is called once per frame and,
+//!   if the period is known, once for each period without a frame. If the period is unknown, the allowed step grows
+//!   with bad frames only.
+//! * Deviation 4: in AUTOSAR, the counter 15 of profile 1, which no sender may use, has no status (the check returns an
+//!   error). Here it is [`Status::WrongCrc`], because no valid sender creates such a payload.
 
 mod receiver;
 
@@ -36,7 +37,7 @@ use serde::{Deserialize, Serialize};
 
 pub use receiver::{CheckConfig, Receiver, Status, StatusCounts};
 
-/// Layout, CRC and counter of a protection.
+/// Profile of end-to-end protection: layout of the header, CRC and range of the counter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum Profile {
     /// Profile 1, variant A: the data identifier is included in the CRC and not sent.
@@ -157,7 +158,7 @@ impl Protection {
         Ok(())
     }
 
-    /// The counter of a payload with valid CRC, identifier and counter; `None` = something is invalid.
+    /// The counter of a valid payload; `None` = the CRC, the identifier or the counter is invalid.
     pub fn verified_counter(&self, payload: &[u8]) -> Option<u8> {
         let counter = self.counter(payload)?;
         let intact = match self.profile {
@@ -168,7 +169,7 @@ impl Protection {
         (intact && counter <= self.profile.max_counter()).then_some(counter)
     }
 
-    /// The counter in the payload, even if the CRC is wrong; `None` = too short.
+    /// The counter in the payload, even if the CRC is wrong; `None` = the payload is too short.
     pub fn counter(&self, payload: &[u8]) -> Option<u8> {
         match self.profile {
             Profile::P01A | Profile::P01C => payload.get(1).map(|byte| byte & 0x0F),
@@ -194,7 +195,7 @@ impl Protection {
     }
 }
 
-/// Table of the CRC of each byte value, for a register of `bits` bits.
+/// CRC of each byte value, for a register of `bits` bits.
 const fn crc_table(bits: u32, polynomial: u16) -> [u16; 256] {
     let (mut table, mut byte) = ([0; 256], 0);
     while byte < 256 {
@@ -213,7 +214,7 @@ static CRC8: [u16; 256] = crc_table(8, 0x1D);
 static CRC16: [u16; 256] = crc_table(16, 0x1021);
 
 fn crc8(start: u8, bytes: &[u8]) -> u8 {
-    // The register is the lowest byte.
+    // An eight-bit register is the lowest byte of a table entry.
     bytes.iter().fold(start, |crc, byte| CRC8[usize::from(crc ^ byte)].to_le_bytes()[0])
 }
 

@@ -1,10 +1,11 @@
-//! Limits the frame rate per identifier, so that a faulty sender does not use up the processing time of the others.
+//! Limits the frame rate per identifier, so that one faulty sender does not use up the processing time that other
+//! messages need.
 //!
 //! In: time and identifier of each received frame. Out: whether the frame is admitted. Dropped frames are counted, and
 //! a [`FloodChange`] reports when dropping starts and ends. Each message has a leaky bucket, stored as one number: the
-//! time up to which the allowed rate is spent. It admits a burst of one tenth of a second's frames at once, and the
-//! allowed rate in the long run. The result depends only on the time stamps, and nothing is allocated after the start.
-//! Messages that are not configured pass, because they are not decoded and cost almost nothing.
+//! time up to which the allowed rate is spent. It admits the frames of a tenth of a second at the allowed rate in one
+//! burst, and the allowed rate in the long run. The result depends only on the time stamps, and nothing is allocated
+//! after the start. Messages that are not configured always pass, because they are not decoded and cost almost no time.
 
 use std::num::NonZeroU32;
 
@@ -138,13 +139,13 @@ impl FloodGate {
         self.end(|last| now.since(last) >= 1.0);
     }
 
-    /// Handles sleep or a clock step: restores the whole budget and ends every flood.
+    /// Restores the whole budget and ends every flood. Called after sleep or a clock step.
     pub fn restart(&mut self) {
         self.end(|_| true);
         self.buckets.iter_mut().for_each(|bucket| bucket.spent_until = None);
     }
 
-    /// Messages with dropped frames, with their number.
+    /// Messages with dropped frames, each with the number of dropped frames.
     pub fn counts(&self) -> impl Iterator<Item = FloodCount> + '_ {
         let dropped = self.buckets.iter().filter(|bucket| bucket.dropped > 0);
         dropped.map(|bucket| FloodCount { bus: bucket.bus, id: bucket.id, dropped: bucket.dropped })

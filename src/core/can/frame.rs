@@ -1,4 +1,4 @@
-//! One CAN frame: classic, FD or remote, with its identifier and up to 64 bytes; independent of any socket.
+//! A CAN frame without its socket: classic, FD or remote, with an identifier and up to 64 bytes.
 //!
 //! A constructor returns `None` for an identifier or length that no frame can have. Error frames are not represented:
 //! the drivers convert them to [`crate::monitor::BusEvent`].
@@ -76,9 +76,8 @@ pub enum FrameKind {
     },
 }
 
-/// Payload bytes, followed by zeros. The alignment ensures that a word that is loaded soon after the frame was copied
-/// comes from a single store. If it spanned two stores, the processor would wait for both, which takes longer than
-/// decoding.
+/// Payload bytes, followed by zeros. With the alignment, a word that is loaded soon after the copy of a frame comes
+/// from a single store. A load that spans two stores must wait for both, which takes longer than decoding.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(align(8))]
 struct Data([u8; MAX_DATA]);

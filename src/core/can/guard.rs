@@ -1,17 +1,18 @@
-//! Checks the protected input messages: status, counts and changes per message.
+//! Checks the end-to-end protection of input messages.
 //!
-//! In: frames with their time and interface, in order of arrival; between frames, the current time
-//! ([`Guards::poll`]). Out: the [`Status`] of each frame, counts per message, and a [`GuardChange`] when a message
-//! starts to fail its check or becomes usable again; the checks in between are only counted. If a message's cycle time
-//! is known, each period without a frame counts as one NONEWDATA. The first is counted one and a half periods after the
-//! last frame (half a period allows for jitter), then one per period. Missing frames up to the number that the check
-//! allows to be lost cause no change: the next frame will be usable, and a sender with jitter would otherwise fill the
-//! log.
+//! In: frames with their time and interface, in order of arrival; between frames, the time ([`Guards::poll`]). Out: the
+//! [`Status`] of each frame, counts per message, and a [`GuardChange`] when a message starts to fail its check or
+//! becomes usable again.
 //!
-//! Time without listening is not the sender's fault: after sleep, a restart of the program or a clock step, the
+//! If a message's cycle time is known, each period without a frame counts as one NONEWDATA. The first is counted one
+//! and a half periods after the last frame (half a period allows for jitter), then one per period. No change is
+//! reported while the number of missing frames is within the number that the check allows to be lost. The next frame
+//! will be usable, and a sender with jitter would otherwise fill the log.
+//!
+//! A time without listening is not the sender's fault. After sleep, a restart of the program or a clock step, the
 //! receivers wait for a first frame again ([`Guards::restart`]). For the same reason, a restarted program restores the
-//! counts but not the counters: the sender has continued, so a stored counter would reject good frames, or accept an
-//! old frame that follows it by chance. Only a state that resumes without a gap restores both ([`Guards::resume`]).
+//! counts but not the frame counters. The sender has continued, so a stored frame counter would reject good frames, or
+//! accept an old frame that fits by chance. Only a state that resumes without a gap restores both ([`Guards::resume`]).
 
 use serde::{Deserialize, Serialize};
 
@@ -19,7 +20,7 @@ use crate::can::e2e::{CheckConfig, Receiver, Status, StatusCounts};
 use crate::can::{CanId, Frame, FrameKind};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// Number of periods after the last frame at which a frame counts as missed. Each further period counts one more.
+/// Number of periods after the last frame at which a frame counts as missed. Each further period counts one more frame.
 const MISSED_AFTER_PERIODS: f64 = 1.5;
 
 /// Configuration of one protected message.
@@ -29,7 +30,7 @@ pub struct GuardConfig {
     pub id: CanId,
     /// Settings of the check.
     pub check: CheckConfig,
-    /// Period, s, above 0; `None` = unknown, missing frames are not counted.
+    /// Period, s, above 0; `None` = unknown, so missing frames are not counted.
     pub cycle_time_s: Option<f64>,
 }
 
@@ -42,8 +43,8 @@ pub struct GuardChange {
     pub status: Status,
     /// Whether the message is usable now.
     pub usable: bool,
-    /// Number of checks without a usable frame since the message was last usable: the count so far while it fails, the
-    /// total when it becomes usable again.
+    /// Number of checks without a usable frame since the message was last usable. When the message becomes usable
+    /// again, this is the total.
     pub count: u64,
 }
 
@@ -80,7 +81,7 @@ struct Guard {
     failed: u64,
 }
 
-/// All protected input messages.
+/// Checks all protected input messages.
 #[derive(Debug, Clone, Default)]
 pub struct Guards {
     /// Sorted by interface and identifier.
@@ -90,17 +91,17 @@ pub struct Guards {
 }
 
 impl Guards {
-    /// Creates guards for messages. The first of several entries for the same message counts.
+    /// Creates guards for messages. If several entries are for the same message, the first one counts.
     pub fn new(mut configs: Vec<GuardConfig>) -> Self {
         configs.sort_by_key(|config| (config.bus, config.id));
         configs.dedup_by_key(|config| (config.bus, config.id));
         let guard = |config| Guard { config, receiver: Receiver::default(), missed_at: None, missed: 0, failed: 0 };
-        // A check adds at most one change, a poll one per message: nothing is allocated later.
+        // A check adds at most one change, and a poll adds at most one per message, so nothing is allocated later.
         Self { changes: Vec::with_capacity(configs.len() + 1), guards: configs.into_iter().map(guard).collect() }
     }
 
-    /// Inherits the counts from `old` for the messages in both. If the check is the same, inherits the receiver, too,
-    /// so that no frame is lost as a new first frame.
+    /// Inherits the counts from `old` for the messages that are in both. If the configuration of a message is the same,
+    /// inherits its receiver, too. Otherwise, its next frame would be a first frame and not be used.
     #[must_use]
     pub fn inheriting(mut self, old: &Self) -> Self {
         for guard in &mut self.guards {
@@ -147,7 +148,8 @@ impl Guards {
         self.guards.iter_mut().for_each(|guard| guard.count_missed(now, &mut self.changes));
     }
 
-    /// Handles time without listening or a clock step: every receiver waits for a first frame again. Keeps the counts.
+    /// Lets every receiver wait for a first frame again. Keeps the counts. Called after a time without listening or a
+    /// clock step.
     pub fn restart(&mut self) {
         for guard in &mut self.guards {
             guard.receiver.restart();

@@ -1,16 +1,16 @@
 //! Index of a message by interface and identifier.
 //!
-//! A standard identifier needs one load, an extended one a binary search. Messages that are not in the table have an
-//! index beyond its end.
+//! A look-up needs one load for a standard identifier and a binary search for an extended one. For a message that is
+//! not in the table, it returns an index beyond the table's end.
 
 use crate::can::CanId;
 use crate::quantity::BusIndex;
 
 const STANDARD_IDS: usize = 0x800;
-/// Entry of an identifier without message.
+/// Marks an identifier without a message.
 const NONE: u32 = u32::MAX;
 
-/// Indices of messages, in the order in which they were given.
+/// Maps an interface and an identifier to the message's index in the list that the table was created from.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(crate) struct IdTable {
     buses: Vec<BusTable>,
@@ -18,9 +18,10 @@ pub(crate) struct IdTable {
 
 #[derive(Debug, Clone, PartialEq)]
 struct BusTable {
-    /// By identifier: 8 KiB; only cache lines of configured messages are used.
+    /// Index by standard identifier. The array has 8 KiB, but look-ups of configured messages touch few of its cache
+    /// lines.
     standard: Box<[u32; STANDARD_IDS]>,
-    /// Extended identifiers, sorted.
+    /// Extended identifiers with their indices, sorted.
     others: Vec<(CanId, u32)>,
 }
 
@@ -31,7 +32,8 @@ impl BusTable {
 }
 
 impl IdTable {
-    /// Creates a table of messages. The first of several with the same interface and identifier counts.
+    /// Creates a table of messages. If several have the same interface and identifier, the table contains the first
+    /// one.
     pub(crate) fn new(messages: impl IntoIterator<Item = (BusIndex, CanId)>) -> Self {
         let mut table = Self::default();
         for ((bus, id), number) in messages.into_iter().zip(0..NONE) {

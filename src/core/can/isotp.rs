@@ -2,8 +2,8 @@
 //! segments them.
 //!
 //! In: payloads of one sender's frames with their times. Out: complete messages, and a fault for each lost message.
-//! Supports classic frames and CAN FD (length escapes), normal and extended addressing. A [`Receiver`] only listens:
-//! the tester sends flow control. It stores one message, and never more memory than has arrived.
+//! Supports classic frames and CAN FD (length escapes), normal and extended addressing. A [`Receiver`] only listens,
+//! because the tester sends flow control. It stores one message, and only the bytes that have arrived.
 
 use crate::quantity::Timestamp;
 
@@ -26,18 +26,18 @@ pub enum IsoTpFault {
     WrongSequence,
     /// No consecutive frame within a second.
     Timeout,
-    /// Another message started before the last one ended: two senders, or a sender that gave up.
+    /// Another message started before the last one ended, because there are two senders or the sender gave up.
     Overlap,
-    /// The requester refused it by flow control (buffer overflow, reserved state).
+    /// The requester refused the message by flow control (buffer overflow, reserved state).
     Refused,
-    /// A length that its frame type cannot have: 0, beyond the frame, or a first frame although the message fits into
-    /// one frame.
+    /// The frame states a length that its type cannot have: 0, beyond the frame, or, in a first frame, a length that
+    /// fits into one frame.
     WrongLength,
-    /// Longer than [`MAX_MESSAGE`].
+    /// The message is longer than [`MAX_MESSAGE`].
     TooLong,
     /// A frame is shorter than the first frame requires.
     ShortFrame,
-    /// A consecutive frame although no message has started.
+    /// A consecutive frame arrived, but no message has started.
     NotBegun,
 }
 
@@ -81,7 +81,7 @@ pub struct Received {
 /// Effect of a frame on a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Progress {
-    /// None: the frame does not belong to a message, or to a lost one.
+    /// No effect: the frame does not belong to a message, or belongs to a lost one.
     #[default]
     None,
     /// The frame started a message of several frames.
@@ -105,7 +105,7 @@ pub struct Receiver {
     /// Payload length of the first frame (RX_DL), without the extension.
     frame_len: usize,
     latest: Timestamp,
-    /// The current message is lost, and the loss is reported: its further frames cause no further fault.
+    /// Whether the current message is lost and the loss is reported. Its further frames then cause no further fault.
     is_discarding: bool,
 }
 
@@ -258,7 +258,7 @@ impl Received {
     }
 }
 
-/// The payload after the extension; `None` = another address.
+/// The payload after the extension; `None` = the extension is another address.
 fn without_extension(extension: Option<u8>, payload: &[u8]) -> Option<&[u8]> {
     match extension {
         None => Some(payload),

@@ -1,8 +1,8 @@
-//! Detects frames with packwatch's own identifiers that packwatch did not send: another sender uses them.
+//! Detects other senders that use packwatch's own identifiers.
 //!
-//! In: sent frames, received frames. Out: an [`OwnIdChange`] at the first such frame, and when none has arrived for
-//! [`GONE_S`]. A socket does not receive what it sent. If an adapter or a recorded log returns sent frames anyway, each
-//! sent frame may return once, unchanged, within [`ECHO_S`].
+//! In: sent frames, received frames. Out: an [`OwnIdChange`] at the first frame of another sender, and another one
+//! after [`GONE_S`] without such a frame. A socket does not receive its own frames. However, an adapter or a recorded
+//! log may return them. Therefore each sent frame may return once, unchanged, within [`ECHO_S`].
 
 use std::collections::VecDeque;
 
@@ -14,20 +14,20 @@ use crate::quantity::{BusIndex, Timestamp};
 
 /// Longest time in which an echo returns, s.
 const ECHO_S: f64 = 1.0;
-/// Number of sent frames that may return: one second of status, health and alarm frames on two interfaces.
+/// Maximum number of stored sent frames: one second of status, health and alarm frames on two interfaces.
 const MAX_SENT: usize = 128;
-/// The other sender is gone after this time without a frame of it, s.
+/// Another sender is gone after this time without one of its frames, s.
 const GONE_S: f64 = 10.0;
 
 /// Reports that another sender started or stopped using packwatch's identifiers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct OwnIdChange {
     pub bus: BusIndex,
-    /// Identifier of its latest frame.
+    /// Identifier of the other sender's latest frame.
     pub id: CanId,
-    /// Whether it started.
+    /// Whether the other sender started.
     pub active: bool,
-    /// Frames so far: 1 at the start, all of them at the end.
+    /// Number of frames of the other sender: 1 when it started, the total when it stopped.
     pub frames: u64,
 }
 
@@ -52,8 +52,8 @@ struct SentFrame {
 }
 
 /// Checksum of a payload and its length: like FNV-1a, but with words of eight bytes instead of bytes, because it is
-/// computed for every sent frame. It identifies copies and is not secure. Two payloads of the same length of up to
-/// eight bytes never have the same checksum.
+/// computed for every sent frame. It identifies copies and is not secure. Two different payloads of the same length
+/// never have the same checksum if the length is at most eight bytes.
 fn sum(data: &[u8]) -> u64 {
     let start = 0xCBF2_9CE4_8422_2325 ^ data.len() as u64;
     data.chunks(8).fold(start, |sum, chunk| {
@@ -71,7 +71,7 @@ pub struct OwnFramesState {
     sent: VecDeque<SentFrame>,
 }
 
-/// packwatch's identifiers, and other senders that use them.
+/// Detects other senders of packwatch's identifiers.
 #[derive(Debug, Clone, Default)]
 pub struct OwnFrames {
     numbers: IdTable,
@@ -157,7 +157,7 @@ impl OwnFrames {
         self.state.uses.iter().map(|other| (other.bus, other.id))
     }
 
-    /// Handles time without listening or a clock step: every other sender is gone, and no echo is expected.
+    /// Forgets every other sender and every expected echo. Called after a time without listening or a clock step.
     pub fn restart(&mut self) {
         self.poll(Timestamp::from_nanos(i64::MAX));
         self.state.uses.clear();
@@ -218,6 +218,6 @@ mod tests {
         own.poll(at(20.0));
         own.changes.clear();
         own.handle(at(22.0), BUS, &frame(OWN, 2));
-        assert_eq!(own.changes.len(), 1, "two seconds are too late for an echo");
+        assert_eq!(own.changes.len(), 1, "after two seconds, the frame is not an echo");
     }
 }

@@ -42,7 +42,7 @@ pub struct PollRequest {
     pub every_s: [Option<f64>; 3],
     /// Whether the response contains the pack current.
     pub has_current: bool,
-    /// Whether the response contains voltages: the current is then requested right before.
+    /// Whether the response contains voltages. If so, the current is requested just before.
     pub has_voltages: bool,
 }
 
@@ -53,7 +53,7 @@ pub struct PollConfig {
     pub requests: Vec<PollRequest>,
     /// Maximum number of requests per second, over all requests.
     pub max_requests_per_s: f64,
-    /// Whether a supply voltage is configured: without a good reading nothing is sent.
+    /// Whether a supply voltage is configured. If so, nothing is sent without a good reading of it.
     pub watches_supply: bool,
 }
 
@@ -196,7 +196,7 @@ impl Poller {
         }
     }
 
-    /// Whether it polls on a bus, and therefore must receive every frame of it.
+    /// Whether the poller sends requests on a bus. If so, it must receive every frame of that bus.
     pub fn is_on(&self, bus: BusIndex) -> bool {
         self.progress.heard.iter().any(|(other, _)| *other == bus)
     }
@@ -235,7 +235,7 @@ impl Poller {
         self.progress.is_standby = is_standby;
     }
 
-    /// Handles time without listening: forgets received frames and the outstanding request.
+    /// Forgets received frames and the outstanding request. Called after a time without listening.
     pub fn restart(&mut self) {
         self.progress.outstanding = None;
         self.progress.heard.iter_mut().for_each(|(_, at)| *at = Timestamp::LONG_AGO);
@@ -256,7 +256,7 @@ impl Poller {
             self.progress.foreign_until = now.plus_nanos(FOREIGN_SILENCE_NS);
             self.progress.outstanding = None;
         } else if !of_polled(|controller| controller.response) {
-            // A response to a request of packwatch does not prove that the car is awake by itself.
+            // A response to packwatch's own request does not prove that the car is awake.
             heard.1 = now;
         }
         self.poll(now, out);
@@ -314,7 +314,7 @@ impl Poller {
         self.poll(now, out);
     }
 
-    /// Sends the request that is due.
+    /// Sends the next request if it is due. Reports when polling stops or starts.
     pub fn poll(&mut self, now: Timestamp, out: &mut PollOutputs) {
         let silence = self.silence_at(now);
         if silence != self.progress.silence {
@@ -342,8 +342,8 @@ impl Poller {
         }
     }
 
-    /// When [`poll`](Self::poll) has something to do next; `None` = only a frame, a command or a reading can change
-    /// that.
+    /// Time at which [`poll`](Self::poll) must be called next; `None` = not before a frame, a command or a reading
+    /// arrives.
     pub fn next_due(&self) -> Option<Timestamp> {
         match self.progress.silence {
             Some(PollSilence::OtherTester) => return Some(self.progress.foreign_until),
@@ -387,7 +387,8 @@ impl Poller {
         self.config.requests[index].every_s[self.progress.state as usize]
     }
 
-    /// The request to send first: before a request for voltages, the one for the current.
+    /// Index of the request to send now. If request `index` asks for voltages, the request for the current is sent
+    /// first.
     fn with_current_before(&self, index: usize) -> usize {
         let wanted = &self.config.requests[index];
         if !wanted.has_voltages || wanted.has_current {

@@ -1,23 +1,25 @@
 //! Detects a second sender of an unprotected input message by comparing the frame rate with the message's cycle time.
 //!
-//! In: time and identifier of each frame, and whether its current contradicts the neighbouring frames; between frames,
-//! the current time ([`SecondSenders::poll`]). Out: a [`SenderChange`] when a second sender is found and when it is gone.
+//! In: the time and identifier of each frame, and the battery current that it reports; between frames, the time
+//! ([`SecondSenders::poll`]). Out: a [`SenderChange`] when a second sender is found and when it is gone.
 //!
 //! Frames are counted in windows of [`WINDOW_NS`]. A second sender is found if [`WINDOWS`] consecutive windows have
 //! more than [`EXCESS`] times the expected number of frames, and if there is a second sign: either many intervals are
-//! much shorter than the mean, because each frame of one sender falls between two frames of the other; or the currents
-//! alternate. A single sender that becomes faster, as many do when the vehicle wakes, shows neither. Short intervals
-//! that a message always has, such as those between the pages of a multiplexed message sent in a burst, are learned
-//! with its rate and do not count. The expected number is the highest steady rate so far, or the rate from the DBC's
-//! cycle time if it is higher. The learned rate is stored, so that a second sender is also found after a restart.
+//! much shorter than the mean, because each frame of one sender falls between two frames of the other; or the reported
+//! currents alternate. A single sender that becomes faster, as many do when the vehicle wakes, shows neither sign.
+//! Short intervals that a message always has, such as those between the pages of a multiplexed message sent in a burst,
+//! are learned with its rate and do not count. The expected number is the highest steady rate so far, or the rate from
+//! the DBC's cycle time if it is higher. The learned rate is stored, so that a second sender is also found after a
+//! restart.
 //!
 //! A second sender is not found in these cases:
 //! * the message has fewer than [`LEAST_PER_S`] frames a second, and the second sender is as slow as the first;
-//! * the message contains no current, and it always arrives in bursts or the second sender is more than twenty times as
-//!   fast;
+//! * the message contains no current and always arrives in bursts;
+//! * the message contains no current, and the second sender is more than twenty times as fast as the first;
 //! * the second sender is present before the rate is known, and its currents do not differ from the first sender's.
 //!
-//! A message with end-to-end protection does not need this check: the counters of two senders do not fit.
+//! A message with end-to-end protection does not need this check, because the frame counters of two senders contradict
+//! each other.
 
 use serde::{Deserialize, Serialize};
 
@@ -26,8 +28,8 @@ use crate::can::id_table::IdTable;
 use crate::quantity::{BusIndex, Timestamp};
 
 const WINDOW_NS: i64 = 1_000_000_000;
-/// Factor on the expected number of frames above which there are too many; a second sender with the same cycle doubles
-/// it.
+/// A window has too many frames above this multiple of the expected number. A second sender with the same cycle time
+/// doubles the number.
 const EXCESS: f64 = 1.5;
 /// Additional frames allowed, for frames that arbitration delayed into the window.
 const DELAYED: f64 = 1.5;
@@ -43,7 +45,7 @@ const STEADY: (f64, f64) = (0.2, 1.0);
 const LEAST_PER_S: f64 = 3.0;
 /// An interval shorter than this fraction of the mean is short.
 const SHORT: f64 = 0.5;
-/// Short intervals or contradictions per expected frame that indicate a second sender.
+/// Least number of short intervals or contradictions per expected frame that indicates a second sender.
 const SIGNS: f64 = 0.4;
 /// Fraction of the frames that follow a short interval by chance, because other messages delay them.
 const CHANCE_SHORT: f64 = 0.02;
@@ -69,9 +71,9 @@ pub struct MessageRate {
     id: CanId,
     /// Highest steady rate, 1/s.
     learned_per_s: Option<f64>,
-    /// Fraction of its frames that usually follow a short interval.
+    /// Fraction of the frames that usually follow a short interval.
     usual_short: f64,
-    /// Rate of the latest windows, and how many windows it has been steady.
+    /// Smoothed rate, 1/s, and the number of consecutive windows in which it was steady.
     candidate: f64,
     steady: u32,
     /// Consecutive windows with too many frames, and consecutive normal windows.
@@ -88,7 +90,7 @@ pub struct MessageRate {
     is_doubtful: bool,
 }
 
-/// All unprotected input messages.
+/// Detects second senders of all unprotected input messages.
 #[derive(Debug, Clone, Default)]
 pub struct SecondSenders {
     /// Sorted by interface and identifier.
@@ -153,7 +155,7 @@ impl SecondSenders {
         rate.currents_a = [between, Some(current_a)];
     }
 
-    /// Ends the windows that are over. A message that has stopped has no second sender.
+    /// Ends the windows that are over. A window without frames is a normal window.
     pub fn poll(&mut self, now: Timestamp) {
         let is_over = |from: Timestamp| now.nanos().saturating_sub(from.nanos()) >= WINDOW_NS;
         if !self.next_end.is_some_and(is_over) {
@@ -165,8 +167,8 @@ impl SecondSenders {
         self.next_end = self.rates.iter().filter_map(|rate| rate.window_from).min();
     }
 
-    /// Handles time without listening or a clock step: counting restarts. Rates are kept, and so is a second sender
-    /// until enough normal windows have passed.
+    /// Restarts counting after a time without listening or after a clock step. Keeps the learned rates. A second sender
+    /// that was found stays until enough normal windows have passed.
     pub fn restart(&mut self) {
         for rate in &mut self.rates {
             *rate = MessageRate {

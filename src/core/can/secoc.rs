@@ -2,12 +2,12 @@
 //! authenticator.
 //!
 //! ```text
-//! data | freshness, its low bits | authenticator, its first bits      most significant bit first
+//! data | low bits of the freshness | first bits of the authenticator      most significant bit first
 //! ```
 //!
-//! The authenticator is AES-128-CMAC over data id (16 bit), data and the whole freshness (64 bit), big-endian. Key and
-//! cipher belong to the caller, who passes the 16 bytes of a CMAC. This module contains no secret, so its results can
-//! be reproduced without one.
+//! Freshness is a counter that never repeats. The authenticator is AES-128-CMAC over data id (16 bit), data and the
+//! whole freshness (64 bit), big-endian. The caller has the key and the cipher and passes the 16 bytes of a CMAC. This
+//! module contains no secret, so its results can be reproduced without the key.
 //!
 //! | profile | freshness | authenticator | bytes | a guess succeeds once in |
 //! | --- | --- | --- | --- | --- |
@@ -115,7 +115,7 @@ impl MacInput {
 
 impl Authentication {
     /// Input of the authenticator for this payload and freshness; `None` = the payload is shorter than the trailer, or
-    /// its data longer than a frame.
+    /// the data is longer than a frame.
     pub fn mac_input(&self, payload: &[u8], freshness: u64) -> Option<MacInput> {
         let data = payload.get(..payload.len().checked_sub(self.profile.trailer_bytes())?)?;
         let mut input = MacInput { bytes: [0; MAX_INPUT], len: 0 };
@@ -177,8 +177,8 @@ impl Authentication {
     }
 }
 
-/// Most freshness values that one payload can represent: two announcements cover 32 values, profile 3 sends 4 bits (16
-/// codes).
+/// Maximum number of freshness values that one payload can represent. Two announcements cover 32 values, and profile 3
+/// sends 4 bits (16 codes).
 const MAX_CANDIDATES: usize = 2;
 
 /// A payload's possible freshness values: everything needed to check its authenticator, except the key.
@@ -189,7 +189,7 @@ pub struct MacCheck {
 }
 
 impl MacCheck {
-    /// The freshness that makes the authenticator of `payload` correct; `None` = no such freshness. `mac` computes
+    /// The candidate that makes the authenticator of `payload` correct; `None` = no candidate does. `mac` computes
     /// AES-128-CMAC.
     pub fn verify(&self, payload: &[u8], mac: impl Fn(&[u8]) -> Mac) -> Option<u64> {
         let is_right = |freshness: &u64| {

@@ -1,8 +1,9 @@
 //! Signal layouts: the position of a number in a payload, its decoding and encoding.
 //!
 //! In: a layout as a DBC gives it, and payload bytes. Out: raw codes (`u64`, the signal's bits, not sign-extended) and
-//! physical values (code x factor + offset, in the DBC's unit). A [`SignalPlan`] is a layout prepared once; decoding is
-//! then load, shift, shift, multiply-add. Signals have 1 to 64 bits at any position of payloads of up to 64 bytes.
+//! physical values (code x factor + offset, in the DBC's unit). A [`SignalPlan`] is a layout prepared once; decoding
+//! then needs one load, two shifts and one multiply-add. Signals have 1 to 64 bits at any position of a payload of up
+//! to 64 bytes.
 //!
 //! Bad input is data: a payload that is too short gives [`Fault::ShortFrame`], NaN or infinity [`Fault::NotFinite`], a
 //! value outside the DBC's range [`Fault::OutOfRange`]. Encoding rounds to the nearest code and saturates.
@@ -65,7 +66,7 @@ pub struct LayoutFault(String);
 pub struct SignalPlan {
     /// First byte of the eight-byte window that is loaded.
     pub(crate) window: u8,
-    /// Bytes that the payload must have.
+    /// Number of bytes that the payload must have.
     bytes_needed: u8,
     /// The signal spans nine bytes, so the window is widened to sixteen.
     wide: bool,
@@ -155,7 +156,7 @@ impl SignalLayout {
         self.bits().any(|bit| theirs.contains(&bit))
     }
 
-    /// Its bits, in the DBC's numbering.
+    /// The signal's bits in DBC numbering.
     fn bits(&self) -> impl Iterator<Item = u32> + use<> {
         let (first, last) = self.span();
         let is_little = self.byte_order == ByteOrder::LittleEndian;
@@ -167,7 +168,7 @@ impl SignalLayout {
         self.minimum != 0.0 || self.maximum != 0.0
     }
 
-    /// Whether one of its bits is in `mask`, which covers the first bytes of the payload.
+    /// Whether one of the signal's bits is set in `mask`, which covers the first bytes of the payload.
     pub fn touches(&self, mask: [u8; 3]) -> bool {
         let mut payload = [0; MAX_DATA];
         payload[..mask.len()].copy_from_slice(&mask);
@@ -206,8 +207,8 @@ impl SignalLayout {
         }
     }
 
-    /// Smallest and largest code within the bits and the stated range; within the bits only if no code lies in the
-    /// range.
+    /// Smallest and largest code that the bits can represent and that lies in the stated range. If no code lies in the
+    /// range, the range is ignored.
     fn code_limits(&self) -> (i128, i128) {
         /// Tolerance for the decimal numbers of the DBC, in codes.
         const ROUNDING: f64 = 1e-6;
@@ -393,7 +394,7 @@ impl SignalPlan {
         }
     }
 
-    /// Like [`Self::code`], but saturated only at the limits of the bits: a value outside the DBC's range stays
+    /// Like [`Self::code`], but saturates only at the limits of the bits. A value outside the DBC's range stays
     /// outside, so that the receiver detects the fault.
     pub fn code_beyond_range(&self, value: f64) -> Option<u64> {
         let bits = self.length_bits();

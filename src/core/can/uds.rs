@@ -1,9 +1,8 @@
-//! Diagnostic responses (UDS ISO 14229-1, KWP 2000, OBD ISO 15031-5) over ISO-TP: which responses are decoded, and
-//! where their signals are.
+//! Receives diagnostic responses over ISO-TP (UDS ISO 14229-1, KWP 2000, OBD ISO 15031-5) and decodes their signals.
 //!
-//! In: frames of the configured identifiers, from any tester. Out: complete responses, and their readings
-//! ([`Answer::readings`]). Counts per controller: decoded responses, negative responses, responses without a preceding
-//! request, and lost messages by fault. This module sends nothing. Memory: one message per configured controller.
+//! In: frames of the configured identifiers, from any tester. Out: complete responses and their readings
+//! ([`Answer::readings`]), and counts per controller ([`ControllerCounts`]). This module sends nothing. It stores one
+//! message per configured controller.
 
 use serde::{Deserialize, Serialize};
 
@@ -88,22 +87,22 @@ impl Question {
 /// A signal of a response.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AnswerSignal {
-    /// Byte at which the layout starts, counted after the echoed service and identifier.
+    /// Byte at which the layout starts. The first byte after the echoed service and identifier has the number 0.
     pub first_byte: usize,
-    /// The signal, relative to this byte. Interface and identifier come from the response frames.
+    /// The signal, whose layout is relative to this byte. Interface and identifier are those of the response frames.
     pub binding: Binding,
 }
 
 /// A response to be decoded.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Answer {
-    /// The request that it answers.
+    /// The request that the response answers.
     pub question: Question,
     pub signals: Vec<AnswerSignal>,
 }
 
 impl Answer {
-    /// Whether it has a signal for a channel that satisfies the predicate.
+    /// Whether the response has a signal for a channel that satisfies the predicate.
     pub fn has(&self, is_wanted: impl Fn(Channel) -> bool) -> bool {
         self.signals.iter().any(|signal| is_wanted(signal.binding.channel))
     }
@@ -118,12 +117,12 @@ impl Answer {
     }
 }
 
-/// Counts of what a controller sent.
+/// Number of messages from a controller, by kind.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct ControllerCounts {
     /// Complete responses that are decoded.
     pub read: u64,
-    /// Complete messages that are not decoded: other identifiers, other services.
+    /// Complete messages that are not decoded, because they have other identifiers or services.
     pub other: u64,
     /// Negative responses, except "response pending".
     pub refused: u64,
@@ -152,7 +151,7 @@ impl ControllerCounts {
         }
     }
 
-    /// Faults that caused lost messages, with their numbers.
+    /// Faults that caused lost messages, each with the number of lost messages.
     pub fn losses(&self) -> impl Iterator<Item = (IsoTpFault, u64)> + '_ {
         IsoTpFault::ALL.into_iter().zip(self.lost).filter(|(_, count)| *count > 0)
     }
@@ -209,9 +208,9 @@ pub enum FrameOutcome<'a> {
     Whole {
         /// Index in [`Listener::counts`].
         controller: usize,
-        /// Its configuration.
+        /// Configuration of the response.
         answer: &'a Answer,
-        /// Its data, after the echoed service and identifier.
+        /// Data of the response, after the echoed service and identifier.
         data: &'a [u8],
         /// Whether it arrived in a single frame, without a preceding [`FrameOutcome::Begun`].
         is_single: bool,
@@ -325,7 +324,7 @@ impl Listener {
         }
     }
 
-    /// Handles time without listening: forgets partial messages.
+    /// Forgets partial messages and requests. Called after a time without listening.
     pub fn restart(&mut self) {
         for link in &mut self.links {
             link.receiver.restart();
@@ -445,8 +444,8 @@ impl Link {
     }
 }
 
-/// Identifiers to be received for these responses, including the request identifiers, which show whether a response was
-/// requested.
+/// Identifiers to be received for these responses. They include the identifiers of the requests, which show whether a
+/// response was requested.
 pub fn wanted(answers: &[Answer]) -> Vec<(BusIndex, CanId)> {
     let both = |answer: &Answer| {
         let Controller { bus, request, response, .. } = answer.question.controller;

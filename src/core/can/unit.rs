@@ -1,23 +1,23 @@
 //! Units as written in a DBC.
 //!
-//! In: the text between the quotation marks. Out: the quantity and its conversion to the program's unit (A, V, degrees
-//! C). DBC files do not define a list of units, so an unknown unit gives no information.
+//! In: the text between the quotation marks. Out: the quantity and the conversion to the program's unit (A, V, degrees
+//! C). The DBC format does not define a list of units, so an unknown unit gives no information.
 
 /// Quantity of a unit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Quantity {
-    /// A.
+    /// Electric current; the program's unit is A.
     Current,
-    /// V.
+    /// Voltage; the program's unit is V.
     Voltage,
-    /// Degrees C.
+    /// Temperature; the program's unit is degrees C.
     Temperature,
-    /// Not an input of a pack; the name with its article, such as `an angle`.
+    /// Any quantity that packwatch does not read. Contains its name with an article, such as `an angle`.
     Other(&'static str),
 }
 
 impl Quantity {
-    /// %.
+    /// A percentage, with the unit `%`.
     pub const PERCENTAGE: Self = Self::Other("a percentage");
 }
 
@@ -25,7 +25,8 @@ impl Quantity {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SignalUnit {
     pub quantity: Quantity,
-    /// Factor to the program's unit: value x factor + offset; 1 for a quantity without such a unit.
+    /// Converts to the program's unit: value x factor + offset. The factor is 1 for quantities that packwatch does not
+    /// read.
     pub factor: f64,
     /// See `factor`.
     pub offset: f64,

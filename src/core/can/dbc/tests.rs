@@ -1,4 +1,4 @@
-//! Complete DBC texts, and texts rejected with their line.
+//! Tests with complete DBC texts, and with faulty texts that are rejected with a line number.
 
 use super::*;
 

@@ -206,7 +206,8 @@ fn indicator(signal: &Signal) -> String {
     }
 }
 
-/// Whether the indicator is not sufficient: for ranges, nested multiplexors, or several multiplexors side by side.
+/// Whether the message needs `SG_MUL_VAL_` lines because the indicators are not sufficient: it has ranges, nested
+/// multiplexors, or several multiplexors side by side.
 fn needs_ranges(message: &Message) -> bool {
     let mut conditions = message.signals.iter().map(|signal| signal.conditions.as_slice());
     let plain = message.signals.iter().filter(|signal| signal.is_multiplexor && signal.conditions.is_empty());

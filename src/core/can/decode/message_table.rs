@@ -1,9 +1,10 @@
 //! Bindings prepared for decoding: by message and page, with shifts, factors and limits per signal.
 //!
-//! In: frames. Out: readings. The codes of a [`Binding`] that give a good value are computed in advance. The binding
-//! itself handles every other code, and signals that are not linear functions of such codes: floats, signals of 64 bits
-//! or spanning nine bytes, a scale that is 0 or not finite, several "not available" codes between the good ones. If a
-//! selector has too many codes for a table, each binding decodes the selector itself.
+//! In: frames. Out: readings. The good codes of a [`Binding`] are the raw codes with a valid value. They form a range,
+//! which is computed in advance. If "not available" codes split the range, its longest part is used. The binding itself
+//! decodes all other codes. It also decodes signals without such a range: floats, signals of 64 bits or spanning nine
+//! bytes, and signals whose scale is 0 or not finite. If a selector has too many codes for a table, each binding
+//! decodes the selector itself.
 
 use std::hint::cold_path;
 use std::ops::Range;
@@ -15,9 +16,10 @@ use crate::can::signal::{ByteOrder, SignalPlan, ValueType, float_of_signed};
 use crate::can::{CanId, Frame};
 use crate::quantity::{BusIndex, Fault};
 
-/// Most codes of a selector with a table: ten bits. Selectors usually have 4 to 8 bits.
+/// Maximum number of codes of a selector that gets a table: ten bits. Selectors usually have 4 to 8 bits.
 const MAX_CODES: u64 = 1024;
-/// Most entries in all tables of one message, so that wide ranges on many signals use little memory.
+/// Maximum number of entries in the page table of one message. Limits the memory if many signals have wide ranges of
+/// codes.
 const MAX_GROUPS: usize = 1 << 16;
 
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -50,7 +52,7 @@ struct SignalGroup {
 /// Longer than any payload, bytes.
 const NEVER: usize = usize::MAX;
 
-/// Groups by the selector's code.
+/// Lists the groups that may be present for each code of the selector.
 #[derive(Debug, Clone, PartialEq)]
 struct PageTable {
     selector: BitPosition,
@@ -62,7 +64,7 @@ struct PageTable {
     groups: Vec<SignalGroup>,
 }
 
-/// Number of words in [`PayloadWords::words`]. As a word index, it marks signals outside these words.
+/// Number of words in [`PayloadWords::words`]. Word indices from this value up mark signals outside these words.
 const FAR: u8 = 2;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -83,15 +85,16 @@ impl BitPosition {
     }
 }
 
-/// One signal: conversion of good codes. Its binding handles any other code. 64 bytes, one cache line.
+/// Converts the good codes of one signal. The binding converts all other codes. The size is 64 bytes, one cache line.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct LinearSignal {
     channel: Channel,
     position: BitPosition,
-    /// The sign bit of a signed signal, 0 for an unsigned one. XOR with it and subtracting it extends the sign.
+    /// The sign bit of a signed signal; 0 for an unsigned signal. XOR with this bit, followed by its subtraction,
+    /// extends the sign.
     sign: u64,
-    /// Good codes, which are within the DBC's and the configured range: the first one with its sign bit flipped, and
-    /// the number of codes after it.
+    /// Good codes are within the DBC's and the configured range. `first_good` is the first one, with its sign bit
+    /// flipped; `more_good` is the number of codes after it.
     first_good: u64,
     more_good: u64,
     factor: f64,
@@ -108,7 +111,7 @@ struct PayloadWords<'a> {
 }
 
 impl<'a> PayloadWords<'a> {
-    /// The words of a frame with a payload.
+    /// Loads the first eight payload bytes of a frame.
     #[inline(always)]
     fn new(frame: &'a Frame) -> Self {
         let word = frame.padded_data().first_chunk().map_or(0, |bytes| u64::from_le_bytes(*bytes));
@@ -339,8 +342,8 @@ impl LinearSignal {
     }
 }
 
-/// The longest run of good codes without a "not available" code. Such codes are nearly always at the ends of the range.
-/// If one is in the middle, the binding handles the codes beyond it.
+/// The longest run of good codes without a "not available" code. "Not available" codes are nearly always at the ends of
+/// the range. If one is in the middle, the binding decodes the shorter part.
 fn available_codes(binding: &Binding, sign: u64, (first, last): (i64, i64)) -> Option<(i64, i64)> {
     let possible = binding.not_available.iter().filter(|code| **code <= binding.plan.all_ones());
     let signed = possible.map(|code| (code ^ sign).wrapping_sub(sign).cast_signed());
@@ -378,7 +381,8 @@ fn good_codes(binding: &Binding) -> Option<(i64, i64)> {
     Some(good)
 }
 
-/// The first code that satisfies a predicate, which must then hold for all later codes; `None` = no code does.
+/// The first code that satisfies a predicate; `None` = no code does. If a code satisfies the predicate, all later codes
+/// must satisfy it, too.
 fn first_where((mut low, mut high): (i64, i64), holds: impl Fn(i64) -> bool) -> Option<i64> {
     if !holds(high) {
         return None;

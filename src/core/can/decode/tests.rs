@@ -263,7 +263,7 @@ fn any_bindings() -> impl Strategy<Value = Vec<Binding>> {
     let plan = layout.prop_filter_map("a layout that can be read", |layout| layout.plan().ok());
     let limits = prop::sample::select(vec![(f64::NEG_INFINITY, f64::INFINITY), (f64::NAN, 5.0), (0.0, f64::NAN)]);
     let range = prop_oneof![2 => limits, 3 => (-1e3..0.0, 0.0..1e3)];
-    // For many lengths the lowest and the highest codes, unsigned and signed, and random ones.
+    // Codes near both ends of the range for many signal lengths, and random codes.
     let end = (0..64u32, 0..3u64).prop_map(|(down, below)| (u64::MAX >> down).saturating_sub(below));
     let codes = prop::collection::vec(prop_oneof![0..4u64, end, any::<u64>()], 0..4);
     let page = prop::collection::vec((prop::sample::select(vec![0u16, 4, 60]), 0..5u64, 0..3u64), 0..3);

@@ -1,10 +1,16 @@
-//! The receiver of one protected message: E2E_P01Check of AUTOSAR, called once per frame (or once per period without
-//! one).
+//! The receiver of one protected message: E2E_P01Check of AUTOSAR. It is called once per frame, and once for each
+//! period without a frame.
 //!
-//! In: payloads in order of arrival. Out: a [`Status`] for each, and counts by status. State, with AUTOSAR's names:
-//! WaitForFirstData (`last_valid` is `None`); LastValidCounter; MaxDeltaCounter, which grows by one with each call,
-//! because each call may stand for a lost frame, and which each valid frame resets; NoNewOrRepeatedDataCounter; and
-//! SyncCounter, the number of valid frames still required before a broken sequence is trusted again.
+//! In: payloads in order of arrival. Out: a [`Status`] for each, and counts by status.
+//!
+//! State, with AUTOSAR's names:
+//!
+//! * WaitForFirstData: `last_valid` is `None`.
+//! * LastValidCounter: counter of the last valid frame.
+//! * MaxDeltaCounter: largest allowed counter step. It grows by one with each call, because each call may stand for a
+//!   lost frame. A valid frame resets it.
+//! * NoNewOrRepeatedDataCounter: consecutive calls without a new frame.
+//! * SyncCounter: number of valid frames still required before a broken sequence is trusted again.
 
 use serde::{Deserialize, Serialize};
 
@@ -18,7 +24,7 @@ const MAX_REPEATED: u8 = 14;
 pub struct CheckConfig {
     /// Profile and data identifier.
     pub protection: Protection,
-    /// Number of frames that may be lost between two calls; each call without a valid frame allows one more.
+    /// Number of frames that may be lost between two calls. Each call without a valid frame allows one more lost frame.
     pub max_delta_counter_init: u8,
     /// Number of consecutive calls without a new frame after which the sequence is broken; 14 = any number.
     pub max_no_new_or_repeated_data: u8,
@@ -39,21 +45,21 @@ impl CheckConfig {
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
 pub enum Status {
-    /// Intact and the next in sequence.
+    /// The frame is intact and the next one in sequence.
     Ok = 0,
-    /// No frame in its period.
+    /// No frame arrived within its period.
     NoNewData = 1,
-    /// Damaged, too short, from another message, or with an invalid counter.
+    /// The frame is damaged, too short, from another message, or has an invalid counter.
     WrongCrc = 2,
-    /// Intact and in sequence, but one of those required after a broken sequence.
+    /// The frame is intact and in sequence, but it is one of the frames required after a broken sequence.
     Sync = 3,
-    /// The first intact frame: there is no previous counter to compare with.
+    /// The frame is the first intact one, so there is no previous counter to compare with.
     Initial = 4,
-    /// Intact, but with the same counter as the last frame.
+    /// The frame is intact, but has the same counter as the last frame.
     Repeated = 5,
-    /// Intact; some frames before it were lost, no more than allowed.
+    /// The frame is intact. Some frames before it were lost, but no more than allowed.
     OkSomeLost = 6,
-    /// Intact, but the counter jumped further than allowed.
+    /// The frame is intact, but the counter jumped further than allowed.
     WrongSequence = 7,
 }
 
@@ -121,7 +127,7 @@ impl StatusCounts {
 /// State of one message's receiver. Its counts are stored separately.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Receiver {
-    /// Counter of the last valid frame; `None` = none yet.
+    /// Counter of the last valid frame; `None` = no valid frame yet.
     last_valid: Option<u8>,
     /// Largest counter step that the next frame may have.
     max_delta: u8,
@@ -222,7 +228,7 @@ impl Receiver {
         self.max_delta = config.max_delta_counter_init;
     }
 
-    /// Whether this frame, which is in sequence, is one of those required after a broken sequence.
+    /// Whether this frame is one of the frames required after a broken sequence. The frame must be in sequence.
     fn synchronise(&mut self, config: &CheckConfig) -> bool {
         if self.no_new_or_repeated > config.max_no_new_or_repeated_data {
             self.sync = config.sync_counter_init;
@@ -234,7 +240,7 @@ impl Receiver {
     }
 }
 
-/// `from + by`, at most `limit`.
+/// Returns `from + by`, but at most `limit`.
 fn grown(from: u8, by: u64, limit: u8) -> u8 {
     from.saturating_add(u8::try_from(by).unwrap_or(u8::MAX)).min(limit)
 }

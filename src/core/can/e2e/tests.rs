@@ -1,4 +1,4 @@
-//! Test vectors, and properties of arbitrary payloads.
+//! Tests with published vectors and with arbitrary payloads.
 
 #![allow(clippy::unwrap_used, reason = "tests may panic")]
 
@@ -118,8 +118,8 @@ fn header_mask_covers_bytes_written_by_protect() {
     }
 }
 
-/// Tries every choice of `wrong_bits` wrong bits of a payload; returns the number that passes the check and the number
-/// tried.
+/// Flips every combination of `wrong_bits` bits of a payload. Returns the number of combinations that pass the check
+/// and the number of combinations tried.
 fn undetected(protection: Protection, payload: &[u8], counter: u8, wrong_bits: usize) -> (usize, usize) {
     let mut payload = payload.to_vec();
     protection.protect(&mut payload, counter).unwrap();
@@ -130,7 +130,7 @@ fn undetected(protection: Protection, payload: &[u8], counter: u8, wrong_bits: u
         missed += usize::from(protection.verified_counter(&payload).is_some());
         tried += 1;
         flip(&mut payload);
-        // The next choice in ascending order: the last bit that can move up moves, and those above it follow.
+        // The next combination in ascending order: the last bit that can move up moves, and the bits above it follow.
         let last = 8 * payload.len() - wrong_bits;
         let Some(place) = (0..wrong_bits).rfind(|place| chosen[*place] < last + place) else { break };
         let first = chosen[place] + 1;

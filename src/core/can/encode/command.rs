@@ -1,8 +1,8 @@
-//! The received command frame, with which another ECU acknowledges or clears alarms, or reports that the pack was
+//! Decodes the command frame, with which another ECU acknowledges or clears alarms, or reports that the pack was
 //! replaced.
 //!
-//! In: a frame whose end-to-end protection the caller has checked. Out: the command, with "all" as `None`. An undefined
-//! code is an error: a command is applied completely or not at all.
+//! In: a frame whose end-to-end protection the caller has checked. Out: the command; a selector is `None` if it selects
+//! all. An undefined code is an error, so that a command is applied completely or not at all.
 
 use super::layout::LayoutMessage;
 use super::message::{PlanFaults, RULES};
@@ -22,7 +22,7 @@ pub enum Command {
     PackReplaced,
 }
 
-/// A command and the alarms it selects; `None` = all.
+/// A command and the alarms that it selects; `None` = all.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct CommandFields {
     pub command: Command,

@@ -1,8 +1,8 @@
-//! The digest frame: number and checksum of all raised alarms, the state of every rule, and one threshold in full
-//! precision.
+//! Encodes the digest frame: number and checksum of all raised alarms, the state of every rule, and one threshold in
+//! full precision.
 //!
-//! In: alarms as their frames carry them. Out: values for the signals of `PACKWATCH_Digest`. With the checksum, a
-//! receiver that lost alarm frames or started late can check whether its table of raised alarms is complete.
+//! In: alarms with the codes of their frames. Out: values for the signals of `PACKWATCH_Digest`. If a receiver lost
+//! alarm frames or started late, the checksum shows whether its table of raised alarms is complete.
 
 use super::layout::LayoutMessage;
 use super::message::{OutputMessage, RULES};
@@ -56,7 +56,7 @@ pub struct DigestFields {
     pub pass_time_s: f64,
     /// States of the rules, in the order of their numbers.
     pub rules: [RuleState; RULE_COUNT],
-    /// The threshold to send in this digest; `None` = none configured.
+    /// The threshold to send in this digest; `None` = no threshold is configured.
     pub threshold: Option<ThresholdFields>,
 }
 
@@ -66,8 +66,8 @@ pub struct DigestFields {
 pub struct TableChecksum(u16);
 
 impl TableChecksum {
-    /// Adds a raised alarm, as its frame carries it: number of the rule, codes of severity and state, cell (`None` =
-    /// the pack), and whether it is acknowledged.
+    /// Adds a raised alarm with the codes of its frame: number of the rule, severity, cell (`None` = the pack), state,
+    /// and whether it is acknowledged.
     pub fn add(&mut self, rule: u8, severity: u8, cell: Option<CellIndex>, state: u8, is_acknowledged: bool) {
         // 2047 is the code of "the whole pack", as in the alarm frame of the shipped DBC.
         let [low, high] = cell.map_or(2047, |cell| cell.0).to_le_bytes();

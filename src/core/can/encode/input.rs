@@ -1,14 +1,14 @@
 //! Encodes channel values as input frames, for CSV replay and the simulator.
 //!
 //! Each message and multiplexer page with at least one value gives one frame. In that frame, a signal without a value
-//! is encoded as its "not available" code, or else as a code that the receiver rejects (NaN, out of range). If no such
-//! code exists, the whole frame is omitted and its values count as not carried. A frame without any value is sent only
-//! if one of its signals has a "not available" code. Values beyond the signal's bits saturate; values outside the DBC's
-//! range stay outside, so that the receiver detects the fault. A diagnostic response is encoded with its request and
-//! flow control, as on a bus with a tester.
+//! is encoded as its "not available" code. If it has none, it is encoded as a code that the receiver rejects (NaN, out
+//! of range). If no such code exists, the whole frame is omitted, and its values count as not carried. A frame without
+//! any value is sent only if one of its signals has a "not available" code. Values beyond the signal's bits saturate.
+//! Values outside the DBC's range stay outside, so that the receiver detects the fault. A diagnostic response is
+//! encoded with its request and flow control, as on a bus with a tester.
 //!
-//! Rows of one log have the same channels in the same order. Therefore the position of each signal's value in a row is
-//! looked up once and kept until the channels change.
+//! The rows of a log usually have the same channels in the same order. Therefore the encoder finds the position of each
+//! signal's value in a row once and keeps it until the channels change.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -25,7 +25,7 @@ use crate::quantity::BusIndex;
 pub struct InputEncoder {
     pages: Vec<InputPage>,
     answers: Vec<AnswerPage>,
-    /// Positions in the last row; kept because the next row usually has the same channels.
+    /// Positions of the values in the last row.
     places: RefCell<RowPlaces>,
 }
 
@@ -47,7 +47,7 @@ struct PlacedRow<'a> {
 #[derive(Debug, Clone, Copy)]
 struct RowChannel {
     channel: Channel,
-    /// A later position has the same channel, so its value counts instead.
+    /// Whether a later position has the same channel. The later value counts.
     is_overridden: bool,
     /// Whether a frame carries the value of the current row.
     is_carried: bool,
@@ -58,7 +58,7 @@ struct AnswerPage {
     question: Question,
     /// The response message, with all signals 0.
     template: Vec<u8>,
-    /// The byte of the message at which each signal's layout starts, and the signal.
+    /// Each signal, after the byte of the message at which its layout starts.
     fields: Vec<(usize, InputField)>,
 }
 
@@ -83,7 +83,7 @@ struct InputField {
     offset: f64,
     /// Code for "no value"; `None` = no such code exists.
     missing: Option<u64>,
-    /// `missing` is a configured "not available" code: a frame is sent even without any value.
+    /// Whether `missing` is a configured "not available" code. If so, a frame is sent even without any value.
     has_not_available: bool,
 }
 
@@ -230,7 +230,7 @@ impl AnswerPage {
         Self { question: answer.question, template, fields: answer.signals.iter().map(field).collect() }
     }
 
-    /// The response with these values; `None` = it carries none of them, or a missing one has no code.
+    /// The response with these values; `None` = the response carries none of them, or a missing value has no code.
     fn message(&self, row: PlacedRow<'_>) -> Option<Vec<u8>> {
         if !self.fields.iter().any(|(_, field)| field.is_sent(row)) {
             return None;
@@ -260,7 +260,7 @@ impl AnswerPage {
 }
 
 impl InputPage {
-    /// The page with the selectors of `template`, and every signal present with these selectors.
+    /// Creates the page with the selectors of `template` and every signal that is present with these selectors.
     fn new(message: &[Binding], template: [u8; MAX_DATA]) -> Self {
         let (bus, id) = (message[0].bus, message[0].id);
         let present: Vec<_> = message.iter().filter(|binding| binding.holds(&template) == Ok(true)).collect();
@@ -290,7 +290,7 @@ fn template(binding: &Binding) -> [u8; MAX_DATA] {
     let mut payload = [0; MAX_DATA];
     for test in &binding.mux {
         let code = test.ranges.first().map_or(0, |range| range.0);
-        // If the code does not fit the selector, the selector stays 0, because no frame of that page can exist.
+        // If the code does not fit the selector, the selector stays 0. No frame of that page can exist.
         let _ = test.plan.encode_raw(&mut payload, code);
     }
     payload

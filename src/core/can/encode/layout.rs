@@ -1,14 +1,19 @@
-//! The layout of the sent frames, the command frame and its reply: one [`Database`] for the encoder and for consumers.
+//! Creates the layout of the sent frames and of the command frame: one [`Database`] for the encoder and for consumers.
 //!
 //! In: a base (the built-in `config/packwatch.dbc`, or the user's own DBC) and settings per message. Out: the base's
 //! messages with identifiers, frame formats, cycle times, end-to-end protection and authentication as configured,
 //! including the signals of header and trailer. The encoder is built from this database and `packwatch dbc` writes it,
 //! so they always agree.
 //!
-//! The built-in base is adapted. The steps of Ah signals grow with the cell. The header of profile 5 is one byte longer
-//! than the reserved space, so all signals move up by a byte. An authenticated message grows by its trailer; an
-//! authenticated command omits the header's bytes. The user's own DBC is not adapted: its signals must leave header and
-//! trailer free. All settings that do not fit are reported together.
+//! The built-in base is adapted:
+//!
+//! * The steps of Ah signals grow with the cell's capacity.
+//! * The header of profile 5 is one byte longer than the reserved space, so all signals move up by a byte.
+//! * An authenticated message grows by its trailer.
+//! * An authenticated command omits the header's bytes.
+//!
+//! The user's own DBC is not adapted: its signals must leave header and trailer free. All settings that do not fit are
+//! reported together.
 
 use std::sync::OnceLock;
 
@@ -19,16 +24,17 @@ use crate::can::secoc::{self, Authentication};
 use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 use crate::can::{CanId, FrameKind};
 
-/// Names of the signals that protection and authentication write. No value of the daemon has one of these names.
+/// Names of the signals that protection and authentication write. No signal with a value of the daemon has one of these
+/// names.
 pub(super) const HEADER_SIGNALS: [&str; 5] = ["E2eCrc", "E2eCounter", "E2eDataIdNibble", "SecOCFreshness", "SecOCMac"];
 
 /// Length of a built-in message whose signals were moved for profile 5, bytes: the next FD length above 8.
 const MOVED_LEN_BYTES: u16 = 12;
 
-/// Number of repetitions of a changed alarm after its first frame. If a tenth of all frames is lost, all four frames of
-/// a change are lost only once in 10,000 changes.
+/// Number of repetitions of a changed alarm after its first frame. If one in ten frames is lost, all four frames of a
+/// change are lost once in 10,000 changes.
 pub const CHANGE_REPETITIONS: u32 = 3;
-/// Time between these repetitions, ms: longer than most error bursts on a bus.
+/// Time between repetitions of a changed alarm, ms. It is longer than most error bursts on a bus.
 pub const CHANGE_REPETITION_MS: u32 = 100;
 /// Smallest mean time between two alarm frames, ms: 100 frames a second use 2.7 % of a bus of 500 kbit/s.
 pub const ALARM_DELAY_MS: u32 = 10;
@@ -44,7 +50,7 @@ pub const DEFAULT_PERIOD_MS: u32 = 1000;
 /// The DBC shipped with the program.
 ///
 /// # Errors
-/// Never for the shipped file, which a test parses.
+/// Never occurs, because a test parses the shipped file.
 pub fn default_database() -> Result<Database, DbcError> {
     Database::parse(include_str!("../../packwatch.dbc"))
 }
@@ -90,7 +96,7 @@ impl LayoutMessage {
         }
     }
 
-    /// Name of its table in the configuration (`output.status`) and in messages.
+    /// Name of the message's table in the configuration (such as `output.status`) and in the program's texts.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Status => "status",
@@ -138,7 +144,7 @@ pub enum E2eSetting {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct MessageSettings {
     pub id: Option<CanId>,
-    /// Whether it is sent in FD frames.
+    /// Whether the message is sent in FD frames.
     pub fd: Option<bool>,
     /// Whether the data phase uses the higher bit rate.
     pub brs: Option<bool>,
@@ -157,7 +163,7 @@ pub enum LayoutBase<'d> {
         /// Rated capacity, Ah.
         rated_capacity_ah: f64,
     },
-    /// Another DBC, unchanged.
+    /// The user's own DBC, which is not adapted.
     Own(&'d Database),
 }
 
@@ -237,7 +243,7 @@ pub fn layout(base: LayoutBase<'_>, settings: &LayoutSettings) -> Result<Databas
     Ok(Database { nodes: database.nodes.clone(), comment: database.comment.clone(), messages })
 }
 
-/// Applies the settings to a message. If `movable`, its signals may be moved.
+/// Applies the settings to a message. If `movable` is true, its signals may be moved.
 fn apply(
     message: &mut Message,
     settings: &MessageSettings,
@@ -365,8 +371,8 @@ fn trailer_signals(len_bytes: u16, authentication: Authentication) -> Vec<Signal
     let length = |bits: u32| u16::try_from(bits).unwrap_or(0);
     let (freshness, mac) = (length(profile.freshness_bits()), length(profile.mac_bits()));
     let first = 8 * len_bytes.saturating_sub(length(u32::from(freshness + mac) / 8));
-    // In a DBC, the start bit of a big-endian signal is its most significant bit; bits of a byte count from the least
-    // significant.
+    // In a DBC, the start bit of a big-endian signal is its most significant bit, and the bits of a byte count from the
+    // least significant bit.
     let place = |bit: u16| bit / 8 * 8 + 7 - bit % 8;
     let signal = |name, bit, length_bits, comment: &str| {
         let mut signal = header_signal(name, place(bit), length_bits, comment);
@@ -393,7 +399,7 @@ fn header_signal(name: &str, start_bit: u16, length_bits: u16, comment: &str) ->
             factor: 1.0,
             offset: 0.0,
             minimum: 0.0,
-            // Only stated if a float represents it exactly; 0 = not stated.
+            // Stated only if a float represents the maximum exactly; 0 = not stated.
             maximum: if length_bits < 53 { ((1_u64 << length_bits) - 1) as f64 } else { 0.0 },
         },
         unit: String::new(),
@@ -470,7 +476,7 @@ fn fit_steps(message: &mut Message, rated_capacity_ah: f64) {
     }
 }
 
-/// The smallest of 1, 2, 5, 10, ... that is not below `needed`; at most the largest step.
+/// The smallest of 1, 2, 5, 10, ... that is not below `needed`, but at most the largest step.
 fn times(needed: f64) -> f64 {
     /// Larger than any cell needs: a million times 40 Ah.
     const LARGEST: f64 = 1e6;

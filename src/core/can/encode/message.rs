@@ -1,4 +1,4 @@
-//! A message of a layout, prepared for encoding: signals, "not available" codes, pages, protection.
+//! Prepares a message of a layout for encoding: signals, "not available" codes, pages, protection.
 //!
 //! In: values by signal name. Out: frames. A message that cannot be encoded is rejected with all its faults.
 
@@ -92,7 +92,7 @@ impl OutputMessage {
         })
     }
 
-    /// Checks that every rule has its value and its threshold, on its own page only.
+    /// Checks that every rule has a value signal and a threshold signal that are present on the rule's page only.
     pub(super) fn check_rules(&self, rules: &[&str], faults: &mut Vec<String>) {
         if self.fields.iter().any(|field| field.name == "Rule" && !field.is_multiplexor) {
             faults.push("signal PACKWATCH_Alarm.Rule must be the multiplexor (M)".to_owned());
@@ -174,7 +174,7 @@ impl OutputMessage {
     }
 }
 
-/// Checks that the message fits into its frames, and its protection into the message.
+/// Checks that the message fits into its frames, and that its protection fits into the message.
 fn check_length(message: &Message, faults: &mut Vec<String>) {
     let (name, len) = (&message.name, usize::from(message.len_bytes));
     if len > MAX_DATA {
@@ -194,7 +194,7 @@ fn check_length(message: &Message, faults: &mut Vec<String>) {
 }
 
 /// Checks that the multiplexor has a code for every page. Otherwise, a page would be sent with the number of another
-/// one.
+/// page.
 fn check_pages(message: &str, fields: &[OutputField], faults: &mut Vec<String>) {
     for selector in fields.iter().filter(|field| field.is_multiplexor) {
         let highest = selector.plan.all_ones();

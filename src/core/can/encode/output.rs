@@ -1,12 +1,12 @@
-//! The frames that the daemon sends, encoded with a layout.
+//! Encodes the frames that the daemon sends, with a layout.
 //!
 //! Any DBC with the message and signal names of the shipped `config/packwatch.dbc` can be used. An unknown value is
-//! sent as the code that the DBC's value table calls "not available", else as all ones (unsigned), the lowest code
-//! (signed) or NaN (float). A known value never has that code: it saturates before it. End-to-end headers use the
-//! counters that the caller keeps ([`SendCounters`]).
+//! sent as the code that the DBC's value table calls "not available". If the table has no such code, an unknown value
+//! is sent as all ones (unsigned), the lowest code (signed) or NaN (float). A known value never has that code, because
+//! it saturates before it. End-to-end headers use the counters that the caller keeps ([`SendCounters`]).
 //!
-//! A DBC is rejected with all its faults if signals are missing, or if a value could be mistaken for another rule's or
-//! page's value.
+//! If signals are missing, or if a value could be mistaken for the value of another rule or page, the DBC is rejected
+//! with all its faults.
 
 use serde::{Deserialize, Serialize};
 
@@ -100,19 +100,19 @@ pub struct HealthFields {
     pub usable_capacity_std_ah: Option<f64>,
     /// Resistance relative to new (1 = as new).
     pub resistance_ratio: Option<f64>,
-    /// Equivalent full cycles until the end of life, median. This and all following values are sent only if the DBC has
-    /// their signal.
+    /// Equivalent full cycles until the end of life, median. This value and all following ones are sent only if the DBC
+    /// has their signal.
     pub remaining_cycles: Option<f64>,
-    /// Its 5 % quantile.
+    /// 5 % quantile of `remaining_cycles`.
     pub remaining_cycles_low: Option<f64>,
-    /// Days, median.
+    /// Days until the end of life, median.
     pub remaining_days: Option<f64>,
-    /// Loss of lithium inventory of the cell with the least capacity, and its standard deviation, fractions of a new
-    /// cell's.
+    /// Loss of lithium inventory of the cell with the least capacity, and its standard deviation. Both are fractions of
+    /// a new cell's inventory.
     pub lli: [Option<f64>; 2],
-    /// Loss of active material of the same cell's negative electrode, and its standard deviation.
+    /// Loss of active material of the same cell's negative electrode, and its standard deviation, as fractions.
     pub lam_ne: [Option<f64>; 2],
-    /// Loss of active material of the same cell's positive electrode, and its standard deviation.
+    /// Loss of active material of the same cell's positive electrode, and its standard deviation, as fractions.
     pub lam_pe: [Option<f64>; 2],
     /// Wire code of how well the cells' model is known.
     pub model_state: Option<u8>,
@@ -128,9 +128,9 @@ pub struct AlarmFields {
     pub state: Option<u8>,
     /// Wire code: 1 info, 2 warning, 3 severe; `None` = unknown.
     pub severity: Option<u8>,
-    /// Whether it is a test, not a real alarm.
+    /// Whether the alarm is a test.
     pub test: bool,
-    /// Whether it is acknowledged.
+    /// Whether the alarm is acknowledged.
     pub acknowledged: bool,
     /// The cell; `None` = the whole pack.
     pub cell: Option<CellIndex>,
@@ -140,8 +140,8 @@ pub struct AlarmFields {
     pub threshold: Option<f64>,
 }
 
-/// The next counter of each message's end-to-end protection. They must survive a restart: to a receiver, a counter that
-/// jumps back indicates an old frame.
+/// The next counter of each message's end-to-end protection. The counters must survive a restart, because to a
+/// receiver, a counter that jumps back indicates an old frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SendCounters {
@@ -180,7 +180,7 @@ pub struct SentMessage {
 }
 
 impl SentMessage {
-    /// Data id of protection or authentication; `None` = it has neither.
+    /// Data id of protection or authentication; `None` = the message has neither.
     pub fn data_id(&self) -> Option<u16> {
         self.protection.map(|protection| protection.data_id).or(self.secoc.map(|secoc| secoc.data_id))
     }

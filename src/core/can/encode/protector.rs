@@ -1,14 +1,15 @@
-//! Protects generated input frames (CSV replay, simulator): the sender's side of the end-to-end check.
+//! Protects generated input frames (CSV replay, simulator): the sender's side of end-to-end protection.
 //!
 //! In: frames in the order in which they are sent. Each frame of a protected message gets the next counter and its CRC.
-//! Other frames are unchanged, and so are frames too short for the header; the receiver detects that fault.
+//! Other frames are unchanged. A frame that is too short for the header is unchanged, too, and the receiver detects the
+//! fault.
 
 use crate::can::e2e::Protection;
 use crate::can::guard::GuardConfig;
 use crate::can::{CanId, Frame};
 use crate::quantity::BusIndex;
 
-/// The sender's side of every protected input message.
+/// Adds counters and CRCs to all protected input messages.
 #[derive(Debug, Clone, Default)]
 pub struct InputProtector {
     senders: Vec<MessageSender>,

@@ -1,8 +1,8 @@
-//! The reply to a command frame.
+//! Encodes the reply to a command frame.
 //!
 //! In: the outcome of a command, or the reason why it was not executed, and the counter that the next command must
-//! have. Out: values for the signals of `PACKWATCH_Reply`. If the checksum of a frame is wrong, the reply does not
-//! repeat its content.
+//! have. Out: values for the signals of `PACKWATCH_Reply`. If the checksum of a command frame is wrong, the reply does
+//! not repeat its content.
 
 use serde::{Deserialize, Serialize};
 
@@ -23,20 +23,20 @@ const REQUIRED: [&str; 9] =
 pub enum CommandRefusal {
     /// The first frame after a start of the receiver, which only sets the counter.
     FirstFrame = 1,
-    /// Damaged, too short, or from another message.
+    /// The frame is damaged, too short, or from another message.
     WrongChecksum = 2,
     /// The counter was already used by the last accepted frame.
     RepeatedCounter = 3,
     /// The counter jumped further than allowed.
     WrongCounter = 4,
-    /// An undefined code.
+    /// The frame has an undefined code.
     NoMeaning = 5,
-    /// The authenticator is wrong: forged, or created with another key.
+    /// The authenticator is wrong: the frame is forged, or its sender has another key.
     NotAuthentic = 8,
     /// The freshness was used before, is older than the previous announcement, or was not announced yet.
     OldFreshness = 9,
-    /// Authentic, but many forged frames were received. The command is executed if it is repeated with another
-    /// freshness.
+    /// The frame is authentic, but many forged frames were received. If the sender repeats the command with another
+    /// freshness, it is executed.
     RepeatNeeded = 10,
 }
 
@@ -75,11 +75,12 @@ impl CommandRefusal {
 /// Contents of the reply.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ReplyFields {
-    /// Numbers of alarms changed and refused by the command, or the reason why it was not executed.
+    /// Number of changed alarms and number of alarms that refused the change, or the reason why the command was not
+    /// executed.
     pub outcome: Result<(u32, u32), CommandRefusal>,
     /// The command; `None` = it could not be decoded.
     pub command: Option<CommandFields>,
-    /// Counter that the next command must have; `None` = any.
+    /// Counter that the next command must have; `None` = any counter.
     pub counter_expected: Option<u8>,
 }
 

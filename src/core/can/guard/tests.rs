@@ -1,4 +1,4 @@
-//! Messages that fail and recover, missing frames, and the effects of a restart.
+//! Tests messages that fail and recover, missing frames, and the effects of a restart.
 
 #![allow(clippy::unwrap_used, reason = "tests may panic")]
 

@@ -1,4 +1,4 @@
-//! ISO-TP: reassembly, a fault for every kind of damage, and arbitrary frames without a panic.
+//! Tests reassembly, the fault for each kind of damage, and arbitrary frames.
 
 #![allow(clippy::unwrap_used, reason = "tests may panic")]
 
@@ -141,9 +141,9 @@ proptest! {
         prop_assert_eq!(receive(extension, &frames), (vec![message(length)], vec![]));
     }
 
-    /// With one frame lost, duplicated or out of order in its message, every accepted message was sent, and every
-    /// message that arrived intact is accepted. (If the end of one message replaces the start of the next, the protocol
-    /// itself cannot detect a fault.)
+    /// One frame is lost, duplicated or out of order in its message. Every accepted message was sent, and every message
+    /// that arrived intact is accepted. (If the end of one message replaces the start of the next, the protocol itself
+    /// cannot detect a fault.)
     #[test]
     fn damaged_messages_are_never_accepted(
         lengths in proptest::collection::vec(1_usize..80, 1..20), place in any::<proptest::sample::Index>(), kind in 0..3_u8

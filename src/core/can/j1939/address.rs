@@ -19,8 +19,8 @@ use super::name::Name;
 use crate::can::Frame;
 use crate::quantity::Timestamp;
 
-/// Time without objection after which the node has the address, ns: the 250 ms of J1939-81, plus 50 ms because a frame
-/// reaches the wire later than its time here (interface start, queues; 12 ms were measured).
+/// Time without objection after which the node has the address, ns: the 250 ms of J1939-81, plus 50 ms. A frame reaches
+/// the wire later than its time stamp here (interface start, queues). A delay of 12 ms was measured.
 const CONTENTION_NS: i64 = 300_000_000;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -54,7 +54,7 @@ enum ClaimAnswer {
     CannotClaim,
 }
 
-/// The table in the module's documentation.
+/// The new state and the answer, as in the table in the module's documentation.
 fn next(state: ClaimState, event: ClaimEvent) -> (ClaimState, ClaimAnswer) {
     match (state, event) {
         (ClaimState::Idle | ClaimState::Claiming | ClaimState::Claimed | ClaimState::Lost, ClaimEvent::Started)
@@ -140,8 +140,8 @@ impl AddressClaim {
         let before = self.state;
         let (state, answer) = next(before, event);
         self.state = state;
-        // Shortest time between two claims, ns: five claims within the time that the other node waits, and no flood of
-        // responses to a flood of claims.
+        // Shortest time between two claims, ns. It allows five claims within the time that the other node waits, but no
+        // flood of responses to a flood of claims.
         let spaced = self.last_sent.map_or(now, |sent| now.max(sent.plus_nanos(50_000_000)));
         match answer {
             ClaimAnswer::Nothing => {}
@@ -156,16 +156,16 @@ impl AddressClaim {
         }
     }
 
-    /// Delay before "cannot claim", derived from the NAME: the same in every run, and most likely different for two
-    /// nodes.
+    /// Delay before "cannot claim". It is derived from the NAME, so that it is the same in every run and most likely
+    /// different for two nodes.
     fn loser_delay_ns(&self) -> i64 {
         // Fibonacci hashing: consecutive serial numbers give very different delays.
         let mixed = self.name.raw().wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 32;
-        // 0 to 153 ms, so that several losers do not collide with equal identifiers (J1939-81).
+        // 0 to 153 ms, so that several nodes without address do not send equal identifiers at the same time (J1939-81).
         1_000_000 * i64::try_from(mixed % 154).unwrap_or(0)
     }
 
-    /// The frame that is due, or the event that the node has the address.
+    /// Returns the frame that is due, or the event that the node has the address.
     pub(super) fn poll(&mut self, now: Timestamp) -> (Option<Frame>, Option<NodeEvent>) {
         if let Some(due) = self.send_at {
             if now < due {
@@ -194,7 +194,7 @@ impl AddressClaim {
         Frame::classic(can_id(PRIORITY, PGN_ADDRESS_CLAIMED, GLOBAL_ADDRESS, source), &self.name.to_bytes())
     }
 
-    /// When `poll` has something to do.
+    /// Time at which `poll` must be called next.
     pub(super) fn next_due(&self) -> Option<Timestamp> {
         self.send_at.or((self.state == ClaimState::Claiming).then_some(self.unopposed_at))
     }

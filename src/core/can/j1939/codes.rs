@@ -1,19 +1,19 @@
-//! Trouble codes as sent, which follow the active codes with at most one change a second each (J1939-73).
+//! Limits each sent trouble code to one change a second (J1939-73).
 //!
-//! A code is sent as soon as it becomes active, and removed as soon as it becomes inactive, unless its last change on
-//! the bus is less than a second ago. In that case, the change waits. A code that was active only while a change waited
-//! is still sent, for at least a second. A code that was inactive only while a change waited stays, with a higher
-//! count.
+//! A code is added to the message as soon as it becomes active, and removed as soon as it becomes inactive. If its last
+//! change on the bus is less than a second ago, the change waits. If the code was active only while a change waited, it
+//! is still sent for at least a second. If the code was inactive only while a change waited, it stays in the message
+//! with a higher count.
 //!
-//! The state "all known" follows the same rule when it becomes true; when it becomes false, it is sent at once.
+//! The state "all known" follows the same rule when it becomes true. When it becomes false, it is sent at once.
 
 use serde::{Deserialize, Serialize};
 
 use super::trouble_code::{Lamp, Lamps, TroubleCode};
 use crate::quantity::Timestamp;
 
-/// Most codes followed at a time: more than a configuration can have (17 rules with three severities are 51), but few
-/// enough for a linear search.
+/// Maximum number of followed codes. It is more than a configuration can have (17 rules with three severities give 51)
+/// and small enough for a linear search.
 const MAX_FOLLOWED: usize = 64;
 
 /// An active code and its lamp.
@@ -23,7 +23,7 @@ pub struct ActiveCode {
     pub lamp: Lamp,
 }
 
-/// One code: its active state, and its state as sent.
+/// A code that is or was active, with its current state and its state on the bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 struct FollowedCode {
     code: TroubleCode,
@@ -33,7 +33,7 @@ struct FollowedCode {
     /// Most severe lamp since the last change on the bus.
     lamp: Lamp,
     lamp_now: Lamp,
-    /// Lamp as sent; `None` = the code is not sent.
+    /// Lamp on the bus; `None` = the code is not sent.
     shown: Option<Lamp>,
     changed_at: Option<Timestamp>,
     /// Whether the change is part of the message that is being transferred.
@@ -64,7 +64,7 @@ impl FollowedCode {
         (self.wanted() != self.shown).then_some(spaced(self.changed_at))
     }
 
-    /// The lamp in a message that is sent at `now`; `None` = the code is not in it.
+    /// The lamp in a message that is sent at `now`; `None` = the message does not contain the code.
     fn shown_at(&self, now: Timestamp) -> Option<Lamp> {
         if self.due().is_some_and(|due| due <= now) { self.wanted() } else { self.shown }
     }
@@ -132,7 +132,7 @@ impl Codes {
         });
     }
 
-    /// Restarts after time without the bus: active codes count as new.
+    /// Treats all active codes as new. Called after a time without the bus.
     pub(super) fn restart(&mut self) {
         self.followed.retain(|followed| followed.is_active);
         for followed in &mut self.followed {
@@ -179,7 +179,7 @@ impl Codes {
         }
     }
 
-    /// Handles the end of a message at `now`: the second without changes starts now.
+    /// Handles the end of a message at `now`, which starts the second without changes.
     pub(super) fn sent(&mut self, now: Timestamp) {
         for followed in self.followed.iter_mut().filter(|followed| followed.is_in_flight) {
             followed.changed_at = Some(now);
@@ -187,12 +187,12 @@ impl Codes {
         }
     }
 
-    /// The lamps as sent, including the lamps of codes that do not fit into the message.
+    /// The lamps to send, including the lamps of codes that do not fit into the message.
     pub(super) fn lamps(&self) -> Lamps {
         Lamps::of(self.followed.iter().filter_map(|followed| followed.shown), self.all_known_shown)
     }
 
-    /// The codes as sent, most severe lamp first, then by number.
+    /// The codes to send, ordered by lamp (most severe first), then by number.
     pub(super) fn shown(&self) -> Vec<TroubleCode> {
         let mut shown: Vec<(Lamp, TroubleCode)> =
             self.followed.iter().filter_map(|followed| Some((followed.shown?, followed.code))).collect();

@@ -8,16 +8,16 @@ use super::name::Name;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "node_event")]
 pub enum NodeEvent {
-    /// The node has its address; codes are sent from now on.
+    /// The node has its address and starts to send codes.
     Claimed { address: u8 },
-    /// Another node took the address; codes are no longer sent.
+    /// Another node took the address. The node stops sending codes.
     AddressLost {
-        /// Its NAME; this node's own NAME if two nodes have the same configuration.
+        /// NAME of the other node. It equals this node's own NAME if two nodes have the same configuration.
         to: Name,
     },
-    /// Another node claimed the address, but has the lower priority.
+    /// Another node claimed the address, but has the higher NAME and therefore loses.
     AddressDefended {
-        /// Its NAME.
+        /// NAME of the other node.
         against: Name,
     },
     /// The number of active codes that do not fit into one message changed.

@@ -1,7 +1,7 @@
-//! J1939: packwatch as one node that claims an address and sends its trouble codes.
+//! J1939: packwatch is a node that claims an address and sends trouble codes.
 //!
-//! In: times, received frames, the active codes. Out: frames to send and events to log. Pure like the rest of
-//! [`can`](crate::can): the output depends only on the input, so a replay gives the same frames.
+//! In: times, received frames and active codes. Out: frames to send and events to log. Like the rest of
+//! [`can`](crate::can), the module is pure: the output depends only on the input, so a replay gives the same frames.
 //!
 //! | file | purpose |
 //! | --- | --- |
@@ -14,15 +14,15 @@
 //! | `event` | events of the node |
 //! | `node` | the node that consists of these parts |
 //!
-//! Promise: without its address, the node sends only address claims. Unknown and short frames are ignored, and requests
-//! are answered at a limited rate; no input causes a panic.
+//! While the node does not have its address, it sends only address claims. It ignores unknown and short frames and
+//! answers requests at a limited rate. No input causes a panic.
 //!
 //! Deviations from the standard:
 //! 1. The arbitrary address capability is not used: a node that loses its address falls silent instead of claiming
-//!    another. A consumer that identifies battery monitors by address could not tell them apart if addresses changed.
+//!    another. If addresses changed, a consumer that identifies battery monitors by address could not distinguish them.
 //! 2. Every payload of more than 8 bytes is sent by BAM, even if a single node requested it (the standard uses a
-//!    connection with flow control for that). That node receives the broadcast as well; the effect is bus load, limited
-//!    by [`MAX_CODES`].
+//!    connection with flow control for that). That node receives the broadcast, too. The effect is a higher bus load,
+//!    which [`MAX_CODES`] limits.
 //! 3. The delay before "cannot claim" is derived from the NAME instead of random, so that a replay gives the same
 //!    frames.
 

@@ -1,4 +1,4 @@
-//! The NAME of J1939-81: 64 bits that identify a node; the node with the smaller NAME wins an address.
+//! The NAME of J1939-81: 64 bits that identify a node. If two nodes claim the same address, the smaller NAME wins.
 
 use std::fmt;
 
@@ -32,7 +32,7 @@ pub struct NameFields {
     pub identity_number: u32,
 }
 
-/// A number that does not fit its bits on the wire.
+/// Reports a number that does not fit its bits on the wire.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("{field} = {found}, must be {lowest} to {highest}")]
 pub struct OutOfRange {

@@ -1,12 +1,12 @@
 //! The node: claims its address, sends DM1 once a second and on every change, answers requests.
 //!
-//! * DM1 is sent once a second, even without codes, and at once on a change (`codes` limits the changes of one code).
+//! * DM1 is sent once a second, even without codes, and at once on a change. `codes` limits how often one code changes.
 //! * DM2 is sent only on request.
 //! * Messages of more than 8 bytes are transferred one after the other: a changed DM1 waits for the end of a transfer.
 //!   If both wait, DM1 and DM2 alternate, so that neither a flood of requests stops DM1 nor a long DM1 stops DM2. A
 //!   single-frame DM1 is sent even while a DM2 is being transferred.
-//! * If the node does not support the requested group, it rejects a request to its own address and ignores a request to
-//!   all.
+//! * If a node requests a group that is not supported, the answer depends on the destination. A request to the node's
+//!   own address is rejected, and a request to all nodes is ignored.
 
 use std::collections::VecDeque;
 
@@ -27,8 +27,8 @@ use crate::quantity::Timestamp;
 
 /// Period of DM1, ns (J1939-73).
 const DM1_PERIOD_NS: i64 = 1_000_000_000;
-/// Most pending responses: a fifth would be sent more than 200 ms after its request, when the requester has given up
-/// (J1939-21).
+/// Maximum number of pending responses. A fifth response would be sent more than 200 ms after its request, when the
+/// requester has given up (J1939-21).
 const MAX_WAITING_ANSWERS: usize = 4;
 
 /// Identity of a node.
@@ -124,8 +124,8 @@ impl Node {
         self.poll(now, out);
     }
 
-    /// Sets the codes to send: active codes and previously active codes, most severe or latest first, and whether every
-    /// value that could activate a code is known. The next [`poll`](Self::poll) sends them.
+    /// Sets the codes that the next [`poll`](Self::poll) sends. The most severe active code and the latest previously
+    /// active code come first. `all_known` says whether every value that could activate a code is known.
     pub fn set_codes(
         &mut self,
         now: Timestamp,
@@ -220,7 +220,7 @@ impl Node {
         let is_cyclic = self.next_dm1 <= now;
         let has_changed = self.codes.change_due().is_some_and(|due| due <= now);
         if (is_cyclic || has_changed) && self.can_start(now, PGN_DM1) {
-            // If it was on time, the next DM1 keeps the cycle; after a change, a new cycle starts now.
+            // If this DM1 is on time, the next one keeps the cycle. After a change, a new cycle starts now.
             let next = self.next_dm1.plus_nanos(DM1_PERIOD_NS);
             self.next_dm1 = if is_cyclic && now < next { next } else { now.plus_nanos(DM1_PERIOD_NS) };
             self.send_dm1(now, out);
@@ -291,7 +291,7 @@ impl Node {
     fn start_at(&self, now: Timestamp, pgn: u32) -> Option<Timestamp> {
         let codes = if pgn == PGN_DM1 { self.codes.count_at(now) } else { self.previously_active.len() };
         match &self.transfer {
-            // An older content must not end after a newer one.
+            // A transfer with older content must not end after a frame with newer content.
             Some(transfer) if codes > 1 || transfer.pgn == pgn => None,
             None if codes > 1 && pgn == PGN_DM1 && self.is_turn_of_dm2() => None,
             None if codes > 1 => Some(self.transport_free_at),
@@ -299,8 +299,8 @@ impl Node {
         }
     }
 
-    /// When [`poll`](Self::poll) has something to do; a time in the past means now; `None` = only a frame or
-    /// [`start`](Self::start) can change that. A poll before this time does nothing.
+    /// Time at which [`poll`](Self::poll) must be called next; a time in the past means now. `None` = not before a
+    /// frame or [`start`](Self::start). A poll before this time does nothing.
     pub fn next_due(&self) -> Option<Timestamp> {
         let claim = self.claim.next_due();
         if self.is_silent() {
@@ -338,8 +338,8 @@ impl Node {
         }
     }
 
-    /// Extended identifiers that the node must receive, as identifier and mask for any priority: claims of its address,
-    /// requests to it and to all.
+    /// Extended identifiers that the node must receive, as identifier and mask for any priority: claims of the node's
+    /// address, requests to the node, and requests to all nodes.
     pub fn wanted(&self) -> [(u32, u32); 3] {
         let (claim, mask) = filter(PGN_ADDRESS_CLAIMED, GLOBAL_ADDRESS);
         [

@@ -5,16 +5,18 @@
 //! byte 1      flashing of the same lamps: 11 = does not flash
 //! then, each  SPN 7..0 | SPN 15..8 | SPN 18..16 and FMI | occurrence count
 //! ```
-//! Without a code: four zero bytes. Up to one code: padded with 0xFF to 8 bytes. The highest bit of an occurrence count
-//! is the conversion method. If it is set, the SPN has one of three older layouts, which cannot be distinguished.
+//! A message without codes has four zero bytes instead. A message with at most one code is padded with 0xFF to 8 bytes.
+//! SPN is the suspect parameter number, and FMI the failure mode identifier. The highest bit of an occurrence count is
+//! the conversion method. If it is set, the SPN has one of three older layouts, which cannot be distinguished.
+//! packwatch never sets it.
 
 use serde::{Deserialize, Serialize};
 
 use super::name::OutOfRange;
 
-/// Most codes in one message: 27, that is 110 bytes in 16 packets. With 50 ms between packets, each up to one tick of
-/// 10 ms late, a transfer ends within 0.96 s, before the next DM1 is due. If thresholds of a rule share a parameter
-/// number, only the most severe is sent, so 17 rules give 17 codes.
+/// Maximum number of codes in one message: 27 codes are 110 bytes in 16 packets. With 50 ms between packets, each up to
+/// one tick of 10 ms late, a transfer ends within 0.96 s, before the next DM1 is due. 27 codes are enough for 17 rules,
+/// because only the most severe threshold of a rule is sent if its thresholds share a parameter number.
 pub const MAX_CODES: usize = 27;
 
 pub(super) const MAX_PAYLOAD: usize = 2 + 4 * MAX_CODES;
@@ -39,7 +41,7 @@ impl TroubleCode {
     /// 126.
     ///
     /// # Errors
-    /// A number that does not fit its bits; SPN 0, which would mean "no code".
+    /// A number does not fit its bits, or the SPN is 0, which would mean "no code".
     pub fn new(spn: u32, fmi: u8, occurrence_count: u32) -> Result<Self, OutOfRange> {
         if !(1..=MAX_SPN).contains(&spn) {
             return Err(OutOfRange { field: "spn", found: spn.into(), lowest: 1, highest: MAX_SPN.into() });
@@ -83,16 +85,16 @@ impl TroubleCode {
     }
 }
 
-/// The lamp of a code, mildest first. The malfunction lamp is not included, because it is only for emissions.
+/// The lamp of a code, least severe first. The malfunction lamp is not included, because it is only for emissions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Lamp {
     None,
-    /// Protect: a fault outside the electronics.
+    /// Protect lamp: a fault outside the electronics.
     Protect,
-    /// Amber warning: service is needed, the vehicle need not stop.
+    /// Amber warning lamp: service is needed, but the vehicle need not stop.
     Amber,
-    /// Red stop: stop the vehicle.
+    /// Red stop lamp: the driver must stop the vehicle.
     Red,
 }
 
@@ -100,10 +102,10 @@ pub enum Lamp {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 #[repr(u8)]
 pub enum LampState {
-    /// No fault.
+    /// There is no fault.
     #[default]
     Off = 0b00,
-    /// A fault.
+    /// There is a fault.
     On = 0b01,
     /// It is unknown whether there is a fault.
     NotAvailable = 0b11,
@@ -121,8 +123,8 @@ pub struct Lamps {
 }
 
 impl Lamps {
-    /// The lamps for active codes. If not everything is known (`all_known` is false), a lamp that no code lights is
-    /// "not available" instead of off: an unknown state must not look healthy.
+    /// The lamps for active codes. If some values are unknown (`all_known` is false), a lamp that no code lights is
+    /// "not available" instead of off, because an unknown state must not look healthy.
     pub fn of(lit: impl IntoIterator<Item = Lamp>, all_known: bool) -> Self {
         let dark = if all_known { LampState::Off } else { LampState::NotAvailable };
         let mut lamps = Self { protect: dark, amber: dark, red: dark };
@@ -173,7 +175,7 @@ impl From<Vec<u8>> for DmPayload {
 }
 
 /// Payload with lamps and codes. It contains at most the first [`MAX_CODES`] codes, so the caller must pass the most
-/// severe first.
+/// severe codes first.
 pub fn dm_payload(lamps: Lamps, codes: &[TroubleCode]) -> DmPayload {
     let mut bytes = [0xFF; MAX_PAYLOAD];
     bytes[0] = lamps.to_byte();

@@ -262,8 +262,9 @@ fn car_state_sets_request_period() {
 }
 
 proptest! {
-    /// For any input: sends only requests of reading services and flow control, nothing within a minute of another
-    /// tester's request, no more than the allowed rate; and the driver does not spin.
+    /// For any input, the poller keeps four limits. It sends only flow control and requests of reading services. It
+    /// sends nothing within a minute of another tester's request. It does not exceed the allowed rate. Its next due
+    /// time is always in the future, so the driver does not spin.
     #[test]
     fn poller_keeps_its_limits_for_any_input(
         acts in proptest::collection::vec((0_u8..8, 0_u16..3000, any::<[u8; 8]>()), 1..80)

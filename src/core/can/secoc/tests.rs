@@ -1,4 +1,4 @@
-//! Layout of the trailer, and which freshness is accepted when.
+//! Tests the layout of the trailer and the acceptance of freshness values.
 
 #![allow(clippy::unwrap_used, reason = "tests may panic")]
 

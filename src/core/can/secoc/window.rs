@@ -1,15 +1,15 @@
-//! Freshness values that commands may have: announced by the receiver, never accepted twice, expired after two
-//! announcements.
+//! Decides which freshness values a command may have. The receiver announces them, accepts none twice, and lets them
+//! expire after two announcements.
 //!
 //! The receiver announces a value once a second, each time [`ANNOUNCEMENT_STEP`] higher. A command carries the
-//! announced value or one of those up to the next announcement, each once and in rising order. A value is accepted if
-//! it is above every value accepted before, not older than the previous announcement, and already announced. So a
-//! command that an attacker holds back expires after two seconds, and one with an invented value is useless until the
-//! receiver announces that value.
+//! announced value or a higher one below the next announcement. The sender uses each value once and in rising order.
+//! The receiver accepts a value if it is higher than every value accepted before, not older than the previous
+//! announcement, and already announced. If an attacker delays a command, it expires after two seconds. A command with
+//! an invented value is useless until the receiver announces that value.
 //!
 //! The sender stores nothing across a restart: it waits for an announcement. The receiver stores its state. After a
 //! restart it begins [`RESTART_STEPS`] announcements beyond the stored state, and at least at the value that
-//! corresponds to its clock, so that no value of the previous run is used again, even if it was not stored.
+//! corresponds to its clock. Therefore it never reuses a value of the previous run, even if that value was not stored.
 
 use serde::{Deserialize, Serialize};
 
@@ -18,7 +18,7 @@ use crate::quantity::Timestamp;
 
 /// Difference between two announcements, and the number of commands that one announcement allows.
 pub const ANNOUNCEMENT_STEP: u64 = 16;
-/// Announcements skipped at a start: more than an hour in which the state could not be stored.
+/// Number of announcements skipped at a start. They cover more than an hour in which the state could not be stored.
 const RESTART_STEPS: u64 = 4096;
 /// A stored value above this is damaged: it would take 10^9 years.
 const MAX_FRESHNESS: u64 = 1 << 60;
@@ -34,7 +34,7 @@ pub struct FreshnessWindow {
 }
 
 impl FreshnessWindow {
-    /// Begins a run at `now`, beyond every value that an earlier run can have announced.
+    /// Begins a run at `now`. Skips every value that an earlier run can have announced.
     pub fn begin(&mut self, now: Timestamp) {
         let by_clock = u64::try_from(now.nanos() / 1_000_000_000).unwrap_or(0).saturating_mul(ANNOUNCEMENT_STEP);
         self.advance(RESTART_STEPS);
@@ -47,7 +47,7 @@ impl FreshnessWindow {
         self.announced
     }
 
-    /// Expires every announced value, after time without listening.
+    /// Expires every announced value. Called after a time without listening.
     pub fn expire(&mut self) {
         self.advance(2);
     }
@@ -77,7 +77,7 @@ impl FreshnessWindow {
         self.announced
     }
 
-    /// Accepts a value: from now on, neither this value nor a lower one is acceptable.
+    /// Accepts a value. Afterwards, neither this value nor a lower one is acceptable.
     pub fn accept(&mut self, freshness: u64) {
         self.accepted = self.accepted.max(freshness);
     }

@@ -184,7 +184,7 @@ fn flood_of_foreign_first_frames_uses_no_memory() {
         bench.hear(CanId::Standard(id), &[0x1F, 0xFF, 1, 2, 3, 4, 5, 6]);
     }
     assert_eq!(bench.listener.counts().count(), 1);
-    // The only relevant identifiers: the responses' identifier (starts a message) and the requests' identifier.
+    // Only the identifiers of responses and requests concern the listener. A frame of the responses started a message.
     assert_eq!(bench.counts(), ControllerCounts::default());
 }
 

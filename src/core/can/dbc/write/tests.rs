@@ -1,4 +1,4 @@
-//! Written text parses to an equal database, and the shipped DBC does not change.
+//! Tests that written text parses to an equal database and that the shipped DBC is up to date.
 
 use proptest::prelude::*;
 

@@ -1,4 +1,4 @@
-//! Every pair of state and event, and realistic sequences of frames.
+//! Tests every pair of state and event, and realistic sequences of frames.
 
 #![allow(clippy::unwrap_used, reason = "tests may panic")]
 
@@ -11,11 +11,11 @@ const LAST: u8 = 7;
 enum State {
     /// WaitForFirstData.
     Waiting,
-    /// Accepted, nothing missed: the next call allows a step of 2.
+    /// The last frame was valid. The next call allows a step of 2.
     Following,
     /// The sequence is broken, and 2 more valid frames are required.
     Syncing,
-    /// More calls without a new frame than configured.
+    /// More calls without a new frame than the configuration allows.
     Silent,
 }
 
@@ -82,8 +82,8 @@ fn apply(receiver: &mut Receiver, config: &CheckConfig, what: Input) -> Status {
     receiver.check(config, &frame(config, counter))
 }
 
-/// For profile 1, a frame with an invalid counter and a correct CRC (found by trial); for profile 5, where 15 is a
-/// normal counter, a frame of another message.
+/// For profile 1, a frame with an invalid counter and a correct CRC. For profile 5, where 15 is a valid counter, a
+/// frame of another message.
 fn counter_15(config: &CheckConfig) -> [u8; 8] {
     let mut payload = frame(config, 14);
     let other = Protection { data_id: 0x0456, ..config.protection };
@@ -97,8 +97,8 @@ fn counter_15(config: &CheckConfig) -> [u8; 8] {
     payload
 }
 
-/// Result of AUTOSAR's check, with `sync` = SyncCounterInit, and (LastValidCounter, MaxDeltaCounter, NoNewOrRepeated,
-/// Sync) afterwards.
+/// Expected status of AUTOSAR's check, followed by the expected (LastValidCounter, MaxDeltaCounter,
+/// NoNewOrRepeatedDataCounter, SyncCounter). `sync` is SyncCounterInit.
 fn wanted(profile: Profile, state: State, what: Input, sync: u8) -> (Status, (Option<u8>, u8, u8, u8)) {
     use Input::{Damaged, Invalid15, Next, NoFrame, OneLost, Same, Short, TooFar};
     use State::{Following, Silent, Syncing, Waiting};
@@ -106,7 +106,7 @@ fn wanted(profile: Profile, state: State, what: Input, sync: u8) -> (Status, (Op
     let (last, grown) = (before.last_valid, before.max_delta + 1);
     let (repeated, syncing) = (before.no_new_or_repeated, before.sync);
     let at = |step: u8| Some(LAST + step);
-    // A too long silence requires synchronisation, and this frame is its first.
+    // After too long a silence, synchronisation is required. This frame is its first.
     let left = sync.saturating_sub(1);
     let after_silence = |normal| if sync > 0 { Status::Sync } else { normal };
     match (state, what) {

@@ -1,4 +1,4 @@
-//! Digest frames, decoded with the shipped DBC.
+//! Tests digest frames, decoded with the shipped DBC.
 
 use super::*;
 use crate::can::encode::{OutputPlan, SendCounters, default_database};

@@ -1,4 +1,4 @@
-//! Frames encoded from values decode to those values.
+//! Tests that encoded frames decode to the original values.
 
 use super::*;
 use crate::can::FrameKind;

@@ -1,4 +1,5 @@
-//! Settings change the layout, or are rejected with their key; a layout built from its own text does not change.
+//! Tests that valid settings change the layout, that invalid settings are rejected with their key, and that a layout
+//! built from its own text does not change.
 
 use super::*;
 use crate::can::encode::{CommandPlan, OutputPlan};
@@ -17,7 +18,8 @@ fn with_status(status: MessageSettings) -> LayoutSettings {
     LayoutSettings { status, ..Default::default() }
 }
 
-/// Key and text of the only fault of an own DBC, which is the shipped DBC with one text replaced.
+/// Replaces a text in the shipped DBC and uses the result as the user's own DBC. Returns the key and the text of the
+/// only fault.
 fn own_fault(from: &str, to: &str, status: MessageSettings) -> (&'static str, String) {
     assert!(TEXT.contains(from), "{from}");
     let own = Database::parse(&TEXT.replace(from, to)).unwrap();

@@ -1,4 +1,4 @@
-//! Sent frames decode with the same DBC, and unknown values never decode to a number.
+//! Tests that sent frames decode with the same DBC, and that unknown values never decode to a number.
 
 use super::*;
 use crate::can::e2e::Profile;
@@ -7,7 +7,7 @@ use crate::quantity::Fault;
 
 const TEXT: &str = include_str!("../../../../../config/packwatch.dbc");
 
-/// The plan, with counters that no test uses.
+/// A plan for tests that do not use counters.
 struct Unprotected(OutputPlan);
 
 impl Unprotected {
@@ -54,7 +54,7 @@ fn assert_not_available(name: &str, frame: &Frame) {
     assert!(value == Err(Fault::OutOfRange) || name == "Alarm.Severity", "{name} reads {value:?}");
 }
 
-/// Faults of the DBC with one text replaced.
+/// Faults of the shipped DBC after one text was replaced.
 fn faults(from: &str, to: &str) -> Vec<String> {
     assert!(TEXT.contains(from), "{from}");
     let dbc = Database::parse(&TEXT.replace(from, to)).unwrap();

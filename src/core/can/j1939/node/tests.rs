@@ -1,4 +1,4 @@
-//! The node on a simulated bus with a simulated clock, and a receiver that reassembles transfers.
+//! Tests the node on a simulated bus with a simulated clock. A simulated receiver reassembles transfers.
 
 mod peer_log;
 mod properties;
@@ -78,7 +78,7 @@ impl Bench {
         self.node.start(at(-50), &mut self.out);
     }
 
-    /// A node with its address, everything known, no active code; it sends the first DM1 at 250 ms.
+    /// A node that has its address, knows all values and has no active code. It sends the first DM1 at 250 ms.
     fn claimed() -> Self {
         let mut bench = Self::new();
         bench.set(&[]);
@@ -147,7 +147,7 @@ impl Bench {
         self.messages.push(Message { ms: self.now_ms, pgn, data });
     }
 
-    /// When each message of a group was complete, and its codes.
+    /// Time at which each message of a group was complete, ms, and its codes.
     fn received(&self, pgn: u32) -> Vec<(i64, Vec<u32>)> {
         self.messages.iter().filter(|m| m.pgn == pgn).map(|m| (m.ms, m.codes())).collect()
     }

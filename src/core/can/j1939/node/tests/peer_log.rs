@@ -1,4 +1,4 @@
-//! The frames that the node sends, as the log that `tests/vcan/j1939_peers.test` plays to other J1939 implementations.
+//! Checks the log of sent frames that `tests/vcan/j1939_peers.test` plays to other J1939 implementations.
 
 use std::fmt::Write as _;
 
@@ -10,8 +10,8 @@ fn code(spn: u32, fmi: u8, count: u32, lamp: Lamp) -> ActiveCode {
     ActiveCode { code: TroubleCode::new(spn, fmi, count).unwrap(), lamp }
 }
 
-/// The claim; then DM1 with no, one, two, five and 27 codes and with nothing known, and DM2 with no, one and three
-/// codes; two seconds each.
+/// Sends the claim. Then sends DM1 with no, one, two, five and 27 codes, and DM1 with nothing known. Last, sends DM2
+/// with no, one and three codes. Each step takes two seconds.
 fn played() -> Bench {
     let mut bench = Bench::new();
     bench.set(&[]);

@@ -17,7 +17,7 @@ enum Act {
 }
 
 fn act() -> impl Strategy<Value = Act> {
-    // Identifiers that concern the node, more often than a random choice would give them.
+    // Identifiers that concern the node occur more often than in a random choice.
     let id = prop_oneof![
         Just(0x18EE_FFF9_u32),
         Just(0x18EA_F921),
@@ -82,7 +82,8 @@ fn perform(bench: &mut Bench, act: &Act) {
     bench.take();
 }
 
-/// The same inputs for a node that is polled only when something is due, and for one that is polled every millisecond.
+/// Gives the same inputs to two nodes. The first one is polled only when something is due, the second one every
+/// millisecond.
 fn sleeping_and_polled(acts: &[Act]) -> (Bench, Bench) {
     let (mut sleeper, mut busy) = (Bench::new(), Bench::new());
     for act in acts {
@@ -118,7 +119,7 @@ fn dm1_shortened_during_transfer_is_due() {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 128, ..ProptestConfig::default() })]
 
-    /// A driver may skip every poll before the due time: a replay does, a live daemon does not.
+    /// A driver may skip every poll before the due time. A replay skips them; a live daemon does not.
     #[test]
     fn polls_before_due_time_change_nothing(acts in proptest::collection::vec(act(), 1..60)) {
         let (sleeper, busy) = sleeping_and_polled(&acts);
