@@ -11,23 +11,22 @@ use std::time::Duration;
 use pyo3::prelude::*;
 
 use crate::error::data;
-use crate::monitor::State;
 
 /// A monitor's state for one call at a time.
-pub(crate) struct ExclusiveState {
-    state: Mutex<State>,
+pub(crate) struct ExclusiveState<S> {
+    state: Mutex<S>,
     /// Thread of the current call.
     holder: Mutex<Option<ThreadId>>,
 }
 
 /// Exclusive access of one call.
-pub(crate) struct StateGuard<'a> {
-    state: MutexGuard<'a, State>,
-    owner: &'a ExclusiveState,
+pub(crate) struct StateGuard<'a, S> {
+    state: MutexGuard<'a, S>,
+    owner: &'a ExclusiveState<S>,
 }
 
-impl ExclusiveState {
-    pub(crate) fn new(state: State) -> Self {
+impl<S> ExclusiveState<S> {
+    pub(crate) fn new(state: S) -> Self {
         Self { state: Mutex::new(state), holder: Mutex::new(None) }
     }
 
@@ -35,7 +34,7 @@ impl ExclusiveState {
     ///
     /// # Errors
     /// An earlier call failed inside the library, this thread is already in a call, or a signal handler raises an exception.
-    pub(crate) fn wait(&self, py: Python<'_>) -> PyResult<StateGuard<'_>> {
+    pub(crate) fn wait(&self, py: Python<'_>) -> PyResult<StateGuard<'_, S>> {
         loop {
             match self.state.try_lock() {
                 Ok(state) => {
@@ -66,21 +65,21 @@ impl ExclusiveState {
     }
 }
 
-impl Deref for StateGuard<'_> {
-    type Target = State;
+impl<S> Deref for StateGuard<'_, S> {
+    type Target = S;
 
-    fn deref(&self) -> &State {
+    fn deref(&self) -> &S {
         &self.state
     }
 }
 
-impl DerefMut for StateGuard<'_> {
-    fn deref_mut(&mut self) -> &mut State {
+impl<S> DerefMut for StateGuard<'_, S> {
+    fn deref_mut(&mut self) -> &mut S {
         &mut self.state
     }
 }
 
-impl Drop for StateGuard<'_> {
+impl<S> Drop for StateGuard<'_, S> {
     fn drop(&mut self) {
         // Before the state is released, because the next holder sets its own.
         self.owner.set_holder(None);

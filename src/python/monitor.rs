@@ -30,14 +30,14 @@ const EXTENDED: u32 = 0x8000_0000;
 /// The monitor of a pack.
 #[pyclass(frozen, module = "packwatch")]
 pub(crate) struct Monitor {
-    state: ExclusiveState,
+    state: ExclusiveState<State>,
     interfaces: Vec<String>,
     cells: u16,
     is_pack_total: bool,
 }
 
 /// State after the inputs so far.
-pub(crate) struct State {
+struct State {
     driver: MonitorDriver,
     columns: Columns,
     wanted: Wanted,

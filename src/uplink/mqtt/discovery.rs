@@ -7,7 +7,7 @@ use packwatch_host::status::document::StatusDocument;
 use serde_json::{Value, json};
 
 use super::entity::{Kind, entities};
-use super::link::Message;
+use super::message::Message;
 use super::settings::MqttSettings;
 use super::topic;
 

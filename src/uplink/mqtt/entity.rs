@@ -7,9 +7,11 @@
 use std::borrow::Cow;
 use std::sync::LazyLock;
 
+use packwatch_host::io::stamp::format_utc;
 use packwatch_host::quantity::catalogue::{PackValues, Part, Quantity, Unit};
-use packwatch_host::quantity::{CellIndex, Mode};
+use packwatch_host::quantity::{CellIndex, Mode, Timestamp};
 use packwatch_host::status::document::StatusDocument;
+use serde::Serialize;
 use serde_json::Value;
 
 /// Kind of value of an entity.
@@ -141,8 +143,7 @@ fn derived() -> [Entity; 19] {
     let millivolts = Kind::Measured { unit: "mV", class: "voltage", decimals: 0 };
     let watts = Kind::Measured { unit: "W", class: "power", decimals: 0 };
     [
-        Entity::new("time", "Time of the Values", Kind::Time, |d| super::payload::stamp(d.wall_time).into())
-            .diagnostic(),
+        Entity::new("time", "Time of the Values", Kind::Time, |d| stamp(d.wall_time).into()).diagnostic(),
         // Battery-Emulator also has a scaled SOC. Here the two are equal.
         Entity::new("SOC_real", "SoC (real)", measure(Unit::Level).0.kind(), |d| {
             published(Quantity::Soc, Part::Mean, d.pack.values.mean(Quantity::Soc))
@@ -170,7 +171,7 @@ fn derived() -> [Entity; 19] {
         Entity::new("shortest_lived_cell", "Shortest-lived Cell", Kind::Number, |d| {
             cell_number(d.pack.shortest_lived_cell)
         }),
-        Entity::new("validity", "Validity of the Estimates", Kind::Word, |d| super::payload::word(&d.state).into()),
+        Entity::new("validity", "Validity of the Estimates", Kind::Word, |d| word(&d.state).into()),
         Entity::new("alarms_raised", "Alarms Raised", Kind::Number, |d| d.alarms.raised.into()),
         Entity::new("event_level", "Event Level", Kind::Word, |d| d.alarms.level().into()),
         Entity::new("uptime", "Uptime", measure(Unit::Seconds).0.kind(), |d| rounded(Some(d.uptime_s), 0)).diagnostic(),
@@ -210,4 +211,15 @@ fn charging_state(mode: Mode) -> Value {
         Mode::Rest => Value::from("Idle"),
         Mode::Unknown => Value::Null,
     }
+}
+
+/// Name of an enumeration value in JSON.
+pub fn word(value: &impl Serialize) -> String {
+    serde_json::to_value(value).ok().and_then(|value| value.as_str().map(str::to_owned)).unwrap_or_default()
+}
+
+/// Formats the time as ISO 8601 in UTC with milliseconds.
+pub fn stamp(time: Timestamp) -> String {
+    let millis = time.nanos().div_euclid(1_000_000).rem_euclid(1000);
+    format!("{}.{millis:03}Z", format_utc(time).trim_end_matches('Z'))
 }

@@ -19,6 +19,7 @@ use serde_json::json;
 use tokio::sync::watch;
 use tokio::time::{Instant, MissedTickBehavior, interval_at, sleep, timeout};
 
+use super::message::Message;
 use super::queue::{Class, Fill, Queue, QueuedMessage};
 use super::settings::MqttSettings;
 use super::{OFFLINE, ONLINE, connect, discovery, payload, topic};
@@ -34,24 +35,6 @@ const ACKNOWLEDGEMENT: Duration = Duration::from_secs(120);
 const QUEUE_RETRY: Duration = Duration::from_secs(5);
 /// Longest time for the last messages before disconnecting.
 const FAREWELL: Duration = Duration::from_secs(2);
-
-/// A message to the broker.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Message {
-    /// Its topic.
-    pub topic: String,
-    /// Its text. If empty and retained, the broker removes the retained message.
-    pub text: String,
-    /// Whether the broker keeps it for later readers.
-    pub is_retained: bool,
-}
-
-impl Message {
-    /// Creates a message that the broker keeps.
-    pub fn retained(topic: String, text: impl Into<String>) -> Self {
-        Self { topic, text: text.into(), is_retained: true }
-    }
-}
 
 /// Why a message was not published.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -15,6 +15,7 @@ pub mod connect;
 pub mod discovery;
 pub mod entity;
 pub mod link;
+pub mod message;
 pub mod payload;
 pub mod queue;
 pub mod recorder;

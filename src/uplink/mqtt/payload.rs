@@ -3,15 +3,13 @@
 //! Input: the daemon's status. Output: JSON. The same status gives the same bytes. Unknown values are `null`.
 
 use packwatch_host::alarm::Rule;
-use packwatch_host::io::stamp::format_utc;
 use packwatch_host::monitor::CellView;
 use packwatch_host::quantity::Timestamp;
 use packwatch_host::quantity::catalogue::{CellValues, Part, Quantity};
 use packwatch_host::status::document::{AlarmStatus, StatusDocument};
-use serde::Serialize;
 use serde_json::{Map, Value, json};
 
-use super::entity::{entities, published, rounded};
+use super::entity::{entities, published, rounded, stamp};
 
 /// Values of the pack: every entity, and `alarms` with the state of each rule that has a threshold.
 pub fn info(document: &StatusDocument) -> Value {
@@ -98,17 +96,6 @@ fn short(number: Option<f64>) -> String {
 fn whole(value: Option<f64>) -> Value {
     #[expect(clippy::cast_possible_truncation, reason = "voltages in mV are far within the range; `as` saturates")]
     value.filter(|value| value.is_finite()).map_or(Value::Null, |value| Value::from(value.round() as i64))
-}
-
-/// Name of an enumeration value in JSON.
-pub fn word(value: &impl Serialize) -> String {
-    serde_json::to_value(value).ok().and_then(|value| value.as_str().map(str::to_owned)).unwrap_or_default()
-}
-
-/// Formats the time as ISO 8601 in UTC with milliseconds.
-pub fn stamp(time: Timestamp) -> String {
-    let millis = time.nanos().div_euclid(1_000_000).rem_euclid(1000);
-    format!("{}.{millis:03}Z", format_utc(time).trim_end_matches('Z'))
 }
 
 #[cfg(test)]
