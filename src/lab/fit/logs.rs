@@ -40,14 +40,16 @@ use crate::replay::{self, OutputWatch, ReplaySettings, Sinks};
 const LEAST_ROWS: usize = 20;
 /// Smallest standard deviation of the SOC at the start of a stretch.
 const BEGINNING_STD: f64 = 0.02;
-/// A stretch starts full if its open-circuit voltage is at least the voltage at this SOC, even with this share of the usual series
-/// resistance; the standard deviation of its SOC is then this value.
+/// A stretch starts full if its open-circuit voltage is at least the voltage at this SOC.
 const FULL_SOC: f64 = 0.975;
+/// Share of the usual series resistance for that open-circuit voltage: the smallest of a cell.
 const LEAST_RESISTANCE: f64 = 0.4;
+/// Standard deviation of the SOC of a stretch that starts full.
 const FULL_STD: f64 = 0.01;
-/// Below this SOC, per unit of the Arrhenius factor above 1 up to the maximum, diffusion limits a cold cell. No circuit models this
-/// voltage, which would be mistaken for lost capacity. Chosen on Panasonic 18650PF.
+/// Diffusion limits a cold cell below this SOC, per unit of the Arrhenius factor above 1. No circuit models the voltage there, which
+/// would be mistaken for lost capacity. Chosen on Panasonic 18650PF.
 const KNEE_SOC: f64 = 0.13;
+/// Upper limit of that SOC.
 const MOST_KNEE_SOC: f64 = 0.35;
 /// A cold cell does not settle within a drive: its voltage is off by this SOC, per unit of the Arrhenius factor above 1. Rests of
 /// 20 min of Panasonic 18650PF at 10 to -20 degrees C show 0.013 to 0.024; rests in drives are shorter.

@@ -8,7 +8,7 @@
 //!
 //! The interval is calibrated on real forecasts: the process is fitted again to the first training rows and judged on the
 //! block that follows, block after block. The width of the interval at each place follows from |error| / standard deviation
-//! of these forecasts ([`spread`]). (Leaving out single rows would not work: windows overlap, so its neighbours reveal each row.)
+//! of these forecasts ([`spread`]). (Leaving out single rows would not work: windows overlap, so the neighbours of a row reveal it.)
 //! No row after the origin is used.
 
 mod spread;
