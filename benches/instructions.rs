@@ -1,10 +1,9 @@
 //! Work whose instructions `tests/instructions` counts: parser, decoder, estimator.
 //!
-//! `instructions WORK PASSES` runs one of [`WORKS`] that many times over the same inputs. It prints the number of units
+//! `instructions WORK PASSES` runs one of [`WORKS`] PASSES times over the same inputs. It prints the number of units
 //! per pass and the wide instructions that the processor offers, because these select the estimator's code. The
 //! difference between two counts, one with twice the passes of the other, excludes start-up. Without arguments, as
 //! under `cargo bench`, it prints the time of each work.
-//! twice as many, the difference is the work alone. Without arguments, as under `cargo bench`, it prints the time of each.
 #![expect(clippy::print_stdout, reason = "a program whose output is read by tests/instructions")]
 
 use std::hint::black_box;
@@ -28,13 +27,13 @@ mod common;
 /// Name, unit, and constructor of each work.
 const WORKS: [Named; 8] = [
     ("parse", "candump line of 8 bytes, read and placed in time", parse),
-    ("parse_and_decode", "such a line and its 3 signals", parse_and_decode),
+    ("parse_and_decode", "candump line and its 3 signals", parse_and_decode),
     ("decode_page", "frame of 3 cells, one of 32 pages", decode_page),
     ("step_one_branch", "step of one cell, 1 branch", || one_cell(1)),
     ("step_two_branches", "step of one cell, 2 branches", || one_cell(2)),
     ("step_three_branches", "step of one cell, 3 branches", || one_cell(3)),
-    ("step_of_96", "cell and step of a pack of 96, 1 branch", pack),
-    ("plain_step", "step of one cell by the readable filter, 1 branch", plain),
+    ("step_of_96", "step of one cell in a pack of 96, 1 branch", pack),
+    ("plain_step", "step of one cell with the plain filter, 1 branch", plain),
 ];
 
 /// Lines, frames or steps per pass.
@@ -51,8 +50,8 @@ fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).filter(|argument| argument != "--bench").collect();
     match arguments.as_slice() {
         [name, passes] => {
-            let (_, _, work) = WORKS.iter().find(|(known, _, _)| known == name).expect("the name of a work");
-            let (mut work, passes) = (work(), passes.parse::<u32>().expect("a number of passes"));
+            let (_, _, work) = WORKS.iter().find(|(known, _, _)| known == name).expect("WORK is one of WORKS");
+            let (mut work, passes) = (work(), passes.parse::<u32>().expect("PASSES is a number"));
             for _ in 0..passes {
                 black_box(work());
             }
@@ -95,7 +94,7 @@ fn log() -> NamedTempFile {
         format!("(17000{:05}.{:06}) can0 100#{data:016X}\n", n / 1000, n % 1000 * 1000)
     };
     let mut log = NamedTempFile::new().expect("a temporary file");
-    (0..u64::from(UNITS)).for_each(|n| log.write_all(line(n).as_bytes()).expect("room for it"));
+    (0..u64::from(UNITS)).for_each(|n| log.write_all(line(n).as_bytes()).expect("a writable file"));
     log
 }
 
@@ -117,7 +116,7 @@ fn parse_and_decode() -> Work {
     })
 }
 
-/// Calls `take` for each frame of a log, read as replay does. Includes reading, parsing and timing of the lines.
+/// Calls `take` for each frame of a log. Reads and parses the lines and assigns times, as `replay` does.
 fn each_frame(log: &NamedTempFile, mut take: impl FnMut(BusIndex, &Frame)) {
     let options = LogOptions {
         interfaces: vec!["can0".to_owned()],

@@ -5,8 +5,8 @@
     examples/listen.py frames.log                reads a candump log, such as one of `packwatch replay --frames`
     options: --dbc FILE (default config/packwatch.dbc), --seconds N (stops then)
 
-Needs python-can and cantools. It follows rules 1 to 4 of the contract (docs/src/ecu/contract.md); rule 5, which confirms the table by
-its checksum, is left out. A line is printed for every change.
+Needs python-can and cantools. It follows rules 1 to 4 of the contract (docs/src/ecu/contract.md). It leaves out rule 5, which
+confirms the table by its checksum. A line is printed for every change.
 """
 import argparse
 import time
@@ -26,17 +26,17 @@ Key = tuple[str, str, str]  # rule, severity, cell
 
 
 class Listener:
-    """The receiver. All times are those of the frames, in seconds."""
+    """The receiver. All times are frame times, in seconds."""
 
     def __init__(self, dbc: Path):
         self.database = cantools.database.load_file(dbc)
         self.alarms: dict[Key, float] = {}  # time of the latest frame of each raised alarm
-        self.pass_time_s = 1.0  # until the digest states it: the cycle time of the alarm frame
+        self.pass_time_s = 1.0  # time to send each raised alarm once; the digest updates it
         self.status_at: float | None = None
         self.validity = "unavailable"
 
     def handle(self, frame: can.Message) -> None:
-        """Takes a frame; one of other senders is ignored."""
+        """Handles a frame. Ignores frames of other senders."""
         try:
             message = self.database.get_message_by_frame_id(frame.arbitration_id)
             signals = {name: text(value) for name, value in message.decode(frame.data).items()}
@@ -72,7 +72,7 @@ class Listener:
             print(f"{now:.1f} alarm {' '.join(key)} {signals['State']}: {value}, threshold {threshold}", flush=True)
 
     def handle_digest(self, now: float, signals: dict[str, str]) -> None:
-        """The digest ends the alarms whose last frame was lost."""
+        """Removes the alarms whose rule the digest no longer reports as raised: their last frame was lost."""
         if signals.get("PassTime", "not available") != "not available":
             self.pass_time_s = float(signals["PassTime"])
         for key in list(self.alarms):
@@ -80,7 +80,7 @@ class Listener:
                 self.remove(now, key, "digest")
 
     def check_time(self, now: float) -> None:
-        """A value that is not repeated is not known any more."""
+        """Discards the status and the alarms that are no longer repeated."""
         if self.status_at is not None and now - self.status_at > STATUS_TIMEOUT_S:
             self.status_at, self.validity = None, "unavailable"
             print(f"{now:.1f} status lost: all values unknown", flush=True)
@@ -103,7 +103,7 @@ def percent(value: str) -> str:
 
 
 def frames(source: str, seconds: float | None) -> Iterator[can.Message | None]:
-    """Frames of a log, or of an interface; `None` where none came for 0.1 s."""
+    """Yields the frames of a log or an interface, and `None` after 0.1 s without a frame."""
     if Path(source).is_file():
         yield from can.LogReader(source)
         return

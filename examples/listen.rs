@@ -5,9 +5,9 @@
 //! cargo run --example listen -- config/packwatch.dbc <frames.log
 //! ```
 //!
-//! In: lines of candump on standard input. Out: a line for every change. It follows rules 1 to 4 of the contract
-//! (`docs/src/ecu/contract.md`); rule 5, which confirms the table by its checksum, is left out. Time-outs are checked
-//! when a frame comes; a real ECU also checks them by its own clock.
+//! Reads candump lines from standard input and prints a line for every change. It follows rules 1 to 4 of the contract
+//! (`docs/src/ecu/contract.md`). It leaves out rule 5, which confirms the table by its checksum. Time-outs are checked
+//! when a frame arrives; a real ECU also checks them by its own clock.
 
 use std::collections::BTreeMap;
 use std::error::Error;
@@ -16,9 +16,9 @@ use std::io::{self, BufRead, Write};
 use packwatch::can::dbc::{Database, Message, Signal};
 use packwatch::can::{CanId, Frame};
 
-/// If no status frame arrives for this time, all values are unknown, s.
+/// After this time without a status frame, all values are unknown, s.
 const STATUS_TIMEOUT_S: f64 = 0.3;
-/// An alarm that is not repeated within this number of passes is over.
+/// An alarm that is not repeated within this number of passes is over. One pass sends each raised alarm once.
 const PASSES: f64 = 7.0;
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -37,7 +37,7 @@ pub(crate) fn listen(dbc: &str, log: impl BufRead, out: &mut impl Write) -> Resu
     Ok(())
 }
 
-/// Time, s, and frame of a line of candump: `(1700000000.000000) vcan0 6B0#0000FFFF0F1CF8BF`.
+/// Time in s and frame of a candump line: `(1700000000.000000) vcan0 6B0#0000FFFF0F1CF8BF`.
 fn parse(line: &str) -> Option<(f64, Frame)> {
     let (stamp, rest) = line.strip_prefix('(')?.split_once(") ")?;
     let (id, digits) = rest.split_whitespace().nth(1)?.split_once('#')?;
@@ -50,12 +50,12 @@ fn parse(line: &str) -> Option<(f64, Frame)> {
 /// Rule, severity and cell of an alarm, as words.
 type Key = (String, String, String);
 
-/// The receiver. All times are those of the frames, s.
+/// The receiver. All times are frame times, s.
 struct Listener {
     database: Database,
     /// Time of the latest frame of each raised alarm.
     alarms: BTreeMap<Key, f64>,
-    /// Duration of a pass according to the latest digest; before the first digest, the cycle time of the alarm frame.
+    /// Duration of a pass according to the latest digest. Before the first digest: the alarm frame's cycle time.
     pass_time_s: f64,
     status_at_s: Option<f64>,
     validity: String,
@@ -67,7 +67,7 @@ impl Listener {
         Self { database, alarms: BTreeMap::new(), pass_time_s: 1.0, status_at_s: None, validity }
     }
 
-    /// Takes a frame; frames of other senders are ignored.
+    /// Handles a frame. Ignores frames of other senders.
     fn handle(&mut self, now_s: f64, frame: &Frame, out: &mut impl Write) -> io::Result<()> {
         let message = self.database.messages.iter().find(|message| message.id == frame.id());
         let Some((name, signals)) = message.map(|message| (message.name.clone(), decode(message, frame.data()))) else {
@@ -111,7 +111,7 @@ impl Listener {
         Ok(())
     }
 
-    /// The digest ends the alarms whose last frame was lost.
+    /// Removes the alarms whose rule the digest no longer reports as raised: their last frame was lost.
     fn handle_digest(&mut self, now_s: f64, signals: &Signals, out: &mut impl Write) -> io::Result<()> {
         if let Some(Ok(pass_time_s)) = signals.get("PassTime").map(|text| text.parse()) {
             self.pass_time_s = pass_time_s;
@@ -125,7 +125,7 @@ impl Listener {
         Ok(())
     }
 
-    /// A value that is not repeated is not known any more.
+    /// Discards the status and the alarms that are no longer repeated.
     fn check_time(&mut self, now_s: f64, out: &mut impl Write) -> io::Result<()> {
         if self.status_at_s.is_some_and(|at_s| now_s - at_s > STATUS_TIMEOUT_S) {
             (self.status_at_s, self.validity) = (None, "unavailable".to_owned());
@@ -154,7 +154,7 @@ fn words((rule, severity, cell): &Key) -> String {
 /// Names of signals, and their values as words or numbers.
 type Signals = BTreeMap<String, String>;
 
-/// The signals that are present in a frame.
+/// The signals present in a frame.
 fn decode(message: &Message, data: &[u8]) -> Signals {
     let is_present = |signal: &&Signal| {
         signal.conditions.iter().all(|condition| {
@@ -167,7 +167,7 @@ fn decode(message: &Message, data: &[u8]) -> Signals {
     present.filter_map(|signal| Some((signal.name.clone(), value(signal, data)?))).collect()
 }
 
-/// The name that the DBC gives to a code, or the number; `None` = the frame is too short.
+/// The DBC's name of a code, or the number. `None` if the frame is too short.
 fn value(signal: &Signal, data: &[u8]) -> Option<String> {
     let plan = signal.layout.plan().ok()?;
     let code = i64::try_from(plan.raw(data).ok()?).ok();

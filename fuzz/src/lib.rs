@@ -1,3 +1,3 @@
-//! Fuzzers of packwatch: every input of the program as a function of bytes.
+//! Fuzzers of packwatch: one entry point for each input of the program.
 
 pub mod doors;

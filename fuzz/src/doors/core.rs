@@ -1,5 +1,5 @@
-//! The core: the bytes determine a small vehicle with its driver, faults, testers and attackers, for up to some
-//! thousand inputs.
+//! The core. The bytes determine a small vehicle with its driver, faults, testers and attackers, for up to some
+//! thousand inputs. A cut replaces the monitor by one restored from its snapshot.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -17,7 +17,7 @@ use super::world;
 
 /// Maximum number of inputs per execution: about 50 ms of work.
 const MAX_INPUTS: usize = 3000;
-/// Maximum number of cuts per execution: each takes as long as some hundred inputs.
+/// Maximum number of cuts per execution. Each takes as long as some hundred inputs.
 const MAX_CUTS: usize = 100;
 /// Maximum number of outputs per input. The configuration has at most two cells and eleven rules.
 const MAX_OUTPUTS: usize = 2000;
@@ -29,7 +29,7 @@ const REPORT_EVERY: u64 = 100_000;
 const BUS: BusIndex = BusIndex(0);
 /// Identifiers sent by the configuration: output messages and diagnostic requests.
 const OWN: [u16; 8] = [0x6B0, 0x6B1, 0x6B2, 0x6B4, 0x6B5, 0x6B6, 0x79B, 0x7DF];
-/// Address of the J1939 node, and the address used while it has none.
+/// Address of the J1939 node, and the address it uses until it has claimed one.
 const OWN_ADDRESSES: [u32; 2] = [249, 254];
 const MS: i64 = 1_000_000;
 /// After a longer time without input, a restored monitor assumes that the program was off, s.
@@ -55,7 +55,7 @@ pub fn cuts(data: &[u8]) {
     let (mut expected, mut found) = (outputs(), outputs());
     let (mut until_cut, mut cuts) = (steps[0], 0);
     for (nth, record) in records.iter().enumerate() {
-        // Use the monitor's clock: after a time stamp in the far future the clock waits before it goes back.
+        // Use the monitor's clock: after a time stamp in the far future, it does not follow earlier stamps at once.
         let is_break = record.time.since(whole.now()).abs() > BREAK_S;
         if until_cut == 0 && cuts < MAX_CUTS && !is_break {
             cuts += 1;
@@ -113,7 +113,7 @@ fn count(inputs: usize, cuts: usize) {
     }
 }
 
-/// A monitor restored from another monitor's state, through its stored form.
+/// Restores a monitor from another monitor's state in its stored form.
 fn restored(monitor: &Monitor) -> Monitor {
     let text = serde_json::to_string(&monitor.snapshot()).expect("a snapshot serialises to JSON");
     let snapshot: Snapshot = serde_json::from_str(&text).expect("its own snapshot reads back");

@@ -78,7 +78,7 @@ fn compare(path: &Path) {
     assert_eq!(records.len(), count, "batches end before the records");
     assert!(text(&records) == text(&batched[..count]), "batches differ: {records:?}\n{batched:?}");
     let (strict, _) = one_by_one(true);
-    assert!(text(&strict) == text(&records[..strict.len().min(count)]), "a strict reader differs");
+    assert!(text(&strict) == text(&records[..strict.len().min(count)]), "a strict reader gives other records");
 }
 
 /// A table of measured values, as the offline commands read it.

@@ -4,7 +4,7 @@
 //! | entry point | input of the program | invariants, in addition to "no panic" |
 //! | --- | --- | --- |
 //! | `core` | frames, ticks, gaps, commands, J1939, diagnostics into the monitor | only own identifiers are sent; estimates are numbers; an unknown value clears no alarm; a second run gives the same outputs |
-//! | `cuts` | the same, with snapshots taken and restored in between | own state is accepted; frames, events and estimates equal those without a cut, bit for bit |
+//! | `cuts` | as for `core`, with snapshots taken and restored in between | own state is accepted; frames, events and estimates equal those without a cut, bit for bit |
 //! | `snapshot` | a stored state with damaged numbers | rejected, or runs on with numbers, and its own state is accepted |
 //! | `configuration` | TOML; numbers of any size in any key | if accepted, it runs and accepts its own state |
 //! | `cell_model` | a cell model file | as for `configuration` |

@@ -1,4 +1,4 @@
-//! Splits bytes into values: numbers, choices, times. After the end every value is zero, so any input is complete.
+//! Splits bytes into values: numbers, choices, times. Past the end every value is zero, so any length is valid.
 
 /// The remaining bytes.
 pub(super) struct Source<'a> {
@@ -40,12 +40,12 @@ impl<'a> Source<'a> {
         i16::from_le_bytes(self.array())
     }
 
-    /// An element of a list.
+    /// Returns one of the choices.
     pub(super) fn one_of<T: Copy>(&mut self, choices: &[T]) -> T {
         choices[usize::from(self.byte()) % choices.len()]
     }
 
-    /// A number: a plausible one, one of random magnitude, a special value, or arbitrary bits.
+    /// Returns a plausible number, one of random magnitude, a special value, or arbitrary bits.
     pub(super) fn number(&mut self) -> f64 {
         match self.byte() % 4 {
             0 => f64::from(self.i16()) / 100.0,

@@ -1,5 +1,5 @@
-//! A database or a state file with changed bytes is opened, or the reason is reported. Afterwards the store is written
-//! and read again.
+//! Opens a database or a state file with changed bytes, which succeeds or reports a reason. Then writes the store and
+//! reads it again.
 
 use std::path::Path;
 use std::sync::OnceLock;

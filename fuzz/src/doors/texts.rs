@@ -12,7 +12,7 @@ pub fn dbc(data: &[u8]) {
     assert_eq!(again.to_dbc(), written, "the written DBC reads back differently");
 }
 
-/// A line sent by a client, and by a daemon.
+/// Parses the bytes as a line sent by a client and as a line sent by a daemon.
 pub fn control(data: &[u8]) {
     if let Ok(request) = Request::parse(data) {
         let line = request.to_line();

@@ -17,7 +17,7 @@ LIC_FILES_CHKSUM = "file://LICENSE-MIT;md5=c4f23983d45446869c7be3f69df2656b \
 inherit cargo cargo-update-recipe-crates externalsrc systemd
 
 EXTERNALSRC ?= "${@os.path.realpath(d.getVar('THISDIR') + '/../../../../..')}"
-# Not `require`: the task that writes it must be able to run before.
+# `include`, not `require`: the file is missing when the task that writes it runs for the first time.
 include ${BPN}-crates.inc
 
 # The profile and the features of the Debian package. The symbols stay here: bitbake itself moves them to packwatch-dbg.
@@ -30,7 +30,7 @@ do_configure:prepend() {
     [ -e "${THISDIR}/${BPN}-crates.inc" ] || bbfatal "no list of crates, run: bitbake -c update_crates ${PN}"
 }
 
-# SQLite and zstd of the crates, with which the program is tested, and not those of the distribution.
+# Uses SQLite and zstd from the crates, because the program is tested with them, not with the distribution's.
 cargo_do_compile:prepend() {
     unset LIBSQLITE3_SYS_USE_PKG_CONFIG ZSTD_SYS_USE_PKG_CONFIG
 }
@@ -46,7 +46,7 @@ do_install:append() {
         ${D}${systemd_system_unitdir}/
 }
 
-# The service has a dynamic user. As with the Debian package, nothing is enabled by installing.
+# The service has a dynamic user. As with the Debian package, the installation enables no unit.
 SYSTEMD_SERVICE:${PN} = "packwatch.service packwatch@.service packwatch-exporter.service"
 SYSTEMD_AUTO_ENABLE = "disable"
 CONFFILES:${PN} = "${sysconfdir}/packwatch/packwatch.toml ${sysconfdir}/packwatch/pack96.dbc ${sysconfdir}/packwatch/cells/example_nmc_2600.toml"
