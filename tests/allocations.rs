@@ -1,5 +1,5 @@
-//! In steady state no code on a frame's path allocates: reading a log, the core with the example's 96 cells, its ticks
-//! and the frames it sends. The first frames (growing buffers), transitions, and events may allocate.
+//! In steady state no code on a frame's path allocates. Covered: reading a log, the core with the example's 96 cells,
+//! its ticks, and the frames that it sends. The first frames (growing buffers), transitions and events may allocate.
 //!
 //! All threads of the process are counted. If a test fails, `dhat-heap.json` shows the allocations.
 
@@ -40,7 +40,7 @@ fn without_allocating(what: &str, work: impl FnOnce()) {
     allocating_at_most(0, what, work);
 }
 
-/// Runs `work`. All threads together may allocate `most` blocks.
+/// Runs `work`. All threads together may allocate at most `most` blocks.
 fn allocating_at_most(most: u64, what: &str, work: impl FnOnce()) {
     let profiler = dhat::Profiler::builder().testing().build();
     work();

@@ -1,4 +1,4 @@
-//! Measures the diagnosis on simulated packs: healthy ones, and ones with one fault each.
+//! Measures the diagnosis on simulated packs: healthy packs, and packs with one fault each.
 //!
 //! `tests/diagnose/run [--quick] [--packs N] [--days N] [--period MS] [--jobs N] [--seed N] [--only WORD] [--list] [--write]`
 //!
@@ -90,14 +90,14 @@ impl Options {
         let mut arguments = std::env::args().skip(1);
         while let Some(name) = arguments.next() {
             let mut number = || arguments.next().and_then(|text| text.parse::<u32>().ok()).filter(|n| *n > 0);
-            let missing = || format!("{name}: a number above 0 must follow");
+            let missing = || format!("{name}: must be followed by a number above 0");
             match name.as_str() {
                 "--packs" => options.packs = number().ok_or_else(missing)? as usize,
                 "--days" => options.days = number().ok_or_else(missing)?,
                 "--period" => options.period_ms = number().ok_or_else(missing)?,
                 "--jobs" => options.jobs = number().ok_or_else(missing)? as usize,
                 "--seed" => options.seed = u64::from(number().ok_or_else(missing)?),
-                "--only" => options.only = arguments.next().ok_or("--only: a word must follow")?,
+                "--only" => options.only = arguments.next().ok_or("--only: must be followed by a word")?,
                 "--quick" => (options.is_quick, options.packs) = (true, 1),
                 "--list" => options.lists = true,
                 "--write" => options.writes = true,

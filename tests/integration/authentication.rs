@@ -157,7 +157,7 @@ fn attack(profile: Profile, frames: u64, seed: u64) {
 }
 
 #[test]
-fn million_attack_frames_only_genuine_execute() {
+fn genuine_frames_alone_execute_among_million() {
     attack(Profile::P1, 1_000_000, 1);
 }
 

@@ -1,5 +1,5 @@
-//! A parked vehicle: if all its buses fall silent at once, this is not a fault. Silence under load, or of one input, is
-//! a fault.
+//! If all buses of a parked vehicle fall silent at once, this is not a fault. Silence under load, or of a single input,
+//! is a fault.
 
 use packwatch::alarm::{Change, Rule};
 use packwatch::can::{CanId, Frame};

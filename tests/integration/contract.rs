@@ -32,7 +32,7 @@ const LOSS: f64 = 0.1;
 const RESTARTS: u32 = 10;
 /// Interval at which the daemon's table is compared, ms.
 const STEP_MS: i64 = 100;
-/// Maximum wait until no alarm has changed for two cycles, ms: the share of bad readings changes for up to a minute.
+/// Maximum wait until no alarm has changed for two cycles, ms. The share of bad readings changes for up to a minute.
 const MAX_WAIT_MS: i64 = 600_000;
 const BUS: BusIndex = BusIndex(0);
 

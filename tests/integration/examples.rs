@@ -13,10 +13,10 @@ mod core_as_library;
 #[path = "../../examples/listen.rs"]
 mod listen;
 
-/// What a listener prints of the frames of the example's log.
+/// Output of a listener for the frames of the example's log.
 const HEARD: &str = "1700000000.1 status valid, SOC 27.8 %\n\
                      1700000175.1 alarm SocLow warning pack active: 20, threshold 20\n";
-/// Most bytes of the example's files: a clone stays small.
+/// Maximum size of the example's files, bytes, so that a clone stays small.
 const MOST_BYTES: u64 = 50_000;
 
 fn repository() -> &'static Path {

@@ -216,8 +216,8 @@ fn bad_input_error_names_place_and_range() {
     assert!(steps.contains("windows of 5 lags and"), "{steps}");
 }
 
-/// Two autoregressive series, x(t) = 1.6 x(t-1) - 0.64 x(t-2) + e. The first also drives the second. In parts of 400
-/// rows.
+/// Two autoregressive series, x(t) = 1.6 x(t-1) - 0.64 x(t-2) + e. The first also drives the second. The rows come in
+/// parts of 400.
 fn process(folder: &Path) {
     let mut draw = noise(11);
     let mut text = "cycle,time_s,voltage_v,temperature_c\n".to_owned();

@@ -199,14 +199,14 @@ fn own_identifiers_are_reported_but_echo_is_not() {
     );
 }
 
-/// Events of a drive, and the time from which the frozen current is wrong by 1 % of the largest, s.
+/// Events of a drive, and the time from which the frozen current is wrong by 1 % of the largest current, s.
 struct Drive {
     events: Vec<(f64, EventKind)>,
     validity: Validity,
     differs_s: Option<f64>,
 }
 
-/// A drive of the shipped pack. If `frozen_s` is given, the current frames repeat the same bits from then on.
+/// A drive of the shipped pack. If `frozen_s` is given, the current frames repeat the same bits from that time on.
 fn drive(frozen_s: Option<f64>, seconds: f64) -> Drive {
     use packwatch::sim::{Scenario, Settings, Simulation, Wiring};
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/example.toml");
@@ -258,7 +258,7 @@ fn frozen_current_is_found_without_false_finding() {
     let Drive { events, .. } = drive(None, 3600.0);
     assert_eq!(frozen_at(&events), None);
     assert!(!events.iter().any(|(_, kind)| matches!(kind, EventKind::SecondSender(_) | EventKind::OwnIdentifier(_))));
-    // After the second time follows a cruise of 100 s, in which the voltages carry no information.
+    // After the second time, the car cruises for 100 s, and the voltages carry no information.
     for frozen_s in [120.0, 333.3] {
         let Drive { events, validity, differs_s } = drive(Some(frozen_s), frozen_s + 240.0);
         let after_s = frozen_at(&events).zip(differs_s).map(|(at_s, differs_s)| at_s - differs_s);

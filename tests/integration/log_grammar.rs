@@ -373,7 +373,7 @@ fn journal_reads_back_as_written() {
     assert_eq!((records.len(), counts.bad_lines), (inputs.len() + 2, 1));
 }
 
-/// Two notes of the largest number of lost frames after a frame, as candump writes them.
+/// A frame, then two notes in candump's form with the largest possible number of lost frames.
 const MOST_DROPPED: &str = "(1.000000) can0 123#11\n\
     DROPCOUNT: dropped 18446744073709551615 CAN frames on 'can0' socket (total drops 18446744073709551615)\n\
     DROPCOUNT: dropped 18446744073709551615 CAN frames on 'can0' socket (total drops 18446744073709551615)\n";

@@ -1,5 +1,5 @@
-//! A snapshot taken after any input and restored on the same clock continues byte-identical: frames, events and
-//! estimates.
+//! A monitor restored from a snapshot on the same clock, after any input, continues with byte-identical frames, events
+//! and estimates.
 //!
 //! A pack of three cells with protected inputs, all kinds of alarms, commands from both sides, a J1939 node and
 //! diagnostic requests runs through random drives, faults, gaps, sleep and backward clock steps. One monitor runs
@@ -298,7 +298,7 @@ fn outputs(monitor: &mut Monitor, record: &Record, out: &mut Outputs) -> String 
     format!("{frames:?}{:?}{:?}", out.events, out.estimates)
 }
 
-/// A sent frame without the authentication trailer. Of an announced freshness only the identifier is kept.
+/// A sent frame without the authentication trailer. If it announces a freshness, only its identifier is kept.
 fn without_freshness(sent: &Transmit) -> String {
     let Some(secured) = sent.secured else { return format!("{sent:?}") };
     let data = sent.frame.data();

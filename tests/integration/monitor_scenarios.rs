@@ -1,5 +1,5 @@
-//! Regression scenarios, with hand-made frames of one measured cell: an earlier version published a false value, lost
-//! one, or flickered.
+//! Regression scenarios with hand-made frames of one measured cell. In each, an earlier version published a false
+//! value, lost a value, or flickered.
 
 use std::path::Path;
 

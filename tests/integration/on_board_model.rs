@@ -29,7 +29,7 @@ fn configuration(chemistry: &str) -> MonitorConfig {
     configuration_with(chemistry, "")
 }
 
-/// `more`: further tables of the configuration.
+/// The monitor's configuration; `more` contains further tables.
 fn configuration_with(chemistry: &str, more: &str) -> MonitorConfig {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     let text = std::fs::read_to_string(folder.join("score.toml")).unwrap();
@@ -90,7 +90,7 @@ fn vehicle(
     all
 }
 
-/// The same, with the vehicle awake for some minutes after each cycle.
+/// Adds frames at rest to those of the cycles: the vehicle stays awake for some minutes after each.
 fn with_rests(
     config: &MonitorConfig,
     frames: Vec<(Timestamp, BusIndex, Frame)>,

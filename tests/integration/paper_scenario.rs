@@ -1,8 +1,8 @@
 //! The paper's scenario through the whole core: truth -> sensors -> frames of the DBC -> Monitor, judged per cycle.
 //!
-//! 2.6 Ah, fading by 0.05 Ah per cycle between SOC 0.3 and 0.9 to 0.25 Ah, 1 s samples. Sensor errors: voltage 5 mV;
-//! current 20 mA noise + 10 mA offset + 0.5 % gain. The paper's figures show |SOC error| of 1 to 5 % during life and
-//! about 20 % at the end, and a capacity that lags by one event, with a dip to 2.2 Ah at the first.
+//! A cell of 2.6 Ah is cycled between SOC 0.3 and 0.9 with 1 s samples. It fades by 0.05 Ah per cycle to 0.25 Ah.
+//! Sensor errors: voltage 5 mV; current 20 mA noise + 10 mA offset + 0.5 % gain. The paper's figures show |SOC error| of
+//! 1 to 5 % during life and about 20 % at the end. Their capacity lags by one event and dips to 2.2 Ah at the first.
 //! To print the table: `cargo test --workspace --test integration paper_scenario -- --nocapture`.
 
 use std::path::Path;

@@ -1,9 +1,10 @@
 //! Normalised recharge periods through the whole core: simulated cells -> sensors -> frames -> Monitor.
 //!
-//! A fleet of cells of 1.4 to 2.6 Ah, each with its own charger (0.3 to 1.2 C, constant current, then constant
-//! voltage), temperature (5 to 40 degrees C), depth and current sensor (20 mA noise, 10 mA offset and 0.5 % gain of
-//! either sign; 5 mV). The normalised period must rank the cells by their true capacity, and its stated interval must
-//! contain the truth. One life has a charger that becomes weaker half-way. Also checks the alarm.
+//! Simulates a fleet of cells of 1.4 to 2.6 Ah. Each cell has its own charger (0.3 to 1.2 C, constant current, then
+//! constant voltage), temperature (5 to 40 degrees C) and depth of discharge. Its current sensor has 20 mA noise, and
+//! 10 mA offset and 0.5 % gain of either sign; its voltage sensor has 5 mV noise. The normalised period must rank the
+//! cells by their true capacity, and its stated interval must contain the truth. One life has a charger that becomes
+//! weaker half-way. Also checks the alarm.
 //! To print the tables: `cargo test --workspace --test integration recharge_fleet -- --nocapture`.
 
 use std::path::Path;

@@ -1,10 +1,11 @@
-//! The published 30 Ah example (scenario `reference`) through the whole core: discharge by random pulses, charge at 15
-//! A, 30 to 90 %, 1 Ah lost per cycle, ten cycles. The example claims a final SOC error below 0.5 %.
+//! The published 30 Ah example (scenario `reference`) through the whole core: ten cycles between 30 and 90 % SOC, with
+//! discharge by random pulses, charge at 15 A, and 1 Ah lost per cycle. The example claims a final SOC error below
+//! 0.5 %.
 //!
 //! The example's tables are not published. This test uses those of `config/cells/example_nmc_2600.toml`, scaled to 30
-//! Ah, that is eleven and a half such cells in parallel (resistances divided by 30 / 2.6, capacitances multiplied by
-//! it). Sensors as in the paper's scenario: voltage 5 mV; current 20 mA noise + 10 mA offset + 0.5 % gain; 1 s. The
-//! gain error of 0.5 % limits the capacity accuracy of any estimator.
+//! Ah, that is eleven and a half such cells in parallel: resistances are divided by 30 / 2.6, capacitances multiplied by
+//! this ratio. Samples and sensors are as in the paper's scenario: 1 s; voltage 5 mV; current 20 mA noise + 10 mA offset
+//! + 0.5 % gain. The gain error limits the capacity accuracy of any estimator.
 //! To print the table: `cargo test --workspace --test integration reference_scenario -- --nocapture`.
 
 use std::path::Path;

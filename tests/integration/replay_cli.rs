@@ -137,7 +137,7 @@ fn stdout_of(assert: &assert_cmd::assert::Assert) -> String {
 }
 
 #[test]
-fn each_logs_are_independent_and_ordered() {
+fn logs_of_each_are_independent_and_ordered() {
     let folder = tempfile::tempdir().expect("a folder");
     let logs = trips(folder.path(), [3000, 5, 200]);
     let out = folder.path().join("out").display().to_string();

@@ -44,8 +44,8 @@ impl Bench {
         fs::write(self.path(name), text).unwrap();
     }
 
-    /// A discharge of `hours` at 1 A from full, one row per second. The voltages are those of a cell with `offset` more
-    /// SOC.
+    /// A discharge of `hours` at 1 A from full, one row per second. The voltages are those of a cell whose SOC is higher
+    /// by `offset`.
     fn write_discharge(&self, name: &str, hours: f64, offset: f64) {
         let mut text = String::from("time_s,current_a,voltage_v,temperature_c,discharged_ah\n");
         for second in 0..=(hours * 3600.0) as u32 {

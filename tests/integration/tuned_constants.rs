@@ -167,7 +167,7 @@ fn named_tests_exist() {
 }
 
 #[test]
-fn every_number_is_tuned_or_not() {
+fn every_constant_is_listed_on_page() {
     let page = read(PAGE);
     let tuned = rows(&page).into_iter().map(|(name, file, ..)| (file, name));
     let listed: BTreeSet<(&str, &str)> = tuned.chain(not_tuned(&page)).collect();

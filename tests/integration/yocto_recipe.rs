@@ -42,7 +42,7 @@ fn recipe_installs_existing_files() {
     assert!(sources.len() >= 8, "{sources:?}");
     for source in sources {
         let folder = source.strip_suffix("/*.toml").unwrap_or(source);
-        assert!(repository().join(folder).exists(), "the recipe installs {source}, which is not there");
+        assert!(repository().join(folder).exists(), "the recipe installs {source}, which does not exist");
     }
 }
 

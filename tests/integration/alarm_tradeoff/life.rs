@@ -18,7 +18,7 @@ use packwatch::sim::{Ageing, Hysteresis, Pack, PackSettings, Settings};
 use super::dice::Dice;
 
 pub(crate) const RATED_AH: f64 = 2.6;
-/// As parts of the rated capacity: the alarm threshold and the end of life.
+/// The alarm threshold and the end of life, as parts of the rated capacity.
 pub(crate) const THRESHOLD: f64 = 0.80;
 pub(crate) const END_OF_LIFE: f64 = 0.70;
 
@@ -104,9 +104,9 @@ pub(crate) enum Kind {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Evaluation {
     pub(crate) time: Timestamp,
-    /// Cycles so far (two half-cycles make a cycle).
+    /// Cycles since the start of the life (two half-cycles make a cycle).
     pub(crate) cycle: f64,
-    /// Equivalent full cycles so far: charge moved divided by twice the rated capacity.
+    /// Equivalent full cycles since the start: charge moved divided by twice the rated capacity.
     pub(crate) full_cycles: f64,
     pub(crate) true_ah: f64,
     pub(crate) mean_ah: f64,

@@ -1,11 +1,17 @@
 //! Capacity from swings by least squares, as published: y = Q x, with x the change of SOC (fraction) and y the charge (Ah).
 //!
 //! G. L. Plett, "Recursive approximate weighted total least squares estimation of battery cell total capacity",
-//! J. Power Sources 196 (2011) 2319: WLS (errors in y alone), TLS (both, one ratio of deviations) and AWTLS (both, any
-//! deviations), all with fading memory. The running sums, over swings i = 1..n with weights gamma^(n-i), are
+//! J. Power Sources 196 (2011) 2319. All methods have fading memory:
+//!
+//! - WLS: errors in y alone
+//! - TLS: errors in both, with one ratio of deviations
+//! - AWTLS: errors in both, with any deviations
+//!
+//! The running sums, over swings i = 1..n with weights gamma^(n-i), are
 //! c1 = x^2/sy^2, c2 = xy/sy^2, c3 = y^2/sy^2, c4 = x^2/sx^2, c5 = xy/sx^2, c6 = y^2/sx^2.
-//! AWTLS minimises sum (y - Q x)^2 / (Q^2 + 1)^2 (Q^2/sx^2 + 1/sy^2), y and sy scaled by K = sx/sy beforehand, so that
-//! Q is near the diagonal where the approximation holds: a quartic in Q. Variance: 2 over the cost's second derivative.
+//! AWTLS minimises sum (y - Q x)^2 / (Q^2 + 1)^2 (Q^2/sx^2 + 1/sy^2). Before that, y and sy are scaled by K = sx/sy, so
+//! that Q is near the diagonal, where the approximation holds. The minimum is a root of a quartic in Q. The variance is
+//! 2 over the cost's second derivative.
 
 use packwatch::filter::ScalarGaussian;
 
@@ -82,7 +88,7 @@ impl Peer {
         }
     }
 
-    /// K: ratio of the deviations of x and y; if the ratio varies between swings, the information-weighted one.
+    /// K: ratio of the deviations of x and y. If it varies between swings: the information-weighted ratio.
     fn scale(&self) -> f64 {
         (self.y_information / self.x_information).sqrt()
     }

@@ -246,8 +246,8 @@ fn heading() {
     println!("| --- | --- | --- | --- | --- | --- |");
 }
 
-/// Margin by which the best peer may lead on the filter's own SOC, Ah. That SOC was counted with the capacity learned
-/// here.
+/// Margin by which the best peer may lead on the filter's own SOC, Ah. That SOC contains the capacity that packwatch
+/// has learned.
 const NEAR_AH: f64 = 0.006;
 
 /// Margin by which the best peer may lead on the voltages, Ah. Its memory is chosen afterwards by the result. Equals an

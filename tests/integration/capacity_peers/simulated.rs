@@ -136,8 +136,8 @@ const LIVES: [(&str, f64); 3] = [("none", 0.0), ("0.005 Ah per cycle", 0.005), (
 /// Number of cycles in the paper's life.
 const CYCLES: u32 = 48;
 
-/// Relative margin by which a peer on the filter's own SOC may lead: 0.1 %. That SOC was counted with the capacity
-/// learned here, and all methods share the current sensor's gain error of 0.5 %.
+/// Relative margin by which a peer on the filter's own SOC may lead: 0.1 %. That SOC contains the capacity that
+/// packwatch has learned, and all methods share the current sensor's gain error of 0.5 %.
 const NEAR: f64 = 0.001;
 
 #[test]
