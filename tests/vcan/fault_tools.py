@@ -4,11 +4,11 @@
     fault_tools.py play LOG INTERFACE [--from SAMPLE]      plays a candump log in real time. While the interface is down or missing, frames
                                                            are dropped and time passes, as for a real pack. SIGTERM parks the pack
     fault_tools.py flood INTERFACE --seconds S [--rate N] [--ids N]   sends frames with unconfigured identifiers
-    fault_tools.py clients SOCKET [--count N] [--seconds S]  opens status clients that never read; are other clients answered?
-    fault_tools.py learned STATE [EVENTS...] [--exactly]   prints the store's capacities, half-cycles and alarms; is no reported event missing?
+    fault_tools.py clients SOCKET [--count N] [--seconds S]  opens status clients that never read; fails unless other clients are answered
+    fault_tools.py learned STATE [EVENTS...] [--exactly]   prints the store's capacities, half-cycles and alarms; fails if a reported event is missing
     fault_tools.py alarm DUMP RULE                         prints the state of the rule's last alarm frame
-    fault_tools.py same BEFORE AFTER                       compares two snapshots: are the learned values the same?
-    fault_tools.py apart DUMP ID OTHER POINTS INTERFACE    compares the status frames of two daemons: do they differ by at most POINTS of SOC?
+    fault_tools.py same BEFORE AFTER                       fails unless two snapshots have the same learned values
+    fault_tools.py apart DUMP ID OTHER POINTS INTERFACE    fails if the status frames of two daemons differ by more than POINTS of SOC
     fault_tools.py covers FOLDER DUMP [--after SAMPLE]     compares estimates on the bus with the truth, both from fast_pack's FOLDER
 """
 
@@ -46,7 +46,7 @@ MOVING = (1, 3)  # charge, discharge
 # Properties of fast_pack.
 PERIOD_S, MAX_RATE_PER_S = 0.01, 0.32
 MEMORY = 300  # samples
-LOST = 0.75  # part of the estimates within two deviations; fewer mean that a fault made them wrong. tests/integration/restart.rs judges the calibration
+LOST = 0.75  # lowest part of the estimates within two deviations: fewer mean that a fault made them wrong. tests/integration/restart.rs judges the calibration
 TOO_LATE_S, STEP_S = 0.1, 600.0
 
 
@@ -86,8 +86,8 @@ class Truth:
                 self.samples[-1].append(float(words[column]))
 
     def errors(self, lines, after: int = -1) -> list[tuple[float, float]]:
-        """Error and stated deviation of the estimates on the bus, from sample `after` on. Excludes what the pack moved while
-        the player itself was late (a busy machine)."""
+        """Error and stated deviation of the estimates on the bus, from sample `after` on. Excludes the charge that
+        moved while a busy machine delayed the player itself."""
         sample, found = -1, []
         self.latest_s = 0.0
         late_s = collections.deque(maxlen=MEMORY)  # delay of each sample in the last seconds
@@ -141,7 +141,7 @@ RULES = (
     "connection_resistance channel_faulty"
 ).split()
 SEVERITIES = {"info": 1, "warning": 2, "severe": 3}
-UNTOLD = ("suppressed", "resumed")  # changes without a row in the store
+NOT_STORED = ("suppressed", "resumed")  # changes without a row in the store
 
 
 class Store:
@@ -176,7 +176,7 @@ def reported_by(files: list[Path]) -> tuple[int, int, int]:
             continue  # the last line of a killed daemon
         counts[0] += event["event"] == "capacity" and event["measured_ah"] is not None
         counts[1] += event["event"] == "half_cycle"
-        counts[2] += event["event"] == "alarm" and event["change"] not in UNTOLD
+        counts[2] += event["event"] == "alarm" and event["change"] not in NOT_STORED
     return tuple(counts)
 
 
@@ -206,7 +206,7 @@ def learned_of(snapshot: dict) -> tuple[list, list]:
 
 
 def comes_back(before: dict, after: dict) -> bool:
-    """Whether a later state contains all of it. Other alarms may have been raised since, without input."""
+    """Whether a later state contains all learned values. Without input, other alarms may have been raised since."""
     (capacities, alarms), (later_capacities, later_alarms) = learned_of(before), learned_of(after)
     near = all(abs(now - then) < 1e-6 for then, now in zip(capacities, later_capacities, strict=True))
     return near and all(alarm in later_alarms for alarm in alarms)
@@ -234,12 +234,11 @@ def apart(args) -> None:
                 worst, pairs = max(worst, abs(status.soc - latest[names[0]].soc)), pairs + 1
             else:
                 unsure += 1
-    print(f"{pairs} estimates at most {100 * worst:.3f} points from those of the one not killed, {unsure} without a value")
+    print(f"{pairs} estimates at most {100 * worst:.3f} points from those of the daemon that was not killed, {unsure} without a value")
     sys.exit(0 if pairs > 100 and 100 * worst <= args.points else "too far apart")
 
 
-# ---- sending
-# -------------------------------------------------------------------------------------------------------------------
+# ---- sending ---------------------------------------------------------------------------------------------------------
 
 
 class Bus:
@@ -296,7 +295,7 @@ def play(args) -> None:
             if name == 0x100:
                 currents[:] = [data]
             bus.send(name, data)
-    print(f"played to its end, {bus.dropped} frames while the interface was away")
+    print(f"played to its end, {bus.dropped} frames dropped while the interface was away")
 
 
 def flood(args) -> None:

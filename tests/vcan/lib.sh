@@ -68,7 +68,7 @@ start() {
 running() { kill -0 "${pids[$1]}" 2>/dev/null; }
 ended() { ! running "$1"; }
 
-# wait_exit NAME SECONDS: waits until it ends by itself. Sets $exit_status.
+# wait_exit NAME SECONDS: waits until NAME ends by itself. Sets $exit_status.
 wait_exit() {
     wait_for "$2" "end of $1" ended "$1"
     # shellcheck disable=SC2034

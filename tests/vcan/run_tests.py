@@ -85,8 +85,7 @@ CHILDREN: set[subprocess.Popen] = set()
 
 
 def environment() -> dict[str, str]:
-    """A copy of the environment for a child. Otherwise the child would read this process's environment, which another thread
-    of
+    """A copy of the environment for a child. Otherwise the child would read this process's environment, which another thread of
     tests/all may be replacing; its start then fails with "Bad address"."""
     return dict(os.environ)
 

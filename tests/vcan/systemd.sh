@@ -4,7 +4,7 @@
 #
 #   systemd_prepare paper.toml            # program, units and configuration where the package puts them
 #   drop_in packwatch.service test '[Service]' 'WatchdogSec=3s'
-#   systemd_boot                          # and starts packwatch.service; `systemd_boot UNIT...`: others; `''`: none
+#   systemd_boot                          # boots and starts packwatch.service, or UNITs: `systemd_boot UNIT...`; `''`: none
 #   wait_for 20 "active unit" has ActiveState active
 #
 # The state is in /var/lib, as on a vehicle. If it must outlive the kernel, mount a disk there before `systemd_boot`.
