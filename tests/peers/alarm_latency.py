@@ -24,9 +24,9 @@ CELL, ALARM, ASK, ANSWER = 0x100, 0x6B2, 0x123, 0x321
 # Start and length of the alarm frame's bit fields, as in config/packwatch.dbc.
 RULE, STATE = (16, 5), (21, 3)
 CAPACITY_LOW, ACTIVE, CLEARED = 1, 1, 2
-# A new mode counts after 10 ms (min_duration_s of the configuration); the next frame decides.
+# The first frame after 10 ms (min_duration_s of the configuration) confirms a new mode.
 MODE_S = 0.012
-# A half-cycle has almost no current; its pulse makes it weak or strong: 0.25 Ah or 2.1 Ah with the configuration's swing.
+# A half-cycle has almost no current except in one pulse. A weak pulse gives 0.25 Ah with the configuration's swing, a strong one 2.1 Ah.
 IDLE_A, WEAK_A, STRONG_A, PULSE_S = 0.008, 0.35, 3.0, 0.03
 # Charge according to the frames' time stamps, Ah. A busy machine lengthens pulses and pauses: half-cycles that are not clearly
 # below or above the alarm's thresholds, or impossible for a cell of 2.6 Ah, are not judged.
@@ -66,8 +66,7 @@ def current_of(data):
 
 
 def last_half_cycle(cells, sign):
-    """Charge of the half-cycle before the latest change of sign, Ah, and the stamp of the frame that ended it (the second one
-    with the
+    """Charge of the half-cycle before the latest change of sign, Ah, and the stamp of the frame that ended it (the second one with the
     new sign). None if a busy machine has not delivered that frame yet."""
     end = max((n for n, (_, current_a) in enumerate(cells) if current_a * sign < 0), default=-1) + 1
     begin = max((n for n, (_, current_a) in enumerate(cells[:end]) if current_a * sign > 0), default=-1) + 1
@@ -189,8 +188,7 @@ def at(late_ns, share):
 
 
 def decided_by_frame(folder, late_ns):
-    """Results decided by a frame. The daemon also checks the clock ten times a second; a check between the two frames confirms
-    the
+    """Results decided by a frame. The daemon also checks the clock ten times a second; a check between the two frames confirms the
     mode. The daemon's events state at which input's time each alarm changed."""
     stamp = re.compile(r"^\((\d+)\.(\d{9})\)", re.MULTILINE)
     frames = {int(a + b) for a, b in stamp.findall((folder / "watched.journal").read_text())}

@@ -44,8 +44,7 @@ def reaches_past(path):
 def load(path, strict):
     """The DBC as cantools reads it, with the file's own names.
 
-    If a file gives long names (over 32 characters), cantools renames a multiplexor but not the references to it in the
-    dependent
+    If a file gives long names (over 32 characters), cantools renames a multiplexor but not the references to it in the dependent
     signals, and then cannot decode them. These attributes are therefore removed.
     """
     import cantools

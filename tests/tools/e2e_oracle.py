@@ -1,10 +1,15 @@
 """End-to-end protection by autosar-e2e and, for profile 5, by cantools.
 
-usage: e2e_oracle.py   reads lines `profile data_id raw ours flipped` with payloads in hex: `raw` before protection, with the
-                       previous counter; `ours` as packwatch protects it, with the next counter; `flipped` with one bit wrong.
-                       Answers with one line each: `peer ours? flipped? [peer ours? flipped?]`: `raw` as the peer protects it,
-                       which advances the counter itself; whether it accepts `ours` and `flipped` (1, 0); the same by cantools
-                       in profile 5, from 4 bytes on (with our counter in `raw`, because cantools does not advance it).
+usage: e2e_oracle.py   reads lines `profile data_id raw ours flipped` with payloads in hex:
+                         raw       before protection, with the previous counter
+                         ours      as packwatch protects it, with the next counter
+                         flipped   `ours` with one bit wrong
+                       Answers each line with `peer ours? flipped? [peer ours? flipped?]`:
+                         peer      `raw` as the peer protects it
+                         ours?     1 if the peer accepts `ours`, otherwise 0
+                         flipped?  1 if the peer accepts `flipped`, otherwise 0
+                       The first three words are by autosar-e2e, which advances the counter itself. The others are by cantools, only
+                       in profile 5 and from 4 bytes on. cantools does not advance the counter, so its `raw` gets our counter.
 """
 import sys
 
