@@ -27,18 +27,18 @@ pub enum CapacityMethod {
     },
 }
 
-/// The event-based capacity filter (A = C = 1).
+/// Settings of the capacity filter, a random walk that steps once per half-cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CapacityConfig {
     /// Source of the measurement.
     pub method: CapacityMethod,
     /// Process noise: standard deviation gained per equivalent full cycle (Swing) or per event (Nominal), Ah.
     pub noise_ah_per_cycle: f64,
-    /// Process noise of rest: standard deviation gained in a day without current (capacity recovers), Ah. At most one
-    /// day counts per half-cycle. Not used by `Nominal`.
+    /// Process noise of rest: standard deviation gained in a day without current, Ah. Rest adds noise because capacity
+    /// recovers. At most one day counts per half-cycle. Not used by `Nominal`.
     pub noise_ah_per_rest_day: f64,
-    /// Lasting error of the open-circuit curve at the ends of a half-cycle, V; `None` = half of the model's own error
-    /// there. Not used by `Nominal`.
+    /// Error of the open-circuit curve at the ends of a half-cycle that does not change with time, V; `None` = half of
+    /// the model's own error there. Not used by `Nominal`.
     pub end_error_v: Option<f64>,
     /// Standard deviation of the current sensor's gain, fraction: a lower bound on the capacity's relative
     /// uncertainty.
@@ -84,9 +84,9 @@ pub struct UsableConfig {
     pub temperature_c: f64,
     /// Voltage under load at which discharge ends, V.
     pub cutoff_v: f64,
-    /// Charging current at the end of a full charge, per cell, A. If the current has fallen to this at the model's
-    /// highest voltage, the charge ended full and the next usable capacity starts from its final SOC. Before the first
-    /// full charge it starts from SOC 1.
+    /// Charging current at the end of a full charge, per cell, A. A charge counts as full if the current falls to this
+    /// value at the model's highest voltage. The next usable capacity is then computed from the final SOC of that
+    /// charge. Before the first full charge, it is computed from SOC 1.
     pub taper_current_a: f64,
 }
 

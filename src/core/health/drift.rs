@@ -1,14 +1,15 @@
-//! Slow drifts of a cell: capacity and fade per cycle. A linear Kalman filter with one step per half-cycle.
+//! Estimates a cell's capacity and its fade per cycle with a linear Kalman filter, one step per half-cycle.
 //!
 //! State x = [C (Ah), fade (Ah per full cycle)]. Measurement: the capacity according to one half-cycle alone
 //! (`ScalarGaussian::information_until`). At the end of a charge of w full cycles, C -= w fade. The capacity also
-//! follows a random walk whose variance the caller gives.
+//! follows a random walk; the caller passes its variance.
 //!
-//! The measurement's lasting errors ([`super::end_errors`]) are considered, not estimated (Schmidt; Woodbury and
-//! Junkins 2010): for each error, the filter keeps the change of x per standard deviation next to P. The lasting
-//! errors enter the gain and the published variance, and never average out.
+//! The lasting errors of the measurement ([`super::end_errors`]) do not change with time. The filter considers them
+//! but does not estimate them (Schmidt; Woodbury and Junkins 2010). In addition to P, it keeps the change of x per
+//! standard deviation of each error. The lasting errors enter the gain and the published variance, and never average
+//! out.
 //!
-//! Assumed: the fade of a cycle takes effect at the cycle's end. Inputs are not checked; a stored state is.
+//! Assumed: all fade happens at the end of a charge. `check` checks a stored filter; inputs are not checked.
 
 use serde::{Deserialize, Serialize};
 
@@ -100,7 +101,7 @@ impl DriftFilter {
         bounds::TRUSTED_CAPACITY.has(self.x[C] / cell_ah) && self.check().is_ok()
     }
 
-    /// Raises the capacity's variance to at least `variance`, Ah^2, after the measurements have been contradicted.
+    /// Raises the capacity's variance to at least `variance`, Ah^2, after new voltages contradicted the measurements.
     pub fn doubt(&mut self, variance: f64) {
         self.p[C][C] = self.p[C][C].max(variance);
     }
@@ -110,8 +111,8 @@ impl DriftFilter {
         self.x[C] = self.x[C].max(charge_ah);
     }
 
-    /// Predicts over a half-cycle of `cycles` full cycles; `charged` of them cause fade. `capacity_variance`, Ah^2, is
-    /// the capacity's process noise.
+    /// Predicts over a half-cycle. `cycles`: its length in full cycles; `charged`: full cycles that cause fade;
+    /// `capacity_variance`: process noise of the capacity, Ah^2.
     pub fn predict(&mut self, config: &CapacityConfig, cycles: f64, charged: f64, capacity_variance: f64) {
         self.x[C] -= charged * self.x[FADE];
         for j in 0..N {
@@ -142,7 +143,8 @@ mod tests {
         fade_noise_ah_per_cycle: 0.0,
     };
 
-    /// Runs 60 % cycles of a cell that loses `loss_ah` at the end of each charge.
+    /// Runs cycles with a swing of 60 % on a cell that loses `loss_ah` at the end of each charge. Returns the filter
+    /// and the true capacity, Ah.
     fn cycle(config: &CapacityConfig, loss_ah: f64) -> (DriftFilter, f64) {
         let mut drift = DriftFilter::new(config, ScalarGaussian::from_std(2.5, 0.1));
         let mut true_ah = 2.6;

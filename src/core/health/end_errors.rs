@@ -1,21 +1,21 @@
-//! Errors of the cell model at the ends of half-cycles. Half-cycles with the same ends share them, so averaging over
-//! many half-cycles does not remove them.
+//! Errors of the cell model at the ends of half-cycles. Half-cycles with the same ends have the same errors, so
+//! averaging over many half-cycles does not remove the errors.
 //!
 //! In: a half-cycle's ends. Out: the change of its capacity, Ah, per standard deviation of each error.
 //!
 //! A half-cycle's capacity is charge / (s_high - s_low). An error e (V) of the open-circuit curve at one end moves the
-//! SOC there by e / slope and the capacity by C / swing times that. The errors are defined at nodes of the SOC, are
+//! SOC there by e / slope, and the capacity by (C / swing) (e / slope). The errors are defined at SOC nodes, are
 //! independent of each other and are interpolated linearly between the nodes. Their size follows from the error that
-//! the model's fit reports. For a model without a reported error, the voltage offset that the filter considers also
-//! covers the curve.
+//! the model's fit reports. If the model reports no error, the voltage offset that the filter considers also covers
+//! the curve.
 
 use super::CapacityConfig;
 use super::half_cycle::HalfCycle;
 use crate::cell::CellModel;
 use crate::quantity::Mode;
 
-/// Number of errors: SOC nodes, evenly spaced from empty to full. In real cells, curve errors a quarter of the range
-/// apart differ.
+/// Number of errors, one per SOC node; the nodes are evenly spaced from empty to full. In real cells, curve errors a
+/// quarter of the SOC range apart differ.
 pub(super) const END_ERRORS: usize = 5;
 
 /// Change of a half-cycle's capacity, Ah, per standard deviation of each error; zero if the half-cycle's ends are
@@ -29,15 +29,15 @@ pub(super) fn effects_ah(
     let mut effects = [0.0; END_ERRORS];
     let Some(ends) = &half_cycle.ends else { return effects };
     let temperature_c = half_cycle.mean_temperature_c.unwrap_or(25.0);
-    // Limits the effect: below a swing of 2 % the measurement is useless.
+    // Limits the effect. Below a swing of 2 %, the measurement is useless.
     let swing = (half_cycle.charge_ah / capacity_ah).max(0.02);
     // A discharge starts at its fuller end, a charge at its emptier end.
     let sign = if half_cycle.mode == Mode::Charge { -1.0 } else { 1.0 };
     for (soc, fuller) in ends.iter().zip([sign, -sign]) {
         let position = model.grid_position(*soc, temperature_c);
         let per_volt = -fuller * capacity_ah / (swing * model.ocv_slope_v(&position, capacity_ah));
-        // Half of the model's own error is attributed to the curve and lasts; the rest depends on the current history
-        // and differs between half-cycles.
+        // Half of the model's own error comes from the curve and does not change. The other half depends on the
+        // history of the current, so it differs between half-cycles.
         let own_v = || model.voltage_error_v(&position).map_or(0.0, |error_v| 0.5 * error_v);
         let error_v = config.end_error_v.unwrap_or_else(own_v);
         let along = soc.clamp(0.0, 1.0) * (END_ERRORS - 1) as f64;

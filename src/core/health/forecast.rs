@@ -3,31 +3,33 @@
 //! In: use (equivalent full cycles, days) and learned capacities (Ah) with variances. Out: median and 90 % interval,
 //! or the reason why there is no forecast ([`InsufficientData`]). Negative and non-finite readings are ignored.
 //!
-//! A linear Kalman filter over the learned capacities, one step per reading. Cost and memory do not grow with the
-//! history. State x = [level, rate, recovery, first], capacities as fractions of a reference capacity:
-//! * level: the capacity without recovery, which only falls; level -= rate dt, with t the use (equivalent full cycles,
-//!   or days if the cycles are unknown);
+//! The forecast is a linear Kalman filter over the learned capacities, with one step per reading. Cost and memory do
+//! not grow with the history. State x = [level, rate, recovery, first], with capacities as fractions of a reference
+//! capacity:
+//! * level: the capacity without recovery, which only falls; level -= rate dt. The use t counts equivalent full
+//!   cycles, or days if the cycles are unknown;
 //! * rate: loss per unit of use. Its logarithm follows a random walk: `RATE_WALK` per square root of capacity lost
 //!   (`KNEE_WALK` in the knee, see [`knee`]), and `RATE_WALK_USE` per e-fold of use. Both are relative, so the same
 //!   numbers serve cells that live for 50 cycles and for 5,000. In the linear filter,
 //!   Q = (w1^2 rate dt + w2^2 ln(t1 / t0)) (rate^2 + P_rate);
 //! * recovery: capacity that returns during rest and is used up again (an Ornstein-Uhlenbeck process; measured cells
 //!   show 1 to 5 % after days of rest). It correlates successive readings, so that ten readings within one cycle do
-//!   not count as ten;
-//! * first: the level at the first reading, which later readings refine. The loss since then is first - level.
+//!   not count as ten independent readings;
+//! * first: the level at the first reading, which later readings refine. The loss since the first reading is
+//!   first - level.
 //!
 //! A reading is level + recovery + noise; outliers get less weight. The forecast integrates over the loss, not over
 //! time: the use until the level has fallen by L is the integral of 1 / rate over the loss. This sum of lognormals is
 //! approximated by one lognormal of the same mean and variance (see [`distribution`]). Because the level only falls,
-//! no first-passage problem arises and no sampling is needed.
+//! it passes a threshold once, so the integral needs no sampling of first-passage times.
 //!
-//! Assumed: outside the knee, fade may slow down as well as speed up, so the median holds the current rate. In the
-//! knee, between 10 and 20 % of loss, fade accelerates in many cells: resistance and current per active area grow with
+//! Assumed: outside the knee, fade may slow down or speed up, so the median keeps the current rate. In the knee,
+//! between 10 and 20 % of loss, fade accelerates in many cells: resistance and current per active area grow with
 //! the loss, and lithium plates. The forecast expects the knee before a reading shows it.
 //!
-//! Deviation: the filter's variance follows the expected acceleration, its mean does not. Reason: cells without a knee
-//! (NASA's) would have their rate overestimated after each recovery. Effect: only the readings show that a knee has
-//! begun. `tests/rul.md` lists the alternatives and figures.
+//! Deviation: the expected acceleration changes the variance of the filter but not its mean. Reason: otherwise the
+//! filter overestimates the rate of cells without a knee (the NASA cells) after each recovery. Effect: only the
+//! readings show that a knee has begun. `tests/rul.md` lists the alternatives and figures.
 
 mod distribution;
 #[cfg(test)]
@@ -41,7 +43,7 @@ use crate::filter::update_states;
 use crate::quantity::InvalidState;
 
 /// Standard deviation of the rate's logarithm per square root of capacity lost (fraction of the reference): over a
-/// loss of 10 % the rate changes by a factor of e^0.32 either way.
+/// loss of 10 %, one standard deviation is a factor of e^0.32.
 const RATE_WALK: f64 = 1.0;
 /// Standard deviation of the rate's logarithm per square root of an e-fold of use since the first reading.
 const RATE_WALK_USE: f64 = 0.3;
@@ -49,14 +51,14 @@ const RATE_WALK_USE: f64 = 0.3;
 const KNEE: (f64, f64) = (0.1, 0.2);
 /// Expected growth of the rate's logarithm in the knee, per fraction of the reference lost: e^0.9 over the whole knee.
 const KNEE_DRIFT: f64 = 9.0;
-/// `RATE_WALK` in the knee: e^0.47 either way over the whole knee, so that the interval also covers cells with hardly
-/// any knee.
+/// `RATE_WALK` in the knee: one standard deviation is a factor of e^0.47 over the whole knee, so that the interval also
+/// covers cells with hardly any knee.
 const KNEE_WALK: f64 = 1.5;
 /// Standard deviation of the recovery while the cell is used, fraction of the reference.
 const RECOVERY_IN_USE: f64 = 0.01;
 /// Standard deviation of the recovery gained by rest, fraction of the reference.
 const RECOVERY_IN_REST: f64 = 0.02;
-/// Time constant of the recovery during rest, days. On the axis of days, also of its decay.
+/// Time constant of the recovery during rest, days. On the axis of days, it is also the time constant of the decay.
 const RECOVERY_DAYS: f64 = 1.0;
 const DAY_S: f64 = 86_400.0;
 
@@ -64,7 +66,8 @@ const DAY_S: f64 = 86_400.0;
 pub const MIN_READINGS: u32 = 3;
 /// Smallest capacity loss of a forecast, in standard deviations of that loss.
 pub const MIN_FADE_DEVIATIONS: f64 = 1.0;
-/// Largest ratio of the interval's upper end to the median. Not applied while the upper end is below the use so far.
+/// Largest ratio of the interval's upper end to the median. It does not apply if the upper end is below the use since
+/// the first reading.
 pub const MAX_SPREAD: f64 = 10.0;
 /// Time constant of the recent rate of use, days.
 const RECENT_DAYS: f64 = 30.0;
@@ -84,7 +87,7 @@ const N: usize = 4;
 pub enum Axis {
     /// Equivalent full cycles.
     Cycles,
-    /// Days, if the history does not record cycles. Any day may have been rest.
+    /// Days, for a history that does not record cycles. Any of these days may have been a day of rest.
     Days,
 }
 
@@ -122,7 +125,7 @@ pub struct Remaining {
     pub high: f64,
 }
 
-/// Remaining useful life; at least one of the two is known.
+/// Remaining useful life; at least one of `cycles` and `days` is known.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RemainingLife {
@@ -139,16 +142,16 @@ pub enum InsufficientData {
     /// Too few readings.
     #[error("{found} capacity readings, needs {MIN_READINGS}")]
     Readings {
-        /// So far.
+        /// Number of readings.
         found: u32,
     },
-    /// All readings are from one time.
+    /// The cell was not used between the first reading and the last.
     #[error("no use between the first reading and the last")]
     Use,
     /// The fade is not significant compared with its standard deviation.
     #[error(
         "capacity lost is {:.1} +- {:.1} %, must be at least {MIN_FADE_DEVIATIONS} times its standard deviation",
-        // Adding zero turns -0 into 0.
+        // Adding 0 turns -0 into 0.
         (1000.0 * lost).round() / 10.0 + 0.0, 100.0 * std
     )]
     Fade {
@@ -158,7 +161,7 @@ pub enum InsufficientData {
         std: f64,
     },
     /// The interval is too wide.
-    #[error("the interval's upper end would be {high:.1}, may be at most {MAX_SPREAD} times the median, {median:.1}")]
+    #[error("the interval's upper end is {high:.1}, must be at most {MAX_SPREAD} times the median of {median:.1}")]
     Spread {
         /// 50 % quantile, units of use.
         median: f64,
@@ -167,7 +170,7 @@ pub enum InsufficientData {
     },
 }
 
-/// Capacity at a future use.
+/// Predicted capacity after some further use.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct FanPoint {
     /// Use after the last reading, in units of the axis.
@@ -198,7 +201,7 @@ pub struct Forecast {
 
 impl Usage {
     /// Use of a half-cycle that moved `charge_ah` in `duration_s`. `since_before_s`: time from the end of the previous
-    /// half-cycle to the end of this one; `None` = unknown, a long rest is assumed.
+    /// half-cycle to the end of this one. If that time is unknown (`None`), a long rest is assumed.
     pub fn in_half_cycle(charge_ah: f64, duration_s: f64, since_before_s: Option<f64>, rated_capacity_ah: f64) -> Self {
         let used_days = duration_s / DAY_S;
         let known = since_before_s.map(|seconds| (seconds / DAY_S - used_days).max(0.0));
@@ -213,8 +216,8 @@ impl Usage {
 }
 
 impl Forecast {
-    /// Creates a filter for a cell with this capacity when new, Ah. An approximate value suffices: it only sets the
-    /// range of the knee, 10 to 20 % below it.
+    /// Creates a filter for a cell with the capacity `reference_ah` when new, Ah. An approximate value suffices,
+    /// because it only sets the range of the knee, 10 to 20 % below it.
     pub fn new(axis: Axis, reference_ah: f64) -> Self {
         let mut p = [[0.0; N]; N];
         // Wide priors: the level is practically unknown, the rate lies within 2 % per cycle.
@@ -230,7 +233,7 @@ impl Forecast {
         Self { axis, reference_ah, readings: 0, used: 0.0, x, p, shared_variance: 0.0, recent: [0.0; 2] }
     }
 
-    /// Predicts over use and rest, then updates with the capacity learned at the end, if any. NaN, infinite and
+    /// Predicts over use and rest, then updates with `reading`, the capacity learned at the end. NaN, infinite and
     /// negative numbers are ignored.
     pub fn update(&mut self, passed: Usage, reading: Option<CapacityReading>) {
         let natural = |value: f64| if value.is_finite() { value.max(0.0) } else { 0.0 };
@@ -287,7 +290,7 @@ impl Forecast {
         self.reference_ah
     }
 
-    /// Number of readings so far.
+    /// Number of readings that the filter has used.
     pub fn readings(&self) -> u32 {
         self.readings
     }
@@ -309,7 +312,7 @@ impl Forecast {
     pub fn remaining(&self, threshold_ah: f64) -> Result<RemainingLife, InsufficientData> {
         self.check_readings()?;
         let threshold = threshold_ah / self.reference_ah;
-        // Passed with 95 % probability.
+        // The level has passed the threshold with a probability of 95 %.
         let has_passed = self.x[LEVEL] + 1.645 * self.level_variance().sqrt() < threshold;
         let remaining = if has_passed { Remaining::default() } else { self.time_to(threshold)? };
         let [cycles, days] = self.recent;
@@ -327,14 +330,14 @@ impl Forecast {
         self.check_fade()?;
         let crossing = self.crossing(threshold);
         let [low, median, high] = QUANTILES.map(|quantile| crossing.quantile(quantile));
-        // The lower end is not checked: near the threshold it tends to 0 at any precision.
+        // The lower end is not checked, because near the threshold it tends to 0 however precise the filter is.
         if high > MAX_SPREAD * median && high > self.used {
             return Err(InsufficientData::Spread { median, high });
         }
         Ok(Remaining { low, median, high })
     }
 
-    /// Capacity at `points` future uses, evenly spaced from 0 to `ahead`. Too slow for online use.
+    /// Predicted capacity at `points` amounts of further use, evenly spaced from 0 to `ahead`. Too slow for online use.
     ///
     /// # Errors
     /// The reason why no forecast is given.
@@ -352,7 +355,7 @@ impl Forecast {
     /// Predicts: the recovery relaxes, the level falls at the rate, and rate and recovery become less certain.
     fn advance(&mut self, passed: &Usage) {
         let (used, rest_days, relaxation) = match self.axis {
-            // In use, the recovery decays by an e-fold in ten cycles.
+            // During use, the recovery decays by a factor of e in ten cycles.
             Axis::Cycles => (passed.cycles, passed.rest_days, 10.0),
             Axis::Days => (passed.days, passed.days, RECOVERY_DAYS),
         };
@@ -368,7 +371,7 @@ impl Forecast {
             row[LEVEL] -= used * row[RATE];
             row[RECOVERY] *= kept;
         }
-        // The rate has changed during the step, and the level with it.
+        // The rate also walks during the step, which makes the level less certain.
         p[RATE][RATE] += walk;
         p[LEVEL][RATE] -= walk * used / 2.0;
         p[RATE][LEVEL] = p[LEVEL][RATE];
@@ -376,7 +379,7 @@ impl Forecast {
         let (in_use, in_rest) = (RECOVERY_IN_USE * RECOVERY_IN_USE, RECOVERY_IN_REST * RECOVERY_IN_REST);
         let recovery = &mut p[RECOVERY][RECOVERY];
         *recovery += in_use * (1.0 - kept * kept);
-        // A second rest adds only recovery that the first rest left out.
+        // A second rest adds only the part of the recovery that the first rest did not complete.
         *recovery += (1.0 - libm::exp(-2.0 * rest_days / RECOVERY_DAYS)) * (in_use + in_rest - *recovery).max(0.0);
         self.used += used;
     }
@@ -439,8 +442,8 @@ impl Forecast {
         1.0 - self.x[LEVEL]
     }
 
-    /// Quantile of the capacity after `ahead` units of use: the threshold that has been passed by then with this
-    /// probability.
+    /// Quantile of the capacity after `ahead` units of use: the threshold that the level passes within that use with
+    /// this probability.
     fn capacity_ah(&self, ahead: f64, quantile: f64) -> f64 {
         let (level, std) = (self.x[LEVEL], self.level_variance().sqrt());
         let is_below = |threshold_ah: f64| self.crossing(threshold_ah).probability(ahead) < quantile;
@@ -448,7 +451,7 @@ impl Forecast {
     }
 }
 
-/// Part of the knee below this loss, fraction of the reference.
+/// Part of the knee that a cell with this loss has passed, fraction of the reference.
 fn knee(lost: f64) -> f64 {
     lost.clamp(KNEE.0, KNEE.1) - KNEE.0
 }
@@ -460,7 +463,7 @@ fn walk_variance(from: f64, to: f64) -> f64 {
 }
 
 impl Remaining {
-    /// Scales all three by `factor`.
+    /// Multiplies all three quantiles by `factor`.
     fn times(self, factor: f64) -> Self {
         Self { low: factor * self.low, median: factor * self.median, high: factor * self.high }
     }

@@ -10,13 +10,13 @@ pub struct HalfCycle {
     pub mode: Mode,
     /// Charge moved, Ah, positive.
     pub charge_ah: f64,
-    /// SOC swing, fraction, positive if it agrees with the sign of the charge, with its variance (the errors of the
-    /// two ends count as independent). `None` if the SOC at the start was not estimated.
+    /// SOC swing, fraction, with its variance; positive if it agrees with the sign of the charge. The variance treats
+    /// the errors of the two ends as independent. `None` if the SOC at the start or the end was not estimated.
     pub swing: Option<ScalarGaussian>,
     /// SOC at the end, fraction; `None` if it was not estimated.
     pub end_soc: Option<f64>,
-    /// SOC at start and end, fractions; `None` if the SOC at the end was not estimated. An unknown start counts as the
-    /// end.
+    /// SOC at start and end, fractions; `None` if the SOC at the end was not estimated. If only the start is unknown,
+    /// both values are the SOC at the end.
     pub ends: Option<[f64; 2]>,
     /// Duration, s.
     pub duration_s: f64,

@@ -3,13 +3,15 @@
 //! In: times and temperatures of samples, SOC of the cells at the ends of half-cycles, charge (A s). Out: half-cycles
 //! and capacity updates (Ah). A half-cycle without an estimated SOC gives no capacity.
 //!
-//! A half-cycle lasts from the beginning of a charge or discharge to its end, both dated by the transition detector.
-//! The capacity filter (paper, section 3.3.4: random walk, one step per half-cycle; with `Swing` also the fade,
-//! [`super::drift`]) gets its measurement in one of two ways:
-//! * `Swing`: the information about the capacity in the voltages since the last half-cycle. The sample-by-sample
-//!   filter estimates the capacity and its correlation with the SOC. The measurement is the step from its previous to
-//!   its current estimate, `ScalarGaussian::information_until`. Charge divided by the swing in that filter's own SOC
-//!   would only return the capacity that the filter assumed.
+//! A half-cycle lasts from the beginning of a charge or discharge to its end. The transition detector dates both. A
+//! *mark* is a copy of all totals at such a time. The *sample filter* of a cell ([`CellEstimator`]) steps with every
+//! sample; the *event filter* steps once per half-cycle and holds the published capacity (paper, section 3.3.4: random
+//! walk). With `Swing`, the event filter also estimates the fade ([`super::drift`]). The event filter gets its
+//! measurement in one of two ways:
+//! * `Swing`: the information about the capacity in the voltages since the last half-cycle. The sample filter
+//!   estimates the capacity and its correlation with the SOC. The measurement is the step from the sample filter's
+//!   previous estimate to its current estimate, `ScalarGaussian::information_until`. Dividing the charge by the swing
+//!   of the sample filter's SOC would only return the capacity that this filter assumed.
 //! * `Nominal`: as in the paper, charge divided by a nominal swing, with a fixed variance.
 
 use serde::{Deserialize, Serialize};
@@ -33,7 +35,7 @@ pub struct CapacityUpdate {
     pub capacity: ScalarGaussian,
 }
 
-/// Totals of one cell at one time.
+/// Cumulative totals of one cell, and its SOC, at one time.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct CellMark {
     soc: Option<ScalarGaussian>,
@@ -52,11 +54,11 @@ impl CellMark {
         bounds::TIME_S.check("the time with a temperature", self.temperature_s)?;
         let Some(soc) = self.soc else { return Ok(()) };
         bounds::STORED_SOC.check("the SOC at a half-cycle's end", soc.mean)?;
-        InvalidState::unless_natural("its variance", soc.variance)
+        InvalidState::unless_natural("the variance of the SOC at a half-cycle's end", soc.variance)
     }
 }
 
-/// Totals of all cells at one time.
+/// A mark: totals of all cells at one time.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Mark {
     time: Timestamp,
@@ -71,9 +73,9 @@ pub struct Learner {
     totals: Vec<CellMark>,
     /// Start of the current half-cycle.
     start: Option<Mark>,
-    /// Start of the mode that may follow.
+    /// Start of a mode that the transition detector has not confirmed yet.
     candidate: Option<Mark>,
-    /// Capacity in each sample filter after the step of the last half-cycle.
+    /// Capacity in each sample filter after the event filter's last step.
     prior: Vec<ScalarGaussian>,
     /// Capacity in the event filter.
     capacity: Vec<ScalarGaussian>,
@@ -81,11 +83,11 @@ pub struct Learner {
     rest_s: f64,
     /// Start of the current mode.
     mode_since: Option<Timestamp>,
-    /// Whether `start` is kept because too little charge has moved since then.
+    /// Whether the current half-cycle continues the previous one, which moved too little charge. `start` then stays.
     joining: bool,
     /// Whether each cell has a measured capacity.
     learned: Vec<bool>,
-    /// Capacity and fade (`Swing`).
+    /// Filters of capacity and fade (`Swing`).
     drift: Vec<DriftFilter>,
     /// Cells whose sample filter was restarted in this half-cycle.
     in_doubt: Vec<usize>,
@@ -97,7 +99,7 @@ pub struct Learner {
 }
 
 impl Learner {
-    /// Creates a learner for cells with these initial capacities.
+    /// Creates a learner; `initial` has the initial capacity of each cell, Ah.
     pub fn new(config: &CapacityConfig, initial: Vec<ScalarGaussian>) -> Self {
         let cells = initial.len();
         Self {
@@ -110,7 +112,7 @@ impl Learner {
         }
     }
 
-    /// Restores a cell's capacity that was measured in an earlier run and is already in the cell's filter.
+    /// Restores a cell's capacity that was measured in an earlier run. The sample filter must already have it.
     pub fn relearn(
         &mut self,
         config: &CapacityConfig,
@@ -124,7 +126,7 @@ impl Learner {
         self.learned[cell] = true;
     }
 
-    /// Restarts a cell that was replaced, with `capacity`: the learned values belong to the previous cell.
+    /// Restarts a replaced cell with `capacity`, because the learned values belong to the previous cell.
     pub fn begin(&mut self, config: &CapacityConfig, cell: usize, capacity: ScalarGaussian) {
         self.drift[cell] = DriftFilter::new(config, capacity);
         (self.prior[cell], self.capacity[cell], self.learned[cell]) = (capacity, capacity, false);
@@ -149,9 +151,9 @@ impl Learner {
 
     /// Adds a cell's sample to its totals.
     ///
-    /// `measured_s` and `gap_s` are the times since the previous sample with and without a measured current, s; the
+    /// `measured_s` and `gap_s` are the times since the previous sample with and without a measured current, s. The
     /// gap is infinite before the first sample and after an unknown gap. Returns whether the candidate's mark lies in
-    /// that gap. If so, the candidate starts at the cell's SOC after the gap ([`Self::move_mark`]).
+    /// that gap. If so, the caller sets the candidate's SOC to the SOC after the gap ([`Self::move_mark`]).
     #[inline]
     pub fn observe(
         &mut self,
@@ -181,7 +183,7 @@ impl Learner {
         self.rest_s = 0.0;
     }
 
-    /// Marks the start of a mode that may follow the current one; `soc` returns the SOC of each cell.
+    /// Marks the start of an unconfirmed mode; `soc` returns the SOC of each cell.
     pub fn mark_candidate(&mut self, time: Timestamp, charge_as: f64, soc: impl Fn(usize) -> Option<ScalarGaussian>) {
         let mut cells = self.candidate.take().map(|mark| mark.cells).unwrap_or_default();
         cells.clone_from(&self.totals);
@@ -189,10 +191,10 @@ impl Learner {
         self.candidate = Some(Mark { time, charge_as, cells });
     }
 
-    /// Completes the mode `from` after the candidate is confirmed.
+    /// Completes the mode `from` after the detector confirmed the candidate.
     ///
     /// If the charge moved since the last half-cycle reaches the configured swing, appends each cell's half-cycle to
-    /// `half_cycles` in cell order. A smaller charge or discharge is joined to the next one.
+    /// `half_cycles` in cell order. Joins a smaller charge or discharge to the next half-cycle.
     pub fn complete(
         &mut self,
         config: &TransitionConfig,
@@ -223,13 +225,12 @@ impl Learner {
         }
     }
 
-    /// Sets the cells whose capacity half-cycles leave unchanged, because the cell's model is not known well
-    /// enough.
+    /// Selects the cells whose capacity stays unchanged by half-cycles, because their model is not known well enough.
     pub fn hold(&mut self, is_held: impl Fn(usize) -> bool) {
         self.is_held = (0..self.capacity.len()).map(is_held).collect();
     }
 
-    /// Runs the capacity filter of one cell over its completed half-cycle.
+    /// Steps the event filter of one cell over its completed half-cycle.
     pub fn learn(
         &mut self,
         model: &CellModel,
@@ -258,9 +259,9 @@ impl Learner {
         CapacityUpdate { measurement, capacity: self.capacity(cell) }
     }
 
-    /// Handles a restart of a cell's sample filter: the voltages contradicted the learned values, so the capacity is
-    /// no more certain than a new cell's (`new_variance_ah2`). The current half-cycle then only sets a lower
-    /// bound: the cell holds at least the charge that was moved.
+    /// Handles a restart of a cell's sample filter, after the voltages contradicted the learned values. The capacity
+    /// becomes at most as certain as the capacity of a new cell (`new_variance_ah2`). The current half-cycle then only
+    /// gives a lower bound: the cell holds at least the charge that was moved.
     pub fn doubt(
         &mut self,
         config: &CapacityConfig,
@@ -281,8 +282,8 @@ impl Learner {
         self.prior[cell] = estimator.capacity();
     }
 
-    /// Handles a change of a cell's model that the estimator has adopted. The current half-cycle restarts at `soc`.
-    /// `capacity`, if given, replaces the capacity (Ah) and the flag that it was learned.
+    /// Handles a new cell model that the estimator has adopted. The current half-cycle restarts at `soc`. If `capacity`
+    /// is given, it replaces the capacity (Ah) and the flag that says whether the capacity was learned.
     pub fn adopt(
         &mut self,
         config: &CapacityConfig,
@@ -329,9 +330,9 @@ impl Learner {
         let is_held = self.is_held.get(cell).copied().unwrap_or(false);
         let evidence = self.prior[cell].information_until(&after).filter(|_| !is_in_doubt && !is_held);
         let measurement = evidence.map(|z| {
-            // The curve depends on the capacity, so solve z = C + s (C_curve - C) for C.
+            // The model's curve depends on its own capacity C_curve: z = C + s (C_curve - C). Solve for C.
             let weight = 1.0 - after.variance / self.prior[cell].variance;
-            // Limits the share that the curve's own capacity may contribute.
+            // Limits the share s of the curve's capacity.
             let by_curve = (estimator.capacity_by_curve() / weight).clamp(-0.8, 0.8);
             let (own, curve_ah) = (1.0 - by_curve, estimator.curve().mean);
             Measurement { value: curve_ah + (z.value - curve_ah) / own, variance: z.variance / (own * own) }
@@ -343,7 +344,7 @@ impl Learner {
         } else if is_in_doubt {
             drift.at_least(half_cycle.charge_ah);
         }
-        // Discard a charge or swing that is impossible for such a cell.
+        // Discard a step that makes the capacity impossible for this cell.
         let is_possible = drift.is_possible(model.capacity_ah);
         if !is_possible {
             *drift = before;
@@ -360,7 +361,7 @@ impl Learner {
         if !drift.is_possible(model.capacity_ah) {
             *drift = learned;
         }
-        // The sample filter continues with the event filter's capacity.
+        // The sample filter continues with the capacity of the event filter.
         estimator.restate_capacity(drift.capacity());
         self.prior[cell] = estimator.capacity();
         measurement
@@ -382,7 +383,7 @@ impl Learner {
         &mut self.offset
     }
 
-    /// Whether a stored learner has this number of cells.
+    /// Whether this stored learner has `cells` cells in all its parts.
     pub fn fits(&self, cells: usize) -> bool {
         [self.totals.len(), self.prior.len(), self.capacity.len(), self.learned.len(), self.drift.len()] == [cells; 5]
             && [&self.start, &self.candidate].into_iter().flatten().all(|mark| mark.cells.len() == cells)
@@ -432,7 +433,7 @@ fn half_cycle(moved_ah: f64, duration_s: f64, a: &CellMark, b: &CellMark) -> Hal
             .zip(b.soc)
             .map(|(a, b)| ScalarGaussian { mean: sign * (a.mean - b.mean), variance: a.variance + b.variance }),
         end_soc: b.soc.map(|soc| soc.mean),
-        // An unobserved start counts as the end.
+        // If the SOC at the start is unknown, use the SOC at the end.
         ends: b.soc.map(|end| [a.soc.unwrap_or(end).mean, end.mean]),
         duration_s,
         mean_current_a: moved_ah * 3600.0 / duration_s,

@@ -1,8 +1,8 @@
 //! Battery ageing: half-cycles, capacity, recharge period, usable capacity, remaining life.
 //!
 //! In: currents (A), samples and estimates of the cells. Out: one [`HalfCycle`] and [`CapacityUpdate`] per cell and
-//! half-cycle, pack values, periods (s), usable capacity (Ah), [`Forecast`]s. Stored states are checked before use. A
-//! half-cycle without estimates updates nothing.
+//! half-cycle, pack values, recharge periods (s), usable capacity (Ah), [`Forecast`]s. Stored states are checked
+//! before use. A half-cycle without estimates updates nothing.
 
 pub mod config;
 pub mod drift;

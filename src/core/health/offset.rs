@@ -1,9 +1,9 @@
-//! The offset of the current sensor, which all cells share.
+//! Learns the offset of the current sensor, which all cells share.
 //!
 //! In: the evidence in the voltages of all cells ([`EstimatorBank::offset_evidence`]) and the elapsed time, s. Out:
-//! mean and standard deviation of the offset, A per cell, measured minus true. Cells at rest show it best, because the
-//! counted charge drifts away from the voltage. Readings of exactly zero are ignored, because such a sensor
-//! suppresses small currents.
+//! mean and standard deviation of the offset, A per cell, measured minus true. The offset shows best at rest, when the
+//! counted charge drifts but the voltage does not. Current readings of exactly zero are ignored: a sensor that sends
+//! them suppresses small currents.
 //!
 //! Source: Friedland (1969), separate estimation of a bias: the innovations of a filter that ignores the bias measure
 //! the bias. Deviation: here the filter considers the bias, and the correction is applied at changes of mode.
@@ -21,7 +21,7 @@ use crate::quantity::InvalidState;
 pub struct CurrentOffset {
     /// Mean, A per cell; subtracted from the current.
     mean_a: f64,
-    /// Standard deviation relative to the configured one, 0 to 1; `None` = nothing learned yet (counts as 1).
+    /// Standard deviation as a fraction of the configured standard deviation; `None` = nothing learned (counts as 1).
     part: Option<f64>,
 }
 
@@ -54,7 +54,7 @@ impl CurrentOffset {
             return 0.0;
         }
         let most_a = 5.0 * configured_a;
-        // Evidence beyond three standard deviations has another cause than an offset.
+        // Evidence beyond three standard deviations has a cause other than an offset.
         let deviations = (score / (1.0 + information)).clamp(-3.0, 3.0);
         let mean_a = (self.mean_a + deviations * std_a).clamp(-most_a, most_a);
         let corrected = (mean_a - self.mean_a) / std_a;
@@ -63,8 +63,8 @@ impl CurrentOffset {
         corrected
     }
 
-    /// Lets the offset drift for `seconds`: a tenth of its initial standard deviation in a day, as sensors do with
-    /// temperature.
+    /// Adds the uncertainty of a drift over `seconds`: a tenth of the initial standard deviation per day. Sensors
+    /// drift that much with temperature.
     pub fn drift(&mut self, seconds: f64) {
         if let Some(part) = &mut self.part {
             *part = (*part * *part + 0.1 * 0.1 * seconds.max(0.0) / 86_400.0).sqrt().min(1.0);
@@ -92,13 +92,13 @@ mod tests {
     fn evidence_is_weighted_by_deviation_and_counts_once() {
         let mut offset = CurrentOffset::default();
         assert_eq!((offset.mean_a(), offset.std_a(0.05), offset.learned(0.05)), (0.0, 0.05, None));
-        // Evidence for one deviation, with three times the prior's information.
+        // Evidence for an offset of one standard deviation, with three times the information of the prior.
         let corrected = offset.update(0.05, (3.0, 3.0));
         assert!((corrected - 0.75).abs() < 1e-12 && (offset.mean_a() - 0.0375).abs() < 1e-12, "{offset:?}");
         assert!((offset.std_a(0.05) - 0.025).abs() < 1e-12);
         assert_eq!(offset.learned(0.05), Some(ScalarGaussian::from_std(offset.mean_a(), offset.std_a(0.05))));
-        assert_eq!(offset.learned(0.0), None, "no longer configured");
-        // Evidence for the remaining half deviation.
+        assert_eq!(offset.learned(0.0), None, "offset learning is off");
+        // Evidence for the remaining half of a standard deviation.
         offset.update(0.05, (99.0, 50.0));
         assert!((offset.mean_a() - 0.05).abs() < 1e-12 && (offset.std_a(0.05) - 0.0025).abs() < 1e-12, "{offset:?}");
     }

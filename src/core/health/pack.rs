@@ -1,9 +1,12 @@
-//! Pack values from the limiting cells, never from a mean.
+//! Computes the pack's values from the limiting cells, never from a mean.
 //!
-//! A series pack stops discharging when its weakest cell is empty and stops charging when its fullest is full:
-//! dischargeable = min_i SOC_i C_i; chargeable = min_i (1 - SOC_i) C_i; pack capacity = their sum; pack SOC =
-//! dischargeable / pack capacity. With one cell, the pack's values are the cell's. Without cells or without capacity,
-//! there are no pack values.
+//! A series pack stops discharging when its weakest cell is empty and stops charging when its fullest cell is full.
+//! * dischargeable charge = min_i SOC_i C_i
+//! * chargeable charge = min_i (1 - SOC_i) C_i
+//! * pack capacity = dischargeable + chargeable charge
+//! * pack SOC = dischargeable charge / pack capacity
+//!
+//! A pack of one cell has the values of that cell. Without cells or without capacity, there are no pack values.
 
 use serde::{Deserialize, Serialize};
 
@@ -29,7 +32,7 @@ pub struct PackState {
     pub soc: f64,
     /// Standard deviation of the limiting cell's SOC.
     pub soc_std: f64,
-    /// Charge between the fullest cell full and the weakest cell empty, Ah.
+    /// Charge that the pack delivers from the point where its fullest cell is full until its weakest cell is empty, Ah.
     pub capacity_ah: f64,
     /// Standard deviation of the limiting cell's capacity, Ah.
     pub capacity_std_ah: f64,
@@ -37,8 +40,8 @@ pub struct PackState {
     pub limiting_cell: CellIndex,
 }
 
-/// Combines the cells. Returns `None` without cells, or if the pack has no capacity (one cell above full, another
-/// below empty).
+/// Combines the cells. Returns `None` if there are no cells or the pack has no capacity, because one cell is full
+/// while another is empty.
 pub fn combine(cells: impl Iterator<Item = CellShare>) -> Option<PackState> {
     let mut weakest: Option<(f64, CellShare)> = None;
     let mut chargeable_ah = f64::INFINITY;
@@ -86,7 +89,7 @@ mod tests {
     }
 
     #[test]
-    fn pack_of_one_cell_has_its_values() {
+    fn pack_of_one_cell_has_cell_values() {
         let pack = combine([share(0, 0.4, 2.5)].into_iter()).expect("one cell");
         assert!((pack.soc - 0.4).abs() < 1e-15);
         assert!((pack.capacity_ah - 2.5).abs() < 1e-15);

@@ -1,26 +1,27 @@
 //! Recharge period: duration of a charge between two SOC values (paper, section 3.3.5), raw and normalised.
 //!
 //! In: the estimated SOC with its time, the mode, the learned capacity (Ah). Out: periods, s. If the SOC jumps, the
-//! caller discards the charge.
+//! caller discards the timer's current charge.
 //!
-//! Raw: the time between the two estimated SOC values, if one uninterrupted charge covers the whole window. A stronger
-//! charger shortens it just as a faded cell does.
+//! Raw: the time between the two estimated SOC values, if one uninterrupted charge covers the whole window. Both a
+//! stronger charger and a faded cell shorten the raw period.
 //!
 //! Normalised: the time that a reference charger would need for the same window of the same pack,
 //! `t = 3600 (to - from) C / I_ref`, with C the pack's capacity (Ah) learned up to the end of this charge and I_ref the
-//! reference current per cell (A). Its standard deviation is C's, scaled, and so includes the gain error of the current
-//! sensor.
+//! reference current per cell (A). The standard deviation of t is that of C, scaled by the same factor. It therefore
+//! includes the gain error of the current sensor.
 //!
-//! Why C and not the charge moved between the two SOC values: between the crossings, the estimated SOC moves by charge
-//! over the assumed capacity. The charge moved is therefore the window times the assumed capacity, corrected by the
-//! voltages within the window only. C uses these voltages and all earlier ones, weighted by their information. Over
-//! the fleet of `tests/recharge_fleet.rs`, which prints both, the RMS error is 0.57 % for C and 0.78 % for the charge
-//! moved. C also has a standard deviation and does not require a charge that covers the window.
+//! Why t uses C, not the charge moved within the window: within the window, the estimated SOC moves by the charge
+//! divided by the assumed capacity. The charge moved is therefore the window times the assumed capacity, corrected
+//! only by the voltages within the window. C uses these voltages and all earlier ones, weighted by their information.
+//! Over the fleet of `tests/recharge_fleet.rs`, which prints both, the RMS error is 0.57 % for C and 0.78 % for the
+//! charge moved. C also has a standard deviation and does not require a charge that covers the window.
 //!
 //! Assumed: the reference charger holds its current over the whole window, so resistance, temperature and tapering
 //! have no effect. C is the capacity between the open-circuit ends at the model's reference temperature, whatever the
-//! temperature of the charge; there is no reference temperature to configure. The charge that a cold or worn cell
-//! accepts within a charger's voltage limit is a different quantity (`usable` computes it for discharges).
+//! temperature during the charge; there is no reference temperature to configure. The charge that a cold or worn cell
+//! accepts within a charger's voltage limit is a different quantity. (`usable` computes the corresponding quantity for
+//! discharges.)
 //!
 //! Deviation 1: the paper's script counts from the first charging sample at any SOC. Here a raw period requires one
 //! uninterrupted charge over the whole window. Reason: periods become comparable.
@@ -39,7 +40,7 @@ use crate::quantity::{InvalidState, Mode, Timestamp};
 pub struct RechargeTimer {
     last: Option<(Timestamp, f64)>,
     entered: Option<Timestamp>,
-    /// Lowest and highest SOC of this charge.
+    /// Lowest and highest SOC during this charge.
     range: Option<(f64, f64)>,
     /// Raw period of this charge, s.
     raw_s: Option<f64>,
@@ -48,7 +49,7 @@ pub struct RechargeTimer {
 /// Outcome of a finished charge.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct ChargeRecord {
-    /// Time over the whole window, s; `None` if no uninterrupted charge covered it.
+    /// Charging time over the whole window, s; `None` if no uninterrupted charge covered the window.
     pub raw_s: Option<f64>,
     /// Part of the window that the charge covered, 0 to 1.
     pub coverage: f64,
@@ -72,12 +73,12 @@ impl RechargeTimer {
         Some(period_s)
     }
 
-    /// Stops timing the current crossing; keeps the period and the SOC range found so far.
+    /// Stops timing the window; keeps the raw period and the SOC range of this charge.
     pub fn interrupt(&mut self) {
         (self.last, self.entered) = (None, None);
     }
 
-    /// Handles a changed window: discards the period of the old window and keeps the SOC range.
+    /// Handles a changed window: discards the raw period of the old window and keeps the SOC range.
     pub fn change_window(&mut self) {
         self.interrupt();
         self.raw_s = None;
@@ -109,7 +110,7 @@ impl RechargeTimer {
     }
 }
 
-/// Time, s, that the reference current needs for the window of a pack of `capacity` (Ah).
+/// Time, s, that the reference current needs to charge a pack of `capacity` (Ah) through the window.
 pub fn normalised_period(config: &RechargeConfig, capacity: ScalarGaussian) -> ScalarGaussian {
     let seconds_per_ah = 3600.0 * (config.to_soc - config.from_soc) / config.reference_current_a;
     ScalarGaussian {
@@ -136,7 +137,8 @@ mod tests {
         alarm_on: RechargeAlarm::Raw,
     };
 
-    /// Charges at 1 % a minute from `from` to `to`, observed every 7 s.
+    /// Charges at 1 % per minute from SOC `from` to `to`, observed every 7 s. Returns the first raw period, s, and the
+    /// outcome of the charge.
     fn charge(from: f64, to: f64, mode_at: impl Fn(f64) -> Mode) -> (Option<f64>, ChargeRecord) {
         let mut timer = RechargeTimer::default();
         let mut period_s = None;
@@ -151,7 +153,7 @@ mod tests {
     #[test]
     fn full_window_charge_is_timed_between_samples() {
         let (period_s, charged) = charge(0.1, 1.0, |_| Mode::Charge);
-        assert!((period_s.expect("covers it") - 3600.0).abs() < 1e-6);
+        assert!((period_s.expect("the charge covers the window") - 3600.0).abs() < 1e-6);
         assert_eq!(charged, ChargeRecord { raw_s: period_s, coverage: 1.0 });
     }
 

@@ -31,7 +31,7 @@ pub struct ModeChange {
 pub struct TransitionOutcome {
     /// The mode change confirmed by this time.
     pub change: Option<ModeChange>,
-    /// Whether a new candidate begins here; the caller then marks its state.
+    /// Whether a new candidate mode begins with this observation. If so, the caller marks the cells' state.
     pub candidate_begins: bool,
 }
 
@@ -48,7 +48,7 @@ impl TransitionDetector {
         self.mode
     }
 
-    /// Handles the current at `time`. First confirms the candidate if it has held long enough by then.
+    /// Handles the current at `time`. If the candidate has held long enough by then, confirms it first.
     pub fn observe(&mut self, config: &TransitionConfig, time: Timestamp, current_a: Option<f64>) -> TransitionOutcome {
         let change = self.poll(config, time);
         let observed = self.classify(config, current_a);
@@ -56,7 +56,7 @@ impl TransitionDetector {
         let mut candidate_begins = false;
         self.candidate = match self.candidate {
             _ if observed == self.mode => None,
-            // If a load ends and the sensor then has no readings, both count as one change, dated at the end of the
+            // If the current becomes stale soon after a load ends, both count as one change, dated at the end of the
             // load.
             Some(before) if before.mode == observed || (idle(before.mode) && idle(observed)) => {
                 Some(ModeCandidate { mode: observed, since: before.since })
@@ -83,8 +83,8 @@ impl TransitionDetector {
         Some(ModeChange { from, to: candidate.mode, since: candidate.since })
     }
 
-    /// Mode of a current. Entering charge or discharge takes dead band plus hysteresis; staying takes the dead band
-    /// alone.
+    /// Mode of a current. To enter charge or discharge, the current must exceed dead band plus hysteresis; to stay
+    /// there, it must exceed only the dead band.
     fn classify(&self, config: &TransitionConfig, current_a: Option<f64>) -> Mode {
         let Some(current_a) = current_a else { return Mode::Unknown };
         let enter = config.dead_band_a + config.hysteresis_a;

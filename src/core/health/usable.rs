@@ -1,12 +1,12 @@
-//! Usable capacity: charge that a full cell delivers at a given current and temperature down to a cut-off voltage
-//! under load. It depends on capacity and resistance.
+//! Usable capacity: charge that a full cell delivers at a given current and temperature until its voltage under load
+//! falls to a cut-off. It depends on capacity and resistance.
 //!
-//! In: model, load, SOC when full, capacity (Ah) and resistance ratios. Out: Ah, with variance. A cell that is below
-//! the cut-off from the start delivers 0.
+//! In: model, load, SOC when full, capacity (Ah) and resistance ratios. Out: Ah, with variance. If the cell is below
+//! the cut-off from the start, the usable capacity is 0.
 //!
 //! The discharge is simulated with the circuit's equations at constant current until the voltage falls to the cut-off.
-//! It starts from the SOC after a full charge, with relaxed branches. The standard deviation is propagated to first
-//! order from capacity and ln rho, with their covariance.
+//! It starts from the SOC after a full charge, with relaxed branches. The variance is propagated to first order from
+//! the slow ratio, the capacity and ln rho (rho is the resistance ratio), with the covariance of the last two.
 
 use super::UsableConfig;
 use crate::cell::circuit::{BranchAt, aged_terminal_v, soc_after};
@@ -19,8 +19,8 @@ const MAX_STEPS: u32 = 2000;
 /// Step of the forward differences in ln rho, ln capacity and slow ratio.
 const LOG_STEP: f64 = 0.01;
 
-/// Charge, Ah, that a cell of `capacity_ah` delivers from `full_soc` down to the cut-off. The two ratios are the
-/// cell's resistance ratio and the additional ratio of its slowest branch.
+/// Charge, Ah, that a cell of `capacity_ah` delivers from `full_soc` until its voltage falls to the cut-off. The two
+/// ratios are the cell's resistance ratio and the additional ratio of its slowest branch.
 pub fn usable_ah(
     model: &CellModel,
     config: &UsableConfig,
@@ -64,8 +64,8 @@ pub fn usable_ah(
     step_ah * f64::from(MAX_STEPS)
 }
 
-/// Usable capacity and its variance, Ah. `capacity` is the published estimate; its variance may exceed the filter's
-/// own.
+/// Usable capacity, Ah, with its variance. `capacity` is the published estimate; its variance may exceed the variance
+/// in the cell's filter.
 pub fn usable_capacity(
     model: &CellModel,
     config: &UsableConfig,
@@ -113,7 +113,7 @@ mod tests {
 
     #[test]
     fn resistance_lowers_the_usable_capacity() {
-        // At 0.2 A every branch (20 to 40 s) has settled: 3.0 + 1.2 s - 0.2 rho (0.12 - 0.08 s) = 3.3.
+        // At 0.2 A, every branch (time constant 20 to 40 s) settles: 3.0 + 1.2 s - 0.2 rho (0.12 - 0.08 s) = 3.3.
         for ratio in [1.0, 3.0] {
             let end = (0.3 + 0.2 * ratio * 0.12) / (1.2 + 0.2 * ratio * 0.08);
             let usable = usable_ah(&small_model(), &CONFIG, 1.0, 2.0, (ratio, 1.0));

@@ -3,24 +3,27 @@
 //! In: mean and covariance of loss and rate (fractions of the reference, per unit of use). Out: probabilities and
 //! quantiles of the use. Extreme inputs saturate within [`LOG_RANGE`].
 //!
-//! Given the loss L and the rate r, the use is T = integral over l from 0 to L of exp(-g(l) - W(l)) / r. g is the
-//! growth that the knee adds to the rate's logarithm, W its walk, a Brownian motion of variance v(l). With
-//! m = exp(v / 2 - g): E T = (1 / r) integral of m(l), and E T^2 = (2 / r^2) integral over l of m(l) (integral over s
-//! from 0 to l of m(s) e^v(s)). Both use the midpoint rule and give a lognormal of that mean and variance.
-//! The rate is positive: a lognormal with the mean and variance of its truncated normal; the walk with use adds its
-//! variance. The loss is normal. A loss of 0 or less is a crossing in the past: T = 0 with that probability. The
-//! remaining range is divided into slices of equal width. Each slice is a lognormal at its middle loss, with the rate
-//! conditional on that loss, and an added variance of (w / L)^2 / 12 for the slice's width w.
+//! Given the loss L and the rate r, the use is T = integral over l from 0 to L of exp(-g(l) - W(l)) / r. Here, g is the
+//! growth that the knee adds to the rate's logarithm. W is the random walk of that logarithm, a Brownian motion of
+//! variance v(l). With m = exp(v / 2 - g):
+//! * E T = (1 / r) integral of m(l);
+//! * E T^2 = (2 / r^2) integral over l of m(l) (integral over s from 0 to l of m(s) e^v(s)).
+//!
+//! Both integrals use the midpoint rule. T is approximated by a lognormal with these moments. The rate is a lognormal
+//! with the mean and variance of the rate's normal distribution truncated to positive values. Its walk with use adds
+//! variance. The loss is normal. A loss of 0 or less means a crossing in the past, so T = 0 with the probability of
+//! such a loss. The remaining range of the loss is divided into slices of equal width. Each slice is a lognormal at its
+//! middle loss, with the rate conditional on that loss. The width w of the slice adds a variance of (w / L)^2 / 12.
 
 use super::{KNEE_DRIFT, RATE_WALK_USE, knee, walk_variance};
 use crate::filter::{bell, bisect, normal_cdf};
 
 /// Number of slices of the loss.
 const SLICES: usize = 10;
-/// Half-width of the sliced range of the loss, standard deviations; the outermost slices include the tails.
+/// Half-width of the sliced range of the loss, standard deviations; the last slice includes the upper tail.
 const SLICED: f64 = 3.5;
 
-/// Steps of a bisection: from about 20 e-folds to 1 part in 10^6.
+/// Steps of a bisection: they narrow a range of about 20 e-folds to 1 part in 10^6.
 pub(super) const HALVINGS: u32 = 24;
 
 /// Range of the logarithm of use and rate.
@@ -41,11 +44,11 @@ pub(super) struct Crossing {
 }
 
 impl Crossing {
-    /// `mean`: [remaining loss, rate]; `covariance`: [loss, loss and rate, rate]; `lost` and `used`: loss and use so
-    /// far.
+    /// `mean`: [remaining loss, rate]. `covariance`: [variance of the loss, covariance of loss and rate, variance of
+    /// the rate]. `lost` and `used`: loss and use up to now.
     pub(super) fn new(mean: [f64; 2], covariance: [f64; 3], lost: f64, used: f64) -> Self {
         let [loss_variance, both, rate_variance] = covariance;
-        // The minimum keeps a certain loss computable: all slices are then equal.
+        // The minimum avoids a division by 0 for an exactly known loss; all slices are then equal.
         let loss_std = loss_variance.max(1e-24).sqrt();
         let by_loss = both / (loss_std * loss_std);
         let left = (rate_variance - by_loss * both).max(0.0);
@@ -65,7 +68,7 @@ impl Crossing {
             let (log_rate, log_rate_variance) = positive(mean[1] + by_loss * loss_std * deviation, left);
             let (log_use, walked) = use_of_loss(lost, loss);
             let log_mean = log_use - log_rate;
-            // The rate keeps walking with use; the use averages over the walk, so about half of its variance counts.
+            // The rate keeps walking with use. The use averages over that walk, so about half of its variance counts.
             let ahead = libm::log1p(libm::exp(log_mean.min(LOG_RANGE.1)) / used.max(f64::MIN_POSITIVE));
             let own_width = loss_std * width / loss;
             let variance =
@@ -91,7 +94,7 @@ impl Crossing {
             return 0.0;
         }
         let likely = || self.slices.iter().filter(|(weight, _)| *weight > 0.0);
-        // Six standard deviations of each slice on either side.
+        // The search range extends six standard deviations beyond the mean of each slice.
         let ends = |sign: f64| likely().map(move |(_, (mean, std))| mean + sign * 6.0 * std);
         let least = ends(-1.0).fold(LOG_RANGE.1, f64::min).max(LOG_RANGE.0);
         let most = ends(1.0).fold(least, f64::max).min(LOG_RANGE.1);
@@ -106,7 +109,7 @@ fn positive(mean: f64, variance: f64) -> (f64, f64) {
     if std == 0.0 {
         return (LOG_RANGE.0, 0.0);
     }
-    // Further below 0, the ratio of density to tail exceeds f64's range; the rate is then close to 0 anyway.
+    // Below -8, the ratio of density to tail cannot be computed in f64. The rate is close to 0 there anyway.
     let place = (mean / std).max(-8.0);
     let density = bell(place) / (2.0 * std::f64::consts::PI).sqrt();
     let hazard = density / normal_cdf(place);
@@ -116,10 +119,10 @@ fn positive(mean: f64, variance: f64) -> (f64, f64) {
     (libm::log(first) - 0.5 * log_variance, log_variance)
 }
 
-/// Mean and variance of the logarithm of the use that a further loss takes at an initial rate of 1.
+/// Mean and variance of the logarithm of the use until a further `loss`, for an initial rate of 1.
 fn use_of_loss(lost: f64, loss: f64) -> (f64, f64) {
     let step = loss / STEPS as f64;
-    // Sums over the loss so far: m, m e^v, and the second moment.
+    // Sums over the loss: m, m e^v, and the second moment.
     let (mut mean, mut inner, mut second) = (0.0, 0.0, 0.0);
     for index in 0..STEPS {
         let at = lost + (index as f64 + 0.5) * step;
@@ -141,8 +144,8 @@ mod tests {
 
     #[test]
     fn moments_of_use_agree_with_sampled_walk() {
-        // Antithetic pairs of a fixed generator: reproducible, and the first moment is nearly exact. The loss starts
-        // before the knee and ends beyond it.
+        // A generator with a fixed seed makes the test reproducible; antithetic pairs make the first moment nearly
+        // exact. The loss starts before the knee and ends beyond it.
         let (lost, loss, steps, paths) = (0.05, 0.3, 200, 4000);
         let mut seed = 1_u64;
         let mut uniform = || {

@@ -1,8 +1,9 @@
-//! Forecasts of synthetic histories.
+//! Tests of the forecast with synthetic histories.
 
 use super::*;
 
-/// Feeds a fade: `capacity(efc)` every `step` cycles; a cycle lasts a quarter of a day.
+/// A forecast that has received `capacity(efc)`, Ah, every `step` equivalent full cycles up to `until`. A cycle lasts a
+/// quarter of a day.
 fn fed(capacity: impl Fn(f64) -> f64, step: f64, until: f64) -> Forecast {
     let mut forecast = Forecast::new(Axis::Cycles, 2.0);
     let mut efc = 0.0;
@@ -225,7 +226,7 @@ fn long_rest_hardly_changes_recent_use() {
     (0..20).for_each(|_| forecast.update(passed(1.0), None));
     let life = forecast.remaining(1.5).expect("enough is known");
     let days_per_cycle = life.days.expect("days").median / life.cycles.expect("cycles").median;
-    // 5 days for 20 cycles plus up to 25 days of rest that a window of 30 days still holds: far below 300.
+    // 5 days for 20 cycles, plus up to 25 days of rest within the window of 30 days: far below 300.
     assert!((0.25..2.0).contains(&days_per_cycle), "{days_per_cycle}");
 }
 

@@ -1,4 +1,4 @@
-//! Tests of what half-cycles teach.
+//! Tests of capacity learning from half-cycles.
 
 use super::*;
 use crate::cell::estimator::tests::{config as estimator_config, truth};
@@ -50,7 +50,7 @@ fn mode_begun_in_gap_starts_at_soc_after_gap() {
     assert!(!learner.observe(0, end, None, 10.0, 0.0));
     learner.mark_candidate(end, 3600.0, |_| at(0.4));
     learner.complete(&transition, 2.0, Mode::Discharge, &mut found);
-    assert!((found[0].swing.expect("both ends seen").mean - 0.5).abs() < 1e-12, "{found:?}");
+    assert!((found[0].swing.expect("the SOC of both ends is known").mean - 0.5).abs() < 1e-12, "{found:?}");
 }
 
 #[test]
@@ -64,7 +64,7 @@ fn half_cycle_without_new_voltages_measures_nothing() {
     assert!(!learner.has_learned_all());
     let first = learner.learn(&small_model(), &config, 0, &mut estimator, &moved);
     assert!(first.measurement.is_some() && learner.has_learned_all());
-    // Without a new measurement, the same voltages must not count again.
+    // Without new voltages, the same information must not count again.
     let second = learner.learn(&small_model(), &config, 0, &mut estimator, &moved);
     assert_eq!(second.measurement, None);
     assert_eq!(moved.swing.map(|swing| swing.mean), Some(0.5));
@@ -114,7 +114,7 @@ fn half_cycle_with_filter_restart_measures_nothing() {
 }
 
 /// Error of the learned capacity, in standard deviations, after 1,000 half-cycles between SOC 0.8 and 0.3 at 1 A. The
-/// voltage is up to 5 mV too high at the upper end of the curve and too low at the lower end.
+/// voltage is up to 5 mV too high at the upper end of the curve and up to 5 mV too low at the lower end.
 fn deviations_after_thousand_half_cycles(config: &CapacityConfig, sensor: SensorErrors) -> f64 {
     let model = small_model();
     let mut estimator_config = estimator_config();
@@ -146,7 +146,7 @@ fn lasting_errors_of_equal_half_cycles_stay_in_interval() {
     let sensor = SensorErrors { voltage_offset_v: 0.004, current_gain: 0.005, ..SensorErrors::NONE };
     let deviations = deviations_after_thousand_half_cycles(&config, sensor);
     assert!(deviations.abs() < 1.96, "{deviations}");
-    // If these errors are treated as noise, they average out and the interval excludes the true capacity.
+    // If the filter treats these errors as noise, they average out and the interval excludes the true capacity.
     let without =
         deviations_after_thousand_half_cycles(&CapacityConfig { end_error_v: Some(0.0), ..config }, SensorErrors::NONE);
     assert!(without.abs() > 3.0, "{without}");
