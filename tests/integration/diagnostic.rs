@@ -159,6 +159,6 @@ fn doctor_finds_pack_voltage_off_by_ten() {
     let mut doctor = Command::cargo_bin("packwatch").unwrap();
     let output = doctor.args(["doctor", "-c", config.to_str().unwrap(), path.to_str().unwrap()]).output().unwrap();
     let text = String::from_utf8(output.stdout).unwrap();
-    assert!(text.contains("WARNING   Leaf.PackVoltage is off by 10"), "{text}");
+    assert!(text.contains("WARNING   Leaf.PackVoltage is off by a factor of 10"), "{text}");
     assert!(text.contains("96 of 96 cell voltages"), "{text}");
 }

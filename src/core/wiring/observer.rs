@@ -1,4 +1,4 @@
-//! Collects frames, events and estimates, and keeps the statistics for the judgement.
+//! Collects frames, interface events and estimates, and keeps the statistics that the checks in `judge` need.
 
 use std::collections::BTreeMap;
 
@@ -15,7 +15,7 @@ use crate::can::{CanId, Frame, FrameKind};
 use crate::monitor::{BusEvent, Estimate};
 use crate::quantity::{BusIndex, Channel, Timestamp};
 
-/// Frames of one identifier on one interface.
+/// Statistics of the frames with one identifier on one interface.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct IdStats {
     pub(crate) count: u64,
@@ -25,7 +25,7 @@ pub(crate) struct IdStats {
     pub(crate) len: usize,
 }
 
-/// Frames and state of an interface.
+/// Statistics and state of one interface.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct BusStats {
     pub(crate) name: String,
@@ -38,7 +38,7 @@ pub(crate) struct BusStats {
     pub(crate) is_down: bool,
 }
 
-/// End-to-end checks of a protected message.
+/// Results of the end-to-end checks of one protected message.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct ProtectionStats {
     pub(crate) counts: BTreeMap<&'static str, u64>,
@@ -55,7 +55,7 @@ pub(crate) struct EstimatorStats {
     pub(crate) innovation_sum: f64,
 }
 
-/// A list of signals in the plan.
+/// Selects one of the plan's lists of signals.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum SignalList {
     Configured,
@@ -74,13 +74,13 @@ pub struct WiringObserver {
     pub(crate) more_cells: Vec<Series>,
     /// Evidence of each signal, in the order of `plan.unconfigured`.
     pub(crate) unconfigured: Vec<Series>,
-    /// Indexes of the signals by message.
+    /// Indexes of the signals in each message.
     by_id: BTreeMap<(BusIndex, CanId), Vec<(SignalList, usize)>>,
     /// Reassembles diagnostic answers with signals.
     listener: Listener,
-    /// Indexes of the signals by diagnostic question.
+    /// Indexes of the signals in the answer to each diagnostic question.
     by_question: BTreeMap<Question, Vec<(SignalList, usize)>>,
-    /// The current's message, if it also appears on other interfaces.
+    /// Statistics of the current's message on each other interface that carries it.
     pub(crate) other_currents: BTreeMap<BusIndex, OtherCurrent>,
     guards: Guards,
     pub(crate) protected: BTreeMap<(BusIndex, CanId), ProtectionStats>,
@@ -89,7 +89,7 @@ pub struct WiringObserver {
     pub(crate) estimator: EstimatorStats,
     /// Time of the latest frame.
     latest: Option<Timestamp>,
-    /// Time between frames, without sleep, s.
+    /// Sum of the times between frames, s. Gaps above 30 s are left out, because the buses sleep during them.
     pub(crate) awake_s: f64,
     /// Time listened on live interfaces, s; `None` for a recording, where `awake_s` counts.
     listened_s: Option<f64>,
@@ -97,7 +97,7 @@ pub struct WiringObserver {
 }
 
 impl WiringObserver {
-    /// Creates an observer that has not received a frame.
+    /// Creates an observer for `plan`.
     pub fn new(plan: Plan) -> Self {
         let mut by_id: BTreeMap<(BusIndex, CanId), Vec<(SignalList, usize)>> = BTreeMap::new();
         let lists = [
@@ -259,12 +259,12 @@ impl WiringObserver {
         &self.responses[0]
     }
 
-    /// Slope of the pack's voltage over its current, from the block length that determines it better.
+    /// Slope of the pack's voltage over its current, from the block length that gives the more certain slope.
     pub(super) fn slope(&self) -> Option<Slope> {
         best_response(&self.responses).slope()
     }
 
-    /// The slope of one cell, from the same block length.
+    /// Slope of one cell's voltage over the current, from the block length that [`Self::slope`] uses.
     pub(super) fn slope_of(&self, cell: usize) -> Option<Slope> {
         best_response(&self.responses).slope_of(cell)
     }
@@ -291,7 +291,7 @@ impl WiringObserver {
         self.latest = Some(last.max(time));
     }
 
-    /// Handles a time of unknown length without listening.
+    /// Handles a period of unknown length in which the observer did not listen.
     pub fn handle_gap(&mut self) {
         let Self { series, more_cells, unconfigured, .. } = self;
         series.iter_mut().chain(more_cells).chain(unconfigured).for_each(Series::pause);
@@ -325,17 +325,17 @@ impl WiringObserver {
         }
     }
 
-    /// Time listened so far, without sleep, s.
+    /// Time for which the observer has listened, without sleep, s.
     pub fn seconds(&self) -> f64 {
         self.listened_s.unwrap_or(self.awake_s)
     }
 
-    /// Sets the time listened on live interfaces, s, with or without frames.
+    /// Sets the time for which the observer has listened on live interfaces, s, with or without frames.
     pub fn handle_listened(&mut self, seconds: f64) {
         self.listened_s = Some(seconds);
     }
 
-    /// Frames so far.
+    /// Number of frames received.
     pub fn frames(&self) -> u64 {
         self.frames
     }

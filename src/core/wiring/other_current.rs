@@ -1,7 +1,7 @@
-//! The configured current's message on another interface.
+//! Statistics of a message on another interface that has the identifier of the configured current.
 //!
 //! Buses of one vehicle may use the same identifier for different messages, or carry the messages of several packs.
-//! One of these messages, decoded as the configured current, may be the current that the voltages follow.
+//! Decoded as the configured current, such a message may be the current that the voltages follow.
 
 use super::evidence::Series;
 use super::evidence::Slope;
@@ -10,7 +10,7 @@ use crate::can::decode::Binding;
 use crate::can::signal::SignalLayout;
 use crate::quantity::Timestamp;
 
-/// The message on one other interface.
+/// Statistics of the message on one other interface.
 #[derive(Debug)]
 pub(crate) struct OtherCurrent {
     pub(crate) series: Series,
@@ -18,7 +18,8 @@ pub(crate) struct OtherCurrent {
 }
 
 impl OtherCurrent {
-    /// Creates a response with `cells` voltages and steps above `tolerance_a`, A.
+    /// Creates empty statistics for `cells` voltages. A current change of at most `tolerance_a`, A, does not count as a
+    /// change of load.
     pub(crate) fn new(layout: &SignalLayout, cells: usize, tolerance_a: f64) -> Self {
         let responses = BLOCKS_S.map(|block_s| VoltageResponse::new(cells, tolerance_a, block_s));
         Self { series: Series::new(layout, None), responses }
@@ -39,7 +40,7 @@ impl OtherCurrent {
         best_response(&self.responses).slope()
     }
 
-    /// Ends the blocks and runs before a time without listening.
+    /// Ends the open blocks and runs before a period in which the observer does not listen.
     pub(crate) fn pause(&mut self) {
         self.series.pause();
         self.responses.iter_mut().for_each(VoltageResponse::pause);

@@ -1,4 +1,4 @@
-//! Plan: the readable parts of the configuration, that is, what the doctor expects on the buses.
+//! Plan: what the doctor expects on the buses, from the readable parts of the configuration.
 
 use crate::can::CanId;
 use crate::can::decode::Binding;
@@ -18,13 +18,13 @@ pub struct Plan {
     /// Signals of the DBC that look like voltages of cells beyond `pack.cells`, in the order of their numbers.
     pub more_cells: Vec<SignalPlan>,
     /// Signals of the DBC that are not configured but look like the pack's voltage (if cell voltages are configured)
-    /// or a state of charge. Their binding has that channel. One entry per interface.
+    /// or a state of charge. Their binding names that channel. A signal has one entry per interface.
     pub unconfigured: Vec<SignalPlan>,
     /// The pack.
     pub pack: PackPlan,
-    /// Age from which a current, voltage or temperature is stale, s; `None` = never.
+    /// Ages from which a current, a voltage and a temperature are stale, s; `None` = never.
     pub max_ages_s: [Option<f64>; 3],
-    /// Smallest and largest plausible current, cell voltage and temperature; infinite = unlimited.
+    /// Smallest and largest plausible value of current, cell voltage and temperature; infinite = unlimited.
     pub limits: [(f64, f64); 3],
     /// Protected messages.
     pub guards: Vec<GuardConfig>,
@@ -32,8 +32,8 @@ pub struct Plan {
     pub outputs: Vec<OutputPlan>,
     /// Messages that carry configured signals.
     pub messages: Vec<MessagePlan>,
-    /// Whether the values come from a CSV file with columns in the program's own units. If so, no sign is proposed for
-    /// a bus signal.
+    /// Whether the values come from a CSV file with columns in the program's own units. If so, the report proposes no
+    /// change of a bus signal's sign.
     pub is_csv: bool,
 }
 
@@ -48,7 +48,7 @@ pub struct PackPlan {
     pub strings: u16,
     /// The cell model; `None` if it cannot be read.
     pub model: Option<CellModel>,
-    /// Capacity of a cell, Ah: the configured one, else the model's.
+    /// Capacity of a cell, Ah: the configured capacity, or the model's if none is configured.
     pub capacity_ah: f64,
     /// Ambient temperature, degrees C.
     pub ambient_c: f64,
@@ -80,7 +80,7 @@ pub struct SignalPlan {
     pub table: String,
     /// Name of the message in the DBC.
     pub message: String,
-    /// `Message.Signal`.
+    /// Full name in the DBC: `Message.Signal`.
     pub name: String,
     /// Unit in the DBC.
     pub unit: String,
@@ -91,7 +91,7 @@ pub struct SignalPlan {
 }
 
 impl SignalPlan {
-    /// Whether the other signal is read from some of the same bits.
+    /// Whether this signal and `other` share bits.
     pub(super) fn shares_bits(&self, other: &Self) -> bool {
         let (a, b) = (&self.binding, &other.binding);
         let is_together = (a.bus, a.id, &a.mux) == (b.bus, b.id, &b.mux);
@@ -130,7 +130,7 @@ pub struct MessagePlan {
     pub id: CanId,
     /// Name in the DBC.
     pub name: String,
-    /// `GenMsgCycleTime`, s.
+    /// Cycle time stated in the DBC (`GenMsgCycleTime`), s.
     pub cycle_time_s: Option<f64>,
     /// Multiplexer pages with configured signals.
     pub pages: usize,
@@ -149,7 +149,7 @@ pub struct OutputPlan {
     pub table: String,
 }
 
-/// Kind of quantity, as far as the judgement distinguishes it.
+/// Kinds of quantities that the checks distinguish.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Kind {
     Current,
@@ -189,7 +189,8 @@ impl Plan {
         self.max_ages_s.get(Kind::of(channel) as usize).copied().flatten().unwrap_or(f64::INFINITY)
     }
 
-    /// Plausible values of the channel, in its unit; `None` = unlimited (also for limits of 0 and 0).
+    /// Smallest and largest plausible value of the channel, in its unit. `None` = unlimited; limits of 0 and 0 also
+    /// mean unlimited.
     pub(super) fn plausible(&self, channel: Channel) -> Option<(f64, f64)> {
         let (low, high) = *self.limits.get(Kind::of(channel) as usize)?;
         let cells = if channel == Channel::PackVoltage { f64::from(self.pack.cells) } else { 1.0 };

@@ -20,13 +20,13 @@ pub enum Severity {
 pub enum Topic {
     /// The configuration itself.
     Configuration,
-    /// The interface is missing, down or silent, or the pack is on another one.
+    /// The interface is missing, down or silent, or the pack is on another interface.
     Interface,
     /// Error frames: bit rate or wiring.
     BitRate,
-    /// Classic and FD frames confused.
+    /// Classic and FD frames are confused.
     Fd,
-    /// Standard and extended identifiers confused.
+    /// Standard and extended identifiers are confused.
     IdKind,
     /// Another node sends with the daemon's identifiers.
     Conflict,
@@ -73,7 +73,7 @@ pub struct Change {
     pub key: String,
     /// Value proposed, as TOML.
     pub proposed: String,
-    /// File and line; set by the caller, which has read the file.
+    /// File and line. The caller sets it, because only the caller has read the file.
     pub place: Option<String>,
     /// Current value in the file; `None` = not set.
     pub now: Option<String>,
@@ -107,7 +107,7 @@ pub struct WiringReport {
     pub seconds: f64,
     /// Frames seen on all interfaces.
     pub frames: u64,
-    /// Most severe first, then causes before effects.
+    /// Findings: most severe first; among equally severe ones, causes before effects.
     pub findings: Vec<WiringFinding>,
     /// Checks that passed.
     pub fine: Vec<String>,
@@ -116,7 +116,7 @@ pub struct WiringReport {
 }
 
 impl WiringFinding {
-    /// A finding without lines to change.
+    /// Creates a finding without lines to change.
     pub fn new(severity: Severity, topic: Topic, title: impl Into<String>) -> Self {
         let (seen, why) = (String::new(), String::new());
         let (changes, consequences) = (Vec::new(), Vec::new());
@@ -150,7 +150,7 @@ impl WiringFinding {
 }
 
 impl WiringReport {
-    /// Inserts a finding in the order of `findings` and returns it.
+    /// Inserts a finding at its place in `findings` and returns it.
     pub fn add(&mut self, finding: WiringFinding) -> &mut WiringFinding {
         let key = |f: &WiringFinding| (f.severity, f.topic);
         let at = self.findings.partition_point(|other| key(other) <= key(&finding));
@@ -158,8 +158,8 @@ impl WiringReport {
         &mut self.findings[at]
     }
 
-    /// Moves further findings on `cause`, and its consequences, below its first finding. Keeps the titles of both and
-    /// the advice of the former.
+    /// Folds all further findings on `cause`, and its consequences, into the first finding on `cause`. Keeps the title
+    /// of every folded finding, and the advice of those on `cause`.
     pub(super) fn fold(&mut self, cause: Topic, is_consequence: impl Fn(&WiringFinding) -> bool) {
         let Some(first) = self.findings.iter().position(|finding| finding.topic == cause) else { return };
         let is_moved = |finding: &mut WiringFinding| finding.topic == cause || is_consequence(finding);

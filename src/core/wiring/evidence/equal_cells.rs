@@ -1,10 +1,10 @@
 //! Finds cells whose voltages are always the same: one signal is configured for two cells, or a cell's value is copied.
 //!
 //! In: the cells' mean voltages, block by block, V. Out: groups of cells that never differed, with the number of
-//! blocks in which they moved. Equality is exact: a copy has the same digits, while two cells in series differ in some
-//! of them.
+//! blocks in which they moved. Equality is exact: a copy has the same digits, while two cells in series differ at least
+//! in the last digit.
 
-/// Groups of cells that have not differed so far.
+/// Groups of cells that have never differed.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct EqualCells {
     /// Group number by cell.
@@ -44,8 +44,8 @@ impl EqualCells {
         self.groups = groups;
     }
 
-    /// Groups of at least two cells that moved in at least `fewest` blocks, with that number of blocks, in the order
-    /// of the cells.
+    /// Groups of at least two equal cells, each with the number of blocks in which its cells moved. Leaves out cells
+    /// that moved in fewer than `fewest` blocks. Groups and cells are in ascending order.
     pub(crate) fn groups(&self, fewest: u32) -> Vec<(Vec<usize>, u32)> {
         let moved = (0..self.groups.len()).filter(|cell| self.changes[*cell] >= fewest);
         let mut found: Vec<(usize, Vec<usize>, u32)> = Vec::new();

@@ -1,8 +1,8 @@
 //! Evidence about a signal from its name and unit.
 //!
-//! In: message name, signal name and unit as written by their author. Out: points for each quantity of a pack, each
-//! with its reason in words, or `None` if the unit belongs to another quantity. The points are weights chosen on three
-//! cars: most units and names count 1 to 3, a word of another device or of a limit costs 3.
+//! In: message name, signal name and unit as written in the DBC. Out: points for each quantity of a pack, with their
+//! reasons in words, or `None` if the unit belongs to another quantity. The points are weights that were chosen on the
+//! DBCs of three cars: a matching unit or name adds 1 to 3, a word of another device or of a limit subtracts 3.
 
 use serde::Serialize;
 
@@ -26,7 +26,7 @@ pub enum PackQuantity {
     Soh,
 }
 
-/// Points for a quantity with their reasons; a reason may be empty.
+/// Points for a quantity, with their reasons.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Score {
     /// Weight of the evidence; only the order matters.
@@ -65,12 +65,12 @@ const ELSEWHERE: &str = "12v twelvevolt =lv aux starter dcdc =dc =ac motor inver
     compressor hvac cabin ambient coolant tpms tire front rear link solar pump fan oil igbt fet pcb cpu \
     pilot connector pin inlet outlet capacitor charger plug port climate freezer stator brake trailer \
     screen bus line isolation relay coil contactor cont";
-/// Words that indicate a limit or request, not a measured value.
+/// Words that indicate a value that is not measured, such as a limit or request.
 const NO_MEASUREMENT: &str = "limit target request =req avail possible set allowed threshold lifetime cumulative rated nominal =id \
     =num count delta =dev deviation fault offset reserve initial";
 
 impl Score {
-    /// Adds points and their reason if `holds` is true.
+    /// If `holds` is true, adds the points and, unless it is empty, their reason.
     pub fn add(&mut self, points: f64, holds: bool, reason: &str) {
         if holds {
             self.points += points;
@@ -86,7 +86,7 @@ impl PackQuantity {
     pub const ALL: [Self; 6] =
         [Self::Current, Self::PackVoltage, Self::CellVoltage, Self::Temperature, Self::Soc, Self::Soh];
 
-    /// Name for reports.
+    /// Name in reports.
     pub fn name(self) -> &'static str {
         match self {
             Self::Current => "pack current",
@@ -108,7 +108,7 @@ impl PackQuantity {
         }
     }
 
-    /// The quantity that its unit measures.
+    /// The physical quantity that a signal of this kind measures.
     fn measured(self) -> Quantity {
         match self {
             Self::Current => Quantity::Current,
@@ -132,7 +132,7 @@ impl SignalLabel {
         Self { is_pack_message, ..label(signal) }
     }
 
-    /// A signal without a name.
+    /// Creates a label for a signal without a name.
     pub fn unnamed(quantity: Quantity) -> Self {
         Self { words: Vec::new(), name: String::new(), unit: LabelUnit::Known(quantity), is_pack_message: false }
     }
@@ -160,12 +160,12 @@ impl SignalLabel {
         self.has(PACK) || self.is_pack_message
     }
 
-    /// Whether the name contains maximum or minimum.
+    /// Whether the name says that the value is a maximum or minimum.
     pub fn says_extreme(&self) -> bool {
         self.has("max min highest lowest")
     }
 
-    /// Whether the name contains cell.
+    /// Whether the name says that the value belongs to a cell.
     pub fn says_cell(&self) -> bool {
         self.has("cell brick cmu zelle =vc")
     }
@@ -180,7 +180,7 @@ impl SignalLabel {
         self.has("soh stateofhealth state_of_health")
     }
 
-    /// Points for a quantity from name and unit; `None` if they exclude it.
+    /// Points for a quantity from name and unit; `None` if name or unit exclude the quantity.
     pub fn score(&self, quantity: PackQuantity) -> Option<Score> {
         let mut score = Score::default();
         let has_unit = self.has_unit_of(quantity.measured());

@@ -3,7 +3,7 @@
 use super::sample::Extent;
 use crate::can::signal::{ByteOrder, SignalLayout, SignalPlan, ValueType};
 
-/// Layout faults that are tested, in the order of the alternatives.
+/// Layout faults that the doctor looks for, in the order of the alternative readings.
 pub(crate) const LAYOUT_FAULTS: [&str; 5] = [
     "wrong byte order",
     "signed and unsigned exchanged",
@@ -23,7 +23,7 @@ pub(crate) struct AlternativeReading {
 }
 
 impl AlternativeReading {
-    /// Readings of a signal's bits with all other layouts.
+    /// All alternative readings of a signal's bits.
     pub(super) fn all(layout: &SignalLayout) -> Vec<Self> {
         let other_sign = |layout: SignalLayout| match layout.value_type {
             ValueType::Unsigned => Some(SignalLayout { value_type: ValueType::Signed, ..layout }),

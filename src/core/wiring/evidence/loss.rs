@@ -1,9 +1,9 @@
 //! Counts missing frames of a cyclic signal.
 //!
-//! In: times between two readings, s. Out: the share of missing readings. The cycle is the median of the first gaps.
-//! After that, a gap of n cycles counts as n - 1 missing readings. The total is limited to the elapsed cycles minus
-//! the readings received, so that late readings that a sender catches up with are not missing. The gaps of a sender
-//! without a cycle are not multiples of one value.
+//! In: times between two readings (gaps), s. Out: the share of missing readings. The cycle is the median of the first
+//! gaps. After these, a gap of n cycles counts as n - 1 missing readings. The total is limited to the elapsed cycles
+//! minus the received readings, so that readings that a sender delays and then sends in a burst do not count as
+//! missing. If the gaps are not multiples of one value, the sender has no cycle and the share is unknown.
 
 use crate::filter::median;
 
@@ -43,7 +43,7 @@ impl LossCounter {
         }
     }
 
-    /// Share of the missing readings, and the cycle, s; `None` with too few gaps, or without a cycle.
+    /// Share of the missing readings, and the cycle, s; `None` if there are too few gaps or the sender has no cycle.
     pub(crate) fn share(&self) -> Option<(f64, f64)> {
         let gaps = f64::from(self.gaps);
         let missing = f64::from(self.missing).min((self.elapsed - gaps).max(0.0));
@@ -63,7 +63,7 @@ mod tests {
     }
 
     #[test]
-    fn loss_share_of_every_seventh_frame() {
+    fn every_seventh_frame_missing_gives_one_seventh() {
         let found = share((0..700).map(|n| if n % 6 == 5 { 0.021 } else { 0.0099 }));
         assert!(found.is_some_and(|share| (share - 1.0 / 7.0).abs() < 0.01), "{found:?}");
     }

@@ -1,22 +1,23 @@
 //! How the cells' voltages follow the pack's current.
 //!
-//! In: voltage readings (V per cell) and the pack current (A, positive = discharge) at that time. They are averaged
-//! over blocks of [`BLOCKS_S`], so that a sensor delay of a tenth of a second does not matter. Out:
+//! In: voltage readings (V per cell) and the pack current (A, positive = discharge). Both are averaged over blocks of
+//! [`BLOCKS_S`], so that a sensor delay of a tenth of a second does not matter. Out:
 //! * the largest block-to-block steps of the current, with the step of each cell's voltage: dV = -R dI;
 //! * runs of steady current with the drift of the voltage: dV = -(dOCV/dSOC) I t / C;
 //! * rests: runs with a current near zero.
 //!
-//! The largest steps and longest runs are kept: selection by current or time alone does not bias the slope.
+//! Only the largest current steps and the longest runs are kept. This selection does not bias the slope, because it
+//! does not look at the voltages.
 
 use super::equal_cells::EqualCells;
 use super::slope::Slope;
 use crate::filter::median;
 use crate::quantity::Timestamp;
 
-/// Block lengths over which readings are averaged, s. Short blocks suit a load that changes all the time, long ones a
-/// load that holds for a while with noisy voltages.
+/// Block lengths over which readings are averaged, s. Short blocks suit a load that changes all the time. Long blocks
+/// suit noisy voltages and a load that holds for a while.
 pub(crate) const BLOCKS_S: [f64; 2] = [1.0, 10.0];
-/// Blocks further apart than this are not compared, s.
+/// Longest time between two blocks that are compared, s.
 const MAX_GAP_S: f64 = 40.0;
 
 /// A step of the current and of the voltages.
@@ -128,7 +129,7 @@ impl OpenRun {
 #[derive(Debug, Clone, Default)]
 pub(crate) struct VoltageResponse {
     block_s: f64,
-    /// Current changes up to this do not count as a change of load, A.
+    /// Largest current change that does not count as a change of load, A.
     tolerance_a: f64,
     current: Option<(Timestamp, f64)>,
     block: Block,
@@ -140,7 +141,7 @@ pub(crate) struct VoltageResponse {
     pub(crate) equal_cells: EqualCells,
 }
 
-/// The response whose slope is better determined.
+/// The response whose slope is more certain.
 pub(crate) fn best_response([fast, slow]: &[VoltageResponse; 2]) -> &VoltageResponse {
     let certainty = |response: &VoltageResponse| response.slope().map_or(0.0, |slope| slope.certainty());
     // Short blocks are preferred if they suffice, because they contain the load steps and no slower changes.
@@ -176,7 +177,7 @@ impl VoltageResponse {
         }
     }
 
-    /// Ends the block and the run before a time without listening.
+    /// Ends the open block and run before a period in which the observer does not listen.
     pub(crate) fn pause(&mut self) {
         self.close_block();
         self.close_run();
@@ -206,7 +207,7 @@ impl VoltageResponse {
             before.cells_v.iter().zip(&after.cells_v).map(|(before, after)| (after - before) as f32).collect();
         let voltage_v = median(cells_v.iter().map(|v| f64::from(*v))).unwrap_or(f64::NAN);
         let step = CurrentStep { current_a: after.current_a - before.current_a, voltage_v, cells_v };
-        // 192 steps determine the slope to a few per cent.
+        // With 192 steps, the slope is accurate to a few per cent.
         if self.steps.len() < 192 {
             self.steps.push(step);
             return;
@@ -245,18 +246,18 @@ impl VoltageResponse {
         self.block_s
     }
 
-    /// The pack's slope over the largest steps.
+    /// Slope of the pack's voltage over its current, from the largest steps.
     pub(crate) fn slope(&self) -> Option<Slope> {
         self.slope_over(|step| Some(step.voltage_v))
     }
 
-    /// The slope of one cell.
+    /// Slope of one cell's voltage over the current, from the largest steps.
     pub(crate) fn slope_of(&self, cell: usize) -> Option<Slope> {
         self.slope_over(|step| step.cells_v.get(cell).map(|v| f64::from(*v)))
     }
 
-    /// Slope over steps of at least a fifth of the largest one, because smaller ones are mostly noise. With fewer than
-    /// five such steps, the smaller ones are included, because they show how large the noise is.
+    /// Slope from the steps of at least a fifth of the largest step, because smaller steps are mostly noise. If there
+    /// are fewer than five of them, the smaller steps are included, because they show how large the noise is.
     fn slope_over(&self, voltage_v: impl Fn(&CurrentStep) -> Option<f64>) -> Option<Slope> {
         let largest = self.steps.iter().map(|step| step.current_a.abs()).fold(0.0, f64::max);
         let points = |least_a: f64| {
@@ -267,7 +268,8 @@ impl VoltageResponse {
             return Slope::of(points(0.2 * largest));
         }
         let all: Vec<(f64, f64)> = points(0.0).collect();
-        // Small for this pack: noise, or a wrong unit. Only steps that agree with each other count.
+        // Even the largest step is small for this pack: it is noise, or the unit is wrong. Use only the larger steps,
+        // without outliers.
         if largest < 5.0 * self.tolerance_a { Slope::of(points(0.2 * largest)) } else { Slope::fit(&all) }
     }
 

@@ -1,7 +1,7 @@
 //! Extent of a stream of values, and a thinned sample of the stream in bounded memory.
 
-/// A sample of a stream: at first every value, then every second, every fourth, ... Samples of one size that receive
-/// the same number of values keep the same positions.
+/// A sample of a stream. It keeps every value until it is full, then every second value, every fourth, and so on. Two
+/// samples of equal size that receive the same number of values keep the values at the same positions.
 #[derive(Debug, Clone)]
 pub struct ThinnedSample {
     values: Vec<f64>,
@@ -11,7 +11,7 @@ pub struct ThinnedSample {
 }
 
 impl Default for ThinnedSample {
-    /// 512 values: their quartiles are accurate to a few per cent.
+    /// Creates a sample of at most 512 values, whose quartiles are accurate to a few per cent.
     fn default() -> Self {
         Self::of_at_most(512)
     }

@@ -1,7 +1,8 @@
-//! Statistics of one signal: counts, periods, extent and roughness of its values, also with other layouts of its bits.
+//! Statistics of one signal: counts, periods, extent and roughness of its values. The extent is also kept for other
+//! layouts of the signal's bits.
 //!
-//! In: payloads or values with their time. Values are in the program's unit, after the configured scale and offset; no
-//! limit is applied. Memory is bounded: gaps and values are kept as a thinned sample.
+//! In: payloads or values with their time. Values are in the program's unit, after the configured scale and offset. No
+//! limits are applied. Memory is bounded: gaps and values are kept as thinned samples.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -12,7 +13,7 @@ use crate::can::decode::Binding;
 use crate::can::signal::SignalLayout;
 use crate::quantity::{Fault, Timestamp};
 
-/// Frames without a value, by reason.
+/// Number of frames without a value, by reason.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct UnusableCounts {
     pub(crate) short: u64,
@@ -26,7 +27,7 @@ pub struct Series {
     /// Frames with the signal's identifier.
     pub(crate) frames: u64,
     pub(crate) unusable: UnusableCounts,
-    /// Values outside `plausible`.
+    /// Number of values outside `plausible`.
     pub(crate) implausible: u64,
     plausible: Option<(f64, f64)>,
     /// Extent of all values.
@@ -39,23 +40,23 @@ pub struct Series {
     pub(crate) gaps: ThinnedSample,
     pub(crate) loss: LossCounter,
     pub(crate) longest_gap_s: f64,
-    /// Gaps above the age from which a reading is stale.
+    /// Number of gaps longer than the age from which a reading is stale.
     pub(crate) stale_gaps: u64,
     /// Absolute changes from one value to the next.
     pub(crate) changes: ThinnedSample,
-    /// Changes that are too fast for a temperature.
+    /// Number of changes that are too fast for a temperature.
     pub(crate) jumps: u64,
     pub(crate) alternatives: Vec<AlternativeReading>,
     last_time: Option<Timestamp>,
 }
 
 impl Series {
-    /// Creates an empty series. `plausible`: smallest and largest plausible value; `None` = unlimited.
+    /// Creates empty statistics. `plausible`: smallest and largest plausible value; `None` = unlimited.
     pub(crate) fn new(layout: &SignalLayout, plausible: Option<(f64, f64)>) -> Self {
         Self { alternatives: AlternativeReading::all(layout), plausible, ..Self::default() }
     }
 
-    /// Handles a frame that may carry the signal. Returns its value.
+    /// Handles a frame that may carry the signal. Returns the signal's value; `None` if the frame has no value.
     pub(crate) fn handle(&mut self, time: Timestamp, payload: &[u8], binding: &Binding, max_age_s: f64) -> Option<f64> {
         self.frames += 1;
         let value = match self.value(payload, binding) {
@@ -70,7 +71,7 @@ impl Series {
         Some(value)
     }
 
-    /// Series of a recorded signal: values with their times, s.
+    /// Creates the statistics of a recorded signal from its values and their times, s.
     pub fn of(readings: impl Iterator<Item = (f64, Result<f64, Fault>)>) -> Self {
         // Enough for a correlation, small enough for thousands of signals.
         let sample = ThinnedSample::of_at_most(4096);
@@ -90,7 +91,7 @@ impl Series {
         if self.extent.count > 0 {
             let change = (value - self.extent.last).abs();
             self.changes.push(change);
-            // Faster than any temperature changes.
+            // No temperature changes this fast.
             self.jumps += u64::from(change > 2.0 && gap_s.is_some_and(|gap_s| gap_s <= 2.0));
         }
         self.implausible += u64::from(self.plausible.is_some_and(|(low, high)| !(low..=high).contains(&value)));
@@ -156,8 +157,8 @@ impl Series {
         self.gaps.median()
     }
 
-    /// Standard deviation of the white noise, from changes between readings; robust if fewer than half of the readings
-    /// step.
+    /// Standard deviation of the white noise, from the changes between readings. Real steps do not affect it if fewer
+    /// than half of the changes are steps.
     pub(crate) fn noise(&self) -> Option<f64> {
         // 0.6745 sqrt(2): median of the absolute difference of two normal variables over their standard deviation.
         Some(self.changes.median()? / (0.6745 * std::f64::consts::SQRT_2))
@@ -183,7 +184,7 @@ impl Series {
         self.values.kept().iter().take(100).map(|value| value.to_bits()).collect::<BTreeSet<u64>>().len()
     }
 
-    /// Whether the signal counts: most steps have the same size, other than 0.
+    /// Whether the signal is a counter: most of its steps have the same size, other than 0.
     pub fn is_counter(&self) -> bool {
         let values = self.values.kept();
         let mut steps: BTreeMap<u64, usize> = BTreeMap::new();
@@ -194,7 +195,7 @@ impl Series {
         5 * most > 3 * values.len().saturating_sub(1).min(200)
     }
 
-    /// Largest step between neighbouring kept values.
+    /// Largest step between consecutive kept values.
     pub fn largest_step(&self) -> f64 {
         self.values.kept().windows(2).map(|pair| (pair[1] - pair[0]).abs()).fold(0.0, f64::max)
     }
@@ -208,7 +209,8 @@ pub fn recorded_value(payload: &[u8], binding: &Binding) -> Result<f64, Fault> {
     if is_customary(payload, binding) { Err(Fault::NotAvailable) } else { binding.value(payload) }
 }
 
-/// All ones outside the range customarily mean "not available", even without an entry in the value table.
+/// Whether all bits are 1 and the value is outside the DBC's range. By convention, this means "not available", even
+/// without an entry in the value table.
 fn is_customary(payload: &[u8], binding: &Binding) -> bool {
     binding.plan.raw(payload) == Ok(binding.plan.all_ones()) && binding.plan.decode(payload) == Err(Fault::OutOfRange)
 }

@@ -1,8 +1,8 @@
-//! Voltage over current: a slope through the origin with its certainty.
+//! Fits voltage steps over current steps: a slope through the origin, with its certainty.
 //!
 //! In: steps of a current (A) and of a voltage (V), from blocks of a stream ([`response`](super::response)) or from
 //! the kept readings of two recorded signals. Out: the resistance with its sign, its standard deviation, and the share
-//! of the voltage's variance that it explains.
+//! of the voltage's variance that the current explains.
 
 use super::series::Series;
 use crate::filter::median;
@@ -16,7 +16,7 @@ pub struct Slope {
     pub ohm: f64,
     /// Standard deviation of `ohm`.
     pub(crate) std_ohm: f64,
-    /// Share of the voltage's variance explained.
+    /// Share of the voltage's variance that the current explains, 0 to 1.
     pub(crate) r2: f64,
     /// Largest step of the current, A.
     pub(crate) largest_a: f64,
@@ -27,8 +27,8 @@ impl Slope {
         self.ohm / self.std_ohm.max(1e-12)
     }
 
-    /// Certainty that the slope is not zero: 1 = sufficient. Few points need more, because they can lie on a line by
-    /// chance.
+    /// Certainty that the slope is not zero; 1 is sufficient. A slope from few points must be more significant, because
+    /// few points can lie on a line by chance.
     pub(crate) fn certainty(&self) -> f64 {
         let needed = match self.points {
             0..=4 => 15.0,
@@ -49,10 +49,10 @@ impl Slope {
         self.correlation().abs() * (self.points as f64).sqrt()
     }
 
-    /// Slope of a recorded voltage over a recorded current, or of any two signals; `None` if they share too few steps.
+    /// Slope of a recorded voltage over a recorded current, or of any two signals; `None` if there are too few steps.
     pub fn between(voltage: &Series, current: &Series) -> Option<Self> {
         let pairs = pairs(voltage, current);
-        // Over longer times the charge changes too.
+        // Over longer times, the state of charge also changes the voltage.
         let near = pairs.windows(2).filter(|pair| pair[1].0 - pair[0].0 <= 15.0);
         let steps: Vec<(f64, f64)> = near.map(|pair| (pair[1].2 - pair[0].2, pair[1].1 - pair[0].1)).collect();
         let moved = steps.iter().filter(|(current_a, _)| *current_a != 0.0).count();
@@ -60,7 +60,7 @@ impl Slope {
         Some(Self { points: moved, ..slope })
     }
 
-    /// Slope through the points without outliers, so that a wrong reading does not decide.
+    /// Slope through the points without outliers, so that a single wrong reading does not change it.
     pub(super) fn of(points: impl Iterator<Item = (f64, f64)>) -> Option<Self> {
         let all: Vec<(f64, f64)> = points.filter(|(x, y)| y.is_finite() && *x != 0.0).collect();
         let ratio = median(all.iter().map(|(x, y)| y / x))?;
@@ -85,7 +85,7 @@ impl Slope {
         Some(Self {
             points: points.len(),
             ohm: -xy / xx,
-            // The minimum accounts for the resolution of the readings: few steps may fit perfectly by chance.
+            // The minimum accounts for the resolution of the readings, with which few steps may fit a line by chance.
             std_ohm: (rest / xx).sqrt().max(1e-7),
             r2,
             largest_a: largest,
@@ -127,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn slope_between_signals_of_different_rates() {
+    fn slope_is_found_between_signals_of_different_rates() {
         let current = |time_s: f64| (3.0 * time_s).sin() * 40.0;
         let fast = Series::of((0..2000).map(|n| f64::from(n) * 0.01).map(|t| (t, Ok(current(t)))));
         let slow = Series::of((0..100).map(|n| f64::from(n) * 0.2).map(|t| (t + 0.001, Ok(380.0 - 0.1 * current(t)))));

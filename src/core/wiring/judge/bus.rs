@@ -1,4 +1,4 @@
-//! Checks interfaces, identifiers, error frames, other senders and end-to-end protection.
+//! Checks interfaces, identifiers, error frames, other nodes that send the daemon's frames, and end-to-end protection.
 
 use super::context::{Judge, error, find, note, warning};
 use super::text::{count, number, seconds};
@@ -34,7 +34,7 @@ fn messages_of<'d>(judge: &Judge<'d>, bus: BusIndex) -> Vec<&'d MessagePlan> {
     judge.plan.messages.iter().filter(|message| message.bus == bus).collect()
 }
 
-/// The other interface with most of the wanted identifiers, and their number.
+/// The other interface that has received most of the wanted identifiers, with their number.
 fn best_other<'d>(judge: &Judge<'d>, index: usize, wanted: &[&MessagePlan]) -> Option<(&'d BusStats, usize)> {
     let others = judge.observed.buses.iter().enumerate().filter(|(other, _)| *other != index);
     let counted = others.map(|(_, bus)| (bus, wanted.iter().filter(|m| bus.ids.contains_key(&m.id)).count()));
@@ -50,7 +50,7 @@ fn interface(judge: &mut Judge<'_>, index: usize) {
     if bus.dropped > 0 {
         note(judge, Topic::Interface, format!("{}: frames were lost", bus.name))
             .seen(format!("{} lost before they were read", count(bus.dropped, "frame")))
-            .advice("periods appear too long; check the load of this computer");
+            .advice("lost frames make periods appear too long; check the load of this computer");
     }
     if bus.frames > 0 || wanted.is_empty() {
         return;
@@ -68,11 +68,11 @@ fn interface(judge: &mut Judge<'_>, index: usize) {
 
 fn silent_interface(judge: &mut Judge<'_>, bus: &BusStats, table: &str) {
     let (state, advice) = match (bus.is_missing, bus.is_down) {
-        (true, _) => ("does not exist", "create it, plug the adapter in, or name another"),
-        (_, true) => ("is down", "bring it up: ip link set NAME up type can bitrate RATE"),
+        (true, _) => ("does not exist", "create the interface, plug the adapter in, or configure another interface"),
+        (_, true) => ("is down", "bring the interface up: ip link set NAME up type can bitrate RATE"),
         _ => (
             "is silent",
-            "wake the vehicle; if it is awake, check the plug, the bit rate, and that CAN_H and CAN_L are not exchanged",
+            "wake the vehicle; if it is awake, check the plug, the bit rate, and whether CAN_H and CAN_L are exchanged",
         ),
     };
     let busy = judge.observed.buses.iter().filter(|other| other.frames > 0).map(|other| other.name.as_str());
@@ -85,8 +85,8 @@ fn silent_interface(judge: &mut Judge<'_>, bus: &BusStats, table: &str) {
     let span = seconds(judge.observed.seconds());
     error(judge, Topic::Interface, format!("{} {state}", bus.name))
         .seen(format!("no frame on {} in {span}; {others}", bus.name))
-        .why("the configured signals are expected there")
-        .change(table, "name", "the interface the pack is on")
+        .why("the configured signals are expected on this interface")
+        .change(table, "name", "the interface that the pack is connected to")
         .advice(advice);
 }
 
@@ -102,7 +102,7 @@ fn error_frames(judge: &mut Judge<'_>, bus: &BusStats) {
     let (severity, what, why) = if bus.frames == 0 {
         (Severity::Error, "only error frames: wrong bit rate?", ", and no valid frame was received")
     } else if share > 0.01 {
-        let why = "; frames are received, so the bit rate is right and the wiring is not";
+        let why = "; valid frames are received, so the bit rate is right and the wiring is probably faulty";
         (Severity::Warning, "many error frames", why)
     } else {
         (Severity::Note, "some error frames", "")
@@ -117,15 +117,15 @@ fn error_frames(judge: &mut Judge<'_>, bus: &BusStats) {
         );
 }
 
-/// Finds messages that arrive in another form or on another bus.
+/// Finds messages that arrive as FD frames, with the other kind of identifier, or on another bus.
 fn messages(judge: &mut Judge<'_>, index: usize) {
     let (bus, wanted) = (&judge.observed.buses[index], messages_of(judge, bus_index(index)));
     let is_fd = |message: &&&MessagePlan| bus.ids.get(&message.id).is_some_and(|stats| stats.fd > 0);
     let fd: Vec<&str> = wanted.iter().filter(is_fd).map(|message| message.name.as_str()).collect();
     if !judge.plan.interfaces[index].fd && !fd.is_empty() {
         error(judge, Topic::Fd, format!("{}: messages of the pack are CAN FD frames", bus.name))
-            .seen(format!("{} came as FD frames", fd.join(", ")))
-            .why("with fd = false the kernel does not deliver them to the service")
+            .seen(format!("received as FD frames: {}", fd.join(", ")))
+            .why("if fd is false, the kernel does not deliver FD frames to the service")
             .change(&interface_table(index), "fd", "true");
     }
     if bus.frames == 0 {
@@ -149,10 +149,10 @@ fn other_kind(judge: &mut Judge<'_>, bus: &BusStats, message: &MessagePlan) -> O
         CanId::Standard(_) => ("an 11-bit", "a 29-bit"),
         CanId::Extended(_) => ("a 29-bit", "an 11-bit"),
     };
-    let title = format!("{name} comes with {found} identifier, the DBC says {wanted} one");
+    let title = format!("{name} arrives with {found} identifier, but the DBC has {wanted} identifier");
     error(judge, Topic::IdKind, title)
         .seen(format!("{frames} of {other} on {}, none of {id}", bus.name))
-        .why("identifiers of both kinds may have the same number and are different messages; bit 31 in the DBC decides")
+        .why("messages with the same number but another kind of identifier differ; bit 31 in the DBC selects the kind")
         .advice(format!("in the DBC: BO_ {} {name}: ...", other.dbc_number()));
     Some(())
 }
@@ -166,14 +166,14 @@ fn on_other_bus(judge: &mut Judge<'_>, message: &MessagePlan) -> Option<()> {
     tables.dedup();
     let finding = error(judge, Topic::Interface, format!("{name} is on {}, not on {here}", other.name))
         .seen(format!("{frames} of {id} on {}, none on {here}", other.name))
-        .why("the other bus has the identifier (it may use it for another message: check the values)");
+        .why("the other bus carries the identifier (possibly for another message: check the values)");
     for table in tables {
         finding.change(table, "interface", format!("{:?}", other.name));
     }
     Some(())
 }
 
-/// Finds other nodes that send with an identifier of the daemon's frames.
+/// Finds other nodes that send frames with an identifier that the daemon uses for its own frames.
 fn conflicts(judge: &mut Judge<'_>) {
     let buses = &judge.observed.buses;
     for output in &judge.plan.outputs {
@@ -182,7 +182,7 @@ fn conflicts(judge: &mut Judge<'_>) {
             let title = format!("another node sends with {}, the identifier of the {} frame", output.id, output.name);
             warning(judge, Topic::Conflict, title)
                 .seen(format!("{} of {} on {}", count(stats.count, "frame"), output.id, bus.name))
-                .why("two senders of one identifier destroy each other's frames, and receivers confuse them")
+                .why("if two nodes send the same identifier, their frames collide and receivers confuse them")
                 .change(&output.table, "id", "an identifier that no other node uses")
                 .advice("ignore this if packwatch itself was running at that time");
         }
@@ -197,7 +197,7 @@ fn protection(judge: &mut Judge<'_>) {
         let message = plan.messages.iter().find(|message| (message.bus, message.id) == key);
         let name = message.map_or("commands", |message| message.name.as_str());
         let all = stats.good + stats.bad;
-        // A few frames are lost at every start.
+        // A few frames fail at every start.
         if all == 0 || stats.bad as f64 <= 0.05 * all as f64 {
             if stats.good > 0 {
                 judge.fine(format!("{name}: {} of {all} frames pass their end-to-end check", stats.good));
@@ -222,16 +222,16 @@ fn why_failing<'f>(
     let profiles = [Profile::P01A, Profile::P01C, Profile::P05];
     if fits(guard.check.protection) {
         return finding
-            .why("the checksums are right, the counters are not: frames are repeated, lost, or from two senders")
+            .why("the checksums are right, but the counters are not: frames are repeated, lost, or from two senders")
             .change(table, "max_delta_counter", "2")
-            .advice("a gateway that repeats or drops frames of the message has this effect too");
+            .advice("a gateway that repeats or drops frames of the message has the same effect");
     }
     let mut others = profiles.into_iter().filter(|other| *other != profile);
     if let Some(other) =
         others.find(|other| data_id <= other.max_data_id() && fits(Protection { profile: *other, data_id }))
     {
         let name = other.name();
-        finding.why(format!("with profile {name} every frame is right"));
+        finding.why(format!("with profile {name}, every frame passes the check"));
         return finding.change(table, "profile", format!("{name:?}"));
     }
     let found = profiles.into_iter().find_map(|profile| {
@@ -239,17 +239,17 @@ fn why_failing<'f>(
         Some((profile, id))
     });
     match found {
-        // The eight bits of the checksum do not distinguish all identifiers: 256 of them fit.
+        // A checksum of eight bits does not distinguish all data identifiers: 256 of them fit.
         Some((Profile::P01A, id)) => finding
-            .why(format!("the checksum is that of profile 1A with another data identifier ({id:#X} and 255 others fit)"))
+            .why(format!("the checksums fit profile 1A with another data identifier ({id:#X} and 255 others fit)"))
             .change(table, "data_id", "the number in the sender's documentation"),
         Some((profile, id)) => finding
-            .why(format!("with profile {} and data identifier {id:#X} every frame is right", profile.name()))
+            .why(format!("with profile {} and data identifier {id:#X}, every frame passes the check", profile.name()))
             .change(table, "profile", format!("{:?}", profile.name()))
             .change(table, "data_id", format!("{id:#X}")),
         None => finding
-            .why("no profile and no data identifier fits: the message is protected in another way, or is another message")
-            .advice("ask the maker of the sender, or remove the table"),
+            .why("no known profile fits with any data identifier: the protection differs, or this is another message")
+            .advice("ask the manufacturer of the sender, or remove the table"),
     }
 }
 

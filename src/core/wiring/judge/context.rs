@@ -1,4 +1,4 @@
-//! Shared state of all checks: the collected data, the plan, the report so far, and the factors found.
+//! State that all checks share: the collected data, the plan, the unfinished report, and the unit factors found.
 
 use std::collections::BTreeSet;
 
@@ -14,8 +14,8 @@ use crate::wiring::report::{Severity, Topic, WiringFinding, WiringReport};
 /// Largest plausible current of a pack, in multiples of its capacity per hour.
 pub(super) const MAX_C_RATE: f64 = 30.0;
 
-/// Smallest share of the voltage's changes that the current must explain before the size of a slope is judged. Below
-/// it, noise in the current makes the slope too small.
+/// Smallest share of the voltage's changes that the current must explain before the size of a slope is judged. If the
+/// current explains less, its noise makes the slope too small.
 pub(super) const EXPLAINED: f64 = 0.8;
 
 /// A configured signal with the statistics of its values.
@@ -26,11 +26,11 @@ pub(super) struct Judge<'d> {
     pub(super) observed: &'d WiringObserver,
     pub(super) plan: &'d Plan,
     pub(super) report: WiringReport,
-    /// Messages whose absence is already explained.
+    /// Messages whose absence a finding already explains.
     pub(super) explained: BTreeSet<(BusIndex, CanId)>,
-    /// Factor that converts the configured reading of the voltages to V.
+    /// Factor that converts the voltages, read as configured, to V.
     pub(super) voltage_factor: f64,
-    /// Factor that converts the configured reading of the current to A.
+    /// Factor that converts the current, read as configured, to A.
     pub(super) current_factor: f64,
     /// Whether a current or voltage signal is not the configured quantity, so that the response of the voltages cannot
     /// be judged.
@@ -104,7 +104,7 @@ impl<'d> Judge<'d> {
 
     /// Smallest and largest voltage that the median cell may have, V.
     pub(super) fn voltage_band(&self) -> (f64, f64) {
-        // Narrow limits suffice for a median over time, which short peaks do not move.
+        // The limits can be narrow, because short peaks do not change a median over time.
         self.plan.pack.model.as_ref().map_or((1.2, 4.6), |m| (m.voltage_min_v - 0.15, m.voltage_max_v + 0.08))
     }
 
@@ -156,7 +156,7 @@ impl<'d> Judge<'d> {
         })
     }
 
-    /// The model's resistance with all branches settled, at the median of the recording, ohm.
+    /// The model's resistance with all branches settled, at the recording's median voltage and temperature, ohm.
     pub(super) fn settled_ohm(&self, model: &CellModel) -> f64 {
         let voltage_v = self.cell_voltage().unwrap_or(f64::NAN) * self.voltage_factor;
         let temperature_c = self.temperature_c();

@@ -1,19 +1,19 @@
-//! Voltage drift during steady current, measured against the cell model.
+//! Compares the voltage drift during steady current with the drift that the cell model expects.
 
 use super::context::Judge;
 use crate::cell::CellModel;
 use crate::wiring::evidence::response::SteadyRun;
 
-/// A drift counts if it is at least this many standard deviations.
+/// Smallest significance of a drift that counts, standard deviations.
 const SURE: f64 = 6.0;
 
 /// Voltage drift over all steady runs, per cell.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Drift {
     pub(super) seconds: f64,
-    /// Sum of the model's drifts, V.
+    /// Sum of the drifts that the model expects, as absolute values, V.
     pub(super) expected_v: f64,
-    /// Measured drift against the expected direction, V, as an absolute value.
+    /// Measured drift in the direction opposite to the expected one, as an absolute value, V.
     pub(super) against_v: f64,
     /// Ratio of measured to expected drift, weighted by the expected drift.
     pub(super) ratio: f64,

@@ -1,4 +1,4 @@
-//! Checks sign of the current and resistance: whether the voltages follow the current as in the cell model.
+//! Checks the sign of the current and the resistance: do the voltages follow the current as in the cell model?
 
 use super::context::{EXPLAINED, Judge, error, find, warning};
 use super::drift::Drift;
@@ -11,7 +11,7 @@ use crate::wiring::report::{Severity, Topic, WiringFinding};
 
 /// Smallest step of the current that is judged, as a fraction of the capacity per hour.
 const SMALLEST_STEP: f64 = 0.02;
-/// A resistance off by this factor from the model's is a finding.
+/// Ratio of the resistance to the model's, or its reciprocal, from which the resistance is a finding.
 const ODD_RATIO: f64 = 2.5;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
@@ -27,7 +27,7 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     let slope = cell_slope(judge).filter(|slope| slope.certainty() >= 1.0 && slope.r2 >= 0.2);
     if let Some(slope) = slope {
         if slope.ohm < 0.0 {
-            let why = "a discharge lowers the voltage: the signal counts charge where discharge is configured";
+            let why = "a discharge lowers the voltage, but here the voltage rises with the configured discharge";
             inverted(judge, signal, risen_by_steps(&slope), why);
         } else {
             let drop = milli(slope.ohm);
@@ -37,14 +37,14 @@ pub(super) fn check(judge: &mut Judge<'_>) {
         }
         resistance(judge, &slope);
     } else if let Some(drift) = drift.filter(Drift::is_opposite) {
-        let why = "a discharge lowers the voltage; judged from steady runs, which are less certain than steps";
+        let why = "a discharge lowers the voltage (judged from steady current, which is less certain than steps)";
         inverted(judge, signal, drifted_against(&drift), why);
     } else if drift.is_some_and(|drift| drift.is_along()) {
-        judge.fine("the sign of the current is right: the voltage drifts with it".to_owned());
+        judge.fine("the sign of the current is right: the voltage drifts in the expected direction".to_owned());
     } else if series.extent.range() * judge.current_factor > SMALLEST_STEP * judge.pack_ah() {
-        judge.unjudged("sign of the current, resistance: too few steps of the current for the noise of the voltages; listen longer");
+        judge.unjudged("sign of the current, resistance: too few current steps for this voltage noise; listen longer");
     } else {
-        judge.unjudged("sign of the current, resistance: the current hardly moved; drive or charge for a minute");
+        judge.unjudged("sign of the current, resistance: the current hardly changed; drive or charge for a minute");
     }
     if !judge.has(&[Topic::CurrentSign, Topic::Unit]) {
         model::check(judge, drift);
@@ -53,7 +53,7 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     }
 }
 
-/// The pack's slope in ohm per cell, with the factors found applied; the strings share the current.
+/// The pack's slope in ohm per cell, corrected for the unit factors found and for parallel strings.
 fn cell_slope(judge: &Judge<'_>) -> Option<Slope> {
     let slope = judge.observed.slope()?;
     let by = judge.voltage_factor / judge.current_factor * f64::from(judge.plan.pack.strings.max(1));
@@ -65,16 +65,16 @@ fn risen_by_steps(slope: &Slope) -> String {
     let (steps, largest, rise) = (slope.points, number(slope.largest_a), milli(-slope.ohm));
     let (sigma, explained) = (number(slope.t().abs().min(999.0).floor()), percent(slope.r2));
     format!(
-        "over {steps} steps of up to {largest} A the cells' voltage rises by {rise} mV per ampere of discharge \
-         ({sigma} sigma, {explained} % of its changes explained)"
+        "over {steps} steps of up to {largest} A, the cells' voltage rises by {rise} mV per ampere of discharge \
+         ({sigma} sigma; the current explains {explained} % of the changes)"
     )
 }
 
 fn drifted_against(drift: &Drift) -> String {
     let (span, against, expected) = (seconds(drift.seconds), milli(drift.against_v), milli(drift.expected_v));
     format!(
-        "in {span} of steady current the voltage drifted {against} mV against the current ({expected} mV with it \
-         would fit the cell model)"
+        "in {span} of steady current, the voltage drifted by {against} mV in the wrong direction (the cell model \
+         expects {expected} mV in the other direction)"
     )
 }
 
@@ -83,7 +83,7 @@ fn inverted(judge: &mut Judge<'_>, signal: &SignalPlan, seen: String, why: &str)
     let finding = error(judge, Topic::CurrentSign, "the sign of the current is inverted").seen(seen).why(why);
     if is_csv {
         finding.advice(
-            "the file's columns are in the program's units: replay it with --csv-sign charge (or without, if it was given)",
+            "the file's columns are in packwatch's units: replay it with --csv-sign charge, or without it if it was given",
         );
     } else {
         let is_charge = signal.binding.scale < 0.0;
@@ -102,28 +102,30 @@ fn resistance(judge: &mut Judge<'_>, slope: &Slope) {
     }
     let (measured, from, to, points) = (milli(ohm), milli(fast), milli(slow), slope.points);
     let seen = format!(
-        "a cell's voltage moves {measured} mV per ampere over {points} steps; the model says {from} to {to} at {} degrees C",
+        "a cell's voltage changes by {measured} mV per ampere over {points} steps; the model says {from} to {to} at {} \
+         degrees C",
         number(judge.temperature_c())
     );
     let (ratio, direction, why) = if ohm > slow {
-        (ohm / slow, "higher", "another, an aged or a very cold cell, or a wrong number of parallel cells")
+        let why = "the cell is of another type, aged or very cold, or the number of parallel cells is wrong";
+        (ohm / slow, "higher", why)
     } else {
-        (fast / ohm, "lower", "another cell, or parallel cells behind one voltage tap")
+        (fast / ohm, "lower", "the cell is of another type, or parallel cells share one voltage tap")
     };
     let configured = judge.plan.pack.strings;
     let strings = likely_strings(configured, ohm, (fast, slow));
-    // Such a ratio is caused by a wrong unit, not by the cell.
+    // Only a wrong unit explains such a ratio.
     if ratio >= 6.0 {
         current_unit(judge, seen, power_of_ten(ohm / (fast * slow).sqrt()), ratio);
     } else if ratio >= ODD_RATIO || ratio >= 2.0 && strings.is_some_and(|n| n < configured) {
-        let title = format!("resistance {} times {direction} than the cell model's", number(ratio));
+        let title = format!("the resistance is {} times {direction} than in the cell model", number(ratio));
         let finding = warning(judge, Topic::CellModel, title).seen(seen).why(why);
         if let Some(strings) = strings {
             finding.change("pack", "strings", strings.to_string());
         }
-        finding.change_cell_model().advice("the estimator learns a resistance of 0.3 to 3 times the model's by itself");
+        finding.change_cell_model().advice("the estimator itself learns a resistance of 0.3 to 3 times the model's");
     } else if slope.ohm > 0.0 {
-        judge.fine(format!("the resistance is of the right size: {seen}"));
+        judge.fine(format!("the resistance is plausible: {seen}"));
     }
 }
 
@@ -141,7 +143,7 @@ fn power_of_ten(ratio: f64) -> f64 {
     10_f64.powf(ratio.log10().round())
 }
 
-/// The power of ten by which the current is off, from its steps; `None` = unknown, or 1.
+/// The power of ten that corrects the current, judged from its steps; `None` if it is unknown or 1.
 pub(super) fn factor_by_steps(judge: &Judge<'_>) -> Option<f64> {
     let slope = cell_slope(judge)?;
     let (fast, slow) = judge.model_ohm(judge.plan.pack.model.as_ref()?, judge.observed.slope_block_s());
@@ -153,12 +155,12 @@ fn current_unit(judge: &mut Judge<'_>, seen: String, factor: f64, ratio: f64) {
     let Some((signal, _)) = judge.current() else { return };
     judge.current_factor *= factor;
     let severity = if (0.05..20.0).contains(&factor) { Severity::Warning } else { Severity::Error };
-    let why = format!("{} times off: too much for ageing or cold", number(ratio));
+    let why = format!("the resistance is off by a factor of {}, too much for ageing or cold", number(ratio));
     wrong_unit_or_cell(judge, signal, factor, severity).seen(seen).why(why);
 }
 
-/// Reports a current that is off by `factor`: its unit is wrong, or the cell is another one. If the DBC states ampere
-/// and nothing is scaled, the reading is probably right and the cell is named first.
+/// Reports a current that `factor` corrects: its unit or the configured cell model is wrong. If the DBC states ampere
+/// and the configuration scales nothing, the reading is probably right, so the finding names the cell model first.
 pub(super) fn wrong_unit_or_cell<'j>(
     judge: &'j mut Judge<'_>,
     signal: &SignalPlan,
@@ -170,7 +172,7 @@ pub(super) fn wrong_unit_or_cell<'j>(
     let is_ampere = unit_of(&signal.unit).is_some_and(|(_, unit, _)| unit == 1.0) && signal.scale == 1.0;
     let (scale, strings) = (toml(signal.scale * factor), judge.plan.pack.strings);
     if is_ampere {
-        let title = format!("the cells are about {times} times {size} than the cell model's");
+        let title = format!("the cells are about {times} times {size} than in the cell model");
         return find(judge, severity, Topic::CellModel, title).change_cell_model().advice(format!(
             "or {} is off by that factor (scale = {scale}), or pack.strings is not {strings}",
             signal.name
@@ -180,6 +182,6 @@ pub(super) fn wrong_unit_or_cell<'j>(
     find(judge, severity, Topic::Unit, format!("pack current: off by a factor of {times}{mark}"))
         .change(&signal.table, "scale", scale)
         .advice(format!(
-            "or the cells are {times} times {size} than the cell model's, or pack.strings is not {strings}"
+            "or the cells are {times} times {size} than in the cell model, or pack.strings is not {strings}"
         ))
 }

@@ -7,7 +7,7 @@ use crate::wiring::evidence::{Series, Slope};
 use crate::wiring::plan::{Kind, SignalPlan};
 use crate::wiring::report::Topic;
 
-/// Fewest readings for a judgement.
+/// Fewest readings of a signal that is judged.
 const FEWEST_READINGS: u64 = 20;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
@@ -30,9 +30,10 @@ fn voltages(judge: &mut Judge<'_>) {
     let (signal, series) = still[0];
     let list: Vec<Channel> = still.iter().map(|(signal, _)| signal.binding.channel).collect();
     let (value, readings) = (number(series.extent.last), count(series.count(), "reading"));
-    error(judge, Topic::Frozen, format!("{} never moves", channels(&list)))
-        .seen(format!("{} is {value} in all of {readings}", signal.name))
-        .why(if is_all { "the current moved, and a voltage must follow it" } else { "the other cells moved" })
+    let why = if is_all { "the current changed, and a voltage must follow it" } else { "the other voltages changed" };
+    error(judge, Topic::Frozen, format!("{}: the value never changes", channels(&list)))
+        .seen(format!("{} is {value} in all {readings}", signal.name))
+        .why(why)
         .change(&signal.table, "signal", "the measured signal, not a default or a copy")
         .advice("or the sender repeats an old value");
 }
@@ -46,13 +47,13 @@ fn pack_current(judge: &mut Judge<'_>, (signal, series): SignalSeries<'_>) {
     }
     let (value, step) = (number(series.extent.last), milli(step_v));
     let readings = count(series.count(), "reading");
-    error(judge, Topic::Frozen, "the pack current never moves")
-        .seen(format!("{} is {value} A in all of {readings}, while the cells step by up to {step} mV", signal.name))
-        .why("only a change of current moves voltages this fast")
+    error(judge, Topic::Frozen, "pack current: the value never changes")
+        .seen(format!("{} is {value} A in all {readings}, while the voltages step by up to {step} mV", signal.name))
+        .why("only a change of the current changes voltages this fast")
         .change(&signal.table, "signal", "the signal of the measured current");
 }
 
-/// Finds cells that show another cell's voltage, by their bits and by their values.
+/// Finds cells whose signals show the voltage of another cell, from their bits and from their values.
 pub(super) fn check_equal(judge: &mut Judge<'_>) {
     let voltages = judge.signals(Kind::Voltage);
     let mut reported: Vec<Channel> = Vec::new();
@@ -83,7 +84,7 @@ pub(super) fn check_equal(judge: &mut Judge<'_>) {
             continue;
         }
         error(judge, Topic::Swapped, format!("{} always have the same voltage", channels(&list)))
-            .seen(format!("{} and {} moved {blocks} times, each time to the same value", first.0.name, second.0.name))
+            .seen(format!("{} and {} changed {blocks} times, each time to the same value", first.0.name, second.0.name))
             .why("two cells in series differ at least in the last digit: both signals show the same cell")
             .change(&first.0.table, "signal", "a pattern that gives each cell its own signal")
             .advice("compare the signals in the DBC, and the sender's list of cells");
@@ -107,9 +108,9 @@ pub(super) fn check_response(judge: &mut Judge<'_>) {
     }
     let numbers: Vec<usize> = odd.iter().map(|(cell, _)| *cell).collect();
     let (first, ratio) = (odd[0].0, number(odd[0].1));
-    let title = format!("cell {} follows the current unlike the others", ranges(&numbers));
+    let title = format!("cell {}: the voltage follows the current unlike the other cells", ranges(&numbers));
     warning(judge, Topic::Cell, title)
-        .seen(format!("cell {first} moves {ratio} times as far as the median cell"))
-        .why("more: a loose connection; less: a wrong signal, or a repeated old value")
+        .seen(format!("the voltage of cell {first} changes {ratio} times as much as the median cell's"))
+        .why("a larger change means a loose connection; a smaller one means a wrong signal or a repeated old value")
         .advice("check the connection of that cell and its signal in the DBC");
 }

@@ -1,9 +1,9 @@
-//! Turns the collected data into a report. Causes are checked first, so that a consequence is not reported as a second
-//! fault.
+//! Turns the collected data into a report. The checks look for causes first, so that the report does not list a
+//! consequence as a second fault.
 //!
 //! | file | checks |
 //! | --- | --- |
-//! | `bus` | interfaces, identifiers, error frames, foreign senders, end-to-end protection |
+//! | `bus` | interfaces, identifiers, error frames, other nodes that send the daemon's frames, end-to-end protection |
 //! | `other_bus` | the current's message on two interfaces |
 //! | `unconfigured` | pack voltage and states of charge that are not configured |
 //! | `presence` | silent signals, number of cells |
@@ -14,7 +14,7 @@
 //! | `model` | open-circuit voltage, current offset, noise, the estimator |
 //! | `timing` | periods |
 //!
-//! All checks share `context`. A factor found in `values` is applied before `electrical` runs.
+//! All checks share the state in `context`. The checks in `values` find unit factors, which `electrical` then applies.
 
 mod bus;
 mod context;
@@ -62,7 +62,7 @@ impl WiringObserver {
     }
 }
 
-/// Moves the consequences of a wrong layout below its finding.
+/// Folds the consequences of a wrong layout into the finding on the layout.
 fn fold(judge: &mut Judge<'_>) {
     const OF_VALUES: [Topic; 8] = [
         Topic::CellCount,

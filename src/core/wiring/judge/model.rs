@@ -1,4 +1,5 @@
-//! Checks open-circuit voltage against the cell model, current offset, noise, and the results of the estimator.
+//! Checks the open-circuit voltage (against the cell model), the current's offset, the noise of the voltages, and the
+//! results of the estimator.
 
 use super::context::{Judge, error, note, warning};
 use super::drift::Drift;
@@ -29,27 +30,28 @@ fn open_circuit(judge: &mut Judge<'_>, model: &CellModel, drift: Option<Drift>) 
         let off_v = if highest > full_v + 0.06 { highest } else { lowest };
         let (off, low, high) = (number(off_v), number(empty_v), number(full_v));
         error(judge, Topic::CellModel, "the resting voltage is not on the cell model's curve")
-            .seen(format!("{off} V at rest; {} runs from {low} to {high} V", model.name))
+            .seen(format!("{off} V at rest; the curve of {} runs from {low} to {high} V", model.name))
             .why("a rested cell shows its open-circuit voltage: the chemistry or the number of cells is wrong")
             .change("pack", "cell_model", chemistry(off_v));
     } else if let Some(drift) = drift.filter(is_flat) {
         let (span, expected) = (seconds(drift.seconds), milli(drift.expected_v));
         let moved = milli(drift.expected_v * drift.ratio.max(0.0));
-        warning(judge, Topic::CellModel, "the voltage is much flatter than the cell model's")
-            .seen(format!("in {span} of steady current it moved {moved} of the {expected} mV the model expects"))
-            .why("a curve this flat is an iron-phosphate cell's (LFP), or the cells are much larger")
+        warning(judge, Topic::CellModel, "the voltage changes much less than in the cell model")
+            .seen(format!("in {span} of steady current, it changed by {moved} mV; the model expects {expected} mV"))
+            .why("the cells are iron phosphate (LFP), which has a flat curve, or much larger than the cell model says")
             .change_cell_model();
     } else if let Some(cell_v) = judge.cell_voltage().filter(|v| is_like_iron_phosphate(judge, model, *v)) {
         let (voltage, soc) = (number(cell_v), per_cent(cell_v));
         let title = "either the pack is nearly empty, or its cells are iron phosphate (LFP)";
         note(judge, Topic::CellModel, title)
-            .seen(format!("the median cell has {voltage} V; by {} that is {soc} %", model.name))
+            .seen(format!("the median cell has {voltage} V; according to {}, that is {soc} %", model.name))
             .why("iron-phosphate cells stay near 3.3 V from full to empty")
             .change_cell_model()
-            .advice("compare with the SOC the vehicle shows");
+            .advice("compare with the SOC that the vehicle shows");
     } else if let Some(last_v) = rests.next_back() {
         let (voltage, soc) = (number(last_v), per_cent(last_v));
-        judge.fine(format!("{voltage} V at rest: {soc} % by the cell model; compare with the SOC the vehicle shows"));
+        let text = format!("{voltage} V at rest: {soc} % according to the cell model");
+        judge.fine(format!("{text}; compare with the SOC that the vehicle shows"));
     } else {
         judge.unjudged("open-circuit voltage: the pack did not rest; leave it without load for a minute");
     }
@@ -68,7 +70,7 @@ fn chemistry(voltage_v: f64) -> &'static str {
     }
 }
 
-/// Reports a steady current near zero that is not zero.
+/// Reports a steady current that is near zero but outside the dead band.
 fn offset(judge: &mut Judge<'_>) {
     let rests = &judge.observed.fast_response().rests;
     let Some((signal, _)) = judge.current() else { return };
@@ -78,7 +80,7 @@ fn offset(judge: &mut Judge<'_>) {
     if offset_a.abs() <= dead_band_a {
         return judge.fine(format!("current at rest {offset} A, within the dead band of {band} A"));
     }
-    // The proposed offset is in the bus's sign and includes the configured offset.
+    // The proposed offset has the sign convention of the bus and includes the configured offset.
     let proposed = signal.offset - offset_a * signal.binding.scale.signum();
     let (span, voltage) = (seconds(longest.seconds), number(longest.end_v));
     let title = format!("the current stays at {offset} A while the voltage rests");
@@ -86,7 +88,7 @@ fn offset(judge: &mut Judge<'_>) {
         .seen(format!("for {span} at {voltage} V; the pack counts as resting up to {band} A"))
         .why("either a load draws this current, or it is the sensor's offset")
         .change(&signal.table, "offset", toml(proposed))
-        .advice("only if the contactors are open and the current must be zero; otherwise raise transition.dead_band_a");
+        .advice("change the offset only if the contactors are open; otherwise raise transition.dead_band_a");
 }
 
 fn noise(judge: &mut Judge<'_>) {
@@ -115,11 +117,11 @@ pub(super) fn check_estimator(judge: &mut Judge<'_>) {
     if rejected > 0.1 && !judge.has(&[Topic::CellModel, Topic::Cell, Topic::Frozen, Topic::CellCount]) {
         let share = percent(rejected);
         warning(judge, Topic::CellModel, "the estimator rejects many voltages")
-            .seen(format!("{share} % of {} readings beyond its gate, {bias} mV off in the mean", stats.estimates))
-            .why("the model's voltages and the measured ones do not agree")
+            .seen(format!("{share} % of {} readings are beyond its gate; mean deviation {bias} mV", stats.estimates))
+            .why("the voltages of the model and the measured voltages disagree")
             .change_cell_model();
     } else {
         let share = percent(1.0 - rejected);
-        judge.fine(format!("the estimator runs: {share} % of its readings accepted, {bias} mV off in the mean"));
+        judge.fine(format!("the estimator runs: {share} % of its readings accepted, mean deviation {bias} mV"));
     }
 }

@@ -1,4 +1,4 @@
-//! Decides which current the voltages follow if the current's message appears on two interfaces.
+//! If the current's message appears on two interfaces, decides which of the two currents the voltages follow.
 
 use super::context::{EXPLAINED, Judge, error, warning};
 use super::text::number;
@@ -50,8 +50,8 @@ fn followed(judge: &mut Judge<'_>, signal: &SignalPlan, (bus, there): (BusIndex,
     let (explained, unexplained) = (share(there), here.as_ref().map_or("0".to_owned(), share));
     error(judge, Topic::Interface, format!("the pack's current is on {other}, not on {configured}"))
         .seen(format!(
-            "{} ({}) comes on both: the one on {other} explains {explained} % of the voltages' steps, the one on \
-             {configured} {unexplained} %",
+            "{} ({}) arrives on both: the message on {other} explains {explained} % of the voltages' steps, the \
+             message on {configured} explains {unexplained} %",
             signal.message, signal.binding.id
         ))
         .why("the voltages of a pack follow its current; the same identifier on the other bus is another message")
@@ -64,20 +64,20 @@ fn two_buses(judge: &mut Judge<'_>, signal: &SignalPlan, (bus, other): (BusIndex
     let (low, high) = (number(other.series.extent.min), number(other.series.extent.max));
     warning(judge, Topic::Interface, format!("the current is read from {configured}, the voltages from {name}"))
         .seen(format!(
-            "{} ({}) is on {name} too, with other values: {low} to {high} A",
+            "{} ({}) also arrives on {name}, with other values: {low} to {high} A",
             signal.message, signal.binding.id
         ))
-        .why("a pack usually sends both on one bus; the other one may be another pack's")
+        .why("a pack usually sends both on one bus; the configured current may belong to another pack")
         .change(&signal.table, "interface", format!("{name:?}"))
-        .advice("compare the resistance and the charge with the pack's; listen under load");
+        .advice("listen under load, and compare the resistance and the charge with those of the pack");
 }
 
-/// Reports that the voltages follow neither current, or that nothing moved.
+/// Reports that the voltages follow neither current, or that the currents did not change.
 fn undecided(judge: &mut Judge<'_>, signal: &SignalPlan, (bus, other): (BusIndex, &OtherCurrent)) {
     let (low, high) = (number(other.series.extent.min), number(other.series.extent.max));
     judge.unjudged(format!(
-        "{} ({}) is on {} too, with other values ({low} to {high} A): which one is the pack's current shows only under load; \
-         drive or charge for a minute",
+        "{} ({}) also arrives on {}, with other values ({low} to {high} A): only a load shows which of the two is the \
+         pack's current; drive or charge for a minute",
         signal.message,
         signal.binding.id,
         judge.interface(bus)

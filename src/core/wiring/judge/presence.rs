@@ -19,7 +19,7 @@ enum Absence {
     NotAvailable,
     NotFinite,
     Short,
-    /// Voltages only: constant and far below any voltage.
+    /// The value is constant and far below a cell voltage (voltages only).
     Zero,
 }
 
@@ -53,7 +53,7 @@ fn absence(judge: &Judge<'_>, signal: &SignalPlan, series: &Series) -> Option<Ab
     let last = series.extent.last;
     let is_still = series.extent.changes == 0 && series.count() > 1;
     let median_v = judge.cell_voltage()?.abs();
-    // If a pack has fewer cells than its DBC, the remaining ones are often zero.
+    // If a pack has fewer cells than its DBC, the signals of the missing cells are often zero.
     let is_cell = matches!(signal.binding.channel, Channel::CellVoltage(_));
     let is_unused = is_cell && judge.plan.pack.cells > 1 && last.abs() < 0.05 * median_v;
     // The pack is switched off, or the identifier belongs to another message.
@@ -65,8 +65,8 @@ fn cell_number(signal: &SignalPlan) -> Option<u16> {
     if let Channel::CellVoltage(cell) = signal.binding.channel { Some(cell.0) } else { None }
 }
 
-/// Reports too many configured cells if exactly the last ones are absent, and returns the signals that are still to be
-/// reported. A dead last module looks the same if its message or its values are missing, so its signals stay in the
+/// If exactly the last cells are absent, reports that too many cells are configured. Returns the signals that are still
+/// to be reported. If a message or its values are missing, the last module may also be dead, so its signals stay in the
 /// list.
 fn fewer_cells<'d>(judge: &mut Judge<'d>, absent: Vec<Absent<'d>>) -> Vec<Absent<'d>> {
     let mut cells: Vec<u16> = absent.iter().filter_map(|(signal, _)| cell_number(signal)).collect();
@@ -84,20 +84,20 @@ fn fewer_cells<'d>(judge: &mut Judge<'d>, absent: Vec<Absent<'d>>) -> Vec<Absent
     let (next, reason) = (first + 1, reason_for_cells(reason));
     find(judge, severity, Topic::CellCount, format!("the pack {has} {counts}"))
         .seen(format!("cells 1-{first} have data; cells {next}-{configured}: {reason}"))
-        .why("exactly the last ones are missing: the DBC also serves a larger pack")
+        .why("exactly the last cells are missing, so the DBC probably also describes a larger pack")
         .change("pack", "cells", first.to_string())
-        .advice("or the last module does not report: count the cells before changing this");
+        .advice("count the cells before you change this, because the last module may have failed");
     absent.into_iter().filter(|(signal, _)| may_be_dead || cell_number(signal).is_none()).collect()
 }
 
 fn reason_for_cells(absence: Absence) -> &'static str {
     match absence {
-        Absence::Message => "their message never came",
-        Absence::Page => "their multiplexer page never came",
+        Absence::Message => "their message was never received",
+        Absence::Page => "their multiplexer page was never received",
         Absence::NotAvailable => "always \"signal not available\"",
-        Absence::NotFinite => "never a number",
+        Absence::NotFinite => "never a valid number",
         Absence::Short => "their frames are too short",
-        Absence::Zero => "always the same code near zero",
+        Absence::Zero => "always the same value near zero",
     }
 }
 
@@ -134,15 +134,15 @@ fn evidence(judge: &Judge<'_>, absence: Absence, signals: &[&SignalPlan], what: 
         Absence::Message => {
             format!("was not received on {} in {}", judge.interface(bus), seconds(judge.observed.seconds()))
         }
-        Absence::Page => format!("came, but never with the page of {what}"),
-        Absence::NotAvailable => "came, but always with the code for \"signal not available\"".to_owned(),
-        Absence::NotFinite => "came, but never with a number".to_owned(),
+        Absence::Page => format!("was received, but never with the page of {what}"),
+        Absence::NotAvailable => "was received, but always with the code for \"signal not available\"".to_owned(),
+        Absence::NotFinite => "was received, but never with a valid number".to_owned(),
         Absence::Short => {
             let longest = judge.bus(bus).and_then(|bus| bus.ids.get(&id)).map_or(0, |stats| stats.len);
             let needed = signals.iter().map(|s| s.binding.plan.bytes_needed()).max().unwrap_or(0);
             format!("has {longest} bytes, {needed} are needed")
         }
-        Absence::Zero => "came, but this signal is always zero".to_owned(),
+        Absence::Zero => "was received, but this signal is always zero".to_owned(),
     }
 }
 
@@ -150,15 +150,15 @@ fn evidence(judge: &Judge<'_>, absence: Absence, signals: &[&SignalPlan], what: 
 fn cause(judge: &Judge<'_>, bus: BusIndex, id: CanId, absence: Absence) -> (&'static str, &'static str) {
     match absence {
         Absence::Message => (
-            "other messages of this bus came, so the bus is right and the identifier or the sender is not",
+            "other messages of this bus were received: the identifier is wrong, or the sender is silent",
             "compare the identifier with candump; some senders send only while driving or charging",
         ),
         Absence::Page => {
-            ("the multiplexor never took the code the DBC gives", "compare the DBC's multiplexor with candump")
+            ("the multiplexor never had the value in the DBC", "compare the DBC's multiplexor with candump")
         }
         Absence::NotAvailable => (
-            "the sender knows the signal and has no value",
-            "switch the pack on, or name the signal that is used on this vehicle",
+            "the sender knows the signal but has no value",
+            "switch the pack on, or configure the signal that this vehicle uses",
         ),
         Absence::NotFinite => {
             ("the bits are not a valid float", "compare the DBC's value type with the sender's documentation")
@@ -168,7 +168,7 @@ fn cause(judge: &Judge<'_>, bus: BusIndex, id: CanId, absence: Absence) -> (&'st
             ("there is no cell at this position", "compare with the pack's own list of cells")
         }
         Absence::Zero if judge.other_bus(bus, id).is_some() => (
-            "another bus has this identifier too, and the same number may be another message on each",
+            "another bus also carries this identifier; each bus may use it for a different message",
             "try the other interface",
         ),
         Absence::Zero => {
@@ -177,7 +177,7 @@ fn cause(judge: &Judge<'_>, bus: BusIndex, id: CanId, absence: Absence) -> (&'st
     }
 }
 
-/// Finds signals of further cells that carry data.
+/// Finds signals of further cells that carry cell voltages.
 fn more_cells(judge: &mut Judge<'_>) {
     let Some(median_v) = judge.cell_voltage() else { return };
     let plan = judge.plan;
@@ -194,7 +194,7 @@ fn more_cells(judge: &mut Judge<'_>) {
     let title = format!("the pack has {cells} cells, {configured} are configured");
     error(judge, Topic::CellCount, title)
         .seen(format!("{names}{more} also carry {} V, as the other cells do", number(median_v)))
-        .why("the DBC's pattern continues, and these signals have values of cells")
+        .why("the pattern of names continues in the DBC, and these signals carry cell voltages")
         .change("pack", "cells", cells.to_string());
 }
 

@@ -1,4 +1,4 @@
-//! Finds swapped signals from the units in the DBC and from the values, for example a voltage configured as the current.
+//! Finds swapped signals from the units in the DBC and from the values; for example, a voltage configured as current.
 
 use super::context::{Judge, MAX_C_RATE, SignalSeries, error, warning};
 use super::text::{channel, number};
@@ -18,13 +18,13 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     }
 }
 
-/// Finds signals whose values differ from all others of their kind.
+/// Finds signals whose values differ from those of all other signals of their kind.
 pub(super) fn check_odd(judge: &mut Judge<'_>) {
     odd_cells(judge);
     odd_sensors(judge);
 }
 
-/// Configured signals whose unit belongs to another kind, with that kind.
+/// Configured signals whose unit belongs to another kind of quantity, with that kind.
 fn misfits<'d>(judge: &Judge<'d>) -> Vec<(&'d SignalPlan, Kind)> {
     let units = judge.plan.signals.iter().filter_map(|signal| Some((signal, unit_of(&signal.unit)?.0)));
     let is_misfit = |(signal, unit): &(&SignalPlan, Kind)| {
@@ -77,7 +77,7 @@ fn pack_voltage_as_current(judge: &mut Judge<'_>) -> bool {
         let (sum, cell) = (number(median.abs()), number(cell_v));
         error(judge, Topic::Swapped, "pack current is read from the pack's voltage")
             .seen(format!("{} reads {sum}, the sum of {cells} cells of {cell} V", signal.name))
-            .why("a current changes and crosses zero; this is the sum of the cell voltages")
+            .why("a current changes and crosses zero; these values are the sum of the cell voltages")
             .change(&signal.table, "signal", "the signal of the current");
     }
     is_sum
@@ -92,7 +92,7 @@ struct Fit {
 
 fn fit(judge: &Judge<'_>, series: &Series) -> Option<Fit> {
     let (low, high) = series.values.bulk()?;
-    // A voltage read as the current has the current's configured sign.
+    // If a voltage is configured as the current, it gets the current's sign.
     let (low, high) = if high <= 0.0 { (-high, -low) } else { (low, high) };
     let (band, cells) = (judge.voltage_band(), judge.cells_per_reading());
     let is_slow = series.changes.median().unwrap_or(0.0) < 1.0 && high - low < 40.0;
@@ -103,8 +103,8 @@ fn fit(judge: &Judge<'_>, series: &Series) -> Option<Fit> {
     })
 }
 
-/// Finds exchanged signals among current, voltage and temperature of a single cell: the values of each
-/// are plausible only for the other quantity.
+/// Finds exchanged signals among current, voltage and temperature of a single cell: the values of each signal are
+/// plausible only for the other quantity.
 fn by_values(judge: &mut Judge<'_>) {
     let voltages = judge.signals(Kind::Voltage);
     let (Some(current), [voltage]) = (judge.current(), voltages.as_slice()) else { return };
@@ -132,14 +132,14 @@ fn by_values(judge: &mut Judge<'_>) {
         .change(&b.0.table, "signal", format!("{:?}", a.0.name));
 }
 
-/// Whether the temperature jumps as only a current does, while the current stays at a value plausible for a
+/// Whether the temperature jumps as only a current does, while the current stays at a value that is plausible for a
 /// temperature.
 fn is_current_like(temperature: &Series, current: &Series) -> bool {
     let level = current.values.median().unwrap_or(0.0).abs();
     temperature.jumps >= 3 && current.jumps == 0 && (5.0..=60.0).contains(&level)
 }
 
-/// Finds cells whose value differs from all others.
+/// Finds cells whose voltage differs from those of all other cells.
 fn odd_cells(judge: &mut Judge<'_>) {
     let voltages = judge.signals(Kind::Voltage);
     let Some(median_v) = judge.cell_voltage().filter(|_| voltages.len() >= 4) else { return };
@@ -161,10 +161,10 @@ fn odd_cells(judge: &mut Judge<'_>) {
     }
 }
 
-/// Finds temperature sensors whose value differs from all others.
+/// Finds temperature sensors whose value differs from those of all other sensors.
 fn odd_sensors(judge: &mut Judge<'_>) {
     let sensors = judge.signals(Kind::Temperature);
-    // Sensors with impossible values are reported by `values`.
+    // `values` reports the sensors with impossible values.
     let possible = |series: &Series| series.values.median().filter(|_| !is_impossible(series));
     let median_c = judge.median_of(Kind::Temperature, possible);
     let Some(median_c) = median_c.filter(|_| sensors.len() >= 4 && judge.cell_voltage().is_some()) else { return };

@@ -1,4 +1,4 @@
-//! Compares periods with the age from which readings are stale and with the DBC's cycle times.
+//! Compares the periods of signals with the age from which readings are stale, and with the DBC's cycle times.
 
 use super::context::{Judge, SignalSeries, find, warning};
 use super::text::{count, percent, seconds, toml};
@@ -20,7 +20,7 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     cycle_times(judge);
 }
 
-/// Finds messages that lose frames: the gaps of each of their signals are multiples of its cycle.
+/// Finds messages that lose frames: the gaps between readings are multiples of the message's cycle.
 fn lost(judge: &mut Judge<'_>) {
     for message in &judge.plan.messages {
         let signals = judge.plan.signals.iter().zip(&judge.observed.series);
@@ -35,16 +35,16 @@ fn lost(judge: &mut Judge<'_>) {
         let title = format!("{name}: one frame in {one_in} is missing");
         warning(judge, Topic::Period, title)
             .seen(format!(
-                "its signals come every {} or after a multiple of that; {} % of them are missing",
+                "its signals arrive every {} or after a multiple of that time; {} % of the readings are missing",
                 seconds(cycle_s),
                 percent(share)
             ))
-            .why("frames are lost on the way: an overloaded gateway or computer, or a second sender of the identifier")
+            .why("a gateway or this computer is overloaded, or a second node sends the identifier")
             .advice("compare with candump on the bus itself, and look at the interface's counters: ip -details -statistics link show");
     }
 }
 
-/// The signal with the longest period; among equal ones, the one with the longest gap.
+/// The signal with the longest period, with that period, s. Among signals of equal period, the longest gap decides.
 fn slowest<'d>(all: &[SignalSeries<'d>]) -> Option<(SignalSeries<'d>, f64)> {
     let timed = all.iter().filter_map(|signal| Some((*signal, signal.1.period_s()?)));
     timed.max_by(|a, b| {
@@ -57,21 +57,21 @@ fn stale(judge: &mut Judge<'_>, (table, what): (&str, &str), (signal, series): S
     let share = series.stale_gaps as f64 / series.count().max(1) as f64;
     let proposed_s = 5.0 * period_s;
     let (severity, title, why, proposed_s) = if period_s > limit_s {
-        let why = "a reading older than max_age_s is not used: estimates coast or stop";
-        (Severity::Error, format!("{what} are stale before the next reading comes"), why, proposed_s)
+        let why = "the estimator ignores readings older than max_age_s, so estimates coast or stop";
+        (Severity::Error, format!("{what}: stale before the next reading arrives"), why, proposed_s)
     } else if 2.0 * period_s > limit_s {
-        let why = "single frames are lost on every bus";
-        (Severity::Warning, format!("{what}: one lost frame makes them stale"), why, proposed_s)
+        let why = "every bus loses single frames";
+        (Severity::Warning, format!("{what}: stale after one lost frame"), why, proposed_s)
     } else if series.stale_gaps > 0 && share > 1e-3 {
-        let title = format!("{what} were stale {}", count(series.stale_gaps, "time"));
-        let why = "the sender is uneven, or frames are lost on the way";
+        let title = format!("{what}: stale {}", count(series.stale_gaps, "time"));
+        let why = "the sender's period is uneven, or frames are lost";
         (Severity::Warning, title, why, 1.5 * series.longest_gap_s)
     } else {
         return;
     };
     let (period, gap, limit) = (seconds(period_s), seconds(series.longest_gap_s), seconds(limit_s));
     find(judge, severity, Topic::Period, title)
-        .seen(format!("{} comes every {period}, longest gap {gap}; stale after {limit}", signal.name))
+        .seen(format!("{} arrives every {period}, longest gap {gap}; stale after {limit}", signal.name))
         .why(why)
         .change(table, "max_age_s", toml(round_up(proposed_s)));
 }
@@ -82,7 +82,7 @@ fn round_up(value: f64) -> f64 {
     (value / step - 1e-9).ceil() * step
 }
 
-/// Finds messages that are slower than stated in the DBC.
+/// Finds messages that arrive less often than the DBC states.
 fn cycle_times(judge: &mut Judge<'_>) {
     for message in &judge.plan.messages {
         let Some(stats) = judge.bus(message.bus).and_then(|bus| bus.ids.get(&message.id)) else { continue };
@@ -95,7 +95,7 @@ fn cycle_times(judge: &mut Judge<'_>) {
             continue;
         }
         let (period, span, cycle) = (seconds(period_s), seconds(span_s), seconds(cycle_s));
-        warning(judge, Topic::Period, format!("{} comes less often than the DBC says", message.name))
+        warning(judge, Topic::Period, format!("{} arrives less often than the DBC states", message.name))
             .seen(format!("every {period} ({} frames in {span}), GenMsgCycleTime is {cycle}", stats.count))
             .why("frames are lost, a gateway drops some of them, or the DBC belongs to another version of the sender")
             .advice("if this period is intended, correct GenMsgCycleTime in the DBC");

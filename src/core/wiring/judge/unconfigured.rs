@@ -1,5 +1,5 @@
-//! Compares signals that are not configured with configured ones: the pack's voltage with the sum of its cells, a
-//! second state of charge with the configured one.
+//! Compares signals that are not configured with configured signals: the pack's voltage with the sum of the cell
+//! voltages, and a second state of charge with the configured state of charge.
 
 use super::context::{Judge, SignalSeries, find, warning};
 use super::text::number;
@@ -7,7 +7,7 @@ use crate::quantity::Channel;
 use crate::wiring::plan::Kind;
 use crate::wiring::report::{Severity, Topic};
 
-/// Deviation of the sum of the cells that sensor errors explain, fraction.
+/// Largest deviation of the sum of the cell voltages from the pack's voltage that sensor errors explain, fraction.
 const SUM_TOLERANCE: f64 = 0.03;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
@@ -16,14 +16,15 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     states_of_charge(judge);
 }
 
-/// DBC signals of a channel that are not configured, with their median values.
+/// Signals of the DBC for a channel that are not configured, with their median values.
 fn unconfigured<'d>(judge: &Judge<'d>, channel: Channel) -> Vec<(SignalSeries<'d>, f64)> {
     let all = judge.plan.unconfigured.iter().zip(&judge.observed.unconfigured);
     let wanted = all.filter(|(signal, _)| signal.binding.channel == channel);
     wanted.filter_map(|signal| Some((signal, signal.1.values.median()?))).collect()
 }
 
-/// `is_clear`: whether all cells are read correctly. If not, only a wrong decimal place is reported.
+/// Checks the pack's voltage. `is_clear`: whether all cells are read correctly. If not, only a wrong decimal place is
+/// reported.
 fn pack_voltage(judge: &mut Judge<'_>, is_clear: bool) {
     let medians_v = judge.signals(Kind::Voltage).into_iter().map(|(_, series)| series.values.median());
     let Some(medians_v) = medians_v.collect::<Option<Vec<f64>>>().filter(|_| !judge.plan.pack.is_total) else { return };
@@ -44,10 +45,10 @@ fn pack_voltage(judge: &mut Judge<'_>, is_clear: bool) {
     let tolerance = if is_clear { SUM_TOLERANCE } else { 0.2 };
     if power != 0.0 && ((pack_v / sum_v) / 10.0_f64.powf(power) - 1.0).abs() <= tolerance {
         let times = number(10.0_f64.powf(power));
-        warning(judge, Topic::PackVoltage, format!("{} is off by {times}", signal.name))
+        warning(judge, Topic::PackVoltage, format!("{} is off by a factor of {times}", signal.name))
             .seen(format!("the medians of {cells} cells add up to {sum} V; {} is {pack} V", signal.name))
-            .why("the voltages of cells in series add up; a factor of ten is a wrong decimal place in its definition")
-            .advice(format!("divide the factor of {} by {times} in its definition", signal.name));
+            .why("the voltages of cells in series add up; a power of ten is a wrong decimal place in the definition")
+            .advice(format!("in the definition of {}, divide the factor by {times}", signal.name));
         return;
     }
     if !is_clear {
@@ -57,7 +58,7 @@ fn pack_voltage(judge: &mut Judge<'_>, is_clear: bool) {
     let finding = warning(judge, Topic::PackVoltage, "the cells do not add up to the pack's voltage")
         .seen(format!("the medians of {cells} cells add up to {sum} V; {} is {pack} V", signal.name))
         .why("the voltages of cells in series add up")
-        .advice("a cell's signal, its factor or the factor of the pack's voltage in the DBC may be wrong too");
+        .advice("or a cell's signal, its factor, or the factor of the pack's voltage in the DBC is wrong");
     if counted >= 1.0 && counted != f64::from(cells) {
         finding.change("pack", "cells", format!("{counted} cells would have that voltage"));
     }
@@ -76,11 +77,11 @@ fn states_of_charge(judge: &mut Judge<'_>) {
             judge.fine(format!("{} and {} agree: {own_percent} and {percent} %", own.name, signal.name));
             continue;
         }
-        // A dashboard that hides a reserve at both ends differs by less.
+        // If a dashboard hides a reserve at both ends, the difference is smaller.
         let severity = if difference > 0.1 { Severity::Warning } else { Severity::Note };
         find(judge, severity, Topic::ReportedSoc, format!("{} and {} disagree", own.name, signal.name))
-            .seen(format!("the configured state of charge is {own_percent} %, the other one {percent} %"))
-            .why("a dash may hide a reserve at both ends; otherwise one of them is not the state of charge")
+            .seen(format!("the configured state of charge is {own_percent} %, the other is {percent} %"))
+            .why("a dashboard may hide a reserve at both ends; otherwise, one of the two is not the state of charge")
             .change(&own.table, "signal", format!("{:?}, if that is the pack's own", signal.name));
     }
 }

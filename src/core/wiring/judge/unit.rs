@@ -1,4 +1,4 @@
-//! Units of a DBC, reduced to the kinds that the judgement distinguishes.
+//! Converts the units of a DBC to the kinds of quantities that the checks distinguish.
 
 use crate::can::unit::{Quantity, SignalUnit};
 use crate::wiring::plan::Kind;

@@ -17,7 +17,7 @@ const UNIT_FACTORS: [f64; 6] = [1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0];
 const PLAUSIBLE_C: std::ops::RangeInclusive<f64> = -40.0..=60.0;
 /// Possible temperatures of a pack, even on fire or in extreme cold, degrees C.
 const POSSIBLE_C: std::ops::RangeInclusive<f64> = -60.0..=120.0;
-/// Share of implausible readings above which they are more than disturbances.
+/// Share of implausible readings above which single disturbances do not explain them.
 const MANY: f64 = 0.01;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
@@ -85,7 +85,7 @@ fn voltages(judge: &mut Judge<'_>) {
     let (Some(median_v), Some((signal, _))) = (judge.cell_voltage(), all.first().copied()) else { return };
     let (low, high) = judge.voltage_band();
     let cells = judge.cells_per_reading();
-    let (what, per) = if judge.plan.pack.is_total { ("pack voltage", " a cell") } else { ("cell voltages", "") };
+    let (what, per) = if judge.plan.pack.is_total { ("pack voltage", " per cell") } else { ("cell voltages", "") };
     let is_plausible = (low..=high).contains(&median_v);
     if let Some(better) = better_voltages(judge, &all) {
         judge.is_mixed_up = true;
@@ -102,16 +102,16 @@ fn voltages(judge: &mut Judge<'_>) {
         let (by, volts) = (number(factor), number(median_v * factor));
         error(judge, Topic::Unit, format!("{what}: off by a factor of {}", above_one(factor)))
             .seen(seen)
-            .why(format!("{band}; times {by} it is {volts} V"))
+            .why(format!("{band}; multiplied by {by}, the reading is {volts} V"))
             .change(&signal.table, "scale", toml(signal.scale * factor));
     } else if judge.plan.pack.is_total && median_v > 0.0 {
         judge.is_mixed_up = true;
         pack_count(judge, median_v * cells);
     } else {
         judge.is_mixed_up = true;
-        error(judge, Topic::CellModel, "cell voltages do not belong to this cell model")
+        error(judge, Topic::CellModel, "the cell voltages do not fit the cell model")
             .seen(seen)
-            .why(format!("{band}, and no power of ten corrects it"))
+            .why(format!("{band}, and no power of ten corrects the reading"))
             .change_cell_model()
             .advice("or the signal is not a cell voltage");
     }
@@ -164,8 +164,8 @@ fn pack_count(judge: &mut Judge<'_>, total_v: f64) {
     let (min_v, max_v) = pack.model.as_ref().map_or((2.8, 4.2), |m| (m.voltage_min_v, m.voltage_max_v));
     let (fewest, most) = ((total_v / max_v).ceil(), (total_v / min_v).floor());
     let (total, per_cell) = (number(total_v), number(total_v / f64::from(pack.cells.max(1))));
-    error(judge, Topic::CellCount, format!("{} cells cannot make this pack voltage", pack.cells))
-        .seen(format!("{total} V in total: {per_cell} V a cell"))
+    error(judge, Topic::CellCount, format!("{} cells cannot have this pack voltage", pack.cells))
+        .seen(format!("{total} V in total: {per_cell} V per cell"))
         .why(format!("cells of this model have {min_v} to {max_v} V: {fewest} to {most} cells are possible"))
         .change("pack", "cells", format!("{fewest} to {most}, the number in the pack's documentation"));
 }
@@ -198,7 +198,7 @@ fn current(judge: &mut Judge<'_>) {
         });
         judge.current_factor = factor;
         electrical::wrong_unit_or_cell(judge, signal, factor, Severity::Error)
-            .why(format!("that is {} times the pack's capacity per hour", number(c_rate)))
+            .why(format!("the current is {} times the pack's capacity per hour", number(c_rate)))
     } else {
         return;
     };
@@ -248,7 +248,7 @@ fn impossible_sensors(judge: &mut Judge<'_>, sensors: &[SignalSeries<'_>], all: 
     let (signal, series) = sensors[0];
     let (low, high) = (number(series.extent.min), number(series.extent.max));
     let share = percent(series.values.share(|c| !POSSIBLE_C.contains(&c)));
-    let others = if sensors.len() < all { "the other sensors are possible" } else { "its other readings are possible" };
+    let others = if sensors.len() < all { "the other sensors are plausible" } else { "other readings are plausible" };
     let finding = error(judge, Topic::Cell, format!("{}: impossible temperature", channels(&list)))
         .seen(format!("{} reads {low} to {high} degrees C; {share} % of its readings are impossible", signal.name))
         .why(format!(
@@ -267,7 +267,7 @@ fn wrong_temperature(
 ) {
     let seen = format!("the median sensor reads {} degrees C", number(median_c));
     let Some((factor, offset, name, converted_c)) = unit else {
-        error(judge, Topic::Unit, "temperatures impossible for a pack")
+        error(judge, Topic::Unit, "temperatures are impossible for a pack")
             .seen(seen)
             .why("no common unit makes it a plausible temperature")
             .change(&all[0].0.table, "signal", "a temperature");
@@ -281,7 +281,7 @@ fn wrong_temperature(
     let (converted, ambient) = (number(converted_c), number(judge.plan.pack.ambient_c));
     let finding = find(judge, severity, Topic::Unit, format!("temperatures: {name}?"))
         .seen(seen)
-        .why(format!("{hint}; as {name} it is {converted} degrees C, near the {ambient} of pack.ambient_c"));
+        .why(format!("{hint}; corrected for {name}, it is {converted} degrees C, near pack.ambient_c ({ambient})"));
     for (signal, _) in all {
         if factor != 1.0 {
             finding.change(&signal.table, "scale", toml(signal.scale * factor));
@@ -292,8 +292,8 @@ fn wrong_temperature(
     }
 }
 
-/// Reports temperatures whose DBC states another unit that the configuration does not convert. Without this check, 50
-/// degrees F would pass for a warm day.
+/// Reports temperatures that the configuration does not convert from the unit in the DBC. Without this check, 50
+/// degrees Fahrenheit would pass as 50 degrees Celsius.
 fn unconverted(judge: &mut Judge<'_>, all: &[SignalSeries<'_>], median_c: f64) -> Option<()> {
     let conversion = |signal: &SignalPlan| {
         let (kind, factor, offset) = unit_of(&signal.unit)?;
@@ -316,8 +316,8 @@ fn unconverted(judge: &mut Judge<'_>, all: &[SignalSeries<'_>], median_c: f64) -
     Some(())
 }
 
-/// Reports readings that the daemon will reject although nothing else is wrong: the limits are too tight, or there are
-/// disturbances.
+/// Reports readings outside the configured limits if no other finding explains them. The daemon will reject these
+/// readings: the limits are too tight, or the readings are disturbed.
 pub(super) fn check_limits(judge: &mut Judge<'_>) {
     if judge.is_mixed_up || judge.has(&[Topic::Unit, Topic::Layout, Topic::Cell, Topic::CellCount]) {
         return;
@@ -337,7 +337,7 @@ pub(super) fn check_limits(judge: &mut Judge<'_>) {
         let high = all.iter().map(|(_, s)| s.extent.max).fold(f64::NEG_INFINITY, f64::max);
         let is_many = implausible as f64 / count.max(1) as f64 > MANY;
         let (severity, why) = match is_many {
-            true => (Severity::Warning, "too many for disturbances, so the limit is too tight; estimates ignore them"),
+            true => (Severity::Warning, "disturbances are rarer, so the limit is too tight; estimates ignore them"),
             false => (Severity::Note, "single readings are disturbances; estimates ignore them"),
         };
         let [from, to, lowest, highest] = [low / cells, high / cells, limits.0, limits.1].map(number);
