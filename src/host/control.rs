@@ -28,16 +28,17 @@ use crate::io::unix_socket::{client_folder, runtime_folder};
 
 pub use server::{ControlServer, PendingRequest};
 
-/// Most connections: room for a person, a display and a script. Each is a task with a few kilobytes.
+/// Maximum number of connections: room for a person, a display and a script. Each is a task with a few kilobytes.
 pub const MAX_CONNECTIONS: usize = 8;
-/// Most connections of one process.
+/// Maximum number of connections of one process.
 pub const MAX_PER_PROCESS: usize = 4;
 /// Longest request, bytes, including the end of the line; the longest valid one has less than 200.
 pub const MAX_REQUEST_BYTES: usize = 4096;
 /// Longest time for a request and for reading its answer. A script needs milliseconds, and a client must not keep one of the
 /// few slots for ever.
 pub const MAX_SILENCE: Duration = Duration::from_secs(10);
-/// Most alarms in an answer: a line of a few hundred kilobytes, serialised in a few milliseconds. Further alarms are counted.
+/// Maximum number of alarms in an answer: a line of a few hundred kilobytes, serialised in a few milliseconds. Further
+/// alarms are counted.
 pub const MAX_LISTED: usize = 1024;
 
 /// The socket's name in the folder of the daemon.

@@ -37,13 +37,13 @@ use super::status::client::{check_length, explain, parse};
 use super::status::document::StatusDocument;
 use super::status::metrics::{openmetrics, prometheus_text};
 
-/// Most connections: several times two servers and a browser.
+/// Maximum number of connections: several times two servers and a browser.
 const MAX_CONNECTIONS: usize = 16;
-/// Most connections of one address.
+/// Maximum number of connections of one address.
 const MAX_PER_ADDRESS: usize = 8;
 /// Longest head of a request, bytes; the smallest limit that hyper supports.
 const MAX_REQUEST_BYTES: usize = 8192;
-/// Most headers of a request.
+/// Maximum number of headers of a request.
 const MAX_HEADERS: usize = 64;
 /// Longest wait for the head of a request; a connection silent for this long is closed.
 const HEAD_LIMIT: Duration = Duration::from_secs(30);
@@ -75,7 +75,7 @@ struct StatusSource {
 /// Serves the status of the daemon at `socket` on the address `listen`, until a signal.
 ///
 /// # Errors
-/// When the address cannot be bound.
+/// Fails if the address cannot be bound.
 pub fn run(listen: SocketAddr, socket: PathBuf) -> Result<(), String> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| format!("cannot start: {error}"))?;

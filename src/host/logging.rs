@@ -45,7 +45,7 @@ pub fn take_left_out() -> u64 {
 /// Starts logging; `filter` is a level (`info`) or a filter (`packwatch::io=debug,info`).
 ///
 /// # Errors
-/// When the filter cannot be parsed.
+/// Fails if the filter cannot be parsed.
 pub fn start(filter: Option<&str>) -> Result<(), String> {
     let text = filter.map(str::to_owned).or_else(|| std::env::var(LOG_VARIABLE).ok()).unwrap_or_else(|| "info".into());
     let registry = tracing_subscriber::registry().with(targets(&text)?);

@@ -132,7 +132,7 @@ pub struct ReplayProgress {
 /// Replays `source` through a monitor without earlier input; returns the summary and the snapshot, if requested.
 ///
 /// # Errors
-/// When a log cannot be read, a result cannot be written, or a snapshot does not fit or its time is not reached.
+/// Fails if a log cannot be read, a result cannot be written, or a snapshot does not fit or its time is not reached.
 pub fn run(
     source: &mut LogSource,
     monitor: Monitor,
@@ -168,7 +168,7 @@ fn progress(source: &LogSource, frames: u64, span: &RecordSpan) -> ReplayProgres
 /// Sends the frames of `source` at their times; returns their number. `send` may block.
 ///
 /// # Errors
-/// When a log cannot be read or `send` fails.
+/// Fails if a log cannot be read or `send` fails.
 pub fn play(
     source: &mut LogSource,
     settings: &ReplaySettings,

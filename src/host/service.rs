@@ -113,7 +113,7 @@ impl Service {
     /// Runs until a signal or the end of its duration.
     ///
     /// # Errors
-    /// When it cannot start, or its final snapshot cannot be written.
+    /// Fails if it cannot start, or its final snapshot cannot be written.
     pub fn run(self) -> Result<(), ServiceError> {
         let mut builder = tokio::runtime::Builder::new_current_thread();
         let runtime = builder.enable_all().max_blocking_threads(BLOCKING_THREADS).build()?;

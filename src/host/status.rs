@@ -37,8 +37,8 @@ pub use server::StatusServer;
 
 use crate::io::unix_socket::{client_folder, runtime_folder};
 
-/// Most clients of both sockets together: many times a display, an exporter and a few scripts. Each uses a descriptor and a
-/// few kilobytes.
+/// Maximum number of clients of both sockets together: many times a display, an exporter and a few scripts. Each uses a
+/// descriptor and a few kilobytes.
 pub const MAX_CLIENTS: usize = 64;
 /// Longest time for a client to read what was sent.
 pub const MAX_SILENCE: Duration = Duration::from_secs(5);

@@ -131,7 +131,7 @@ impl Store {
     /// Opens the store; `None` = disabled, or its folder cannot be used.
     ///
     /// # Errors
-    /// When another daemon uses the folder.
+    /// Fails if another daemon uses the folder.
     pub fn open(
         setting: &PlaceSetting,
         config: &StoreConfig,

@@ -43,7 +43,7 @@ impl Interrupt {
     /// Starts catching the signals.
     ///
     /// # Errors
-    /// When the signals cannot be caught.
+    /// Fails if the signals cannot be caught.
     pub fn watch() -> std::io::Result<Self> {
         let interrupt = Self::default();
         let flag = Arc::clone(&interrupt.0);
@@ -122,7 +122,7 @@ impl Session {
 /// Replays logs, at most `limit_s` of them.
 ///
 /// # Errors
-/// When a log cannot be read.
+/// Fails if a log cannot be read.
 pub fn replay(
     survey: &Survey,
     logs: &[PathBuf],
@@ -180,7 +180,7 @@ struct BusListener {
 /// Listens to the configured interfaces and all other CAN interfaces of this computer for `duration`.
 ///
 /// # Errors
-/// When this kernel has no SocketCAN.
+/// Fails if this kernel has no SocketCAN.
 pub fn listen(
     survey: &Survey,
     duration: Duration,

@@ -72,7 +72,7 @@ fn describe(which: &Selector) -> String {
 /// The outcome of a command, from the events it caused and the alarms after it. The caller sets `is_stored`.
 ///
 /// # Errors
-/// When the core has not reported an outcome.
+/// Fails if the core has not reported an outcome.
 pub fn outcome(
     engine: &AlarmEngine,
     command: &Command,

@@ -36,7 +36,7 @@ impl ControlClient {
     /// Sends a request; returns the answer as a line of JSON.
     ///
     /// # Errors
-    /// When no daemon answers; names the socket and the next step.
+    /// Fails if no daemon answers; names the socket and the next step.
     pub fn ask_line(&self, request: Request) -> Result<Vec<u8>, String> {
         self.exchange(request).map_err(|error| self.explain(request, &error))
     }
@@ -44,7 +44,7 @@ impl ControlClient {
     /// Sends a request; returns the contents of the answer.
     ///
     /// # Errors
-    /// When no daemon answers, or its answer is an error.
+    /// Fails if no daemon answers, or its answer is an error.
     pub fn ask<T: for<'de> Deserialize<'de>>(&self, request: Request) -> Result<T, String> {
         contents(&self.ask_line(request)?)
     }

@@ -109,7 +109,7 @@ impl Request {
     /// Parses a line.
     ///
     /// # Errors
-    /// States the value found and the values allowed.
+    /// Returns an error that states the value found and the values allowed.
     pub fn parse(line: &[u8]) -> Result<Self, String> {
         let value: Value = serde_json::from_slice(line).map_err(|error| format!("not a JSON document: {error}"))?;
         let Value::Object(mut keys) = value else { return Err(format!("found {value}, must be a JSON object")) };

@@ -39,7 +39,7 @@ impl ControlServer {
     /// Opens the socket, whose requests go to `requests`. `None` = it failed (logged).
     ///
     /// # Errors
-    /// When another daemon uses it, or a requested socket cannot be created.
+    /// Fails if another daemon uses it, or a requested socket cannot be created.
     pub async fn start(setting: &PlaceSetting, requests: mpsc::Sender<PendingRequest>) -> Result<Option<Self>, String> {
         let Some((path, is_needed)) = setting.resolve(|| (daemon_path(), false)) else { return Ok(None) };
         match bind(&path, MODE).await {

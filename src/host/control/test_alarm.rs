@@ -152,7 +152,7 @@ impl ObservedFrames {
 /// Runs the test. `SIGINT` and `SIGTERM` end it early, also in the daemon.
 ///
 /// # Errors
-/// When no alarm frame is configured, an interface cannot be opened, or the daemon refuses.
+/// Fails if no alarm frame is configured, an interface cannot be opened, or the daemon refuses.
 pub fn run(
     config: &Config,
     client: &ControlClient,

@@ -1,7 +1,7 @@
 //! A file written by its own thread, so that a slow disk never delays the loop.
 //!
-//! Bytes are collected and sent to the thread in pieces. After a failed write, or when too many pieces wait because the
-//! disk is too slow, every further write is an error: the caller gives up the file and continues.
+//! Bytes are collected and sent to the thread in pieces. After a failed write, or if too many pieces wait for a slow
+//! disk, every further write is an error. The caller then gives up the file and continues.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -15,17 +15,18 @@ use super::segments::{SegmentLimits, SegmentWriter};
 
 /// Bytes collected before they are sent to the thread, unless flushed.
 const PIECE_BYTES: usize = 64 * 1024;
-/// Most waiting pieces: 4 MB, ten seconds of a full 1 Mbit/s bus.
+/// Maximum number of waiting pieces: 4 MB, ten seconds of a full 1 Mbit/s bus.
 const MAX_PIECES: usize = 64;
 
-/// Longest wait for the last bytes at the end; half of the time after which systemd kills the service.
+/// Longest wait for the last bytes when the file is finished. It is half of the time after which systemd kills the
+/// service.
 pub const MAX_FINISH: Duration = Duration::from_secs(5);
 
 /// A file and the thread that writes it.
 #[derive(Debug)]
 pub struct BackgroundFile {
     piece: Vec<u8>,
-    /// `None` once finished or failed.
+    /// Queue of the thread; `None` after the file was finished or has failed.
     pieces: Option<SyncSender<Vec<u8>>>,
     writer: Option<JoinHandle<io::Result<()>>>,
 }
@@ -34,7 +35,7 @@ impl BackgroundFile {
     /// Creates the file and its thread.
     ///
     /// # Errors
-    /// When the file cannot be created.
+    /// Fails if the file cannot be created.
     pub fn create(path: &Path) -> io::Result<Self> {
         keep_earlier(path)?;
         let file = File::create(path)?;
@@ -44,7 +45,7 @@ impl BackgroundFile {
     /// Like [`create`](Self::create), but in segments that begin with `header`. The text itself contains the first header.
     ///
     /// # Errors
-    /// When the first segment cannot be created.
+    /// Fails if the first segment cannot be created.
     pub fn create_segments(path: &Path, header: &'static str, limits: SegmentLimits) -> io::Result<Self> {
         let mut segments = SegmentWriter::create(path, header, limits)?;
         Self::start(move |queue| {
@@ -64,7 +65,7 @@ impl BackgroundFile {
     /// Writes the remaining bytes, synchronises the file to disk and waits for both.
     ///
     /// # Errors
-    /// The first error of any write.
+    /// Returns the first error of any write.
     pub fn finish(mut self) -> io::Result<()> {
         let sent = self.send_piece();
         self.join()?;
@@ -113,7 +114,7 @@ pub fn ends_in_time<T>(thread: &JoinHandle<T>) -> bool {
     true
 }
 
-/// Renames the file of an earlier run to `NAME.1`, because it may show what led to a crash.
+/// Renames the file of an earlier run to `NAME.1`, because it may show the cause of a crash.
 fn keep_earlier(path: &Path) -> io::Result<()> {
     let Ok(earlier) = std::fs::metadata(path) else { return Ok(()) };
     if !earlier.is_file() || earlier.len() == 0 {
@@ -140,7 +141,7 @@ fn write_all(mut file: File, queue: &Receiver<Vec<u8>>) -> io::Result<()> {
     for piece in queue {
         file.write_all(&piece)?;
     }
-    // Pipes and devices cannot be synchronised (EINVAL), which is fine.
+    // Pipes and devices cannot be synchronised (EINVAL); this is not an error.
     file.sync_all().or_else(|error| if error.raw_os_error() == Some(22) { Ok(()) } else { Err(error) })
 }
 

@@ -1,4 +1,5 @@
-//! The key of authenticated frames: read once at the start from a systemd credential or a file, and never shown.
+//! Reads the key of authenticated frames once at the start, from a systemd credential or a file. The key is never
+//! shown.
 //!
 //! In: the key's location. Out: AES-128-CMAC of any bytes. A key that is missing, readable by others, or not 16 bytes (or 32
 //! hex digits) is an error; the error does not contain the key.
@@ -33,7 +34,7 @@ impl CanKey {
     /// Reads the key. `credentials` is the folder of the service manager's credentials (`$CREDENTIALS_DIRECTORY`).
     ///
     /// # Errors
-    /// Why the key cannot be used, and its location.
+    /// Returns the location of the key and the reason why it cannot be used.
     pub fn load(source: &KeySource, credentials: Option<OsString>) -> Result<Self, String> {
         match source {
             KeySource::Credential(name) => {
@@ -50,20 +51,20 @@ impl CanKey {
         let error = |why: String| format!("key of [authentication]: {}: {why}", path.display());
         let file = File::open(path).map_err(|why| error(why.to_string()))?;
         let mode = file.metadata().map_err(|why| error(why.to_string()))?.mode() & 0o7777;
-        // Permissions of other users.
+        // The mask 0o077 selects the permissions of other users.
         if is_private && mode & 0o077 != 0 {
             return Err(error(format!("mode {mode:04o}, must be 0600 or 0400: no other user may read it")));
         }
         let mut content = Vec::new();
-        // The longest key (hex digits and a line break) and one byte more, to detect longer files.
+        // Reads one byte more than the longest key (hex digits and a line break), to detect longer files.
         file.take(2 * KEY_BYTES as u64 + 3).read_to_end(&mut content).map_err(|why| error(why.to_string()))?;
         Self::parse(&content).map_err(error)
     }
 
-    /// A key from raw bytes, or from hex digits with or without a line break.
+    /// Parses a key from raw bytes, or from hex digits with or without a line break.
     ///
     /// # Errors
-    /// When it is neither, or if all bytes are equal.
+    /// Fails if the content has neither form, or if all bytes are equal.
     pub fn parse(content: &[u8]) -> Result<Self, String> {
         let found = content.len();
         let neither = || format!("{found} bytes, must be {KEY_BYTES} bytes or {} hex digits", 2 * KEY_BYTES);

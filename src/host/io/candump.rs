@@ -1,4 +1,4 @@
-//! candump log lines: parses and writes the format that `candump -L` writes and `canplayer` reads.
+//! Parses and writes candump log lines, the format that `candump -L` writes and `canplayer` reads.
 //!
 //! Input is text that begins with a line; output is a [`Line`] that borrows the interface name. Beyond the usual form
 //! `(1700000000.123456) can0 123#1122`, the parser accepts nanosecond and relative stamps, padded names, the direction suffix
@@ -31,7 +31,7 @@ pub enum Line<'a> {
         interface: &'a [u8],
         /// The frame.
         frame: Frame,
-        /// Marked ` T`: sent by the machine that recorded the log.
+        /// Whether the line ends with ` T`: the recording machine sent the frame.
         transmitted: bool,
     },
     /// An error frame.
@@ -90,7 +90,7 @@ impl LineError {
 /// Parses one line (without its line feed; a carriage return at its end is ignored).
 ///
 /// # Errors
-/// When the line begins with `(` and violates the grammar.
+/// Fails if the line begins with `(` and violates the grammar.
 pub fn parse_line(line: &[u8]) -> Result<Line<'_>, LineError> {
     LineParser::new(&[]).parse(line).map(|parsed| parsed.line)
 }
@@ -98,7 +98,7 @@ pub fn parse_line(line: &[u8]) -> Result<Line<'_>, LineError> {
 /// Parses a stamp `(seconds.fraction)` at the start of `text`; also returns the rest of the text.
 ///
 /// # Errors
-/// When the text does not begin with a stamp.
+/// Fails if the text does not begin with a stamp.
 pub fn parse_stamp(text: &[u8]) -> Result<(Timestamp, &[u8]), LineError> {
     let mut cursor = Cursor { text, at: 0 };
     let time = cursor.stamp()?;
@@ -115,7 +115,7 @@ pub fn parse_frame(text: &[u8]) -> Option<(&[u8], Frame, &[u8])> {
     }
 }
 
-/// Decimals of a written stamp.
+/// Number of decimals of a written stamp.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StampDigits {
     /// Six, like `candump -L` (further digits are cut off).
@@ -127,7 +127,7 @@ pub enum StampDigits {
 /// Writes one line like `candump -L`, including the line feed.
 ///
 /// # Errors
-/// Errors of `out`.
+/// Returns the errors of `out`.
 pub fn write_line(
     out: &mut impl Write,
     time: Timestamp,
@@ -155,7 +155,7 @@ pub fn frame_text(frame: &Frame) -> String {
 /// Writes `(seconds.fraction)`.
 ///
 /// # Errors
-/// Errors of `out`.
+/// Returns the errors of `out`.
 pub fn write_stamp(out: &mut impl Write, time: Timestamp, digits: StampDigits) -> io::Result<()> {
     let (sign, nanos) = (if time.nanos() < 0 { "-" } else { "" }, time.nanos().unsigned_abs());
     let (seconds, fraction) = (nanos / 1_000_000_000, nanos % 1_000_000_000);
@@ -165,7 +165,7 @@ pub fn write_stamp(out: &mut impl Write, time: Timestamp, digits: StampDigits) -
     }
 }
 
-/// Text of a frame, on the stack: identifier, `##`, flags, 64 bytes in hex, line feed.
+/// Buffer on the stack for the text of a frame: identifier, `##`, flags, 64 bytes in hex, line feed.
 struct FrameText {
     bytes: [u8; 8 + 3 + 2 * MAX_DATA + 1],
     len: usize,

@@ -1,13 +1,13 @@
 //! A clock that never steps: wall time at the program's start plus CLOCK_BOOTTIME since then (which counts suspend).
 //!
-//! The kernel stamps received frames with CLOCK_REALTIME, which steps (NTP, a clock set by hand), or with the adapter's own
-//! clock, whose origin is arbitrary. [`StampMapper`] maps both to our clock:
+//! The kernel stamps received frames with CLOCK_REALTIME, which steps (NTP, a clock set by hand), or with the adapter's
+//! own clock, whose origin is arbitrary. [`StampMapper`] maps both to the program's clock:
 //!
-//! * A software stamp becomes `stamp - (realtime - boottime)`, with this difference measured when the frame is read. Around a
-//!   step of the clock the previous difference is tried too, and the later plausible time is used. A stamp that is plausible
-//!   with neither is replaced by the time of reading.
-//! * A time is plausible if it is after the socket was last found empty and before the frame was read. The error of any
-//!   stamp is therefore bounded by that interval, and so is the distortion of time differences by a step.
+//! * A software stamp becomes `stamp - (realtime - boottime)`, with this difference measured when the frame is read.
+//!   Around a step of the clock, the previous difference is tried too, and the later of the plausible times is used. If
+//!   neither difference gives a plausible time, the time of reading replaces the stamp.
+//! * A time is plausible if it is after the socket was last found empty and before the frame was read. This interval
+//!   therefore bounds the error of any stamp, and the distortion of time differences by a step.
 //! * A hardware stamp becomes `stamp + offset`. The offset is the smallest recent (arrival - stamp), because queueing only
 //!   adds to it. Old values are forgotten, so that the offset follows the drift of the adapter's quartz.
 //!
@@ -20,10 +20,11 @@ use nix::time::{ClockId, clock_gettime};
 
 use crate::quantity::Timestamp;
 
-/// Half of the time that the smallest hardware offset is kept, ns. Over it, a quartz 100 ppm off drifts by 1 ms.
+/// Half of the time for which the smallest hardware offset is kept, ns. During this time, a quartz with an error of 100
+/// ppm drifts by 1 ms.
 const HARDWARE_WINDOW_NS: i64 = 10_000_000_000;
 
-/// Most readings of the wall clock for one [`Reading`].
+/// Maximum number of readings of the wall clock for one [`Reading`].
 const MOST_READINGS: usize = 4;
 
 /// Both kernel clocks at one moment, ns since their origins.
@@ -36,7 +37,7 @@ pub struct Reading {
 }
 
 impl Reading {
-    /// Reads both clocks. Every kernel since 2.6.39 has CLOCK_BOOTTIME; otherwise the reading is zero.
+    /// Reads both clocks. Every kernel since 2.6.39 has CLOCK_BOOTTIME; on older kernels the reading is zero.
     pub fn now() -> Self {
         Self::between(nanos_of)
     }
@@ -52,7 +53,8 @@ impl Reading {
         };
         let mut closest = read();
         for _ in 1..MOST_READINGS {
-            // If the boot clock readings are this close, ns, no further attempt is needed: two system calls on a slow processor.
+            // If the boot clock readings differ by at most this many ns, no further attempt is needed. Two system calls
+            // on a slow processor take this long.
             if closest.0 <= 20_000 {
                 break;
             }
@@ -135,14 +137,14 @@ impl StampMapper {
         }
     }
 
-    /// Notes that the socket was found empty at `reading`: later frames arrived after that.
+    /// Notes that the socket was found empty at `reading`: frames that are read later arrived after `reading`.
     pub fn socket_empty(&mut self, reading: Reading) {
         self.emptied_ns = reading.boottime_ns;
         self.emptied_offset_ns = reading.offset_ns();
     }
 
-    /// Notes that the call that returned the latest frame, read at `reading`, emptied the socket: later frames arrived after
-    /// that frame.
+    /// Notes that one call returned the latest frame at `reading` and emptied the socket. Frames that are read later
+    /// arrived after that frame.
     pub fn socket_emptied(&mut self, reading: Reading) {
         self.emptied_ns = self.latest.nanos().saturating_sub(self.clock.origin_ns);
         self.emptied_offset_ns = reading.offset_ns();
@@ -175,11 +177,12 @@ impl StampMapper {
     fn software(&self, stamp: Option<i64>, reading: Reading) -> i64 {
         let candidates =
             [reading.offset_ns(), self.emptied_offset_ns].map(|offset| stamp.map(|s| s.saturating_sub(offset)));
-        // Both are plausible only around a step. Frames are read soon after they arrive, so the later one is used.
+        // Both candidates are plausible only around a step. Frames are read soon after they arrive, so the later
+        // candidate is used.
         candidates.into_iter().flatten().filter(|&t| self.possible(t, reading)).max().unwrap_or(reading.boottime_ns)
     }
 
-    /// Whether a frame read at `reading` can have arrived at `arrived_ns`.
+    /// Whether a frame that was read at `reading` can have arrived at `arrived_ns`.
     fn possible(&self, arrived_ns: i64, reading: Reading) -> bool {
         // Tolerance, ns, for stamps older than the moment the socket was last found empty: between stamping and queueing there
         // is a soft interrupt and, with USB adapters, a batch.
@@ -190,7 +193,7 @@ impl StampMapper {
 /// The smallest (arrival - stamp), remembered for one to two windows.
 #[derive(Debug, Clone, Default)]
 struct HardwareClock {
-    /// Smallest of this window and of the previous one; `None` before the first stamp.
+    /// Smallest difference of this window and of the previous window, ns; `None` before the first stamp.
     least_ns: Option<(i64, i64)>,
     window_start_ns: i64,
 }
@@ -213,7 +216,7 @@ impl HardwareClock {
         stamp_ns.saturating_add(current.min(previous))
     }
 
-    /// Starts again after the adapter's clock jumped (it was reset, or slept).
+    /// Starts again after a jump of the adapter's clock (it was reset, or slept).
     fn restart(&mut self, stamp_ns: i64, arrived_ns: i64) -> i64 {
         let offset = arrived_ns.saturating_sub(stamp_ns);
         *self = Self { least_ns: Some((offset, offset)), window_start_ns: arrived_ns };
@@ -250,7 +253,7 @@ mod tests {
                 let stamps =
                     KernelStamps { software_ns: Some(OFFSET + arrived + wall_step(arrived)), hardware_ns: None };
                 let time = mapper.arrival(stamps, at(read, wall_step(read)));
-                // Found empty by the same call, or by another after it.
+                // The socket is found empty by the same call or by the next call.
                 if by_the_same_call {
                     mapper.socket_emptied(at(read, wall_step(read)));
                 } else {
@@ -276,7 +279,7 @@ mod tests {
         for reading in [reading_with_waits(&[]), reading_with_waits(&busy), reading_with_waits(&[0, MS])] {
             assert_eq!(reading.offset_ns(), OFFSET, "{reading:?}");
         }
-        // Always busy: the closest calls are used.
+        // If the processor is always busy, the closest calls are used.
         let reading = reading_with_waits(&[0, MS, MS, 0, 9 * MS, MS, 0, MS, 0, 0, 9 * MS, MS]);
         assert!((reading.offset_ns() - OFFSET).abs() <= MS / 2, "{reading:?}");
     }
@@ -288,7 +291,7 @@ mod tests {
 
     #[test]
     fn wall_clock_step_keeps_time_differences() {
-        // Between two frames, and between stamp and reading of one frame.
+        // The clock steps between two frames, or between stamp and reading of one frame.
         for step_at in [1950 * MS, 2001 * MS] {
             for step in [3600 * S, -3600 * S, S / 2, -S / 2, 50 * MS, -50 * MS] {
                 for times in [true, false].map(|by_the_same_call| arrivals(step, step_at, by_the_same_call)) {
@@ -339,7 +342,8 @@ mod tests {
     #[test]
     fn hardware_stamps_remove_jitter_and_follow_drift() {
         let mut mapper = mapper();
-        // The adapter's clock started at 7 s of ours and runs 100 ppm fast; stamping in software is up to 3 ms late.
+        // The adapter's clock started at 7 s of the program's clock and runs 100 ppm fast. Software stamps are up to 3
+        // ms late.
         for k in 1..600_i64 {
             let arrived = 10 * S + k * 100 * MS;
             let late = (k * 7 % 4) * MS;

@@ -1,25 +1,25 @@
 //! Limits a server's connections, in total and per client. A new connection replaces the one that has been idle longest, so
 //! that silent and slow clients cannot keep others out.
 //!
-//! A connection is idle while the client has to act: to send a request, or to read the answer. A connection is never closed
-//! while its request is being processed, or within [`GRACE`] of becoming idle. If all slots are taken by such connections, a
-//! new connection is rejected.
+//! A connection is idle while the client has to act: to send a request, or to read the answer. A connection is never
+//! closed while its request is being processed, or within [`GRACE`] of becoming idle. If such connections take all
+//! slots, a new connection is rejected.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use tokio::task::AbortHandle;
 
-/// Time for a client to send its request or read its answer before another client may take the slot; far more than a
-/// working client needs.
+/// Time in which a client may send its request or read its answer before another client may take the slot. A working
+/// client needs far less.
 pub(crate) const GRACE: Duration = Duration::from_millis(250);
 
 /// Limits on simultaneous connections.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SlotLimits {
-    /// Most connections of all clients together.
+    /// Maximum number of connections of all clients together.
     pub total: usize,
-    /// Most connections of one client.
+    /// Maximum number of connections of one client.
     pub per_client: usize,
 }
 
@@ -47,12 +47,12 @@ impl Activity {
         Self(Arc::new(Mutex::new(Some(Instant::now()))))
     }
 
-    /// Call when a request has been received.
+    /// Notes that a request has been received.
     pub(crate) fn begin_request(&self) {
         self.set(None);
     }
 
-    /// Call when the answer is ready to be sent.
+    /// Notes that the answer is ready to be sent.
     pub(crate) fn end_request(&self) {
         self.set(Some(Instant::now()));
     }
@@ -67,12 +67,12 @@ impl Activity {
 }
 
 impl<K: PartialEq> ConnectionSlots<K> {
-    /// Slots without connections.
+    /// Creates slots without connections.
     pub(crate) fn new(limits: SlotLimits) -> Self {
         Self { limits, taken: Vec::new() }
     }
 
-    /// Makes room for a connection of `client`; `false` = not possible.
+    /// Makes room for a connection of `client`. Returns `false` if this is not possible.
     pub(crate) fn make_room(&mut self, client: &K, now: Instant) -> bool {
         self.taken.retain(|place| !place.task.is_finished());
         let of_client = self.taken.iter().filter(|place| place.client == *client).count();
@@ -121,7 +121,7 @@ mod tests {
         busy.begin_request();
         let (_, first) = connect(&mut places, 2, now).unwrap();
         let (_, second) = connect(&mut places, 3, now).unwrap();
-        assert!(connect(&mut places, 4, now).is_none(), "none has been idle for long");
+        assert!(connect(&mut places, 4, now).is_none(), "no connection has been idle for long enough");
         let later = Instant::now() + GRACE;
         let (fourth, _task) = connect(&mut places, 4, later).unwrap();
         assert!(first.await.unwrap_err().is_cancelled());
@@ -134,7 +134,7 @@ mod tests {
         );
         busy_task.abort();
         assert!(busy_task.await.is_err());
-        assert!(connect(&mut places, 6, now).is_some(), "one has ended");
+        assert!(connect(&mut places, 6, now).is_some(), "one connection has ended");
     }
 
     #[tokio::test]

@@ -1,4 +1,4 @@
-//! CSV logs: one row per sample, columns found by name, values in the program's units.
+//! Reads CSV logs: one row per sample, columns found by name, values in packwatch's units.
 //!
 //! Files in the Battery Data Format are recognised by its columns ([`BDF_COLUMNS`]). Positive current is discharge, except
 //! with [`CsvOptions::charge_positive`] and in the Battery Data Format. An empty field means "no reading". A row is bad if a
@@ -15,7 +15,7 @@ use super::table::{self, Header, PART_COLUMNS, Quotes, Row, Table, TableError};
 use crate::can::decode::{Channel, SensorIndex};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// How to read CSV files.
+/// Options for reading CSV files.
 #[derive(Debug, Clone, Default)]
 pub struct CsvOptions {
     /// Maps a role to a column: `time`, `current`, `voltage`, `temperature`, `section`. With `{n}` in role and column there is
@@ -36,7 +36,7 @@ pub struct CsvOptions {
 pub struct RowTime {
     /// Time of the row.
     pub time: Timestamp,
-    /// The time between this row and the one before is unknown.
+    /// Whether the time between this row and the previous row is unknown.
     pub after_unknown_gap: bool,
 }
 
@@ -62,10 +62,10 @@ struct Sections {
 }
 
 impl CsvLog {
-    /// Reads the header line and finds the columns; `name` is the file's, for messages.
+    /// Reads the header line and finds the columns. `name` is the file name for messages.
     ///
     /// # Errors
-    /// The source cannot be read, a column is missing, or the table of start times is faulty.
+    /// Fails if the source cannot be read, a column is missing, or the table of start times is faulty.
     pub fn open(source: Box<dyn Read>, name: &str, options: &CsvOptions) -> Result<Self, TableError> {
         let table = Table::new(source, name.to_owned(), Quotes::Literal)?;
         let columns = Columns { named: SampleColumns::new(table.header(), Some(&options.columns)), options };
@@ -76,10 +76,11 @@ impl CsvLog {
         Ok(Self { table, time_column, channels, charge_positive, sections, values })
     }
 
-    /// Reads one row into [`values`](Self::values); `None` = end of file, inner error = the row cannot be used.
+    /// Reads one row into [`values`](Self::values). Returns `None` at the end of the file, and an inner error if the
+    /// row cannot be used.
     ///
     /// # Errors
-    /// The source fails.
+    /// Fails if the source fails.
     pub fn next_row(&mut self) -> Result<Option<Result<RowTime, TableError>>, TableError> {
         let Some(row) = self.table.next_row()? else { return Ok(None) };
         self.values.clear();
@@ -117,24 +118,26 @@ impl Sections {
     }
 }
 
-/// Columns of the Battery Data Format: our name, the format's label, its machine-readable name. The first existing one is used.
+/// Columns of the Battery Data Format: packwatch's name, the format's label, and the format's machine-readable name.
+/// The first name that exists in the file is used.
 pub const BDF_COLUMNS: [(&str, &str, &str); 6] = [
     ("time_s", "Test Time / s", "test_time_second"),
     ("current_a", "Current / A", "current_ampere"),
     ("voltage_v", "Voltage / V", "voltage_volt"),
     ("temperature_c", "Surface Temperature T1 / degC", "temperature_t1_celsius"),
     ("temperature_c", "Ambient Temperature / degC", "ambient_temperature_celsius"),
-    // With the opposite sign, like the current.
+    // This column has the opposite sign, like the current.
     ("discharged_ah", "Net Capacity / Ah", "net_capacity_ah"),
 ];
 
-/// Finds the columns of samples: mapped by the user, or else packwatch's names or the Battery Data Format's.
+/// Finds the columns of samples. A column has the name that the user maps, else packwatch's name or the name in the
+/// Battery Data Format.
 pub struct SampleColumns<'a> {
     header: &'a Header,
     /// Maps a role to a column; `None` = the user cannot map columns.
     mapping: Option<&'a [(String, String)]>,
-    /// Whether the file is in the Battery Data Format. Its positive current is charge: the format does not state it, but counts
-    /// net capacity as charged minus discharged, and cyclers write it so.
+    /// Whether the file is in the Battery Data Format. A positive current in this format is a charge. The format does
+    /// not state the sign, but its net capacity is charged minus discharged capacity, and cyclers use this sign.
     pub is_bdf: bool,
 }
 
@@ -165,18 +168,19 @@ impl<'a> SampleColumns<'a> {
         self.header.find_any(names).ok_or_else(missing)
     }
 
-    /// Index of the column of a role; `ours` if the user maps none.
+    /// Index of the column of a role. If the user maps no column, its name is `ours`.
     ///
     /// # Errors
-    /// The file does not have it.
+    /// Fails if the file does not have it.
     pub fn required(&self, role: &str, ours: &'a str) -> Result<usize, TableError> {
         self.find(role, &self.mapped(role).map_or_else(|| self.usual(ours), |column| vec![column]))
     }
 
-    /// Index of the column of a role, `ours` if the user maps none; `None` = the file does not have it.
+    /// Index of the column of a role. If the user maps no column, its name is `ours`. `None` = the file does not have
+    /// this column.
     ///
     /// # Errors
-    /// The file does not have the column that the user maps.
+    /// Fails if the file does not have the column that the user maps.
     pub fn optional(&self, role: &str, ours: &'a str) -> Result<Option<usize>, TableError> {
         match self.mapped(role) {
             Some(column) => self.find(role, &[column]).map(Some),
@@ -184,10 +188,10 @@ impl<'a> SampleColumns<'a> {
         }
     }
 
-    /// Index of the section column, at whose values time restarts.
+    /// Index of the section column. Time restarts at each new value of this column.
     ///
     /// # Errors
-    /// The file does not have the column that the user maps.
+    /// Fails if the file does not have the column that the user maps.
     pub fn part(&self) -> Result<Option<usize>, TableError> {
         match self.mapped("section") {
             Some("") => Ok(None),
@@ -197,7 +201,7 @@ impl<'a> SampleColumns<'a> {
     }
 }
 
-/// Our column's names in the Battery Data Format.
+/// The names in the Battery Data Format of packwatch's column `ours`.
 fn bdf_names(ours: &str) -> Vec<&'static str> {
     BDF_COLUMNS.iter().filter(|of| of.0 == ours).flat_map(|of| [of.1, of.2]).collect()
 }
@@ -229,7 +233,8 @@ impl Columns<'_> {
         Ok(channels)
     }
 
-    /// One column for the first sensor, or a pattern for as many sensors as the file has; optional.
+    /// Finds the temperature columns, which are optional: one column for the first sensor, or a pattern for all sensors
+    /// of the file.
     fn temperatures(&self, channels: &mut Vec<(Channel, usize)>) -> Result<(), TableError> {
         if let Some(pattern) = self.named.mapped("temperature{n}") {
             self.named.find("temperature{n}", &[&numbered(pattern, 0)])?;

@@ -1,5 +1,6 @@
-//! Writes core events as log lines: on change, with fields, by severity. Error frames and lost or unsent frames are logged
-//! once and then as counts, because a bus without a partner causes thousands a second. As JSON lines, every event is written.
+//! Writes core events as log lines with fields; the severity decides the log level. Error frames, lost frames and
+//! unsent frames are logged once and then as counts, because a bus without another node causes thousands of them per
+//! second. In the JSON format, every event is written.
 
 mod text;
 
@@ -46,15 +47,15 @@ struct EventSum {
 }
 
 impl EventSum {
-    /// Adds frames. Returns the number to log if a line is due.
+    /// Adds frames. If a line is due, returns the number of frames to log.
     fn add(&mut self, time: Timestamp, frames: u64) -> Option<u64> {
         self.unreported = self.unreported.saturating_add(frames);
         let since_s = self.reported.map_or(f64::INFINITY, |reported| time.since(reported));
         if since_s < self.period_s {
             return None;
         }
-        // After a pause the next frames are logged at once. While frames continue, counts are logged after 10 s, then after
-        // twice the previous time, up to an hour.
+        // After a pause the next frames are logged at once. While frames continue, a count is logged after 10 s, and
+        // then after twice the previous time, but at least once an hour.
         let continues = since_s < 2.0 * self.period_s;
         self.period_s = if continues { (2.0 * self.period_s).min(3600.0) } else { 10.0 };
         self.reported = Some(time);
@@ -78,7 +79,7 @@ pub struct EventLog {
 }
 
 impl EventLog {
-    /// A log for these interfaces, in configuration order.
+    /// Creates a log for these interfaces, which are in configuration order.
     pub fn new(interfaces: Vec<String>) -> Self {
         let sums = vec![InterfaceSums::default(); interfaces.len()];
         Self { interfaces, sums }
@@ -239,7 +240,8 @@ impl EventLog {
     }
 }
 
-/// Removes the digits that binary arithmetic adds: rounds to nine significant digits, more than any value has.
+/// Rounds to nine significant digits, which removes the digits that binary arithmetic adds. No logged value has more
+/// significant digits.
 fn rounded(value: f64) -> f64 {
     format!("{value:.8e}").parse().unwrap_or(value)
 }
@@ -352,7 +354,7 @@ mod tests {
         let logged: Vec<u64> =
             (0..86_400 * 4).filter_map(|n| sum.add(Timestamp::from_secs(f64::from(n) * 0.25), 2)).collect();
         assert!((20..=45).contains(&logged.len()), "{} lines", logged.len());
-        assert_eq!(logged[0], 2, "the first is logged at once");
+        assert_eq!(logged[0], 2, "the first error frame is logged at once");
         assert_eq!(logged.iter().sum::<u64>() + sum.unreported, 86_400 * 4 * 2);
     }
 

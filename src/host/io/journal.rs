@@ -1,7 +1,7 @@
-//! The journal: every input of the core, in order, so that a replay reproduces the live run.
+//! The journal records every input of the core in order, so that a replay reproduces the live run.
 //!
-//! A text file. Frames are candump lines with nanosecond stamps, which `canplayer` can play; it skips the other lines.
-//! First line `PACKWATCH-JOURNAL 1`, then
+//! The journal is a text file. Frames are candump lines with nanosecond stamps, which `canplayer` can play; `canplayer`
+//! skips the other lines. The first line is `PACKWATCH-JOURNAL 1`. These lines follow:
 //!
 //! ```text
 //! (1700000000.123456789) can0 123#1122
@@ -15,10 +15,11 @@
 //! RELOAD (1700000000.600000000)
 //! ```
 //!
-//! `SECURED`: a frame of an authenticated message, with the freshness value that made its authenticator valid (`-`: not
-//! valid), so that a replay needs no key. `RELOAD`: from here on another configuration applies, which the journal does not
-//! contain. `RESTORE`: the first line of a run that restored a stored state, with the downtime (`-`: follows from the
-//! stamps). A last line without line feed was torn by a power cut and counts as a bad line, even if it can be parsed.
+//! `SECURED` is a frame of an authenticated message. Its last field is the freshness value that made the authenticator
+//! valid (`-`: not valid), so a replay needs no key. `RELOAD` means that another configuration applies after this line;
+//! the journal does not contain it. `RESTORE` is the first line of a run that restored a stored state, with the
+//! downtime (`-`: the stamps give it). If the last line has no line feed, a power cut has torn it. It counts as a bad
+//! line, even if it can be parsed.
 
 use std::io::{self, Write};
 
@@ -38,10 +39,10 @@ pub fn is_mark(line: &[u8]) -> bool {
     line.iter().position(|&b| b == b' ').is_some_and(|space| KEYWORDS.contains(&&line[..space]))
 }
 
-/// Parses such a line; `None` = its interface is unknown to `bus`.
+/// Parses a journal line for which [`is_mark`] is true. Returns `None` if `bus` does not know its interface.
 ///
 /// # Errors
-/// When the line breaks the journal's grammar.
+/// Fails if the line breaks the journal's grammar.
 pub fn parse_mark(line: &[u8], bus: impl FnOnce(&[u8]) -> Option<BusIndex>) -> Result<Option<Record>, LineError> {
     let line = line.strip_suffix(b"\r").unwrap_or(line);
     let space = memchr::memchr(b' ', line).unwrap_or(line.len());
@@ -122,7 +123,7 @@ impl<W: Write> JournalWriter<W> {
     /// Begins a journal; `interfaces` are the configured names in order.
     ///
     /// # Errors
-    /// Errors of `out`.
+    /// Returns the errors of `out`.
     pub fn new(mut out: W, interfaces: Vec<String>) -> io::Result<Self> {
         writeln!(out, "{HEADER}")?;
         Ok(Self { out, interfaces })
@@ -131,15 +132,15 @@ impl<W: Write> JournalWriter<W> {
     /// Records that a stored state was restored and how old it was. Must precede every input.
     ///
     /// # Errors
-    /// Errors of the file.
+    /// Returns the errors of the file.
     pub fn restored(&mut self, now: Timestamp, away: Downtime) -> io::Result<()> {
         write_mark(&mut self.out, "RESTORE", now, format_args!(" {away}"))
     }
 
-    /// Records that another configuration applies from now on.
+    /// Records that another configuration applies after this point.
     ///
     /// # Errors
-    /// Errors of the file.
+    /// Returns the errors of the file.
     pub fn reloaded(&mut self, time: Timestamp) -> io::Result<()> {
         write_mark(&mut self.out, "RELOAD", time, "")
     }
@@ -147,7 +148,7 @@ impl<W: Write> JournalWriter<W> {
     /// Appends one record, as the core receives it.
     ///
     /// # Errors
-    /// Errors of the file; invalid input for an interface that is not configured.
+    /// Returns the errors of the file; invalid input for an interface that is not configured.
     pub fn append(&mut self, record: &Record) -> io::Result<()> {
         let time = record.time;
         match &record.kind {
@@ -181,7 +182,7 @@ impl<W: Write> JournalWriter<W> {
     /// Passes everything to the operating system.
     ///
     /// # Errors
-    /// Errors of the file.
+    /// Returns the errors of the file.
     pub fn flush(&mut self) -> io::Result<()> {
         self.out.flush()
     }

@@ -1,8 +1,8 @@
 //! Lines of a plain, gzip or zstd file, read in large blocks and borrowed without copying.
 //!
-//! The content decides the compression, not the name. A line longer than the block is returned as [`RawLine::TooLong`] and
-//! skipped to its end. Bytes read from the file are counted for the progress bar. Compressed files are decompressed on a
-//! separate thread.
+//! The compression is detected from the content, not from the file name. A line longer than the block is returned as
+//! [`RawLine::TooLong`] and skipped to its end. Bytes read from the file are counted for the progress bar. Compressed
+//! files are decompressed on a separate thread.
 
 mod read_ahead;
 
@@ -14,7 +14,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use super::segments::JoinedFiles;
 use read_ahead::ReadAhead;
 
-/// Bytes read from the file or decompressor at once; also the longest line accepted. A CAN XL line has 4,200.
+/// Number of bytes read at once from the file or the decompressor, and longest accepted line. A CAN XL line has 4,200
+/// bytes.
 const BLOCK: usize = 256 * 1024;
 
 /// One line without its line feed.
@@ -22,7 +23,7 @@ const BLOCK: usize = 256 * 1024;
 pub enum RawLine<'a> {
     /// A whole line.
     Whole(&'a [u8]),
-    /// The file's last line, if it has no line feed; it may be torn.
+    /// The file's last line if it has no line feed. It may be torn.
     Last(&'a [u8]),
     /// A line longer than 256 KiB; it was skipped.
     TooLong,
@@ -31,7 +32,7 @@ pub enum RawLine<'a> {
 /// Opens a log. `-` is standard input; gzip and zstd are decompressed. `read_bytes` counts the bytes read from the file.
 ///
 /// # Errors
-/// When the file cannot be opened or its first bytes cannot be read.
+/// Fails if the file cannot be opened or its first bytes cannot be read.
 pub fn open(path: &Path, read_bytes: &Arc<AtomicU64>) -> io::Result<Box<dyn Read>> {
     open_parts(&[path.to_owned()], read_bytes)
 }
@@ -39,7 +40,7 @@ pub fn open(path: &Path, read_bytes: &Arc<AtomicU64>) -> io::Result<Box<dyn Read
 /// Like [`open`], for several files that together form one log.
 ///
 /// # Errors
-/// When the first file cannot be opened or its first bytes cannot be read.
+/// Fails if the first file cannot be opened or its first bytes cannot be read.
 pub(super) fn open_parts(paths: &[PathBuf], read_bytes: &Arc<AtomicU64>) -> io::Result<Box<dyn Read>> {
     let is_standard_input = paths.iter().any(|path| path == Path::new("-"));
     let raw: Box<dyn Read + Send> =
@@ -94,7 +95,7 @@ impl Lines {
         self.number
     }
 
-    /// Bytes read but not yet returned. They may end within a line, or be empty before the end of the source.
+    /// Bytes read but not yet returned. They may end within a line, and may be empty although the source has not ended.
     #[inline]
     pub(super) fn unread(&self) -> &[u8] {
         &self.buffer[self.start..self.end]
@@ -112,7 +113,7 @@ impl Lines {
     /// The next line, or `None` at the end.
     ///
     /// # Errors
-    /// Errors of the source, such as a damaged compressed file.
+    /// Returns the errors of the source, such as a damaged compressed file.
     pub fn next_line(&mut self) -> io::Result<Option<RawLine<'_>>> {
         let mut searched = self.start;
         let mut too_long = false;
@@ -138,7 +139,7 @@ impl Lines {
     /// The first line without consuming it (without its line feed).
     ///
     /// # Errors
-    /// Errors of the source.
+    /// Returns the errors of the source.
     pub fn peek(&mut self) -> io::Result<&[u8]> {
         loop {
             let unread = self.start..self.end;
@@ -162,7 +163,7 @@ impl Lines {
         self.start = 0;
     }
 
-    /// Reads more; `false` = end of the source.
+    /// Reads more bytes. Returns `false` at the end of the source.
     fn fill(&mut self) -> io::Result<bool> {
         if self.ended {
             return Ok(false);

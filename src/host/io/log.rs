@@ -1,8 +1,9 @@
 //! One stream of core inputs from logs of any format: journals, candump logs, CSV; plain, gzip or zstd.
 //!
-//! The first line decides the format (CSV also by file name). Several logs are read one after another on one clock. If a log,
-//! or a CSV section without a start time, begins before the end of the records so far, it is moved to one second after them,
-//! preceded by an unknown gap. [`LogCounts`] counts everything that does not become a record.
+//! The first line decides the format (CSV also by file name). Several logs are read one after another on one clock. If
+//! a log, or a CSV section without a start time, begins before the end of the records already read, an unknown gap
+//! follows these records, and the log or section is moved to one second after them. [`LogCounts`] counts everything
+//! that does not become a record.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
@@ -25,20 +26,21 @@ pub use super::record::Batch;
 use super::record::UNUSED;
 pub use super::table::TableError as LogError;
 
-/// Most names of unconfigured interfaces that are counted separately; further ones are counted together under "...".
+/// Maximum number of unconfigured interfaces that are counted separately. Further interfaces are counted together under
+/// "...".
 const MAX_FOREIGN_NAMES: usize = 64;
 
-/// Most interfaces, configured and adopted together; a log has a handful.
+/// Maximum number of interfaces, configured and adopted together. Usual logs have fewer than ten.
 pub const MAX_ADOPTED: usize = 64;
 
 /// Encodes the values of a CSV row in the frames that carry them; returns how many values no frame can carry.
 pub type RowEncoder = Box<dyn FnMut(&[(Channel, Option<f64>)], &mut Vec<(BusIndex, Frame)>) -> usize>;
 
-/// How to read logs.
+/// Options for reading logs.
 pub struct LogOptions {
     /// Configured interface names, in the order of their numbers.
     pub interfaces: Vec<String>,
-    /// Whether a bad line ends the reading.
+    /// Whether reading ends at the first bad line.
     pub strict: bool,
     /// How CSV logs are read.
     pub csv: CsvOptions,
@@ -69,11 +71,11 @@ pub struct LogCounts {
     pub foreign: BTreeMap<String, u64>,
     /// Records with a stamp before the preceding one.
     pub time_backwards: u64,
-    /// Parts that follow an unknown gap.
+    /// Number of parts that follow an unknown gap.
     pub unknown_gaps: u64,
     /// CSV values that no input frame can carry (out of the signal's range, or no such signal).
     pub uncarried_values: u64,
-    /// Segments of a journal missing before the first one read (deleted or not given).
+    /// Segments of a journal that are missing before the first segment read (deleted or not given).
     pub deleted_segments: u64,
 }
 
@@ -112,7 +114,7 @@ struct ReadState {
     latest: Option<Timestamp>,
     /// Whether the next record begins a file or section.
     fresh: bool,
-    /// Whether the time between the records so far and the next one is unknown.
+    /// Whether the time between the latest record and the next record is unknown.
     unknown: bool,
     /// Whether a file's stamps were moved to follow the previous file.
     has_moved_stamps: bool,
@@ -144,7 +146,8 @@ impl LogSource {
         }
     }
 
-    /// Also returns records of unconfigured interfaces: each interface gets the next number, up to [`MAX_ADOPTED`] in total.
+    /// Makes the source also return records of unconfigured interfaces. Each such interface gets the next number, up to
+    /// [`MAX_ADOPTED`] in total.
     pub fn adopt_foreign(&mut self) {
         self.state.adopt = true;
     }
@@ -154,7 +157,7 @@ impl LogSource {
         &self.state.interfaces
     }
 
-    /// Counts of what was read so far.
+    /// Counts of the lines and frames already read.
     pub fn counts(&self) -> &LogCounts {
         &self.state.counts
     }
@@ -164,7 +167,7 @@ impl LogSource {
         self.state.has_moved_stamps
     }
 
-    /// Bytes read from the files so far (compressed size).
+    /// Number of bytes already read from the files (compressed size).
     pub fn read_bytes(&self) -> &Arc<AtomicU64> {
         &self.read_bytes
     }
@@ -177,7 +180,7 @@ impl LogSource {
     /// The next record; `None` at the end of the last log.
     ///
     /// # Errors
-    /// When a log cannot be opened, a CSV header does not fit, or, if strict, at the first bad line.
+    /// Fails if a log cannot be opened or a CSV header does not fit. If `strict`, also fails at the first bad line.
     pub fn next_record(&mut self) -> Result<Option<Record>, LogError> {
         loop {
             if let Some(record) = self.queue.pop_front() {
@@ -226,10 +229,11 @@ impl LogSource {
         }
     }
 
-    /// The next records, at least one: those available without reading more of the file. `false` = end of the last log.
+    /// Reads the next records, at least one: the records that are available without reading more of the file. Returns
+    /// `false` at the end of the last log.
     ///
     /// # Errors
-    /// Like [`next_record`](Self::next_record), after all records before the error were returned.
+    /// Fails like [`next_record`](Self::next_record), after all records before the error were returned.
     pub fn next_batch(&mut self, batch: &mut Batch) -> Result<bool, LogError> {
         batch.len = 0;
         if let Some(open) = &mut self.current
@@ -269,15 +273,15 @@ impl LogSource {
     }
 }
 
-/// `.csv`, `.csv.gz`, `.csv.zst`.
+/// Whether the name ends with `.csv`, `.csv.gz` or `.csv.zst`.
 fn named_csv(path: &Path) -> bool {
     let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
     name.trim_end_matches(".gz").trim_end_matches(".zst").ends_with(".csv")
 }
 
 impl ReadState {
-    /// Fills slots with the next records of a text log while they are frames in whole lines already read from the file, but not
-    /// the first record of the file. Returns how many.
+    /// Fills slots with the next frames of a text log, as far as their whole lines are already in the buffer. The first
+    /// record of the file is excluded. Returns the number of frames.
     fn next_frames(&mut self, lines: &mut Lines, slots: &mut [Record]) -> usize {
         let Some(mut latest) = self.latest.filter(|_| !self.fresh) else { return 0 };
         let all = lines.unread();
@@ -422,7 +426,7 @@ impl ReadState {
         None
     }
 
-    /// The next good row's time, on the file's own clock.
+    /// The time of the next good row, on the file's own clock.
     fn next_row(&mut self, log: &mut CsvLog) -> Result<Option<Timestamp>, LogError> {
         loop {
             let row = match log.next_row() {
@@ -453,7 +457,7 @@ impl ReadState {
             self.shift_ns = 0;
             gap = std::mem::take(&mut self.unknown);
             if let Some(latest) = self.latest.filter(|&latest| raw < latest) {
-                // A part after an unknown gap starts 1 s after the records so far.
+                // A part after an unknown gap starts 1 s after the latest record.
                 self.shift_ns = latest.plus_nanos(1_000_000_000).nanos().saturating_sub(raw.nanos());
                 (gap, self.has_moved_stamps) = (true, true);
             }

@@ -1,4 +1,4 @@
-//! Files and sockets: logs in every format, journals, result files, CAN interfaces.
+//! Files and sockets: logs in every format, journals, result files and CAN interfaces.
 
 pub mod background_file;
 pub mod can_key;

@@ -1,11 +1,11 @@
-//! File names of a command: rejects duplicates, and makes short names that distinguish the files.
+//! Checks the file names of a command for duplicates, and creates short names that distinguish the files.
 
 use std::path::{Path, PathBuf};
 
 /// Rejects a file that is given twice.
 ///
 /// # Errors
-/// When a file is given twice.
+/// Fails if a file is given twice.
 pub fn check_distinct(files: &[PathBuf]) -> Result<(), String> {
     match files.iter().enumerate().find(|(index, file)| files[..*index].contains(file)) {
         Some((_, file)) => Err(format!("{}: named twice", file.display())),
@@ -13,7 +13,8 @@ pub fn check_distinct(files: &[PathBuf]) -> Result<(), String> {
     }
 }
 
-/// Short names that distinguish the files: folder and name without extensions, or the whole path if two are equal.
+/// Short names that distinguish the files: folder and name without extensions. If two short names are equal, both files
+/// get their whole path.
 pub fn short_names(files: &[PathBuf]) -> Vec<String> {
     let short = |path: &PathBuf| {
         let name = path.file_name().unwrap_or_default().to_string_lossy();

@@ -5,9 +5,10 @@ use std::path::{Path, PathBuf};
 /// Location of a socket, or of the daemon's state.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum PlaceSetting {
-    /// The folder created by systemd, else the standard one; if it cannot be used, the daemon runs without.
+    /// The folder created by systemd, else the standard folder. If the folder cannot be used, the daemon runs without
+    /// the socket or the stored state.
     Standard,
-    /// None.
+    /// The socket or the stored state is switched off.
     Off,
     /// This path; if a socket cannot be created there, the daemon does not start.
     At(PathBuf),
@@ -23,7 +24,7 @@ impl PlaceSetting {
         }
     }
 
-    /// The path and whether it is required; `None` = none.
+    /// The path, and whether it is required; `None` = switched off.
     pub fn resolve(&self, standard: impl FnOnce() -> (PathBuf, bool)) -> Option<(PathBuf, bool)> {
         match self {
             Self::Off => None,
@@ -33,7 +34,8 @@ impl PlaceSetting {
     }
 }
 
-/// The first folder in a systemd variable, which may list several separated by colons; the first is the unit's own.
+/// The first folder in a systemd variable. The variable may list several folders separated by colons; the first one
+/// belongs to the unit itself.
 pub fn first_folder(variable: &str) -> Option<PathBuf> {
     let folders = std::env::var_os(variable).filter(|folders| !folders.is_empty())?;
     std::env::split_paths(&folders).next()

@@ -17,11 +17,12 @@ pub struct Batch {
 }
 
 impl Batch {
-    /// Most records of a batch: 12 KiB, which fit into the processor's first-level cache together with the estimators.
+    /// Maximum number of records in a batch. They take 12 KiB, which fit into the processor's first-level cache
+    /// together with the estimators.
     pub const MAX: usize = 128;
 
-    /// Room for up to `max` (1 to [`MAX`](Self::MAX)) records. With more than one, the source may already have read beyond
-    /// the records that are used.
+    /// Creates a batch for up to `max` (1 to [`MAX`](Self::MAX)) records. If `max` is above 1, the source may have read
+    /// beyond the records that the caller uses.
     pub fn new(max: usize) -> Self {
         Self { slots: vec![UNUSED; max.clamp(1, Self::MAX)].into_boxed_slice(), len: 0, carries_ticks: false }
     }

@@ -1,7 +1,7 @@
-//! Files that a command writes: complete or not at all; every failure is reported.
+//! Files that a command writes. A file is written completely or not at all, and every failure is reported.
 //!
-//! A regular file is written as `NAME.part` in the same folder and renamed when it is complete; an abandoned part is deleted.
-//! `-` is standard output. A device or pipe is written directly.
+//! A regular file is written as `NAME.part` in the same folder and renamed when it is complete. If the command does not
+//! complete it, the part is deleted. `-` is standard output. A device or pipe is written directly.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
@@ -14,7 +14,7 @@ use super::place::with_suffix;
 #[derive(Debug)]
 pub struct ResultFile {
     path: PathBuf,
-    /// Path of the incomplete file; `None` = written in place.
+    /// Path of the incomplete file; `None` = the final path is written directly.
     part: Option<PathBuf>,
     out: BufWriter<File>,
 }
@@ -23,7 +23,7 @@ impl ResultFile {
     /// Starts writing `path`.
     ///
     /// # Errors
-    /// When the file cannot be created; the message names it.
+    /// Fails if the file cannot be created; the message names it.
     pub fn create(path: &Path) -> io::Result<Self> {
         let (file, part): (File, _) = if path == Path::new("-") {
             (io::stdout().as_fd().try_clone_to_owned()?.into(), None)
@@ -33,14 +33,14 @@ impl ResultFile {
             let part = with_suffix(path, ".part");
             (File::create(&part).map_err(|e| named(path, e))?, Some(part))
         };
-        // The buffer size.
+        // 256 KiB are the size of the buffer.
         Ok(Self { path: path.to_owned(), part, out: BufWriter::with_capacity(256 * 1024, file) })
     }
 
-    /// Completes the file: all bytes are on disk under the final name.
+    /// Completes the file. When this function returns, all bytes are on disk under the final name.
     ///
     /// # Errors
-    /// When the file cannot be written; the message names it.
+    /// Fails if the file cannot be written; the message names it.
     pub fn finish(mut self) -> io::Result<()> {
         self.out.flush().map_err(|e| named(&self.path, e))?;
         let Some(part) = self.part.as_ref() else { return Ok(()) };
@@ -75,17 +75,17 @@ impl Drop for ResultFile {
 /// Writes a whole file.
 ///
 /// # Errors
-/// Like [`ResultFile::create`] and [`ResultFile::finish`].
+/// Fails like [`ResultFile::create`] and [`ResultFile::finish`].
 pub fn write_file(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let mut file = ResultFile::create(path)?;
     file.write_all(bytes)?;
     file.finish()
 }
 
-/// Checks, before hours of work, that the result's path can be written and is not one of the inputs.
+/// Checks that the result's path can be written and is not one of the inputs. Commands call it before hours of work.
 ///
 /// # Errors
-/// States the result's path and the fault.
+/// Returns an error that states the result's path and the fault.
 pub fn check_place<'a>(result: &Path, mut inputs: impl Iterator<Item = &'a PathBuf>) -> Result<(), String> {
     if result == Path::new("-") {
         return Ok(());
@@ -94,7 +94,7 @@ pub fn check_place<'a>(result: &Path, mut inputs: impl Iterator<Item = &'a PathB
     if let Some(folder) = folder.filter(|folder| !folder.is_dir()) {
         return Err(format!("{}: cannot be written: folder {} does not exist", result.display(), folder.display()));
     }
-    // Detects the same file under another name.
+    // The canonical path detects the same file under another name.
     let place = fs::canonicalize(result).ok();
     let is_read = |input: &PathBuf| input == result || (place.is_some() && fs::canonicalize(input).ok() == place);
     if inputs.any(is_read) {
@@ -128,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn result_needs_folder_and_is_no_input() {
+    fn result_needs_folder_and_must_differ_from_inputs() {
         let folder = tempfile::tempdir().expect("a folder");
         let [log, other] = ["a.log", "b.log"].map(|name| folder.path().join(name));
         fs::write(&log, "").expect("written");
@@ -145,7 +145,7 @@ mod tests {
     fn full_disk_error_names_file() {
         let mut file = ResultFile::create(Path::new("/dev/full")).expect("opened");
         file.write_all(b"x").expect("buffered");
-        let error = file.finish().expect_err("no room");
+        let error = file.finish().expect_err("the disk is full");
         assert!(error.to_string().starts_with("/dev/full: cannot be written"), "{error}");
     }
 }

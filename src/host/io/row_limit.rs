@@ -1,12 +1,13 @@
-//! Limits the bytes of one row: a compressed file of a few kilobytes may expand to one line of gigabytes.
+//! Limits the bytes of one row, because a compressed file of a few kilobytes may expand to one line of gigabytes.
 //!
-//! In: the source of the table. Out: the same bytes, or an error after more than [`MAX_ROW_BYTES`] without a row.
+//! In: the source of the table. Out: the same bytes, or an error if more than [`MAX_ROW_BYTES`] contain no complete
+//! row.
 
 use std::cell::Cell;
 use std::io::{Error, ErrorKind, Read, Result};
 use std::rc::Rc;
 
-/// Longest row, bytes, including what is read ahead. The largest pack has 3,000 columns of 20 bytes.
+/// Longest row, bytes, including bytes that are read ahead. The largest pack has 3,000 columns of 20 bytes.
 pub(super) const MAX_ROW_BYTES: usize = 1 << 20;
 
 /// A source that fails when a row is too long.

@@ -1,9 +1,11 @@
-//! A recording in segments: compressed parts of one text. When their total size exceeds a limit, the oldest are deleted.
+//! Writes and finds recordings in segments, which are compressed parts of one text. If their total size exceeds a
+//! limit, the oldest segments are deleted.
 //!
-//! `FILE` is written as `FILE.000001.zst`, `FILE.000002.zst` and so on. Each segment is a complete zstd frame with whole lines
-//! that begins with the text's header, so it can be read alone. Read one after another, the segments are the text with
-//! repeated headers, which the reader skips. A power cut tears only the last segment, which is readable up to its last flush.
-//! The segments of an earlier run become `FILE.1.000001.zst` and so on; the limit covers both runs.
+//! `FILE` is written as `FILE.000001.zst`, `FILE.000002.zst` and so on. Each segment is a complete zstd frame with
+//! whole lines that begins with the text's header, so it can be read alone. Read one after another, the segments give
+//! the text with repeated headers, which the reader skips. A power cut tears only the last segment, which is readable
+//! up to its last flush. The segments of an earlier run become `FILE.1.000001.zst` and so on; the limit covers both
+//! runs.
 
 use std::collections::VecDeque;
 use std::fs::{self, File};
@@ -14,9 +16,10 @@ use zstd::stream::write::Encoder;
 
 use super::place::with_suffix;
 
-/// Smallest and largest size of a segment, bytes. Smaller ones would be mostly headers; deleting a larger one loses days.
+/// Smallest and largest size of a segment, bytes. Smaller segments would be mostly headers; the deletion of a larger
+/// segment would lose days.
 pub const SEGMENT_BYTES: std::ops::RangeInclusive<u64> = 64 << 10..=4 << 30;
-/// Default size of a segment, bytes: six hours of a pack of 96 cells.
+/// Default size of a segment, bytes; a pack of 96 cells fills it in six hours.
 pub const DEFAULT_SEGMENT_BYTES: u64 = 64 << 20;
 
 /// Size limits of a recording in segments.
@@ -32,7 +35,7 @@ impl SegmentLimits {
     /// Checks limits, which must allow at least two segments: the one being written and the one before it.
     ///
     /// # Errors
-    /// States the allowed values.
+    /// Returns an error that states the allowed values.
     pub fn new(total_bytes: u64, segment_bytes: u64) -> Result<Self, String> {
         if !SEGMENT_BYTES.contains(&segment_bytes) {
             let (least, greatest) = (SEGMENT_BYTES.start() >> 10, SEGMENT_BYTES.end() >> 30);
@@ -88,11 +91,11 @@ pub(super) struct LogParts {
     pub deleted: u64,
 }
 
-/// Takes the next log from a list of files: a single file; all segments of a base name, if no file has that name; or
-/// consecutive segments in the list.
+/// Takes the next log from a list of files. The log is a single file, or consecutive segments in the list. If a name in
+/// the list is not a file but the base name of segments, the log consists of all these segments.
 ///
 /// # Errors
-/// When a segment between two others is missing.
+/// Fails if a segment is missing between two others.
 pub(super) fn next_log(files: &mut VecDeque<PathBuf>) -> io::Result<Option<LogParts>> {
     let Some(first) = files.pop_front() else { return Ok(None) };
     let mut segments: Vec<Segment> = Vec::new();
@@ -124,7 +127,7 @@ impl JoinedFiles {
     /// Opens the first file.
     ///
     /// # Errors
-    /// When it cannot be opened, or the list is empty.
+    /// Fails if the first file cannot be opened, or if the list is empty.
     pub(super) fn open(paths: &[PathBuf]) -> io::Result<Self> {
         let mut rest: VecDeque<PathBuf> = paths.iter().cloned().collect();
         let first = rest.pop_front().ok_or(io::ErrorKind::NotFound)?;
@@ -180,7 +183,7 @@ impl SegmentWriter {
     /// Renames the segments of an earlier run and starts the first segment. The text itself contains the first `header`.
     ///
     /// # Errors
-    /// When a file cannot be renamed, deleted or created.
+    /// Fails if a file cannot be renamed, deleted or created.
     pub(super) fn create(base: &Path, header: &'static str, limits: SegmentLimits) -> io::Result<Self> {
         let complete = keep_earlier(base)?;
         let open = begin(&path_of(base, 1))?;
@@ -230,8 +233,9 @@ impl SegmentWriter {
 }
 
 fn begin(path: &Path) -> io::Result<Encoder<'static, CountedFile>> {
-    // Compression level of zstd. Frames of a pack of 96 cells shrink by a factor of 8.0; level 3, which needs 2 MB more memory,
-    // gives 7.2. The vehicle's package (`packaging/debian/build`) leaves out the compressors of the other levels.
+    // Compression level of zstd. It shrinks frames of a pack of 96 cells by a factor of 8.0. Level 3 needs 2 MB more
+    // memory and gives a factor of 7.2. The vehicle's package (`packaging/debian/build`) leaves out the compressors of
+    // the other levels.
     Encoder::new(CountedFile { file: File::create(path)?, bytes: 0 }, 1)
 }
 

@@ -1,4 +1,4 @@
-//! The core's state as a JSON file, written completely or not at all.
+//! The core's state as a JSON file, which is written completely or not at all.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -9,7 +9,7 @@ use crate::monitor::Snapshot;
 /// Stores a state. After a power cut the file contains either the old or the new state, complete.
 ///
 /// # Errors
-/// When the file cannot be written; the message names it.
+/// Fails if the file cannot be written; the message names it.
 pub fn write(path: &Path, snapshot: &Snapshot) -> io::Result<()> {
     let mut file = ResultFile::create(path)?;
     file.write_all(&serde_json::to_vec(snapshot)?)?;
@@ -20,8 +20,8 @@ pub fn write(path: &Path, snapshot: &Snapshot) -> io::Result<()> {
 /// Reads a stored state.
 ///
 /// # Errors
-/// When the file cannot be read or is not a snapshot. The message names the file and the reason, and the line if the
-/// content is invalid.
+/// Fails if the file cannot be read or is not a snapshot. The message names the file and the reason, and the line if
+/// the content is invalid.
 pub fn read(path: &Path) -> Result<Snapshot, String> {
     let bytes = std::fs::read(path).map_err(|error| format!("{}: cannot be read: {error}", path.display()))?;
     serde_json::from_slice(&bytes)

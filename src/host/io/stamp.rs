@@ -61,8 +61,8 @@ fn number(text: &str) -> Option<i64> {
     (text.len() <= 9 && text.bytes().all(|b| b.is_ascii_digit())).then(|| text.parse().ok())?
 }
 
-/// Days since 1970-01-01 in the Gregorian calendar (years counted from March, in eras of 400 years). For a date that does
-/// not exist it returns the number of another date.
+/// Days since 1970-01-01 in the Gregorian calendar (years counted from March, in eras of 400 years). If the date does
+/// not exist, the result is the number of another date.
 fn days_from_epoch(year: i64, month: i64, day: i64) -> i64 {
     let shifted = if month <= 2 { year - 1 } else { year };
     let (era, of_era) = (shifted.div_euclid(400), shifted.rem_euclid(400));

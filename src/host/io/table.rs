@@ -1,9 +1,9 @@
-//! The only reader of CSV tables: columns by name, rows streamed, every fault with its position.
+//! Reads all CSV tables. Columns are found by name, rows are streamed, and every fault has its position.
 //!
-//! In: CSV with one header line; plain, gzip or zstd. Out: [`Row`]s whose fields are read as text, numbers or stamps. Blanks
-//! around fields and a byte order mark are removed. Rows may be shorter or longer than the header; a missing field reads as
-//! empty. A row of more than a megabyte ends the reading. A fault reads `FILE:LINE: column NAME: found X, must be ALLOWED`. It
-//! does not end the reading, so the caller may skip the row.
+//! In: CSV with one header line, uncompressed or as gzip or zstd. Out: [`Row`]s whose fields are read as text, numbers
+//! or stamps. Blanks around fields and a byte order mark are removed. Rows may be shorter or longer than the header; a
+//! missing field counts as empty. A row of more than a megabyte ends the reading. A fault reads `FILE:LINE: column
+//! NAME: found X, must be ALLOWED`. It does not end the reading, so the caller may skip the row.
 
 use std::borrow::Cow;
 use std::cell::Cell;
@@ -17,7 +17,7 @@ use super::row_limit::RowLimit;
 use super::{lines, stamp};
 use crate::quantity::Timestamp;
 
-/// Default columns at whose values time restarts.
+/// Default section columns: time restarts at each new value of such a column.
 pub const PART_COLUMNS: [&str; 3] = ["cycle", "segment", "ref"];
 
 /// Allowed forms of a point in time.
@@ -35,7 +35,8 @@ pub enum TableError {
 }
 
 impl TableError {
-    /// A failed read: [`File`](Self::File) if the operating system reported it, else [`Data`](Self::Data), such as a damaged compressed file.
+    /// Converts a failed read. The result is [`File`](Self::File) if the operating system reported the error, else
+    /// [`Data`](Self::Data), for example for a damaged compressed file.
     pub fn of_io(text: String, error: &std::io::Error) -> Self {
         if error.raw_os_error().is_some() { Self::File(text) } else { Self::Data(text) }
     }
@@ -46,8 +47,8 @@ impl TableError {
 pub enum Quotes {
     /// Quotes may enclose fields that hold commas or line breaks.
     Enclose,
-    /// Every line is a row, whatever quotes it contains, because one stray quote would swallow all later rows. Quotes around a
-    /// whole number or column name are still removed.
+    /// Every line is a row, regardless of quotes in it. Otherwise, one stray quote would swallow all later rows. Quotes
+    /// around a whole number or column name are still removed.
     Literal,
 }
 
@@ -80,7 +81,7 @@ impl Table {
     /// Opens a file and reads its header; `-` is standard input.
     ///
     /// # Errors
-    /// The file cannot be read.
+    /// Fails if the file cannot be read.
     pub fn open(path: &Path) -> Result<Self, TableError> {
         let file = path.display().to_string();
         let source = lines::open(path, &Arc::default());
@@ -91,7 +92,7 @@ impl Table {
     /// Reads the header of decompressed text; `file` is its name in messages.
     ///
     /// # Errors
-    /// The source cannot be read.
+    /// Fails if the source cannot be read.
     pub fn new(source: Box<dyn Read>, file: String, quotes: Quotes) -> Result<Self, TableError> {
         let mut builder = csv::ReaderBuilder::new();
         builder.quoting(quotes == Quotes::Enclose).flexible(true).trim(csv::Trim::All);
@@ -111,7 +112,7 @@ impl Table {
     /// The next row; `None` at the end.
     ///
     /// # Errors
-    /// The source fails, for example a damaged compressed file.
+    /// Fails if the source fails, for example a damaged compressed file.
     pub fn next_row(&mut self) -> Result<Option<Row<'_>>, TableError> {
         self.since_row.set(0);
         let more = self.reader.read_byte_record(&mut self.record).map_err(|e| damaged(&self.header.file, &e))?;
@@ -147,7 +148,7 @@ impl Header {
     /// Index of the first of these columns that the table has.
     ///
     /// # Errors
-    /// The table has none of them.
+    /// Fails if the table has none of them.
     pub fn required(&self, names: &[&str]) -> Result<usize, TableError> {
         let missing = || self.fault(format!("no column {}, found {}", names.join(" or "), self.names.join(",")));
         self.find_any(names).ok_or_else(missing)
@@ -178,7 +179,7 @@ impl<'t> Row<'t> {
     /// A finite number; `None` for an empty field.
     ///
     /// # Errors
-    /// The field is neither.
+    /// Fails if the field is neither.
     pub fn number(&self, column: usize) -> Result<Option<f64>, TableError> {
         self.number_in(column, f64::MIN..=f64::MAX, "a finite number or an empty field")
     }
@@ -186,7 +187,7 @@ impl<'t> Row<'t> {
     /// A number in `range`; `None` for an empty field.
     ///
     /// # Errors
-    /// The field is neither; the message contains `allowed`.
+    /// Fails if the field is neither a number in `range` nor empty; the message contains `allowed`.
     pub fn number_in(
         &self,
         column: usize,
@@ -201,12 +202,12 @@ impl<'t> Row<'t> {
     /// A point in time: a date, or seconds.
     ///
     /// # Errors
-    /// The field is neither.
+    /// Fails if the field is neither.
     pub fn stamp(&self, column: usize) -> Result<Timestamp, TableError> {
         stamp::parse_stamp(&self.text(column)).ok_or_else(|| self.fault(column, STAMP))
     }
 
-    /// A fault of a field: what was found, and that it must be `allowed`.
+    /// A fault of a field. The message states the found text, and that it must be `allowed`.
     pub fn fault(&self, column: usize, allowed: &str) -> TableError {
         let found = self.bytes(column).map(String::from_utf8_lossy);
         let found = found.map_or("no such field".to_owned(), |found| format!("{found:?}"));

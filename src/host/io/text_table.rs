@@ -1,4 +1,4 @@
-//! Text tables for readers.
+//! Formats tables as text for people.
 
 /// Formats columns as wide as their widest entry. The first `left` columns are left-aligned, the others right-aligned.
 pub fn text_table<H: AsRef<str>>(heads: &[H], rows: impl IntoIterator<Item = Vec<String>>, left: usize) -> String {

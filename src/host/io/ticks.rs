@@ -1,10 +1,11 @@
-//! Generates the ticks for logs without ticks: the times between records when the core receives a tick.
+//! Generates ticks for logs that contain none. A tick is a time at which the core runs although no record arrives.
 //!
-//! Live, the driver ticks every [`TICK_PERIOD_MS`](crate::monitor::TICK_PERIOD_MS) while it is awake. A plain log states
-//! only when frames arrived, so this module generates the same ticks at multiples of the period: a tick at T comes after
-//! every record of T and before the first later one. After a record, the recorder stays awake for the sleep gap, like a
-//! daemon on a silent bus (so that a lost input is detected); after that it is assumed to be asleep. The first record,
-//! and the first one after sleep, wake it: one tick at that record's time. There are no ticks after the last record.
+//! Live, the driver ticks every [`TICK_PERIOD_MS`](crate::monitor::TICK_PERIOD_MS) while it is awake. A plain log
+//! states only when frames arrived, so this module generates the same ticks, at multiples of the period. A tick at time
+//! T comes after every record of time T and before the first later record. After a record, the recorder counts as awake
+//! for the sleep gap, like a daemon on a silent bus, so that the core detects a lost input. After the sleep gap, the
+//! recorder counts as asleep. The first record, and the first record after sleep, wake it: one tick has the time of
+//! that record. There are no ticks after the last record.
 //!
 //! The caller passes the time of the core's next necessary tick ([`Ticks::pop`]'s `due`). Earlier ticks are skipped
 //! because they would change nothing.
@@ -17,18 +18,19 @@ use crate::quantity::Timestamp;
 pub struct Ticks {
     period_ns: i64,
     sleep_gap_ns: i64,
-    /// Stamp of the next tick.
+    /// Time of the next tick.
     next_ns: i64,
     /// Ticks before this time may be popped.
     limit_ns: i64,
     /// Latest record; `None` before the first and after [`Ticks::sleep`].
     latest_ns: Option<i64>,
-    /// Time of the first tick after a hole, once the ticks before the hole have been popped.
+    /// Time of the first tick after a hole in the log, which follows the ticks before the hole.
     wake_ns: Option<i64>,
 }
 
 impl Ticks {
-    /// Ticks every `period_ms` (at least 1), which stop `sleep_gap_s` after a record if no other record follows.
+    /// Generates ticks every `period_ms` (at least 1). Ticks stop `sleep_gap_s` after a record if no other record
+    /// follows.
     pub fn new(period_ms: u32, sleep_gap_s: f64) -> Self {
         Self {
             period_ns: i64::from(period_ms.max(1)) * 1_000_000,
@@ -41,8 +43,8 @@ impl Ticks {
     }
 
     /// Announces a record at `time`. The caller then calls [`pop`](Self::pop) until `None`, and processes the record.
-    /// Returns whether the recorder was asleep before it (the first record, or one after a hole). A record slightly older
-    /// than the latest (interfaces merged out of order) causes no tick.
+    /// Returns whether the recorder was asleep before it (the first record, or one after a hole). A record slightly
+    /// older than the latest record (interfaces merged out of order) causes no tick.
     #[inline]
     pub fn advance(&mut self, time: Timestamp) -> bool {
         let time_ns = time.nanos();
@@ -76,13 +78,14 @@ impl Ticks {
         }
     }
 
-    /// Whether [`pop`](Self::pop) has work to do, regardless of what the core needs; false for most records.
+    /// Whether [`pop`](Self::pop) may return a tick, regardless of what the core needs. It is false for most records.
     #[inline]
     pub fn is_pending(&self) -> bool {
         self.next_ns < self.limit_ns || self.wake_ns.is_some()
     }
 
-    /// The next due tick at or after `due`, the time at which the core needs one (`None` = it needs none).
+    /// Returns the next tick at or after `due`, the time at which the core needs a tick. `due` is `None` if the core
+    /// needs no tick.
     pub fn pop(&mut self, due: Option<Timestamp>) -> Option<Timestamp> {
         if self.next_ns < self.limit_ns {
             let due_ns = due.map_or(self.limit_ns, |d| d.nanos().min(self.limit_ns));

@@ -1,4 +1,5 @@
-//! Unix sockets and their files. A dead daemon's socket file is replaced, a running daemon's is kept.
+//! Unix sockets and their files. The socket file of a daemon that has ended is replaced; that of a running daemon is
+//! kept.
 
 use std::fs::Permissions;
 use std::io::{self, ErrorKind};
@@ -11,7 +12,7 @@ use tokio::time::timeout;
 
 use super::place::first_folder;
 
-/// The folder of the service, and of a daemon started by root from a shell.
+/// The folder of the service, and of a daemon that root starts from a shell.
 const STANDARD_FOLDER: &str = "/run/packwatch";
 
 /// Default folder of a daemon's sockets: created by systemd, else `/run/packwatch` for root, else the user's own folder.
@@ -71,10 +72,11 @@ impl From<io::Error> for BindError {
 }
 
 impl BindError {
-    /// Decides how the server with option `--OPTION` continues; `None` = without the socket, which is logged.
+    /// Decides whether the server with option `--OPTION` continues without its socket. If it does, the reason is logged
+    /// and the result is `None`.
     ///
     /// # Errors
-    /// When another daemon uses the socket, or the socket is required.
+    /// Fails if another daemon uses the socket, or the socket is required.
     pub fn without_socket<T>(self, path: &Path, is_needed: bool, option: &str) -> Result<Option<T>, String> {
         let shown = path.display();
         match self {
@@ -110,7 +112,7 @@ async fn remove_stale(path: &Path) -> Result<(), BindError> {
         }
         Ok(_) => {}
     }
-    // A stopped daemon does not accept and its queue may be full, so the wait is limited.
+    // A suspended daemon does not accept connections, and its queue may be full, so the wait is limited.
     match timeout(Duration::from_secs(1), UnixStream::connect(path)).await {
         Ok(Err(error)) if error.kind() == ErrorKind::ConnectionRefused => Ok(std::fs::remove_file(path)?),
         Ok(Err(error)) if error.kind() == ErrorKind::NotFound => Ok(()),

@@ -36,7 +36,7 @@ impl Journal {
     /// Connects to the running journald.
     ///
     /// # Errors
-    /// When journald is not running, or its socket cannot be reached.
+    /// Fails if journald is not running, or its socket cannot be reached.
     pub(super) fn new() -> io::Result<Self> {
         let socket = UnixDatagram::unbound()?;
         socket.set_nonblocking(true)?;

@@ -13,7 +13,7 @@ use crate::quantity::CellIndex;
 use crate::quantity::catalogue::RecordedValues;
 use crate::status::document::{ControllerStatus, MessageFlood};
 
-/// Most raised alarms that are listed; all are counted.
+/// Maximum number of raised alarms that are listed; all are counted.
 const MAX_LISTED_ALARMS: usize = 1000;
 
 /// Summary of a replay.

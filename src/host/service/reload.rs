@@ -61,7 +61,7 @@ impl Reload {
     /// Catches SIGHUP, which no longer ends the program. Must be called inside the runtime.
     ///
     /// # Errors
-    /// When the signal cannot be caught.
+    /// Fails if the signal cannot be caught.
     pub(super) fn new(running: &Config) -> io::Result<Self> {
         Ok(Self {
             hangup: signal(SignalKind::hangup())?,

@@ -31,7 +31,7 @@ impl StatusClient {
     /// Reads the document as a line of JSON.
     ///
     /// # Errors
-    /// When no daemon sends it; names the socket and the next step.
+    /// Fails if no daemon sends it; names the socket and the next step.
     pub fn line(&self) -> Result<Vec<u8>, String> {
         self.read(PATIENCE).map_err(|error| explain(&self.path, &error))
     }
@@ -88,7 +88,7 @@ pub fn explain(path: &Path, error: &io::Error) -> String {
 /// Parses a document.
 ///
 /// # Errors
-/// When it is not a document, or has another version.
+/// Fails if it is not a document, or has another version.
 pub fn parse(line: &[u8]) -> Result<StatusDocument, String> {
     #[derive(Deserialize)]
     struct Versioned {

@@ -69,7 +69,7 @@ impl StatusServer {
     /// Opens the sockets. `None` = it failed (logged).
     ///
     /// # Errors
-    /// When another daemon uses them, or requested sockets cannot be created.
+    /// Fails if another daemon uses them, or requested sockets cannot be created.
     pub fn start(setting: &PlaceSetting) -> Result<Option<Self>, String> {
         let Some((path, is_needed)) = setting.resolve(|| (daemon_path(), false)) else { return Ok(None) };
         match Self::open(path.clone(), Limits { max_silence: MAX_SILENCE, stale: STALE }) {

@@ -9,8 +9,8 @@ use std::collections::VecDeque;
 use super::rows::{HistoryRow, RowBatch};
 use super::stamp::Stamp;
 
-/// Most rows kept while the disk accepts none: half a megabyte of memory; for a pack of 96 cells about 25 transitions, which
-/// are days of driving.
+/// Maximum number of rows kept while the disk accepts none: half a megabyte of memory; for a pack of 96 cells about 25
+/// transitions, which are days of driving.
 pub(super) const MAX_ROWS: usize = 5_000;
 
 /// Waiting rows, oldest first.

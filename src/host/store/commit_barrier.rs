@@ -16,8 +16,8 @@ use crate::monitor::Transmit;
 
 /// Longest wait for the disk.
 const MAX_WAIT: Duration = Duration::from_millis(200);
-/// Most held frames: the largest pack, with an alarm for each cell, sends that many in twice the longest wait. Beyond this
-/// number, held frames are released.
+/// Maximum number of held frames: the largest pack, with an alarm for each cell, sends that many in twice the longest
+/// wait. Beyond this number, held frames are released.
 const MAX_HELD: usize = 4096;
 
 /// Holds announcing frames while commits are running.

@@ -123,7 +123,7 @@ pub(super) struct Database {
 /// Limits of the history, beyond which the oldest segments are deleted.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct RowLimits {
-    /// Most rows kept.
+    /// Maximum number of rows kept.
     max_rows: i64,
     /// Longest age, years; `None` = unlimited.
     keep_years: Option<f64>,

@@ -19,7 +19,7 @@ pub(super) const DATABASE: &str = "packwatch.db";
 const LOCK: &str = "packwatch.lock";
 /// Suffixes of SQLite's files of a database. The log comes first, because SQLite would use it with the next database.
 const FILES: [&str; 3] = ["-wal", "-shm", ""];
-/// Most damaged databases kept, so that a disk that damages every file does not fill up with them.
+/// Maximum number of damaged databases kept, so that a disk that damages every file does not fill up with them.
 const MAX_SET_ASIDE: u32 = 8;
 
 /// The state folder.

@@ -11,7 +11,7 @@ use crate::monitor::LearnedCell;
 use crate::quantity::CellIndex;
 use crate::quantity::catalogue::Quantity;
 
-/// Most segments that are read, newest first: days of use.
+/// Maximum number of segments that are read, newest first: days of use.
 const MAX_SEGMENTS: usize = 16;
 
 /// The learned values of the cells of pack `pack`, ordered by cell.

@@ -38,7 +38,7 @@ pub struct HistoryQuery {
     pub since_ns: Option<i64>,
     /// Latest wall clock, ns since 1970.
     pub until_ns: Option<i64>,
-    /// Most rows, the latest ones; `None` = all.
+    /// Maximum number of rows, the latest ones; `None` = all.
     pub limit: Option<u32>,
 }
 
@@ -85,7 +85,7 @@ impl HistoryReader {
     /// Opens the store in a folder.
     ///
     /// # Errors
-    /// If it does not exist or cannot be read; the error names the file.
+    /// Fails if it does not exist or cannot be read; the error names the file.
     pub fn open(folder: &Path) -> Result<Self, String> {
         let path = folder.join(DATABASE);
         let named = |error: String| format!("{}: {error}", path.display());
@@ -107,7 +107,7 @@ impl HistoryReader {
     /// The vehicle of the history, as last configured.
     ///
     /// # Errors
-    /// When the file cannot be read.
+    /// Fails if the file cannot be read.
     pub fn vehicle(&self) -> Result<VehicleIdentity, String> {
         database::vehicle(&self.connection).map_err(|error| self.named(&error))
     }
@@ -115,7 +115,7 @@ impl HistoryReader {
     /// How many half-cycles the store contains.
     ///
     /// # Errors
-    /// When the file cannot be read.
+    /// Fails if the file cannot be read.
     pub fn extent(&self) -> Result<HistoryExtent, String> {
         // A single statement, so that a daemon cannot write in between.
         let sql = "SELECT (SELECT coalesce(max(id), 0) FROM pack), (SELECT count(*) FROM half_cycle), coalesce(sum(half_cycles * \
@@ -134,7 +134,7 @@ impl HistoryReader {
     /// Checks the hash chain.
     ///
     /// # Errors
-    /// When the file cannot be read to the end.
+    /// Fails if the file cannot be read to the end.
     pub fn verify(&self) -> Result<ChainReport, String> {
         self.at_once(segments::verify)
     }
@@ -142,7 +142,7 @@ impl HistoryReader {
     /// Why the history contradicts a chain end noted elsewhere; `None` = it does not.
     ///
     /// # Errors
-    /// When the file cannot be read.
+    /// Fails if the file cannot be read.
     pub fn contradiction(&self, noted: &NotedHead) -> Result<Option<String>, String> {
         self.at_once(|connection| segments::contradiction(connection, noted))
     }
@@ -171,7 +171,7 @@ impl HistoryReader {
     /// The selected rows, in the order of writing.
     ///
     /// # Errors
-    /// When the file cannot be read.
+    /// Fails if the file cannot be read.
     pub fn entries(&self, filter: &HistoryQuery) -> Result<Vec<HistoryEntry>, String> {
         let mut entries = Vec::new();
         for kind in filter.wanted_kinds() {
@@ -188,7 +188,7 @@ impl HistoryReader {
     /// Calls `take` with each selected row of one table, oldest first.
     ///
     /// # Errors
-    /// When the file cannot be read.
+    /// Fails if the file cannot be read.
     pub fn for_each(
         &self,
         kind: HistoryTable,

@@ -29,8 +29,8 @@ impl Recorder {
     /// Creates the store in a folder that contains none.
     ///
     /// # Errors
-    /// When the folder contains one, because a replay must never be written into the history of a real pack, or when it cannot
-    /// be created.
+    /// Fails if the folder contains one, because a replay must never be written into the history of a real pack, or
+    /// when it cannot be created.
     pub fn create(path: &Path, config: &StoreConfig, vehicle: &VehicleIdentity) -> Result<Self, String> {
         let shown = path.join(DATABASE).display().to_string();
         if folder::is_used(path) {

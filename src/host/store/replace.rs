@@ -14,7 +14,7 @@ use crate::quantity::Timestamp;
 /// of the next pack.
 ///
 /// # Errors
-/// If the folder contains no store, a daemon uses it, or it cannot be written; nothing has changed then.
+/// Fails if the folder contains no store, a daemon uses it, or it cannot be written; nothing has changed then.
 pub fn replace_pack(path: &Path) -> Result<i64, String> {
     let file = path.join(DATABASE);
     let named = |error: String| format!("{}: {error}", file.display());

@@ -94,7 +94,7 @@ impl StateDocument {
     /// Encodes the contents of its file.
     ///
     /// # Errors
-    /// When the result could not be read back: a number that is not finite is written as `null`.
+    /// Fails if the result could not be read back: a number that is not finite is written as `null`.
     fn encode(&self) -> Result<Vec<u8>, String> {
         let mut json = Vec::new();
         self.serialize(&mut serde_json::Serializer::with_formatter(&mut json, Rounding(CompactFormatter)))

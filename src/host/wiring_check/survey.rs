@@ -51,7 +51,7 @@ impl Survey {
 /// Reads the readable part of a configuration.
 ///
 /// # Errors
-/// When no interface is configured or no signal can be found; returns all faults.
+/// Fails if no interface is configured or no signal can be found; returns all faults.
 pub fn survey(path: &Path) -> Result<Survey, ConfigFaults> {
     let partial = PartialConfig::read(path)?;
     let found = partial.signals();

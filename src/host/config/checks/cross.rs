@@ -9,7 +9,7 @@ use crate::config::schema::keys::{
     CellVoltageInput, DiagnosticInput, MethodKey, Pack, PackVoltageInput, TemperatureInput,
 };
 
-/// Most interfaces of one daemon; more than any vehicle computer has, and fits one byte in journals.
+/// Maximum number of interfaces of one daemon; more than any vehicle computer has, and fits one byte in journals.
 const MAX_INTERFACES: usize = 16;
 /// Longest kernel name of an interface (IFNAMSIZ without the closing zero).
 const MAX_INTERFACE_NAME: usize = 15;

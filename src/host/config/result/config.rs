@@ -49,7 +49,7 @@ impl Config {
 pub struct StoreConfig {
     /// Shortest time between checkpoints of the state, s.
     pub checkpoint_s: f64,
-    /// Most rows kept in the history; above this number the oldest segments are deleted.
+    /// Maximum number of rows kept in the history; above this number the oldest segments are deleted.
     pub max_rows: u32,
     /// Longest age of rows, years; `None` = unlimited.
     pub keep_years: Option<f64>,

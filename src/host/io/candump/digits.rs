@@ -17,16 +17,16 @@ pub(super) static HEX: [u32; 256] = {
     table
 };
 
-/// Eight bytes of the text; zeros beyond its end, which callers never use.
+/// Eight bytes of the text. Bytes beyond its end are zeros, which callers never use.
 #[inline(always)]
 pub(super) fn word(text: &[u8], at: usize) -> u64 {
     text.get(at..).and_then(|rest| rest.first_chunk()).map_or(0, |bytes| u64::from_le_bytes(*bytes))
 }
 
-/// Six digits and `) `, in nanoseconds.
+/// Parses six digits followed by `) `; the result is in nanoseconds.
 #[inline(always)]
 pub(super) fn six_decimals(text: u64) -> Option<i64> {
-    // Two leading zeros make the six digits eight.
+    // Two leading zeros extend the six digits to eight.
     lanes(text ^ u64::from_le_bytes(*b"000000) "), 0x7F7F_7676_7676_7676).map(|digits| number::<1000>(digits << 16))
 }
 
@@ -36,7 +36,7 @@ pub(super) fn eight_digits(text: u64) -> Option<i64> {
     lanes(text ^ (u64::from(b'0') * ONES), 0x76 * ONES).map(number::<1>)
 }
 
-/// Returns the lanes, or `None` if adding `wrong` brings any of them to 0x80 or more.
+/// Returns the lanes. Returns `None` if adding `wrong` brings any lane to 0x80 or more.
 #[inline(always)]
 fn lanes(lanes: u64, wrong: u64) -> Option<u64> {
     ((lanes | lanes.wrapping_add(wrong)) & HIGHS == 0).then_some(lanes)
@@ -56,9 +56,9 @@ fn number<const UNIT: u64>(digits: u64) -> i64 {
 pub(super) fn eight_hex_bytes(text: [u8; 16]) -> Option<u64> {
     let (mut values, mut wrong) = ([0; 16], [0; 16]);
     for ((&byte, value), wrong) in text.iter().zip(&mut values).zip(&mut wrong) {
-        // 0 to 9 for a digit, at least 16 for anything else.
+        // The value is 0 to 9 for a digit and at least 16 for any other character.
         let digit = byte.wrapping_add(0xFF - b'9').saturating_sub(6).wrapping_sub(0xF0);
-        // 10 to 15 for a letter, at least 16 for anything else.
+        // The value is 10 to 15 for a letter of a hex digit and at least 16 for any other character.
         let letter = (byte & 0xDF).wrapping_sub(b'A').saturating_add(10);
         *value = digit.min(letter);
         *wrong = *value & 0xF0;

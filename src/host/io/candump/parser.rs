@@ -1,9 +1,9 @@
 //! Parser of candump lines.
 //!
-//! In: text that begins with a line; the parser ignores what follows the line feed. Out: the line, or the first position at
-//! which it violates the grammar. Nothing is allocated and nothing is read twice. The parts that nearly all lines share have
-//! fast paths that convert several bytes at a time: the same second as in the previous line, a known interface, a payload of
-//! eight bytes.
+//! In: text that begins with a line; the parser ignores what follows the line feed. Out: the line, or the first
+//! position at which it violates the grammar. Nothing is allocated and nothing is read twice. Parts that nearly all
+//! lines have in common use fast paths, which convert several bytes at a time. These parts are: the same second as in
+//! the previous line, a known interface, and a payload of eight bytes.
 
 use super::digits::{HEX, eight_digits, eight_hex_bytes, six_decimals, word};
 use super::{Line, LineError};
@@ -20,7 +20,7 @@ const NO_HEAD: [u64; 2] = [0, u64::MAX];
 struct Interface {
     /// The name and the space after it; different names have different words.
     name: u64,
-    /// Selects the bytes of the name and the space in a word of text.
+    /// Mask that selects the bytes of the name and the space in a word of text.
     mask: u64,
     len: usize,
     bus: BusIndex,
@@ -43,7 +43,8 @@ impl Interface {
     }
 }
 
-/// Parses lines one after another. Remembers the second of the previous line, since thousands of lines share it.
+/// Parses lines one after another. The parser remembers the second of the previous line, because thousands of lines
+/// share it.
 #[derive(Debug, Clone)]
 pub struct LineParser {
     interfaces: Vec<Interface>,
@@ -67,8 +68,8 @@ pub struct ParsedLine<'a> {
 pub(crate) struct LineHead<'a> {
     pub time: Timestamp,
     pub interface: &'a [u8],
-    /// Number of the interface if the parser knows its name; always `None` for names of more than seven bytes, and after
-    /// more than one space.
+    /// Number of the interface if the parser knows its name. It is always `None` if the name has more than seven bytes
+    /// or follows more than one space.
     pub bus: Option<BusIndex>,
     /// The rest of the line.
     pub rest: Cursor<'a>,
@@ -83,7 +84,7 @@ pub(crate) enum Body {
 }
 
 impl LineParser {
-    /// A parser that knows these interfaces, numbered in this order.
+    /// Creates a parser that knows these interfaces, numbered in this order.
     pub fn new(interfaces: &[String]) -> Self {
         let known = (0..u8::MAX).map(BusIndex).zip(interfaces);
         let interfaces = known.filter_map(|(bus, name)| Interface::new(name.as_bytes(), bus)).collect();
@@ -93,7 +94,7 @@ impl LineParser {
     /// Parses the line at the start of `text`.
     ///
     /// # Errors
-    /// When the line begins with `(` and violates the grammar.
+    /// Fails if the line begins with `(` and violates the grammar.
     pub fn parse<'a>(&mut self, text: &'a [u8]) -> Result<ParsedLine<'a>, LineError> {
         if text.first() != Some(&b'(') {
             return Ok(ParsedLine { line: drop_count(text).unwrap_or(Line::Other), len: 0 });
@@ -148,12 +149,12 @@ impl LineParser {
     /// The interface's name, its number if known, and the space after it.
     #[inline(always)]
     fn interface<'a>(&self, cursor: &mut Cursor<'a>) -> Result<(&'a [u8], Option<BusIndex>), LineError> {
-        // The position after the name depends on its length. Comparing with known names lets the processor predict it,
-        // whereas counting bytes would make it wait.
+        // The position after the name depends on its length. If the name is compared with known names, the processor
+        // predicts this position; if its bytes were counted, the processor would wait.
         let ahead = cursor.ahead().unwrap_or(&[0; 8]);
         let name = u64::from_le_bytes(*ahead);
         let is_known = |known: &&Interface| name & known.mask == known.name;
-        // Most logs have one interface, so the first is compared without a loop.
+        // Most logs have one interface, so the first known name is compared without a loop.
         let known = self.interfaces.first().filter(is_known);
         if let Some(known) = known.or_else(|| self.interfaces.iter().skip(1).find(is_known)) {
             cursor.at += known.len;
@@ -186,7 +187,7 @@ fn drop_count(line: &[u8]) -> Option<Line<'_>> {
     Some(Line::Dropped { interface, frames })
 }
 
-/// A position in a line. Functions for rare forms take it by value, so that it stays in registers.
+/// A position in a line. Functions for rare forms take the cursor by value, so that it stays in registers.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Cursor<'a> {
     pub(super) text: &'a [u8],
@@ -223,13 +224,13 @@ impl<'a> Cursor<'a> {
         found
     }
 
-    /// Value of the hex digit at `offset` from here; above 15 if it is not a hex digit.
+    /// Value of the hex digit at `offset` from this position; above 15 if the byte is not a hex digit.
     fn hex_at(&self, offset: usize) -> u32 {
         self.text.get(self.at + offset).map_or(u32::MAX, |&b| HEX[usize::from(b)])
     }
 
-    /// `(` seconds `.` six or nine digits `)`, in nanoseconds. A minus sign is accepted because [`super::write_stamp`] writes
-    /// one for times before the clock's origin.
+    /// Parses `(` seconds `.` six or nine digits `)`; the result is in nanoseconds. A minus sign is accepted because
+    /// [`super::write_stamp`] writes one for times before the clock's origin.
     pub(super) fn stamp(&mut self) -> Result<Timestamp, LineError> {
         self.demand(b'(', "a stamp in parentheses")?;
         let negative = self.take(b'-');
@@ -280,7 +281,8 @@ impl<'a> Cursor<'a> {
         Ok((name, self.at))
     }
 
-    /// A frame with a standard identifier and eight bytes, and the position of the line's end after it; `None` = another form.
+    /// Parses a frame with a standard identifier and eight bytes, and the line's end after it. Also returns the
+    /// position of the line's end. `None` = the frame has another form.
     #[inline(always)]
     pub(crate) fn usual_frame_and_end(&self) -> Option<(Frame, usize)> {
         let text: &[u8; 21] = self.ahead()?;
@@ -292,8 +294,8 @@ impl<'a> Cursor<'a> {
         Some((Frame::of_word(id, eight_hex_bytes(*text[4..].first_chunk()?)?, 8), self.at + 20))
     }
 
-    /// Any frame and the line's end after it: the content, whether it was sent by the machine that recorded it, and the
-    /// position of the line's end.
+    /// Parses any frame and the line's end after it. Returns the content, whether the recording machine sent the frame,
+    /// and the position of the line's end.
     #[inline(never)]
     pub(crate) fn frame_and_end(mut self) -> Result<(Body, bool, usize), LineError> {
         let body = self.frame()?;
@@ -339,7 +341,7 @@ impl<'a> Cursor<'a> {
         Ok(Body::Error(class))
     }
 
-    /// `N` hex digits.
+    /// Parses `N` hex digits.
     fn number<const N: usize>(&mut self) -> Result<u32, LineError> {
         let mut value = 0;
         for _ in 0..N {
@@ -379,7 +381,8 @@ impl<'a> Cursor<'a> {
         self.expect(Frame::remote(id, len), "a length of 0 to 8")
     }
 
-    /// `_9` to `_F` after a length of 8: the length code on the wire. The payload still has 8 bytes.
+    /// Parses `_9` to `_F` after a length of 8, which is the length code on the wire. The payload has 8 bytes for all
+    /// these codes.
     fn raw_length_code(&mut self, len: usize) -> Result<(), LineError> {
         if len != 8 || !self.take(b'_') {
             return Ok(());
@@ -400,7 +403,7 @@ impl<'a> Cursor<'a> {
         self.expect(Frame::fd_padded(id, flags & 1 != 0, flags & 2 != 0, len, &data), "at most 64 bytes")
     }
 
-    /// Bytes of two hex digits, optionally separated by dots, until `data` is full.
+    /// Parses bytes of two hex digits, optionally separated by dots, until `data` is full.
     fn bytes(&mut self, data: &mut [u8]) -> Result<usize, LineError> {
         let mut len = 0;
         while len < data.len() {
@@ -423,7 +426,8 @@ impl<'a> Cursor<'a> {
         Ok(len)
     }
 
-    /// vcid(2) prio(3) # flags(2) : sdt(2) : af(8) # bytes.
+    /// Parses a CAN XL frame: vcid(2) prio(3) # flags(2) : sdt(2) : af(8) # bytes. Numbers in parentheses count hex
+    /// digits.
     fn xl(&mut self) -> Result<(), LineError> {
         const HEADER: &str = "CAN XL's flags:sdt:af#";
         self.number::<5>()?;

@@ -1,23 +1,23 @@
 //! A reader that decompresses ahead on its own thread, because decompression costs several times as much as parsing.
 //!
-//! Bytes and errors keep their order. At most [`BLOCKS`] blocks are in flight and are reused, so memory is bounded and nothing
-//! is allocated while reading. After the reader is dropped, the thread ends with its next block. Nobody waits for it,
-//! because its source may be a pipe that stays silent for long.
+//! Bytes and errors keep their order. At most [`BLOCKS`] blocks exist at a time. They are reused, so memory is bounded
+//! and nothing is allocated while reading. After the reader is dropped, the thread ends with its next block. The drop
+//! does not wait for the thread, because the source may be a pipe that stays silent for a long time.
 
 use std::io::{self, Read};
 use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
 use std::thread;
 
-/// Blocks in flight: one being filled, one being read, two to absorb delays.
+/// Number of blocks: one being filled, one being read, and two to absorb delays.
 const BLOCKS: usize = 4;
 
 /// The reading end.
 pub(super) struct ReadAhead {
-    /// Blocks in order; an empty block marks the end.
+    /// Filled blocks in order; an empty block marks the end.
     pieces: Receiver<io::Result<Vec<u8>>>,
     used: Sender<Vec<u8>>,
     block: Vec<u8>,
-    /// Bytes of the block already read.
+    /// Number of bytes of the current block that were already read.
     given: usize,
     ended: bool,
 }
@@ -34,7 +34,7 @@ impl ReadAhead {
         Ok(Self { pieces, used, block: Vec::new(), given: 0, ended: false })
     }
 
-    /// Waits for the next block; `false` = end of the source.
+    /// Waits for the next block. Returns `false` at the end of the source.
     fn next_block(&mut self) -> io::Result<bool> {
         if self.ended {
             return Ok(false);
@@ -137,7 +137,7 @@ mod tests {
         struct Panics;
         impl Read for Panics {
             fn read(&mut self, _: &mut [u8]) -> io::Result<usize> {
-                panic!("as a decoder with a fault would");
+                panic!("simulates a faulty decoder");
             }
         }
         let mut ahead = ReadAhead::new(Panics, 100).expect("a thread");

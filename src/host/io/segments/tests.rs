@@ -1,4 +1,4 @@
-//! Segments: written and read back.
+//! Writes segments and reads them back.
 
 #![allow(clippy::unwrap_used, reason = "tests may panic")]
 
@@ -55,7 +55,7 @@ fn segments_join_to_text_with_repeated_headers() {
     assert_eq!(whole, segments.concat());
     let without: String = whole.split_inclusive('\n').filter(|line| line.trim_end() != HEADER).collect();
     assert_eq!(without, lines[1..].concat());
-    assert_eq!(parts_of(&parts.paths).unwrap(), parts, "the segments named one by one are the same log");
+    assert_eq!(parts_of(&parts.paths).unwrap(), parts, "segments that are named one by one form the same log");
 }
 
 #[test]
@@ -68,8 +68,8 @@ fn oldest_segments_are_deleted_beyond_limit() {
     let parts = parts_of(std::slice::from_ref(&base)).unwrap();
     let bytes: u64 = parts.paths.iter().map(|path| fs::metadata(path).unwrap().len()).sum();
     assert!(parts.deleted > 0 && bytes <= limits.total_bytes, "{} deleted, {bytes} bytes", parts.deleted);
-    assert!(bytes > limits.total_bytes / 2, "no more is deleted than must be: {bytes} bytes");
-    assert!(read(&parts).ends_with(lines.last().unwrap()), "the newest stay");
+    assert!(bytes > limits.total_bytes / 2, "only as many segments are deleted as necessary: {bytes} bytes");
+    assert!(read(&parts).ends_with(lines.last().unwrap()), "the newest segments are kept");
 }
 
 #[test]
@@ -85,7 +85,7 @@ fn earlier_run_is_kept_within_limit() {
     write(&base, limits, &text(40_000));
     let bytes: u64 = fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().metadata().unwrap().len()).sum();
     assert!(bytes <= limits.total_bytes, "{bytes} bytes");
-    assert!(find(&earlier).unwrap().is_empty(), "the earlier run goes first");
+    assert!(find(&earlier).unwrap().is_empty(), "segments of the earlier run are deleted first");
 }
 
 #[test]
@@ -113,7 +113,7 @@ fn missing_segment_is_rejected_other_files_ignored() {
         fs::write(folder.path().join(name), "").unwrap();
     }
     let plain = parts_of(std::slice::from_ref(&base)).unwrap();
-    assert_eq!(plain.paths, std::slice::from_ref(&base), "a file of that name is the log");
+    assert_eq!(plain.paths, std::slice::from_ref(&base), "if a file has the base name, it is the log");
     fs::remove_file(&base).unwrap();
     fs::remove_file(path_of(&base, 2)).unwrap();
     let error = parts_of(std::slice::from_ref(&base)).unwrap_err().to_string();

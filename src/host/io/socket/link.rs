@@ -1,9 +1,10 @@
-//! One interface during the daemon's whole life: receives, sends, and survives that the interface goes down, is removed and
-//! returns. Every change is a [`BusEvent`]; no failure here ends the program.
+//! One interface during the daemon's whole life. The link receives and sends, and continues when the interface goes
+//! down, is removed or returns. It reports every change as a [`BusEvent`]; no failure here ends the program.
 //!
-//! If the interface goes down, the socket is kept: it stays bound, so the first frame after the interface comes up is not
-//! lost. If the interface is removed, its socket is dead even if an interface of the same name returns, and a new one is opened.
-//! One task uses the socket for both directions, because the kernel hides our own frames only from the socket that sent them.
+//! If the interface goes down, the socket is kept: it stays bound, so the first frame after the interface comes up is
+//! not lost. If the interface is removed, its socket is dead even if an interface of the same name returns, and a new
+//! one is opened. One task uses the socket for both directions, because the kernel hides the daemon's own frames only
+//! from the socket that sent them.
 
 use std::io;
 use std::sync::Arc;
@@ -26,17 +27,17 @@ use crate::quantity::{BusIndex, Timestamp};
 
 /// First pause before an interface that is down or missing is checked again.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
-/// Longest such pause: a check costs a few system calls; a missed frame is lost.
+/// Longest pause before such a check. A check costs a few system calls, but each frame that is missed is lost.
 const LONGEST_PAUSE: Duration = Duration::from_secs(1);
 /// Frames read before other tasks run: 8 ms of a full 1 Mbit/s bus, less than one tick.
 const READ_BATCH: usize = 64;
-/// Frames that wait to be sent: many times the status, health and alarm frames of a second.
+/// Maximum number of frames that wait to be sent, many times the number of status, health and alarm frames per second.
 const SEND_QUEUE: usize = 256;
 
 /// Settings of a link.
 #[derive(Debug, Clone)]
 pub struct LinkConfig {
-    /// Its number.
+    /// Number of the interface.
     pub bus: BusIndex,
     /// Kernel name.
     pub interface: String,
@@ -48,7 +49,7 @@ pub struct LinkConfig {
     pub patterns: Vec<(u32, u32)>,
     /// Whether every frame is wanted.
     pub all: bool,
-    /// Receive buffer to request, bytes.
+    /// Size of the receive buffer to request, bytes.
     pub receive_buffer_bytes: usize,
 }
 
@@ -100,9 +101,9 @@ pub struct Link {
     unsent: Arc<AtomicU64>,
     health: Arc<SharedHealth>,
     state: LinkState,
-    /// When the state was noted.
+    /// Time when the state was noted.
     state_since: Timestamp,
-    /// Frames lost since the last report, in the kernel or because our inbox was full.
+    /// Number of frames lost since the last report, in the kernel or because the daemon's inbox was full.
     lost: u64,
     report: Interval,
     pause: Duration,
@@ -113,10 +114,10 @@ pub struct Link {
 struct OpenSocket {
     socket: AsyncFd<RawSocket>,
     mapper: StampMapper,
-    /// Frames of one call; kept to reuse its memory.
+    /// Frames of the latest call; kept to reuse the memory.
     received: Vec<RawRead>,
     dropped_total: u32,
-    /// The next frame to send, waiting for room in the kernel.
+    /// The next frame to send, which waits for room in the kernel.
     pending: Option<QueuedFrame>,
 }
 
@@ -134,7 +135,7 @@ impl Link {
     pub fn new(config: LinkConfig, clock: MappedClock, inbox: mpsc::Sender<Record>) -> (Self, LinkOutput) {
         let (queue, outgoing) = mpsc::channel(SEND_QUEUE);
         let unsent = Arc::new(AtomicU64::new(0));
-        // Period of loss reports; a stalled bus must not fill the journal.
+        // Period of loss reports, limited so that a stalled bus does not fill the journal.
         let mut report = interval(Duration::from_millis(250));
         report.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let health = Arc::<SharedHealth>::default();
@@ -212,8 +213,8 @@ impl Link {
                 ready = open.socket.ready(interest) => match ready {
                     Ok(mut guard) => {
                         let ready = guard.ready();
-                        // Cleared before the work, so that an edge during the work sets it again. The loop reads until the
-                        // socket is empty.
+                        // The readiness is cleared before the work, so that an edge during the work sets it again. The
+                        // loop reads until the socket is empty.
                         guard.clear_ready_matching(if ready.is_writable() { Ready::WRITABLE } else { Ready::EMPTY });
                         guard.clear_ready_matching(Ready::READABLE | Ready::ERROR);
                         Ok(())
@@ -224,7 +225,8 @@ impl Link {
                 _ = self.report.tick() => {
                     self.note_dropped(open);
                     if self.has_losses() {
-                        // Later frames must not have an earlier time than an event, so frames in the socket are read first.
+                        // A frame after an event must not have an earlier time than the event, so frames in the socket
+                        // are read first.
                         let noticed = Reading::now();
                         if !self.receive_all(open).await {
                             return ServiceEnd::Dead;
@@ -253,14 +255,14 @@ impl Link {
         }
     }
 
-    /// Reads until the socket is empty, yielding to other tasks; `false` = the socket is dead.
+    /// Reads until the socket is empty, and yields to other tasks. Returns `false` if the socket is dead.
     async fn receive_all(&mut self, open: &mut OpenSocket) -> bool {
         loop {
             for _ in 0..READ_BATCH / CALL_BATCH {
                 open.received.clear();
                 match open.socket.get_ref().receive(&mut open.received) {
                     Ok(()) => {
-                        // One reading for all frames, because one call read them at the same moment.
+                        // One clock reading serves all frames, because one call read them at the same moment.
                         let reading = Reading::now();
                         for received in &open.received {
                             self.take(&mut open.mapper, received, reading).await;
@@ -320,7 +322,7 @@ impl Link {
         self.health.count(|counts| counts.kernel_dropped += dropped);
     }
 
-    /// Sends the waiting frame if there is room; `false` = the socket is dead.
+    /// Sends the waiting frame if there is room. Returns `false` if the socket is dead.
     async fn send_pending(&mut self, open: &mut OpenSocket) -> bool {
         let Some(outgoing) = open.pending.take() else { return true };
         // A frame that has waited this long is outdated and is dropped.
@@ -337,7 +339,7 @@ impl Link {
         true
     }
 
-    /// Handles a socket error and notes the interface's state; `false` = the socket is dead.
+    /// Handles a socket error and notes the interface's state. Returns `false` if the socket is dead.
     async fn survives(&mut self, error: Errno) -> bool {
         let (state, is_known, is_alive) = match error {
             Errno::ENETDOWN => (Some(LinkState::Down), true, true),
@@ -355,7 +357,8 @@ impl Link {
         is_alive
     }
 
-    /// Checks whether an interface that was down is up again; `false` = the socket is bound to a removed interface.
+    /// Checks whether an interface that was down is up again. Returns `false` if the socket is bound to a removed
+    /// interface.
     async fn look(&mut self, open: &OpenSocket) -> bool {
         if index_of(&self.config.interface).ok() != Some(open.socket.get_ref().index) {
             return false;
@@ -366,7 +369,7 @@ impl Link {
         true
     }
 
-    /// Waits without a socket and drops the frames to send.
+    /// Waits while there is no socket, and drops the frames to send.
     async fn wait(&mut self) -> ServiceEnd {
         let until = Instant::now() + self.lengthen_pause();
         loop {
@@ -432,13 +435,14 @@ impl Link {
         }
     }
 
-    /// Reports an event. Events are never dropped: a full inbox is waited for, while the kernel queues, drops and counts frames.
+    /// Reports an event. Events are never dropped. If the inbox is full, the link waits; in that time the kernel queues
+    /// frames, or drops and counts them.
     async fn notify(&self, time: Timestamp, event: BusEvent) {
         // An error means that the daemon is stopping and no longer receives.
         let _ = self.inbox.send(Record::bus(time, self.config.bus, event)).await;
     }
 
-    /// Logs a problem once, until a different one occurs.
+    /// Logs a problem unless it is the same as the last logged problem.
     fn problem(&mut self, error: &io::Error) {
         let text = error.to_string();
         if self.last_problem.as_ref() != Some(&text) {

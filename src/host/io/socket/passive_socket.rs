@@ -1,4 +1,5 @@
-//! Receives from an interface without blocking: frames (including this computer's own), error frames, the number of dropped frames.
+//! Receives from an interface without blocking: frames (including frames that this computer sends), error frames, and
+//! the number of dropped frames.
 
 use std::io;
 
@@ -12,12 +13,12 @@ use crate::io::clock::{MappedClock, Reading, StampMapper};
 use crate::monitor::{BusEvent, Record};
 use crate::quantity::BusIndex;
 
-/// Listens on one interface; sends nothing and never waits.
+/// Listens on one interface. It sends nothing and never waits.
 #[derive(Debug)]
 pub struct PassiveSocket {
     socket: RawSocket,
     mapper: StampMapper,
-    /// Frames of one call; kept to reuse its memory.
+    /// Frames of the latest call; kept to reuse the memory.
     received: Vec<RawRead>,
     dropped_total: u32,
     /// The clocks before the next read.
@@ -28,7 +29,7 @@ impl PassiveSocket {
     /// Opens the interface for all identifiers, classic and FD. Also returns whether the interface is up.
     ///
     /// # Errors
-    /// When the interface does not exist, or this kernel has no SocketCAN.
+    /// Fails if the interface does not exist, or this kernel has no SocketCAN.
     pub fn open(interface: &str, clock: MappedClock) -> io::Result<(Self, bool)> {
         let socket = RawSocket::open(interface, true, &[CanFilter::new(0, 0)], DEFAULT_RECEIVE_BUFFER_BYTES)?;
         let is_up = socket.take_error()?.is_none();
@@ -39,7 +40,7 @@ impl PassiveSocket {
     /// `fd` = also FD frames.
     ///
     /// # Errors
-    /// When the interface does not exist, is down, or this kernel has no SocketCAN.
+    /// Fails if the interface does not exist, is down, or this kernel has no SocketCAN.
     pub fn open_for(interface: &str, fd: bool, ids: &[CanId], patterns: &[(u32, u32)]) -> io::Result<Self> {
         let socket = RawSocket::open_up(interface, fd, &filters(ids, patterns), DEFAULT_RECEIVE_BUFFER_BYTES)?;
         Ok(Self::new(socket, MappedClock::new(Reading::now())))
@@ -51,10 +52,11 @@ impl PassiveSocket {
         Self { socket, mapper, received, dropped_total: 0, before }
     }
 
-    /// Appends the frames and events received so far, as of interface `bus`; `false` = no more at the moment.
+    /// Appends the received frames and events as records of interface `bus`. Returns `false` if the socket is empty at
+    /// the moment.
     ///
     /// # Errors
-    /// When the interface went down (`ENETDOWN`; the socket remains usable) or was removed.
+    /// Fails if the interface went down (`ENETDOWN`; the socket remains usable) or was removed.
     pub fn next(&mut self, bus: BusIndex, into: &mut Vec<Record>) -> io::Result<bool> {
         self.received.clear();
         match self.socket.receive(&mut self.received) {

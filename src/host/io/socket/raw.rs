@@ -22,15 +22,16 @@ use super::wire::{self, FD_BYTES, Wire};
 use crate::can::{CanId, Frame};
 use crate::io::clock::{KernelStamps, nanos};
 
-/// Receive buffer to request, bytes: about 2,700 frames of 768 bytes (the kernel counts a frame with its bookkeeping), a third
-/// of a second of a full 1 Mbit/s bus. The kernel limits it to net.core.rmem_max.
+/// Size of the receive buffer to request, bytes. It holds about 2,700 frames, because the kernel counts 768 bytes per
+/// frame including its bookkeeping. A full 1 Mbit/s bus sends that many in a third of a second. The kernel limits the
+/// size to net.core.rmem_max.
 pub const DEFAULT_RECEIVE_BUFFER_BYTES: usize = 1 << 20;
 
-/// Most frames read in one system call. With 16, the call itself no longer dominates the cost of a frame, and preparing
-/// the buffers is cheap even if only one frame arrives.
+/// Maximum number of frames read in one system call. With 16 frames, the call itself no longer dominates the cost of a
+/// frame. Preparing 16 buffers is cheap even if only one frame arrives.
 pub(super) const CALL_BATCH: usize = 16;
 
-/// Most filters that the kernel accepts (CAN_RAW_FILTER_MAX).
+/// Maximum number of filters that the kernel accepts (CAN_RAW_FILTER_MAX).
 const MAX_KERNEL_FILTERS: usize = 512;
 
 /// A frame read from the socket, and its stamps.
@@ -40,9 +41,9 @@ pub(super) struct RawRead {
     pub(super) stamps: KernelStamps,
 }
 
-/// Buffers of one call, reused. The kernel writes into each header how much of the room for control messages it used, and that
-/// is the room for the next frame in this slot. The room is sufficient as long as every frame carries a stamp; after a frame
-/// without one, the headers are built again.
+/// Buffers of one call, which are reused. The kernel writes into each header how much space for control messages it
+/// used, and this becomes the space for the next frame in the same slot. The space is sufficient while every frame has
+/// a stamp. After a frame without a stamp, the headers are built again.
 struct Slots {
     headers: MultiHeaders<()>,
     bytes: [[u8; FD_BYTES]; CALL_BATCH],
@@ -65,7 +66,7 @@ impl Slots {
             let messages = recvmmsg(fd, &mut self.headers, slices.iter_mut(), MsgFlags::MSG_DONTWAIT, None)?;
             for (message, length) in messages.zip(&mut lengths) {
                 *length = message.bytes.min(FD_BYTES);
-                // An error means that a control message was cut off; treated like a missing stamp.
+                // An error means that a control message was cut off. It is treated like a missing stamp.
                 let stamps = message.cmsgs().map_or(KernelStamps::default(), read_control);
                 into.push(RawRead { what: Wire::Malformed, stamps });
             }
@@ -81,7 +82,7 @@ impl Slots {
 }
 
 thread_local! {
-    /// Shared by all sockets of a thread. Headers contain pointers, so unlike sockets they cannot move between threads.
+    /// Slots for all sockets of a thread. Headers contain pointers, so they cannot move between threads as sockets do.
     static SLOTS: RefCell<Slots> = RefCell::new(Slots::new());
 }
 
@@ -94,7 +95,8 @@ pub(super) struct RawSocket {
 }
 
 impl RawSocket {
-    /// Opens and binds; `fd` = also FD frames. Filters are set before the bind, so that no unwanted frame is queued.
+    /// Opens and binds the socket. If `fd`, it also receives FD frames. Filters are set before the bind, so that no
+    /// unwanted frame is queued.
     ///
     /// # Errors
     /// `ENODEV` if the interface does not exist. An interface that is down opens successfully; [`RawSocket::take_error`]
@@ -121,7 +123,7 @@ impl RawSocket {
     /// Like [`RawSocket::open`], but requires the interface to be up; errors contain its name.
     ///
     /// # Errors
-    /// Like [`RawSocket::open`]; also if the interface is down.
+    /// Fails like [`RawSocket::open`]; also if the interface is down.
     pub(super) fn open_up(interface: &str, fd: bool, filters: &[CanFilter], buffer_bytes: usize) -> io::Result<Self> {
         let opened = Self::open(interface, fd, filters, buffer_bytes);
         let opened = opened.and_then(|socket| socket.take_error()?.map_or(Ok(socket), Err));
@@ -138,7 +140,7 @@ impl RawSocket {
         self.socket.as_raw_socket().recv_buffer_size()
     }
 
-    /// Reads up to [`CALL_BATCH`] frames and appends them; fewer mean that the socket is empty.
+    /// Reads up to [`CALL_BATCH`] frames and appends them. If fewer are read, the socket is empty.
     ///
     /// # Errors
     /// `EAGAIN` if the socket is empty; `ENETDOWN` or `ENODEV` once when the interface went down or was removed.
@@ -188,7 +190,7 @@ pub(super) fn index_of(interface: &str) -> io::Result<u32> {
     Ok(nix::net::if_::if_nametoindex(interface)?)
 }
 
-/// Requests hardware and software stamps; if the kernel cannot distinguish them, plain software stamps.
+/// Requests hardware and software stamps. If the kernel cannot distinguish them, requests plain software stamps.
 fn set_stamping(fd: &impl AsFd) -> io::Result<()> {
     let flags = TimestampingFlag::SOF_TIMESTAMPING_RX_SOFTWARE
         | TimestampingFlag::SOF_TIMESTAMPING_SOFTWARE
@@ -240,7 +242,7 @@ fn read_control(messages: impl Iterator<Item = ControlMessageOwned>) -> KernelSt
     stamps
 }
 
-/// Zero means "no such stamp".
+/// Converts a kernel stamp; zero means that the kernel has no such stamp.
 fn stamp(time: TimeSpec) -> Option<i64> {
     Some(nanos(time)).filter(|nanos| *nanos != 0)
 }
@@ -266,14 +268,14 @@ mod tests {
     }
 
     #[test]
-    fn zero_stamp_means_none() {
+    fn zero_stamp_is_ignored() {
         assert_eq!(stamp(TimeSpec::new(0, 0)), None);
         assert_eq!(stamp(TimeSpec::new(1, 5)), Some(1_000_000_005));
     }
 
     #[test]
-    fn frames_without_stamps_spoil_no_later_stamps() {
-        // Any datagram socket will do: the kernel's headers are the same.
+    fn frames_without_stamps_keep_later_stamps() {
+        // Any datagram socket works here, because the kernel's headers are the same.
         let (tx, rx) = (UdpSocket::bind("127.0.0.1:0").unwrap(), UdpSocket::bind("127.0.0.1:0").unwrap());
         tx.connect(rx.local_addr().unwrap()).unwrap();
         let frames = [1, 2, 3].map(|id| Frame::classic(CanId::Standard(id), &[7, 8]).unwrap());

@@ -13,7 +13,8 @@ use crate::can::Frame;
 /// Pause before the next attempt if the transmit queue is full: about four frames on a 500 kbit/s bus.
 const RETRY_PAUSE: Duration = Duration::from_millis(1);
 
-/// Most attempts before a full queue is an error: 2 s, in which a working bus sends hundreds of frames.
+/// Maximum number of attempts before a full queue is an error. They take 2 s, in which a working bus sends hundreds of
+/// frames.
 const MAX_TRIES: u32 = 2_000;
 
 /// Sends frames one after the other on one interface; receives nothing.
@@ -27,7 +28,7 @@ impl CanSender {
     /// Opens the interface; `fd` allows FD frames.
     ///
     /// # Errors
-    /// When the interface does not exist, is down, or this kernel has no SocketCAN.
+    /// Fails if the interface does not exist, is down, or this kernel has no SocketCAN.
     pub fn open(interface: &str, fd: bool) -> io::Result<Self> {
         let socket = RawSocket::open_up(interface, fd, &[], 0)?;
         Ok(Self { socket, interface: interface.to_owned() })
@@ -36,7 +37,8 @@ impl CanSender {
     /// Sends one frame; waits while the transmit queue is full, at most about 2 s.
     ///
     /// # Errors
-    /// When the queue does not empty, the interface goes down or is removed, or it cannot carry this frame (FD on classic).
+    /// Fails if the queue does not empty, the interface goes down or is removed, or it cannot carry this frame (FD on
+    /// classic).
     pub fn send(&self, frame: &Frame) -> io::Result<()> {
         for _ in 0..MAX_TRIES {
             match self.socket.send(frame) {

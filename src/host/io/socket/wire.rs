@@ -1,4 +1,4 @@
-//! `struct can_frame` and `struct canfd_frame` of linux/can.h: decoded from and encoded to bytes.
+//! Decodes and encodes the bytes of `struct can_frame` and `struct canfd_frame` of linux/can.h.
 
 use crate::can::{CanId, Frame, FrameKind};
 
@@ -6,14 +6,14 @@ use crate::can::{CanId, Frame, FrameKind};
 pub(super) const CLASSIC_BYTES: usize = 16;
 /// Bytes of `struct canfd_frame`.
 pub(super) const FD_BYTES: usize = 72;
-/// Offset of the payload in both.
+/// Offset of the payload in both structs.
 const DATA_AT: usize = 8;
 
-/// Identifier bit: 29-bit identifier.
+/// Identifier bit that marks a 29-bit identifier.
 pub(super) const EXTENDED_FLAG: u32 = 0x8000_0000;
-/// Identifier bit: remote request.
+/// Identifier bit that marks a remote request.
 pub(super) const REMOTE_FLAG: u32 = 0x4000_0000;
-/// Identifier bit: error frame.
+/// Identifier bit that marks an error frame.
 pub(super) const ERROR_FLAG: u32 = 0x2000_0000;
 /// Bits of a standard identifier.
 pub(super) const STANDARD_MASK: u32 = 0x7FF;
@@ -25,12 +25,12 @@ const FD_BRS: u8 = 0x01;
 /// FD flag: error state indicator.
 const FD_ESI: u8 = 0x02;
 
-/// Content of a read from the kernel.
+/// The content of one read from the kernel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Wire {
     /// A data or remote frame.
     Frame(Frame),
-    /// An error frame; its class bits.
+    /// An error frame, given by its class bits.
     Error(u32),
     /// Invalid bytes: wrong size or impossible length.
     Malformed,
