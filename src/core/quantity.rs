@@ -1,4 +1,4 @@
-//! Time, cell numbers, the quality of a reading, and the conventions that every module keeps.
+//! Time, cell numbers, readings with their faults, and the conventions that every module keeps.
 //!
 //! Conventions inside the program (only `can` and `config` use wire units and wire signs):
 //! * current in A, **positive = discharge** (the paper's sign, dSOC/dt = -I / (3600 C));
@@ -21,7 +21,7 @@ use serde::{Deserialize, Serialize};
 pub struct Timestamp(i64);
 
 impl Timestamp {
-    /// Earlier than any event.
+    /// A point earlier than any event.
     pub const LONG_AGO: Self = Self::from_nanos(i64::MIN);
 
     /// The clock's origin.
@@ -58,12 +58,12 @@ impl Timestamp {
         nanos as f64 * 1e-9
     }
 
-    /// This point moved by `seconds` (may be negative).
+    /// Returns this point moved by `seconds`, which may be negative.
     pub fn plus_secs(self, seconds: f64) -> Self {
         self.plus_nanos((seconds * 1e9).round() as i64)
     }
 
-    /// This point moved by `nanos` (may be negative).
+    /// Returns this point moved by `nanos`, which may be negative.
     pub const fn plus_nanos(self, nanos: i64) -> Self {
         Self(self.0.saturating_add(nanos))
     }
@@ -80,11 +80,12 @@ pub struct InvalidState {
 }
 
 impl InvalidState {
-    /// Rejects the number unless `is_sound`.
-    /// Returns an error unless `is_sound`.
+    /// Rejects the number unless `is_sound` is true.
     pub fn unless(is_sound: bool, what: &'static str, found: f64, allowed: &'static str) -> Result<(), Self> {
         if is_sound { Ok(()) } else { Err(Self { what, found, allowed }) }
     }
+
+    /// Rejects numbers that are not finite or whose square or cube overflows.
     pub fn unless_number(what: &'static str, found: f64) -> Result<(), Self> {
         bounds::NUMBER.check(what, found)
     }
@@ -104,7 +105,7 @@ impl InvalidState {
         all.into_iter().try_for_each(|found| Self::unless_natural(what, found))
     }
 
-    /// Rejects numbers at or near 0, so that the caller can divide by the square.
+    /// Rejects numbers at or near 0, so that the caller can divide by the number's square.
     pub fn unless_positive(what: &'static str, found: f64) -> Result<(), Self> {
         bounds::VARIANCE.check(what, found)
     }
@@ -115,8 +116,8 @@ impl InvalidState {
     }
 }
 
-/// Largest number of cells (series elements) of a pack. With 1,024, a cell number or "the whole pack" fits the 11-bit
-/// field of the alarm frame.
+/// Largest number of cells (series elements) of a pack. With 1,024 cells, the 11-bit field of the alarm frame can hold
+/// a cell number or "the whole pack".
 pub const MAX_CELLS: usize = 1024;
 
 /// Index of a cell in the pack, from 0. Displays and DBC patterns may count from 1.
@@ -196,15 +197,15 @@ pub enum Fault {
     EndToEnd,
     /// The sender marks the signal as not available.
     NotAvailable,
-    /// NaN or infinite on the wire (IEEE float signals).
+    /// The value is NaN or infinite on the wire (IEEE float signals).
     NotFinite,
-    /// Outside the range the DBC or the configuration gives.
+    /// The value is outside the range that the DBC or the configuration gives.
     OutOfRange,
-    /// Changed faster than the configured rate allows.
+    /// The value changed faster than the configured rate allows.
     RateTooHigh,
-    /// Unchanged for longer than the configured time while current flows.
+    /// The value was unchanged for longer than the configured time while current flowed.
     Stuck,
-    /// No value for longer than the configured age.
+    /// There was no value for longer than the configured age.
     Stale,
 }
 
@@ -221,14 +222,14 @@ pub struct Reading {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Mode {
-    /// No current reading yet, or it is stale.
+    /// There is no current reading yet, or the latest one is stale.
     #[default]
     Unknown,
-    /// Current negative beyond the dead band.
+    /// The current is negative, beyond the dead band.
     Charge,
-    /// Current inside the dead band.
+    /// The current is inside the dead band.
     Rest,
-    /// Current positive beyond the dead band.
+    /// The current is positive, beyond the dead band.
     Discharge,
 }
 

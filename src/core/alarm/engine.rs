@@ -1,4 +1,4 @@
-//! One alarm machine per rule, severity and cell; reports their changes.
+//! Holds one alarm machine per rule, severity and cell, and reports changes of the alarms.
 //!
 //! In: values in each rule's unit with the time of their comparison, and commands. Out: [`AlarmChange`]s and the list
 //! of raised alarms in the order rule, severity, cell (the pack first). A rule may have one threshold per severity;
@@ -32,13 +32,13 @@ pub struct Alarm {
     pub threshold: f64,
     /// How often the alarm was raised.
     pub occurrences: u32,
-    /// Time of the comparison that raised it first; `None` = never raised.
+    /// Time of the comparison that raised the alarm for the first time; `None` = never raised.
     pub first_raised: Option<Timestamp>,
-    /// Time of the comparison that raised it last; `None` = never raised.
+    /// Time of the comparison that raised the alarm last; `None` = never raised.
     pub last_raised: Option<Timestamp>,
-    /// The value that raised it last; `None` = never raised.
+    /// The value that raised the alarm last; `None` = never raised.
     pub raised_value: Option<f64>,
-    /// Whether it has been acknowledged since it was last raised.
+    /// Whether the alarm has been acknowledged since it was last raised.
     pub is_acknowledged: bool,
 }
 
@@ -56,7 +56,7 @@ pub struct ThresholdState {
     pub severity: Severity,
     /// Whether any alarm of the threshold is raised.
     pub is_raised: bool,
-    /// Largest number of times that one of its alarms was raised.
+    /// How often the alarm that was raised most often was raised.
     pub occurrences: u32,
 }
 
@@ -76,7 +76,7 @@ impl StoredAlarm {
         self.machine.state.is_raised()
     }
 
-    /// How often it was raised.
+    /// How often the alarm was raised.
     pub fn occurrences(&self) -> u32 {
         self.machine.occurrences
     }
@@ -197,8 +197,8 @@ impl AlarmEngine {
         self.each_threshold(rule, cell, changes, |machine, config| machine.observe(now, config, observation));
     }
 
-    /// Whether values of `rule` up to `worst` change no alarm, for any cell: every alarm of the rule is at rest, and
-    /// `worst` is not beyond a threshold. Also true if the rule is not configured.
+    /// Whether no value of `rule` up to `worst` can change an alarm, for any cell. This is so if every alarm of the
+    /// rule is at rest and `worst` is not beyond a threshold, or if the rule is not configured.
     pub fn is_quiet(&self, rule: Rule, worst: f64) -> bool {
         self.rules[self.by_rule[usize::from(rule as u8)].clone()].iter().all(|slots| {
             let is_beyond = || LimitCheck::of(&slots.config, &Observation::new(Some(worst))).0 != LimitCheck::Healthy;
@@ -230,8 +230,8 @@ impl AlarmEngine {
         }
     }
 
-    /// Handles a period without values (vehicle asleep, restart, hole in a log): it does not count towards the debounce
-    /// of measured values.
+    /// Handles a period without values (vehicle asleep, restart, gap in a log). The period does not count towards the
+    /// debounce of measured values.
     pub fn handle_gap(&mut self) {
         let measured: Vec<usize> = self.counting.iter().copied().filter(|&slot| !self.is_learned(slot)).collect();
         for slot in measured {
@@ -263,7 +263,7 @@ impl AlarmEngine {
         self.raised.iter().map(|&slot| self.alarm(self.rule_of(slot), slot))
     }
 
-    /// Every alarm of every rule, in the same order.
+    /// Every alarm of every rule, in the order of [`raised`](Self::raised).
     pub fn all(&self) -> impl Iterator<Item = Alarm> + '_ {
         self.rules
             .iter()
@@ -297,8 +297,8 @@ impl AlarmEngine {
         AlarmSnapshot { alarms: self.rules.iter().flat_map(of_rule).collect() }
     }
 
-    /// Restores a stored state whose times the caller has rebased. Returns the alarms that no configured threshold
-    /// watches any longer; the caller reports them.
+    /// Restores a stored state whose times the caller has rebased. Returns the alarms that no longer have a configured
+    /// threshold, so that the caller can report them.
     pub fn restore(&mut self, state: &AlarmSnapshot) -> Vec<StoredAlarm> {
         let cells = self.cells();
         *self = Self::new(self.rules.drain(..).map(|rule| rule.config).collect(), cells);
@@ -345,9 +345,9 @@ impl AlarmEngine {
         }
     }
 
-    /// Replaces the rules. An alarm whose rule, severity and cell are still watched is kept, and compared again if its
-    /// threshold changed. Other alarms that are pending, raised or were raised are forgotten;
-    /// returns their number.
+    /// Replaces the rules. An alarm whose rule, severity and cell are still watched is kept. If its threshold changed,
+    /// its value is compared again. All other alarms are forgotten. Returns how many of them were pending or had been
+    /// raised.
     pub fn reconfigure(
         &mut self,
         now: Timestamp,

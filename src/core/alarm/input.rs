@@ -1,9 +1,9 @@
-//! Every input of an alarm engine as a value, so that another engine can replay the same inputs.
+//! Represents every input of an alarm engine as a value, so that another engine can replay the same inputs.
 //!
-//! In: values that the [`Monitor`](crate::monitor::Monitor) passes to its rules. Out: the same as the engine's own
-//! methods. The values do not depend on thresholds, so an engine with other thresholds and the same inputs does what a
-//! monitor with those thresholds would have done. Exception: for `input_missing`, the strictest threshold decides
-//! whether the monitor reports a silence to the engine at all.
+//! In: values that the [`Monitor`](crate::monitor::Monitor) passes to its rules. Out: the same changes as the engine's
+//! own methods give. The values do not depend on thresholds. Therefore an engine with other thresholds gives the same
+//! changes as a monitor with those thresholds. Exception: for `input_missing`, the strictest threshold decides whether
+//! the monitor reports a silence to the engine at all.
 
 use super::engine::{AlarmChange, AlarmEngine};
 use super::limit::Observation;
@@ -22,8 +22,8 @@ pub enum AlarmInput {
         cell: Option<CellIndex>,
         observation: Observation,
     },
-    /// Whether the inputs of a learned value are valid now. While they are not, the value cannot be renewed and changes
-    /// no alarm. Ignored for rules that are not learned.
+    /// Whether the inputs of a learned value are valid now. While they are invalid, the value cannot be renewed and
+    /// changes no alarm. Ignored for rules whose value is not learned.
     InputsValid {
         rule: Rule,
         /// The cell; `None` = the pack.
@@ -35,8 +35,8 @@ pub enum AlarmInput {
     /// [`AlarmEngine::handle_gap`].
     Gap,
     Acknowledge(Selector),
-    /// Clears alarms: latched alarms end (unless they are beyond their threshold again), the history of past alarms is
-    /// forgotten. Alarms that are active, or whose value has not been healthy since, stay and count as refused. Learned
+    /// Clears alarms. A latched alarm ends, and the history of a past alarm is forgotten. A raised alarm that is not
+    /// latched stays and counts as refused. So does a latched alarm whose value is beyond its threshold again. Learned
     /// values do not change.
     Clear(Selector),
     /// [`AlarmEngine::forget_learned`].

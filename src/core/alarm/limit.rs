@@ -9,10 +9,10 @@
 //! healthy   P(truth beyond the clear threshold) <= min(p, c)
 //! ```
 //!
-//! where c is 0.05 for a learned value and 0.5 otherwise: only a value at the clear threshold or better clears an
-//! alarm, never a growing uncertainty. The clear threshold is on the healthy side of the set threshold, so the second
-//! probability is the larger one and no value is both beyond and healthy. With p = 0.5, the result is the same as for
-//! `when = "mean"`. If the standard deviation is needed but missing, the result is unknown.
+//! where c is 0.05 for a learned value and 0.5 otherwise. Therefore only a value at the clear threshold or better
+//! clears an alarm; a growing uncertainty does not. The clear threshold is on the healthy side of the set threshold, so
+//! the second probability is the larger one and no value is both beyond and healthy. With p = 0.5, the result is the
+//! same as for `when = "mean"`. If the standard deviation is needed but missing, the result is unknown.
 //!
 //! A learned value (a capacity, a resistance, a remaining life) does not recover by itself. Therefore c also applies to
 //! `when = "mean"`: an estimate that fluctuates around its threshold must not clear its alarm.
@@ -35,11 +35,13 @@ pub enum Comparison {
 #[derive(Debug, Clone, PartialEq)]
 pub struct RuleConfig {
     pub rule: Rule,
-    /// Its severity. A rule has at most one threshold per severity.
+    /// Severity of the alarm. A rule has at most one threshold per severity.
     pub severity: Severity,
-    /// The alarm is raised if the value is beyond this (below for `*Low`, above for the others), in the rule's unit.
+    /// The alarm is raised if the value is beyond this threshold (below for `*Low`, above for the others), in the
+    /// rule's unit.
     pub threshold: f64,
-    /// The alarm clears only if the value is here or further on the healthy side; never on the bad side of `threshold`.
+    /// The alarm clears only if the value is at this threshold or on its healthy side. This threshold is never on the
+    /// bad side of `threshold`.
     pub clear: f64,
     /// What is compared with the threshold.
     pub when: Comparison,
@@ -56,7 +58,7 @@ pub struct RuleConfig {
 pub struct Observation {
     /// The value in the rule's unit; `None` or not finite = unknown.
     pub value: Option<f64>,
-    /// Its standard deviation, in the same unit; `None` = unknown.
+    /// Standard deviation of the value, in the same unit; `None` = unknown.
     pub std: Option<f64>,
     /// The true value may be worse than this value, never better: the value is the worst of several sources, some of
     /// them unknown. Such a value can be beyond a threshold, but not healthy.
@@ -77,7 +79,7 @@ impl Observation {
         Self { std: Some(std), ..self }
     }
 
-    /// If `is_bound`, marks the value as known from some of its sources only: the others may be worse.
+    /// If `is_bound` is true, marks the value as known from some of its sources only; the other sources may be worse.
     #[must_use]
     pub fn of_part(self, is_bound: bool) -> Self {
         Self { is_bound, ..self }

@@ -14,14 +14,13 @@
 //! * Rest: `cleared` if the alarm was raised and not acknowledged, else `inactive`.
 //! * End: `latched` for a latching rule, else rest.
 //! * Count: both the time and the number of new values of the debounce must be reached.
-//! * Hold: stay, and keep what was counted.
+//! * Hold: stay, and keep the time and the number of values counted.
 //! * Mark: acknowledge the latest occurrence. Forget: reset the number of occurrences. Refuse: change nothing.
 //!
 //! An alarm is raised while it is active, clearing, suppressed or latched.
 //!
 //! Time counts only between two observations of known values on the same side. Time before or after an unknown value
-//! does not count, but does not reset the count either: otherwise a flickering input could keep an alarm from being
-//! raised forever.
+//! does not count, but does not reset the count either. Otherwise, a flickering input could prevent an alarm forever.
 
 use serde::{Deserialize, Serialize};
 use strum::IntoStaticStr;
@@ -33,7 +32,7 @@ use crate::quantity::Timestamp;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum AlarmState {
-    /// The value is unknown, and so is whether the alarm should be raised.
+    /// The value is unknown, so it is also unknown whether the alarm should be raised.
     #[default]
     Unknown,
     /// The value is not beyond the threshold.
@@ -42,13 +41,13 @@ pub enum AlarmState {
     Pending,
     /// Raised.
     Active,
-    /// Raised; the value is healthy again, but not long enough yet.
+    /// The alarm is raised. The value is healthy again, but not for long enough.
     Clearing,
-    /// Raised, but the value has become unknown.
+    /// The alarm is raised, but the value has become unknown.
     Suppressed,
-    /// Raised earlier; the value is healthy again. The alarm stays until a command clears it.
+    /// The alarm was raised earlier, and the value is healthy again. The alarm stays until a command clears it.
     Latched,
-    /// Raised earlier; the value is healthy again. Not acknowledged.
+    /// The alarm was raised earlier, and the value is healthy again. The alarm is not acknowledged.
     Cleared,
 }
 
@@ -77,19 +76,20 @@ impl AlarmState {
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case")]
 pub enum Change {
-    /// Raised, or raised again while latched.
+    /// The alarm was raised, or raised again while latched.
     Raised,
-    /// Still raised, but the value has become unknown.
+    /// The alarm is still raised, but the value has become unknown.
     Suppressed,
-    /// Still raised, and the value is known again.
+    /// The alarm is still raised, and the value is known again.
     Resumed,
     /// The value is healthy again; the alarm stays until a command clears it.
     Latched,
-    /// No longer raised.
+    /// The alarm is no longer raised.
     Cleared,
-    /// Acknowledged by a command.
+    /// A command acknowledged the alarm.
     Acknowledged,
-    /// History forgotten: by a command, after a pack exchange, or because the alarm no longer has a threshold.
+    /// The history of the alarm was forgotten: by a command, after a pack exchange, or because the alarm no longer has
+    /// a threshold.
     Forgotten,
 }
 
@@ -97,7 +97,7 @@ pub enum Change {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Refusal {
-    /// The alarm is raised and its value is not healthy or unknown. Only a healthy value can end it.
+    /// The alarm is raised, and its value is unhealthy or unknown, or has not been healthy for long enough.
     NotHealthy,
     /// There is nothing to acknowledge or to clear.
     Nothing,
@@ -110,14 +110,15 @@ pub(super) struct Machine {
     /// Whether the latest observation could be compared.
     #[serde(skip)]
     pub(super) is_known: bool,
-    /// The latest observation, and its probability; a learned value is kept while its inputs are lost.
+    /// The latest observation, and the probability that it is beyond the threshold. A learned value is kept while its
+    /// inputs are lost.
     #[serde(skip)]
     pub(super) observation: Observation,
     #[serde(skip)]
     pub(super) probability: Option<f64>,
-    /// How often it was raised since its history was last forgotten.
+    /// How often the alarm was raised since its history was last forgotten.
     pub(super) occurrences: u32,
-    /// Times of the comparisons that raised it first and last, and the value that raised it last.
+    /// Times of the comparisons that raised the alarm first and last, and the value that raised it last.
     pub(super) first_raised: Timestamp,
     pub(super) last_raised: Timestamp,
     pub(super) raised_value: Option<f64>,
@@ -129,7 +130,7 @@ pub(super) struct Machine {
     events: u32,
     /// Time up to which the debounce has counted; `None` = not counting.
     counted_to: Option<Timestamp>,
-    /// The inputs of a learned value are not valid now.
+    /// Whether the inputs of a learned value are invalid now.
     is_suspended: bool,
 }
 
@@ -163,8 +164,8 @@ impl Machine {
     }
 
     /// Handles a value. If the inputs of a learned value are lost, a value may still arrive, because the loss ends a
-    /// half-cycle. It may raise the alarm, but it does not change an alarm that is already raised: it would clear the
-    /// alarm or make it look up to date.
+    /// half-cycle. This value may raise the alarm. It does not change an alarm that is already raised, because it would
+    /// clear the alarm or make it look up to date.
     pub(super) fn observe(&mut self, now: Timestamp, rule: &RuleConfig, observation: &Observation) -> Option<Change> {
         self.observation = *observation;
         if self.is_suspended && self.state == AlarmState::Suppressed {
@@ -188,7 +189,7 @@ impl Machine {
         self.handle_check(now, rule, LimitCheck::Unknown, false)
     }
 
-    /// Handles the return of the inputs: the learned value is valid again, or a newer one that was learned since.
+    /// Handles the return of the inputs: the latest learned value is valid again.
     pub(super) fn resume(&mut self, now: Timestamp, rule: &RuleConfig) -> Option<Change> {
         if !std::mem::take(&mut self.is_suspended) {
             return None;
@@ -222,12 +223,12 @@ impl Machine {
         Ok(Change::Acknowledged)
     }
 
-    /// Handles the command "clear": ends a latched alarm, forgets the history of a past alarm, refuses if the value is
-    /// beyond the threshold or unknown.
+    /// Handles the command "clear": ends a latched alarm, or forgets the history of a past alarm. Refuses if the alarm
+    /// is raised and not latched, or latched and beyond its threshold again.
     pub(super) fn clear(&mut self) -> Result<Change, Refusal> {
         match self.state {
             AlarmState::Active | AlarmState::Clearing | AlarmState::Suppressed => Err(Refusal::NotHealthy),
-            // Beyond again, but not long enough yet.
+            // The value is beyond the threshold again, but not for long enough.
             AlarmState::Latched if self.events > 0 || self.counted_to.is_some() => Err(Refusal::NotHealthy),
             AlarmState::Latched => {
                 self.is_acknowledged = true;
@@ -245,8 +246,8 @@ impl Machine {
         }
     }
 
-    /// The published state: with an unknown value, also before the first observation after a restart, it is `Unknown`
-    /// or `Suppressed`.
+    /// The published state. While the value is unknown, an inactive or cleared alarm is published as `Unknown`, and an
+    /// active or clearing alarm as `Suppressed`. The value is also unknown between a restart and the first observation.
     pub(super) fn shown(&self) -> AlarmState {
         match self.state {
             AlarmState::Inactive | AlarmState::Cleared if !self.is_known => AlarmState::Unknown,

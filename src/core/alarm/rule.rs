@@ -16,7 +16,7 @@ pub enum Rule {
     UsableCapacityLow = 2,
     /// Recharge period below the threshold, s.
     RechargePeriodLow = 3,
-    /// A configured input is missing for too long; the value is its age, s.
+    /// A configured input is missing for too long; the value is the input's age, s.
     InputMissing = 4,
     /// A configured input keeps being implausible; the value is the share of bad readings, fraction.
     InputImplausible = 5,
@@ -41,13 +41,14 @@ pub enum Rule {
     StoreFailed = 13,
     /// An interface is down, missing, bus-off or accepts no frames; the value is the duration, s.
     BusFault = 14,
-    /// Self-discharge relative to the other cells of the pack above the threshold, fraction of the capacity per day.
+    /// A cell's self-discharge exceeds that of the other cells by more than the threshold, fraction of the capacity per
+    /// day.
     CellLeak = 15,
-    /// Contact resistance in excess of the other cells' above the threshold, fraction of a cell's series resistance at
-    /// medium SOC and 25 degrees C.
+    /// A cell's contact resistance exceeds that of the other cells by more than the threshold, fraction of a cell's
+    /// series resistance at medium SOC and 25 degrees C.
     ConnectionResistance = 16,
-    /// The voltage channel does not show its own cell; the value is then 1, else 0. While it is 1, the
-    /// cell's rules that depend on its voltage are unknown.
+    /// A voltage channel does not show its own cell. The value is 1 in this case, else 0. While it is 1, the rules that
+    /// depend on the cell's voltage are unknown.
     ChannelFaulty = 17,
 }
 
@@ -65,9 +66,9 @@ pub enum Scope {
 /// Which side of a threshold is bad.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Direction {
-    /// Raised below the threshold.
+    /// The alarm is raised below the threshold.
     Below,
-    /// Raised above it.
+    /// The alarm is raised above the threshold.
     Above,
 }
 
@@ -106,16 +107,16 @@ impl Unit {
 pub struct RuleSpec {
     /// Pack, cells or both.
     pub scope: Scope,
-    /// The bad side of its threshold.
+    /// The bad side of the threshold.
     pub direction: Direction,
     /// Unit of value and threshold.
     pub unit: Unit,
-    /// Whether the value has a standard deviation, so that a threshold can compare its probability.
+    /// Whether the value has a standard deviation, so that a probability can be compared.
     pub has_deviation: bool,
     /// Whether a value stays valid until the next one, so that the time debounce runs on between values.
     ///
-    /// A learned value does: a capacity stays low until the next cycle. A measured value does not: without new data,
-    /// the old value proves nothing.
+    /// A learned value stays valid: a capacity stays low until the next cycle. A measured value does not, because
+    /// without new data, the old value proves nothing.
     pub is_learned: bool,
     /// The compared quantity, for messages.
     pub about: &'static str,
@@ -225,16 +226,16 @@ impl Rule {
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
 pub enum Severity {
-    /// Worth knowing.
+    /// No action is needed.
     Info = 1,
-    /// Plan a visit.
+    /// A workshop visit should be planned.
     Warning = 2,
-    /// Act now.
+    /// Action is needed at once.
     Severe = 3,
 }
 
 impl Severity {
-    /// All severities, mildest first.
+    /// All severities, least severe first.
     pub const ALL: [Self; 3] = [Self::Info, Self::Warning, Self::Severe];
 
     /// The name in configurations, events and on the command line.

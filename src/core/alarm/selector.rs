@@ -1,4 +1,4 @@
-//! Selection of alarms by a command, and the outcome of the command.
+//! The alarms that a command selects, and the outcome of the command.
 
 use serde::{Deserialize, Serialize};
 
@@ -27,8 +27,8 @@ impl Selector {
 /// Outcome of a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct CommandOutcome {
-    /// Alarms changed.
+    /// Number of changed alarms.
     pub changed: u32,
-    /// Alarms that could not be cleared, because they are raised and their value is unhealthy or unknown.
+    /// Number of alarms that could not be cleared, because they are raised and their value is unhealthy or unknown.
     pub refused: u32,
 }

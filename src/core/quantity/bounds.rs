@@ -1,8 +1,8 @@
-//! Physical bounds: the range that a quantity of a cell, a sensor or a clock can have, regardless of what a file or a
-//! bus says.
+//! Physical bounds of the quantities of cells, sensors and clocks, regardless of the content of a file or a frame.
 //!
-//! The same bounds apply to configuration keys, cell models, stored states and the running filters, which restart when
-//! they leave them. The bounds are wide: a number outside is certainly wrong, a number inside may still be wrong.
+//! The same bounds apply to configuration keys, cell models, stored states and running filters. A filter whose state
+//! leaves its bounds restarts. The bounds are wide: a number outside is certainly wrong, but a number inside may be
+//! wrong, too.
 
 use super::InvalidState;
 
@@ -49,10 +49,11 @@ pub const CONFIGURED_CAPACITY_AH: Bounds = Bounds::new(1e-3, 1e5, "0.001 to 1e5 
 /// Estimated capacity of a cell, Ah: from a thousandth of the smallest cell to ten thousand times the largest.
 pub const CAPACITY_AH: Bounds = Bounds::new(1e-6, 1e9, "1e-6 to 1e9 Ah");
 
-/// SOC in a running filter: as far beyond empty and full as a model's curve is extrapolated. A filter outside restarts.
+/// SOC in a running filter. A model's curve is extrapolated this far beyond empty and full. A filter whose SOC is
+/// outside restarts.
 pub const FILTER_SOC: Bounds = Bounds::new(-0.5, 1.5, "-0.5 to 1.5");
 
-/// SOC of a trusted estimate: allows for the error at the ends of a curve.
+/// SOC of a trusted estimate. The bounds allow for the error at the ends of a curve.
 pub const TRUSTED_SOC: Bounds = Bounds::new(-0.1, 1.1, "-0.1 to 1.1");
 
 /// SOC in a stored state. Wider than [`FILTER_SOC`], because earlier versions allowed a filter to go further.
@@ -64,8 +65,8 @@ pub const LOG_RESISTANCE: Bounds = Bounds::new(-7.0, 7.0, "-7 to 7");
 /// Like [`LOG_RESISTANCE`], for a trusted estimate: a factor of 33.
 pub const TRUSTED_LOG_RESISTANCE: Bounds = Bounds::new(-3.5, 3.5, "-3.5 to 3.5");
 
-/// Learned capacity that is trusted, relative to the cell model's or the configured capacity: a worn cell keeps more
-/// than a twentieth, and no cell has three times its label.
+/// Learned capacity that is trusted, relative to the cell model's or the configured capacity. A worn cell keeps more
+/// than a twentieth of its capacity, and no cell has three times the capacity on its label.
 pub const TRUSTED_CAPACITY: Bounds = Bounds::new(0.05, 3.0, "0.05 to 3 times the cell's");
 
 /// Configured initial capacity relative to the cell model's.
@@ -80,7 +81,7 @@ pub const CAPACITANCE_F: Bounds = Bounds::new(1e-6, 1e12, "1e-6 to 1e12 F");
 /// Temperature of a cell, degrees C.
 pub const TEMPERATURE_C: Bounds = Bounds::new(-100.0, 200.0, "-100 to 200 degrees C");
 
-/// Voltage of a cell, V. The reading may come from a broken wire.
+/// Voltage of a cell, V. The bounds are wide, because the reading may come from a broken wire.
 pub const VOLTAGE_V: Bounds = Bounds::new(-1e3, 1e3, "-1000 to 1000 V");
 
 /// Current of a pack, A.

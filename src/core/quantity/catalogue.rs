@@ -47,7 +47,7 @@ impl From<f64> for Estimate {
     }
 }
 
-/// Which number of an [`Estimate`].
+/// One of the two numbers of an [`Estimate`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Part {
     Mean,
@@ -103,11 +103,11 @@ pub enum VssPath {
 /// Description and names of a quantity for one owner: the pack, or each cell.
 #[derive(Debug, Clone, Copy)]
 pub struct Presentation {
-    /// Description, for readers.
+    /// Description for tables and documentation.
     pub about: &'static str,
     /// Key in MQTT; `None` = not published there.
     pub mqtt_key: Option<&'static str>,
-    /// Name of its entity in Home Assistant; empty for a cell, which has no entity.
+    /// Name of the quantity's entity in Home Assistant; empty for a cell, which has no entity.
     pub mqtt_name: &'static str,
     pub vss: VssPath,
 }
@@ -116,12 +116,12 @@ pub struct Presentation {
 #[derive(Debug, Clone, Copy)]
 pub struct QuantityRow {
     pub quantity: Quantity,
-    /// JSON key and column name of its mean.
+    /// JSON key and column name of the mean.
     pub key: &'static str,
-    /// JSON key and column name of its standard deviation; `None` = it has none.
+    /// JSON key and column name of the standard deviation; `None` = the quantity has none.
     pub std_key: Option<&'static str>,
     pub unit: Unit,
-    /// Name of its metric, without prefix and unit.
+    /// Name of the metric, without prefix and unit.
     pub metric: &'static str,
     /// Presentation as a value of the pack; `None` = only cells have it.
     pub pack: Option<Presentation>,

@@ -1,8 +1,8 @@
 //! The sample that the sampler passes to a cell's estimator, and the moment shared by voltages that were measured
 //! together.
 //!
-//! In: a voltage (V) with the fresh current (A) and temperature (degrees C) and the charge counted so far (As). Stored
-//! samples are checked ([`CellSample::check`]).
+//! In: a voltage (V), the fresh current (A) and temperature (degrees C), and the charge counted up to the voltage's
+//! time (As). Stored samples are checked ([`CellSample::check`]).
 
 use serde::{Deserialize, Serialize};
 
@@ -38,10 +38,10 @@ impl CellSample {
     /// The first impossible number.
     pub fn check(&self) -> Result<(), InvalidState> {
         bounds::VOLTAGE_V.check("the voltage of a pending sample", self.voltage_v)?;
-        bounds::CURRENT_A.check_all("its current", self.current_a)?;
-        bounds::CHARGE_AS.check("its charge", self.charge_as)?;
-        bounds::TEMPERATURE_C.check_all("its temperature", self.temperature_c)?;
-        bounds::TIME_S.check_all("its times", [self.offset_s, self.unmeasured_s])
+        bounds::CURRENT_A.check_all("the current of a pending sample", self.current_a)?;
+        bounds::CHARGE_AS.check("the charge of a pending sample", self.charge_as)?;
+        bounds::TEMPERATURE_C.check_all("the temperature of a pending sample", self.temperature_c)?;
+        bounds::TIME_S.check_all("a time of a pending sample", [self.offset_s, self.unmeasured_s])
     }
 
     /// Returns the same voltage as measured at `moment`.

@@ -34,13 +34,14 @@ pub(super) fn channels(config: &SampleConfig, sensors: usize) -> Vec<Channel> {
     channels
 }
 
-/// Clock of the stuck check: cumulative time in which the signal should have changed, s. A charger may hold the voltage
-/// constant, so for a voltage only discharging counts; temperature and current should change whenever current flows.
+/// Clock of the stuck check: cumulative time in which the signal should have changed, s. For a voltage, only the time
+/// of discharge counts, because a charger may hold the voltage constant. Temperature and current should change whenever
+/// current flows.
 pub(super) fn should_move_s(channel: Channel, totals: &ChargeTotals) -> f64 {
     match channel {
         Channel::Current | Channel::Temperature(_) => totals.flowing_s,
         Channel::PackVoltage | Channel::CellVoltage(_) => totals.discharging_s,
-        // Not checked for being stuck.
+        // These channels have no stuck check.
         Channel::ReportedSoc
         | Channel::ReportedSoh
         | Channel::SupplyVoltage

@@ -3,14 +3,14 @@
 //! In: good current readings, A, positive = discharge. Out: cumulative charge, As, and cumulative unmeasured time, s;
 //! only their differences are meaningful. An interval between two current readings counts as follows:
 //! * up to the current's `max_age_s`: trapezoid over the elapsed time;
-//! * longer: the first reading is held for `max_age_s` (the longest time that a value may be used), the rest of the
-//!   interval is unmeasured. Holes are never interpolated, regardless of their cause (bad readings, lost frames, sleep,
-//!   a restart).
+//! * longer: the first reading is held for `max_age_s` (the longest time that a value may be used), and the rest of the
+//!   interval is unmeasured. It is never interpolated, regardless of its cause (bad readings, lost frames, sleep, a
+//!   restart).
 //!
-//! After the latest reading, the current is held in the same way; the next reading replaces the held value by the
-//! trapezoid. While the contactors are open, the current is zero, measured or not, for as long as the contactors'
-//! reading is valid. Unmeasured time never decreases and never grows faster than time; before the first current
-//! reading, all time is unmeasured.
+//! After the latest reading, the current is held in the same way. The next reading replaces the held value by the
+//! trapezoid. While the contactors' reading is valid and says that they are open, the current is zero, measured or not.
+//! Unmeasured time never decreases and never grows faster than time. Before the first current reading, all time is
+//! unmeasured.
 
 use serde::{Deserialize, Serialize};
 
@@ -45,7 +45,7 @@ pub(super) struct ChargeCounter {
 }
 
 impl ChargeCounter {
-    /// Starts the clock at the first input of any kind. From here on, time without a current is unmeasured.
+    /// Starts the clock at the first input of any kind. Time without a current after this input is unmeasured.
     pub(super) fn begin(&mut self, time: Timestamp) {
         self.counted_to.get_or_insert(time);
     }
@@ -89,7 +89,7 @@ impl ChargeCounter {
         self.open_until.is_some_and(|until| now <= until)
     }
 
-    /// Handles open contactors: no current from `time` to `until`, unless they close earlier.
+    /// Handles open contactors: no current flows from `time` to `until`, unless they close earlier.
     pub(super) fn open(&mut self, time: Timestamp, until: Timestamp, max_age_s: f64) {
         self.hold(time, Some(0.0), max_age_s);
         self.open_until = Some(until);
@@ -143,7 +143,7 @@ impl ChargeCounter {
     }
 }
 
-/// 1 if the sensor's offset is part of the reading, else 0: a reading of exactly zero has no offset.
+/// 1 if the reading includes the sensor's offset, else 0. A reading of exactly zero does not include it.
 fn offset_part(current_a: f64) -> f64 {
     if current_a == 0.0 { 0.0 } else { 1.0 }
 }

@@ -1,9 +1,9 @@
-//! Settings of the sample stage: plausible values, maximum ages, and the sensor of each cell. `config` checks their
-//! ranges.
+//! Settings of the sample stage: plausible values, maximum ages, and the sensor of each cell. The
+//! configuration module of the host crate checks the ranges.
 
 use crate::quantity::SensorIndex;
 
-/// Limits of one kind of reading. A value outside is a bad reading and changes no estimate.
+/// Limits of one kind of reading. A value outside the limits is a bad reading and changes no estimate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Limits {
     /// Smallest plausible value, in the channel's unit.
@@ -35,7 +35,7 @@ pub enum VoltageSource {
 pub struct ContactorConfig {
     /// Values that mean "open".
     pub open: Vec<f64>,
-    /// Limits of its readings. After the maximum age, the state is unknown.
+    /// Limits of the signal's readings. After the maximum age, the state of the contactors is unknown.
     pub limits: Limits,
 }
 
@@ -58,9 +58,9 @@ pub struct SampleConfig {
     pub reported_soc: Option<Limits>,
     /// Limits of the SOH reported by the pack; `None` = not reported.
     pub reported_soh: Option<Limits>,
-    /// The contactors; `None` = no signal, the measured current always counts.
+    /// The contactors; `None` = no signal, so that the measured current always counts.
     pub contactor: Option<ContactorConfig>,
-    /// Temperature sensor of each cell; `None` = no sensor, only the thermal model.
+    /// Temperature sensor of each cell; `None` = no sensor, so that the thermal model gives the temperature.
     pub sensor_of_cell: Vec<Option<SensorIndex>>,
     /// Standard deviation of a voltage sensor's noise, V.
     pub voltage_noise_v: f64,
@@ -69,7 +69,7 @@ pub struct SampleConfig {
 }
 
 impl SampleConfig {
-    /// Cells in series.
+    /// Number of cells in series.
     pub const fn series(&self) -> u16 {
         match self.voltage_source {
             VoltageSource::Cells => self.cells,

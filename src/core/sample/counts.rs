@@ -7,27 +7,27 @@ use crate::quantity::Fault;
 /// Readings by outcome since the first start; part of the stored state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct ReadingCounts {
-    /// Used.
+    /// Readings that were used.
     pub accepted: u64,
-    /// For channels that the configuration does not use.
+    /// Readings of channels that the configuration does not use.
     pub unused: u64,
-    /// Steps to a new level, rejected at first and accepted once they persisted.
+    /// Steps to a new level that were rejected at first and accepted once they persisted.
     pub levels_believed: u64,
-    /// The frame was too short.
+    /// Readings whose frame was too short.
     pub short_frame: u64,
-    /// The frame failed its end-to-end check.
+    /// Readings whose frame failed its end-to-end check.
     pub end_to_end: u64,
-    /// The sender marks the signal as not available.
+    /// Readings that the sender marked as not available.
     pub not_available: u64,
-    /// NaN or infinite.
+    /// Readings that were NaN or infinite.
     pub not_finite: u64,
-    /// Outside its range.
+    /// Readings outside their range.
     pub out_of_range: u64,
-    /// Changed too fast.
+    /// Readings that changed too fast.
     pub rate_too_high: u64,
-    /// Unchanged although it should have changed.
+    /// Readings that did not change although they should have.
     pub stuck: u64,
-    /// Times a signal became too old.
+    /// How often a signal became too old.
     pub stale: u64,
 }
 

@@ -4,38 +4,40 @@
 //! frozen until its reading changes.
 //!
 //! A constant reading alone proves nothing: a parked pack, a charger and a laboratory hold a current for hours, and a
-//! coarse sensor then shows one value throughout. But then the voltages rest, or drift in one direction. A changing
-//! load moves them back and forth: the median of the cells moves in one direction and turns back, each time by more
-//! than its noise, within [`MAX_TURN_S`]. The sensor is frozen if its reading is still the same [`MIN_FROZEN_S`] later,
-//! after at least [`MIN_READINGS`] equal readings. The delay allows for a reading that arrives later than the voltages.
+//! coarse sensor then shows one value throughout. In these cases, the voltages rest or drift in one direction. A
+//! changing load moves the voltages back and forth: the median of the cells moves in one direction and turns back
+//! within [`MAX_TURN_S`]. Both movements exceed the noise of the median. The sensor is frozen if its reading is still
+//! the same [`MIN_FROZEN_S`] after the turn and at least [`MIN_READINGS`] readings were equal. The delay allows for a
+//! reading that arrives later than the voltages.
 //!
-//! Limits: the check does not detect a load that does not turn back or moves the voltages by less than the step. It
-//! does not detect a sensor whose last digits still change either; in that case the voltages contradict the estimate.
+//! Limits: the check does not detect a load that does not turn back or moves the voltages by less than the step. Nor
+//! does it detect a sensor whose last digits still change. In that case, the voltages contradict the estimate.
 
 use serde::{Deserialize, Serialize};
 
 use crate::quantity::{InvalidState, Timestamp, bounds};
 
-/// Fewest equal current readings.
+/// Minimum number of equal current readings.
 const MIN_READINGS: u32 = 20;
-/// How long the reading must remain unchanged after the voltages turned back, s. No current arrives that much
-/// later.
+/// Time for which the reading must remain unchanged after the voltages turned back, s. A current reading is never this
+/// late.
 const MIN_FROZEN_S: f64 = 5.0;
-/// Longest time between an extreme voltage and the return from it, s. Cells that rest, cool or balance turn more
-/// slowly.
+/// Longest time between an extreme voltage and the return from it, s. The voltages of cells that rest, cool or balance
+/// turn more slowly.
 const MAX_TURN_S: f64 = 60.0;
 /// Step that exceeds a voltage's noise, in configured standard deviations.
 const STEP_SIGMA: f64 = 5.0;
 /// The same step as a multiple of the median change of the voltage per round, used if the real noise exceeds the
-/// configured noise. Corresponds to 8 standard deviations, so that not even two readings in a row reach it by chance
-/// within a day.
+/// configured noise. The value corresponds to 8 standard deviations, so that two consecutive readings do not reach it
+/// by chance within a day.
 const STEP_MOVES: f64 = 8.4;
-/// Largest and smallest number of changes for their median.
+/// Maximum and minimum number of voltage changes from which their median is calculated.
 const MAX_MOVES: usize = 32;
 const MIN_MOVES: usize = 8;
-/// Smallest step, V. Less may be a charger's ripple, or a load within one step of a coarse current sensor.
+/// Smallest step, V. A smaller step may be a charger's ripple, or a load within one step of a coarse current sensor.
 const MIN_STEP_V: f64 = 0.02;
-/// Number of cells for the median: the first ones, enough to tell a glitch from a load.
+/// Maximum number of cells whose median is calculated. The first cells are used; they are enough to distinguish a
+/// glitch from a load.
 const MAX_MEDIAN: usize = 15;
 /// Longest time between two current readings, s. After a longer pause the check restarts.
 const MAX_PAUSE_S: f64 = 5.0;
@@ -48,11 +50,11 @@ struct Reversals {
     range_v: Option<(f64, f64)>,
     /// Whether the voltage has risen since the last turning point; `None` = no turning point yet.
     is_rising: Option<bool>,
-    /// Time of the extreme voltage in this direction.
+    /// Time of the extreme voltage in the current direction.
     extreme_at: Timestamp,
-    /// One reading shows a turn; the next one has to confirm it.
+    /// Whether one reading shows a turn that the next one has to confirm.
     is_unconfirmed: bool,
-    /// The voltage has turned back within [`MAX_TURN_S`].
+    /// Whether the voltage has turned back within [`MAX_TURN_S`].
     has_turned: bool,
 }
 
@@ -91,20 +93,21 @@ impl Reversals {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct FrozenCheck {
-    /// The unchanged reading, the time of its latest occurrence, and their number.
+    /// The unchanged reading of the current, the time of its latest occurrence, and the number of occurrences.
     current_a: Option<f64>,
     latest: Timestamp,
     readings: u32,
     reversals: Reversals,
     /// Time of the first current reading after the voltages turned back.
     turned_at: Option<Timestamp>,
-    /// Voltages of the current round, V, at most [`MAX_MEDIAN`]. The first cell starts a round.
+    /// Voltages of the round, V, at most [`MAX_MEDIAN`]. The first cell starts a round.
     round_v: Vec<f64>,
-    /// The current round started before the current reading changed.
+    /// Whether the round of voltages started before the reading of the current changed.
     is_mixed: bool,
     /// Median of the previous round, V.
     median_v: f64,
-    /// Latest absolute changes of the median, V, at most [`MAX_MOVES`]. Kept when the current reading changes.
+    /// Latest absolute changes of the median, V, at most [`MAX_MOVES`]. They are kept when the reading of the current
+    /// changes.
     moves_v: Vec<f64>,
     is_frozen: bool,
 }
@@ -159,7 +162,7 @@ impl FrozenCheck {
     fn end_round(&mut self, now: Timestamp, step_v: f64) {
         self.round_v.sort_unstable_by(f64::total_cmp);
         let cells = self.round_v.len();
-        // Of the two middle cells, take the one that changed less: a load moves both.
+        // Of the two middle cells, take the one that changed less, because a load moves both.
         let (low, high) = (self.round_v[(cells - 1) / 2], self.round_v[cells / 2]);
         let is_low_nearer = (low - self.median_v).abs() <= (high - self.median_v).abs();
         let median = if is_low_nearer { low } else { high };
@@ -182,7 +185,7 @@ impl FrozenCheck {
         *moves_v.select_nth_unstable_by(self.moves_v.len() / 2, f64::total_cmp).1
     }
 
-    /// Forgets everything, after a gap of unknown length.
+    /// Forgets everything. Called after a gap of unknown length.
     pub(super) fn restart(&mut self) {
         *self = Self::default();
     }
@@ -263,7 +266,7 @@ mod tests {
 
     #[test]
     fn late_current_and_slow_turns_are_not_frozen() {
-        // End of a charge: the voltages fall three seconds before the current reading does.
+        // At the end of the charge, the voltages fall three seconds before the reading of the current changes.
         let charge = |time_s: f64| if time_s < 100.0 { 3.6 + 2e-3 * time_s } else { 3.7 };
         assert_eq!(found_s(200, |time_s| if time_s < 103.0 { -50.0 } else { 0.0 }, charge), None);
         let found = found_s(200, |_| -50.0, charge);
@@ -275,7 +278,8 @@ mod tests {
     fn measured_load_and_glitches_are_not_frozen() {
         let voltage = |time_s: f64| 3.7 - 1.5e-3 * load_a(time_s);
         assert_eq!(found_s(600, load_a, voltage), None);
-        // Five times the configured noise, as a coarse sensor may have; pseudorandom, uniform, derived from the time.
+        // A coarse sensor may have five times the configured noise. Here, it is pseudorandom, uniform and derived from
+        // the time.
         let noise = |time_s: f64| {
             let bits = ((10.0 * time_s) as u64).wrapping_add(1).wrapping_mul(0x9E37_79B9_7F4A_7C15);
             let bits = (bits ^ (bits >> 29)).wrapping_mul(0xBF58_476D_1CE4_E5B9);

@@ -1,4 +1,4 @@
-//! The sampler: one signal per configured channel, the charge counter, and the samples built from them.
+//! Combines the signals of all configured channels and the charge counter into samples.
 //!
 //! In: readings with their time (V, A, degrees C). Out: a [`CellSample`] per good voltage, with the current and
 //! temperature that are fresh at that time, and the charge and unmeasured time counted up to it. A bad voltage gives no
@@ -18,15 +18,15 @@ use super::frozen::{self, FrozenCheck};
 use super::signal::Signal;
 use crate::quantity::{CellIndex, Channel, Fault, InvalidState, Reading, SensorIndex, Timestamp};
 
-/// Smallest current that counts as flowing, as a fraction of the largest plausible current: above a sensor's noise and
-/// offset at rest, below any load under which a voltage or temperature must change.
+/// Smallest current that counts as flowing, as a fraction of the largest plausible current. It is above a sensor's
+/// noise and offset at rest. It is below any load under which a voltage or temperature must change.
 pub const FLOW_SHARE: f64 = 0.01;
 
 /// A signal that turned bad (`Err`: the fault) or good again (`Ok`: the number of bad readings before).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SignalChange {
     pub channel: Channel,
-    /// Its new state.
+    /// New state of the signal.
     pub state: Result<u64, Fault>,
 }
 
@@ -96,8 +96,8 @@ pub struct Sampler {
     shared: SharedInputs,
 }
 
-/// Inputs shared by readings with the same time stamp. A new current invalidates all of them, a new temperature only
-/// the sensor's value.
+/// Inputs shared by readings with the same time stamp. A new current invalidates all of them. A new temperature
+/// invalidates only `sensor`.
 #[derive(Debug, Clone, Copy, Default)]
 struct SharedInputs {
     /// Whether the other fields are valid.
@@ -106,7 +106,7 @@ struct SharedInputs {
     totals: ChargeTotals,
     cell_current_a: Option<f64>,
     cell_charge_as: f64,
-    /// The sensor of the last sample, and its value. Neighbouring cells often share a sensor.
+    /// The sensor of the last sample with the sensor's value. Neighbouring cells often share a sensor.
     sensor: Option<(SensorIndex, Option<f64>)>,
 }
 
@@ -139,10 +139,10 @@ impl Sampler {
         &self.config
     }
 
-    /// Replaces the limits of the same signals.
+    /// Replaces the limits and keeps the state of the signals.
     ///
     /// # Panics
-    /// If the signals differ. The caller must check that they are the same.
+    /// Panics if the configuration has other signals. The caller must check this first.
     pub fn reconfigure(&mut self, config: &SampleConfig) {
         let state = std::mem::replace(self, Self::new(config.clone())).state;
         self.restore(state);
@@ -260,8 +260,8 @@ impl Sampler {
         self.next_stale = Some(next);
     }
 
-    /// Handles a gap of unknown length before `time`: no value is fresh, no charge is counted over the gap, ages
-    /// restart.
+    /// Handles a gap of unknown length before `time`. Afterwards, no value is fresh, and ages start at `time`. The gap
+    /// counts no charge.
     pub fn handle_gap(&mut self, time: Timestamp) {
         self.state.charge.handle_gap(self.state.latest, time, self.config.current.max_age_s);
         self.state.signals.iter_mut().for_each(Signal::handle_gap);
@@ -271,8 +271,8 @@ impl Sampler {
         (self.next_stale, self.shared.is_known) = (None, false);
     }
 
-    /// Handles the end of a sleep at `time`: values keep their age, but the time asleep makes no signal silent or
-    /// stale.
+    /// Handles the end of a sleep at `time`. Values keep their age, but the time asleep does not make a signal silent
+    /// or stale.
     pub fn wake(&mut self, time: Timestamp) {
         self.state.began = Some(time);
         self.next_stale = None;
@@ -331,7 +331,7 @@ impl Sampler {
     pub fn all_silent_s(&self, now: Timestamp, quiet_s: f64) -> Option<f64> {
         let received = |signal: &Signal| signal.received;
         let is_recent = |at: Timestamp| now.since(at) <= quiet_s;
-        // The current arrives most often: usually it alone decides.
+        // Check the current first: it arrives most often and usually decides.
         if received(&self.state.signals[0]).is_some_and(is_recent) {
             return None;
         }
@@ -449,8 +449,8 @@ impl Sampler {
         SamplerState { strings, series, ..self.state.clone() }
     }
 
-    /// Restores a stored state, whose times the caller has rebased and which [`fits`](Self::fits). The downtime is
-    /// unmeasured like any other hole.
+    /// Restores a stored state. The caller has rebased its times and checked that it [`fits`](Self::fits). The downtime
+    /// is unmeasured, like any other time without a current.
     pub fn restore(&mut self, state: SamplerState) {
         assert!(self.fits(&state), "the stored state must have the same signals");
         let signals = self.state.signals.len();
@@ -463,7 +463,7 @@ impl Sampler {
         (self.next_stale, self.shared.is_known) = (None, false);
     }
 
-    /// The current moment, for voltages that are measured now and arrive later.
+    /// Current and counters at `now`, for voltages that are measured now and arrive later.
     pub fn moment(&mut self, now: Timestamp) -> Moment {
         let time = self.advance(now);
         self.refresh_shared_inputs(time);
@@ -531,7 +531,7 @@ impl Sampler {
         f64::from(self.config.strings.max(1))
     }
 
-    /// Divisor from a reading to a cell's value: a total voltage is divided by the number of cells in series.
+    /// Divisor that converts a reading to a cell's value. A total voltage is divided by the number of cells in series.
     #[inline]
     fn divisor(&self, channel: Channel) -> f64 {
         match self.config.voltage_source {

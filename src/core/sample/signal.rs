@@ -8,8 +8,7 @@
 //!   wrong, and rejecting the value would lock out a healthy sensor.
 //! * **Stuck**: a value that stays exactly the same for too long while it should change is bad until it changes. The
 //!   caller passes a clock that runs only while the value should change.
-//! * **Stale**: no good value for too long.
-//!
+//! * **Stale**: the last good value is older than the maximum age.
 //!
 //! A fault found by the decoder is passed on. A bad reading never becomes the signal's value.
 
@@ -26,7 +25,7 @@ pub const ACCEPT_AFTER: u32 = 3;
 /// over a zero interval would be infinite.
 pub const MIN_RATE_INTERVAL_S: f64 = 1e-3;
 
-/// Number of readings after which an old one has lost most of its weight in the share of bad readings.
+/// Number of readings after which a reading has lost most of its weight in the share of bad readings.
 pub const BAD_SHARE_READINGS: u32 = 100;
 
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -48,9 +47,9 @@ pub(super) struct Signal {
     refused: Option<TimedValue>,
     /// Number of consecutive readings that agree with `refused`.
     refused_count: u32,
-    /// The value that has not changed.
+    /// The latest value, which has not changed since `rests_since_s`.
     rests_at: Option<f64>,
-    /// Stuck clock at the last change of the value, s.
+    /// Time of the stuck clock at the last change of the value, s.
     rests_since_s: f64,
     /// Time of the latest reading, good or bad.
     #[serde(rename = "heard")]
@@ -68,7 +67,7 @@ pub(super) struct Signal {
 pub(super) struct SignalUpdate {
     pub(super) value: Result<f64, Fault>,
     pub(super) change: Option<Result<u64, Fault>>,
-    /// Whether a step to a new level, rejected so far, is accepted now.
+    /// Whether a step to a new level is accepted now, after its first readings were rejected.
     pub(super) is_new_level: bool,
 }
 
@@ -99,7 +98,7 @@ impl Signal {
         Fault::Stale
     }
 
-    /// Time from which the signal is stale if no good reading arrives; its age starts at `began` at the earliest.
+    /// Time from which the signal is stale if no good reading arrives. Its age does not start before `began`.
     pub(super) fn stale_from(&self, began: Timestamp, limits: &Limits) -> Timestamp {
         self.good.map_or(began, |good| good.time.max(began)).plus_secs(limits.max_age_s)
     }
@@ -125,7 +124,7 @@ impl Signal {
         (self.readings > 0).then_some(self.bad_share)
     }
 
-    /// Handles a gap of unknown length: forgets values and times, keeps the fault and the share of bad readings.
+    /// Handles a gap of unknown length. Forgets values and times, but keeps the fault and the share of bad readings.
     pub(super) fn handle_gap(&mut self) {
         *self = Self {
             fault: self.fault,

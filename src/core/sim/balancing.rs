@@ -1,8 +1,8 @@
-//! Passive balancing: a BMS that bleeds cells whose voltage is above the lowest cell voltage.
+//! Simulates passive balancing: the BMS bleeds cells whose voltage is above the lowest cell voltage.
 //!
-//! The BMS bleeds near the end of a charge and during the first rest after it, also while the buses sleep. A drive
-//! between the charge and that rest pauses the balancing. The BMS compares voltages as its own channels measure them,
-//! with their constant offsets but without noise, because a BMS averages.
+//! The BMS bleeds near the end of a charge and during the first rest after it, even while the buses sleep. A drive
+//! between the charge and that rest pauses the balancing. The BMS compares the voltages that its own channels measure.
+//! They include the channels' constant offsets, but no noise, because a BMS averages.
 
 use super::truth::Pack;
 
@@ -30,7 +30,7 @@ impl Balancing {
 pub(crate) struct Balancer {
     settings: Balancing,
     charging_s: f64,
-    /// A charge is or was near its end, and the first rest after it has not ended yet.
+    /// Whether a charge is or was near its end, and the first rest after it has not ended yet.
     is_armed: bool,
     has_rested: bool,
 }

@@ -14,7 +14,7 @@ use crate::quantity::{CellIndex, SensorIndex};
 pub struct Fault {
     /// Kind, place and size.
     pub kind: FaultKind,
-    /// Start, in s after the start of the simulation.
+    /// Start of the fault after the start of the simulation, s.
     pub from_s: f64,
 }
 
@@ -30,7 +30,7 @@ pub enum Leak {
 /// Size of a contact's resistance.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum ContactResistance {
-    /// Ohm.
+    /// Resistance, ohm.
     Ohm(f64),
     /// Share of the cell's own ohmic resistance at SOC 50 % and 25 degrees C when the fault starts.
     OfCell(f64),
@@ -43,7 +43,7 @@ pub enum FaultKind {
     Leak {
         /// The cell.
         cell: CellIndex,
-        /// Its leak.
+        /// Size of the leak.
         leak: Leak,
     },
     /// A resistance in series with the cell, between its two voltage taps. It does not depend on temperature, and its
@@ -51,10 +51,10 @@ pub enum FaultKind {
     Contact {
         /// The cell.
         cell: CellIndex,
-        /// Its size.
+        /// Size of the resistance.
         resistance: ContactResistance,
     },
-    /// The cell's capacity changes, its SOC does not.
+    /// The cell's capacity changes, but its SOC does not.
     Weak {
         /// The cell.
         cell: CellIndex,
@@ -78,9 +78,9 @@ pub enum FaultKind {
         /// Change of the capacity.
         change: f64,
     },
-    /// The current sensor's offset changes by this, A, positive = discharge.
+    /// The current sensor's offset changes by this value, A, positive = discharge.
     CurrentOffset(f64),
-    /// The current sensor's gain changes by this, relative.
+    /// The current sensor's gain changes by this relative value.
     CurrentGain(f64),
     /// The current reading is frozen.
     CurrentStuck,
@@ -117,7 +117,7 @@ pub enum FaultKind {
 pub struct FaultError {
     /// The part of the fault.
     pub what: &'static str,
-    /// The found text.
+    /// The text that was found.
     pub found: String,
     /// What is allowed.
     pub allowed: String,
@@ -130,7 +130,7 @@ impl FaultError {
 }
 
 impl FaultKind {
-    /// Cells that the fault names, the highest last.
+    /// Cells that the fault names.
     fn cells(&self) -> [Option<CellIndex>; 2] {
         match *self {
             Self::Leak { cell, .. }

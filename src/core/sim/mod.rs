@@ -1,8 +1,8 @@
 //! The simulator: a pack with a known true state, its sensors, and the scenarios that load it.
 //!
 //! In: a cell model, settings and a seed. Out: readings at their sampling times, as a BMS would measure them, and the
-//! true state. All randomness is seeded and all functions come from `libm`: the same seed gives the same bytes on every
-//! machine.
+//! true state. All randomness is seeded and all functions come from `libm`, so the same seed gives the same bytes on
+//! every machine.
 //!
 //! | file | purpose |
 //! | --- | --- |
@@ -14,6 +14,7 @@
 //! | [`fault`] | injected faults of cells, contacts, modules and sensors |
 //! | [`balancing`] | passive balancing by the BMS |
 //! | [`run`] | the loop: truth, course and sensors stepped together |
+
 pub mod balancing;
 mod course;
 pub mod fault;

@@ -8,8 +8,8 @@ use rand::Rng;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-/// What a stream of random numbers is used for. The number of a stream affects results, so it never changes and is never
-/// given to another use.
+/// Use of a stream of random numbers. The number of a stream affects results, so it never changes and is never reused
+/// for another purpose.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Stream {
     Spread,

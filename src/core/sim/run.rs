@@ -1,9 +1,9 @@
 //! The simulation's loop: steps true state, course and sensors together, and returns readings.
 //!
 //! At each moment, the current until the next moment is known. The readings and the true state of a moment belong
-//! together: the voltage includes that current's drop. Cells are stepped at their own sampling period with the mean
-//! current over it. The charge is exact. The relative difference of a branch voltage from stepping at every current
-//! sample is less than half a period divided by the branch's time constant.
+//! together: the voltage includes the drop that this current causes. Cells are stepped once per cell sampling period,
+//! with the mean current of the period. The charge is exact. Compared with a step at every current sample, the relative
+//! difference of a branch voltage is less than half a period divided by the branch's time constant.
 
 use super::balancing::{Balancer, Balancing};
 use super::course::{Course, Demand};
@@ -19,9 +19,9 @@ use crate::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
 /// Wiring and sensors of the pack.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Wiring {
-    /// Number of parallel strings: the pack current is the cell current times this.
+    /// Number of parallel strings. The pack current is the cell current times this number.
     pub strings: u16,
-    /// The cell of each temperature sensor; `None` = measures the ambient temperature.
+    /// The cell of each temperature sensor; `None` = the sensor measures the ambient temperature.
     pub temperature_at: Vec<Option<CellIndex>>,
 }
 
@@ -93,7 +93,7 @@ pub struct Simulation {
     readings: Vec<(Channel, Option<f64>)>,
     time: Timestamp,
     current_a: f64,
-    /// Charge, As, and time, ns, since the last step of the cells.
+    /// Charge, As, and time, ns, that the cells have not been stepped for yet.
     pending: (f64, i64),
     cells_due: bool,
     started: bool,
@@ -147,8 +147,9 @@ impl Simulation {
         self
     }
 
-    /// Makes the BMS report for each cell whether it is bled (1) or not (0). It reports these bits with the voltages,
-    /// and during sleep every minute while it bleeds any cell, ending with one report that no cell is bled.
+    /// Makes the BMS report for each cell whether it is bled (1) or not (0). It reports these bits together with the
+    /// voltages. During sleep, it reports them every minute while it bleeds a cell, and once more when it no longer
+    /// bleeds any.
     #[must_use]
     pub fn with_balancing_bits(mut self) -> Self {
         self.has_bits = true;
@@ -184,12 +185,13 @@ impl Simulation {
         Some(Moment { time: self.time, current_a: self.current_a, cells_sampled })
     }
 
-    /// Readings of the latest moment; `None` as a value = dropped out.
+    /// Readings of the latest moment; the value `None` = dropped out.
     pub fn readings(&self) -> &[(Channel, Option<f64>)] {
         &self.readings
     }
 
-    /// Constant errors of the sensors, without injected faults: of the current, A, and of each cell's voltage, V.
+    /// Constant errors of the current sensor, A, and of each cell's voltage sensor, V. Injected faults are not
+    /// included.
     pub fn sensor_offsets(&self) -> (f64, Vec<f64>) {
         (self.sensors.current.offset(), self.sensors.voltages.iter().map(Sensor::offset).collect())
     }
@@ -226,12 +228,12 @@ impl Simulation {
     fn fall_asleep(&mut self, duration_s: f64) {
         self.step_pending();
         self.current_a = 0.0;
-        // Longest step during sleep, s: limits the error from changing resistances and temperatures.
+        // Longest step during sleep, s. It limits the error from changing resistances and temperatures.
         let steps = (duration_s / 60.0).ceil().max(1.0) as u32;
         self.asleep = Some(Asleep { from: self.time, duration_s, step: 0, steps });
     }
 
-    /// Continues a sleep; returns whether there are bits to report before it ends.
+    /// Continues the sleep, if there is one. Returns whether it reported balancing bits before the end of the sleep.
     fn sleep(&mut self) -> bool {
         while let Some(asleep) = &mut self.asleep {
             let (now, step_s) = (asleep.time(), asleep.duration_s / f64::from(asleep.steps));
@@ -303,7 +305,8 @@ impl Simulation {
         }
     }
 
-    /// A contact's resistance is between the taps, so its drop appears in the cell's channel and in the pack voltage.
+    /// Measures the cell voltages and the pack voltage. A contact's resistance is between the taps, so its drop appears
+    /// in both.
     fn measure_voltages(&mut self) {
         self.sensed_v.clear();
         let taps = self.pack.voltages_v(self.current_a).zip(self.pack.cells());

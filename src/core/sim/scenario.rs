@@ -1,8 +1,8 @@
 //! The named scenarios and their settings.
 //!
 //! Amounts are given for the cell of the source (nominal capacity below) and scale with the capacity of the configured
-//! cell model, so that any configuration can be simulated. For a cell of the nominal capacity, they are the source's
-//! own numbers.
+//! cell model, so that any configuration can be simulated. For a cell of the nominal capacity, the amounts are those of
+//! the source.
 //!
 //! | scenario | nominal | source | course |
 //! | --- | --- | --- | --- |
@@ -42,11 +42,11 @@ pub struct Settings {
     pub current_period_ns: i64,
     /// Time between samples of voltages and temperatures, ns; a multiple of `current_period_ns`.
     pub cell_period_ns: i64,
-    /// Ends after this many cycles, as the scenario defines them; `None` = no limit.
+    /// The simulation ends after this number of the scenario's cycles; `None` = no limit.
     pub cycles: Option<u32>,
-    /// Ends after this time, s; `None` = no limit.
+    /// The simulation ends after this time, s; `None` = no limit.
     pub duration_s: Option<f64>,
-    /// Ends when the weakest cell would fall below this capacity, Ah; 0 = no limit.
+    /// The simulation ends when the weakest cell would fall below this capacity, Ah; 0 = no limit.
     pub end_capacity_ah: f64,
     /// SOC at which charging and discharging start, in the cycling scenarios.
     pub soc_window: (f64, f64),
@@ -109,8 +109,8 @@ impl Settings {
                 s.sensors = Sensors { voltage, ..Sensors::default() };
                 (s.end_capacity_ah, s.cycles) = (0.0, Some(10));
             }
-            // Ageing at which one block of 1,500 loads (about 310 Ah) costs about 5 % capacity and 10 % resistance, as
-            // in the measured cells.
+            // With this ageing, a block of 1,500 loads (about 310 Ah) reduces the capacity by about 5 % and increases
+            // the resistance by about 10 %, as in the measured cells.
             Scenario::RandomWalk => {
                 s.pack.ageing = Ageing {
                     capacity_loss_ah_per_ah: 3.4e-4,
@@ -124,7 +124,8 @@ impl Settings {
         s
     }
 
-    /// Current every 10 ms, cells every 100 ms; errors of a typical pack: 0.5 % gain, 1 mV noise, 1 % capacity spread.
+    /// Sets a current sample every 10 ms, cell samples every 100 ms, and the errors of a typical pack: 0.5 % gain, 1 mV
+    /// noise, 1 % capacity spread.
     fn set_ev_day(&mut self) {
         let capacity_ah = self.pack.capacity_ah;
         self.pack.cells = 96;

@@ -2,8 +2,9 @@
 //!
 //! Each cell is the circuit of [`CellModel`] with its own capacity, resistance and temperature, and with effects that
 //! the estimator does not model. Current is positive for discharge. During a step of `dt` seconds, the current and the
-//! values from the tables are constant; under this condition every equation is solved exactly:
-//! * `SOC -= (I + I_leak) dt / (3600 C)`; not clamped, because 0 and 1 are open-circuit voltages, not limits;
+//! values from the tables are constant. Under this condition, every equation is solved exactly:
+//! * `SOC -= (I + I_leak) dt / (3600 C)`; not clamped, because 0 and 1 stand for open-circuit voltages and are not
+//!   limits;
 //! * `U_i = U_i a + R_i I (1 - a)`, `a = exp(-dt / tau_i)`; ageing scales every resistance but no time constant;
 //! * hysteresis, one state h in [-1, 1] (Plett): `h = h e - (1 - e) sign(I)`, `e = exp(-|I dt| gamma / (3600 C))`;
 //! * heat: `T = T_end + (T - T_end) exp(-dt / (R_th C_th))`, `T_end = T_ambient + R_th (I^2 R0 + sum U_i^2 / R_i)`.
@@ -19,9 +20,9 @@ use crate::quantity::CellIndex;
 /// Hysteresis of the open-circuit voltage, which the estimator does not model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hysteresis {
-    /// Distance of the settled charge and discharge curves from the OCV, V; 0 = none.
+    /// Distance of the settled charge and discharge curves from the OCV, V; 0 = no hysteresis.
     pub magnitude_v: f64,
-    /// How fast the voltage changes to the other curve: e-foldings per full charge moved.
+    /// How fast the voltage changes from one curve to the other, in e-foldings per full charge moved.
     pub rate: f64,
 }
 
@@ -94,7 +95,7 @@ pub struct TruthCell {
     pub capacity_ah: f64,
     /// Resistance relative to the cell model.
     pub resistance_ratio: f64,
-    /// Charge moved so far in either direction, Ah.
+    /// Charge moved in either direction since the start, Ah.
     pub throughput_ah: f64,
     /// Leak of an injected fault.
     pub leak: Option<Leak>,
@@ -137,8 +138,7 @@ impl TruthCell {
         (self.unloaded_v(model, hysteresis) - voltage_v) / (model.r0_ohm(&place) * self.resistance_ratio)
     }
 
-    /// Current of the injected leak, A. It stops when the cell is empty. Its drop in the terminal voltage is
-    /// negligible.
+    /// Current of the injected leak, A. It stops when the cell is empty. The voltage drop that it causes is negligible.
     pub fn leak_a(&self, model: &CellModel, hysteresis: &Hysteresis) -> f64 {
         match self.leak {
             None => 0.0,
@@ -226,7 +226,7 @@ impl Pack {
         }
     }
 
-    /// Changes the ageing from now on, because fade is rarely linear.
+    /// Changes the ageing of the following steps, to simulate fade that is not linear.
     pub fn set_ageing(&mut self, ageing: Ageing) {
         self.settings.ageing = ageing;
     }
@@ -289,7 +289,7 @@ impl Pack {
         self.cells.iter().map(|cell| cell.leak_a(&self.model, &self.settings.hysteresis))
     }
 
-    /// Cycles completed.
+    /// Number of completed cycles.
     pub fn cycles(&self) -> u32 {
         self.cycles
     }

@@ -6,7 +6,7 @@ use crate::quantity::CellIndex;
 /// Summary of all alarms of one rule.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RuleSummary {
-    /// The worst severity of the raised alarms of the rule; `None` = none raised.
+    /// The worst severity of the raised alarms of the rule; `None` = no alarm is raised.
     pub worst: Option<Severity>,
     /// Whether every alarm of the rule has a known value.
     pub is_known: bool,
@@ -26,7 +26,7 @@ impl AlarmEngine {
         })
     }
 
-    /// The worst severity of all raised alarms; `None` = none raised.
+    /// The worst severity of all raised alarms; `None` = no alarm is raised.
     pub fn highest_severity(&self) -> Option<Severity> {
         self.raised.iter().map(|&slot| self.rules[self.rule_of(slot)].config.severity).max()
     }

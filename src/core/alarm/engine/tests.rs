@@ -1,4 +1,4 @@
-//! Scenarios with a whole engine; `machine/tests.rs` tests the transition table.
+//! Tests scenarios with a whole engine; `machine/tests.rs` tests the transition table.
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;

@@ -1,4 +1,4 @@
-//! The transition table, and what it cannot express: counting, history, suspension.
+//! Tests the transition table, and behaviour that the table does not express: counting, history, suspension.
 
 use super::super::{Comparison, Rule, Severity};
 use super::*;
@@ -57,7 +57,7 @@ fn observe(machine: &mut Machine, rule: &RuleConfig, seconds: f64, check: LimitC
     machine.observe(at(seconds), rule, &Observation::new(value))
 }
 
-/// A machine that has reached `state` at 100 s at the latest; its debounce, if running, starts then.
+/// A machine in `state` at 100 s. If its debounce is running, it starts at 100 s.
 fn machine_in(state: AlarmState) -> (Machine, RuleConfig) {
     use LimitCheck::{Beyond, Healthy, Unknown};
     let rule = rule(state == AlarmState::Latched);
@@ -78,8 +78,8 @@ fn machine_in(state: AlarmState) -> (Machine, RuleConfig) {
     (machine, rule)
 }
 
-/// Expected state after `input`, expected state after the same input once the debounce has run out, and the change
-/// published by the first.
+/// Expected state after `input`, expected state after the same input once the debounce has run out, and the change that
+/// the first input publishes.
 fn expected(state: AlarmState, input: MachineInput) -> (AlarmState, AlarmState, Option<Change>) {
     use AlarmState::{Active, Cleared, Clearing, Inactive, Latched, Pending, Suppressed, Unknown};
     use LimitCheck::{Between, Beyond, Healthy};
@@ -139,7 +139,7 @@ fn transitions_match_table_for_all_inputs() {
     }
 }
 
-/// Commands never make a value known.
+/// Whether the value is known after `input`. A command does not change whether it is known.
 fn is_known_in(state: AlarmState, input: MachineInput) -> bool {
     match input {
         MachineInput::Check(_) => true,
@@ -244,7 +244,7 @@ fn unknown_value_pauses_debounce_without_reset() {
         observe(&mut machine, &rule, 105.0, LimitCheck::Unknown);
         assert_eq!(machine.poll(at(190.0), &rule), None);
         observe(&mut machine, &rule, 200.0, check);
-        assert_eq!(machine.poll(at(205.9), &rule), None, "4 s before the unknown value count, 1 s next to it does not");
+        assert_eq!(machine.poll(at(205.9), &rule), None, "the 4 s count, the 1 s up to the unknown value does not");
         assert_eq!(machine.poll(at(206.0), &rule), Some(change));
     }
 }

@@ -84,7 +84,7 @@ fn open_contactors_force_zero_current_and_charge() {
     bench.ok(2.0, Channel::Current, 5.0);
     let open = bench.ok(9.0, CELL, 3.7).expect("a sample");
     assert_eq!((open.current_a, open.charge_as, open.offset_s, open.unmeasured_s), (Some(0.0), 2.0, 1.0, 0.0));
-    // Neither bad readings nor time up to the maximum age close them.
+    // The contactors stay open after a bad reading, and until the maximum age of the last good one.
     bench.give(9.5, Channel::Contactor, Err(Fault::NotAvailable));
     let late = bench.ok(12.0, CELL, 3.7).expect("a sample");
     assert_eq!(
@@ -114,7 +114,7 @@ fn stale_values_are_omitted_and_hole_is_unmeasured() {
 
 #[test]
 fn recorded_glitches_give_no_sample_and_one_report() {
-    // As in the NASA files: samples of 8.4 V, and empty fields.
+    // The NASA files contain samples of 8.4 V and empty fields.
     let mut bench = Bench::new(config());
     assert!(bench.ok(0.0, CELL, 3.9).is_some());
     assert_eq!(bench.ok(1.0, CELL, 8.393), None);

@@ -1,4 +1,4 @@
-//! What a course demands next: a current that flows until the next sample, a time asleep, or the end of the course.
+//! The next demand of a course: a current that flows until the next sample, a time asleep, or the end of the course.
 
 /// Next demand of a scenario.
 #[derive(Debug, Clone, Copy, PartialEq)]

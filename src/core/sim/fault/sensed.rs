@@ -1,4 +1,4 @@
-//! Effects of sensor faults on true values before they are measured, and on readings.
+//! Applies sensor faults to true values before they are measured, and to readings.
 
 use super::FaultKind;
 use crate::quantity::{Channel, SensorIndex};

@@ -1,4 +1,4 @@
-//! Text forms of faults, and their effects on true state and readings.
+//! Tests the text forms of faults, and the effects of faults on true state and readings.
 
 use super::super::truth::tests::{plain_model, plain_settings};
 use super::super::{Balancing, Moment, Scenario, SensorQuality, Sensors, Settings, Simulation, Wiring};
@@ -35,7 +35,7 @@ fn voltage_v(sim: &Simulation, cell: u16) -> f64 {
     reading(sim, Channel::CellVoltage(CellIndex(cell)))
 }
 
-/// Runs a pack with and without `faults`; calls `each` with both at each moment.
+/// Runs a pack with `faults` and a pack without; calls `each` with both at each moment.
 fn compare(faults: &[&str], mut each: impl FnMut(Moment, &Simulation, &Simulation)) -> (Simulation, Simulation) {
     let (mut faulty, mut healthy) = (simulation(faults), simulation(&[]));
     while let Some((moment, _)) = faulty.advance().zip(healthy.advance()) {

@@ -1,4 +1,4 @@
-//! Whole scenarios, run in memory.
+//! Runs whole scenarios in memory.
 
 use super::super::balancing::Balancing;
 use super::super::scenario::Scenario;
@@ -111,7 +111,7 @@ fn sleeping_bms_reports_bits_while_bleeding() {
     (settings.cycles, settings.duration_s) = (Some(2), Some(100_000.0));
     (settings.current_period_ns, settings.cell_period_ns) = (1_000_000_000, 1_000_000_000);
     let mut nights = 0;
-    // Some drives home include a stop, which counts as the rest after the charge.
+    // With some seeds, the drive home includes a stop, which counts as the rest after the charge.
     for seed in 1..=20 {
         settings.seed = seed;
         let run = |has_bits: bool| {

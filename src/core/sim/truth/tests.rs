@@ -1,4 +1,4 @@
-//! Closed-form solutions of the true state.
+//! Compares the true state with closed-form solutions.
 
 use super::*;
 use crate::cell::{Branch, Table, Thermal};
