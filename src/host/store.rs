@@ -1,11 +1,11 @@
 //! State and history that survive a restart and a power cut: two state files and a history database in one folder.
 //!
-//! * Learned results and alarm changes are on disk, with the state of that moment, before they are announced; an announcement waits
-//!   at most 200 ms for that ([`commit_barrier`]). The rows are committed first, then the state (`writer`). After a power cut,
-//!   everything that was announced is therefore in both. A cut between the two leaves rows that were not announced: the restored
-//!   state is older than these rows, so results and alarms that still apply are learned or raised again and get another row. A
-//!   change of the pack between the two is not undone: the history says that the state's pack is closed, and the state is not
-//!   restored.
+//! * Learned results and alarm changes are written to disk, with the state of that moment, before they are announced.
+//!   An announcement waits at most 200 ms for the disk ([`commit_barrier`]). The rows are committed first, then the
+//!   state (`writer`). After a power cut, both therefore contain everything that was announced. A power cut between the
+//!   two commits leaves rows that were not announced. The restored state is older than these rows, so results and
+//!   alarms that still apply are learned or raised again and get another row. A pack change between the two commits is
+//!   not undone: the history says that the state's pack is closed, so the state is not restored.
 //! * The state is also written at checkpoints (`checkpoint`), on stop, and every second to the runtime folder, which is in memory.
 //! * The state is written to two files in turn (`state_files`) and does not depend on the database. If there is no valid state,
 //!   the capacities in the history are used (`learned`).
@@ -65,10 +65,12 @@ pub use writer::StoreProgress;
 const STANDARD_FOLDER: &str = "/var/lib/packwatch";
 /// Time between states in the runtime folder, s.
 const RUNTIME_PERIOD_S: f64 = 1.0;
-/// Time between checkpoints while no frame arrives, s; the state does not change then, it only becomes older.
+/// Time between checkpoints while no frame arrives, s. During this time the state does not change; it only becomes
+/// older.
 const QUIET_PERIOD_S: f64 = 3600.0;
 
-/// The default folder for clients: the service's or, if it does not exist, the folder of a daemon started from a shell.
+/// The default folder for clients: the folder of the service or, if it does not exist, the folder of a daemon started
+/// from a shell.
 pub fn standard_folder() -> PathBuf {
     let service = first_folder("STATE_DIRECTORY").unwrap_or_else(|| PathBuf::from(STANDARD_FOLDER));
     let own = daemon_folder().0;
@@ -98,7 +100,7 @@ pub struct StateCandidate {
     pub snapshot: Snapshot,
     /// Its age.
     pub downtime: Downtime,
-    /// Where it comes from, for the log.
+    /// Origin of the state, for the log.
     pub source: &'static str,
 }
 
@@ -128,7 +130,7 @@ pub struct Store {
 }
 
 impl Store {
-    /// Opens the store; `None` = disabled, or its folder cannot be used.
+    /// Opens the store. Returns no store if it is disabled or its folder cannot be used.
     ///
     /// # Errors
     /// Fails if another daemon uses the folder.
@@ -152,7 +154,7 @@ impl Store {
                 tracing::info!(folder = shown, %error, "state not kept; give a folder with --state to keep it");
                 return Ok(none(true));
             }
-            Err(_) => {} // logged below, and tried again
+            Err(_) => {} // this error is logged below, and the writer tries again
         }
         Self::start(folder, config, vehicle).map_err(|error| format!("{shown}: {error}"))
     }
@@ -211,7 +213,7 @@ impl Store {
         &self.folder
     }
 
-    /// Keeps a stored state that could not be restored, until a start that it fits. `why` is recorded in the history.
+    /// Keeps a stored state that could not be restored until a start that it fits. `why` is recorded in the history.
     pub fn set_state_aside(&self, why: &str, now: Timestamp) {
         tracing::error!(error = why, "stored state {SET_ASIDE}");
         let row = HistoryRow::Own { reason: "state_unfit", detail: format!("{why}; {SET_ASIDE}") };
@@ -224,8 +226,8 @@ impl Store {
         self.progress.clone()
     }
 
-    /// Commits what was learned from one input's events. Returns the ticket that the announcement must wait for; `None` = no
-    /// wait.
+    /// Commits the results learned from the events of one input. Returns the ticket that the announcement must wait
+    /// for; `None` = no wait.
     pub fn learned(&mut self, events: &[Event], monitor: &Monitor, now: Timestamp) -> Option<u64> {
         let rows = match self.history_filter.take(events, self.schedule.has_room(now)) {
             Some(rows) => rows,
@@ -236,8 +238,8 @@ impl Store {
         Some(self.submit(rows, monitor, now))
     }
 
-    /// Writes the runtime state every second, and a checkpoint when it is due. `is_fresh`: whether frames have arrived since the
-    /// last checkpoint. Returns whether a checkpoint was written.
+    /// Writes the runtime state every second, and a checkpoint when it is due. `is_fresh` states whether frames have
+    /// arrived since the last checkpoint. Returns whether a checkpoint was written.
     pub fn tick(&mut self, monitor: &Monitor, now: Timestamp, is_fresh: bool) -> bool {
         let last = self.runtime_written;
         if let Some(runtime) = &self.runtime
@@ -305,7 +307,7 @@ fn is_command_with_effect(kind: &EventKind) -> bool {
 #[derive(Debug)]
 struct OpenedFolder {
     state_files: StateFiles,
-    /// `None` = it cannot be used at present.
+    /// The open database; `None` = it cannot be used at present.
     database: Option<Database>,
     /// Rows about the opening, to be added to the history.
     rows: Vec<HistoryRow>,
@@ -356,7 +358,8 @@ impl OpenedFolder {
     }
 }
 
-/// A row for the history if the newest rows known to the state are missing; damage of SQLite's log is not visible otherwise.
+/// Returns a row for the history if the newest rows known to the state are missing. Without this check, damage of
+/// SQLite's log would not be visible.
 fn lost_rows(state: &StateDocument, database: &Database) -> Option<HistoryRow> {
     let (known, found) = (state.history_rows, database.rows());
     let detail = format!("the history ends with row {found}, the stored state knew {known}");
@@ -383,7 +386,8 @@ fn running_state(file: &Path, folder: &Path) -> Option<StateDocument> {
     }
 }
 
-/// The existing states with their sources: first the newer one of the runtime state and the stored state, last the one set aside.
+/// Lists the existing states with their sources. The newer of the runtime state and the stored state comes first; the
+/// state that was set aside comes last.
 fn candidates([running, stored, aside]: [Option<StateDocument>; 3]) -> Vec<(StateDocument, &'static str)> {
     let is_older = |running: &StateDocument, stored: &StateDocument| {
         running.stamp.same_boot(&stored.stamp) && running.stamp.boottime_ns < stored.stamp.boottime_ns

@@ -1,16 +1,16 @@
 //! Rows that wait for the disk, in limited memory.
 //!
-//! In: batches of rows. Out: the same batches, oldest first. If there is no room, details are dropped before learned results:
-//! the oldest half-cycles first, then the oldest other rows. Dropped rows are counted, and the count is written with the next
-//! rows.
+//! In: batches of rows. Out: the same batches, oldest first. If there is no room, the oldest half-cycles are dropped
+//! first, because they are details. Then the oldest other rows are dropped. Dropped rows are counted, and the count is
+//! written with the next rows.
 
 use std::collections::VecDeque;
 
 use super::rows::{HistoryRow, RowBatch};
 use super::stamp::Stamp;
 
-/// Maximum number of rows kept while the disk accepts none: half a megabyte of memory; for a pack of 96 cells about 25
-/// transitions, which are days of driving.
+/// Maximum number of rows that wait for the disk. They take half a megabyte of memory. For a pack of 96 cells they are
+/// about 25 transitions, which are days of driving.
 pub(super) const MAX_ROWS: usize = 5_000;
 
 /// Waiting rows, oldest first.
@@ -19,7 +19,7 @@ pub(super) struct Backlog {
     batches: VecDeque<RowBatch>,
     rows: usize,
     lost: LossCount,
-    /// The losses reported by the rows taken last.
+    /// The losses that the rows taken last report.
     reported: LossCount,
 }
 
@@ -38,7 +38,7 @@ impl Backlog {
         self.shrink();
     }
 
-    /// Takes all rows, and a row at the moment `now` that reports earlier losses.
+    /// Takes all rows. Adds a row with the time `now` that reports earlier losses, if any.
     pub(super) fn take(&mut self, now: &Stamp) -> Vec<RowBatch> {
         self.rows = 0;
         let mut batches: Vec<RowBatch> = self.batches.drain(..).collect();
@@ -52,14 +52,14 @@ impl Backlog {
         batches
     }
 
-    /// Notes that the rows taken last, including their report of losses, are on disk.
+    /// Notes that the rows taken last are on disk, including their report of losses.
     pub(super) fn commit(&mut self) {
         let LossCount { details, rows } = std::mem::take(&mut self.reported);
         self.lost.details -= details;
         self.lost.rows -= rows;
     }
 
-    /// Returns rows that could not be written to the front. The next rows report the losses again.
+    /// Puts rows that could not be written back at the front. The next rows report the losses again.
     pub(super) fn put_back(&mut self, batches: Vec<RowBatch>) {
         self.reported = LossCount::default();
         let is_loss = |row: &HistoryRow| matches!(row, HistoryRow::Own { reason: "rows_lost", .. });

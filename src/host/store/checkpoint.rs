@@ -1,13 +1,14 @@
-//! Decides when the next checkpoint of the state is due. A checkpoint writes the whole state, and flash wears.
+//! Decides when the next checkpoint of the state is due. Checkpoints are limited because each writes the whole state,
+//! which wears flash memory.
 //!
-//! In: the size and time of every written state. Every state counts, so committed alarms postpone checkpoints. A pack of 96
-//! cells (70 kB) gets a checkpoint every 7 minutes, a pack of 12 cells every minute.
+//! In: the size and time of every written state. States that are written with committed alarms count too, so they
+//! postpone checkpoints. A pack of 96 cells (70 kB) gets a checkpoint every 7 minutes, a pack of 12 cells every minute.
 
 use crate::quantity::Timestamp;
 
-/// Bytes of states written per day. Of the 20 MB that may be written, history and file system take the rest.
+/// Bytes of states written per day. In total 20 MB may be written per day; history and file system take the rest.
 const BYTES_PER_DAY: f64 = 15e6;
-/// Bytes that may be written ahead of that rate, when alarms change often after a quiet time.
+/// Bytes that may be written ahead of the daily rate, for alarms that change often after a quiet time.
 const MAX_AHEAD_BYTES: f64 = 3e6;
 
 /// The schedule of checkpoints.
@@ -17,7 +18,7 @@ pub(super) struct CheckpointSchedule {
     period_s: f64,
     /// Time of the last state.
     last: Option<Timestamp>,
-    /// Bytes written ahead of the daily rate at that time.
+    /// Bytes written ahead of the daily rate at the time `last`.
     ahead_bytes: f64,
 }
 
@@ -37,7 +38,7 @@ impl CheckpointSchedule {
         self.ahead_at(now) < MAX_AHEAD_BYTES
     }
 
-    /// Notes a written state of this size.
+    /// Notes that a state of this size was written.
     pub(super) fn note_written(&mut self, now: Timestamp, bytes: u64) {
         self.ahead_bytes = self.ahead_at(now) + bytes as f64;
         self.last = Some(now);
@@ -79,7 +80,7 @@ mod tests {
     fn commits_postpone_checkpoints() {
         let (checkpoints, written) = day(70_000, Some(3600));
         assert!((180..=190).contains(&checkpoints) && written <= 15_100_000, "{checkpoints}, {written} bytes");
-        // Flickering alarms.
+        // Alarms flicker every second.
         let (checkpoints, written) = day(70_000, Some(1));
         assert!(checkpoints == 0 && written <= 18_100_000, "{checkpoints}, {written} bytes");
     }

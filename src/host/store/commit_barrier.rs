@@ -1,9 +1,9 @@
 //! Holds frames until the results that they announce are on disk.
 //!
-//! During a commit, every announcing frame ([`Transmit::announces`]) waits: the frames of the input that taught something, the
-//! cyclic frames that would repeat it, and the later packets of a transfer whose first packet waits. They are sent in order.
-//! The status frame is not held, because state of charge and validity must not become old and it only contains the number of
-//! raised alarms.
+//! During a commit, every announcing frame ([`Transmit::announces`]) waits. These are the frames of the input that led
+//! to the result, the cyclic frames that would repeat the result, and the later packets of a transfer whose first
+//! packet waits. The frames are sent in order. The status frame is not held, because its state of charge and validity
+//! must not become old. It contains only the number of raised alarms.
 //!
 //! No frame waits longer than [`MAX_WAIT`], because an alarm on the bus is more important than an alarm on disk.
 
@@ -16,7 +16,7 @@ use crate::monitor::Transmit;
 
 /// Longest wait for the disk.
 const MAX_WAIT: Duration = Duration::from_millis(200);
-/// Maximum number of held frames: the largest pack, with an alarm for each cell, sends that many in twice the longest
+/// Maximum number of held frames. The largest pack, with an alarm for each cell, sends that many in twice the longest
 /// wait. Beyond this number, held frames are released.
 const MAX_HELD: usize = 4096;
 
@@ -29,12 +29,12 @@ pub struct CommitBarrier {
 }
 
 impl CommitBarrier {
-    /// Opens a ticket; from now on announcing frames wait.
+    /// Opens a ticket. Announcing frames wait until it is closed.
     pub fn begin(&mut self, ticket: u64, now: Instant) {
         self.tickets.push_back((ticket, now + MAX_WAIT));
     }
 
-    /// Holds an announcing frame while a ticket is open; `false` = the frame may be sent.
+    /// Holds an announcing frame while a ticket is open. Returns `false` if the frame may be sent.
     pub fn hold(&mut self, transmit: &Transmit) -> bool {
         let last = self.tickets.back().filter(|_| transmit.announces);
         self.held.extend(last.map(|(ticket, _)| (*ticket, *transmit)));
@@ -55,7 +55,7 @@ impl CommitBarrier {
         });
     }
 
-    /// The last ticket that has waited too long or holds too many frames.
+    /// The last ticket that is overdue, because it has waited too long or too many frames are held.
     pub fn overdue(&self, now: Instant) -> Option<u64> {
         if self.held.len() > MAX_HELD {
             return self.tickets.back().map(|(ticket, _)| *ticket);
@@ -88,7 +88,7 @@ mod tests {
         let (control, data, health) = (0x10, 0x11, 0x12);
         assert!(!barrier.hold(&frame(health, 0)), "nothing to wait for");
         barrier.begin(1, now);
-        // A transfer's announcement, its packets on later ticks, a cyclic frame between them.
+        // The frames are a transfer's announcement, its packets on later ticks, and a cyclic frame between them.
         for (id, data) in [(control, 1), (data, 2), (health, 3), (data, 4)] {
             assert!(barrier.hold(&frame(id, data)));
         }
@@ -98,7 +98,7 @@ mod tests {
         assert_eq!(sent(&mut barrier, 1), [1, 2, 3, 4]);
         assert!(barrier.hold(&frame(health, 6)));
         assert_eq!(sent(&mut barrier, 2), [5, 6]);
-        assert!(!barrier.hold(&frame(health, 7)), "all is on the disk");
+        assert!(!barrier.hold(&frame(health, 7)), "all results are on disk");
     }
 
     #[test]

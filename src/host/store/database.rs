@@ -1,4 +1,4 @@
-//! The history database: checked when it is opened, written in transactions.
+//! The history database. It is checked when it is opened, and written in transactions.
 //!
 //! | table | contents of a row | kept |
 //! | --- | --- | --- |
@@ -12,7 +12,7 @@
 //!
 //! * One file in write-ahead mode with `synchronous=FULL`: a commit that has returned survives a power cut, and a commit that
 //!   has not returned leaves no trace.
-//! * A damaged file and an inaccessible file are different errors. A file with another format counts as damaged.
+//! * A damaged file and an inaccessible file give different errors. A file with another format counts as damaged.
 
 use std::fs::File;
 use std::path::Path;
@@ -34,7 +34,7 @@ use crate::monitor::{EventKind, LearnedCell};
 pub(super) const FORMAT: i32 = 1;
 /// Longest wait of a commit for a reader that has locked the database.
 const BUSY_TIMEOUT: Duration = Duration::from_millis(100);
-/// Longest check of the file at the start. Damage beyond that is found when that part is read.
+/// Longest check of the file at the start. Damage in the part that was not checked is found when that part is read.
 const MAX_CHECK: Duration = Duration::from_secs(2);
 /// The tables that are not in [`HistoryTable`].
 const TABLES: &str = "
@@ -69,10 +69,10 @@ CREATE TABLE segment (
 /// Why the database cannot be opened.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(super) enum OpenError {
-    /// The file is not a history, or is damaged so that it no longer is one.
+    /// The file is not a history, or is too damaged to be used as a history.
     #[error("damaged: {0}")]
     Damaged(String),
-    /// The disk, the folder or the permissions prevent it.
+    /// The disk, the folder or the permissions prevent the opening.
     #[error("{0}")]
     Unavailable(String),
 }
@@ -83,8 +83,8 @@ impl From<rusqlite::Error> for OpenError {
     }
 }
 
-/// Whether an error means that the file's contents are wrong: every error not caused by the disk or another process. If damage
-/// were not recognised, the store would never be written again.
+/// Whether an error means that the file's contents are wrong. This holds for every error that the disk or another
+/// process does not cause. If damage were not recognised, the store would never be written again.
 pub(super) fn is_damage(error: &rusqlite::Error) -> bool {
     match error {
         rusqlite::Error::SqliteFailure(failure, _) => !matches!(
@@ -93,7 +93,7 @@ pub(super) fn is_damage(error: &rusqlite::Error) -> bool {
                 | ErrorCode::DiskFull
                 | ErrorCode::CannotOpen
                 | ErrorCode::PermissionDenied
-                | ErrorCode::ReadOnly // of a writable file: `Database::open`
+                | ErrorCode::ReadOnly // `Database::open` has found that the file itself is writable
                 | ErrorCode::DatabaseBusy
                 | ErrorCode::DatabaseLocked
                 | ErrorCode::FileLockingProtocolFailed
@@ -136,7 +136,8 @@ impl From<&StoreConfig> for RowLimits {
 }
 
 impl Database {
-    /// Opens the file, or creates it if it is missing. `pack` is the pack's number according to the stored state (0 = unknown).
+    /// Opens the file, or creates it if it is missing. `pack` is the number of the pack in the stored state (0 =
+    /// unknown).
     pub(super) fn open(path: &Path, now: &Stamp, pack: i64) -> Result<Self, OpenError> {
         let mut connection = Connection::open_with_flags(
             path,
@@ -169,7 +170,7 @@ impl Database {
         Ok(Self { connection, segment, pack })
     }
 
-    /// Number of rows written so far.
+    /// Number of rows ever written.
     pub(super) fn rows(&self) -> i64 {
         self.segment.last
     }
@@ -184,7 +185,8 @@ impl Database {
         (self.segment.last, hex(&self.segment.hash))
     }
 
-    /// Whether another pack was connected after this one. Checks two values, so that one flipped bit does not make a state obsolete.
+    /// Whether another pack was connected after pack `pack`. Two stored values are checked, so that one flipped bit
+    /// does not make a state obsolete.
     pub(super) fn is_closed(&self, pack: i64) -> rusqlite::Result<bool> {
         let sql = "SELECT 1 FROM pack WHERE id = ?1 AND closed_ns IS NOT NULL";
         Ok(pack < self.pack && self.connection.prepare(sql)?.exists([pack])?)
@@ -199,7 +201,7 @@ impl Database {
         self.connection.execute("UPDATE meta SET vehicle = ?1 WHERE id = 1", [text]).map(drop)
     }
 
-    /// Writes rows, all or none; they are durable when it returns.
+    /// Writes all rows or none. The rows are durable when this function returns.
     pub(super) fn commit(&mut self, batches: &[RowBatch]) -> rusqlite::Result<()> {
         let transaction = self.connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
         let (mut segment, mut pack) = (self.segment, self.pack);
@@ -224,8 +226,8 @@ impl Database {
         learned::read(&self.connection, self.pack)
     }
 
-    /// Closes the history of the pack with the last capacity of its weakest cell, and opens the next pack's. Returns the
-    /// number of the new pack.
+    /// Closes the history of the pack with the last capacity of its weakest cell, and opens the history of the next
+    /// pack. Returns the number of the new pack.
     pub(super) fn replace_pack(&mut self, now: &Stamp) -> rusqlite::Result<i64> {
         let learned = self
             .connection
@@ -260,7 +262,7 @@ pub(super) fn vehicle(connection: &Connection) -> rusqlite::Result<VehicleIdenti
     Ok(text.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default())
 }
 
-/// Creates the tables, all or none.
+/// Creates all tables or none.
 fn create(connection: &mut Connection) -> rusqlite::Result<()> {
     let transaction = connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
     transaction.execute_batch(TABLES)?;
@@ -271,7 +273,7 @@ fn create(connection: &mut Connection) -> rusqlite::Result<()> {
             format!("CREATE TABLE {} (seq INTEGER PRIMARY KEY, moment INTEGER NOT NULL{columns}) STRICT", table.name());
         transaction.execute(&sql, [])?;
     }
-    // "pkwt": marks the file for file(1).
+    // The bytes "pkwt" identify the file for file(1).
     transaction.pragma_update(None, "application_id", 0x706B_7774)?;
     transaction.pragma_update(None, "user_version", FORMAT)?;
     transaction.commit()
@@ -279,15 +281,15 @@ fn create(connection: &mut Connection) -> rusqlite::Result<()> {
 
 /// Sets up the connection and, if it is new, the file.
 fn prepare(connection: &Connection) -> rusqlite::Result<()> {
-    // Bytes. A small page, because a commit changes few bytes but writes whole pages.
+    // The page size in bytes is small, because a commit changes few bytes but writes whole pages.
     connection.pragma_update(None, "page_size", 1024)?;
     let mode: String = connection.query_row("PRAGMA journal_mode = WAL", [], |row| row.get(0))?;
     if mode != "wal" {
-        // File systems without shared memory. As safe, but every commit is written and synced twice.
+        // The file system has no shared memory. Commits are as safe, but each is written and synced twice.
         tracing::warn!(mode, "no write-ahead log on this file system: every commit is written twice");
     }
     connection.pragma_update(None, "synchronous", "FULL")?;
-    // KiB.
+    // A negative value is in KiB.
     connection.pragma_update(None, "cache_size", -256)?;
     connection.pragma_update(None, "temp_store", "MEMORY")?;
     connection.pragma_update(None, "cell_size_check", true)?;
@@ -296,7 +298,7 @@ fn prepare(connection: &Connection) -> rusqlite::Result<()> {
     connection.query_row("PRAGMA wal_autocheckpoint = 512", [], |_| Ok(()))
 }
 
-/// Checks the file for a limited time.
+/// Checks the file for at most [`MAX_CHECK`].
 fn check(connection: &mut Connection) -> Result<(), OpenError> {
     let started = Instant::now();
     // The handler runs every 10,000 steps of SQLite's virtual machine.
@@ -314,7 +316,7 @@ fn check(connection: &mut Connection) -> Result<(), OpenError> {
     }
 }
 
-/// Writes the rows of one moment, and applies their changes to `pack`.
+/// Writes the rows of one moment, and applies the pack changes among them to `pack`.
 fn write_batch(
     transaction: &Transaction<'_>,
     segment: &mut Segment,

@@ -19,16 +19,17 @@ pub(super) const DATABASE: &str = "packwatch.db";
 const LOCK: &str = "packwatch.lock";
 /// Suffixes of SQLite's files of a database. The log comes first, because SQLite would use it with the next database.
 const FILES: [&str; 3] = ["-wal", "-shm", ""];
-/// Maximum number of damaged databases kept, so that a disk that damages every file does not fill up with them.
+/// Maximum number of damaged databases that are kept, so that a disk that damages every file does not fill up with
+/// them.
 const MAX_SET_ASIDE: u32 = 8;
 
 /// The state folder.
 #[derive(Debug)]
 pub(super) struct Folder {
     path: PathBuf,
-    /// The lock file; the lock is held as long as this lives.
+    /// The lock file. The lock is held while this file is open.
     lock: Option<File>,
-    /// Damage of the database, which must be replaced; `None` = no known damage.
+    /// Description of the damage if the database must be replaced; `None` = no known damage.
     damage: Option<String>,
 }
 
@@ -39,12 +40,12 @@ impl fmt::Display for Folder {
 }
 
 impl Folder {
-    /// A folder that may not exist yet.
+    /// Creates the value for a folder that may not exist yet.
     pub(super) fn new(path: PathBuf) -> Self {
         Self { path, lock: None, damage: None }
     }
 
-    /// Its path.
+    /// Path of the folder.
     pub(super) fn path(&self) -> &Path {
         &self.path
     }
@@ -59,7 +60,7 @@ impl Folder {
     /// Creates the folder if it does not exist, and locks it for this process.
     ///
     /// # Errors
-    /// `WouldBlock` if another process has locked it, else why it cannot be written.
+    /// Returns `WouldBlock` if another process has locked the folder, else the reason why the folder cannot be written.
     pub(super) fn lock(&mut self) -> io::Result<()> {
         if self.lock.is_some() {
             return Ok(());
@@ -76,8 +77,8 @@ impl Folder {
         }
     }
 
-    /// Opens the database, or an empty one instead of a damaged one, for the pack known to the stored state. Returns rows about
-    /// the opening for the history.
+    /// Opens the database for the pack that the stored state knows. If the database is damaged, opens an empty one
+    /// instead. Also returns rows about the opening, for the history.
     pub(super) fn open(&mut self, now: &Stamp, pack: i64) -> Result<(Database, Vec<HistoryRow>), OpenError> {
         self.lock().map_err(|error| OpenError::Unavailable(format!("{}: {error}", self.path.display())))?;
         let path = self.path.join(DATABASE);
@@ -100,7 +101,7 @@ impl Folder {
         Ok((Database::open(&path, now, pack)?, vec![HistoryRow::Own { reason: "damaged", detail }]))
     }
 
-    /// Notes that the database is damaged; the next opening replaces it.
+    /// Notes that the database is damaged. The next call of [`open`](Self::open) replaces it.
     pub(super) fn mark_damaged(&mut self, why: &str) {
         self.damage = Some(why.to_owned());
     }
@@ -126,7 +127,7 @@ impl Folder {
     fn free_place(&self) -> PathBuf {
         let place = |number: u32| self.path.join(format!("{DATABASE}.damaged-{number}"));
         let free = (1..MAX_SET_ASIDE).map(place).find(|place| !place.exists());
-        // All names are in use: the last one is replaced, because the first is the most useful to a reader.
+        // If all names are in use, the last one is replaced, because the first damaged database is the most useful.
         free.unwrap_or_else(|| place(MAX_SET_ASIDE))
     }
 }

@@ -1,7 +1,8 @@
 //! Selects the events that are kept in the history, and those that are committed at once.
 //!
-//! A flickering alarm must not wear out the flash or delay another alarm. In: the events of one input. Out: rows to commit now,
-//! if any. Limits are token buckets and the bytes of written states ([`super::checkpoint`]); times are taken from the events.
+//! A flickering alarm must not wear out the flash memory or delay another alarm. In: the events of one input. Out: rows
+//! to commit now, if any. Limits are token buckets and the bytes of written states ([`super::checkpoint`]); times are
+//! taken from the events.
 
 use std::collections::BTreeMap;
 
@@ -12,18 +13,19 @@ use crate::quantity::catalogue::Quantity;
 use crate::quantity::{CellIndex, Timestamp};
 use crate::token_bucket::{BucketSize, TokenBucket};
 
-/// Capacities of one cell that are written unconditionally: two days of an electric car at once, then one per hour. Further ones
-/// (of a hybrid that reverses every minute) are written only if they differ, because each row takes 100 bytes for years.
+/// Number of capacities of one cell that are written unconditionally: 64 at once (two days of an electric car), then
+/// one per hour. Further capacities (of a hybrid that reverses every minute) are written only if they have changed,
+/// because each row takes 100 bytes for years.
 const CAPACITIES: BucketSize = BucketSize { burst: 64.0, period_s: 3600.0 };
-/// Smallest change of such a further capacity, in standard deviations.
+/// Smallest change for which a further capacity is written, in standard deviations.
 const MIN_CHANGE_STD: f64 = 0.25;
-/// Commits reserved for each alarm, and for all filter resets together: other alarms cannot use them up. Further commits depend on
-/// the write budget. Beyond both, rows wait for a checkpoint, and only the first and last row of each alarm or cell are kept; the
-/// occurrence count covers the rest. A rule that flickers in 96 cells at different times causes 290 commits of about 70 kB on the
-/// first day.
+/// Commits reserved for each alarm, and for all filter resets together. Other alarms cannot use them up. Further
+/// commits depend on the write budget. If both are used up, rows wait for a checkpoint, and only the first and the last
+/// row of each alarm or cell are kept. The occurrence count covers the other rows. A rule that flickers in 96 cells at
+/// different times causes 290 commits of about 70 kB on the first day.
 const OWN_COMMITS: BucketSize = BucketSize { burst: 2.0, period_s: 86_400.0 };
-/// Writes of waiting rows with a checkpoint or other rows: one hour of checkpoints, then once per hour. Each write adds two rows
-/// per alarm, which are kept for years.
+/// How often waiting rows may be written with a checkpoint or with other rows: 60 times at once (one hour of
+/// checkpoints), then once per hour. Each write adds two rows per alarm, which are kept for years.
 const CARRIED: BucketSize = BucketSize { burst: 60.0, period_s: 3600.0 };
 
 /// The capacity last written.
@@ -64,8 +66,9 @@ impl Default for HistoryFilter {
 }
 
 impl HistoryFilter {
-    /// The rows to commit with the state now (possibly none), including those that waited. `None` = nothing was learned and no
-    /// alarm changed, except alarms that change too often; their rows wait. `has_room`: the write budget allows a commit.
+    /// Returns the rows to commit with the state now (possibly none), including rows that waited. Returns `None` if
+    /// nothing was learned and no alarm changed. Alarms that change too often do not count, and their rows wait.
+    /// `has_room` states whether the write budget allows a commit.
     pub(super) fn take(&mut self, events: &[Event], has_room: bool) -> Option<Vec<HistoryRow>> {
         let now = events.iter().find(|event| is_learned(&event.kind))?.time;
         let learned = || events.iter().map(|event| event.kind).filter(is_learned);
@@ -77,7 +80,7 @@ impl HistoryFilter {
         let mut rows = self.for_checkpoint(now);
         let mut writes_capacity = false;
         for kind in learned() {
-            // Loss modes follow from the cell's capacity, whose event comes before.
+            // Loss modes follow from the cell's capacity, whose event comes first.
             let is_worth_writing = match kind {
                 EventKind::LossModes { .. } => writes_capacity,
                 _ => self.is_worth_writing(&kind, now),
@@ -87,7 +90,7 @@ impl HistoryFilter {
             }
             if is_worth_writing {
                 let row = HistoryRow::Event(kind);
-                // Waiting rows of the same alarm come first.
+                // Waiting rows of the same alarm are written first.
                 rows.extend(self.deferred.extract_if(.., |waiting| waiting.repeats(&row)));
                 rows.push(row);
             }
@@ -122,7 +125,7 @@ impl HistoryFilter {
         self.deferred.push(row);
     }
 
-    /// Whether to write a remaining life; beyond the allowance, only if it has changed.
+    /// Whether to write a remaining life. If the allowance is used up, it is written only if it has changed.
     fn is_life_worth_writing(&mut self, cycles: Option<(f64, f64)>, now: Timestamp) -> bool {
         let written = &mut self.written_life;
         let has_moved = match (written.cycles, cycles) {
@@ -136,8 +139,8 @@ impl HistoryFilter {
         is_worth_writing
     }
 
-    /// Whether to write an event. A capacity is not written if it has no measurement and the same usable part, nor, beyond the
-    /// allowance, if it has hardly changed.
+    /// Whether to write an event. A capacity is not written if it has no measurement and the same usable part. If the
+    /// allowance is used up, it is not written if it has hardly changed.
     fn is_worth_writing(&mut self, kind: &EventKind, now: Timestamp) -> bool {
         if matches!(kind, EventKind::PackReplaced { .. }) {
             self.written_life.cycles = None;
@@ -274,7 +277,11 @@ mod tests {
             days_low: None,
             days_high: None,
         };
-        assert_eq!(take(&mut history_filter, 86_342.0, &[half_cycle(0), unknown]), Some(2), "not known any longer");
+        assert_eq!(
+            take(&mut history_filter, 86_342.0, &[half_cycle(0), unknown]),
+            Some(2),
+            "the remaining life is no longer known"
+        );
         assert_eq!(take(&mut history_filter, 86_343.0, &[half_cycle(0), unknown]), Some(1));
     }
 

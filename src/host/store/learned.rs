@@ -1,6 +1,7 @@
-//! Reads the learned values of the connected pack from the history, for a start without any valid stored state.
+//! Reads the learned values of the connected pack from the history. They are used if a start finds no valid stored
+//! state.
 //!
-//! In: the rows of `capacity`. Out: for each cell its newest row in an intact segment.
+//! In: the rows of `capacity`. Out: the newest row of each cell in an intact segment.
 
 use rusqlite::{Connection, Row};
 
@@ -11,7 +12,7 @@ use crate::monitor::LearnedCell;
 use crate::quantity::CellIndex;
 use crate::quantity::catalogue::Quantity;
 
-/// Maximum number of segments that are read, newest first: days of use.
+/// Maximum number of segments that are read, newest first. A segment is a day of use or less.
 const MAX_SEGMENTS: usize = 16;
 
 /// The learned values of the cells of pack `pack`, ordered by cell.

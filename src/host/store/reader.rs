@@ -1,4 +1,4 @@
-//! Reads a store without changing it: next to a running daemon, after a crash, or on a read-only disk.
+//! Reads a store without changing it. This works next to a running daemon, after a crash, and on a read-only disk.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -15,7 +15,7 @@ use crate::config::VehicleIdentity;
 use crate::io::place::with_suffix;
 use crate::monitor::Snapshot;
 
-/// Largest database (with its log) that is copied for reading, bytes; a temporary folder has room for it.
+/// Largest database (with its log) that is copied for reading, bytes. A temporary folder has room for this size.
 const MAX_COPY_BYTES: u64 = 256 << 20;
 
 /// A store, open for reading.
@@ -38,7 +38,7 @@ pub struct HistoryQuery {
     pub since_ns: Option<i64>,
     /// Latest wall clock, ns since 1970.
     pub until_ns: Option<i64>,
-    /// Maximum number of rows, the latest ones; `None` = all.
+    /// Maximum number of rows; older rows are left out. `None` = all rows.
     pub limit: Option<u32>,
 }
 
@@ -56,11 +56,11 @@ pub struct HistoryEntry {
     pub kind: HistoryTable,
     /// Number of the row, counted across the tables.
     pub seq: i64,
-    /// Wall clock at that time, ns since 1970.
+    /// Wall clock when the row was written, ns since 1970.
     pub wall_ns: i64,
-    /// The inputs' clock, ns.
+    /// Clock of the inputs when the row was written, ns.
     pub time_ns: i64,
-    /// The boot, 32 hexadecimal digits.
+    /// Identity of the boot, 32 hexadecimal digits.
     pub boot: String,
     /// Number of the pack, from 1.
     pub pack: i64,
@@ -71,11 +71,11 @@ pub struct HistoryEntry {
 /// How many half-cycles a store contains.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct HistoryExtent {
-    /// Number of the connected pack, from 1; 0 = none yet.
+    /// Number of the connected pack, from 1; 0 = no pack has been connected.
     pub pack: i64,
     /// Half-cycles of all packs in the store.
     pub half_cycles: i64,
-    /// Half-cycles of all packs that the store has deleted because of their number or age.
+    /// Half-cycles of all packs that the store has deleted because of its limits on rows and age.
     pub deleted_half_cycles: i64,
     /// Half-cycles of all packs ever written, as counted by the store.
     pub written_half_cycles: i64,
@@ -139,7 +139,7 @@ impl HistoryReader {
         self.at_once(segments::verify)
     }
 
-    /// Why the history contradicts a chain end noted elsewhere; `None` = it does not.
+    /// Returns why the history contradicts a chain end that was noted elsewhere; `None` = no contradiction.
     ///
     /// # Errors
     /// Fails if the file cannot be read.
@@ -147,7 +147,7 @@ impl HistoryReader {
         self.at_once(|connection| segments::contradiction(connection, noted))
     }
 
-    /// Reads several times from one snapshot of the file, even while a daemon writes.
+    /// Runs all queries of `read` on one snapshot of the file, even while a daemon writes.
     fn at_once<T>(&self, read: impl FnOnce(&Connection) -> rusqlite::Result<T>) -> Result<T, String> {
         let snapshot = self.connection.unchecked_transaction();
         snapshot.and_then(|snapshot| read(&snapshot)).map_err(|error| self.named(&error))
@@ -158,7 +158,7 @@ impl HistoryReader {
         self.state().map(|document| *document.snapshot)
     }
 
-    /// The stored snapshot and the wall clock when it was taken, ns since 1970; `None` as for [`HistoryReader::snapshot`].
+    /// The stored snapshot, and the wall clock when it was taken, ns since 1970; `None` = missing or damaged.
     pub fn dated_snapshot(&self) -> Option<(i64, Snapshot)> {
         self.state().map(|document| (document.stamp.wall_ns, *document.snapshot))
     }
@@ -243,8 +243,8 @@ fn json(value: Value) -> serde_json::Value {
     }
 }
 
-/// Opens the database for reading, next to a daemon that writes. Opens a copy on a read-only disk, where SQLite cannot create
-/// its index of the log.
+/// Opens the database for reading, next to a daemon that writes. On a read-only disk, SQLite cannot create its index of
+/// the log, so a copy is opened.
 fn open_read_only(path: &Path, max_copy_bytes: u64) -> Result<(Connection, Option<TemporaryCopy>), String> {
     let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
     let open = |path: &Path, flags: OpenFlags| -> rusqlite::Result<Connection> {

@@ -1,4 +1,5 @@
-//! The store of a replay: the same files as the daemon's, written synchronously and stamped with bus time.
+//! The store of a replay. It has the same files as the daemon's store, but writes them synchronously and stamps them
+//! with bus time.
 
 use std::path::Path;
 
@@ -26,11 +27,11 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// Creates the store in a folder that contains none.
+    /// Creates the store in a folder that contains no store.
     ///
     /// # Errors
-    /// Fails if the folder contains one, because a replay must never be written into the history of a real pack, or
-    /// when it cannot be created.
+    /// Fails if the folder contains a store, because a replay must never be written into the history of a real pack.
+    /// Also fails if the store cannot be created.
     pub fn create(path: &Path, config: &StoreConfig, vehicle: &VehicleIdentity) -> Result<Self, String> {
         let shown = path.join(DATABASE).display().to_string();
         if folder::is_used(path) {
@@ -51,7 +52,7 @@ impl Recorder {
         })
     }
 
-    /// Writes the rows of one input's events, and the checkpoint if it is due.
+    /// Writes the rows of the events of one input, and the checkpoint if it is due.
     pub fn record(&mut self, events: &[Event], monitor: &Monitor, now: Timestamp) -> Result<(), String> {
         let is_due = self.schedule.is_due(now, 0.0);
         let rows = match self.history_filter.take(events, self.schedule.has_room(now)) {

@@ -10,11 +10,12 @@ use super::state_files::{self, StateFiles};
 use crate::io::clock::Reading;
 use crate::quantity::Timestamp;
 
-/// Closes the history of the pack in a state folder, opens the next pack's, and deletes the state. Returns the number
-/// of the next pack.
+/// Closes the history of the pack in a state folder, opens the history of the next pack, and deletes the state. Returns
+/// the number of the next pack.
 ///
 /// # Errors
-/// Fails if the folder contains no store, a daemon uses it, or it cannot be written; nothing has changed then.
+/// Fails if the folder contains no store, if a daemon uses it, or if it cannot be written. In these cases nothing has
+/// changed.
 pub fn replace_pack(path: &Path) -> Result<i64, String> {
     let file = path.join(DATABASE);
     let named = |error: String| format!("{}: {error}", file.display());
@@ -30,7 +31,7 @@ pub fn replace_pack(path: &Path) -> Result<i64, String> {
     })?;
     let now = Stamp::now(Timestamp::from_nanos(Reading::now().realtime_ns), BootId::current());
     let known = StateFiles::open(path).1.newest.map_or(0, |state| state.pack);
-    // Opens the folder like the daemon does, so that damage is found and reported in the history that is closed.
+    // The folder is opened as by the daemon, so that damage is found and reported in the history that is closed.
     let mut replace = || {
         let (mut database, rows) = folder.open(&now, known).map_err(|error| named(error.to_string()))?;
         let replaced = database.commit(&[RowBatch { stamp: now, rows }]).and_then(|()| database.replace_pack(&now));
@@ -43,7 +44,7 @@ pub fn replace_pack(path: &Path) -> Result<i64, String> {
     };
     // If the first attempt finds damage, the second attempt sets the database aside.
     let pack = replace().or_else(|_| replace())?;
-    // A state of a closed pack is not restored, but it would be if the database were lost.
+    // A state of a closed pack is not restored. If the database were lost, it would be restored, so it is deleted.
     state_files::forget(path).map_err(|error| named(error.to_string()))?;
     Ok(pack)
 }

@@ -1,7 +1,8 @@
-//! Reserves disk space for the time when the disk is full: a file that is shortened step by step, so that learned results and
-//! alarms can be stored, and is restored when there is room again.
+//! Reserves disk space for the time when the disk is full. The reserve is a file, which is shortened step by step so
+//! that learned results and alarms can be stored. It is restored when the disk has room again.
 //!
-//! One step is enough for several commits. States without new rows do not use the reserve; they wait until the disk has room.
+//! One step is enough for several commits. States without new rows do not use the reserve, but wait until the disk has
+//! room.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -10,11 +11,12 @@ use std::time::{Duration, Instant};
 
 /// Name of the file in the state folder.
 const FILE_NAME: &str = "packwatch.reserve";
-/// Size of the file, bytes; as much as the write-ahead log may take.
+/// Size of the file, bytes. It equals the largest size of the write-ahead log.
 const BYTES: usize = 1 << 20;
-/// Bytes released at once; more than a commit writes. Another program that still fills the disk may take some of it.
+/// Bytes released at once. This is more than a commit writes, because another program that fills the disk may take some
+/// of the space.
 const STEP_BYTES: usize = 128 << 10;
-/// File that is written to find out whether the disk is full.
+/// Name of the file that is written to find out whether the disk is full.
 const PROBE_NAME: &str = "packwatch.probe";
 /// Shortest time between two attempts to restore the reserve.
 const PAUSE: Duration = Duration::from_secs(15);
@@ -46,7 +48,7 @@ impl Reserve {
         self.left > 0
     }
 
-    /// Restores the file from time to time, unless the disk is full.
+    /// Tries to restore the file once per pause, unless the disk is full.
     pub(super) fn restore(&mut self) {
         if self.is_whole() || self.tried.is_some_and(|tried| tried.elapsed() < PAUSE) {
             return;
@@ -63,7 +65,7 @@ impl Reserve {
         let path = self.folder.join(FILE_NAME);
         let grown = File::options().create(true).append(true).open(&path).and_then(|file| {
             let grown = write(&file, BYTES - self.left);
-            // A partly extended file would only take room from others.
+            // A partly extended file would only take room from other files.
             let kept = grown.as_ref().map_or(Some(self.left), |()| None);
             kept.map_or(Ok(()), |left| file.set_len(left as u64)).and(grown)
         });
@@ -73,13 +75,14 @@ impl Reserve {
         }
     }
 
-    /// Frees one step if the disk is full; `false` = the disk has room, or there is nothing to free. SQLite's errors are not
-    /// used because they do not distinguish a full disk from a file that cannot be opened or extended.
+    /// Releases one step if the disk is full. Returns `false` if the disk has room, or if nothing is left to release.
+    /// SQLite's errors are not used, because they do not distinguish a full disk from a file that cannot be opened or
+    /// extended.
     pub(super) fn release_if_full(&mut self) -> bool {
         self.is_usable() && self.is_disk_full() && self.release()
     }
 
-    /// Tries to write as much as one step.
+    /// Tries to write one step to the probe file.
     fn is_disk_full(&self) -> bool {
         let path = self.folder.join(PROBE_NAME);
         let written = File::create(&path).and_then(|file| write(&file, STEP_BYTES));
@@ -91,7 +94,8 @@ impl Reserve {
         self.left = self.left.saturating_sub(STEP_BYTES);
         self.tried = Some(Instant::now());
         let path = self.folder.join(FILE_NAME);
-        // Synced, because a file system does not give the space to another file before the change is in its journal.
+        // The file is synced, because a file system gives the space to another file only after the change is in its
+        // journal.
         let freed = File::options().write(true).open(&path).and_then(|file| {
             file.set_len(self.left as u64)?;
             file.sync_all()
@@ -125,9 +129,9 @@ mod tests {
         assert!(reserve.release() && reserve.is_usable() && !reserve.is_whole());
         assert_eq!(length(), (1 << 20) - (128 << 10));
         reserve.restore();
-        assert!(!reserve.is_whole(), "not at once: the disk is full");
+        assert!(!reserve.is_whole(), "the reserve is restored only after a pause");
         let mut reserve = Reserve::new(folder.path());
-        assert!(reserve.is_usable() && !reserve.is_whole(), "after a start");
+        assert!(reserve.is_usable() && !reserve.is_whole(), "a new start finds the shortened reserve");
         reserve.restore();
         assert!(reserve.is_whole() && length() == 1 << 20);
         (0..8).for_each(|_| assert!(reserve.release()));

@@ -1,7 +1,7 @@
 //! The tables of the history, and the rows made from the core's events.
 //!
-//! A column with the name of an event's field holds that field. Cells count from 0; units are in the names. A number that is
-//! not finite is stored as NULL.
+//! A column that has the name of an event's field contains that field. Cells count from 0; units are in the names. A
+//! number that is not finite is stored as NULL.
 
 use std::sync::LazyLock;
 
@@ -30,7 +30,7 @@ pub(super) enum HistoryRow {
 /// Rows written at one moment.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct RowBatch {
-    /// The moment.
+    /// Moment at which the rows are written.
     pub stamp: Stamp,
     /// The rows, in the order of the events.
     pub rows: Vec<HistoryRow>,
@@ -81,7 +81,7 @@ impl HistoryTable {
         }
     }
 
-    /// Its columns without moment and number; the cell (from 0) comes first.
+    /// Columns of the table, without moment and number. The cell (from 0) comes first.
     pub fn columns(self) -> &'static [&'static str] {
         static CAPACITY: LazyLock<Vec<&str>> = LazyLock::new(|| {
             ["cell", "measured_ah", "measured_std_ah"].into_iter().chain(RecordedValues::keys()).collect()
@@ -122,7 +122,7 @@ impl HistoryTable {
 }
 
 impl HistoryRow {
-    /// The row's table and the values of its columns; `None` = the history has no row for this event.
+    /// Returns the row's table and the values of its columns; `None` = the history has no row for this event.
     pub(super) fn values(&self) -> Option<(HistoryTable, Vec<Value>)> {
         let text = |text: &str| Value::Text(text.to_owned());
         let kind = match self {
@@ -132,7 +132,7 @@ impl HistoryRow {
             }
             Self::Event(kind) => kind,
         };
-        // Values of columns that differ from the event's field of that name.
+        // These values differ from the event's field with the name of the column.
         let (table, own) = match kind {
             EventKind::HalfCycle { .. } => (HistoryTable::HalfCycle, vec![]),
             EventKind::Capacity { .. } => (HistoryTable::Capacity, vec![]),
@@ -190,13 +190,13 @@ impl HistoryRow {
         }
     }
 
-    /// Whether another pack begins after this row.
+    /// Whether rows after this row belong to another pack.
     pub(super) const fn replaces_pack(&self) -> bool {
         matches!(self, Self::Event(EventKind::PackReplaced { .. }))
     }
 }
 
-/// The subject of events that may repeat without anything being learned.
+/// The subject of events that may repeat although nothing is learned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum EventSubject {
     /// Filter resets, of any cell.

@@ -10,14 +10,14 @@ use std::thread::JoinHandle;
 
 use super::state_files::StateDocument;
 
-/// Name of the file.
+/// Name of the state file in the runtime folder.
 pub(super) const FILE_NAME: &str = "state.json";
 
 /// Writes the runtime state.
 #[derive(Debug)]
 pub(super) struct RuntimeState {
     latest: Arc<Mutex<Option<StateDocument>>>,
-    /// Signals that a state is waiting; `None` only during the drop.
+    /// Signals to the thread that a state is waiting; `None` only during the drop.
     wake: Option<SyncSender<()>>,
     writer: Option<JoinHandle<()>>,
 }
@@ -32,7 +32,7 @@ impl RuntimeState {
         Ok(Self { latest, wake: Some(wake), writer: Some(writer) })
     }
 
-    /// Queues the latest state, which replaces a waiting one.
+    /// Queues the latest state. It replaces a state that is still waiting.
     pub(super) fn put(&self, document: StateDocument) {
         *self.latest.lock().unwrap_or_else(PoisonError::into_inner) = Some(document);
         let _ = self.wake.as_ref().map(|wake| wake.try_send(()));

@@ -1,10 +1,10 @@
-//! Segments of the history: the rows of a day, or about 10,000 rows, chained by hash.
+//! Segments of the history. A segment has the rows of a day, but at most about 10,000 rows. Rows are chained by hash.
 //!
-//! Every row has a number, counted across the tables. The hash of a segment is the SHA-256 chain over its rows, starting from
-//! the hash of the segment before. It reveals rows that were changed, removed, inserted or moved. The number of segments, stored
-//! separately, reveals segments cut off at the end. The oldest segments are deleted as a whole but keep their hashes, so the
-//! remaining ones can still be verified. A person who can write the file can recompute the whole chain; a copy of the chain's
-//! end kept elsewhere reveals that too ([`contradiction`]).
+//! Every row has a number, counted across the tables. The hash of a segment is the SHA-256 chain over its rows,
+//! starting from the hash of the segment before. It reveals rows that were changed, removed, inserted or moved. The
+//! number of segments, stored separately, reveals segments cut off at the end. The oldest segments are deleted as a
+//! whole but keep their hashes, so the remaining ones can still be verified. A person who can write the file can
+//! recompute the whole chain. A copy of the chain's end that is kept elsewhere reveals this too ([`contradiction`]).
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -24,7 +24,8 @@ pub(super) type Hash = [u8; 32];
 
 /// Nanoseconds in a day.
 pub(super) const NS_PER_DAY: i64 = 86_400_000_000_000;
-/// Rows after which a segment ends (with the batch that reaches them); deleting so many rows takes about 0.1 s.
+/// Number of rows after which a segment ends, together with the batch that reaches this number. Deleting so many rows
+/// takes about 0.1 s.
 const MAX_ROWS: i64 = 10_000;
 
 /// A segment.
@@ -75,7 +76,7 @@ impl Segment {
         Ok(connection.query_row(&sql, [], Self::of_row).optional()?.unwrap_or(Self::START))
     }
 
-    /// The segment for rows of this moment: this one, or a new one after it.
+    /// Returns the segment for rows of the moment `stamp`: this segment, or a new one after it.
     pub(super) fn at(self, connection: &Connection, stamp: &Stamp) -> rusqlite::Result<Self> {
         let day = stamp.wall_ns.div_euclid(NS_PER_DAY);
         if self.id > 0 && self.day == day && self.last.saturating_sub(self.first) < MAX_ROWS - 1 {
@@ -121,10 +122,10 @@ impl Segment {
             .map(drop)
     }
 
-    /// The hash of its row `last`, computed from the stored rows.
+    /// Computes the hash of row `last` from the stored rows.
     fn hash_to(&self, connection: &Connection, before: &Hash, last: i64) -> rusqlite::Result<Hash> {
         let mut rows: BTreeMap<(i64, HistoryTable), Vec<Value>> = BTreeMap::new();
-        // Bounded, so that a damaged number does not fill the memory.
+        // The number is bounded, so that a damaged number does not fill the memory.
         let last = last.min(self.first.saturating_add(MAX_ROWS + backlog::MAX_ROWS as i64));
         for table in HistoryTable::ALL {
             let sql = format!(
@@ -145,7 +146,7 @@ impl Segment {
     }
 }
 
-/// Hash of a row: over the hash before it, the table, the number, and every value with its type and length.
+/// Computes the hash of a row from the hash before it, the table, the number, and every value with its type and length.
 fn link<'v>(before: &Hash, table: HistoryTable, seq: i64, values: impl IntoIterator<Item = &'v Value>) -> Hash {
     let mut hasher = Sha256::new();
     hasher.update(before);
@@ -193,8 +194,9 @@ fn pairs(connection: &Connection) -> rusqlite::Result<Vec<(Segment, Segment)>> {
     Ok(pairs)
 }
 
-/// Deletes the rows of the oldest segment with rows, if there are more than `max_rows` in total or it ended before `horizon_ns`.
-/// A segment written while the wall clock was unset is at least as old as the segments after it.
+/// Deletes the rows of the oldest segment that has rows, if there are more than `max_rows` rows in total or if the
+/// segment ended before `horizon_ns`. A segment written while the wall clock was unset is at least as old as the
+/// segments after it.
 pub(super) fn delete_oldest(
     connection: &Connection,
     newest: &Segment,
@@ -232,9 +234,9 @@ pub struct ChainReport {
     pub rows: i64,
     /// Rows that the store has deleted.
     pub deleted_rows: i64,
-    /// Hash of the last row, to be noted elsewhere.
+    /// Hash of the last row. Users can note it elsewhere and compare it later.
     pub head: String,
-    /// The first broken segment; `None` = none.
+    /// The first broken segment; `None` = the chain is intact.
     pub broken: Option<BrokenSegment>,
 }
 
@@ -282,7 +284,7 @@ pub(super) fn verify(connection: &Connection) -> rusqlite::Result<ChainReport> {
     Ok(report)
 }
 
-/// The fault of the segment after `before`; `None` = valid.
+/// Returns the fault of the segment after `before`; `None` = the segment is valid.
 fn judge(connection: &Connection, before: &Segment, segment: &Segment) -> rusqlite::Result<Option<BrokenSegment>> {
     let Segment { id, first, last, is_deleted, hash, .. } = *segment;
     let broken = |expected, found| Some(BrokenSegment { segment: id, rows: [first, last], expected, found });
@@ -350,7 +352,7 @@ impl FromStr for NotedHead {
     }
 }
 
-/// Why the history contradicts a noted chain end; `None` = it does not.
+/// Returns why the history contradicts a noted chain end; `None` = no contradiction.
 pub(super) fn contradiction(connection: &Connection, noted: &NotedHead) -> rusqlite::Result<Option<String>> {
     let NotedHead { rows, hash } = noted;
     let pairs = pairs(connection)?;

@@ -1,12 +1,12 @@
 //! The time when a state was stored, on every clock, and its age at a later time.
 //!
-//! The wall clock of a vehicle computer may show 1970 until it is set, and may step. The boot clock never steps but restarts
-//! with every boot. Therefore both are stored, together with the boot's identity.
+//! The wall clock of a vehicle computer may show 1970 until it is set, and may step. The boot clock never steps but
+//! restarts with every boot. Therefore both times are stored, together with the boot's identity.
 //!
-//! Across boots only the wall clock can measure the age, and only if a hardware clock ran while the computer was off. Without
-//! a battery-backed clock, the wall clock continues from its last saved value (systemd saves it at every boot): a week without
-//! power looks like seconds, and the time itself does not reveal this. The wall clock is therefore trusted only if a hardware
-//! clock agrees with it ([`WallClock`]) or a time server has set it.
+//! Across boots, only the wall clock can measure the age, and only if a hardware clock ran while the computer was off.
+//! Without a battery-backed clock, the wall clock continues from its last saved value (systemd saves it at every boot).
+//! A week without power then looks like seconds, and the time itself does not reveal this. The wall clock is therefore
+//! trusted only if a hardware clock agrees with it ([`WallClock`]) or a time server has set it.
 
 use std::fmt;
 use std::path::Path;
@@ -23,12 +23,12 @@ pub(super) const SANE_WALL_NS: i64 = 1_704_067_200_000_000_000;
 /// Nanoseconds in a year of 365.25 days.
 const NS_PER_YEAR: f64 = 365.25 * 86_400.0 * 1e9;
 
-/// The kernel's list of hardware clocks; readable even in a sandbox that forbids `adjtimex`.
+/// The kernel's list of hardware clocks. A sandbox that forbids `adjtimex` can read it.
 const HARDWARE_CLOCKS: &str = "/sys/class/rtc";
 /// systemd's time client creates this file when a time server has set the clock since the boot.
 const SYNCHRONISED: &str = "/run/systemd/timesync/synchronized";
-/// Largest difference of an agreeing hardware clock, s. It counts whole seconds, drifts a few seconds a day, and the wall clock
-/// may have been corrected since the boot.
+/// Largest difference between the wall clock and a hardware clock that confirms it, s. A hardware clock counts whole
+/// seconds and drifts a few seconds a day, and the wall clock may have been corrected since the boot.
 const HARDWARE_TOLERANCE_S: i64 = 60;
 
 /// One boot of one computer, as identified by the kernel.
@@ -40,14 +40,14 @@ pub struct BootId(pub(super) [u8; 16]);
 const BOOT_ID_VARIABLE: &str = "PACKWATCH_BOOT_ID";
 
 impl BootId {
-    /// The kernel reports no identity.
+    /// The identity of a boot that the kernel does not report.
     const UNKNOWN: Self = Self([0; 16]);
-    /// Not a boot: bus time of a replayed record.
+    /// Marks the bus time of a replayed record, which has no boot.
     pub const REPLAY: Self = Self(*b"packwatch replay");
 
     /// The current boot.
     pub fn current() -> Self {
-        // A sandbox without that file (`ProcSubset=pid`) gets the identity from its unit.
+        // In a sandbox without the kernel's file (`ProcSubset=pid`), the unit passes the identity.
         let text = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").ok();
         let kernel = text.and_then(|text| Self::parse(&text));
         let variable = || std::env::var(BOOT_ID_VARIABLE).ok().and_then(|text| Self::parse(&text));
@@ -98,22 +98,22 @@ pub(super) struct Stamp {
 /// Whether the wall clock can measure times across boots.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum WallClock {
-    /// A hardware clock or a time server confirms it.
+    /// A hardware clock or a time server confirms the wall clock.
     Reliable,
-    /// It may continue from a value saved before the computer was off.
+    /// The wall clock may continue from a value that was saved before the computer was off.
     Unverified,
 }
 
 impl WallClock {
-    /// Assesses the wall clock at the start. GPS or a time server that sets it later is too late, because the age of the state
-    /// is determined once.
+    /// Assesses the wall clock at the start. A GPS receiver or time server that sets the clock later is too late,
+    /// because the age of the state is determined only once.
     pub(super) fn assess(now: &Stamp) -> Self {
         Self::judge(now, Path::new(HARDWARE_CLOCKS), Path::new(SYNCHRONISED))
     }
 
     fn judge(now: &Stamp, hardware_clocks: &Path, synchronised: &Path) -> Self {
         let wall_s = now.wall_ns / 1_000_000_000;
-        // A hardware clock without a battery counts from its own start, so its value must be compared.
+        // A hardware clock without a battery counts from its own start, so its value is compared with the wall clock.
         let agrees = |clock: &Path| {
             let text = std::fs::read_to_string(clock.join("since_epoch")).ok();
             let hardware_s = text.and_then(|text| text.trim().parse::<i64>().ok());
@@ -129,25 +129,25 @@ impl WallClock {
 }
 
 impl Stamp {
-    /// The present time, with the inputs' clock at `time`.
+    /// Returns the present time; the clock of the inputs shows `time`.
     pub(super) fn now(time: Timestamp, boot: BootId) -> Self {
         let Reading { realtime_ns, boottime_ns } = Reading::now();
         Self { wall_ns: realtime_ns, time, boottime_ns, boot }
     }
 
-    /// Bus time of a replayed record, which has no other clock.
+    /// Returns the bus time of a replayed record, which has no other clock.
     pub(super) fn replayed(time: Timestamp) -> Self {
         Self { wall_ns: time.nanos(), time, boottime_ns: time.nanos(), boot: BootId::REPLAY }
     }
 
-    /// The wall clock this many years ago, ns since 1970; `None` = the clock is not confirmed.
+    /// The wall-clock time this many years ago, ns since 1970; `None` = the wall clock is not confirmed.
     pub(super) fn years_ago_ns(&self, years: f64) -> Option<i64> {
         let is_reliable = self.boot == BootId::REPLAY || WallClock::assess(self) == WallClock::Reliable;
         // The cast saturates.
         is_reliable.then(|| self.wall_ns.saturating_sub((years * NS_PER_YEAR) as i64))
     }
 
-    /// Whether both belong to the same known boot.
+    /// Whether both times belong to the same known boot.
     pub(super) fn same_boot(&self, other: &Self) -> bool {
         self.boot == other.boot && self.boot != BootId::UNKNOWN
     }
@@ -193,10 +193,14 @@ mod tests {
         let stored = stamp(1, 100, 1_800_000_000);
         let age = |stored: Stamp, now: Stamp| stored.age(&now, WallClock::Reliable);
         assert_eq!(age(stored, stamp(2, 5, 1_800_000_600)), Downtime::Seconds(600.0));
-        assert_eq!(age(stored, stamp(2, 5, 1_799_999_999)), Downtime::Unknown, "before what was stored");
+        assert_eq!(
+            age(stored, stamp(2, 5, 1_799_999_999)),
+            Downtime::Unknown,
+            "the wall clock is before the stored time"
+        );
         assert_eq!(age(stored, stamp(2, 5, 30)), Downtime::Unknown, "1970");
         assert_eq!(age(stamp(1, 100, 30), stamp(2, 5, 1_800_000_000)), Downtime::Unknown, "stored in 1970");
-        assert_eq!(age(stamp(0, 100, 30), stamp(0, 130, 60)), Downtime::Unknown, "boots that are not known");
+        assert_eq!(age(stamp(0, 100, 30), stamp(0, 130, 60)), Downtime::Unknown, "both boots are unknown");
     }
 
     #[test]
@@ -207,7 +211,7 @@ mod tests {
 
     #[test]
     fn saved_clock_gives_unknown_age() {
-        // Without a hardware clock: the time of the last save, 20 s after the last checkpoint.
+        // Without a hardware clock, the wall clock continues from the last saved time, 20 s after the last checkpoint.
         let (stored, now) = (stamp(1, 100, 1_800_000_000), stamp(2, 5, 1_800_000_020));
         assert_eq!(stored.age(&now, WallClock::Unverified), Downtime::Unknown);
     }

@@ -1,16 +1,18 @@
-//! The stored state: two files next to the database, written in turn, so that damage or a power cut costs at most the newer one.
+//! The stored state: two files next to the database, which are written in turn, so that damage or a power cut costs at
+//! most the newer state.
 //!
 //! | file | contents |
 //! | --- | --- |
 //! | `state-a.json.zst`, `state-b.json.zst` | the latest state and the one before it |
 //! | `state-aside.json.zst` | a state that could not be restored, kept until a start that it fits |
 //!
-//! A file is one zstd frame of JSON and a skippable frame with its SHA-256, so `zstdcat` prints the JSON, and every flipped bit
-//! is detected. The file is written to a temporary name, synced and renamed, and the folder is synced: a state whose write has
-//! returned survives a power cut. The newest state is the valid file with the highest number.
+//! A file is one zstd frame of JSON and a skippable frame with its SHA-256. Therefore `zstdcat` prints the JSON, and
+//! every flipped bit is detected. The file is written to a temporary name, synced and renamed, and the folder is
+//! synced. A state therefore survives a power cut once its write has returned. The newest state is the valid file with
+//! the highest number.
 //!
-//! Numbers are stored with nine digits and six decimals (see [`rounded`]), which halves the size to about 70 kB for a pack of 96
-//! cells.
+//! Numbers are stored with nine digits or six decimals (see [`rounded`]), which halves the size to about 70 kB for a
+//! pack of 96 cells.
 
 use std::fs::{self, File};
 use std::io::{self, Read as _, Write as _};
@@ -34,9 +36,10 @@ pub(super) const ASIDE: &str = "state-aside.json.zst";
 const PART: &str = "state.json.zst.part";
 /// Log and history text about a state that is set aside.
 pub(super) const SET_ASIDE: &str = "set aside for the first start at which it fits";
-/// Compression level; low, because an announcement waits for the compression. Level 19 saves a sixth and takes fifty times as long.
+/// Compression level. It is low because announcements wait for the compression. Level 19 makes files a sixth smaller
+/// and takes fifty times as long.
 const LEVEL: i32 = 1;
-/// Longest JSON, bytes; ten times the state of the largest pack.
+/// Largest size of the JSON, bytes: ten times the size for the largest pack.
 const MAX_JSON_BYTES: u64 = 64 << 20;
 /// Head of the frame with the hash: the magic number of a skippable zstd frame, and its length.
 const HASH_HEAD: [u8; 8] = [0x50, 0x2A, 0x4D, 0x18, 32, 0, 0, 0];
@@ -48,13 +51,13 @@ pub(super) struct StateDocument {
     pub format: u32,
     /// Number of the state, counting all written states.
     pub number: i64,
-    /// Its state folder, because two daemons may share a runtime folder.
+    /// The state folder of the state, because two daemons may share a runtime folder.
     pub folder: String,
     /// Number of the pack that was connected; 0 = unknown.
     pub pack: i64,
-    /// Number of rows in the history at that time.
+    /// Number of rows in the history when the state was taken.
     pub history_rows: i64,
-    /// When it was taken.
+    /// Time when the state was taken.
     pub stamp: Stamp,
     /// The core's state.
     pub snapshot: Box<Snapshot>,
@@ -84,17 +87,17 @@ impl StateDocument {
         serde_json::from_slice(json).map_err(unfit)
     }
 
-    /// Writes JSON to a temporary name and renames it. Does not sync, because the file is in memory.
+    /// Writes JSON to a temporary name and renames it. The file is not synced, because it is in memory.
     pub(super) fn write_json(&self, path: &Path) -> io::Result<()> {
         let part = path.with_extension("json.part");
         fs::write(&part, serde_json::to_vec(self)?)?;
         fs::rename(&part, path)
     }
 
-    /// Encodes the contents of its file.
+    /// Encodes the contents of the state's file.
     ///
     /// # Errors
-    /// Fails if the result could not be read back: a number that is not finite is written as `null`.
+    /// Fails if the result could not be read back, because a number that is not finite is written as `null`.
     fn encode(&self) -> Result<Vec<u8>, String> {
         let mut json = Vec::new();
         self.serialize(&mut serde_json::Serializer::with_formatter(&mut json, Rounding(CompactFormatter)))
@@ -136,7 +139,7 @@ impl StateDocument {
     }
 }
 
-/// Writes numbers [`rounded`].
+/// Writes numbers that are [`rounded`].
 struct Rounding(CompactFormatter);
 
 impl Formatter for Rounding {
@@ -163,7 +166,7 @@ pub(super) struct StateFiles {
     next: usize,
     /// Number of the latest state.
     number: i64,
-    /// Index of a state that the next write first sets aside.
+    /// Index of a state that the next write sets aside first; `None` = no state.
     aside: Option<usize>,
 }
 
@@ -179,7 +182,7 @@ pub(super) struct FoundStates {
 }
 
 impl StateFiles {
-    /// The state files of a folder, which may not exist yet, and the states that they contain.
+    /// Opens the state files of a folder, which may not exist yet. Also returns the states in the files.
     pub(super) fn open(folder: &Path) -> (Self, FoundStates) {
         let mut files = Self { folder: folder.to_owned(), next: 0, number: 0, aside: None };
         let mut found = FoundStates::default();
@@ -206,12 +209,12 @@ impl StateFiles {
         (files, found)
     }
 
-    /// Makes the next write keep the newest state until a start that it fits.
+    /// Makes the next write set the newest state aside. It is kept until a start that it fits.
     pub(super) fn set_aside(&mut self) {
         self.aside = Some(1 - self.next);
     }
 
-    /// Overwrites the older state; durable when it returns. Returns the size of the file.
+    /// Overwrites the older state. The new state is durable when this function returns. Returns the size of the file.
     pub(super) fn write(&mut self, document: StateDocument) -> Result<u64, String> {
         let named = |name: &str, error: io::Error| format!("{}: {error}", self.folder.join(name).display());
         let file = StateDocument { number: self.number + 1, ..document }.encode()?;
@@ -228,7 +231,7 @@ impl StateFiles {
             .and_then(|()| replace(&part, &path))
             .and_then(|()| File::open(&self.folder)?.sync_all())
             .map_err(|error| {
-                // Frees the space.
+                // The incomplete file is deleted to free its space.
                 let _ = fs::remove_file(&part);
                 named(FILES[self.next], error)
             })?;

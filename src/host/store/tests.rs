@@ -1,4 +1,4 @@
-//! The store with real states.
+//! Tests of the store with real states.
 
 mod flips;
 mod healing;
@@ -49,7 +49,7 @@ fn log(config: &Config, folder: &Path) -> LogSource {
     LogSource::new(vec![path], options)
 }
 
-/// The state after so many seconds of the log.
+/// The state after `seconds` of the log, or at its end if `None`.
 fn snapshot(seconds: Option<i64>, store: Option<Recorder>) -> Snapshot {
     let folder = tempfile::tempdir().unwrap();
     let config = config();
@@ -74,7 +74,7 @@ fn restored(snapshot: Snapshot) -> Monitor {
     monitor
 }
 
-/// The newest state in a folder.
+/// Reads the newest state in a folder.
 fn stored(folder: &Path) -> StateDocument {
     StateFiles::open(folder).1.newest.unwrap()
 }
@@ -138,15 +138,15 @@ fn state_of_replaced_pack_is_not_restored() {
     opened.state_files.write(now.clone()).unwrap();
     drop(opened);
     assert_eq!(open(None).0, [STATE_SOURCE]);
-    // A power cut after the row of the pack change and before the state.
+    // A power cut happens after the row of the pack change was written and before the state was written.
     open(None).1.database.unwrap().replace_pack(&now.stamp).unwrap();
     assert_eq!(open(None).0.len(), 0);
     assert_eq!(open(Some(1)).0.len(), 0, "the runtime state of the old pack is not restored either");
     assert_eq!(open(Some(2)).0, ["runtime folder"]);
-    // Losing the history does not bring it back either.
+    // A lost history does not bring back the old state either.
     std::fs::remove_file(place.path().join(DATABASE)).unwrap();
     assert_eq!(open(Some(2)).0, ["runtime folder"]);
-    assert_eq!(open(Some(0)).0, ["runtime folder", STATE_SOURCE], "a pack that is not known");
+    assert_eq!(open(Some(0)).0, ["runtime folder", STATE_SOURCE], "the pack is unknown");
 }
 
 #[test]
@@ -185,7 +185,7 @@ fn answer(store: &Store, ticket: u64) -> StoreProgress {
     let progress = store.progress();
     let begun = Instant::now();
     while progress.borrow().ticket < ticket {
-        assert!(begun.elapsed() < Duration::from_secs(30), "no answer");
+        assert!(begun.elapsed() < Duration::from_secs(30), "the writer did not answer");
         std::thread::sleep(Duration::from_millis(1));
     }
     *progress.borrow()
@@ -195,7 +195,7 @@ fn answer(store: &Store, ticket: u64) -> StoreProgress {
 fn failing_disk_gets_everything_when_it_works() {
     let place = tempfile::tempdir().unwrap();
     let state = place.path().join("folder");
-    // A file in place of the folder, so that nothing can be created there.
+    // A file in place of the folder prevents the store from creating anything there.
     std::fs::write(&state, "").unwrap();
     let (store, found) =
         Store::open(&PlaceSetting::At(state.clone()), &config().store, &VehicleIdentity::default()).unwrap();
@@ -213,7 +213,7 @@ fn failing_disk_gets_everything_when_it_works() {
     std::fs::remove_file(&state).unwrap();
     let begun = Instant::now();
     while !store.progress().borrow().works {
-        assert!(begun.elapsed() < Duration::from_secs(30), "not tried again");
+        assert!(begun.elapsed() < Duration::from_secs(30), "the writer did not retry");
         std::thread::sleep(Duration::from_millis(10));
     }
     assert!(store.progress().borrow().file_bytes.is_some_and(|bytes| bytes > 0));
@@ -237,9 +237,9 @@ fn failing_disk_is_retried_after_pauses() {
         progress.borrow_and_update();
         std::thread::sleep(Duration::from_micros(200));
     }
-    // After 1 s; the next pause is 2 s.
+    // The first retry comes after 1 s; the next pause is 2 s.
     assert_eq!((changes, progress.borrow().failures), (1, 1));
-    // Tickets answered in between cause no attempt.
+    // Tickets that are answered during the pause cause no attempt.
     let write_queue = Arc::clone(&store.write_queue);
     for _ in 0..3 {
         let ticket = write_queue.submit(None, document(1, 1, 1));
@@ -280,9 +280,9 @@ fn database_damaged_while_running_is_set_aside() {
     let (store, found) =
         Store::open(&PlaceSetting::At(place.path().to_owned()), &config().store, &VehicleIdentity::default()).unwrap();
     let mut store = store.unwrap();
-    // Cached pages may not have been read again; the next start finds the damage then.
+    // If the damaged pages were still cached, only the next start finds the damage.
     assert!(!found.works || place.path().join("packwatch.db.damaged-1").exists());
-    assert_eq!(found.states.len(), 1, "the state does not depend on it");
+    assert_eq!(found.states.len(), 1, "the state does not depend on the database");
     let ticket = learn(&mut store, 10.0);
     assert!(answer(&store, ticket).works);
     store.finish(&monitor, Timestamp::from_secs(11.0));
@@ -343,18 +343,18 @@ fn unfit_state_waits_for_matching_start() {
     assert_eq!(reasons(place.path()), ["state_unfit"]);
     let (store, found) = open();
     assert_eq!(states(&found), [(STATE_SOURCE, 2.0), (ASIDE, 1.0)]);
-    // It stays, however many states are written later.
+    // The state that was set aside stays when later states are written.
     finish(store, 3.0);
     let (store, found) = open();
     assert_eq!(states(&found), [(STATE_SOURCE, 3.0), (ASIDE, 1.0)]);
-    // The change was undone: the two states change places.
+    // The start fits the first state again, so the two states change places.
     store.set_state_aside("snapshot is of 5 cells", Timestamp::from_secs(4.0));
     finish(store, 4.0);
     let (store, found) = open();
     assert_eq!(states(&found), [(STATE_SOURCE, 4.0), (ASIDE, 3.0)]);
     drop(found);
     finish(store, 5.0);
-    // It belongs to the pack.
+    // The state that was set aside belongs to the old pack, so a pack change deletes it.
     replace_pack(place.path()).unwrap();
     assert_eq!(states(&open().1), []);
 }

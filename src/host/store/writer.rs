@@ -1,8 +1,9 @@
 //! The thread that writes to disk, and the queue that it shares with the loop.
 //!
-//! The loop queues rows and the latest state, and continues. The thread takes everything queued, commits the rows, then writes
-//! the state, and reports the last ticket that is completely on disk. It retries a failing disk after increasing pauses; until
-//! then every ticket is answered at once as failed. A failing database does not prevent the state from being written.
+//! The loop queues rows and the latest state, and continues. The thread takes everything queued, commits the rows, then
+//! writes the state, and reports the last ticket that is completely on disk. It retries a failing disk after increasing
+//! pauses. During a pause, every ticket is answered at once as failed. A failing database does not prevent the state
+//! from being written.
 
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -22,13 +23,13 @@ use crate::quantity::Timestamp;
 
 /// First pause after a failure; each further pause doubles.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
-/// Longest pause, within which a working disk is detected.
+/// Longest pause. When the disk works again, this is detected within this time.
 const LAST_PAUSE: Duration = Duration::from_secs(15);
 
 /// Progress of the writer.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct StoreProgress {
-    /// Everything up to this ticket was written or has failed.
+    /// All work up to this ticket was written or has failed.
     pub ticket: u64,
     /// Whether the last attempt succeeded.
     pub works: bool,
@@ -46,7 +47,7 @@ pub struct StoreProgress {
     pub pack: i64,
 }
 
-/// Rows and state on their way from the loop to the writer.
+/// Queue of the rows and the state that the loop passes to the writer.
 #[derive(Debug, Default)]
 pub(super) struct WriteQueue {
     queue: Mutex<QueueState>,
@@ -91,7 +92,7 @@ impl WriteQueue {
         queue.ticket
     }
 
-    /// Keeps rows for the next commit.
+    /// Keeps rows until the next commit.
     pub(super) fn keep(&self, rows: RowBatch) {
         self.lock().backlog.push(rows);
     }
@@ -101,7 +102,7 @@ impl WriteQueue {
         self.lock().sets_aside = true;
     }
 
-    /// Ends the writer after the work queued so far.
+    /// Ends the writer after the work that is already queued.
     pub(super) fn stop(&self) {
         let mut queue = self.lock();
         (queue.stop, queue.wanted) = (true, true);
@@ -151,7 +152,7 @@ pub(super) struct Writer {
     pub(super) reserve: Reserve,
     /// Latest day (UTC, since 1970) whose chain end was logged.
     pub(super) head_day: Option<i64>,
-    /// `None` = not open.
+    /// The open database; `None` = the database is not open.
     pub(super) database: Option<Database>,
     pub(super) progress: watch::Sender<StoreProgress>,
     pub(super) retry: Retry,
@@ -190,7 +191,8 @@ impl Writer {
             if sets_aside {
                 self.state_files.set_aside();
             }
-            // The last attempt before the end does not wait for the pause, nor does one that the reserve may help.
+            // The last attempt before the end does not wait for the pause. Neither does an attempt that may succeed
+            // with the reserve.
             let is_urgent = stop || (!batches.is_empty() && self.reserve.is_usable());
             let mut progress = *self.progress.borrow();
             progress.works = if self.retry.is_due() || is_urgent {
@@ -207,8 +209,8 @@ impl Writer {
         }
     }
 
-    /// Writes rows and state; failed writes wait for the next attempt. Without a state nothing is written, but an attempt is made
-    /// to open a database that could not be opened before.
+    /// Writes rows and state. If this fails, they wait for the next attempt. Without a state nothing is written, but a
+    /// database that could not be opened before is opened if possible.
     fn write(
         &mut self,
         mut batches: Vec<RowBatch>,
@@ -247,8 +249,9 @@ impl Writer {
         }
     }
 
-    /// Like [`Writer::commit`], but retries learned rows at once: as often as the reserve provides space, and once without it,
-    /// because space may have become free, and because a damaged database is set aside at the second attempt.
+    /// Like [`Writer::commit`], but retries learned rows at once. It retries as often as the reserve provides space,
+    /// and once without the reserve: space may have become free, and a damaged database is set aside at the second
+    /// attempt.
     fn commit_urgently(&mut self, batches: &mut Vec<RowBatch>, document: &StateDocument) -> Result<u64, String> {
         let is_learned = !batches.is_empty();
         let mut is_first = true;
@@ -295,7 +298,7 @@ impl Writer {
         Ok(())
     }
 
-    /// Logs the chain's end with each day's first commit. A rewritten chain does not match it.
+    /// Logs the chain's end with the first commit of each day. A rewritten chain does not match the logged end.
     fn log_head(&mut self, now: &Stamp) {
         let day = now.wall_ns.div_euclid(NS_PER_DAY);
         if let Some(database) = &self.database
@@ -310,7 +313,7 @@ impl Writer {
         }
     }
 
-    /// The database, which is opened if necessary.
+    /// Returns the database, and opens it first if necessary.
     fn open(&mut self, now: &Stamp) -> Result<&mut Database, String> {
         let database = match self.database.take() {
             Some(database) => database,
@@ -327,7 +330,8 @@ impl Writer {
             self.state_files = files;
             rows.extend(found.faults);
             if found.newest.is_some() {
-                // The disk became available after the daemon had started without this state. It is kept for the user.
+                // The disk became available after the daemon had started without this state. The state is kept for the
+                // user.
                 self.state_files.set_aside();
                 tracing::error!(folder = %self.folder, "stored state found after the start: set aside, not used");
                 rows.push(HistoryRow::Own { reason: "state_too_late", detail: "set aside".to_owned() });

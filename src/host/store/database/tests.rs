@@ -1,4 +1,4 @@
-//! Commits, packs, and readers next to a writer, on real databases.
+//! Tests commits, pack changes, and readers next to a writer, on real databases.
 
 use super::super::folder::DATABASE;
 use super::super::reader::{HistoryQuery, HistoryReader};
@@ -32,7 +32,7 @@ fn filled(folder: &Path) -> Database {
 fn commit_survives_reopening() {
     let folder = tempfile::tempdir().unwrap();
     let mut database = open(folder.path());
-    // Every kind of row, and a zero, which SQLite stores without its sign.
+    // The commit has every kind of row, and a negative zero, which SQLite stores without its sign.
     let mut kinds =
         vec![half_cycle(0), capacity(0, Some(2.0), 1.9), loss_modes(0, -0.0), remaining_life(90.0), model(None)];
     kinds.extend([alarm(Change::Raised), EventKind::FilterReset { cell: crate::quantity::CellIndex(3) }]);
@@ -87,7 +87,7 @@ fn pack_change_closes_history_and_opens_next() {
         entries.iter().map(|entry| (entry.kind, entry.pack)).collect::<Vec<_>>(),
         [(HistoryTable::Reset, 1), (HistoryTable::Capacity, 2)]
     );
-    // A state written after later pack changes.
+    // The state was written after later pack changes.
     let path = folder.path().join(DATABASE);
     assert_eq!(Database::open(&path, &Stamp::replayed(Timestamp::ZERO), 5).unwrap().pack(), 5);
     assert_eq!(open(folder.path()).pack(), 5);

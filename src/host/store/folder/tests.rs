@@ -1,4 +1,4 @@
-//! State folders with damaged, foreign or locked contents.
+//! Tests state folders with damaged, foreign or locked contents.
 
 use std::os::unix::fs::FileExt as _;
 
@@ -28,7 +28,11 @@ fn damaged_database_is_set_aside() {
     let [HistoryRow::Own { reason: "damaged", detail }] = &about[..] else { panic!("{about:?}") };
     assert!(detail.contains("packwatch.db.damaged-1"), "{detail}");
     assert!(place.path().join("packwatch.db.damaged-1").exists());
-    assert_eq!((database.rows(), database.pack()), (0, 3), "the pack that the state knows");
+    assert_eq!(
+        (database.rows(), database.pack()),
+        (0, 3),
+        "the new history continues with the pack that the state knows"
+    );
     database.commit(&[RowBatch { stamp: document(1, 200, 1_800_000_100).stamp, rows: about }]).unwrap();
     drop(database);
     assert!(open(place.path(), 3).1.is_empty(), "the next start finds nothing wrong");

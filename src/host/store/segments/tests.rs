@@ -1,4 +1,4 @@
-//! Histories of many days: changed, truncated, and beyond their limits.
+//! Tests histories of many days that are changed, truncated, or beyond their limits.
 
 use super::super::database::{Database, RowLimits};
 use super::super::folder::DATABASE;
@@ -75,7 +75,7 @@ fn changed_row_breaks_its_segment() {
     ] {
         assert_eq!(broken(change).map(|(segment, _)| segment), Some(segment), "{change}");
     }
-    // Rows cut off at the end, or added without extending the chain.
+    // These changes remove rows at the end, or add rows without extending the chain.
     let cut = "DELETE FROM segment WHERE id = 20; DELETE FROM capacity WHERE seq > 190; DELETE FROM alarm WHERE seq > 190; \
                DELETE FROM half_cycle WHERE seq > 190";
     assert_eq!(broken(cut), Some((20, [191, 191])));
@@ -104,7 +104,7 @@ fn history_beyond_limit_loses_oldest_days() {
     let extent = reader.extent().unwrap();
     assert_eq!((extent.half_cycles, extent.deleted_half_cycles, extent.written_half_cycles), (20, 80, 100));
     assert_eq!(reader.entries(&HistoryQuery::default()).unwrap().len(), 200);
-    // The noted end of each day matches, whether its rows still exist or not.
+    // The noted end of each day matches, even if its rows were deleted.
     for (rows, hash) in heads {
         assert_eq!(reader.contradiction(&NotedHead { rows, hash }).unwrap(), None, "{rows}");
         let other = NotedHead { rows, hash: "0".repeat(64) };
@@ -136,7 +136,7 @@ fn rows_beyond_horizon_are_deleted() {
     let mut database = filled(place.path(), 0..800);
     let now = Stamp::replayed(Timestamp::from_secs(800.0 * DAY_S));
     database.apply(&limits(1_000_000, None), &now).unwrap();
-    assert_eq!(verify(database.connection()).unwrap().deleted_rows, 0, "without a horizon all are kept");
+    assert_eq!(verify(database.connection()).unwrap().deleted_rows, 0, "without a horizon all rows are kept");
     for _ in 0..800 {
         database.apply(&limits(1_000_000, Some(1.0)), &now).unwrap();
     }

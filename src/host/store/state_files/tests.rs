@@ -1,14 +1,14 @@
-//! State files: written and read, damaged and set aside, on a real disk.
+//! Tests writing, reading, damaging and setting aside state files on a real file system.
 
 use super::super::tests::document;
 use super::*;
 
-/// Memory where the system has a folder for it: a write costs several syncs.
+/// A folder in memory if the system has one, because a write needs several syncs.
 fn place() -> tempfile::TempDir {
     tempfile::tempdir_in("/dev/shm").unwrap_or_else(|_| tempfile::tempdir().unwrap())
 }
 
-/// Writes states of these packs, one after the other.
+/// Writes a state for each of these packs, in order.
 fn written(folder: &Path, packs: impl IntoIterator<Item = i64>) -> StateFiles {
     let mut files = StateFiles::open(folder).0;
     for pack in packs {
@@ -27,7 +27,7 @@ fn states_are_written_alternately_newest_is_read() {
     let place = place();
     assert_eq!(found(place.path()), (None, None, 0));
     for pack in 1..=5 {
-        // A start between two states.
+        // The files are opened again between two states, as after a start.
         drop(written(place.path(), [pack]));
         assert_eq!(found(place.path()), (Some(pack), None, 0));
     }

@@ -1,21 +1,25 @@
-//! Every single-bit flip of a small store: the store can be written again, and the learned capacity survives.
+//! Flips single bits of a small store. After each flip, the store can be written again, and the learned capacity
+//! survives.
 //!
-//! The tests take a sample. `PACKWATCH_FLIPS=all` tests every bit, `PACKWATCH_FLIPS=N` every N-th. The counts are printed.
+//! By default the test flips a sample of the bits. `PACKWATCH_FLIPS=all` tests every bit, `PACKWATCH_FLIPS=N` every
+//! N-th bit. The counts are printed.
 
 use super::*;
 
-/// Bits between two flips of the sample; a prime, so that every bit of a byte and every place of a page is reached.
+/// Bits between two flips of the sample. It is a prime, so that the flips reach every bit of a byte and every place of
+/// a page.
 const SAMPLE_STEP: usize = 397;
 
 /// Effects of the flips.
 #[derive(Debug, Default)]
 struct FlipCounts {
     flips: usize,
-    /// The database was set aside.
+    /// Number of flips after which the database was set aside.
     set_aside: usize,
-    /// The newest state was not found.
+    /// Number of flips after which the newest state was not found.
     older: usize,
-    /// The learned capacity was not found, nothing could be written, or it was missing at the next start.
+    /// Flips after which the learned capacity was not found, nothing could be written, or the capacity was missing at
+    /// the next start.
     failed: Vec<(&'static str, usize, String)>,
 }
 
@@ -60,7 +64,7 @@ impl Reference {
         });
         std::fs::remove_file(state.join(newest_file.unwrap())).unwrap();
         let states = [json(&newest.snapshot), json(&stored(&state).snapshot)];
-        // As stored in the files.
+        // The states are encoded as in the files.
         StateFiles::open(&state).0.write(document(2, 100, 1_900_000_000)).unwrap();
         let next = stored(&state);
         Self { files, states, now: document(2, 200, 1_900_000_100).stamp, next }

@@ -1,4 +1,4 @@
-//! What a start recovers from a store without states, and what it must not restore.
+//! Tests what a start recovers from a store without states, and what it must not restore.
 
 use super::folder::Folder;
 use super::rows::tests::{alarm, capacity};
@@ -41,7 +41,7 @@ fn start_without_state_uses_capacities_in_history() {
     assert!((after.mean - learned.mean).abs() < 1e-9 && (after.std() - learned.std()).abs() < 1e-9, "{after:?}");
     assert!((after.mean - before.mean).abs() < 0.1 * before.std(), "{before:?}, then {after:?}");
     let fresh = Monitor::new(config().monitor).capacity(CellIndex(0));
-    assert!(fresh.std() > 1.5 * after.std(), "as a new cell: {fresh:?}, {after:?}");
+    assert!(fresh.std() > 1.5 * after.std(), "the capacity of a new cell is less certain: {fresh:?}, {after:?}");
 }
 
 #[test]
@@ -105,7 +105,7 @@ fn command_is_committed_while_alarm_flickers() {
     assert_eq!(store.learned(&[command(0)], &monitor, time), None, "nothing has changed");
     let ticket = store.learned(&[cleared, command(1)], &monitor, time).unwrap();
     assert!(answer(&store, ticket).works);
-    assert!(flickers(&mut store).is_none(), "no more than that");
+    assert!(flickers(&mut store).is_none(), "no further commit of the flickering alarm");
     let entries = HistoryReader::open(place.path()).unwrap().entries(&HistoryQuery::default()).unwrap();
     assert_eq!(entries.last().unwrap().values[3], "cleared");
 }
@@ -130,7 +130,10 @@ fn chain_end_is_logged_daily() {
         text[std::mem::replace(&mut seen, text.len())..].to_owned()
     };
     tracing::subscriber::with_default(subscriber, || {
-        assert!(logged(-7200).contains("end of the history's chain"), "the first of this process");
+        assert!(
+            logged(-7200).contains("end of the history's chain"),
+            "the first commit of the process logs the chain end"
+        );
         assert_eq!(logged(-1), "", "the same day");
         let head = logged(0);
         let word =

@@ -1,11 +1,12 @@
-//! Estimates after a power cut: restored from a state file, whose numbers are rounded, with an age from the clocks.
+//! Tests estimates after a power cut. They are restored from a state file, whose numbers are rounded, and have an age
+//! from the clocks.
 
 use nalgebra::DMatrix;
 use serde_json::Value;
 
 use super::*;
 
-/// The state as read back from its file.
+/// Writes the state to a file and reads it back.
 fn from_the_disk(state: &StateDocument) -> StateDocument {
     let place = tempfile::tempdir().unwrap();
     StateFiles::open(place.path()).0.write(state.clone()).unwrap();
@@ -35,8 +36,8 @@ fn compare(before: (&Value, &Value), after: (&Value, &Value), what: &str) {
         }
     }
     assert_eq!(kept, kept.transpose(), "{what}");
-    // The smallest margin to a covariance that cannot be factorised, relative to its size; quantities that are configured not to
-    // be learned have no variance.
+    // The smallest eigenvalue is the relative margin to a covariance that cannot be factorised. Quantities that are
+    // configured not to be learned have no variance and are left out.
     let varied: Vec<usize> = (0..mean.len()).filter(|&i| covariance[(i, i)] > 0.0).collect();
     let scaled = DMatrix::from_fn(varied.len(), varied.len(), |a, b| {
         let (i, j) = (varied[a], varied[b]);
