@@ -1,9 +1,9 @@
 //! Measures how long the BMS bled one cell, from its balancing bits.
 //!
 //! In: bits with their time and validity; starts and ends of rows. Out: for the time between the middles of two rows,
-//! how long the cell was bled, how long its state was unknown, and how long no bits came. A row shows the charge at
-//! its middle, so half of its bleed time belongs to the next row. Bleed time between two rows, while the buses slept,
-//! belongs to the later row.
+//! how long the cell was bled, how long its state was unknown, and how long no bits were received. A row shows the
+//! charge at its middle, so half of its bleed time counts in the next row. Bleed time between two rows, while the
+//! buses sleep, counts in the later row.
 
 use serde::{Deserialize, Serialize};
 
@@ -16,19 +16,19 @@ pub struct BalancingConfig {
     pub bleed_a: f64,
     /// Longest validity of a bit, s.
     pub max_age_s: f64,
-    /// Whether no cell is bled while no bits are sent. Otherwise the state is unknown during that time.
+    /// Whether the BMS bleeds no cell while it sends no bits. If false, the state is unknown while no bits are sent.
     pub is_only_while_sent: bool,
 }
 
-/// Parts of a time span, s. In the remaining time the cell was not bled.
+/// Parts of a time span, s. In the rest of the span, the cell was not bled.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct BleedTime {
-    /// The cell was bled.
+    /// Time in which the cell was bled.
     pub(super) bled_s: f64,
-    /// A bit was received but could not be read.
+    /// Time in which the latest bit could not be read.
     pub(super) unknown_s: f64,
-    /// No bit was received.
+    /// Time in which no bit was valid.
     pub(super) silent_s: f64,
 }
 
@@ -50,7 +50,7 @@ impl BleedTime {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Bit {
-    /// `None` if it could not be read.
+    /// Value of the bit; `None` if it could not be read.
     is_bled: Option<bool>,
     holds_until: Timestamp,
 }
@@ -70,7 +70,7 @@ pub(super) struct BleedTimer {
 }
 
 impl BleedTimer {
-    /// Handles a bit that is valid until `holds_until` or the next bit; `None` = it cannot be read.
+    /// Handles a bit that is valid until `holds_until` or the next bit. `is_bled` is `None` if the bit cannot be read.
     pub(super) fn take(&mut self, time: Timestamp, is_bled: Option<bool>, holds_until: Timestamp) {
         self.count(time);
         self.counted_until.get_or_insert(time);
@@ -78,14 +78,14 @@ impl BleedTimer {
         self.bit = Some(Bit { is_bled, holds_until });
     }
 
-    /// Handles a time in which the daemon did not run and received no bits.
+    /// Handles a period in which the daemon did not run, so that it received no bits.
     pub(super) fn note_missed_bits(&mut self, from: Timestamp, to: Timestamp) {
         if self.has_bits {
             self.take(from, None, to);
         }
     }
 
-    /// Counts the time up to `now`; counts nothing before the first bit.
+    /// Counts the time up to `now`. Time before the first bit does not count.
     fn count(&mut self, now: Timestamp) {
         if !self.has_bits && self.bit.is_none() {
             return;
@@ -115,7 +115,7 @@ impl BleedTimer {
         std::mem::replace(&mut self.before, half).plus(half)
     }
 
-    /// Discards the time so far.
+    /// Discards all counted time.
     pub(super) fn forget_time(&mut self) {
         *self = Self { has_bits: self.has_bits, ..Self::default() };
     }
@@ -183,7 +183,7 @@ mod tests {
         let mut timer = BleedTimer::default();
         timer.begin_row(at(0.0));
         assert_near(timer.end_row(at(50.0)), bled(0.0));
-        assert_eq!(timer, BleedTimer::default(), "none came");
+        assert_eq!(timer, BleedTimer::default(), "no bit was received");
         take(&mut timer, 50.0, true);
         timer.begin_row(at(110.0));
         assert_near(timer.end_row(at(110.0)), BleedTime { silent_s: 50.0, ..bled(10.0) });

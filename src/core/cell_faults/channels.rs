@@ -1,4 +1,4 @@
-//! Voltage channels that do not show their own cell: frozen at one value, or showing another cell.
+//! Finds voltage channels that do not show their own cell: they are frozen at one value or show another cell.
 
 use serde::{Deserialize, Serialize};
 
@@ -7,22 +7,22 @@ use crate::quantity::InvalidState;
 
 /// A channel is frozen if it does not change while the other cells change by more than this, V.
 const FROZEN_V: f64 = 0.03;
-/// Fewest voltage changes within a row for a comparison with other channels. Also the number of consecutive rows that
-/// must agree (in `doubled`): with a resolution of 2.5 mV, two of 96 healthy cells agreed in three rows.
+/// Fewest voltage changes within a row for a comparison with other channels. `doubled` also requires this many
+/// consecutive rows that agree: with a resolution of 2.5 mV, two of 96 healthy cells agreed in three rows.
 const LEAST_CHANGES: u32 = 10;
 
 /// State of one voltage channel.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct Channel {
-    /// Voltage of the middle cells, V, in the row in which the channel last changed (or in the first row).
+    /// Middle voltage of the pack, V, in the row in which the channel last changed; before a change, in the first row.
     middle_v: Option<f64>,
     pub(super) is_frozen: bool,
-    /// The channel with the same values, and in how many consecutive rows.
+    /// The channel with the same values, and the number of consecutive rows in which they agreed.
     same_as: Option<(u16, u8)>,
 }
 
 impl Channel {
-    /// Ends a row in which the middle cells had the voltage `middle_v`, V.
+    /// Ends a row; `middle_v` is the middle voltage of the pack, V.
     pub(super) fn end_row(&mut self, sums: &CellSums, middle_v: f64) {
         if sums.changes > 0 {
             (self.middle_v, self.is_frozen) = (Some(middle_v), false);
@@ -32,12 +32,12 @@ impl Channel {
         }
     }
 
-    /// Handles a gap in the samples: the voltages, including the channel's, may have changed in it.
+    /// Handles a gap in the samples, during which all voltages may have changed.
     pub(super) fn interrupt(&mut self) {
         self.middle_v = None;
     }
 
-    /// The other channel that shows the same values, if enough rows agree.
+    /// The other channel that shows the same values; `None` unless enough rows agree.
     pub(super) fn doubled(&self) -> Option<u16> {
         self.same_as.filter(|(_, rows)| *rows >= 10).map(|(other, _)| other)
     }
@@ -55,8 +55,8 @@ impl Channel {
     }
 }
 
-/// Compares the channels of a row and pairs those with identical values throughout. If the pack's cells are hardly
-/// distinct, none counts as doubled.
+/// Compares the channels of a row and pairs two channels if all their values are identical. If the values hardly
+/// distinguish the pack's cells, no channel counts as doubled.
 pub(super) fn compare(channels: &mut [Channel], sums: &[CellSums]) {
     let compared = |cell: &usize| sums[*cell].changes >= LEAST_CHANGES;
     let mut order: Vec<usize> = (0..sums.len()).filter(compared).collect();
@@ -100,7 +100,7 @@ mod tests {
         channel.end_row(&row(&[3.7, 3.71]), 3.70);
         for middle_v in [3.69, 3.68, 3.675] {
             channel.end_row(&row(&[3.71, 3.71]), middle_v);
-            assert!(!channel.is_frozen, "the others have moved by less");
+            assert!(!channel.is_frozen, "the others have moved by less than the limit");
         }
         channel.end_row(&row(&[3.71, 3.71]), 3.66);
         assert!(channel.is_frozen);
@@ -113,7 +113,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_channels_are_doubled_unless_all_are_alike() {
+    fn equal_channels_are_doubled_unless_all_channels_agree() {
         let shown = |offset: f64| -> Vec<f64> { (0..30).map(|i| 3.7 + offset + f64::from(i % 7) * 0.001).collect() };
         let mut channels = vec![Channel::default(); 4];
         let one_doubled = [shown(0.0), shown(0.002), shown(0.0), shown(0.005)].map(|v| row(&v));

@@ -1,7 +1,8 @@
-//! Detector for all cells of a pack: rows in, findings out (`judge`).
+//! Detector for all cells of a pack: adds samples to rows, compares the cells once per row and derives findings
+//! (`judge`).
 //!
-//! The errors of a row are rounded values of a circuit model and a typical cell monitor. They were checked on the
-//! simulated pack of ten cells and on the simulator's packs; no measured pack was used to set them.
+//! The assumed errors of a row are rounded values for a circuit model and a typical cell monitor. They were checked on
+//! a simulated pack of ten cells and on the simulator's other packs. No measured pack was used to choose them.
 
 mod balancing;
 mod judge;
@@ -22,35 +23,35 @@ use crate::quantity::{CellIndex, InvalidState, Timestamp};
 use balancing::Bleed;
 use judge::Population;
 
-/// A row ends when this part of the charge has moved, or after this time, s. At rest it ends after this part of the
-/// rest so far, because further samples add no information. Shorter rows find a contact sooner, but mistake an aged
-/// cell for a bad contact and miss exchanged channels.
+/// Length of a row. A row ends when `ROW_SOC` of the capacity has moved, or after `ROW_S` seconds. During a long rest,
+/// it ends after `REST_PART` of the time at rest, because further samples add no information. Shorter rows would find a
+/// bad contact sooner, but mistake an aged cell for a bad contact and miss exchanged channels.
 const ROW_SOC: f64 = 0.02;
 const ROW_S: f64 = 300.0;
 const REST_PART: f64 = 0.5;
 /// Fewest cells for a comparison.
 pub(super) const LEAST_CELLS: usize = 3;
-/// Standard deviations of a row's errors: of the voltage, V; of the drop, fraction; of the SOC on the curve.
+/// Standard deviations of a row's errors: of the voltage, V; of the voltage drop, fraction; of the SOC on the curve.
 const ROW_V: f64 = 0.002;
 const ROW_DROP: f64 = 0.03;
 const ROW_CURVE: f64 = 0.001;
-/// Additional errors of a cell at another SOC, per unit of SOC difference: of the curve, V, and of the drop, fraction.
-/// And the largest ratio between the model's resistances at the two SOCs.
+/// Additional errors of a cell whose SOC differs from the mean cell's, per unit of SOC difference: of the curve, V, and
+/// of the voltage drop, fraction. `MOST_ELSEWHERE` limits the ratio of the model's resistances at the two SOCs.
 const FAR_V: f64 = 0.05;
 const FAR_DROP: f64 = 1.0;
 const MOST_ELSEWHERE: f64 = 3.0;
-/// Standard deviations of a resistance from steps, fraction, and of a step's voltage, V.
+/// Standard deviations of a resistance from current steps, fraction, and of a step's voltage, V.
 const STEP_PART: f64 = 0.05;
 const STEP_V: f64 = 0.003;
-/// Smallest sum of squared steps for a resistance, in squares of the capacity per hour.
+/// Smallest sum of squared current steps that gives a resistance, in squares of the capacity per hour.
 const LEAST_STEPS: f64 = 0.02;
 /// Largest difference between the change of the mean cell's SOC and the counted charge between two rows.
 const SOC_JUMP: f64 = 0.02;
 const DAY_S: f64 = 86_400.0;
-/// Number of kinds that apply to cells: those up to the temperature sensor.
+/// Number of kinds up to the temperature sensor, which include all kinds that apply to cells.
 const CELL_KINDS: usize = CellFaultKind::TemperatureSensor as usize;
 
-/// Estimates of the cell in the middle of the pack at one moment.
+/// Estimates of the mean cell at one moment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeanCell {
     /// SOC, fraction.
@@ -61,7 +62,7 @@ pub struct MeanCell {
     pub drop_v: f64,
     /// Temperature, degrees C.
     pub temperature_c: f64,
-    /// Charge taken out so far, Ah. Only differences are used.
+    /// Charge taken out since any fixed time, Ah. Only differences are used.
     pub charge_ah: f64,
 }
 
@@ -73,16 +74,16 @@ struct WatchedCell {
     #[serde(default = "yes", skip_serializing_if = "Clone::clone")]
     is_compared: bool,
     difference: Difference,
-    /// Means before rows started to contradict them.
+    /// Means of the states before consecutive rows contradicted them.
     settled: [f64; STATES],
-    /// Means before the last sudden change.
+    /// Means of the states before the last sudden change.
     before_jump: [f64; STATES],
     sums: CellSums,
     channel: Channel,
     #[serde(default, skip_serializing_if = "Bleed::is_unused")]
     bleed: Bleed,
     temperature: WarmingRatio,
-    /// Since when each kind has been more likely than not.
+    /// Per kind: time since which the fault has been more likely than not.
     suspected: [Option<Timestamp>; CELL_KINDS],
     /// Time of the last sudden change.
     jumped: Option<Timestamp>,
@@ -93,7 +94,7 @@ fn yes() -> bool {
 }
 
 impl WatchedCell {
-    /// A cell without any rows yet.
+    /// Creates the state of a cell before its first row.
     fn new(is_compared: bool) -> Self {
         Self {
             is_compared,
@@ -109,7 +110,7 @@ impl WatchedCell {
         }
     }
 
-    /// Discards the samples of the current row, because the following ones are not contiguous with them.
+    /// Discards the samples of the current row, because the next sample follows after a gap.
     fn interrupt(&mut self) {
         self.sums.interrupt();
         self.channel.interrupt();
@@ -124,13 +125,13 @@ pub struct CellFaultDetector {
     pack: PackSums,
     /// Middle time, SOC and charge (Ah) of the last row.
     last_row: Option<(Timestamp, f64, f64)>,
-    /// Time at rest so far, s.
+    /// Duration of the current rest, s.
     rest_s: f64,
     /// Series resistance of the mean cell in this row, ohm.
     ohm: f64,
-    /// The cell closest to the median in SOC and resistance.
+    /// The middle cell: the cell closest to the median in SOC and resistance.
     middle: usize,
-    /// Whether a BMS may bleed the cells above the lowest one.
+    /// Whether a BMS may bleed all cells except the lowest cell.
     is_balanced: bool,
     /// The cell with the lowest charge, if it is unambiguous.
     lowest: Option<usize>,
@@ -139,15 +140,15 @@ pub struct CellFaultDetector {
 }
 
 impl CellFaultDetector {
-    /// Creates a detector for a pack in which only the cells `compared` are of one kind. Only those may be
-    /// [added](Self::add).
+    /// Creates a detector for a pack in which only the cells `compared` are of one kind. The caller may
+    /// [add](Self::add) samples of these cells only.
     pub fn among(cells: usize, compared: &[usize]) -> Self {
         let mut diagnosis = Self::new(if compared.len() < LEAST_CELLS { 0 } else { cells });
         diagnosis.compare_only(compared);
         diagnosis
     }
 
-    /// Compares these cells from now on. Resets the other cells, and cells that were not compared before.
+    /// Selects the cells to compare. Resets cells that are no longer compared or were not compared before.
     pub fn compare_only(&mut self, compared: &[usize]) {
         for (index, cell) in self.cells.iter_mut().enumerate() {
             let is_compared = compared.contains(&index);
@@ -195,8 +196,9 @@ impl CellFaultDetector {
         self.cells.get(cell.index()).filter(|cell| cell.is_compared).map(|cell| &cell.difference)
     }
 
-    /// A cell's states minus the median of the pack. `None` if the pack is not compared or has no such cell. A state
-    /// is `None` if it is unknown: every state of a cell of another kind, and the leak of a cell that may be bled.
+    /// A cell's states minus the median of the pack. `None` if the detector is inactive or the pack has no such cell.
+    /// A single state is `None` if it is unknown. This applies to every state of a cell of another kind, and to the
+    /// leak of a cell that the BMS may bleed.
     pub fn relative(&self, cell: CellIndex) -> Option<[Option<ScalarGaussian>; STATES]> {
         let WatchedCell { is_compared, difference, .. } = self.cells.get(cell.index())?;
         Some(std::array::from_fn(|state| {
@@ -218,7 +220,7 @@ impl CellFaultDetector {
         self.last_row.map(|(time, soc, _)| (time, soc))
     }
 
-    /// Adds a sample of a cell. `current_a`: `None` discards the cell's samples in this row.
+    /// Adds a sample of a cell. If `current_a` is `None`, discards the cell's samples in this row.
     #[inline]
     pub fn add(
         &mut self,
@@ -235,8 +237,8 @@ impl CellFaultDetector {
         }
     }
 
-    /// Adds the mean cell after all samples of one moment. Returns whether the row is complete; the caller then ends
-    /// it with [`Self::close_row`].
+    /// Adds the mean cell after all samples of one moment. Returns whether the row is complete. If so, the caller ends
+    /// the row with [`Self::close_row`].
     pub fn note(&mut self, time: Timestamp, mean: &MeanCell, capacity_ah: f64) -> bool {
         if ![mean.soc, mean.current_a, mean.drop_v, mean.temperature_c, mean.charge_ah].iter().all(|it| it.is_finite())
         {
@@ -281,8 +283,8 @@ impl CellFaultDetector {
         find(&self.findings).filter(|_| !was_known)
     }
 
-    /// Handles the learned values of all cells, once a day. Returns a finding if the gain of the current sensor has
-    /// newly risen.
+    /// Handles the learned values of all cells, once a day. Returns a finding if it has newly found a risen gain of the
+    /// current sensor.
     pub fn note_day(
         &mut self,
         time: Timestamp,
@@ -296,9 +298,11 @@ impl CellFaultDetector {
         self.note_sensor(time, CellFaultKind::CurrentGain, probability, size)
     }
 
-    /// Ends a row. `socs`: estimated SOC of the cells, to choose the middle cell. `is_balanced`: whether the BMS may
-    /// bleed fuller cells after a charge. `balancing`: meaning of the balancing bits, if the BMS sends them. Returns
-    /// the new findings.
+    /// Ends a row and returns the new findings.
+    ///
+    /// * `socs`: estimated SOC of each cell, to choose the middle cell.
+    /// * `is_balanced`: whether the BMS may bleed fuller cells after a charge.
+    /// * `balancing`: meaning of the balancing bits, if the BMS sends them.
     pub fn close_row(
         &mut self,
         model: &CellModel,
@@ -339,19 +343,19 @@ impl CellFaultDetector {
         self.findings.iter().filter(is_new).copied().collect()
     }
 
-    /// Predicts all cells over time and charge since the last row.
+    /// Predicts all cells over the time and the charge since the last row.
     fn pass(&mut self, time: Timestamp, row: &Row<'_>) {
         let Some((last, last_soc, last_ah)) = self.last_row.replace((time, row.soc, row.charge_ah)) else { return };
         let counted = (last_ah - row.charge_ah) / row.capacity_ah;
         let estimated = row.soc - last_soc;
-        // If the estimated SOC jumped because the filter converged, no charge has moved.
+        // If the estimated SOC jumped, the filter has converged, but no charge has moved: use the counted charge.
         let change = if (estimated - counted).abs() < SOC_JUMP { estimated } else { counted };
         let days = (time.since(last) / DAY_S).max(0.0);
         self.cells.iter_mut().for_each(|cell| cell.difference.pass(days, change));
     }
 
-    /// Compares every cell with the middle ones, `seconds` after the previous row. Returns whether there were enough
-    /// cells.
+    /// Compares every cell with the middle voltage of the pack, `seconds` after the previous row. Returns whether there
+    /// were enough cells.
     fn observe(&mut self, time: Timestamp, seconds: f64, row: &Row<'_>) -> bool {
         let voltages_v: Vec<Option<f64>> = self.cells.iter().map(|cell| cell.sums.mean_v()).collect();
         let Some(middle_v) = middle(voltages_v.iter().flatten().copied()) else { return false };
@@ -384,7 +388,7 @@ impl CellFaultDetector {
         true
     }
 
-    /// Compares the series resistances from the current steps.
+    /// Compares the cells' series resistances, as measured from current steps.
     fn observe_steps(&mut self, row: &Row<'_>) {
         let least_a2 = LEAST_STEPS * row.capacity_ah * row.capacity_ah;
         let ohms: Vec<Option<(f64, f64)>> = self.cells.iter().map(|cell| cell.sums.ohm(least_a2)).collect();
@@ -421,7 +425,7 @@ impl CellFaultDetector {
         }
     }
 
-    /// Compares the temperature at each cell with the median of the pack.
+    /// Compares the warming at each cell with the median warming of the pack.
     fn observe_temperatures(&mut self, time: Timestamp, seconds: f64) {
         let of_cells: Vec<Option<f64>> = self.cells.iter().map(|cell| cell.sums.mean_c()).collect();
         if of_cells.iter().flatten().count() < LEAST_CELLS {
@@ -455,7 +459,7 @@ impl CellFaultDetector {
         }
     }
 
-    /// Resets the charge of all cells after a time of unknown length.
+    /// Resets the charge of all cells after a gap of unknown length.
     pub fn forget_charge(&mut self) {
         self.interrupt();
         self.last_row = None;
@@ -465,7 +469,7 @@ impl CellFaultDetector {
         }
     }
 
-    /// Discards the samples of the current row, because the following ones are not contiguous with them.
+    /// Discards the samples of the current row, because the next sample follows after a gap.
     pub fn interrupt(&mut self) {
         self.pack = PackSums::default();
         self.rest_s = 0.0;
@@ -537,7 +541,7 @@ struct Row<'a> {
 }
 
 impl Row<'_> {
-    /// Observation of a cell's difference, V, at the means of its states.
+    /// Observation of a cell's voltage difference, `difference_v`, linearised at the means of the cell's states.
     fn observation(&self, means: &[f64; STATES], difference_v: f64) -> Observation {
         let (model, temperature) = (self.model, self.model.temperature_position(self.temperature_c));
         let at = |soc: f64| model.grid_position_at(&temperature, soc.clamp(0.0, 1.0));
@@ -546,7 +550,7 @@ impl Row<'_> {
         let contact_v = self.current_a * self.contact_ohm();
         let slope = [slope_v, 0.0, -self.drop_v, -contact_v, 1.0, 0.0];
         let curve_v = model.aged_ocv_v(&own, self.capacity_ah) - model.aged_ocv_v(&middle, self.capacity_ah);
-        // At another SOC, even a healthy cell has another resistance.
+        // The resistance depends on the SOC, so at another SOC even a healthy cell has another resistance.
         let elsewhere = (model.r0_ohm(&own) / model.r0_ohm(&middle)).clamp(1.0 / MOST_ELSEWHERE, MOST_ELSEWHERE) - 1.0;
         let expected_v = curve_v - self.drop_v * elsewhere
             + slope[RESISTANCE] * means[RESISTANCE]
@@ -559,18 +563,19 @@ impl Row<'_> {
         Observation { innovation: difference_v - expected_v, slope, variance }
     }
 
-    /// Series resistance of the mean cell now, ohm.
+    /// Series resistance of the mean cell in this row, ohm.
     fn ohm(&self) -> f64 {
         self.model.r0_ohm(&self.model.grid_position(self.soc, self.temperature_c))
     }
 
-    /// Series resistance at SOC 0.5 and 25 degrees C, ohm: the unit of a contact, which depends on neither.
+    /// Series resistance at SOC 0.5 and 25 degrees C, ohm. It is the unit of the contact resistance, which depends on
+    /// neither SOC nor temperature.
     fn contact_ohm(&self) -> f64 {
         self.model.r0_ohm(&self.model.grid_position(0.5, 25.0))
     }
 }
 
-/// Mean of the middle half of the values, which one outlier hardly moves. `None` with fewer than three values.
+/// Mean of the middle half of the values, which one outlier hardly changes. `None` for fewer than three values.
 fn middle(values: impl Iterator<Item = f64>) -> Option<f64> {
     // One allocation: `collect` of a filtered iterator starts small and grows.
     let mut kept = Vec::with_capacity(values.size_hint().1.unwrap_or_default());
@@ -582,7 +587,7 @@ fn middle(values: impl Iterator<Item = f64>) -> Option<f64> {
     Some(inner.iter().sum::<f64>() / inner.len() as f64)
 }
 
-/// Sorts the values and returns those in neither the lowest nor the highest quarter.
+/// Sorts the values and returns them without the lowest and the highest quarter.
 fn inner_half<T>(values: &mut [T], by: impl Fn(&T) -> f64) -> &[T] {
     values.sort_by(|a, b| by(a).total_cmp(&by(b)));
     let cut = values.len() / 4;

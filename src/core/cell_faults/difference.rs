@@ -1,19 +1,20 @@
 //! Filter of the difference between one cell and the middle of its pack.
 //!
-//! In: per row, the cell's voltage minus that of the middle cells. Out: the states that explain the difference. A
-//! linear Kalman filter with the observation linearised at the cell's own SOC. The states depend on different
-//! quantities and can therefore be told apart:
+//! In: per row, the cell's voltage minus the middle voltage of the pack. Out: the states that explain the difference.
+//! The filter is a linear Kalman filter; its observation is linearised at the cell's own SOC. The states have different
+//! effects, so the filter can distinguish them:
 //!
 //! | state | effect on the voltage difference |
 //! | --- | --- |
 //! | charge | follows the slope of the open-circuit curve |
 //! | capacity | follows the charge moved |
-//! | resistance | follows the whole voltage drop, hence load and temperature, with its delay |
-//! | contact | follows the current alone, without delay and temperature |
+//! | resistance | follows the whole voltage drop, which depends on load and temperature and has a delay |
+//! | contact | follows the current without delay, independently of the temperature |
 //! | channel | constant |
 //! | leak | grows with time |
 //!
-//! Sources: mean cell plus differences is Plett's bar-delta filtering (Battery Management Systems II, section 4.11).
+//! Sources: to estimate a mean cell and the differences from it is Plett's bar-delta filtering (Battery Management
+//! Systems II, section 4.11).
 //! Contact resistance of one cell in a vehicle: Zheng et al., J. Power Sources 241 (2013) 181.
 
 use serde::{Deserialize, Serialize};
@@ -21,41 +22,41 @@ use serde::{Deserialize, Serialize};
 use crate::filter::ScalarGaussian;
 use crate::quantity::InvalidState;
 
-/// States: differences in SOC, in capacity, in resistance and in contact resistance (relative to the mean cell),
-/// fractions; offset of the voltage channel, V; leak, fraction of the capacity per day.
+/// State: difference in SOC from the mean cell, fraction.
 pub const SOC: usize = 0;
-/// See [`SOC`].
+/// State: difference in capacity, fraction of the mean cell's capacity.
 pub const CAPACITY: usize = 1;
-/// See [`SOC`].
+/// State: difference in resistance, fraction of the mean cell's resistance.
 pub const RESISTANCE: usize = 2;
-/// See [`SOC`].
+/// State: difference in contact resistance, fraction of the mean cell's series resistance.
 pub const CONTACT: usize = 3;
-/// See [`SOC`].
+/// State: offset of the voltage channel, V.
 pub const CHANNEL: usize = 4;
-/// See [`SOC`].
+/// State: leak, fraction of the capacity per day.
 pub const LEAK: usize = 5;
 /// Number of states.
 pub const STATES: usize = 6;
 const PAIRS: usize = STATES * (STATES + 1) / 2;
 
-/// Standard deviations before the first row. The channel's is typical of cell monitors.
+/// Standard deviations before the first row. The value for the channel is typical of cell monitors.
 const FIRST_STD: [f64; STATES] = [0.05, 0.1, 0.2, 0.5, 0.005, 0.05];
-/// Growth of the standard deviations per day, and of the charge's per unit of SOC moved.
+/// Growth of the standard deviations per day; `MOVED_STD` is the growth for the SOC per unit of SOC moved.
 const DAILY_STD: [f64; STATES] = [1e-4, 3e-4, 5e-3, 5e-3, 3e-4, 1e-4];
 const MOVED_STD: f64 = 5e-4;
 /// Standard deviations added after a sudden change of one cell: its contact, its channel or the cell itself has
-/// changed. The charge gets little, because it cannot change without a current.
+/// changed. The value for the SOC is small, because the SOC cannot change without a current.
 const ALONE_STD: [f64; STATES] = [0.005, 0.05, 0.2, 0.5, 0.04, 0.01];
-/// Standard deviations added if the cell has been replaced together with its neighbours.
+/// Standard deviations added if the cell was replaced together with its neighbours.
 const REPLACED_STD: [f64; STATES] = [0.05, 0.1, 0.3, 0.1, 0.005, 0.01];
-/// Standard deviations added if only the resistance has changed. Ageing takes weeks, so it is the contact.
+/// Standard deviations added if only the resistance has changed. Ageing takes weeks, so the contact must have changed.
 const RESISTANCE_STD: [f64; STATES] = [0.0, 0.0, 0.01, 0.5, 0.0, 0.0];
-/// Typical loss of a cell that a BMS may bleed: standard deviation, fraction of the capacity per day. A larger loss,
-/// possible after a time without rows, is handled by `open_charge`. With 0.01 per day, exchanged channels and modules
-/// would go undetected.
+/// Typical loss of a cell that a BMS may bleed: standard deviation, fraction of the capacity per day. After a time
+/// without rows, the loss may be larger; `open_charge` handles this. With 0.01 per day, the detector would miss
+/// exchanged channels and modules.
 const BLED_PER_DAY: f64 = 0.002;
-/// Limits of the innovation, in standard deviations: beyond `HUBER` a row counts less; beyond `JUMP` (means) or
-/// `STEPS_JUMP` (steps) it counts as odd. Three consecutive odd rows are a jump.
+/// Limits of the innovation, in standard deviations. Beyond `HUBER`, a row has less weight. Beyond `JUMP` (mean
+/// voltage) or `STEPS_JUMP` (resistance from steps), a row is odd. Three consecutive odd rows on the same side are a
+/// jump.
 const HUBER: f64 = 3.0;
 const JUMP: f64 = 4.0;
 const STEPS_JUMP: f64 = 3.0;
@@ -65,10 +66,11 @@ const STEPS_JUMP: f64 = 3.0;
 #[serde(deny_unknown_fields)]
 pub struct Difference {
     mean: [f64; STATES],
-    /// Upper triangle, row by row.
+    /// Covariance of the states: upper triangle, row by row.
     covariance: [f64; PAIRS],
-    /// Consecutive odd rows, signed by side: by their means and by their steps.
+    /// Number of consecutive rows with an odd mean voltage, with the sign of the innovation.
     odd_rows: i8,
+    /// Number of consecutive rows with an odd resistance from steps, with the sign of the innovation.
     odd_steps: i8,
 }
 
@@ -81,8 +83,8 @@ pub(super) enum Jump {
     Replaced,
 }
 
-/// Counts consecutive deviations to one side. Returns whether there are enough for a jump, and then restarts the
-/// count.
+/// Counts consecutive deviations on the same side. If there are enough of them for a jump, restarts the count and
+/// returns true.
 fn count_odd(odd: &mut i8, deviations: f64, limit: f64) -> bool {
     let side = if deviations.abs() < limit { 0 } else { deviations.signum() as i8 };
     *odd = if side == 0 || odd.signum() * side < 0 { side } else { *odd + side };
@@ -108,7 +110,7 @@ const fn pair(i: usize, j: usize) -> usize {
 }
 
 impl Difference {
-    /// A cell without any rows yet.
+    /// Creates the filter of a cell before its first row.
     pub(super) fn new() -> Self {
         let mut covariance = [0.0; PAIRS];
         for (i, std) in FIRST_STD.iter().enumerate() {
@@ -126,7 +128,7 @@ impl Difference {
         &self.mean
     }
 
-    /// Predicts over `days` and a change of the mean cell's SOC.
+    /// Predicts over `days` in which the mean cell's SOC changes by `soc_change`.
     pub(super) fn pass(&mut self, days: f64, soc_change: f64) {
         // charge += (1 / (1 + capacity) - 1) * soc_change - leak * days
         let part = 1.0 / (1.0 + self.mean[CAPACITY]).max(0.1);
@@ -150,7 +152,8 @@ impl Difference {
         self.keep_possible();
     }
 
-    /// Removes charge that the current sensor does not see: SOC and its variance.
+    /// Removes charge that the current sensor does not measure. `soc`: the charge as a fraction of the capacity;
+    /// `variance`: the variance of `soc`.
     pub(super) fn remove_charge(&mut self, soc: f64, variance: f64) {
         self.mean[SOC] -= soc;
         self.covariance[pair(SOC, SOC)] += variance;
@@ -165,12 +168,12 @@ impl Difference {
         self.covariance[pair(SOC, SOC)] = FIRST_STD[SOC] * FIRST_STD[SOC];
     }
 
-    /// Resets the leak because the BMS may bleed the cell from now on.
+    /// Resets the leak when the BMS may begin to bleed the cell.
     pub(super) fn forget_leak(&mut self) {
         self.begin_leak(BLED_PER_DAY);
     }
 
-    /// Resets the leak because the BMS no longer bleeds the cell: further loss is a leak.
+    /// Resets the leak when the BMS no longer bleeds the cell. Any further loss is a leak.
     pub(super) fn watch_leak(&mut self) {
         self.begin_leak(FIRST_STD[LEAK]);
     }
@@ -183,8 +186,8 @@ impl Difference {
         self.covariance[pair(LEAK, LEAK)] = std * std;
     }
 
-    /// Handles hours without rows in which the cell may have lost more than usual. If the row contradicts the
-    /// prediction, widens charge and channel; the next drive shows which of them changed.
+    /// Handles hours without rows, during which the cell may have lost more charge than usual. If the row contradicts
+    /// the prediction, raises the uncertainty of SOC and channel. The next drive shows which of them changed.
     pub(super) fn open_charge(&mut self, days: f64, observed: &Observation) {
         if days >= 0.04 && self.deviations(observed).abs() > JUMP {
             let lost = FIRST_STD[LEAK] * days;
@@ -193,8 +196,8 @@ impl Difference {
         }
     }
 
-    /// Expected reading of the channel relative to the middle at rest, V, where the open-circuit curve has slope
-    /// `slope_v`, V.
+    /// Expected reading of the channel at rest, relative to the middle voltage of the pack, V. `slope_v`: slope of the
+    /// open-circuit curve, V per unit of SOC.
     pub(super) fn reading_v(&self, slope_v: f64) -> ScalarGaussian {
         let mean = slope_v * self.mean[SOC] + self.mean[CHANNEL];
         let variance = slope_v * slope_v * self.covariance[pair(SOC, SOC)]
@@ -217,8 +220,8 @@ impl Difference {
         (with, total.max(f64::MIN_POSITIVE))
     }
 
-    /// Updates with a row's mean. Returns whether the cell has changed suddenly: consecutive rows contradict the
-    /// prediction. The row is then left for [`Self::open`].
+    /// Updates with a row's mean voltage. Returns true if the cell has changed suddenly, that is, if consecutive rows
+    /// contradict the prediction. In that case the update is left to [`Self::open`].
     pub(super) fn observe(&mut self, observed: &Observation) -> bool {
         let off = self.deviations(observed);
         let is_jump = count_odd(&mut self.odd_rows, off, JUMP);
@@ -228,7 +231,7 @@ impl Difference {
         is_jump
     }
 
-    /// Updates with a row's series resistance.
+    /// Updates with a row's series resistance, measured from current steps.
     pub(super) fn observe_steps(&mut self, observed: &Observation) {
         let off = self.deviations(observed);
         if count_odd(&mut self.odd_steps, off, STEPS_JUMP) {
@@ -239,13 +242,13 @@ impl Difference {
         }
     }
 
-    /// Widens the states after a sudden change and updates with the row that showed it.
+    /// Raises the uncertainty of the states after a sudden change, and updates with the row that showed the change.
     pub(super) fn open(&mut self, jump: Jump, observed: &Observation) {
         self.widen_as(jump);
         self.update(observed, 1.0);
     }
 
-    /// Widens the states because the cell may have changed suddenly.
+    /// Raises the uncertainty of the states because the cell may have changed suddenly.
     pub(super) fn widen_as(&mut self, jump: Jump) {
         self.widen(match jump {
             Jump::Alone => &ALONE_STD,
@@ -253,7 +256,7 @@ impl Difference {
         });
     }
 
-    /// Updates with the innovation variance multiplied by `beyond`, so that outliers count linearly.
+    /// Updates with the innovation variance multiplied by `beyond`, which limits the weight of an outlier (Huber).
     fn update(&mut self, observed: &Observation, beyond: f64) {
         let (with, total) = self.by_slope(observed);
         let total = total * beyond;
@@ -268,15 +271,15 @@ impl Difference {
         self.keep_possible();
     }
 
-    /// Keeps variances positive despite rounding. Restarts the filter if a number is impossible, because the readings
-    /// then did not come from a cell.
+    /// Keeps variances positive despite rounding. If a number is impossible, restarts the filter, because the readings
+    /// cannot come from a cell.
     fn keep_possible(&mut self) {
         for i in 0..STATES {
             let variance = &mut self.covariance[pair(i, i)];
             *variance = variance.max(1e-12);
         }
         let numbers = self.mean.iter().chain(&self.covariance);
-        // A thousand times the cell's own value.
+        // The limit is a thousand times the value of a cell.
         if !numbers.clone().all(|number| number.abs() <= 1e3) {
             *self = Self::new();
         }
@@ -287,7 +290,7 @@ impl Difference {
         self.odd_rows == 0
     }
 
-    /// Sets the means, and restarts the count of odd rows.
+    /// Sets the means and restarts the count of odd rows.
     pub(super) fn settle(&mut self, mean: &[f64; STATES]) {
         (self.mean, self.odd_rows) = (*mean, 0);
     }
@@ -314,7 +317,8 @@ impl Difference {
 mod tests {
     use super::*;
 
-    /// Simulates days of driving and rest of a cell with these differences, seen by an ideal channel.
+    /// Simulates days of driving and rest for a cell with the differences `truth` and an ideal voltage channel. Returns
+    /// the filter.
     fn watched(truth: [f64; STATES], days: usize) -> Difference {
         let (mut filter, mut charge, mut soc) = (Difference::new(), truth[SOC], 0.8);
         for row in 0..days * 60 {
@@ -327,7 +331,7 @@ mod tests {
             soc += change;
             charge += (1.0 / (1.0 + truth[CAPACITY]) - 1.0) * change - truth[LEAK] * passed_days;
             filter.pass(passed_days, change);
-            // A curved open-circuit curve, a drop with a slow part, and a contact.
+            // The slope of the open-circuit curve depends on the SOC; the voltage drop has a slow part.
             let slope_v = 0.4 + 12.0 * (soc - 0.5) * (soc - 0.5);
             let drop_v = 3.0 * current + if row % 2 == 0 { 0.02 } else { 0.0 };
             let slope = [slope_v, 0.0, -drop_v, -1.5 * current, 1.0, 0.0];
@@ -339,7 +343,7 @@ mod tests {
     }
 
     #[test]
-    fn each_state_is_found_and_told_apart() {
+    fn each_state_is_found_without_the_others() {
         let faults = [(CAPACITY, -0.1), (RESISTANCE, 0.2), (CONTACT, 0.2), (CHANNEL, 0.03), (LEAK, 0.002)];
         for (state, size) in faults {
             let mut truth = [0.0; STATES];
@@ -394,7 +398,7 @@ mod tests {
             })
             .collect();
         assert_eq!(jumps.iter().filter(|jumped| **jumped).count(), 1);
-        assert!(jumps[2], "at the third row");
+        assert!(jumps[2], "the third row reports the jump");
         assert!(row(&filter).innovation.abs() < 0.003, "{:?}", row(&filter));
     }
 }

@@ -7,23 +7,23 @@ use serde::{Deserialize, Serialize};
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Kind of a finding. The number is the one on the wire and is never reused.
+/// Kind of a finding. The number identifies the kind in CAN frames; it is never reused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
 pub enum CellFaultKind {
-    /// The cell loses charge against the others; fraction of its capacity in a day.
+    /// The cell loses charge relative to the others; fraction of its capacity per day.
     Leak = 1,
-    /// The contact resistance of the cell's connection is higher than the others'; fraction of the cell's series
-    /// resistance.
+    /// The contact resistance of the cell's connection is higher than that of the other cells; fraction of the cell's
+    /// series resistance.
     Contact = 2,
-    /// The cell's capacity is lower than the others'; fraction.
+    /// The cell's capacity is lower than that of the other cells; fraction.
     WeakCell = 3,
-    /// The cell's resistance is higher than the others', as in an aged cell; fraction.
+    /// The cell's resistance is higher than that of the other cells, as in an aged cell; fraction.
     HighResistance = 4,
-    /// The cell's capacity is higher than the others': a cell of another age; fraction.
+    /// The cell's capacity is higher than that of the other cells, because the cell is of another age; fraction.
     ForeignCell = 5,
-    /// Neighbouring cells have changed suddenly: a replaced module; mean change of their capacity, fraction.
+    /// Neighbouring cells have changed suddenly: a module was replaced; mean change of their capacity, fraction.
     Module = 6,
     /// The cell's voltage channel has a constant offset; V.
     VoltageChannel = 7,
@@ -44,7 +44,7 @@ pub enum CellFaultKind {
 }
 
 impl CellFaultKind {
-    /// Every kind, in the order of the numbers on the wire.
+    /// Every kind, in the order of the numbers in CAN frames.
     pub const ALL: [Self; 14] = [
         Self::Leak,
         Self::Contact,
@@ -102,7 +102,7 @@ impl CellFaultKind {
         }
     }
 
-    /// What the user should do about it.
+    /// What the user should do.
     pub const fn advice(self) -> &'static str {
         match self {
             Self::Leak => {
@@ -127,13 +127,13 @@ impl CellFaultKind {
         }
     }
 
-    /// Whether the two cells are a pair and not the ends of a range.
+    /// Whether the two cells of a finding are a pair, not the ends of a range.
     pub const fn is_of_pair(self) -> bool {
         matches!(self, Self::DoubledChannels | Self::SwappedChannels)
     }
 
-    /// Probability below which a finding is withdrawn. For a leak it is lower, because a BMS that bleeds the other
-    /// cells hides a known leak.
+    /// Probability below which a finding is withdrawn. It is lower for a leak: while the BMS bleeds the other cells, a
+    /// known leak is hidden.
     pub(super) const fn withdrawn_below(self) -> f64 {
         match self {
             Self::Leak => 0.01,
@@ -141,7 +141,7 @@ impl CellFaultKind {
         }
     }
 
-    /// Whether the measurement fails, so that nothing is known of the cell.
+    /// Whether the voltage measurement fails, so that nothing is known about the cell.
     pub const fn is_of_channel(self) -> bool {
         matches!(self, Self::VoltageChannel | Self::VoltageFrozen | Self::DoubledChannels)
     }
@@ -165,7 +165,7 @@ impl CellFaultKind {
     }
 }
 
-/// A finding.
+/// A finding about one cell, several cells or the whole pack.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CellFault {
@@ -226,17 +226,17 @@ pub const RESISTANCE: f64 = 0.1;
 /// Limit of the voltage channel's offset, V.
 pub const CHANNEL_V: f64 = 0.015;
 
-/// Limit of the current sensor's offset, fraction of the rated capacity per hour: the SOC would drift by a quarter in
-/// a day.
+/// Limit of the current sensor's offset, fraction of the rated capacity per hour. At the limit, the SOC drifts by a
+/// quarter per day.
 pub const OFFSET_PER_H: f64 = 0.01;
 
 /// Limit of the rise of the current sensor's gain, fraction.
 pub const GAIN: f64 = 0.02;
 
-/// A finding is reported from the first probability on and withdrawn below the second.
+/// Probabilities from which a finding is reported, and below which it is withdrawn.
 pub(super) const REPORTED: f64 = 0.999;
 pub(super) const WITHDRAWN: f64 = 0.5;
 
-/// Smallest distance from the median of the pack, in robust standard deviations of its cells, because healthy cells
-/// differ too.
+/// Smallest distance of a finding from the median of the pack, in robust standard deviations of the pack's cells. It
+/// accounts for the spread of healthy cells.
 pub(super) const OUTLIER: f64 = 3.5;

@@ -2,9 +2,9 @@
 //!
 //! In: once a day, the learned capacity and resistance of all cells. Out: the rise of the gain.
 //!
-//! A sensor that shows `g` times the current scales every resistance by `1/g` at once, and every capacity by `g` as
-//! new readings arrive. No battery gains capacity while its resistance falls. A falling gain looks like ageing and is
-//! not reported.
+//! If a sensor shows `g` times the current, every learned resistance changes by the factor `1/g` at once, and every
+//! learned capacity by the factor `g` as new readings arrive. In no real battery does the capacity rise while the
+//! resistance falls. A falling gain looks like ageing and is not reported.
 
 use serde::{Deserialize, Serialize};
 
@@ -12,16 +12,16 @@ use super::fault::{GAIN, REPORTED};
 use crate::filter::{ScalarGaussian, median, normal_cdf};
 use crate::quantity::{InvalidState, Timestamp};
 
-/// Number of days that are compared: slower changes are seasons or ageing.
+/// Number of days that are compared. Slower changes are seasons or ageing.
 const DAYS: usize = 10;
 const DAY_S: f64 = 86_400.0;
 /// Longest time within which the resistances must fall, s. The estimated resistance follows within hours, so two daily
 /// checks may each see a part of the fall.
 const APART_S: f64 = 2.5 * DAY_S;
-/// Standard deviation of a change within these days, fraction.
+/// Standard deviation of a healthy change within these days, fraction.
 const ERROR: f64 = 0.005;
-/// Largest median relative standard deviation of the capacities on a day that counts. Capacities that are still being
-/// learned change too much.
+/// Largest relative standard deviation (median of the cells) of the capacities on a day that counts. Capacities that
+/// are still being learned change too much.
 const KNOWN: f64 = 0.03;
 
 /// Median values of the cells on one day.
@@ -29,23 +29,24 @@ const KNOWN: f64 = 0.03;
 #[serde(deny_unknown_fields)]
 struct Day {
     time: Timestamp,
-    /// Logarithms of the capacity in Ah and of the resistance ratio to the model.
+    /// Logarithm of the capacity in Ah.
     log_capacity: f64,
+    /// Logarithm of the resistance ratio to the model.
     log_resistance: f64,
-    /// Degrees C.
+    /// Temperature, degrees C.
     temperature_c: f64,
 }
 
 /// Learned capacity and resistance of one cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CellAgeing {
-    /// Ah.
+    /// Capacity, Ah.
     pub capacity_ah: ScalarGaussian,
     /// Logarithm of the resistance ratio to the model.
     pub log_resistance: f64,
 }
 
-/// Values of the last days.
+/// Detector of a risen gain; holds the values of the last days.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Gain {
@@ -55,13 +56,13 @@ pub(super) struct Gain {
 }
 
 impl Gain {
-    /// Whether a day has passed since the last one.
+    /// Whether a day has passed since the last check.
     pub(super) fn is_due(&self, now: Timestamp) -> bool {
         self.last.is_none_or(|last| !(0.0..DAY_S).contains(&now.since(last)))
     }
 
-    /// Adds a day. Returns the probability that the gain has risen beyond [`GAIN`], and the rise, fraction. While a
-    /// rise is reported, the days before it are kept.
+    /// Adds a day. Returns the probability that the gain has risen by more than [`GAIN`], and the rise, fraction. While
+    /// a rise is reported, the days before the rise are kept for comparison.
     pub(super) fn take(&mut self, time: Timestamp, temperature_c: f64, cells: &[CellAgeing]) -> (f64, ScalarGaussian) {
         let none = (0.0, ScalarGaussian { mean: 0.0, variance: ERROR * ERROR });
         let part = |cell: &CellAgeing| cell.capacity_ah.std() / cell.capacity_ah.mean;
@@ -110,8 +111,8 @@ impl Gain {
     }
 }
 
-/// Rise of the gain between two days that `now` still shows, fraction: the smaller of the fall in resistance and the
-/// rise in capacity. `None` if the days cannot be compared.
+/// Rise of the gain between two days, fraction, if it still lasts at `now`. The rise is the smaller of the fall in
+/// resistance and the rise in capacity. `None` if the days cannot be compared.
 fn rise(before: &Day, after: &Day, now: &Day) -> Option<f64> {
     let is_near = |day: &Day| (day.temperature_c - before.temperature_c).abs() <= 5.0;
     let is_next = after.time.since(before.time) <= APART_S;
@@ -123,7 +124,8 @@ fn rise(before: &Day, after: &Day, now: &Day) -> Option<f64> {
 mod tests {
     use super::*;
 
-    /// Probability and size after each day. `gains`: the gain of each day; the capacity follows by a third a day.
+    /// Probability and size after each day. `gains`: the gain on each day. Each day, the learned capacity moves a third
+    /// of the way to its new value.
     fn after_days(gains: &[f64], temperatures_c: impl Fn(usize) -> f64) -> Vec<(f64, f64)> {
         let (mut watch, mut capacity_ah) = (Gain::default(), 60.0);
         gains

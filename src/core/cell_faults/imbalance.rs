@@ -1,8 +1,9 @@
-//! Cost of the differences between cells: charge lost by imbalance and by the weakest cell, and the limiting cells.
+//! Computes what the differences between cells cost: charge lost by imbalance and by the weakest cell, and the cells
+//! that limit the pack.
 //!
 //! In: each cell's difference from the middle of the pack in SOC, capacity and resistance; SOC and capacity of the
-//! middle cell. Out: [`Imbalance`], in fractions of the mean cell's capacity. A charge ends when the first cell is
-//! full, a discharge when the first cell is empty. With a cell's SOC s and capacity C:
+//! middle cell. Out: [`Imbalance`], in fractions of the mean of the cells' capacities. A charge ends when the first
+//! cell is full, a discharge when the first cell is empty. With a cell's SOC s and capacity C:
 //!
 //! ```text
 //! usable            = min s C + min (1 - s) C
@@ -10,13 +11,16 @@
 //! lost by weakest   = mean C - min C
 //! ```
 //!
-//! Standard deviations are first-order in the states of the limiting cells. Assumed: the errors of different cells,
-//! and of one cell's SOC and capacity, are independent; the middle cell's SOC is exact (its error moves `usable` by
-//! the error times the capacity difference of the two limiting cells). The minimum of many uncertain values lies below
-//! the true minimum: if the cells differ by no more than their standard deviations, the losses are overestimated.
+//! Standard deviations are propagated to first order from the states of the limiting cells. Assumptions:
+//! * the errors of different cells, and the errors of one cell's SOC and capacity, are independent;
+//! * the middle cell's SOC is exact. An error e would change `usable` by e times the difference between the capacities
+//!   of the two limiting cells.
 //!
-//! Cells with a faulty channel or a still uncertain difference are left out. With fewer than three remaining cells, or
-//! fewer than half of the cells, the imbalance is unknown.
+//! The minimum of many uncertain values lies below the true minimum. If the cells differ by no more than their standard
+//! deviations, the losses are therefore overestimated.
+//!
+//! Cells with a faulty channel or a still uncertain difference are left out. If fewer than three cells, or fewer than
+//! half of the cells, remain, the imbalance is unknown.
 
 use serde::Serialize;
 
@@ -27,13 +31,13 @@ use crate::cell::CellModel;
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Timestamp};
 
-/// A cell's SOC and capacity are unknown from these standard deviations on: at most half of those before the first
+/// Standard deviations from which a cell's SOC or capacity is unknown: half of the standard deviations before the first
 /// row.
 const UNKNOWN_SOC_STD: f64 = 0.025;
 const UNKNOWN_CAPACITY_STD: f64 = 0.05;
 const OCV_PARTS: u32 = 100;
 
-/// Cost of the differences between cells. Fractions are of the mean cell's capacity.
+/// Cost of the differences between cells. All charges are fractions of the mean of the cells' capacities.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Imbalance {
     /// Time of the last comparison.
@@ -42,11 +46,11 @@ pub struct Imbalance {
     pub cells: usize,
     /// Mean of the cells' capacities, Ah.
     pub mean_ah: ScalarGaussian,
-    /// Charge between the first full cell and the first empty cell, fraction.
+    /// Charge that the pack delivers from the time its first cell is full until its first cell is empty, fraction.
     pub usable: ScalarGaussian,
     /// Charge that balancing would recover, fraction.
     pub lost_by_imbalance: ScalarGaussian,
-    /// Charge by which a pack of mean cells exceeds this pack, both balanced, fraction.
+    /// Charge by which a balanced pack of mean cells exceeds this pack if balanced, fraction.
     pub lost_by_weakest: ScalarGaussian,
     /// The cell with the least capacity.
     pub weakest: CellIndex,
@@ -56,9 +60,9 @@ pub struct Imbalance {
     pub charge_limit: LimitingCell,
     /// Differences of SOC, fraction.
     pub soc: CellSpread,
-    /// Differences of capacity, fraction of the middle cell's.
+    /// Differences of capacity, fraction of the middle cell's capacity.
     pub capacity: CellSpread,
-    /// Differences of resistance, fraction of the middle cell's.
+    /// Differences of resistance, fraction of the middle cell's resistance.
     pub resistance: CellSpread,
     /// Cells that are not compared, with the reason.
     pub left_out: Vec<(CellIndex, LeftOut)>,
@@ -69,11 +73,11 @@ pub struct Imbalance {
 pub struct LimitingCell {
     /// Index of the cell.
     pub cell: CellIndex,
-    /// The larger of the two causes.
+    /// The larger of the two causes, SOC and capacity.
     pub reason: LimitReason,
-    /// Charge missing relative to the mean cell because of the cell's SOC, fraction of the mean cell's capacity.
+    /// Charge missing relative to the mean cell because of this cell's SOC, fraction of the mean capacity.
     pub by_charge: f64,
-    /// Charge missing relative to the mean cell because of the cell's capacity, fraction of the mean cell's capacity.
+    /// Charge missing relative to the mean cell because of this cell's capacity, fraction of the mean capacity.
     pub by_capacity: f64,
 }
 
@@ -81,15 +85,15 @@ pub struct LimitingCell {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum LimitReason {
-    /// It has less charge than the others when the pack is full.
+    /// The cell has less charge than the others when the pack is full.
     LeastCharge,
-    /// It has more charge than the others when the pack is empty.
+    /// The cell has more charge than the others when the pack is empty.
     MostCharge,
-    /// It has less capacity than the others.
+    /// The cell has less capacity than the others.
     LeastCapacity,
-    /// It has a leak finding.
+    /// A finding says that the cell leaks.
     Leak,
-    /// It has a weak-cell finding.
+    /// A finding says that the cell is weak.
     WeakCell,
 }
 
@@ -106,12 +110,13 @@ impl LimitReason {
     }
 }
 
-/// Spread of the cells in one state.
+/// Spread of the cells' values of one state.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CellSpread {
     /// Standard deviation of the cells' estimates.
     pub std: f64,
-    /// Root mean square of the estimates' own standard deviations. A `std` below this is not significant.
+    /// Root mean square of the standard deviations of the single estimates. If `std` is below it, the spread is not
+    /// significant.
     pub error: f64,
     /// Cell with the lowest value, and its difference from the middle.
     pub lowest: (CellIndex, f64),
@@ -123,9 +128,9 @@ pub struct CellSpread {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum LeftOut {
-    /// Its voltage reading is wrong or belongs to another cell.
+    /// The cell's voltage reading is wrong or belongs to another cell.
     FaultyChannel,
-    /// Its SOC or capacity relative to the others is still uncertain.
+    /// The cell's SOC or capacity relative to the others is still uncertain.
     NotKnown,
 }
 
@@ -136,7 +141,7 @@ pub enum UnknownImbalance {
     #[error("the cells have not been compared yet")]
     NotCompared,
     /// Too few cells can be compared.
-    #[error("{known} of {cells} cells can be compared, at least {least} are needed")]
+    #[error("{known} of {cells} cells can be compared, at least {least} are required")]
     TooFewCells {
         /// Cells that can be compared.
         known: usize,
@@ -162,7 +167,7 @@ impl CellFaultDetector {
     /// Computes the imbalance. `middle_ah`: capacity of the middle cell, Ah.
     ///
     /// # Errors
-    /// The reason why it is unknown.
+    /// The reason why the imbalance is unknown.
     pub fn imbalance(&self, middle_ah: ScalarGaussian) -> Result<Imbalance, UnknownImbalance> {
         let (time, middle_soc) = self.middle_soc().ok_or(UnknownImbalance::NotCompared)?;
         let (mut known, mut left_out) = (Vec::new(), Vec::new());
@@ -191,20 +196,22 @@ impl CellFaultDetector {
     }
 }
 
-/// Mean open-circuit voltage, V, from empty to full, of a cell that has aged to `capacity_ah`.
+/// Mean open-circuit voltage between empty and full, V, of a cell that has aged to `capacity_ah`.
 pub fn mean_ocv_v(model: &CellModel, capacity_ah: f64) -> f64 {
     let soc = |part: u32| (f64::from(part) + 0.5) / f64::from(OCV_PARTS);
     let ocv_v = |part| model.aged_ocv_v(&model.grid_position(soc(part), 25.0), capacity_ah);
     (0..OCV_PARTS).map(ocv_v).sum::<f64>() / f64::from(OCV_PARTS)
 }
 
-/// A cell relative to the middle one.
+/// A cell relative to the middle cell.
 #[derive(Debug, Clone, Copy)]
 struct ComparedCell {
     cell: CellIndex,
-    /// Difference in SOC. Differences in capacity and resistance: fractions of the middle cell's.
+    /// Difference in SOC, fraction.
     soc: ScalarGaussian,
+    /// Difference in capacity, fraction of the middle cell's capacity.
     capacity: ScalarGaussian,
+    /// Difference in resistance, fraction of the middle cell's resistance.
     resistance: ScalarGaussian,
     /// SOC of the middle cell.
     middle_soc: f64,
@@ -213,7 +220,7 @@ struct ComparedCell {
 }
 
 impl ComparedCell {
-    /// Capacity, fraction of the middle cell's.
+    /// Capacity, fraction of the middle cell's capacity.
     fn capacity(&self) -> f64 {
         1.0 + self.capacity.mean
     }
@@ -263,7 +270,7 @@ fn imbalance(time: Timestamp, cells: &[ComparedCell], middle_ah: ScalarGaussian)
         mean: mean / mean_capacity,
         variance: variance / (mean_capacity * mean_capacity),
     };
-    // Missing charge = missing capacity + the excess at the other end.
+    // Charge missing at one end = missing capacity + charge in excess at the other end.
     let less = |it: &ComparedCell, other_end: fn(&ComparedCell) -> f64, charge| {
         let by_capacity = (mean_capacity - it.capacity()) / mean_capacity;
         let by_charge = (other_end(it) - mean(other_end)) / mean_capacity;
@@ -329,7 +336,7 @@ mod tests {
 
     const MIDDLE_AH: ScalarGaussian = ScalarGaussian { mean: 50.0, variance: 1.0 };
 
-    /// Ten cells, the middle one at SOC 0.6. `others`: cell, difference in SOC, difference in capacity (fraction).
+    /// Ten cells; the middle cell has a SOC of 0.6. `others`: cell, difference in SOC and in capacity (fractions).
     fn pack(others: &[(u16, f64, f64)]) -> Vec<ComparedCell> {
         let known = |mean, std| ScalarGaussian::from_std(mean, std);
         let cell = |cell| {
@@ -367,7 +374,7 @@ mod tests {
 
     #[test]
     fn cell_with_least_charge_limits_discharge() {
-        // 0.55 until this cell is empty, 0.4 until the others are full.
+        // The pack delivers 0.55 until this cell is empty and accepts 0.4 until the others are full.
         let found = of(&pack(&[(3, -0.05, 0.0)]));
         assert_near(found.usable.mean, 0.95);
         assert_near(found.lost_by_imbalance.mean, 0.05);
@@ -384,7 +391,7 @@ mod tests {
 
     #[test]
     fn weak_cell_full_with_others_loses_nothing_by_imbalance() {
-        // 0.4 of a mean cell until full, with a capacity of 0.9: SOC 5 / 9.
+        // This cell, of capacity 0.9, accepts 0.4 like the others, so its SOC is 1 - 0.4 / 0.9 = 5 / 9.
         let found = of(&pack(&[(3, 5.0 / 9.0 - 0.6, -0.1)]));
         assert_near(found.usable.mean, 0.9 / 0.99);
         assert_near(found.lost_by_imbalance.mean, 0.0);

@@ -1,8 +1,13 @@
 //! Finds failing cells by comparing each cell with the others of its pack.
 //!
 //! In: samples of the cells of one series pack, and the estimators' values of the mean cell. Out: [`CellFault`]s. All
-//! cells carry the same current, so common errors (model, SOC, current sensor) cancel in the differences, and a cell
-//! stands out by a few millivolts. With fewer than three cells nothing is found.
+//! cells carry the same current. Errors that all cells share (model, SOC, current sensor) therefore cancel in the
+//! differences between cells, and a failing cell stands out by a few millivolts. With fewer than three cells, the
+//! detector is inactive.
+//!
+//! Terms: a *row* is the sum of each cell's samples over a few minutes. The *mean cell* is an imaginary cell with the
+//! typical values of the pack. The *middle cell* is the real cell closest to the pack's median; its estimates stand
+//! for the mean cell. A cell is *bled* while a balancing resistor discharges it.
 //!
 //! | file | purpose |
 //! | --- | --- |
@@ -11,10 +16,11 @@
 //! | [`bleed_timer`] | how long a cell was bled, from the balancing bits of its BMS |
 //! | `row` | samples of a few minutes, summed per cell |
 //! | [`gain`] | gain of the current sensor, from changes that all cells share |
-//! | `channels` | frozen and doubled voltage channels |
+//! | `channels` | voltage channels that are frozen or show the same cell |
 //! | `temperature` | temperature sensors that do not follow the load |
-//! | [`imbalance`] | capacity lost by the differences, and the limiting cells |
+//! | [`imbalance`] | charge lost by the differences, and the limiting cells |
 //! | [`fault`] | kinds of findings and the limits for reporting them |
+
 pub mod bleed_timer;
 pub mod detector;
 pub mod difference;

@@ -1,25 +1,27 @@
-//! A row: samples of a few minutes, summed per cell.
+//! Sums of a row: the samples of a few minutes, per cell and for the pack.
 
 use serde::{Deserialize, Serialize};
 
 use crate::quantity::Timestamp;
 
-/// Sums of one cell.
+/// Sums of one cell over a row.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct CellSums {
     pub(super) count: u32,
-    /// Sum of the voltages plus the mean cell's ohmic drop at the current of each sample, because the cells are
-    /// sampled at different times.
+    /// Sum of the voltages. Each is corrected by the mean cell's ohmic drop at the current of its sample, because the
+    /// cells are sampled at different times.
     voltage_v: f64,
-    /// Over the steps between samples: sums of the squared current step and of current step times voltage step.
+    /// Sum of the squared current steps between samples.
     steps_a2: f64,
+    /// Sum of current step times voltage step between samples.
     steps_va: f64,
     /// Time, voltage and current of the previous sample.
     last: Option<(Timestamp, f64, f64)>,
     temperature_c: f64,
     temperatures: u32,
-    /// Hash of the sequence of voltages, and number of voltage changes.
+    /// Hash of the sequence of voltages.
     pub(super) digest: u64,
+    /// Number of voltage changes.
     pub(super) changes: u32,
 }
 
@@ -35,7 +37,7 @@ impl CellSums {
         ohm: f64,
     ) {
         let apart_ns = |before: Timestamp| time.nanos().wrapping_sub(before.nanos());
-        // At most about one sample per second: more add no information.
+        // Uses about one sample per second at most, because more samples add no information.
         if self.last.is_some_and(|(before, ..)| (0..900_000_000).contains(&apart_ns(before))) {
             return;
         }
@@ -77,7 +79,7 @@ impl CellSums {
         *self = Self { last: self.last, ..Self::default() };
     }
 
-    /// Discards the samples so far, because the following ones are not contiguous with them.
+    /// Discards the samples of this row, because the next sample follows after a gap.
     pub(super) fn interrupt(&mut self) {
         *self = Self::default();
     }
@@ -88,7 +90,7 @@ impl CellSums {
     }
 }
 
-/// Sums of the pack.
+/// Sums of the pack over a row.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct PackSums {
     pub(super) begun: Option<Timestamp>,
@@ -98,7 +100,8 @@ pub(super) struct PackSums {
     pub(super) drop_v: f64,
     pub(super) soc: f64,
     pub(super) temperature_c: f64,
-    /// Sum of the charges minus the first one, and the first one, Ah.
+    /// Sum of the charges, each minus `first_ah`, Ah.
     pub(super) charge_ah: f64,
+    /// First charge of the row, Ah.
     pub(super) first_ah: f64,
 }

@@ -1,41 +1,43 @@
-//! Temperature sensors that do not follow the load: frozen or detached ones.
+//! Finds temperature sensors that do not follow the load, because they are frozen or detached.
 //!
-//! In: per row, the temperature at each cell and the median of the pack. Cells that share a sensor show the same
-//! temperature, so a faulty sensor appears as a range of cells. With one or two sensors for all cells, no sensor
+//! In: per row, the temperature at each cell and the median warming of the pack. Cells that share a sensor show the
+//! same temperature, so a faulty sensor appears as a range of cells. If all cells share one or two sensors, no sensor
 //! stands out.
 
 use serde::{Deserialize, Serialize};
 
-/// A sensor is judged once the sum of squared warmings reaches this, K^2.
+/// Sum of the pack's squared warmings from which a sensor is judged, K^2.
 const LEAST_K2: f64 = 30.0;
-/// A sensor is detached below this part of the pack's warming, and attached again above `ATTACHED`.
+/// A sensor counts as detached if it shows less than `DETACHED` of the pack's warming, and as attached again if it
+/// shows more than `ATTACHED`.
 const DETACHED: f64 = 0.35;
 const ATTACHED: f64 = 0.6;
 
 /// Warming at one cell relative to the median warming of the pack.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct WarmingRatio {
-    /// Slow mean, degrees C.
+    /// Slow mean of the temperature, degrees C.
     slow_c: Option<f64>,
-    /// Sums of squares of the pack's warming and of products with the one here, K^2.
+    /// Sum of the pack's squared warmings, K^2.
     squares_k2: f64,
+    /// Sum of the products of the pack's warming and the warming at this cell, K^2.
     products_k2: f64,
     pub(super) is_detached: bool,
 }
 
 impl WarmingRatio {
-    /// Handles the temperature of a row, `seconds` after the previous one. Returns the warming, K, in which a constant
-    /// sensor offset cancels.
+    /// Handles the temperature of a row, `seconds` after the previous row. Returns the warming, K: the temperature
+    /// minus its slow mean, in which a constant sensor offset cancels.
     pub(super) fn warming_k(&mut self, seconds: f64, here_c: f64) -> f64 {
         let slow_c = self.slow_c.get_or_insert(here_c);
-        // Time constant of a warming by the load.
+        // Two hours, the time constant of warming by the load.
         *slow_c = here_c + libm::exp(-seconds.max(0.0) / 7200.0) * (*slow_c - here_c);
         here_c - *slow_c
     }
 
     /// Compares the warming at a cell with the median warming of the pack in the same row.
     pub(super) fn compare(&mut self, seconds: f64, middle_k: f64, here_k: f64) {
-        // Halves the weight of a row after five days.
+        // The weight of a row halves in five days.
         let older = libm::exp2(-seconds.max(0.0) / (5.0 * 86_400.0));
         self.squares_k2 = older * self.squares_k2 + middle_k * middle_k;
         self.products_k2 = older * self.products_k2 + middle_k * here_k;
@@ -54,7 +56,7 @@ impl WarmingRatio {
 mod tests {
     use super::*;
 
-    /// Runs two days of a pack that warms by 8 K several times; the sensor shows `part` of it.
+    /// Runs two days of a pack that warms by 8 K several times; the sensor shows `part` of the warming.
     fn after_days(part: f64) -> WarmingRatio {
         let (mut pack, mut following) = (WarmingRatio::default(), WarmingRatio::default());
         for row in 0..2 * 288 {

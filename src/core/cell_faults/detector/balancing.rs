@@ -1,4 +1,4 @@
-//! Corrects the differences between the cells for balancing, if bits show which cells are bled.
+//! Corrects the differences between the cells for balancing, if the BMS sends bits that show which cells it bleeds.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,13 +6,14 @@ use super::{CellFaultDetector, inner_half};
 use crate::cell_faults::bleed_timer::{BalancingConfig, BleedTime, BleedTimer};
 use crate::quantity::{InvalidState, Timestamp};
 
-/// Relative standard deviation of the bled charge according to the bits. The resistors of one BMS are alike, but their
-/// current follows the voltage.
+/// Relative standard deviation of the bled charge that the bits give. The resistors of one BMS are equal, but their
+/// current depends on the voltage.
 const BLEED_PART: f64 = 0.2;
-/// Largest SOC that a cell loses relative to the others: a BMS bleeds it only down to the lowest cell.
+/// Largest SOC that bleeding takes from a cell relative to the others. It is limited because a BMS bleeds a cell only
+/// down to the lowest cell.
 const MOST_BESIDE: f64 = 0.1;
 
-/// Correlated errors: while the cause lasts, the errors have the same sign, so they add up linearly, not in squares.
+/// Correlated errors: while their cause lasts, they have the same sign, so the errors add up instead of their squares.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct CorrelatedError {
@@ -20,8 +21,8 @@ struct CorrelatedError {
 }
 
 impl CorrelatedError {
-    /// Returns the increase of the squared sum by one more row. The sum, and so the increase, is bounded. A row
-    /// without loss resets the sum.
+    /// Adds the error of one row. Returns the increase of the squared sum, which is bounded because the sum is bounded.
+    /// A row without loss resets the sum.
     fn add(&mut self, part: f64) -> f64 {
         let before = std::mem::take(&mut self.sum);
         let part = part.clamp(-MOST_BESIDE, MOST_BESIDE);
@@ -38,7 +39,7 @@ impl CorrelatedError {
 #[serde(deny_unknown_fields)]
 pub(super) struct Bleed {
     pub(super) timer: BleedTimer,
-    /// SOC bled relative to the middle cells, while this cell or the middle cells are bled.
+    /// SOC bled relative to the middle cells, while the BMS bleeds this cell or the middle cells.
     bled: CorrelatedError,
     /// Largest SOC that may have been bled while the state was unknown.
     unseen: CorrelatedError,
@@ -50,7 +51,7 @@ impl Bleed {
         *self == Self::default()
     }
 
-    /// Discards the time so far.
+    /// Discards all counted time and the errors.
     pub(super) fn forget_time(&mut self) {
         self.timer.forget_time();
         *self = Self { timer: self.timer, ..Self::default() };
@@ -65,10 +66,11 @@ impl Bleed {
 }
 
 impl CellFaultDetector {
-    /// Handles a balancing bit of a cell, valid until `holds_until` or the next bit; `None` = it cannot be read.
+    /// Handles a balancing bit of a cell, valid until `holds_until` or the next bit. `is_bled` is `None` if the bit
+    /// cannot be read.
     pub fn handle_balancing(&mut self, cell: usize, time: Timestamp, is_bled: Option<bool>, holds_until: Timestamp) {
         let Some(watched) = self.cells.get(cell) else { return };
-        // From the first bit on, a loss beyond the bits is a leak.
+        // After the first bit, any loss that the bits do not explain is a leak.
         let begins = is_bled.is_some() && !watched.bleed.timer.has_bits && self.may_be_bled(cell);
         let watched = &mut self.cells[cell];
         watched.bleed.timer.take(time, is_bled, holds_until);
@@ -77,7 +79,7 @@ impl CellFaultDetector {
         }
     }
 
-    /// Handles a time in which the daemon did not run and received no bits.
+    /// Handles a period in which the daemon did not run, so that it received no bits.
     pub fn note_missed_bits(&mut self, from: Timestamp, to: Timestamp) {
         self.cells.iter_mut().for_each(|cell| cell.bleed.timer.note_missed_bits(from, to));
     }
@@ -95,14 +97,14 @@ impl CellFaultDetector {
             let has_bits = cell.bleed.timer.has_bits;
             let soc = if has_bits { soc_per_s * (time.bled_s - middle_s) } else { 0.0 };
             let silent_s = if balancing.is_only_while_sent { 0.0 } else { time.silent_s };
-            // The lowest cell is never bled. A cell without bits may have lost as much as the middle cells.
+            // A BMS never bleeds the lowest cell. A cell without bits may have lost as much as the middle cells.
             let unseen_s = match has_bits {
                 _ if self.lowest == Some(index) => 0.0,
                 true => time.unknown_s + silent_s,
                 false => middle_s,
             };
             let variance = BLEED_PART * BLEED_PART * cell.bleed.bled.add(soc)
-                // Mean square of a value uniform between -1 and 1.
+                // The mean square of a value that is uniform between -1 and 1.
                 + (1.0 / 3.0) * cell.bleed.unseen.add(soc_per_s * unseen_s);
             cell.difference.remove_charge(soc, variance);
         }
@@ -148,7 +150,7 @@ mod tests {
 
     #[test]
     fn time_without_bits_is_unknown_unless_configured_otherwise() {
-        // SOC lost in 8 h at 0.06 A / 60 Ah, as a uniform distribution.
+        // Standard deviation of the SOC lost in 8 h at 0.06 A / 60 Ah, as a uniform distribution.
         let unknown = 0.008 / 3.0_f64.sqrt();
         let silent = BalancingConfig { is_only_while_sent: false, ..BALANCING };
         let near = |a: f64, b: f64| (a - b).abs() < 0.01 * unknown;
@@ -175,13 +177,13 @@ mod tests {
         let silent = BalancingConfig { is_only_while_sent: false, ..BALANCING };
         let std = lost_std(&mut year, 8760.0 * HOUR, silent);
         assert!((std - MOST_BESIDE / 3.0_f64.sqrt()).abs() < 1e-6, "{std}");
-        // Each further hour may lose a thousandth of the capacity, to the same side.
+        // Each further hour may take another thousandth of the capacity, with the same sign.
         let mut last = std;
         for row in 1..100 {
             last = lost_std(&mut year, (8760.0 + f64::from(row)) * HOUR, silent);
         }
         let hour = (MOST_BESIDE + 0.001).powi(2) - MOST_BESIDE.powi(2);
-        assert!((last * last - hour / 3.0).abs() < 1e-9, "a row, not all of them: {std}, then {last}");
+        assert!((last * last - hour / 3.0).abs() < 1e-9, "one row adds only its own loss: {std}, then {last}");
         assert!(year.check(3).is_ok());
     }
 

@@ -1,4 +1,4 @@
-//! Turns the states of the cells into findings, and decides when a finding is reported and withdrawn.
+//! Turns the states of the cells into findings, and decides when to report and when to withdraw a finding.
 
 use super::CellFaultDetector;
 use crate::cell_faults::difference::{self, CHANNEL, CONTACT, Jump, LEAK, RESISTANCE, SOC, STATES};
@@ -6,22 +6,22 @@ use crate::cell_faults::fault::{self, CellFault, CellFaultKind, OUTLIER, REPORTE
 use crate::filter::{ScalarGaussian, normal_cdf};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Cells of one module are found to have more capacity than the others within this time, s.
+/// Longest time between the findings of more capacity for cells of the same replaced module, s.
 const SAME_MODULE_S: f64 = 3.0 * DAY_S;
-/// Largest standard deviation of a known size, in limits of its kind.
+/// Largest standard deviation of a size that counts as known, in multiples of the limit of its kind.
 const KNOWN_LIMITS: f64 = 2.0;
 
 /// Difference in SOC beyond which resistance and channel of a cell cannot be compared with the others.
 const TOO_FAR: f64 = 0.1;
 const DAY_S: f64 = 86_400.0;
 
-/// Judgement of one cell for one kind.
+/// Judgement of one cell for one kind of fault.
 #[derive(Debug, Clone, Copy)]
 struct Judgement {
     kind: CellFaultKind,
     size: ScalarGaussian,
     probability: f64,
-    /// Whether the cell is close enough to the others for this kind.
+    /// Whether the cell's SOC is close enough to the others to judge this kind.
     is_comparable: bool,
 }
 
@@ -33,7 +33,7 @@ pub(super) struct Population {
 
 impl Population {
     pub(super) fn of(of_cells: impl Iterator<Item = f64>) -> Self {
-        // Allocates once for the upper bound: `collect` would use the lower bound of the size hint, 0 for a filter.
+        // Allocates once. `collect` would allocate the lower bound of the size hint, which is 0 for a filter.
         let mut values: Vec<f64> = Vec::with_capacity(of_cells.size_hint().1.unwrap_or_default());
         values.extend(of_cells);
         values.sort_by(f64::total_cmp);
@@ -53,8 +53,8 @@ impl CellFaultDetector {
         Population::of(compared.map(|cell| cell.difference.state(state).mean))
     }
 
-    /// Judges all cells. `bled_slope_v`: slope of the open-circuit curve at the SOC where the BMS bleeds, V; `None` =
-    /// the BMS does not bleed.
+    /// Judges all cells. `bled_slope_v`: slope of the open-circuit curve at the SOC where the BMS bleeds cells, V;
+    /// `None` if the BMS bleeds no cells.
     pub(super) fn judge(&mut self, time: Timestamp, bled_slope_v: Option<f64>) {
         self.is_balanced = bled_slope_v.is_some();
         let lowest = bled_slope_v.and_then(|slope_v| self.clearly_lowest(slope_v));
@@ -75,7 +75,7 @@ impl CellFaultDetector {
                 continue;
             }
             let judged = self.judged(index, &populations);
-            // After a channel fault (the first one in the order of `judged`), nothing else is known of the cell.
+            // If the cell has a channel fault, only the first such fault counts: nothing else is known about the cell.
             let fault =
                 judged.iter().find(|it| it.kind.is_of_channel() && it.probability >= REPORTED).map(|it| it.kind);
             for it in judged {
@@ -90,8 +90,8 @@ impl CellFaultDetector {
         self.find_modules(time, &foreign);
     }
 
-    /// Size per cell and kind relative to the middle of the pack, in the unit of the kind. `None` if it cannot be
-    /// judged: the cell is too far from the others, its channel is faulty, or the value is still too uncertain.
+    /// Size per cell and kind relative to the median of the pack, in the unit of the kind. `None` if the size cannot be
+    /// judged: the cell's SOC is too far from the others, its channel is faulty, or the size is still too uncertain.
     pub fn sizes<const N: usize>(&self, kinds: [CellFaultKind; N]) -> Vec<[Option<ScalarGaussian>; N]> {
         let populations = self.populations();
         (0..self.cells.len()).map(|cell| kinds.map(|kind| self.size(cell, kind, &populations))).collect()
@@ -108,8 +108,8 @@ impl CellFaultDetector {
         (judged.is_comparable && is_known && self.has_channel_fault(cell) == Some(false)).then_some(judged.size)
     }
 
-    /// Whether a cell's voltage reading belongs to another cell or is wrong; `None` if the cell is not compared, or
-    /// not yet.
+    /// Whether a cell's voltage reading is wrong or belongs to another cell. `None` if the cell is not compared, or if
+    /// no row has ended yet.
     pub fn has_channel_fault(&self, cell: CellIndex) -> Option<bool> {
         self.cells.get(cell.index()).filter(|cell| cell.is_compared)?;
         let is_found = self.findings.iter().any(|found| found.kind.is_channel_fault() && found.is_of(cell));
@@ -120,9 +120,9 @@ impl CellFaultDetector {
         std::array::from_fn(|state| self.population(state))
     }
 
-    /// The cell whose channel clearly reads lowest at the SOC where a BMS bleeds; `None` if no cell does. No BMS
-    /// bleeds this cell, because a BMS follows its readings, whatever their errors. The cell remains the lowest until
-    /// another one reads lower.
+    /// The cell whose channel clearly reads lowest at the SOC where a BMS bleeds cells; `None` if no cell clearly reads
+    /// lowest. A BMS never bleeds this cell, because it follows its readings, whatever their errors. The cell remains
+    /// the lowest until another cell reads lower.
     fn clearly_lowest(&self, slope_v: f64) -> Option<usize> {
         let (mut lowest, mut next): (Option<(usize, ScalarGaussian)>, Option<ScalarGaussian>) = (None, None);
         let compared = self.cells.iter().enumerate().filter(|(_, cell)| cell.is_compared);
@@ -140,15 +140,16 @@ impl CellFaultDetector {
         (next.mean - shown.mean > 2.0 * shown.std().hypot(next.std())).then_some(lowest)
     }
 
-    /// Whether a BMS may bleed the cell without a bit that shows it: every cell but the lowest one of a balanced pack
-    /// without bits. A cell with a reported leak does not count, because the leak continues while the others are bled.
+    /// Whether a BMS may bleed the cell without a bit that shows it. This applies to every cell of a balanced pack
+    /// without bits, except the lowest cell and cells with a reported leak. A leak is still a leak while the BMS bleeds
+    /// the other cells.
     pub(super) fn may_be_bled(&self, index: usize) -> bool {
         let is_found = |found: &CellFault| found.kind == CellFaultKind::Leak && found.is_of(CellIndex(index as u16));
         let is_open = self.is_balanced && !self.cells[index].bleed.timer.has_bits;
         is_open && self.lowest != Some(index) && !self.findings.iter().any(is_found)
     }
 
-    /// Judges one cell for every kind.
+    /// Judges one cell for every kind of fault.
     fn judged(&self, index: usize, populations: &[Population; STATES]) -> [Judgement; 8] {
         let cell = &self.cells[index];
         let beyond = |state: usize, limit: f64, sign: f64| {
@@ -173,14 +174,14 @@ impl CellFaultDetector {
         let channel = if channel[0].1 >= channel[1].1 { channel[0] } else { channel[1] };
         let mut leak = beyond(LEAK, fault::LEAK_PER_DAY, 1.0);
         if self.may_be_bled(index) {
-            // A leak would soon make this the lowest cell; until then it does not matter.
+            // A leak soon makes this cell the lowest. Until then, the leak does no harm.
             leak = (ScalarGaussian { mean: 0.0, variance: 0.0 }, 0.0);
         } else if !cell.bleed.timer.has_bits && cell.difference.mean()[SOC] >= populations[SOC].middle {
-            // A cell above the others is bled until it matches them, or has been until now.
+            // The BMS bleeds a cell above the others until it matches them.
             leak = (ScalarGaussian { mean: leak.0.mean.min(0.0), ..leak.0 }, 0.0);
         }
-        // A channel offset leaves the charge unchanged. With a leak, the cell's own charge explains the voltage, and
-        // the cell is not a new one.
+        // A leak explains a deviating voltage by the cell's charge. While a leak is likely, report neither an offset of
+        // the channel, which would leave the charge unchanged, nor a foreign cell.
         let unless_leaking =
             |(size, probability): (ScalarGaussian, f64)| (size, if leak.1 >= WITHDRAWN { 0.0 } else { probability });
         let is_comparable = cell.difference.mean()[SOC].abs() < TOO_FAR;
@@ -200,7 +201,7 @@ impl CellFaultDetector {
         ]
     }
 
-    /// Updates the list with a judgement that has lasted long enough for its kind. Returns the finding, listed or not.
+    /// Updates the list of findings with a judgement. Returns the judgement as a finding, whether or not it is listed.
     fn take(&mut self, time: Timestamp, index: usize, judged: &Judgement) -> CellFault {
         let Judgement { kind, size, probability, .. } = *judged;
         let cell = &mut self.cells[index];
@@ -217,16 +218,16 @@ impl CellFaultDetector {
         let cells = other.map_or((own, own), |other| (own.min(CellIndex(other)), own.max(CellIndex(other))));
         let finding = CellFault { kind, cells: Some(cells), since, reported: time, probability, size };
         let is_in_module = kind == CellFaultKind::ForeignCell && self.module_of(index).is_some();
-        // Two doubled channels share one finding, listed under the lower one.
+        // Two doubled channels share one finding, which is listed under the lower channel.
         if cells.0 == own && !is_in_module {
             self.put(finding);
         }
         finding
     }
 
-    /// Whether a kind has been likely for long enough to be reported. In a balanced pack the leak is unknown at first,
-    /// so other changes look like a leak until the cell has completed a cycle. A cell with more capacity waits for its
-    /// neighbours, because together they may be a module.
+    /// Whether a kind has been likely for long enough to be reported. Two kinds must wait. In a balanced pack, the leak
+    /// is unknown at first, so other changes look like a leak until the cell has completed a cycle. A cell with more
+    /// capacity than the others may belong to a module, whose other cells are found later.
     fn has_lasted(&self, kind: CellFaultKind, since: Timestamp, now: Timestamp) -> bool {
         let settling_s = match kind {
             CellFaultKind::Leak if self.is_balanced => DAY_S,
@@ -236,7 +237,7 @@ impl CellFaultDetector {
         now.since(since) >= settling_s
     }
 
-    /// Replaces the finding of the same kind and first cell, or removes it if it is no longer likely.
+    /// Lists a finding: replaces the finding of the same kind and first cell, or removes it if it is no longer likely.
     pub(super) fn put(&mut self, finding: CellFault) {
         let first = |found: &CellFault| found.cells.map(|cells| cells.0);
         let is_same = |found: &CellFault| found.kind == finding.kind && first(found) == first(&finding);
@@ -266,8 +267,8 @@ impl CellFaultDetector {
         self.findings.iter().find(is_of)
     }
 
-    /// Joins neighbouring cells with more capacity than the others since about the same time into a replaced module.
-    /// `foreign`: per cell, its module finding or its certain finding of more capacity.
+    /// Joins neighbouring cells into a replaced module if they have had more capacity than the others since about the
+    /// same time. `foreign`: per cell, its module finding or its certain finding of more capacity.
     fn find_modules(&mut self, time: Timestamp, foreign: &[Option<CellFault>]) {
         let is_same_event = |a: &Option<CellFault>, b: &Option<CellFault>| {
             a.zip(*b).is_some_and(|(a, b)| a.since.since(b.since).abs() <= SAME_MODULE_S)
@@ -300,7 +301,7 @@ impl CellFaultDetector {
         self.findings.retain(|it| !is_within(it));
         self.insert(CellFault { kind, cells: Some(cells), since, reported, probability: 1.0, size });
         if earlier.is_none() {
-            // The module's ends are uncertain: adjacent cells with a smaller change may belong to it.
+            // Adjacent cells with a smaller change may also belong to the module, so raise their uncertainty.
             let edges = [cells.0.index().checked_sub(1), Some(cells.1.index() + 1)];
             for edge in edges.into_iter().flatten() {
                 self.cells.get_mut(edge).into_iter().for_each(|cell| cell.difference.widen_as(Jump::Replaced));

@@ -1,4 +1,4 @@
-//! Handles sudden changes: exchanged channels, a replaced module, or single cells.
+//! Handles sudden changes: two exchanged channels, a replaced module, or a change of a single cell.
 
 use super::{CellFaultDetector, Row, WatchedCell};
 use crate::cell_faults::difference::{Jump, Observation, STATES};
@@ -6,13 +6,14 @@ use crate::cell_faults::fault::{CellFault, CellFaultKind};
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Jumps of several cells within this time are one event, s.
+/// Longest time between jumps of several cells that count as one event, s.
 const SAME_EVENT_S: f64 = 1800.0;
 /// Largest innovation, V, with which two exchanged channels explain each other.
 const SWAP_V: f64 = 0.008;
 
 impl CellFaultDetector {
-    /// Handles the cells that have changed suddenly: exchanges two channels, or widens neighbouring or single cells.
+    /// Handles the cells that have changed suddenly: exchanges the states of two exchanged channels, or raises the
+    /// uncertainty of single or neighbouring cells.
     pub(super) fn handle_jumps(
         &mut self,
         time: Timestamp,
@@ -38,7 +39,7 @@ impl CellFaultDetector {
         }
     }
 
-    /// If two cells' voltages have been exchanged, exchanges their states. Returns whether they were.
+    /// If the voltages of two cells have been exchanged, exchanges the cells' states and returns true.
     fn exchange_if_swapped(
         &mut self,
         time: Timestamp,
