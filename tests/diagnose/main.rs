@@ -139,7 +139,7 @@ fn main() -> Result<(), String> {
     Ok(())
 }
 
-/// CPU time of this process so far, s. Unlike wall-clock time, it does not depend on the load of the machine.
+/// CPU time of this process since its start, s. Unlike wall-clock time, it does not depend on the load of the machine.
 fn cpu_s() -> Option<f64> {
     const TICKS_PER_S: f64 = 100.0; // USER_HZ of Linux
     let stat = std::fs::read_to_string("/proc/self/stat").ok()?;

@@ -119,8 +119,8 @@ impl Day {
     /// Expects one raise, one clear, and an alarm frame in each 1 s period between them.
     fn assert_quiet(&self) {
         assert_eq!((self.raised, self.cleared), (1, 1));
-        assert_eq!(self.states, [ACTIVE, CLEARED], "on the wire");
-        assert!(self.frames > 70_000, "{} alarm frames in more than 20 raised hours", self.frames);
+        assert_eq!(self.states, [ACTIVE, CLEARED], "alarm states on the bus");
+        assert!(self.frames > 70_000, "only {} alarm frames in more than 20 hours of a raised alarm", self.frames);
     }
 
     fn assert_flickers(&self) {

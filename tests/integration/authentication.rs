@@ -1,5 +1,5 @@
-//! Authenticated commands: of a million frames, forged, replayed, delayed and outdated ones are never executed, and
-//! genuine ones always are. A journal replays without the key. Sent frames never reuse a freshness value.
+//! Authenticated commands among a million frames: forged, replayed, delayed and outdated frames are never executed, and
+//! genuine frames always are. A journal replays without the key. Sent frames never reuse a freshness value.
 
 mod ecu;
 
@@ -157,7 +157,7 @@ fn attack(profile: Profile, frames: u64, seed: u64) {
 }
 
 #[test]
-fn genuine_frames_alone_execute_among_million() {
+fn only_genuine_frames_of_million_execute() {
     attack(Profile::P1, 1_000_000, 1);
 }
 

@@ -222,7 +222,7 @@ fn leak_alarm_names_its_cell_and_survives_restart() {
     assert_eq!(pack.raised(Rule::CellLeak), [Some(6)]);
     assert_eq!((pack.raised(Rule::ConnectionResistance), pack.raised(Rule::ChannelFaulty)), (vec![], vec![]));
     let (leak, truth) = (pack.value(Rule::CellLeak, 6).unwrap(), 24.0 * 0.002 / 2.6);
-    assert!((leak / truth - 1.0).abs() < 0.3, "{leak} of {truth} a day");
+    assert!((leak / truth - 1.0).abs() < 0.3, "leak {leak} a day, truth {truth}");
     let before = pack.monitor.alarms().get(Rule::CellLeak, Some(CellIndex(6))).unwrap();
     pack.restart();
     pack.events.clear();
@@ -286,7 +286,7 @@ fn faulty_channel_suppresses_alarm_until_new_pack() {
     assert_eq!(
         pack.state(Rule::ChannelFaulty, 4),
         AlarmState::Suppressed,
-        "suppressed until the first row of the new pack"
+        "alarms must stay suppressed until the first row of the new pack"
     );
 }
 
@@ -393,7 +393,7 @@ fn downtime_reduces_knowledge_of_leak() {
         stds.sum::<f64>() / f64::from(CELLS)
     };
     let (bled, never) = (leak_std(0.0026), leak_std(1e-9));
-    assert!(bled > 1.2 * never, "{bled} {never}");
+    assert!(bled > 1.2 * never, "standard deviation {bled} with bleeding, {never} without");
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! If the contactors report open, no current flows, whatever the sensor reports. A contactor state that is no longer
+//! If the contactors report open, no current flows, even if the sensor reports one. A contactor state that is no longer
 //! received counts as unknown.
 
 use packwatch::monitor::Downtime;
@@ -60,7 +60,7 @@ fn stale_contactor_state_uses_measured_current() {
     rig.seconds(5);
     rig.contactor = None;
     rig.seconds(3);
-    assert_eq!(current_a(&rig), Some(0.0), "still fresh");
+    assert_eq!(current_a(&rig), Some(0.0), "the contactor state is not stale yet");
     rig.seconds(3);
     assert_eq!(current_a(&rig), Some(1.0));
     assert!(rig.monitor.lost_inputs().eq([Channel::Contactor]));

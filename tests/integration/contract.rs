@@ -361,7 +361,7 @@ fn digest_timeout_withdraws_table_confirmation() {
         let (now_ms, truth) = (daemon.now_ms, daemon.table());
         let listener = daemon.listener.as_mut().unwrap();
         assert!(truth.contains_key(&(9, 2, 2047)), "{truth:?}");
-        assert_eq!(listener.table(now_ms), truth, "alarm frames keep the table correct");
+        assert_eq!(listener.table(now_ms), truth, "alarm frames must keep the table correct");
         listener.is_confirmed(now_ms)
     };
     assert!(confirmed(&mut daemon));
@@ -369,15 +369,15 @@ fn digest_timeout_withdraws_table_confirmation() {
     let last_ms = daemon.listener.as_ref().unwrap().digest_ms.unwrap();
     while daemon.now_ms < last_ms + timeout_ms - 10 {
         daemon.run_for(10);
-        assert!(confirmed(&mut daemon), "{} ms after the last digest", daemon.now_ms - last_ms);
+        assert!(confirmed(&mut daemon), "not confirmed {} ms after the last digest", daemon.now_ms - last_ms);
     }
     for _ in 0..100 {
         daemon.run_for(100);
-        assert!(!confirmed(&mut daemon), "{} ms after the last digest", daemon.now_ms - last_ms);
+        assert!(!confirmed(&mut daemon), "still confirmed {} ms after the last digest", daemon.now_ms - last_ms);
     }
     daemon.is_digest_lost = false;
     daemon.run_for(2_000);
-    assert!(confirmed(&mut daemon), "the digest is back");
+    assert!(confirmed(&mut daemon), "not confirmed after the digest is back");
 }
 
 #[test]

@@ -120,7 +120,7 @@ fn compare_payload(message: &Message, payload: &[u8], expected: &mut HashMap<Str
         if wanted.is_finite() {
             let found = found.unwrap();
             let close = (found - wanted).abs() <= 1e-9 * wanted.abs().max(1e-9);
-            assert!(close, "{name} in {}: {found} for {wanted}", hex(payload));
+            assert!(close, "{name} in {}: {found}, cantools {wanted}", hex(payload));
         } else {
             // The raw value is invalid, or the scaled value is; neither may be returned.
             let plan = signal.layout.plan().unwrap();

@@ -217,7 +217,7 @@ fn car_signals_are_among_first_three_candidates() {
     let scores: Vec<(usize, usize)> = trials.iter().map(Trial::run).collect();
     let (hits, all) = scores.iter().fold((0, 0), |(hits, all), score| (hits + score.0, all + score.1));
     eprintln!("{hits} of {all} signals among the first three candidates");
-    assert!(hits as f64 >= BAR * all as f64, "{hits} of {all}");
+    assert!(hits as f64 >= BAR * all as f64, "only {hits} of {all} signals");
 }
 
 #[test]

@@ -87,9 +87,9 @@ impl Case {
         let what = self.question();
         let [theirs, accepts, accepts_flipped] = answer else { panic!("{peer} answers {answer:?} to {what}") };
         let theirs = bytes(theirs);
-        assert_eq!(theirs, self.ours, "{peer} protects otherwise: {what}");
+        assert_eq!(theirs, self.ours, "{peer} gives other bytes: {what}");
         assert_eq!(self.protection.verified_counter(&theirs), Some(self.counter), "we reject {peer}'s payload: {what}");
-        assert_eq!(*accepts, "1", "{peer} refuses ours: {what}");
+        assert_eq!(*accepts, "1", "{peer} rejects our payload: {what}");
         assert_eq!(*accepts_flipped, "0", "{peer} accepts a wrong bit: {what}");
         assert_eq!(self.protection.verified_counter(&self.flipped), None, "we accept a wrong bit: {what}");
     }

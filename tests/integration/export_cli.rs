@@ -91,7 +91,7 @@ fn exported_half_cycles_and_alarms_match_replay() {
         }
         known += usize::from(!row["remaining_cycles"].is_empty());
     }
-    assert!(known > 5 && known < rows.len(), "{known} of {}", rows.len());
+    assert!(known > 5 && known < rows.len(), "{known} of {} rows have a forecast", rows.len());
 }
 
 #[test]
@@ -130,7 +130,7 @@ fn period_thins_only_estimates() {
     }
     let rows = |name: &str| bench.parquet(name).metadata().file_metadata().num_rows();
     let (all, thin) = (rows("all/life/estimates.parquet"), rows("thin/life/estimates.parquet"));
-    assert!((all / 60..=all / 60 + 1).contains(&thin), "{thin} of {all}");
+    assert!((all / 60..=all / 60 + 1).contains(&thin), "{thin} of {all} rows, must be one in 60");
     assert_eq!(rows("all/life/half_cycles.parquet"), rows("thin/life/half_cycles.parquet"));
     assert!(rows("all/life/half_cycles.parquet") >= 5);
 }

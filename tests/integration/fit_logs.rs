@@ -102,8 +102,11 @@ fn partial_drives_give_capacity_and_curve() {
     let (label_rmse, label_inside) =
         soc_score(&[&["score", "--json", "--truth-capacity", "2.7", c][..], &LABEL].concat());
     let (rmse, inside) = soc_score(&["score", "--json", "--truth-capacity", "2.7", "--cell", model, c]);
-    assert!(label_inside > 0.95 && inside > 0.95, "{label_inside} {inside}");
-    assert!(rmse < 1.5 && rmse < 0.6 * label_rmse, "{rmse} after {label_rmse}");
+    assert!(
+        label_inside > 0.95 && inside > 0.95,
+        "inside the interval: {label_inside} by the label, {inside} by the fit"
+    );
+    assert!(rmse < 1.5 && rmse < 0.6 * label_rmse, "RMSE {rmse} by the fit, {label_rmse} by the label");
 }
 
 #[test]

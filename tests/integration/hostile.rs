@@ -158,7 +158,7 @@ fn second_current_sender_is_reported_and_distrusted() {
         with_second_sender(&mut rig, 6, more, 90.0);
         let found = rig.events.iter().find(|event| matches!(event.kind, EventKind::SecondSender(it) if it.active));
         let found_s = found.unwrap_or_else(|| panic!("{more}: not found")).time.since(from);
-        assert!(found_s <= 5.0, "{more}: {found_s} s");
+        assert!(found_s <= 5.0, "{more} frames more a second: found after {found_s} s");
         assert_eq!(rig.monitor.pack_view().validity, Validity::Untrusted, "{more}");
         assert_eq!(rig.changes(Rule::InputImplausible), [Change::Raised], "{more}");
         assert_eq!(rig.monitor.second_senders().collect::<Vec<_>>(), [(BUS, CanId::Standard(0x100))]);

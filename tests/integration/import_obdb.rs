@@ -16,7 +16,7 @@ use packwatch::can::uds::Answer;
 use packwatch::quantity::{Channel, Fault, Timestamp};
 use toml::Value;
 
-/// The signal sets, in the data folder or the one next to it.
+/// The signal sets, in the data folder or the folder next to it.
 pub(crate) fn folder() -> PathBuf {
     let inside = measured::path("obd");
     if inside.is_dir() { inside } else { measured::path("../more-data/obd") }

@@ -42,7 +42,7 @@ impl Chance {
         usize::try_from(self.0.next_u32()).unwrap() % limit
     }
 
-    /// Messages of 1 to 4,095 bytes, mostly short ones, as in diagnostics.
+    /// Messages of 1 to 4,095 bytes, mostly short, as in diagnostics.
     fn messages(&mut self) -> Vec<Vec<u8>> {
         let lengths: Vec<usize> = (0..MESSAGES)
             .map(|_| match self.below(20) {

@@ -238,6 +238,6 @@ fn repeated_replay_is_byte_identical() {
     }
     for (kind, (first, second)) in kinds.iter().zip(runs[0].iter().zip(&runs[1])) {
         assert!(first.len() > 10_000, "{kind}: {} bytes", first.len());
-        assert!(first == second, "{kind} differ");
+        assert!(first == second, "{kind} of the two runs differ");
     }
 }

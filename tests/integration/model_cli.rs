@@ -179,8 +179,8 @@ fn invalid_source_error_lists_allowed_sources() {
     assert!(refused(1, &["model", "show", "--state", "config"]).contains("no history found"));
 }
 
-/// A folder with the log of a one-cell vehicle whose model was learned on board from the label alone: deep swings for
-/// most of a day, and the first readings after the night.
+/// A folder with the log of a one-cell vehicle whose model was learned on board from the label alone. The log contains
+/// deep swings for most of a day, and the first readings after the night.
 fn learned() -> Place {
     let place = Place::new();
     let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");

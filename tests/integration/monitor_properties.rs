@@ -94,8 +94,8 @@ fn draws(seed: u64, limit: usize) -> impl Iterator<Item = usize> {
 
 const WHAT: [&str; 3] = ["estimates", "events", "frames"];
 
-/// Compares an uninterrupted monitor with ones restored at `splits`. Returns a line for the first difference of each
-/// kind.
+/// Compares an uninterrupted monitor with monitors restored at `splits`. Returns a line for the first difference of
+/// each kind.
 fn differences(config: &MonitorConfig, records: &[Record], splits: &[usize], away: Downtime) -> Vec<String> {
     let mut found = Vec::new();
     for &split in splits {
@@ -218,7 +218,8 @@ fn reload_differences(
             if is_edited {
                 edit(&mut other);
             }
-            let done = reloaded.reconfigure(other, record.time, &mut out_reloaded).expect("taken over");
+            let done =
+                reloaded.reconfigure(other, record.time, &mut out_reloaded).expect("the configuration is accepted");
             assert_eq!(done.alarms_ended, 0);
         }
         let expected = outputs(&mut whole, record, &mut out_whole);

@@ -334,7 +334,7 @@ fn bad_command_flood_is_reported_once_per_second() {
         }
     }
     let reported = rig.events.iter().filter(|event| matches!(event.kind, EventKind::BadCommand { .. })).count();
-    assert!((4..=6).contains(&reported), "{reported} in five seconds");
+    assert!((4..=6).contains(&reported), "{reported} reports in five seconds");
 }
 
 #[test]

@@ -431,7 +431,7 @@ fn written_dbc_decodes_frames_within_half_step() {
             assert_eq!((frame.kind(), frame.id()), (kind, case.message(*number).id.unwrap()));
             for (name, value, half_step) in wanted {
                 let off = (read[name] - value).abs();
-                assert!(off <= half_step + 1e-9, "{case:?} {name}: {} for {value}", read[name]);
+                assert!(off <= half_step + 1e-9, "{case:?} {name}: read {}, sent {value}", read[name]);
             }
             let header =
                 if case.profile.is_some() { read.keys().filter(|name| name.starts_with("E2e")).count() } else { 0 };

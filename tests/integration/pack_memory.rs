@@ -38,7 +38,7 @@ fn resistances(rig: &mut Rig) -> Vec<f64> {
 fn assert_near(found: &[f64], wanted: &[f64]) {
     assert!(
         found.iter().zip(wanted).all(|(found, wanted)| (found - wanted).abs() < 0.01 * wanted),
-        "{found:?} {wanted:?}"
+        "found {found:?}, wanted {wanted:?}"
     );
 }
 

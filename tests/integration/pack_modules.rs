@@ -63,7 +63,7 @@ fn each_cell_kind_uses_its_own_model() {
     let mut alone = Rig::with(config_texts::load(PACK, DBC).monitor);
     discharge(&mut alone, models);
     let [own_alone, taken] = socs(&alone);
-    assert!((own_alone.0 - own.0).abs() < 0.005, "{own_alone:?} {own:?}");
+    assert!((own_alone.0 - own.0).abs() < 0.005, "without the module {own_alone:?}, with it {own:?}");
     assert!((taken.0 - 0.15).abs() > 0.1, "{taken:?}");
     // Stored values continue.
     mixed.restart(Downtime::Seconds(1.0));
@@ -71,7 +71,7 @@ fn each_cell_kind_uses_its_own_model() {
     let [own_after, module_after] = socs(&mixed);
     assert!(
         (own_after.0 - own.0).abs() < 0.005 && (module_after.0 - module.0).abs() < 0.02,
-        "{module_after:?} {module:?}"
+        "module after the restart {module_after:?}, before {module:?}"
     );
 }
 

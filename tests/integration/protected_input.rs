@@ -98,7 +98,7 @@ impl Bench {
         self.estimates.clear();
     }
 
-    /// Collects the outputs so far, without waiting for the rest of a round of voltages.
+    /// Collects the outputs now, without waiting for the rest of a round of voltages.
     fn take(&mut self) {
         self.monitor.settle(&mut self.out);
         self.events.append(&mut self.out.events);

@@ -40,7 +40,7 @@ fn repeated_replay_gives_same_bytes() {
         let [estimates, events, frames, snapshot] = paths.each_ref().map(|path| path.to_str().expect("UTF-8"));
         let files = ["--estimates", estimates, "--events", events, "--frames", frames, "--snapshot", snapshot];
         replay(&[&[log.as_str()], &files[..]].concat()).success();
-        paths.map(|path| fs::read(path).expect("result written"))
+        paths.map(|path| fs::read(path).expect("the result is written"))
     });
     assert_eq!(results[0], results[1]);
     let rows = String::from_utf8_lossy(&results[0][0]).lines().count();
@@ -137,7 +137,7 @@ fn stdout_of(assert: &assert_cmd::assert::Assert) -> String {
 }
 
 #[test]
-fn logs_of_each_are_independent_and_ordered() {
+fn each_replays_logs_independently_in_order() {
     let folder = tempfile::tempdir().expect("a folder");
     let logs = trips(folder.path(), [3000, 5, 200]);
     let out = folder.path().join("out").display().to_string();

@@ -300,7 +300,7 @@ fn kill_during_drive_costs_little_soc_accuracy() {
     let driving: Vec<&Case> = cases.iter().filter(|case| case.mode == Mode::Discharge).collect();
     let figures = Figures::of("killed in a drive", &driving);
     assert!(figures.restarts >= 150 && figures.compared == figures.restarts * usize::from(CELLS));
-    assert!(figures.worst_first.max(figures.worst_later) <= 0.002, "from the first estimate on");
+    assert!(figures.worst_first.max(figures.worst_later) <= 0.002, "SOC difference from the first estimate on");
     assert!(cases.iter().all(|case| case.kept_learned));
 }
 

@@ -53,7 +53,7 @@ fn seed_determines_output_bytes() {
 }
 
 #[test]
-fn two_day_cycles_are_two_days() {
+fn two_cycles_of_day_take_two_days() {
     let truth = |cycles: &str| {
         let example = config("example.toml");
         let cells = ["--cells", "1", "--period", "1000", "--cell-period", "1000"];
@@ -65,7 +65,7 @@ fn two_day_cycles_are_two_days() {
         output.stdout.len()
     };
     let (one, two) = (truth("1"), truth("2"));
-    assert!(two as f64 > 1.8 * one as f64, "{one} {two}");
+    assert!(two as f64 > 1.8 * one as f64, "truth of one cycle {one} bytes, of two {two}");
 }
 
 #[test]

@@ -1,5 +1,5 @@
-//! Compares `docs/src/reference/tuned-constants.md` with the source: every row has the value of its constant and names a
-//! test that exists, and every floating-point constant of the algorithms is a row or listed as not tuned.
+//! Compares `docs/src/reference/tuned-constants.md` with the source. Every row must have the value of its constant and
+//! name a test that exists. Every floating-point constant of the algorithms must be a row or listed as not tuned.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;

@@ -67,7 +67,7 @@ impl Fleet {
                 assert_eq!(
                     reported,
                     judged::changes(&CANDIDATES[rule], life),
-                    "the Monitor's own {}",
+                    "the Monitor's own rule {}",
                     CANDIDATES[rule].name
                 );
             }
@@ -116,7 +116,7 @@ fn higher_probability_raises_later_with_fewer_false_alarms() {
         assert!(judge(&CANDIDATES[MEAN], life).in_time(life).is_some(), "the mean rule misses a life");
     }
     for life in &fleet.healthy {
-        assert!(judge(&CANDIDATES[P95], life).first.is_none(), "p = 0.95 calls a healthy cell worn");
+        assert!(judge(&CANDIDATES[P95], life).first.is_none(), "p = 0.95 raises for a healthy cell");
     }
 }
 

@@ -1,9 +1,13 @@
 //! Compares packwatch's capacity with recursive total least squares (Plett 2011) on the same swings.
 //!
-//! The peers get swings from three sources. `filter`: the filter's own SOC at both ends (event `half_cycle`, with its
-//! deviation; in windows the same ends as `voltage`). `voltage`: both ends by inversion of the open-circuit curve
-//! (`swings`), which uses the current capacity only for the curve's change of shape. `filter, capacity held`: the
-//! filter's SOC, always counted with the wrong initial capacity.
+//! The peers get swings from three sources:
+//!
+//! - `filter`: the filter's own SOC at both ends (event `half_cycle`, with its deviation; in windows the same ends as
+//!   `voltage`)
+//! - `voltage`: both ends by inversion of the open-circuit curve (`swings`), which uses the current capacity only for
+//!   the curve's change of shape
+//! - `filter, capacity held`: the filter's SOC, always counted with the wrong initial capacity
+//!
 //! Measured lives publish the capacity delivered at 2 A, not the capacity between open-circuit voltages. Each peer's
 //! capacity is therefore converted by the product's own usable capacity (same resistance, same full SOC), so that only
 //! the capacities differ.

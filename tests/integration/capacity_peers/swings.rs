@@ -2,8 +2,8 @@
 //!
 //! The open-circuit voltage is V + I R0 rho + sum U. The branch voltages are stepped in open loop from rest (from 180 s
 //! on if the record begins under load); rho is the filter's resistance ratio. All readings of the first and the last 60
-//! s count, each with the charge that had flowed by then. The capacity is assumed only for the curve's change of shape.
-//! The deviation of an end is the product's own (`[capacity]`).
+//! s count, each with the charge that had flowed until that reading. The capacity is assumed only for the curve's change
+//! of shape. The deviation of an end is the product's own (`[capacity]`).
 
 use packwatch::cell::aged_ocv::SHIFT_STD;
 use packwatch::cell::circuit::BranchAt;
@@ -48,7 +48,7 @@ struct Point {
     new_soc: f64,
     /// Variance of `new_soc`.
     variance: f64,
-    /// Charge removed so far, Ah.
+    /// Charge removed since the start, Ah.
     charge_ah: f64,
     /// The filter's SOC and its variance.
     soc: f64,

@@ -1,4 +1,4 @@
-//! Measured data: the folder named by `PACKWATCH_DATA`, or the one next to the project.
+//! Measured data: the folder named by `PACKWATCH_DATA`, or the folder next to the project.
 //!
 //! Tests that need measured data are ignored without `cfg(measured_data)`, which the build script sets.
 

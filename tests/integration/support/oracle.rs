@@ -32,7 +32,7 @@ pub(crate) fn ask(python: &OsString, dbc: &Path, arguments: &[&str], lines: &[St
 
 /// Signal values of one answer. Panics with the reason if cantools rejected the payload.
 pub(crate) fn values(question: &str, answer: &str) -> HashMap<String, f64> {
-    assert!(!answer.starts_with('!'), "cantools refused {question}: {answer}");
+    assert!(!answer.starts_with('!'), "cantools rejected {question}: {answer}");
     let pair = |pair: &str| pair.split_once('=').map(|(name, value)| (name.to_owned(), value.parse().unwrap()));
     answer.split('\t').filter_map(pair).collect()
 }
