@@ -313,7 +313,7 @@ def flood(args) -> None:
 
 
 def clients(args) -> None:
-    """Many idle clients that never read, and a few normal ones that must still be answered."""
+    """Many idle clients that never read, and a few normal clients that must still be answered."""
     def connected(path):
         client = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         client.settimeout(10)
