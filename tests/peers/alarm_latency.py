@@ -1,8 +1,8 @@
 """Measures the time from a frame on vcan0 to the answering frame. The kernel stamps both on one listening socket.
 
-usage: alarm_latency.py alarm FILE COUNT   half-cycles for a daemon with the configuration of alarm_latency.test: from the
-                                           frame that completes one to the alarm frame it causes
-       alarm_latency.py loop FILE COUNT    frames 0x123 for a program that answers each with the same data under 0x321
+usage: alarm_latency.py alarm FILE COUNT   sends half-cycles to a daemon with the configuration of alarm_latency.test; measures
+                                           from the frame that completes a half-cycle to the alarm frame it causes
+       alarm_latency.py loop FILE COUNT    sends frames 0x123 to a program that answers each with the same data under 0x321
        alarm_latency.py echo               runs such a program, as the lower bound of the time
        alarm_latency.py report FOLDER      prints and judges the results; also needs the daemon's files
 

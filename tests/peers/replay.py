@@ -2,9 +2,9 @@
 
 replay.py LOG CONFIG SOCS      prints: frames steps seconds; writes the SOC after each step to SOCS, one number per line
 
-The filter is the one of src/cell/estimator.rs: states [SOC, U1, ln rho, C], the same tables, circuit, process and measurement
-noises (defaults of docs/src/reference/keys.md), and sigma points by filterpy's own class, redrawn before the update. The peer
-omits, to its advantage: gate, consistency check, gaps in the current (an error here), learning at transitions, alarms, sent
+The filter is the same as in src/cell/estimator.rs: states [SOC, U1, ln rho, C], and the same tables, circuit, process and measurement
+noises (defaults of docs/src/reference/keys.md). The sigma points come from filterpy's own class and are redrawn before the update.
+The peer omits, to its advantage: gate, consistency check, gaps in the current (an error here), learning at transitions, alarms, sent
 frames.
 """
 import bisect

@@ -3,9 +3,13 @@
 usage: life_decodes.py FILE.dbc FRAMES.log ESTIMATES.csv EVENTS.jsonl RATED_AH
 
 FRAMES, ESTIMATES and EVENTS come from `packwatch replay`, FILE.dbc from `packwatch dbc` with the same configuration. The
-expected values are computed independently: those of the status frame from the estimates (pack rule, mode, validity) and the
-alarm events, those of the health frame from estimates and from capacity and recharge events, those of alarm frames from alarm
-events. Every value must agree within one bit; unknown values must be sent as unknown. The last line is a JSON document with the
+expected values are computed independently:
+
+- status frame: from the estimates (pack rule, mode, validity) and the alarm events
+- health frame: from the estimates, and the capacity and recharge events
+- alarm frames: from the alarm events
+
+Every value must agree within one bit; unknown values must be sent as unknown. The last line is a JSON document with the
 comparison; the exit status is 0 only if all values agree.
 """
 import csv
