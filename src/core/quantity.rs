@@ -181,7 +181,7 @@ pub enum Channel {
     /// Voltage of the vehicle's 12 V (or 24 V) supply, V. If it is too low, no diagnostic requests are sent. Never used
     /// by an estimate.
     SupplyVoltage,
-    /// Whether the BMS bleeds a cell; 0 = it does not. Only the diagnosis uses it.
+    /// Whether the BMS bleeds a cell; 0 = the BMS does not bleed it. Only the diagnosis uses this value.
     Balancing(CellIndex),
     /// Serial number of the pack, or another number that identifies it.
     PackIdentity,

@@ -1,6 +1,6 @@
 //! Holds one alarm machine per rule, severity and cell, and reports changes of the alarms.
 //!
-//! In: values in each rule's unit with the time of their comparison, and commands. Out: [`AlarmChange`]s and the list
+//! In: commands, and values in each rule's unit with the time of their comparison. Out: [`AlarmChange`]s and the list
 //! of raised alarms in the order rule, severity, cell (the pack first). A rule may have one threshold per severity;
 //! each threshold has its own alarms. Values are ignored if their rule is not configured or does not watch their cell.
 
@@ -56,7 +56,7 @@ pub struct ThresholdState {
     pub severity: Severity,
     /// Whether any alarm of the threshold is raised.
     pub is_raised: bool,
-    /// How often the alarm that was raised most often was raised.
+    /// Number of occurrences of the alarm that was raised most often.
     pub occurrences: u32,
 }
 
@@ -242,7 +242,7 @@ impl AlarmEngine {
         }
     }
 
-    /// Forgets alarms on learned values and their history, because another pack is connected.
+    /// Forgets alarms on learned values and their history. Called when another pack is connected.
     pub fn forget_learned(&mut self, changes: &mut Vec<AlarmChange>) {
         for index in 0..self.rules.len() {
             if !self.rules[index].config.rule.spec().is_learned {

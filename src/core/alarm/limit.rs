@@ -1,8 +1,8 @@
-//! Compares a value with a rule's thresholds: beyond, between, healthy or unknown.
+//! Compares a value with a rule's thresholds. The outcome is beyond, between, healthy or unknown.
 //!
-//! A rule compares the value itself (`when = "mean"`), or the probability that the true value is beyond the threshold
-//! (`when = { probability = p }`). For the latter, the value is assumed to be normally distributed with its standard
-//! deviation, and
+//! A rule compares the value itself (`when = "mean"`), or the probability P that the true value is beyond the threshold
+//! (`when = { probability = p }`). For P, the value is assumed to be normally distributed with its standard deviation.
+//! The outcome is
 //!
 //! ```text
 //! beyond    P(truth beyond the set threshold)   >  p
@@ -63,7 +63,7 @@ pub struct Observation {
     /// The true value may be worse than this value, never better: the value is the worst of several sources, some of
     /// them unknown. Such a value can be beyond a threshold, but not healthy.
     pub is_bound: bool,
-    /// Whether it is a new measurement; only new measurements count towards `debounce_events`.
+    /// Whether the value is a new measurement. Only new measurements count towards `debounce_events`.
     pub is_new: bool,
 }
 
@@ -94,7 +94,7 @@ pub(super) enum LimitCheck {
     Between,
     /// The value is at the clear threshold or better.
     Healthy,
-    /// No usable value.
+    /// There is no usable value.
     Unknown,
 }
 

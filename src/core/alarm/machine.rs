@@ -20,7 +20,7 @@
 //! An alarm is raised while it is active, clearing, suppressed or latched.
 //!
 //! Time counts only between two observations of known values on the same side. Time before or after an unknown value
-//! does not count, but does not reset the count either. Otherwise, a flickering input could prevent an alarm forever.
+//! does not count. It does not reset the count either, because a flickering input could then prevent an alarm forever.
 
 use serde::{Deserialize, Serialize};
 use strum::IntoStaticStr;
@@ -37,9 +37,9 @@ pub enum AlarmState {
     Unknown,
     /// The value is not beyond the threshold.
     Inactive,
-    /// Beyond the threshold, but not long enough yet.
+    /// The value is beyond the threshold, but not for long enough.
     Pending,
-    /// Raised.
+    /// The alarm is raised.
     Active,
     /// The alarm is raised. The value is healthy again, but not for long enough.
     Clearing,
@@ -134,7 +134,7 @@ pub(super) struct Machine {
     is_suspended: bool,
 }
 
-/// The facts about an alarm that the engine counts and lists.
+/// Properties of an alarm that the engine counts and lists.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct IndexEntry {
     pub(super) is_known: bool,

@@ -1,7 +1,7 @@
 //! Alarm rules and severities.
 //!
-//! The table in [`Rule::spec`] specifies what each rule compares; configuration, reference page, frames and engine use
-//! it.
+//! The table in [`Rule::spec`] specifies what each rule compares. The configuration, the reference page, the frames and
+//! the engine use this table.
 
 use serde::{Deserialize, Serialize};
 
@@ -10,11 +10,11 @@ use serde::{Deserialize, Serialize};
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
 pub enum Rule {
-    /// Capacity (full to empty open-circuit) below the threshold, Ah.
+    /// The capacity between the full and the empty open-circuit voltage is below the threshold, Ah.
     CapacityLow = 1,
-    /// Usable capacity (configured load and cut-off) below the threshold, Ah.
+    /// The usable capacity, with the configured load and cut-off, is below the threshold, Ah.
     UsableCapacityLow = 2,
-    /// Recharge period below the threshold, s.
+    /// The recharge period is below the threshold, s.
     RechargePeriodLow = 3,
     /// A configured input is missing for too long; the value is the input's age, s.
     InputMissing = 4,
@@ -24,15 +24,15 @@ pub enum Rule {
     /// the mean normalised innovation squared, or the mismatch ([`ModelCheck`](crate::cell::ModelCheck)) on the same
     /// scale.
     EstimateUntrusted = 6,
-    /// Resistance relative to new above the threshold, as learned in the last half-cycle.
+    /// The resistance relative to new is above the threshold. The value is the one learned in the last half-cycle.
     ResistanceHigh = 7,
-    /// SOC of the cell that limits discharge below the threshold, fraction.
+    /// The SOC of the cell that limits discharge is below the threshold, fraction.
     SocLow = 8,
-    /// The hottest sensor above the threshold, degrees C.
+    /// The highest temperature is above the threshold, degrees C.
     TemperatureHigh = 9,
-    /// SOC difference between the fullest and the emptiest cell above the threshold, fraction.
+    /// The SOC difference between the fullest and the emptiest cell is above the threshold, fraction.
     CellImbalance = 10,
-    /// Remaining useful life below the threshold, equivalent full cycles.
+    /// The remaining useful life is below the threshold, equivalent full cycles.
     RemainingLifeLow = 11,
     /// SOC or SOH reported by the pack differs from the estimate; the value is the larger of the two differences,
     /// fraction.
@@ -41,11 +41,10 @@ pub enum Rule {
     StoreFailed = 13,
     /// An interface is down, missing, bus-off or accepts no frames; the value is the duration, s.
     BusFault = 14,
-    /// A cell's self-discharge exceeds that of the other cells by more than the threshold, fraction of the capacity per
-    /// day.
+    /// A cell's self-discharge in excess of the other cells is above the threshold, fraction of the capacity per day.
     CellLeak = 15,
-    /// A cell's contact resistance exceeds that of the other cells by more than the threshold, fraction of a cell's
-    /// series resistance at medium SOC and 25 degrees C.
+    /// A cell's contact resistance in excess of the other cells is above the threshold, fraction of a cell's series
+    /// resistance at medium SOC and 25 degrees C.
     ConnectionResistance = 16,
     /// A voltage channel does not show its own cell. The value is 1 in this case, else 0. While it is 1, the rules that
     /// depend on the cell's voltage are unknown.
@@ -78,9 +77,9 @@ pub enum Unit {
     /// Ah; the configuration may give a threshold as a fraction of the rated capacity.
     AmpereHours,
     Seconds,
-    /// 0 to 1.
+    /// Fraction, 0 to 1.
     Fraction,
-    /// 0 to 1 per day.
+    /// Fraction per day, 0 to 1.
     FractionPerDay,
     /// A multiple of a reference (of the value when new, of the expected value).
     Ratio,
@@ -213,7 +212,7 @@ impl Rule {
             Self::BusFault => (Pack, Above, Seconds, false, false, "the duration of an interface fault"),
             Self::CellLeak => (Cell, Above, FractionPerDay, true, true, "a cell's self-discharge"),
             Self::ConnectionResistance => {
-                (Cell, Above, Fraction, true, true, "a cell's contact resistance in excess of the others'")
+                (Cell, Above, Fraction, true, true, "a cell's contact resistance in excess of the other cells")
             }
             Self::ChannelFaulty => (Cell, Above, Fraction, false, false, "whether a voltage channel is faulty"),
         };

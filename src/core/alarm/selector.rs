@@ -1,4 +1,4 @@
-//! The alarms that a command selects, and the outcome of the command.
+//! Selects the alarms of a command, and reports the command's outcome.
 
 use serde::{Deserialize, Serialize};
 

@@ -1,13 +1,13 @@
 //! Parses DBC text to messages and signals.
 //!
-//! In: the text of a DBC file (grammar: the `can-dbc` crate). Out: a [`Database`] of messages with their signals,
-//! multiplexing resolved to conditions on raw selector codes, value tables, units, cycle times, frame formats and
-//! end-to-end protection. [`Database::to_dbc`] writes the text; parsing that text gives an equal database.
+//! In: the text of a DBC file (grammar: the `can-dbc` crate). Out: a [`Database`] of messages and signals, with value
+//! tables, units, cycle times, frame formats and end-to-end protection. Multiplexing is resolved to conditions on raw
+//! selector codes. [`Database::to_dbc`] writes a database as text, and parsing this text gives an equal database.
 //!
-//! A file that is not a DBC, an identifier out of range, a name defined twice, or multiplexing that cannot be resolved
-//! gives a [`DbcError`] with its line. A signal that extends beyond its message is accepted: decoding it gives
-//! [`Fault::ShortFrame`](crate::quantity::Fault::ShortFrame). An invalid layout is accepted, too;
-//! [`SignalLayout::plan`] rejects it.
+//! The parser returns a [`DbcError`] with the line if the file is not a DBC, an identifier is out of range, a name is
+//! defined twice, or multiplexing cannot be resolved. It accepts a signal that extends beyond its message, whose
+//! decoding gives [`Fault::ShortFrame`](crate::quantity::Fault::ShortFrame). It also accepts an invalid layout, which
+//! [`SignalLayout::plan`] rejects.
 
 use std::collections::{HashMap, HashSet};
 
@@ -35,9 +35,9 @@ pub struct DbcError {
 /// Messages of one DBC, in the file's order.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Database {
-    /// `BU_`: the nodes on the bus.
+    /// Nodes on the bus (`BU_`).
     pub nodes: Vec<String>,
-    /// `CM_` without an object: comment on the whole database.
+    /// Comment on the whole database (`CM_`).
     pub comment: Option<String>,
     pub messages: Vec<Message>,
 }
@@ -45,10 +45,10 @@ pub struct Database {
 /// Kind of frame that carries a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum FrameFormat {
-    /// Classic, at most 8 bytes.
+    /// Classic frame, at most 8 bytes.
     #[default]
     Classic,
-    /// CAN FD, at most 64 bytes.
+    /// CAN FD frame, at most 64 bytes.
     Fd {
         /// Whether the data phase uses the higher bit rate.
         brs: bool,
@@ -58,11 +58,11 @@ pub enum FrameFormat {
 /// How a message is repeated after an event; `None` = not stated in the DBC.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Repetition {
-    /// `GenMsgNrOfRepetition`: number of frames after the first.
+    /// Number of frames after the first one (`GenMsgNrOfRepetition`).
     pub count: Option<u32>,
-    /// `GenMsgCycleTimeFast`: time between these frames, ms.
+    /// Time between these frames, ms (`GenMsgCycleTimeFast`).
     pub period_ms: Option<u32>,
-    /// `GenMsgDelayTime`: smallest mean time between two frames of the message, ms.
+    /// Smallest mean time between two frames of the message, ms (`GenMsgDelayTime`).
     pub delay_ms: Option<u32>,
 }
 
@@ -77,19 +77,19 @@ pub struct Message {
     pub len_bytes: u16,
     /// Sending node.
     pub sender: Option<String>,
-    /// `VFrameFormat` and `CANFD_BRS`.
+    /// Kind of frame (`VFrameFormat` and `CANFD_BRS`).
     pub format: FrameFormat,
-    /// `E2EProfile` and `E2EDataId`, packwatch's own attributes.
+    /// End-to-end protection (`E2EProfile` and `E2EDataId`, packwatch's own attributes).
     pub e2e: Option<Protection>,
-    /// `SecOCProfile` and `SecOCDataId`, packwatch's own attributes.
+    /// Authentication (`SecOCProfile` and `SecOCDataId`, packwatch's own attributes).
     pub secoc: Option<Authentication>,
     /// Signals in the file's order.
     pub signals: Vec<Signal>,
-    /// `GenMsgCycleTime` (or its default), if above 0.
+    /// Cycle time, ms, if above 0 (`GenMsgCycleTime` or its default).
     pub cycle_time_ms: Option<u32>,
     /// Repetition after an event.
     pub repetition: Repetition,
-    /// `CM_ BO_`.
+    /// Comment on the message (`CM_ BO_`).
     pub comment: Option<String>,
 }
 
@@ -104,13 +104,13 @@ pub struct Signal {
     pub unit: String,
     /// Receiving nodes.
     pub receivers: Vec<String>,
-    /// The signal is present if all conditions hold; outermost multiplexor first.
+    /// Conditions that must all hold for the signal to be present, outermost multiplexor first.
     pub conditions: Vec<MuxCondition>,
     /// Whether the presence of other signals depends on this one.
     pub is_multiplexor: bool,
-    /// `VAL_`: raw values (signed for signed signals) and their names.
+    /// Raw values (signed for signed signals) and their names (`VAL_`).
     pub values: Vec<(i64, String)>,
-    /// `CM_ SG_`.
+    /// Comment on the signal (`CM_ SG_`).
     pub comment: Option<String>,
 }
 
@@ -119,7 +119,7 @@ pub struct Signal {
 pub struct MuxCondition {
     /// Index of the multiplexor in its message's `signals`.
     pub selector: usize,
-    /// Ranges of raw codes, ends included; one of them must contain the selector's code.
+    /// Ranges of raw codes, ends included. One of the ranges must contain the selector's code.
     pub ranges: Vec<(u64, u64)>,
 }
 
@@ -127,7 +127,7 @@ impl Database {
     /// Parses the text of a DBC.
     ///
     /// # Errors
-    /// The first fault, with its line.
+    /// Returns the first fault with its line.
     pub fn parse(text: &str) -> Result<Self, DbcError> {
         let text = text.strip_prefix('\u{feff}').unwrap_or(text);
         // The grammar requires a line end after every statement.
@@ -149,13 +149,13 @@ impl Database {
     /// UTF-8. A DBC does not state its encoding.
     ///
     /// # Errors
-    /// Like [`Self::parse`], and for UTF-16 text.
+    /// Returns the errors of [`Self::parse`], and an error for UTF-16 text.
     pub fn parse_bytes(bytes: &[u8]) -> Result<Self, DbcError> {
         if is_utf_16(bytes) {
-            let what = "is UTF-16 text, must be UTF-8 or Latin-1: save it in that encoding";
+            let what = "the file is UTF-16 text, must be UTF-8 or Latin-1: save it in one of these encodings";
             return Err(DbcError { line: 1, what: what.to_owned() });
         }
-        // The byte-order mark U+FEFF in UTF-8. Some editors also put it before Latin-1 text.
+        // Remove the byte-order mark U+FEFF in UTF-8, which some editors also put before Latin-1 text.
         let bytes = bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes);
         match std::str::from_utf8(bytes) {
             Ok(text) => Self::parse(text),
@@ -206,7 +206,7 @@ impl Message {
 
 impl Signal {
     /// Raw codes (the signal's bits) that the value table calls "not available", "signal not available", "n/a" or
-    /// "SNA", ignoring case and with `_` as a blank.
+    /// "SNA", ignoring case and treating `_` as a blank.
     pub fn not_available_codes(&self) -> Vec<u64> {
         let mask = u64::MAX >> (64 - u32::from(self.layout.length_bits.clamp(1, 64)));
         let says_so = |name: &str| {
@@ -277,7 +277,7 @@ fn check_identifiers(text: &str) -> Result<(), DbcError> {
     Ok(())
 }
 
-/// Statements about a signal outside its `SG_` definition.
+/// Properties of a signal that are stated outside its `SG_` definition.
 #[derive(Default)]
 struct Details<'a> {
     comment: Option<&'a str>,

@@ -1,9 +1,9 @@
 //! Decodes input frames to readings.
 //!
 //! The decoding plan is built once from the configured signals. Each frame needs one look-up by interface and
-//! identifier, one by the selector's code, and a shift and a multiply-add per signal. A signal whose multiplexor says
-//! that it is absent gives no reading; one that is present but unusable gives a reading with its fault. The same
-//! identifier on another interface is another message, and so is the extended identifier with the same number.
+//! identifier, one by the selector's code, and a shift and a multiply-add per signal. A signal that is absent because
+//! of its multiplexor gives no reading. A signal that is present but unusable gives a reading with its fault. A message
+//! is identified by its interface, its identifier, and whether the identifier is standard or extended.
 
 mod message_table;
 
@@ -20,9 +20,9 @@ pub use crate::quantity::{Channel, Reading, SensorIndex};
 /// ranges, ends included.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MuxTest {
-    /// The selector.
+    /// Position of the selector in the payload.
     pub plan: SignalPlan,
-    /// Codes with which the signal is present.
+    /// Ranges of codes with which the signal is present.
     pub ranges: Vec<(u64, u64)>,
 }
 
@@ -42,7 +42,7 @@ pub struct Binding {
     pub plan: SignalPlan,
     /// Conditions that must all hold; empty = always present.
     pub mux: Vec<MuxTest>,
-    /// Channel of its readings.
+    /// Channel of the signal's readings.
     pub channel: Channel,
     /// Applied after the DBC's factor and offset: value x scale + offset. For a bus that counts charging positive, the
     /// scale of the current is -1.
@@ -56,8 +56,8 @@ pub struct Binding {
 }
 
 impl Binding {
-    /// Binds a DBC signal to a channel: scale 1, offset 0, no range beyond the DBC's, "not available" codes from the
-    /// value table. The caller applies the configuration.
+    /// Binds a DBC signal to a channel with scale 1, offset 0, only the DBC's range, and the "not available" codes of
+    /// the value table. The caller applies the configuration.
     ///
     /// # Errors
     /// The layout of the signal or of one of its multiplexors is invalid.
@@ -110,13 +110,13 @@ impl Binding {
 /// All configured signals, indexed by interface and identifier.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct InputMap {
-    /// Sorted by message, then channel.
+    /// The bindings, sorted by message, then channel.
     bindings: Vec<Binding>,
     messages: MessageTable,
 }
 
 impl InputMap {
-    /// Sorts the bindings by message and channel.
+    /// Creates the map; sorts the bindings by message and channel.
     pub fn new(mut bindings: Vec<Binding>) -> Self {
         bindings.sort_by_key(|binding| (binding.bus, binding.id, binding.channel));
         Self { messages: MessageTable::new(&bindings), bindings }

@@ -1,5 +1,6 @@
-//! Encodes the daemon's frames with a layout from a DBC ([`layout`], [`OutputPlan`]) and decodes its command frame
-//! ([`CommandPlan`]). Encodes input frames for CSV replay and the simulator ([`InputEncoder`]).
+//! Encodes the frames that the daemon sends, with a layout from a DBC ([`layout`], [`OutputPlan`]), and decodes the
+//! command frame that it receives ([`CommandPlan`]). Also encodes input frames for CSV replay and the simulator
+//! ([`InputEncoder`]).
 //!
 //! In: values in the program's units (fractions, Ah, s, A positive for discharge). Out: frames. An unknown value is
 //! sent as the signal's "not available" code, never as a number.

@@ -23,9 +23,9 @@ pub struct FloodConfig {
 }
 
 impl Default for FloodConfig {
-    /// 2,000: a saturated bus of 500 kbit/s carries about 4,000 frames a second in total, and no battery message is
-    /// sent more often than once a millisecond. This is twice the rate of the fastest intended sender and half of what
-    /// one faulty sender can send.
+    /// 2,000 frames a second: twice the rate of the fastest intended sender, because no battery message is sent more
+    /// often than once a millisecond. It is half of what one faulty sender can send, because a saturated bus of 500
+    /// kbit/s carries about 4,000 frames a second.
     fn default() -> Self {
         Self { max_frames_per_s: const { NonZeroU32::new(2000).unwrap() } }
     }
@@ -38,7 +38,7 @@ pub struct FloodChange {
     pub id: CanId,
     /// Whether dropping started.
     pub active: bool,
-    /// Frames dropped in this flood so far: 1 at its start, all of them at its end.
+    /// Number of frames dropped in this flood: 1 at the start, the total at the end.
     pub dropped: u64,
 }
 
@@ -64,12 +64,12 @@ pub struct FloodProgress {
 struct LeakyBucket {
     bus: BusIndex,
     id: CanId,
-    /// Burst that is admitted at once, as time at the allowed rate, ns.
+    /// Size of the burst that is admitted at once: its duration at the allowed rate, ns.
     burst_ns: i64,
     /// Time up to which the allowed rate is spent.
     spent_until: Option<Timestamp>,
     dropped: u64,
-    /// The current flood: frames dropped in it, and the time of the last one.
+    /// The current flood: number of dropped frames, and time of the last dropped frame.
     flood: Option<(u64, Timestamp)>,
 }
 

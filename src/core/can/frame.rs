@@ -65,7 +65,7 @@ pub(crate) const fn is_frame_length(len: usize) -> bool {
 pub enum FrameKind {
     /// Classic data frame, at most 8 bytes.
     Classic,
-    /// Classic remote request: no data; the length is the requested one.
+    /// Classic remote request, without data. Its length is the requested length.
     Remote,
     /// CAN FD data frame, at most 64 bytes.
     Fd {
@@ -76,8 +76,8 @@ pub enum FrameKind {
     },
 }
 
-/// Payload bytes, followed by zeros. With the alignment, a word that is loaded soon after the copy of a frame comes
-/// from a single store. A load that spans two stores must wait for both, which takes longer than decoding.
+/// Payload bytes, followed by zeros. The alignment makes decoding faster: a word that is loaded soon after a copy of
+/// the frame comes from a single store. A load that spans two stores must wait for both.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(align(8))]
 struct Data([u8; MAX_DATA]);

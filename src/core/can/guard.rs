@@ -43,8 +43,7 @@ pub struct GuardChange {
     pub status: Status,
     /// Whether the message is usable now.
     pub usable: bool,
-    /// Number of checks without a usable frame since the message was last usable. When the message becomes usable
-    /// again, this is the total.
+    /// Number of failed checks since the message was last usable. When it becomes usable again, this is the total.
     pub count: u64,
 }
 
@@ -73,11 +72,11 @@ pub struct GuardProgress {
 struct Guard {
     config: GuardConfig,
     receiver: Receiver,
-    /// When the next frame counts as missed; `None` = cycle time unknown, or not listening yet.
+    /// When the next frame counts as missed; `None` = the cycle time is unknown, or listening has not started.
     missed_at: Option<Timestamp>,
     /// Consecutive periods without a frame.
     missed: u64,
-    /// Checks without a usable frame since the last usable one; 0 = usable, or no frame yet.
+    /// Number of failed checks since the last usable frame; 0 = the message is usable, or no frame has arrived.
     failed: u64,
 }
 
@@ -136,7 +135,8 @@ impl Guards {
         Some(status)
     }
 
-    /// Counter that the next frame of a protected message must have; `None` = not protected, or any counter.
+    /// Counter that the next frame of a protected message must have; `None` = the message is not protected, or any
+    /// counter is valid.
     pub fn next_counter(&self, bus: BusIndex, id: CanId) -> Option<u8> {
         let found = self.guards.binary_search_by_key(&(bus, id), |guard| (guard.config.bus, guard.config.id)).ok()?;
         let guard = &self.guards[found];
@@ -179,7 +179,7 @@ impl Guards {
         self.guards.iter().map(of).collect()
     }
 
-    /// Resumes the checks as stored. The caller restores the counts first.
+    /// Resumes the stored progress of each check. The caller restores the counts first.
     pub fn resume(&mut self, stored: &[GuardProgress]) {
         for guard in &mut self.guards {
             let key = (guard.config.bus, guard.config.id);
@@ -206,7 +206,7 @@ impl Guard {
     /// Counts one NONEWDATA for each period without a frame.
     fn count_missed(&mut self, now: Timestamp, changes: &mut Vec<GuardChange>) {
         let Some(period_s) = self.config.cycle_time_s else { return };
-        // Missing frames count only from the start of listening.
+        // At the start of listening, the first period begins now.
         let missed_at = *self.missed_at.get_or_insert(now.plus_secs(MISSED_AFTER_PERIODS * period_s));
         if now < missed_at {
             return;

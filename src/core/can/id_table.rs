@@ -1,4 +1,4 @@
-//! Index of a message by interface and identifier.
+//! Finds the index of a message by interface and identifier.
 //!
 //! A look-up needs one load for a standard identifier and a binary search for an extended one. For a message that is
 //! not in the table, it returns an index beyond the table's end.

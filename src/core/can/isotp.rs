@@ -30,8 +30,8 @@ pub enum IsoTpFault {
     Overlap,
     /// The requester refused the message by flow control (buffer overflow, reserved state).
     Refused,
-    /// The frame states a length that its type cannot have: 0, beyond the frame, or, in a first frame, a length that
-    /// fits into one frame.
+    /// The frame states an impossible length: 0, beyond the end of a single frame, or so small that the message needs
+    /// no first frame.
     WrongLength,
     /// The message is longer than [`MAX_MESSAGE`].
     TooLong,
@@ -121,7 +121,7 @@ impl Receiver {
         &self.message
     }
 
-    /// Resumes from `stored`. Drops a partial message that is not possible.
+    /// Resumes from `stored`. Drops a stored partial message that is impossible.
     pub fn resume(&mut self, stored: &Self) {
         let is_possible = stored.message.len() < stored.length
             && stored.length <= MAX_MESSAGE
@@ -137,7 +137,7 @@ impl Receiver {
         self.length > 0
     }
 
-    /// Handles a payload of the sender.
+    /// Handles the payload of a received frame.
     pub fn handle(&mut self, now: Timestamp, payload: &[u8]) -> Received {
         let late = self.poll(now);
         let Some(data) = without_extension(self.extension, payload) else { return Received::lost(late) };
@@ -209,7 +209,7 @@ impl Receiver {
             _ => (0, data),
         };
         let length = usize::try_from(length).unwrap_or(usize::MAX);
-        // A message that fits into one frame has no first frame, and a first frame is full.
+        // A message that fits into one frame must not have a first frame, and a first frame must be full.
         let fault = if length <= body.len() || data.len() < self.classic_len() {
             Some(IsoTpFault::WrongLength)
         } else {
@@ -266,9 +266,9 @@ fn without_extension(extension: Option<u8>, payload: &[u8]) -> Option<&[u8]> {
     }
 }
 
-/// Segments a message into classic payloads, padded with `padding` (ISO 15765-2 recommends 0xCC; cars also send 0x00,
-/// 0x55 and 0xAA): one single frame, or a first and consecutive frames. Empty for a message of 0 bytes or of more than
-/// 4,095.
+/// Segments a message into classic payloads: one single frame, or a first and consecutive frames. They are padded with
+/// `padding` (ISO 15765-2 recommends 0xCC; cars also send 0x00, 0x55 and 0xAA). The result is empty for a message of 0
+/// bytes or of more than 4,095.
 pub fn segment(extension: Option<u8>, message: &[u8], padding: u8) -> Vec<[u8; CLASSIC]> {
     let room = CLASSIC - usize::from(extension.is_some());
     let Ok(length) = u16::try_from(message.len()) else { return Vec::new() };

@@ -1,8 +1,9 @@
-//! CAN frames and their contents: layouts from DBC files, decoding of received frames, encoding of sent frames,
-//! end-to-end protection and authentication, diagnostics over ISO-TP, J1939.
+//! Decodes and encodes CAN frames, with layouts from DBC files, end-to-end protection, authentication, diagnostics over
+//! ISO-TP, and J1939.
 //!
-//! In: frames with interface and time. Out: readings in the program's units and signs, and frames. Any bytes are
-//! accepted: bad input becomes a fault of its reading. Pure: no socket, no file, no clock.
+//! In: frames with interface and time. Out: readings in the program's units and signs, and frames. The module accepts
+//! any bytes: a reading that cannot be decoded has a fault instead of a value. The module is pure: it uses no socket,
+//! no file and no clock.
 
 pub mod dbc;
 pub mod decode;

@@ -148,7 +148,7 @@ impl OwnFrames {
 
     /// How long another sender has been present, s; 0 = no other sender.
     pub fn longest_s(&self, now: Timestamp) -> f64 {
-        // Not 0 in the first moment, because 0 means that there is no other sender.
+        // At least 1 ns, because 0 means that there is no other sender.
         self.state.uses.iter().map(|other| now.since(other.since).max(1e-9)).fold(0.0, f64::max)
     }
 
@@ -169,7 +169,7 @@ impl OwnFrames {
         &self.state
     }
 
-    /// Restores a stored state; the identifiers stay.
+    /// Restores a stored state and keeps packwatch's identifiers.
     pub fn resume(&mut self, stored: &OwnFramesState) {
         self.state.clone_from(stored);
         self.state.sent.truncate(MAX_SENT);

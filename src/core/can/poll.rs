@@ -1,11 +1,11 @@
 //! Sends diagnostic requests to controllers, and stops when they could disturb the vehicle or another tester.
 //!
-//! In: frames, responses, the state of the car, the supply voltage, the time. Out: request and flow control frames, and
-//! a [`PollChange`] each time that polling stops or starts. One request is outstanding at a time. Polling stops while
-//! another tester is active, while the bus sleeps, while the supply voltage is low or unknown, and on standby.
+//! In: frames, responses, the state of the car, the supply voltage and the time. Out: request and flow control frames,
+//! and a [`PollChange`] each time polling stops or starts. At most one request is outstanding at a time. Polling stops
+//! while another tester is active, while the bus sleeps, while the supply voltage is low or unknown, and on standby.
 //!
 //! Only requests of a [`Service`](super::uds::Service) can be sent: the types cannot express a write, a session or a
-//! routine. Pure: no clock, no socket.
+//! routine. The module is pure: it uses no clock and no socket.
 
 use serde::{Deserialize, Serialize};
 
@@ -14,11 +14,14 @@ use super::uds::{Controller, PENDING, Question, Refusal};
 use super::{CanId, Frame};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// Silence after another tester's request, ns. Longer than the pause between the requests of a workshop tester.
+/// Pause of polling after another tester's request, ns. It is longer than the pause between the requests of a workshop
+/// tester.
 pub const FOREIGN_SILENCE_NS: i64 = 60_000_000_000;
-/// A bus without a frame from other nodes for this long is asleep, ns. A running car broadcasts many times a second.
+/// A bus is asleep after this time without a frame from other nodes, ns. The nodes of a running car send many frames a
+/// second.
 pub const ASLEEP_AFTER_NS: i64 = 2_000_000_000;
-/// Longest wait for the next frame of a response, ns (P2 is 50 ms, N_Cr 1 s).
+/// Longest wait for the next frame of a response, ns. The standards allow 50 ms for the first frame (P2) and 1 s for
+/// further frames (N_Cr).
 const ANSWER_WITHIN_NS: i64 = 1_000_000_000;
 
 /// State of the car, as derived from the pack current.
@@ -116,7 +119,7 @@ pub struct PollOutputs {
 struct Item {
     due: Timestamp,
     failures: u32,
-    /// Never sent again.
+    /// Whether the request is never sent again.
     is_refused: bool,
 }
 
@@ -445,7 +448,8 @@ impl Poller {
     }
 }
 
-/// Whether only testers use an identifier: the physical and functional requests of ISO 15765-4.
+/// Whether the identifier is one of the request identifiers of ISO 15765-4 (physical or functional), which only testers
+/// use.
 fn is_tester(id: CanId) -> bool {
     match id {
         CanId::Standard(raw) => raw == 0x7DF || (0x7E0..=0x7E7).contains(&raw),

@@ -28,20 +28,21 @@ use crate::can::id_table::IdTable;
 use crate::quantity::{BusIndex, Timestamp};
 
 const WINDOW_NS: i64 = 1_000_000_000;
-/// A window has too many frames above this multiple of the expected number. A second sender with the same cycle time
-/// doubles the number.
+/// Multiple of the expected number of frames above which a window has too many. A second sender with the same cycle
+/// time doubles the number.
 const EXCESS: f64 = 1.5;
-/// Additional frames allowed, for frames that arbitration delayed into the window.
+/// Number of additional frames that are allowed, because arbitration may have delayed them into the window.
 const DELAYED: f64 = 1.5;
-/// Number of consecutive windows with too many frames. A burst after a pause of the bus affects only one.
+/// Number of consecutive windows with too many frames after which a second sender is found. A burst after a pause of
+/// the bus affects only one window.
 const WINDOWS: u32 = 3;
 /// Number of consecutive normal windows after which the second sender is gone.
 const GONE_WINDOWS: u32 = 10;
 /// Number of consecutive windows with a similar number of frames after which a rate is steady.
 const STEADY_WINDOWS: u32 = 20;
-/// Largest deviation of a similar number of frames: relative part plus number of frames.
+/// Largest difference between similar numbers of frames: relative part, and number of frames added to it.
 const STEADY: (f64, f64) = (0.2, 1.0);
-/// Lowest rate that is learned, frames a second: fewer frames in a window are not significant.
+/// Lowest rate that is learned, frames a second. Fewer frames in a window are not significant.
 const LEAST_PER_S: f64 = 3.0;
 /// An interval shorter than this fraction of the mean is short.
 const SHORT: f64 = 0.5;
@@ -98,7 +99,7 @@ pub struct SecondSenders {
     /// Rate from the DBC's cycle time, 1/s.
     configured_per_s: Vec<Option<f64>>,
     numbers: IdTable,
-    /// No window ends before this time plus the length of a window.
+    /// Earliest start of a window. No window ends before this time plus [`WINDOW_NS`].
     next_end: Option<Timestamp>,
     /// Changes to be published, in order.
     pub(crate) changes: Vec<SenderChange>,
@@ -142,8 +143,8 @@ impl SecondSenders {
         }
     }
 
-    /// Handles the current of a frame that was [counted](Self::handle). `step_a` is the smallest step that exceeds
-    /// noise, A.
+    /// Compares the battery current in a [counted](Self::handle) frame with the two currents before it. `step_a` is the
+    /// smallest step that exceeds noise, A.
     pub fn note_current(&mut self, bus: BusIndex, id: CanId, current_a: f64, step_a: f64) {
         let Some(rate) = self.rates.get_mut(self.numbers.number(bus, id)) else { return };
         let [before, between] = rate.currents_a;

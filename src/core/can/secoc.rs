@@ -1,4 +1,4 @@
-//! AUTOSAR secure on-board communication (SecOC): the layout of an authenticated payload, and the input of its
+//! AUTOSAR secure on-board communication (SecOC): defines the layout of an authenticated payload and the input of its
 //! authenticator.
 //!
 //! ```text
@@ -85,7 +85,7 @@ impl Profile {
         }
     }
 
-    /// Bytes of both at the end of the payload.
+    /// Number of bytes of freshness and authenticator at the end of the payload.
     pub const fn trailer_bytes(self) -> usize {
         ((self.freshness_bits() + self.mac_bits()) / 8) as usize
     }
@@ -145,7 +145,7 @@ impl Authentication {
         }
     }
 
-    /// Whether the payload carries the first bits of `mac`, in constant time.
+    /// Whether the payload carries the first bits of `mac`. The comparison takes constant time.
     pub fn has_mac(&self, payload: &[u8], mac: Mac) -> bool {
         let sent_bits = (1 << self.profile.mac_bits()) - 1;
         // Compare whole words, so that the time does not depend on the position of a difference.

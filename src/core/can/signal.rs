@@ -1,6 +1,6 @@
-//! Signal layouts: the position of a number in a payload, its decoding and encoding.
+//! Decodes and encodes signals: numbers at a position of a payload.
 //!
-//! In: a layout as a DBC gives it, and payload bytes. Out: raw codes (`u64`, the signal's bits, not sign-extended) and
+//! In: a layout from a DBC, and payload bytes. Out: raw codes (`u64`, the signal's bits, not sign-extended) and
 //! physical values (code x factor + offset, in the DBC's unit). A [`SignalPlan`] is a layout prepared once; decoding
 //! then needs one load, two shifts and one multiply-add. Signals have 1 to 64 bits at any position of a payload of up
 //! to 64 bytes.
@@ -38,7 +38,8 @@ pub enum ValueType {
 /// Position and conversion of a signal, as in a DBC.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SignalLayout {
-    /// DBC numbering: bit 0 is the least significant bit of byte 0, bit 7 its most significant, bit 8 starts byte 1.
+    /// Start bit in DBC numbering: bit 0 is the least significant bit of byte 0, bit 7 is its most significant bit, and
+    /// bit 8 is the least significant bit of byte 1.
     pub start_bit: u16,
     /// Length, 1 to 64 bits.
     pub length_bits: u16,
@@ -68,20 +69,20 @@ pub struct SignalPlan {
     pub(crate) window: u8,
     /// Number of bytes that the payload must have.
     bytes_needed: u8,
-    /// The signal spans nine bytes, so the window is widened to sixteen.
+    /// Whether the signal spans nine bytes, so that the window is widened to sixteen.
     wide: bool,
     pub(crate) byte_order: ByteOrder,
     value_type: ValueType,
     /// Left shift that moves the signal's highest bit to the top of the word.
     pub(crate) up: u8,
-    /// Right shift that then moves its lowest bit to the bottom of the word: 64 - length.
+    /// Right shift that then moves the signal's lowest bit to the bottom of the word: 64 - length.
     pub(crate) down: u8,
     pub(crate) factor: f64,
     pub(crate) offset: f64,
     /// Physical limits, widened by half a code so that rounding never rejects a code on the limit.
     pub(crate) low: f64,
     pub(crate) high: f64,
-    /// Smallest and largest code (sign-extended) within both the DBC's range and the bits.
+    /// Smallest and largest code (sign-extended) that lies in the DBC's range and fits the bits.
     low_code: i128,
     high_code: i128,
 }
@@ -110,7 +111,7 @@ fn nearest(number: f64) -> i64 {
     towards_zero.saturating_add(i64::from(rest >= 0.5) - i64::from(rest <= -0.5))
 }
 
-/// The code nearest to a number, for unsigned codes of 64 bits.
+/// The code nearest to a number, for codes that do not fit `i64`.
 #[cold]
 fn wide_code(number: f64, low: i128, high: i128) -> u64 {
     low_64(integer_of(number.round()).clamp(low, high))
@@ -226,7 +227,7 @@ impl SignalLayout {
     /// Physical limits, widened by half a code (for floats, by 1e-6 of the larger limit).
     fn physical_limits(&self) -> (f64, f64) {
         if !self.has_range() {
-            // Still rejects values that factor and offset make infinite.
+            // Without a range, reject only values that factor and offset make infinite.
             return (f64::MIN, f64::MAX);
         }
         let room = match self.value_type {
@@ -425,7 +426,7 @@ impl SignalPlan {
         match self.value_type {
             ValueType::Float32 => {
                 let number = number.clamp(f64::from(f32::MIN), f64::from(f32::MAX));
-                // Rounds to the nearest single; the clamp keeps it finite.
+                // Rounds to the nearest single-precision number; the clamp keeps it finite.
                 Some(u64::from((number as f32).to_bits()))
             }
             ValueType::Float64 | ValueType::Unsigned | ValueType::Signed => Some(number.to_bits()),

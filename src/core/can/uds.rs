@@ -48,13 +48,13 @@ impl Service {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Controller {
     pub bus: BusIndex,
-    /// Identifier of its responses.
+    /// Identifier of the controller's responses.
     pub response: CanId,
-    /// First data byte of its responses, for extended addressing.
+    /// First data byte of the responses, for extended addressing.
     pub response_extension: Option<u8>,
-    /// Identifier of its requests.
+    /// Identifier of requests to the controller.
     pub request: CanId,
-    /// First data byte of its requests, for extended addressing.
+    /// First data byte of the requests, for extended addressing.
     pub request_extension: Option<u8>,
 }
 
@@ -87,9 +87,9 @@ impl Question {
 /// A signal of a response.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AnswerSignal {
-    /// Byte at which the layout starts. The first byte after the echoed service and identifier has the number 0.
+    /// Byte at which the layout starts, counted from 0 after the echoed service and identifier.
     pub first_byte: usize,
-    /// The signal, whose layout is relative to this byte. Interface and identifier are those of the response frames.
+    /// The signal, with its layout relative to this byte, and with the interface and identifier of the response frames.
     pub binding: Binding,
 }
 
@@ -186,14 +186,14 @@ pub struct Refusal {
 /// Result of a received frame.
 #[derive(Debug, PartialEq)]
 pub enum FrameOutcome<'a> {
-    /// Nothing to decode.
+    /// There is nothing to decode.
     Nothing,
-    /// The first frame of a response. Its values were measured now.
+    /// The frame is the first one of a response, whose values were measured now.
     Begun {
         /// Index in [`Listener::counts`].
         controller: usize,
     },
-    /// A further frame of a response.
+    /// The frame is a further one of a response.
     Continued {
         /// Index in [`Listener::counts`].
         controller: usize,
@@ -212,7 +212,7 @@ pub enum FrameOutcome<'a> {
         answer: &'a Answer,
         /// Data of the response, after the echoed service and identifier.
         data: &'a [u8],
-        /// Whether it arrived in a single frame, without a preceding [`FrameOutcome::Begun`].
+        /// Whether the response arrived in a single frame, without a preceding [`FrameOutcome::Begun`].
         is_single: bool,
     },
 }
@@ -262,7 +262,7 @@ impl Listener {
         }
         sorted.sort_by_key(|answer| answer.question);
         for answer in &mut sorted {
-            // Decode the current before the voltages, whose samples use it.
+            // Decode the current before the voltages, because their samples use it.
             answer.signals.sort_by_key(|signal| signal.binding.channel);
         }
         let mut controllers: Vec<Controller> = sorted.iter().map(|answer| answer.question.controller).collect();

@@ -67,10 +67,10 @@ pub const TRUSTED_LOG_RESISTANCE: Bounds = Bounds::new(-3.5, 3.5, "-3.5 to 3.5")
 
 /// Learned capacity that is trusted, relative to the cell model's or the configured capacity. A worn cell keeps more
 /// than a twentieth of its capacity, and no cell has three times the capacity on its label.
-pub const TRUSTED_CAPACITY: Bounds = Bounds::new(0.05, 3.0, "0.05 to 3 times the cell's");
+pub const TRUSTED_CAPACITY: Bounds = Bounds::new(0.05, 3.0, "0.05 to 3 times the cell's capacity");
 
-/// Configured initial capacity relative to the cell model's.
-pub const INITIAL_CAPACITY: Bounds = Bounds::new(0.05, 3.0, "0.05 to 3 times the cell model's");
+/// Configured initial capacity, relative to the cell model's capacity.
+pub const INITIAL_CAPACITY: Bounds = Bounds::new(0.05, 3.0, "0.05 to 3 times the cell model's capacity");
 
 /// Resistance in a cell, ohm: from a copper bar to a watch cell.
 pub const RESISTANCE_OHM: Bounds = Bounds::new(1e-9, 1e3, "1e-9 to 1000 ohm");

@@ -1,9 +1,9 @@
 //! Catalogue of every published number of the pack and its cells.
 //!
-//! [`TABLE`] has a row per quantity: its JSON keys, its unit, and for the pack and for a cell a description and the
-//! names in metrics, MQTT and VSS. The status document, metrics, MQTT entities, VSS signals, exports and the manual's
-//! page iterate over it; the [`Monitor`](crate::monitor::Monitor) sets the values. To publish another number, add a row
-//! here and set its value in the monitor.
+//! [`TABLE`] has a row per quantity, with its JSON keys, its unit and its name in metrics. For the pack and for a cell,
+//! the row has a description and the names in MQTT and VSS. The status document, metrics, MQTT entities, VSS signals,
+//! exports and the manual's page iterate over the table. The [`Monitor`](crate::monitor::Monitor) sets the values. To
+//! publish another number, add a row here and set its value in the monitor.
 
 use std::fmt;
 
@@ -64,7 +64,7 @@ pub enum Unit {
     /// Multiple of the value when new.
     Ratio,
     Volts,
-    /// A, positive = discharge.
+    /// Amperes, positive = discharge.
     Amperes,
     Celsius,
     AmpereHours,

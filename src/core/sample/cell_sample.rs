@@ -1,5 +1,5 @@
-//! The sample that the sampler passes to a cell's estimator, and the moment shared by voltages that were measured
-//! together.
+//! Defines the sample that the sampler passes to a cell's estimator, and the moment that voltages share if they were
+//! measured together.
 //!
 //! In: a voltage (V), the fresh current (A) and temperature (degrees C), and the charge counted up to the voltage's
 //! time (As). Stored samples are checked ([`CellSample::check`]).

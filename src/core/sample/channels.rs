@@ -1,4 +1,4 @@
-//! The channels in use, the limits of each channel, and the clock of its stuck check.
+//! Lists the channels in use, the limits of each channel, and the clock of each channel's stuck check.
 
 use super::charge::ChargeTotals;
 use super::config::{Limits, SampleConfig, VoltageSource};

@@ -32,13 +32,13 @@ pub struct ChargeTotals {
     pub(super) discharging_s: f64,
 }
 
-/// The counter: totals up to `counted_to`, and the current from there on.
+/// Counter of charge and time: totals up to `counted_to`, and the current after it.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct ChargeCounter {
     totals: ChargeTotals,
     /// Time up to which the totals are final; `None` = no input yet.
     counted_to: Option<Timestamp>,
-    /// The current from `counted_to` on, A; `None` = unmeasured.
+    /// The current after `counted_to`, A; `None` = unmeasured.
     current_a: Option<f64>,
     /// The contactors are open until this time; `None` = closed or unknown.
     open_until: Option<Timestamp>,
@@ -103,7 +103,7 @@ impl ChargeCounter {
         }
     }
 
-    /// Makes the totals final up to `time`, and holds `current_a` from there on.
+    /// Makes the totals final up to `time`, and holds `current_a` after it.
     fn hold(&mut self, time: Timestamp, current_a: Option<f64>, max_age_s: f64) {
         self.totals = self.totals_at(time, max_age_s);
         self.counted_to = Some(self.counted_to.map_or(time, |last| last.max(time)));

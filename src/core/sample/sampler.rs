@@ -4,8 +4,8 @@
 //! temperature that are fresh at that time, and the charge and unmeasured time counted up to it. A bad voltage gives no
 //! sample. Readings of channels that are not used are counted ([`Sampler::reading_counts`]).
 //!
-//! Memory is one record per channel, allocated at the start. A reading touches one whole record, so the records are
-//! stored as an array of structs. Handling a reading allocates nothing.
+//! The memory is one record per channel, allocated at the start. Handling a reading allocates nothing. The records are
+//! an array of structs, because a reading touches one whole record.
 
 use serde::{Deserialize, Serialize};
 
@@ -22,7 +22,7 @@ use crate::quantity::{CellIndex, Channel, Fault, InvalidState, Reading, SensorIn
 /// noise and offset at rest. It is below any load under which a voltage or temperature must change.
 pub const FLOW_SHARE: f64 = 0.01;
 
-/// A signal that turned bad (`Err`: the fault) or good again (`Ok`: the number of bad readings before).
+/// Reports that a signal turned bad (`Err` with the fault) or good again (`Ok` with the number of bad readings before).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SignalChange {
     pub channel: Channel,
@@ -75,7 +75,7 @@ impl SamplerState {
     }
 }
 
-/// The sample stage.
+/// Checks readings and combines them into samples.
 #[derive(Debug, Clone)]
 pub struct Sampler {
     config: SampleConfig,
@@ -212,7 +212,7 @@ impl Sampler {
         }
     }
 
-    /// Whether the current reading is frozen: the voltages show another load.
+    /// Whether the reading of the current is frozen while the voltages show another load.
     pub fn is_current_frozen(&self) -> bool {
         self.state.frozen.is_frozen()
     }
@@ -305,7 +305,8 @@ impl Sampler {
 
     /// Time since the channel's latest reading, good or bad, s: the value of the rule `input_missing`.
     pub fn silence_s(&self, channel: Channel, now: Timestamp) -> Option<f64> {
-        // `None` < `Some`. Time before the start or the last waking does not count.
+        // Use the later of the two times; `None` is less than `Some`. Time before the start or the last waking does not
+        // count.
         let since = self.state.signals[self.slot(channel)?].received.max(self.state.began);
         Some(since.map_or(0.0, |from| now.since(from).max(0.0)))
     }
@@ -552,7 +553,7 @@ impl Sampler {
             }
             (Channel::PackVoltage, VoltageSource::Cells)
             | (Channel::CellVoltage(_), VoltageSource::PackTotal { .. })
-            // Used by the monitor, not sampled.
+            // The monitor uses these channels; they are not sampled.
             | (Channel::SupplyVoltage | Channel::Balancing(_) | Channel::PackIdentity, _) => None,
             (Channel::ReportedSoc | Channel::ReportedSoh | Channel::Contactor, _) => {
                 let first = voltage + self.voltages;

@@ -4,8 +4,8 @@
 //!
 //! * **Range**: a value outside the limits is bad.
 //! * **Rate**: a value is bad if its distance from the last good value exceeds the fastest plausible change, unless
-//!   [`ACCEPT_AFTER`] consecutive readings agree with each other. Then the step was real or the last good value was
-//!   wrong, and rejecting the value would lock out a healthy sensor.
+//!   [`ACCEPT_AFTER`] consecutive readings agree with each other. In that case, the step was real or the last good
+//!   value was wrong. Further rejection would lock out a healthy sensor.
 //! * **Stuck**: a value that stays exactly the same for too long while it should change is bad until it changes. The
 //!   caller passes a clock that runs only while the value should change.
 //! * **Stale**: the last good value is older than the maximum age.
@@ -47,7 +47,7 @@ pub(super) struct Signal {
     refused: Option<TimedValue>,
     /// Number of consecutive readings that agree with `refused`.
     refused_count: u32,
-    /// The latest value, which has not changed since `rests_since_s`.
+    /// The latest value. It has not changed since the stuck clock showed `rests_since_s`.
     rests_at: Option<f64>,
     /// Time of the stuck clock at the last change of the value, s.
     rests_since_s: f64,

@@ -1,4 +1,4 @@
-//! The course of the current: a scenario's next demand, given the pack's true state.
+//! Determines the course of the current: a scenario's next demand, given the pack's true state.
 //!
 //! Each course is called once per current sample and returns the current until the next sample.
 

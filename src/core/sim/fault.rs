@@ -23,7 +23,8 @@ pub struct Fault {
 pub enum Leak {
     /// A constant current, A.
     Current(f64),
-    /// A soft short circuit with this resistance, ohm: the current is the unloaded cell voltage divided by it.
+    /// A soft short circuit with this resistance, ohm. The current is the unloaded cell voltage divided by the
+    /// resistance.
     Resistance(f64),
 }
 
@@ -39,7 +40,7 @@ pub enum ContactResistance {
 /// Kind, place and size of a fault. Changes are relative: 0.1 = 10 % more.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum FaultKind {
-    /// The cell loses charge continuously, also at rest.
+    /// The cell loses charge continuously, even at rest.
     Leak {
         /// The cell.
         cell: CellIndex,

@@ -1,8 +1,9 @@
 //! Seeded random numbers that are bit-identical on every machine.
 //!
-//! Generator: ChaCha with 8 rounds, keyed by the seed, with one stream per use, so that more cells or another scenario
-//! do not change the numbers of other streams. Uniform: the upper 53 bits of a 64-bit word divided by 2^53, in [0, 1).
-//! Normal: Box-Muller (both values of a pair are used) with `ln`, `sin` and `cos` of `libm`.
+//! The generator is ChaCha with 8 rounds, keyed by the seed. Each use has its own stream, so that more cells or another
+//! scenario do not change the numbers of other streams. A uniform number is the upper 53 bits of a 64-bit word divided
+//! by 2^53, in [0, 1). A normal number comes from Box-Muller (both values of a pair are used) with `ln`, `sin` and
+//! `cos` of `libm`.
 
 use rand::Rng;
 use rand::SeedableRng;
@@ -56,13 +57,13 @@ impl Noise {
         Self { generator, spare_normal: None }
     }
 
-    /// Uniform in [0, 1).
+    /// A number uniformly distributed in [0, 1).
     pub(crate) fn uniform(&mut self) -> f64 {
         const UNIT: f64 = 1.0 / (1_u64 << 53) as f64;
         (self.generator.next_u64() >> 11) as f64 * UNIT
     }
 
-    /// Uniform in [`low`, `high`).
+    /// A number uniformly distributed in [`low`, `high`).
     pub(crate) fn between(&mut self, low: f64, high: f64) -> f64 {
         low + (high - low) * self.uniform()
     }
@@ -73,7 +74,7 @@ impl Noise {
         choices[((self.uniform() * N as f64) as usize).min(N - 1)]
     }
 
-    /// Normal with mean 0 and standard deviation 1.
+    /// A normally distributed number with mean 0 and standard deviation 1.
     pub(crate) fn normal(&mut self) -> f64 {
         if let Some(spare) = self.spare_normal.take() {
             return spare;

@@ -1,8 +1,7 @@
-//! The named scenarios and their settings.
+//! Defines the named scenarios and their settings.
 //!
-//! Amounts are given for the cell of the source (nominal capacity below) and scale with the capacity of the configured
-//! cell model, so that any configuration can be simulated. For a cell of the nominal capacity, the amounts are those of
-//! the source.
+//! Amounts are given for a cell with the nominal capacity of the source. They scale with the capacity of the configured
+//! cell model, so that any configuration can be simulated.
 //!
 //! | scenario | nominal | source | course |
 //! | --- | --- | --- | --- |

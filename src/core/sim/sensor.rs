@@ -1,7 +1,7 @@
 //! Sensors: readings of true values with errors.
 //!
 //! `reading = round_to_resolution(truth (1 + gain) + offset + noise_std n)`. n is normally distributed and independent
-//! from sample to sample. With the probability `dropout` there is no reading. Resolution 0 leaves quantisation to the
+//! from sample to sample. A reading is missing with the probability `dropout`. Resolution 0 leaves quantisation to the
 //! signal's encoding in the DBC. Each channel adds its own constant errors, drawn once from the seed.
 
 use super::noise::{Noise, Stream};

@@ -1,4 +1,4 @@
-//! True state of the pack, which the estimator must infer from readings.
+//! Simulates the true state of the pack, which the estimator must infer from readings.
 //!
 //! Each cell is the circuit of [`CellModel`] with its own capacity, resistance and temperature, and with effects that
 //! the estimator does not model. Current is positive for discharge. During a step of `dt` seconds, the current and the
@@ -45,31 +45,31 @@ pub struct Ageing {
     pub resistance_growth_per_ah: f64,
 }
 
-/// Standard deviations across cells.
+/// Differences between the cells of a pack.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Spread {
-    /// Capacity, relative.
+    /// Relative standard deviation of the capacity.
     pub capacity: f64,
-    /// Resistance, relative.
+    /// Relative standard deviation of the resistance.
     pub resistance: f64,
-    /// SOC at the start, fraction.
+    /// Standard deviation of the SOC at the start, fraction.
     pub soc: f64,
 }
 
 /// Settings of a pack of cells in series that are equal except for their spread.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PackSettings {
-    /// Cells in series, at least 1.
+    /// Number of cells in series, at least 1.
     pub cells: u16,
     /// Capacity of a new cell, Ah.
     pub capacity_ah: f64,
     /// SOC at the start, fraction.
     pub initial_soc: f64,
-    /// Spread of the cells.
+    /// Differences between the cells.
     pub spread: Spread,
-    /// Ageing.
+    /// Ageing of the cells.
     pub ageing: Ageing,
-    /// Hysteresis.
+    /// Hysteresis of the cells.
     pub hysteresis: Hysteresis,
     /// Self-discharge, A.
     pub leakage_a: f64,
@@ -241,7 +241,7 @@ impl Pack {
         match fault {
             FaultKind::Leak { cell, leak } => self.cells[cell.index()].leak = Some(leak),
             FaultKind::Contact { cell, resistance } => {
-                // A contact's resistance is relative to the cell's at this SOC and temperature, degrees C.
+                // A relative contact resistance refers to the cell's resistance at this SOC and temperature, degrees C.
                 let place = self.model.grid_position(0.5, 25.0);
                 let cell = &mut self.cells[cell.index()];
                 cell.contact_ohm += match resistance {

@@ -1,4 +1,4 @@
-//! Summaries of thresholds and rules: counts, severities, and alarms by rotating index.
+//! Summarises thresholds and rules: counts, severities, and alarms by rotating index.
 
 use super::{Alarm, AlarmEngine, Rule, Severity, ThresholdState};
 use crate::quantity::CellIndex;

@@ -41,7 +41,8 @@ fn noise_at_threshold_raises_and_clears_once() {
     let mut crossings = 0;
     let mut was_beyond = false;
     for second in 0..24 * 3600 {
-        // Six hours healthy, twelve hours at the threshold, six hours healthy; noise of +/- 0.4 throughout.
+        // The value is healthy for six hours, at the threshold for twelve hours, and healthy for six hours, always with
+        // noise of +/- 0.4.
         let mean = if (6 * 3600..18 * 3600).contains(&second) { 3.0 } else { 1.5 };
         let value = mean + rng.random_range(-0.4..0.4);
         crossings += u32::from((value > 3.0) != was_beyond);
@@ -257,7 +258,7 @@ fn commands_change_selected_alarms_and_refuse_unhealthy_ones() {
 fn show_equals_observe_for_quiet_values() {
     let rules = [Rule::InputMissing, Rule::EstimateUntrusted, Rule::CellImbalance];
     let mut configs = rules.map(|r| rule(r, 3.0, 0.5, 5.0, 3)).to_vec();
-    // Two thresholds of one rule, and one that needs a standard deviation, which shown values lack.
+    // One rule has two thresholds. Another threshold needs a standard deviation, which shown values lack.
     configs.push(RuleConfig { severity: Severity::Severe, ..rule(Rule::InputMissing, 3.1, 0.2, 1.0, 1) });
     configs[2].when = Comparison::Probability(0.9);
     let mut observation = AlarmEngine::new(configs, 2);
@@ -266,7 +267,7 @@ fn show_equals_observe_for_quiet_values() {
     for second in 0..5000 {
         let (now, r) = (at(f64::from(second)), rules[rng.random_range(0..3)]);
         let cell = [None, CELL, Some(CellIndex(1)), Some(CellIndex(2))][rng.random_range(0..4)];
-        // Occasionally, a period beyond the threshold.
+        // From time to time, the value is beyond the threshold for a period.
         let value = rng.random_range(0.0..3.2) + if second % 1000 > 900 { 1.0 } else { 0.0 };
         let mut shown = observation.clone();
         let is_quiet = observation.is_quiet(r, value);

@@ -148,5 +148,5 @@ fn utf_8_byte_order_mark_is_skipped_and_utf_16_rejected() {
     assert_eq!((unit(marked(text.clone().into_bytes())), unit(marked(latin_1))), ("\u{b0}C".into(), "\u{b0}C".into()));
     let utf_16: Vec<u8> = text.encode_utf16().flat_map(u16::to_be_bytes).collect();
     let error = Database::parse_bytes(&utf_16).unwrap_err();
-    assert!(error.line == 1 && error.what.starts_with("is UTF-16 text"), "{error}");
+    assert!(error.line == 1 && error.what.starts_with("the file is UTF-16 text"), "{error}");
 }

@@ -1,4 +1,4 @@
-//! Bindings prepared for decoding: by message and page, with shifts, factors and limits per signal.
+//! Prepares bindings for decoding: groups them by message and page, and computes shifts, factors and limits per signal.
 //!
 //! In: frames. Out: readings. The good codes of a [`Binding`] are the raw codes with a valid value. They form a range,
 //! which is computed in advance. If "not available" codes split the range, its longest part is used. The binding itself
@@ -49,7 +49,7 @@ struct SignalGroup {
     bytes_needed: usize,
 }
 
-/// Longer than any payload, bytes.
+/// A length above that of any payload, bytes.
 const NEVER: usize = usize::MAX;
 
 /// Lists the groups that may be present for each code of the selector.
@@ -199,7 +199,7 @@ fn value_of(binding: &Binding, payload: &[u8]) -> Result<f64, Fault> {
     binding.value(payload)
 }
 
-/// Decodes bindings that are present together, if they are present.
+/// Decodes the bindings of a group, if the group is present.
 fn decode_one_by_one(bindings: &[Binding], payload: &[u8], each: &mut impl FnMut(Reading)) {
     let present = bindings.first().map_or(Ok(false), |first| first.holds(payload));
     if present == Ok(false) {
@@ -302,7 +302,7 @@ impl LinearSignal {
         let Binding { channel, scale, offset: shift, .. } = *binding;
         let never_good = Self {
             channel,
-            // One bit, without good codes.
+            // Any position of one bit; no code is good.
             position: BitPosition { word: 0, window: 0, up: 0, down: 63 },
             sign: 0,
             first_good: u64::MAX,

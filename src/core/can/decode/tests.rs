@@ -1,4 +1,4 @@
-//! Frames that an input map decodes, and frames that it ignores.
+//! Tests which frames an input map decodes and which frames it ignores.
 
 use proptest::prelude::*;
 
@@ -7,8 +7,8 @@ use crate::can::dbc::Database;
 use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 use crate::quantity::CellIndex;
 
-/// Three messages: a plain one with the voltage first and the current last, a multiplexed one with a signal on every
-/// page, and one with nested pages.
+/// Three messages. The first one is plain, with the voltage first and the current last. The second one is multiplexed,
+/// with one signal on every page. The third one has nested pages.
 pub(crate) const DBC: &str = r#"VERSION ""
 BU_: BMS
 BO_ 256 Pack: 6 BMS

@@ -207,9 +207,9 @@ impl Receiver {
         if delta > self.max_delta {
             self.no_new_or_repeated = 0;
             self.sync = config.sync_counter_init;
-            // Profile 5, and a configured synchronisation, continue from any intact frame. Profile 1 without
-            // synchronisation keeps the last accepted counter until the sender reaches it again, or until the allowed
-            // step is large enough.
+            // With profile 5 or a configured synchronisation, the sequence continues from any intact frame. With
+            // profile 1 and no synchronisation, the last accepted counter stays until the sender reaches it again or
+            // the allowed step is large enough.
             if self.sync > 0 || config.protection.profile == Profile::P05 {
                 self.accept(config, counter);
             }

@@ -139,7 +139,7 @@ fn undetected(protection: Protection, payload: &[u8], counter: u8, wrong_bits: u
     (missed, tried)
 }
 
-/// The figures in the section "What a profile finds" of the manual's page `ecu/protection.md`.
+/// Checks the figures in the section "What a profile finds" of the manual's page `ecu/protection.md`.
 #[test]
 fn undetected_bit_errors_match_manual() {
     const ZEROS: [u8; 12] = [0; 12];
@@ -164,7 +164,7 @@ fn undetected_bit_errors_match_manual() {
     }
     let manual = include_str!("../../../../docs/src/ecu/protection.md");
     let row = "| three wrong bits | all but 198 (1A) or 169 (1C) of 41,664 possible errors (0.5 %, 0.4 %) | all |";
-    assert!(manual.lines().any(|line| line == row), "the manual has other figures than\n{row}");
+    assert!(manual.lines().any(|line| line == row), "the manual must contain the row\n{row}");
 }
 
 fn any_protection() -> impl Strategy<Value = Protection> {

@@ -28,7 +28,7 @@ pub struct CommandFields {
     pub command: Command,
     /// Number of the rule.
     pub rule: Option<u8>,
-    /// 1 info, 2 warning, 3 severe.
+    /// Wire code of the severity: 1 info, 2 warning, 3 severe.
     pub severity: Option<u8>,
     pub cell: Option<CellIndex>,
 }

@@ -75,7 +75,7 @@ impl TableChecksum {
         self.0 = self.0.wrapping_add(crc16(0xFFFF, &entry));
     }
 
-    /// The value to send: 65535 means "not available", so a sum of 65535 is sent as 65534.
+    /// The value to send. The code 65535 means "not available", so a sum of 65535 is sent as 65534.
     pub fn value(self) -> u16 {
         self.0.min(u16::MAX - 1)
     }

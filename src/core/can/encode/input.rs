@@ -62,7 +62,7 @@ struct AnswerPage {
     fields: Vec<(usize, InputField)>,
 }
 
-/// One message, or one multiplexer page of it.
+/// A message, or a multiplexer page of a message.
 #[derive(Debug, Clone)]
 struct InputPage {
     bus: BusIndex,
@@ -285,7 +285,7 @@ impl InputPage {
     }
 }
 
-/// A payload with the selectors of the binding's page, each with the first code of its first range.
+/// A payload with the selectors of the binding's page. Each selector has the first code of its first range.
 fn template(binding: &Binding) -> [u8; MAX_DATA] {
     let mut payload = [0; MAX_DATA];
     for test in &binding.mux {

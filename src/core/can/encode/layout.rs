@@ -36,12 +36,12 @@ const MOVED_LEN_BYTES: u16 = 12;
 pub const CHANGE_REPETITIONS: u32 = 3;
 /// Time between repetitions of a changed alarm, ms. It is longer than most error bursts on a bus.
 pub const CHANGE_REPETITION_MS: u32 = 100;
-/// Smallest mean time between two alarm frames, ms: 100 frames a second use 2.7 % of a bus of 500 kbit/s.
+/// Smallest mean time between two alarm frames, ms. The resulting 100 frames a second use 2.7 % of a bus of 500 kbit/s.
 pub const ALARM_DELAY_MS: u32 = 10;
 /// Smallest mean time between two replies, ms.
 pub const REPLY_DELAY_MS: u32 = 100;
 
-/// Period of the freshness announcements, ms. With it, a command is valid for at most two seconds.
+/// Period of the freshness announcements, ms. A command is valid for two periods at most.
 pub const FRESHNESS_PERIOD_MS: u32 = 1000;
 
 /// Cycle time of a sent message if neither the settings nor the base give one, ms.
@@ -55,7 +55,7 @@ pub fn default_database() -> Result<Database, DbcError> {
     Database::parse(include_str!("../../packwatch.dbc"))
 }
 
-/// The shipped DBC, parsed once: parsing takes longer than the rest of loading a configuration.
+/// The shipped DBC. It is parsed only once, because parsing takes longer than the rest of loading a configuration.
 fn shipped() -> &'static Database {
     static SHIPPED: OnceLock<Database> = OnceLock::new();
     // Cannot fail: a test parses the shipped file.
@@ -68,7 +68,7 @@ pub enum LayoutMessage {
     Status,
     Health,
     Alarm,
-    /// Command frame, received.
+    /// Command frame, which the daemon receives.
     Command,
     /// Digest of all alarms.
     Digest,
@@ -478,7 +478,7 @@ fn fit_steps(message: &mut Message, rated_capacity_ah: f64) {
 
 /// The smallest of 1, 2, 5, 10, ... that is not below `needed`, but at most the largest step.
 fn times(needed: f64) -> f64 {
-    /// Larger than any cell needs: a million times 40 Ah.
+    /// The largest factor. It is enough for a million times 40 Ah, which is more than any cell has.
     const LARGEST: f64 = 1e6;
     let ladder = std::iter::successors(Some(1.0), |decade| Some(decade * 10.0)).take_while(|decade| *decade < LARGEST);
     let mut ladder = ladder.flat_map(|decade| [decade, 2.0 * decade, 5.0 * decade]);

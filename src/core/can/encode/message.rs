@@ -139,9 +139,9 @@ impl OutputMessage {
         self
     }
 
-    /// Encodes a page. `value` returns the value of a signal, given its name and its [index](Self::with_places).
-    /// `counter` is the protection's next counter and is advanced. The trailer of an authenticated message stays 0; it
-    /// is written once the freshness is known.
+    /// Encodes a page. `value` returns the value of a signal from its name and its [index](Self::with_places).
+    /// `counter` is the protection's next counter, which this function advances. The trailer of an authenticated
+    /// message stays 0; it is written once the freshness is known.
     pub(super) fn frame(
         &self,
         page: u64,
@@ -169,7 +169,7 @@ impl OutputMessage {
             FrameFormat::Classic => Frame::classic(self.id, payload.get(..self.len).unwrap_or(&[])),
             FrameFormat::Fd { brs } => Frame::fd_padded(self.id, brs, false, self.len, &payload),
         };
-        // Always a frame: lengths were checked when the plan was created.
+        // The frame always exists, because lengths were checked when the plan was created.
         frame.unwrap_or(Frame::empty(self.id))
     }
 }

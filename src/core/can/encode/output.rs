@@ -63,15 +63,15 @@ const ALARM: [&str; 6] = ["Rule", "State", "Severity", "Test", "Cell", "Acknowle
 /// Contents of the status frame; `None` = not available.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct StatusFields {
-    /// Fraction.
+    /// State of charge, fraction.
     pub soc: Option<f64>,
-    /// Fraction.
+    /// Standard deviation of the SOC, fraction.
     pub soc_std: Option<f64>,
     /// Operating mode of the pack.
     pub mode: Option<Mode>,
-    /// Wire code: 0 unavailable, 1 valid, 2 degraded, 3 untrusted.
+    /// Wire code of the validity: 0 unavailable, 1 valid, 2 degraded, 3 untrusted.
     pub validity: u8,
-    /// Wire code: 0 none, 1 info, 2 warning, 3 severe.
+    /// Wire code of the highest severity: 0 none, 1 info, 2 warning, 3 severe.
     pub highest_severity: Option<u8>,
     /// Number of active alarms.
     pub active_alarms: Option<u16>,
@@ -84,19 +84,19 @@ pub struct StatusFields {
 /// Contents of all pages of the health frame; `None` = not available.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct HealthFields {
-    /// Ah.
+    /// Lowest capacity of a cell, Ah.
     pub capacity_ah: Option<f64>,
-    /// Ah.
+    /// Standard deviation of the capacity, Ah.
     pub capacity_std_ah: Option<f64>,
-    /// Fraction of the rated capacity.
+    /// State of health: capacity as a fraction of the rated capacity.
     pub soh: Option<f64>,
-    /// s.
+    /// Recharge period, s.
     pub recharge_period_s: Option<f64>,
-    /// s.
+    /// Recharge period with the reference charger, s.
     pub normalized_recharge_period_s: Option<f64>,
-    /// Ah.
+    /// Usable capacity, Ah.
     pub usable_capacity_ah: Option<f64>,
-    /// Ah.
+    /// Standard deviation of the usable capacity, Ah.
     pub usable_capacity_std_ah: Option<f64>,
     /// Resistance relative to new (1 = as new).
     pub resistance_ratio: Option<f64>,
@@ -114,7 +114,7 @@ pub struct HealthFields {
     pub lam_ne: [Option<f64>; 2],
     /// Loss of active material of the same cell's positive electrode, and its standard deviation, as fractions.
     pub lam_pe: [Option<f64>; 2],
-    /// Wire code of how well the cells' model is known.
+    /// Wire code that says how well the cells' model is known.
     pub model_state: Option<u8>,
 }
 
@@ -123,10 +123,10 @@ pub struct HealthFields {
 pub struct AlarmFields {
     /// Number of the rule.
     pub rule: u8,
-    /// Wire code: 0 inactive, 1 active, 2 cleared, 3 pending, 4 latched, 5 suppressed (raised, but its input is
-    /// invalid), 6 unknown; `None` = not available.
+    /// Wire code of the state: 0 inactive, 1 active, 2 cleared, 3 pending, 4 latched, 5 suppressed (raised, but its
+    /// input is invalid), 6 unknown; `None` = not available.
     pub state: Option<u8>,
-    /// Wire code: 1 info, 2 warning, 3 severe; `None` = unknown.
+    /// Wire code of the severity: 1 info, 2 warning, 3 severe; `None` = unknown.
     pub severity: Option<u8>,
     /// Whether the alarm is a test.
     pub test: bool,
@@ -140,8 +140,8 @@ pub struct AlarmFields {
     pub threshold: Option<f64>,
 }
 
-/// The next counter of each message's end-to-end protection. The counters must survive a restart, because to a
-/// receiver, a counter that jumps back indicates an old frame.
+/// The next counter of each message's end-to-end protection. The counters must survive a restart: if a counter jumps
+/// back, the receiver treats the frame as an old one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SendCounters {
@@ -171,7 +171,7 @@ pub struct OutputPlan {
 pub struct SentMessage {
     pub message: LayoutMessage,
     pub id: CanId,
-    /// Kind of its frames.
+    /// Kind of the message's frames.
     pub format: FrameFormat,
     pub protection: Option<Protection>,
     pub secoc: Option<Authentication>,
@@ -216,7 +216,7 @@ impl OutputPlan {
         }
     }
 
-    /// The sent messages: status, health, alarm, then digest, reply and freshness if the layout has them.
+    /// The sent messages: status, health and alarm, followed by digest, reply and freshness if the layout has them.
     pub fn messages(&self) -> impl Iterator<Item = SentMessage> + '_ {
         let always = [
             (LayoutMessage::Status, &self.status),
@@ -299,7 +299,7 @@ impl OutputPlan {
         self.health.frame(code, &mut counters.health, |_, place| value_of(&HEALTH, fields, place))
     }
 
-    /// Encodes one alarm. Value and threshold use the rule's own `Value_...` and `Threshold_...` signals.
+    /// Encodes one alarm. Its value and its threshold are in the rule's own `Value_...` and `Threshold_...` signals.
     pub fn alarm(&self, fields: &AlarmFields, counters: &mut SendCounters) -> Frame {
         let bit = |set: bool| Some(if set { 1.0 } else { 0.0 });
         self.alarm.frame(u64::from(fields.rule), &mut counters.alarm, |name, _| match name {

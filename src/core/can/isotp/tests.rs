@@ -36,7 +36,7 @@ fn message(length: usize) -> Vec<u8> {
 
 #[test]
 fn leaf_response_is_reassembled() {
-    // Frames of a 2019 Leaf, group 1 of service 0x21 (its log: 0x35 = 53 bytes).
+    // Frames from the log of a 2019 Leaf: group 1 of service 0x21, 53 bytes (0x35).
     let frames: Vec<Vec<u8>> = [
         [0x10, 0x35, 0x61, 0x01, 0xFF, 0xFF, 0xF3, 0xCC],
         [0x21, 0x02, 0xAF, 0xFF, 0xFF, 0xEB, 0xA6, 0xFF],

@@ -25,9 +25,9 @@ const CONTENTION_NS: i64 = 300_000_000;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) enum ClaimState {
-    /// Not started.
+    /// The node has not started.
     Idle,
-    /// Waiting for objections to the claim.
+    /// The node waits for objections to its claim.
     Claiming,
     Claimed,
     Lost,
@@ -35,7 +35,7 @@ pub(super) enum ClaimState {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ClaimEvent {
-    /// The program starts, or resumes after time without listening.
+    /// The program starts, or resumes after a time without listening.
     Started,
     /// A lower or equal NAME claims the address.
     ClaimedByStronger,
@@ -43,7 +43,7 @@ pub(super) enum ClaimEvent {
     ClaimedByWeaker,
     /// A node requests address claims.
     Requested,
-    /// No objection during the contention time.
+    /// No node objected during the contention time.
     Unopposed,
 }
 
@@ -110,7 +110,7 @@ impl AddressClaim {
         (self.name, self.address) == (other.name, other.address)
     }
 
-    /// Starts, or restarts after time without listening.
+    /// Starts the claim, or restarts it after a time without listening.
     pub(super) fn start(&mut self, now: Timestamp) {
         self.last_sent = None;
         self.send_at = None;

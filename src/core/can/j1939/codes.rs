@@ -81,7 +81,7 @@ impl FollowedCode {
         self.code = active.code.with_occurrences(active.code.occurrence_count().max(count_before).into());
     }
 
-    /// Handles the end of a new list: keeps the most severe lamp that was not sent yet.
+    /// Updates the lamp after a new list: keeps the most severe lamp that was not sent yet.
     fn settle_lamp(&mut self) {
         if self.is_active {
             let is_unseen = self.shown.is_none_or(|shown| self.lamp > shown);
@@ -162,7 +162,7 @@ impl Codes {
         self.followed.iter().filter(|followed| followed.shown_at(now).is_some()).count()
     }
 
-    /// Applies every change that is due to the message that is built at `now`.
+    /// Applies every due change to the message that is built at `now`.
     pub(super) fn show(&mut self, now: Timestamp) {
         for followed in &mut self.followed {
             if followed.due().is_some_and(|due| due <= now) {

@@ -1,10 +1,10 @@
-//! The node: claims its address, sends DM1 once a second and on every change, answers requests.
+//! The J1939 node: claims its address, sends DM1 once a second and on every change, and answers requests.
 //!
 //! * DM1 is sent once a second, even without codes, and at once on a change. `codes` limits how often one code changes.
 //! * DM2 is sent only on request.
-//! * Messages of more than 8 bytes are transferred one after the other: a changed DM1 waits for the end of a transfer.
-//!   If both wait, DM1 and DM2 alternate, so that neither a flood of requests stops DM1 nor a long DM1 stops DM2. A
-//!   single-frame DM1 is sent even while a DM2 is being transferred.
+//! * Messages of more than 8 bytes are transferred one after the other, so a changed DM1 waits for the end of a
+//!   transfer. If both wait, DM1 and DM2 alternate, so that neither a flood of requests stops DM1 nor a long DM1 stops
+//!   DM2. A single-frame DM1 is sent even while a DM2 is being transferred.
 //! * If a node requests a group that is not supported, the answer depends on the destination. A request to the node's
 //!   own address is rejected, and a request to all nodes is ignored.
 
@@ -163,7 +163,7 @@ impl Node {
         let &[low, middle, high, ..] = frame.data() else { return };
         let is_for_all = header.destination == GLOBAL_ADDRESS;
         let answer = match (pgn_of([low, middle, high]), self.claim.state) {
-            // After a loss, the address belongs to another node: only requests to all concern this node.
+            // After a loss, the address belongs to another node. Then only requests to all nodes concern this node.
             (PGN_ADDRESS_CLAIMED, ClaimState::Lost) if !is_for_all => return,
             (PGN_ADDRESS_CLAIMED, ClaimState::Idle | ClaimState::Claiming | ClaimState::Claimed | ClaimState::Lost) => {
                 return self.claim.handle_request(now);
@@ -324,8 +324,8 @@ impl Node {
         if pgn != PGN_DM1 || start.is_some_and(|start| start <= from) {
             return start;
         }
-        // When codes leave the message, it may become short enough to be sent during a transfer or before its spacing
-        // ends.
+        // When codes leave the message, it may become short enough to be sent during a transfer or during the pause
+        // after it.
         let shorter = self.codes.changes().filter(|&change| change > from);
         shorter.filter_map(|change| self.start_at(change, pgn).map(|start| start.max(change))).chain(start).min()
     }

@@ -1,4 +1,4 @@
-//! Polling: due times of requests, the current before voltages, standby and silence.
+//! Tests due times of requests, the request for the current before voltages, standby and silence.
 
 #![allow(clippy::unwrap_used, reason = "tests may panic")]
 

@@ -71,7 +71,7 @@ fn freshness_is_accepted_once_and_in_rising_order() {
     window.announce();
     assert!(fits(&window, announced + 6), "still covered by the previous announcement");
     window.announce();
-    assert!(!fits(&window, announced + 15), "two announcements later it is old");
+    assert!(!fits(&window, announced + 15), "after two announcements, the value is too old");
     let last = window.announce();
     window.expire();
     assert!(!fits(&window, last + 15), "after time without listening, no earlier value is accepted");

@@ -7,7 +7,7 @@
 //! announcement, and already announced. If an attacker delays a command, it expires after two seconds. A command with
 //! an invented value is useless until the receiver announces that value.
 //!
-//! The sender stores nothing across a restart: it waits for an announcement. The receiver stores its state. After a
+//! The sender stores nothing: after a restart, it waits for an announcement. The receiver stores its state. After a
 //! restart it begins [`RESTART_STEPS`] announcements beyond the stored state, and at least at the value that
 //! corresponds to its clock. Therefore it never reuses a value of the previous run, even if that value was not stored.
 
@@ -20,7 +20,7 @@ use crate::quantity::Timestamp;
 pub const ANNOUNCEMENT_STEP: u64 = 16;
 /// Number of announcements skipped at a start. They cover more than an hour in which the state could not be stored.
 const RESTART_STEPS: u64 = 4096;
-/// A stored value above this is damaged: it would take 10^9 years.
+/// A stored value above this limit is damaged, because reaching it takes 10^9 years.
 const MAX_FRESHNESS: u64 = 1 << 60;
 
 /// Freshness values that a receiver accepts.
@@ -61,7 +61,8 @@ impl FreshnessWindow {
         self.announced.saturating_sub(ANNOUNCEMENT_STEP).max(self.accepted.saturating_add(1))
     }
 
-    /// The values that a payload's freshness may represent; none if it is expired or the payload is too short.
+    /// The values that a payload's freshness may represent. There are none if the freshness is expired or the payload
+    /// is too short.
     pub fn check(&self, authentication: Authentication, payload: &[u8]) -> MacCheck {
         let mut candidates = [None; MAX_CANDIDATES];
         if let Some(sent) = authentication.sent_freshness(payload) {

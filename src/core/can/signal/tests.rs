@@ -1,4 +1,4 @@
-//! Signal plans compared with bit-by-bit decoding and with published vectors.
+//! Compares signal plans with bit-by-bit decoding and with published vectors.
 
 use proptest::prelude::*;
 

@@ -1,4 +1,4 @@
-//! Scenarios for the whole sample stage; the charge counter has its own tests.
+//! Tests scenarios of the whole sample stage; the charge counter has its own tests.
 
 use proptest::prelude::*;
 

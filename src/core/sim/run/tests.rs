@@ -137,7 +137,7 @@ fn sleeping_bms_reports_bits_while_bleeding() {
         }
         nights += asleep.iter().filter(|(_, is_bled)| !is_bled).count();
     }
-    assert!(nights > 0, "no cell was bled during any sleep");
+    assert!(nights > 0, "the BMS must bleed a cell during at least one sleep");
 }
 
 #[test]

@@ -298,7 +298,7 @@ fn byte_order_mark_is_skipped_utf_16_rejected() {
     let latin_1: Vec<u8> = DBC.replace("degC", "\u{b0}C").chars().map(|c| c as u8).collect();
     assert_eq!(read_bytes(marked(&latin_1)), Ok(()), "a byte order mark before Latin-1 text is skipped");
     let utf_16: Vec<u8> = "\u{feff}".chars().chain(DBC.chars()).flat_map(|c| (c as u16).to_le_bytes()).collect();
-    let fault = "pack.dbc:1: is UTF-16 text, must be UTF-8 or Latin-1: save it in that encoding";
+    let fault = "pack.dbc:1: the file is UTF-16 text, must be UTF-8 or Latin-1: save it in one of these encodings";
     for text in [utf_16.clone(), utf_16[2..].to_vec()] {
         assert_eq!(read_bytes(text), Err(vec![fault.to_owned()]));
     }
