@@ -1,6 +1,6 @@
 //! The control socket: lists the alarms of a running daemon on the same computer and sends it commands.
 //!
-//! A Unix stream socket. Requests and answers are lines of JSON; answers have the order of the requests:
+//! It is a Unix stream socket. Requests and answers are lines of JSON. Answers have the order of the requests:
 //! ```text
 //! {"version":1,"request":"alarms"}                    {"version":1,"ok":true,"time":...,"alarms":[...],...}
 //! {"version":1,"request":"clear","rule":"soc_low"}    {"version":1,"ok":true,"changed":1,"refused":0,...}
@@ -10,9 +10,9 @@
 //!
 //! * The socket's owner and group may read (mode 0660). Commands are executed only for the daemon's own user and for root, as
 //!   identified by the kernel (`SO_PEERCRED`). Other users get an error.
-//! * Each connection is a task. It sends the loop one request at a time over a bounded queue. A connection that never reads or
-//!   writes blocks no other and is closed. If all slots are taken, a new connection replaces the one that has been idle
-//!   longest.
+//! * Each connection is a task. It sends the loop one request at a time over a bounded queue. A connection that never
+//!   reads or writes does not block other connections and is closed. If all slots are taken, a new connection replaces
+//!   the one that has been idle longest.
 //! * A command reaches the core as an input, so it is in the journal and is replayed.
 
 pub mod answer;
@@ -28,22 +28,23 @@ use crate::io::unix_socket::{client_folder, runtime_folder};
 
 pub use server::{ControlServer, PendingRequest};
 
-/// Maximum number of connections: room for a person, a display and a script. Each is a task with a few kilobytes.
+/// Maximum number of connections, enough for a person, a display and a script. Each connection is a task with a few
+/// kilobytes.
 pub const MAX_CONNECTIONS: usize = 8;
 /// Maximum number of connections of one process.
 pub const MAX_PER_PROCESS: usize = 4;
-/// Longest request, bytes, including the end of the line; the longest valid one has less than 200.
+/// Longest request, bytes, including the end of the line. The longest valid request has less than 200 bytes.
 pub const MAX_REQUEST_BYTES: usize = 4096;
 /// Longest time for a request and for reading its answer. A script needs milliseconds, and a client must not keep one of the
 /// few slots for ever.
 pub const MAX_SILENCE: Duration = Duration::from_secs(10);
-/// Maximum number of alarms in an answer: a line of a few hundred kilobytes, serialised in a few milliseconds. Further
-/// alarms are counted.
+/// Maximum number of alarms in an answer. They make a line of a few hundred kilobytes, which is serialised in a few
+/// milliseconds. Further alarms are counted.
 pub const MAX_LISTED: usize = 1024;
 
 /// The socket's name in the folder of the daemon.
 const FILE_NAME: &str = "control.sock";
-/// Owner and group may connect.
+/// File mode of the socket: owner and group may connect.
 const MODE: u32 = 0o660;
 
 /// The default path of a daemon's socket.

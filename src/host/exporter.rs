@@ -1,12 +1,14 @@
-//! The exporter: serves the daemon's status as metrics over HTTP. It is a separate process, so that no fault in it can affect
-//! the estimation loop.
+//! The exporter serves the daemon's status as metrics over HTTP. It is a separate process, so that no fault in it can
+//! affect the estimation loop.
 //!
-//! * `/metrics`: each scrape reads the status socket within [`STATUS_LIMIT`]. Without a fresh document the answer contains
-//!   only `packwatch_up 0`. OpenMetrics 1.0 for clients that accept it, else Prometheus' text format 0.0.4.
+//! * `/metrics`: each scrape reads the status socket within [`STATUS_LIMIT`]. If there is no fresh document, the answer
+//!   contains only `packwatch_up 0`. Clients that accept OpenMetrics 1.0 receive it; other clients receive Prometheus'
+//!   text format 0.0.4.
 //! * `/`: a short page; `/-/healthy`: a liveness check.
-//! * At most [`MAX_CONNECTIONS`], and [`MAX_PER_ADDRESS`] per client address. A further connection replaces the one that has
-//!   been idle longest ([`ConnectionSlots`]). Requests may have [`MAX_REQUEST_BYTES`], and their head must arrive within
-//!   [`HEAD_LIMIT`]; bodies are not read. SIGTERM and SIGINT stop the exporter cleanly.
+//! * At most [`MAX_CONNECTIONS`] connections are open, and [`MAX_PER_ADDRESS`] per client address. A further connection
+//!   replaces the one that has been idle longest ([`ConnectionSlots`]). The head of a request may have up to
+//!   [`MAX_REQUEST_BYTES`] bytes and must arrive within [`HEAD_LIMIT`]. Bodies are not read. SIGTERM and SIGINT stop
+//!   the exporter cleanly.
 
 use std::cell::Cell;
 use std::convert::Infallible;
@@ -37,21 +39,22 @@ use super::status::client::{check_length, explain, parse};
 use super::status::document::StatusDocument;
 use super::status::metrics::{openmetrics, prometheus_text};
 
-/// Maximum number of connections: several times two servers and a browser.
+/// Maximum number of connections. This is several times the need of two Prometheus servers and a browser.
 const MAX_CONNECTIONS: usize = 16;
 /// Maximum number of connections of one address.
 const MAX_PER_ADDRESS: usize = 8;
-/// Longest head of a request, bytes; the smallest limit that hyper supports.
+/// Longest head of a request, bytes. It is the smallest limit that hyper supports.
 const MAX_REQUEST_BYTES: usize = 8192;
 /// Maximum number of headers of a request.
 const MAX_HEADERS: usize = 64;
-/// Longest wait for the head of a request; a connection silent for this long is closed.
+/// Longest wait for the head of a request. A connection that is silent for longer is closed.
 const HEAD_LIMIT: Duration = Duration::from_secs(30);
 /// Longest life of a connection, so that a slow reader does not keep its slot for ever.
 const CONNECTION_LIMIT: Duration = Duration::from_secs(300);
-/// Time to finish the current answer at that limit; as long as a scrape may take.
+/// Time to finish the current answer when a connection reaches [`CONNECTION_LIMIT`]. It equals the longest duration of
+/// a scrape.
 const ANSWER_LIMIT: Duration = Duration::from_secs(10);
-/// Time to read the daemon's status; less than the ten seconds of a scrape.
+/// Longest time to read the daemon's status. It is less than the ten seconds that a scrape may take.
 const STATUS_LIMIT: Duration = Duration::from_secs(3);
 /// Time to finish running answers when the exporter stops.
 const DRAIN_LIMIT: Duration = Duration::from_secs(1);
@@ -116,7 +119,8 @@ async fn serve(listener: TcpListener, source: Rc<StatusSource>) -> io::Result<()
     }
     notify(&[NotifyState::Stopping]);
     drop(listener);
-    // Idle connections have nothing to finish, so all connections are closed after a short wait.
+    // Running answers are finished within a short wait. Then all connections are closed, because idle connections have
+    // nothing to finish.
     let drained = async { while connections.join_next().await.is_some() {} };
     let _ = timeout(DRAIN_LIMIT, drained).await;
     tracing::info!("exporter stopped");
@@ -140,7 +144,7 @@ async fn serve_connection(stream: TcpStream, source: Rc<StatusSource>, activity:
     let ended = match timeout(CONNECTION_LIMIT, connection.as_mut()).await {
         Ok(ended) => ended,
         Err(_) => {
-            // Finishes the current answer and accepts no further request.
+            // The connection finishes its current answer and accepts no further request.
             connection.as_mut().graceful_shutdown();
             timeout(ANSWER_LIMIT, connection).await.unwrap_or(Ok(()))
         }
@@ -198,7 +202,7 @@ fn wants_openmetrics(headers: &HeaderMap) -> bool {
 }
 
 impl StatusSource {
-    /// Reads the daemon's status; `None` = not received in time. Logs changes.
+    /// Reads the daemon's status; `None` = no status was received in time. A change between the two is logged.
     async fn read(&self) -> Option<StatusDocument> {
         let line = timeout(STATUS_LIMIT, self.line()).await.unwrap_or_else(|late| Err(late.into()));
         let document = line.map_err(|error| explain(&self.path, &error)).and_then(|line| parse(&line));
@@ -259,7 +263,7 @@ mod tests {
     #[test]
     fn openmetrics_is_sent_if_version_1_accepted() {
         for (accept, wanted) in [
-            // What Prometheus 2.42 sends.
+            // This is the header of Prometheus 2.42.
             (
                 "application/openmetrics-text;version=1.0.0,application/openmetrics-text;version=0.0.1;q=0.75,\
                  text/plain;version=0.0.4;q=0.5,*/*;q=0.1",

@@ -1,4 +1,4 @@
-//! Why a command failed: the message for the terminal and the exit code, for every program of packwatch.
+//! The failure of a command: the message for the terminal and the exit code. Every program of packwatch uses it.
 
 use crate::config::ConfigFaults;
 
@@ -15,12 +15,12 @@ pub struct Failure {
 }
 
 impl Failure {
-    /// A failure of the work itself; exit code 1.
+    /// Creates a failure of the work itself, with exit code 1.
     pub fn new(message: impl Into<String>) -> Self {
         Self { message: message.into(), code: 1 }
     }
 
-    /// A failure that another start does not fix; exit code 78.
+    /// Creates a failure that a restart does not fix, with exit code 78.
     pub fn config(message: impl Into<String>) -> Self {
         Self { message: message.into(), code: EXIT_CONFIG }
     }

@@ -1,4 +1,5 @@
-//! The log: written to journald with fields if systemd connected standard error to it, else to standard error.
+//! The log. If systemd has connected standard error to journald, lines are sent to journald with fields, else they are
+//! written to standard error.
 //!
 //! In both cases the number of lines is limited (`limit`). In: a filter from `--log`. Out: log lines.
 
@@ -26,10 +27,10 @@ use crate::quantity::Timestamp;
 /// Environment variable with the filter, used if `--log` is not given.
 pub const LOG_VARIABLE: &str = "PACKWATCH_LOG";
 
-/// Lines that are in no log because they exceeded the limit or journald did not accept them.
+/// Number of lines that are in no log because they exceeded the limit or journald did not accept them.
 static LEFT_OUT: AtomicU64 = AtomicU64::new(0);
 
-/// Crates of this program that log, in addition to `packwatch` itself.
+/// Crates of this program that log in addition to `packwatch` itself.
 const MEMBER_CRATES: [&str; 4] = ["packwatch_core", "packwatch_host", "packwatch_lab", "packwatch_uplink"];
 
 /// Counts a line that is in no log.
@@ -37,12 +38,12 @@ fn note_left_out() {
     LEFT_OUT.fetch_add(1, Ordering::Relaxed);
 }
 
-/// Lines dropped from the log since the last call.
+/// Number of lines dropped from the log since the last call.
 pub fn take_left_out() -> u64 {
     LEFT_OUT.swap(0, Ordering::Relaxed)
 }
 
-/// Starts logging; `filter` is a level (`info`) or a filter (`packwatch::io=debug,info`).
+/// Starts logging. `filter` is a level (`info`) or a filter (`packwatch::io=debug,info`).
 ///
 /// # Errors
 /// Fails if the filter cannot be parsed.
@@ -52,7 +53,7 @@ pub fn start(filter: Option<&str>) -> Result<(), String> {
     // A second start (in tests) keeps the first logger.
     let _ = match stderr_is_journal().then(Journal::new) {
         Some(Ok(journal)) => registry.with(journal.with_filter(RateLimit::default())).try_init(),
-        // Colours only on a terminal. An empty NO_COLOR counts as not set.
+        // Colours are used only on a terminal. An empty NO_COLOR counts as not set.
         _ => {
             let wanted = std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
             let ansi = wanted && std::io::stderr().is_terminal();
@@ -63,7 +64,8 @@ pub fn start(filter: Option<&str>) -> Result<(), String> {
     Ok(())
 }
 
-/// Formats the time of a line, UTC to the microsecond. tracing's own timer uses `SystemTime::now`, which panics from 2038 on 32-bit processors with musl.
+/// Formats the time of a line in UTC, to the microsecond. The timer of `tracing` is not used, because it calls
+/// `SystemTime::now`, which panics after 2038 on 32-bit processors with musl.
 struct WallClock;
 
 impl FormatTime for WallClock {
@@ -72,7 +74,7 @@ impl FormatTime for WallClock {
     }
 }
 
-/// Parses a filter; `packwatch::MODULE` means that module of every member crate.
+/// Parses a filter. `packwatch::MODULE` selects the module of that name in every member crate.
 fn targets(text: &str) -> Result<Targets, String> {
     let filter: Targets = text.parse().map_err(|error| format!("log filter '{text}': {error}"))?;
     let modules = filter.iter().filter_map(|(target, level)| Some((target.strip_prefix("packwatch::")?, level)));

@@ -1,8 +1,8 @@
-//! The replay loop: reads records, runs the core, writes results, returns a summary.
+//! The replay loop reads records, runs the core, writes results and returns a summary.
 //!
-//! Promise: the same logs and configuration give the same result files, byte for byte; a journal gives the results of the
-//! run that wrote it. Plain logs and CSV get the ticks of [`Ticks`]; journals contain their own. Wall time is used only for
-//! pacing (`speed`) and for reports.
+//! Promise: the same logs and configuration give the same result files, byte for byte. A journal gives the results of
+//! the run that wrote it. Plain logs and CSV get the ticks of [`Ticks`]; journals contain their own. Wall time is used
+//! only for pacing (`speed`) and for reports.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write};
@@ -51,7 +51,7 @@ pub struct ReplaySettings {
     pub from: Option<LogTime>,
     /// Records after this time are skipped.
     pub until: Option<LogTime>,
-    /// A longer hole in the log means that the recorder was asleep, s.
+    /// Sleep gap, s. If a hole in the log is longer, the recorder was asleep.
     pub sleep_gap_s: f64,
     /// Whether to take a snapshot.
     pub snapshot: bool,
@@ -59,7 +59,7 @@ pub struct ReplaySettings {
     pub snapshot_at: Option<LogTime>,
     /// Initial state.
     pub restore: Option<Snapshot>,
-    /// Age of that state; `None` = according to the journal, else to its stamp.
+    /// Age of the initial state. `None` = the journal states it, else the stamp of the state.
     pub away: Option<Downtime>,
     /// Store of state and history, in the daemon's format.
     pub store: Option<Recorder>,
@@ -68,7 +68,7 @@ pub struct ReplaySettings {
 }
 
 impl ReplaySettings {
-    /// Settings for the whole log, as fast as possible, storing nothing.
+    /// Settings for a replay of the whole log as fast as possible, which stores nothing.
     pub fn plain(sleep_gap_s: f64, interfaces: Vec<String>) -> Self {
         Self { sleep_gap_s, interfaces, ..Self::default() }
     }
@@ -125,14 +125,15 @@ pub struct ReplayProgress {
     pub bytes: u64,
     /// Frames passed to the core.
     pub frames: u64,
-    /// Speed so far, as a multiple of real time.
+    /// Average speed, as a multiple of real time.
     pub times_real_time: f64,
 }
 
-/// Replays `source` through a monitor without earlier input; returns the summary and the snapshot, if requested.
+/// Replays `source` through a monitor that has had no input. Returns the summary and, if requested, the snapshot.
 ///
 /// # Errors
-/// Fails if a log cannot be read, a result cannot be written, or a snapshot does not fit or its time is not reached.
+/// Fails if a log cannot be read or a result cannot be written. Also fails if a snapshot does not fit or if the log
+/// ends before the snapshot's time.
 pub fn run(
     source: &mut LogSource,
     monitor: Monitor,
@@ -141,7 +142,7 @@ pub fn run(
     report: &mut dyn FnMut(ReplayProgress),
 ) -> Result<(ReplaySummary, Option<Snapshot>), ReplayError> {
     let mut replay = Replay::new(monitor, sinks, settings)?;
-    // A replay that is paced or stops before the end of the log must not read beyond the current record.
+    // If a replay is paced or stops before the end of the log, it must not read beyond the current record.
     let one_by_one = replay.pace.speed.is_some() || replay.window.until.is_some();
     let mut batch = Batch::new(if one_by_one { 1 } else { Batch::MAX });
     let mut unreported: usize = 0;
@@ -214,7 +215,7 @@ struct Replay {
     snapshot_at: Option<Timestamp>,
     snapshot: Option<Snapshot>,
     summary: ReplaySummary,
-    /// Whether a reload of the recorded run has been noted.
+    /// Whether the summary already notes a reload of the recorded run.
     reloaded: bool,
     learned: BTreeMap<CellIndex, RecordedValues>,
     /// Cell steps counted in the restored state; `None` until the first input.
@@ -246,7 +247,7 @@ impl Replay {
         })
     }
 
-    /// Handles one record; `false` = the rest of the log is not needed.
+    /// Handles one record. Returns `false` if the rest of the log is not needed.
     fn take(&mut self, record: &Record, carries_ticks: bool) -> Result<bool, ReplayError> {
         let time = record.time;
         match self.window.judge(time) {
@@ -278,7 +279,7 @@ impl Replay {
         Ok(true)
     }
 
-    /// Notes the first reload of the recorded run: this replay may differ from there on.
+    /// Notes the first reload of the recorded run, because the results of this replay may differ after it.
     fn note_reload(&mut self, time: Timestamp) {
         if !std::mem::replace(&mut self.reloaded, true) {
             let at_s = time.secs();
@@ -430,7 +431,7 @@ fn cell_steps(monitor: &Monitor) -> u64 {
 }
 
 impl Sinks {
-    /// Flushes all files, because a paced replay may be watched.
+    /// Flushes all files, because a person may watch a paced replay.
     fn flush(&mut self) -> io::Result<()> {
         [&mut self.estimates, &mut self.events, &mut self.frames].into_iter().flatten().try_for_each(Write::flush)
     }

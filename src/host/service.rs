@@ -1,8 +1,8 @@
 //! The service: runs the core on live interfaces, with a tick every [`TICK_PERIOD_MS`](crate::monitor::TICK_PERIOD_MS).
 //!
-//! In: frames and states of the interfaces, ticks, commands. Out: frames, events, status. One task owns the core. Every input
-//! is written to the journal before the core handles it, so that a replay of the journal produces the same frames. No fault of
-//! a bus, a disk or the service manager ends the loop; SIGTERM and SIGINT end it cleanly.
+//! In: frames and states of the interfaces, ticks, commands. Out: frames, events, status. One task owns the core. Every
+//! input is written to the journal before the core handles it, so that a replay of the journal produces the same
+//! frames. No fault of a bus, a disk or the service manager ends the loop. SIGTERM and SIGINT end it cleanly.
 
 mod engine;
 mod j1939_carrier;
@@ -41,10 +41,11 @@ use live::ServiceLoop;
 use reload::Reload;
 use status_publisher::StatusPublisher;
 
-/// Frames and events waiting for the core: half a second of a full 1 Mbit/s bus.
+/// Maximum number of frames and events that wait for the core, half a second of a full 1 Mbit/s bus.
 const INBOX: usize = 4096;
 
-/// Threads for work that would block the loop: reading a configuration, long answers, the fit of a cell model. More threads would only wait for the disk.
+/// Number of threads for work that would block the loop: reading a configuration, serialising long answers, and fitting
+/// a cell model. More threads would only wait for the disk.
 const BLOCKING_THREADS: usize = 4;
 
 /// The settings of a run.
@@ -62,7 +63,7 @@ pub struct Service {
     pub events: Option<PathBuf>,
     /// Initial state.
     pub restore: Option<Snapshot>,
-    /// Age of that state.
+    /// Age of the initial state.
     pub downtime: Downtime,
     /// File for the state when the daemon stops.
     pub snapshot: Option<PathBuf>,
@@ -110,14 +111,15 @@ pub enum ServiceError {
 }
 
 impl Service {
-    /// Runs until a signal or the end of its duration.
+    /// Runs the service until a signal arrives or its duration ends.
     ///
     /// # Errors
-    /// Fails if it cannot start, or its final snapshot cannot be written.
+    /// Fails if the service cannot start, or if its final snapshot cannot be written.
     pub fn run(self) -> Result<(), ServiceError> {
         let mut builder = tokio::runtime::Builder::new_current_thread();
         let runtime = builder.enable_all().max_blocking_threads(BLOCKING_THREADS).build()?;
-        // Spawned as a task, because waking the future of `block_on` itself costs a system call per frame.
+        // The service runs as a spawned task, because waking the future of `block_on` itself costs a system call per
+        // frame.
         let served = runtime.block_on(async { tokio::spawn(self.serve()).await });
         // A running fit is abandoned and started again after the next start.
         runtime.shutdown_background();
@@ -130,7 +132,7 @@ impl Service {
         let clock = MappedClock::new(Reading::now());
         let (sender, inbox) = mpsc::channel(INBOX);
         let snapshot = self.snapshot.take();
-        // Before any file is opened, so that a second daemon does not overwrite the files of the first.
+        // The sockets are opened before any file, so that a second daemon does not overwrite the files of the first.
         let (sender_of_requests, requests) = mpsc::channel(MAX_CONNECTIONS);
         let control = ControlServer::start(&self.control, sender_of_requests).await.map_err(ServiceError::Socket)?;
         let status = StatusServer::start(&self.status).map_err(ServiceError::Socket)?;
@@ -138,7 +140,7 @@ impl Service {
         let (links, outputs) = self.start_links(clock, &sender);
         engine.links = outputs;
         drop(sender);
-        // The first input is the time of the start; the frames that it causes wait for the interfaces.
+        // The first input is a tick at the time of the start. The frames that it causes wait for the interfaces.
         engine.handle(&Record::tick(clock.now()));
         engine.report_store_health(clock.now());
         let status_publisher = StatusPublisher::new(status, self.identity(clock));

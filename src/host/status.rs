@@ -1,21 +1,22 @@
 //! Publishes the daemon's status once a second.
 //!
-//! Two Unix sockets that only write; the daemon reads nothing from a client:
+//! There are two Unix sockets. The daemon only writes to them and reads nothing from a client:
 //!
 //! | socket | what a client receives |
 //! | --- | --- |
 //! | `status.sock` | one [`StatusDocument`] as a line of JSON, then end of file |
-//! | `status-stream.sock` | the same, one line a second, until the client closes |
+//! | `status-stream.sock` | one [`StatusDocument`] as a line of JSON every second, until the client closes |
 //!
-//! * Every user who can reach the sockets may read (mode 0666), because the document contains no secrets and the exporter runs
-//!   as a separate user. Under the shipped unit only root and the exporter can reach them, because the folder of a dynamic
-//!   user's service is in a closed folder. Only the control socket can change anything; other users cannot connect to it.
+//! * Every user who can reach the sockets may read (mode 0666), because the document contains no secrets and the
+//!   exporter runs as a separate user. With the shipped unit, only root and the exporter can reach the sockets, because
+//!   the service runs as a dynamic user and systemd keeps its folder inside a closed folder. Only the control socket
+//!   can change anything, and other users cannot connect to it.
 //! * Once a second the loop copies structs into a draft and offers it. A separate thread serialises the draft and serves the
 //!   clients, so no client affects the loop. A draft offered while the thread is busy is dropped and counted.
-//! * At most [`MAX_CLIENTS`]; further ones are rejected immediately and counted. A client that does not read within
-//!   [`MAX_SILENCE`] is dropped and counted.
-//! * A document older than [`STALE`] is not sent: a client waits for a fresh one, and receives nothing if none arrives within
-//!   [`MAX_SILENCE`]. A loop that hangs therefore does not look healthy.
+//! * At most [`MAX_CLIENTS`] clients are served. Further clients are rejected immediately and counted. A client that
+//!   does not read within [`MAX_SILENCE`] is dropped and counted.
+//! * A document older than [`STALE`] is not sent. The client waits for a fresh document, and receives nothing if there
+//!   is none within [`MAX_SILENCE`]. A loop that hangs therefore does not look healthy.
 
 pub mod client;
 pub mod collect;
@@ -37,10 +38,10 @@ pub use server::StatusServer;
 
 use crate::io::unix_socket::{client_folder, runtime_folder};
 
-/// Maximum number of clients of both sockets together: many times a display, an exporter and a few scripts. Each uses a
-/// descriptor and a few kilobytes.
+/// Maximum number of clients of both sockets together. A vehicle needs far fewer: a display, an exporter and a few
+/// scripts. Each client uses a descriptor and a few kilobytes.
 pub const MAX_CLIENTS: usize = 64;
-/// Longest time for a client to read what was sent.
+/// Longest time in which a client must read a document.
 pub const MAX_SILENCE: Duration = Duration::from_secs(5);
 /// Time between documents.
 pub const PERIOD: Duration = Duration::from_secs(1);
@@ -49,7 +50,7 @@ pub const STALE: Duration = Duration::from_secs(3);
 
 /// The socket's name in the folder of the daemon.
 const FILE_NAME: &str = "status.sock";
-/// Every user may connect.
+/// File mode of the sockets: every user may connect.
 const MODE: u32 = 0o666;
 
 /// The default path of a daemon's socket.

@@ -1,7 +1,7 @@
-//! Limits how often something may happen: a burst, then once per period.
+//! Limits how often an action may happen: a burst at once, then once per period.
 //!
-//! Limits the rows and commits caused by a flickering alarm (`store`) and the lines of the log (`logging`). In: the time of
-//! each request. Out: whether it is allowed. A time before the previous one counts as no time passed.
+//! The store uses it to limit the rows and commits of a flickering alarm; `logging` uses it to limit log lines. In: the
+//! time of each request. Out: whether it is allowed. If a time is before the previous time, no time counts as passed.
 
 use crate::quantity::Timestamp;
 
@@ -28,7 +28,7 @@ impl TokenBucket {
         Self { size, tokens: size.burst, filled: None }
     }
 
-    /// Takes a token; `false` = none is left.
+    /// Takes a token. Returns `false` if no token is left.
     pub(crate) fn take(&mut self, now: Timestamp) -> bool {
         let elapsed_s = self.filled.map_or(0.0, |filled| now.since(filled).max(0.0));
         self.filled = Some(now);

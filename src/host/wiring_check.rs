@@ -1,7 +1,8 @@
 //! The loops of `packwatch doctor`: pass replayed logs or live interfaces to the core's [`WiringObserver`] and, if the
 //! configuration is valid, also to a [`Monitor`].
 //!
-//! Listening is passive: nothing is sent. An [`Interrupt`] ends both loops early with a report of what was received so far.
+//! Listening is passive: nothing is sent. An [`Interrupt`] ends both loops early. The report then covers what was
+//! received until that time.
 
 mod survey;
 
@@ -35,7 +36,7 @@ pub struct CheckProgress {
     pub seconds: f64,
 }
 
-/// Ends the loops; set by SIGINT and SIGTERM.
+/// Flag that ends the loops; SIGINT and SIGTERM set it.
 #[derive(Debug, Clone, Default)]
 pub struct Interrupt(Arc<AtomicBool>);
 
@@ -119,7 +120,7 @@ impl Session {
     }
 }
 
-/// Replays logs, at most `limit_s` of them.
+/// Replays logs, at most their first `limit_s` seconds.
 ///
 /// # Errors
 /// Fails if a log cannot be read.
@@ -208,7 +209,7 @@ pub fn listen(
         received.sort_by_key(|record| record.time);
         received.drain(..).for_each(|record| session.feed(&record));
         each(CheckProgress { bytes: 0, frames: session.observer.frames(), seconds: began.elapsed().as_secs_f64() });
-        // A full bus delivers 80 frames in that time; the kernel buffers thousands.
+        // A full bus delivers 80 frames in 10 ms, and the kernel buffers thousands.
         std::thread::sleep(Duration::from_millis(10));
     }
     session.observer.handle_listened(began.elapsed().as_secs_f64());
@@ -257,7 +258,8 @@ impl BusListener {
     }
 }
 
-/// Names of the CAN interfaces of this computer: those to which a CAN socket can be bound, sorted.
+/// Names of the CAN interfaces of this computer, sorted. An interface counts as a CAN interface if a CAN socket can be
+/// bound to it.
 fn can_interfaces(clock: MappedClock) -> Vec<String> {
     let Ok(interfaces) = nix::net::if_::if_nameindex() else { return Vec::new() };
     let names = interfaces.iter().filter_map(|interface| interface.name().to_str().ok());

@@ -1,4 +1,4 @@
-//! Answers to requests, computed from the current alarms. Pure.
+//! Computes answers to requests from the current alarms. All functions are pure.
 
 use super::MAX_LISTED;
 use super::protocol::{AlarmList, Answer, CommandOutcome, UnknownAlarms};
@@ -6,7 +6,8 @@ use crate::alarm::{Alarm, AlarmEngine, AlarmState, Selector};
 use crate::monitor::{Command, Event, EventKind, Source};
 use crate::quantity::Timestamp;
 
-/// Lists the alarms; without `all` only those that need attention (raised, about to be raised, or not yet acknowledged).
+/// Lists the alarms. Without `all`, lists only alarms that need attention (raised, about to be raised, or not yet
+/// acknowledged).
 pub fn list(engine: &AlarmEngine, time: Timestamp, all: bool) -> Answer {
     Answer::Alarms(alarm_list(engine, time, all))
 }
@@ -32,7 +33,7 @@ fn needs_attention(alarm: &Alarm) -> bool {
     }
 }
 
-/// Keeps the alarms that fit into an answer, raised ones first; returns the number of the others.
+/// Keeps the alarms that fit into an answer, raised alarms first. Returns the number of omitted alarms.
 fn shorten(alarms: &mut Vec<Alarm>) -> usize {
     let omitted = alarms.len().saturating_sub(MAX_LISTED);
     if omitted > 0 {
@@ -69,7 +70,8 @@ fn describe(which: &Selector) -> String {
     if words.is_empty() { "\"all\"".to_owned() } else { words.join(", ") }
 }
 
-/// The outcome of a command, from the events it caused and the alarms after it. The caller sets `is_stored`.
+/// Computes the outcome of a command from its events and from the alarms after the command. The caller sets
+/// `is_stored`.
 ///
 /// # Errors
 /// Fails if the core has not reported an outcome.
@@ -169,7 +171,9 @@ mod tests {
         };
         assert_eq!(clear(None, None), None);
         assert_eq!(clear(Some(Rule::CapacityLow), Some(1)), None);
-        let Some(Answer::Error(error)) = clear(Some(Rule::SocLow), Some(2)) else { panic!("not refused") };
+        let Some(Answer::Error(error)) = clear(Some(Rule::SocLow), Some(2)) else {
+            panic!("the command was not rejected")
+        };
         assert_eq!(
             error,
             "no configured alarm matches rule soc_low, cell 3 (the first is 1); rules with a threshold are: \

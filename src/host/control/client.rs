@@ -1,4 +1,4 @@
-//! Client of the control socket: sends a request to a running daemon and waits for its answer. Blocking.
+//! Client of the control socket. It sends a request to a running daemon and blocks until the answer arrives.
 
 use std::io::{self, BufRead, BufReader, ErrorKind, Read, Write};
 use std::os::unix::net::UnixStream;
@@ -10,7 +10,7 @@ use serde::Deserialize;
 use super::protocol::{Request, contents};
 use super::standard_path;
 
-/// Longest wait for a list. A daemon answers between two ticks, so one that needs longer hangs.
+/// Longest wait for a list. A daemon answers between two ticks, so a daemon that needs longer hangs.
 const PATIENCE: Duration = Duration::from_secs(5);
 /// Longest answer, bytes: ten times a thousand alarms of 400 bytes.
 const MAX_ANSWER_BYTES: u64 = 4 << 20;
@@ -22,12 +22,12 @@ pub struct ControlClient {
 }
 
 impl ControlClient {
-    /// The socket at `path`; `None` = the standard path.
+    /// A client of the socket at `path`; `None` = the standard path.
     pub fn new(path: Option<&Path>) -> Self {
         Self { path: path.map_or_else(standard_path, Path::to_owned) }
     }
 
-    /// Whether a daemon may be listening; false only for a missing or abandoned socket.
+    /// Whether a daemon may be listening. It is false only if the socket is missing or abandoned.
     pub fn is_served(&self) -> bool {
         let absent = [ErrorKind::NotFound, ErrorKind::ConnectionRefused];
         UnixStream::connect(&self.path).map_or_else(|error| !absent.contains(&error.kind()), |_| true)
@@ -36,7 +36,7 @@ impl ControlClient {
     /// Sends a request; returns the answer as a line of JSON.
     ///
     /// # Errors
-    /// Fails if no daemon answers; names the socket and the next step.
+    /// Fails if no daemon answers. The message names the socket and the next step.
     pub fn ask_line(&self, request: Request) -> Result<Vec<u8>, String> {
         self.exchange(request).map_err(|error| self.explain(request, &error))
     }
@@ -53,7 +53,7 @@ impl ControlClient {
         let mut stream = UnixStream::connect(&self.path)?;
         stream.set_read_timeout(Some(patience(request)))?;
         stream.set_write_timeout(Some(PATIENCE))?;
-        // A daemon without a free slot may already have answered and closed.
+        // A daemon without a free slot may already have answered and closed the connection.
         let written = stream.write_all(request.to_line().as_bytes());
         let mut line = Vec::new();
         BufReader::new(stream.take(MAX_ANSWER_BYTES)).read_until(b'\n', &mut line)?;

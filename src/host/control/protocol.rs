@@ -8,7 +8,8 @@
 //! | `poll` | `standby`: stops sending diagnostic requests | [`CommandOutcome`] |
 //! | `test` | `rule`, `seconds` (0 ends a test) | [`CommandOutcome`] |
 //!
-//! Every line has `version`. Any other line gets an error with the value found and the values allowed.
+//! Every line has the key `version`. The answer to an invalid line is an error with the value found and the values
+//! allowed.
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
@@ -49,7 +50,7 @@ pub enum Answer {
     Alarms(AlarmList),
     /// The answer to a command.
     Outcome(CommandOutcome),
-    /// The request failed; states the value found and the values allowed.
+    /// The request failed. The text states the value found and the values allowed.
     Error(String),
 }
 
@@ -60,11 +61,11 @@ pub struct AlarmList {
     pub time: Timestamp,
     /// Number of configured thresholds.
     pub thresholds: usize,
-    /// Thresholds with alarms that cannot be evaluated.
+    /// The thresholds that have alarms that cannot be evaluated.
     pub unknown: Vec<UnknownAlarms>,
     /// Alarms, ordered by rule, severity and cell.
     pub alarms: Vec<Alarm>,
-    /// Number of further alarms that did not fit.
+    /// Number of further alarms that did not fit into the answer.
     pub omitted: usize,
 }
 
@@ -90,13 +91,13 @@ pub struct CommandOutcome {
     pub refused: u32,
     /// The refused alarms.
     pub refused_alarms: Vec<Alarm>,
-    /// Whether its changes are on disk, so that a power cut does not undo them. `None` = nothing stored has changed, or no state
-    /// is kept.
+    /// Whether the changes of the command are on disk, so that a power cut does not undo them. `None` = the command
+    /// changed nothing that is stored, or no state is kept.
     #[serde(default)]
     pub is_stored: Option<bool>,
 }
 
-/// The keys that every answer has, and its contents.
+/// The keys that every answer has, and the contents of the answer.
 #[derive(Serialize)]
 struct Envelope<'a, T> {
     version: u64,
@@ -156,7 +157,7 @@ impl Request {
         format!("{keys}\n")
     }
 
-    /// Whether it is a command.
+    /// Whether the request is a command.
     pub const fn changes_something(&self) -> bool {
         matches!(self, Self::Command(_))
     }
@@ -183,7 +184,7 @@ impl Answer {
 /// Parses the contents of an answer.
 ///
 /// # Errors
-/// The error in the answer, or why the answer is not valid.
+/// Returns the error in the answer, or the reason why the answer is not valid.
 pub fn contents<T: for<'de> Deserialize<'de>>(line: &[u8]) -> Result<T, String> {
     let strange = |what: String| format!("unexpected answer of the daemon: {what}");
     let value: Value = serde_json::from_slice(line).map_err(|error| strange(error.to_string()))?;

@@ -16,7 +16,7 @@ use crate::io::event_log::command_words;
 use crate::io::place::PlaceSetting;
 use crate::io::unix_socket::{BoundSocket, SocketFile, bind};
 
-/// Pause after a connection could not be accepted (no descriptor left); an immediate retry would fail too.
+/// Pause after a connection could not be accepted because no descriptor is left. An immediate retry would fail too.
 const ACCEPT_PAUSE: Duration = Duration::from_secs(1);
 
 /// A request on its way to the loop.
@@ -36,10 +36,10 @@ pub struct ControlServer {
 }
 
 impl ControlServer {
-    /// Opens the socket, whose requests go to `requests`. `None` = it failed (logged).
+    /// Opens the socket. Its requests go to `requests`. Returns `None` if the socket cannot be opened (logged).
     ///
     /// # Errors
-    /// Fails if another daemon uses it, or a requested socket cannot be created.
+    /// Fails if another daemon uses the socket, or if a socket that the user requested cannot be created.
     pub async fn start(setting: &PlaceSetting, requests: mpsc::Sender<PendingRequest>) -> Result<Option<Self>, String> {
         let Some((path, is_needed)) = setting.resolve(|| (daemon_path(), false)) else { return Ok(None) };
         match bind(&path, MODE).await {
@@ -56,7 +56,7 @@ impl ControlServer {
         requests: mpsc::Sender<PendingRequest>,
         max_silence: Duration,
     ) -> std::io::Result<Self> {
-        // The daemon's own user, as the kernel reports it for a peer.
+        // This is the daemon's own user, as the kernel reports it for a peer.
         let own_uid = UnixStream::pair()?.0.peer_cred()?.uid();
         tracing::info!(path = %bound.file.path.display(), "control socket open");
         let mut tasks = JoinSet::new();
@@ -104,7 +104,7 @@ async fn accept(listener: UnixListener, context: ConnectionContext) {
     }
 }
 
-/// Rejects a connection; sends the reason only if that does not block.
+/// Rejects a connection. The reason is sent only if this does not block.
 fn refuse(stream: &UnixStream) {
     tracing::warn!(limit = MAX_CONNECTIONS, "connection to the control socket rejected: too many at once");
     let error = format!("{MAX_CONNECTIONS} connections are open, which is the limit; try again later");
@@ -118,7 +118,7 @@ async fn serve_connection(stream: UnixStream, peer: UCred, context: &ConnectionC
     let mut line = Vec::new();
     loop {
         line.clear();
-        // One byte more than allowed, to detect a line that is too long.
+        // One byte more than allowed is read, to detect a line that is too long.
         let mut limited = (&mut reader).take(MAX_REQUEST_BYTES as u64 + 1);
         match timeout(context.max_silence, limited.read_until(b'\n', &mut line)).await {
             Ok(Ok(0) | Err(_)) => return,
@@ -166,7 +166,8 @@ async fn ask(context: &ConnectionContext, request: Request) -> Answer {
     answered.await.unwrap_or_else(|_| stopping())
 }
 
-/// Writes an answer. An error ends the connection; it is also returned if the client does not read in time.
+/// Writes an answer. Returns an error, which ends the connection, if the write fails or the client does not read in
+/// time.
 async fn send(write: &mut OwnedWriteHalf, answer: Answer, context: &ConnectionContext) -> std::io::Result<()> {
     // Serialising a long list takes milliseconds, so it does not run on the loop's thread.
     let line = tokio::task::spawn_blocking(move || answer.to_line()).await?;

@@ -1,4 +1,4 @@
-//! Tests a rule's alarm from outside: asks the daemon to send it and listens for the frames on the bus.
+//! Tests the alarm of a rule from outside: asks the daemon to send the alarm, and listens for its frames on the bus.
 //!
 //! In: the daemon's configuration, a rule, a duration. Out: a [`ChannelReport`] per interface. Frames are received on a separate
 //! socket with the kernel's stamps. Alarm frames without the test marker are genuine alarms and are counted separately.
@@ -21,9 +21,9 @@ use crate::io::stop::Stop;
 use crate::monitor::{BusEvent, Command, RecordKind};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// Period of reading the sockets; results do not depend on it because stamps are the kernel's.
+/// Period of reading the sockets. Results do not depend on it, because the kernel stamps the frames.
 const READ_PERIOD: Duration = Duration::from_millis(10);
-/// Longest delay of the last frame after the end of the test: fifty ticks of the daemon.
+/// Longest delay of the last frame after the end of the test, equal to fifty ticks of the daemon.
 const GRACE: Duration = Duration::from_millis(500);
 
 /// The alarm frames of one interface.
@@ -39,7 +39,7 @@ pub struct ChannelReport {
     pub protection: Option<StatusCounts>,
     /// Frames dropped by the kernel.
     pub dropped: u64,
-    /// Why listening ended early.
+    /// Why listening ended early; `None` = it did not.
     pub error: Option<String>,
 }
 
@@ -48,13 +48,13 @@ pub struct ChannelReport {
 pub struct ObservedFrames {
     /// Frames of the tested rule with the test marker.
     pub tests: u64,
-    /// Time of the first of these.
+    /// Time of the first frame of the tested rule with the test marker.
     pub first: Option<Timestamp>,
-    /// Time of the last of these.
+    /// Time of the last frame of the tested rule with the test marker.
     pub last: Option<Timestamp>,
-    /// Whether one of these reported the end of the test.
+    /// Whether one of the frames with the test marker reported the end of the test.
     pub ended: bool,
-    /// Frames of other rules with the test marker: another test is running.
+    /// Frames of other rules with the test marker. They show that another test is running.
     pub foreign: u64,
     /// Frames without the marker, by the codes of rule and state.
     pub genuine: BTreeMap<(u8, u8), u64>,
@@ -68,7 +68,7 @@ impl ChannelReport {
         self.observed.tests > 0 && self.error.is_none() && self.is_intact()
     }
 
-    /// Whether every frame was intact and none was missing; true for unprotected frames.
+    /// Whether every frame was intact and no frame was missing. It is true for unprotected frames.
     pub fn is_intact(&self) -> bool {
         let good = [Status::Ok, Status::Initial];
         self.protection.is_none_or(|counts| counts.iter().all(|(status, count)| count == 0 || good.contains(&status)))

@@ -1,9 +1,9 @@
-//! Log lines as journal entries with fields, over journald's native protocol (systemd.io/JOURNAL_NATIVE_PROTOCOL).
+//! Sends log lines to journald as entries with fields, over its native protocol (systemd.io/JOURNAL_NATIVE_PROTOCOL).
 //!
-//! An entry has `MESSAGE` (the text, with the fields as `name=value`, so that `systemctl status` shows them), `PRIORITY`,
-//! `SYSLOG_IDENTIFIER`, `TARGET`, its source location, each field as `PACKWATCH_NAME`, and, for messages that programs search
-//! for, a `MESSAGE_ID`. Nothing here blocks: an entry that a stalled journald does not accept is dropped and counted, so that
-//! the estimation loop, which also logs, continues.
+//! An entry has `MESSAGE`, `PRIORITY`, `SYSLOG_IDENTIFIER`, `TARGET`, its source location, and each field as
+//! `PACKWATCH_NAME`. `MESSAGE` is the text with the fields as `name=value`, so that `systemctl status` shows them.
+//! Messages that programs search for also have a `MESSAGE_ID`. Nothing here blocks, because the estimation loop also
+//! logs. If journald stalls and does not accept an entry, the entry is dropped and counted.
 
 use std::fmt::{self, Write as _};
 use std::io::{self, ErrorKind};
@@ -17,7 +17,7 @@ use super::note_left_out;
 
 /// The socket of journald.
 const SOCKET: &str = "/run/systemd/journal/socket";
-/// Longest value, bytes. An entry with a few such values fits into a datagram.
+/// Longest value, bytes. An entry with a few values of this length fits into a datagram.
 const MAX_VALUE: usize = 8 * 1024;
 /// Permanent ids of messages that programs search for (`journalctl MESSAGE_ID=...`), by their text.
 const MESSAGE_IDS: [(&str, &str); 3] = [
@@ -40,7 +40,8 @@ impl Journal {
     pub(super) fn new() -> io::Result<Self> {
         let socket = UnixDatagram::unbound()?;
         socket.set_nonblocking(true)?;
-        // journald ignores an empty datagram. Sending one fails if journald does not listen; a full queue means that it does.
+        // journald ignores an empty datagram. Sending it fails if journald does not listen. If the queue is full,
+        // journald listens.
         match socket.send_to(&[], SOCKET) {
             Err(error) if error.kind() != ErrorKind::WouldBlock => Err(error),
             Ok(_) | Err(_) => Ok(Self { socket }),
@@ -90,7 +91,8 @@ fn priority(level: Level) -> &'static str {
     }
 }
 
-/// `PACKWATCH_CELL` for `cell`. journald allows capital letters, digits and underscores.
+/// Returns the journal's name of a field, such as `PACKWATCH_CELL` for `cell`. journald allows capital letters, digits
+/// and underscores.
 fn field_name(name: &str) -> String {
     let allowed = |c: char| if c.is_ascii_alphanumeric() { c.to_ascii_uppercase() } else { '_' };
     format!("PACKWATCH_{}", name.chars().map(allowed).collect::<String>())

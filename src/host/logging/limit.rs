@@ -1,9 +1,9 @@
-//! Limits the number of log lines per kind: a burst, then a low rate. Further lines are dropped and counted; the count is
-//! logged once a minute.
+//! Limits the number of log lines of each kind: a burst, then a low rate. Further lines are dropped and counted. The
+//! count is logged once a minute.
 //!
-//! A bus that changes state all day must not wear out the flash. A kind of line is a place in the program, so a thousand lines
-//! about cells do not suppress the line about an interface. Two kinds are never dropped: lines about alarms, which the rules
-//! debounce, and lines below `info`, which are logged only on request.
+//! A bus that changes state all day must not wear out the flash memory. Lines are of one kind if the same place in the
+//! program logs them, so a thousand lines about cells do not suppress the line about an interface. Two kinds are never
+//! dropped: lines about alarms, which the rules debounce, and lines below `info`, which are logged only on request.
 
 use std::collections::HashMap;
 use std::sync::Mutex;
@@ -18,11 +18,11 @@ use super::note_left_out;
 use crate::quantity::Timestamp;
 use crate::token_bucket::{BucketSize, TokenBucket};
 
-/// Limit for each kind of line. The burst covers a pack of 96 cells that loses its input, with a line per signal. The rate gives
-/// about 30 MB of journal in a day of signals that come and go all the time.
+/// Limit for each kind of line. The burst covers a pack of 96 cells that loses its input, with a line per signal. If
+/// signals come and go all day, the rate gives about 30 MB of journal.
 const LINES: BucketSize = BucketSize { burst: 150.0, period_s: 2.0 };
 
-/// The limit, with a bucket per place in the program that logs.
+/// The limit, with a bucket for each place in the program that logs.
 #[derive(Debug)]
 pub(super) struct RateLimit {
     began: Instant,
@@ -45,7 +45,7 @@ impl<S: Subscriber> Filter<S> for RateLimit {
             return true;
         }
         let now = Timestamp::from_secs(self.began.elapsed().as_secs_f64());
-        // A panic while the lock was held leaves the buckets valid.
+        // If a thread panics while it holds the lock, the buckets are still valid.
         let mut buckets = self.buckets.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         let is_written = buckets.entry(event.metadata().callsite()).or_insert(TokenBucket::new(LINES)).take(now);
         if !is_written {
@@ -55,7 +55,8 @@ impl<S: Subscriber> Filter<S> for RateLimit {
     }
 }
 
-/// Whether a line is about an alarm (it has the rule's name) or about dropped lines (it is written once a minute).
+/// Whether a line is exempt from the limit. Lines about alarms have the field `rule`; the line about dropped lines is
+/// written only once a minute.
 fn is_exempt(event: &Event<'_>) -> bool {
     struct Exempt(bool);
     impl Visit for Exempt {
@@ -90,7 +91,7 @@ mod tests {
             (0..1000).for_each(|n| tracing::warn!(n, "signal lost"));
             let others = count.swap(0, Ordering::Relaxed);
             assert!((150..=155).contains(&others), "{others} of 1000 lines");
-            // Another kind of line has its own bucket.
+            // Lines of another kind have their own bucket.
             tracing::info!("interface up");
             assert_eq!(count.swap(0, Ordering::Relaxed), 1);
             (0..1000).for_each(|n| tracing::warn!(rule = ?"soc_low", n, "alarm raised"));

@@ -15,14 +15,14 @@ pub struct CellSummary {
     pub cell: u16,
     /// SOC, fraction.
     pub soc: f64,
-    /// Its standard deviation, fraction.
+    /// Standard deviation of the SOC, fraction.
     pub soc_std: f64,
     /// Capacity, usable capacity after the last capacity update, resistance relative to new.
     #[serde(flatten)]
     pub values: RecordedValues,
 }
 
-/// The latest estimate of every cell that has one, combined with its last learned values.
+/// The latest estimate of each cell (if it has one), combined with the cell's last learned values.
 pub(super) fn summaries(monitor: &Monitor, learned: &BTreeMap<CellIndex, RecordedValues>) -> Vec<CellSummary> {
     let of = |estimate: Estimate| {
         let learned = learned.get(&estimate.cell).copied().unwrap_or_default();

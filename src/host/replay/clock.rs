@@ -26,7 +26,7 @@ impl LogTime {
 pub(super) struct TimeWindow {
     from: Option<LogTime>,
     pub(super) until: Option<LogTime>,
-    /// The log's first stamp, inside the window or not.
+    /// The log's first stamp, even if it is outside the window.
     pub(super) first: Option<Timestamp>,
 }
 
@@ -58,7 +58,7 @@ pub(super) struct RecordSpan {
     sleep_gap_ns: i64,
     pub(super) first: Option<Timestamp>,
     pub(super) latest: Option<Timestamp>,
-    /// In nanoseconds, so that the sum of millions of steps is exact.
+    /// Covered time without holes. Nanoseconds keep the sum of millions of steps exact.
     awake_ns: i64,
     pub(super) started: Instant,
 }
@@ -74,7 +74,7 @@ impl RecordSpan {
         }
     }
 
-    /// Adds a record; returns whether it follows a hole.
+    /// Adds a record. Returns whether the record follows a hole.
     pub(super) fn advance(&mut self, time: Timestamp) -> bool {
         self.first.get_or_insert(time);
         let latest = *self.latest.get_or_insert(time);
@@ -108,7 +108,7 @@ impl Pace {
         Self { speed, anchor: None }
     }
 
-    /// Restarts the pace at the next record, so that holes and unknown gaps are skipped.
+    /// Restarts the pace at the next record, so that the replay skips holes and unknown gaps.
     pub(super) fn rebase(&mut self) {
         self.anchor = None;
     }

@@ -1,4 +1,5 @@
-//! A monitor that the caller feeds with rows of values or frames; the driver adds the ticks of a replay between them.
+//! Drives a monitor. The caller feeds it rows of values or frames, and the driver adds the ticks of a replay between
+//! them.
 //!
 //! In: rows (A, positive = discharge; V; degrees C) or frames, with their times. Out: the monitor's [`Outputs`], which the
 //! caller clears. Promise: `packwatch replay` with a log of the same inputs gives the same outputs.
@@ -18,14 +19,15 @@ pub struct MonitorDriver {
     row_frames: RowFrames,
     ticks: Ticks,
     frames: Vec<(BusIndex, Frame)>,
-    /// Outputs since the caller last cleared them.
+    /// Outputs since the caller last cleared this field.
     pub out: Outputs,
-    /// Values that no frame can carry.
+    /// Number of values that no frame can carry.
     pub uncarried_values: usize,
 }
 
 impl MonitorDriver {
-    /// A monitor before its first input. A gap of more than `sleep_gap_s` (s) means that the recorder was asleep.
+    /// Creates a monitor before its first input. A gap of more than `sleep_gap_s` (s) means that the recorder was
+    /// asleep.
     pub fn new(config: MonitorConfig, sleep_gap_s: f64) -> Self {
         Self {
             row_frames: RowFrames::new(&config),
@@ -37,7 +39,7 @@ impl MonitorDriver {
         }
     }
 
-    /// Handles one row; `None` and NaN mean no value.
+    /// Handles one row. `None` and NaN mean that there is no value.
     pub fn handle_row(&mut self, time: Timestamp, values: &[(Channel, Option<f64>)]) {
         self.advance(time);
         let mut frames = std::mem::take(&mut self.frames);
@@ -61,7 +63,7 @@ impl MonitorDriver {
         self.monitor.handle(&Record::unknown_gap(time), &mut self.out);
     }
 
-    /// Ends the record; its last samples become estimates.
+    /// Ends the input, so that the last samples become estimates.
     pub fn finish(&mut self) {
         self.ticks.sleep();
         self.send_ticks();

@@ -1,16 +1,17 @@
 //! Processes many items on several threads and returns the results in the order of the items.
 //!
-//! Promise: memory for waiting results is bounded by the number of threads, not of items, because no thread starts an item far
-//! beyond the first unfinished one.
+//! Promise: the number of threads, not the number of items, bounds the memory for waiting results, because no thread
+//! starts an item far beyond the first unfinished item.
 
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Mutex, PoisonError};
 use std::thread;
 
-/// Items per thread that may be started beyond the first unfinished one, so that a long item does not stop the others soon.
+/// Number of items per thread that may be started beyond the first unfinished item. It is above 1, so that a long item
+/// does not stop the other threads soon.
 const AHEAD: usize = 4;
 
-/// Items not yet started, and the queue of receivers for results, in the same order.
+/// Items that are not yet started, and the queue of receivers for their results, in the same order.
 struct Schedule<'a, T, R> {
     items: std::slice::Iter<'a, T>,
     results: SyncSender<Receiver<R>>,
@@ -25,8 +26,9 @@ impl<'a, T, R> Schedule<'a, T, R> {
     }
 }
 
-/// Passes every item to `work` on up to `jobs` threads, and each result to `take` on this thread, in the order of the items and
-/// as soon as all earlier results are done. After `take` returns `false`, no further item is started and no result passed.
+/// Passes every item to `work` on up to `jobs` threads. Passes each result to `take` on this thread, in the order of
+/// the items, as soon as all earlier results are done. After `take` has returned `false`, no further item is started
+/// and no further result is passed.
 pub fn in_order<T: Sync, R: Send>(
     items: &[T],
     jobs: usize,
@@ -42,11 +44,11 @@ pub fn in_order<T: Sync, R: Send>(
         for _ in 0..jobs {
             scope.spawn(|| {
                 while let Some((item, result)) = begin() {
-                    let _ = result.send(work(item)); // fails if no more results are wanted
+                    let _ = result.send(work(item)); // sending fails if no more results are wanted
                 }
             });
         }
-        let queue = queue; // dropped with this block, so that no thread waits for room in it
+        let queue = queue; // the queue is dropped with this block, so that no thread waits for room in it
         // A thread that panics drops its channel without a result.
         let _ = items.iter().try_for_each(|item| take(item, queue.recv().ok()?.recv().ok()?).then_some(()));
     });
@@ -64,7 +66,7 @@ mod tests {
         for jobs in [0, 1, 3, 500] {
             let mut seen = Vec::new();
             let work = |item: &usize| {
-                // Early items take the longest.
+                // The first items take the longest.
                 (0..(200 - item) * 50).for_each(|_| std::hint::spin_loop());
                 item * 2
             };

@@ -1,4 +1,4 @@
-//! Checks of frames before they are decoded (end-to-end protection, dropped frames), for the summary of a replay.
+//! Summarises, for a replay, the checks of frames before they are decoded: end-to-end protection and dropped frames.
 
 use std::collections::BTreeMap;
 

@@ -1,4 +1,4 @@
-//! How to read logs with a configuration: the reader's settings, completed from the configuration.
+//! Settings for reading logs with a configuration: the user's settings, completed from the configuration.
 
 use std::path::PathBuf;
 
@@ -12,24 +12,24 @@ use crate::monitor::MonitorConfig;
 use crate::quantity::BusIndex;
 use crate::sample::VoltageSource;
 
-/// Default sleep gap: a longer hole in a log means that the recorder was asleep, s.
+/// Default sleep gap, s. If a hole in a log is longer, the recorder was asleep.
 pub const SLEEP_GAP_S: f64 = 30.0;
 
-/// How to read logs.
+/// Settings for reading logs.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct LogReading {
-    /// Whether a malformed line ends the reading.
+    /// Whether reading ends at the first malformed line.
     pub strict: bool,
-    /// CSV: maps roles to columns, see [`CsvOptions::columns`].
+    /// For CSV logs: maps roles to columns, see [`CsvOptions::columns`].
     pub columns: Vec<(String, String)>,
-    /// CSV: whether positive current is charge.
+    /// For CSV logs: whether a positive current is a charge.
     pub charge_positive: bool,
-    /// CSV: table with the section column and `start`.
+    /// For CSV logs: table with the section column and `start`.
     pub start_times: Option<PathBuf>,
 }
 
 impl LogReading {
-    /// The options for reading a log with this configuration.
+    /// Returns the options for reading a log with this configuration.
     pub fn options(&self, config: &Config) -> LogOptions {
         let sample = &config.monitor.sample;
         LogOptions {
@@ -58,7 +58,7 @@ pub struct RowFrames {
 }
 
 impl RowFrames {
-    /// An encoder for the input signals of this configuration.
+    /// Creates an encoder for the input signals of this configuration.
     pub fn new(config: &MonitorConfig) -> Self {
         Self {
             encoder: InputEncoder::new(&config.input).with_answers(&config.answers),
@@ -66,7 +66,8 @@ impl RowFrames {
         }
     }
 
-    /// Appends the frames that carry `values` (`None` and NaN: no value); returns how many values no frame can carry.
+    /// Appends the frames that carry `values` (`None` and NaN mean no value). Returns the number of values that no
+    /// frame can carry.
     pub fn encode(&mut self, values: &[(Channel, Option<f64>)], frames: &mut Vec<(BusIndex, Frame)>) -> usize {
         let uncarried = self.encoder.encode(values, frames);
         self.protector.protect(frames);

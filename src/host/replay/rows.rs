@@ -31,7 +31,7 @@ pub(super) fn write_estimates_header(out: &mut impl Write) -> io::Result<()> {
     writeln!(out, "{}", ESTIMATE_COLUMNS.join(","))
 }
 
-/// Writes one row: floats in the shortest form that reads back the same, NaN as an empty field.
+/// Writes one row. Floats have the shortest form that parses to the same value; NaN is an empty field.
 pub(super) fn write_estimate(out: &mut impl Write, estimate: &Estimate) -> io::Result<()> {
     let e = estimate;
     let nanos = e.time.nanos();

@@ -1,4 +1,4 @@
-//! Summary of a replay: counts, alarms, the cells at the end.
+//! Summary of a replay: counts, alarms, and the cells at the end.
 
 use std::collections::BTreeMap;
 
@@ -13,7 +13,7 @@ use crate::quantity::CellIndex;
 use crate::quantity::catalogue::RecordedValues;
 use crate::status::document::{ControllerStatus, MessageFlood};
 
-/// Maximum number of raised alarms that are listed; all are counted.
+/// Maximum number of raised alarms that are listed. All raised alarms are counted.
 const MAX_LISTED_ALARMS: usize = 1000;
 
 /// Summary of a replay.
@@ -26,19 +26,19 @@ pub struct ReplaySummary {
     pub skipped_records: u64,
     /// Ticks passed to the core.
     pub ticks: u64,
-    /// Estimates (counted only if they are written).
+    /// Number of estimates, counted only if they are written.
     pub estimates: u64,
     /// Frames that would be sent.
     pub frames_out: u64,
-    /// Bad readings of signals that became good again.
+    /// Number of bad readings of signals that became good again.
     pub bad_readings: u64,
     /// Protected input messages.
     pub protected: Vec<ProtectedSummary>,
-    /// Messages with frames dropped because their rate was too high.
+    /// Messages whose frames were dropped because their rate was too high.
     pub dropped: Vec<MessageFlood>,
     /// Controllers that answer diagnostic requests.
     pub controllers: Vec<ControllerStatus>,
-    /// Number of events by name; alarms by change.
+    /// Number of events by name. Alarms are counted by change.
     pub events: BTreeMap<String, u64>,
     /// The first 1,000 alarms raised.
     pub alarms_raised: Vec<Event>,
@@ -46,7 +46,7 @@ pub struct ReplaySummary {
     pub cells: Vec<CellSummary>,
     /// Learned offset of the current sensor at the end, A: reading minus true current, positive = discharge.
     pub current_offset_a: Option<f64>,
-    /// Its standard deviation, A.
+    /// Standard deviation of the learned offset, A.
     pub current_offset_std_a: Option<f64>,
     /// First stamp, s.
     pub first_s: Option<f64>,
@@ -95,7 +95,7 @@ pub(super) fn note_event(
     *summary.events.entry(name).or_default() += 1;
 }
 
-/// VmHWM of /proc/self/status.
+/// Peak resident memory, from VmHWM in /proc/self/status, KiB.
 pub(super) fn peak_memory_kib() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?.trim().strip_suffix("kB")?.trim().parse().ok()

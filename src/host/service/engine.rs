@@ -1,4 +1,5 @@
-//! The core with its journal, log, files and store. In: one input. Out: frames and events, dispatched.
+//! Runs the core with its journal, log, files and store. In: one input. Out: frames and events, sent to their
+//! destinations.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -31,7 +32,7 @@ use crate::store::{HISTORY_SOURCE, STATE_SOURCE, StateCandidate, Store, StorePro
 pub(super) struct Engine {
     pub(super) monitor: Monitor,
     pub(super) outputs: Outputs,
-    /// Where its frames are sent; empty before the start and after the stop.
+    /// Outputs of the interfaces for the core's frames; empty before the start and after the stop.
     pub(super) links: Vec<LinkOutput>,
     /// Key of authenticated frames.
     key: Option<CanKey>,
@@ -56,9 +57,9 @@ pub(super) struct Engine {
     pub(super) readiness: Readiness,
     /// The latest events, for the status document.
     pub(super) recent: RecentEvents,
-    /// Progress of the store; `None` = not yet reported.
+    /// Progress of the store; `None` = no progress was reported.
     progress: Option<StoreProgress>,
-    /// Results that were announced before they were stored.
+    /// Number of results that were announced before they were stored.
     late: u64,
 }
 
@@ -71,7 +72,8 @@ impl Engine {
         let mut monitor = Monitor::new(service.config.monitor.clone());
         let now = clock.now();
         let mut stamped_s = 0.0;
-        // Before any file is opened, so that a failed start keeps the recording of an earlier run.
+        // The state is restored before any file is opened, so that a failed start keeps the recording of an earlier
+        // run.
         let (downtime, unfit) = if let Some(snapshot) = service.restore.take() {
             stamped_s = now.since(snapshot.time);
             monitor.restore(snapshot, service.downtime)?;
@@ -124,8 +126,8 @@ impl Engine {
         })
     }
 
-    /// Handles one record; checks the authenticator of an authenticated frame first. Returns the ticket of the commit with the
-    /// record's changes; `None` = nothing to store, or no store.
+    /// Handles one record. The authenticator of an authenticated frame is checked first. Returns the ticket of the
+    /// commit with the record's changes; `None` = nothing to store, or no store.
     pub(super) fn handle(&mut self, record: &Record) -> Option<u64> {
         if let RecordKind::Frame { bus, frame } = &record.kind
             && let Some(check) = self.monitor.mac_check(*bus, frame)
@@ -148,7 +150,7 @@ impl Engine {
     /// Applies another configuration to the core, and records that in the journal.
     ///
     /// # Errors
-    /// Why the core rejects it; nothing has changed then.
+    /// Returns the reasons why the core rejects the configuration. In this case nothing has changed.
     pub(super) fn reconfigure(&mut self, config: MonitorConfig, time: Timestamp) -> Result<Reconfigured, Vec<String>> {
         self.outputs.clear();
         let changed =
@@ -180,7 +182,7 @@ impl Engine {
         ticket
     }
 
-    /// Commits learned results. Their announcement waits for the commit unless the store has failed.
+    /// Commits learned results. Unless the store has failed, their announcement waits for the commit.
     fn commit_learned(&mut self, now: Timestamp) -> Option<u64> {
         let ticket = self.store.as_mut()?.learned(&self.outputs.events, &self.monitor, now)?;
         if self.store_works {
@@ -189,7 +191,7 @@ impl Engine {
         Some(ticket)
     }
 
-    /// The store's progress, updated with every change; `None` = no store.
+    /// A receiver of the store's progress, updated with every change; `None` = no store.
     pub(super) fn store_progress(&self) -> Option<watch::Receiver<StoreProgress>> {
         self.store.as_ref().map(Store::progress)
     }
@@ -227,7 +229,7 @@ impl Engine {
         self.barrier.release(u64::MAX, |transmit| send(&self.links, self.key.as_ref(), transmit));
     }
 
-    /// Sends frames that have waited too long, and lets the store write its checkpoints; called with every tick.
+    /// Sends frames that have waited too long, and lets the store write its checkpoints. It is called with every tick.
     pub(super) fn poll_store(&mut self, time: Timestamp) {
         if let Some(ticket) = self.barrier.overdue(Instant::now()) {
             self.barrier.release(ticket, |transmit| send(&self.links, self.key.as_ref(), transmit));
@@ -243,9 +245,9 @@ impl Engine {
         self.report_store_health(time);
     }
 
-    /// Reports to the core whether files can be written, if that has changed.
+    /// Reports to the core whether files can be written, if this has changed.
     pub(super) fn report_store_health(&mut self, time: Timestamp) {
-        // The core receives this input even if the lost file is the journal.
+        // The core receives this report even if the journal itself cannot be written.
         let works = self.store_works && self.has_room && !self.has_lost_file;
         if self.reported_works != Some(works) {
             self.reported_works = Some(works);
@@ -284,12 +286,13 @@ fn send(links: &[LinkOutput], key: Option<&CanKey>, transmit: &Transmit) {
     match (transmit.secured, key) {
         (None, _) => link.send(transmit.frame),
         (Some(secured), Some(key)) => link.send(secured.seal(&transmit.frame, |bytes| key.mac(bytes))),
-        // Unreachable because the start fails without a key. A frame without its authenticator must never be sent.
+        // This case cannot occur, because the start fails without a key. A frame without its authenticator must never
+        // be sent.
         (Some(_), None) => {}
     }
 }
 
-/// A new state with the learned values in the history; `None` = the history has none for these cells.
+/// Creates a state from the learned values in the history; `None` = the history has no values for these cells.
 fn state_of_history(config: &MonitorConfig, learned: &[LearnedCell]) -> Option<StateCandidate> {
     if learned.is_empty() {
         return None;
@@ -302,8 +305,9 @@ fn state_of_history(config: &MonitorConfig, learned: &[LearnedCell]) -> Option<S
     Some(StateCandidate { snapshot: monitor.snapshot(), downtime: Downtime::Unknown, source: HISTORY_SOURCE })
 }
 
-/// Restores the first valid stored state. Returns its age, and why the database's state does not fit if it does not. Writes the
-/// state next to a journal, because a replay of the journal starts from it.
+/// Restores the first valid stored state. Returns the age of this state and, if the state in the state file does not
+/// fit, the reason. If there is a journal, writes the state next to it, because a replay of the journal starts from
+/// this state.
 fn restore_first_valid(
     monitor: &mut Monitor,
     states: Vec<StateCandidate>,
@@ -331,7 +335,7 @@ fn restore_first_valid(
     (None, unfit)
 }
 
-/// Writes to a file, if there is one. If the file cannot be written, closes it and returns `true`.
+/// Writes to a file, if it is open. If the file cannot be written, closes it and returns `true`.
 fn write_or_stop<F>(file: &mut Option<F>, what: &str, write: impl FnOnce(&mut F) -> io::Result<()>) -> bool {
     let Some(Err(error)) = file.as_mut().map(write) else { return false };
     tracing::error!(what, %error, "file cannot be written, closed");

@@ -24,7 +24,8 @@ use crate::monitor::{Command, Record, TICK_PERIOD_MS};
 use crate::quantity::Timestamp;
 use crate::store::StoreProgress;
 
-/// Records handled between two checks of the timer; a full bus delivers fewer during one tick.
+/// Maximum number of records handled between two checks of the timer. A full bus delivers fewer records during one
+/// tick.
 const BATCH: usize = 256;
 /// Time for the interfaces to send queued frames when the daemon stops.
 const DRAIN_LIMIT: Duration = Duration::from_millis(500);
@@ -54,7 +55,7 @@ impl ServiceLoop {
         let watchdog = sd_notify::watchdog_enabled().map(|period| period / 2);
         let (mut fed, mut flushed) = (Instant::now(), Instant::now());
         loop {
-            // In this order, so that a busy bus delays neither the stop nor the ticks.
+            // The branches have this order, so that a busy bus delays neither the stop nor the ticks.
             tokio::select! {
                 biased;
                 () = stop.wait() => return,
@@ -69,7 +70,8 @@ impl ServiceLoop {
                         notify(&[NotifyState::Watchdog]);
                         fed = now;
                     }
-                    // A crash of the daemon loses at most the last second of the files.
+                    // The files are flushed every second, so that a crash of the daemon loses at most their last
+                    // second.
                     if now.duration_since(flushed) >= Duration::from_secs(1) {
                         self.engine.flush();
                         flushed = now;
@@ -93,7 +95,7 @@ impl ServiceLoop {
         }
     }
 
-    /// Runs a fit that the core requests on another thread, because it takes too long for frames and ticks to wait.
+    /// If the core requests a fit, runs it on another thread, because frames and ticks cannot wait that long.
     fn begin_model_fit(&mut self) {
         if self.model_fit.is_none()
             && let Some(task) = self.engine.monitor.take_model_fit()
@@ -125,7 +127,7 @@ impl ServiceLoop {
         }
     }
 
-    /// Handles a tick after the input received before it; returns its time.
+    /// Handles the input that was received before the tick, then the tick. Returns the time of the tick.
     async fn tick(&mut self) -> Timestamp {
         self.drain().await;
         let time = self.clock.now();
@@ -134,7 +136,8 @@ impl ServiceLoop {
         time
     }
 
-    /// Answers a request of the control socket. The answer to a command that changes stored data waits until they are on disk.
+    /// Answers a request of the control socket. If a command changes stored data, its answer waits until the data are
+    /// on disk.
     async fn answer(&mut self, PendingRequest { request, answer: client }: PendingRequest) {
         let alarms = self.engine.monitor.alarms();
         let answer = match request {
@@ -154,7 +157,8 @@ impl ServiceLoop {
         let _ = client.send(answer);
     }
 
-    /// Passes a command to the core after the input received before it. Returns its outcome and the ticket of its commit.
+    /// Handles the input that was received before the command, then passes the command to the core. Returns the outcome
+    /// and the ticket of the commit.
     async fn apply_command(&mut self, command: Command) -> (Result<CommandOutcome, Answer>, Option<u64>) {
         self.drain().await;
         let time = self.clock.now();
@@ -163,10 +167,10 @@ impl ServiceLoop {
         (answer::outcome(monitor.alarms(), &command, &outputs.events, time), ticket)
     }
 
-    /// Handles everything that the interfaces have received so far.
+    /// Handles everything that the interfaces have already received.
     async fn drain(&mut self) {
         for _ in 0..INBOX / BATCH {
-            // Lets the tasks of the interfaces read from and write to their sockets.
+            // The tasks of the interfaces read from and write to their sockets here.
             tokio::task::yield_now().await;
             while self.batch.len() < BATCH
                 && let Ok(received) = self.inbox.try_recv()
@@ -210,7 +214,7 @@ impl ServiceLoop {
         let Engine { readiness, monitor, .. } = &mut self.engine;
         readiness.note_reload(taken.err().map(|faults| faults.join("; ")));
         let line = readiness.line_now(monitor, Instant::now());
-        // If a further reload waits, the end of that one is reported.
+        // If a further reload waits, only the end of the last reload is reported.
         let ready = (readiness.is_ready() && !self.reload.is_busy()).then_some(NotifyState::Ready);
         let status = line.as_deref().map(NotifyState::Status);
         notify(&ready.into_iter().chain(status).collect::<Vec<_>>());
@@ -248,7 +252,7 @@ impl ServiceLoop {
     }
 }
 
-/// Waits for the next progress of the store. Reports a failure once if its thread has ended before the loop.
+/// Waits for the next progress of the store. If the store's thread has ended before the loop, reports a failure once.
 async fn next_progress(stored: &mut Option<watch::Receiver<StoreProgress>>) -> StoreProgress {
     let Some(receiver) = stored else { return std::future::pending().await };
     if receiver.changed().await.is_ok() {
@@ -260,7 +264,7 @@ async fn next_progress(stored: &mut Option<watch::Receiver<StoreProgress>>) -> S
     StoreProgress { works: false, failures: last.failures + 1, ..last }
 }
 
-/// Waits for a fit; `None` = it failed, and the core runs it itself.
+/// Waits for a fit. Returns `None` if the fit failed; the core then runs it itself.
 async fn next_model_fit(fit: &mut Option<JoinHandle<(FitTask, FitFindings)>>) -> Option<(FitTask, FitFindings)> {
     let Some(running) = fit else { return std::future::pending().await };
     let found = running.await.ok();
@@ -279,6 +283,9 @@ mod tests {
         drop(sender);
         let mut stored = Some(progress);
         assert_eq!(next_progress(&mut stored).await, StoreProgress { works: false, failures: 1, ..last });
-        assert!(timeout(Duration::from_millis(20), next_progress(&mut stored)).await.is_err(), "once");
+        assert!(
+            timeout(Duration::from_millis(20), next_progress(&mut stored)).await.is_err(),
+            "the failure is reported only once"
+        );
     }
 }

@@ -1,8 +1,9 @@
-//! Holds the answers to commands until their changes are on disk, because a client that reads "done" may cut the power.
+//! Holds the answers to commands until their changes are on disk, because a client that has received the answer may cut
+//! the power.
 //!
-//! In: the ticket of the commit with the command's outcome, the progress of the store, the time. Out: the answer, with
-//! whether its outcome is stored. A failing disk is answered at once, a slow one after [`MAX_WAIT`]. In both cases the outcome
-//! is in effect, and is stored when the disk works again.
+//! In: the ticket of the commit with the command's outcome, the progress of the store, the time. Out: the answer, which
+//! states whether the outcome is stored. If the disk fails, the answer is sent at once; if the disk is slow, after
+//! [`MAX_WAIT`]. In both cases the outcome is in effect, and it is stored when the disk works again.
 
 use tokio::sync::oneshot;
 use tokio::time::{Duration, Instant};
@@ -10,7 +11,7 @@ use tokio::time::{Duration, Instant};
 use crate::control::protocol::{Answer, CommandOutcome};
 use crate::store::StoreProgress;
 
-/// Longest wait for the disk; a client waits longer ([`crate::control::client`]).
+/// Longest wait for the disk. A client waits longer for its answer ([`crate::control::client`]).
 pub(super) const MAX_WAIT: Duration = Duration::from_secs(30);
 
 /// Waiting answers, at most one per connection.
@@ -33,7 +34,7 @@ impl PendingAnswers {
         self.waiting.push(PendingAnswer { ticket, until: now + MAX_WAIT, outcome, answer });
     }
 
-    /// Sends the answers that are decided by the store's progress.
+    /// Sends the answers for which the store has succeeded or failed.
     pub(super) fn note_progress(&mut self, progress: &StoreProgress) {
         self.send_if(Some(progress.works), |waiting| waiting.ticket <= progress.ticket);
     }

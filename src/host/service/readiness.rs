@@ -1,8 +1,8 @@
-//! Determines the reports to the service manager: readiness, and a status line.
+//! Determines the reports to the service manager: the readiness and a status line.
 //!
-//! The service is ready when the configuration is valid and the first usable reading has arrived or the wait for it has ended.
-//! The line states every problem. It is reported when it changes, at most every [`STATUS_PERIOD`]. The caller passes the times
-//! and sends the returned reports, so this file needs no service manager.
+//! The service is ready when the configuration is valid and the first usable reading has arrived or the wait for it has
+//! ended. The line states every problem. It is reported when it changes, but at most once per [`STATUS_PERIOD`]. The
+//! caller passes the times and sends the returned reports, so this file needs no service manager.
 
 use std::time::Duration;
 
@@ -13,15 +13,16 @@ use crate::io::socket::LinkState;
 use crate::monitor::{BusEvent, Event, EventKind, Monitor};
 use crate::quantity::Channel;
 
-/// Longest wait for the first reading, s; the unit's `TimeoutStartSec` is longer.
+/// Longest configurable wait for the first reading, s. The unit's `TimeoutStartSec` is longer.
 pub const MAX_READY_TIMEOUT_S: f64 = 60.0;
-/// Default wait, s: ten times the wake-up time of a bus, and too short to look like a hung start.
+/// Default wait for the first reading, s. It is ten times the wake-up time of a bus, but too short to look like a start
+/// that hangs.
 pub const DEFAULT_READY_TIMEOUT_S: f64 = 10.0;
 /// Shortest time between two reports of the line.
 const STATUS_PERIOD: Duration = Duration::from_secs(1);
-/// Signals named in the line; further ones are counted.
+/// Maximum number of lost signals that the line names. Further signals are counted.
 const MAX_NAMED: usize = 3;
-/// Longest line, bytes: as much as a terminal can show; a datagram to the service manager could carry more.
+/// Longest line, bytes. A terminal can show this much. A datagram to the service manager could carry more.
 const MAX_LINE: usize = 1500;
 
 /// A report to the service manager.
@@ -52,12 +53,13 @@ pub(super) struct Readiness {
     restored: Option<String>,
     reported: String,
     reported_at: Option<Instant>,
-    /// Whether something in the line has changed since it was built; most ticks build no line.
+    /// Whether something has changed since the line was built. Without a change, a tick builds no line.
     is_changed: bool,
 }
 
 impl Readiness {
-    /// Readiness of a service that starts now with these interfaces and waits this long for the first reading.
+    /// Creates the readiness of a service that starts now with these interfaces and waits at most `timeout` for the
+    /// first reading.
     pub(super) fn new(names: &[String], timeout: Duration, restored: Option<String>, now: Instant) -> Self {
         Self {
             interfaces: names.iter().map(|name| (name.clone(), LinkState::Unknown)).collect(),
@@ -97,13 +99,13 @@ impl Readiness {
         self.is_changed = true;
     }
 
-    /// Notes the result of a reload; `refused` = why it was rejected.
+    /// Notes the result of a reload. `refused` is the reason why it was rejected.
     pub(super) fn note_reload(&mut self, refused: Option<String>) {
         self.refused = refused;
         self.is_changed = true;
     }
 
-    /// Checks the core, and returns the report that is due.
+    /// Checks the state of the core, and returns the report that is due.
     pub(super) fn poll(&mut self, monitor: &Monitor, now: Instant) -> ManagerUpdate {
         let waited = now.duration_since(self.began);
         if self.first_after.is_none() && monitor.has_usable_reading() {
@@ -121,7 +123,7 @@ impl Readiness {
         ManagerUpdate { ready, status: self.new_line(now) }
     }
 
-    /// The line if it has changed, regardless of the period.
+    /// Returns the line if it has changed, regardless of the period.
     pub(super) fn line_now(&mut self, monitor: &Monitor, now: Instant) -> Option<String> {
         self.check_inputs(monitor);
         self.new_line(now)
@@ -145,7 +147,7 @@ impl Readiness {
         self.is_changed = true;
     }
 
-    /// The line if it differs from the last reported one.
+    /// Returns the line if it differs from the last reported line.
     fn new_line(&mut self, now: Instant) -> Option<String> {
         if !std::mem::take(&mut self.is_changed) {
             return None;

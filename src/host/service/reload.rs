@@ -1,9 +1,10 @@
 //! Reloads the configuration on SIGHUP, outside the loop. If the new configuration is rejected, the old one stays.
 //!
-//! Reads one file at a time. Signals that arrive while it reads cause one further reading, at least [`MIN_PERIOD`] after the
-//! start of the last. A storm of signals therefore neither fills the log nor blocks the loop, and in the end the file as of the
-//! last signal applies. A change of interfaces or store requires a restart and is rejected with that hint; the core decides
-//! about all other changes ([`Monitor::reconfigure`](crate::monitor::Monitor::reconfigure)).
+//! Only one reading runs at a time. Signals that arrive during a reading cause one further reading, at least
+//! [`MIN_PERIOD`] after the start of the last reading. Many signals in a short time therefore neither fill the log nor
+//! block the loop, and the configuration that applies at the end was read after the last signal. A change of interfaces
+//! or store requires a restart and is rejected with this hint. The core decides about all other changes
+//! ([`Monitor::reconfigure`](crate::monitor::Monitor::reconfigure)).
 
 use std::fmt;
 use std::io;
@@ -19,15 +20,15 @@ use crate::config::{self, Config, InterfaceConfig, KeySource, StoreConfig, Vehic
 use crate::monitor::{MonitorConfig, Reconfigured};
 use crate::status::document::ConfigFile;
 
-/// Shortest time between two readings of the file.
+/// Shortest time between the starts of two readings.
 const MIN_PERIOD: Duration = Duration::from_secs(1);
-/// Faults that are logged one by one; a file of another kind has thousands.
+/// Maximum number of faults that are logged one by one. A file of another kind has thousands of faults.
 const MAX_FAULTS_LOGGED: usize = 50;
 
 /// A step of a reload.
 #[derive(Debug)]
 pub(super) enum ReloadStep {
-    /// A signal came; [`ReloadStep::Read`] follows.
+    /// A signal arrived; [`ReloadStep::Read`] follows.
     Requested,
     /// The file was read: the new configuration, or every fault.
     Read(Result<Box<LoadedConfig>, Vec<String>>),
@@ -51,14 +52,14 @@ pub(super) struct Reload {
     path: PathBuf,
     fixed: Arc<FixedSettings>,
     reading: Option<LoadTask>,
-    /// Whether a signal waits for a reading.
+    /// Whether a signal has not yet led to a reading.
     is_requested: bool,
     /// Earliest start of the next reading.
     not_before: Instant,
 }
 
 impl Reload {
-    /// Catches SIGHUP, which no longer ends the program. Must be called inside the runtime.
+    /// Starts catching SIGHUP, so that it does not end the program. Must be called inside the runtime.
     ///
     /// # Errors
     /// Fails if the signal cannot be caught.
@@ -73,7 +74,7 @@ impl Reload {
         })
     }
 
-    /// Waits for the next step; safe to cancel.
+    /// Waits for the next step. The wait may be cancelled.
     pub(super) async fn next(&mut self) -> ReloadStep {
         loop {
             tokio::select! {
@@ -116,7 +117,7 @@ async fn finished(reading: &mut Option<LoadTask>) -> Result<Box<LoadedConfig>, V
     }
 }
 
-/// Settings outside the core that cannot change while the service runs: names and types of the interfaces, the store.
+/// Settings outside the core that cannot change while the service runs, such as the interfaces and the store.
 #[derive(Debug)]
 struct FixedSettings {
     interfaces: Vec<InterfaceConfig>,
@@ -138,7 +139,7 @@ impl FixedSettings {
     /// Checks whether `new` can be applied.
     ///
     /// # Errors
-    /// Names the setting that needs a restart.
+    /// Returns a text that names the setting that needs a restart.
     fn check(&self, new: &Config) -> Result<(), String> {
         let new = Self::of(new);
         if self.interfaces != new.interfaces {

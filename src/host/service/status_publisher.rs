@@ -19,7 +19,8 @@ pub(super) struct StatusPublisher {
     counters: ServiceCounters,
     latency: Latency,
     published: Option<Instant>,
-    /// Taken with the first document: the first tick has restored the stored state, and no frame has been counted yet.
+    /// Counts of earlier runs. They are taken with the first document, when the first tick has restored the stored
+    /// state and no frame has been counted yet.
     before: Option<CounterBaseline>,
 }
 
@@ -40,7 +41,7 @@ impl StatusPublisher {
         frames.for_each(|received| self.latency.record(now.since(received.time)));
     }
 
-    /// Counts a reload; `Ok` = the configuration was applied.
+    /// Counts a reload. `Ok` means that the configuration was applied.
     pub(super) fn note_reload(&mut self, taken: Result<Option<ConfigFile>, ()>) {
         match taken {
             Ok(file) => {

@@ -1,4 +1,4 @@
-//! Client of the status socket: reads one document, blocking, within a limited time.
+//! Client of the status socket. It reads one document and blocks for a limited time.
 
 use std::io::{self, ErrorKind, Read};
 use std::os::unix::net::UnixStream;
@@ -10,20 +10,20 @@ use serde::Deserialize;
 use super::document::{StatusDocument, VERSION};
 use super::{MAX_SILENCE, standard_path};
 
-/// Longest wait: one second longer than a daemon waits for a fresh document.
+/// Longest wait. It is one second longer than a daemon waits for a fresh document.
 pub const PATIENCE: Duration = Duration::from_secs(1 + MAX_SILENCE.as_secs());
-/// Longest document, bytes; 1,024 cells and as many alarms take less than 1 MB.
+/// Longest document, bytes. A document with 1,024 cells and as many alarms takes less than 1 MB.
 pub const MAX_DOCUMENT_BYTES: usize = 8 << 20;
 
 /// A daemon's status socket.
 #[derive(Debug, Clone)]
 pub struct StatusClient {
-    /// Its path.
+    /// Path of the socket.
     pub path: PathBuf,
 }
 
 impl StatusClient {
-    /// The socket at `path`; `None` = the standard path.
+    /// A client of the socket at `path`; `None` = the standard path.
     pub fn new(path: Option<&Path>) -> Self {
         Self { path: path.map_or_else(standard_path, Path::to_owned) }
     }
@@ -31,7 +31,7 @@ impl StatusClient {
     /// Reads the document as a line of JSON.
     ///
     /// # Errors
-    /// Fails if no daemon sends it; names the socket and the next step.
+    /// Fails if no daemon sends the document. The message names the socket and the next step.
     pub fn line(&self) -> Result<Vec<u8>, String> {
         self.read(PATIENCE).map_err(|error| explain(&self.path, &error))
     }
@@ -88,7 +88,7 @@ pub fn explain(path: &Path, error: &io::Error) -> String {
 /// Parses a document.
 ///
 /// # Errors
-/// Fails if it is not a document, or has another version.
+/// Fails if the line is not a status document, or if the document has another version.
 pub fn parse(line: &[u8]) -> Result<StatusDocument, String> {
     #[derive(Deserialize)]
     struct Versioned {

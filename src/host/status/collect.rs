@@ -19,15 +19,16 @@ use crate::monitor::{BusStatistics, CommandCounts, ControllerCount, Event, Event
 use crate::quantity::{BusIndex, Timestamp};
 use crate::sample::ReadingCounts;
 
-/// Events in the document: one screen.
+/// Number of events in the document. They fill one screen.
 pub const MAX_EVENTS: usize = 32;
 
-/// The latest events, except those that occur once per cell and half-cycle, which would displace all others.
+/// The latest events. Events that occur once per cell and half-cycle are left out, because they would displace all
+/// others.
 #[derive(Debug, Default)]
 pub struct RecentEvents(VecDeque<Event>);
 
 impl RecentEvents {
-    /// Notes an event.
+    /// Adds an event.
     pub fn note(&mut self, event: &Event) {
         if matches!(event.kind, EventKind::HalfCycle { .. } | EventKind::Capacity { .. } | EventKind::LossModes { .. })
         {
@@ -69,7 +70,7 @@ impl CounterBaseline {
         if statistics.restores == 0 {
             return Self::default();
         }
-        // This restore belongs to the current run.
+        // This restore itself belongs to the current run.
         statistics.restores -= 1;
         Self {
             statistics,

@@ -1,4 +1,4 @@
-//! Counters of the loop and of the status clients, and the latency of frames: plain numbers owned by the loop.
+//! Counters of the loop and of the status clients, and the latency of frames. All are plain numbers that the loop owns.
 //!
 //! In: the lateness of ticks and the latency of frames, s. Out: structs of the status document. Nothing is allocated or
 //! locked per frame.
@@ -16,16 +16,16 @@ pub struct Latency {
     pub buckets: Vec<Bucket>,
     /// Number of frames.
     pub frames: u64,
-    /// Sum of their latencies, s.
+    /// Sum of the latencies of all frames, s.
     pub sum_s: f64,
 }
 
 /// One bucket.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Bucket {
-    /// Its upper bound, s; `None` = unbounded.
+    /// Upper bound of the bucket, s; `None` = unbounded.
     pub le_s: Option<f64>,
-    /// Frames in it.
+    /// Number of frames in the bucket.
     pub frames: u64,
 }
 
@@ -49,7 +49,8 @@ impl Latency {
         self.sum_s += seconds;
     }
 
-    /// The bound not exceeded by this share of the frames, s; `None` = no frames, or above the last bound.
+    /// The smallest bound that at least this share of the frames does not exceed, s. `None` = there are no frames, or
+    /// the bound would be above the last one.
     pub fn quantile_s(&self, share: f64) -> Option<f64> {
         let wanted = (share * self.frames as f64).ceil().max(1.0);
         let mut so_far = 0;
@@ -90,13 +91,13 @@ impl ServiceCounters {
 /// Clients of the status sockets.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ClientCounts {
-    /// Connected at present.
+    /// Clients that are connected at present.
     pub connected: u64,
-    /// Served so far, including those being served.
+    /// Clients served since the start, including clients that are being served.
     pub served: u64,
-    /// Rejected because there were too many.
+    /// Clients rejected because there were too many.
     pub refused: u64,
-    /// Dropped because they did not read in time.
+    /// Clients dropped because they did not read in time.
     pub dropped: u64,
 }
 

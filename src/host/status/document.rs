@@ -60,11 +60,11 @@ pub struct StatusDocument {
     pub cells: Vec<CellView>,
     /// Alarms that need attention.
     pub alarms: AlarmStatus,
-    /// Counts.
+    /// Counters of the core, the loop and the clients.
     pub counters: StatusCounters,
     /// Protected input messages, and the authenticated command message.
     pub protection: Vec<MessageProtection>,
-    /// Commands from the bus; `None` = not executed.
+    /// Commands from the bus; `None` = commands are not executed.
     #[serde(default)]
     pub commands: Option<CommandStatus>,
     /// Controllers that answer diagnostic requests.
@@ -76,12 +76,12 @@ pub struct StatusDocument {
     /// Diagnostic requests of this program; `None` = polling is not configured.
     #[serde(default)]
     pub poll: Option<PollStatus>,
-    /// Input messages with frames dropped because their rate was too high.
+    /// Input messages whose frames were dropped because their rate was too high.
     pub floods: Vec<MessageFlood>,
     /// Unexpected senders on the buses.
     #[serde(default)]
     pub intruders: Vec<Intruder>,
-    /// Whether the current's reading is frozen: the voltages show another load.
+    /// Whether the current reading is frozen, because the voltages show a different load.
     #[serde(default)]
     pub current_frozen: bool,
     /// Findings about cells and sensors, in the format of `--events`.
@@ -118,11 +118,11 @@ impl StatusDocument {
 pub struct ConfigFile {
     /// The file.
     pub path: String,
-    /// Its drop-ins, in merge order.
+    /// The drop-ins of the configuration file, in merge order.
     #[serde(default)]
     pub drop_ins: Vec<String>,
-    /// SHA-256 of the file followed by its drop-ins, hexadecimal, as printed by `cat FILE FILE.d/*.toml | sha256sum`. It does
-    /// not cover the other files they name.
+    /// SHA-256 of the file followed by its drop-ins, hexadecimal, as printed by `cat FILE FILE.d/*.toml | sha256sum`.
+    /// It does not cover other files that these files name.
     pub sha256: String,
 }
 
@@ -131,9 +131,9 @@ pub struct ConfigFile {
 pub struct InterfaceStatus {
     /// Kernel name.
     pub name: String,
-    /// Its state.
+    /// State of the interface.
     pub state: LinkState,
-    /// How often it came up again.
+    /// How often the interface came up again.
     pub reconnects: u64,
     /// Frames received.
     #[serde(flatten)]
@@ -155,16 +155,17 @@ pub struct AlarmStatus {
     pub raised: usize,
     /// Highest severity of the raised alarms.
     pub highest_severity: Option<Severity>,
-    /// Thresholds with alarms that cannot be evaluated because their value is unknown.
+    /// Thresholds that have alarms that cannot be evaluated because their value is unknown.
     pub unknown: Vec<UnknownAlarms>,
     /// Alarms that are raised, about to be raised, or not yet acknowledged.
     pub list: Vec<Alarm>,
-    /// Number of further alarms that did not fit.
+    /// Number of further alarms that did not fit into `list`.
     pub omitted: usize,
 }
 
 impl AlarmStatus {
-    /// Whether there are thresholds and all of them can be evaluated. If so, no raised alarm means that all is well.
+    /// Whether there are thresholds and all of them can be evaluated. If it is true and no alarm is raised, all is
+    /// well.
     pub fn are_judged(&self) -> bool {
         self.thresholds > 0 && self.unknown.is_empty()
     }
@@ -176,23 +177,23 @@ impl AlarmStatus {
     }
 }
 
-/// Counters. All of them start at 0 with the program (also the counters of interfaces, protected messages, controllers and floods),
-/// except `lifetime`. A stored count may be a minute old after a power cut, and readers that sum differences need counters that
-/// never decrease.
+/// Counters. All of them start at 0 with the program (also the counters of interfaces, protected messages, controllers
+/// and floods), except `lifetime`. The reason: a stored count may be a minute old after a power cut, but readers that
+/// sum differences need counters that never decrease.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StatusCounters {
     /// Counters of the core.
     pub core: Statistics,
-    /// The same since the first start, as far as stored; without the interfaces.
+    /// Counters of the core since the first start, as far as they are stored. The interfaces are not included.
     #[serde(default)]
     pub lifetime: Statistics,
     /// Readings by outcome.
     pub readings: ReadingCounts,
     /// Inputs with an earlier time than the input before them.
     pub time_backwards: u64,
-    /// The loop.
+    /// Counters of the loop.
     pub service: ServiceCounters,
-    /// Clients of the status sockets.
+    /// Counts of clients of the status sockets.
     pub clients: ClientCounts,
 }
 
@@ -201,7 +202,7 @@ pub struct StatusCounters {
 pub struct MessageProtection {
     /// Interface of the message.
     pub interface: String,
-    /// Its identifier: 3 hexadecimal digits, or 8 for an extended one.
+    /// Identifier of the message: 3 hexadecimal digits, or 8 for an extended identifier.
     pub id: String,
     /// Number of checks with each status.
     pub checks: Vec<StatusCount>,
@@ -221,14 +222,14 @@ pub struct StatusCount {
 pub struct CommandStatus {
     /// Interface of the commands.
     pub interface: String,
-    /// Their identifier, formatted as in [`MessageProtection`].
+    /// Identifier of the commands, formatted as in [`MessageProtection`].
     pub id: String,
     /// SecOC profile; `None` = the commands are unauthenticated.
     pub secoc: Option<String>,
 }
 
 impl CommandStatus {
-    /// In words: `authenticated (SecOC 1)`, `unauthenticated`.
+    /// The status in words: `authenticated (SecOC 1)`, `unauthenticated`.
     pub fn words(&self) -> String {
         self.secoc
             .as_ref()
@@ -239,14 +240,14 @@ impl CommandStatus {
 /// Diagnostic requests of this program.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PollStatus {
-    /// Why no requests are sent at present; `None` = they are sent.
+    /// Why no requests are sent at present; `None` = requests are sent.
     pub silent: Option<PollSilence>,
     /// Number of requests that are no longer sent because their controller rejected them permanently.
     pub refused: usize,
 }
 
 impl PollStatus {
-    /// In words: `asking`, `silent: the bus sleeps`.
+    /// The status in words: `asking`, `silent: the bus sleeps`.
     pub fn words(&self) -> String {
         let state = self.silent.map_or_else(|| "asking".to_owned(), |reason| format!("silent: {}", reason.words()));
         if self.refused == 0 { state } else { format!("{state}; {} rejected permanently", self.refused) }
@@ -293,7 +294,7 @@ pub struct MessageFlood {
     pub interface: String,
     /// Identifier, formatted as in [`MessageProtection`].
     pub id: String,
-    /// Frames.
+    /// Number of dropped frames.
     pub dropped: u64,
 }
 
@@ -301,9 +302,9 @@ pub struct MessageFlood {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum IntruderKind {
-    /// It sends an input message in addition to the message's own sender.
+    /// The sender sends an input message in addition to the message's own sender.
     SecondSender,
-    /// It uses an identifier of this program's frames.
+    /// The sender uses an identifier of this program's frames.
     OwnIdentifier,
 }
 
@@ -312,9 +313,9 @@ pub enum IntruderKind {
 pub struct Intruder {
     /// Interface.
     pub interface: String,
-    /// Identifier of its latest frames.
+    /// Identifier of the latest frames of the sender.
     pub id: String,
-    /// What it does.
+    /// What the sender does.
     pub kind: IntruderKind,
 }
 
@@ -322,22 +323,22 @@ pub struct Intruder {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct StoreStatus {
-    /// Its folder; empty if it could not be opened.
+    /// Path of the store; empty if the store could not be opened.
     pub path: String,
-    /// Whether it can be written; `None` = not yet tried.
+    /// Whether the store can be written; `None` = not yet tried.
     pub works: Option<bool>,
-    /// Commits done.
+    /// Number of successful commits.
     pub commits: u64,
-    /// Commits that failed.
+    /// Number of failed commits.
     pub failures: u64,
-    /// Results announced before they were stored, because the commit took too long.
+    /// Number of results that were announced before they were stored, because the commit took too long.
     pub late: u64,
     /// Size of the database and its log at the last commit, bytes; `None` = no commit yet.
     pub file_bytes: Option<u64>,
 }
 
 impl ConfigFile {
-    /// Reads the files' names and checksum; `None` = they can no longer be read.
+    /// Reads the names of the files and computes their checksum; `None` = a file can no longer be read.
     pub fn of(path: &Path) -> Option<Self> {
         let files = ConfigFiles::find(path).ok()?;
         let mut digest = Sha256::new();

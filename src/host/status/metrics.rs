@@ -1,8 +1,8 @@
-//! The status document as metrics: OpenMetrics 1.0 text, or Prometheus' older text format 0.0.4.
+//! Converts the status document to metrics: OpenMetrics 1.0 text, or Prometheus' older text format 0.0.4.
 //!
-//! * Units are in the names (`_volts`, `_amperes`, `_celsius`, `_ratio`, `_seconds`, `_amperehours`), counters end with
-//!   `_total`, cells count from 1.
-//! * Unknown values are omitted: a value that is present is valid.
+//! * Units are in the names (`_volts`, `_amperes`, `_celsius`, `_ratio`, `_seconds`, `_amperehours`). Counters end with
+//!   `_total`. Cells count from 1.
+//! * Unknown values are omitted, so a value that is present is valid.
 //! * All counters start with the daemon's process (`packwatch_uptime_seconds`), as readers that sum increases expect.
 //! * Without a daemon there is only `packwatch_up 0`.
 
@@ -25,7 +25,7 @@ use crate::monitor::{CellView, PackView, Validity};
 use crate::quantity::catalogue::{Part, Presentation, Unit, Values};
 use crate::quantity::{CellIndex, Mode};
 
-/// OpenMetrics text, which ends with `# EOF`; `None` = no daemon.
+/// Formats the document as OpenMetrics text, which ends with `# EOF`. `None` = no daemon answers.
 pub fn openmetrics(document: Option<StatusDocument>) -> String {
     let mut registry = Registry::with_prefix("packwatch");
     registry.register_collector(Box::new(Metrics(document)));
@@ -35,7 +35,8 @@ pub fn openmetrics(document: Option<StatusDocument>) -> String {
     text
 }
 
-/// Converts it to Prometheus' older format: a counter's description has its full name, and there are no lines for units.
+/// Converts OpenMetrics text to Prometheus' older format. In that format a counter's description has the full name, and
+/// there are no lines for units.
 pub fn prometheus_text(openmetrics: &str) -> String {
     let typed = |wanted: &str| -> HashSet<&str> {
         let types = openmetrics.lines().filter_map(|line| line.strip_prefix("# TYPE ")?.split_once(' '));
@@ -67,14 +68,14 @@ pub fn prometheus_text(openmetrics: &str) -> String {
     text
 }
 
-/// The document, as a collector of metrics.
+/// A collector that writes the metrics of a document.
 #[derive(Debug)]
 struct Metrics(Option<StatusDocument>);
 
 /// Labels of a sample.
 type Labels = Vec<(&'static str, String)>;
 
-/// Writes metric families with the samples that are known.
+/// Writes metric families with the known samples.
 struct Families<'a>(DescriptorEncoder<'a>);
 
 impl Families<'_> {
@@ -133,7 +134,7 @@ fn label(name: &'static str, value: impl Into<String>) -> Labels {
     vec![(name, value.into())]
 }
 
-/// 1 for true, 0 for false.
+/// Converts true to 1 and false to 0.
 fn flag(value: bool) -> Option<f64> {
     Some(f64::from(u8::from(value)))
 }
@@ -260,7 +261,7 @@ fn cells(families: &mut Families<'_>, cells: &[CellView]) -> fmt::Result {
     quantities(families, "cell", &values)
 }
 
-/// The quantities of the catalogue and their standard deviations.
+/// Writes the quantities of the catalogue and their standard deviations.
 fn quantities<const IS_PACK: bool>(
     families: &mut Families<'_>,
     owner: &str,
@@ -283,7 +284,7 @@ fn quantities<const IS_PACK: bool>(
     Ok(())
 }
 
-/// The unit in a metric's name, and the factor to it.
+/// The unit in a metric's name, and the factor that converts to this unit.
 const fn metric_unit(unit: Unit) -> (&'static str, f64) {
     match unit {
         Unit::Level | Unit::Fraction | Unit::Ratio => ("ratio", 1.0),

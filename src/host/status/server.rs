@@ -20,11 +20,11 @@ use crate::io::place::PlaceSetting;
 use crate::io::unix_socket::{BindError, BoundSocket, bind};
 use crate::monitor::Event;
 
-/// Pause after a connection could not be accepted (no descriptor left); an immediate retry would fail too.
+/// Pause after a connection could not be accepted because no descriptor is left. An immediate retry would fail too.
 const ACCEPT_PAUSE: Duration = Duration::from_secs(1);
 /// Shortest time between two log lines about rejected clients.
 const REFUSAL_LOG_PERIOD: Duration = Duration::from_secs(60);
-/// Stack of the thread, bytes; it only serialises and waits.
+/// Stack of the thread, bytes. A small stack is enough, because the thread only serialises and waits.
 const STACK_BYTES: usize = 512 << 10;
 
 /// A document that has not been serialised yet.
@@ -59,17 +59,17 @@ type Latest = watch::Receiver<Option<PublishedLine>>;
 /// The running sockets. Dropping this closes them and deletes their files.
 #[derive(Debug)]
 pub struct StatusServer {
-    /// `None` only during the drop.
+    /// Channel to the thread; `None` only during the drop.
     drafts: Option<mpsc::Sender<Box<Draft>>>,
     counters: Arc<Mutex<ClientCounts>>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl StatusServer {
-    /// Opens the sockets. `None` = it failed (logged).
+    /// Opens the sockets. Returns `None` if they cannot be opened (logged).
     ///
     /// # Errors
-    /// Fails if another daemon uses them, or requested sockets cannot be created.
+    /// Fails if another daemon uses the sockets, or if sockets that the user requested cannot be created.
     pub fn start(setting: &PlaceSetting) -> Result<Option<Self>, String> {
         let Some((path, is_needed)) = setting.resolve(|| (daemon_path(), false)) else { return Ok(None) };
         match Self::open(path.clone(), Limits { max_silence: MAX_SILENCE, stale: STALE }) {
@@ -96,12 +96,12 @@ impl StatusServer {
         }
     }
 
-    /// Offers a draft to the thread; `false` = the thread is busy and the draft is dropped. Does not block.
+    /// Offers a draft to the thread without blocking. Returns `false` if the thread is busy and the draft is dropped.
     pub fn offer(&self, draft: Draft) -> bool {
         self.drafts.as_ref().is_some_and(|drafts| drafts.try_send(Box::new(draft)).is_ok())
     }
 
-    /// Client counts so far.
+    /// Counts of clients since the start.
     pub fn clients(&self) -> ClientCounts {
         *self.counters.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -109,7 +109,7 @@ impl StatusServer {
 
 impl Drop for StatusServer {
     fn drop(&mut self) {
-        // Closing the channel ends the thread; it does not wait for clients.
+        // Closing the channel ends the thread, which does not wait for clients.
         self.drafts = None;
         if self.thread.take().is_some_and(|thread| thread.join().is_err()) {
             tracing::error!("the status thread has panicked");
@@ -117,7 +117,7 @@ impl Drop for StatusServer {
     }
 }
 
-/// Time limits; shorter in tests.
+/// Time limits, which are shorter in tests.
 #[derive(Debug, Clone, Copy)]
 struct Limits {
     max_silence: Duration,
@@ -194,7 +194,7 @@ fn publish(draft: Draft, published: &watch::Sender<Option<PublishedLine>>) {
     }
 }
 
-/// Rejected clients since the last log line.
+/// The number of clients rejected since the last log line.
 #[derive(Debug, Default)]
 struct RefusalLog {
     unreported: u64,
@@ -242,7 +242,7 @@ async fn serve_once(mut client: UnixStream, context: ClientContext, mut latest: 
         latest.wait_for(|published| published.as_ref().is_some_and(|it| it.at.elapsed() < context.limits.stale));
     let line = match timeout(context.limits.max_silence, fresh).await {
         Ok(Ok(published)) => published.as_ref().map(|published| Arc::clone(&published.line)),
-        // The loop publishes nothing, or has ended.
+        // The loop publishes no document, or has ended.
         Ok(Err(_)) | Err(_) => None,
     };
     if let Some(line) = line {
@@ -250,7 +250,7 @@ async fn serve_once(mut client: UnixStream, context: ClientContext, mut latest: 
     }
 }
 
-/// Sends every document from now on; a slow client misses some.
+/// Sends every document that is published after the client connected. A slow client misses some documents.
 async fn serve_stream(mut client: UnixStream, context: ClientContext, mut latest: Latest) {
     while latest.changed().await.is_ok() {
         let fresh =
@@ -264,7 +264,7 @@ async fn serve_stream(mut client: UnixStream, context: ClientContext, mut latest
     }
 }
 
-/// Writes a line; `false` = the client has closed, or was dropped because it did not read in time.
+/// Writes a line. Returns `false` if the client has closed, or was dropped because it did not read in time.
 async fn send_line(client: &mut UnixStream, line: &[u8], context: &ClientContext) -> bool {
     match timeout(context.limits.max_silence, client.write_all(line)).await {
         Ok(written) => written.is_ok(),

@@ -20,7 +20,7 @@ use crate::config::{
 use crate::quantity::{CellIndex, Channel, MAX_CELLS};
 use crate::wiring::{InterfacePlan, MessagePlan, OutputPlan, PackPlan, Plan, SignalPlan};
 
-/// Capacity used if none is stated, Ah: a typical cell of a car.
+/// Capacity that is used if the configuration states none, Ah: a typical cell of a car.
 const USUAL_AH: f64 = 50.0;
 
 /// The readable part of a configuration, as `packwatch doctor` needs it.
@@ -40,7 +40,8 @@ pub struct Survey {
 }
 
 impl Survey {
-    /// Position of a key (of its table, if the key is absent) as `file:line`, and its value.
+    /// Returns the position of a key as `file:line`, and its value. If the key is absent, the position is that of its
+    /// table.
     pub fn locate(&self, table: &str, key: &str) -> Option<(String, Option<String>)> {
         let place = self.places.get(table)?;
         let found = place.found(key).map(str::to_owned);
@@ -126,7 +127,7 @@ fn signal_plan(source: &SignalSource<'_>, message: &Message, signal: &Signal, bi
     }
 }
 
-/// Consecutive signals that match the cells' pattern beyond the configured number.
+/// Consecutive signals that match the pattern of the cells beyond the configured number of cells.
 fn more_cells(raw: &RawTables, databases: &Databases) -> Vec<SignalPlan> {
     let (Some(keys), Some(pack)) = (&raw.cell_voltage, &raw.pack) else { return Vec::new() };
     let source = keys.config();

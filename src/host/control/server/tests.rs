@@ -1,4 +1,5 @@
-//! The control socket with good and bad clients. Each is answered or dropped; none blocks the loop or another client.
+//! Tests the control socket with good and bad clients. Each client is answered or dropped, and no client blocks the
+//! loop or another client.
 
 use std::path::{Path, PathBuf};
 
@@ -25,7 +26,7 @@ fn done(changed: u32) -> Answer {
     })
 }
 
-/// A server whose loop answers every request with the number of requests so far.
+/// Starts a server whose loop answers every request with the number of requests received.
 async fn serve(folder: &TempDir) -> (ControlServer, PathBuf) {
     serve_patiently(folder, MAX_SILENCE).await
 }
@@ -70,7 +71,7 @@ fn requests_are_answered_in_order() {
         client.write_all(b"rubbish\n").await.unwrap();
         assert!(line(&mut client).await.contains("not a JSON document"));
         client.write_all(REPLACED.to_line().as_bytes()).await.unwrap();
-        assert!(line(&mut client).await.contains("\"changed\":4"), "not served after an invalid request");
+        assert!(line(&mut client).await.contains("\"changed\":4"), "the server must answer after an invalid request");
     });
 }
 
@@ -96,7 +97,7 @@ fn overlong_request_ends_connection() {
 fn silent_client_is_dropped() {
     block_on(async {
         let folder = tempfile::tempdir().unwrap();
-        // Sockets need real time.
+        // The test uses real sockets, which need real time.
         let max_silence = Duration::from_millis(200);
         let (_server, path) = serve_patiently(&folder, max_silence).await;
         let mut client = connect(&path).await;
@@ -118,14 +119,17 @@ fn client_that_never_reads_is_dropped() {
         let flood = REPLACED.to_line().repeat(100);
         let mut client = connect(&path).await;
         let mut served = 0;
-        // Until a write fails because the server has closed the connection.
+        // The loop ends when a write fails because the server has closed the connection.
         loop {
             match deaf.try_write(flood.as_bytes()) {
                 Err(error) if error.kind() != std::io::ErrorKind::WouldBlock => break,
                 Ok(_) | Err(_) => {}
             }
             client.write_all(REPLACED.to_line().as_bytes()).await.unwrap();
-            assert!(line(&mut client).await.contains("\"ok\":true"), "not served while another client is silent");
+            assert!(
+                line(&mut client).await.contains("\"ok\":true"),
+                "the server must answer while another client is silent"
+            );
             served += 1;
         }
         assert!(served > 0);
@@ -151,7 +155,7 @@ fn request_displaces_silent_clients() {
         next.write_all(REPLACED.to_line().as_bytes()).await.unwrap();
         assert!(line(&mut next).await.contains("\"ok\":true"));
         assert!(began.elapsed() < MAX_SILENCE / 10, "{:?}", began.elapsed());
-        assert_eq!(line(&mut silent[0]).await, "", "the one that was silent longest is closed");
+        assert_eq!(line(&mut silent[0]).await, "", "the connection that was silent longest is closed");
     });
 }
 
@@ -161,7 +165,7 @@ fn only_dead_daemons_socket_is_replaced() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("control.sock");
         drop(std::os::unix::net::UnixListener::bind(&path).unwrap());
-        assert!(path.exists(), "the file of a dead daemon stays");
+        assert!(path.exists(), "the test needs the socket file of a dead daemon");
         let (server, path) = serve(&folder).await;
         let (sender, _requests) = mpsc::channel(1);
         let second = ControlServer::start(&PlaceSetting::At(path.clone()), sender).await.unwrap_err();
@@ -170,7 +174,7 @@ fn only_dead_daemons_socket_is_replaced() {
         use std::os::unix::fs::PermissionsExt as _;
         assert_eq!(std::fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o660);
         drop(server);
-        assert!(!path.exists(), "the file stays after the end");
+        assert!(!path.exists(), "the server must delete its socket file when it ends");
     });
 }
 

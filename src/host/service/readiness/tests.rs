@@ -1,4 +1,4 @@
-//! Readiness reports, and the status line about interfaces, lost signals and reloads.
+//! Tests readiness reports, and the status line about interfaces, lost signals and reloads.
 
 use super::*;
 use crate::can::{CanId, Frame};
@@ -7,7 +7,7 @@ use crate::monitor::{MonitorConfig, Outputs, Record};
 use crate::quantity::{BusIndex, Timestamp};
 use std::path::Path;
 
-/// A core and its readiness, with their time.
+/// A core, its readiness and the time of both.
 struct Scene {
     monitor: Monitor,
     readiness: Readiness,
@@ -30,7 +30,7 @@ impl Scene {
         Self { monitor: Monitor::new(config.monitor), readiness, began, at_s: 0.0 }
     }
 
-    /// Feeds one input, `after_s` later.
+    /// Feeds one input, `after_s` after the previous one.
     fn feed(&mut self, after_s: f64, record: impl Fn(Timestamp) -> Record) -> ManagerUpdate {
         self.at_s += after_s;
         let mut out = Outputs::default();
@@ -67,7 +67,7 @@ fn service_is_ready_with_first_usable_reading() {
     let mut scene = Scene::new(None);
     assert_eq!(scene.tick(0.0), ManagerUpdate { ready: false, status: Some("waiting for the first frame".to_owned()) });
     assert!(!scene.bus(0.1, 0, BusEvent::Up).ready);
-    // A frame without a configured signal does not count.
+    // A frame that carries no configured signal does not count.
     let foreign = leaked(0x7FE, &[1]);
     assert!(!scene.feed(0.1, |time| Record::frame(time, BusIndex(0), foreign)).ready);
     let frame = good_frame();
@@ -87,7 +87,7 @@ fn service_without_input_is_ready_after_wait() {
     assert!(update.ready);
     let line = update.status.expect("a line");
     assert_eq!(line, "running without input: no frame in 10 s, restored state 12 s old; can1 is missing");
-    // The first frame is reported even after that.
+    // The first frame is reported even after the end of the wait.
     let frame = good_frame();
     scene.feed(1.5, |time| Record::frame(time, BusIndex(0), frame));
     assert_eq!(
@@ -116,7 +116,7 @@ fn lost_signals_are_counted_and_named() {
     let mut scene = Scene::with(None, |config| config.asleep_after_s = None);
     let frame = good_frame();
     scene.feed(0.0, |time| Record::frame(time, BusIndex(0), frame));
-    // Longer than the maximum age of a temperature.
+    // 130 s are longer than the maximum age of a temperature.
     let line = scene.wait(130).expect("signals were lost");
     assert!(line.starts_with("running without input; 3 of 3 signals lost (pack current, "), "{line}");
     for _ in 0..20 {

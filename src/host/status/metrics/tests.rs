@@ -1,4 +1,4 @@
-//! Metrics of a sample document, checked as text and with promtool of the Prometheus project.
+//! Checks the metrics of a sample document as text, and with promtool of the Prometheus project.
 
 use std::io::Write as _;
 use std::process::{Command, Stdio};
@@ -7,7 +7,7 @@ use super::super::sample::sample;
 use super::*;
 use crate::quantity::catalogue::Quantity;
 
-/// The samples of a family, as written.
+/// The samples of a metric family, as written.
 fn samples<'a>(text: &'a str, name: &str) -> Vec<&'a str> {
     text.lines().filter(|line| line.split(['{', ' ']).next() == Some(name)).collect()
 }
@@ -66,7 +66,7 @@ fn older_format_has_full_counter_names_without_units() {
     assert!(!text.contains("# UNIT") && !text.contains("# EOF"));
 }
 
-/// `promtool check metrics` of the Debian package `prometheus`; `None` = not installed.
+/// Runs `promtool check metrics` of the Debian package `prometheus`; `None` = promtool is not installed.
 fn promtool(text: &str) -> Option<(bool, String)> {
     let mut child = Command::new("promtool")
         .args(["check", "metrics"])
@@ -89,5 +89,5 @@ fn promtool_accepts_metrics() {
         assert!(is_good && said.is_empty(), "{said}");
     }
     let (is_good, said) = promtool("# TYPE bad_total gauge\nbad_total 1\n").unwrap();
-    assert!(!is_good && !said.is_empty(), "promtool does not report a bad name");
+    assert!(!is_good && !said.is_empty(), "promtool must report a bad name");
 }

@@ -22,7 +22,7 @@ fn draft(cells: u16, pid: u32) -> Draft {
     Draft { document: StatusDocument { pid, events: Vec::new(), ..sample(cells) }, events: Vec::new() }
 }
 
-/// Offers until the thread accepts.
+/// Offers drafts until the thread accepts one.
 fn offer(server: &StatusServer, cells: u16, pid: u32) {
     while !server.offer(draft(cells, pid)) {
         std::thread::sleep(Duration::from_millis(1));
@@ -35,7 +35,7 @@ fn connect(path: &Path) -> UnixStream {
     stream
 }
 
-/// Reads until the end.
+/// Reads until the end of the stream.
 fn rest(mut stream: UnixStream) -> Vec<u8> {
     let mut all = Vec::new();
     let _ = stream.read_to_end(&mut all);
@@ -54,7 +54,7 @@ fn until(what: &str, mut is_so: impl FnMut() -> bool) {
 fn client_receives_one_document_then_eof() {
     let folder = tempfile::tempdir().unwrap();
     let (server, path) = serve(&folder, PATIENT);
-    // Connected before there is a document: the client waits for the first one.
+    // The client connects before there is a document, and waits for the first document.
     let early = connect(&path);
     offer(&server, 96, 1);
     let received = parse(&rest(early)).unwrap();
@@ -63,7 +63,7 @@ fn client_receives_one_document_then_eof() {
     assert_eq!(parse(&line).unwrap(), received);
     assert_eq!(server.clients().served, 2);
     drop(server);
-    assert!(!path.exists() && !stream_path(&path).exists(), "the sockets are still there");
+    assert!(!path.exists() && !stream_path(&path).exists(), "the server must delete its sockets");
     assert!(StatusClient::new(Some(&path)).line().unwrap_err().contains("no daemon listens there"));
 }
 
@@ -98,9 +98,9 @@ fn clients_beyond_limit_are_rejected_and_counted() {
     assert_eq!((server.clients().served, server.clients().refused), (MAX_CLIENTS as u64, 136));
     offer(&server, 1, 7);
     for mut stream in seated {
-        assert_ne!(stream.read(&mut [0; 16]).unwrap(), 0, "an admitted client is not served");
+        assert_ne!(stream.read(&mut [0; 16]).unwrap(), 0, "the server must serve an admitted client");
     }
-    // They have closed, so there is room again.
+    // The admitted clients have closed, so there is room again.
     until("room", || {
         offer(&server, 1, 8);
         server.clients().connected == 0
@@ -114,12 +114,12 @@ fn client_that_never_reads_is_dropped() {
     let (server, path) = serve(&folder, Limits { max_silence: Duration::from_millis(300), ..PATIENT });
     let deaf = [connect(&path), connect(&stream_path(&path))];
     until("connected", || server.clients().connected == 2);
-    // More than a socket's buffer can hold.
+    // The server sends more than a socket's buffer can hold.
     let mut pid = 0;
     until("both are dropped", || {
         pid += 1;
         offer(&server, 1024, pid);
-        assert!(parse(&rest(connect(&path))).is_ok(), "not served while another client is silent");
+        assert!(parse(&rest(connect(&path))).is_ok(), "the server must serve while another client is silent");
         server.clients().dropped == 2
     });
     drop(deaf);
@@ -133,7 +133,7 @@ fn stale_document_is_not_served() {
     offer(&server, 1, 1);
     assert!(!rest(connect(&path)).is_empty());
     std::thread::sleep(stale);
-    assert_eq!(rest(connect(&path)), b"", "a stale document is served");
+    assert_eq!(rest(connect(&path)), b"", "the server must not send a stale document");
     offer(&server, 1, 2);
     assert!(!rest(connect(&path)).is_empty());
 }
@@ -150,7 +150,7 @@ fn second_daemon_cannot_take_the_sockets() {
 fn offer_never_blocks() {
     let folder = tempfile::tempdir().unwrap();
     let (server, _path) = serve(&folder, PATIENT);
-    // Serialising 1,024 cells takes the thread milliseconds; offers come faster, so some must be rejected.
+    // The thread needs milliseconds to serialise 1,024 cells. Offers come faster, so some offers must be rejected.
     let taken = (0..200).filter(|pid| server.offer(draft(1024, *pid))).count();
     assert!((1..200).contains(&taken), "{taken} of 200 taken");
 }

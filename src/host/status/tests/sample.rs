@@ -1,4 +1,4 @@
-//! A sample document for tests: all but a few values are known.
+//! A sample document for tests, in which nearly all values are known.
 
 use crate::alarm::{Alarm, AlarmState, Rule, Severity};
 use crate::can::poll::PollSilence;
@@ -20,7 +20,8 @@ use crate::status::document::{
     PollStatus, StatusCount, StatusCounters, StatusDocument, StoreStatus, VERSION,
 };
 
-/// The document of a pack. With several cells, the last sends no data and the last but one is not trusted.
+/// The document of a pack. If the pack has several cells, the last cell sends no data, and the estimate of the
+/// second-last cell is untrusted.
 pub(crate) fn sample(cells: u16) -> StatusDocument {
     let mut latency = Latency::default();
     [40e-6, 80e-6, 80e-6, 300e-6, 3e-3].into_iter().for_each(|seconds| latency.record(seconds));

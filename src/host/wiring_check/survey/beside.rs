@@ -11,7 +11,7 @@ use crate::quantity::{BusIndex, Channel};
 use crate::wiring::SignalPlan;
 use crate::wiring::evidence::{PackQuantity, SignalLabel};
 
-/// The comparable signals.
+/// Returns the comparable signals.
 pub(super) fn signals(raw: &RawTables, databases: &Databases, found: &[ResolvedSignal<'_>]) -> Vec<SignalPlan> {
     let is_configured = |signal: &Signal| found.iter().any(|resolved| std::ptr::eq(resolved.signal, signal));
     let free = databases.signals().filter(|named| !is_configured(named.signal));
@@ -28,7 +28,7 @@ pub(super) fn signals(raw: &RawTables, databases: &Databases, found: &[ResolvedS
     bound.take(64).collect()
 }
 
-/// What a signal measures, according to name and unit; `None` = not comparable.
+/// What a signal measures, according to its name and unit; `None` = the signal is not comparable.
 fn channel_of(raw: &RawTables, message: &Message, signal: &Signal) -> Option<Channel> {
     let label = SignalLabel::new(&message.name, &signal.name, &signal.unit);
     let is = |quantity| !label.says_extreme() && label.score(quantity).is_some_and(|score| score.points >= 3.0);
@@ -43,7 +43,7 @@ fn plan(bus: BusIndex, message: &Message, signal: &Signal, channel: Channel) -> 
     let unit = SignalUnit::parse(&signal.unit);
     let scale = match channel {
         Channel::PackVoltage => unit.map_or(1.0, |unit| unit.factor),
-        // Without a unit, a signal that can exceed 1.5 is in percent.
+        // If the unit is missing, a signal that can exceed 1.5 is in percent.
         _ if unit.is_some() || signal.layout.extent().1 > 1.5 => 0.01,
         _ => 1.0,
     };
