@@ -146,8 +146,8 @@ fn node<'a>(root: &'a mut Map<String, Value>, path: &str) -> &'a mut Value {
 fn reference() -> String {
     let mut page = "# VSS signals\n\nWritten by `packwatch vss --reference`: the signals that are not in the table of [quantities](quantities.md). A signal \
                     has no value while the daemon is silent, while one of its fields in the [status document](status.md) is unknown, or \
-                    where a column says so. Cells count from 0. An array has a value only if every cell has one, because VSS has no unknown \
-                    number.\n"
+                    in the cases that the column `remark` states. Cells count from 0. An array has a value only if every cell has \
+                    one, because VSS has no unknown number.\n"
         .to_owned();
     for (title, origin) in [("Standard signals", Origin::Standard), ("Overlay signals", Origin::Overlay)] {
         let branch =

@@ -104,7 +104,7 @@ const STANDARD: [Row; 9] = [
         Some("percent"),
         "pack.soh",
         |status| float(status.pack.values.mean(Quantity::Soh).map(|soh| 100.0 * soh)),
-        "Learned capacity over rated capacity. VSS allows 0 to 100; with more than its rated capacity, a cell has no value here",
+        "Learned capacity over rated capacity. VSS allows 0 to 100, so this signal has no value while the capacity is above the rated capacity",
     ),
     (
         "ErrorCodes",

@@ -285,7 +285,7 @@ section! {
         temperature_c: f64, "degrees C", TEMPERATURE_C, Required;
         /// Cut-off voltage of the discharge, under load.
         cutoff_v: f64, "V", Above(0.0, 100.0), Required;
-        /// A charge is complete when its current, per cell, has dropped to this at the cell model's highest voltage. Usable capacity is counted from the SOC at that moment.
+        /// A charge is complete when its current, per cell, has dropped to this value at the cell model's highest voltage. Usable capacity is counted from the SOC at that moment.
         taper_current_a: Option<f64>, "A", Above(0.0, 1e6), Optional("C/20: the rated capacity over 20 h")
             => taper_current_a: keys.taper_current_a.unwrap_or(rated_ah / 20.0);
     }

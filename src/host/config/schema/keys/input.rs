@@ -42,7 +42,7 @@ section! {
 }
 
 section! {
-    /// An answer to a diagnostic request over ISO-TP, from any tester. Most electric cars report cell voltages only this way. packwatch sends requests only with `[poll]`. The tables `[input.*]` name the signals of an answer like DBC signals: `Name.Signal`. The values have the time at which the first frame of the answer arrived.
+    /// An answer to a diagnostic request over ISO-TP; any tester may have sent the request. Most electric cars report cell voltages only this way. packwatch sends requests only with `[poll]`. The tables `[input.*]` name the signals of an answer in the same way as DBC signals: `Name.Signal`. The values have the time at which the first frame of the answer arrived.
     DiagnosticInput at "input.diagnostic" {
         /// Name of the answer, which precedes the dot in `Name.Signal`. Several answers may share a name.
         name: String, "", NotEmpty, Required;
