@@ -158,8 +158,8 @@ impl SensorIndex {
 
 /// The input that a configured signal provides.
 ///
-/// The order is the order in which readings of one frame are processed: a voltage triggers the estimator, so current
-/// and temperature of the same frame come first.
+/// Readings of one frame are processed in this order. A voltage triggers the estimator, so current and temperature of
+/// the same frame come first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Channel {

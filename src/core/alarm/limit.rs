@@ -10,9 +10,9 @@
 //! ```
 //!
 //! where c is 0.05 for a learned value and 0.5 otherwise. Therefore only a value at the clear threshold or better
-//! clears an alarm; a growing uncertainty does not. The clear threshold is on the healthy side of the set threshold, so
-//! the second probability is the larger one and no value is both beyond and healthy. With p = 0.5, the result is the
-//! same as for `when = "mean"`. If the standard deviation is needed but missing, the result is unknown.
+//! clears an alarm; a growing uncertainty does not. The clear threshold is on the healthy side of the set threshold.
+//! Therefore the second probability is the larger one, and no value is both beyond and healthy. With p = 0.5, the
+//! result is the same as for `when = "mean"`. If the standard deviation is needed but missing, the result is unknown.
 //!
 //! A learned value (a capacity, a resistance, a remaining life) does not recover by itself. Therefore c also applies to
 //! `when = "mean"`: an estimate that fluctuates around its threshold must not clear its alarm.
@@ -60,8 +60,8 @@ pub struct Observation {
     pub value: Option<f64>,
     /// Standard deviation of the value, in the same unit; `None` = unknown.
     pub std: Option<f64>,
-    /// The true value may be worse than this value, never better: the value is the worst of several sources, some of
-    /// them unknown. Such a value can be beyond a threshold, but not healthy.
+    /// Whether the value is the worst of several sources, some of which are unknown. The true value may then be worse,
+    /// but not better. Such a value can be beyond a threshold, but not healthy.
     pub is_bound: bool,
     /// Whether the value is a new measurement. Only new measurements count towards `debounce_events`.
     pub is_new: bool,
@@ -133,8 +133,8 @@ impl LimitCheck {
     }
 }
 
-/// Probability that a normally distributed value is on the bad side. `good_by` is the distance of its mean from the
-/// threshold, positive on the good side.
+/// Probability that a normally distributed value is on the bad side of a threshold. `good_by` is the distance of the
+/// mean from the threshold, positive on the good side.
 fn probability_beyond(good_by: f64, std: f64) -> f64 {
     if std > 0.0 {
         probability_below(-good_by, std)

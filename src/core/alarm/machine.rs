@@ -164,8 +164,8 @@ impl Machine {
     }
 
     /// Handles a value. If the inputs of a learned value are lost, a value may still arrive, because the loss ends a
-    /// half-cycle. This value may raise the alarm. It does not change an alarm that is already raised, because it would
-    /// clear the alarm or make it look up to date.
+    /// half-cycle. This value may raise the alarm. It does not change an alarm that is already raised. Otherwise, it
+    /// would clear the alarm or make it look up to date.
     pub(super) fn observe(&mut self, now: Timestamp, rule: &RuleConfig, observation: &Observation) -> Option<Change> {
         self.observation = *observation;
         if self.is_suspended && self.state == AlarmState::Suppressed {

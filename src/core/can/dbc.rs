@@ -4,10 +4,10 @@
 //! tables, units, cycle times, frame formats and end-to-end protection. Multiplexing is resolved to conditions on raw
 //! selector codes. [`Database::to_dbc`] writes a database as text, and parsing this text gives an equal database.
 //!
-//! The parser returns a [`DbcError`] with the line if the file is not a DBC, an identifier is out of range, a name is
-//! defined twice, or multiplexing cannot be resolved. It accepts a signal that extends beyond its message, whose
-//! decoding gives [`Fault::ShortFrame`](crate::quantity::Fault::ShortFrame). It also accepts an invalid layout, which
-//! [`SignalLayout::plan`] rejects.
+//! The parser returns a [`DbcError`] with the line for a file that is not a DBC, an identifier out of range, a name
+//! that is defined twice, and multiplexing that cannot be resolved. It accepts a signal that extends beyond its
+//! message, whose decoding gives [`Fault::ShortFrame`](crate::quantity::Fault::ShortFrame). It also accepts an invalid
+//! layout, which [`SignalLayout::plan`] rejects.
 
 use std::collections::{HashMap, HashSet};
 
@@ -206,7 +206,7 @@ impl Message {
 
 impl Signal {
     /// Raw codes (the signal's bits) that the value table calls "not available", "signal not available", "n/a" or
-    /// "SNA", ignoring case and treating `_` as a blank.
+    /// "SNA". Ignores case and treats `_` as a blank.
     pub fn not_available_codes(&self) -> Vec<u64> {
         let mask = u64::MAX >> (64 - u32::from(self.layout.length_bits.clamp(1, 64)));
         let says_so = |name: &str| {

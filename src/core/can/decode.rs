@@ -16,7 +16,7 @@ use crate::quantity::{BusIndex, Fault};
 
 pub use crate::quantity::{Channel, Reading, SensorIndex};
 
-/// Condition for the presence of a bound signal: the code of one multiplexor (the selector) must lie in one of the
+/// Condition for the presence of a bound signal. The code of one multiplexor, the selector, must lie in one of the
 /// ranges, ends included.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MuxTest {

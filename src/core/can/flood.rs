@@ -3,9 +3,9 @@
 //!
 //! In: time and identifier of each received frame. Out: whether the frame is admitted. Dropped frames are counted, and
 //! a [`FloodChange`] reports when dropping starts and ends. Each message has a leaky bucket, stored as one number: the
-//! time up to which the allowed rate is spent. It admits the frames of a tenth of a second at the allowed rate in one
-//! burst, and the allowed rate in the long run. The result depends only on the time stamps, and nothing is allocated
-//! after the start. Messages that are not configured always pass, because they are not decoded and cost almost no time.
+//! time up to which the allowed rate is spent. The bucket admits a burst of a tenth of a second's frames. In the long
+//! run, it admits the allowed rate. The result depends only on the time stamps, and nothing is allocated after the
+//! start. Messages that are not configured always pass, because they are not decoded and cost almost no time.
 
 use std::num::NonZeroU32;
 
@@ -23,9 +23,9 @@ pub struct FloodConfig {
 }
 
 impl Default for FloodConfig {
-    /// 2,000 frames a second: twice the rate of the fastest intended sender, because no battery message is sent more
-    /// often than once a millisecond. It is half of what one faulty sender can send, because a saturated bus of 500
-    /// kbit/s carries about 4,000 frames a second.
+    /// 2,000 frames a second. The fastest intended sender has half this rate: no battery message is sent more often
+    /// than once a millisecond. A faulty sender can reach twice this rate: a saturated bus of 500 kbit/s carries about
+    /// 4,000 frames a second.
     fn default() -> Self {
         Self { max_frames_per_s: const { NonZeroU32::new(2000).unwrap() } }
     }

@@ -1,13 +1,13 @@
 //! Checks the end-to-end protection of input messages.
 //!
 //! In: frames with their time and interface, in order of arrival; between frames, the time ([`Guards::poll`]). Out: the
-//! [`Status`] of each frame, counts per message, and a [`GuardChange`] when a message starts to fail its check or
-//! becomes usable again.
+//! [`Status`] of each frame and counts per message. A [`GuardChange`] reports that a message starts to fail its check
+//! or becomes usable again.
 //!
 //! If a message's cycle time is known, each period without a frame counts as one NONEWDATA. The first is counted one
-//! and a half periods after the last frame (half a period allows for jitter), then one per period. No change is
-//! reported while the number of missing frames is within the number that the check allows to be lost. The next frame
-//! will be usable, and a sender with jitter would otherwise fill the log.
+//! and a half periods after the last frame (half a period allows for jitter), then one per period. As long as the check
+//! allows this number of lost frames, no change is reported. The next frame will be usable, and a sender with jitter
+//! would otherwise fill the log.
 //!
 //! A time without listening is not the sender's fault. After sleep, a restart of the program or a clock step, the
 //! receivers wait for a first frame again ([`Guards::restart`]). For the same reason, a restarted program restores the

@@ -51,9 +51,9 @@ struct SentFrame {
     sum: u64,
 }
 
-/// Checksum of a payload and its length: like FNV-1a, but with words of eight bytes instead of bytes, because it is
-/// computed for every sent frame. It identifies copies and is not secure. Two different payloads of the same length
-/// never have the same checksum if the length is at most eight bytes.
+/// Checksum of a payload and its length. It is like FNV-1a, but uses words of eight bytes, because it is computed for
+/// every sent frame. It identifies copies and is not secure. Two different payloads of the same length never have the
+/// same checksum if the length is at most eight bytes.
 fn sum(data: &[u8]) -> u64 {
     let start = 0xCBF2_9CE4_8422_2325 ^ data.len() as u64;
     data.chunks(8).fold(start, |sum, chunk| {

@@ -4,13 +4,12 @@
 //! ([`SecondSenders::poll`]). Out: a [`SenderChange`] when a second sender is found and when it is gone.
 //!
 //! Frames are counted in windows of [`WINDOW_NS`]. A second sender is found if [`WINDOWS`] consecutive windows have
-//! more than [`EXCESS`] times the expected number of frames, and if there is a second sign: either many intervals are
-//! much shorter than the mean, because each frame of one sender falls between two frames of the other; or the reported
-//! currents alternate. A single sender that becomes faster, as many do when the vehicle wakes, shows neither sign.
-//! Short intervals that a message always has, such as those between the pages of a multiplexed message sent in a burst,
-//! are learned with its rate and do not count. The expected number is the highest steady rate so far, or the rate from
-//! the DBC's cycle time if it is higher. The learned rate is stored, so that a second sender is also found after a
-//! restart.
+//! more than [`EXCESS`] times the expected number of frames and one of two further signs. Either many intervals are
+//! much shorter than the mean, because each frame of one sender falls between two frames of the other. Or the reported
+//! currents alternate. A single sender that becomes faster, as many do when the vehicle wakes, shows neither sign. Some
+//! messages always have short intervals, for example between the pages of a multiplexed message. These intervals are
+//! learned with the rate and do not count. The expected number is the highest steady rate so far, or the rate from the
+//! DBC's cycle time if it is higher. The learned rate is stored, so that a second sender is also found after a restart.
 //!
 //! A second sender is not found in these cases:
 //! * the message has fewer than [`LEAST_PER_S`] frames a second, and the second sender is as slow as the first;

@@ -5,8 +5,9 @@
 //! then needs one load, two shifts and one multiply-add. Signals have 1 to 64 bits at any position of a payload of up
 //! to 64 bytes.
 //!
-//! Bad input is data: a payload that is too short gives [`Fault::ShortFrame`], NaN or infinity [`Fault::NotFinite`], a
-//! value outside the DBC's range [`Fault::OutOfRange`]. Encoding rounds to the nearest code and saturates.
+//! Bad input is data. A payload that is too short gives [`Fault::ShortFrame`]. NaN or infinity gives
+//! [`Fault::NotFinite`]. A value outside the DBC's range gives [`Fault::OutOfRange`]. Encoding rounds to the nearest
+//! code and saturates.
 
 use crate::can::MAX_DATA;
 use crate::quantity::Fault;
@@ -38,8 +39,8 @@ pub enum ValueType {
 /// Position and conversion of a signal, as in a DBC.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SignalLayout {
-    /// Start bit in DBC numbering: bit 0 is the least significant bit of byte 0, bit 7 is its most significant bit, and
-    /// bit 8 is the least significant bit of byte 1.
+    /// Start bit in DBC numbering. Bits 0 to 7 are byte 0, from the least to the most significant bit; bit 8 starts
+    /// byte 1.
     pub start_bit: u16,
     /// Length, 1 to 64 bits.
     pub length_bits: u16,
@@ -124,8 +125,8 @@ fn low_64(code: i128) -> u64 {
 }
 
 impl SignalLayout {
-    /// Positions of the first and last bit in wire order: within a byte from bit 0 up for little-endian signals, from
-    /// bit 7 down for big-endian signals.
+    /// Positions of the first and last bit in wire order. Within a byte, little-endian signals count from bit 0 up, and
+    /// big-endian signals from bit 7 down.
     pub(crate) fn span(&self) -> (u32, u32) {
         let start = u32::from(self.start_bit);
         let first = match self.byte_order {
@@ -433,8 +434,8 @@ impl SignalPlan {
         }
     }
 
-    /// Encodes a physical value: rounds to the nearest code, and saturates (also infinities) at the limits of the bits
-    /// and of the DBC's range. Other bits of the payload do not change.
+    /// Encodes a physical value. Rounds to the nearest code. Saturates at the limits of the bits and of the DBC's
+    /// range, also for infinities. Other bits of the payload do not change.
     ///
     /// # Errors
     /// [`Fault::ShortFrame`] if the payload ends before the signal does, [`Fault::NotFinite`] for NaN. The payload is

@@ -3,7 +3,7 @@
 //! In: good current readings, A, positive = discharge. Out: cumulative charge, As, and cumulative unmeasured time, s;
 //! only their differences are meaningful. An interval between two current readings counts as follows:
 //! * up to the current's `max_age_s`: trapezoid over the elapsed time;
-//! * longer: the first reading is held for `max_age_s` (the longest time that a value may be used), and the rest of the
+//! * longer: the first reading is held for `max_age_s` (the longest time that a value may be used). The rest of the
 //!   interval is unmeasured. It is never interpolated, regardless of its cause (bad readings, lost frames, sleep, a
 //!   restart).
 //!

@@ -3,12 +3,12 @@
 //! In: good readings of the current, A, and of the cells' voltages, V. Out: whether the current is frozen. It stays
 //! frozen until its reading changes.
 //!
-//! A constant reading alone proves nothing: a parked pack, a charger and a laboratory hold a current for hours, and a
-//! coarse sensor then shows one value throughout. In these cases, the voltages rest or drift in one direction. A
-//! changing load moves the voltages back and forth: the median of the cells moves in one direction and turns back
-//! within [`MAX_TURN_S`]. Both movements exceed the noise of the median. The sensor is frozen if its reading is still
-//! the same [`MIN_FROZEN_S`] after the turn and at least [`MIN_READINGS`] readings were equal. The delay allows for a
-//! reading that arrives later than the voltages.
+//! A constant reading alone proves nothing. A parked pack, a charger and a laboratory hold a current for hours, and a
+//! coarse sensor then shows one value. In these cases, the voltages rest or drift in one direction. A changing load
+//! moves the voltages back and forth. The median of the cells moves in one direction and turns back within
+//! [`MAX_TURN_S`]. Both movements exceed the noise of the median. The sensor is frozen if its reading is still the same
+//! [`MIN_FROZEN_S`] after the turn and at least [`MIN_READINGS`] readings were equal. The delay allows for a reading
+//! that arrives later than the voltages.
 //!
 //! Limits: the check does not detect a load that does not turn back or moves the voltages by less than the step. Nor
 //! does it detect a sensor whose last digits still change. In that case, the voltages contradict the estimate.
@@ -27,7 +27,7 @@ const MIN_FROZEN_S: f64 = 5.0;
 const MAX_TURN_S: f64 = 60.0;
 /// Step that exceeds a voltage's noise, in configured standard deviations.
 const STEP_SIGMA: f64 = 5.0;
-/// The same step as a multiple of the median change of the voltage per round, used if the real noise exceeds the
+/// The same step as a multiple of the median change of the voltage per round. It applies if the real noise exceeds the
 /// configured noise. The value corresponds to 8 standard deviations, so that two consecutive readings do not reach it
 /// by chance within a day.
 const STEP_MOVES: f64 = 8.4;

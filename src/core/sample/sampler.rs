@@ -1,7 +1,7 @@
 //! Combines the signals of all configured channels and the charge counter into samples.
 //!
-//! In: readings with their time (V, A, degrees C). Out: a [`CellSample`] per good voltage, with the current and
-//! temperature that are fresh at that time, and the charge and unmeasured time counted up to it. A bad voltage gives no
+//! In: readings with their time (V, A, degrees C). Out: a [`CellSample`] per good voltage. It has the current and
+//! temperature that are fresh at that time, and the charge and unmeasured time up to that time. A bad voltage gives no
 //! sample. Readings of channels that are not used are counted ([`Sampler::reading_counts`]).
 //!
 //! The memory is one record per channel, allocated at the start. Handling a reading allocates nothing. The records are

@@ -3,8 +3,8 @@
 //! In: readings in the channel's unit, with their time. Out: the value or its fault, and changes between good and bad.
 //!
 //! * **Range**: a value outside the limits is bad.
-//! * **Rate**: a value is bad if its distance from the last good value exceeds the fastest plausible change, unless
-//!   [`ACCEPT_AFTER`] consecutive readings agree with each other. In that case, the step was real or the last good
+//! * **Rate**: a value is bad if its distance from the last good value exceeds the fastest plausible change. Once
+//!   [`ACCEPT_AFTER`] consecutive readings agree with each other, they are accepted: the step was real or the last good
 //!   value was wrong. Further rejection would lock out a healthy sensor.
 //! * **Stuck**: a value that stays exactly the same for too long while it should change is bad until it changes. The
 //!   caller passes a clock that runs only while the value should change.
@@ -62,8 +62,8 @@ pub(super) struct Signal {
     bad_share: f64,
 }
 
-/// Outcome of a reading: the checked value, and the signal's new state if it changed (`Ok` = good again, with the
-/// number of bad readings before).
+/// Outcome of a reading: the checked value, and the signal's new state if the state changed. `Ok` means good again and
+/// contains the number of bad readings before.
 pub(super) struct SignalUpdate {
     pub(super) value: Result<f64, Fault>,
     pub(super) change: Option<Result<u64, Fault>>,

@@ -108,8 +108,8 @@ impl Settings {
                 s.sensors = Sensors { voltage, ..Sensors::default() };
                 (s.end_capacity_ah, s.cycles) = (0.0, Some(10));
             }
-            // With this ageing, a block of 1,500 loads (about 310 Ah) reduces the capacity by about 5 % and increases
-            // the resistance by about 10 %, as in the measured cells.
+            // With this ageing, a block of 1,500 loads (about 310 Ah) costs about 5 % capacity and adds about 10 %
+            // resistance, as in the measured cells.
             Scenario::RandomWalk => {
                 s.pack.ageing = Ageing {
                     capacity_loss_ah_per_ah: 3.4e-4,
@@ -123,8 +123,8 @@ impl Settings {
         s
     }
 
-    /// Sets a current sample every 10 ms, cell samples every 100 ms, and the errors of a typical pack: 0.5 % gain, 1 mV
-    /// noise, 1 % capacity spread.
+    /// Sets a current sample every 10 ms and cell samples every 100 ms. Sets the errors of a typical pack: 0.5 % gain,
+    /// 1 mV noise, 1 % capacity spread.
     fn set_ev_day(&mut self) {
         let capacity_ah = self.pack.capacity_ah;
         self.pack.cells = 96;

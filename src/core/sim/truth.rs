@@ -4,8 +4,8 @@
 //! the estimator does not model. Current is positive for discharge. During a step of `dt` seconds, the current and the
 //! values from the tables are constant. Under this condition, every equation is solved exactly:
 //! * `SOC -= (I + I_leak) dt / (3600 C)`; not clamped, because 0 and 1 stand for open-circuit voltages and are not
-//!   limits;
-//! * `U_i = U_i a + R_i I (1 - a)`, `a = exp(-dt / tau_i)`; ageing scales every resistance but no time constant;
+//!   limits.
+//! * `U_i = U_i a + R_i I (1 - a)`, `a = exp(-dt / tau_i)`. Ageing scales every resistance but no time constant.
 //! * hysteresis, one state h in [-1, 1] (Plett): `h = h e - (1 - e) sign(I)`, `e = exp(-|I dt| gamma / (3600 C))`;
 //! * heat: `T = T_end + (T - T_end) exp(-dt / (R_th C_th))`, `T_end = T_ambient + R_th (I^2 R0 + sum U_i^2 / R_i)`.
 //!

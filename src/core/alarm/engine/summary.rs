@@ -42,8 +42,8 @@ impl AlarmEngine {
         waiting.map(|rule| (rule.config.rule, rule.config.severity, rule.unknown))
     }
 
-    /// An alarm that has an unknown value and is not raised, from the `turn`-th threshold with unknown values (modulo
-    /// their number); `None` = no such alarm.
+    /// An alarm that has an unknown value and is not raised; `None` = no such alarm. The alarm is from the `turn`-th
+    /// threshold with unknown values, modulo the number of these thresholds.
     pub fn unknown_alarm(&self, turn: usize) -> Option<Alarm> {
         let (_, count) = self.unknown();
         let mut waiting = self.rules.iter().enumerate().filter(|(_, rule)| rule.unknown > 0);
@@ -72,7 +72,7 @@ impl AlarmEngine {
         Some(RuleSummary { worst, is_known: thresholds.iter().all(|slots| slots.unknown == 0) })
     }
 
-    /// Rule, severity and value of the `turn`-th threshold (modulo their number); `None` = no thresholds.
+    /// Rule, severity and value of the `turn`-th threshold, modulo the number of thresholds; `None` = no thresholds.
     pub fn threshold(&self, turn: usize) -> Option<(Rule, Severity, f64)> {
         let config = &self.rules.get(turn.checked_rem(self.rules.len())?)?.config;
         Some((config.rule, config.severity, config.threshold))

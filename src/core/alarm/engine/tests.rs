@@ -41,8 +41,8 @@ fn noise_at_threshold_raises_and_clears_once() {
     let mut crossings = 0;
     let mut was_beyond = false;
     for second in 0..24 * 3600 {
-        // The value is healthy for six hours, at the threshold for twelve hours, and healthy for six hours, always with
-        // noise of +/- 0.4.
+        // The value is healthy for six hours, at the threshold for twelve hours, and healthy again for six hours. It
+        // always has noise of +/- 0.4.
         let mean = if (6 * 3600..18 * 3600).contains(&second) { 3.0 } else { 1.5 };
         let value = mean + rng.random_range(-0.4..0.4);
         crossings += u32::from((value > 3.0) != was_beyond);

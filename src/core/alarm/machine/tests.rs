@@ -78,7 +78,7 @@ fn machine_in(state: AlarmState) -> (Machine, RuleConfig) {
     (machine, rule)
 }
 
-/// Expected state after `input`, expected state after the same input once the debounce has run out, and the change that
+/// Expected state after `input`, expected state after the same input at the end of the debounce, and the change that
 /// the first input publishes.
 fn expected(state: AlarmState, input: MachineInput) -> (AlarmState, AlarmState, Option<Change>) {
     use AlarmState::{Active, Cleared, Clearing, Inactive, Latched, Pending, Suppressed, Unknown};

@@ -1,7 +1,7 @@
 //! Attributes of a DBC: cycle time, repetition, frame format, end-to-end protection, authentication.
 //!
-//! The attribute names and the order of the values of `VFrameFormat` follow DBC editors; the attributes for
-//! end-to-end protection and authentication are specific to packwatch. An invalid attribute counts as missing.
+//! The attribute names and the order of the values of `VFrameFormat` follow DBC editors. The attributes for end-to-end
+//! protection and authentication are specific to packwatch. An invalid attribute counts as missing.
 
 use can_dbc::{AttributeDefinition, AttributeValue, AttributeValueType, Dbc, MessageId};
 

@@ -44,8 +44,8 @@ struct SignalGroup {
     signals: Arc<[LinearSignal]>,
     /// Index of the group's first binding among all bindings.
     first: usize,
-    /// A payload of at least this length carries all signals of the group; [`NEVER`] if the binding must decide whether
-    /// they are present.
+    /// A payload of at least this length carries all signals of the group. [`NEVER`] means that the binding decides
+    /// whether they are present.
     bytes_needed: usize,
 }
 
@@ -248,8 +248,8 @@ impl MessageGroups {
 }
 
 impl PageTable {
-    /// Creates the table for the selector that most runs depend on; `None` without a selector, or if the table would be
-    /// too large.
+    /// Creates the table for the selector that most runs depend on; `None` = no selector, or the table would be too
+    /// large.
     fn new(bindings: &[Binding], runs: &[Range<usize>], all: &[SignalGroup]) -> Option<Self> {
         let tests = |run: &Range<usize>| bindings[run.start].mux.as_slice();
         let dependents = |plan: SignalPlan| runs.iter().flat_map(tests).filter(|test| test.plan == plan).count();

@@ -208,8 +208,8 @@ impl Receiver {
             self.no_new_or_repeated = 0;
             self.sync = config.sync_counter_init;
             // With profile 5 or a configured synchronisation, the sequence continues from any intact frame. With
-            // profile 1 and no synchronisation, the last accepted counter stays until the sender reaches it again or
-            // the allowed step is large enough.
+            // profile 1 and no synchronisation, the last accepted counter stays. The sender must reach it again, or the
+            // allowed step must become large enough.
             if self.sync > 0 || config.protection.profile == Profile::P05 {
                 self.accept(config, counter);
             }

@@ -66,8 +66,7 @@ pub struct DigestFields {
 pub struct TableChecksum(u16);
 
 impl TableChecksum {
-    /// Adds a raised alarm with the codes of its frame: number of the rule, severity, cell (`None` = the pack), state,
-    /// and whether it is acknowledged.
+    /// Adds a raised alarm with the codes of its frame; `cell`: `None` = the pack.
     pub fn add(&mut self, rule: u8, severity: u8, cell: Option<CellIndex>, state: u8, is_acknowledged: bool) {
         // 2047 is the code of "the whole pack", as in the alarm frame of the shipped DBC.
         let [low, high] = cell.map_or(2047, |cell| cell.0).to_le_bytes();

@@ -1,9 +1,9 @@
 //! Creates the layout of the sent frames and of the command frame: one [`Database`] for the encoder and for consumers.
 //!
 //! In: a base (the built-in `config/packwatch.dbc`, or the user's own DBC) and settings per message. Out: the base's
-//! messages with identifiers, frame formats, cycle times, end-to-end protection and authentication as configured,
-//! including the signals of header and trailer. The encoder is built from this database and `packwatch dbc` writes it,
-//! so they always agree.
+//! messages with the configured identifiers, frame formats, cycle times, end-to-end protection and authentication. They
+//! include the signals of header and trailer. The encoder is built from this database and `packwatch dbc` writes it, so
+//! they always agree.
 //!
 //! The built-in base is adapted:
 //!
@@ -371,8 +371,8 @@ fn trailer_signals(len_bytes: u16, authentication: Authentication) -> Vec<Signal
     let length = |bits: u32| u16::try_from(bits).unwrap_or(0);
     let (freshness, mac) = (length(profile.freshness_bits()), length(profile.mac_bits()));
     let first = 8 * len_bytes.saturating_sub(length(u32::from(freshness + mac) / 8));
-    // In a DBC, the start bit of a big-endian signal is its most significant bit, and the bits of a byte count from the
-    // least significant bit.
+    // In a DBC, a big-endian signal starts at its most significant bit. The bits of a byte count from the least
+    // significant bit.
     let place = |bit: u16| bit / 8 * 8 + 7 - bit % 8;
     let signal = |name, bit, length_bits, comment: &str| {
         let mut signal = header_signal(name, place(bit), length_bits, comment);

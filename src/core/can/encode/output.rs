@@ -5,8 +5,8 @@
 //! is sent as all ones (unsigned), the lowest code (signed) or NaN (float). A known value never has that code, because
 //! it saturates before it. End-to-end headers use the counters that the caller keeps ([`SendCounters`]).
 //!
-//! If signals are missing, or if a value could be mistaken for the value of another rule or page, the DBC is rejected
-//! with all its faults.
+//! A DBC is rejected with all its faults if signals are missing. It is also rejected if a value could be mistaken for
+//! the value of another rule or page.
 
 use serde::{Deserialize, Serialize};
 

@@ -1,8 +1,8 @@
 //! Encodes the reply to a command frame.
 //!
-//! In: the outcome of a command, or the reason why it was not executed, and the counter that the next command must
-//! have. Out: values for the signals of `PACKWATCH_Reply`. If the checksum of a command frame is wrong, the reply does
-//! not repeat its content.
+//! In: the outcome of a command or the reason for its refusal, and the counter that the next command must have. Out:
+//! values for the signals of `PACKWATCH_Reply`. If the checksum of a command frame is wrong, the reply does not repeat
+//! its content.
 
 use serde::{Deserialize, Serialize};
 

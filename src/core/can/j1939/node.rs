@@ -338,8 +338,8 @@ impl Node {
         }
     }
 
-    /// Extended identifiers that the node must receive, as identifier and mask for any priority: claims of the node's
-    /// address, requests to the node, and requests to all nodes.
+    /// Identifiers and masks of the extended frames that the node must receive, for any priority. These are claims of
+    /// the node's address, requests to the node, and requests to all nodes.
     pub fn wanted(&self) -> [(u32, u32); 3] {
         let (claim, mask) = filter(PGN_ADDRESS_CLAIMED, GLOBAL_ADDRESS);
         [

@@ -14,9 +14,9 @@ use serde::{Deserialize, Serialize};
 
 use super::name::OutOfRange;
 
-/// Maximum number of codes in one message: 27 codes are 110 bytes in 16 packets. With 50 ms between packets, each up to
-/// one tick of 10 ms late, a transfer ends within 0.96 s, before the next DM1 is due. 27 codes are enough for 17 rules,
-/// because only the most severe threshold of a rule is sent if its thresholds share a parameter number.
+/// Maximum number of codes in one message. 27 codes are 110 bytes in 16 packets. The packets are sent every 50 ms, each
+/// up to one tick of 10 ms late. So a transfer ends within 0.96 s, before the next DM1 is due. 17 rules need only 17
+/// codes if the thresholds of each rule share a parameter number, because only the most severe one is sent.
 pub const MAX_CODES: usize = 27;
 
 pub(super) const MAX_PAYLOAD: usize = 2 + 4 * MAX_CODES;
@@ -123,8 +123,8 @@ pub struct Lamps {
 }
 
 impl Lamps {
-    /// The lamps for active codes. If some values are unknown (`all_known` is false), a lamp that no code lights is
-    /// "not available" instead of off, because an unknown state must not look healthy.
+    /// The lamps for active codes. If `all_known` is false, a lamp that no code lights is "not available" instead of
+    /// off, because an unknown state must not look healthy.
     pub fn of(lit: impl IntoIterator<Item = Lamp>, all_known: bool) -> Self {
         let dark = if all_known { LampState::Off } else { LampState::NotAvailable };
         let mut lamps = Self { protect: dark, amber: dark, red: dark };

@@ -3,7 +3,7 @@
 //!
 //! The receiver announces a value once a second, each time [`ANNOUNCEMENT_STEP`] higher. A command carries the
 //! announced value or a higher one below the next announcement. The sender uses each value once and in rising order.
-//! The receiver accepts a value if it is higher than every value accepted before, not older than the previous
+//! The receiver accepts a value if it is higher than all values accepted before, not older than the previous
 //! announcement, and already announced. If an attacker delays a command, it expires after two seconds. A command with
 //! an invented value is useless until the receiver announces that value.
 //!

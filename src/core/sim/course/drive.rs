@@ -139,8 +139,8 @@ fn power_w(speed_m_s: f64, acceleration_m_s2: f64) -> f64 {
     if speed_m_s == 0.0 {
         return AUXILIARY_W;
     }
-    // Mass 1900 kg including two people; rolling resistance 1 % of the weight; air density, drag coefficient, frontal
-    // area.
+    // The mass is 1900 kg including two people. The rolling resistance is 1 % of the weight. The other factors are air
+    // density, drag coefficient and frontal area.
     let force_n = 1900.0 * (acceleration_m_s2 + 9.81 * 0.010) + (0.5 * 1.2 * 0.25 * 2.3) * speed_m_s * speed_m_s;
     let wheel_w = force_n * speed_m_s;
     // Efficiency from battery to wheel, and from wheel to battery.

@@ -1,5 +1,5 @@
-//! Tests that valid settings change the layout, that invalid settings are rejected with their key, and that a layout
-//! built from its own text does not change.
+//! Tests that valid settings change the layout and that invalid settings are rejected with their key. Also tests that a
+//! layout built from its own text does not change.
 
 use super::*;
 use crate::can::encode::{CommandPlan, OutputPlan};

@@ -102,8 +102,8 @@ fn sleeping_and_polled(acts: &[Act]) -> (Bench, Bench) {
     (sleeper, busy)
 }
 
-/// Found by the property below: during the transfer of a DM2, the second code leaves the DM1, which then fits into one
-/// frame.
+/// A case that the property below found. During the transfer of a DM2, the second code leaves the DM1, which then fits
+/// into one frame.
 #[test]
 fn dm1_shortened_during_transfer_is_due() {
     let set = |spns: &[(u8, u8)], previously| Act::Set { spns: spns.to_vec(), previously, all_known: true };
