@@ -1,15 +1,15 @@
-//! State and history that survive a restart and a power cut: two state files and a history database in one folder.
+//! State and history that survive restarts and power cuts: two state files and a database of the history, in one folder.
 //!
-//! * Learned results and alarm changes are written to disk, with the state of that moment, before they are announced.
-//!   An announcement waits at most 200 ms for the disk ([`commit_barrier`]). The rows are committed first, then the
-//!   state (`writer`). After a power cut, both therefore contain everything that was announced. A power cut between the
-//!   two commits leaves rows that were not announced. The restored state is older than these rows, so results and
-//!   alarms that still apply are learned or raised again and get another row. A pack change between the two commits is
-//!   not undone: the history says that the state's pack is closed, so the state is not restored.
+//! * Learned results and alarm changes are on disk before they are announced; an announcement waits at most 200 ms for the disk
+//!   ([`commit_barrier`]). Learned results are stored with the whole state. An alarm change is stored as a small row of the history; a
+//!   start restores the newest state and repeats the newer alarm changes (`learned`).
+//! * Rows are committed before the state that contains them (`writer`). A power cut between the two leaves rows that were not
+//!   announced. The next start repeats their alarm changes; learned results are learned again and get another row. A change of the
+//!   pack between the two is not undone: the history says that the state's pack is closed, and the state is not restored.
 //! * The state is also written at checkpoints (`checkpoint`), on stop, and every second to the runtime folder, which is in memory.
 //! * The state is written to two files in turn (`state_files`) and does not depend on the database. If there is no valid state,
-//!   the capacities in the history are used (`learned`).
-//! * A damaged database is set aside and a new one is created (`folder`).
+//!   the capacities and alarms in the history are used (`learned`).
+//! * A damaged database is set aside and a new one is created (`folder`). The next start then uses the state alone.
 //! * On a full disk, a reserve provides space for learned results and alarms (`reserve`).
 //! * The loop never accesses the disk; a separate thread does (`writer`).
 //! * After any fault of disk, folder or file, the daemon keeps running and reports the fault to the core (`store_failed`).
@@ -38,15 +38,16 @@ use std::thread::JoinHandle;
 
 use tokio::sync::watch;
 
+use crate::alarm::AlarmChange;
 use crate::config::{StoreConfig, VehicleIdentity};
 use crate::io::background_file::{MAX_FINISH, ends_in_time};
 use crate::io::place::{PlaceSetting, first_folder};
-use crate::monitor::{Command, Downtime, Event, EventKind, LearnedCell, Monitor, Snapshot};
+use crate::monitor::{Downtime, Event, LearnedCell, Monitor, Snapshot};
 use crate::quantity::Timestamp;
 use checkpoint::CheckpointSchedule;
 use database::Database;
 use folder::Folder;
-use history_filter::HistoryFilter;
+use history_filter::{HistoryCommit, HistoryFilter};
 use reserve::Reserve;
 use rows::{HistoryRow, RowBatch};
 use runtime::RuntimeState;
@@ -90,8 +91,8 @@ pub fn daemon_folder() -> (PathBuf, bool) {
 /// Source of the newest stored state.
 pub const STATE_SOURCE: &str = "state file";
 
-/// Source of a state made from the capacities in the history.
-pub const HISTORY_SOURCE: &str = "learned values in the history";
+/// Source of a state that was built from the capacities and alarms in the history.
+pub const HISTORY_SOURCE: &str = "history";
 
 /// A stored state that may be restored.
 #[derive(Debug)]
@@ -111,11 +112,13 @@ pub struct StoredStates {
     pub states: Vec<StateCandidate>,
     /// Learned values of the connected pack's cells in the history, if there is no valid state.
     pub learned: Vec<LearnedCell>,
-    /// Whether the store could be read and can be written.
+    /// Alarm changes of the connected pack in the history; empty if there is a valid state.
+    pub alarms: Vec<(Timestamp, AlarmChange)>,
+    /// Whether the store was readable, undamaged and is writable.
     pub works: bool,
 }
 
-/// The loop's side of the store.
+/// The store, as the service loop uses it.
 #[derive(Debug)]
 pub struct Store {
     write_queue: Arc<WriteQueue>,
@@ -139,7 +142,7 @@ impl Store {
         config: &StoreConfig,
         vehicle: &VehicleIdentity,
     ) -> Result<(Option<Self>, StoredStates), String> {
-        let none = |works| (None, StoredStates { states: Vec::new(), learned: Vec::new(), works });
+        let none = |works| (None, StoredStates { states: Vec::new(), learned: Vec::new(), alarms: Vec::new(), works });
         let Some((path, is_needed)) = setting.resolve(daemon_folder) else { return Ok(none(true)) };
         let shown = path.display().to_string();
         let mut folder = Folder::new(path.clone());
@@ -168,13 +171,15 @@ impl Store {
         let path = folder.path().to_owned();
         let runtime_file = first_folder("RUNTIME_DIRECTORY").map(|folder| folder.join(runtime::FILE_NAME));
         let running = runtime_file.as_deref().and_then(|file| running_state(file, &path));
-        let OpenedFolder { state_files, database, rows, pack, found } = OpenedFolder::open(&mut folder, running, &now);
+        let OpenedFolder { state_files, database, rows, pack, known_rows, found } =
+            OpenedFolder::open(&mut folder, running, &now);
         let mut retry = Retry::default();
         if database.is_none() {
             retry.after_failure();
         }
-        let (sender, progress) =
-            watch::channel(StoreProgress { works: found.works, has_room: true, pack, ..StoreProgress::default() });
+        let progress =
+            StoreProgress { works: found.works, has_room: true, pack, rows: known_rows, ..StoreProgress::default() };
+        let (sender, progress) = watch::channel(progress);
         let write_queue = Arc::new(WriteQueue::default());
         if !rows.is_empty() {
             // These rows are written with the first state.
@@ -189,6 +194,7 @@ impl Store {
             folder,
             state_files,
             knows_state: database.is_some() || !found.states.is_empty(),
+            needs_state: true,
             database,
             progress: sender,
             retry,
@@ -229,13 +235,8 @@ impl Store {
     /// Commits the results learned from the events of one input. Returns the ticket that the announcement must wait
     /// for; `None` = no wait.
     pub fn learned(&mut self, events: &[Event], monitor: &Monitor, now: Timestamp) -> Option<u64> {
-        let rows = match self.history_filter.take(events, self.schedule.has_room(now)) {
-            Some(rows) => rows,
-            // The sender of the command is answered when the change is stored.
-            None if events.iter().any(|event| is_command_with_effect(&event.kind)) => self.history_filter.deferred(),
-            None => return None,
-        };
-        Some(self.submit(rows, monitor, now))
+        let commit = self.history_filter.take(events)?;
+        Some(self.submit(commit, monitor, now))
     }
 
     /// Writes the runtime state every second, and a checkpoint when it is due. `is_fresh` states whether frames have
@@ -251,8 +252,8 @@ impl Store {
         if !self.schedule.is_due(now, if is_fresh { 0.0 } else { QUIET_PERIOD_S }) {
             return false;
         }
-        let waiting = self.history_filter.for_checkpoint(now);
-        self.submit(waiting, monitor, now);
+        let commit = self.history_filter.checkpoint(now);
+        self.submit(commit, monitor, now);
         true
     }
 
@@ -262,8 +263,8 @@ impl Store {
         if let Some(runtime) = &self.runtime {
             runtime.put(self.document(monitor, now));
         }
-        let waiting = self.history_filter.deferred();
-        self.submit(waiting, monitor, now);
+        let commit = self.history_filter.finish();
+        self.submit(commit, monitor, now);
         self.write_queue.stop();
         let Some(writer) = self.writer.take() else { return };
         if !ends_in_time(&writer) {
@@ -277,30 +278,26 @@ impl Store {
     }
 
     /// Queues rows and the state for the writer; returns the ticket.
-    fn submit(&mut self, rows: Vec<HistoryRow>, monitor: &Monitor, now: Timestamp) -> u64 {
+    fn submit(&mut self, HistoryCommit { rows, with_state }: HistoryCommit, monitor: &Monitor, now: Timestamp) -> u64 {
         let state = self.document(monitor, now);
-        self.schedule.note_written(now, self.progress.borrow().state_bytes);
+        self.schedule.note_written(now, with_state.then_some(self.progress.borrow().state_bytes));
         let batch = (!rows.is_empty()).then_some(RowBatch { stamp: state.stamp, rows });
-        self.write_queue.submit(batch, state)
+        self.write_queue.submit(batch, state, with_state)
     }
 
     fn document(&self, monitor: &Monitor, now: Timestamp) -> StateDocument {
+        let StoreProgress { pack, rows, .. } = *self.progress.borrow();
         StateDocument {
             format: FORMAT,
             // The writer assigns the number.
             number: 0,
             folder: self.folder.to_string_lossy().into_owned(),
-            pack: self.progress.borrow().pack,
-            history_rows: 0,
+            pack,
+            history_rows: rows,
             stamp: Stamp::now(now, self.boot),
             snapshot: Box::new(monitor.snapshot().for_restart()),
         }
     }
-}
-
-/// Whether an event is a command that has changed alarms.
-fn is_command_with_effect(kind: &EventKind) -> bool {
-    matches!(kind, EventKind::Command { command: Command::Acknowledge(_) | Command::Clear(_), changed: 1.., .. })
 }
 
 /// The contents of a folder at the start.
@@ -313,13 +310,16 @@ struct OpenedFolder {
     rows: Vec<HistoryRow>,
     /// Number of the connected pack; 0 = unknown.
     pack: i64,
+    /// Rows of the history that the newest state contains or that are repeated in it.
+    known_rows: i64,
     found: StoredStates,
 }
 
 impl OpenedFolder {
     /// Reads the states and opens the database; `running` is the state in the runtime folder.
     fn open(folder: &mut Folder, running: Option<StateDocument>, now: &Stamp) -> Self {
-        let (state_files, FoundStates { newest, aside, faults: mut rows }) = StateFiles::open(folder.path());
+        let (state_files, FoundStates { mut newest, aside, faults: mut rows }) = StateFiles::open(folder.path());
+        let mut running = running.filter(|running| running.stamp.same_boot(now));
         let database = match folder.open(now, newest.as_ref().map_or(0, |state| state.pack)) {
             Ok((database, about)) => {
                 rows.extend(about.into_iter().chain(newest.as_ref().and_then(|state| lost_rows(state, &database))));
@@ -331,7 +331,12 @@ impl OpenedFolder {
                 None
             }
         };
-        let mut states = candidates([running.filter(|running| running.stamp.same_boot(now)), newest, aside]);
+        let known_rows = running.iter().chain(&newest).map(|state| state.history_rows).max().unwrap_or(0);
+        for state in running.iter_mut().chain(&mut newest) {
+            let changes = read(database.as_ref(), |database| database.alarm_changes(state.history_rows));
+            state.snapshot.repeat_alarms(&changes);
+        }
+        let mut states = candidates([running, newest, aside]);
         let newest_pack = states.iter().map(|(state, _)| state.pack).max().unwrap_or(0);
         // The state of a replaced pack must not be restored.
         states.retain(|(state, _)| {
@@ -344,22 +349,26 @@ impl OpenedFolder {
             snapshot: *state.snapshot,
             source,
         };
-        let learned = database.as_ref().filter(|_| states.is_empty()).map(Database::learned).transpose();
+        let stateless = database.as_ref().filter(|_| states.is_empty());
         let found = StoredStates {
-            learned: learned
-                .inspect_err(|error| tracing::error!(%error, "the history cannot be read"))
-                .unwrap_or_default()
-                .unwrap_or_default(),
+            learned: read(stateless, Database::learned),
+            alarms: read(stateless, |database| database.alarm_changes(0)),
             works: database.is_some() && rows.is_empty(),
             states: states.into_iter().map(candidate).collect(),
         };
-        let pack = database.as_ref().map_or(newest_pack, Database::pack);
-        Self { state_files, database, rows, pack, found }
+        let (pack, known_rows) =
+            database.as_ref().map_or((newest_pack, known_rows), |database| (database.pack(), database.rows()));
+        Self { state_files, database, rows, pack, known_rows, found }
     }
 }
 
-/// Returns a row for the history if the newest rows known to the state are missing. Without this check, damage of
-/// SQLite's log would not be visible.
+/// Reads from the history; logs an error and returns nothing if reading fails.
+fn read<T>(database: Option<&Database>, read: impl Fn(&Database) -> rusqlite::Result<Vec<T>>) -> Vec<T> {
+    let found = database.map(read).transpose();
+    found.inspect_err(|error| tracing::error!(%error, "the history cannot be read")).ok().flatten().unwrap_or_default()
+}
+
+/// A row that reports missing rows: the state knows newer rows than the database has. Damage to SQLite's log has no other symptom.
 fn lost_rows(state: &StateDocument, database: &Database) -> Option<HistoryRow> {
     let (known, found) = (state.history_rows, database.rows());
     let detail = format!("the history ends with row {found}, the stored state knew {known}");

@@ -99,6 +99,28 @@ pub struct AlarmSnapshot {
 }
 
 impl AlarmSnapshot {
+    /// Repeats a change that was published at `time`, after this state was taken. The alarm's debounce starts again.
+    pub fn repeat(&mut self, time: Timestamp, AlarmChange { change, alarm }: &AlarmChange) {
+        let Alarm { rule, severity, cell, occurrences, is_acknowledged, .. } = *alarm;
+        let is_same = |stored: &StoredAlarm| (stored.rule, stored.severity, stored.cell) == (rule, severity, cell);
+        let place = self.alarms.iter().position(is_same).unwrap_or_else(|| {
+            self.alarms.push(StoredAlarm { rule, severity, cell, machine: Machine::default() });
+            self.alarms.len() - 1
+        });
+        let machine = &mut self.alarms[place].machine;
+        if machine.occurrences == 0 {
+            (machine.first_raised, machine.last_raised) = (time, time);
+        }
+        if *change == Change::Raised {
+            (machine.last_raised, machine.raised_value) = (time, alarm.value);
+        }
+        (machine.occurrences, machine.is_acknowledged) = (occurrences, is_acknowledged);
+        machine.enter_shown(alarm.state);
+        if !machine.is_worth_storing() {
+            self.alarms.remove(place);
+        }
+    }
+
     /// Moves every time stamp by `by_nanos`, onto another clock.
     pub fn rebase(&mut self, by_nanos: i64) {
         for alarm in &mut self.alarms {
@@ -297,9 +319,9 @@ impl AlarmEngine {
         AlarmSnapshot { alarms: self.rules.iter().flat_map(of_rule).collect() }
     }
 
-    /// Restores a stored state whose times the caller has rebased. Returns the alarms that no longer have a configured
-    /// threshold, so that the caller can report them.
-    pub fn restore(&mut self, state: &AlarmSnapshot) -> Vec<StoredAlarm> {
+    /// Restores a stored state whose times the caller has rebased; none is later than `now`. Returns the alarms that no configured threshold
+    /// watches any longer; the caller reports them.
+    pub fn restore(&mut self, now: Timestamp, state: &AlarmSnapshot) -> Vec<StoredAlarm> {
         let cells = self.cells();
         *self = Self::new(self.rules.drain(..).map(|rule| rule.config).collect(), cells);
         let mut orphans = Vec::new();
@@ -309,7 +331,7 @@ impl AlarmEngine {
                 continue;
             };
             // The value arrives with the next observation.
-            self.machines[slot] = alarm.machine.without_value();
+            self.machines[slot] = alarm.machine.restored(now);
             self.update_index(index, slot, Machine::default().index_entry());
         }
         orphans

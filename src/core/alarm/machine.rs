@@ -266,9 +266,20 @@ impl Machine {
         self.occurrences > 0 || self.state == AlarmState::Pending
     }
 
-    /// Resets the value before a restore; it is unknown until the next observation.
-    pub(super) fn without_value(self) -> Self {
-        Self { is_known: false, observation: Observation::default(), probability: None, ..self }
+    /// The machine after a restore at `now`: the value is unknown until the next observation, and no time is in the future.
+    pub(super) fn restored(self, now: Timestamp) -> Self {
+        let (first_raised, last_raised) = (self.first_raised.min(now), self.last_raised.min(now));
+        let value = Observation::default();
+        Self { is_known: false, observation: value, probability: None, first_raised, last_raised, ..self }
+    }
+
+    /// Enters the state that was published as `shown`.
+    pub(super) fn enter_shown(&mut self, shown: AlarmState) {
+        self.enter(match shown {
+            AlarmState::Active | AlarmState::Clearing | AlarmState::Suppressed => AlarmState::Active,
+            AlarmState::Latched => AlarmState::Latched,
+            AlarmState::Inactive | AlarmState::Pending | AlarmState::Cleared | AlarmState::Unknown => self.rest(),
+        });
     }
 
     pub(super) fn rebase(&mut self, by_nanos: i64) {

@@ -5,6 +5,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::alarm::AlarmChange;
 use crate::cell::Label;
 use crate::cell_faults::{CellFaultDetector, Imbalance, UnknownImbalance};
 use crate::filter::ScalarGaussian;
@@ -119,6 +120,11 @@ impl Snapshot {
         restarted.sending.restart();
         restarted.packs.drop_aside();
         restarted
+    }
+
+    /// Repeats the changes of alarms that were recorded after the state was taken.
+    pub fn repeat_alarms(&mut self, changes: &[(Timestamp, AlarmChange)]) {
+        changes.iter().for_each(|(time, change)| self.alarming.alarms.repeat(*time, change));
     }
 
     /// State of the cell-fault detector; `None` if the pack is too small for a comparison.

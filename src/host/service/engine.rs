@@ -9,6 +9,7 @@ use tokio::time::Instant;
 
 use super::readiness::{Readiness, describe_restored};
 use super::{Service, ServiceError};
+use crate::alarm::AlarmChange;
 use crate::io::background_file::BackgroundFile;
 use crate::io::can_key::CanKey;
 use crate::io::candump::{self, StampDigits};
@@ -81,7 +82,7 @@ impl Engine {
             (Some(service.downtime), None)
         } else {
             let mut states = found.states;
-            states.extend(state_of_history(&service.config.monitor, &found.learned));
+            states.extend(state_of_history(&service.config.monitor, &found.learned, &found.alarms));
             restore_first_valid(&mut monitor, states, service.record.as_deref())
         };
         if let Some((store, why)) = store.as_ref().zip(unfit.as_ref()) {
@@ -292,9 +293,13 @@ fn send(links: &[LinkOutput], key: Option<&CanKey>, transmit: &Transmit) {
     }
 }
 
-/// Creates a state from the learned values in the history; `None` = the history has no values for these cells.
-fn state_of_history(config: &MonitorConfig, learned: &[LearnedCell]) -> Option<StateCandidate> {
-    if learned.is_empty() {
+/// A new state with the learned values and alarms in the history; `None` = the history has none for these cells.
+fn state_of_history(
+    config: &MonitorConfig,
+    learned: &[LearnedCell],
+    alarms: &[(Timestamp, AlarmChange)],
+) -> Option<StateCandidate> {
+    if learned.is_empty() && alarms.is_empty() {
         return None;
     }
     let mut monitor = Monitor::new(config.clone());
@@ -302,7 +307,10 @@ fn state_of_history(config: &MonitorConfig, learned: &[LearnedCell]) -> Option<S
         tracing::warn!("learned values in the history belong to other cells, not used");
         return None;
     }
-    Some(StateCandidate { snapshot: monitor.snapshot(), downtime: Downtime::Unknown, source: HISTORY_SOURCE })
+    let mut snapshot = monitor.snapshot();
+    snapshot.time = alarms.last().map_or(snapshot.time, |(time, _)| *time);
+    snapshot.repeat_alarms(alarms);
+    Some(StateCandidate { snapshot, downtime: Downtime::Unknown, source: HISTORY_SOURCE })
 }
 
 /// Restores the first valid stored state. Returns the age of this state and, if the state in the state file does not

@@ -23,7 +23,7 @@ pub(super) struct Backlog {
     reported: LossCount,
 }
 
-/// Rows dropped for lack of room.
+/// Numbers of dropped rows.
 #[derive(Debug, Clone, Copy, Default)]
 struct LossCount {
     details: u64,

@@ -14,7 +14,7 @@ use tokio::time::Instant;
 
 use crate::monitor::Transmit;
 
-/// Longest wait for the disk.
+/// Longest wait of a frame for the disk.
 const MAX_WAIT: Duration = Duration::from_millis(200);
 /// Maximum number of held frames. The largest pack, with an alarm for each cell, sends that many in twice the longest
 /// wait. Beyond this number, held frames are released.

@@ -27,8 +27,10 @@ use super::learned;
 use super::rows::{HistoryRow, HistoryTable, RowBatch};
 use super::segments::{self, Segment, hex};
 use super::stamp::Stamp;
+use crate::alarm::AlarmChange;
 use crate::config::{StoreConfig, VehicleIdentity};
 use crate::monitor::{EventKind, LearnedCell};
+use crate::quantity::Timestamp;
 
 /// The format that this program reads and writes.
 pub(super) const FORMAT: i32 = 1;
@@ -221,7 +223,12 @@ impl Database {
         transaction.commit()
     }
 
-    /// The learned values of the connected pack's cells in the history.
+    /// Alarm changes of the connected pack after row `after`, oldest first, with their times on the inputs' clock.
+    pub(super) fn alarm_changes(&self, after: i64) -> rusqlite::Result<Vec<(Timestamp, AlarmChange)>> {
+        learned::alarm_changes(&self.connection, self.pack, after)
+    }
+
+    /// Learned values of the connected pack's cells.
     pub(super) fn learned(&self) -> rusqlite::Result<Vec<LearnedCell>> {
         learned::read(&self.connection, self.pack)
     }

@@ -15,7 +15,7 @@ use crate::io::place::with_suffix;
 
 /// Name of the database.
 pub(super) const DATABASE: &str = "packwatch.db";
-/// Name of the file that a daemon locks while it uses the folder.
+/// Name of the file that a daemon keeps locked.
 const LOCK: &str = "packwatch.lock";
 /// Suffixes of SQLite's files of a database. The log comes first, because SQLite would use it with the next database.
 const FILES: [&str; 3] = ["-wal", "-shm", ""];

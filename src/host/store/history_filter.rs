@@ -1,12 +1,11 @@
-//! Selects the events that are kept in the history, and those that are committed at once.
+//! Selects the events that the history keeps, and decides when they are committed.
 //!
-//! A flickering alarm must not wear out the flash memory or delay another alarm. In: the events of one input. Out: rows
-//! to commit now, if any. Limits are token buckets and the bytes of written states ([`super::checkpoint`]); times are
-//! taken from the events.
+//! In: the events of one input. Out: rows to commit now, if any, and whether to write the state with them. Token buckets limit rows
+//! with little news; times are taken from the events. Alarm changes are limited only by their debounce.
 
 use std::collections::BTreeMap;
 
-use super::rows::{EventSubject, HistoryRow};
+use super::rows::HistoryRow;
 use crate::alarm::Change;
 use crate::monitor::{Event, EventKind};
 use crate::quantity::catalogue::Quantity;
@@ -19,13 +18,8 @@ use crate::token_bucket::{BucketSize, TokenBucket};
 const CAPACITIES: BucketSize = BucketSize { burst: 64.0, period_s: 3600.0 };
 /// Smallest change for which a further capacity is written, in standard deviations.
 const MIN_CHANGE_STD: f64 = 0.25;
-/// Commits reserved for each alarm, and for all filter resets together. Other alarms cannot use them up. Further
-/// commits depend on the write budget. If both are used up, rows wait for a checkpoint, and only the first and the last
-/// row of each alarm or cell are kept. The occurrence count covers the other rows. A rule that flickers in 96 cells at
-/// different times causes 290 commits of about 70 kB on the first day.
-const OWN_COMMITS: BucketSize = BucketSize { burst: 2.0, period_s: 86_400.0 };
-/// How often waiting rows may be written with a checkpoint or with other rows: 60 times at once (one hour of
-/// checkpoints), then once per hour. Each write adds two rows per alarm, which are kept for years.
+/// How often deferred rows are written with a checkpoint or with other rows: an hour of checkpoints, then once an hour. Each time up to
+/// two rows per cell are written and kept for years.
 const CARRIED: BucketSize = BucketSize { burst: 60.0, period_s: 3600.0 };
 
 /// The capacity last written.
@@ -43,12 +37,19 @@ struct WrittenLife {
     token_bucket: TokenBucket,
 }
 
-/// Selects the events that are kept in the history.
+/// What to commit before the events of one input are announced.
+#[derive(Debug, PartialEq)]
+pub(super) struct HistoryCommit {
+    pub rows: Vec<HistoryRow>,
+    /// Whether the state is written as well.
+    pub with_state: bool,
+}
+
+/// Selects the events that the history keeps.
 #[derive(Debug)]
 pub(super) struct HistoryFilter {
     written: BTreeMap<CellIndex, WrittenCapacity>,
     written_life: WrittenLife,
-    own_commits: BTreeMap<EventSubject, TokenBucket>,
     carried: TokenBucket,
     deferred: Vec<HistoryRow>,
 }
@@ -58,7 +59,6 @@ impl Default for HistoryFilter {
         Self {
             written: BTreeMap::new(),
             written_life: WrittenLife { cycles: None, token_bucket: TokenBucket::new(CAPACITIES) },
-            own_commits: BTreeMap::new(),
             carried: TokenBucket::new(CARRIED),
             deferred: Vec::new(),
         }
@@ -66,21 +66,16 @@ impl Default for HistoryFilter {
 }
 
 impl HistoryFilter {
-    /// Returns the rows to commit with the state now (possibly none), including rows that waited. Returns `None` if
-    /// nothing was learned and no alarm changed. Alarms that change too often do not count, and their rows wait.
-    /// `has_room` states whether the write budget allows a commit.
-    pub(super) fn take(&mut self, events: &[Event], has_room: bool) -> Option<Vec<HistoryRow>> {
-        let now = events.iter().find(|event| is_learned(&event.kind))?.time;
-        let learned = || events.iter().map(|event| event.kind).filter(is_learned);
-        let may_wait = learned().all(|kind| EventSubject::of(&kind).is_some());
-        if may_wait && !self.may_commit(learned().filter_map(|kind| EventSubject::of(&kind)), now) && !has_room {
-            learned().for_each(|kind| self.defer(kind));
-            return None;
-        }
+    /// What to commit now; `None` = nothing was learned and no alarm changed.
+    pub(super) fn take(&mut self, events: &[Event]) -> Option<HistoryCommit> {
+        let now = events.first()?.time;
+        let stored = || events.iter().map(|event| event.kind).filter_map(|kind| Some((Urgency::of(&kind)?, kind)));
+        stored().filter(|(urgency, _)| *urgency == Urgency::Deferred).for_each(|(_, kind)| self.defer(kind));
+        let urgency = stored().map(|(urgency, _)| urgency).max().filter(|urgency| *urgency > Urgency::Deferred)?;
         let mut rows = self.for_checkpoint(now);
         let mut writes_capacity = false;
-        for kind in learned() {
-            // Loss modes follow from the cell's capacity, whose event comes first.
+        for (_, kind) in stored().filter(|(urgency, _)| *urgency > Urgency::Deferred) {
+            // Loss modes follow from the capacity, whose event precedes them.
             let is_worth_writing = match kind {
                 EventKind::LossModes { .. } => writes_capacity,
                 _ => self.is_worth_writing(&kind, now),
@@ -88,37 +83,31 @@ impl HistoryFilter {
             if matches!(kind, EventKind::Capacity { .. }) {
                 writes_capacity = is_worth_writing;
             }
-            if is_worth_writing {
-                let row = HistoryRow::Event(kind);
-                // Waiting rows of the same alarm are written first.
-                rows.extend(self.deferred.extract_if(.., |waiting| waiting.repeats(&row)));
-                rows.push(row);
-            }
+            rows.extend(is_worth_writing.then_some(HistoryRow::Event(kind)));
         }
-        Some(rows)
+        Some(HistoryCommit { rows, with_state: urgency == Urgency::WithState })
     }
 
-    /// Takes the waiting rows, if a checkpoint may write them.
-    pub(super) fn for_checkpoint(&mut self, now: Timestamp) -> Vec<HistoryRow> {
+    /// What to commit at a checkpoint.
+    pub(super) fn checkpoint(&mut self, now: Timestamp) -> HistoryCommit {
+        HistoryCommit { rows: self.for_checkpoint(now), with_state: true }
+    }
+
+    /// What to commit when the program ends.
+    pub(super) fn finish(&mut self) -> HistoryCommit {
+        HistoryCommit { rows: std::mem::take(&mut self.deferred), with_state: true }
+    }
+
+    /// Takes the deferred rows, if they may be written now.
+    fn for_checkpoint(&mut self, now: Timestamp) -> Vec<HistoryRow> {
         let may_go = !self.deferred.is_empty() && self.carried.take(now);
-        if may_go { self.deferred() } else { Vec::new() }
+        if may_go { std::mem::take(&mut self.deferred) } else { Vec::new() }
     }
 
-    /// Takes the waiting rows.
-    pub(super) fn deferred(&mut self) -> Vec<HistoryRow> {
-        std::mem::take(&mut self.deferred)
-    }
-
-    fn may_commit(&mut self, mut subjects: impl Iterator<Item = EventSubject>, now: Timestamp) -> bool {
-        let own = &mut self.own_commits;
-        let mut of = |subject| own.entry(subject).or_insert(TokenBucket::new(OWN_COMMITS)).take(now);
-        subjects.any(&mut of)
-    }
-
-    /// Keeps the first and the last row of each alarm and each cell's filter.
+    /// Keeps the first and the last row of each cell's filter.
     fn defer(&mut self, kind: EventKind) {
         let row = HistoryRow::Event(kind);
-        let same: Vec<usize> = (0..self.deferred.len()).filter(|&at| self.deferred[at].repeats(&row)).collect();
+        let same: Vec<usize> = (0..self.deferred.len()).filter(|&at| self.deferred[at] == row).collect();
         if let [_, .., last] = same[..] {
             self.deferred.remove(last);
         }
@@ -177,22 +166,35 @@ impl HistoryFilter {
     }
 }
 
-/// Whether an event must be durable before it is announced. Losing and regaining an alarm's value does not change what was
-/// announced, and a flickering input causes many of these changes.
-fn is_learned(kind: &EventKind) -> bool {
-    match kind {
-        EventKind::HalfCycle { .. }
-        | EventKind::Capacity { .. }
-        | EventKind::LossModes { .. }
-        | EventKind::RemainingLife { .. }
-        | EventKind::RechargePeriod { .. }
-        | EventKind::Model { .. }
-        | EventKind::AlarmDropped { .. }
-        | EventKind::FilterReset { .. }
-        | EventKind::PackReplaced { .. }
-        | EventKind::PackIdentity { .. } => true,
-        EventKind::Alarm { change, .. } => !matches!(change, Change::Suppressed | Change::Resumed),
-        _ => false,
+/// When and how an event is stored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Urgency {
+    /// With the next commit: filter resets, which may be frequent and are not announced.
+    Deferred,
+    /// As a row, before it is announced; a start can repeat it from the row.
+    AsRow,
+    /// With the whole state, before it is announced; its row alone is not enough to restore it.
+    WithState,
+}
+
+impl Urgency {
+    /// The urgency of an event; `None` = the event is not stored. An alarm whose value becomes unknown or known again stays announced, and
+    /// a flickering input causes many such events.
+    const fn of(kind: &EventKind) -> Option<Self> {
+        match kind {
+            EventKind::HalfCycle { .. }
+            | EventKind::Capacity { .. }
+            | EventKind::LossModes { .. }
+            | EventKind::RemainingLife { .. }
+            | EventKind::RechargePeriod { .. }
+            | EventKind::Model { .. }
+            | EventKind::PackReplaced { .. }
+            | EventKind::PackIdentity { .. } => Some(Self::WithState),
+            EventKind::Alarm { change: Change::Suppressed | Change::Resumed, .. } => None,
+            EventKind::Alarm { .. } | EventKind::AlarmDropped { .. } => Some(Self::AsRow),
+            EventKind::FilterReset { .. } => Some(Self::Deferred),
+            _ => None,
+        }
     }
 }
 
@@ -200,13 +202,12 @@ fn is_learned(kind: &EventKind) -> bool {
 mod tests {
     use super::super::rows::tests::{alarm, capacity, half_cycle, loss_modes, model, remaining_life};
     use super::*;
-    use crate::alarm::{Rule, Severity};
 
-    /// Number of rows committed at once although the write budget is used up.
+    /// Rows that are committed at once.
     fn take(history_filter: &mut HistoryFilter, seconds: f64, kinds: &[EventKind]) -> Option<usize> {
         let time = Timestamp::from_secs(seconds);
         let events: Vec<Event> = kinds.iter().map(|&kind| Event { time, kind }).collect();
-        history_filter.take(&events, false).map(|rows| rows.len())
+        history_filter.take(&events).map(|commit| commit.rows.len())
     }
 
     #[test]
@@ -286,52 +287,19 @@ mod tests {
     }
 
     #[test]
-    fn flickering_alarm_keeps_first_and_last_row() {
+    fn alarm_change_is_committed_without_state() {
         let mut history_filter = HistoryFilter::default();
-        let (mut commits, mut rows) = (0, 0);
-        for second in 0..10 * 86_400 {
-            let change = if second % 2 == 0 { Change::Raised } else { Change::Cleared };
-            if let Some(written) = take(&mut history_filter, f64::from(second), &[alarm(change)]) {
-                (commits, rows) = (commits + 1, rows + written);
-            }
-        }
-        assert!((11..=12).contains(&commits) && rows < 40, "{commits} commits, {rows} rows");
-        let event = Event { time: Timestamp::from_secs(864_000.0), kind: alarm(Change::Raised) };
-        assert!(
-            history_filter.take(&[event], true).is_some_and(|rows| rows.len() == 3),
-            "the new rows and those that waited"
-        );
-        assert!(history_filter.deferred().is_empty());
-    }
-
-    #[test]
-    fn flickering_alarm_delays_no_other() {
-        let mut history_filter = HistoryFilter::default();
-        let of = |of_rule, of_severity, of_cell| {
-            let mut kind = alarm(Change::Raised);
-            if let EventKind::Alarm { rule, severity, cell, .. } = &mut kind {
-                (*rule, *severity, *cell) = (of_rule, of_severity, of_cell);
-            }
-            kind
+        let mut take = |kinds: &[EventKind]| {
+            let events: Vec<Event> = kinds.iter().map(|&kind| Event { time: Timestamp::ZERO, kind }).collect();
+            history_filter.take(&events).map(|commit| (commit.rows.len(), commit.with_state))
         };
-        let noisy = of(Rule::SocLow, Severity::Warning, Some(CellIndex(0)));
-        let mut commits = 0;
-        for second in 0..2000 {
-            let reset = EventKind::FilterReset { cell: CellIndex(second % 96) };
-            for kind in [reset, noisy] {
-                commits += u32::from(take(&mut history_filter, f64::from(second), &[kind]).is_some());
-            }
+        for change in [Change::Raised, Change::Cleared].repeat(1000) {
+            assert_eq!(take(&[alarm(change)]), Some((1, false)));
         }
-        assert_eq!(commits, 4, "two of each");
-        assert_eq!(take(&mut history_filter, 2000.0, &[noisy]), None);
-        let others = [
-            of(Rule::SocLow, Severity::Severe, Some(CellIndex(0))),
-            of(Rule::SocLow, Severity::Warning, Some(CellIndex(1))),
-            of(Rule::SocLow, Severity::Warning, None),
-        ];
-        for kind in others {
-            assert!(take(&mut history_filter, 2000.0, &[kind]).is_some(), "{kind:?}");
-        }
+        let reset = EventKind::FilterReset { cell: CellIndex(3) };
+        assert_eq!([take(&[reset]), take(&[reset]), take(&[reset])], [None; 3]);
+        assert_eq!(take(&[alarm(Change::Raised)]), Some((3, false)), "with the first and the last reset");
+        assert_eq!(take(&[alarm(Change::Raised), half_cycle(0)]), Some((2, true)));
     }
 
     #[test]
@@ -340,11 +308,11 @@ mod tests {
         let mut rows = 0;
         for minute in 0..1440_u32 {
             for second in 0..60_u32 {
-                let change = if second % 2 == 0 { Change::Raised } else { Change::Cleared };
-                take(&mut history_filter, f64::from(minute * 60 + second), &[alarm(change)]);
+                let reset = EventKind::FilterReset { cell: CellIndex(0) };
+                take(&mut history_filter, f64::from(minute * 60 + second), &[reset]);
             }
             let waiting = history_filter.deferred.len();
-            let taken = history_filter.for_checkpoint(Timestamp::from_secs(f64::from(minute * 60 + 59))).len();
+            let taken = history_filter.checkpoint(Timestamp::from_secs(f64::from(minute * 60 + 59))).rows.len();
             assert!(minute >= 60 || taken == waiting, "minute {minute}: {taken} of {waiting}");
             rows += taken;
         }

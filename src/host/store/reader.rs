@@ -30,7 +30,7 @@ pub struct HistoryReader {
 /// A selection of rows.
 #[derive(Debug, Clone, Default)]
 pub struct HistoryQuery {
-    /// Tables; empty = all.
+    /// Selected tables; empty = all.
     pub kinds: Vec<HistoryTable>,
     /// Cell, from 0; `None` = all.
     pub cell: Option<u16>,

@@ -6,8 +6,8 @@ use std::path::Path;
 use super::checkpoint::CheckpointSchedule;
 use super::database::{Database, RowLimits};
 use super::folder::{self, DATABASE, Folder};
-use super::history_filter::HistoryFilter;
-use super::rows::{HistoryRow, RowBatch};
+use super::history_filter::{HistoryCommit, HistoryFilter};
+use super::rows::RowBatch;
 use super::stamp::Stamp;
 use super::state_files::{FORMAT, StateDocument, StateFiles};
 use crate::config::{StoreConfig, VehicleIdentity};
@@ -55,28 +55,31 @@ impl Recorder {
     /// Writes the rows of the events of one input, and the checkpoint if it is due.
     pub fn record(&mut self, events: &[Event], monitor: &Monitor, now: Timestamp) -> Result<(), String> {
         let is_due = self.schedule.is_due(now, 0.0);
-        let rows = match self.history_filter.take(events, self.schedule.has_room(now)) {
-            Some(rows) => rows,
-            None if is_due => self.history_filter.for_checkpoint(now),
-            None => return Ok(()),
-        };
-        self.write(rows, monitor, now)
+        match self.history_filter.take(events) {
+            Some(commit) => self.write(commit, monitor, now),
+            None if is_due => {
+                let commit = self.history_filter.checkpoint(now);
+                self.write(commit, monitor, now)
+            }
+            None => Ok(()),
+        }
     }
 
     /// Writes the last state.
     pub fn finish(mut self, monitor: &Monitor, now: Timestamp) -> Result<(), String> {
-        let rows = self.history_filter.deferred();
-        self.write(rows, monitor, now)
+        let commit = self.history_filter.finish();
+        self.write(commit, monitor, now)
     }
 
-    fn write(&mut self, rows: Vec<HistoryRow>, monitor: &Monitor, now: Timestamp) -> Result<(), String> {
+    fn write(&mut self, commit: HistoryCommit, monitor: &Monitor, now: Timestamp) -> Result<(), String> {
+        let HistoryCommit { rows, with_state } = commit;
         let stamp = Stamp::replayed(now);
         let written = match rows.is_empty() {
             true => self.database.apply(&self.limits, &stamp),
             false => self.database.commit(&[RowBatch { stamp, rows }]),
         };
         written.map_err(|error| format!("{}: {error}", self.folder))?;
-        let bytes = self.state_files.write(StateDocument {
+        let state = with_state.then(|| StateDocument {
             format: FORMAT,
             number: 0,
             folder: self.folder.to_string(),
@@ -84,7 +87,8 @@ impl Recorder {
             history_rows: self.database.rows(),
             stamp,
             snapshot: Box::new(monitor.snapshot().for_restart()),
-        })?;
+        });
+        let bytes = state.map(|state| self.state_files.write(state)).transpose()?;
         self.schedule.note_written(now, bytes);
         Ok(())
     }

@@ -105,7 +105,7 @@ impl Reserve {
     }
 }
 
-/// Writes bytes that no file system stores as a hole.
+/// Writes bytes other than zeros, which a file system could store as a hole.
 fn write(mut file: &File, bytes: usize) -> io::Result<()> {
     let contents: Vec<u8> = (0..=u8::MAX).cycle().take(bytes).collect();
     file.write_all(&contents)?;

@@ -8,17 +8,18 @@ use std::sync::LazyLock;
 use rusqlite::types::Value;
 
 use super::stamp::Stamp;
-use crate::alarm::{Rule, Severity};
 use crate::monitor::EventKind;
-use crate::quantity::CellIndex;
 use crate::quantity::catalogue::RecordedValues;
+
+/// Value of `change` for an alarm that ended because no threshold watches it any longer.
+pub(super) const DROPPED: &str = "dropped";
 
 /// One row to write.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum HistoryRow {
     /// An event of the core: a half-cycle, a capacity, a new cell model, an alarm, a filter reset, another pack.
     Event(EventKind),
-    /// An event of the store itself.
+    /// A report of the store itself.
     Own {
         /// Name of the event: `damaged`, `state_damaged`, `rows_lost`.
         reason: &'static str,
@@ -45,11 +46,11 @@ pub enum HistoryTable {
     Capacity,
     /// Loss modes of the cells.
     LossModes,
-    /// Remaining life of the cell whose life ends first.
+    /// Remaining lives, each of the cell that reaches its end of life first.
     RemainingLife,
     /// Changes of the cell model learned on board.
     Model,
-    /// Alarms.
+    /// Changes of alarms.
     Alarm,
     /// Resets, pack changes, damage.
     Reset,
@@ -59,7 +60,8 @@ impl HistoryTable {
     /// All tables, in display order.
     pub const ALL: [Self; 7] =
         [Self::HalfCycle, Self::Capacity, Self::LossModes, Self::RemainingLife, Self::Model, Self::Alarm, Self::Reset];
-    /// Type of a column in the database.
+
+    /// SQL type of a column.
     pub(super) fn sql_type(column: &str) -> &'static str {
         match column {
             "mode" | "state" | "chemistry" | "rule" | "severity" | "change" | "reason" | "detail" => "TEXT",
@@ -145,7 +147,7 @@ impl HistoryRow {
             // No threshold monitors this alarm any more, so it has ended without a deciding value.
             EventKind::AlarmDropped { .. } => {
                 let no = Value::Integer(0);
-                let own = [("change", text("dropped")), ("state", text("inactive")), ("active", no.clone())];
+                let own = [("change", text(DROPPED)), ("state", text("inactive")), ("active", no.clone())];
                 (HistoryTable::Alarm, own.into_iter().chain([("acknowledged", no)]).collect())
             }
             EventKind::FilterReset { .. } => (HistoryTable::Reset, vec![("reason", text("filter_reset"))]),
@@ -168,21 +170,7 @@ impl HistoryRow {
         matches!(self, Self::Event(EventKind::HalfCycle { .. }))
     }
 
-    /// Whether both rows are about the same alarm, or about the same cell's filter.
-    pub(super) fn repeats(&self, other: &Self) -> bool {
-        match (self, other) {
-            (Self::Event(EventKind::FilterReset { cell }), Self::Event(EventKind::FilterReset { cell: other })) => {
-                cell == other
-            }
-            (Self::Event(one), Self::Event(other)) => {
-                let subject = EventSubject::of(one);
-                subject.is_some_and(|subject| subject != EventSubject::Filters) && subject == EventSubject::of(other)
-            }
-            _ => false,
-        }
-    }
-
-    /// The identity of the connected pack, if this row states it.
+    /// The identity of the connected pack, if this row contains it.
     pub(super) const fn pack_identity(&self) -> Option<f64> {
         match self {
             Self::Event(EventKind::PackIdentity { identity }) => Some(*identity),
@@ -196,27 +184,7 @@ impl HistoryRow {
     }
 }
 
-/// The subject of events that may repeat although nothing is learned.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) enum EventSubject {
-    /// Filter resets, of any cell.
-    Filters,
-    /// An alarm.
-    Alarm(Rule, Severity, Option<CellIndex>),
-}
-
-impl EventSubject {
-    /// The subject of an event; `None` = an event of another kind.
-    pub(super) const fn of(kind: &EventKind) -> Option<Self> {
-        match *kind {
-            EventKind::FilterReset { .. } => Some(Self::Filters),
-            EventKind::Alarm { rule, severity, cell, .. } => Some(Self::Alarm(rule, severity, cell)),
-            _ => None,
-        }
-    }
-}
-
-/// An event's field as an SQLite value; NULL if it has no equivalent.
+/// The SQLite value of an event's field; NULL for arrays and objects.
 fn sql_value(field: &serde_json::Value) -> Value {
     match field {
         serde_json::Value::Bool(flag) => Value::Integer(i64::from(*flag)),

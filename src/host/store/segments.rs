@@ -177,7 +177,7 @@ fn update_bytes(hasher: &mut Sha256, tag: u8, bytes: &[u8]) {
     hasher.update(bytes);
 }
 
-/// A hash in hexadecimal digits.
+/// Formats a hash in hexadecimal digits.
 pub(super) fn hex(hash: &[u8]) -> String {
     hash.iter().map(|byte| format!("{byte:02x}")).collect()
 }
@@ -240,7 +240,7 @@ pub struct ChainReport {
     pub broken: Option<BrokenSegment>,
 }
 
-/// A segment in which a row was changed, is missing or was inserted.
+/// A segment with a changed, missing or inserted row.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct BrokenSegment {
     /// Number of the segment.
@@ -321,11 +321,16 @@ fn judge_number(
     }))
 }
 
-/// Intact segments, newest first, at most `limit`.
-pub(super) fn intact(connection: &Connection, limit: usize) -> rusqlite::Result<Vec<Segment>> {
+/// Up to `limit` newest segments with rows after row `after`, oldest first. Reports and leaves out damaged segments.
+pub(super) fn intact(connection: &Connection, after: i64, limit: usize) -> rusqlite::Result<Vec<Segment>> {
+    let mut pairs = pairs(connection)?;
+    pairs.retain(|(_, segment)| !segment.is_deleted && segment.last > after);
     let mut intact = Vec::new();
-    for (before, segment) in pairs(connection)?.iter().rev().filter(|(_, segment)| !segment.is_deleted).take(limit) {
-        intact.extend(judge(connection, before, segment)?.is_none().then_some(*segment));
+    for (before, segment) in &pairs[pairs.len().saturating_sub(limit)..] {
+        match judge(connection, before, segment)? {
+            None => intact.push(*segment),
+            Some(broken) => tracing::error!("the history is damaged: {broken}; the start does not use them"),
+        }
     }
     Ok(intact)
 }

@@ -30,7 +30,7 @@ use crate::monitor::Snapshot;
 pub(super) const FORMAT: u32 = 1;
 /// Names of the files.
 pub(super) const FILES: [&str; 2] = ["state-a.json.zst", "state-b.json.zst"];
-/// Name of a state that was set aside.
+/// Name of the file of a state that was set aside.
 pub(super) const ASIDE: &str = "state-aside.json.zst";
 /// Name of a file while it is being written.
 const PART: &str = "state.json.zst.part";
@@ -173,7 +173,7 @@ pub(super) struct StateFiles {
 /// The states of a folder.
 #[derive(Debug, Default)]
 pub(super) struct FoundStates {
-    /// The newest good state.
+    /// The newest valid state.
     pub newest: Option<StateDocument>,
     /// The state that was set aside.
     pub aside: Option<StateDocument>,

@@ -177,10 +177,11 @@ fn writer(folder: &Path) -> Writer {
         progress: watch::channel(StoreProgress::default()).0,
         retry: Retry::default(),
         knows_state: true,
+        needs_state: true,
     }
 }
 
-/// Waits for the writer's answer to a ticket.
+/// Waits for the writer's progress to reach a ticket.
 fn answer(store: &Store, ticket: u64) -> StoreProgress {
     let progress = store.progress();
     let begun = Instant::now();
@@ -242,7 +243,7 @@ fn failing_disk_is_retried_after_pauses() {
     // Tickets that are answered during the pause cause no attempt.
     let write_queue = Arc::clone(&store.write_queue);
     for _ in 0..3 {
-        let ticket = write_queue.submit(None, document(1, 1, 1));
+        let ticket = write_queue.submit(None, document(1, 1, 1), true);
         assert_eq!(answer(&store, ticket).failures, 1);
     }
     std::fs::remove_file(&state).unwrap();

@@ -1,9 +1,11 @@
-//! The thread that writes to disk, and the queue that it shares with the loop.
+//! The thread that writes to the disk, and the queue that it shares with the service loop.
 //!
-//! The loop queues rows and the latest state, and continues. The thread takes everything queued, commits the rows, then
-//! writes the state, and reports the last ticket that is completely on disk. It retries a failing disk after increasing
-//! pauses. During a pause, every ticket is answered at once as failed. A failing database does not prevent the state
-//! from being written.
+//! The loop queues rows and the latest state. The thread takes everything queued, commits the rows, writes the state if it is due, and
+//! reports the last ticket that is completely on disk. It retries a failing disk after increasing pauses; until then every ticket is
+//! answered at once as failed. A failing database does not prevent the state from being written.
+//!
+//! A start repeats the alarm changes in the rows that are newer than the stored state. This requires that the rows continue the state
+//! in the same database. So the first rows after a start, after a failure and in a new database are written together with a state.
 
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -39,12 +41,14 @@ pub struct StoreProgress {
     pub file_bytes: Option<u64>,
     /// Successful commits.
     pub commits: u64,
-    /// Attempts that failed.
+    /// Number of failed attempts.
     pub failures: u64,
     /// Size of the last written state, bytes.
     pub state_bytes: u64,
     /// Number of the connected pack in the history; 0 = unknown.
     pub pack: i64,
+    /// Number of rows in the history.
+    pub rows: i64,
 }
 
 /// Queue of the rows and the state that the loop passes to the writer.
@@ -58,7 +62,9 @@ pub(super) struct WriteQueue {
 struct QueueState {
     backlog: Backlog,
     state: Option<StateDocument>,
-    /// Whether the next state must not overwrite the stored one.
+    /// The state must be written.
+    is_state_due: bool,
+    /// The next state must not overwrite the stored one.
     sets_aside: bool,
     ticket: u64,
     /// Whether the writer has work.
@@ -69,7 +75,9 @@ struct QueueState {
 /// Work that the writer takes from the queue at once.
 struct PendingWrite {
     batches: Vec<RowBatch>,
+    /// The state after these rows.
     state: Option<StateDocument>,
+    is_state_due: bool,
     sets_aside: bool,
     ticket: u64,
     stop: bool,
@@ -80,12 +88,14 @@ impl WriteQueue {
         self.queue.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Queues rows and their state; returns the ticket of the commit that will contain both.
-    pub(super) fn submit(&self, rows: Option<RowBatch>, state: StateDocument) -> u64 {
+    /// Queues rows and the state after them. The state is written if `is_state_due`, or if the rows do not continue the stored state.
+    /// Returns the ticket of the commit.
+    pub(super) fn submit(&self, rows: Option<RowBatch>, state: StateDocument, is_state_due: bool) -> u64 {
         let mut queue = self.lock();
         rows.into_iter().for_each(|batch| queue.backlog.push(batch));
         // A later state includes the earlier ones.
         queue.state = Some(state);
+        queue.is_state_due |= is_state_due;
         queue.ticket += 1;
         queue.wanted = true;
         self.wake.notify_one();
@@ -126,10 +136,11 @@ impl WriteQueue {
         }
         queue.wanted = false;
         let state = queue.state.take();
-        // Rows are written together with their state.
+        let is_state_due = std::mem::take(&mut queue.is_state_due);
+        // Rows and the state after them are taken together: the state records the number of the last row.
         let batches = state.as_ref().map(|state| queue.backlog.take(&state.stamp)).unwrap_or_default();
         let sets_aside = std::mem::take(&mut queue.sets_aside);
-        PendingWrite { batches, state, sets_aside, ticket: queue.ticket, stop: queue.stop }
+        PendingWrite { batches, state, is_state_due, sets_aside, ticket: queue.ticket, stop: queue.stop }
     }
 
     fn put_back(&self, batches: Vec<RowBatch>, state: Option<StateDocument>) {
@@ -139,7 +150,7 @@ impl WriteQueue {
     }
 }
 
-/// The thread's side.
+/// The writer thread.
 #[derive(Debug)]
 pub(super) struct Writer {
     pub(super) write_queue: Arc<WriteQueue>,
@@ -158,6 +169,8 @@ pub(super) struct Writer {
     pub(super) retry: Retry,
     /// Whether the daemon has read the folder's states.
     pub(super) knows_state: bool,
+    /// Whether the next commit must write the state.
+    pub(super) needs_state: bool,
 }
 
 /// Time of the next attempt after a failure.
@@ -187,7 +200,8 @@ impl Writer {
         self.database = self.database.take().filter(|database| database.set_vehicle(&self.vehicle).is_ok());
         loop {
             let work = self.write_queue.take(self.retry.at);
-            let PendingWrite { batches, state, sets_aside, ticket, stop } = work;
+            let PendingWrite { batches, state, is_state_due, sets_aside, ticket, stop } = work;
+            self.needs_state |= is_state_due;
             if sets_aside {
                 self.state_files.set_aside();
             }
@@ -220,7 +234,9 @@ impl Writer {
         let begun = Instant::now();
         let is_learned = !batches.is_empty();
         let written = match &state {
-            Some(document) => self.commit_urgently(&mut batches, document).map(|bytes| progress.state_bytes = bytes),
+            Some(document) => self
+                .commit_urgently(&mut batches, document)
+                .map(|bytes| progress.state_bytes = bytes.unwrap_or(progress.state_bytes)),
             None if self.retry.pause.is_none() => return true,
             None => self.open(&Stamp::now(Timestamp::ZERO, BootId::current())).map(drop),
         };
@@ -233,7 +249,9 @@ impl Writer {
                 self.retry = Retry::default();
                 progress.commits += u64::from(state.is_some());
                 progress.file_bytes = self.folder.database_bytes();
-                progress.pack = self.database.as_ref().map_or(progress.pack, Database::pack);
+                if let Some(database) = &self.database {
+                    (progress.pack, progress.rows) = (database.pack(), database.rows());
+                }
                 self.reserve.restore();
                 true
             }
@@ -242,6 +260,7 @@ impl Writer {
                     tracing::error!(folder = %self.folder, error = why, "state and history not written; kept in memory");
                 }
                 progress.failures += 1;
+                self.needs_state = true;
                 self.retry.after_failure();
                 self.write_queue.put_back(batches, state);
                 false
@@ -249,10 +268,13 @@ impl Writer {
         }
     }
 
-    /// Like [`Writer::commit`], but retries learned rows at once. It retries as often as the reserve provides space,
-    /// and once without the reserve: space may have become free, and a damaged database is set aside at the second
-    /// attempt.
-    fn commit_urgently(&mut self, batches: &mut Vec<RowBatch>, document: &StateDocument) -> Result<u64, String> {
+    /// Calls [`Writer::commit`]. If rows cannot be written, tries again at once: after each step that the reserve releases, and once
+    /// without a release, because space may be available again and a second attempt sets a damaged database aside.
+    fn commit_urgently(
+        &mut self,
+        batches: &mut Vec<RowBatch>,
+        document: &StateDocument,
+    ) -> Result<Option<u64>, String> {
         let is_learned = !batches.is_empty();
         let mut is_first = true;
         loop {
@@ -264,22 +286,30 @@ impl Writer {
         }
     }
 
-    /// Commits the rows, removes them from `batches`, and writes the state. Returns the size of the state.
-    pub(super) fn commit(&mut self, batches: &mut Vec<RowBatch>, document: &StateDocument) -> Result<u64, String> {
+    /// Commits the rows, which then leave `batches`, and writes the state if that is due. Returns the size of the state.
+    pub(super) fn commit(
+        &mut self,
+        batches: &mut Vec<RowBatch>,
+        document: &StateDocument,
+    ) -> Result<Option<u64>, String> {
         let rows = self.commit_rows(batches, &document.stamp);
         if rows.is_ok() {
             batches.clear();
             self.write_queue.lock().backlog.commit();
         } else if !self.knows_state {
-            // The existing state has not been read yet and must not be overwritten.
-            return rows.map(|()| 0);
+            // Do not overwrite a state that has not been read yet.
+            return rows.map(|()| None);
+        }
+        if rows.is_ok() && !self.needs_state {
+            return Ok(None);
         }
         let mut document = document.clone();
         if let Some(database) = &self.database {
             (document.pack, document.history_rows) = (database.pack(), database.rows());
         }
-        let bytes = self.state_files.write(document);
-        rows.and(bytes)
+        let state = self.state_files.write(document);
+        self.needs_state = rows.is_err() || state.is_err();
+        rows.and(state.map(Some))
     }
 
     fn commit_rows(&mut self, batches: &[RowBatch], now: &Stamp) -> Result<(), String> {
@@ -324,6 +354,7 @@ impl Writer {
 
     fn reopen(&mut self, now: &Stamp) -> Result<Database, String> {
         let pack = self.progress.borrow().pack;
+        self.needs_state = true;
         let (mut database, mut rows) = self.folder.open(now, pack).map_err(|error| error.to_string())?;
         if !self.knows_state {
             let (files, found) = StateFiles::open(self.folder.path());

@@ -175,13 +175,61 @@ fn restored_engine_behaves_like_stored_engine() {
     assert_eq!(text, serde_json::to_string(&state).expect("serialises"));
     state.rebase(1_000_000_000_000);
     let mut second = AlarmEngine::new(rules, 2);
-    assert_eq!(second.restore(&state), []);
+    assert_eq!(second.restore(at(1001.0), &state), []);
     assert_eq!(second.raised().next().and_then(|a| a.last_raised), Some(at(1000.0)));
     changes.clear();
     observe(&mut second, at(1014.9), Rule::CapacityLow, CELL, Some(1.3), &mut changes);
     assert_eq!(changes, []);
     second.poll(at(1015.0), &mut changes);
     assert_eq!(changes.len(), 1);
+}
+
+/// What a restart keeps of every alarm.
+fn kept(state: &AlarmSnapshot, rules: &[RuleConfig]) -> Vec<(bool, u32, bool, [Option<Timestamp>; 2], Option<f64>)> {
+    let mut engine = AlarmEngine::new(rules.to_vec(), 2);
+    engine.restore(at(1e6), state);
+    let of = |alarm: Alarm| {
+        let raised = [alarm.first_raised, alarm.last_raised];
+        let is_acknowledged = alarm.is_acknowledged && alarm.occurrences > 0;
+        (alarm.state.is_raised(), alarm.occurrences, is_acknowledged, raised, alarm.raised_value)
+    };
+    engine.all().map(of).collect()
+}
+
+#[test]
+fn repeated_changes_lead_old_state_to_new_one() {
+    let latching = RuleConfig { is_latching: true, ..rule(Rule::EstimateUntrusted, 3.0, 0.5, 0.0, 1) };
+    let rules = [rule(Rule::CapacityLow, 1.4, 0.1, 2.0, 1), latching];
+    let mut rng = ChaCha8Rng::seed_from_u64(3);
+    let mut engine = AlarmEngine::new(rules.to_vec(), 2);
+    let (mut old, mut changes, mut recorded) = (engine.snapshot(), Vec::new(), 0);
+    for second in 0..5_000 {
+        let now = at(f64::from(second));
+        let cell = Some(CellIndex(rng.random_range(0..2)));
+        match rng.random_range(0..20) {
+            0 => {
+                engine.apply(now, &AlarmInput::Acknowledge(Selector::default()), &mut changes);
+            }
+            1 => {
+                engine.apply(now, &AlarmInput::Clear(Selector::default()), &mut changes);
+            }
+            2..8 => observe(&mut engine, now, Rule::CapacityLow, cell, Some(rng.random_range(1.3..1.6)), &mut changes),
+            8 => observe(&mut engine, now, Rule::EstimateUntrusted, cell, None, &mut changes),
+            _ => {
+                observe(&mut engine, now, Rule::EstimateUntrusted, cell, Some(rng.random_range(2.0..3.3)), &mut changes)
+            }
+        }
+        engine.poll(now, &mut changes);
+        for change in changes.drain(..).filter(|it| !matches!(it.change, Change::Suppressed | Change::Resumed)) {
+            recorded += 1;
+            old.repeat(now, &change);
+        }
+        assert_eq!(kept(&old, &rules), kept(&engine.snapshot(), &rules), "second {second}");
+        if rng.random_range(0..100) == 0 {
+            old = engine.snapshot();
+        }
+    }
+    assert!(recorded > 500, "{recorded} changes");
 }
 
 #[test]
@@ -191,7 +239,7 @@ fn restore_returns_alarms_of_removed_rules() {
         observe(&mut first, at(0.0), Rule::CapacityLow, Some(CellIndex(cell)), Some(1.0), &mut Vec::new());
     }
     let mut fewer_cells = AlarmEngine::new(vec![rule(Rule::CapacityLow, 1.4, 0.0, 0.0, 1)], 3);
-    assert_eq!(fewer_cells.restore(&first.snapshot()).len(), 1);
+    assert_eq!(fewer_cells.restore(at(1.0), &first.snapshot()).len(), 1);
     assert_eq!(fewer_cells.count(), 3);
 }
 

@@ -229,7 +229,7 @@ impl Stages {
     /// Restores the stored alarms. Alarms without a configured threshold end, also for receivers on the bus.
     fn restore_alarms(&mut self, time: Timestamp, state: &AlarmSnapshot, is_continued: bool, out: &mut Outputs) {
         self.alarming.state.knows_all_valid = false;
-        let orphans = self.alarming.engine.restore(state);
+        let orphans = self.alarming.engine.restore(time, state);
         if !is_continued {
             self.sending.compare_first(time);
             self.sending.skip_counters(time, &self.alarming.engine);

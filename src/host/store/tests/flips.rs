@@ -88,7 +88,7 @@ impl Reference {
         }
     }
 
-    /// Starts with the damaged store, writes, and starts again.
+    /// Starts with the damaged store, writes a state, and starts again.
     fn start(&self, flipped: &str, place: &Path, counts: &mut FlipCounts) -> Result<(), String> {
         let (OpenedFolder { database, state_files, found, .. }, folder) = opened(place, &self.now);
         let state = found.states.first().map(|state| json(&state.snapshot)).ok_or("no state")?;

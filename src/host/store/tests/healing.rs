@@ -1,10 +1,10 @@
 //! Tests what a start recovers from a store without states, and what it must not restore.
 
 use super::folder::Folder;
-use super::rows::tests::{alarm, capacity};
+use super::rows::tests::capacity;
 use super::*;
-use crate::alarm::{Change, Selector};
-use crate::monitor::{LearnedCell, Source};
+use crate::alarm::{AlarmState, Change, Rule, Severity};
+use crate::monitor::{EventKind, LearnedCell};
 
 /// A store in a new folder, and the final state of its replay.
 fn replayed_store() -> (tempfile::TempDir, Snapshot) {
@@ -86,28 +86,104 @@ fn lost_history_does_not_restore_old_pack() {
     assert!(found.states.is_empty() && found.learned.is_empty());
 }
 
+/// A change of an alarm that the configuration of these tests contains.
+fn change(change: Change, occurrences: u32, acknowledged: bool) -> EventKind {
+    let state = if change == Change::Raised { AlarmState::Active } else { AlarmState::Inactive };
+    EventKind::Alarm {
+        rule: Rule::EstimateUntrusted,
+        cell: Some(CellIndex(0)),
+        change,
+        state,
+        active: state.is_raised(),
+        severity: Severity::Warning,
+        value: Some(5.0),
+        probability: None,
+        threshold: 4.0,
+        occurrences,
+        acknowledged,
+    }
+}
+
+/// Starts in a copy of the folder, as after a power cut.
+fn after_cut(place: &Path) -> StoredStates {
+    let copy = tempfile::tempdir().unwrap();
+    for entry in std::fs::read_dir(place.join("state")).unwrap() {
+        let entry = entry.unwrap();
+        std::fs::create_dir_all(copy.path().join("state")).unwrap();
+        std::fs::copy(entry.path(), copy.path().join("state").join(entry.file_name())).unwrap();
+    }
+    let (store, found) = open(copy.path());
+    store.finish(&at(9.0), Timestamp::from_secs(9.0));
+    found
+}
+
+/// The raised alarms of a restored state: occurrences and time of the last, s.
+fn raised(snapshot: Snapshot) -> Vec<(u32, f64)> {
+    let monitor = restored(snapshot);
+    monitor.alarms().raised().map(|alarm| (alarm.occurrences, alarm.last_raised.unwrap().secs())).collect()
+}
+
 #[test]
-fn command_is_committed_while_alarm_flickers() {
+fn announced_alarm_survives_power_cut_without_new_state() {
     let place = tempfile::tempdir().unwrap();
-    let (store, _) =
-        Store::open(&PlaceSetting::At(place.path().to_owned()), &config().store, &VehicleIdentity::default()).unwrap();
-    let mut store = store.unwrap();
-    let monitor = Monitor::new(config().monitor);
-    let time = Timestamp::from_secs(1.0);
-    let event = |kind| Event { time, kind };
-    let flickers = |store: &mut Store| store.learned(&[event(alarm(Change::Raised))], &monitor, time);
-    while flickers(&mut store).is_some() {}
-    let command = |changed| {
-        let command = Command::Clear(Selector::default());
-        event(EventKind::Command { source: Source::Local, command, changed, refused: 0 })
+    let (mut store, _) = open(place.path());
+    let monitor = at(1.0);
+    let mut announce = |seconds: u32, kind: EventKind| {
+        let time = Timestamp::from_secs(f64::from(seconds));
+        let ticket = store.learned(&[Event { time, kind }], &monitor, time).unwrap();
+        assert!(answer(&store, ticket).works);
     };
-    let cleared = event(alarm(Change::Cleared));
-    assert_eq!(store.learned(&[command(0)], &monitor, time), None, "nothing has changed");
-    let ticket = store.learned(&[cleared, command(1)], &monitor, time).unwrap();
-    assert!(answer(&store, ticket).works);
-    assert!(flickers(&mut store).is_none(), "no further commit of the flickering alarm");
-    let entries = HistoryReader::open(place.path()).unwrap().entries(&HistoryQuery::default()).unwrap();
-    assert_eq!(entries.last().unwrap().values[3], "cleared");
+    for second in 1..=200 {
+        let kind = if second % 2 == 1 { Change::Raised } else { Change::Cleared };
+        announce(second, change(kind, second.div_ceil(2), false));
+    }
+    assert_eq!(stored(&place.path().join("state")).number, 1, "no other state was written");
+    let mut found = after_cut(place.path());
+    assert_eq!(raised(found.states.remove(0).snapshot), []);
+    announce(201, change(Change::Raised, 101, false));
+    assert_eq!(stored(&place.path().join("state")).number, 1);
+    let mut found = after_cut(place.path());
+    assert_eq!(raised(found.states.remove(0).snapshot), [(101, 1.0)], "times are not later than the state's restore");
+    // Without a valid state, the history is enough.
+    without_states(place.path());
+    let found = after_cut(place.path());
+    assert_eq!((found.states.len(), found.alarms.len()), (0, 201));
+    let mut snapshot = Monitor::new(config().monitor).snapshot();
+    snapshot.repeat_alarms(&found.alarms);
+    snapshot.time = Timestamp::from_secs(300.0);
+    assert_eq!(raised(snapshot), [(101, 201.0)]);
+}
+
+#[test]
+fn alarm_rows_of_a_new_database_continue_a_new_state() {
+    let (place, _) = replayed_store();
+    std::fs::write(place.path().join("state").join(DATABASE), "nothing").unwrap();
+    let (mut store, found) = open(place.path());
+    assert!(found.states.len() == 1 && found.alarms.is_empty() && !found.works);
+    let before = stored(&place.path().join("state")).number;
+    for second in 1..=3_u32 {
+        let time = Timestamp::from_secs(f64::from(second));
+        let kind = change(Change::Raised, second, false);
+        let ticket = store.learned(&[Event { time, kind }], &at(1.0), time).unwrap();
+        assert!(answer(&store, ticket).works);
+    }
+    let state = stored(&place.path().join("state"));
+    assert_eq!(state.number, before + 1, "the first row is written with a state");
+    assert!(state.history_rows <= 2, "of the new database: {}", state.history_rows);
+    assert_eq!(raised(after_cut(place.path()).states.remove(0).snapshot).len(), 1);
+}
+
+#[test]
+fn damaged_alarm_rows_are_not_repeated() {
+    let (place, _) = replayed_store();
+    let mut folder = Folder::new(place.path().join("state"));
+    let mut database = folder.open(&document(1, 1, 1).stamp, 0).unwrap().0;
+    let before = database.rows();
+    let rows = vec![HistoryRow::Event(change(Change::Raised, 1, false))];
+    database.commit(&[RowBatch { stamp: document(1, 1, 1_800_000_000).stamp, rows }]).unwrap();
+    assert_eq!(database.alarm_changes(before).unwrap().len(), 1);
+    database.connection().execute("UPDATE alarm SET occurrences = 7 WHERE seq > ?1", [before]).unwrap();
+    assert_eq!(database.alarm_changes(before).unwrap(), []);
 }
 
 #[test]
