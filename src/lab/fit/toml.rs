@@ -53,7 +53,7 @@ fn electrodes(out: &mut String, found: &FittedElectrodes) {
     line(
         out,
         &format!(
-            "\n# Fit the open-circuit curve within {:.1} mV. Contents: empty and full cell.",
+            "\n# These electrodes reproduce the open-circuit curve within {:.1} mV. Contents: in the empty and in the full cell.",
             1e3 * found.residual_v
         ),
     );
@@ -116,7 +116,7 @@ fn tables(out: &mut String, request: &FitRequest, outcome: &FitOutcome) {
         false => ModelTables::beyond(fit, errors, &outcome.measured, outcome.logs.is_some()),
     };
     let (ocv_v, r0_ohm, branches) = tables.model(grid.soc.len());
-    let beyond = if is_ageing { "" } else { ", the first and the last beyond those measured" };
+    let beyond = if is_ageing { "" } else { "; the first and the last row are outside the measured range" };
     line(out, &format!("\n# Rows: temperature{beyond}. Columns: SOC.\n[tables]"));
     line(out, &format!("soc = [{}]", list(&grid.soc)));
     line(out, &format!("temperature_c = [{}]", list(&grid.temperature_c)));
