@@ -3,9 +3,9 @@
 //! `tests/diagnose/run [--quick] [--packs N] [--days N] [--period MS] [--jobs N] [--seed N] [--only WORD] [--list] [--write]`
 //!
 //! A pack drives, parks with sleeping buses and charges every day (scenario `ev-day`); its cells differ. Each kind of
-//! fault is injected at a random cell on a random day of the first third, in packs with good, usual and poor sensors,
-//! without balancing, with balancing, and with balancing whose bits show which cells are bled. Needs only the
-//! repository's cell model.
+//! fault is injected at a random cell on a random day of the first third. This is done in packs with good, usual and
+//! poor sensors, and with three kinds of balancing: none, unreported, and reported by bits that show the bled cells.
+//! Needs only the repository's cell model.
 //!
 //! - `--packs`: total number of packs, distributed over the rows, at least one per row
 //! - `--quick`: one pack per fault, with usual sensors and balancing
@@ -240,11 +240,15 @@ fn list((f, q, balancing): Row, case: &Case, seen: &[FirstFinding]) {
 fn table(scores: &BTreeMap<Row, Score>, options: &Options) -> String {
     let days = options.days;
     let mut text = format!(
-        "# Diagnosis of simulated packs\n\nWritten by `tests/diagnose/run --write`. {days} days each. Found: right kind and right cell. \
-         Median and 90 %: delay in days after the start of the fault within which that share of the row's packs was found; `-` if fewer were \
-         found. In one drive: found before the second drive with the fault began. Wrong cell: right kind, but only on other cells. Wrong \
-         kind: another kind, in addition or instead. False: findings per pack-month without a fault; in brackets the upper 95 % limit of \
-         that rate. A finding that recurs counts once.\n\nThe rows are not independent samples: all rows use the same packs with different \
+        "# Diagnosis of simulated packs\n\nWritten by `tests/diagnose/run --write`. Each pack runs for {days} days.\n\n\
+         | column | meaning |\n| --- | --- |\n\
+         | found | right kind and right cell |\n\
+         | in one drive | found before the second drive with the fault began |\n\
+         | median, 90 % | delay within which that share of the row's packs was found, in days from the start of the fault; `-` if fewer were found |\n\
+         | wrong cell | right kind, but only on other cells |\n\
+         | wrong kind | another kind, in addition or instead |\n\
+         | false | findings per pack-month without a fault; in brackets the upper 95 % limit of that rate |\n\n\
+         A finding that recurs counts once. The rows are not independent samples: all rows use the same packs with different \
          faults. The packs' true cells follow the monitor's cell model exactly, unlike real cells.\n\n\
          | fault | pack | sensors | balancing | packs | found | in one drive | median | 90 % | wrong cell | wrong kind | any finding | false |\n\
          | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |\n"

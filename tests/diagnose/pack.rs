@@ -78,7 +78,7 @@ pub(crate) struct FirstFinding {
     pub(crate) found: CellFault,
 }
 
-/// Writes the configuration of a pack whose BMS reports which cells it bleeds to `folder`.
+/// Writes to `folder` the configuration of a pack whose BMS reports which cells it bleeds.
 pub(crate) fn configuration(folder: &Path, size: PackSize) -> Result<MonitorConfig, String> {
     let sensors = size.cells.div_ceil(CELLS_PER_SENSOR);
     let write = |name: &str, text: String| std::fs::write(folder.join(name), text).map_err(|e| e.to_string());
