@@ -13,7 +13,7 @@ use rand_chacha::ChaCha8Rng;
 
 use ecu::{Daemon, Ecu, FRESHNESS, REPLY, config, frame_of, key};
 
-/// An attacker keeps this many recorded frames, the newest.
+/// Number of the newest frames that an attacker keeps.
 const RECORDED: usize = 512;
 
 /// An attacker who hears all traffic but has no key.

@@ -107,7 +107,7 @@ fn silent_cells_among_active_inputs_raise_fault() {
     let mut rig = parked();
     rig.voltages_v = [None; 2];
     rig.seconds(60);
-    // Two cells with two severities each.
+    // Four alarms: two cells with two severities each.
     assert_eq!((sleeps(&rig.events), rig.changes(Rule::InputMissing)), (vec![], vec![Change::Raised; 4]));
     // The other inputs fall asleep later; the missing inputs stay missing.
     fall_silent(&mut rig);

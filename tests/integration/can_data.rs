@@ -1,5 +1,5 @@
-//! Configured signals against the log of a real car: pack voltage and current of a Hyundai Kona. Its two buses use the
-//! same identifier for different messages.
+//! Decodes the pack voltage and current from the log of a real car, a Hyundai Kona. Its two buses use the same
+//! identifier for different messages.
 
 use std::io::Read;
 use std::path::Path;
@@ -50,7 +50,7 @@ fn read(map: &InputMap, frames: &[(BusIndex, Frame)]) -> (Vec<f64>, Vec<f64>) {
             Channel::Current => currents.push(reading.value.unwrap()),
             Channel::PackVoltage => {
                 voltages.push(reading.value.unwrap());
-                assert_eq!(currents.len(), voltages.len(), "the current of a frame comes before its voltage");
+                assert_eq!(currents.len(), voltages.len(), "the current of a frame must come before its voltage");
             }
             other => panic!("{other:?} was not bound"),
         });

@@ -1,5 +1,5 @@
-//! Rules that compare each cell with its pack: simulated packs with one fault run through the whole core; the test
-//! checks the alarms of every cell.
+//! Rules that compare each cell with its pack. Simulated packs with one fault run through the whole core, and the test
+//! checks the alarms of every cell. A row is the sum of each cell's samples over a few minutes.
 
 use std::fmt::Write as _;
 
@@ -164,8 +164,8 @@ impl FaultyPack {
         pack
     }
 
-    /// Runs to the given day plus a quarter of an hour, so that the day's row ends and all inputs are back after the
-    /// night.
+    /// Runs to the given day plus a quarter of an hour, so that the latest row ends and all inputs are back after
+    /// the night.
     fn run_to(&mut self, day: f64) {
         let (mut out, mut frames) = (Outputs::default(), Vec::new());
         let mut moments_after = 0;

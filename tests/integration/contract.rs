@@ -1,5 +1,5 @@
-//! The contract with other ECUs: a listener that loses frames, starts late and sees the daemon killed has the daemon's
-//! alarm table after two cycles. The listener is built only from the written DBC and the manual's page
+//! The contract with other ECUs. A listener loses frames, starts late and sees the daemon killed. After two cycles it
+//! must have the daemon's alarm table. The listener is built only from the written DBC and the manual's page
 //! `ecu/contract.md`.
 //!
 //! `PACKWATCH_CONTRACT_RUNS` sets the number of runs (default 200); the full test has 10,000.
@@ -183,7 +183,7 @@ impl<'a> Daemon<'a> {
         self.out.clear();
     }
 
-    /// Advances the time: input frames twice a second, and ticks when they have an effect.
+    /// Advances the time. Sends input frames twice a second, and ticks when they have an effect.
     fn run_for(&mut self, duration_ms: i64) {
         let end_ms = self.now_ms + duration_ms;
         while self.now_ms < end_ms {
@@ -324,7 +324,7 @@ fn lossy_listener_has_table_after_two_cycles() {
     }
     let mean = sum as f64 / runs as f64;
     eprintln!(
-        "{runs} runs, {mean:.1} alarms at once ({most} at most), two cycles of up to {longest_ms} ms: 0 differences"
+        "{runs} runs, {mean:.1} alarms at once ({most} at most), two cycles of up to {longest_ms} ms: no differences"
     );
     assert!(most > 97 && sum > 3 * usize::try_from(runs).unwrap(), "too few alarms for this test");
 }

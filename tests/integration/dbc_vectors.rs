@@ -122,7 +122,7 @@ fn compare_payload(message: &Message, payload: &[u8], expected: &mut HashMap<Str
             let close = (found - wanted).abs() <= 1e-9 * wanted.abs().max(1e-9);
             assert!(close, "{name} in {}: {found}, cantools {wanted}", hex(payload));
         } else {
-            // The raw value is invalid, or the scaled value is; neither may be returned.
+            // If the raw or the scaled value is invalid, no value may be returned.
             let plan = signal.layout.plan().unwrap();
             let fault = plan.decode(payload).unwrap_err();
             assert!(matches!(fault, Fault::NotFinite | Fault::OutOfRange), "{name} in {}: {fault:?}", hex(payload));
@@ -140,7 +140,7 @@ fn tesla_dbc_signals_decode_as_cantools() {
     let Some(python) = python() else { return };
     let tally = compare(&python, &path, false);
     let past: BTreeSet<String> = ask(&python, &path, &["short"], &[]).into_iter().collect();
-    assert_eq!(tally.short.keys().cloned().collect::<BTreeSet<_>>(), past, "signals that reach past their message");
+    assert_eq!(tally.short.keys().cloned().collect::<BTreeSet<_>>(), past, "signals that extend past their message");
     assert!(!past.is_empty() && tally.per_signal.len() > 3000);
     eprintln!("signals that extend past their message, so that every frame is too short: {past:?}");
 }

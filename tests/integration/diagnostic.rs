@@ -1,4 +1,5 @@
-//! Cells read by diagnostic requests, end to end: simulated, replayed, estimated; and the log of a polled car.
+//! Cells read by diagnostic requests, end to end: a simulated pack is replayed and estimated. Also reads the log of a
+//! polled car.
 
 use std::fs;
 use std::path::{Path, PathBuf};

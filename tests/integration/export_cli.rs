@@ -1,5 +1,5 @@
-//! Runs `packwatch export` as a user does. The tables hold what a replay reports; a failed export leaves no partial
-//! table.
+//! Runs `packwatch export` as a user does. The tables contain what a replay reports. A failed export leaves no
+//! partial table.
 
 use std::collections::BTreeMap;
 use std::fs;

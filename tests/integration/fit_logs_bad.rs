@@ -55,8 +55,8 @@ impl Drive {
         model
     }
 
-    /// Current at a second, A: 20 s at 1C, 20 s at C/3, 20 s of rest, longer rests of 10 min; half of that for a
-    /// charge.
+    /// Current at the given second, A. Repeats 20 s at 1C, 20 s at C/3 and 20 s of rest, with longer rests of 10 min. A
+    /// charge has half of these currents.
     fn current_a(&self, second: u32) -> f64 {
         let discharge_a = match second % 60 {
             _ if self.has_rests && second % 3000 > 2400 => 0.0,
@@ -114,7 +114,7 @@ fn json(args: &[&str]) -> Value {
     serde_json::from_slice(&output.stdout).unwrap()
 }
 
-/// Root mean square error, points, and fraction within the interval, for a drive that the fit has not used.
+/// Root mean square error in points and fraction within the interval, for a drive that the fit has not used.
 fn score(args: &[&str]) -> (f64, f64) {
     let found = json(&[&["score", "--json", "--truth-capacity", "50"][..], args].concat());
     let soc = &found["scores"][0]["soc"];

@@ -66,7 +66,7 @@ fn decode(python: &OsString, life: &Life, folder: &Path) -> serde_json::Value {
     assert!(output.status.success(), "{text}{}", String::from_utf8_lossy(&output.stderr));
     let found: serde_json::Value = serde_json::from_str(text.lines().last().unwrap()).unwrap();
     eprintln!(
-        "{} cells: {} values in {}, {} restated",
+        "{} cells: {} values in {}, {} changed without a report",
         found["cells"], found["values"], found["frames"], found["restated"]
     );
     // Every frame must have been decoded.
@@ -75,7 +75,7 @@ fn decode(python: &OsString, life: &Life, folder: &Path) -> serde_json::Value {
     assert_eq!(frames.iter().sum::<u64>(), u64::try_from(sent).unwrap());
     assert!(
         found["restated"].as_u64().unwrap() < frames[1] / 100,
-        "restated other than at changes of mode: {}",
+        "too many resistances changed without a report: {}",
         found["restated"]
     );
     found

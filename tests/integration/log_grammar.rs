@@ -217,7 +217,7 @@ fn read_batches(paths: &[PathBuf], strict: bool, max: usize) -> Result<(Vec<Reco
     Ok((records, source.counts().clone()))
 }
 
-/// Log files with lines of every kind: usual, unusual, malformed, of other interfaces, and ends of files.
+/// Log files with lines of every kind: usual, unusual, malformed, of other interfaces, and without a line end.
 fn any_log() -> impl Strategy<Value = Vec<u8>> {
     let usual = "\\(000000000[0-9]\\.[0-9]{6}\\) can[012] [0-7][0-9A-F]{2}#([0-9A-F]{2}){0,8}\r?\n";
     let unusual = "\\([0-9]{1,3}\\.[0-9]{6}\\)  ?can[01] [0-7][0-9A-F]{2}#[R#]?([0-9A-F]{2}){0,9}( [RTX])?\n";
@@ -384,7 +384,7 @@ fn lost_frame_counts_saturate() {
     let candump = file(folder.path(), "a.log", MOST_DROPPED.as_bytes());
     let lost = Record::bus(Timestamp::from_nanos(1_000_000_000), BusIndex(0), BusEvent::Dropped { frames: u64::MAX });
     let one_by_one = read(std::slice::from_ref(&candump), true, |_| {}).expect("read");
-    assert_eq!(one_by_one.0[1..], [lost, lost], "each line is a record with its own number");
+    assert_eq!(one_by_one.0[1..], [lost, lost], "each line must be a record with its own number");
     assert_eq!((one_by_one.1.dropped_frames, one_by_one.1.bad_lines), (u64::MAX, 0));
     assert_eq!(read_batches(&[candump], true, Batch::MAX).expect("read"), one_by_one);
     let line = "BUS (1.000000000) can0 dropped 18446744073709551615\n";
@@ -413,9 +413,13 @@ fn lost_frame_counts_leave_statistics_unchanged() {
         _ => None,
     });
     assert_eq!(noted.collect::<Vec<_>>(), [notes[0], notes[0], notes[1], notes[1]]);
-    assert_eq!(*rig.monitor.statistics(), before, "the interface counts lost frames");
+    assert_eq!(*rig.monitor.statistics(), before, "lost frames must not change the statistics");
     rig.seconds(1);
-    assert_eq!(rig.monitor.statistics().buses[0].frames, before.buses[0].frames + 20, "the monitor continues to count");
+    assert_eq!(
+        rig.monitor.statistics().buses[0].frames,
+        before.buses[0].frames + 20,
+        "the monitor must continue to count"
+    );
 }
 
 #[test]

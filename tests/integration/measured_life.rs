@@ -133,7 +133,7 @@ fn alarm_comes_at_end_of_life() {
     };
     let at = raised(1.4).expect("the cell falls below 1.4 Ah");
     println!("alarm at 1.4 Ah after discharge {at}");
-    assert!((120..=130).contains(&at), "published below 1.4 Ah at discharge 125, alarm at {at}");
+    assert!((120..=130).contains(&at), "the published capacity is below 1.4 Ah from discharge 125, alarm at {at}");
     assert_eq!(raised(1.2), None, "the published capacity never falls below 1.2 Ah");
 }
 
@@ -178,7 +178,10 @@ fn usable_capacity_converges_from_wrong_start() {
             assert!(life.mean_absolute_ah < 0.015, "{cell} {part}: {} Ah", life.mean_absolute_ah);
             assert!(life.covered > 0.9, "{cell} {part}: {}", life.covered);
             let at = life.first_below.expect("falls below 1.4 Ah");
-            assert!(at.abs_diff(end_of_life) <= 3, "{cell} {part}: below 1.4 Ah at {at}, published {end_of_life}");
+            assert!(
+                at.abs_diff(end_of_life) <= 3,
+                "{cell} {part}: estimate below 1.4 Ah at discharge {at}, published {end_of_life}"
+            );
         }
     }
 }

@@ -1,7 +1,7 @@
 //! Properties of the whole core: a restored monitor behaves as if it had never stopped, and ticks before `next_due` may
-//! be omitted. Inputs from the simulator: the paper's cell (with a recharge window, transitions and alarms) and a pack
-//! of 96 cells whose voltages come in many frames. Outputs are compared bit for bit (floats by their shortest text that
-//! reads back unchanged).
+//! be omitted. The inputs come from the simulator: the paper's cell (with a recharge window, transitions and alarms)
+//! and a pack of 96 cells whose voltages come in many frames. Outputs are compared bit for bit (floats by their
+//! shortest text that reads back unchanged).
 
 use std::path::Path;
 
@@ -129,7 +129,7 @@ fn differences(config: &MonitorConfig, records: &[Record], splits: &[usize], awa
             || whole.recharge_period_s() != restored.recharge_period_s()
             || whole.normalised_recharge_period() != restored.normalised_recharge_period()
         {
-            found.push(format!("split {split}: pack or a recharge period differ at the end"));
+            found.push(format!("split {split}: the pack's values or a recharge period differ at the end"));
         }
     }
     found
@@ -276,7 +276,7 @@ fn assert_early_ticks_have_no_effect(config: &MonitorConfig, records: &[Record])
         let got = outputs(&mut few, record, &mut out_few);
         assert_eq!(expected, got, "input {nth} at {} s", record.time.secs());
     }
-    assert!(skipped > given, "the test must leave ticks out: {skipped} of {}", skipped + given);
+    assert!(skipped > given, "the test must omit most ticks, omitted {skipped} of {}", skipped + given);
 }
 
 #[test]
@@ -291,8 +291,7 @@ fn early_ticks_have_no_effect_on_pack() {
     assert_early_ticks_have_no_effect(&config, &records);
 }
 
-/// The paper's cell with each record changed, moved or removed. (The cut over the sleep lies between two due ticks,
-/// because the last tick before it may be omitted.)
+/// The paper's cell with each record changed, moved or removed.
 fn edited(edit: impl Fn(f64, Record) -> Option<Record>) -> (MonitorConfig, Vec<Record>) {
     let (config, records) = paper();
     let records = records.into_iter().filter_map(|record| edit(record.time.secs(), record)).collect();
@@ -310,6 +309,7 @@ fn early_ticks_have_no_effect_on_silent_sensor() {
 
 #[test]
 fn early_ticks_have_no_effect_over_sleep() {
+    // Start the sleep between two due ticks, because the last tick before it may be omitted.
     let (config, records) = edited(|time_s, record| (!(5000.035..8600.0).contains(&time_s)).then_some(record));
     assert_early_ticks_have_no_effect(&config, &records);
 }

@@ -268,11 +268,11 @@ fn waking_alone_does_not_clear_input_missing() {
     let mut b = Bench::new(c, 0.9);
     b.run(2.6, 300);
     b.quiet(30);
-    assert_eq!(b.count(|k| alarm(k, Rule::InputMissing, true)), 2, "cell voltage and pack current");
+    assert_eq!(b.count(|k| alarm(k, Rule::InputMissing, true)), 2, "one alarm each for cell voltage and pack current");
     b.t += 3600.0;
     b.quiet(30);
 
-    assert_eq!(b.count(|k| alarm(k, Rule::InputMissing, false)), 0, "cleared without an input");
+    assert_eq!(b.count(|k| alarm(k, Rule::InputMissing, false)), 0, "the alarm was cleared without an input");
 }
 
 #[test]
@@ -290,7 +290,7 @@ fn repeatedly_lost_filter_is_not_trusted() {
         }
     }
     assert!(b.count(|k| matches!(k, EventKind::FilterReset { .. })) > 0);
-    assert!(valid < 600, "valid for {valid} of 3600 s");
+    assert!(valid < 600, "SOC valid for {valid} of 3600 s");
 
     assert!(b.count(|k| alarm(k, Rule::EstimateUntrusted, true)) > 0);
 }
@@ -301,7 +301,7 @@ fn soc_jump_is_not_a_recharge_period() {
     c.rules = vec![rule(Rule::RechargePeriodLow, 1500.0, 0.0)];
     let mut b = Bench::new(c, 0.2);
     b.run(-1.3, 60);
-    // While asleep or miswired the filter is lost during a charge and restarts at 0.9.
+    // The filter is lost during a charge and restarts at 0.9, as after a sleep or with wrong wiring.
     b.soc = 0.88;
     b.run(-1.3, 200);
 

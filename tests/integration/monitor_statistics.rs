@@ -42,7 +42,7 @@ fn counts_continue_after_restart() {
     assert_eq!(after.gaps, before.gaps + 1);
     assert_eq!(after.buses[0].frames, before.buses[0].frames + 20);
     assert!(rig.monitor.reading_counts().accepted > readings.accepted);
-    // The difference contains what was counted since.
+    // The difference contains only the counts since `before`.
     let added = after.since(&before);
     assert_eq!((added.learning.half_cycles, added.restores, added.gaps, added.buses[0].frames), (0, 1, 1, 20));
     assert_eq!(rig.monitor.reading_counts().since(&readings).accepted, 60);
@@ -69,7 +69,7 @@ fn stale_values_are_not_shown() {
     let voltage_v = pack.values.mean(Quantity::Voltage).unwrap();
     assert!((voltage_v - rig.voltages_v.iter().flatten().sum::<f64>()).abs() < 1e-3, "{voltage_v}");
     assert!(pack.weakest_cell.is_some() && pack.values.mean(Quantity::Soh).is_some_and(|soh| soh > 0.0));
-    // One cell is silent: only its learned values are shown, and no pack value that depends on it.
+    // One cell is silent: only its learned values are shown. Pack values that depend on the cell are not shown.
     rig.voltages_v[1] = None;
     rig.seconds(20);
     let cells: Vec<_> = rig.monitor.cell_views().collect();

@@ -1,5 +1,5 @@
-//! The written DBC loads strictly in `cantools`, and every frame encoded by the same layout decodes to the original
-//! values within one bit, for every kind of frame, protection, identifier and cell.
+//! The written DBC must load strictly in `cantools`. Every frame encoded by the same layout must decode to the original
+//! values within one bit. The test covers every kind of frame, protection, identifier and cell.
 
 use std::collections::{BTreeSet, HashMap};
 use std::path::Path;
@@ -536,7 +536,7 @@ fn rule_value_tables_match_rule_numbers() {
         let signal = &format!("PACKWATCH_{message}");
         let table = &dbc.signal(signal).unwrap().1.values;
         assert_eq!(table[..rules.len()], rules, "{signal}");
-        assert_eq!(table.len(), rules.len() + 1, "{signal}: every rule, and a code for none or all");
+        assert_eq!(table.len(), rules.len() + 1, "{signal} must have every rule, and a code for none or all");
     }
 }
 

@@ -1,9 +1,11 @@
-//! Runs `packwatch passport` as a user does: values against the store's own numbers, unknown values, and the formats of
-//! both standards.
+//! Runs `packwatch passport` as a user does. Checks the values against the store's own numbers, unknown values, and the
+//! formats of both standards.
 //!
-//! Peers: IDTA's template through `aas-submodel-validate`, if `PACKWATCH_PYTHON` names a Python that has it; and the
-//! published JSON schemas, if `PACKWATCH_SCHEMAS` also names a folder with `ProductConditionBattery-schema.json`
-//! (1.0.1) and `BatteryPass-schema.json` (6.0.0). Otherwise the tests report that they were skipped.
+//! Two peers also check the formats. If one is missing, its test reports that it was skipped:
+//!
+//! - IDTA's template through `aas-submodel-validate`: `PACKWATCH_PYTHON` names a Python that has it
+//! - the published JSON schemas: `PACKWATCH_SCHEMAS` also names a folder with `ProductConditionBattery-schema.json`
+//!   (1.0.1) and `BatteryPass-schema.json` (6.0.0)
 
 use std::fs;
 use std::path::{Path, PathBuf};

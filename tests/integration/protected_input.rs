@@ -1,4 +1,4 @@
-//! Bad frames of protected messages, and floods, at the core's interface: each one is counted and reported, none
+//! Bad frames of protected messages, and floods, at the core's interface. Each bad frame is counted and reported. None
 //! changes an estimate, and other messages are still processed.
 
 use crate::support::config_texts;

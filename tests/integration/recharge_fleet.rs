@@ -219,7 +219,7 @@ impl Rig {
     }
 }
 
-/// The paper's configuration for cells with known rated capacity only.
+/// The paper's configuration, for cells whose rated capacity alone is known.
 fn configuration() -> MonitorConfig {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml");
     let mut config = config::load(&path).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n"))).monitor;

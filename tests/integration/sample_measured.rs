@@ -1,5 +1,5 @@
-//! The sample stage on a measured life (NASA B0005, uneven time steps, real glitches): it rejects exactly the glitches,
-//! and each cycle's charge matches the data set's own table.
+//! The sample stage on a measured life (NASA B0005, uneven time steps, real glitches). It must reject exactly the
+//! glitches, and each cycle's charge must match the data set's own table.
 
 use std::collections::BTreeMap;
 use std::path::Path;

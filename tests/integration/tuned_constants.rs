@@ -53,7 +53,7 @@ fn rust_files(base: &Path, folder: &Path, found: &mut Vec<PathBuf>) {
     }
 }
 
-/// Source text without blanks and without the trailing commas of broken lines.
+/// Source text without blanks and without the trailing commas of wrapped lines.
 fn compact(text: &str) -> String {
     let text: String = text.split_whitespace().collect();
     text.replace(",]", "]").replace(",)", ")").replace(",}", "}")
@@ -90,7 +90,7 @@ fn quoted(line: &str) -> Vec<&str> {
     line.split('`').skip(1).step_by(2).collect()
 }
 
-/// The rows of the page as (constant, file, value, test); the test is `None` if there is none.
+/// The rows of the page as (constant, file, value, test); the test is `None` if the row names none.
 fn rows(page: &str) -> Vec<(&str, &str, &str, Option<&str>)> {
     page.lines()
         .filter(|line| line.starts_with("| `"))

@@ -21,7 +21,7 @@ const fn candidate(name: &'static str, when: Comparison, debounce_events: u32) -
     Candidate { name, when, debounce_events }
 }
 
-/// The rules to compare. The Monitor itself also runs those in `MONITORED`, each as one severity.
+/// The rules to compare. The Monitor itself also runs the rules in `MONITORED`, each as one severity.
 pub(crate) const CANDIDATES: [Candidate; 8] = [
     candidate("p = 0.05", Comparison::Probability(0.05), 1),
     candidate("p = 0.2", Comparison::Probability(0.2), 1),

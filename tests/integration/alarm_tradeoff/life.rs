@@ -361,7 +361,7 @@ impl Rig {
         self.step(0.0, SWITCH_S);
     }
 
-    /// One reading at `current_a`, which then flows for `dt_s`.
+    /// Sends one reading at `current_a`, then lets this current flow for `dt_s`.
     fn step(&mut self, current_a: f64, dt_s: f64) {
         let (voltage_v, temperature_c) = (self.pack.lowest_v(current_a), self.truth().temperature_c);
         let readings = self.sensors.read(current_a, voltage_v, temperature_c);

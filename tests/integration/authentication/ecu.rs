@@ -93,7 +93,7 @@ pub(crate) fn frame_of(payload: &[u8]) -> Frame {
     if payload.len() <= 8 { Frame::classic(id, payload) } else { Frame::fd(id, false, false, payload) }.unwrap()
 }
 
-/// A tick (`None`), or a frame with the freshness if its authenticator is right.
+/// A tick (`None`), or a frame with its freshness. The freshness is `None` if the authenticator is wrong.
 pub(crate) type JournalLine = Option<(Frame, Option<u64>)>;
 
 /// The daemon on a simulated bus, with manual time.

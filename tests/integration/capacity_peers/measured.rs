@@ -274,7 +274,7 @@ fn usable_capacity_of_whole_lives_matches_best_peer() {
     }
 }
 
-/// Factor by which the best peer, its memory chosen afterwards by the result, may lead over all windows.
+/// Factor by which the best peer may lead over all windows. Its memory is chosen afterwards by the result.
 const LEVEL: f64 = 1.1;
 
 /// Here the filter's swings use the same ends as the voltage swings: after a gap, swing and charge of a `half_cycle`

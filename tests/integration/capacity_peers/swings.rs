@@ -2,8 +2,8 @@
 //!
 //! The open-circuit voltage is V + I R0 rho + sum U. The branch voltages are stepped in open loop from rest (from 180 s
 //! on if the record begins under load); rho is the filter's resistance ratio. All readings of the first and the last 60
-//! s count, each with the charge that had flowed until that reading. The capacity is assumed only for the curve's change
-//! of shape. The deviation of an end is the product's own (`[capacity]`).
+//! s count, each with the charge that had flowed until that reading. The capacity is assumed only for the curve's
+//! change of shape. The deviation of an end is the product's own (`[capacity]`).
 
 use packwatch::cell::aged_ocv::SHIFT_STD;
 use packwatch::cell::circuit::BranchAt;
@@ -12,7 +12,7 @@ use packwatch::health::CapacityConfig;
 
 use super::least_squares::Swing;
 
-/// A longer step is a gap, in which the charge is unknown.
+/// A longer step between readings is a gap, in which the charge is unknown, s.
 const GAP_S: f64 = 60.0;
 /// Below this current the cell rests, A.
 const REST_A: f64 = 0.05;
@@ -97,7 +97,7 @@ pub(crate) fn charge_variance(config: &CapacityConfig, charge_ah: f64, duration_
     (gain_ah * gain_ah + offset_ah * offset_ah).max(1e-6 * charge_ah * charge_ah)
 }
 
-/// The SOC whose open-circuit voltage an aged cell shares with a new one at `new_soc`.
+/// SOC at which the aged cell has the same open-circuit voltage as a new cell at `new_soc`.
 fn aged_soc(model: &CellModel, new_soc: f64, capacity_ah: f64) -> f64 {
     const ANY_C: f64 = 25.0;
     let voltage_v = model.ocv_v(&model.grid_position(new_soc, ANY_C));
@@ -140,7 +140,7 @@ pub(crate) fn weigh(model: &CellModel, config: &CapacityConfig, ends: Ends, read
 /// Index of the charge reversal, once enough charge has flowed back.
 fn reversal(model: &CellModel, points: &[Point]) -> Option<usize> {
     let (first, last) = (points.first()?.charge_ah, points.last()?.charge_ah);
-    // Check every 32nd point only: a reversal that counts lies much further back.
+    // Checking every 32nd point is enough: the charge of a reversal takes many more points to flow back.
     if !points.len().is_multiple_of(32) {
         return None;
     }

@@ -1,4 +1,4 @@
-//! Healthy packs for the doctor's tests: configurations, DBC files and simulated logs, into which faults are then put.
+//! Healthy packs for the doctor's tests: configurations, DBC files and simulated logs. The tests put faults into them.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

@@ -6,7 +6,7 @@ use super::bench::Bench::{Pack12, Pack96, Pulses, Steady, Total, Walk};
 use super::bench::BrokenPack;
 use super::faults::{Fault, fault};
 
-/// Swaps `@1` and `@0` but leaves the start bits of the cells unchanged, as a careless author would.
+/// Swaps `@1` and `@0` but leaves the start bits of the cells unchanged.
 fn byte_order_alone(broken: &mut BrokenPack) {
     for start in [16, 32, 48] {
         broken.dbc(&format!("{start}|16@1+ (0.0001"), &format!("{start}|16@0+ (0.0001"));
@@ -29,8 +29,8 @@ fn set(data: &mut [u8], page: u8, at: usize, value: i32) {
     }
 }
 
-/// Adds a second bus on which another sender uses identifier 100; its current is the first one's, inverted and delayed.
-/// The configured current is on interface `on`.
+/// Adds a second bus on which another sender uses identifier 100. Its current is that of the first sender, inverted and
+/// delayed. The configured current is on interface `on`.
 fn second_bus(broken: &mut BrokenPack, on: &str) {
     broken.config("[[interface]]\nname = \"can0\"", "[[interface]]\nname = \"can1\"\n\n[[interface]]\nname = \"can0\"");
     broken.table("[input.cell_voltage]", "interface = \"can0\"");
