@@ -1,12 +1,14 @@
-//! The clock of the inputs: never runs backwards, and detects time asleep and a clock that was set back.
+//! The monitor's clock, which follows the times of the inputs. It never runs backwards, and detects time asleep and a
+//! driver's clock that was set back.
 //!
 //! In: the time of each input. Out: the time that the stages use, and a [`TimeJump`] if an input does not closely
-//! follow the previous one. A step back within [`MERGE_TOLERANCE_NS`] is counted and treated as "now".
+//! follow the previous input. An input that is late by at most [`MERGE_TOLERANCE_NS`] is counted and treated as if it
+//! arrived now.
 
 use super::message::MERGE_TOLERANCE_NS;
 use crate::quantity::Timestamp;
 
-/// Longest time between inputs, including ticks, while the computer is awake, s: 500 ticks.
+/// Longest time between inputs (including ticks) while the computer is awake, s: 500 ticks.
 pub(crate) const ASLEEP_S: f64 = 5.0;
 const ASLEEP_NS: i64 = (ASLEEP_S * 1e9) as i64;
 
@@ -20,23 +22,23 @@ pub(crate) struct Clock {
     pub(crate) has_started: bool,
     /// Time of the latest input that had an effect.
     pub(crate) now: Timestamp,
-    /// Number of inputs with a time before an earlier input's.
+    /// Number of inputs whose time is before the time of an earlier input.
     pub(crate) time_backwards: u64,
-    /// Time at which a tick next has an effect; `None` = not started.
+    /// Time at which a tick next has an effect; `None` before the first input.
     pub(crate) due: Option<Timestamp>,
 }
 
-/// An input that does not closely follow the previous one.
+/// A jump of time: an input does not closely follow the previous input.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum TimeJump {
-    /// The clock was set back by this much, s; the elapsed time is unknown.
+    /// The driver's clock was set back, so the elapsed time is unknown.
     Backwards {
-        /// Size of the step, s.
+        /// Size of the step back, s.
         seconds: f64,
     },
-    /// No input arrived for this long, s: the computer was asleep, or the log has a gap.
+    /// No input arrived for a while: the computer was asleep, or the log has a gap.
     Asleep {
-        /// Length, s.
+        /// Time without an input, s.
         seconds: f64,
     },
 }
@@ -48,8 +50,8 @@ impl Clock {
         self.due.is_some_and(|due| time < due)
     }
 
-    /// Advances to the time of an input. If it returns a jump, the time is unchanged: the caller ends everything in
-    /// progress, then sets the new time.
+    /// Advances to the time of an input. If time jumps, returns the jump and leaves the clock unchanged. The caller
+    /// then ends everything in progress and sets the new time.
     #[inline]
     pub(crate) fn advance(&mut self, time: Timestamp) -> Option<TimeJump> {
         if (0..=ASLEEP_NS).contains(&time.nanos().saturating_sub(self.now.nanos())) {
@@ -84,7 +86,7 @@ mod tests {
         let at = Timestamp::from_secs;
         let mut clock = Clock { now: at(100.0), ..Clock::default() };
         assert_eq!((clock.advance(at(105.0)), clock.now), (None, at(105.0)));
-        // Merged out of order: the input is counted and the time stays.
+        // An input that was merged out of order is counted, and the time stays.
         assert_eq!((clock.advance(at(104.5)), clock.now), (None, at(105.0)));
         assert_eq!((clock.advance(at(100.0)), clock.now), (Some(TimeJump::Backwards { seconds: 5.0 }), at(105.0)));
         assert_eq!((clock.advance(at(111.0)), clock.now), (Some(TimeJump::Asleep { seconds: 6.0 }), at(105.0)));

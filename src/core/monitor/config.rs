@@ -1,6 +1,6 @@
 //! Checked configuration of a [`Monitor`](super::Monitor), and comparisons between two configurations.
 //!
-//! Each stage keeps its part. The complete configuration is kept only for comparison with a new one.
+//! Each stage keeps its own settings. The monitor keeps the complete configuration only to compare it with a new one.
 
 use crate::alarm::{Rule, RuleConfig, Severity};
 use crate::can::CanId;
@@ -27,35 +27,35 @@ pub struct MonitorConfig {
     pub input: InputMap,
     /// Diagnostic answers that are decoded.
     pub answers: Vec<Answer>,
-    /// Diagnostic requests to send; `None` = none.
+    /// Diagnostic requests to send; `None` = the daemon sends no requests.
     pub poll: Option<PollConfig>,
     /// Supply voltage required before requests are sent.
     pub supply: Option<SupplyConfig>,
     /// Input messages with end-to-end protection.
     pub guards: Vec<GuardConfig>,
-    /// Cycle times of input messages, s, if known.
+    /// Known cycle times of input messages, s.
     pub cycle_times_s: Vec<(BusIndex, CanId, f64)>,
-    /// Consecutive readings that must agree on another pack identity, if such a signal is in `input`.
+    /// Number of consecutive readings that must agree before another pack identity counts.
     pub identity_readings: u32,
     /// Limits on the number of frames of one identifier.
     pub flood: FloodConfig,
     /// Silence of all inputs at rest after which the buses count as asleep, s; `None` = never.
     pub asleep_after_s: Option<f64>,
-    /// Sample stage.
+    /// Settings of the sampling stage.
     pub sample: SampleConfig,
     /// Cell model.
     pub model: CellModel,
     /// Cells of another kind, with their own models.
     pub modules: Vec<CellModule>,
-    /// Label of the cells, if their model is learned; `None` = the model is given.
+    /// Label of the cells, from which their model is learned; `None` = the model is given.
     pub label: Option<Label>,
     /// Whether the BMS bleeds fuller cells after a charge.
     pub is_balanced: bool,
-    /// Meaning of the balancing bits in `input`; `None` = no such bits.
+    /// Meaning of the balancing bits in `input`; `None` = `input` has no balancing bits.
     pub balancing: Option<BalancingConfig>,
-    /// Estimator.
+    /// Settings of the estimator.
     pub estimator: EstimatorConfig,
-    /// Learning at charge/discharge transitions.
+    /// Settings for learning at charge/discharge transitions.
     pub health: HealthConfig,
     /// Alarm rules.
     pub rules: Vec<RuleConfig>,
@@ -72,7 +72,7 @@ pub struct MonitorConfig {
 pub struct SupplyConfig {
     /// Minimum voltage, V.
     pub minimum_v: f64,
-    /// Readings older than this are ignored, s.
+    /// Age above which a reading is ignored, s.
     pub max_age_s: f64,
 }
 
@@ -81,8 +81,7 @@ pub struct SupplyConfig {
 pub struct CommandConfig {
     /// Interface of the command frames.
     pub bus: BusIndex,
-    /// Layout of the command frames. Authenticated frames are checked by the command gate, protected frames by a
-    /// guard.
+    /// Layout of the command frames. The command gate checks authenticated frames; a guard checks protected frames.
     pub plan: CommandPlan,
 }
 
@@ -91,7 +90,7 @@ pub struct CommandConfig {
 pub struct OutputConfig {
     /// Layouts and identifiers.
     pub plan: OutputPlan,
-    /// Interfaces on which they are sent.
+    /// Interfaces on which the frames are sent.
     pub buses: Vec<BusIndex>,
     /// Period of the status frame, s.
     pub status_period_s: f64,
@@ -123,9 +122,9 @@ pub struct AlarmCode {
     pub rule: Rule,
     /// The threshold's severity.
     pub severity: Severity,
-    /// The trouble code, with an occurrence count of 0.
+    /// The trouble code; its occurrence count is 0.
     pub code: TroubleCode,
-    /// The lamp that it lights.
+    /// The lamp that the trouble code lights.
     pub lamp: Lamp,
 }
 
@@ -151,7 +150,8 @@ pub struct ReconfigureError {
 }
 
 impl MonitorConfig {
-    /// Whether every frame of an interface is received, because requests are sent there only while the bus is awake.
+    /// Whether the daemon must receive every frame of an interface. It must if it sends requests on the interface,
+    /// because it sends them only while the bus is awake.
     pub fn wants_all(&self, bus: BusIndex) -> bool {
         self.poll.as_ref().is_some_and(|poll| poll.requests.iter().any(|it| it.question.controller.bus == bus))
     }
@@ -162,19 +162,19 @@ impl MonitorConfig {
         module.map_or(&self.model, |module| &module.model)
     }
 
-    /// Whether a cell belongs to no module of another kind.
+    /// Whether a cell is one of the pack's own kind, that is, not in a module of another kind.
     pub fn is_own(&self, cell: CellIndex) -> bool {
         !self.modules.iter().any(|module| module.cells.contains(&cell))
     }
 
-    /// Number of cells that belong to no module of another kind.
+    /// Number of cells of the pack's own kind, that is, not in a module of another kind.
     pub fn own_cells(&self) -> u32 {
         let in_modules: usize = self.modules.iter().map(|module| module.cells.len()).sum();
         u32::from(self.sample.cells).saturating_sub(u32::try_from(in_modules).unwrap_or(u32::MAX))
     }
 
-    /// Identifiers to receive on an interface, ascending. Includes those of our own frames, which another node may
-    /// use.
+    /// Identifiers to receive on an interface, ascending. They include the identifiers of the daemon's own frames,
+    /// because another node may use these too.
     pub fn wanted_ids(&self, bus: BusIndex) -> Vec<CanId> {
         let mut ids = self.listened_ids(bus);
         ids.extend(self.own_ids().filter(|(other, _)| *other == bus).map(|(_, id)| id));
@@ -192,8 +192,8 @@ impl MonitorConfig {
         self.output.iter().flat_map(of)
     }
 
-    /// Unprotected input messages with the cycle time of their frames, s, if known. The cycle time of a multiplexed
-    /// message counts as unknown, because it may be each page's.
+    /// Unprotected input messages with the cycle time of their frames, s, if known. For a multiplexed message it counts
+    /// as unknown, because the stated cycle time may be the cycle time of each page.
     pub(crate) fn unprotected(&self) -> impl Iterator<Item = (BusIndex, CanId, Option<f64>)> + '_ {
         let is_protected = |bus, id| self.guards.iter().any(|guard| (guard.bus, guard.id) == (bus, id));
         let cycle_s = |bus, id| self.cycle_times_s.iter().find(|of| (of.0, of.1) == (bus, id)).map(|of| of.2);
@@ -277,7 +277,7 @@ impl MonitorConfig {
         }
     }
 
-    /// Whether `new` gives the same estimates.
+    /// Whether `new` has the same settings as `self` wherever these affect estimates.
     pub(crate) fn estimates_as(&self, new: &Self) -> bool {
         self.model == new.model
             && self.modules == new.modules

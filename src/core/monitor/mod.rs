@@ -1,17 +1,19 @@
 //! The core: handles records and produces outputs. It never reads a clock, a file or a socket, and never logs.
 //!
-//! Records come in the order in which they happened; the same records give the same outputs, byte for byte. A bad
-//! record causes an event and is counted; it never causes a panic. The data path, one file per stage:
+//! Records arrive in the order in which they happened. The same records give the same outputs, byte for byte. A bad
+//! record is counted and causes an event, never a panic. The data path has one file per stage:
 //!
 //! ```text
 //! frame ─▶ intake ─▶ sampling ─▶ estimation ─▶ learning ─▶ alarming ─▶ sending
 //!          readings  samples     estimates     health      alarms      frames
 //! ```
 //!
-//! * `message`: inputs and outputs; independent of the stages;
-//! * `stage`: the stages; each knows only stages before it;
-//! * `stages`: connects the stages after the intake, passes their values to the rules, and remembers exchanged packs;
-//! * `snapshot`: the stored state; `lifecycle`: restores it, relearns from a history, reconfigures;
+//! * `message`: inputs and outputs, independent of the stages;
+//! * `stage`: the stages, each of which knows only the stages before it;
+//! * `stages`: connects the stages after the intake, passes their values to the alarm rules, and remembers exchanged
+//!   packs;
+//! * `snapshot`: the stored state;
+//! * `lifecycle`: restores a stored state, relearns from a history, and applies a new configuration;
 //! * `clock`, `config`, `view`: time, configuration and current values of the whole monitor.
 
 mod clock;
@@ -65,7 +67,7 @@ pub struct Monitor {
     pub(crate) pending: Option<PendingRestore>,
 }
 
-/// Range of timestamps.
+/// Range of timestamps that the monitor handles.
 const EARLIEST: Timestamp = Timestamp::from_nanos(-LATEST.nanos());
 const LATEST: Timestamp = Timestamp::from_nanos(bounds::STAMP_NS.high as i64);
 
@@ -88,7 +90,7 @@ impl Monitor {
             self.intake.own.note_sent(sent.time, sent.bus, &sent.frame);
         }
         if self.stages.sending.poller.is_some() {
-            // The bus does not echo our requests, but the listener needs them to recognise their answers.
+            // The bus does not echo the daemon's requests, but the listener needs them to recognise the answers.
             for sent in &out.frames[first_frame..] {
                 self.intake.listener.handle(sent.time, sent.bus, &sent.frame);
             }
@@ -186,8 +188,9 @@ impl Monitor {
         }
     }
 
-    /// Handles a frame of diagnostic requests and answers. The values of an answer date from its first frame: by then
-    /// the controller has assembled the answer, and the remaining frames only depend on the tester's flow control.
+    /// Handles a frame of diagnostic requests and answers. The values of an answer count as measured at its first
+    /// frame: by then, the controller has assembled the answer. The times of the remaining frames only depend on the
+    /// tester's flow control.
     fn handle_diagnostic(&mut self, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
         let Self { clock, intake, stages, .. } = self;
         let (now, Intake { listener, moments, controllers, .. }) = (clock.now, &mut *intake);
@@ -209,7 +212,7 @@ impl Monitor {
             FrameOutcome::Whole { controller, answer, data, is_single } => {
                 stages.end_bus_sleep(now, out);
                 let began = moments[controller].take();
-                // If an answer contains the current, all its values count as measured at its end.
+                // If an answer contains the current, all its values count as measured at the end of the answer.
                 let is_now = is_single || answer.has(|channel| channel == Channel::Current);
                 let moment = began.filter(|_| !is_now);
                 for reading in answer.readings(data) {
@@ -257,7 +260,7 @@ impl Monitor {
                     stages.sending.claim_address(now, out);
                 }
             }
-            // Frames and gaps are handled by the caller; the other records are for the driver.
+            // The caller handles frames and gaps; the other records are for the driver.
             RecordKind::Frame { .. }
             | RecordKind::SecuredFrame { .. }
             | RecordKind::UnknownGap
@@ -267,8 +270,8 @@ impl Monitor {
     }
 
     /// How to check the authenticator of a frame; `None` if the frame does not belong to an authenticated message. The
-    /// driver, which has the key, passes such a frame as [`RecordKind::SecuredFrame`]. Passed as
-    /// [`RecordKind::Frame`], it counts as forged.
+    /// driver has the key: it checks such a frame and passes it as [`RecordKind::SecuredFrame`]. If the driver passes
+    /// it as [`RecordKind::Frame`], it counts as forged.
     #[inline]
     pub fn mac_check(&self, bus: BusIndex, frame: &Frame) -> Option<MacCheck> {
         let commands = self.config.commands.as_ref()?;
@@ -277,20 +280,20 @@ impl Monitor {
         is_command.then(|| self.intake.command_gate.mac_check(secoc, frame.data()))
     }
 
-    /// The model fit that has just started; returned once. A fit takes longer than a tick may. A live driver runs it
-    /// on another thread and passes the findings to [`Self::give_model_fit`]. Otherwise the monitor runs the fit when
-    /// it is due, with the same result.
+    /// The model fit that has just started; returned once. A fit takes longer than handling a tick may take, so a live
+    /// driver runs the fit on another thread and passes the findings to [`Self::give_model_fit`]. Otherwise, the
+    /// monitor runs the fit when it is due, with the same result.
     pub fn take_model_fit(&mut self) -> Option<FitTask> {
         self.stages.modelling.take_task()
     }
 
-    /// Receives the findings of a fit.
+    /// Receives the findings of a fit that the driver ran.
     pub fn give_model_fit(&mut self, task: FitTask, findings: FitFindings) {
         self.stages.modelling.give(task, findings);
     }
 
-    /// Steps the cells with a waiting sample, without waiting for the other cells. The core does this itself before it
-    /// uses estimates; a driver calls it after its last input.
+    /// Steps the cells that have a waiting sample, without waiting for the other cells. The core does this itself
+    /// before it uses estimates; a driver calls this function after its last input.
     pub fn settle(&mut self, out: &mut Outputs) {
         let first_event = out.events.len();
         self.stages.step_waiting(self.clock.now, true, out);
@@ -308,14 +311,14 @@ impl Monitor {
         self.clock.due = self.clock.has_started.then(|| self.stages.sending.next_due());
     }
 
-    /// Starts at the time of the first input, from the pending stored state, if any.
+    /// Starts at the time of the first input, from the pending stored state if there is one.
     fn start(&mut self, time: Timestamp, out: &mut Outputs) {
         (self.clock.has_started, self.clock.now) = (true, time);
         self.stages.sending.restart(time);
         let beginning = self.apply_pending(time, out);
         if beginning == Beginning::Continued {
-            // Another run may have continued from the same state, so commands that it accepted must not be accepted
-            // again.
+            // Another run may have continued from the same state. This run must reject the commands that the other run
+            // accepted.
             if !self.config.authentications().is_empty() {
                 self.begin_freshness(time);
             }
@@ -327,7 +330,7 @@ impl Monitor {
         let was_brief = beginning != Beginning::RestoredAgeless && away_s <= ASLEEP_S;
         if beginning == Beginning::Restored {
             if away_s > HOUSEKEEPING_S {
-                // Samples from before the downtime must be stepped before it; they say nothing about the present.
+                // Samples that were waiting before the downtime belong to the time before it.
                 stages.step_waiting(taken, was_brief, out);
             }
             stages.estimation.bank.change_all(|config, estimator| estimator.note_downtime(config, away_s));
@@ -342,14 +345,14 @@ impl Monitor {
             // Also claims the J1939 address.
             self.handle_unknown_gap(time, out);
         }
-        // After a longer downtime `advance` detects the gap and claims the address.
+        // After a longer downtime, `advance` detects the gap and claims the address.
         if was_brief {
             self.stages.sending.claim_address(time, out);
         }
         self.find_due();
     }
 
-    /// Starts the freshness of commands and sent frames above the values of any earlier run.
+    /// Starts the freshness of commands and sent frames above the values of all earlier runs.
     fn begin_freshness(&mut self, now: Timestamp) {
         self.intake.command_gate.begin(now);
         self.stages.sending.begin_freshness(now);

@@ -1,7 +1,8 @@
-//! The monitor's state as a versioned document: assembled from the stages' states, checked, and restored.
+//! The monitor's state as a versioned document: contents and checks.
 //!
-//! In: a [`Snapshot`] from a store or a file. Out: a monitor that continues from it at its first input, or the damaged
-//! number. Snapshots are stored in the field as JSON, so names and order of the fields must not change.
+//! In: a [`Snapshot`] from a store or a file. Out: a monitor that continues from the snapshot at its first input, or an
+//! error that names the damaged number. Vehicles store snapshots as JSON, so names and order of the fields must not
+//! change.
 
 use serde::{Deserialize, Serialize};
 
@@ -22,9 +23,9 @@ use crate::monitor::stages::pack_memory::{PackMemory, StoredCell};
 use crate::quantity::{InvalidState, Timestamp, bounds};
 use crate::sample::{CellSample, SampleConfig};
 
-/// Name of the checked charge in an error.
+/// Name in error messages of the charge that [`Snapshot::check_charges`] checks.
 const CHARGE: &str = "the charge since a cell's latest voltage or half-cycle";
-/// Tolerance for current limits that were wider when the charge was counted, and for a clock that was set.
+/// Tolerances for current limits that were wider when the charge was counted, and for a clock that was set.
 const CHARGE_TOLERANCE: f64 = 2.0;
 const CHARGE_TOLERANCE_S: f64 = 1000.0;
 
@@ -39,22 +40,22 @@ pub struct Snapshot {
     pub version: u32,
     /// Time of the snapshot, on the clock of the inputs.
     pub time: Timestamp,
-    /// Whether the same clock may continue; `false` if it was stored [for a restart](Self::for_restart).
+    /// Whether the same clock may continue; `false` if the snapshot was stored [for a restart](Self::for_restart).
     pub(crate) may_continue: bool,
     pub(crate) time_backwards: u64,
     pub(crate) intake: IntakeState,
     pub(crate) sampling: SamplingState,
     pub(crate) estimation: EstimationState,
     pub(crate) cells: Vec<StoredCell>,
-    /// `None` if the cells' model is given.
+    /// State of the modelling stage; `None` if the cells' model is given.
     pub(crate) modelling: Option<ModellingState>,
     pub(crate) learning: LearningState,
-    /// `None` if the pack is too small for a comparison.
+    /// State of the cell-fault detector; `None` if the pack is too small for a comparison.
     pub(crate) diagnosis: Option<CellFaultDetector>,
     pub(crate) alarming: StoredAlarming,
     pub(crate) sending: SendingState,
     pub(crate) statistics: Statistics,
-    /// Since when the buses have been asleep.
+    /// Start of the current bus sleep; `None` if the buses are awake.
     pub(crate) asleep_since: Option<Timestamp>,
     pub(crate) packs: PackMemory,
 }
@@ -62,17 +63,17 @@ pub struct Snapshot {
 /// Reason why a snapshot cannot be used.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum RestoreError {
-    /// It was written by another version or with another configuration.
+    /// The snapshot was written by another version or with another configuration.
     #[error("{0}")]
     Unfit(String),
-    /// A number in it is impossible, so it is damaged.
+    /// A number in the snapshot is impossible, so the snapshot is damaged.
     #[error("snapshot is damaged: {what}{} = {found:?}, must be {allowed}", .cell.map(|cell| format!(" (cell {cell})")).unwrap_or_default())]
     Number {
         /// Name of the number.
         what: &'static str,
-        /// Cell, counted from 0, if the number belongs to one.
+        /// Cell, counted from 0; `None` if the number does not belong to a single cell.
         cell: Option<usize>,
-        /// Its value.
+        /// Value of the number.
         found: f64,
         /// Allowed values.
         allowed: &'static str,
@@ -88,13 +89,13 @@ impl From<InvalidState> for RestoreError {
 /// How a monitor started at its first input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Beginning {
-    /// It had no stored state.
+    /// The monitor had no stored state.
     New,
-    /// It continued from a state on the same clock, as if the program had not stopped.
+    /// The monitor continued from a state on the same clock, as if the program had not stopped.
     Continued,
-    /// It restored a state of known age.
+    /// The monitor restored a state of known age.
     Restored,
-    /// It restored a state of unknown age.
+    /// The monitor restored a state of unknown age.
     RestoredAgeless,
 }
 
@@ -106,8 +107,8 @@ pub(crate) struct PendingRestore {
 }
 
 impl Snapshot {
-    /// Drops everything that requires the same clock to continue. The result is smaller and suits a program that will
-    /// be restarted.
+    /// Drops everything that is valid only if the same clock continues. The result is smaller. A program that will be
+    /// restarted stores it.
     #[must_use]
     pub fn for_restart(self) -> Self {
         let mut restarted = Self { may_continue: false, ..self };
@@ -141,7 +142,7 @@ impl Snapshot {
         Some(self.diagnosis.as_ref()?.imbalance(middle))
     }
 
-    /// Number of half-cycles of all cells and packs since the first start.
+    /// Number of half-cycles since the first start, summed over all cells and packs.
     pub fn half_cycles(&self) -> u64 {
         self.statistics.learning.half_cycles
     }
@@ -166,8 +167,8 @@ impl Snapshot {
         self.sampling.sampler.wiring()
     }
 
-    /// State of the cells' model. `label`: the configured label, for a state without a fit. `None` if the model comes
-    /// from a model file, or if the label is unknown.
+    /// State of the cells' model. `label`: the configured label, which is used if the stored state has no fit. `None`
+    /// if the model comes from a model file, or if the label is unknown.
     ///
     /// # Errors
     /// The first number that is out of range.
@@ -177,7 +178,8 @@ impl Snapshot {
         Ok(stored.stored_view(label))
     }
 
-    /// Whether the waiting samples belong to different cells of the snapshot that have reported in this round.
+    /// Whether the waiting samples belong to different cells of the snapshot, all of which have reported in the current
+    /// batch.
     pub(crate) fn waiting_fits(&self) -> bool {
         let mut has_come: Vec<bool> = self.cells.iter().map(|cell| cell.updated_in_round).collect();
         let mut is_first = |cell: usize| has_come.get_mut(cell).is_some_and(std::mem::take);
@@ -195,20 +197,20 @@ impl Snapshot {
         self.sampling.sampler.check()?;
         self.intake.commands.check_state()?;
         self.packs.check()?;
-        // Limits the timestamps so that their differences do not overflow.
+        // The limit on timestamps prevents overflow of their differences.
         bounds::STAMP_NS.check("the time of the state, ns", self.time.nanos() as f64)?;
         Ok(self.learning.check()?)
     }
 
-    /// Checks that the charge moved between past marks and the time of the state is possible with the largest
-    /// plausible current. Only the difference is checked; the absolute charges are arbitrary.
+    /// Checks the charge that moved between past marks and the time of the state: the largest plausible current must be
+    /// able to move it. Only differences are checked, because the absolute charges are arbitrary.
     pub(crate) fn check_charges(&self, config: &SampleConfig) -> Result<(), RestoreError> {
         let (strings, limits) = (f64::from(config.strings.max(1)), &config.current);
         let most_a = limits.min.abs().max(limits.max.abs()) / strings;
-        // A cell's latest voltage includes the current that was held until then.
+        // The charge at a cell's latest voltage includes the current that was held until then.
         let charge_as = self.sampling.sampler.charge_as(self.time, limits.max_age_s) / strings;
         let check = |time: Timestamp, before_as: f64| {
-            // A current may have been held this long before the next reading replaced it.
+            // The sampler may have held a current for `max_age_s` before the next reading replaced it.
             let passed_s = self.time.since(time).abs() + limits.max_age_s + CHARGE_TOLERANCE_S;
             let moved_as = charge_as - before_as;
             let is_possible = moved_as.abs() <= CHARGE_TOLERANCE * most_a * passed_s;

@@ -1,7 +1,7 @@
 //! Connects the stages after the intake: readings → samples → estimates → health → alarms → frames.
 //!
-//! Each stage owns its configuration and state; only this file knows their order. Every function takes the time of the
-//! current input.
+//! Each stage owns its configuration and state; only this file knows the order of the stages. `now` is the time of the
+//! current input in all functions.
 
 pub(crate) mod pack_memory;
 pub(crate) mod watch;
@@ -74,7 +74,7 @@ impl Stages {
         (&mut self.learning, publisher)
     }
 
-    /// Handles a reading.
+    /// Passes a reading to the stages that use its channel.
     #[inline]
     pub(crate) fn handle_reading(&mut self, now: Timestamp, bus: BusIndex, reading: Reading, out: &mut Outputs) {
         match reading.channel {
@@ -110,7 +110,7 @@ impl Stages {
         }
     }
 
-    /// Handles a reading of a diagnostic answer, which may have been measured at an earlier `moment`.
+    /// Handles a reading of a diagnostic answer. If `moment` is given, the reading was measured at that earlier moment.
     pub(crate) fn handle_answer_reading(
         &mut self,
         now: Timestamp,
@@ -150,8 +150,8 @@ impl Stages {
         out.events.push(Event { time: now, kind: EventKind::PackIdentity { identity } });
     }
 
-    /// Adds a sample to the batch. The batch is stepped when every cell has a sample, or when a cell reports for the
-    /// second time.
+    /// Adds a sample to the batch. If the cell has already reported, steps the old batch first. If every cell has now
+    /// reported, steps the batch.
     #[inline]
     fn handle_sample(&mut self, now: Timestamp, sample: CellSample, out: &mut Outputs) {
         if !self.estimation.batch.awaits(sample.cell) {
@@ -173,8 +173,8 @@ impl Stages {
         learning.combine_pack(all_fresh, &estimation.bank, &mut Publisher { now, alarming, sending, out });
     }
 
-    /// Steps the cells with a waiting sample, without waiting for the other cells; called before estimates are used.
-    /// `is_current`: the samples are recent, so their innovations are passed to the rule.
+    /// Steps the cells that have a waiting sample, without waiting for the other cells. Callers do this before they use
+    /// estimates. `is_current`: whether the samples are recent, so that the rule on innovations may judge them.
     pub(crate) fn step_waiting(&mut self, now: Timestamp, is_current: bool, out: &mut Outputs) {
         if self.estimation.batch.waiting.is_empty() {
             return;
@@ -211,12 +211,12 @@ impl Stages {
         }
     }
 
-    /// A cell's estimate after its latest step; `None` before the first.
+    /// A cell's estimate after its latest step; `None` before its first step.
     pub(crate) fn estimate(&self, index: usize) -> Option<Estimate> {
         self.estimation.estimate(index, self.learning.capacity(index))
     }
 
-    /// Passes the pack current to the mode detector; `None` = stale. Learns at a change of mode.
+    /// Passes the pack current (`None` if stale) to the mode detector. At a change of mode, the cells learn.
     fn observe_current(&mut self, now: Timestamp, current_a: Option<f64>, out: &mut Outputs) {
         let Learning { config, state, .. } = &mut self.learning;
         let observed = state.detector.observe(&config.transition, now, current_a);
@@ -240,7 +240,7 @@ impl Stages {
         learning.complete_mode(change, &mut estimation.bank, modelling.teaches_capacity(), &mut publisher);
     }
 
-    /// Fits the model of the cells to the noted rows and adopts the result.
+    /// Fits the model of the cells to the rows of the notebook and adopts the result.
     fn learn_model(&mut self, now: Timestamp, out: &mut Outputs) {
         self.step_waiting(now, true, out);
         let Self { estimation, modelling, learning, .. } = self;
@@ -257,7 +257,7 @@ impl Stages {
         }
     }
 
-    /// Passes the capacities of the cells whose model has changed to their rule.
+    /// Passes the capacities of the cells whose model has changed to the rules on capacity.
     fn restate_capacities(&mut self, now: Timestamp, out: &mut Outputs) {
         for index in self.estimation.bank.own_cells().to_vec() {
             let capacity = self.learning.learned_capacity(index);
@@ -315,7 +315,7 @@ impl Stages {
         CommandOutcome { changed, refused }
     }
 
-    /// Records the learned values of the old pack and forgets them.
+    /// Publishes the learned capacity of the old pack as an event, and forgets all its learned values.
     fn replace_pack(&mut self, now: Timestamp, out: &mut Outputs) {
         let capacity = self.learning.weakest().map(|(_, capacity)| capacity);
         let kind = EventKind::PackReplaced {
@@ -343,8 +343,9 @@ impl Stages {
         self.estimation.batch.begin();
     }
 
-    /// Ends everything in progress after the last input at `now`. The mode is unknown from then on, no period is timed
-    /// across the gap, and the pack's values require a new reading of every cell.
+    /// Ends everything in progress, because no input follows for a while; `now` is the time of the last input. The mode
+    /// becomes unknown, recharge periods are not timed across the gap, and the pack's values become unknown until every
+    /// cell has a new reading.
     pub(crate) fn fall_asleep(&mut self, now: Timestamp, out: &mut Outputs) {
         self.observe_current(now, None, out);
         if self.modelling.is_due() {
@@ -365,7 +366,7 @@ impl Stages {
         self.sending.claim_address(time, out);
     }
 
-    /// Ends everything that cannot continue across a gap of unknown length that starts at `now`.
+    /// Ends everything that cannot continue across a gap of unknown length. The gap starts at `now`.
     pub(crate) fn begin_unknown_gap(&mut self, now: Timestamp, out: &mut Outputs) {
         self.sending.end_test(now, &self.alarming.engine, out);
         if let Some(change) = self.learning.state.detector.settle() {
@@ -383,7 +384,8 @@ impl Stages {
         self.findings.diagnosis.forget_charge();
     }
 
-    /// Checks the ages of the inputs, the mode's minimum duration, and the alarms.
+    /// Runs the checks that depend only on time: the ages of the inputs, the minimum duration of the mode, and the
+    /// alarms.
     pub(crate) fn run_housekeeping(
         &mut self,
         now: Timestamp,
@@ -489,7 +491,7 @@ impl Stages {
         let sampler = &self.sampling.sampler;
         let transition = &self.learning.config.transition;
         let rest_a = transition.dead_band_a + transition.hysteresis_a;
-        // Before the first reading the buses cannot have fallen asleep; the wiring may be wrong.
+        // Silence before the first reading is not a sleep, because the wiring may be wrong.
         let Some(silent_s) = sampler.all_silent_s(now, QUIET_S) else { return Silence::None };
         if sampler.latest_current_a(now).is_none_or(|current_a| current_a.abs() > rest_a) {
             return Silence::None;
@@ -497,7 +499,7 @@ impl Stages {
         if silent_s > after_s { Silence::Begins } else { Silence::Quiet }
     }
 
-    /// Handles the start of a bus sleep.
+    /// Starts a bus sleep.
     pub(crate) fn begin_bus_sleep(&mut self, now: Timestamp, out: &mut Outputs) {
         self.sleep.since = Some(now);
         self.fall_asleep(now, out);
@@ -513,7 +515,7 @@ impl Stages {
         self.sampling.sampler.wake(now);
     }
 
-    /// Whether a reading of this channel wakes the buses. The supply voltage does not, because the computer may
+    /// Whether a reading of this channel ends a bus sleep. The supply voltage does not, because the computer may
     /// measure it itself. Balancing bits do not, because a BMS may balance while the vehicle is parked.
     pub(crate) fn wakes(channel: Channel) -> bool {
         !matches!(channel, Channel::SupplyVoltage | Channel::Balancing(_))

@@ -1,4 +1,4 @@
-//! Current values of cells and pack for readers (status, tables, reports). `None` = not known yet, or no longer known.
+//! Current values of cells and pack for status, tables and reports. `None` = not known yet, or no longer known.
 
 use super::Monitor;
 use super::config::CommandConfig;
@@ -30,7 +30,7 @@ impl Monitor {
         self.clock.now
     }
 
-    /// Number of inputs with a time before an earlier input's.
+    /// Number of inputs whose time is before the time of an earlier input.
     pub fn time_backwards(&self) -> u64 {
         self.clock.time_backwards
     }
@@ -40,7 +40,7 @@ impl Monitor {
         self.intake.protected()
     }
 
-    /// How commands from the bus are decoded; `None` = commands from the bus are not executed.
+    /// Configuration of commands from the bus; `None` = commands from the bus are not executed.
     pub fn commands(&self) -> Option<&CommandConfig> {
         self.config.commands.as_ref()
     }
@@ -52,7 +52,7 @@ impl Monitor {
         Some((commands.bus, commands.plan.id(), self.intake.command_gate.counts))
     }
 
-    /// Input messages with frames dropped because they exceeded the rate limit.
+    /// Input messages that exceeded the rate limit, with the number of dropped frames.
     pub fn dropped(&self) -> impl Iterator<Item = FloodCount> + '_ {
         self.intake.dropped()
     }
@@ -62,12 +62,12 @@ impl Monitor {
         self.intake.second_senders()
     }
 
-    /// Interfaces on which another node sends with our identifiers, with the latest such identifier.
+    /// Interfaces on which another node uses identifiers of the daemon's frames, with the latest such identifier.
     pub fn own_id_uses(&self) -> impl Iterator<Item = (BusIndex, CanId)> + '_ {
         self.intake.own_id_uses()
     }
 
-    /// Whether the current's reading is frozen while the voltages show a changing load.
+    /// Whether the reading of the current is frozen while the voltages show a changing load.
     pub fn is_current_frozen(&self) -> bool {
         self.stages.sampling.sampler.is_current_frozen()
     }
@@ -92,13 +92,13 @@ impl Monitor {
         self.stages.findings.diagnosis.difference(cell)
     }
 
-    /// Reason why no diagnostic request is sent (`None` = they are sent), and number of requests that are refused
-    /// permanently; `None` without `[poll]`.
+    /// Reason why the daemon sends no diagnostic requests (`None` if it sends them), and number of requests that are
+    /// refused permanently. `None` without `[poll]`.
     pub fn poll(&self) -> Option<(Option<PollSilence>, usize)> {
         self.stages.sending.poller.as_ref().map(|poller| (poller.silence(), poller.refused()))
     }
 
-    /// Since when the buses have been asleep; `None` = they are awake.
+    /// Start of the current bus sleep; `None` if the buses are awake.
     pub fn asleep_since(&self) -> Option<Timestamp> {
         self.stages.sleep.since
     }
@@ -113,14 +113,15 @@ impl Monitor {
         self.stages.sampling.has_usable_reading
     }
 
-    /// Configured signals whose last good value is too old, because no reading arrived or all were bad. A signal
-    /// without any reading counts from the time at which it should have arrived.
+    /// Configured signals whose last good value is too old, because no reading arrived or all readings were bad. For a
+    /// signal that has never had a reading, the age counts from the time at which the first reading should have
+    /// arrived.
     pub fn lost_inputs(&self) -> impl Iterator<Item = Channel> + '_ {
         let sampler = &self.stages.sampling.sampler;
         sampler.channels().iter().copied().filter(|&channel| sampler.is_lost(channel, self.now()))
     }
 
-    /// The latest good reading of every signal that has had one, at any age: channel, time, value.
+    /// The latest good reading of every signal that has had a good reading, at any age: channel, time, value.
     pub fn latest_readings(&self) -> impl Iterator<Item = (Channel, Timestamp, f64)> + '_ {
         self.stages.sampling.sampler.latest_readings()
     }
@@ -140,8 +141,8 @@ impl Monitor {
         self.stages.sampling.identity.known
     }
 
-    /// The latest estimate of every cell, for live tables; `None` before the first one. Does not include samples since
-    /// the last [`settle`](Self::settle).
+    /// The latest estimate of every cell, for live tables; `None` before a cell's first estimate. Samples that still
+    /// wait for their step are not included; [`settle`](Self::settle) steps them.
     pub fn latest(&self) -> impl Iterator<Item = Option<super::Estimate>> {
         (0..self.stages.estimation.cells()).map(|index| self.stages.estimate(index))
     }
@@ -161,7 +162,8 @@ impl Monitor {
         self.stages.learning.state.recharge_period_s
     }
 
-    /// Time, s, that the reference charger needs for the window, after the last charge that covered enough of it.
+    /// Time, s, that the reference charger needs for the recharge window. The value was learned from the last charge
+    /// that covered enough of the window.
     pub fn normalised_recharge_period(&self) -> Option<ScalarGaussian> {
         self.stages.learning.state.normalised_recharge
     }
@@ -195,10 +197,10 @@ impl Monitor {
         Some(ScalarGaussian { mean: strings * of_cell.mean, variance: strings * strings * of_cell.variance })
     }
 
-    /// Remaining life of a cell until its capacity passes the configured end of life.
+    /// Remaining life of a cell until its capacity falls below the configured end of life.
     ///
     /// # Errors
-    /// The reason why it is unknown.
+    /// The reason why the remaining life is unknown.
     pub fn remaining_life(&self, cell: CellIndex) -> Result<RemainingLife, InsufficientData> {
         self.stages.learning.lives.of_cell(cell)
     }
@@ -251,7 +253,7 @@ impl Monitor {
         }
     }
 
-    /// Sum of the cells' voltages, V, while all of them are fresh.
+    /// Sum of the cells' voltages, V; `None` unless all of them are fresh.
     fn pack_voltage_v(&self) -> Option<f64> {
         let sum_v: Option<f64> = self.cell_views().map(|view| view.values.mean(Quantity::Voltage)).sum();
         match self.stages.sampling.sampler.config().voltage_source {

@@ -1,12 +1,13 @@
 //! Applies a new configuration to a running monitor.
 //!
-//! In: a checked configuration. Out: the changes, with the resulting events and frames; or the reason why a restart is
-//! needed, with nothing changed. Limits, thresholds, modes, noises and outputs change. Filters, learned values,
-//! counters, schedules and alarms whose rule and severity are still configured are kept, so estimates change only as
-//! far as their settings do.
+//! In: a checked configuration. Out: the changes, with the resulting events and frames. If a restart is needed, the
+//! result is the reason, and nothing changes. Limits, thresholds, modes, noises and outputs change. The monitor keeps
+//! filters, learned values, counters, schedules, and alarms whose rule and severity are still configured. Estimates
+//! therefore change only if their settings change.
 //!
-//! A measured value keeps its definition: with another recharge window or usable load it becomes unknown, unless the
-//! old value can be restated exactly. Initial values only affect unknown cells, so they apply from the next pack on.
+//! A measured value keeps its definition. If the recharge window or the usable load changes, the value becomes unknown,
+//! unless it can be converted exactly. Initial values only affect cells of which nothing is known, so changed ones
+//! apply when the next pack is connected.
 
 use crate::alarm::{Observation, Rule};
 use crate::health::HealthConfig;
@@ -17,11 +18,11 @@ use crate::monitor::stage::publisher::Publisher;
 use crate::quantity::Timestamp;
 
 impl Monitor {
-    /// Applies a new configuration, as if between two inputs. `now` is the time of the request: it is the time of the
-    /// event, but the clock does not advance.
+    /// Applies a new configuration between two inputs. `now`, the time of the request, becomes the time of the event,
+    /// but the clock does not advance.
     ///
     /// # Errors
-    /// The first setting that needs a restart; the monitor is unchanged.
+    /// The first setting that needs a restart. The monitor is then unchanged.
     pub fn reconfigure(
         &mut self,
         config: MonitorConfig,
@@ -33,7 +34,7 @@ impl Monitor {
         let first_event = out.events.len();
         let at = self.clock.now;
         if !old.estimates_as(&config) {
-            // Earlier samples are stepped with the earlier settings.
+            // Step the waiting samples with the old settings.
             self.stages.step_waiting(at, true, out);
         }
         let changed = old.changed_tables(&config);
@@ -68,7 +69,7 @@ impl Monitor {
         Ok(Reconfigured { changed, alarms_ended })
     }
 
-    /// Forgets values measured with another window or load, before new thresholds are set.
+    /// Forgets values that were measured with another window or load. Runs before the new thresholds are set.
     fn forget_measures(&mut self, old: &HealthConfig, out: &mut Outputs) {
         let now = self.clock.now;
         let cells = self.stages.estimation.cell_indices();

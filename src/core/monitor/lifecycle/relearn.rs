@@ -1,7 +1,7 @@
-//! Restores learned values of the cells from a history if the state of the last run is lost.
+//! Restores learned values of the cells from a history, for use if the state of the last run is lost.
 //!
-//! In: capacities (Ah) and resistances (relative to new) of cells, for a monitor without any input. Out: a monitor
-//! that knows only these values. Its snapshot is checked like any other when it is restored.
+//! In: capacities (Ah) and resistances (relative to a new cell) of cells, for a monitor that has not received an input.
+//! Out: a monitor that knows only these values.
 
 use crate::filter::ScalarGaussian;
 use crate::health::CapacityMethod;
@@ -10,8 +10,8 @@ use crate::monitor::message::LearnedCell;
 use crate::monitor::stages::Stages;
 
 impl Monitor {
-    /// Sets the learned values of the cells. Returns `false` and changes nothing if a cell does not exist or a number
-    /// is impossible, because the history then belongs to another pack.
+    /// Sets the learned values of the cells. If a cell does not exist or a number is impossible, the history belongs to
+    /// another pack: returns `false` and changes nothing.
     pub fn relearn(&mut self, learned: &[LearnedCell]) -> bool {
         let Stages { estimation, learning, .. } = &mut self.stages;
         let is_valid =

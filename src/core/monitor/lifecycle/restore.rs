@@ -15,8 +15,8 @@ use crate::monitor::stages::Stages;
 use crate::monitor::stages::pack_memory::{StoredCell, StoredPack};
 use crate::quantity::Timestamp;
 
-/// Longest time without an input while a program runs, s, because a running program ticks. A longer gap is a restart,
-/// whatever the timestamps say.
+/// Longest time without an input while a program runs, s; a running program sends ticks. A longer gap is a restart,
+/// even if the timestamps are on the same clock.
 const BREAK_S: f64 = 30.0;
 
 impl Monitor {
@@ -47,20 +47,22 @@ impl Monitor {
         }
     }
 
-    /// Restores a stored state in a monitor that has not received an input. The first input gives the current time.
-    /// The snapshot was taken `downtime` before it; its timestamps are shifted to the current clock, and the downtime
-    /// counts as a gap. [`Downtime::AsStamped`] means that the same clock continues: frames, events and estimates are
-    /// then, byte for byte, those of a monitor that had not stopped. Exceptions are a downtime of more than half a
-    /// minute and a state that was stored [for a restart](Snapshot::for_restart).
+    /// Restores a stored state in a monitor that has not received an input. The first input gives the current time; the
+    /// snapshot was taken `downtime` before that time. The snapshot's timestamps are shifted to the current clock, and
+    /// the downtime counts as a gap.
+    ///
+    /// [`Downtime::AsStamped`] means that the same clock continues. Frames, events and estimates are then, byte for
+    /// byte, those of a monitor that had not stopped. This does not apply if the downtime exceeds half a minute, or if
+    /// the state was stored [for a restart](Snapshot::for_restart).
     ///
     /// # Errors
-    /// If the snapshot's version or shape does not fit, or a number in it is impossible. Nothing of the snapshot is
-    /// then used, because one damaged number casts doubt on the others.
+    /// If the snapshot's version or shape does not fit, or a number in it is impossible. The monitor then uses nothing
+    /// of the snapshot, because one damaged number casts doubt on the others.
     pub fn restore(&mut self, snapshot: Snapshot, downtime: Downtime) -> Result<(), RestoreError> {
         if snapshot.version != SNAPSHOT_VERSION {
             let found = snapshot.version;
             return Err(RestoreError::Unfit(format!(
-                "snapshot version {found}, this program reads {SNAPSHOT_VERSION}"
+                "snapshot has version {found}, this program reads version {SNAPSHOT_VERSION}"
             )));
         }
         let Stages { sampling, estimation, .. } = &self.stages;
@@ -84,8 +86,8 @@ impl Monitor {
         Ok(())
     }
 
-    /// Continues from the pending snapshot, if any, and sets the clock to the time of the snapshot. The
-    /// caller handles the downtime.
+    /// If a snapshot is pending, continues from it and sets the clock to the time of the snapshot. The caller handles
+    /// the downtime.
     pub(crate) fn apply_pending(&mut self, now: Timestamp, out: &mut Outputs) -> Beginning {
         let Some(PendingRestore { mut snapshot, downtime }) = self.pending.take() else { return Beginning::New };
         let is_brief = now.since(snapshot.time).abs() <= BREAK_S;
@@ -210,7 +212,7 @@ impl Stages {
         self.restore_learned(&pack.cells, pack.modelling, pack.learning, batch, is_current_doubtful);
         self.modelling.end_stretch();
         self.estimation.handle_unknown_gap();
-        // Balancing during the absence was not counted, so the charge is forgotten.
+        // Balancing while the pack was absent was not counted, so the charge of the cells is unknown.
         self.findings.restore(pack.diagnosis, Some((now, now)));
         self.findings.diagnosis.forget_charge();
         self.note_faulty_channels();
@@ -226,7 +228,7 @@ impl Stages {
         self.publisher(now, out).publish_alarms();
     }
 
-    /// Restores the stored alarms. Alarms without a configured threshold end, also for receivers on the bus.
+    /// Restores the stored alarms. Alarms without a configured threshold end, and receivers on the bus are notified.
     fn restore_alarms(&mut self, time: Timestamp, state: &AlarmSnapshot, is_continued: bool, out: &mut Outputs) {
         self.alarming.state.knows_all_valid = false;
         let orphans = self.alarming.engine.restore(time, state);

@@ -13,7 +13,7 @@ pub enum Command {
     Acknowledge(Selector),
     /// End latched alarms and forget past ones; learned values are kept.
     Clear(Selector),
-    /// Another pack is connected: forget the values learned of the old one.
+    /// Another pack is connected: forget the learned values of the old pack.
     PackReplaced,
     /// Stop or resume diagnostic requests.
     Poll {
@@ -33,8 +33,8 @@ pub enum Command {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Source {
-    /// This computer.
+    /// A program on this computer.
     Local,
-    /// A frame.
+    /// A frame on this interface.
     Bus(BusIndex),
 }

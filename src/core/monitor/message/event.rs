@@ -20,7 +20,7 @@ use crate::cell_faults::CellFault;
 use crate::quantity::catalogue::RecordedValues;
 use crate::quantity::{BusIndex, CellIndex, Fault, Mode, Timestamp};
 
-/// Something worth a log line or a history row.
+/// Kind of an event, with its data.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, IntoStaticStr)]
 #[serde(rename_all = "snake_case", tag = "event")]
 #[strum(serialize_all = "snake_case")]
@@ -40,7 +40,7 @@ pub enum EventKind {
         mode: Mode,
         /// Charge moved, Ah, positive.
         charge_ah: f64,
-        /// SOC swing, fraction, positive; `None` if the start was not estimated.
+        /// SOC swing, fraction, positive; `None` if the SOC at the start was not estimated.
         swing: Option<f64>,
         /// Standard deviation of the swing.
         swing_std: Option<f64>,
@@ -55,7 +55,7 @@ pub enum EventKind {
     Capacity {
         /// Index of the cell.
         cell: CellIndex,
-        /// Measurement from the half-cycle alone, Ah; `None` = no information.
+        /// Capacity measured by this half-cycle alone, Ah; `None` if the half-cycle has no information.
         measured_ah: Option<f64>,
         /// Standard deviation of the measurement, Ah.
         measured_std_ah: Option<f64>,
@@ -63,7 +63,8 @@ pub enum EventKind {
         #[serde(flatten)]
         values: RecordedValues,
     },
-    /// Losses of a cell after a half-cycle, once its capacity has been measured; fractions of the model's new cell.
+    /// Losses of a cell after a half-cycle, as fractions of the model's new cell. Sent once the cell's capacity has
+    /// been measured.
     LossModes {
         /// Index of the cell.
         cell: CellIndex,
@@ -80,31 +81,31 @@ pub enum EventKind {
         /// Standard deviation of the positive electrode's loss.
         lam_pe_std: f64,
     },
-    /// Remaining life after a half-cycle, of the cell whose life ends first. Sent while it is known, and once without
-    /// values when it becomes unknown.
+    /// Remaining life, after a half-cycle, of the cell with the shortest remaining life. Sent while it is known, and
+    /// once without values when it becomes unknown.
     RemainingLife {
         /// Index of the cell.
         cell: Option<CellIndex>,
-        /// Equivalent full cycles until its capacity falls to its end-of-life value, median.
+        /// Equivalent full cycles until the capacity falls to its end-of-life value, median.
         cycles: Option<f64>,
-        /// 5 % quantile.
+        /// 5 % quantile of `cycles`.
         cycles_low: Option<f64>,
-        /// 95 % quantile.
+        /// 95 % quantile of `cycles`.
         cycles_high: Option<f64>,
         /// Days at the recent rate of use, median.
         days: Option<f64>,
-        /// 5 % quantile.
+        /// 5 % quantile of `days`.
         days_low: Option<f64>,
-        /// 95 % quantile.
+        /// 95 % quantile of `days`.
         days_high: Option<f64>,
     },
-    /// A charge has ended. It covered the recharge window, or enough of the window.
+    /// A charge that covered the recharge window, or enough of it, has ended.
     RechargePeriod {
         /// Time between the two configured SOC values, s; `None` if the charge did not cover the whole window without
         /// interruption.
         seconds: Option<f64>,
-        /// Time that the reference charger would need, s; `None` if not every cell's capacity has been learned, or if
-        /// the charge covered too little.
+        /// Time that the reference charger would need, s; `None` if the capacity of a cell has not been learned, or if
+        /// the charge covered too little of the window.
         normalised_s: Option<f64>,
         /// Standard deviation of the normalised period, s.
         normalised_std_s: Option<f64>,
@@ -123,7 +124,7 @@ pub enum EventKind {
         active: bool,
         /// Severity of the alarm.
         severity: Severity,
-        /// The deciding value; `None` = unknown.
+        /// The value that the rule compares with the threshold; `None` = unknown.
         value: Option<f64>,
         /// Probability that the true value is beyond the threshold; `None` if the value has no standard deviation.
         probability: Option<f64>,
@@ -131,12 +132,12 @@ pub enum EventKind {
         threshold: f64,
         /// Number of times the alarm was raised.
         occurrences: u32,
-        /// Whether it has been acknowledged since it was raised.
+        /// Whether the alarm has been acknowledged since it was raised.
         acknowledged: bool,
     },
     /// A command was executed.
     Command {
-        /// Its origin.
+        /// Origin of the command.
         source: Source,
         /// The command.
         #[serde(rename = "request")]
@@ -149,9 +150,9 @@ pub enum EventKind {
     },
     /// A command frame was rejected.
     BadCommand {
-        /// Interface that received it.
+        /// Interface that received the frame.
         bus: BusIndex,
-        /// Whether its checksum was right.
+        /// Whether the frame's checksum was right.
         intact: bool,
         /// Reason for the rejection.
         reason: CommandRefusal,
@@ -160,10 +161,10 @@ pub enum EventKind {
     Test {
         /// The rule.
         rule: Rule,
-        /// Whether it started.
+        /// Whether the test started.
         running: bool,
     },
-    /// Another pack is connected. Holds the last learned values of the old one, for the records.
+    /// Another pack is connected. Holds the last learned capacity of the old pack, for the records.
     PackReplaced {
         /// Capacity of the old pack's weakest cell, Ah; `None` if nothing was learned.
         capacity_ah: Option<f64>,
@@ -174,17 +175,17 @@ pub enum EventKind {
     PackReturned {
         /// Number of the pack.
         identity: f64,
-        /// Capacity of its weakest cell, Ah; `None` if it is not known for every cell.
+        /// Capacity of the pack's weakest cell, Ah; `None` if the capacity of a cell is unknown.
         capacity_ah: Option<f64>,
         /// Standard deviation of the capacity, Ah.
         capacity_std_ah: Option<f64>,
     },
-    /// A new configuration applies from here on.
+    /// A new configuration applies from this time.
     Reconfigured {
         /// Number of raised or past alarms that ended because the new configuration has no threshold for them.
         alarms_ended: u32,
     },
-    /// A stored alarm ended because the configuration has no threshold for it any more.
+    /// A stored alarm ended because the configuration no longer has a threshold for it.
     AlarmDropped {
         /// The rule.
         rule: Rule,
@@ -192,7 +193,7 @@ pub enum EventKind {
         severity: Severity,
         /// Index of the cell; `None` = the pack.
         cell: Option<CellIndex>,
-        /// Whether it was raised.
+        /// Whether the alarm was raised.
         active: bool,
         /// Number of times the alarm was raised.
         occurrences: u32,
@@ -204,10 +205,10 @@ pub enum EventKind {
     },
     /// Writing the files of the learned state and the records started to fail, or works again.
     Store {
-        /// Whether they can be written.
+        /// Whether the files can be written.
         works: bool,
     },
-    /// A signal turned bad (reported once per change, then counted).
+    /// A signal turned bad. Further bad readings are only counted.
     SignalBad {
         /// The signal.
         channel: Channel,
@@ -218,19 +219,19 @@ pub enum EventKind {
     SignalGood {
         /// The signal.
         channel: Channel,
-        /// Number of bad readings in between.
+        /// Number of bad readings since the signal turned bad.
         bad_readings: u64,
     },
-    /// A protected message started to fail its check, or became usable again (reported on change, then counted). The
-    /// first frame is not a change. Lost frames are a change only if there are more than the check allows.
+    /// A protected message started to fail its check, or became usable again. Further results are only counted. The
+    /// first frame is not a change. Lost frames are a change only if more frames are lost than the check allows.
     Protection(GuardChange),
     /// A message started or stopped exceeding its frame limit.
     Flood(FloodChange),
     /// A second sender of an unprotected input message appeared or disappeared.
     SecondSender(SenderChange),
-    /// Another node started or stopped using our identifiers.
+    /// Another node started or stopped using identifiers of the daemon's frames.
     OwnIdentifier(OwnIdChange),
-    /// Diagnostic messages of a controller were lost (reported at most once a minute, all are counted).
+    /// Diagnostic messages of a controller were lost. Reported at most once a minute; every loss is counted.
     MessageLoss(MessageLoss),
     /// The daemon started or stopped sending diagnostic requests.
     Poll(PollChange),
@@ -238,7 +239,7 @@ pub enum EventKind {
     Bus {
         /// The interface.
         bus: BusIndex,
-        /// The report.
+        /// The event.
         what: BusEvent,
     },
     /// The J1939 node's address or its trouble codes changed.
@@ -248,24 +249,24 @@ pub enum EventKind {
     },
     /// The vehicle fell asleep (all buses are silent and no current flows), or woke up (inputs arrive again).
     BusAsleep {
-        /// Whether it fell asleep.
+        /// Whether the vehicle fell asleep.
         asleep: bool,
-        /// Duration of the sleep, s, when it wakes up.
+        /// Duration of the sleep, s; `None` when the vehicle falls asleep.
         seconds: Option<f64>,
     },
-    /// Nothing was measured for this long (computer asleep, or gap in the log).
+    /// Nothing was measured for a while: the computer was asleep, or the log has a gap.
     Gap {
         /// Duration, s; `None` = unknown.
         seconds: Option<f64>,
     },
-    /// An input's time was before the latest one.
+    /// The time of an input was before the time of the latest input.
     TimeBackwards {
         /// Size of the step back, s.
         seconds: f64,
     },
     /// The model of the cells was learned from the vehicle's data, or it turned out that it cannot be learned.
     Model {
-        /// State of the model now.
+        /// State of the model after the change.
         state: ModelState,
         /// Capacity of the mean cell, Ah; `None` if nothing was learned.
         capacity_ah: Option<f64>,
@@ -289,10 +290,10 @@ pub enum EventKind {
     Trust {
         /// Index of the cell.
         cell: CellIndex,
-        /// Whether its innovations agree with their covariance and its model fits the cell.
+        /// Whether the cell's innovations agree with their covariance and the model fits the cell.
         trusted: bool,
-        /// Mean normalised innovation squared over the window; if the model does not fit the cell, the mismatch on the
-        /// same scale.
+        /// Mean normalised innovation squared over the consistency window. If the model does not fit the cell, at least
+        /// the mismatch on the same scale.
         mean_nis: f64,
     },
 }
@@ -308,20 +309,20 @@ impl EventKind {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ModelState {
-    /// The label's model; nothing has been learned yet.
+    /// The model is the label's; nothing has been learned yet.
     Prior,
-    /// Partly learned.
+    /// The model is partly learned.
     Learning,
-    /// Learned; the remaining uncertainty is small.
+    /// The model is learned, and its remaining uncertainty is small.
     Learned,
-    /// Contradicted by the voltages: another chemistry explains them better.
+    /// The voltages contradict the model: another chemistry explains them better.
     Unfit,
-    /// Given by a model file; nothing is learned.
+    /// The model comes from a model file; nothing is learned.
     Given,
 }
 
 impl ModelState {
-    /// Code on the wire.
+    /// Code in CAN frames.
     pub fn code(self) -> u8 {
         match self {
             Self::Prior => 0,
@@ -336,9 +337,9 @@ impl ModelState {
 /// An event with its time.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Event {
-    /// Time of the input that caused it.
+    /// Time of the input that caused the event.
     pub time: Timestamp,
-    /// The event.
+    /// Kind of the event, with its data.
     #[serde(flatten)]
     pub kind: EventKind,
 }

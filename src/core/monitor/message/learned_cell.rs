@@ -1,4 +1,4 @@
-//! Learned values of one cell from a history, used if the state of the last run is lost.
+//! Learned values of one cell from a history. They replace the stored state if it is lost.
 
 use crate::filter::ScalarGaussian;
 use crate::quantity::CellIndex;
@@ -12,6 +12,6 @@ pub struct LearnedCell {
     pub capacity: ScalarGaussian,
     /// Usable capacity, Ah.
     pub usable: Option<ScalarGaussian>,
-    /// Resistance relative to new.
+    /// Resistance relative to the resistance of a new cell.
     pub resistance: Option<ScalarGaussian>,
 }

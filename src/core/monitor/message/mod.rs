@@ -1,5 +1,5 @@
-//! Inputs and outputs of the core: records and commands in; events, estimates and frames out. Independent of the
-//! stages.
+//! Inputs and outputs of the core: records and commands in; events, estimates and frames out. These types do not depend
+//! on the stages.
 
 mod command;
 mod event;

@@ -11,24 +11,24 @@ use crate::quantity::{BusIndex, CellIndex, Timestamp};
 /// A frame to send.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Transmit {
-    /// Time of the input that caused it.
+    /// Time of the input that caused the frame.
     pub time: Timestamp,
     /// Interface to send on.
     pub bus: BusIndex,
     /// The frame.
     pub frame: Frame,
-    /// Whether it announces a learned value or an alarm change. True for all health, alarm and J1939 frames, so that
-    /// all frames of one identifier and all parts of one transfer have the same flag.
+    /// Whether the frame announces a learned value or an alarm change. True for all health, alarm and J1939 frames, so
+    /// that all frames of one identifier and all parts of one transfer have the same flag.
     pub announces: bool,
-    /// How to authenticate the frame; `None` = not authenticated. The frame already contains its freshness, and zeros in
-    /// place of the authenticator.
+    /// How to authenticate the frame; `None` = the frame is not authenticated. The frame already contains its
+    /// freshness, and zeros in place of the authenticator.
     pub secured: Option<Secured>,
 }
 
-/// What the authenticator of a sent frame is computed from, in addition to the frame's data and the key.
+/// Inputs for the authenticator of a sent frame, in addition to the frame's data and the key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Secured {
-    /// Lengths and data id.
+    /// Lengths of the fields, and the data identifier.
     pub authentication: Authentication,
     /// The complete freshness value.
     pub freshness: u64,
@@ -45,12 +45,12 @@ impl Secured {
     }
 }
 
-/// Validity of the published estimates, as on the wire.
+/// Validity of the published estimates; the numbers are those in CAN frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
 pub enum Validity {
-    /// No estimate yet, or none any more because a cell's voltage is overdue.
+    /// There is no estimate: not every cell has an estimate yet, or a cell's voltage is overdue.
     Unavailable = 0,
     /// Inputs are fresh and the filter is consistent.
     Valid = 1,
@@ -77,7 +77,7 @@ pub struct Estimate {
     pub capacity_ah: f64,
     /// Standard deviation of the capacity, Ah.
     pub capacity_std_ah: f64,
-    /// Resistance relative to new.
+    /// Resistance relative to the resistance of a new cell.
     pub resistance_ratio: f64,
     /// Standard deviation of the resistance ratio.
     pub resistance_ratio_std: f64,
@@ -85,7 +85,7 @@ pub struct Estimate {
     pub innovation_v: f64,
     /// Predicted standard deviation of the innovation, V.
     pub innovation_std_v: f64,
-    /// Whether the reading passed the gate and moved the estimate.
+    /// Whether the reading passed the gate and changed the estimate.
     pub accepted: bool,
     /// The readings used.
     pub measured: MeasuredValues,
@@ -102,19 +102,19 @@ pub struct MeasuredValues {
     pub temperature_c: f64,
 }
 
-/// Outputs of the monitor. The caller empties and reuses it, so that the steady state does not allocate.
+/// Outputs of the monitor. The caller empties and reuses one value, so that normal operation does not allocate memory.
 #[derive(Debug, Default)]
 pub struct Outputs {
     /// Frames to send.
     pub frames: Vec<Transmit>,
     /// Events to log.
     pub events: Vec<Event>,
-    /// Estimates, only if `want_estimates`.
+    /// Estimates; empty unless `want_estimates` is set.
     pub estimates: Vec<Estimate>,
     /// Whether the caller wants `estimates`.
     pub want_estimates: bool,
-    /// Inputs of the alarm engine, only if `want_alarm_inputs`; without changes due to a restore or a new
-    /// configuration.
+    /// Inputs of the alarm engine; empty unless `want_alarm_inputs` is set. Changes due to a restore or a new
+    /// configuration are not included.
     pub alarm_inputs: Vec<(Timestamp, AlarmInput)>,
     /// Whether the caller wants `alarm_inputs`.
     pub want_alarm_inputs: bool,

@@ -1,5 +1,5 @@
-//! Records: inputs of the core, and contents of logs and journals: frames, ticks, reports of interfaces and files,
-//! commands.
+//! Records: the inputs of the core and the contents of logs and journals. A record is a frame, a tick, a report of an
+//! interface or of the files, or a command.
 
 use serde::{Deserialize, Serialize};
 
@@ -7,11 +7,11 @@ use super::command::Command;
 use crate::can::Frame;
 use crate::quantity::{BusIndex, Timestamp};
 
-/// Something that happened, with the driver's time. Logs and journals hold records, the core handles them.
+/// Something that happened, with the time on the driver's clock. Logs and journals hold records; the core handles them.
 ///
-/// Records come in the order in which they happened. A time slightly before the latest one (within
-/// [`MERGE_TOLERANCE_NS`], because buses merge out of order) is counted and treated as the latest. Further back, the
-/// clock was set back and the elapsed time is unknown.
+/// Records arrive in the order in which they happened. A time up to [`MERGE_TOLERANCE_NS`] before the latest time is
+/// possible, because records of several buses may be merged out of order; it is counted and treated as the latest time.
+/// A time further back means that the clock was set back, so the elapsed time is unknown.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Record {
     /// Time on the driver's clock.
@@ -25,7 +25,7 @@ pub struct Record {
 pub enum RecordKind {
     /// A frame was received.
     Frame {
-        /// Interface that received it.
+        /// Interface that received the frame.
         bus: BusIndex,
         /// The frame.
         frame: Frame,
@@ -33,24 +33,24 @@ pub enum RecordKind {
     /// A frame of an authenticated message was received and its authenticator was checked
     /// ([`Monitor::mac_check`](crate::monitor::Monitor::mac_check)).
     SecuredFrame {
-        /// Interface that received it.
+        /// Interface that received the frame.
         bus: BusIndex,
         /// The frame.
         frame: Frame,
         /// The freshness value that the authenticator confirms; `None` = no value fits.
         freshness: Option<u64>,
     },
-    /// Time passed. The driver ticks every [`TICK_PERIOD_MS`] while awake; cyclic frames and time-outs depend on
-    /// ticks.
+    /// Time passed. The driver sends a tick every [`TICK_PERIOD_MS`] while the computer is awake. Cyclic frames and
+    /// time-outs depend on ticks.
     Tick,
     /// An interface changed its state or lost frames.
     Bus {
         /// The interface.
         bus: BusIndex,
-        /// Its report.
+        /// Report of the interface.
         event: BusEvent,
     },
-    /// The record continues after a gap of unknown length (a log without timestamps between its parts).
+    /// The log continues after a gap of unknown length, for example between two parts without a common clock.
     UnknownGap,
     /// A command from this computer. Commands from the bus are frames.
     Command {
@@ -59,7 +59,7 @@ pub enum RecordKind {
     },
     /// Writing the files of the learned state and the records started to fail, or works again.
     Store {
-        /// Whether they can be written.
+        /// Whether the files can be written.
         works: bool,
     },
     /// The recorded run changed its configuration here. For the driver; the core ignores it.
@@ -72,60 +72,60 @@ pub enum RecordKind {
 }
 
 impl Record {
-    /// A received frame.
+    /// Creates the record of a received frame.
     #[inline]
     pub const fn frame(time: Timestamp, bus: BusIndex, frame: &Frame) -> Self {
         Self { time, kind: RecordKind::Frame { bus, frame: *frame } }
     }
 
-    /// A received frame with the result of checking its authenticator.
+    /// Creates the record of a received frame whose authenticator was checked.
     pub const fn secured_frame(time: Timestamp, bus: BusIndex, frame: &Frame, freshness: Option<u64>) -> Self {
         Self { time, kind: RecordKind::SecuredFrame { bus, frame: *frame, freshness } }
     }
 
-    /// Time passed.
+    /// Creates a tick.
     #[inline]
     pub const fn tick(time: Timestamp) -> Self {
         Self { time, kind: RecordKind::Tick }
     }
 
-    /// A report of an interface.
+    /// Creates the record of an interface's report.
     pub const fn bus(time: Timestamp, bus: BusIndex, event: BusEvent) -> Self {
         Self { time, kind: RecordKind::Bus { bus, event } }
     }
 
-    /// An unknown time passed before this record.
+    /// Creates the record of a gap of unknown length, which ends at `time`.
     pub const fn unknown_gap(time: Timestamp) -> Self {
         Self { time, kind: RecordKind::UnknownGap }
     }
 
-    /// A command from this computer.
+    /// Creates the record of a command from this computer.
     pub const fn command(time: Timestamp, command: Command) -> Self {
         Self { time, kind: RecordKind::Command { command } }
     }
 
-    /// A report on whether files can be written.
+    /// Creates the record of a report on whether the files can be written.
     pub const fn store(time: Timestamp, works: bool) -> Self {
         Self { time, kind: RecordKind::Store { works } }
     }
 
-    /// The recorded run changed to another configuration.
+    /// Creates the record of a change of configuration.
     pub const fn reload(time: Timestamp) -> Self {
         Self { time, kind: RecordKind::Reload }
     }
 
-    /// The recorded run restored a stored state.
+    /// Creates the record of a restored state.
     pub const fn restore(time: Timestamp, away: Downtime) -> Self {
         Self { time, kind: RecordKind::Restore { away } }
     }
 
-    /// Whether the time before the record is unknown.
+    /// Whether the time that passed before this record is unknown.
     pub const fn is_unknown_gap(&self) -> bool {
         matches!(self.kind, RecordKind::UnknownGap)
     }
 }
 
-/// Report of an interface, in addition to data frames.
+/// Report of an interface about something other than a data frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "bus_event")]
 pub enum BusEvent {
@@ -137,7 +137,7 @@ pub enum BusEvent {
     Missing,
     /// The kernel or a full queue of the daemon dropped frames since the last report.
     Dropped {
-        /// Frames lost.
+        /// Number of frames lost.
         frames: u64,
     },
     /// An error frame was received.
@@ -147,7 +147,7 @@ pub enum BusEvent {
     },
     /// Frames of the daemon could not be sent (queue full, interface gone).
     SendFailed {
-        /// Frames not sent.
+        /// Number of frames not sent.
         frames: u64,
     },
 }
@@ -155,13 +155,13 @@ pub enum BusEvent {
 /// Time between a stored state and the first input ([`Monitor::restore`](crate::monitor::Monitor::restore)).
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum Downtime {
-    /// The difference between the two timestamps. A state whose timestamp is after "now" by more than
-    /// [`MERGE_TOLERANCE_NS`] was stored on another clock; the downtime is then unknown.
+    /// The downtime is the difference between the two timestamps. If the state's timestamp is later than the first
+    /// input by more than [`MERGE_TOLERANCE_NS`], the state was stored on another clock and the downtime is unknown.
     #[default]
     AsStamped,
-    /// This long, s.
+    /// The downtime in seconds.
     Seconds(f64),
-    /// Unknown, as after [`RecordKind::UnknownGap`].
+    /// The downtime is unknown, as after [`RecordKind::UnknownGap`].
     Unknown,
 }
 
@@ -176,7 +176,7 @@ impl std::fmt::Display for Downtime {
     }
 }
 
-/// The text is not a downtime.
+/// Error: the text is not a downtime.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("must be seconds, 0 or more, or unknown")]
 pub struct DowntimeParseError;
@@ -201,6 +201,6 @@ impl std::str::FromStr for Downtime {
 /// Period of the driver's ticks, ms: a tenth of the shortest sensible period of a cyclic frame.
 pub const TICK_PERIOD_MS: u32 = 10;
 
-/// Largest step back in time that counts as frames of several interfaces merged out of order, ns. Beyond it, the clock
-/// was set back.
+/// Largest step back in time that counts as frames of several interfaces merged out of order, ns. A larger step means
+/// that the clock was set back.
 pub const MERGE_TOLERANCE_NS: i64 = 1_000_000_000;

@@ -1,4 +1,4 @@
-//! Current values of cells and pack for readers (status, tables, reports). `None` = not known yet, or no longer known.
+//! Current values of cells and pack for status, tables and reports. `None` = not known yet, or no longer known.
 
 use serde::{Deserialize, Serialize};
 
@@ -13,14 +13,15 @@ use crate::quantity::{CellIndex, Mode};
 pub struct CellView {
     /// Index of the cell.
     pub cell: CellIndex,
-    /// Values of the cell. Measured values are known while their readings are fresh, state of charge and resistance
-    /// while the voltage is fresh, learned values after the first half-cycle with a result.
+    /// Values of the cell. Measured values are known while their readings are fresh. State of charge and resistance are
+    /// known while the voltage is fresh. Learned values are known after the first half-cycle that measured the
+    /// capacity.
     #[serde(flatten)]
     pub values: CellValues,
     /// Reason why the remaining life is unknown.
     #[serde(default)]
     pub remaining_unknown: Option<String>,
-    /// Whether the cell's innovations agree with their covariance; `None` without an SOC.
+    /// Whether the cell's innovations agree with their covariance; `None` while its SOC is unknown.
     pub trusted: Option<bool>,
 }
 

@@ -1,4 +1,4 @@
-//! Alarming stage: the alarm engine, with its knowledge of rules and files.
+//! Alarming stage: holds the alarm engine, and the state that the comparison of values with the rules needs.
 //!
 //! In: values of the rules, from the [`Publisher`](super::publisher::Publisher) and the periodic
 //! [`watch`](crate::monitor::stages::watch). Out: raised alarms and their changes.
@@ -16,21 +16,22 @@ const SHOW_S: f64 = 1.0;
 #[derive(Debug)]
 pub(crate) struct Alarming {
     pub(crate) engine: AlarmEngine,
-    /// Silence after which the strictest threshold reports an input as missing, s; `None` without such a rule.
+    /// Shortest silence after which a configured threshold reports an input as missing, s; `None` without such a rule.
     pub(crate) missing_after_s: Option<f64>,
     /// Changes that wait to be published.
     pub(crate) changes: Vec<AlarmChange>,
-    /// Cells whose voltage channel is faulty, so that nothing is known of them. Derived from the cell-fault detector.
+    /// Cells whose voltage channel is faulty, so that nothing is known about them. The cell-fault detector finds them.
     pub(crate) faulty_channels: Vec<CellIndex>,
     pub(crate) state: AlarmingState,
 }
 
-/// State of the comparison of values with the rules.
+/// State that the comparison of values with the rules needs.
 #[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct AlarmingState {
-    /// Time of the last refresh of displayed inputs, and of innovations, that change no alarm.
+    /// Time of the last refresh of displayed input values that change no alarm.
     pub(crate) inputs_shown_at: Option<Timestamp>,
+    /// Time of the last refresh of displayed innovations that change no alarm.
     pub(crate) innovations_shown_at: Option<Timestamp>,
     /// Whether the engine knows that every learned value has valid inputs.
     pub(crate) knows_all_valid: bool,
@@ -77,7 +78,7 @@ impl Alarming {
         StoredAlarming { alarms: self.engine.snapshot(), running: self.engine.running(), state: self.state }
     }
 
-    /// Resumes with the latest value of every alarm; raised alarms have already been restored.
+    /// Resumes with the latest value of every alarm. The caller has already restored the raised alarms.
     pub(crate) fn resume(&mut self, stored: &StoredAlarming) {
         self.engine.resume(&stored.running);
         self.state = stored.state;
@@ -96,7 +97,7 @@ fn missing_after_s(rules: &[RuleConfig]) -> Option<f64> {
     rules.map(|rule| rule.threshold).min_by(f64::total_cmp)
 }
 
-/// Whether displayed values were last refreshed long enough ago; if so, sets `shown_at` to `now`.
+/// Whether a refresh of displayed values is due. If so, sets `shown_at` to `now`.
 pub(crate) fn take_show_due(shown_at: &mut Option<Timestamp>, now: Timestamp) -> bool {
     let is_due = shown_at.is_none_or(|shown_at| now.since(shown_at).abs() >= SHOW_S);
     if is_due {
@@ -113,7 +114,7 @@ pub(crate) struct StoreHealth {
 }
 
 impl StoreHealth {
-    /// Handles the driver's report. Returns whether it is a change.
+    /// Handles the driver's report. Returns whether it differs from the previous report.
     pub(crate) fn handle_report(&mut self, now: Timestamp, works: bool) -> bool {
         let was_failing = self.failing_since.is_some();
         let is_change = !self.is_known || was_failing == works;
@@ -122,7 +123,7 @@ impl StoreHealth {
         is_change
     }
 
-    /// Value of the rule about files: how long they could not be written, s; 0 while they can.
+    /// Value for the rule about files: how long the files could not be written, s; 0 while they can be written.
     pub(crate) fn failing(&self, now: Timestamp) -> Observation {
         let failing_s = self.failing_since.map_or(0.0, |since| now.since(since).max(0.0));
         Observation::new(self.is_known.then_some(failing_s))

@@ -1,8 +1,8 @@
 //! Estimation stage: computes the estimate of every cell from cell samples.
 //!
-//! In: batches of samples, and the learned values of half-cycles ([`Learner`]). Out: one filter step per sample;
-//! whether each cell's innovations agree with their covariance; whether its model fits the cell ([`ModelCheck`]). If a
-//! filter fails at a sample, only that filter is reset.
+//! In: batches of samples, and the learned values of half-cycles ([`Learner`]). Out: one filter step per sample, and
+//! two judgements per cell: do the innovations agree with their covariance, and does the model fit the cell
+//! ([`ModelCheck`])? If a filter fails at a sample, only that filter is reset.
 
 use serde::{Deserialize, Serialize};
 
@@ -22,8 +22,8 @@ use crate::monitor::message::{Estimate, MeasuredValues};
 use crate::quantity::{CellIndex, Timestamp};
 use crate::sample::CellSample;
 
-/// Contradiction score of an estimate that is known to be wrong (multiples of the consistency limit); it trips an
-/// alarm at the limit.
+/// Contradiction score of an estimate that is known to be wrong, in multiples of the consistency limit. It is high
+/// enough to trip an alarm whose threshold is the limit.
 const DOUBT: f64 = 2.0;
 
 /// The estimation stage.
@@ -33,16 +33,16 @@ pub(crate) struct Estimation {
     /// Modules with cells of another kind.
     modules: Vec<CellModule>,
     pub(crate) batch: CellBatch,
-    /// One per cell.
+    /// Per cell: how far its samples have been used.
     progress: Vec<CellProgress>,
     /// Per cell: whether its innovations agree with their covariance.
     trusted: Vec<bool>,
     pub(crate) all_trusted: bool,
-    /// One per cell.
+    /// Per cell: the check of its model.
     checks: Vec<ModelCheck>,
     any_check_open: bool,
     pub(crate) any_mismatched: bool,
-    /// Whether the voltages contradict the current.
+    /// Whether the current's reading is frozen, or an input message has a second sender.
     pub(crate) is_current_doubtful: bool,
     ambient_c: f64,
     /// Cells whose next half-cycle may have started in the gap before their latest sample.
@@ -53,17 +53,17 @@ pub(crate) struct Estimation {
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct EstimationState {
-    /// Samples that have not been stepped.
+    /// Samples that wait for their filter step.
     pub(crate) waiting: Vec<CellSample>,
-    /// Whether the voltages contradict the current.
+    /// Whether the current's reading is frozen, or an input message has a second sender.
     pub(crate) is_current_doubtful: bool,
 }
 
-/// How far a cell's samples have been used. Kept apart from the filters for cache locality, because every sample
-/// updates it.
+/// How far a cell's samples have been used. It is stored apart from the filters for cache locality, because every
+/// sample updates it.
 #[derive(Debug, Clone, Copy, Default)]
 struct CellProgress {
-    /// Sampler totals at the last step; `None` before the first.
+    /// Sampler totals at the last step; `None` before the first step.
     consumed: Option<Consumed>,
     /// The sample of the latest estimate.
     sample: Option<CellSample>,
@@ -143,7 +143,7 @@ impl Estimation {
         self.note_checks();
     }
 
-    /// Temperature used if none is measured, degrees C.
+    /// Temperature that replaces a missing measurement, degrees C.
     pub(crate) fn ambient_c(&self) -> f64 {
         self.ambient_c
     }
@@ -158,7 +158,8 @@ impl Estimation {
         (0..u16::try_from(self.cells()).unwrap_or(u16::MAX)).map(CellIndex)
     }
 
-    /// Steps the filters of all waiting samples. Returns the samples for [`finish`](Self::finish).
+    /// Steps the filters of all waiting samples. Returns the samples, which the caller later passes to
+    /// [`finish`](Self::finish).
     pub(crate) fn step(&mut self, learner: &mut Learner, modelling: &mut Modelling) -> Vec<CellSample> {
         let samples = std::mem::take(&mut self.batch.waiting);
         for sample in &samples {
@@ -176,7 +177,7 @@ impl Estimation {
         samples
     }
 
-    /// Mean SOC of the cells whose model is learned, fraction; 0.5 without an estimate.
+    /// Mean SOC of the pack's own kind of cells, fraction; 0.5 if no such cell has an estimate.
     fn mean_soc(&self) -> f64 {
         let own = self.bank.own_cells().iter();
         let socs = own.filter_map(|&cell| self.bank.filtered_soc(cell)).map(|soc| soc.mean);
@@ -184,7 +185,7 @@ impl Estimation {
         if count > 0.0 { sum / count } else { 0.5 }
     }
 
-    /// Adopts another model. The cells keep their differences from the mean cell.
+    /// Adopts another model. The cells keep their differences from the mean of the cells.
     pub(crate) fn adopt(&mut self, adoption: &Adoption, learner: &mut Learner, config: &CapacityConfig) {
         let Adoption { model, config: estimator, mean, with_capacity, is_learned } = adoption;
         let (own, bank) = (self.bank.own_cells().to_vec(), &self.bank);
@@ -214,7 +215,7 @@ impl Estimation {
         self.note_checks();
     }
 
-    /// Completes the work on stepped samples.
+    /// Completes the work on stepped samples, and reuses their buffer.
     pub(crate) fn finish(&mut self, mut samples: Vec<CellSample>, learner: &mut Learner) {
         samples.clear();
         self.batch.waiting = samples;
@@ -244,7 +245,7 @@ impl Estimation {
         if learner.observe(index, sample.time, sample.temperature_c, measured_s, gap_s) {
             self.after_gap.push(index);
         }
-        // Corrects the current for the sensor's offset; a reading of exactly zero has no offset.
+        // Corrects the current for the sensor's offset. A reading of exactly zero counts as free of offset.
         let offset_a = learner.current_offset().mean_a();
         let corrected = |current_a: f64| if current_a == 0.0 { 0.0 } else { current_a - offset_a };
         CellStep {
@@ -302,7 +303,7 @@ impl Estimation {
         self.any_mismatched = self.checks.iter().any(ModelCheck::is_mismatched);
     }
 
-    /// Whether a cell with this stored check differs from the current cell of its module.
+    /// Whether the stored check belongs to another cell than the cell that the module now has.
     pub(crate) fn is_other_cell(&self, index: usize, check: &ModelCheck) -> bool {
         let id = || model_id(self.bank.model(index), self.bank.config(index).initial.log_resistance_std);
         !self.bank.is_own(index) && check.is_of_other(id())
@@ -314,8 +315,8 @@ impl Estimation {
     }
 
     /// How much a cell contradicts its estimate: the mean normalised innovation squared. If the model does not fit the
-    /// cell, at least the mismatch times the consistency limit. If the estimate is impossible or the current doubtful,
-    /// at least [`DOUBT`] times the limit.
+    /// cell, the result is at least the mismatch times the consistency limit. If the estimate is impossible or the
+    /// current is doubtful, the result is at least [`DOUBT`] times the limit.
     pub(crate) fn contradiction(&self, index: usize) -> f64 {
         let (mean_nis, check) = (self.bank.mean_nis(index), &self.checks[index]);
         let limit = self.bank.own_config().consistency.limit;
@@ -324,7 +325,7 @@ impl Estimation {
         if mismatch.max(doubt) > 0.0 { mean_nis.max(mismatch.max(doubt) * limit) } else { mean_nis }
     }
 
-    /// Judges a cell's innovations. Returns the new trust if it has changed.
+    /// Judges a cell's innovations. If the trust in the cell has changed, returns the new trust.
     pub(crate) fn judge_trust(&mut self, cell: CellIndex) -> Option<bool> {
         let is_trusted = self.contradiction(cell.index()) <= self.bank.own_config().consistency.limit;
         if is_trusted == self.trusted[cell.index()] {
@@ -335,13 +336,13 @@ impl Estimation {
         Some(is_trusted)
     }
 
-    /// Handles a gap of unknown length: charge is not counted across it.
+    /// Handles a gap of unknown length. Charge is not counted across the gap.
     pub(crate) fn handle_unknown_gap(&mut self) {
         self.bank.change_all(|_, cell| cell.handle_unknown_gap());
         self.progress.iter_mut().for_each(|cell| cell.consumed = None);
     }
 
-    /// A cell's estimate after its latest step; `None` before the first.
+    /// A cell's estimate after its latest step; `None` before its first step.
     pub(crate) fn estimate(&self, index: usize, capacity: ScalarGaussian) -> Option<Estimate> {
         let sample = self.progress[index].sample.as_ref()?;
         let soc = self.bank.soc(index)?;
@@ -368,7 +369,7 @@ impl Estimation {
         })
     }
 
-    /// Resistance of a cell relative to new.
+    /// Resistance of a cell relative to a new cell.
     pub(crate) fn resistance(&self, index: usize) -> ScalarGaussian {
         resistance(&self.bank, index)
     }
@@ -417,7 +418,7 @@ fn ids_of_models(bank: &PackBank) -> Vec<u64> {
     (0..bank.cells()).map(|cell| of_kinds[bank.kind(cell)]).collect()
 }
 
-/// Resistance of a cell relative to new.
+/// Resistance of a cell relative to a new cell.
 pub(crate) fn resistance(bank: &PackBank, index: usize) -> ScalarGaussian {
     let log_resistance = bank.log_resistance(index);
     let ratio = libm::exp(log_resistance.mean);

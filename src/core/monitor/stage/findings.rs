@@ -1,8 +1,8 @@
 //! Findings stage: detects faults of single cells from cell samples.
 //!
 //! In: the samples of all cells with their estimates. Out: an event for each new finding ([`EventKind::Finding`]). The
-//! stage only observes: no estimate and no capacity depends on it. Its results are passed to the rules about single
-//! cells when a row of the detector ends.
+//! stage only observes: no estimate and no capacity depends on it. When a row of the detector (a few minutes of
+//! samples) ends, its results are passed to the alarm rules about single cells.
 
 use super::estimation::Estimation;
 use super::learning::Learning;
@@ -20,11 +20,11 @@ use crate::sample::CellSample;
 pub(crate) struct Findings {
     pub(crate) diagnosis: CellFaultDetector,
     cells: usize,
-    /// The cells that are compared: those in no module of another kind.
+    /// The cells that are compared: the pack's own kind, without the modules of another kind.
     compared: Vec<usize>,
     /// Whether the BMS bleeds fuller cells after a charge.
     is_balanced: bool,
-    /// Meaning of the balancing bits, if there are any.
+    /// Meaning of the balancing bits; `None` without balancing bits.
     balancing: Option<BalancingConfig>,
 }
 
@@ -52,7 +52,8 @@ impl Findings {
         self.diagnosis.is_active().then(|| self.diagnosis.clone())
     }
 
-    /// Restores a checked state. `away`: time in which the daemon did not run; `None` = no break.
+    /// Restores a checked state. `away`: start and end of the time in which the daemon did not run; `None` if it ran
+    /// without a break.
     pub(crate) fn restore(&mut self, stored: Option<CellFaultDetector>, away: Option<(Timestamp, Timestamp)>) {
         let Some(stored) = stored.filter(|_| self.diagnosis.is_active()) else { return };
         self.diagnosis = stored;
@@ -77,8 +78,8 @@ impl Findings {
         }
     }
 
-    /// Handles whether the reading of the current is frozen. Reported immediately, because no row ends without a
-    /// current.
+    /// Adds or withdraws the finding that the reading of the current is frozen. This cannot wait for the end of a row,
+    /// because no row ends without a current.
     pub(crate) fn watch_current(&mut self, now: Timestamp, is_frozen: bool, out: &mut Outputs) {
         let is_found = || self.diagnosis.findings().iter().any(|found| found.kind == CellFaultKind::CurrentFrozen);
         if self.diagnosis.is_active() && is_frozen != is_found() {

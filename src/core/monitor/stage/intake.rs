@@ -1,7 +1,7 @@
 //! Intake stage: turns frames into judged readings and commands.
 //!
-//! In: frames with their time, events of the interfaces. Out: the readings or the command of an admitted frame,
-//! counts, and events on change. If a frame fails its end-to-end check, its readings are bad, not missing. Frames
+//! In: frames with their time, events of the interfaces. Out: the readings or the command of an admitted frame, counts,
+//! and an event for each change. If a frame fails its end-to-end check, its readings are bad, not missing. Frames
 //! beyond the flood limit are dropped and counted.
 
 use serde::{Deserialize, Serialize};
@@ -41,9 +41,9 @@ pub(crate) struct Intake {
     pub(crate) command_gate: CommandGate,
     /// Controllers, in the listener's order.
     pub(crate) controllers: Vec<Controller>,
-    /// Diagnostic answers.
+    /// Reassembles diagnostic answers.
     pub(crate) listener: Listener,
-    /// Start of the answer that each controller is sending.
+    /// Per controller: moment at which its current answer started.
     pub(crate) moments: Vec<Option<Moment>>,
     /// Time of the last report of a rejected command frame.
     pub(crate) bad_command_at: Option<Timestamp>,
@@ -54,7 +54,7 @@ pub(crate) struct Intake {
 pub(crate) struct ReceivedFrame<'a> {
     pub(crate) bus: BusIndex,
     pub(crate) frame: &'a Frame,
-    /// The freshness that its authenticator confirms; `None` = no value fits, or it was not checked.
+    /// The freshness that the frame's authenticator confirms; `None` = no value fits, or it was not checked.
     pub(crate) freshness: Option<u64>,
 }
 
@@ -63,7 +63,7 @@ pub(crate) struct ReceivedFrame<'a> {
 pub(crate) struct Admission(Option<Status>);
 
 impl Admission {
-    /// Whether the frame's readings may be used.
+    /// Returns `Ok` if the frame's readings may be used.
     #[inline]
     pub(crate) fn readings(self) -> Result<(), Fault> {
         if self.0.is_none_or(Status::is_usable) { Ok(()) } else { Err(Fault::EndToEnd) }
@@ -80,7 +80,7 @@ pub(crate) struct IntakeState {
     pub(crate) commands: CommandGate,
     senders: Vec<MessageRate>,
     pub(crate) buses: Buses,
-    /// `None` in a state for a restart, because frames are missed.
+    /// State of partially received messages; `None` in a state for a restart, because frames are missed meanwhile.
     progress: Option<Box<IntakeProgress>>,
 }
 
@@ -133,7 +133,7 @@ impl Intake {
         }
     }
 
-    /// Applies other limits and checks to the same messages; counts and current floods are kept.
+    /// Applies other limits and checks to the same messages; keeps the counts and the state of current floods.
     pub(crate) fn reconfigure(&mut self, config: &MonitorConfig) {
         let new = Self::new(config);
         self.gate = new.gate.inheriting(&self.gate);
@@ -142,7 +142,7 @@ impl Intake {
         (self.senders, self.own) = (new.senders, new.own);
         self.senders.restore(&rates);
         self.own.resume(&own);
-        // Diagnostic definitions cannot change here, so partially received messages stay.
+        // Diagnostic definitions cannot change here, so the listener keeps partially received messages.
     }
 
     /// Judges a frame. Returns `None` if it is dropped, otherwise the result of its end-to-end check.
@@ -163,7 +163,8 @@ impl Intake {
         admitted.then_some(Admission(status))
     }
 
-    /// The command of a frame, and the fields that could be decoded. A rejection is reported at most once a second.
+    /// The fields of a command frame that could be decoded, and the command. Rejections are reported at most once a
+    /// second.
     ///
     /// # Errors
     /// The reason why the command is not executed.
@@ -194,7 +195,7 @@ impl Intake {
         (fields, result)
     }
 
-    /// Counter that the next command must have; `None` = any.
+    /// Counter that the next command must have; `None` if any counter is accepted.
     pub(crate) fn next_command_counter(&self, config: &CommandConfig) -> Option<u8> {
         self.guards.next_counter(config.bus, config.plan.id())
     }
@@ -205,7 +206,7 @@ impl Intake {
         out.events.push(Event { time: now, kind: EventKind::Bus { bus, what: event } });
     }
 
-    /// Value of the rule about interfaces: how long the worst interface has been out of order, s.
+    /// Value for the rule about interfaces: how long the worst interface has been out of order, s.
     pub(crate) fn bus_fault(&self, now: Timestamp, interfaces: usize) -> Observation {
         let (fault_s, is_whole) = self.buses.worst_s(now, interfaces);
         let foreign_s = Some(self.own.longest_s(now)).filter(|seconds| *seconds > 0.0);
@@ -223,7 +224,7 @@ impl Intake {
         self.report(now, out);
     }
 
-    /// Restarts the checks after being asleep or after a step of the clock.
+    /// Restarts the checks after a sleep or a step of the clock.
     pub(crate) fn restart(&mut self, now: Timestamp, out: &mut Outputs) {
         self.guards.restart();
         self.gate.restart();
@@ -280,12 +281,12 @@ impl Intake {
         self.senders.doubtful()
     }
 
-    /// Interfaces on which another node uses our identifiers, with the latest such identifier.
+    /// Interfaces on which another node uses identifiers of the daemon's frames, with the latest such identifier.
     pub(crate) fn own_id_uses(&self) -> impl Iterator<Item = (BusIndex, CanId)> + '_ {
         self.own.uses()
     }
 
-    /// Resumes without a break.
+    /// Resumes a stored state as if frames had been received without a break.
     fn resume(&mut self, stored: &IntakeProgress) {
         self.guards.resume(&stored.protected);
         self.gate.resume(&stored.floods);

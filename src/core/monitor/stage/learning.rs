@@ -1,8 +1,12 @@
 //! Learning stage: turns estimates and the pack current into half-cycles, and half-cycles into health values.
 //!
-//! In: the pack current, the cells' filters and samples. Out: changes of mode; per half-cycle and cell, capacity,
-//! usable capacity, resistance and remaining life; per charge, the recharge period; the pack's state. All of these are
-//! passed to the [`Publisher`] as events and alarm values. A half-cycle without information changes no value.
+//! In: the pack current, the cells' filters and samples. Out, passed to the [`Publisher`] as events and alarm values:
+//! * changes of mode;
+//! * per half-cycle and cell: capacity, usable capacity, resistance and remaining life;
+//! * per charge: the recharge period;
+//! * the pack's state.
+//!
+//! A half-cycle without information changes no value.
 
 use serde::{Deserialize, Serialize};
 
@@ -28,7 +32,7 @@ use crate::quantity::catalogue::{Quantity, RecordedValues};
 use crate::quantity::{CellIndex, InvalidState, Mode, Timestamp, bounds};
 use crate::sample::CellSample;
 
-/// A charge is in its constant-voltage part within this distance from the model's highest voltage, V.
+/// Largest distance from the model's highest voltage at which a charge is in its constant-voltage phase, V.
 const TAPER_BAND_V: f64 = 0.03;
 
 /// The learning stage.
@@ -48,7 +52,7 @@ pub(crate) struct Learning {
 pub(crate) struct LearningState {
     pub(crate) detector: TransitionDetector,
     pub(crate) learner: Learner,
-    /// Time of the last half-cycle; `None` = never, or at an unknown time.
+    /// Time of the last half-cycle; `None` if there was none, or if its time is unknown.
     pub(crate) learned_at: Option<Timestamp>,
     /// Time of the last correction of the current offset.
     offset_at: Option<Timestamp>,
@@ -61,17 +65,17 @@ pub(crate) struct LearningState {
 /// Health of one cell.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub(crate) struct CellHealth {
-    /// SOC after the last full charge; 1 before the first one.
+    /// SOC after the last full charge; 1 before the first full charge.
     pub(crate) full_soc: f64,
     /// Whether the current charge has tapered off at the highest voltage.
     tapered: bool,
     pub(crate) usable: Option<ScalarGaussian>,
-    /// Resistance relative to new after the last discharge.
+    /// Resistance relative to a new cell, after the last discharge.
     pub(crate) discharge_resistance: Option<ScalarGaussian>,
     pub(crate) throughput: Throughput,
 }
 
-/// Sums over all half-cycles of a cell. Stored as an array in the order of the fields.
+/// Sums over all half-cycles of a cell. In a stored state, it is an array in the order of the fields.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[serde(from = "[f64; 3]", into = "[f64; 3]")]
 pub struct Throughput {
@@ -96,7 +100,7 @@ impl From<Throughput> for [f64; 3] {
 }
 
 impl Throughput {
-    /// Adds a half-cycle. The times are limited to what a state can hold, however the clock jumps.
+    /// Adds a half-cycle. Limits the times to the range of a stored state, because the clock may jump.
     pub fn add(&mut self, mode: Mode, charge_ah: f64, duration_s: f64) {
         self.charge_ah += charge_ah.max(0.0);
         let time_s = if mode == Mode::Charge { &mut self.charging_s } else { &mut self.discharging_s };
@@ -116,7 +120,7 @@ impl Default for CellHealth {
     }
 }
 
-/// Whether the recharge period is plausible (it is not while the capacity is unknown).
+/// Whether the recharge period is plausible. It may be implausible while the capacity is unknown.
 fn is_period(period: &ScalarGaussian) -> bool {
     bounds::TIME_S.has(period.mean) && bounds::TIME_S.has(period.std())
 }
@@ -159,7 +163,7 @@ impl LearningState {
 }
 
 impl Learning {
-    /// Creates the stage. `bank`: new estimators of the cells.
+    /// Creates the stage. `bank`: the cells' new estimators.
     pub(crate) fn new(config: &MonitorConfig, bank: &PackBank) -> Self {
         Self {
             config: config.health,
@@ -192,9 +196,9 @@ impl Learning {
         self.state.learner.has_learned(index).then(|| self.capacity(index))
     }
 
-    /// Ends a mode. If it completes a half-cycle, every cell learns from it. `teaches_capacity`: whether the model of
-    /// the pack's own cells is good enough to learn capacities. Cells of a module learn their capacity if their model
-    /// was given.
+    /// Ends a mode. If this completes a half-cycle, every cell learns from the half-cycle. `teaches_capacity`: whether
+    /// the model of the pack's own kind of cells is good enough to learn capacities. Cells of a module learn their
+    /// capacity if their model was given.
     pub(crate) fn complete_mode(
         &mut self,
         change: ModeChange,
@@ -205,7 +209,7 @@ impl Learning {
         let teaches = |cell| if bank.is_own(cell) { teaches_capacity } else { bank.has_given_model(cell) };
         self.state.learner.hold(|cell| !teaches(cell));
         to.event(EventKind::Mode { from: change.from, to: change.to });
-        // If the current is lost, offset and slow branches are not learned; the evidence is kept.
+        // If the current is lost, keep the evidence for the offset and the slow branches until the next change of mode.
         if change.to != Mode::Unknown {
             self.learn_offset(bank, to.now);
             bank.learn_slow_branches();
@@ -247,8 +251,8 @@ impl Learning {
         }
     }
 
-    /// Learns from a cell's half-cycle, which ended `since_before_s` after the previous one (`None` = unknown).
-    /// Returns whether its capacity was measured.
+    /// Learns from a cell's half-cycle. `since_before_s`: time from the end of the previous half-cycle to the end of
+    /// this one; `None` = unknown. Returns whether the half-cycle measured the cell's capacity.
     fn learn_cell(
         &mut self,
         index: usize,
@@ -270,8 +274,8 @@ impl Learning {
         if half_cycle.mode == Mode::Charge && health.tapered {
             health.full_soc = half_cycle.end_soc.unwrap_or(health.full_soc);
         }
-        // Discharges update the usable capacity. A charge only sets the first value, because it leaves the resistance of
-        // charging.
+        // Discharges update the usable capacity. A charge only sets the first value, because the resistance after a
+        // charge is that of charging.
         let is_discharge = half_cycle.mode == Mode::Discharge;
         let is_restated = is_discharge || health.usable.is_none();
         if let Some(usable) = config.usable.as_ref().filter(|_| is_restated) {
@@ -304,7 +308,7 @@ impl Learning {
         update.measurement.is_some()
     }
 
-    /// Handles a stepped sample: detects that a charge tapers off at the highest voltage.
+    /// Handles a stepped sample: detects when a charge tapers off at the highest voltage.
     pub(crate) fn handle_sample(&mut self, sample: &CellSample, model: &CellModel) {
         let (Some(usable), Some(current_a)) = (&self.config.usable, sample.current_a) else { return };
         let is_tapering = current_a < 0.0 && -current_a <= usable.taper_current_a;
@@ -323,8 +327,8 @@ impl Learning {
         bank.put(cell.index(), &estimator);
     }
 
-    /// Combines the cells into the pack's values. `all_fresh`: whether every cell's voltage is fresh. Records the raw
-    /// recharge period when a charge has crossed the window.
+    /// Combines the cells into the pack's values. If a charge has just crossed the recharge window, records the raw
+    /// recharge period. `all_fresh`: whether every cell's voltage is fresh.
     pub(crate) fn combine_pack(&mut self, all_fresh: bool, bank: &PackBank, to: &mut Publisher<'_>) {
         self.state.pack = if all_fresh { self.combined(bank) } else { None };
         let Some(pack) = self.state.pack else { return };
@@ -346,8 +350,8 @@ impl Learning {
         }))
     }
 
-    /// Ends a charge: computes the raw and normalised recharge periods. `has_learned`: whether the cells learned from
-    /// the charge.
+    /// Ends a charge and publishes its raw and normalised recharge periods. `has_learned`: whether the cells learned
+    /// from the charge.
     fn finish_charge(&mut self, has_learned: bool, bank: &PackBank, to: &mut Publisher<'_>) {
         let config = &self.config.recharge;
         let charged = self.state.recharge.finish(config);
@@ -374,7 +378,7 @@ impl Learning {
         }
     }
 
-    /// The last recharge period, of the kind that the rule uses.
+    /// The last recharge period, raw or normalised as the rule requires.
     pub(crate) fn known_recharge_period(&self) -> Option<Observation> {
         match self.config.recharge.alarm_on {
             RechargeAlarm::Raw => self.state.recharge_period_s.map(|seconds| Observation::new(Some(seconds))),
@@ -382,15 +386,15 @@ impl Learning {
         }
     }
 
-    /// Restates the recharge periods for another window or current. A period that cannot be restated exactly becomes
-    /// unknown.
+    /// Converts the recharge periods to another window or reference current. A period that cannot be converted exactly
+    /// becomes unknown.
     pub(crate) fn restate_recharge(&mut self, old: &RechargeConfig) {
         let new = &self.config.recharge;
         if (old.from_soc, old.to_soc) != (new.from_soc, new.to_soc) {
             self.state.recharge.change_window();
             self.state.recharge_period_s = None;
         }
-        // Both periods follow from the same capacity, over another window or current.
+        // The old and the new normalised period follow from the same capacity.
         let seconds_per_ah = |config: &RechargeConfig| (config.to_soc - config.from_soc) / config.reference_current_a;
         let ratio = seconds_per_ah(new) / seconds_per_ah(old);
         self.state.normalised_recharge = self
@@ -487,7 +491,7 @@ impl CellHealth {
     }
 }
 
-/// Checks that mean and variance are 0 or more.
+/// Checks that mean and variance are at least 0.
 pub(crate) fn check_positive(what: &'static str, value: Option<ScalarGaussian>) -> Result<(), InvalidState> {
     let Some(ScalarGaussian { mean, variance }) = value else { return Ok(()) };
     InvalidState::unless_natural(what, mean)?;

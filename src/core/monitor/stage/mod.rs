@@ -1,4 +1,5 @@
-//! The stages. Each has its configuration, its state and its methods; no stage knows the data path as a whole.
+//! The stages of the data path. Each stage has its configuration, its state and its methods; no stage knows the whole
+//! data path.
 
 pub(crate) mod alarming;
 pub(crate) mod estimation;

@@ -1,14 +1,16 @@
 //! Modelling stage: learns a model of the pack's own cells from data of the vehicle.
 //!
 //! In: the steps of all cells, and the times at which the vehicle rests or sleeps. Out: a new model for the
-//! estimators, with the state in which they continue, and a [`ModelView`]. A model is learned only for a pack whose
-//! cells are described by a [`Label`]; otherwise the model comes from a file.
+//! estimators, with the state in which they continue, and a [`ModelView`]. The stage learns a model only if the
+//! configuration describes the cells by a [`Label`]; otherwise the model comes from a file.
 //!
-//! A new model is fitted when the vehicle rests and enough new rows have come. The estimators change to it during the
-//! rest, never while driving. The fit is a [`FitTask`] that starts some time before the change, so that a host can run
-//! it on another thread. Before the change, the current model and the previous one are compared on the new rows, which
-//! neither has seen, and the worse one is dropped. A settled model is fitted again only if the pack has reached
-//! another range of temperature or charge; the capacity is then left to the half-cycles.
+//! The [`Notebook`] collects rows of data. When the vehicle rests and there are enough new rows, a new model is fitted.
+//! The estimators change to the new model during the rest, never while driving. The fit is a [`FitTask`] that starts
+//! some time before the change, so that a host can run it on another thread.
+//!
+//! Before the change, the task compares the current model and the previous model on the new rows, which neither of them
+//! has seen, and the worse model is dropped. A settled model is fitted again only if the pack has reached another range
+//! of temperature or charge. The half-cycles then continue to learn the capacity.
 
 use serde::{Deserialize, Serialize};
 
@@ -22,7 +24,7 @@ use crate::monitor::config::MonitorConfig;
 use crate::monitor::message::{Event, EventKind, ModelState};
 use crate::quantity::{InvalidState, Mode, Timestamp};
 
-/// Fewest new rows for a fit, and smallest charge moved in them, fraction of the rated capacity.
+/// Fewest new rows for a fit, and smallest charge moved in these rows, fraction of the rated capacity.
 const LEAST_NEW_ROWS: usize = 6;
 const LEAST_NEW_CHARGE: f64 = 0.12;
 
@@ -32,14 +34,14 @@ const REST_S: f64 = 120.0;
 /// Time from the start of a fit to the change of the model, s: enough for a thread of a slow computer.
 const FIT_S: f64 = 30.0;
 
-/// Largest misfit of a usable fit. With typical sensors it is up to 0.65. Heavy load in the cold, a faulty sensor, or
-/// a pack exchanged in between cause more.
+/// Largest misfit of a usable fit. With typical sensors, the misfit is at most 0.65. Heavy load in the cold, a faulty
+/// sensor, or a pack that was exchanged between the rows cause a larger misfit.
 const MOST_MISFIT: f64 = 0.7;
 /// Misfit above which the current model is dropped, because the rows deviate more than they should.
 const HOPELESS_MISFIT: f64 = 1.0;
 
-/// Largest relative standard deviation of a usable fit's capacity. The label's is 0.1. Rows that determine the
-/// capacity poorly also determine the curve poorly.
+/// Largest relative standard deviation of a usable fit's capacity. For the label's capacity, it is 0.1. Rows that
+/// determine the capacity poorly also determine the curve poorly.
 const MOST_CAPACITY_STD: f64 = 0.05;
 
 /// Maximum number of stored changes of the model.
@@ -53,7 +55,7 @@ pub struct ModelChange {
     pub time: Timestamp,
     /// State of the model after the change.
     pub state: ModelState,
-    /// Capacity, Ah; `None` = the label's model.
+    /// Learned capacity, Ah; `None` for the label's model.
     pub capacity: Option<ScalarGaussian>,
     /// Root mean square of the residuals of the rows, V.
     pub residual_v: Option<f64>,
@@ -63,7 +65,7 @@ pub struct ModelChange {
     pub is_taken_back: bool,
 }
 
-/// State of the cells' model.
+/// View of the cells' model and of how it was learned.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ModelView<'a> {
     /// How well the model is known.
@@ -78,7 +80,7 @@ pub struct ModelView<'a> {
     pub chemistry: Option<Chemistry>,
     /// Number of fits.
     pub fits: u32,
-    /// Number of models dropped because the previous one was better.
+    /// Number of models that were dropped in favour of the previous model or the label's model.
     pub taken_back: u32,
     /// The latest changes, oldest first.
     pub changes: &'a [ModelChange],
@@ -93,7 +95,7 @@ pub(crate) struct Modelling {
     estimator: EstimatorConfig,
     notebook: NotebookConfig,
     pub(crate) state: ModellingState,
-    /// Whether the current fit still has to be offered to the host.
+    /// Whether the host has not yet been offered the current fit.
     is_offered: bool,
     /// A task that the host has run, with its findings.
     given: Option<(FitTask, FitFindings)>,
@@ -104,6 +106,7 @@ pub(crate) struct Modelling {
 /// Outcome of a fit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum FitOutcome {
+    /// The model did not change.
     Nothing,
     /// The new model is used.
     Adopted,
@@ -126,9 +129,9 @@ pub(crate) struct ModellingState {
     fits: u32,
     taken_back: u32,
     changes: Vec<ModelChange>,
-    /// Since when the pack has been resting.
+    /// Start of the current rest.
     rest_since: Option<Timestamp>,
-    /// Start of the current fit; rows are not closed during a fit.
+    /// Start of the current fit. No row is closed during a fit.
     fit_since: Option<Timestamp>,
     /// Whether a row is complete.
     has_row: bool,
@@ -141,14 +144,14 @@ pub(crate) struct Adoption {
     pub(crate) config: EstimatorConfig,
     /// State of the mean cell.
     pub(crate) mean: AdoptedState,
-    /// Whether the cells' capacities restart from the mean cell's.
+    /// Whether the cells' capacities restart from the capacity of the mean cell.
     pub(crate) with_capacity: bool,
-    /// Whether the model was learned. If not, it is the label's, and the capacity is unknown.
+    /// Whether the model was learned. If not, it is the label's model, and the capacity is unknown.
     pub(crate) is_learned: bool,
 }
 
 impl ModellingState {
-    /// Drops everything that requires contiguous rows: after a restart, or for a pack that is not connected.
+    /// Drops everything that requires contiguous rows. Called for a restart and for a pack that is not connected.
     pub(crate) fn restart(&mut self) {
         (self.rest_since, self.fit_since, self.has_row) = (None, None, false);
     }
@@ -161,7 +164,7 @@ impl ModellingState {
         InvalidState::unless(count <= most, "the changes of the model", count as f64, "at most 16")
     }
 
-    /// State of the model for cells with this label; `None` = from a model file.
+    /// View of the model for cells with this label; `label` is `None` if the model comes from a file.
     fn view(&self, label: Option<Label>) -> ModelView<'_> {
         let Self { notebook, own, chemistry, fits, taken_back, changes, .. } = self;
         let state = match (label, own) {
@@ -183,7 +186,8 @@ impl ModellingState {
         }
     }
 
-    /// State of the stored model. Uses the label with which it was learned, or else `label`; `None` without either.
+    /// View of the stored model, for the label with which it was learned. If the stored state has no label, uses
+    /// `label`; `None` without either.
     pub(crate) fn stored_view(&self, label: Option<Label>) -> Option<ModelView<'_>> {
         let label = self.label.or(label)?;
         Some(self.view(Some(label)))
@@ -260,7 +264,7 @@ impl Modelling {
         self.state.notebook.close_row(&self.notebook, soc);
     }
 
-    /// Handles the pack's mode. Returns whether a fit is due to end; the caller then calls [`Self::refit`].
+    /// Handles the pack's mode. Returns whether the current fit is due to end. If so, the caller calls [`Self::refit`].
     pub(crate) fn observe_mode(&mut self, now: Timestamp, mode: Mode) -> bool {
         if self.label.is_none() || mode != Mode::Rest {
             (self.state.rest_since, self.state.fit_since) = (None, None);
@@ -277,13 +281,13 @@ impl Modelling {
         false
     }
 
-    /// The current fit, returned once, for a host that runs it on another thread.
+    /// Returns the current fit once, for a host that runs it on another thread.
     pub(crate) fn take_task(&mut self) -> Option<FitTask> {
         let is_new = std::mem::take(&mut self.is_offered) && self.state.fit_since.is_some();
         is_new.then(|| self.task()).flatten()
     }
 
-    /// Receives the findings of a task. They only save the computation; the result is the same.
+    /// Receives the findings of a task that the host has run. They only save the computation; the result is the same.
     pub(crate) fn give(&mut self, task: FitTask, findings: FitFindings) {
         self.given = Some((task, findings));
     }
@@ -293,8 +297,8 @@ impl Modelling {
         Some(FitTask::new(self.label?, notebook, own.as_ref(), before.as_ref()))
     }
 
-    /// Whether half-cycles may learn the capacity. With the label's model, its errors would be mistaken for lost
-    /// capacity.
+    /// Whether half-cycles may learn the capacity. They may not while the label's model is used, because its errors
+    /// would look like lost capacity.
     pub(crate) fn teaches_capacity(&self) -> bool {
         self.label.is_none() || self.state.own.is_some()
     }
@@ -310,7 +314,7 @@ impl Modelling {
     }
 
     /// Compares the current and the previous model on the new rows, then fits a model to all rows. Returns the model
-    /// to adopt, if any.
+    /// that the estimators must adopt; `None` if there is no such model.
     pub(crate) fn refit(&mut self) -> Option<Adoption> {
         let label = self.label?;
         if self.state.fit_since.take().is_none() {
@@ -337,7 +341,8 @@ impl Modelling {
             return self.return_to_label().or_else(|| unless_fitted(self));
         }
         let Some(fitted) = fit else { return unless_fitted(self) };
-        // The hysteresis of LFP hides its flat curve and is not part of a row's error.
+        // A fit of LFP cells is not used: hysteresis hides their flat curve, and the error of a row does not include
+        // it.
         let is_flat = label.chemistry == Chemistry::LfpGraphite;
         let is_rough = fitted.misfit > MOST_MISFIT;
         if is_flat || is_rough || fitted.own.capacity.std() > MOST_CAPACITY_STD * fitted.own.capacity.mean {
@@ -355,8 +360,8 @@ impl Modelling {
         Some(Adoption { model, config, mean, with_capacity: !was_settled, is_learned: true })
     }
 
-    /// Returns to the label's model if the rows contradict a model that is not settled. `None` if the model does not
-    /// change.
+    /// Returns to the label's model, unless the current model is settled. Called if the rows contradict the current
+    /// model. `None` if the model does not change.
     fn return_to_label(&mut self) -> Option<Adoption> {
         self.state.own.take_if(|own| !own.is_settled())?;
         self.state.before = None;
@@ -384,8 +389,8 @@ impl Modelling {
         self.label.map(|_| self.state.clone())
     }
 
-    /// Records the change by the latest fit and returns its event; `None` without a change. `before`: the state before
-    /// the fit.
+    /// Records the change that the latest fit caused, and returns the event; `None` without a change. `before`: state
+    /// of the model before the fit.
     pub(crate) fn note_change(&mut self, time: Timestamp, before: ModelState) -> Option<Event> {
         let ModelView { state, own, chemistry, .. } = self.view();
         if state == before && self.outcome == FitOutcome::Nothing {
@@ -403,7 +408,7 @@ impl Modelling {
         Some(Event { time, kind })
     }
 
-    /// State of the cells' model.
+    /// View of the cells' model.
     pub(crate) fn view(&self) -> ModelView<'_> {
         self.state.view(self.label)
     }

@@ -1,7 +1,7 @@
 //! End of the data path: publishes events, alarm values and the resulting frames at the time of one input.
 //!
-//! A stage publishes an event or a rule's value. If an alarm changes, an event, the alarm's frame and J1939 trouble
-//! codes follow immediately.
+//! A stage publishes an event or the value of a rule. If an alarm changes, the publisher immediately adds an event, the
+//! alarm's frame and the J1939 trouble codes.
 
 use super::alarming::Alarming;
 use super::sending::Sending;
@@ -11,7 +11,7 @@ use crate::filter::ScalarGaussian;
 use crate::monitor::message::{Event, EventKind, Outputs};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Alarms, frames and outputs at one time.
+/// Access to alarms, frames and outputs at the time of one input.
 pub(crate) struct Publisher<'a> {
     pub(crate) now: Timestamp,
     pub(crate) alarming: &'a mut Alarming,
@@ -69,7 +69,7 @@ impl Publisher<'_> {
     }
 }
 
-/// The rule value for a newly learned value.
+/// The observation for a rule from a newly learned value.
 pub(crate) fn learned(value: ScalarGaussian) -> Observation {
     Observation::new(Some(value.mean)).with_std(value.std())
 }

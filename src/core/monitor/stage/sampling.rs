@@ -1,8 +1,8 @@
 //! Sampling stage: turns readings into cell samples, and detects which pack is connected.
 //!
-//! In: judged readings. Out: a [`CellSample`] for each good voltage, an event for each change of a signal, and the
-//! pack's identity once enough consecutive readings agree. Bad readings and single odd identities change nothing. The
-//! identity is stored, so that a pack exchanged during a downtime is detected.
+//! In: judged readings. Out: a [`CellSample`] for each good voltage, an event for each signal that turns bad or good,
+//! and the pack's identity once enough consecutive readings agree. Bad readings and single odd identities change
+//! nothing. The identity is stored, so that an exchange of the pack during a downtime is detected.
 
 use serde::{Deserialize, Serialize};
 
@@ -17,7 +17,7 @@ pub(crate) struct Sampling {
     pub(crate) sampler: Sampler,
     pub(crate) identity: Identity,
     identity_readings: u32,
-    /// Whether a usable reading has come since the first input.
+    /// Whether a usable reading has arrived since the first input.
     pub(crate) has_usable_reading: bool,
     /// Whether an input message has a second sender.
     pub(crate) has_second_sender: bool,
@@ -36,7 +36,7 @@ pub(crate) struct SamplingState {
 }
 
 impl SamplingState {
-    /// Drops everything that requires readings of this run; signals and pack are kept.
+    /// Drops everything that requires readings of this run; keeps the state of the signals and the pack's identity.
     pub(crate) fn restart(&mut self) {
         self.identity.candidate = None;
         (self.has_usable_reading, self.has_second_sender) = (false, false);
@@ -47,13 +47,13 @@ impl SamplingState {
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(crate) struct Identity {
     pub(crate) known: Option<f64>,
-    /// Another number, and how many consecutive readings have given it.
+    /// Another number than the known one, and how many consecutive readings have given it.
     candidate: Option<(f64, u32)>,
 }
 
 impl Identity {
-    /// Handles a reading. Returns the new number after `readings` consecutive readings, and whether it replaces a
-    /// known one.
+    /// Handles a reading. If `readings` consecutive readings agree on a new number, returns the number and whether it
+    /// replaces a known number.
     fn observe(&mut self, value: f64, readings: u32) -> Option<(f64, bool)> {
         if self.known == Some(value) {
             self.candidate = None;
@@ -71,7 +71,7 @@ impl Identity {
 }
 
 impl Identity {
-    /// Whether a reading gives another number than the connected pack's; `None` if either is unknown.
+    /// Whether a reading gives another number than that of the connected pack; `None` if either number is unknown.
     pub(crate) fn is_other(&self, reading: Result<f64, Fault>) -> Option<bool> {
         let value = reading.ok().filter(|value| value.is_finite())?;
         Some(self.known? != value)
@@ -113,7 +113,7 @@ impl Sampling {
         self.identity_readings = config.identity_readings;
     }
 
-    /// Handles a reading of a signal. Returns the sample that a good voltage completes.
+    /// Handles a reading of a signal. If it is a good voltage, returns the resulting sample.
     pub(crate) fn handle_reading(&mut self, now: Timestamp, reading: Reading, out: &mut Outputs) -> Option<CellSample> {
         let sample = self.sampler.handle_reading(now, reading, &mut self.changes);
         self.has_usable_reading =
@@ -122,7 +122,8 @@ impl Sampling {
         sample
     }
 
-    /// Handles a reading of the identity signal. Returns a new identity, and whether it replaces a known one.
+    /// Handles a reading of the identity signal. If the identity is new, returns it and whether it replaces a known
+    /// identity.
     pub(crate) fn handle_identity(&mut self, reading: Result<f64, Fault>) -> Option<(f64, bool)> {
         let value = reading.ok().filter(|value| value.is_finite())?;
         self.identity.observe(value, self.identity_readings)
@@ -142,7 +143,7 @@ impl Sampling {
         }
     }
 
-    /// Whether the inputs of a cell's estimate, the current and its voltage, are not lost.
+    /// Whether both inputs of a cell's estimate, the current and the cell's voltage, are available.
     pub(crate) fn inputs_valid(&self, cell: CellIndex, now: Timestamp) -> bool {
         let is_lost = |channel| self.sampler.is_lost(channel, now);
         !is_lost(Channel::Current) && !is_lost(self.voltage_channel(cell))

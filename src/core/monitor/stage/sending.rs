@@ -1,7 +1,8 @@
-//! Sending stage: cyclic frames, alarm frames, replies to commands, tests, and the J1939 node.
+//! Sending stage: cyclic frames, alarm frames, replies to commands, tests, diagnostic requests, and the J1939 node.
 //!
-//! In: fields of the frames from the other stages, alarms, ticks. Out: frames in [`Outputs`]. Missed periods are
-//! skipped. Without `[output]`, only the J1939 node sends.
+//! In: the other stages' values for the frames, alarms, ticks. Out: frames in [`Outputs`]. If the stage misses a
+//! period, it does not send the frame later. Without `[output]`, only the J1939 node and the poller (diagnostic
+//! requests) send.
 
 use serde::{Deserialize, Serialize};
 
@@ -24,20 +25,20 @@ use crate::monitor::config::{MonitorConfig, OutputConfig, SupplyConfig};
 use crate::monitor::message::{Event, EventKind, Outputs, Secured, Transmit};
 use crate::quantity::{BusIndex, Fault, Timestamp};
 
-/// Period of a test's frames, s: a consumer that reads once a second still receives several.
+/// Period of a test's frames, s: a receiver that reads once a second still gets several frames.
 const TEST_PERIOD_S: f64 = 0.1;
 /// Longest test, s, so that a forgotten test ends.
 pub const MAX_TEST_S: f64 = 600.0;
 
-/// Number of immediate replies after a pause; further ones are sent every [`REPLY_DELAY_MS`]. A sender of commands
-/// waits for each reply.
+/// Number of immediate replies after a pause; further replies are at least [`REPLY_DELAY_MS`] apart. A small number
+/// suffices, because a sender of commands waits for each reply.
 const REPLY_BURST: i64 = 5;
 const REPLY_DELAY_NS: i64 = REPLY_DELAY_MS as i64 * 1_000_000;
 
-/// Freshness values skipped at a start: more than the frames of three hours at the highest rate, which may have been
-/// sent since the state was stored.
+/// Number of freshness values skipped at a start. It exceeds the number of frames in three hours at the highest rate,
+/// because an earlier process may have sent that many since the state was stored.
 const RESTART_FRESHNESS: u64 = 1 << 20;
-/// Minimum freshness per second of the clock: more than the frames of a second.
+/// Minimum freshness per second of the clock. It exceeds the number of frames in a second.
 const FRESHNESS_PER_S: u64 = 256;
 
 /// The sending stage.
@@ -45,12 +46,12 @@ const FRESHNESS_PER_S: u64 = 256;
 pub(crate) struct Sending {
     config: Option<OutputConfig>,
     pub(crate) schedule: Schedule,
-    /// A running test of an alarm frame; not continued after a restart.
+    /// The running test of an alarm frame; a test does not continue after a restart.
     test: Option<AlarmTest>,
     pub(crate) j1939: Option<J1939>,
     pub(crate) poller: Option<Poller>,
     supply: Option<SupplyConfig>,
-    /// Whether an alarm change has moved the time of the next due work.
+    /// Whether an alarm change has changed the time at which work is next due.
     is_rescheduled: bool,
     /// Buffer for the poller's outputs; reused to avoid allocations.
     polled: PollOutputs,
@@ -88,17 +89,17 @@ pub(crate) struct Schedule {
     status: Timestamp,
     health: Timestamp,
     alarm: Timestamp,
-    /// Turn of the alarms that cannot be judged.
+    /// Counts the alarm periods; selects the unknown alarm that is announced next.
     alarm_turn: usize,
     digest: Timestamp,
-    /// Turn of the thresholds in the digest.
+    /// Counts the digests; selects the threshold in the next digest.
     threshold_turn: usize,
     /// Earliest time of the next reply.
     reply: Timestamp,
     pub(crate) alarms: AlarmQueue,
     /// Counters of the frames' end-to-end protection.
     counters: SendCounters,
-    /// Next announcement of the commands' freshness.
+    /// Time of the next announcement of the commands' freshness.
     freshness: Timestamp,
     /// Freshness of the last authenticated frame; all messages share one sequence.
     sent_freshness: u64,
@@ -133,13 +134,13 @@ impl Schedule {
     }
 }
 
-/// The interfaces of a frame: only `bus` if frames are sent on it, otherwise all.
+/// Interfaces on which to send a frame: only `bus` if it is an output interface, otherwise all output interfaces.
 fn buses_of(output: &OutputConfig, bus: Option<BusIndex>) -> impl Iterator<Item = BusIndex> + '_ {
     let only = bus.filter(|bus| output.buses.contains(bus));
     output.buses.iter().copied().filter(move |other| only.is_none_or(|bus| bus == *other))
 }
 
-/// Whether work is due. If so, sets its next time; missed periods are skipped.
+/// Whether work is due. If so, sets the time at which it is next due; missed periods are skipped.
 fn take_due(due: &mut Timestamp, now: Timestamp, period_s: f64) -> bool {
     if now < *due {
         return false;
@@ -173,8 +174,8 @@ impl Sending {
         }
     }
 
-    /// Resumes a test, diagnostic requests and the J1939 node from a stored state; the schedule has already been
-    /// restored.
+    /// Resumes a test, diagnostic requests and the J1939 node from a stored state. The caller has already restored the
+    /// schedule.
     pub(crate) fn resume(&mut self, state: &SendingState) {
         self.test = state.test;
         if let (Some(poller), Some(stored)) = (&mut self.poller, &state.poller) {
@@ -185,7 +186,7 @@ impl Sending {
         }
     }
 
-    /// Applies other cyclic frames. Without any, a running test ends.
+    /// Applies another `[output]` configuration. If the new configuration has no `[output]`, a running test ends.
     pub(crate) fn reconfigure(
         &mut self,
         now: Timestamp,
@@ -204,7 +205,7 @@ impl Sending {
         }
     }
 
-    /// Applies another J1939 configuration. An unchanged node keeps its address, another one claims its own.
+    /// Applies another J1939 configuration. An unchanged node keeps its address; a new node claims an address.
     pub(crate) fn reconfigure_j1939(
         &mut self,
         now: Timestamp,
@@ -224,12 +225,13 @@ impl Sending {
         }
     }
 
-    /// Schedules a comparison of all values before anything is sent, because they are unknown after a restart.
+    /// Makes housekeeping due now. After a restart, all values are unknown, so they must be compared with the rules
+    /// before a frame is sent.
     pub(crate) fn compare_first(&mut self, now: Timestamp) {
         self.schedule.housekeeping = self.schedule.housekeeping.min(now);
     }
 
-    /// Makes all cyclic work due now: after a start and after being asleep.
+    /// Makes all cyclic work due now. Called after a start and after a sleep.
     pub(crate) fn restart(&mut self, now: Timestamp) {
         self.schedule.dues().into_iter().for_each(|due| *due = now);
         self.schedule.reply = self.schedule.reply.min(now);
@@ -237,15 +239,15 @@ impl Sending {
     }
 
     /// Starts the freshness of authenticated frames above all values that an earlier process can have sent, because
-    /// receivers accept each value once. If the stored state was lost, the clock gives the value.
+    /// receivers accept each value only once. If the stored state was lost, the value follows from the clock.
     pub(crate) fn begin_freshness(&mut self, now: Timestamp) {
         let by_clock = u64::try_from(now.nanos() / 1_000_000_000).unwrap_or(0).saturating_mul(FRESHNESS_PER_S);
         let sent = &mut self.schedule.sent_freshness;
         *sent = sent.saturating_add(RESTART_FRESHNESS).max(by_clock);
     }
 
-    /// Skips the counters of frames that an earlier process has sent since its state was stored, or would have sent by
-    /// `now`. Receivers see the frames of the downtime as lost, and no counter repeats.
+    /// Skips the counters of all frames that an earlier process sent after its state was stored, or would have sent by
+    /// `now`. To receivers, the frames of the downtime then look lost, and no counter repeats.
     pub(crate) fn skip_counters(&mut self, now: Timestamp, engine: &AlarmEngine) {
         let Some(config) = &self.config else { return };
         let Schedule { status, health, alarm, digest, alarms, counters, .. } = &mut self.schedule;
@@ -255,8 +257,7 @@ impl Sending {
             periods.max(0.0) as u64
         };
         let pages = |count: usize| u64::try_from(count).unwrap_or(0);
-        // After a restart all alarms are unknown; the queue still holds those that the earlier process announced as
-        // unknown.
+        // The queue still holds the alarms that the earlier process announced as unknown.
         let unknown = u64::from(alarms.has_unknown()) * periods(*alarm, config.alarm_period_s);
         alarms.limit(now, config.alarm_period_s);
         for (message, frames) in [
@@ -270,7 +271,7 @@ impl Sending {
                 periods(*digest, config.digest_period_s).saturating_mul(pages(config.plan.digest_pages())),
             ),
             (LayoutMessage::Alarm, alarms.frames_until(now, engine, config.alarm_period_s).saturating_add(unknown)),
-            // A refused command does not store the state, so its reply's counter may be missing from it.
+            // The state is not stored after a refused command, so it may lack the counter of the reply to that command.
             (LayoutMessage::Reply, 1),
         ] {
             config.plan.skip(message, frames, counters);
@@ -297,7 +298,7 @@ impl Sending {
         take_due(&mut self.schedule.housekeeping, now, period_s)
     }
 
-    /// Whether status, health and alarm frames and the digest are due; `None` without cyclic frames.
+    /// Whether the status, health and alarm frames and the digest are due; `None` without `[output]`.
     pub(crate) fn take_frames_due(&mut self, now: Timestamp) -> Option<[bool; 4]> {
         let (config, schedule) = (self.config.as_ref()?, &mut self.schedule);
         Some([
@@ -339,7 +340,7 @@ impl Sending {
         }
     }
 
-    /// Sends the next alarm that cannot be judged, and notes the alarms that can be judged again.
+    /// Sends the next unknown alarm, and queues the alarms that are known again.
     pub(crate) fn send_unknown_alarm(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
         let turn = self.schedule.alarm_turn;
         self.schedule.alarm_turn = turn.wrapping_add(1);
@@ -358,7 +359,7 @@ impl Sending {
         }
     }
 
-    /// Notes an alarm change; the caller then calls [`send_changed_alarms`](Self::send_changed_alarms).
+    /// Queues an alarm change. The caller then calls [`send_changed_alarms`](Self::send_changed_alarms).
     pub(crate) fn note_change(&mut self, now: Timestamp, key: AlarmKey) {
         if self.config.is_some() {
             self.schedule.alarms.note_change(now, key);
@@ -366,7 +367,8 @@ impl Sending {
         }
     }
 
-    /// Sends the current state of changed alarms within the budget; the rest and the repetitions follow later.
+    /// Sends the current state of changed alarms within the budget. The remaining alarms and the repetitions follow
+    /// later.
     pub(crate) fn send_changed_alarms(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
         while let Some(key) = self.schedule.alarms.take_changed(now) {
             self.send_key(now, key, engine, out);
@@ -418,8 +420,8 @@ impl Sending {
         }
     }
 
-    /// Sends the reply to a command that was received on `bus`: on that interface if frames are sent on it, otherwise
-    /// on all.
+    /// Sends the reply to a command that was received on `bus`. If `bus` is not an output interface, sends the reply on
+    /// all output interfaces.
     pub(crate) fn send_reply(&mut self, now: Timestamp, bus: BusIndex, fields: &ReplyFields, out: &mut Outputs) {
         if self.schedule.reply > now || self.config.as_ref().is_none_or(|output| !output.plan.has_reply()) {
             return;
@@ -433,7 +435,7 @@ impl Sending {
         self.send(now, LayoutMessage::Alarm, out, |plan, counters| Some(plan.alarm(fields, counters)));
     }
 
-    /// Sends a frame, if `encode` returns one, on every interface.
+    /// Sends the frame that `encode` returns on every output interface.
     fn send(
         &mut self,
         time: Timestamp,
@@ -444,8 +446,8 @@ impl Sending {
         self.send_on(time, message, None, out, encode);
     }
 
-    /// Sends a frame, if `encode` returns one. `bus`: interface of the request that it answers; `None` = not an
-    /// answer.
+    /// Sends the frame that `encode` returns. `bus`: interface of the request that the frame answers; `None` if the
+    /// frame is not an answer.
     fn send_on(
         &mut self,
         time: Timestamp,
@@ -467,8 +469,8 @@ impl Sending {
         out.frames.extend(buses_of(output, bus).map(transmit));
     }
 
-    /// Starts to send a rule's alarm frame marked as a test, and ends a running test. With 0 s, only ends it. Returns
-    /// `false` without `[output]`.
+    /// Ends a running test and starts to send a rule's alarm frame, marked as a test. If `seconds` is 0, only ends the
+    /// running test. Returns `false` without `[output]`.
     pub(crate) fn start_test(
         &mut self,
         now: Timestamp,
@@ -512,13 +514,13 @@ impl Sending {
         self.poll_j1939(now, out);
     }
 
-    /// Sends neither value nor threshold, so that a test cannot be mistaken for a measurement.
+    /// Sends a test frame. It has neither value nor threshold, so that receivers cannot mistake it for a measurement.
     fn send_test(&mut self, now: Timestamp, rule: Rule, state: AlarmState, out: &mut Outputs) {
         let (rule, state) = (rule as u8, Some(state.wire_code()));
         self.send_alarm_fields(now, &AlarmFields { rule, state, test: true, ..AlarmFields::default() }, out);
     }
 
-    /// Runs `act` on the poller, if any, and sends its frames and events.
+    /// If there is a poller, runs `act` on it and adds its frames and events to the outputs.
     pub(crate) fn poll_with(
         &mut self,
         now: Timestamp,
@@ -541,14 +543,14 @@ impl Sending {
         }
     }
 
-    /// Claims the J1939 address: at the start, after being asleep, and when the interface is up again.
+    /// Claims the J1939 address. Called at the start, after a sleep, and when the interface is up again.
     pub(crate) fn claim_address(&mut self, now: Timestamp, out: &mut Outputs) {
         if let Some(j1939) = &mut self.j1939 {
             j1939.claim_address(now, out);
         }
     }
 
-    /// Passes a frame to the J1939 node; the node ignores other interfaces.
+    /// Passes a frame to the J1939 node. The node ignores frames of other interfaces.
     pub(crate) fn handle_j1939_frame(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
         if let Some(j1939) = &mut self.j1939 {
             j1939.handle_frame(now, bus, frame, out);

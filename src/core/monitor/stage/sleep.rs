@@ -1,14 +1,14 @@
 //! Detects that the vehicle is asleep: no current and no traffic on any bus.
 //!
 //! In: the time, and the time of the latest reading of any input. Out: whether the inputs may be judged, and an event
-//! at the start and end of a sleep. A single silent input, or silence under load, is a fault and not handled here.
-//! While the buses sleep, no input turns bad, no alarm is raised, and no estimate is valid.
+//! at the start and end of a sleep. A single silent input, and silence under load, are faults that other modules
+//! handle. While the buses sleep, no input turns bad, no alarm is raised, and no estimate is valid.
 
 use crate::monitor::config::MonitorConfig;
 use crate::quantity::Timestamp;
 
-/// After this time without a reading of any input, inputs at rest are not judged, s, because all buses may have fallen
-/// asleep. Longer than the pauses between frames of an awake bus, shorter than the age at which a reading is stale.
+/// Silence of all inputs at rest after which inputs are not judged, s, because all buses may be falling asleep. It is
+/// longer than the pauses between frames of an awake bus, and shorter than the age at which a reading is stale.
 pub(crate) const QUIET_S: f64 = 0.25;
 
 /// State of the bus sleep.
@@ -23,7 +23,7 @@ pub(crate) struct BusSleep {
 /// Meaning of the silence of all inputs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Silence {
-    /// Inputs arrive or current flows; each input is judged by its own age.
+    /// Inputs arrive or current flows, so each input is judged by its own age.
     None,
     /// The buses may be falling asleep.
     Quiet,

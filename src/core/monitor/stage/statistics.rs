@@ -1,8 +1,10 @@
 //! Counts of the core's work for the status socket and its metrics.
 //!
-//! The counts are part of the stored state and continue after a restart. Not included are counts kept elsewhere:
-//! readings ([`crate::sample::ReadingCounts`]), checks of protected messages ([`Monitor::protected`](super::Monitor)),
-//! floods ([`Monitor::dropped`](super::Monitor)), steps back in time ([`Monitor::time_backwards`](super::Monitor)).
+//! The counts are part of the stored state and continue after a restart. Other modules keep the counts of
+//! * readings ([`crate::sample::ReadingCounts`]),
+//! * checks of protected messages ([`Monitor::protected`](super::Monitor)),
+//! * floods ([`Monitor::dropped`](super::Monitor)),
+//! * steps back in time ([`Monitor::time_backwards`](super::Monitor)).
 
 use serde::{Deserialize, Serialize};
 
@@ -20,16 +22,17 @@ fn add(count: &mut u64, by: u64) {
 /// Counts since the first start.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Statistics {
-    /// Counts per interface, in the order of the configuration; interfaces without input may be missing at the end.
+    /// Counts per interface, in the order of the configuration. The last interfaces may be missing if they have had no
+    /// input.
     pub buses: Vec<BusStatistics>,
     /// Voltage readings by effect.
     #[serde(flatten)]
     pub voltages: VoltageCounts,
-    /// Filters that were restarted from their voltage.
+    /// Number of times a filter was restarted from a voltage.
     pub filter_resets: u64,
-    /// Times an estimate lost its trust.
+    /// Number of times a cell's estimate became untrusted.
     pub trust_lost: u64,
-    /// Periods without measurement: computer asleep, program not running, or gap in the record.
+    /// Number of periods without measurements: computer asleep, program not running, or gap in the log.
     pub gaps: u64,
     /// Changes of mode.
     pub mode_changes: u64,
@@ -42,24 +45,24 @@ pub struct Statistics {
     pub commands: u64,
     /// Rejected command frames.
     pub bad_commands: u64,
-    /// Times the pack was replaced.
+    /// Number of times the pack was replaced.
     pub packs_replaced: u64,
-    /// Times a stored state was restored.
+    /// Number of times a stored state was restored.
     pub restores: u64,
-    /// Times the files could not be written.
+    /// Number of times that writing the files started to fail.
     pub store_failures: u64,
 }
 
-/// Voltage readings by their effect on the estimates.
+/// Numbers of voltage readings by their effect on the estimates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct VoltageCounts {
-    /// Readings that moved an estimate.
+    /// Readings that changed an estimate.
     #[serde(rename = "voltages_used")]
     pub used: u64,
     /// Readings beyond the filter's gate, which were ignored.
     #[serde(rename = "voltages_gated")]
     pub gated: u64,
-    /// Readings without a current to compare them with.
+    /// Readings that could not be compared with a prediction, because there was no current.
     #[serde(rename = "voltages_without_current")]
     pub without_current: u64,
 }
@@ -71,14 +74,14 @@ impl VoltageCounts {
     }
 }
 
-/// Half-cycles and their results.
+/// Numbers of half-cycles and of their results.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct LearningCounts {
-    /// Half-cycles, per cell.
+    /// Half-cycles, summed over the cells.
     pub half_cycles: u64,
-    /// Updates of a capacity filter, per cell.
+    /// Updates of a capacity filter, summed over the cells.
     pub capacity_updates: u64,
-    /// Updates with a measurement.
+    /// Updates of a capacity filter with a measurement.
     pub capacity_measurements: u64,
     /// Recharge periods recorded, raw or normalised.
     pub recharge_periods: u64,
@@ -105,7 +108,7 @@ impl BusStatistics {
     }
 }
 
-/// Alarms by severity.
+/// Numbers of alarms by severity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct AlarmCounts {
     /// Alarms of severity `info`.

@@ -1,11 +1,12 @@
-//! Remembers what was learned of previously connected packs, by their number, so that it is available when a pack
+//! Remembers the learned values of previously connected packs by pack number, so that they are available when a pack
 //! returns.
 //!
-//! In: the parts of the state that belong to the connected pack, stored when readings start to show another number;
-//! the new number once it is confirmed. Out: the stored values of that pack, if any. Stored are capacities,
-//! resistances, remaining lives, recharge periods and the current offset (a pack often has its own sensor). The
-//! current half-cycle and the state of charge are not stored; the first voltage determines the state of charge. A pack
-//! without learned values is not stored, so that bogus numbers do not displace real packs.
+//! In: the learned values of the connected pack, put aside when readings start to show another number; the new number
+//! once it is confirmed. Out: the stored values of the pack with that number, if there are any.
+//!
+//! Stored are capacities, resistances, remaining lives, recharge periods and the current offset (a pack often has its
+//! own sensor). The current half-cycle and the state of charge are not stored; the first voltage determines the state
+//! of charge. A pack without learned values is not stored, so that bogus numbers do not displace real packs.
 
 use serde::{Deserialize, Serialize};
 
@@ -17,10 +18,10 @@ use crate::monitor::stage::learning::{CellHealth, LearningState, Throughput, che
 use crate::monitor::stage::modelling::ModellingState;
 use crate::quantity::{InvalidState, bounds};
 
-/// Maximum number of stored packs besides the connected one: more than a vehicle exchanges in turn.
+/// Maximum number of stored packs, without the connected pack: more than a vehicle uses in turn.
 const MAX_PACKS: usize = 8;
-/// Maximum number of cells of all stored packs, but at least one pack is stored. A cell takes 2.6 kB of the stored
-/// state.
+/// Maximum number of cells in all stored packs together. One pack is stored even if it has more cells. A cell takes
+/// 2.6 kB of the stored state.
 const MAX_CELLS: usize = 384;
 
 /// Stored packs, least recently connected first.
@@ -75,7 +76,7 @@ impl PackMemory {
         self.aside = None;
     }
 
-    /// Stores the pack that was put aside, and returns and removes the stored pack with `number`.
+    /// Stores the pack that was put aside. Removes the stored pack with `number` and returns it.
     pub(crate) fn exchange(&mut self, number: f64) -> Option<StoredPack> {
         let found = self.packs.iter().position(|pack| pack.number == number).map(|place| self.packs.remove(place));
         if let Some(pack) = self.aside.take().filter(|pack| pack.has_learned()) {
@@ -87,7 +88,7 @@ impl PackMemory {
         found
     }
 
-    /// Forgets recharge periods or usable capacities that were measured with another window or load.
+    /// Forgets recharge periods measured with another window, and usable capacities computed for another load.
     pub(crate) fn forget_measures(&mut self, is_other_recharge: bool, is_other_load: bool) {
         for pack in &mut self.packs {
             if is_other_recharge {
@@ -99,7 +100,7 @@ impl PackMemory {
         }
     }
 
-    /// Drops packs whose shape does not fit the configuration.
+    /// Keeps only the packs for which `fits` is true.
     pub(crate) fn retain(&mut self, fits: impl Fn(&StoredPack) -> bool) {
         self.packs.retain(&fits);
         self.aside.take_if(|pack| !fits(pack));

@@ -1,8 +1,9 @@
-//! Passes current values to their rules every 0.1 s. Learned values are passed when they are learned.
+//! Passes current values to their alarm rules every 0.1 s. (The learning stage passes learned values when it learns
+//! them.)
 //!
-//! In: all stages. Out: values for the [alarming](crate::monitor::stage::alarming) stage. A value with an unknown part
-//! is passed as a bound: it can raise an alarm but not clear one. Fast path: if the worst value trips no threshold,
-//! the others are only refreshed for display, once a second.
+//! In: all stages. Out: values for the [alarming](crate::monitor::stage::alarming) stage. If a part of a value is
+//! unknown, the value is passed as a bound, which can raise an alarm but not clear one. Fast path: if the worst value
+//! trips no threshold, the other values are only refreshed for display, once a second.
 
 use super::Stages;
 use crate::alarm::{AlarmInput, Observation, Rule};
@@ -54,7 +55,7 @@ struct SocSpread {
 }
 
 impl Stages {
-    /// Passes values that are not learned at a transition to their rules.
+    /// Passes the values that are not learned at a change of mode to their rules.
     pub(crate) fn watch(&mut self, now: Timestamp, out: &mut Outputs) {
         let any_lost = self.sampling.sampler.any_lost();
         let worst = self.sampling.sampler.worst_input(now);
@@ -71,12 +72,12 @@ impl Stages {
         publisher.observe(Rule::StoreFailed, None, store);
         publisher.apply(AlarmInput::Poll);
         publisher.publish_alarms();
-        // Whether every value is known may have changed without an alarm.
+        // The trouble codes also say whether all values are known, which may change without an alarm.
         publisher.update_trouble_codes();
     }
 
-    /// Checks silence and plausibility of every input. A cell's own voltage counts for the cell, every other input for
-    /// the pack.
+    /// Passes silence and share of bad readings of every input to their rules. A cell voltage counts for its cell,
+    /// every other input for the pack.
     fn watch_inputs(&mut self, now: Timestamp, worst: Option<(f64, f64)>, out: &mut Outputs) {
         let engine = &self.alarming.engine;
         let quiet = |(silence_s, share): (f64, f64)| {
@@ -101,7 +102,7 @@ impl Stages {
         }
         if let Some(mut pack) = pack {
             if has_second_sender {
-                // It is unknown which readings come from the sensor, so none counts as good.
+                // It is unknown which readings come from the sensor, so no reading counts as good.
                 pack.bad_share = Observation::new(Some(1.0));
             }
             self.observe_input(now, None, pack, out);
@@ -129,7 +130,7 @@ impl Stages {
     fn input_observation(&self, now: Timestamp, channel: Channel) -> InputObservation {
         let sampler = &self.sampling.sampler;
         let silence_s = sampler.silence_s(channel, now);
-        // Without a reading since waking, neither silence nor its end can be judged.
+        // If no reading has arrived since waking, the input may still be waking up: only a long silence counts.
         let has_reading = sampler.has_input_since_waking(channel);
         let is_missing = |silence: &f64| self.alarming.missing_after_s.is_some_and(|limit| *silence > limit);
         // The share of bad readings before a silence says nothing about the present.
@@ -150,8 +151,8 @@ impl Stages {
         publisher.observe(Rule::InputImplausible, cell, input.bad_share);
     }
 
-    /// Marks learned values as valid only while their inputs can renew them: no input is lost and the channel is not
-    /// faulty.
+    /// Marks learned values as valid only while inputs can renew them, that is, while no input of the cell is lost and
+    /// its channel is not faulty.
     fn watch_learned(&mut self, now: Timestamp, any_lost: bool, out: &mut Outputs) {
         if self.alarming.state.knows_all_valid && !out.want_alarm_inputs && !any_lost {
             return;
@@ -200,7 +201,8 @@ impl Stages {
         publisher.observe(Rule::BmsDisagrees, None, disagreement);
     }
 
-    /// SOC of the emptiest and the fullest cell with a fresh estimate and a sound channel; `None` if no cell has one.
+    /// SOC of the emptiest and the fullest cell, among the cells with a fresh estimate and a sound channel; `None` if
+    /// there is no such cell.
     fn soc_spread(&self, now: Timestamp, all_fresh: bool) -> Option<SocSpread> {
         let bank = &self.estimation.bank;
         if all_fresh
@@ -229,7 +231,8 @@ impl Stages {
         spread.map(|spread| SocSpread { is_whole: known == self.estimation.cells(), ..spread })
     }
 
-    /// The larger of the differences between reported and estimated SOC and SOH.
+    /// Difference between the values that the BMS reports and the estimates: the larger of the differences in SOC and
+    /// in SOH.
     fn disagreement(&self, now: Timestamp) -> Observation {
         let config = self.sampling.sampler.config();
         let soc = self.learning.state.pack.map(|pack| ScalarGaussian::from_std(pack.soc, pack.soc_std));
@@ -258,7 +261,8 @@ impl Stages {
         Observation { is_new: true, ..worst }
     }
 
-    /// Whether no cell's innovations can change an alarm or its trust, so that they are only displayed.
+    /// Whether the innovations of all cells change neither an alarm nor the trust in a cell. If so, they only need to
+    /// be displayed.
     pub(crate) fn are_innovations_quiet(&self, out: &Outputs) -> bool {
         let Estimation { all_trusted, any_mismatched, is_current_doubtful, .. } = self.estimation;
         let is_known_good = all_trusted && !any_mismatched && !is_current_doubtful;
@@ -271,7 +275,7 @@ impl Stages {
         }
     }
 
-    /// Refreshes the displayed innovations once a second while they change no alarm.
+    /// Refreshes the displayed innovations, which change no alarm, once a second.
     pub(crate) fn show_innovations(&mut self, now: Timestamp, samples: &[CellSample]) {
         if !take_show_due(&mut self.alarming.state.innovations_shown_at, now) {
             return;
@@ -284,12 +288,12 @@ impl Stages {
         }
     }
 
-    /// Judges whether a cell's innovations agree with their covariance; reports a change as an event. `is_current`:
-    /// also passes them to the rule.
+    /// Judges whether a cell's innovations agree with their covariance, and reports a change as an event. If
+    /// `is_current`, also passes the innovations to their rule.
     pub(crate) fn judge_trust(&mut self, now: Timestamp, cell: CellIndex, is_current: bool, out: &mut Outputs) {
         let mean_nis = self.estimation.contradiction(cell.index());
         let change = self.estimation.judge_trust(cell);
-        // Without a current the filter continues, but its innovations say nothing about its model.
+        // Without a current, the filter continues, but its innovations say nothing about the cell's model.
         let is_observed = is_current && self.sampling.inputs_valid(cell, now);
         let mut publisher = self.publisher(now, out);
         if let Some(trusted) = change {
@@ -300,9 +304,9 @@ impl Stages {
         }
     }
 
-    /// Passes known values to their rules, after a restart as old ones. `was_brief`: the downtime was short enough
-    /// that measured values still apply. `is_new`: the rules have not seen the values, because they belong to a pack
-    /// that returned.
+    /// Passes restored values to their rules. `was_brief`: whether the downtime was so short that measured values still
+    /// apply. `is_new`: whether the rules have not seen the values before, because they belong to a pack that returned;
+    /// false after a restart.
     pub(crate) fn restate_known(&mut self, now: Timestamp, was_brief: bool, is_new: bool, out: &mut Outputs) {
         let old = |value: ScalarGaussian| Observation { is_new, ..learned(value) };
         for index in self.estimation.cell_indices() {
@@ -336,8 +340,8 @@ impl Stages {
         learning.lives.observe(is_new, &mut publisher);
     }
 
-    /// Passes the results of a row to the rules about single cells. `is_new`: the rules have not seen them; values of
-    /// a cell whose inputs are lost are then left for the next row.
+    /// Passes the results of a row to the rules about single cells. `is_new`: whether the rules have not seen the
+    /// results before. If so, the results of a cell whose inputs are lost are skipped until the next row.
     pub(crate) fn publish_diagnosis(&mut self, now: Timestamp, is_new: bool, out: &mut Outputs) {
         self.note_faulty_channels();
         let diagnosis = &self.findings.diagnosis;

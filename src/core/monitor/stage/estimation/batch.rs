@@ -1,13 +1,13 @@
-//! Collects the samples of cells that report one after another. Once every cell has reported, all samples are stepped
-//! together.
+//! Collects the samples of cells that report one after another. When every cell has reported, the filters of all cells
+//! are stepped together.
 //!
-//! How long a sample waits does not affect its estimate: a step uses only its own sample's time and charge, and
-//! no data of other cells.
+//! The waiting time of a sample does not affect its estimate, because a step uses only the time and charge of its own
+//! sample and no data of other cells.
 
 use crate::quantity::CellIndex;
 use crate::sample::CellSample;
 
-/// Cells that have reported since the pack's values were last combined.
+/// A batch: the cells that have reported since the pack's values were last combined, and their waiting samples.
 #[derive(Debug)]
 pub(crate) struct CellBatch {
     /// Samples that wait for their step, in the order of arrival, at most one per cell.

@@ -1,8 +1,12 @@
-//! State of the interfaces for the rule about them.
+//! State of the interfaces, for the alarm rule about interfaces.
 //!
-//! An interface is out of order while it is down or missing, from bus-off until it is up again or a frame arrives, and
-//! while frames of the daemon cannot be sent. It is unknown before its first report. A fault continues across a
-//! restart until the interface is reported to be in order.
+//! An interface is out of order in three cases:
+//! * while it is down or missing;
+//! * from bus-off until the interface is up again or receives a frame;
+//! * while the daemon's frames cannot be sent.
+//!
+//! Its state is unknown before its first report. After a restart, a fault continues until the interface reports that it
+//! is in order.
 
 use serde::{Deserialize, Serialize};
 
@@ -13,7 +17,8 @@ use crate::quantity::{BusIndex, Timestamp};
 pub(crate) const CAN_ERR_BUSOFF: u32 = 0x40;
 const CAN_ERR_RESTARTED: u32 = 0x100;
 
-/// Sending counts as working again this long after the last failure report, s: four report periods of the drivers.
+/// Time after the last report of a failure from which sending counts as working again, s: four report periods of the
+/// driver.
 const SEND_RECOVERED_S: f64 = 1.0;
 
 #[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]
@@ -58,8 +63,8 @@ impl Buses {
         (state.is_known, state.off_since) = (true, None);
     }
 
-    /// How long the worst of `interfaces` has been out of order, s (0 = all that have reported are in order,
-    /// `None` = none has reported), and whether each has reported.
+    /// How long the worst interface has been out of order, s, and whether all `interfaces` have reported. The time is 0
+    /// if all interfaces that have reported are in order, and `None` if no interface has reported.
     pub(crate) fn worst_s(&self, now: Timestamp, interfaces: usize) -> (Option<f64>, bool) {
         let known = self.states.iter().filter(|state| state.is_known);
         let worst_s = known.clone().map(|state| state.fault_s(now)).max_by(f64::total_cmp);
@@ -75,8 +80,8 @@ impl Buses {
         }
     }
 
-    /// Continues at `now` with the faults stored at `taken`. Whether a fault continues is unknown until the interface
-    /// reports, and whether frames can be sent again until a second has passed.
+    /// Continues at `now` with the faults stored at `taken`. Faults continue until the interface reports. If frames
+    /// could not be sent, this counts as a fault for another [`SEND_RECOVERED_S`].
     pub(crate) fn restored(mut self, taken: Timestamp, now: Timestamp) -> Self {
         for state in &mut self.states {
             let unsent = state.unsent.filter(|(_, latest)| taken.since(*latest) <= SEND_RECOVERED_S);
@@ -98,7 +103,7 @@ impl BusState {
     fn fault_s(&self, now: Timestamp) -> f64 {
         let unsent = self.unsent.filter(|(_, latest)| now.since(*latest) <= SEND_RECOVERED_S);
         let since = [self.down_since, self.off_since, unsent.map(|(first, _)| first)];
-        // A fault that starts now counts with a minimal duration, because 0 means "no fault".
+        // A duration of 0 means "no fault", so a fault that starts now gets a minimal duration.
         since.into_iter().flatten().map(|since| now.since(since).max(1e-9)).fold(0.0, f64::max)
     }
 }

@@ -1,12 +1,13 @@
 //! Decides which authenticated command frames are executed.
 //!
-//! In: a command frame, and the freshness that its authenticator confirms, if any. Out: whether the command is
-//! executed, with the reason if not; the freshness to announce.
+//! In: a command frame, and the freshness that its authenticator confirms, if any. Out: permission to execute the
+//! command, or the reason for the refusal; the freshness to announce.
 //!
-//! A short authenticator can be guessed by many attempts. After [`FORGED_BURST`] wrong ones, and then for
-//! [`FORGED_PERIOD_NS`] after each further one, a right authenticator alone is not enough: the same command must be
-//! sent again within [`REPEAT_NS`], with another freshness. A genuine sender repeats a refused command and is served
-//! during an attack; an attacker must guess right twice.
+//! With many attempts, an attacker can guess a short authenticator. After [`FORGED_BURST`] wrong authenticators, and
+//! for [`FORGED_PERIOD_NS`] after each further wrong one, the gate is *under attack*. A command with a right
+//! authenticator must then be sent again within [`REPEAT_NS`], with another freshness, before it is executed. A genuine
+//! sender repeats a refused command, so its commands are executed even during an attack. An attacker must guess right
+//! twice.
 
 use serde::{Deserialize, Serialize};
 
@@ -16,14 +17,14 @@ use crate::quantity::{InvalidState, Timestamp};
 
 /// Number of wrong authenticators tolerated after a pause.
 const FORGED_BURST: i64 = 10;
-/// Afterwards, one more is tolerated per this time, ns. The probability of guessing one of 24 bits within a day is
-/// then 1 in 1900.
+/// Time per further wrong authenticator that is tolerated, ns. The probability of guessing an authenticator of 24 bits
+/// within a day is then 1 in 1900.
 const FORGED_PERIOD_NS: i64 = 10_000_000_000;
-/// Longest time between a command and its repetition during an attack, ns. At 2000 guesses a second, the flood limit's
-/// default, the probability of guessing an authenticator of 24 bits and its repetition within a day is 1 in 800.
+/// Longest time between a command and its repetition during an attack, ns. At 2000 guesses a second (the default flood
+/// limit), the probability of guessing an authenticator of 24 bits and its repetition within a day is 1 in 800.
 const REPEAT_NS: i64 = 1_000_000_000;
 
-/// An announced freshness is outdated this long after its announcement, ns: two announcement periods.
+/// Age at which an announced freshness is outdated, ns: two announcement periods.
 const STALE_NS: i64 = 2 * FRESHNESS_PERIOD_MS as i64 * 1_000_000;
 
 /// The gate with its counts. All of it is stored.
@@ -33,9 +34,9 @@ pub(crate) struct CommandGate {
     window: FreshnessWindow,
     /// Time of the last announcement of the freshness.
     announced_at: Timestamp,
-    /// Until this time, a right authenticator alone is not enough.
+    /// End of the time under attack, in which commands must be repeated.
     attacked_until: Timestamp,
-    /// A command that must be repeated, and the time until which it must be.
+    /// A command that the sender must repeat, with the latest time of the repetition.
     unconfirmed: Option<(Timestamp, Vec<u8>)>,
     pub(crate) counts: CommandCounts,
 }
@@ -44,13 +45,13 @@ pub(crate) struct CommandGate {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CommandCounts {
-    /// Right authenticator and fresh value.
+    /// Frames with a right authenticator and an unused freshness.
     pub authentic: u64,
-    /// Wrong authenticator.
+    /// Frames with a wrong authenticator.
     pub forged: u64,
-    /// Freshness that was already used, is too old or was not announced.
+    /// Frames whose freshness was already used, is too old or was not announced.
     pub old: u64,
-    /// Right authenticator, but the command must be repeated, because many wrong ones came.
+    /// Frames with a right authenticator whose command must be repeated, because many wrong authenticators arrived.
     pub unconfirmed: u64,
 }
 
@@ -73,7 +74,7 @@ impl CommandGate {
         self.announced_at = now;
     }
 
-    /// Handles a time without listening, or a step of the clock.
+    /// Handles a period in which no frames were received, or a step of the clock.
     pub(crate) fn restart(&mut self, now: Timestamp) {
         self.window.expire();
         self.attacked_until = self.attacked_until.min(now.plus_nanos(FORGED_PERIOD_NS));

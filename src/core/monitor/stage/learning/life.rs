@@ -1,4 +1,5 @@
-//! Remaining useful life: half-cycles update each cell's forecast, and the shortest life is the pack's.
+//! Remaining useful life: half-cycles update each cell's forecast. The pack has the remaining life of the cell whose
+//! life is shortest.
 //!
 //! A forecast uses the measurement from each half-cycle alone, not the learned capacity, because successive learned
 //! capacities share most of their evidence. The error that all half-cycles share (the current sensor's gain) enters as
@@ -14,7 +15,7 @@ use crate::monitor::message::EventKind;
 use crate::monitor::stage::publisher::Publisher;
 use crate::quantity::CellIndex;
 
-/// Standard deviations of a normal distribution between its median and its 5 % quantile.
+/// Number of standard deviations between the median and the 5 % quantile of a normal distribution.
 const LOW_DEVIATIONS: f64 = 1.645;
 
 /// A cell's forecast and its latest result.
@@ -35,8 +36,8 @@ impl CellLife {
         Self { forecast, remaining }
     }
 
-    /// Updates with a half-cycle that ended `since_before_s` after the previous one (`None` = unknown). `update`: its
-    /// capacity update.
+    /// Updates with a half-cycle. `since_before_s`: time from the end of the previous half-cycle to the end of this
+    /// one; `None` = unknown. `update`: the capacity update of this half-cycle.
     pub(crate) fn learn(
         &mut self,
         model: &CellModel,
@@ -104,8 +105,8 @@ impl PackLife {
         Some((cell, self.cells[cell.index()].remaining.ok()?))
     }
 
-    /// Publishes the remaining life after a half-cycle: while it is known, and once when it becomes unknown. `is_new`:
-    /// whether a cell's capacity was measured.
+    /// Publishes the remaining life after a half-cycle, if it is known or has just become unknown. `was_known`: whether
+    /// it was known before the half-cycle. `is_new`: whether the half-cycle measured a cell's capacity.
     pub(crate) fn publish(&self, was_known: bool, is_new: bool, to: &mut Publisher<'_>) {
         let life = self.of_pack();
         if was_known || life.is_some() {
@@ -114,7 +115,7 @@ impl PackLife {
         self.observe(is_new, to);
     }
 
-    /// Restates the lives for another end of life. The alarm value is unknown until new thresholds are set.
+    /// Computes the remaining lives for another end of life. The alarm value is unknown until new thresholds are set.
     pub(crate) fn restate(&mut self, config: &HealthConfig, to: &mut Publisher<'_>) {
         let before = self.of_pack();
         self.cells.iter_mut().for_each(|cell| cell.restate(config));
@@ -125,7 +126,7 @@ impl PackLife {
         }
     }
 
-    /// Passes the shortest life to its rule, as an upper bound while some cell's life is unknown.
+    /// Passes the shortest known life to its rule. While the life of a cell is unknown, the value is an upper bound.
     pub(crate) fn observe(&self, is_new: bool, to: &mut Publisher<'_>) {
         let is_bound = self.of_pack().is_none();
         let cycles = self.shortest().and_then(|(_, life)| life.cycles);

@@ -1,12 +1,12 @@
-//! Decides which alarm is sent next: changes immediately and repeated, raised alarms in turn, all within a budget of
-//! frames.
+//! Decides which alarm is sent next. A changed alarm is sent immediately and then repeated. All raised alarms are also
+//! sent one after another, each once per period (*in turn*). All frames share one budget.
 //!
 //! In: changed alarms, the alarm engine, the time. Out: one alarm at a time, most severe first. The budget is a token
-//! bucket: [`BURST`] frames at once, then one every [`ALARM_DELAY_MS`]. First frames of changes have priority over
-//! frames in turn, which use at most half of the budget. Repetitions come last.
+//! bucket: [`BURST`] frames at once, then one every [`ALARM_DELAY_MS`]. The first frames of changes have priority over
+//! frames in turn, which use at most half of the budget. Repetitions have the lowest priority.
 //!
-//! Deviation: a frame shows the alarm's state when it is sent, not at each change. Effect: if an alarm changes twice
-//! while the budget is used up, the receiver sees only the second change.
+//! Deviation: a frame shows the alarm's state at the time of sending, not at each change. Effect: if an alarm changes
+//! twice while the budget is used up, the receiver sees only the second change.
 
 use std::cmp::Reverse;
 
@@ -16,12 +16,12 @@ use crate::alarm::{Alarm, AlarmEngine, AlarmState, Rule, Severity};
 use crate::can::encode::{ALARM_DELAY_MS, CHANGE_REPETITION_MS, CHANGE_REPETITIONS};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Number of immediate frames after a pause: an event changes the alarms of a few cells, or one rule of each module.
+/// Number of immediate frames after a pause: one event changes the alarms of a few cells, or one alarm per module.
 const BURST: i64 = 20;
-/// Smallest distance of frames in turn, in units of [`ALARM_DELAY_MS`]: the other half of the budget is for changes.
+/// Shortest time between frames in turn, in units of [`ALARM_DELAY_MS`]: half of the budget remains for changes.
 const TURN_DELAYS: u32 = 2;
-/// Maximum number of alarms announced as unknown (17 rules of three severities are 51). Beyond it, none is announced,
-/// but the digest shows their rules.
+/// Maximum number of alarms that are announced as unknown (17 rules with three severities are 51). Further unknown
+/// alarms are not announced, but the digest shows their rules.
 const MAX_UNKNOWN: usize = 64;
 
 const NANOS_PER_MS: i64 = 1_000_000;
@@ -61,7 +61,7 @@ struct ChangedAlarm {
     key: AlarmKey,
     /// Number of frames left to send.
     frames: u32,
-    /// Time of the next one.
+    /// Time of the next frame.
     due: Timestamp,
 }
 
@@ -71,18 +71,18 @@ impl ChangedAlarm {
     }
 }
 
-/// Queue of alarms to send; see the module.
+/// Queue of alarms to send; the module documentation describes the order.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub(crate) struct AlarmQueue {
-    /// Most severe first; each alarm once.
+    /// Changed alarms, most severe first; each alarm at most once.
     changed: Vec<ChangedAlarm>,
     /// Alarms that were announced as unknown and are not yet known again.
     unknown: Vec<AlarmKey>,
     /// The raised alarm that was last sent in turn.
     last: Option<AlarmKey>,
-    /// Time of the next raised alarm in turn; `None` = no alarm is raised.
+    /// Time of the next frame in turn; `None` if no alarm is raised.
     turn: Option<Timestamp>,
-    /// Time from which the budget has a frame.
+    /// Time from which the budget allows a frame.
     free: Timestamp,
 }
 
@@ -92,13 +92,14 @@ impl AlarmQueue {
         !self.unknown.is_empty()
     }
 
-    /// Time between two frames of one raised alarm without changes, s.
+    /// Time between two frames in turn of the same raised alarm, s.
     pub(crate) fn pass_time_s(engine: &AlarmEngine, period_s: f64) -> f64 {
         let count = i64::try_from(engine.count()).unwrap_or(i64::MAX).max(1);
         Timestamp::from_nanos(Self::turn_ns(engine, period_s).saturating_mul(count)).secs()
     }
 
-    /// Time between two frames in turn, ns: all raised alarms in each period, or slower if the budget requires it.
+    /// Time between two frames in turn, ns: short enough to send all raised alarms in each period, unless the budget
+    /// requires more time.
     fn turn_ns(engine: &AlarmEngine, period_s: f64) -> i64 {
         let period_ns = Timestamp::ZERO.plus_secs(period_s).nanos().max(1);
         let count = i64::try_from(engine.count()).unwrap_or(i64::MAX).max(1);
@@ -106,7 +107,7 @@ impl AlarmQueue {
         period_ns.saturating_add(count - 1).checked_div(count).unwrap_or(period_ns).max(least_ns)
     }
 
-    /// Notes an alarm change, which is sent immediately and repeated.
+    /// Adds a changed alarm, which will be sent immediately and repeated.
     pub(crate) fn note_change(&mut self, now: Timestamp, key: AlarmKey) {
         let entry = ChangedAlarm { key, frames: 1 + CHANGE_REPETITIONS, due: now };
         match self.changed.binary_search_by_key(&key, |changed| changed.key) {
@@ -120,7 +121,7 @@ impl AlarmQueue {
         self.take_entry(now, ChangedAlarm::is_first)
     }
 
-    /// The next alarm to send; `None` if none is due or the budget is used up.
+    /// The next alarm to send; `None` if no alarm is due or the budget is used up.
     pub(crate) fn take(&mut self, now: Timestamp, engine: &AlarmEngine, period_s: f64) -> Option<AlarmKey> {
         self.take_changed(now)
             .or_else(|| self.take_turn(now, engine, period_s))
@@ -153,7 +154,7 @@ impl AlarmQueue {
         if due > now || self.free > now {
             return None;
         }
-        // Missed turns are skipped, except those of a late tick.
+        // Skips missed turns, except the few that a late tick causes.
         let earliest = now.plus_nanos(-BURST * DELAY_NS);
         self.turn = Some(due.max(earliest).plus_nanos(step_ns));
         let keys = || engine.raised().map(|alarm| AlarmKey::of(&alarm));
@@ -163,7 +164,7 @@ impl AlarmQueue {
         Some(next)
     }
 
-    /// The next alarm that cannot be judged, within the budget.
+    /// The next alarm to announce as unknown; `None` if there is no such alarm or the budget is used up.
     pub(crate) fn take_unknown(&mut self, now: Timestamp, engine: &AlarmEngine, turn: usize) -> Option<Alarm> {
         let alarm = engine.unknown_alarm(turn).filter(|_| self.free <= now)?;
         let key = AlarmKey::of(&alarm);
@@ -177,7 +178,7 @@ impl AlarmQueue {
         Some(alarm)
     }
 
-    /// Notes a change of each alarm that was announced as unknown and is known again.
+    /// Adds a change for each alarm that was announced as unknown and is known again.
     pub(crate) fn note_known(&mut self, now: Timestamp, engine: &AlarmEngine) {
         let is_open = |key: &AlarmKey| {
             let state = key.find(engine).map(|alarm| alarm.state);
@@ -194,13 +195,13 @@ impl AlarmQueue {
         self.free = self.free.max(now.plus_nanos(-(BURST - 1) * DELAY_NS)).plus_nanos(DELAY_NS);
     }
 
-    /// Time at which something is due and within the budget; `None` = nothing waits.
+    /// Time at which the next frame is due and within the budget; `None` if nothing waits.
     pub(crate) fn next_due(&self) -> Option<Timestamp> {
         let changed = self.changed.iter().map(|changed| changed.due).min();
         changed.into_iter().chain(self.turn).min().map(|due| due.max(self.free))
     }
 
-    /// Number of frames that are due up to `now` without further changes.
+    /// Number of frames that become due up to `now` if no alarm changes.
     pub(crate) fn frames_until(&self, now: Timestamp, engine: &AlarmEngine, period_s: f64) -> u64 {
         let due = |from: Timestamp, step_ns: i64| {
             let past_ns = now.nanos().saturating_sub(from.nanos());
@@ -211,14 +212,14 @@ impl AlarmQueue {
         repeated.fold(turns, u64::saturating_add)
     }
 
-    /// Limits all due times to `now`: after a start, after being asleep, and when the clock was set back.
+    /// Limits all due times to `now`. Called after a start, after a sleep, and after the clock was set back.
     pub(crate) fn restart(&mut self, now: Timestamp) {
         self.free = self.free.min(now);
         self.turn = self.turn.map(|turn| turn.min(now));
         self.changed.iter_mut().for_each(|changed| changed.due = changed.due.min(now));
     }
 
-    /// Limits all due times of a stored state to those after a frame at `now`.
+    /// Limits all due times of a stored state to the times that a frame sent at `now` would give.
     pub(crate) fn limit(&mut self, now: Timestamp, period_s: f64) {
         self.free = self.free.min(now.plus_nanos(DELAY_NS));
         self.turn = self.turn.map(|turn| turn.min(now.plus_secs(period_s)));

@@ -1,4 +1,5 @@
-//! Contents of the digest frame: all raised alarms, the state of every rule, and one threshold in turn.
+//! Contents of the digest frame: a summary of all raised alarms, the state of every rule, and one threshold. Successive
+//! digests show the thresholds one after another.
 //!
 //! In: the alarm engine. Out: [`DigestFields`]. A rule that cannot be judged is shown as unknown, never as "no alarm".
 
@@ -6,7 +7,7 @@ use super::alarm_queue::AlarmQueue;
 use crate::alarm::{AlarmEngine, Rule, RuleSummary, Severity};
 use crate::can::encode::{DigestFields, RuleState, TableChecksum, ThresholdFields};
 
-/// Contents of the digest; `turn` selects the threshold.
+/// Computes the contents of the digest; `turn` selects the threshold.
 pub(crate) fn fields(engine: &AlarmEngine, alarm_period_s: f64, turn: usize) -> DigestFields {
     let mut checksum = TableChecksum::default();
     for alarm in engine.raised() {

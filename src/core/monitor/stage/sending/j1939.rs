@@ -1,8 +1,8 @@
 //! The J1939 node, which sends alarms as trouble codes in addition to the frames of `[output]`.
 //!
 //! In: frames of the node's interface, alarms, ticks. Out: the node's frames and events. If several raised thresholds
-//! share a suspect parameter number, only the most severe is sent, for any cell. Its occurrence count is the largest
-//! one among its alarms.
+//! share a suspect parameter number (SPN), the node sends only the trouble code of the most severe threshold, whichever
+//! cells raised it. The occurrence count of the code is the largest count among the threshold's alarms.
 
 use crate::alarm::AlarmEngine;
 use crate::can::Frame;
@@ -11,7 +11,7 @@ use crate::monitor::config::{AlarmCode, J1939Config};
 use crate::monitor::message::{Event, EventKind, Outputs, Transmit};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// The node, and the trouble codes it sends.
+/// The node, and the trouble codes that it sends.
 #[derive(Debug)]
 pub(crate) struct J1939 {
     config: J1939Config,
@@ -32,7 +32,8 @@ impl J1939 {
         }
     }
 
-    /// Applies other codes to the same node; returns `false` if the node differs.
+    /// Applies a configuration with other trouble codes. Returns `false` and changes nothing if the node itself
+    /// differs.
     pub(crate) fn reconfigure(&mut self, config: &J1939Config) -> bool {
         let is_same = (self.config.bus, self.config.node) == (config.bus, config.node);
         if is_same {
@@ -80,7 +81,7 @@ impl J1939 {
                 self.previously_active.push(code);
             }
         }
-        // The most severe rule comes first, because a list that is too long is cut off at its end.
+        // A list that is too long is cut off at its end, so the most severe codes come first.
         self.previously_active.reverse();
         if is_test_running {
             self.active.push(ActiveCode { code: self.config.test_code, lamp: Lamp::None });

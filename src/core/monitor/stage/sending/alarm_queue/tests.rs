@@ -19,7 +19,7 @@ fn config(rule: Rule, severity: Severity) -> RuleConfig {
     }
 }
 
-/// Rules: warnings for cells, and a severe alarm of the pack.
+/// An engine with two rules: a warning for each cell, and a severe alarm of the pack.
 fn engine() -> AlarmEngine {
     let rules =
         vec![config(Rule::EstimateUntrusted, Severity::Warning), config(Rule::TemperatureHigh, Severity::Severe)];
@@ -40,7 +40,7 @@ fn cell_key(cell: u16) -> AlarmKey {
 
 const PACK_KEY: fn() -> AlarmKey = || AlarmKey::new(Rule::TemperatureHigh, Severity::Severe, None);
 
-/// Frames sent tick by tick from `from_ms` on, for `for_ms`, each with its time, ms.
+/// Frames that ticks from `from_ms` send during `for_ms`, each with its time, ms.
 fn sent(queue: &mut AlarmQueue, engine: &AlarmEngine, from_ms: i64, for_ms: i64) -> Vec<(i64, AlarmKey)> {
     let mut sent = Vec::new();
     for ms in (from_ms..from_ms + for_ms).step_by(10) {
@@ -82,7 +82,7 @@ fn many_changes_stay_within_budget_worst_first() {
         sent(&mut queue, &engine, 10_000, 10_000).into_iter().map(|(ms, key)| (ms - 10_000, key)).collect();
     assert_eq!(sent[0].1, PACK_KEY());
     let first_98: Vec<AlarmKey> = sent[..98].iter().map(|(_, key)| *key).collect();
-    assert!(first_98.is_sorted(), "each once, in order of severity, before any is repeated");
+    assert!(first_98.is_sorted(), "every alarm is sent once, most severe first, before any frame is repeated");
     assert!(sent[97].0 <= 800, "the last first frame leaves after {} ms", sent[97].0);
     for window_ms in [0, 1_000, 3_000, 8_000] {
         let count = sent.iter().filter(|(ms, _)| (window_ms..window_ms + 1_000).contains(ms)).count();
@@ -128,7 +128,7 @@ fn announced_unknown_alarms_are_limited() {
     let (mut queue, mut engine) = (AlarmQueue::default(), engine());
     let mut announced = 0;
     for second in 0..i64::from(CELLS) {
-        // Each time another cell is the first unknown one.
+        // In each round, another cell is the first unknown cell.
         observe(&mut engine, Rule::EstimateUntrusted, Some(u16::try_from(second).unwrap()), Some(1.0));
         announced += u32::from(queue.take_unknown(Timestamp::from_secs(second as f64), &engine, 0).is_some());
     }
