@@ -1,5 +1,5 @@
-//! Everything that interacts with the computer: configuration, log files, sockets, the state store, the service with its
-//! status, control and metrics sockets, and the loops that run the core on recorded logs.
+//! Everything that interacts with the computer: configuration, log files, sockets, the state store, and the service
+//! with its status, control and metrics sockets. The loops that run the core on recorded logs are also here.
 
 pub use packwatch_core::{alarm, can, cell, cell_faults, filter, health, monitor, quantity, sample, sim, wiring};
 

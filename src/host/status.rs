@@ -8,9 +8,9 @@
 //! | `status-stream.sock` | one [`StatusDocument`] as a line of JSON every second, until the client closes |
 //!
 //! * Every user who can reach the sockets may read (mode 0666), because the document contains no secrets and the
-//!   exporter runs as a separate user. With the shipped unit, only root and the exporter can reach the sockets, because
-//!   the service runs as a dynamic user and systemd keeps its folder inside a closed folder. Only the control socket
-//!   can change anything, and other users cannot connect to it.
+//!   exporter runs as a separate user. With the shipped unit, only root and the exporter can reach the sockets. The
+//!   service runs as a dynamic user, and systemd keeps its folder inside a closed folder. Only the control socket can
+//!   change anything, and other users cannot connect to it.
 //! * Once a second the loop copies structs into a draft and offers it. A separate thread serialises the draft and serves the
 //!   clients, so no client affects the loop. A draft offered while the thread is busy is dropped and counted.
 //! * At most [`MAX_CLIENTS`] clients are served. Further clients are rejected immediately and counted. A client that

@@ -1,8 +1,8 @@
 //! Cell model files: reads TOML into a checked [`CellModel`](crate::cell::CellModel) and reports every fault at once.
 //!
-//! A model is accepted only if breakpoints increase strictly, SOC runs from 0 to 1, the open-circuit voltage increases
-//! strictly with SOC at every temperature, tables are complete, and resistances, capacitances and capacities are
-//! positive.
+//! A model is accepted only if its tables are complete, breakpoints increase strictly and SOC runs from 0 to 1. The
+//! open-circuit voltage must increase strictly with SOC at every temperature. Resistances, capacitances and capacities
+//! must be positive.
 //!
 //! | file | content |
 //! | --- | --- |

@@ -13,9 +13,9 @@ use std::time::{Duration, Instant};
 use super::place::with_suffix;
 use super::segments::{SegmentLimits, SegmentWriter};
 
-/// Bytes collected before they are sent to the thread, unless flushed.
+/// Number of bytes that are collected before they are sent to the thread. A flush sends fewer bytes.
 const PIECE_BYTES: usize = 64 * 1024;
-/// Maximum number of waiting pieces: 4 MB, ten seconds of a full 1 Mbit/s bus.
+/// Maximum number of waiting pieces. They take 4 MB, which is ten seconds of a full 1 Mbit/s bus.
 const MAX_PIECES: usize = 64;
 
 /// Longest wait for the last bytes when the file is finished. It is half of the time after which systemd kills the
@@ -42,7 +42,8 @@ impl BackgroundFile {
         Self::start(move |queue| write_all(file, queue))
     }
 
-    /// Like [`create`](Self::create), but in segments that begin with `header`. The text itself contains the first header.
+    /// Like [`create`](Self::create), but writes segments that begin with `header`. The text itself contains the first
+    /// header.
     ///
     /// # Errors
     /// Fails if the first segment cannot be created.
@@ -108,7 +109,7 @@ pub fn ends_in_time<T>(thread: &JoinHandle<T>) -> bool {
         if began.elapsed() > MAX_FINISH {
             return false;
         }
-        // Polling period.
+        // The thread is checked every 5 ms.
         std::thread::sleep(Duration::from_millis(5));
     }
     true

@@ -1,8 +1,8 @@
 //! Reads the key of authenticated frames once at the start, from a systemd credential or a file. The key is never
 //! shown.
 //!
-//! In: the key's location. Out: AES-128-CMAC of any bytes. A key that is missing, readable by others, or not 16 bytes (or 32
-//! hex digits) is an error; the error does not contain the key.
+//! In: the key's location. Out: AES-128-CMAC of any bytes. A key that is missing, or that other users can read, is an
+//! error. So is a key that does not have 16 bytes or 32 hex digits. The error does not contain the key.
 
 use std::ffi::OsString;
 use std::fmt;
@@ -17,7 +17,7 @@ use cmac::{Cmac, KeyInit, Mac as _};
 use crate::can::secoc::Mac;
 use crate::config::KeySource;
 
-/// Bytes of a key.
+/// Length of a key, bytes.
 const KEY_BYTES: usize = 16;
 
 /// A key for AES-128-CMAC.

@@ -1,10 +1,11 @@
 //! Parses and writes candump log lines, the format that `candump -L` writes and `canplayer` reads.
 //!
-//! Input is text that begins with a line; output is a [`Line`] that borrows the interface name. Beyond the usual form
-//! `(1700000000.123456) can0 123#1122`, the parser accepts nanosecond and relative stamps, padded names, the direction suffix
-//! of `-x`, remote frames, raw length codes, CAN FD, error frames, bytes separated by dots, and drop counts of `-d`. CAN XL is
-//! recognised but not decoded. Like canplayer, the parser ignores lines that do not begin with `(` ([`Line::Other`]). A line
-//! that begins with `(` and violates the grammar is a [`LineError`] with its column.
+//! Input is text that begins with a line; output is a [`Line`] that borrows the interface name. The usual form of a
+//! line is `(1700000000.123456) can0 123#1122`. The parser also accepts nanosecond and relative stamps, padded names,
+//! the direction suffix of `-x`, and drop counts of `-d`. It accepts remote frames, raw length codes, CAN FD, error
+//! frames, and bytes separated by dots. CAN XL is recognised but not decoded. Like canplayer, the parser ignores lines
+//! that do not begin with `(` ([`Line::Other`]). A line that begins with `(` and violates the grammar is a
+//! [`LineError`] with its column.
 //!
 //! FD payloads of a length that the bus cannot carry are padded with zeros to the next valid length, as canplayer does.
 
@@ -25,7 +26,7 @@ pub use parser::{LineParser, ParsedLine};
 pub enum Line<'a> {
     /// A frame.
     Frame {
-        /// Its stamp.
+        /// Stamp of the frame.
         time: Timestamp,
         /// The interface's name as written.
         interface: &'a [u8],
@@ -36,7 +37,7 @@ pub enum Line<'a> {
     },
     /// An error frame.
     ErrorFrame {
-        /// Its stamp.
+        /// Stamp of the frame.
         time: Timestamp,
         /// The interface's name.
         interface: &'a [u8],
@@ -45,7 +46,7 @@ pub enum Line<'a> {
     },
     /// A CAN XL frame: valid but not supported.
     Xl {
-        /// Its stamp.
+        /// Stamp of the frame.
         time: Timestamp,
         /// The interface's name.
         interface: &'a [u8],
@@ -72,7 +73,7 @@ pub struct LineError {
 }
 
 impl LineError {
-    /// The error with the text found in `line`, the parsed line.
+    /// Formats the error with the text found in `line`, which is the parsed line.
     pub fn describe(&self, line: &[u8]) -> String {
         const SHOWN: usize = 24;
         let rest = line.get(self.column - 1..).unwrap_or_default();
@@ -95,7 +96,7 @@ pub fn parse_line(line: &[u8]) -> Result<Line<'_>, LineError> {
     LineParser::new(&[]).parse(line).map(|parsed| parsed.line)
 }
 
-/// Parses a stamp `(seconds.fraction)` at the start of `text`; also returns the rest of the text.
+/// Parses a stamp `(seconds.fraction)` at the start of `text`. Also returns the rest of the text.
 ///
 /// # Errors
 /// Fails if the text does not begin with a stamp.
@@ -105,7 +106,8 @@ pub fn parse_stamp(text: &[u8]) -> Result<(Timestamp, &[u8]), LineError> {
     Ok((time, &text[cursor.at..]))
 }
 
-/// Parses an interface's name and a frame at the start of `text`; also returns the rest of the text. `None` = not found.
+/// Parses an interface's name and a frame at the start of `text`. Also returns the rest of the text. `None` = the text
+/// begins with something else.
 pub fn parse_frame(text: &[u8]) -> Option<(&[u8], Frame, &[u8])> {
     let (interface, at) = Cursor { text, at: 0 }.interface().ok()?;
     let mut cursor = Cursor { text, at };
@@ -118,9 +120,9 @@ pub fn parse_frame(text: &[u8]) -> Option<(&[u8], Frame, &[u8])> {
 /// Number of decimals of a written stamp.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StampDigits {
-    /// Six, like `candump -L` (further digits are cut off).
+    /// Six decimals, like `candump -L`. Further digits are cut off.
     Micros,
-    /// Nine, like `candump -L -N`.
+    /// Nine decimals, like `candump -L -N`.
     Nanos,
 }
 

@@ -1,4 +1,5 @@
-//! A clock that never steps: wall time at the program's start plus CLOCK_BOOTTIME since then (which counts suspend).
+//! A clock that never steps: wall time at the program's start plus CLOCK_BOOTTIME since the start (which counts
+//! suspend).
 //!
 //! The kernel stamps received frames with CLOCK_REALTIME, which steps (NTP, a clock set by hand), or with the adapter's
 //! own clock, whose origin is arbitrary. [`StampMapper`] maps both to the program's clock:
@@ -184,8 +185,8 @@ impl StampMapper {
 
     /// Whether a frame that was read at `reading` can have arrived at `arrived_ns`.
     fn possible(&self, arrived_ns: i64, reading: Reading) -> bool {
-        // Tolerance, ns, for stamps older than the moment the socket was last found empty: between stamping and queueing there
-        // is a soft interrupt and, with USB adapters, a batch.
+        // Stamps may be older than the time when the socket was last found empty, by this tolerance, ns. The reason is
+        // the delay between stamping and queueing: a soft interrupt and, with USB adapters, a batch.
         (self.emptied_ns - 20_000_000..=reading.boottime_ns).contains(&arrived_ns)
     }
 }
@@ -264,7 +265,7 @@ mod tests {
             .collect()
     }
 
-    /// A reading by a thread that waits `waits_ns[n]` before its n-th call. Each call takes 1 us.
+    /// Returns the reading of a thread that waits `waits_ns[n]` before its n-th call. Each call takes 1 us.
     fn reading_with_waits(waits_ns: &[i64]) -> Reading {
         let (calls, now_ns) = (Cell::new(0), Cell::new(0));
         Reading::between(|clock| {

@@ -1,10 +1,10 @@
 //! Reads CSV logs: one row per sample, columns found by name, values in packwatch's units.
 //!
-//! Files in the Battery Data Format are recognised by its columns ([`BDF_COLUMNS`]). Positive current is discharge, except
-//! with [`CsvOptions::charge_positive`] and in the Battery Data Format. An empty field means "no reading". A row is bad if a
-//! field is missing or is not a finite number. If there is a section column (`cycle`, `segment` or `ref` unless the user
-//! names one), time restarts at each new value. A table of start times makes the stamps absolute; without it the gap between
-//! sections is unknown.
+//! Files in the Battery Data Format are recognised by its columns ([`BDF_COLUMNS`]). A positive current is a discharge,
+//! except with [`CsvOptions::charge_positive`] and in the Battery Data Format. An empty field means "no reading". A row
+//! is bad if a field is missing or is not a finite number. If there is a section column (`cycle`, `segment` or `ref`
+//! unless the user names one), time restarts at each new value. With a table of start times, the stamps are absolute.
+//! Without it, the gap between sections is unknown.
 
 use std::collections::HashMap;
 use std::io::Read;
@@ -18,8 +18,8 @@ use crate::quantity::{CellIndex, Timestamp};
 /// Options for reading CSV files.
 #[derive(Debug, Clone, Default)]
 pub struct CsvOptions {
-    /// Maps a role to a column: `time`, `current`, `voltage`, `temperature`, `section`. With `{n}` in role and column there is
-    /// one column per cell or sensor, counted from 1.
+    /// Maps a role to a column: `time`, `current`, `voltage`, `temperature`, `section`. If role and column contain
+    /// `{n}`, there is one column per cell or sensor, counted from 1.
     pub columns: Vec<(String, String)>,
     /// Whether the file counts a charging current as positive.
     pub charge_positive: bool,
@@ -171,7 +171,7 @@ impl<'a> SampleColumns<'a> {
     /// Index of the column of a role. If the user maps no column, its name is `ours`.
     ///
     /// # Errors
-    /// Fails if the file does not have it.
+    /// Fails if the file does not have this column.
     pub fn required(&self, role: &str, ours: &'a str) -> Result<usize, TableError> {
         self.find(role, &self.mapped(role).map_or_else(|| self.usual(ours), |column| vec![column]))
     }

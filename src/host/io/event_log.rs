@@ -37,7 +37,7 @@ pub fn write_head(out: &mut impl Write, vehicle: &VehicleIdentity) -> io::Result
     out.write_all(b"\n")
 }
 
-/// Frames of one kind on one interface, logged as counts.
+/// Counts the frames of one kind on one interface, for the log.
 #[derive(Debug, Clone, Copy, Default)]
 struct EventSum {
     reported: Option<Timestamp>,

@@ -1,7 +1,7 @@
 //! The journal records every input of the core in order, so that a replay reproduces the live run.
 //!
 //! The journal is a text file. Frames are candump lines with nanosecond stamps, which `canplayer` can play; `canplayer`
-//! skips the other lines. The first line is `PACKWATCH-JOURNAL 1`. These lines follow:
+//! skips the other lines. The first line is `PACKWATCH-JOURNAL 1`. Further lines have these forms:
 //!
 //! ```text
 //! (1700000000.123456789) can0 123#1122
@@ -39,7 +39,8 @@ pub fn is_mark(line: &[u8]) -> bool {
     line.iter().position(|&b| b == b' ').is_some_and(|space| KEYWORDS.contains(&&line[..space]))
 }
 
-/// Parses a journal line for which [`is_mark`] is true. Returns `None` if `bus` does not know its interface.
+/// Parses a journal line for which [`is_mark`] is true. Returns `None` if `bus` does not know the interface of the
+/// line.
 ///
 /// # Errors
 /// Fails if the line breaks the journal's grammar.
@@ -120,7 +121,7 @@ pub struct JournalWriter<W: Write> {
 }
 
 impl<W: Write> JournalWriter<W> {
-    /// Begins a journal; `interfaces` are the configured names in order.
+    /// Begins a journal. `interfaces` are the configured names in order.
     ///
     /// # Errors
     /// Returns the errors of `out`.
@@ -148,7 +149,7 @@ impl<W: Write> JournalWriter<W> {
     /// Appends one record, as the core receives it.
     ///
     /// # Errors
-    /// Returns the errors of the file; invalid input for an interface that is not configured.
+    /// Returns the errors of the file. Also fails if the interface of the record is not configured.
     pub fn append(&mut self, record: &Record) -> io::Result<()> {
         let time = record.time;
         match &record.kind {
@@ -179,7 +180,7 @@ impl<W: Write> JournalWriter<W> {
         }
     }
 
-    /// Passes everything to the operating system.
+    /// Passes all written bytes to the operating system.
     ///
     /// # Errors
     /// Returns the errors of the file.

@@ -1,4 +1,4 @@
-//! Lines of a plain, gzip or zstd file, read in large blocks and borrowed without copying.
+//! Reads the lines of a plain, gzip or zstd file in large blocks. The lines are borrowed without copying.
 //!
 //! The compression is detected from the content, not from the file name. A line longer than the block is returned as
 //! [`RawLine::TooLong`] and skipped to its end. Bytes read from the file are counted for the progress bar. Compressed
@@ -77,7 +77,7 @@ impl Read for CountingReader {
 pub struct Lines {
     source: Box<dyn Read>,
     buffer: Vec<u8>,
-    /// Unread part of the buffer.
+    /// Start of the unread part of the buffer.
     start: usize,
     end: usize,
     number: u64,
@@ -85,7 +85,7 @@ pub struct Lines {
 }
 
 impl Lines {
-    /// Lines of `source`.
+    /// Creates a reader of the lines of `source`.
     pub fn new(source: Box<dyn Read>) -> Self {
         Self { source, buffer: vec![0; BLOCK], start: 0, end: 0, number: 0, ended: false }
     }

@@ -1,9 +1,10 @@
-//! One stream of core inputs from logs of any format: journals, candump logs, CSV; plain, gzip or zstd.
+//! Reads logs of any format as one stream of core inputs: journals, candump logs and CSV, uncompressed or as gzip or
+//! zstd.
 //!
-//! The first line decides the format (CSV also by file name). Several logs are read one after another on one clock. If
-//! a log, or a CSV section without a start time, begins before the end of the records already read, an unknown gap
-//! follows these records, and the log or section is moved to one second after them. [`LogCounts`] counts everything
-//! that does not become a record.
+//! The first line decides the format (CSV also by file name). Several logs are read one after another on one clock. A
+//! log, or a CSV section without a start time, may begin before the latest record already read. In this case, an
+//! unknown gap follows that record, and the log or section is moved to one second after it. [`LogCounts`] counts
+//! everything that does not become a record.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
@@ -33,7 +34,7 @@ const MAX_FOREIGN_NAMES: usize = 64;
 /// Maximum number of interfaces, configured and adopted together. Usual logs have fewer than ten.
 pub const MAX_ADOPTED: usize = 64;
 
-/// Encodes the values of a CSV row in the frames that carry them; returns how many values no frame can carry.
+/// Encodes the values of a CSV row in the frames that carry them. Returns the number of values that no frame can carry.
 pub type RowEncoder = Box<dyn FnMut(&[(Channel, Option<f64>)], &mut Vec<(BusIndex, Frame)>) -> usize>;
 
 /// Options for reading logs.
@@ -48,7 +49,7 @@ pub struct LogOptions {
     pub encode_row: RowEncoder,
 }
 
-/// Counts of lines, frames, and of everything that did not become a record.
+/// Counts of lines, of frames, and of everything that did not become a record.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct LogCounts {
     /// Lines and CSV rows read, including bad ones.
@@ -290,7 +291,7 @@ impl ReadState {
             && let Ok(LineHead { time, interface, bus, rest }) = self.parser.parse_head(text)
         {
             let time = time.plus_nanos(self.shift_ns);
-            // Two assignments, so that the usual frame is built in place instead of being copied.
+            // The frame is assigned in two places, so that the usual frame is built in place instead of being copied.
             let (len, is_known) = if let (Some(bus), Some((frame, len))) = (bus, rest.usual_frame_and_end()) {
                 *slot = Record::frame(time, bus, &frame);
                 (len, true)
@@ -357,7 +358,7 @@ impl ReadState {
                     return Ok(None);
                 }
             };
-            // Header of the next segment.
+            // This line is the header of the next segment.
             if journal && number > 1 && bytes == journal::HEADER.as_bytes() {
                 continue;
             }
@@ -409,7 +410,7 @@ impl ReadState {
         }
     }
 
-    /// The interface's number; unconfigured interfaces are counted.
+    /// Returns the interface's number. Unconfigured interfaces are counted.
     fn bus(&mut self, interface: &[u8]) -> Option<BusIndex> {
         let name = String::from_utf8_lossy(interface);
         if let Some(index) = self.interfaces.iter().position(|known| *known == name) {

@@ -10,7 +10,7 @@ pub enum PlaceSetting {
     Standard,
     /// The socket or the stored state is switched off.
     Off,
-    /// This path; if a socket cannot be created there, the daemon does not start.
+    /// The given path. If a socket cannot be created there, the daemon does not start.
     At(PathBuf),
 }
 

@@ -6,7 +6,7 @@ use std::path::Path;
 use crate::io::result_file::ResultFile;
 use crate::monitor::Snapshot;
 
-/// Stores a state. After a power cut the file contains either the old or the new state, complete.
+/// Stores a state. After a power cut the file contains either the complete old state or the complete new state.
 ///
 /// # Errors
 /// Fails if the file cannot be written; the message names it.

@@ -2,7 +2,8 @@
 
 use crate::quantity::Timestamp;
 
-/// Parses decimal seconds (`12.5`, `-3`, `1e3`) without losing digits; `None` if it is not a finite number.
+/// Parses decimal seconds (`12.5`, `-3`, `1e3`) without losing digits. Returns `None` if the text is not a finite
+/// number.
 pub fn parse_seconds(text: &[u8]) -> Option<Timestamp> {
     let text = text.trim_ascii();
     parse_exact(text).or_else(|| {
@@ -11,7 +12,7 @@ pub fn parse_seconds(text: &[u8]) -> Option<Timestamp> {
     })
 }
 
-/// Parses digits with at most nine decimals, exactly; `None` for every other form.
+/// Parses digits with at most nine decimals exactly. Returns `None` for every other form.
 fn parse_exact(text: &[u8]) -> Option<Timestamp> {
     let (negative, digits) = match text.strip_prefix(b"-") {
         Some(rest) => (true, rest),
@@ -32,7 +33,8 @@ fn parse_exact(text: &[u8]) -> Option<Timestamp> {
     Some(Timestamp::from_nanos(if negative { -nanos } else { nanos }))
 }
 
-/// Parses `2008-04-02T13:08:17.921` as UTC (a space instead of the T, a final Z and missing seconds are allowed), or seconds.
+/// Parses seconds, or a date such as `2008-04-02T13:08:17.921` in UTC. A space instead of the T, a final Z and missing
+/// seconds are allowed.
 pub fn parse_stamp(text: &str) -> Option<Timestamp> {
     let text = text.trim();
     match text.split_once(['T', ' ']) {
@@ -56,7 +58,7 @@ fn parse_iso(date: &str, time: &str) -> Option<Timestamp> {
     Some(seconds.plus_nanos(whole.checked_mul(1_000_000_000)?))
 }
 
-/// A number of at most nine digits, so that later calculations cannot overflow.
+/// Parses a number of at most nine digits, so that later calculations cannot overflow.
 fn number(text: &str) -> Option<i64> {
     (text.len() <= 9 && text.bytes().all(|b| b.is_ascii_digit())).then(|| text.parse().ok())?
 }
@@ -70,7 +72,7 @@ fn days_from_epoch(year: i64, month: i64, day: i64) -> i64 {
     era * 146_097 + of_era * 365 + of_era / 4 - of_era / 100 + of_year - 719_468
 }
 
-/// A point in time for readers, UTC, to the second: `2008-04-02T13:08:17Z`.
+/// Formats a point in time in UTC, to the second: `2008-04-02T13:08:17Z`.
 pub fn format_utc(time: Timestamp) -> String {
     let seconds = time.nanos().div_euclid(1_000_000_000);
     let (days, of_day) = (seconds.div_euclid(86_400), seconds.rem_euclid(86_400));
@@ -128,7 +130,7 @@ mod tests {
 
     #[test]
     fn iso_stamps_are_utc() {
-        // From `date -u -d ... +%s`.
+        // The expected values are from `date -u -d ... +%s`.
         let secs = |text: &str| parse_stamp(text).map(|t| t.nanos() / 1_000_000);
         assert_eq!(secs("2008-04-02T13:08:17.921"), Some(1_207_141_697_921));
         assert_eq!(secs("1970-01-01 00:00"), Some(0));

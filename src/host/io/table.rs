@@ -20,7 +20,7 @@ use crate::quantity::Timestamp;
 /// Default section columns: time restarts at each new value of such a column.
 pub const PART_COLUMNS: [&str; 3] = ["cycle", "segment", "ref"];
 
-/// Allowed forms of a point in time.
+/// Allowed forms of a point in time, for messages.
 const STAMP: &str = "like 2008-04-02T13:08:17.921 or seconds";
 
 /// A table that cannot be read or a field that cannot be used, with its position.
@@ -78,7 +78,7 @@ pub struct Row<'t> {
 }
 
 impl Table {
-    /// Opens a file and reads its header; `-` is standard input.
+    /// Opens a file and reads its header. `-` is standard input.
     ///
     /// # Errors
     /// Fails if the file cannot be read.
@@ -89,7 +89,7 @@ impl Table {
         Self::new(source, file, Quotes::Enclose)
     }
 
-    /// Reads the header of decompressed text; `file` is its name in messages.
+    /// Reads the header of decompressed text. `file` is the name in messages.
     ///
     /// # Errors
     /// Fails if the source cannot be read.
@@ -112,7 +112,7 @@ impl Table {
     /// The next row; `None` at the end.
     ///
     /// # Errors
-    /// Fails if the source fails, for example a damaged compressed file.
+    /// Fails if the source fails, for example because a compressed file is damaged.
     pub fn next_row(&mut self) -> Result<Option<Row<'_>>, TableError> {
         self.since_row.set(0);
         let more = self.reader.read_byte_record(&mut self.record).map_err(|e| damaged(&self.header.file, &e))?;
@@ -179,7 +179,7 @@ impl<'t> Row<'t> {
     /// A finite number; `None` for an empty field.
     ///
     /// # Errors
-    /// Fails if the field is neither.
+    /// Fails if the field is neither a finite number nor empty.
     pub fn number(&self, column: usize) -> Result<Option<f64>, TableError> {
         self.number_in(column, f64::MIN..=f64::MAX, "a finite number or an empty field")
     }
@@ -202,7 +202,7 @@ impl<'t> Row<'t> {
     /// A point in time: a date, or seconds.
     ///
     /// # Errors
-    /// Fails if the field is neither.
+    /// Fails if the field is neither a date nor seconds.
     pub fn stamp(&self, column: usize) -> Result<Timestamp, TableError> {
         stamp::parse_stamp(&self.text(column)).ok_or_else(|| self.fault(column, STAMP))
     }

@@ -43,8 +43,8 @@ impl Ticks {
     }
 
     /// Announces a record at `time`. The caller then calls [`pop`](Self::pop) until `None`, and processes the record.
-    /// Returns whether the recorder was asleep before it (the first record, or one after a hole). A record slightly
-    /// older than the latest record (interfaces merged out of order) causes no tick.
+    /// Returns whether the recorder was asleep before this record, that is, whether it is the first record or follows a
+    /// hole. A record slightly older than the latest record (interfaces merged out of order) causes no tick.
     #[inline]
     pub fn advance(&mut self, time: Timestamp) -> bool {
         let time_ns = time.nanos();
@@ -70,8 +70,8 @@ impl Ticks {
         asleep
     }
 
-    /// Ends the log, or starts an unknown gap: the remaining ticks up to the latest record may be popped, and the next
-    /// record wakes the recorder regardless of its stamp.
+    /// Ends the log, or starts an unknown gap. The remaining ticks up to the latest record may be popped. The next
+    /// record wakes the recorder, regardless of its stamp.
     pub fn sleep(&mut self) {
         if let Some(latest_ns) = self.latest_ns.take() {
             self.limit_ns = latest_ns.saturating_add(1);
@@ -117,7 +117,7 @@ mod tests {
 
     const EVERY: Option<Timestamp> = Some(Timestamp::from_nanos(i64::MIN));
 
-    /// The ticks, ms, between records at `records` ms and at the end of the log.
+    /// Returns the times of the ticks, ms, for records at `records` ms, up to the end of the log.
     fn ticks_ms(records: &[i64], due: Option<Timestamp>) -> Vec<i64> {
         let mut ticks = Ticks::new(10, 0.05);
         let mut made = Vec::new();
@@ -164,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn clock_set_back_moves_the_grid() {
+    fn clock_set_back_restarts_tick_grid() {
         assert_eq!(ticks_ms(&[9_000_000, 9_000_015, 5_003, 5_025], EVERY), [9_000_000, 9_000_010, 5_003, 5_010, 5_020]);
     }
 
@@ -185,13 +185,13 @@ mod tests {
     }
 
     #[test]
-    fn ticks_before_the_due_time_are_skipped() {
+    fn ticks_before_due_time_are_skipped() {
         assert_eq!(ticks_ms(&[0, 45], Some(Timestamp::from_nanos(21_000_000))), [30, 40]);
         assert_eq!(ticks_ms(&[0, 45], None), [0i64; 0]);
     }
 
     #[test]
-    fn skipping_keeps_the_grid() {
+    fn skipped_ticks_keep_tick_grid() {
         let mut ticks = Ticks::new(10, 30.0);
         ticks.advance(Timestamp::from_nanos(3_000_000));
         while ticks.pop(None).is_some() {}

@@ -15,14 +15,15 @@ use super::place::first_folder;
 /// The folder of the service, and of a daemon that root starts from a shell.
 const STANDARD_FOLDER: &str = "/run/packwatch";
 
-/// Default folder of a daemon's sockets: created by systemd, else `/run/packwatch` for root, else the user's own folder.
+/// Default folder of a daemon's sockets: the folder that systemd created, else `/run/packwatch` for root, else the
+/// user's own folder.
 pub fn runtime_folder() -> PathBuf {
     let is_root = || std::fs::metadata("/proc/self").is_ok_and(|process| process.uid() == 0);
     let own = || own_folder().filter(|_| !is_root());
     first_folder("RUNTIME_DIRECTORY").or_else(own).unwrap_or_else(|| PathBuf::from(STANDARD_FOLDER))
 }
 
-/// Default folder of the sockets for clients: the service's if it exists, else the user's own.
+/// Default folder of the sockets for clients: the folder of the service if it exists, else the user's own folder.
 pub fn client_folder() -> PathBuf {
     let standard = PathBuf::from(STANDARD_FOLDER);
     let own = || own_folder().filter(|own| !standard.exists() && own.exists());
@@ -33,11 +34,11 @@ fn own_folder() -> Option<PathBuf> {
     Some(first_folder("XDG_RUNTIME_DIR")?.join("packwatch"))
 }
 
-/// Creates the default folder if systemd did not. If that fails, the bind fails too and is reported.
+/// Creates the default folder if systemd has not created it. If this fails, the bind fails too and is reported.
 fn make_default_folder(path: &Path) {
     let Some(folder) = path.parent().filter(|folder| *folder == runtime_folder()) else { return };
     if first_folder("RUNTIME_DIRECTORY").is_none() && std::fs::create_dir(folder).is_ok() {
-        // Others may list this folder; the modes of the sockets decide who may connect.
+        // Other users may list this folder. The modes of the sockets decide who may connect.
         let _ = std::fs::set_permissions(folder, Permissions::from_mode(0o755));
     }
 }
@@ -139,7 +140,7 @@ fn inode(path: &Path) -> io::Result<(u64, u64)> {
 
 impl Drop for SocketFile {
     fn drop(&mut self) {
-        // Another daemon may have created its own socket there.
+        // Another daemon may have created its own socket at this path.
         if inode(&self.path).is_ok_and(|found| found == self.inode)
             && let Err(error) = std::fs::remove_file(&self.path)
         {

@@ -2,8 +2,8 @@
 //!
 //! Only one reading runs at a time. Signals that arrive during a reading cause one further reading, at least
 //! [`MIN_PERIOD`] after the start of the last reading. Many signals in a short time therefore neither fill the log nor
-//! block the loop, and the configuration that applies at the end was read after the last signal. A change of interfaces
-//! or store requires a restart and is rejected with this hint. The core decides about all other changes
+//! block the loop. The configuration that applies at the end is read after the last signal. A change of interfaces or
+//! store requires a restart and is rejected with this hint. The core decides about all other changes
 //! ([`Monitor::reconfigure`](crate::monitor::Monitor::reconfigure)).
 
 use std::fmt;

@@ -1,9 +1,9 @@
 //! Holds frames until the results that they announce are on disk.
 //!
-//! During a commit, every announcing frame ([`Transmit::announces`]) waits. These are the frames of the input that led
-//! to the result, the cyclic frames that would repeat the result, and the later packets of a transfer whose first
-//! packet waits. The frames are sent in order. The status frame is not held, because its state of charge and validity
-//! must not become old. It contains only the number of raised alarms.
+//! During a commit, every announcing frame ([`Transmit::announces`]) waits. Announcing frames are the frames of the
+//! input that led to the result, and the cyclic frames that would repeat it. If the first packet of a transfer waits,
+//! its later packets wait too. The frames are sent in order. The status frame is not held, because its state of charge
+//! and validity must not become old. It contains only the number of raised alarms.
 //!
 //! No frame waits longer than [`MAX_WAIT`], because an alarm on the bus is more important than an alarm on disk.
 

@@ -4,14 +4,14 @@
 //! | --- | --- | --- |
 //! | `pack` | a pack that was or is connected | always |
 //! | `moment` | the time of a commit: wall clock, inputs' clock, boot, pack | as long as its segment |
-//! | `half_cycle`, `capacity`, `loss_modes`, `remaining_life`, `model`, `alarm`, `reset` | a charge or discharge of one cell, a learned capacity, a cell's loss modes, a forecast, a change of the cell model, a change of an alarm, a reset; numbered across the tables | until the segment is deleted, oldest first |
+//! | `half_cycle`, `capacity`, `loss_modes`, `remaining_life`, `model`, `alarm`, `reset` | one table per kind of event: a charge or discharge of a cell, a learned capacity, loss modes of a cell, a forecast, a model change, an alarm change, a reset. Rows are numbered across these tables | until the segment is deleted, oldest first |
 //! | `segment` | the rows of a day, with the end of their hash chain (`segments`) | always |
 //! | `meta` | one row: the number of segments, the vehicle | |
 //!
 //! Cells count from 0, times are nanoseconds. `PRAGMA user_version` is the format.
 //!
-//! * One file in write-ahead mode with `synchronous=FULL`: a commit that has returned survives a power cut, and a commit that
-//!   has not returned leaves no trace.
+//! * The database is one file in write-ahead mode with `synchronous=FULL`. A commit that has returned survives a power
+//!   cut, and a commit that has not returned leaves no trace.
 //! * A damaged file and an inaccessible file give different errors. A file with another format counts as damaged.
 
 use std::fs::File;
@@ -251,14 +251,14 @@ impl Database {
         Ok(self.pack)
     }
 
-    /// The connection, for tests.
+    /// Returns the connection, for tests.
     #[cfg(test)]
     pub(super) fn connection(&self) -> &Connection {
         &self.connection
     }
 }
 
-/// The format of an open database.
+/// Returns the format of an open database.
 pub(super) fn format(connection: &Connection) -> rusqlite::Result<i32> {
     connection.query_row("PRAGMA user_version", [], |row| row.get(0))
 }

@@ -265,7 +265,7 @@ mod tests {
             assert!((64 + 22..=64 + 24).contains(&rows), "{rows} rows");
             history_filter
         };
-        // Constant, and slowly decreasing.
+        // The remaining life is constant, then slowly decreases.
         day(0.0);
         let mut history_filter = day(0.01);
         assert_eq!(take(&mut history_filter, 86_341.0, &[half_cycle(0), remaining_life(700.0)]), Some(2), "far");

@@ -85,7 +85,7 @@ impl HistoryReader {
     /// Opens the store in a folder.
     ///
     /// # Errors
-    /// Fails if it does not exist or cannot be read; the error names the file.
+    /// Fails if the store does not exist or cannot be read. The error names the file.
     pub fn open(folder: &Path) -> Result<Self, String> {
         let path = folder.join(DATABASE);
         let named = |error: String| format!("{}: {error}", path.display());
@@ -117,7 +117,7 @@ impl HistoryReader {
     /// # Errors
     /// Fails if the file cannot be read.
     pub fn extent(&self) -> Result<HistoryExtent, String> {
-        // A single statement, so that a daemon cannot write in between.
+        // A single statement reads all counts, so that a daemon cannot write in between.
         let sql = "SELECT (SELECT coalesce(max(id), 0) FROM pack), (SELECT count(*) FROM half_cycle), coalesce(sum(half_cycles * \
                    deleted), 0), coalesce(sum(half_cycles), 0) FROM segment";
         let extent = self.connection.query_row(sql, [], |row| {

@@ -1,8 +1,8 @@
 //! Segments of the history. A segment has the rows of a day, but at most about 10,000 rows. Rows are chained by hash.
 //!
 //! Every row has a number, counted across the tables. The hash of a segment is the SHA-256 chain over its rows,
-//! starting from the hash of the segment before. It reveals rows that were changed, removed, inserted or moved. The
-//! number of segments, stored separately, reveals segments cut off at the end. The oldest segments are deleted as a
+//! starting from the hash of the segment before. The hash reveals rows that were changed, removed, inserted or moved.
+//! The number of segments, stored separately, reveals segments cut off at the end. The oldest segments are deleted as a
 //! whole but keep their hashes, so the remaining ones can still be verified. A person who can write the file can
 //! recompute the whole chain. A copy of the chain's end that is kept elsewhere reveals this too ([`contradiction`]).
 
@@ -43,7 +43,7 @@ pub(super) struct Segment {
     pub last_moment: i64,
     /// Number of half-cycles among the rows.
     pub half_cycles: i64,
-    /// Whether the rows were deleted because of their number or age.
+    /// Whether the rows were deleted because of the limits on rows and age.
     pub is_deleted: bool,
     /// Hash of the last row.
     pub hash: Hash,
@@ -338,7 +338,7 @@ pub(super) fn intact(connection: &Connection, after: i64, limit: usize) -> rusql
 /// A chain's end that was noted elsewhere, written `ROWS:HASH`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NotedHead {
-    /// Number of rows at that time.
+    /// Number of rows when the end was noted.
     pub rows: i64,
     /// Hash of the last row, 64 hexadecimal digits.
     pub hash: String,

@@ -32,7 +32,7 @@ pub(super) const FORMAT: u32 = 1;
 pub(super) const FILES: [&str; 2] = ["state-a.json.zst", "state-b.json.zst"];
 /// Name of the file of a state that was set aside.
 pub(super) const ASIDE: &str = "state-aside.json.zst";
-/// Name of a file while it is being written.
+/// Name of a state file while it is being written.
 const PART: &str = "state.json.zst.part";
 /// Log and history text about a state that is set aside.
 pub(super) const SET_ASIDE: &str = "set aside for the first start at which it fits";
@@ -41,7 +41,7 @@ pub(super) const SET_ASIDE: &str = "set aside for the first start at which it fi
 const LEVEL: i32 = 1;
 /// Largest size of the JSON, bytes: ten times the size for the largest pack.
 const MAX_JSON_BYTES: u64 = 64 << 20;
-/// Head of the frame with the hash: the magic number of a skippable zstd frame, and its length.
+/// Head of the frame that contains the hash: the magic number of a skippable zstd frame, and the length of the hash.
 const HASH_HEAD: [u8; 8] = [0x50, 0x2A, 0x4D, 0x18, 32, 0, 0, 0];
 
 /// A state, its time, and its folder and pack.
@@ -68,7 +68,7 @@ pub(super) struct StateDocument {
 pub(super) enum StateFault {
     /// The file has changed since it was written.
     Damaged(String),
-    /// Another version of the program wrote it.
+    /// Another version of the program wrote the state.
     Unfit(String),
 }
 

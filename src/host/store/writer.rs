@@ -1,11 +1,13 @@
 //! The thread that writes to the disk, and the queue that it shares with the service loop.
 //!
-//! The loop queues rows and the latest state. The thread takes everything queued, commits the rows, writes the state if it is due, and
-//! reports the last ticket that is completely on disk. It retries a failing disk after increasing pauses; until then every ticket is
-//! answered at once as failed. A failing database does not prevent the state from being written.
+//! The loop queues rows and the latest state. The thread takes all queued work, commits the rows, and writes the state if
+//! it is due. Then it reports the last ticket that is completely on disk. It retries a failing disk after increasing pauses.
+//! During a pause, every ticket is answered at once as failed. A failing database does not prevent the state from being
+//! written.
 //!
-//! A start repeats the alarm changes in the rows that are newer than the stored state. This requires that the rows continue the state
-//! in the same database. So the first rows after a start, after a failure and in a new database are written together with a state.
+//! A start repeats the alarm changes in the rows that are newer than the stored state. This requires that the rows
+//! continue the state in the same database. The first rows after a start, after a failure and in a new database are
+//! therefore written together with a state.
 
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -107,7 +109,7 @@ impl WriteQueue {
         self.lock().backlog.push(rows);
     }
 
-    /// Notes that the stored state was not restored, so that the next one does not overwrite it.
+    /// Notes that the stored state was not restored, so that the next state does not overwrite it.
     pub(super) fn set_aside(&self) {
         self.lock().sets_aside = true;
     }
@@ -181,7 +183,7 @@ pub(super) struct Retry {
 }
 
 impl Retry {
-    /// Notes a failure now.
+    /// Notes that an attempt has failed now.
     pub(super) fn after_failure(&mut self) {
         let pause = self.pause.map_or(FIRST_PAUSE, |pause| (2 * pause).min(LAST_PAUSE));
         (self.pause, self.at) = (Some(pause), Some(Instant::now() + pause));

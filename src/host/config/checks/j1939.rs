@@ -100,7 +100,8 @@ fn code(alarm: &Alarm, severity: Severity) -> Option<AlarmCode> {
 /// The default failure mode identifier of an alarm, from J1939-73, appendix A.
 fn failure_mode(rule: Rule, severity: Severity) -> u8 {
     match rule {
-        // Abnormal update rate; received network data in error; data erratic, intermittent or incorrect; condition exists.
+        // These FMIs mean: 9 abnormal update rate, 19 received network data in error, 2 data erratic, intermittent or
+        // incorrect, 31 condition exists.
         Rule::InputMissing => 9,
         Rule::BusFault => 19,
         Rule::InputImplausible | Rule::BmsDisagrees | Rule::ChannelFaulty => 2,

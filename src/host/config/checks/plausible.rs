@@ -1,4 +1,5 @@
-//! Checks for settings that parse but cannot be intended: signals that extend beyond their message or share bits, wrong units, empty ranges, and the capacity of another cell.
+//! Checks for settings that parse but cannot be intended. Examples are signals that extend beyond their message or
+//! share bits, wrong units, empty ranges, and the capacity of another cell.
 //!
 //! In: the tables, the signals found, the cell model. Out: faults for certain errors, warnings for unlikely
 //! values. A configured `scale` or `offset` overrides the DBC's unit.

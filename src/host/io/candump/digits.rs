@@ -1,11 +1,12 @@
-//! Converts the digits of a candump line several bytes at a time: as lanes of a `u64` (first byte lowest), or in loops that
-//! compile to vector instructions.
+//! Converts the digits of a candump line several bytes at a time. The functions use lanes of a `u64` (first byte
+//! lowest), or loops that compile to vector instructions.
 
 /// 1 in every byte of a word, and the highest bit of every byte.
 const ONES: u64 = 0x0101_0101_0101_0101;
 const HIGHS: u64 = 0x80 * ONES;
 
-/// Values of the hex digits; for other characters a value larger than any number with that many digits.
+/// Values of the hex digits. The value of any other character is larger than any number that the parser reads with
+/// these digits.
 pub(super) static HEX: [u32; 256] = {
     let mut table = [u16::MAX as u32; 256];
     let mut digit = 0;
@@ -30,7 +31,7 @@ pub(super) fn six_decimals(text: u64) -> Option<i64> {
     lanes(text ^ u64::from_le_bytes(*b"000000) "), 0x7F7F_7676_7676_7676).map(|digits| number::<1000>(digits << 16))
 }
 
-/// The number of eight decimal digits, most significant first.
+/// Converts eight decimal digits, most significant first, to a number.
 #[inline(always)]
 pub(super) fn eight_digits(text: u64) -> Option<i64> {
     lanes(text ^ (u64::from(b'0') * ONES), 0x76 * ONES).map(number::<1>)
@@ -42,7 +43,8 @@ fn lanes(lanes: u64, wrong: u64) -> Option<u64> {
     ((lanes | lanes.wrapping_add(wrong)) & HIGHS == 0).then_some(lanes)
 }
 
-/// The number of eight lanes of 0 to 9, most significant first, times `UNIT`; the result must be below 2^32.
+/// Converts eight lanes of 0 to 9, most significant first, to a number and multiplies it by `UNIT`. The result must be
+/// below 2^32.
 #[inline(always)]
 fn number<const UNIT: u64>(digits: u64) -> i64 {
     let pairs = (digits.wrapping_mul(10 << 8 | 1) >> 8) & 0x00FF_00FF_00FF_00FF;
@@ -50,8 +52,8 @@ fn number<const UNIT: u64>(digits: u64) -> i64 {
     (fours.wrapping_mul((10_000 * UNIT) << 32 | UNIT) >> 32).cast_signed()
 }
 
-/// Eight bytes from sixteen hex digits, first byte lowest. Every step is a loop over sixteen bytes, which compiles to one
-/// vector instruction.
+/// Converts sixteen hex digits to eight bytes, first byte lowest. Every step is a loop over sixteen bytes, which
+/// compiles to one vector instruction.
 #[inline(always)]
 pub(super) fn eight_hex_bytes(text: [u8; 16]) -> Option<u64> {
     let (mut values, mut wrong) = ([0; 16], [0; 16]);

@@ -1,4 +1,4 @@
-//! Parser of candump lines.
+//! Parses candump lines.
 //!
 //! In: text that begins with a line; the parser ignores what follows the line feed. Out: the line, or the first
 //! position at which it violates the grammar. Nothing is allocated and nothing is read twice. Parts that nearly all
@@ -59,7 +59,8 @@ pub struct LineParser {
 pub struct ParsedLine<'a> {
     /// The line.
     pub line: Line<'a>,
-    /// Bytes before the line feed, or of the whole text if it has none; 0 for [`Line::Other`] and [`Line::Dropped`].
+    /// Number of bytes before the line feed, or of the whole text if there is no line feed. It is 0 for [`Line::Other`]
+    /// and [`Line::Dropped`].
     pub len: usize,
 }
 
@@ -118,7 +119,7 @@ impl LineParser {
         Ok(LineHead { time, interface, bus, rest })
     }
 
-    /// The stamp and the space after it.
+    /// Parses the stamp and the space after it.
     #[inline(always)]
     fn stamp(&mut self, cursor: &mut Cursor<'_>) -> Result<Timestamp, LineError> {
         if let Some(text) = cursor.text.first_chunk::<24>()
@@ -133,12 +134,12 @@ impl LineParser {
         Ok(time)
     }
 
-    /// Any stamp and the space after it, and the position after both.
+    /// Parses a stamp of any form and the space after it. Also returns the position after both.
     #[inline(never)]
     fn other_stamp(&mut self, mut cursor: Cursor<'_>) -> Result<(Timestamp, usize), LineError> {
         let time = cursor.stamp()?;
         let (text, second_ns) = (cursor.text, time.nanos() - time.nanos().rem_euclid(1_000_000_000));
-        // Remember only stamps of ten digits, and only if adding a fraction of a second cannot overflow.
+        // A stamp is remembered only if it has ten digits and adding a fraction of a second cannot overflow.
         if text.get(11) == Some(&b'.') && text.get(1) != Some(&b'-') && second_ns.checked_add(1_000_000_000).is_some() {
             (self.head, self.second_ns) = ([word(text, 0), word(text, 4)], second_ns);
         }
@@ -146,7 +147,7 @@ impl LineParser {
         Ok((time, cursor.at))
     }
 
-    /// The interface's name, its number if known, and the space after it.
+    /// Parses the interface's name and the space after it. Returns the name, and its number if known.
     #[inline(always)]
     fn interface<'a>(&self, cursor: &mut Cursor<'a>) -> Result<(&'a [u8], Option<BusIndex>), LineError> {
         // The position after the name depends on its length. If the name is compared with known names, the processor
@@ -166,7 +167,8 @@ impl LineParser {
     }
 }
 
-/// The fraction of a ten-digit stamp in nanoseconds, and the length of the stamp and the space after it.
+/// Parses the fraction of a ten-digit stamp. Returns it in nanoseconds, with the length of the stamp and the space
+/// after it.
 #[inline(always)]
 fn fraction(text: &[u8; 24]) -> Option<(i64, usize)> {
     if text[18] == b')' {
@@ -251,7 +253,7 @@ impl<'a> Cursor<'a> {
         Ok(Timestamp::from_nanos(if negative { -total } else { total }))
     }
 
-    /// Decimal digits (saturating far above any stamp) and their number.
+    /// Parses decimal digits. Returns the number, which saturates far above any stamp, and the count of digits.
     fn decimal(&mut self) -> (i64, usize) {
         let start = self.at;
         let mut value: i64 = 0;
@@ -268,7 +270,7 @@ impl<'a> Cursor<'a> {
         Ok(())
     }
 
-    /// Any interface name with the spaces around it, and the position after them.
+    /// Parses any interface name with the spaces around it. Also returns the position after them.
     #[inline(never)]
     pub(super) fn interface(mut self) -> Result<(&'a [u8], usize), LineError> {
         while self.take(b' ') {}
@@ -303,7 +305,7 @@ impl<'a> Cursor<'a> {
         Ok((body, transmitted, self.at))
     }
 
-    /// A frame and the spaces before it.
+    /// Parses a frame and the spaces before it.
     pub(super) fn frame(&mut self) -> Result<Body, LineError> {
         while self.take(b' ') {}
         let is_delimited = |digits: usize| self.text.get(self.at + digits) == Some(&b'#');

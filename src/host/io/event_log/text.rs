@@ -1,10 +1,10 @@
-//! Channels and commands in words, for log lines. Cells and sensors are counted from 1, as everywhere for users.
+//! Channels and commands in words, for log lines. Cells and sensors are counted from 1, as in all texts for users.
 
 use crate::alarm::Selector;
 use crate::monitor::Command;
 use crate::quantity::Channel;
 
-/// The channel: `cell voltage 73`.
+/// The channel in words, such as `cell voltage 73`.
 pub(super) fn channel(channel: Channel) -> String {
     match channel {
         Channel::Contactor => "contactor".to_owned(),
@@ -20,7 +20,7 @@ pub(super) fn channel(channel: Channel) -> String {
     }
 }
 
-/// The command: `clear capacity_low of cell 73`.
+/// The command in words, such as `clear capacity_low of cell 73`.
 pub fn command(command: &Command) -> String {
     match command {
         Command::Acknowledge(which) => format!("acknowledge {}", selected(which)),

@@ -6,7 +6,7 @@ use super::*;
 
 const HEADER: &str = "HEAD";
 
-/// Lines that compress badly, so that segments fill.
+/// Creates lines that compress badly, so that segments fill.
 fn text(lines: u64) -> Vec<String> {
     let mut state = 1_u64;
     let mut number = move || {
@@ -95,7 +95,7 @@ fn torn_segment_is_readable_to_last_flush() {
     let mut writer = SegmentWriter::create(&base, HEADER, SMALL).unwrap();
     let lines = text(500).concat();
     writer.write(lines.as_bytes()).unwrap();
-    // A power cut here leaves a frame without an end.
+    // A power cut at this point leaves a frame without an end.
     let torn = fs::read(path_of(&base, 1)).unwrap();
     let mut decoder = zstd::stream::read::Decoder::new(torn.as_slice()).unwrap();
     let mut found = vec![0; lines.len()];

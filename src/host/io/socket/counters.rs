@@ -1,4 +1,4 @@
-//! Counters of a link since the program's start, written by its task and read by others.
+//! Counters of a link since the program's start. The link's task writes them, and other tasks read them.
 
 use std::sync::{Mutex, PoisonError};
 
@@ -22,7 +22,7 @@ pub enum LinkState {
 /// Frames of one interface that were sent or lost.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct LinkCounts {
-    /// Frames dropped by the kernel: its receive buffer was full.
+    /// Frames dropped by the kernel because its receive buffer was full.
     pub kernel_dropped: u64,
     /// Frames dropped by the daemon because its queue was full.
     pub queue_dropped: u64,

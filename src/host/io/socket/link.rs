@@ -29,7 +29,7 @@ use crate::quantity::{BusIndex, Timestamp};
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
 /// Longest pause before such a check. A check costs a few system calls, but each frame that is missed is lost.
 const LONGEST_PAUSE: Duration = Duration::from_secs(1);
-/// Frames read before other tasks run: 8 ms of a full 1 Mbit/s bus, less than one tick.
+/// Number of frames read before other tasks run. A full 1 Mbit/s bus sends them in 8 ms, which is less than one tick.
 const READ_BATCH: usize = 64;
 /// Maximum number of frames that wait to be sent, many times the number of status, health and alarm frames per second.
 const SEND_QUEUE: usize = 256;
@@ -121,7 +121,8 @@ struct OpenSocket {
     pending: Option<QueuedFrame>,
 }
 
-/// Registers a socket with the runtime, including errors: after its interface is removed, a socket is neither readable nor writable.
+/// Registers a socket with the runtime. Errors are included, because a socket is neither readable nor writable after
+/// its interface is removed.
 #[expect(
     deprecated,
     reason = "its successor needs unsafe, which this crate forbids; RawSocket keeps its one descriptor open while it lives"
@@ -395,7 +396,7 @@ impl Link {
         pause
     }
 
-    /// Notes the interface's state; reports an event if it is new.
+    /// Notes the interface's state. Reports an event if the state is new.
     async fn enter(&mut self, state: LinkState) {
         self.enter_at(state, self.clock.now()).await;
     }

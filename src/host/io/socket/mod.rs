@@ -3,9 +3,9 @@
 //! * [`CanSender`]: a blocking sender for `replay --to` and `simulate --to`:
 //!   `CanSender::open("vcan0", fd)?`, then `sender.send(&frame)?`, which waits for a full transmit queue up to a limit.
 //! * `PassiveSocket`: receives everything on an interface for `doctor`, or frames of some identifiers for `test-alarm`.
-//! * `Link`: the daemon's task for one interface: receives, sends, and survives every state of the interface.
+//! * `Link`: the daemon's task for one interface. It receives, sends, and survives every state of the interface.
 //!
-//! Layers below: `raw` is one socket, `wire` the kernel's frame layouts as bytes.
+//! These types use two layers: `raw` is one socket, and `wire` converts the kernel's frame layouts from and to bytes.
 
 mod counters;
 mod link;

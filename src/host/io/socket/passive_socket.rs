@@ -36,8 +36,8 @@ impl PassiveSocket {
         Ok((Self::new(socket, clock), is_up))
     }
 
-    /// Opens the interface for these identifiers (ascending) and for extended identifiers that match an identifier and mask;
-    /// `fd` = also FD frames.
+    /// Opens the interface for these identifiers (ascending) and for extended identifiers that match a pair of
+    /// identifier and mask. If `fd`, the socket also receives FD frames.
     ///
     /// # Errors
     /// Fails if the interface does not exist, is down, or this kernel has no SocketCAN.

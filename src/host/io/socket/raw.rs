@@ -1,8 +1,8 @@
 //! One SocketCAN raw socket. Its filters are set before it is bound, so it receives only wanted identifiers. It reads several
 //! frames with their stamps in one system call, and writes without blocking.
 //!
-//! The kernel's drop counter is read separately. A frame's control message contains it only after a later frame was received,
-//! and the control message's size changes with the first drop (see [`Slots`]).
+//! The kernel's drop counter is read separately. A frame's control message contains the counter only after a later
+//! frame was received. The size of the control message changes with the first drop (see [`Slots`]).
 
 use std::cell::RefCell;
 use std::io::{self, IoSliceMut};
@@ -99,8 +99,8 @@ impl RawSocket {
     /// unwanted frame is queued.
     ///
     /// # Errors
-    /// `ENODEV` if the interface does not exist. An interface that is down opens successfully; [`RawSocket::take_error`]
-    /// then returns the error.
+    /// Returns `ENODEV` if the interface does not exist. If the interface is down, the call succeeds, and
+    /// [`RawSocket::take_error`] returns the error.
     pub(super) fn open(interface: &str, fd: bool, filters: &[CanFilter], buffer_bytes: usize) -> io::Result<Self> {
         let flags = SockFlag::SOCK_NONBLOCK | SockFlag::SOCK_CLOEXEC;
         let descriptor = socket(AddressFamily::Can, SockType::Raw, flags, SockProtocol::CanRaw)?;
@@ -123,7 +123,7 @@ impl RawSocket {
     /// Like [`RawSocket::open`], but requires the interface to be up; errors contain its name.
     ///
     /// # Errors
-    /// Fails like [`RawSocket::open`]; also if the interface is down.
+    /// Fails like [`RawSocket::open`], and also if the interface is down.
     pub(super) fn open_up(interface: &str, fd: bool, filters: &[CanFilter], buffer_bytes: usize) -> io::Result<Self> {
         let opened = Self::open(interface, fd, filters, buffer_bytes);
         let opened = opened.and_then(|socket| socket.take_error()?.map_or(Ok(socket), Err));
@@ -143,27 +143,28 @@ impl RawSocket {
     /// Reads up to [`CALL_BATCH`] frames and appends them. If fewer are read, the socket is empty.
     ///
     /// # Errors
-    /// `EAGAIN` if the socket is empty; `ENETDOWN` or `ENODEV` once when the interface went down or was removed.
+    /// Returns `EAGAIN` if the socket is empty. Returns `ENETDOWN` or `ENODEV` once when the interface went down or was
+    /// removed.
     pub(super) fn receive(&self, into: &mut Vec<RawRead>) -> Result<(), Errno> {
         SLOTS.with_borrow_mut(|slots| slots.receive(self.socket.as_raw_fd(), into))
     }
 
-    /// Frames lost since the socket was opened because its receive buffer was full, modulo 2^32; 0 if the kernel does not
-    /// support this.
+    /// Number of frames lost since the socket was opened because its receive buffer was full, modulo 2^32. It is 0 if
+    /// the kernel does not support this.
     pub(super) fn dropped_total(&self) -> u32 {
-        // SO_MEMINFO returns nine numbers; the last one counts drops (linux/sock_diag.h; since Linux 4.12).
+        // SO_MEMINFO returns nine numbers. The last one counts drops (linux/sock_diag.h, since Linux 4.12).
         let mut bytes = [0; 9 * size_of::<u32>()];
         let result = self.socket.get_socket_option_bytes(libc::SOL_SOCKET, libc::SO_MEMINFO, &mut bytes);
         let (numbers, _) = bytes.as_chunks();
-        // If the kernel returns fewer numbers, this one stays zero.
+        // If the kernel returns fewer numbers, the last one stays zero.
         result.map_or(0, |_| u32::from_ne_bytes(numbers[8]))
     }
 
     /// Passes one frame to the kernel.
     ///
     /// # Errors
-    /// `EAGAIN` and `ENOBUFS` if the send buffer is full; `ENETDOWN`, `ENODEV`, `ENXIO` if the interface is down or was removed;
-    /// `EINVAL` for an FD frame on a classic interface.
+    /// Returns `EAGAIN` or `ENOBUFS` if the send buffer is full, and `ENETDOWN`, `ENODEV` or `ENXIO` if the interface
+    /// is down or was removed. Returns `EINVAL` for an FD frame on a classic interface.
     pub(super) fn send(&self, frame: &Frame) -> Result<(), Errno> {
         let mut buffer = [0; FD_BYTES];
         send(self.socket.as_raw_fd(), wire::encode(frame, &mut buffer), MsgFlags::MSG_DONTWAIT).map(drop)
@@ -185,7 +186,7 @@ impl AsFd for RawSocket {
 /// The kernel's index of an interface.
 ///
 /// # Errors
-/// `ENODEV` if no interface has this name.
+/// Returns `ENODEV` if no interface has this name.
 pub(super) fn index_of(interface: &str) -> io::Result<u32> {
     Ok(nix::net::if_::if_nametoindex(interface)?)
 }
@@ -202,8 +203,8 @@ fn set_stamping(fd: &impl AsFd) -> io::Result<()> {
     Ok(())
 }
 
-/// Filters for exactly these identifiers, data frames only. If the kernel does not accept that many filters, all frames pass
-/// and the reader ignores unknown identifiers.
+/// Filters that pass only data frames with these identifiers. If the kernel does not accept that many filters, all
+/// frames pass, and the reader ignores unknown identifiers.
 pub(super) fn filters(ids: &[CanId], patterns: &[(u32, u32)]) -> Vec<CanFilter> {
     if ids.len() + patterns.len() > MAX_KERNEL_FILTERS {
         return every_frame();

@@ -10,14 +10,15 @@ use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use super::raw::RawSocket;
 use crate::can::Frame;
 
-/// Pause before the next attempt if the transmit queue is full: about four frames on a 500 kbit/s bus.
+/// Pause before the next attempt if the transmit queue is full. A 500 kbit/s bus carries about four frames in this
+/// time.
 const RETRY_PAUSE: Duration = Duration::from_millis(1);
 
 /// Maximum number of attempts before a full queue is an error. They take 2 s, in which a working bus sends hundreds of
 /// frames.
 const MAX_TRIES: u32 = 2_000;
 
-/// Sends frames one after the other on one interface; receives nothing.
+/// Sends frames one after the other on one interface. It receives nothing.
 #[derive(Debug)]
 pub struct CanSender {
     socket: RawSocket,
@@ -25,7 +26,7 @@ pub struct CanSender {
 }
 
 impl CanSender {
-    /// Opens the interface; `fd` allows FD frames.
+    /// Opens the interface. `fd` allows FD frames.
     ///
     /// # Errors
     /// Fails if the interface does not exist, is down, or this kernel has no SocketCAN.
@@ -34,11 +35,11 @@ impl CanSender {
         Ok(Self { socket, interface: interface.to_owned() })
     }
 
-    /// Sends one frame; waits while the transmit queue is full, at most about 2 s.
+    /// Sends one frame. Waits while the transmit queue is full, but at most about 2 s.
     ///
     /// # Errors
-    /// Fails if the queue does not empty, the interface goes down or is removed, or it cannot carry this frame (FD on
-    /// classic).
+    /// Fails if the queue does not empty, or if the interface goes down or is removed. Also fails if a classic
+    /// interface cannot carry an FD frame.
     pub fn send(&self, frame: &Frame) -> io::Result<()> {
         for _ in 0..MAX_TRIES {
             match self.socket.send(frame) {

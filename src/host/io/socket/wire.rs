@@ -81,7 +81,7 @@ pub(super) fn encode<'a>(frame: &Frame, buffer: &'a mut [u8; FD_BYTES]) -> &'a [
     &buffer[..bytes]
 }
 
-/// The identifier with its kind bit.
+/// The identifier with the bit that marks its kind.
 pub(super) fn id_word(id: CanId) -> u32 {
     match id {
         CanId::Standard(id) => u32::from(id),

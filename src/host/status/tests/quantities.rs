@@ -6,13 +6,13 @@ use crate::quantity::catalogue::{CellValues, PackValues, Presentation, QuantityR
 
 const HEAD: &str = "# Quantities
 
-The numbers that packwatch publishes of the pack and of each cell. This page is written from `src/core/quantity/catalogue.rs`.
+The quantities that packwatch publishes for the pack and for each cell. This page is generated from `src/core/quantity/catalogue.rs`.
 
-* A quantity with two keys has a standard deviation: the second key. Its metric and its key in MQTT end with `_std`, its VSS signal with
-  `StandardDeviation`.
+* If a quantity has two keys, the second key is its standard deviation. The metric and the MQTT key of a standard deviation end with
+  `_std`, and its VSS signal ends with `StandardDeviation`.
 * [Status document](status.md): the keys are in `pack` and in each of `cells[]`. An unknown value is `null`.
-* [Metrics](metrics.md): the unit is in the name; days are seconds. An unknown value is left out.
-* [MQTT](../operations/mqtt.md) and [VSS](vss.md): fractions are percent, currents are positive into the battery. Cells have arrays.
+* [Metrics](metrics.md): the unit is in the name; days are seconds. An unknown value is omitted.
+* [MQTT](../operations/mqtt.md) and [VSS](vss.md): fractions are sent as percent, and a positive current charges the battery. Values of cells are sent as arrays.
 ";
 
 /// A table of one owner's quantities.

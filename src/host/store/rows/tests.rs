@@ -1,4 +1,4 @@
-//! Events for the tests of the store, and the rows made from them.
+//! Creates events for the tests of the store, and tests the rows made from these events.
 
 use super::*;
 use crate::alarm::{AlarmState, Change, Rule, Severity};

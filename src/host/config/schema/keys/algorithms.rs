@@ -54,7 +54,7 @@ section! {
         away_use_per_h: f64, "fraction", Between(0.0, 100.0), Default("0.5");
         /// Largest current, per cell, that counts as rest. A larger current next to a gap in the readings may have flowed during the whole gap.
         rest_current_a: Option<f64>, "A", Between(0.0, 1e6), Optional("C/50: the rated capacity over 50 h");
-        /// `true`: a silent bus means zero current. If no current reading arrives for more than 5 s between two voltages of a cell, the cell rested during that time, regardless of the current before and after. Voltages must therefore arrive more often than that. `false`: the load before the gap may have continued, or a charger may have been connected.
+        /// `true`: a silent bus means zero current. If no current reading arrives for more than 5 s between two voltages of a cell, the cell rested between them. The current before and after does not matter, so voltages must arrive more often than every 5 s. `false`: the load before the gap may have continued, or a charger may have been connected.
         silence_is_rest: bool, "", Any, Default("false");
         /// Standard deviation of the voltage sensor's noise. If the signal's resolution is coarser, its rounding noise is added (5.8 mV for steps of 20 mV).
         voltage_noise_v: f64, "V", within(bounds::VOLTAGE_NOISE_V), Default("0.005");
@@ -64,9 +64,9 @@ section! {
         slow_branch_std: Option<f64>, "fraction", DEVIATION, Optional("the cell model's `spread.slow_branch`, else 0.2 (0.1 with one branch)");
         /// Slow error of the cell model: standard deviation of its average over one second. More samples per second do not reduce it. A cell model's `voltage_error_v` replaces this key.
         model_error_v_sqrt_s: f64, "V sqrt(s)", DEVIATION, Default("0.15");
-        /// Slow error of the cell model relative to the present voltage drop in the cell: standard deviation of its average over one second.
+        /// Slow error of the cell model that is proportional to the present voltage drop in the cell: standard deviation of its average over one second, relative to this drop.
         drop_error_sqrt_s: f64, "sqrt(s)", DEVIATION, Default("0.3");
-        /// Slow error of the cell model under load, relative to the voltage drop caused by the load of the last minutes: standard deviation of its average over one second.
+        /// Slow error of the cell model under load: standard deviation of its average over one second. It is relative to the voltage drop that the load of the last minutes causes.
         load_error_sqrt_s: f64, "sqrt(s)", DEVIATION, Default("0.5");
         /// Time constant with which the error of `load_error_sqrt_s` decays after a load (slow diffusion).
         load_memory_s: f64, "s", Above(0.0, 1e6), Default("1200.0");

@@ -36,7 +36,7 @@ section! {
         max_delta_counter: u8, "frames", Between(0.0, 255.0), Default("1");
         /// After this many consecutive repeated or missing frames, the sender must establish its sequence again (see `sync_counter`). 14 = never.
         max_repeated: u8, "frames", Between(0.0, 14.0), Default("14");
-        /// Number of frames in sequence that establish the sender's sequence again after its counter has jumped too far. The readings of these frames are used. 0 = no such frames are required. In that case, profile 1 keeps its old counter after a jump (for example after a restart of the sender) until the sender's counter reaches it, which takes at most 14 frames.
+        /// Number of frames in sequence that establish the sender's sequence again after its counter has jumped too far. The readings of these frames are used. 0 = no such frames are required. In that case, profile 1 keeps its old counter after a jump, for example after a restart of the sender. The sender's counter reaches the old counter after at most 14 frames.
         sync_counter: u8, "frames", Between(0.0, 14.0), Default("0");
     }
 }

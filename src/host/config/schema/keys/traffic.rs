@@ -9,7 +9,7 @@ use crate::config::schema::section::section;
 
 section! {
     /// Diagnostic requests that packwatch sends, for the answers of `[[input.diagnostic]]` that have a period. Off by default, because polling can disturb a car (warning lamps, a car that does not fall asleep, an empty 12 V battery). Try it in a parked car first.
-    /// packwatch sends only the services that an answer can have (0x22, 0x21, 0x01), one request at a time. It sends nothing for one minute after a request of another tester, while the bus sleeps (no foreign frame for two seconds), while the supply voltage is low (`[input.supply_voltage]`), and after `packwatch poll standby`. If a controller rejects a request permanently (0x11, 0x31, 0x33), packwatch does not send this request again. After other failures, packwatch sends the request less and less often. All frames of a polled interface are received, and recorded by `--record`.
+    /// packwatch sends only the services that an answer can have (0x22, 0x21, 0x01), one request at a time. It sends nothing for one minute after a request of another tester, and nothing after `packwatch poll standby`. It also sends nothing while the bus sleeps (no foreign frame for two seconds) and while the supply voltage is low (`[input.supply_voltage]`). If a controller rejects a request permanently (0x11, 0x31, 0x33), packwatch does not send this request again. After other failures, packwatch sends the request less and less often. All frames of a polled interface are received, and recorded by `--record`.
     Poll at "poll" {
         /// Whether requests are sent.
         enabled: bool, "", Any, Default("false");
@@ -99,7 +99,7 @@ macro_rules! frame_section {
                 brs: Option<bool>, "", Any, Optional("the DBC's; built-in: no");
                 /// Period.
                 period_ms: Option<u32>, "ms", Between(10.0, 3_600_000.0), Optional("the DBC's cycle time, else 1000");
-                /// AUTOSAR end-to-end protection: checksum and counter in the first bytes, profile 1 variant A or C (2 bytes) or profile 5 (3 bytes; the built-in layout then has 12 bytes and requires `fd = true`).
+                /// AUTOSAR end-to-end protection with a checksum and a counter in the first bytes: profile 1 variant A or C (2 bytes), or profile 5 (3 bytes). With profile 5, the built-in layout has 12 bytes and requires `fd = true`.
                 e2e: Option<E2eKey>, "", Any, Optional("the DBC's; built-in: off");
                 /// AUTOSAR SecOC authentication with the key of `[authentication]`: appends 12 bytes of freshness and authenticator to the data. Only "fd" is allowed here (32 bits of freshness, 64 bits of AES-128-CMAC; requires `fd = true`).
                 secoc: Option<secoc::Profile>, "", Any, Optional("none");
@@ -116,7 +116,7 @@ frame_section! {
 }
 
 frame_section! {
-    /// The health frame: learned values, all pages together in each period.
+    /// The health frame: learned values. All pages are sent together in each period.
     OutputHealth at "output.health"
 }
 
@@ -126,12 +126,12 @@ frame_section! {
 }
 
 frame_section! {
-    /// The digest frame: number, worst severity and checksum of all raised alarms, the state of every rule, and one threshold; all pages in each period. Not sent if `output.dbc` lacks `PACKWATCH_Digest`.
+    /// The digest frame: number, worst severity and checksum of all raised alarms, the state of every rule, and one threshold. All pages are sent in each period. Not sent if `output.dbc` lacks `PACKWATCH_Digest`.
     OutputDigest at "output.digest"
 }
 
 frame_section! {
-    /// The reply to each command frame, sent only with `[commands]`: whether the command was executed, the reason if not, and the counter that the next command must have. It has no period. Not sent if `output.dbc` lacks `PACKWATCH_Reply`.
+    /// The reply to each command frame, sent only with `[commands]`. It states whether the command was executed, the reason if it was not, and the counter that the next command must have. It has no period. Not sent if `output.dbc` lacks `PACKWATCH_Reply`.
     OutputReply at "output.reply"
 }
 
