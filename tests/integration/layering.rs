@@ -45,7 +45,7 @@ const TABLE: &[(&str, &[&str], Core)] = &[
     ("main", &["cli"], Core::Shell),
 ];
 
-/// The modules of `src/core` and `src/host`, lowest first, then those of the lab.
+/// The modules of `src/core` and `src/host`, lowest first, then the lab's modules.
 const MODULES: [&str; 26] = [
     "quantity",
     "filter",

@@ -90,7 +90,7 @@ fn vehicle(
     all
 }
 
-/// Adds frames at rest to those of the cycles: the vehicle stays awake for some minutes after each.
+/// Adds frames at rest after each cycle: the vehicle stays awake for some minutes.
 fn with_rests(
     config: &MonitorConfig,
     frames: Vec<(Timestamp, BusIndex, Frame)>,

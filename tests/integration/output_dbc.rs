@@ -302,7 +302,7 @@ impl Maker {
             2 => {
                 let (rule, severity) = (f64::from(threshold.rule), f64::from(threshold.severity));
                 let mut wanted = self.wanted("Digest", &[("ThresholdRule", rule), ("ThresholdSeverity", severity)]);
-                // Not rounded: the only error is that of a 32-bit float.
+                // Not rounded: the only error is the resolution of a 32-bit float.
                 wanted.push(("Threshold".to_owned(), threshold_read, threshold_read * f64::from(f32::EPSILON)));
                 wanted
             }

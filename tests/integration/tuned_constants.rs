@@ -59,7 +59,7 @@ fn compact(text: &str) -> String {
     text.replace(",]", "]").replace(",)", ")").replace(",}", "}")
 }
 
-/// The constants of a source text, without those of its test module.
+/// The constants of a source text, without the test module's constants.
 fn constants(source: &str) -> Vec<Constant> {
     let code: Vec<&str> = source.lines().map(|line| line.split("//").next().unwrap_or_default()).collect();
     let code = code.join("\n");
@@ -76,7 +76,7 @@ fn constants(source: &str) -> Vec<Constant> {
             depth += i32::from("([{".contains(c)) - i32::from(")]}".contains(c));
             c == ';' && depth == 0
         });
-        // A parameter `const N: usize,` on a line of its own has no value on that line.
+        // A parameter `const N: usize,` on a separate line has no value on that line.
         let item = end.and_then(|end| rest[..end].split_once(" =")).filter(|(type_text, _)| !type_text.contains('\n'));
         if let Some((type_text, value)) = item {
             found.push(Constant { name: name.into(), type_text: type_text.into(), value: compact(value) });

@@ -127,7 +127,7 @@ def measure_alarm(count):
         sender.send(cell(sign * IDLE_A))
         time.sleep(MODE_S)
         sender.send(cell(sign * IDLE_A))
-        # The half-cycle that is complete now is the previous one: a weak one before a strong one.
+        # The half-cycle that has just ended is the previous one: before a strong half-cycle, a weak one.
         change = (CAPACITY_LOW, ACTIVE if strong else CLEARED)
         def is_answer(i, data, change=change):
             return i == ALARM and (bits(data, *RULE), bits(data, *STATE)) == change

@@ -23,7 +23,7 @@ def install():
 
 
 def python(*modules):
-    """An interpreter with the modules: that of `--install`, of PACKWATCH_PYTHON, or the current one; None if none has them."""
+    """The first interpreter that has the modules: from `--install`, PACKWATCH_PYTHON, or the current one. None if all lack them."""
     for interpreter in (VENV / "bin/python3", os.environ.get("PACKWATCH_PYTHON", sys.executable)):
         command = [str(interpreter), "-c", "import " + ", ".join(modules)]
         try:

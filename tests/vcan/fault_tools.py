@@ -128,7 +128,7 @@ def covers(args) -> None:
 
 
 def last_alarm(args) -> None:
-    """State of the last alarm frame of a rule, or -."""
+    """State of the last alarm frame of a rule; - without a frame."""
     found = [alarm.state for name, data in frames(open(args.dump)) if name == ALARM and (alarm := Alarm(data)).rule == args.rule]
     print(found[-1] if found else "-")
 

@@ -52,7 +52,7 @@ learned_more() { reported_more half_cycle "$1"; }
 # fault NAME: marks the start of a fault.
 fault() {
     fault_name=$1 fault_before=$(reported_all)
-    running main || fail "$fault_name: the daemon is not running before"
+    running main || fail "$fault_name: the daemon is not running before the fault"
 }
 
 # survived WHAT...: marks the end of the fault. The daemon must still be the same process, keep learning, and have stored all

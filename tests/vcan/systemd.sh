@@ -73,7 +73,7 @@ system_process() { pgrep -P "${pids[systemd]}" || true; }
 
 # Process 1 of the namespaces.
 systemd_init() {
-    # Mount a new /sys, because that of the kernel's first network namespace does not show these interfaces.
+    # Mount a new /sys, because the old one belongs to the kernel's first network namespace and does not show these interfaces.
     mount -t sysfs sysfs /sys && mount -t tmpfs tmpfs /run && mount -t cgroup2 cgroup2 /sys/fs/cgroup
     mkdir -p /run/systemd && cp -r "$1" /run/systemd/system && rm -f /run/systemd/system/test.wants
     exec env -i container=test PATH="$PATH" /usr/lib/systemd/systemd --system --unit=test.target \

@@ -27,7 +27,7 @@ mod world;
 /// An entry point: takes arbitrary bytes and panics if an invariant is broken.
 pub type Door = fn(&[u8]);
 
-/// All entry points. The name is also that of the fuzz target and of the folder of seeds.
+/// All entry points. The fuzz target and the folder of seeds have the same name.
 pub const DOORS: &[(&str, Door)] = &[
     ("core", core::core),
     ("cuts", core::cuts),

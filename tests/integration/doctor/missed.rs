@@ -29,7 +29,7 @@ fn set(data: &mut [u8], page: u8, at: usize, value: i32) {
     }
 }
 
-/// Adds a second bus on which another sender uses identifier 100. Its current is that of the first sender, inverted and
+/// Adds a second bus on which another sender uses identifier 100. It sends the first sender's current, inverted and
 /// delayed. The configured current is on interface `on`.
 fn second_bus(broken: &mut BrokenPack, on: &str) {
     broken.config("[[interface]]\nname = \"can0\"", "[[interface]]\nname = \"can1\"\n\n[[interface]]\nname = \"can0\"");
