@@ -256,5 +256,5 @@ fn command_rejects_unreadable_input_with_place() {
     std::fs::write(&few, "date,capacity_ah\n0,2\n5,1.9\n").unwrap();
     let text = command(&[few.to_str().unwrap(), "--end-of-life", "1.4"]).success();
     let text = String::from_utf8_lossy(&text.get_output().stdout).into_owned();
-    assert!(text.contains("no forecast: 2 capacity readings, needs 3"), "{text}");
+    assert!(text.contains("no forecast: 2 capacity readings, 3 are needed"), "{text}");
 }

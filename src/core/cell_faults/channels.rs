@@ -48,7 +48,7 @@ impl Channel {
         let (other, _) = self.same_as.unwrap_or_default();
         InvalidState::unless(
             usize::from(other) < cells,
-            "the double of a channel",
+            "the channel with the values of another channel",
             f64::from(other),
             "a cell of the pack",
         )

@@ -498,7 +498,7 @@ impl CellFaultDetector {
     pub fn check(&self, cells: usize) -> Result<(), InvalidState> {
         let expected = if cells < LEAST_CELLS { 0 } else { cells };
         let count = self.cells.len();
-        InvalidState::unless(count == expected, "the cells of the diagnosis", count as f64, "those of the pack")?;
+        InvalidState::unless(count == expected, "the cells of the diagnosis", count as f64, "the cells of the pack")?;
         let middle = self.middle;
         InvalidState::unless(middle <= cells, "the middle cell of the diagnosis", middle as f64, "a cell of the pack")?;
         for cell in &self.cells {

@@ -13,8 +13,8 @@
 //! | channel | constant |
 //! | leak | grows with time |
 //!
-//! Sources: to estimate a mean cell and the differences from it is Plett's bar-delta filtering (Battery Management
-//! Systems II, section 4.11).
+//! Sources: the estimation of a mean cell and of the differences from it is Plett's bar-delta filtering (Battery
+//! Management Systems II, section 4.11).
 //! Contact resistance of one cell in a vehicle: Zheng et al., J. Power Sources 241 (2013) 181.
 
 use serde::{Deserialize, Serialize};

@@ -113,7 +113,7 @@ impl CellFaultKind {
             Self::WeakCell => "this cell limits the pack: plan its replacement",
             Self::HighResistance => "the cell has aged more than the others: watch its temperature under load",
             Self::ForeignCell => "the cell has been replaced: balance the pack",
-            Self::Module => "modules have been replaced: balance the pack; their history starts anew",
+            Self::Module => "modules have been replaced: balance the pack; their history starts again",
             Self::VoltageChannel => "compare the channel with a voltmeter, and check its sense wire",
             Self::VoltageFrozen => "the channel does not show a cell voltage: check monitor chip and sense wire",
             Self::DoubledChannels => "check the wiring of the two channels and the layout of their frames",
@@ -123,7 +123,7 @@ impl CellFaultKind {
             Self::CurrentGain => {
                 "compare the sensor under load with an ammeter: all capacities and resistances have changed by its gain"
             }
-            Self::TemperatureSensor => "the sensor has fallen off or shows one value: check where it sits",
+            Self::TemperatureSensor => "the sensor has fallen off or shows one value: check how it is mounted",
         }
     }
 

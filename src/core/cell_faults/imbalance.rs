@@ -50,7 +50,7 @@ pub struct Imbalance {
     pub usable: ScalarGaussian,
     /// Charge that balancing would recover, fraction.
     pub lost_by_imbalance: ScalarGaussian,
-    /// Charge by which a balanced pack of mean cells exceeds this pack if balanced, fraction.
+    /// Charge that a balanced pack of mean cells would deliver beyond this pack after balancing, fraction.
     pub lost_by_weakest: ScalarGaussian,
     /// The cell with the least capacity.
     pub weakest: CellIndex,

@@ -37,8 +37,8 @@ pub struct CapacityConfig {
     /// Process noise of rest: standard deviation gained in a day without current, Ah. Rest adds noise because capacity
     /// recovers. At most one day counts per half-cycle. Not used by `Nominal`.
     pub noise_ah_per_rest_day: f64,
-    /// Error of the open-circuit curve at the ends of a half-cycle that does not change with time, V; `None` = half of
-    /// the model's own error there. Not used by `Nominal`.
+    /// Constant error of the open-circuit curve at the ends of a half-cycle, V; `None` = half of the model's own error
+    /// there. Not used by `Nominal`.
     pub end_error_v: Option<f64>,
     /// Standard deviation of the current sensor's gain, fraction: a lower bound on the capacity's relative
     /// uncertainty.
@@ -54,9 +54,9 @@ pub struct CapacityConfig {
 /// Recharge period that the alarm rule uses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RechargeAlarm {
-    /// Measured, with the actual charger.
+    /// The raw period, measured with the actual charger.
     Raw,
-    /// Computed for the reference charger.
+    /// The normalised period, computed for the reference charger.
     Normalised,
 }
 
@@ -93,14 +93,14 @@ pub struct UsableConfig {
 /// Settings for learning at charge/discharge transitions.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HealthConfig {
-    /// Mode detection.
+    /// Settings of the mode detection.
     pub transition: TransitionConfig,
-    /// Capacity filter.
+    /// Settings of the capacity filter.
     pub capacity: CapacityConfig,
-    /// Recharge period.
+    /// Settings of the recharge period.
     pub recharge: RechargeConfig,
     /// Capacity at which a cell is at the end of its life, Ah.
     pub end_of_life_ah: f64,
-    /// Usable capacity; `None` = not reported.
+    /// Load for the usable capacity; `None` = the usable capacity is not computed.
     pub usable: Option<UsableConfig>,
 }

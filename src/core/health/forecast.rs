@@ -140,7 +140,7 @@ pub struct RemainingLife {
 #[serde(rename_all = "snake_case", tag = "reason")]
 pub enum InsufficientData {
     /// Too few readings.
-    #[error("{found} capacity readings, needs {MIN_READINGS}")]
+    #[error("{found} capacity readings, {MIN_READINGS} are needed")]
     Readings {
         /// Number of readings.
         found: u32,
@@ -157,7 +157,7 @@ pub enum InsufficientData {
     Fade {
         /// Capacity lost, fraction of the reference.
         lost: f64,
-        /// Its standard deviation.
+        /// Standard deviation of the capacity lost.
         std: f64,
     },
     /// The interval is too wide.

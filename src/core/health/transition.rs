@@ -29,7 +29,7 @@ pub struct ModeChange {
 /// Outcome of one observation.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct TransitionOutcome {
-    /// The mode change confirmed by this time.
+    /// The mode change that this observation confirms, if any.
     pub change: Option<ModeChange>,
     /// Whether a new candidate mode begins with this observation. If so, the caller marks the cells' state.
     pub candidate_begins: bool,

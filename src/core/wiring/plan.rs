@@ -145,7 +145,7 @@ pub struct OutputPlan {
     pub id: CanId,
     /// Name of the frame: `status`, `health` or `alarm`.
     pub name: &'static str,
-    /// Its table in the configuration.
+    /// Table of the frame in the configuration.
     pub table: String,
 }
 

@@ -8,7 +8,7 @@ use serde::Serialize;
 pub enum Severity {
     /// Estimates will be wrong or missing.
     Error,
-    /// The user should check it.
+    /// The user should check the subject of the finding.
     Warning,
     /// Useful information.
     Note,
@@ -52,7 +52,7 @@ pub enum Topic {
     Range,
     /// One cell or sensor differs from the others.
     Cell,
-    /// Readings come too slowly or too unevenly.
+    /// Readings arrive too slowly or too unevenly.
     Period,
     /// The cell model belongs to another cell.
     CellModel,

@@ -257,7 +257,7 @@ mod tests {
         assert!(outlook(&short, &PageContext::default()).unwrap_err().contains("a configuration (-c) does"));
         alarm_at(&mut short, 1.6);
         let why = outlook(&short, &PageContext::default()).unwrap_err();
-        assert_eq!(why, "unknown for 2 of 2 cells (cell 1: 2 capacity readings, needs 3)");
+        assert_eq!(why, "unknown for 2 of 2 cells (cell 1: 2 capacity readings, 3 are needed)");
         let mut mixed = worn(100, &[0.001, 0.0]);
         alarm_at(&mut mixed, 1.6);
         let outlook_of_one = outlook(&mixed, &PageContext::default()).expect("of one cell");

@@ -60,8 +60,8 @@ impl Bleed {
     /// Checks the numbers of a stored state.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         self.timer.check()?;
-        InvalidState::unless_natural("charge bled of a cell", self.bled.sum.abs())?;
-        InvalidState::unless_natural("charge bled unseen of a cell", self.unseen.sum)
+        InvalidState::unless_natural("the charge bled from a cell", self.bled.sum.abs())?;
+        InvalidState::unless_natural("the charge bled from a cell in unknown state", self.unseen.sum)
     }
 }
 

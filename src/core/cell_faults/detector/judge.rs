@@ -121,8 +121,8 @@ impl CellFaultDetector {
     }
 
     /// The cell whose channel clearly reads lowest at the SOC where a BMS bleeds cells; `None` if no cell clearly reads
-    /// lowest. A BMS never bleeds this cell, because it follows its readings, whatever their errors. The cell remains
-    /// the lowest until another cell reads lower.
+    /// lowest. A BMS never bleeds this cell, because the BMS follows its own readings, whatever their errors. The cell
+    /// remains the lowest until another cell reads lower.
     fn clearly_lowest(&self, slope_v: f64) -> Option<usize> {
         let (mut lowest, mut next): (Option<(usize, ScalarGaussian)>, Option<ScalarGaussian>) = (None, None);
         let compared = self.cells.iter().enumerate().filter(|(_, cell)| cell.is_compared);
@@ -141,8 +141,8 @@ impl CellFaultDetector {
     }
 
     /// Whether a BMS may bleed the cell without a bit that shows it. This applies to every cell of a balanced pack
-    /// without bits, except the lowest cell and cells with a reported leak. A leak is still a leak while the BMS bleeds
-    /// the other cells.
+    /// without bits, except the lowest cell and cells with a reported leak. A reported leak continues while the BMS
+    /// bleeds the other cells.
     pub(super) fn may_be_bled(&self, index: usize) -> bool {
         let is_found = |found: &CellFault| found.kind == CellFaultKind::Leak && found.is_of(CellIndex(index as u16));
         let is_open = self.is_balanced && !self.cells[index].bleed.timer.has_bits;

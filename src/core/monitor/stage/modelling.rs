@@ -28,7 +28,7 @@ use crate::quantity::{InvalidState, Mode, Timestamp};
 const LEAST_NEW_ROWS: usize = 6;
 const LEAST_NEW_CHARGE: f64 = 0.12;
 
-/// Shortest rest before a fit starts, s: longer than a red light.
+/// Shortest rest before a fit starts, s: longer than a stop at a red light.
 const REST_S: f64 = 120.0;
 
 /// Time from the start of a fit to the change of the model, s: enough for a thread of a slow computer.

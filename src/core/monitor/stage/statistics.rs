@@ -1,6 +1,6 @@
 //! Counts of the core's work for the status socket and its metrics.
 //!
-//! The counts are part of the stored state and continue after a restart. Other modules keep the counts of
+//! The counts are part of the stored state and continue after a restart. Other modules keep the counts of:
 //! * readings ([`crate::sample::ReadingCounts`]),
 //! * checks of protected messages ([`Monitor::protected`](super::Monitor)),
 //! * floods ([`Monitor::dropped`](super::Monitor)),

@@ -142,14 +142,14 @@ impl StoredCell {
         self.model_check.check()?;
         bounds::STORED_SOC.check("the SOC of a full cell", self.health.full_soc)?;
         check_positive("the usable capacity", self.health.usable)?;
-        check_positive("the resistance of discharge", self.health.discharge_resistance)?;
+        check_positive("the resistance after a discharge", self.health.discharge_resistance)?;
         let Throughput { charge_ah, charging_s, discharging_s } = self.health.throughput;
         InvalidState::unless_natural("the charge moved", charge_ah)?;
         bounds::TIME_S.check_all("the time of charges and discharges", [charging_s, discharging_s])?;
         self.forecast.check(Axis::Cycles)?;
         let Some(Consumed { charge_as, unmeasured_s, .. }) = self.consumed else { return Ok(()) };
-        bounds::CHARGE_AS.check("the charge taken in", charge_as)?;
-        bounds::TIME_S.check("the unmeasured time taken in", unmeasured_s)
+        bounds::CHARGE_AS.check("the charge used by a cell's filter", charge_as)?;
+        bounds::TIME_S.check("the unmeasured time used by a cell's filter", unmeasured_s)
     }
 
     /// Whether the filter has as many branches as this cell of the bank. Cells of a module always fit, because the

@@ -43,8 +43,8 @@ impl Slope {
         -self.ohm.signum() * self.r2.sqrt()
     }
 
-    /// Significance of the correlation, in standard deviations of a random one: correlation times the square root of
-    /// the number of steps.
+    /// Significance of the correlation, in standard deviations of a random correlation: the correlation times the
+    /// square root of the number of steps.
     pub fn strength(&self) -> f64 {
         self.correlation().abs() * (self.points as f64).sqrt()
     }

@@ -152,7 +152,7 @@ fn other_kind(judge: &mut Judge<'_>, bus: &BusStats, message: &MessagePlan) -> O
     let title = format!("{name} arrives with {found} identifier, but the DBC has {wanted} identifier");
     error(judge, Topic::IdKind, title)
         .seen(format!("{frames} of {other} on {}, none of {id}", bus.name))
-        .why("messages with the same number but another kind of identifier differ; bit 31 in the DBC selects the kind")
+        .why("an 11-bit and a 29-bit identifier of equal number are different; bit 31 in the DBC selects the kind")
         .advice(format!("in the DBC: BO_ {} {name}: ...", other.dbc_number()));
     Some(())
 }

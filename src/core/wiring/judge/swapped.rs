@@ -175,7 +175,7 @@ fn odd_sensors(judge: &mut Judge<'_>) {
         if (value - median_c).abs() <= 30.0 || is_impossible(series) {
             continue;
         }
-        let still = if series.extent.changes == 0 { " and never moves" } else { "" };
+        let still = if series.extent.changes == 0 { " and never changes" } else { "" };
         let (value, others) = (number(value), number(median_c));
         let title = format!("temperature {} is unlike the other sensors", sensor.0 + 1);
         warning(judge, Topic::Cell, title)

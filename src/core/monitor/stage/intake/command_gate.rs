@@ -140,7 +140,7 @@ impl CommandGate {
 
     pub(crate) fn check_state(&self) -> Result<(), InvalidState> {
         let found = self.window.announced() as f64;
-        let allowed = "a multiple of 16 up to 2^60, above what was accepted";
+        let allowed = "a multiple of 16 up to 2^60, above the accepted values";
         InvalidState::unless(self.window.is_possible(), "the freshness of commands", found, allowed)
     }
 }

@@ -83,7 +83,7 @@ fn many_changes_stay_within_budget_worst_first() {
     assert_eq!(sent[0].1, PACK_KEY());
     let first_98: Vec<AlarmKey> = sent[..98].iter().map(|(_, key)| *key).collect();
     assert!(first_98.is_sorted(), "every alarm is sent once, most severe first, before any frame is repeated");
-    assert!(sent[97].0 <= 800, "the last first frame leaves after {} ms", sent[97].0);
+    assert!(sent[97].0 <= 800, "the last change is first sent after {} ms", sent[97].0);
     for window_ms in [0, 1_000, 3_000, 8_000] {
         let count = sent.iter().filter(|(ms, _)| (window_ms..window_ms + 1_000).contains(ms)).count();
         assert!(count <= 100 + usize::try_from(BURST).unwrap(), "{count} frames in a second");
