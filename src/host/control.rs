@@ -8,8 +8,8 @@
 //! ```
 //! [`protocol`] defines every request and answer; cells count from 0 there, as in events.
 //!
-//! * The socket's owner and group may read (mode 0660). Commands are executed only for the daemon's own user and for root, as
-//!   identified by the kernel (`SO_PEERCRED`). Other users get an error.
+//! * The socket's owner and group may read (mode 0660). Commands are executed only for the daemon's own user and for
+//!   root. The kernel identifies the user (`SO_PEERCRED`). Other users get an error.
 //! * Each connection is a task. It sends the loop one request at a time over a bounded queue. A connection that never
 //!   reads or writes does not block other connections and is closed. If all slots are taken, a new connection replaces
 //!   the one that has been idle longest.

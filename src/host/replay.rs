@@ -74,10 +74,10 @@ impl ReplaySettings {
     }
 }
 
-/// Called with each input and its outputs.
+/// A callback that receives each input and its outputs.
 pub type OutputWatch = Box<dyn FnMut(&Record, &Outputs)>;
 
-/// Called with outputs before they are cleared.
+/// A callback that receives outputs before they are cleared.
 pub type OutputSink = Box<dyn FnMut(&Outputs)>;
 
 /// Files and callbacks for the results.

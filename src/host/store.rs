@@ -1,12 +1,14 @@
 //! State and history that survive restarts and power cuts: two state files and a database of the history, in one folder.
 //!
 //! * Learned results and alarm changes are on disk before they are announced; an announcement waits at most 200 ms for the disk
-//!   ([`commit_barrier`]). Learned results are stored with the whole state. An alarm change is stored as a small row of the history; a
-//!   start restores the newest state and repeats the newer alarm changes (`learned`).
+//!   ([`commit_barrier`]). Learned results are stored with the whole state. An alarm change is stored as a small row of
+//!   the history; a start restores the newest state and repeats the newer alarm changes (`learned`).
 //! * Rows are committed before the state that contains them (`writer`). A power cut between the two leaves rows that were not
-//!   announced. The next start repeats their alarm changes; learned results are learned again and get another row. A change of the
-//!   pack between the two is not undone: the history says that the state's pack is closed, and the state is not restored.
-//! * The state is also written at checkpoints (`checkpoint`), on stop, and every second to the runtime folder, which is in memory.
+//!   announced. The next start repeats their alarm changes; learned results are learned again and get another row. A
+//!   change of the pack between the two is not undone: the history says that the state's pack is closed, and the state
+//!   is not restored.
+//! * The state is also written at checkpoints (`checkpoint`), on stop, and every second to the runtime folder, which is
+//!   in memory.
 //! * The state is written to two files in turn (`state_files`) and does not depend on the database. If there is no valid state,
 //!   the capacities and alarms in the history are used (`learned`).
 //! * A damaged database is set aside and a new one is created (`folder`). The next start then uses the state alone.
@@ -368,7 +370,8 @@ fn read<T>(database: Option<&Database>, read: impl Fn(&Database) -> rusqlite::Re
     found.inspect_err(|error| tracing::error!(%error, "the history cannot be read")).ok().flatten().unwrap_or_default()
 }
 
-/// A row that reports missing rows: the state knows newer rows than the database has. Damage to SQLite's log has no other symptom.
+/// A row that reports missing rows: the state knows newer rows than the database has. Damage to SQLite's log has no
+/// other symptom.
 fn lost_rows(state: &StateDocument, database: &Database) -> Option<HistoryRow> {
     let (known, found) = (state.history_rows, database.rows());
     let detail = format!("the history ends with row {found}, the stored state knew {known}");

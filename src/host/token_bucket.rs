@@ -23,7 +23,7 @@ pub(crate) struct TokenBucket {
 }
 
 impl TokenBucket {
-    /// A full bucket.
+    /// Creates a full bucket.
     pub(crate) const fn new(size: BucketSize) -> Self {
         Self { size, tokens: size.burst, filled: None }
     }

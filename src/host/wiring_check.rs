@@ -1,4 +1,4 @@
-//! The loops of `packwatch doctor`: pass replayed logs or live interfaces to the core's [`WiringObserver`] and, if the
+//! The loops of `packwatch doctor`. They pass replayed logs or live input to the core's [`WiringObserver`] and, if the
 //! configuration is valid, also to a [`Monitor`].
 //!
 //! Listening is passive: nothing is sent. An [`Interrupt`] ends both loops early. The report then covers what was

@@ -1,6 +1,9 @@
-//! Reads, merges and checks the TOML configuration. All faults are reported at once, each with file, line, key, found value and allowed values.
+//! Reads, merges and checks the TOML configuration. All faults are reported at once, each with file, line, key, found
+//! value and allowed values.
 //!
-//! In: the configuration file, its drop-ins and the files they name (DBC files, cell models). Out: [`Config`], consistent settings for the other modules, or [`ConfigFaults`], one line per fault. In this module, to "note" a fault means to add it to the list of faults and to continue.
+//! In: the configuration file, its drop-ins and the files they name (DBC files, cell models). Out: [`Config`],
+//! consistent settings for the other modules, or [`ConfigFaults`], one line per fault. In this module, to "note" a
+//! fault means to add it to the list of faults and to continue.
 //!
 //! The module has six layers. Each layer uses only the layers above it in this table, and none uses this file.
 //!

@@ -12,7 +12,7 @@ pub fn list(engine: &AlarmEngine, time: Timestamp, all: bool) -> Answer {
     Answer::Alarms(alarm_list(engine, time, all))
 }
 
-/// Like [`list`], without the envelope.
+/// Lists the alarms like [`list`], but without the envelope of an answer.
 pub fn alarm_list(engine: &AlarmEngine, time: Timestamp, all: bool) -> AlarmList {
     let mut alarms: Vec<Alarm> = engine.all().filter(|alarm| all || needs_attention(alarm)).collect();
     let omitted = shorten(&mut alarms);

@@ -12,7 +12,7 @@ use super::standard_path;
 
 /// Longest wait for a list. A daemon answers between two ticks, so a daemon that needs longer hangs.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// Longest answer, bytes: ten times a thousand alarms of 400 bytes.
+/// Longest answer, bytes. It is ten times the size of a thousand alarms of 400 bytes.
 const MAX_ANSWER_BYTES: u64 = 4 << 20;
 
 /// A daemon's control socket.
@@ -33,7 +33,7 @@ impl ControlClient {
         UnixStream::connect(&self.path).map_or_else(|error| !absent.contains(&error.kind()), |_| true)
     }
 
-    /// Sends a request; returns the answer as a line of JSON.
+    /// Sends a request. Returns the answer as a line of JSON.
     ///
     /// # Errors
     /// Fails if no daemon answers. The message names the socket and the next step.
@@ -41,10 +41,10 @@ impl ControlClient {
         self.exchange(request).map_err(|error| self.explain(request, &error))
     }
 
-    /// Sends a request; returns the contents of the answer.
+    /// Sends a request. Returns the contents of the answer.
     ///
     /// # Errors
-    /// Fails if no daemon answers, or its answer is an error.
+    /// Fails if no daemon answers, or if its answer is an error.
     pub fn ask<T: for<'de> Deserialize<'de>>(&self, request: Request) -> Result<T, String> {
         contents(&self.ask_line(request)?)
     }

@@ -61,7 +61,7 @@ pub struct AlarmList {
     pub time: Timestamp,
     /// Number of configured thresholds.
     pub thresholds: usize,
-    /// The thresholds that have alarms that cannot be evaluated.
+    /// Thresholds with alarms that cannot be evaluated because their value is unknown.
     pub unknown: Vec<UnknownAlarms>,
     /// Alarms, ordered by rule, severity and cell.
     pub alarms: Vec<Alarm>,
@@ -87,7 +87,7 @@ pub struct CommandOutcome {
     pub time: Timestamp,
     /// Number of alarms that were changed.
     pub changed: u32,
-    /// Number of refusals: alarms that are not healthy, or a test without output.
+    /// Number of refused changes: alarms that are not healthy, or a test although no output is configured.
     pub refused: u32,
     /// The refused alarms.
     pub refused_alarms: Vec<Alarm>,

@@ -17,7 +17,7 @@ pub struct CellSummary {
     pub soc: f64,
     /// Standard deviation of the SOC, fraction.
     pub soc_std: f64,
-    /// Capacity, usable capacity after the last capacity update, resistance relative to new.
+    /// Capacity and usable capacity after the last capacity update, and resistance relative to a new cell.
     #[serde(flatten)]
     pub values: RecordedValues,
 }

@@ -18,7 +18,8 @@ struct Schedule<'a, T, R> {
 }
 
 impl<'a, T, R> Schedule<'a, T, R> {
-    /// The next item and the channel for its result; blocks while too many results wait. `None` = no more results are wanted.
+    /// Returns the next item and the channel for its result. Blocks while too many results wait. `None` = all items are
+    /// started, or no more results are wanted.
     fn begin(&mut self) -> Option<(&'a T, SyncSender<R>)> {
         let item = self.items.next()?;
         let (result, receiver) = sync_channel(1);

@@ -1,4 +1,5 @@
-//! Reloads the configuration on SIGHUP, outside the loop. If the new configuration is rejected, the old one stays.
+//! Reloads the configuration on SIGHUP, outside the loop. If the new configuration is rejected, the old configuration
+//! stays in use.
 //!
 //! Only one reading runs at a time. Signals that arrive during a reading cause one further reading, at least
 //! [`MIN_PERIOD`] after the start of the last reading. Many signals in a short time therefore neither fill the log nor

@@ -1,4 +1,5 @@
-//! Collects the status document from the core, the interfaces and the loop's counters. It copies structs and serialises nothing.
+//! Collects the status document from the core, the interfaces and the loop's counters. The functions copy structs and
+//! serialise nothing.
 
 use std::collections::VecDeque;
 
@@ -63,8 +64,9 @@ pub struct CounterBaseline {
 }
 
 impl CounterBaseline {
-    /// The counts of a monitor that has just restored its state, if it has. Events of the same tick (such as an alarm about an
-    /// input that is missing since the downtime) count as earlier.
+    /// Returns the counts of a monitor that has just restored a state, or zeros if the monitor has restored none.
+    /// Events of the same tick count as events of the earlier runs, for example an alarm about an input that is missing
+    /// after the downtime.
     pub fn of(monitor: &Monitor) -> Self {
         let mut statistics = monitor.statistics().clone();
         if statistics.restores == 0 {

@@ -96,12 +96,12 @@ pub struct StatusDocument {
 }
 
 impl StatusDocument {
-    /// The first cell with the lowest value, and the value; `None` if any cell's value is unknown.
+    /// The first cell with the lowest value, and this value. `None` if the value of any cell is unknown.
     pub fn least(&self, quantity: Quantity) -> Option<(CellIndex, f64)> {
         self.extreme(quantity, |candidate, best| candidate < best)
     }
 
-    /// The first cell with the highest value, and the value; `None` if any cell's value is unknown.
+    /// The first cell with the highest value, and this value. `None` if the value of any cell is unknown.
     pub fn greatest(&self, quantity: Quantity) -> Option<(CellIndex, f64)> {
         self.extreme(quantity, |candidate, best| candidate > best)
     }
@@ -155,7 +155,7 @@ pub struct AlarmStatus {
     pub raised: usize,
     /// Highest severity of the raised alarms.
     pub highest_severity: Option<Severity>,
-    /// Thresholds that have alarms that cannot be evaluated because their value is unknown.
+    /// Thresholds with alarms that cannot be evaluated because their value is unknown.
     pub unknown: Vec<UnknownAlarms>,
     /// Alarms that are raised, about to be raised, or not yet acknowledged.
     pub list: Vec<Alarm>,

@@ -1,4 +1,5 @@
-//! The thread that serialises documents and sends them to clients. In: drafts from the loop. Out: lines to clients.
+//! Runs the thread that serialises documents and sends them to clients. In: drafts from the loop. Out: lines to
+//! clients.
 
 use std::io;
 use std::path::PathBuf;

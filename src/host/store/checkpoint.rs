@@ -1,13 +1,14 @@
 //! Decides when the next checkpoint of the state is due. A checkpoint writes the whole state, and flash memory wears out.
 //!
-//! In: the bytes and the time of each commit. Alarm changes and learned results are never delayed; they delay the checkpoints instead.
-//! A pack of 96 cells (70 kB) gets a checkpoint every 7 minutes, a pack of 12 cells every minute.
+//! In: the bytes and the time of each commit. Alarm changes and learned results are never delayed; they delay the
+//! checkpoints instead. A pack of 96 cells (70 kB) gets a checkpoint every 7 minutes, a pack of 12 cells every minute.
 
 use crate::quantity::Timestamp;
 
 /// Bytes of states written per day. In total 20 MB may be written per day; history and file system take the rest.
 const BYTES_PER_DAY: f64 = 15e6;
-/// Bytes written by a commit without a state: three pages of SQLite in its log and later in its file, in whole pages of the system.
+/// Bytes written by a commit without a state: three pages of SQLite in its log and later in its file, in whole pages of
+/// the system.
 const COMMIT_BYTES: f64 = 8e3;
 /// Longest time without a checkpoint, s, whatever else was written.
 const MAX_PERIOD_S: f64 = 3600.0;

@@ -1,7 +1,8 @@
 //! Selects the events that the history keeps, and decides when they are committed.
 //!
-//! In: the events of one input. Out: rows to commit now, if any, and whether to write the state with them. Token buckets limit rows
-//! with little news; times are taken from the events. Alarm changes are limited only by their debounce.
+//! In: the events of one input. Out: rows to commit now, if any, and whether to write the state with them. Token
+//! buckets limit rows with little news; times are taken from the events. Alarm changes are limited only by their
+//! debounce.
 
 use std::collections::BTreeMap;
 
@@ -18,8 +19,8 @@ use crate::token_bucket::{BucketSize, TokenBucket};
 const CAPACITIES: BucketSize = BucketSize { burst: 64.0, period_s: 3600.0 };
 /// Smallest change for which a further capacity is written, in standard deviations.
 const MIN_CHANGE_STD: f64 = 0.25;
-/// How often deferred rows are written with a checkpoint or with other rows: an hour of checkpoints, then once an hour. Each time up to
-/// two rows per cell are written and kept for years.
+/// How often deferred rows are written with a checkpoint or with other rows: an hour of checkpoints, then once an hour.
+/// Each time up to two rows per cell are written and kept for years.
 const CARRIED: BucketSize = BucketSize { burst: 60.0, period_s: 3600.0 };
 
 /// The capacity last written.
@@ -178,8 +179,8 @@ enum Urgency {
 }
 
 impl Urgency {
-    /// The urgency of an event; `None` = the event is not stored. An alarm whose value becomes unknown or known again stays announced, and
-    /// a flickering input causes many such events.
+    /// The urgency of an event; `None` = the event is not stored. An alarm whose value becomes unknown or known again
+    /// stays announced, and a flickering input causes many such events.
     const fn of(kind: &EventKind) -> Option<Self> {
         match kind {
             EventKind::HalfCycle { .. }

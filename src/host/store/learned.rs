@@ -1,5 +1,5 @@
-//! Reads the history for a start: alarm changes that are newer than the stored state, and learned values and alarms if there is no
-//! valid state. Reads intact segments only.
+//! Reads the history for a start: alarm changes that are newer than the stored state, and learned values and alarms if
+//! there is no valid state. Reads intact segments only.
 
 use rusqlite::{Connection, Row};
 

@@ -148,7 +148,8 @@ impl Formatter for Rounding {
     }
 }
 
-/// Rounds a number to nine digits, or to six decimals from 1,000 on. Whole numbers (identities) and large ones (times) stay exact.
+/// Rounds a number to nine digits, or to six decimals from 1,000 on. Whole numbers (identities) and large ones (times)
+/// stay exact.
 fn rounded(value: f64) -> f64 {
     let text = match value.abs() {
         size if value.fract() == 0.0 || size >= 1e9 => return value,

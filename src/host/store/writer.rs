@@ -90,8 +90,8 @@ impl WriteQueue {
         self.queue.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Queues rows and the state after them. The state is written if `is_state_due`, or if the rows do not continue the stored state.
-    /// Returns the ticket of the commit.
+    /// Queues rows and the state after them. The state is written if `is_state_due`, or if the rows do not continue the
+    /// stored state. Returns the ticket of the commit.
     pub(super) fn submit(&self, rows: Option<RowBatch>, state: StateDocument, is_state_due: bool) -> u64 {
         let mut queue = self.lock();
         rows.into_iter().for_each(|batch| queue.backlog.push(batch));
@@ -270,8 +270,9 @@ impl Writer {
         }
     }
 
-    /// Calls [`Writer::commit`]. If rows cannot be written, tries again at once: after each step that the reserve releases, and once
-    /// without a release, because space may be available again and a second attempt sets a damaged database aside.
+    /// Calls [`Writer::commit`]. If rows cannot be written, tries again at once: after each step that the reserve
+    /// releases, and once without a release, because space may be available again and a second attempt sets a damaged
+    /// database aside.
     fn commit_urgently(
         &mut self,
         batches: &mut Vec<RowBatch>,

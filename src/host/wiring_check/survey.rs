@@ -20,7 +20,7 @@ use crate::config::{
 use crate::quantity::{CellIndex, Channel, MAX_CELLS};
 use crate::wiring::{InterfacePlan, MessagePlan, OutputPlan, PackPlan, Plan, SignalPlan};
 
-/// Capacity that is used if the configuration states none, Ah: a typical cell of a car.
+/// Capacity that is used if the configuration states none, Ah. It is typical of a car's cell.
 const USUAL_AH: f64 = 50.0;
 
 /// The readable part of a configuration, as `packwatch doctor` needs it.
@@ -52,7 +52,7 @@ impl Survey {
 /// Reads the readable part of a configuration.
 ///
 /// # Errors
-/// Fails if no interface is configured or no signal can be found; returns all faults.
+/// Fails if no interface is configured or no signal can be found, and returns all faults.
 pub fn survey(path: &Path) -> Result<Survey, ConfigFaults> {
     let partial = PartialConfig::read(path)?;
     let found = partial.signals();

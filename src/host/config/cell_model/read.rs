@@ -104,7 +104,7 @@ impl Measured {
     }
 }
 
-/// How the open-circuit curve ages; notes impossible values. Called only if the tables have no fault.
+/// Returns how the open-circuit curve ages, and notes impossible values. It is called only if the tables have no fault.
 fn ageing(head: &Head, tables: &Tables, electrodes: Option<&ElectrodesKeys>, faults: &Faults) -> AgedOcv {
     if !faults.is_empty() {
         return AgedOcv::default();

@@ -23,11 +23,11 @@ pub fn state_words(state: ModelState) -> &'static str {
 /// The lowest and highest measured conditions; `None` = unknown.
 #[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize)]
 pub struct MeasuredRange {
-    /// Degrees C.
+    /// Temperature, degrees C.
     pub temperature_c: Option<[f64; 2]>,
-    /// A, positive = discharge.
+    /// Current, A, positive = discharge.
     pub current_a: Option<[f64; 2]>,
-    /// Fraction.
+    /// SOC, fraction.
     pub soc: Option<[f64; 2]>,
 }
 
@@ -104,15 +104,15 @@ pub struct SourcedModel {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum KnownBy {
-    /// Within the measured range.
+    /// The part lies within the measured range.
     Measured,
-    /// Beyond the measured range.
+    /// The part lies beyond the measured range.
     Extrapolated,
     /// The file does not state the measured range.
     NotStated,
-    /// Typical of the chemistry.
+    /// The values are typical of the chemistry.
     Prior,
-    /// The vehicle's own data.
+    /// The values come from the vehicle's own data.
     Data,
 }
 

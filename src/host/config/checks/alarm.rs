@@ -151,7 +151,7 @@ fn check_needs(alarm: &Alarm, raw: &RawTables) {
     }
 }
 
-/// Checks that each clear threshold is on the healthy side and that more severe thresholds are further out.
+/// Checks that each clear threshold is on the healthy side, and that more severe thresholds are farther from it.
 fn check_thresholds(alarm: &Alarm, rated: &RatedCell) {
     let (place, sign) = (&alarm.place, beyond_sign(alarm.rule));
     let side = if sign > 0.0 { "below" } else { "above" };

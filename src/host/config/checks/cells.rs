@@ -1,6 +1,8 @@
-//! The cells of the pack: the pack's own cells, described by a model file or a label, and modules of other cells (`[[pack.module]]`).
+//! The cells of the pack: the pack's own cells, described by a model file or a label, and modules of other cells
+//! (`[[pack.module]]`).
 //!
-//! In: the tables and the cell model files they name. Out: the models. Notes missing and contradicting keys. Notes cells of a module if they do not exist, belong to two modules, or have no known type.
+//! In: the tables and the cell model files they name. Out: the models. Notes missing and contradicting keys. Notes
+//! cells of a module if they do not exist, belong to two modules, or have no known type.
 
 use std::path::Path;
 

@@ -9,11 +9,11 @@ use crate::config::schema::keys::{
     CellVoltageInput, DiagnosticInput, MethodKey, Pack, PackVoltageInput, TemperatureInput,
 };
 
-/// Maximum number of interfaces of one daemon; more than any vehicle computer has, and fits one byte in journals.
+/// Maximum number of interfaces of one daemon. No vehicle computer has more, and the number fits one byte in journals.
 const MAX_INTERFACES: usize = 16;
 /// Longest kernel name of an interface (IFNAMSIZ without the closing zero).
 const MAX_INTERFACE_NAME: usize = 15;
-/// Longest name of a vehicle or pack, characters; one status line shows all three.
+/// Longest name of a vehicle or pack, characters. One status line shows name, id and pack.
 const MAX_VEHICLE_TEXT: usize = 64;
 
 /// Notes keys that contradict each other.
@@ -169,7 +169,8 @@ fn health(raw: &RawTables, model: Option<&CellModel>) {
         recharge.place.fault(key, if key == "to_soc" { &what } else { &other });
     }
     if let (Some(capacity), Some(estimator)) = (&raw.capacity, &raw.estimator) {
-        // The paper's filter holds the capacity between half-cycles; ours estimates it. Mixing them is not supported.
+        // The paper's filter holds the capacity between half-cycles; packwatch's filter estimates it. Mixing the two is
+        // not supported.
         let (key, needed) = match (capacity.method, estimator.capacity_state) {
             (MethodKey::Swing, CapacityState::Joint) | (MethodKey::Nominal, CapacityState::Held) => ("", ""),
             (MethodKey::Swing, CapacityState::Held) => ("swing", "joint"),

@@ -29,7 +29,7 @@ const SENT: [LayoutMessage; 6] = [
     LayoutMessage::Freshness,
 ];
 
-/// The sent frames and their layout; `None` = none (not configured, or faults noted).
+/// The sent frames and their layout. `None` = no frames are configured, or faults are noted.
 pub(crate) fn output(
     raw: &RawTables,
     found: &[ResolvedSignal<'_>],
@@ -150,7 +150,8 @@ fn authentication(keys: &FrameKeys<'_>) -> Option<Option<Authentication>> {
     keys.data_id.map(|data_id| Some(Authentication { profile, data_id }))
 }
 
-/// Notes SecOC profiles that only commands may use: their few bits of freshness do not survive a restart of the sender.
+/// Notes SecOC profiles that only commands may use. A sent frame needs more bits of freshness, because this program may
+/// restart.
 fn check_sent_secoc(keys: &FrameKeys<'_>) {
     if keys.secoc.is_some_and(|profile| profile != secoc::Profile::Fd) {
         keys.place.fault("secoc", "must be \"fd\" for a frame that is sent");
@@ -193,8 +194,8 @@ fn keys_of<'k, 'a>(frames: &'k [(LayoutMessage, FrameKeys<'a>)], message: Layout
     frames.iter().find(|(which, _)| *which == message).map(|(_, keys)| keys)
 }
 
-/// Notes identifiers and data ids that two frames share, because receivers could mistake one frame for the other, and
-/// identifiers of inputs on the same interface.
+/// Notes identifiers and data ids that two frames share, because receivers could mistake one frame for the other. Also
+/// notes identifiers that an input uses on the same interface.
 fn check_ids(
     frames: &[(LayoutMessage, FrameKeys<'_>)],
     plan: &OutputPlan,

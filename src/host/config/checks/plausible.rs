@@ -15,8 +15,8 @@ use crate::config::schema::RawTables;
 use crate::quantity::{Channel, bounds};
 use crate::sample::Limits;
 
-/// Ratio of rated capacities (or its reciprocal) above which the cells count as different: the estimator learns a
-/// resistance up to this many times the model's.
+/// If the ratio of two rated capacities (or its reciprocal) is larger than this, the cells count as different. The
+/// estimator learns resistances up to this multiple of the model's.
 const OTHER_CELL: f64 = 3.0;
 
 /// Notes implausible signals.
@@ -36,7 +36,7 @@ pub(crate) fn signals(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Opti
 
 /// Range of values, in the channel's unit, that the channel must be able to report at least in part; `None` = any.
 fn needed_values(channel: Channel, (model, series): (Option<&CellModel>, u16)) -> Option<(f64, f64)> {
-    // Without a model: the voltages of any lithium-ion cell.
+    // Without a model, the range is that of any lithium-ion cell.
     let (low, high) = model.map_or((1.2, 4.6), |model| (model.voltage_min_v, model.voltage_max_v));
     match channel {
         Channel::CellVoltage(_) => Some((low, high)),
@@ -190,7 +190,9 @@ fn overlaps(raw: &RawTables, found: &[ResolvedSignal<'_>]) {
 fn is_beside(a: &ResolvedSignal<'_>, b: &ResolvedSignal<'_>) -> bool {
     let is_other_page = |condition: &MuxCondition| {
         let same = b.signal.conditions.iter().find(|other| other.selector == condition.selector);
-        same.is_some_and(|other| !condition.ranges.iter().any(|range| other.ranges.iter().any(|o| is_met(*range, *o))))
+        same.is_some_and(|other| {
+            !condition.ranges.iter().any(|range| other.ranges.iter().any(|o| ranges_overlap(*range, *o)))
+        })
     };
     a.bus == b.bus
         && std::ptr::eq(a.message, b.message)
@@ -211,7 +213,7 @@ fn has_bits_of(a: &ResolvedSignal<'_>, b: &ResolvedSignal<'_>) -> bool {
 }
 
 /// Whether two inclusive ranges overlap.
-fn is_met(a: (u64, u64), b: (u64, u64)) -> bool {
+fn ranges_overlap(a: (u64, u64), b: (u64, u64)) -> bool {
     a.0 <= b.1 && b.0 <= a.1
 }
 
@@ -418,8 +420,8 @@ pub(crate) fn initial_capacity(raw: &RawTables, model: Option<&CellModel>) {
     initial_of(&pack.place, pack.initial_capacity_ah, model);
 }
 
-/// Notes a module's implausible initial or rated capacity, and cells of a very different size than the pack's own cells,
-/// which have `own_ah`.
+/// Notes an implausible initial or rated capacity of a module. Also notes cells whose size differs much from the pack's
+/// own cells, which have `own_ah`.
 pub(crate) fn module(Module { keys, model, .. }: &Module<'_>, own_ah: Option<f64>) {
     let beside = own_ah.map_or(1.0, |own_ah| model.rated_capacity_ah / own_ah);
     if let Some(own_ah) = own_ah.filter(|_| beside.max(1.0 / beside) >= OTHER_CELL) {

@@ -9,7 +9,8 @@ use crate::config::schema::did_you_mean;
 use crate::config::schema::keys::ProtectedInput;
 use crate::quantity::{BusIndex, Channel};
 
-/// The guards of the protected messages; faults are noted. `inputs_whole` states whether every configured signal was found. If it is true, a message that is not found has a wrong name.
+/// The guards of the protected messages; faults are noted. `inputs_whole` states whether every configured signal was
+/// found. If it is true, a message that is not found has a wrong name.
 pub(crate) fn guards(raw: &RawTables, found: &[ResolvedSignal<'_>], inputs_whole: bool) -> Vec<GuardConfig> {
     let mut guards: Vec<(GuardConfig, &ProtectedInput)> = Vec::new();
     for keys in &raw.protected {

@@ -59,9 +59,9 @@ impl NamedSignal<'_> {
 /// A configured signal that was found.
 #[derive(Debug, Clone)]
 pub(crate) struct ResolvedSignal<'d> {
-    /// Input that it feeds.
+    /// Input that the signal feeds.
     pub channel: Channel,
-    /// Interface that carries it.
+    /// Interface that carries the signal.
     pub bus: BusIndex,
     /// DBC file or table of the answer.
     pub file: &'d str,
@@ -96,7 +96,8 @@ pub(crate) struct DbcRanges {
 pub(crate) const UNLIMITED: (f64, f64) = (f64::NEG_INFINITY, f64::INFINITY);
 
 impl Databases {
-    /// Reads the DBC files and the answers. Returns `None` if there are none, or if one is unusable (noted), because signals cannot be looked up in that case.
+    /// Reads the DBC files and the answers. Returns `None` if there are none, or if one is unusable (noted), because
+    /// signals cannot be looked up in that case.
     pub(crate) fn load(config: &Path, raw: &RawTables, read: ReadFile<'_>) -> Option<Self> {
         let mut files = Vec::new();
         for name in raw.input.as_ref().map_or(&[][..], |input| &input.dbc) {

@@ -68,9 +68,9 @@ pub struct InterfaceUse {
 /// A configured signal as found in its DBC.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct SignalUse {
-    /// Input that it feeds: `pack current`, `cell 7 voltage`.
+    /// Input that the signal feeds: `pack current`, `cell 7 voltage`.
     pub channel: String,
-    /// Interface that carries it.
+    /// Interface that carries the signal.
     pub interface: String,
     /// Identifier in candump notation.
     pub id: String,
@@ -80,15 +80,16 @@ pub struct SignalUse {
     pub message: String,
     /// Signal name.
     pub signal: String,
-    /// Condition for the signal: `Page = 3` in a multiplexed frame, `answer of 7EC to 22 01 01` in a diagnostic answer. Empty = the signal is in every frame.
+    /// Condition for the signal: `Page = 3` in a multiplexed frame, `answer of 7EC to 22 01 01` in a diagnostic answer.
+    /// Empty = the signal is in every frame.
     pub multiplex: String,
     /// DBC start bit. In a diagnostic answer: the first bit, counted after the echoed service and identifier.
     pub start_bit: usize,
     /// Length, bits.
     pub length_bits: u16,
-    /// `little-endian` or `big-endian`.
+    /// Byte order: `little-endian` or `big-endian`.
     pub byte_order: &'static str,
-    /// `unsigned`, `signed`, `float32`, `float64`.
+    /// Type of the value: `unsigned`, `signed`, `float32` or `float64`.
     pub value_type: &'static str,
     /// DBC factor.
     pub factor: f64,
@@ -266,7 +267,7 @@ fn serves(sensor: &TemperatureInput) -> String {
     }
 }
 
-/// `1-3, 7` from increasing numbers.
+/// Formats increasing numbers as `1-3, 7`.
 fn cell_list(cells: &[u16]) -> String {
     let mut runs: Vec<(u16, u16)> = Vec::new();
     for &cell in cells {
@@ -278,7 +279,7 @@ fn cell_list(cells: &[u16]) -> String {
     runs.iter().map(|(first, last)| span(first, last)).collect::<Vec<_>>().join(", ")
 }
 
-/// `1-3`, or `7` if both ends are equal.
+/// Formats a range as `1-3`, or as `7` if both ends are equal.
 fn span<T: PartialEq + std::fmt::Display>(first: &T, last: &T) -> String {
     if first == last { format!("{first}") } else { format!("{first}-{last}") }
 }

@@ -15,15 +15,15 @@ use crate::monitor::{AlarmCode, SupplyConfig};
 /// A frame that is sent.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct OutputUse {
-    /// `status`, `health`, `alarm`, `digest`, `reply`, `freshness`.
+    /// Name of the frame: `status`, `health`, `alarm`, `digest`, `reply` or `freshness`.
     pub frame: &'static str,
     /// Identifier in candump notation.
     pub id: String,
-    /// Interfaces.
+    /// Interfaces on which the frame is sent.
     pub interfaces: Vec<String>,
     /// Period, ms; `None` = the frame is sent only on events.
     pub period_ms: Option<f64>,
-    /// `classic`, `FD`, `FD with bit rate switch`.
+    /// Kind of the frame: `classic`, `FD` or `FD with bit rate switch`.
     pub kind: &'static str,
     /// End-to-end protection: `profile 1A, data id 0x123`, or `none`.
     pub protection: String,
@@ -118,7 +118,7 @@ pub(crate) fn polling(config: &Config) -> Vec<String> {
     words
 }
 
-/// `can0: asks 7E4 for 22 01 01 every 1 s while driving, every 5 s while charging`.
+/// Describes a request: `can0: asks 7E4 for 22 01 01 every 1 s while driving, every 5 s while charging`.
 fn request_words(config: &Config, request: &PollRequest) -> String {
     let Controller { bus, request: id, .. } = request.question.controller;
     let interface = config.interface_name(bus);

@@ -26,7 +26,8 @@ pub struct ConfigFiles {
 }
 
 impl ConfigFiles {
-    /// Finds the drop-ins of `main`: the files `main.d/*.toml`, sorted by name, except those whose name begins with a dot.
+    /// Finds the drop-ins of `main`: the files `main.d/*.toml`, sorted by name. Files whose name begins with a dot are
+    /// ignored.
     ///
     /// # Errors
     /// Fails if the folder cannot be listed or has too many drop-ins.
@@ -76,7 +77,7 @@ fn list(folder: &Path) -> io::Result<Vec<PathBuf>> {
 #[derive(Debug)]
 pub(crate) struct SourceFile {
     name: String,
-    /// Position of its first byte in the sequence of all texts.
+    /// Position of the file's first byte in the sequence of all texts.
     start: usize,
     /// The text, preceded by `start` blanks, so that positions in it are positions in the sequence of all texts.
     placed: String,

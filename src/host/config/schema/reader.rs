@@ -12,7 +12,8 @@ use crate::config::document::{Document, SourceLine};
 /// Reads the declared tables of one document.
 pub(crate) struct SchemaReader<'a> {
     document: &'a Document<'a>,
-    /// Whether syntax or tables are broken somewhere. If so, a key that was not found may still exist, so no key is reported as missing.
+    /// Whether syntax or tables are broken somewhere. If so, a key that was not found may still exist, so no key is
+    /// reported as missing.
     pub broken: bool,
 }
 

@@ -120,7 +120,7 @@ macro_rules! section {
         #[derive(Debug, Clone)]
         #[allow(dead_code, reason = "some keys are only for people, and the places of some tables are not used by later checks")]
         pub(crate) struct $name {
-            /// Place in the file.
+            /// Place of the table in the file.
             pub place: $crate::config::document::TablePlace,
             $( $(#[doc = $doc])+ pub $key: $type, )*
         }
@@ -157,10 +157,12 @@ macro_rules! table_field {
 }
 pub(crate) use table_field;
 
-/// Lists the tables of a file in the order of the reference page: generates their struct and how it is read.
+/// Lists the tables of a file in the order of the reference page. The macro generates the struct of these tables and
+/// the function that reads it.
 ///
-/// A table is `one` (always read: if it is absent, its defaults apply and its required keys are missing), `optional` (read
-/// if present) or `many` (`[[path]]`, repeatable). `with` names the tables inside one of its keys.
+/// A table is `one`, `optional` or `many`. `one` is always read: if the table is absent, its defaults apply and its
+/// required keys are missing. `optional` is read if it is present. `many` is repeatable (`[[path]]`). `with` names the
+/// tables inside a key of the table.
 macro_rules! tables {
     ($(#[$about:meta])* $name:ident, $sections:ident { $($field:ident: $kind:ident $section:ident $(with $below:ident)?),+ $(,)? }) => {
         $(#[$about])*
@@ -178,7 +180,7 @@ macro_rules! tables {
         }
 
         impl $name {
-            /// Reads every table; faults of single keys and unknown keys are noted.
+            /// Reads every table. Faulty and unknown keys are noted.
             pub(crate) fn read(document: &$crate::config::document::Document<'_>) -> Self {
                 use $crate::config::schema::Section as _;
                 let reader = $crate::config::schema::SchemaReader::new(document, $sections);

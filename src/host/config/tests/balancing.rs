@@ -11,7 +11,7 @@ fn read_with(pack: &str) -> Result<Config, Vec<String>> {
     read_texts(pack, CELL, &format!("{DBC}\n{BITS}")).map(|(config, _)| config)
 }
 
-/// Line 15 is `[input.balancing]`.
+/// A configuration whose line 15 is `[input.balancing]`.
 fn pack(keys: &str) -> String {
     format!("{PACK}[input.balancing]\n{keys}")
 }

@@ -1,4 +1,4 @@
-//! Cell model files: the full text of every fault.
+//! Tests cell model files, and compares the full text of every fault.
 
 use super::*;
 

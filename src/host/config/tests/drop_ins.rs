@@ -1,4 +1,4 @@
-//! Drop-ins: merged settings, and faults located in the right file.
+//! Tests drop-ins: their settings are merged, and their faults name the right file.
 
 use super::*;
 

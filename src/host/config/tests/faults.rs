@@ -1,4 +1,4 @@
-//! One wrong key at a time: the full text of its fault.
+//! Tests one wrong key at a time, and compares the full text of its fault.
 
 use super::*;
 

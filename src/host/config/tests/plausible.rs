@@ -1,4 +1,4 @@
-//! Valid syntax with implausible contents: the full text of every fault and warning.
+//! Tests valid syntax with implausible contents, and compares the full text of every fault and warning.
 
 use super::*;
 

@@ -1,4 +1,4 @@
-//! `[[input.diagnostic]]`: resulting settings and the full text of every fault.
+//! `[[input.diagnostic]]`: tests the resulting settings, and compares the full text of every fault.
 
 #![allow(clippy::panic, reason = "tests may panic")]
 

@@ -47,7 +47,7 @@ impl Scene {
         self.feed(after_s, |time| Record::bus(time, BusIndex(bus), event))
     }
 
-    /// The line reported after `seconds` of ticks, if any.
+    /// Runs ticks for `seconds`. Returns the last line reported in this time, if any.
     fn wait(&mut self, seconds: u32) -> Option<String> {
         (0..seconds * 10).filter_map(|_| self.tick(0.1).status).last()
     }

@@ -51,7 +51,7 @@ fn unknown_values_are_omitted() {
     assert!(!text.contains("packwatch_pack_soc_ratio") && !text.contains("packwatch_cell_voltage_volts"));
     let mut samples_only = text.lines().filter(|line| !line.starts_with('#'));
     assert!(samples_only.all(|line| !line.ends_with("NaN") && !line.ends_with("inf")));
-    // The second cell is silent; all values of the first cell except its voltage are present.
+    // The second cell is silent. The first cell has all values except its voltage.
     assert_eq!(samples(&text, "packwatch_cell_soc_ratio"), ["packwatch_cell_soc_ratio{cell=\"1\"} 0.6"]);
     // Without a daemon there is only one metric.
     let none = openmetrics(None);
