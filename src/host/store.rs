@@ -1,11 +1,12 @@
 //! State and history that survive restarts and power cuts: two state files and a database of the history, in one folder.
 //!
-//! * Learned results and alarm changes are on disk before they are announced; an announcement waits at most 200 ms for the disk
-//!   ([`commit_barrier`]). Learned results are stored with the whole state. An alarm change is stored as a small row of
-//!   the history; a start restores the newest state and repeats the newer alarm changes (`learned`).
-//! * Rows are committed before the state that contains them (`writer`). A power cut between the two leaves rows that were not
-//!   announced. The next start repeats their alarm changes; learned results are learned again and get another row. A
-//!   change of the pack between the two is not undone: the history says that the state's pack is closed, and the state
+//! * Learned results and alarm changes are written to disk before they are announced. An announcement waits at most 200
+//!   ms for the disk ([`commit_barrier`]). Learned results are stored with the whole state. An alarm change is stored
+//!   as a small row of the history. A start restores the newest state, then repeats the alarm changes that are newer
+//!   (`learned`).
+//! * Rows are committed before the state that contains them (`writer`). A power cut between the two leaves rows that
+//!   were not announced. The next start repeats their alarm changes. Learned results are learned again and get another
+//!   row. A pack change between the two is not undone: the history says that the state's pack is closed, so the state
 //!   is not restored.
 //! * The state is also written at checkpoints (`checkpoint`), on stop, and every second to the runtime folder, which is
 //!   in memory.
@@ -101,7 +102,7 @@ pub const HISTORY_SOURCE: &str = "history";
 pub struct StateCandidate {
     /// The state.
     pub snapshot: Snapshot,
-    /// Its age.
+    /// Age of the state.
     pub downtime: Downtime,
     /// Origin of the state, for the log.
     pub source: &'static str,
@@ -116,7 +117,7 @@ pub struct StoredStates {
     pub learned: Vec<LearnedCell>,
     /// Alarm changes of the connected pack in the history; empty if there is a valid state.
     pub alarms: Vec<(Timestamp, AlarmChange)>,
-    /// Whether the store was readable, undamaged and is writable.
+    /// Whether the store was readable and undamaged, and is writable.
     pub works: bool,
 }
 
@@ -279,7 +280,7 @@ impl Store {
         }
     }
 
-    /// Queues rows and the state for the writer; returns the ticket.
+    /// Queues rows and the state for the writer. Returns the ticket.
     fn submit(&mut self, HistoryCommit { rows, with_state }: HistoryCommit, monitor: &Monitor, now: Timestamp) -> u64 {
         let state = self.document(monitor, now);
         self.schedule.note_written(now, with_state.then_some(self.progress.borrow().state_bytes));
@@ -312,13 +313,13 @@ struct OpenedFolder {
     rows: Vec<HistoryRow>,
     /// Number of the connected pack; 0 = unknown.
     pack: i64,
-    /// Rows of the history that the newest state contains or that are repeated in it.
+    /// Number of rows of the history that the newest state contains or that the start repeats.
     known_rows: i64,
     found: StoredStates,
 }
 
 impl OpenedFolder {
-    /// Reads the states and opens the database; `running` is the state in the runtime folder.
+    /// Reads the states and opens the database. `running` is the state in the runtime folder.
     fn open(folder: &mut Folder, running: Option<StateDocument>, now: &Stamp) -> Self {
         let (state_files, FoundStates { mut newest, aside, faults: mut rows }) = StateFiles::open(folder.path());
         let mut running = running.filter(|running| running.stamp.same_boot(now));
@@ -364,13 +365,13 @@ impl OpenedFolder {
     }
 }
 
-/// Reads from the history; logs an error and returns nothing if reading fails.
+/// Reads from the history. If reading fails, logs the error and returns an empty list.
 fn read<T>(database: Option<&Database>, read: impl Fn(&Database) -> rusqlite::Result<Vec<T>>) -> Vec<T> {
     let found = database.map(read).transpose();
     found.inspect_err(|error| tracing::error!(%error, "the history cannot be read")).ok().flatten().unwrap_or_default()
 }
 
-/// A row that reports missing rows: the state knows newer rows than the database has. Damage to SQLite's log has no
+/// Returns a row for the history if the state knows newer rows than the database has. Damage to SQLite's log has no
 /// other symptom.
 fn lost_rows(state: &StateDocument, database: &Database) -> Option<HistoryRow> {
     let (known, found) = (state.history_rows, database.rows());

@@ -293,7 +293,8 @@ fn send(links: &[LinkOutput], key: Option<&CanKey>, transmit: &Transmit) {
     }
 }
 
-/// A new state with the learned values and alarms in the history; `None` = the history has none for these cells.
+/// Creates a state from the learned values and alarms in the history; `None` = the history has no values for these
+/// cells.
 fn state_of_history(
     config: &MonitorConfig,
     learned: &[LearnedCell],

@@ -1,16 +1,16 @@
 //! Decides when the next checkpoint of the state is due. A checkpoint writes the whole state, and flash memory wears out.
 //!
-//! In: the bytes and the time of each commit. Alarm changes and learned results are never delayed; they delay the
+//! In: the bytes and the time of each commit. Alarm changes and learned results are never delayed. They delay the
 //! checkpoints instead. A pack of 96 cells (70 kB) gets a checkpoint every 7 minutes, a pack of 12 cells every minute.
 
 use crate::quantity::Timestamp;
 
 /// Bytes of states written per day. In total 20 MB may be written per day; history and file system take the rest.
 const BYTES_PER_DAY: f64 = 15e6;
-/// Bytes written by a commit without a state: three pages of SQLite in its log and later in its file, in whole pages of
-/// the system.
+/// Bytes that a commit without a state writes: three pages of SQLite, first in its log and later in its file, rounded
+/// up to whole pages of the system.
 const COMMIT_BYTES: f64 = 8e3;
-/// Longest time without a checkpoint, s, whatever else was written.
+/// Longest time without a checkpoint, s, regardless of what else was written.
 const MAX_PERIOD_S: f64 = 3600.0;
 
 /// The schedule of checkpoints.
@@ -20,7 +20,7 @@ pub(super) struct CheckpointSchedule {
     period_s: f64,
     /// Time of the last state.
     last: Option<Timestamp>,
-    /// Bytes written beyond the daily rate, and the time of that figure.
+    /// Bytes written beyond the daily rate, and the time for which this number holds.
     ahead: (f64, Timestamp),
 }
 
@@ -30,14 +30,15 @@ impl CheckpointSchedule {
         Self { period_s, last: None, ahead: (0.0, Timestamp::ZERO) }
     }
 
-    /// Whether a checkpoint is due, at least `period_s` after the last state. The first one is due a period after the start.
+    /// Whether a checkpoint is due, at least `period_s` after the last state. The first checkpoint is due one period
+    /// after the start.
     pub(super) fn is_due(&mut self, now: Timestamp, period_s: f64) -> bool {
         let elapsed_s = now.since(*self.last.get_or_insert(now));
         let may_write = self.ahead_at(now) <= 0.0 || elapsed_s >= MAX_PERIOD_S;
         elapsed_s >= self.period_s.max(period_s) && may_write
     }
 
-    /// Notes a commit; `None` = without a state.
+    /// Notes a commit and the size of its state; `None` = a commit without a state.
     pub(super) fn note_written(&mut self, now: Timestamp, state_bytes: Option<u64>) {
         let bytes = state_bytes.map_or(COMMIT_BYTES, |bytes| bytes as f64);
         self.ahead = (self.ahead_at(now) + bytes, now);
@@ -54,7 +55,8 @@ impl CheckpointSchedule {
 mod tests {
     use super::*;
 
-    /// Checkpoints and bytes of a day with states of this size and a commit of rows in each second for which `commits` is true.
+    /// Returns the checkpoints and bytes of a day. States have this size, and rows are committed in each second for
+    /// which `commits` is true.
     fn day(bytes: u64, commits: impl Fn(u32) -> bool) -> (u32, f64) {
         let (mut schedule, mut checkpoints, mut written) = (CheckpointSchedule::new(60.0), 0, 0.0);
         for second in 0..86_400_u32 {
@@ -80,7 +82,7 @@ mod tests {
 
     #[test]
     fn alarms_delay_checkpoints_by_at_most_an_hour() {
-        // Ten alarms a minute for the last hour.
+        // Ten alarms change per minute during the last hour.
         let (checkpoints, written) = day(70_000, |second| second >= 82_800 && second % 6 == 0);
         assert!((195..=206).contains(&checkpoints) && written <= 19.5e6, "{checkpoints}, {written} bytes");
         let (checkpoints, _) = day(70_000, |second| second % 6 == 0);

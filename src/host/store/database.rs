@@ -223,12 +223,13 @@ impl Database {
         transaction.commit()
     }
 
-    /// Alarm changes of the connected pack after row `after`, oldest first, with their times on the inputs' clock.
+    /// Returns the alarm changes of the connected pack after row `after`, oldest first, with their times on the inputs'
+    /// clock.
     pub(super) fn alarm_changes(&self, after: i64) -> rusqlite::Result<Vec<(Timestamp, AlarmChange)>> {
         learned::alarm_changes(&self.connection, self.pack, after)
     }
 
-    /// Learned values of the connected pack's cells.
+    /// Returns the learned values of the connected pack's cells.
     pub(super) fn learned(&self) -> rusqlite::Result<Vec<LearnedCell>> {
         learned::read(&self.connection, self.pack)
     }

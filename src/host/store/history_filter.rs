@@ -1,8 +1,7 @@
 //! Selects the events that the history keeps, and decides when they are committed.
 //!
 //! In: the events of one input. Out: rows to commit now, if any, and whether to write the state with them. Token
-//! buckets limit rows with little news; times are taken from the events. Alarm changes are limited only by their
-//! debounce.
+//! buckets limit rows that change little; their times are those of the events. Only the debounce limits alarm changes.
 
 use std::collections::BTreeMap;
 
@@ -19,8 +18,8 @@ use crate::token_bucket::{BucketSize, TokenBucket};
 const CAPACITIES: BucketSize = BucketSize { burst: 64.0, period_s: 3600.0 };
 /// Smallest change for which a further capacity is written, in standard deviations.
 const MIN_CHANGE_STD: f64 = 0.25;
-/// How often deferred rows are written with a checkpoint or with other rows: an hour of checkpoints, then once an hour.
-/// Each time up to two rows per cell are written and kept for years.
+/// How often deferred rows are written with a checkpoint or with other rows: 60 times at once (one hour of
+/// checkpoints), then once an hour. Each time, up to two rows per cell are written, which are kept for years.
 const CARRIED: BucketSize = BucketSize { burst: 60.0, period_s: 3600.0 };
 
 /// The capacity last written.
@@ -38,7 +37,7 @@ struct WrittenLife {
     token_bucket: TokenBucket,
 }
 
-/// What to commit before the events of one input are announced.
+/// The rows to commit before the events of one input are announced.
 #[derive(Debug, PartialEq)]
 pub(super) struct HistoryCommit {
     pub rows: Vec<HistoryRow>,
@@ -67,7 +66,7 @@ impl Default for HistoryFilter {
 }
 
 impl HistoryFilter {
-    /// What to commit now; `None` = nothing was learned and no alarm changed.
+    /// Returns what to commit now; `None` = nothing was learned and no alarm changed.
     pub(super) fn take(&mut self, events: &[Event]) -> Option<HistoryCommit> {
         let now = events.first()?.time;
         let stored = || events.iter().map(|event| event.kind).filter_map(|kind| Some((Urgency::of(&kind)?, kind)));
@@ -89,12 +88,12 @@ impl HistoryFilter {
         Some(HistoryCommit { rows, with_state: urgency == Urgency::WithState })
     }
 
-    /// What to commit at a checkpoint.
+    /// Returns what to commit at a checkpoint.
     pub(super) fn checkpoint(&mut self, now: Timestamp) -> HistoryCommit {
         HistoryCommit { rows: self.for_checkpoint(now), with_state: true }
     }
 
-    /// What to commit when the program ends.
+    /// Returns what to commit when the program ends.
     pub(super) fn finish(&mut self) -> HistoryCommit {
         HistoryCommit { rows: std::mem::take(&mut self.deferred), with_state: true }
     }
@@ -170,17 +169,18 @@ impl HistoryFilter {
 /// When and how an event is stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Urgency {
-    /// With the next commit: filter resets, which may be frequent and are not announced.
+    /// The event is stored with the next commit. Filter resets are deferred, because they may be frequent and are not
+    /// announced.
     Deferred,
-    /// As a row, before it is announced; a start can repeat it from the row.
+    /// The event is stored as a row before it is announced. A start can repeat it from the row.
     AsRow,
-    /// With the whole state, before it is announced; its row alone is not enough to restore it.
+    /// The event is stored with the whole state before it is announced. Its row alone is not enough to restore it.
     WithState,
 }
 
 impl Urgency {
-    /// The urgency of an event; `None` = the event is not stored. An alarm whose value becomes unknown or known again
-    /// stays announced, and a flickering input causes many such events.
+    /// The urgency of an event; `None` = the event is not stored. If an alarm's value becomes unknown or known again,
+    /// the announced alarm does not change. Such events are not stored, because a flickering input causes many of them.
     const fn of(kind: &EventKind) -> Option<Self> {
         match kind {
             EventKind::HalfCycle { .. }
@@ -204,7 +204,7 @@ mod tests {
     use super::super::rows::tests::{alarm, capacity, half_cycle, loss_modes, model, remaining_life};
     use super::*;
 
-    /// Rows that are committed at once.
+    /// Number of rows that are committed at once.
     fn take(history_filter: &mut HistoryFilter, seconds: f64, kinds: &[EventKind]) -> Option<usize> {
         let time = Timestamp::from_secs(seconds);
         let events: Vec<Event> = kinds.iter().map(|&kind| Event { time, kind }).collect();

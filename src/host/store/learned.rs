@@ -1,5 +1,5 @@
-//! Reads the history for a start: alarm changes that are newer than the stored state, and learned values and alarms if
-//! there is no valid state. Reads intact segments only.
+//! Reads the history for a start. Alarm changes are read if they are newer than the stored state. If there is no valid
+//! state, learned values and all alarms are read. Only intact segments are read.
 
 use rusqlite::{Connection, Row};
 
@@ -14,7 +14,7 @@ use crate::quantity::{CellIndex, Timestamp};
 /// Maximum number of segments that are read, newest first. A segment is a day of use or less.
 const MAX_SEGMENTS: usize = 16;
 
-/// Alarm changes of pack `pack` after row `after`, oldest first, with their times on the inputs' clock.
+/// Returns the alarm changes of pack `pack` after row `after`, oldest first, with their times on the inputs' clock.
 pub(super) fn alarm_changes(
     connection: &Connection,
     pack: i64,
@@ -36,7 +36,7 @@ pub(super) fn alarm_changes(
     Ok(changes)
 }
 
-/// The contents of a row of `alarm`; `None` = written by a version with other alarms.
+/// Returns the contents of a row of `alarm`; `None` = a version with other alarms wrote the row.
 fn alarm_change(row: &Row<'_>) -> rusqlite::Result<Option<AlarmChange>> {
     let change: String = row.get("change")?;
     let is_dropped = change == DROPPED;
@@ -55,7 +55,8 @@ fn alarm_change(row: &Row<'_>) -> rusqlite::Result<Option<AlarmChange>> {
     Ok(change.zip(alarm).map(|(change, alarm)| AlarmChange { change, alarm }))
 }
 
-/// Learned values of the cells of pack `pack`, in the order of the cells: each from the newest row of the cell.
+/// Returns the learned values of the cells of pack `pack`, in the order of the cells. Each value is from the newest row
+/// of the cell.
 pub(super) fn read(connection: &Connection, pack: i64) -> rusqlite::Result<Vec<LearnedCell>> {
     let mut statement = connection.prepare(&format!(
         "SELECT r.{} FROM capacity r JOIN moment m ON m.id = r.moment WHERE m.pack = ?1 AND r.seq BETWEEN ?2 AND ?3 ORDER BY r.seq DESC",

@@ -11,7 +11,7 @@ use super::stamp::Stamp;
 use crate::monitor::EventKind;
 use crate::quantity::catalogue::RecordedValues;
 
-/// Value of `change` for an alarm that ended because no threshold watches it any longer.
+/// Value of `change` for an alarm that ended because no threshold monitors it any longer.
 pub(super) const DROPPED: &str = "dropped";
 
 /// One row to write.
@@ -46,7 +46,7 @@ pub enum HistoryTable {
     Capacity,
     /// Loss modes of the cells.
     LossModes,
-    /// Remaining lives, each of the cell that reaches its end of life first.
+    /// Remaining lives. Each is that of the cell that reaches its end of life first.
     RemainingLife,
     /// Changes of the cell model learned on board.
     Model,

@@ -321,7 +321,8 @@ fn judge_number(
     }))
 }
 
-/// Up to `limit` newest segments with rows after row `after`, oldest first. Reports and leaves out damaged segments.
+/// Returns up to `limit` newest segments with rows after row `after`, oldest first. Damaged segments are reported and
+/// left out.
 pub(super) fn intact(connection: &Connection, after: i64, limit: usize) -> rusqlite::Result<Vec<Segment>> {
     let mut pairs = pairs(connection)?;
     pairs.retain(|(_, segment)| !segment.is_deleted && segment.last > after);

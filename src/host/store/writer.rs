@@ -64,9 +64,9 @@ pub(super) struct WriteQueue {
 struct QueueState {
     backlog: Backlog,
     state: Option<StateDocument>,
-    /// The state must be written.
+    /// Whether the state must be written.
     is_state_due: bool,
-    /// The next state must not overwrite the stored one.
+    /// Whether the next state must not overwrite the stored one.
     sets_aside: bool,
     ticket: u64,
     /// Whether the writer has work.
@@ -270,9 +270,9 @@ impl Writer {
         }
     }
 
-    /// Calls [`Writer::commit`]. If rows cannot be written, tries again at once: after each step that the reserve
-    /// releases, and once without a release, because space may be available again and a second attempt sets a damaged
-    /// database aside.
+    /// Calls [`Writer::commit`]. If rows cannot be written, tries again at once, after each step that the reserve
+    /// releases. Also tries again once without a release: space may be available again, and a second attempt sets a
+    /// damaged database aside.
     fn commit_urgently(
         &mut self,
         batches: &mut Vec<RowBatch>,
@@ -289,7 +289,7 @@ impl Writer {
         }
     }
 
-    /// Commits the rows, which then leave `batches`, and writes the state if that is due. Returns the size of the state.
+    /// Commits the rows, removes them from `batches`, and writes the state if it is due. Returns the size of the state.
     pub(super) fn commit(
         &mut self,
         batches: &mut Vec<RowBatch>,
@@ -300,7 +300,7 @@ impl Writer {
             batches.clear();
             self.write_queue.lock().backlog.commit();
         } else if !self.knows_state {
-            // Do not overwrite a state that has not been read yet.
+            // A state that has not been read yet must not be overwritten.
             return rows.map(|()| None);
         }
         if rows.is_ok() && !self.needs_state {

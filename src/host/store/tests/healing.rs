@@ -86,7 +86,7 @@ fn lost_history_does_not_restore_old_pack() {
     assert!(found.states.is_empty() && found.learned.is_empty());
 }
 
-/// A change of an alarm that the configuration of these tests contains.
+/// Returns a change of an alarm that the configuration of these tests contains.
 fn change(change: Change, occurrences: u32, acknowledged: bool) -> EventKind {
     let state = if change == Change::Raised { AlarmState::Active } else { AlarmState::Inactive };
     EventKind::Alarm {
@@ -104,7 +104,7 @@ fn change(change: Change, occurrences: u32, acknowledged: bool) -> EventKind {
     }
 }
 
-/// Starts in a copy of the folder, as after a power cut.
+/// Starts the store in a copy of the folder, as after a power cut.
 fn after_cut(place: &Path) -> StoredStates {
     let copy = tempfile::tempdir().unwrap();
     for entry in std::fs::read_dir(place.join("state")).unwrap() {
@@ -117,7 +117,7 @@ fn after_cut(place: &Path) -> StoredStates {
     found
 }
 
-/// The raised alarms of a restored state: occurrences and time of the last, s.
+/// The raised alarms of a restored state, each with its occurrences and the time of the last occurrence, s.
 fn raised(snapshot: Snapshot) -> Vec<(u32, f64)> {
     let monitor = restored(snapshot);
     monitor.alarms().raised().map(|alarm| (alarm.occurrences, alarm.last_raised.unwrap().secs())).collect()
