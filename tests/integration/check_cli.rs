@@ -106,7 +106,7 @@ fn all_faults_are_reported_with_code_78() {
     assert_eq!(code, 78);
     let at = |name: &str, line: usize| format!("{}:{line}: ", folder.path().join(name).display());
     let beginnings = [
-        at("pack.toml", 1) + "interface is missing, must have at least one table [[interface]]",
+        at("pack.toml", 1) + "the file has no table [[interface]], must have at least one",
         at("pack.toml", 4) + "input.current.signal is missing",
         at("pack.toml", 2) + "pack.cells = 0, must be 1 to 1024",
         at("pack.toml", 6) + "input.speed is not a known key",

@@ -73,7 +73,7 @@ impl CanKey {
             .or_else(|| hex_key(content.trim_ascii_end()))
             .ok_or_else(neither)?;
         if key.iter().all(|byte| *byte == key[0]) {
-            return Err("one byte repeated, must be random".to_owned());
+            return Err("all bytes of the key are equal, must be random".to_owned());
         }
         Cmac::new_from_slice(&key).map(Self).map_err(|_| neither())
     }
@@ -141,7 +141,7 @@ mod tests {
             let error = CanKey::parse(bad).unwrap_err();
             assert_eq!(error, format!("{} bytes, must be 16 bytes or 32 hex digits", bad.len()));
         }
-        assert_eq!(CanKey::parse(&[b'0'; 32]).unwrap_err(), "one byte repeated, must be random");
+        assert_eq!(CanKey::parse(&[b'0'; 32]).unwrap_err(), "all bytes of the key are equal, must be random");
         assert_eq!(format!("{:?}", CanKey::parse(KEY).unwrap()), "CanKey(hidden)");
     }
 

@@ -14,9 +14,9 @@ section! {
     Head at "" {
         /// Version of the file format.
         format: u16, "", Between(1.0, 1.0), Required;
-        /// Name of the cell, for readers.
+        /// Name of the cell, for people.
         name: String, "", NotEmpty, Required;
-        /// Chemistry, for readers.
+        /// Chemistry, for people.
         chemistry: Option<String>, "", NotEmpty, Optional("none");
         /// Rated capacity, as on the label. SOH is relative to it.
         rated_capacity_ah: f64, "Ah", within(bounds::CONFIGURED_CAPACITY_AH), Required;
@@ -48,7 +48,7 @@ section! {
 }
 
 section! {
-    /// The conditions of the cell's measurement, written by `packwatch fit` for readers. Beyond these temperatures a fitted model continues with a larger `voltage_error_v`, so that estimates are less certain there.
+    /// The conditions under which the cell was measured, written by `packwatch fit` for people. Beyond these temperatures a fitted model continues with a larger `voltage_error_v`, so that estimates are less certain there.
     Measured at "measured" {
         /// Lowest and highest temperature.
         temperature_c: Option<Vec<f64>>, "degrees C", within(bounds::TEMPERATURE_C), Optional("unknown");
@@ -148,7 +148,7 @@ pub(crate) const SECTIONS: &[SectionInfo] = &[
     SectionInfo::one::<Head>(),
     SectionInfo::notes(
         "provenance",
-        "The source of the numbers, for readers; any keys are allowed. `packwatch cells` shows `citation` (or `source`) and `licence`.",
+        "The source of the numbers, for people. Any keys are allowed. `packwatch cells` shows `citation` (or `source`) and `licence`.",
     ),
     SectionInfo::one::<Measured>(),
     SectionInfo::one::<Tables>(),

@@ -48,10 +48,12 @@ fn vehicle(raw: &RawTables) {
 
 fn interfaces(raw: &RawTables) {
     if raw.interfaces.is_empty() && raw.has_all_interfaces() {
-        raw.faults.add(&raw.file, 1, "interface is missing, must have at least one table [[interface]]");
+        raw.faults.add(&raw.file, 1, "the file has no table [[interface]], must have at least one");
     }
     if let Some(one_too_many) = raw.interfaces.get(MAX_INTERFACES) {
-        one_too_many.place.fault("name", format!("is one interface too many, must be at most {MAX_INTERFACES}"));
+        one_too_many
+            .place
+            .fault("name", format!("is one interface too many, the file must have at most {MAX_INTERFACES}"));
     }
     for (index, interface) in raw.interfaces.iter().enumerate() {
         let name = &interface.name;

@@ -50,7 +50,7 @@ impl CanSender {
                 Err(error) => return Err(io::Error::other(format!("{}: {frame:?} not sent: {error}", self.interface))),
             }
         }
-        Err(io::Error::new(io::ErrorKind::TimedOut, format!("{}: transmit queue stays full", self.interface)))
+        Err(io::Error::new(io::ErrorKind::TimedOut, format!("{}: the transmit queue stays full", self.interface)))
     }
 
     fn wait_for_room(&self) -> io::Result<()> {

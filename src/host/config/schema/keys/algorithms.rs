@@ -44,7 +44,7 @@ section! {
         charge_noise_per_sqrt_soc: f64, "fraction/sqrt(SOC)", DEVIATION, Default("3e-3");
         /// Process noise of the branch voltages.
         branch_noise_v_per_sqrt_s: f64, "V/sqrt(s)", DEVIATION, Default("1e-3");
-        /// Process noise of ln(resistance). It covers ageing. It also covers deviations of the resistance from the tables in the cold, and its changes within minutes of driving.
+        /// Process noise of ln(resistance). It covers ageing. It also covers differences between the true resistance and the tables, in the cold or within minutes of driving.
         log_resistance_noise_per_sqrt_s: f64, "1/sqrt(s)", DEVIATION, Default("1e-3");
         /// Process noise of the SOC while no current is measured (vehicle asleep).
         gap_noise_per_sqrt_s: f64, "fraction/sqrt(s)", DEVIATION, Default("1.5e-5");
@@ -177,7 +177,7 @@ section! {
             => hysteresis_a: keys.hysteresis_a.unwrap_or(0.5 * keys.dead_band_a(pack_ah));
         /// A new mode must last this long before it is accepted.
         min_duration_s: f64, "s", Between(0.0, 1e6), Default("10.0");
-        /// A charge or discharge smaller than this fraction of the rated capacity is merged with the following ones until their sum reaches it. For method "nominal", set it slightly below `nominal_swing`, so that a pause does not split a half-cycle.
+        /// A charge or discharge smaller than this fraction of the rated capacity is merged with the following ones until their sum reaches it. For method "nominal", set it to most of `nominal_swing`, so that a pause does not split a half-cycle.
         min_swing: f64, "fraction", Between(0.0, 1.0), Default("0.02");
     }
 }
@@ -204,7 +204,7 @@ section! {
         /// Standard deviation gained per day of rest, because some capacity recovers at rest ("swing" only).
         noise_ah_per_rest_day: Option<f64>, "Ah", DEVIATION, Optional("1 % of the rated capacity")
             => noise_ah_per_rest_day: keys.noise_ah_per_rest_day.unwrap_or(0.01 * rated_ah);
-        /// Error of the cell model's open-circuit curve at the ends of a half-cycle ("swing" only). All half-cycles that end at the same SOC have the same error, so it never averages out.
+        /// Error of the cell model's open-circuit curve at the ends of a half-cycle ("swing" only). Half-cycles that end at the same SOC have the same error, so it never averages out.
         end_error_v: Option<f64>, "V", DEVIATION, Optional("half of the error stated by the cell model, else 0");
         /// Standard deviation of the cell model's `ocv_ageing_shift`, that is, how uncertain the ageing of the open-circuit curve is ("swing" only). A cell model with `[electrodes]` states its own.
         ageing_shift_error: f64, "", DEVIATION, Default("0.3") =>;
@@ -271,7 +271,7 @@ section! {
             => reference_current_a: keys.reference_current_a.unwrap_or(rated_ah / 2.0);
         /// Fraction of the window that a charge must cover before a normalised period is reported (a raw period needs the whole window).
         min_coverage: f64, "fraction", Above(0.0, 1.0), Default("0.5");
-        /// What the alarm `recharge_period_low` compares. "raw": each raw period, as soon as the charge leaves the window; a stronger charger then looks like a worn pack, and a weaker one hides wear. "normalised": the normalised period, at the end of each charge that covers enough of the window.
+        /// What the alarm `recharge_period_low` compares. "raw": each raw period, as soon as the charge leaves the window. With this setting, a stronger charger looks like a worn pack, and a weaker charger hides wear. "normalised": the normalised period, at the end of each charge that covers enough of the window.
         alarm_on: RechargeAlarm, "", Any, Default("\"raw\"");
     }
 }

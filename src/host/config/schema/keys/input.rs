@@ -10,7 +10,7 @@ use crate::config::schema::section::section;
 use crate::config::schema::setting::{CellRanges, NumberRange};
 
 section! {
-    /// The inputs: what is read from the buses. `[input.current]` is required, and either `[input.cell_voltage]` or `[input.pack_voltage]`.
+    /// The inputs that are read from the buses. `[input.current]` is required. Either `[input.cell_voltage]` or `[input.pack_voltage]` is required too.
     Input at "input" {
         /// DBC files that describe the signals named below, relative to this file. Not required if all signals are in the answers of `[[input.diagnostic]]`.
         dbc: Vec<String>, "", Any, Default("[]");
@@ -22,7 +22,7 @@ section! {
 }
 
 section! {
-    /// An input message that its sender protects end to end (AUTOSAR). A frame fails its check if it is damaged, repeated, out of sequence, the first frame after a start, or if it belongs to another message. The readings of such a frame are bad. Each outcome is counted; a change between good and bad is reported.
+    /// An input message that its sender protects end to end (AUTOSAR). A frame fails its check if it is damaged, repeated or out of sequence. It also fails if it belongs to another message, or if it is the first frame after a start. The readings of such a frame are bad. Each outcome is counted; a change between good and bad is reported.
     ProtectedInput at "input.protected" {
         /// Name of the message in its DBC file. At least one of its signals must be an input.
         message: String, "", NotEmpty, Required;
@@ -46,9 +46,9 @@ section! {
     DiagnosticInput at "input.diagnostic" {
         /// Name of the answer, which precedes the dot in `Name.Signal`. Several answers may share a name.
         name: String, "", NotEmpty, Required;
-        /// CAN identifier of the requests; above 0x7FF a 29-bit identifier.
+        /// CAN identifier of the requests. A number above 0x7FF is a 29-bit identifier.
         request: u32, "", Between(0.0, 0x1FFF_FFFF as f64), Required;
-        /// CAN identifier of the answers; above 0x7FF a 29-bit identifier.
+        /// CAN identifier of the answers. A number above 0x7FF is a 29-bit identifier.
         response: u32, "", Between(0.0, 0x1FFF_FFFF as f64), Required;
         /// Extended addressing: first data byte of the requests.
         request_extension: Option<u8>, "", Any, Optional("normal addressing");
@@ -76,7 +76,7 @@ section! {
         name: String, "", NotEmpty, Required;
         /// Position of the first (most significant) bit, counted from the most significant bit of the byte after the echoed service and identifier (like `bix` in OBDb).
         bit: u32, "bits", Between(0.0, 8.0 * 65_535.0), Required;
-        /// Length.
+        /// Length of the signal.
         length: u16, "bits", Between(1.0, 64.0), Required;
         /// Whether the codes are signed (two's complement).
         signed: bool, "", Any, Default("false");
@@ -149,7 +149,7 @@ signal_section! {
 }
 
 signal_section! {
-    /// The state of the pack's contactors. While it reads "open", packwatch uses 0 A, regardless of the current sensor and even if it is silent. If the state is unknown (no reading within `max_age_s`), the current sensor's reading is used.
+    /// The state of the pack's contactors. While it reads "open", packwatch uses 0 A, regardless of the current sensor's reading and even if the sensor is silent. If the state is unknown (no reading within `max_age_s`), the current sensor's reading is used.
     ContactorInput at "input.contactor", "any unit" {
         /// Signal values (after the DBC's factor, `scale` and `offset`) that mean open. Every other value means closed.
         open: Vec<f64>, "", NotEmpty, Required =>;

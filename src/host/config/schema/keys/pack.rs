@@ -26,15 +26,15 @@ section! {
 section! {
     /// The pack: number, connection and type of its cells.
     Pack at "pack" {
-        /// Cells in series. Parallel cells that share one voltage tap count as one.
+        /// Number of cells in series. Parallel cells that share one voltage tap count as one cell.
         cells: u16, "", Between(1.0, MAX_CELLS as f64), Required;
-        /// Parallel strings; each is assumed to carry an equal share of the pack current.
+        /// Number of parallel strings. Each is assumed to carry an equal share of the pack current.
         strings: u16, "", Between(1.0, 1024.0), Default("1");
         /// Cell model file, relative to this file.
         cell_model: Option<String>, "", NotEmpty, Optional("a model made from `chemistry` and `rated_capacity_ah`");
         /// Chemistry of a cell without a model file. Estimates start from values typical of this chemistry, and their intervals cover the differences between such cells. "lmo-graphite" means the blend with a layered oxide used in early electric cars. Use "nmc-graphite" if the nickel content is unknown.
         chemistry: Option<Chemistry>, "", Any, Optional("required without `cell_model`");
-        /// For cells without a model file: whether the daemon learns their model on board from drives, charges and rests.
+        /// Whether the daemon learns the model of cells without a model file on board, from drives, charges and rests.
         learn_model: bool, "", Any, Default("true");
         /// Whether the BMS balances, that is, discharges the fuller cells near and after the end of a charge. If it does, only the cell with the least charge can be recognised as leaking, unless `[input.balancing]` shows which cells are bled.
         balancing: bool, "", Any, Default("true");
@@ -44,7 +44,7 @@ section! {
         voltage_max_v: Option<f64>, "V", Above(0.0, 100.0), Optional("usual value of the chemistry: 3.65 V for LFP, else 4.2 V");
         /// Rated capacity of one cell, as on its label. SOH is relative to it.
         rated_capacity_ah: Option<f64>, "Ah", within(bounds::CONFIGURED_CAPACITY_AH), Optional("the cell model's");
-        /// Initial capacity of a cell, before any is learned.
+        /// Initial capacity of a cell, used until a capacity is learned.
         initial_capacity_ah: Option<f64>, "Ah", within(bounds::CONFIGURED_CAPACITY_AH), Optional("the cell model's `capacity_ah`");
         /// Standard deviation of the initial capacity.
         initial_capacity_std_ah: Option<f64>, "Ah", Above(0.0, 1e5), Optional("10 % of the initial capacity");
@@ -64,7 +64,7 @@ section! {
         chemistry: Option<Chemistry>, "", Any, Optional("required without `cell_model`");
         /// Rated capacity of one cell, as on its label. SOH is relative to it.
         rated_capacity_ah: Option<f64>, "Ah", within(bounds::CONFIGURED_CAPACITY_AH), Optional("the cell model's");
-        /// Initial capacity of a cell, before any is learned.
+        /// Initial capacity of a cell, used until a capacity is learned.
         initial_capacity_ah: Option<f64>, "Ah", within(bounds::CONFIGURED_CAPACITY_AH), Optional("the cell model's `capacity_ah`");
         /// Standard deviation of the initial capacity.
         initial_capacity_std_ah: Option<f64>, "Ah", Above(0.0, 1e5), Optional("10 % of the initial capacity");
@@ -82,11 +82,11 @@ section! {
 }
 
 section! {
-    /// The alarms of a rule. The rules compare these values, in these units:
-    /// `capacity_low`, `usable_capacity_low`: capacity per cell, Ah. `recharge_period_low`: recharge period, s. `resistance_high`: resistance relative to a new cell (1 = as new).
+    /// The alarms of a rule. The rules compare the following values.
+    /// `capacity_low` and `usable_capacity_low`: capacity per cell, Ah. `recharge_period_low`: recharge period, s. `resistance_high`: resistance relative to a new cell (1 = as new).
     /// `soc_low`: SOC of the emptiest cell, fraction. `cell_imbalance`: SOC of the fullest cell minus SOC of the emptiest cell, fraction. `bms_disagrees`: SOC or SOH reported by the pack minus the estimate, fraction. `input_implausible`: share of bad readings, fraction.
     /// `temperature_high`: temperature of the hottest sensor, degrees C. `remaining_life_low`: remaining life, equivalent full cycles.
-    /// `input_missing`, `store_failed`, `bus_fault`: how long the fault has lasted, s. `estimate_untrusted`: the mean normalised innovation squared, or the cell model's mismatch on the same scale.
+    /// `input_missing`, `store_failed` and `bus_fault`: how long the fault has lasted, s. `estimate_untrusted`: the mean normalised innovation squared, or the cell model's mismatch on the same scale.
     /// Three rules compare each cell with the other cells. `cell_leak`: self-discharge per day as a fraction of the cell's capacity. `connection_resistance`: additional contact resistance as a fraction of the cell's series resistance at 50 % SOC and 25 degrees C. `channel_faulty`: 1 while the cell's voltage channel is faulty (frozen, offset, doubled or swapped), else 0.
     Alarm at "alarm" {
         /// What the alarm compares.
@@ -99,13 +99,13 @@ section! {
         severe: Option<Threshold>, "the rule's", Between(-1e9, 1e9), Optional("no such alarm");
         /// If the threshold has no `clear`, the alarm clears when the value is back on the healthy side by this much. An alarm on a learned value also waits until the true value is on the healthy side with a probability of 95 %.
         hysteresis: Option<f64>, "the rule's", Between(0.0, 1e9), Optional("2 % of the threshold");
-        /// What is compared with the threshold. "mean": the value itself. `{ probability = 0.95 }`: the alarm is raised when the true value is beyond the threshold with more than this probability. It clears when the probability of being beyond the clear threshold is at most the smaller of this and 0.5. A probability above 0.5 raises the alarm later and with fewer false alarms; one below 0.5 raises it earlier.
+        /// What is compared with the threshold. "mean": the value itself. `{ probability = 0.95 }`: the alarm is raised when the true value is beyond the threshold with more than this probability. It clears when the probability of being beyond the clear threshold is at most the smaller of this and 0.5. With a probability above 0.5, the alarm is raised later and false alarms are rarer. With one below 0.5, it is raised earlier.
         when: Comparison, "", Any, Default("\"mean\"");
         /// The value must be beyond the threshold for this long before the alarm is raised, and healthy for this long before it clears.
         debounce_s: f64, "s", Between(0.0, 1e9), Default("0.0");
         /// Number of consecutive new values that must agree before the alarm is raised or cleared.
         debounce_events: u32, "", Between(1.0, 1e6), Default("1");
-        /// Whether the alarm stays raised after the value is healthy again, until a command clears it.
+        /// Whether the alarm stays raised until a command clears it, even if the value is healthy again.
         latched: bool, "", Any, Default("false");
         /// J1939: suspect parameter number.
         spn: Option<u32>, "", Between(1.0, 524_287.0), Optional("520192 (manufacturer-assignable) plus the rule's number");
@@ -117,7 +117,7 @@ section! {
 section! {
     /// State and history on disk (`run --state`). Learned values are stored as soon as they are reported, independently of these keys.
     Store at "store" {
-        /// Shortest time between checkpoints of the running state. A power cut loses all changes since the last checkpoint; a restart of the service loses one second. Each checkpoint writes the whole state, about 70 kB for a pack of 96 cells. The time is extended so that at most 15 MB are written per day (7 minutes for such a pack).
+        /// Shortest time between checkpoints of the running state. A power cut loses the changes of this state since the last checkpoint; a restart of the service loses one second. Each checkpoint writes the whole state, about 70 kB for a pack of 96 cells. The time is extended so that at most 15 MB are written per day (7 minutes for such a pack).
         checkpoint_s: f64, "s", Between(1.0, 3600.0), Default("60.0");
         /// Maximum number of rows in the history: half-cycles, capacities, loss modes, remaining lives, cell models, alarms and resets. Above this number a checkpoint deletes the oldest segment (one day or about 10,000 rows). The default holds one year of ten half-cycles a day for 96 cells in about 100 MB.
         max_rows: u32, "", Between(10_000.0, 1e8), Default("1000000");

@@ -49,11 +49,11 @@ section! {
 }
 
 section! {
-    /// Frames that the daemon sends: status, health, alarm, digest and, with `[commands]`, reply. Without this table the daemon only listens; with it, it sends no other identifiers. `packwatch dbc` writes the DBC of the frames as configured.
+    /// Frames that the daemon sends: status, health, alarm, digest and, with `[commands]`, reply. Without this table the daemon only listens. With this table, it sends no other identifiers. `packwatch dbc` writes the DBC of the frames as configured.
     Output at "output" {
         /// Whether anything is sent.
         enabled: bool, "", Any, Default("true");
-        /// Interfaces to send on.
+        /// Interfaces on which the frames are sent.
         interfaces: Option<Vec<String>>, "", NotEmpty, Optional("all");
         /// DBC that defines the layout of the frames, relative to this file.
         dbc: Option<String>, "", NotEmpty, Optional("built-in `packwatch.dbc`, with an Ah resolution that fits the cell");
@@ -131,12 +131,12 @@ frame_section! {
 }
 
 frame_section! {
-    /// The reply to each command frame, sent only with `[commands]`. It states whether the command was executed, the reason if it was not, and the counter that the next command must have. It has no period. Not sent if `output.dbc` lacks `PACKWATCH_Reply`.
+    /// The reply to each command frame, sent only with `[commands]`. It states whether the command was executed, the reason if it was not, and the counter that the next command must have. It has no period, and is not sent if `output.dbc` lacks `PACKWATCH_Reply`.
     OutputReply at "output.reply"
 }
 
 frame_section! {
-    /// Announces the freshness value for authenticated commands once a second; sent only with `commands.secoc`. The frame is itself authenticated (36 bits of freshness, 28 bits of AES-128-CMAC) and requires `data_id`; it has no period and no `e2e`.
+    /// Announces the freshness value for authenticated commands once a second. The frame is sent only with `commands.secoc`. It is itself authenticated (36 bits of freshness, 28 bits of AES-128-CMAC) and requires `data_id`. It has no `period_ms` and no `e2e`.
     OutputFreshness at "output.freshness"
 }
 
