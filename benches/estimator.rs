@@ -2,7 +2,7 @@
 
 use common::{example, reading};
 use packwatch_host::can::encode::InputEncoder;
-use packwatch_host::cell::{CellEstimator, CellModel};
+use packwatch_host::cell::{CellModel, EstimatorBank};
 use packwatch_host::monitor::{Monitor, Outputs, Record};
 use packwatch_host::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
 
@@ -26,11 +26,13 @@ fn model(branches: usize) -> CellModel {
 #[divan::bench(args = [1, 2, 3])]
 fn ukf_step(bencher: divan::Bencher, branches: usize) {
     let (model, config) = (model(branches), example().monitor.estimator);
-    let mut estimator = CellEstimator::new(&config);
+    let mut bank = EstimatorBank::new(&model, &config, 1);
     let mut k = 0_u32;
     bencher.bench_local(|| {
         k = k.wrapping_add(1);
-        divan::black_box(estimator.step(&model, &config, &reading(k, 0)))
+        bank.add(0, &reading(k, 0));
+        bank.step();
+        divan::black_box(*bank.result(0))
     });
 }
 

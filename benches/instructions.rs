@@ -15,7 +15,7 @@ use packwatch_host::can::Frame;
 use packwatch_host::can::dbc::Database;
 use packwatch_host::can::decode::{Binding, InputMap};
 use packwatch_host::can::encode::InputEncoder;
-use packwatch_host::cell::{CellEstimator, CellModel, EstimatorBank, EstimatorConfig};
+use packwatch_host::cell::{CellModel, EstimatorBank, EstimatorConfig};
 use packwatch_host::io::csv_log::CsvOptions;
 use packwatch_host::io::log::{Batch, LogOptions, LogSource};
 use packwatch_host::monitor::RecordKind;
@@ -25,7 +25,7 @@ use tempfile::NamedTempFile;
 mod common;
 
 /// Name, unit, and constructor of each work.
-const WORKS: [Named; 8] = [
+const WORKS: [Named; 7] = [
     ("parse", "candump line of 8 bytes, read and placed in time", parse),
     ("parse_and_decode", "candump line and its 3 signals", parse_and_decode),
     ("decode_page", "frame of 3 cells, one of 32 pages", decode_page),
@@ -33,7 +33,6 @@ const WORKS: [Named; 8] = [
     ("step_two_branches", "step of one cell, 2 branches", || one_cell(2)),
     ("step_three_branches", "step of one cell, 3 branches", || one_cell(3)),
     ("step_of_96", "step of one cell in a pack of 96, 1 branch", pack),
-    ("plain_step", "step of one cell with the plain filter, 1 branch", plain),
 ];
 
 /// Lines, frames or steps per pass.
@@ -187,16 +186,5 @@ fn steps(branches: usize, cells: usize) -> Work {
             pack.step();
         }
         pack.soc(0).map_or(0.0, |soc| soc.mean)
-    })
-}
-
-fn plain() -> Work {
-    let (model, config) = cell(1);
-    let mut estimator = CellEstimator::new(&config);
-    Box::new(move || {
-        for k in 0..UNITS {
-            black_box(estimator.step(&model, &config, black_box(&reading(k, 0))));
-        }
-        estimator.soc().map_or(0.0, |soc| soc.mean)
     })
 }

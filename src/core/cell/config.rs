@@ -1,6 +1,6 @@
 //! Settings of the per-cell estimator. `config` checks their ranges; the estimator uses them as they are.
 
-use crate::filter::{CONSIDERED, ScalarGaussian};
+use crate::filter::ScalarGaussian;
 
 /// How the circuit's equations are stepped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -138,11 +138,6 @@ pub struct SensorErrors {
 impl SensorErrors {
     /// Sensors without constant errors, as in the paper.
     pub const NONE: Self = Self { voltage_offset_v: 0.0, current_offset_a: 0.0, current_gain: 0.0, slow_branch: 0.0 };
-
-    /// The deviations in the order of the filter's constant errors.
-    pub fn deviations(&self) -> [f64; CONSIDERED] {
-        [self.voltage_offset_v, self.current_offset_a, self.current_gain, self.slow_branch]
-    }
 }
 
 /// Rejection of outliers among the voltage readings.

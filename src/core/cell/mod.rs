@@ -28,7 +28,7 @@ pub use config::{
 pub use coverage::Coverage;
 pub use electrodes::{Electrodes, NegativeMaterial, PositiveMaterial};
 pub use estimator::{
-    AdoptedState, CellEstimator, CellModule, CellState, CellStep, EstimatorBank, PackBank, StepResult,
+    AdoptedState, CellEstimator, CellModule, CellState, CellStep, EstimatorBank, PackBank, StepResult, Update,
 };
 pub use loss_modes::LossModes;
 pub use model::{

@@ -18,8 +18,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::cell::CellModel;
-use crate::filter::{Update, square};
+use crate::cell::{CellModel, Update};
+use crate::filter::square;
 use crate::quantity::InvalidState;
 
 /// Time of use that is judged, s. Half of it shows another cell on drives from -10 to 40 degrees C; later, ageing counts as well.

@@ -4,28 +4,26 @@
 //!
 //! Almost every step is ordinary: the current was measured all the time since the last voltage, and the voltage is
 //! within the gate. The [`kernel`] makes these steps, [`WIDTH`] cells at a time, over structures of arrays; it selects
-//! wider instructions at run time (without the feature `wide`, cells are stepped one by one). The readable
-//! [`CellEstimator`] makes all other steps: a first voltage, a gap, no current, a reading beyond the gate, a covariance
-//! without a factor. The kernel is tested against it: SOC within 1e-9 over 100,000 steps. Which of the two makes a step
-//! depends on that cell alone, and a lane's bits do not depend on other lanes, so a cell's estimates do not depend on the
-//! other cells of the pack.
+//! wider instructions at run time (without the feature `wide`, cells are stepped one by one). All other
+//! steps are made from parts of the same kernel with one lane ([`SingleCell`]): a first voltage, a gap, no current, a reading
+//! beyond the gate, a covariance without a factor. The tests compare the kernel with the textbook filter: SOC within 1e-9
+//! over 100,000 steps. Which way a step is made depends on that cell alone, and a lane's bits do not depend on other lanes,
+//! so a cell's estimates do not depend on the other cells of the pack.
 
 mod filter_array;
 mod input;
 mod kernel;
+mod single;
 mod tables;
 
-use filter_array::{BatchStep, FilterArray};
+use filter_array::{BatchStep, FilterArray, FilterArrays, each_array};
 use input::{BlockInput, CellSlot, WIDTH};
-use kernel::{
-    INFORMATION_S, KernelConstants, LOAD_A, MEAN_NIS, OFFSET_INFORMATION, OFFSET_SCORE, REST_S, SLOW_INFORMATION,
-    SLOW_SCORE, at,
-};
+use kernel::{KernelConstants, MEAN_NIS, OFFSET_INFORMATION, OFFSET_SCORE, at};
+pub(super) use single::SingleCell;
+use single::{hot, with_hot};
 
 use super::cell_estimator::{CellEstimator, thermal_c};
-use super::filter::Filter;
 use super::memory::Memory;
-use super::slow_branch::SlowBranch;
 use super::state_vector::{CAPACITY, LOG_RESISTANCE, widened, within_bounds};
 use super::step::{CellStep, StepResult};
 use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES};
@@ -49,25 +47,6 @@ pub struct EstimatorBank {
     others: Vec<(usize, CellStep)>,
     #[cfg(feature = "wide")]
     machine: pulp::Arch,
-}
-
-/// The filters of a pack, by number of branches.
-#[derive(Debug, Clone)]
-enum FilterArrays {
-    One(FilterArray<4, 10, 16>),
-    Two(FilterArray<5, 15, 20>),
-    Three(FilterArray<6, 21, 24>),
-}
-
-/// Runs an expression for the pack's number of branches.
-macro_rules! each_array {
-    ($filters:expr, $x:ident => $body:expr) => {
-        match $filters {
-            FilterArrays::One($x) => $body,
-            FilterArrays::Two($x) => $body,
-            FilterArrays::Three($x) => $body,
-        }
-    };
 }
 
 impl EstimatorBank {
@@ -168,7 +147,8 @@ impl EstimatorBank {
         for at in 0..self.others.len() {
             let (cell, step) = self.others[at];
             let mut estimator = self.cell(cell);
-            self.results[cell] = estimator.step(&self.model, &self.config, &step);
+            let kernel = SingleCell::new(&mut self.filters, &self.constants, cell);
+            self.results[cell] = estimator.rare_step(kernel, &self.model, &self.config, &step);
             self.put(cell, &estimator);
         }
         self.others.clear();
@@ -284,43 +264,17 @@ impl EstimatorBank {
 
     /// A copy of a cell's estimator.
     pub fn cell(&self, cell: usize) -> CellEstimator {
-        let (block, lane) = (cell / WIDTH, cell % WIDTH);
-        let CellSlot { memory, has_filter, .. } = self.cells[cell];
-        let (filter, hot) = match &self.filters {
-            FilterArrays::One(x) => x.filter(block, lane, Filter::One),
-            FilterArrays::Two(x) => x.filter(block, lane, Filter::Two),
-            FilterArrays::Three(x) => x.filter(block, lane, Filter::Three),
-        };
-        let memory = Memory {
-            load_a: hot[LOAD_A],
-            mean_nis: hot[MEAN_NIS],
-            information_s: hot[INFORMATION_S],
-            rest_s: hot[REST_S],
-            offset_information: hot[OFFSET_INFORMATION],
-            offset_score: hot[OFFSET_SCORE],
-            slow_branch: SlowBranch {
-                information: hot[SLOW_INFORMATION],
-                score: hot[SLOW_SCORE],
-                ..memory.slow_branch
-            },
-            ..memory
-        };
-        CellEstimator { filter: has_filter.then_some(filter), memory }
+        let CellSlot { memory, has_filter } = &self.cells[cell];
+        let (filter, hot) = each_array!(&self.filters, x => x.lane(cell));
+        CellEstimator { filter: has_filter.then_some(filter), memory: with_hot(memory, &hot) }
     }
 
     /// Replaces a cell's estimator.
     pub fn put(&mut self, cell: usize, estimator: &CellEstimator) {
-        let (block, lane) = (cell / WIDTH, cell % WIDTH);
         let CellEstimator { filter, memory } = estimator;
+        let hot = hot(memory, &self.constants);
+        self.cells[cell].has_filter = each_array!(&mut self.filters, x => x.set(cell, filter.as_ref(), hot));
         self.cells[cell].memory = *memory;
-        let slow_std = memory.slow_branch.std(self.config.sensor.slow_branch);
-        self.cells[cell].has_filter = match (&mut self.filters, filter) {
-            (FilterArrays::One(x), Some(Filter::One(filter))) => x.set(block, lane, filter, memory, slow_std),
-            (FilterArrays::Two(x), Some(Filter::Two(filter))) => x.set(block, lane, filter, memory, slow_std),
-            (FilterArrays::Three(x), Some(Filter::Three(filter))) => x.set(block, lane, filter, memory, slow_std),
-            // The filter has as many branches as the model: states are checked when they are restored.
-            (filters, _) => each_array!(filters, x => x.clear(block, lane, memory, slow_std)),
-        };
     }
 
     /// Changes a cell's estimator.

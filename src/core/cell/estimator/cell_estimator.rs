@@ -3,21 +3,21 @@
 //! In: one [`CellStep`] per voltage reading. Out: a [`StepResult`], and estimates with their variances. A reading beyond
 //! the gate leaves the state unchanged; a step that cannot be computed restarts the filter.
 
-use nalgebra::{SMatrix, SVector};
+use nalgebra::SMatrix;
 
+use super::bank::SingleCell;
 use super::downtime::update_after_downtime;
-use super::filter::{Filter, LearnedState, each, initial_state, is_possible, predict, update};
+use super::gaussian::{Gaussian, LearnedState};
 use super::memory::{Memory, USED_PRIOR};
-use super::noise::VoltageReading;
 use super::slow_branch::SlowBranch;
 use super::state_vector::{
-    BRANCHES, CAPACITY, CURRENT_OFFSET, CURVE_CAPACITY, KNOWN_VARIANCE, LOG_RESISTANCE, SLOW_BRANCH,
-    UNKNOWN_SOC_VARIANCE, square, widened, within_bounds,
+    BRANCHES, CAPACITY, CONSTANT_ERRORS, CURRENT_OFFSET, CURVE_CAPACITY, KNOWN_VARIANCE, LOG_RESISTANCE, SLOW_BRANCH,
+    square, widened, within_bounds,
 };
-use super::step::{CellStep, StepResult};
+use super::step::{CellStep, StepResult, Update};
 use crate::cell::circuit;
 use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES, SensorErrors};
-use crate::filter::{CONSTANT_ERRORS, FilterError, ScalarGaussian, Update};
+use crate::filter::ScalarGaussian;
 use crate::quantity::bounds;
 
 /// State in which a cell continues with another model.
@@ -38,7 +38,7 @@ pub struct AdoptedState {
 /// The estimator of one cell.
 #[derive(Debug, Clone)]
 pub struct CellEstimator {
-    pub(super) filter: Option<Filter>,
+    pub(super) filter: Option<Gaussian>,
     pub(super) memory: Memory,
 }
 
@@ -48,73 +48,69 @@ impl CellEstimator {
         Self { filter: None, memory: Memory::new(config) }
     }
 
-    /// Predicts over the time since the last reading, then updates with the voltage.
-    pub fn step(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) -> StepResult {
-        self.memory.temperature_c = Some(self.temperature(model, step));
-        let result = self.try_step(model, config, step).and_then(|update| match &self.filter {
-            Some(filter) if !each!(filter, x => is_possible(x)) => Err(FilterError::Impossible),
-            _ => Ok(update),
-        });
-        let reset = result.is_err() || self.memory.has_lost_cell(config);
-        if reset {
-            self.start(model, config, step);
-            if result.is_err() {
-                // The correlation may have prevented the factorisation.
-                self.forget_correlation();
-            }
-        }
-        StepResult { update: result.unwrap_or(None), reset }
-    }
-
-    fn try_step(
+    /// Makes a step that is not ordinary: predicts over the time since the last reading, then updates with the voltage.
+    pub(super) fn rare_step(
         &mut self,
+        mut kernel: SingleCell,
         model: &CellModel,
         config: &EstimatorConfig,
         step: &CellStep,
-    ) -> Result<Option<Update>, FilterError> {
-        let temperature_c = self.memory.temperature_c.unwrap_or(step.ambient_c);
+    ) -> StepResult {
+        let step = CellStep { temperature_c: Some(self.temperature(model, step)), ..*step };
+        self.memory.temperature_c = step.temperature_c;
+        let result = self.try_step(&mut kernel, model, config, &step);
+        let result = result.filter(|_| self.filter.as_ref().is_none_or(Gaussian::is_possible));
+        let reset = result.is_none() || self.memory.has_lost_cell(config);
+        if reset {
+            self.start(model, config, &step);
+        }
+        if let (None, Some(x)) = (&result, &mut self.filter) {
+            // The correlation may have prevented the factorisation.
+            x.correlate(LOG_RESISTANCE, CAPACITY, 0.0);
+            x.by_constant.fill(0.0);
+        }
+        StepResult { update: result.flatten(), reset }
+    }
+
+    /// `None` when the step cannot be computed.
+    fn try_step(
+        &mut self,
+        kernel: &mut SingleCell,
+        model: &CellModel,
+        config: &EstimatorConfig,
+        step: &CellStep,
+    ) -> Option<Option<Update>> {
         if self.filter.is_none() || (self.memory.is_soc_unknown && step.current_a.is_some()) {
             self.start(model, config, step);
-        } else if let Some(filter) = &mut self.filter {
-            let capacity_ah = each!(&*filter, x => x.mean[CAPACITY]);
-            let gap_std = self.memory.note_gap(config, step, capacity_ah);
-            each!(filter, x => predict(x, model, config, step, temperature_c, gap_std))?;
-        }
-        self.memory.update_load(model, config, step);
-        self.memory.information_s += self.memory.new_information_s(config, step);
-        self.memory.last_current_a = step.current_a.unwrap_or(self.memory.last_current_a);
-        let downtime_std = self.memory.downtime_std_if_any();
-        let (Some(current_a), Some(filter)) = (step.current_a, &mut self.filter) else { return Ok(None) };
-        let information_s = self.memory.information_s.clamp(1e-3, config.voltage.max_information_s);
-        let load_a = self.memory.load_a;
-        let temperature = model.temperature_position(temperature_c);
-        let curve = self.memory.curve;
-        let slow_branch = self.memory.slow_branch;
-        let (slow_ratio, slow_std) = (slow_branch.ratio, slow_branch.std(config.sensor.slow_branch));
-        let reading = VoltageReading {
-            voltage_v: step.voltage_v,
-            current_a,
-            load_a,
-            temperature,
-            information_s,
-            curve,
-            slow_ratio,
-            slow_std,
-        };
-        let (update, effects_v) = match downtime_std {
-            None => each!(filter, x => update(x, model, config, &reading))?,
-            Some(std) => {
-                let downtime = (std, self.memory.used_prior);
-                (each!(filter, x => update_after_downtime(x, model, config, &reading, downtime))?, SVector::zeros())
+        } else if let Some(x) = &mut self.filter {
+            let gap_std = self.memory.note_gap(config, step, x.mean[CAPACITY]);
+            if step.measured_s > 0.0 || step.charge_as != 0.0 {
+                kernel.predict_measured((x, &self.memory), step)?;
             }
-        };
-        self.memory.end_downtime();
-        if update.accepted {
-            self.memory.note_offset(effects_v[CURRENT_OFFSET], &update);
-            self.memory.slow_branch.note(effects_v[SLOW_BRANCH], &update);
+            if step.unmeasured_s > 0.0 {
+                kernel.predict_unmeasured((x, &self.memory), step)?;
+                let variance = square(config.gap.noise_per_sqrt_s) * step.unmeasured_s
+                    + square(config.gap.self_discharge_per_s * step.unmeasured_s)
+                    + square(gap_std);
+                x.covariance[(0, 0)] = widened(x.covariance[(0, 0)], variance);
+            }
         }
-        self.memory.record_update(config, step, &update);
-        Ok(Some(update))
+        let memory = &mut self.memory;
+        let elapsed_s = memory.information_s + step.measured_s + step.unmeasured_s;
+        kernel.pass_measured(memory, step);
+        if step.unmeasured_s > 0.0 {
+            memory.pass_gap(model, config, step);
+            memory.information_s = elapsed_s;
+        }
+        memory.last_current_a = step.current_a.unwrap_or(memory.last_current_a);
+        let (Some(_), Some(x)) = (step.current_a, &mut self.filter) else { return Some(None) };
+        let update = match memory.downtime_std_if_any() {
+            None => kernel.update((x, memory), step)?,
+            Some(_) => update_after_downtime(kernel, (x, memory), (model, config), step)?,
+        };
+        memory.end_downtime();
+        memory.record_update(config, step, &update);
+        Some(Some(update))
     }
 
     /// Starts SOC and branches from the voltage; keeps the learned resistance and capacity.
@@ -140,11 +136,7 @@ impl CellEstimator {
             covariance: self.capacity_resistance_covariance(),
             by_constant: self.learned_by_constant(),
         };
-        self.filter = Some(match model.branches.len() {
-            1 => Filter::One(initial_state(soc, &branch_variance, &kept)),
-            2 => Filter::Two(initial_state(soc, &branch_variance, &kept)),
-            _ => Filter::Three(initial_state(soc, &branch_variance, &kept)),
-        });
+        self.filter = Some(Gaussian::at_start(soc, &branch_variance[..model.branches.len()], &kept));
         // Trust returns through the window, not by a restart.
         self.memory.mean_nis = self.memory.mean_nis.min(config.consistency.limit * std::f64::consts::E);
         self.memory.information_s = config.voltage.max_information_s;
@@ -181,21 +173,12 @@ impl CellEstimator {
         for (i, variance) in branch_variance.iter_mut().enumerate().take(model.branches.len()) {
             *variance += square(config.initial.log_resistance_std * branch_v(i));
         }
-        let mut filter = match model.branches.len() {
-            1 => Filter::One(initial_state(soc, &branch_variance, &kept)),
-            2 => Filter::Two(initial_state(soc, &branch_variance, &kept)),
-            _ => Filter::Three(initial_state(soc, &branch_variance, &kept)),
-        };
-        each!(&mut filter, x => {
-            // Rounding must not make them more than fully correlated.
-            let most = 0.99 * (x.covariance[(0, 0)] * x.covariance[(CAPACITY, CAPACITY)]).sqrt();
-            let covariance = state.soc_by_capacity.clamp(-most, most);
-            (x.covariance[(0, CAPACITY)], x.covariance[(CAPACITY, 0)]) = (covariance, covariance);
-            for i in 0..model.branches.len() {
-                x.mean[BRANCHES + i] = branch_v(i);
-            }
-        });
-        self.filter = Some(filter);
+        let mut x = Gaussian::at_start(soc, &branch_variance[..model.branches.len()], &kept);
+        // Rounding must not make them more than fully correlated.
+        let most = 0.99 * (x.covariance[(0, 0)] * x.covariance[(CAPACITY, CAPACITY)]).sqrt();
+        x.correlate(0, CAPACITY, state.soc_by_capacity.clamp(-most, most));
+        (0..model.branches.len()).for_each(|i| x.mean[BRANCHES + i] = branch_v(i));
+        self.filter = Some(x);
     }
 
     /// Variance of each branch's voltage at a start, V^2: under load, a usual load of unknown duration has filled it.
@@ -219,16 +202,6 @@ impl CellEstimator {
         variance
     }
 
-    fn forget_correlation(&mut self) {
-        if let Some(filter) = &mut self.filter {
-            each!(filter, x => {
-                let (r, c) = (LOG_RESISTANCE, CAPACITY);
-                (x.covariance[(r, c)], x.covariance[(c, r)]) = (0.0, 0.0);
-                x.by_constant.fill(0.0);
-            });
-        }
-    }
-
     /// The sensor's value, or the thermal model's prediction from the last known one, degrees C.
     fn temperature(&self, model: &CellModel, step: &CellStep) -> f64 {
         step.temperature_c.unwrap_or_else(|| {
@@ -241,14 +214,9 @@ impl CellEstimator {
     pub fn handle_unknown_gap(&mut self) {
         self.memory.end_downtime();
         (self.memory.rest_s, self.memory.is_unseen, self.memory.is_soc_unknown) = (0.0, true, true);
-        let Some(filter) = &mut self.filter else { return };
-        each!(filter, x => {
-            x.covariance[(0, 0)] = widened(x.covariance[(0, 0)], UNKNOWN_SOC_VARIANCE);
-            for i in BRANCHES..x.mean.len() {
-                x.mean[i] *= 0.5;
-                x.covariance[(i, i)] += square(x.mean[i]);
-            }
-        });
+        if let Some(x) = &mut self.filter {
+            x.widen_after_unknown_gap();
+        }
     }
 
     /// State of charge, between empty and full; `None` before the first voltage.
@@ -261,12 +229,10 @@ impl CellEstimator {
     /// Branch voltages, V; NaN beyond the model's branches and before the first voltage.
     pub fn branch_v(&self) -> [f64; MAX_BRANCHES] {
         let mut branch_v = [f64::NAN; MAX_BRANCHES];
-        if let Some(filter) = &self.filter {
-            each!(filter, x => {
-                let slowest = x.mean.len() - 1;
-                (BRANCHES..=slowest).for_each(|i| branch_v[i - BRANCHES] = x.mean[i]);
-                branch_v[slowest - BRANCHES] *= self.memory.slow_branch.ratio;
-            });
+        if let Some(x) = &self.filter {
+            let branches = x.states - BRANCHES;
+            branch_v[..branches].copy_from_slice(x.mean.rows(BRANCHES, branches).as_slice());
+            branch_v[branches - 1] *= self.memory.slow_branch.ratio;
         }
         branch_v
     }
@@ -282,15 +248,13 @@ impl CellEstimator {
     }
 
     fn marginal(&self, state: usize) -> Option<ScalarGaussian> {
-        self.filter.as_ref().map(|filter| each!(filter, x => x.marginal(state)))
+        self.filter.as_ref().map(|x| x.marginal(state))
     }
 
     /// Errors of ln rho and of the capacity by the constant errors.
     fn learned_by_constant(&self) -> SMatrix<f64, 2, CONSTANT_ERRORS> {
-        let rows = |x: &dyn Fn(usize, usize) -> f64| SMatrix::from_fn(|i, k| x([LOG_RESISTANCE, CAPACITY][i], k));
-        self.filter
-            .as_ref()
-            .map_or_else(SMatrix::zeros, |filter| each!(filter, x => rows(&|i, k| x.by_constant[(i, k)])))
+        let rows = |x: &Gaussian| x.by_constant.fixed_rows::<2>(LOG_RESISTANCE).into_owned();
+        self.filter.as_ref().map_or_else(SMatrix::zeros, rows)
     }
 
     /// Corrects the state by `deviations` of the current's offset, whose remaining deviation becomes `remains` times the
@@ -302,7 +266,7 @@ impl CellEstimator {
 
     /// Corrects the slowest of several branches by the voltages since the last correction.
     pub fn learn_slow_branch(&mut self, config: &EstimatorConfig) {
-        if matches!(self.filter, None | Some(Filter::One(_))) {
+        if self.filter.as_ref().is_none_or(|x| x.states == BRANCHES + 1) {
             (self.memory.slow_branch.information, self.memory.slow_branch.score) = (0.0, 0.0);
         } else if let Some(correction) = self.memory.slow_branch.correct(config.sensor.slow_branch) {
             self.absorb(SLOW_BRANCH, correction.deviations, correction.remains);
@@ -319,32 +283,25 @@ impl CellEstimator {
     /// Corrects the state by `deviations` of a constant error, whose remaining deviation becomes `remains` times the one
     /// before.
     fn absorb(&mut self, constant_error: usize, deviations: f64, remains: f64) {
-        let Some(filter) = &mut self.filter else { return };
-        each!(filter, x => {
-            let column = x.by_constant.column(constant_error).into_owned();
-            x.mean += column * deviations;
-            if remains <= 1.0 {
-                x.by_constant.set_column(constant_error, &(column * remains));
-            } else {
-                // A part of the larger error is new and has not moved any state.
-                x.by_constant.set_column(constant_error, &(column / remains));
-                x.covariance += column * column.transpose() * (1.0 - 1.0 / square(remains));
-            }
-        });
+        if let Some(x) = &mut self.filter {
+            x.absorb(constant_error, deviations, remains);
+        }
     }
 
     /// Restates the errors by constant errors for other deviations of them.
     pub(super) fn restate_constant_errors(&mut self, old: &SensorErrors, new: &SensorErrors) {
-        let Some(filter) = &mut self.filter else { return };
-        for (k, (old, new)) in old.deviations().into_iter().zip(new.deviations()).enumerate() {
+        let Some(x) = &mut self.filter else { return };
+        let deviations =
+            |of: &SensorErrors| [of.voltage_offset_v, of.current_offset_a, of.current_gain, of.slow_branch];
+        for (k, (old, new)) in deviations(old).into_iter().zip(deviations(new)).enumerate() {
             let factor = if old > 0.0 { new / old } else { 1.0 };
-            each!(filter, x => x.by_constant.column_mut(k).scale_mut(factor));
+            x.by_constant.column_mut(k).scale_mut(factor);
         }
     }
 
     /// Covariance of capacity (Ah) and ln(resistance), without the constant errors.
     pub fn capacity_resistance_covariance(&self) -> f64 {
-        self.filter.as_ref().map_or(0.0, |filter| each!(filter, x => x.covariance[(LOG_RESISTANCE, CAPACITY)]))
+        self.filter.as_ref().map_or(0.0, |x| x.covariance[(LOG_RESISTANCE, CAPACITY)])
     }
 
     /// Capacity of the open-circuit curve, Ah.
@@ -356,9 +313,7 @@ impl CellEstimator {
     pub fn capacity_by_curve(&self) -> f64 {
         let std_ah = self.memory.curve.std();
         let by_curve = |x: f64| if std_ah > 0.0 { -x / std_ah } else { 0.0 };
-        self.filter
-            .as_ref()
-            .map_or(0.0, |filter| each!(filter, x => by_curve(x.by_constant[(CAPACITY, CURVE_CAPACITY)])))
+        self.filter.as_ref().map_or(0.0, |x| by_curve(x.by_constant[(CAPACITY, CURVE_CAPACITY)]))
     }
 
     /// Replaces the capacity estimate, and the open-circuit curve by that of this capacity (at transitions only). The state
@@ -369,21 +324,18 @@ impl CellEstimator {
         self.memory.capacity = capacity;
         let before = self.memory.curve;
         self.memory.curve = capacity;
-        if let Some(filter) = &mut self.filter {
-            each!(filter, x => {
-                let column = x.by_constant.column(CURVE_CAPACITY).into_owned();
-                if before.variance > 0.0 {
-                    x.mean += column * ((before.mean - capacity.mean) / before.std());
-                }
-                // What is left of the curve's error is the capacity's, and no longer apart from it.
-                x.covariance += column * column.transpose();
-                x.by_constant.column_mut(CURVE_CAPACITY).fill(0.0);
-                x.mean[CAPACITY] = capacity.mean;
-                // A smaller variance would not fit the covariances with the other states.
-                let missing = capacity.variance - x.marginal(CAPACITY).variance;
-                x.covariance[(CAPACITY, CAPACITY)] += missing.max(0.0);
-            });
+        let Some(x) = &mut self.filter else { return };
+        let column = x.by_constant.column(CURVE_CAPACITY).into_owned();
+        if before.variance > 0.0 {
+            x.mean += column * ((before.mean - capacity.mean) / before.std());
         }
+        // What is left of the curve's error is the capacity's, and no longer apart from it.
+        x.covariance += column * column.transpose();
+        x.by_constant.column_mut(CURVE_CAPACITY).fill(0.0);
+        x.mean[CAPACITY] = capacity.mean;
+        // A smaller variance would not fit the covariances with the other states.
+        let missing = capacity.variance - x.marginal(CAPACITY).variance;
+        x.covariance[(CAPACITY, CAPACITY)] += missing.max(0.0);
     }
 
     /// Sets ln of the resistance relative to new with which the filter begins.
@@ -395,8 +347,8 @@ impl CellEstimator {
     pub fn hold_capacity(&mut self, capacity_ah: f64) {
         self.memory.capacity.mean = capacity_ah;
         self.memory.curve = ScalarGaussian { mean: capacity_ah, variance: 0.0 };
-        if let Some(filter) = &mut self.filter {
-            each!(filter, x => x.mean[CAPACITY] = capacity_ah);
+        if let Some(x) = &mut self.filter {
+            x.mean[CAPACITY] = capacity_ah;
         }
     }
 

@@ -20,76 +20,59 @@
 //!
 //! [`Memory`]: super::memory::Memory
 
-use nalgebra::SMatrix;
-
-use super::filter::update;
-use super::noise::VoltageReading;
+use super::bank::SingleCell;
+use super::gaussian::Gaussian;
+use super::memory::Memory;
 use super::state_vector::{BRANCHES, LOG_RESISTANCE, square, widened};
+use super::step::{CellStep, Update};
 use crate::cell::{CellModel, EstimatorConfig};
-use crate::filter::{FilterError, Gaussian, Update};
 
-/// Updates with the first reading after a downtime.
-pub(super) fn update_after_downtime<const N: usize>(
-    x: &mut Gaussian<N>,
-    model: &CellModel,
-    config: &EstimatorConfig,
-    reading: &VoltageReading,
-    (downtime_std, used_probability): (f64, f64),
-) -> Result<Update, FilterError> {
-    let before_soc = x.mean[0];
-    let mut used = used_prior(x, config, downtime_std);
+/// Updates with the first reading after a downtime. It says nothing of the sensor's offset and the slowest branch: their evidence
+/// stays.
+pub(super) fn update_after_downtime(
+    kernel: &mut SingleCell,
+    (x, memory): (&mut Gaussian, &Memory),
+    (model, config): (&CellModel, &EstimatorConfig),
+    step: &CellStep,
+) -> Option<Update> {
+    let mut update = |x: &mut Gaussian| kernel.update((x, &mut memory.clone()), step);
+    let (before_soc, ratio) = (x.mean[0], libm::exp(x.mean[LOG_RESISTANCE]));
+    let mut used = used_prior(x, config, memory.downtime_std);
     // The load of the reading may have begun at any time: its branches are anywhere between relaxed and settled.
-    let position = model.grid_position_at(&reading.temperature, before_soc);
-    let settled_v = reading.current_a * libm::exp(x.mean[LOG_RESISTANCE]);
-    for i in BRANCHES..N {
-        let most_v = settled_v * model.branch_r_ohm(i - BRANCHES, &position);
+    let current_a = step.current_a.unwrap_or(0.0);
+    let temperature = model.temperature_position(step.temperature_c.unwrap_or(step.ambient_c));
+    let position = model.grid_position_at(&temperature, before_soc);
+    let mut drop_v = current_a * model.r0_ohm(&position) * ratio;
+    for i in BRANCHES..used.states {
+        let most_v = current_a * ratio * model.branch_r_ohm(i - BRANCHES, &position);
         used.mean[i] = 0.5 * most_v;
         used.covariance[(i, i)] += square(most_v) / 12.0;
+        drop_v += if i + 1 < used.states { used.mean[i] } else { memory.slow_branch.ratio * used.mean[i] };
     }
     // The odds are those of a prior that wide; the copy is discarded.
-    let (wide, _) = update(&mut used.clone(), model, config, reading)?;
-    let drop_v = reading.current_a * model.r0_ohm(&position) * libm::exp(x.mean[LOG_RESISTANCE])
-        + reading.branches_v(&used.mean);
-    let reach = 3.0_f64.sqrt() * downtime_std;
-    let soc = model.soc_of_aged_ocv(&reading.temperature, reading.curve.mean, reading.voltage_v + drop_v);
+    let wide = update(&mut used.clone())?;
+    let reach = 3.0_f64.sqrt() * memory.downtime_std;
+    let soc = model.soc_of_aged_ocv(&temperature, memory.curve.mean, step.voltage_v + drop_v);
     // Every SOC within reach is as likely: the prior is centred where the voltage is, so that the curve is linear there.
     used.mean[0] = soc.clamp(before_soc - reach, before_soc + reach);
-    let (by_used, _) = update(&mut used, model, config, reading)?;
-    let (by_left_alone, _) = update(x, model, config, reading)?;
+    let by_used = update(&mut used)?;
+    let by_left_alone = update(x)?;
     let log_likelihood =
         |u: &Update| -0.5 * (libm::log(u.innovation_variance) + square(u.innovation) / u.innovation_variance);
     let odds = libm::exp(log_likelihood(&by_left_alone) - log_likelihood(&wide)).max(f64::MIN_POSITIVE);
-    let weight = used_probability / (used_probability + (1.0 - used_probability) * odds);
-    merge(x, &used, weight);
-    Ok(if weight > 0.5 { by_used } else { by_left_alone })
+    let weight = memory.used_prior / (memory.used_prior + (1.0 - memory.used_prior) * odds);
+    x.merge(&used, weight);
+    Some(if weight > 0.5 { by_used } else { by_left_alone })
 }
 
 /// Prior of a cell that was used: SOC anywhere within reach and uncorrelated, branches as at a start.
-fn used_prior<const N: usize>(x: &Gaussian<N>, config: &EstimatorConfig, downtime_std: f64) -> Gaussian<N> {
+fn used_prior(x: &Gaussian, config: &EstimatorConfig, downtime_std: f64) -> Gaussian {
     let mut used = *x;
-    let soc_variance = widened(x.marginal(0).variance, square(downtime_std));
-    for i in std::iter::once(0).chain(BRANCHES..N) {
-        for j in 0..N {
-            if i != j {
-                (used.covariance[(i, j)], used.covariance[(j, i)]) = (0.0, 0.0);
-            }
-        }
-    }
-    used.covariance[(0, 0)] = soc_variance;
-    used.by_constant.row_mut(0).fill(0.0);
-    for i in BRANCHES..N {
-        used.by_constant.row_mut(i).fill(0.0);
+    used.covariance[(0, 0)] = widened(x.marginal(0).variance, square(downtime_std));
+    used.isolate(0);
+    for i in BRANCHES..used.states {
+        used.isolate(i);
         used.covariance[(i, i)] += square(config.initial.branch_std_v);
     }
     used
-}
-
-/// Mean and covariance of the mixture of two Gaussians, the second with `weight`. The difference of their constant errors is
-/// left out: it is small against that of their means.
-fn merge<const N: usize>(x: &mut Gaussian<N>, other: &Gaussian<N>, weight: f64) {
-    let apart = other.mean - x.mean;
-    let between: SMatrix<f64, N, N> = apart * apart.transpose();
-    x.covariance = x.covariance * (1.0 - weight) + other.covariance * weight + between * (weight * (1.0 - weight));
-    x.by_constant = x.by_constant * (1.0 - weight) + other.by_constant * weight;
-    x.mean += apart * weight;
 }

@@ -6,15 +6,12 @@
 use serde::{Deserialize, Serialize};
 
 use super::slow_branch::SlowBranch;
-use super::state_vector::{KNOWN_VARIANCE, bounded_sum, square};
-use super::step::CellStep;
+use super::state_vector::{KNOWN_VARIANCE, square};
+use super::step::{CellStep, Update};
 use crate::cell::{CapacityState, CellModel, EstimatorConfig};
-use crate::filter::{ScalarGaussian, Update};
+use crate::filter::ScalarGaussian;
 use crate::quantity::InvalidState;
 use crate::quantity::bounds::{self, Bounds};
-
-/// Rest after which a cell's voltage adds little information, s: what still relaxes then is slower than the branches.
-pub(super) const REST_REPEATS_S: f64 = 1000.0;
 
 /// Assumed load in a gap that has a load next to it, per rated capacity: 1 C.
 const GAP_LOAD_PER_H: f64 = 1.0;
@@ -103,19 +100,6 @@ impl Memory {
         }
     }
 
-    /// Time that counts as new information in the present reading, s: all of it under load, a decreasing part at rest.
-    #[inline]
-    pub(super) fn new_information_s(&mut self, config: &EstimatorConfig, step: &CellStep) -> f64 {
-        let elapsed_s = step.measured_s + step.unmeasured_s;
-        if step.charge_as.abs() > config.gap.rest_current_a * step.measured_s || step.unmeasured_s > 0.0 {
-            self.rest_s = 0.0;
-            return elapsed_s;
-        }
-        let before_s = self.rest_s;
-        self.rest_s += elapsed_s;
-        REST_REPEATS_S * libm::log((REST_REPEATS_S + self.rest_s) / (REST_REPEATS_S + before_s))
-    }
-
     /// Notes a downtime in which the cell was used with probability `used`, by a charge of up to `most`, fraction of SOC.
     pub(super) fn note_downtime(&mut self, most: f64, used: f64) {
         self.downtime_std = (self.downtime_std + most / 3.0_f64.sqrt()).min(1.0);
@@ -158,20 +142,14 @@ impl Memory {
         self.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs())
     }
 
-    /// Updates the load's low-pass. A gap with a load next to it counts as the heaviest usual load.
-    #[inline]
-    pub(super) fn update_load(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
-        let keep = |elapsed_s: f64| libm::exp(-elapsed_s / config.voltage.load_memory_s);
-        if step.measured_s > 0.0 {
-            let mean_a = step.charge_as.abs() / step.measured_s;
-            self.load_a = mean_a + (self.load_a - mean_a) * keep(step.measured_s);
-        }
-        if step.unmeasured_s > 0.0 {
-            self.load_a *= keep(step.unmeasured_s);
-            let adjacent_a = self.gap_load_a(config, step);
-            if adjacent_a > config.gap.rest_current_a {
-                self.load_a = self.load_a.max(adjacent_a).max(model.rated_capacity_ah * GAP_LOAD_PER_H);
-            }
+    /// Updates load and rest for the unmeasured time of a step, after its measured time. A gap with a load next to it counts
+    /// as the heaviest usual load.
+    pub(super) fn pass_gap(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
+        self.rest_s = 0.0;
+        self.load_a *= libm::exp(-step.unmeasured_s / config.voltage.load_memory_s);
+        let adjacent_a = self.gap_load_a(config, step);
+        if adjacent_a > config.gap.rest_current_a {
+            self.load_a = self.load_a.max(adjacent_a).max(model.rated_capacity_ah * GAP_LOAD_PER_H);
         }
     }
 
@@ -191,14 +169,6 @@ impl Memory {
     #[inline]
     pub(super) fn is_carried_over(&self) -> bool {
         self.is_unseen || self.downtime_std_if_any().is_some()
-    }
-
-    /// Adds what a reading says about the current's offset, whose standard deviation moves the innovation by `offset_v`.
-    #[inline]
-    pub(super) fn note_offset(&mut self, offset_v: f64, update: &Update) {
-        let per_variance = offset_v / (update.innovation_variance - square(offset_v));
-        self.offset_information = bounded_sum(self.offset_information, per_variance * offset_v);
-        self.offset_score = bounded_sum(self.offset_score, per_variance * update.innovation);
     }
 
     /// Consistency monitor: exponentially forgotten mean of the normalised innovation squared.

@@ -10,8 +10,6 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::state_vector::{bounded_sum, square};
-use crate::filter::Update;
 use crate::quantity::InvalidState;
 
 /// Least standard deviation, part of the first one: the ratio changes with temperature and SOC, and no evidence is for good.
@@ -59,14 +57,6 @@ impl SlowBranch {
     #[inline]
     pub(super) fn std(&self, configured: f64) -> f64 {
         self.part * configured
-    }
-
-    /// Adds what a reading says, whose innovation one standard deviation of the ratio moves by `effect_v`.
-    #[inline]
-    pub(super) fn note(&mut self, effect_v: f64, update: &Update) {
-        let per_variance = effect_v / (update.innovation_variance - square(effect_v));
-        self.information = bounded_sum(self.information, per_variance * effect_v);
-        self.score = bounded_sum(self.score, per_variance * update.innovation);
     }
 
     /// Corrects the ratio by the evidence, which is then used; `None` when there is none.

@@ -7,10 +7,9 @@ use nalgebra::{SMatrix, SVector};
 use serde::{Deserialize, Serialize};
 
 use super::cell_estimator::CellEstimator;
-use super::filter::{Filter, each};
+use super::gaussian::{Covariance, Gaussian, MAX_STATES};
 use super::memory::{Memory, check_log_resistance};
-use super::state_vector::{BRANCHES, CAPACITY, LOG_RESISTANCE};
-use crate::filter::{CONSTANT_ERRORS, Gaussian};
+use super::state_vector::{BRANCHES, CAPACITY, CONSTANT_ERRORS, LOG_RESISTANCE};
 use crate::quantity::InvalidState;
 use crate::quantity::bounds;
 
@@ -40,8 +39,7 @@ const fn place_of(i: usize, n: usize) -> usize {
 impl CellEstimator {
     /// Returns the state for storing.
     pub fn snapshot(&self) -> CellState {
-        let (mean, covariance, by_constant) =
-            self.filter.as_ref().map_or_else(Default::default, |filter| each!(filter, x => document(x)));
+        let (mean, covariance, by_constant) = self.filter.as_ref().map_or_else(Default::default, document);
         CellState { mean, covariance, by_constant, memory: self.memory }
     }
 
@@ -53,10 +51,8 @@ impl CellEstimator {
         let filter = match (state.mean.len(), branches) {
             (0, _) => None,
             _ if !state.mean.first().is_some_and(|soc| bounds::FILTER_SOC.has(*soc)) => None,
-            (4, 1) => Some(Filter::One(gaussian(state)?)),
-            (5, 2) => Some(Filter::Two(gaussian(state)?)),
-            (6, 3) => Some(Filter::Three(gaussian(state)?)),
-            _ => return None,
+            (states, _) if states != BRANCHES + branches => return None,
+            _ => Some(gaussian(state)?),
         };
         Some(Self { filter, memory: state.memory })
     }
@@ -82,37 +78,37 @@ impl CellState {
     }
 }
 
-fn document<const N: usize>(x: &Gaussian<N>) -> (Vec<f64>, Vec<f64>, Vec<f64>) {
-    let place = |i| place_of(i, N);
-    let mean = (0..N).map(|i| x.mean[place(i)]).collect();
+fn document(x: &Gaussian) -> (Vec<f64>, Vec<f64>, Vec<f64>) {
+    let n = x.states;
+    let place = |i| place_of(i, n);
+    let mean = (0..n).map(|i| x.mean[place(i)]).collect();
     // A variance that has decayed to nothing is stored as the least one.
-    let least = |i: usize| if i / N == i % N { bounds::VARIANCE.low } else { f64::NEG_INFINITY };
-    let covariance = (0..N * N).map(|i| x.covariance[(place(i / N), place(i % N))].max(least(i))).collect();
+    let least = |i: usize| if i / n == i % n { bounds::VARIANCE.low } else { f64::NEG_INFINITY };
+    let covariance = (0..n * n).map(|i| x.covariance[(place(i / n), place(i % n))].max(least(i))).collect();
     let by_constant =
-        (0..N * CONSTANT_ERRORS).map(|i| x.by_constant[(place(i / CONSTANT_ERRORS), i % CONSTANT_ERRORS)]);
+        (0..n * CONSTANT_ERRORS).map(|i| x.by_constant[(place(i / CONSTANT_ERRORS), i % CONSTANT_ERRORS)]);
     (mean, covariance, by_constant.collect())
 }
 
-fn gaussian<const N: usize>(state: &CellState) -> Option<Gaussian<N>> {
-    if state.covariance.len() != N * N || state.by_constant.len() != N * CONSTANT_ERRORS {
+fn gaussian(state: &CellState) -> Option<Gaussian> {
+    let n = state.mean.len();
+    if state.covariance.len() != n * n || state.by_constant.len() != n * CONSTANT_ERRORS {
         return None;
     }
-    let mut mean = SVector::<f64, N>::zeros();
-    let mut covariance = SMatrix::<f64, N, N>::zeros();
-    let mut by_constant = SMatrix::<f64, N, CONSTANT_ERRORS>::zeros();
-    for i in 0..N {
-        mean[place_of(i, N)] = state.mean[i];
-        for k in 0..CONSTANT_ERRORS {
-            by_constant[(place_of(i, N), k)] = state.by_constant[i * CONSTANT_ERRORS + k];
-        }
-        for j in 0..N {
-            covariance[(place_of(i, N), place_of(j, N))] = state.covariance[i * N + j];
-        }
+    let (mut mean, mut covariance, mut by_constant) = (SVector::zeros(), Covariance::zeros(), SMatrix::zeros());
+    let place = |i| place_of(i, n);
+    for i in 0..n {
+        mean[place(i)] = state.mean[i];
+        (0..CONSTANT_ERRORS).for_each(|k| by_constant[(place(i), k)] = state.by_constant[i * CONSTANT_ERRORS + k]);
+        (0..n).for_each(|j| covariance[(place(i), place(j))] = state.covariance[i * n + j]);
     }
+    let mut factored = covariance;
+    (n..MAX_STATES).for_each(|i| factored[(i, i)] = 1.0);
     let is_symmetric = (covariance - covariance.transpose()).amax() <= 1e-9 * covariance.amax();
-    let is_consistent = is_symmetric && covariance.cholesky().is_some();
-    let covariance = if is_consistent { covariance } else { SMatrix::from_diagonal(&covariance.diagonal()) };
-    Some(Gaussian { mean, covariance, by_constant })
+    if !(is_symmetric && factored.cholesky().is_some()) {
+        covariance = SMatrix::from_diagonal(&covariance.diagonal());
+    }
+    Some(Gaussian { states: n, mean, covariance, by_constant })
 }
 
 #[cfg(test)]

@@ -4,7 +4,6 @@
 
 use crate::filter::ScalarGaussian;
 pub(super) use crate::filter::square;
-use crate::quantity::bounds;
 
 /// Variance of a known value: small against any noise, large against rounding.
 pub(super) const KNOWN_VARIANCE: f64 = 1e-12;
@@ -19,12 +18,6 @@ pub(super) const CAPACITY: usize = 2;
 /// Index of the first branch voltage in the state.
 pub(super) const BRANCHES: usize = 3;
 
-/// A sum that stays storable: evidence that is not a number adds nothing.
-#[inline]
-pub(super) fn bounded_sum(sum: f64, added: f64) -> f64 {
-    if added.is_nan() { sum } else { (sum + added).clamp(bounds::NUMBER.low, bounds::NUMBER.high) }
-}
-
 /// A SOC variance grown by `by`, at most to that of an unknown SOC.
 #[inline]
 pub(super) fn widened(variance: f64, by: f64) -> f64 {
@@ -36,6 +29,11 @@ pub(super) fn widened(variance: f64, by: f64) -> f64 {
 pub(super) fn within_bounds(soc: ScalarGaussian) -> ScalarGaussian {
     ScalarGaussian { mean: soc.mean.clamp(0.0, 1.0), ..soc }
 }
+
+/// Number of constant errors whose effect is followed.
+pub(super) const CONSTANT_ERRORS: usize = 7;
+/// The first of them are considered in the weight of a measurement.
+pub(super) const CONSIDERED: usize = 4;
 
 /// Index of the voltage sensor's offset among the constant errors: measured less true.
 pub(super) const VOLTAGE_OFFSET: usize = 0;

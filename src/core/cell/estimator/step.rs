@@ -1,7 +1,5 @@
 //! Input and outcome of one step of the estimator.
 
-use crate::filter::Update;
-
 /// A voltage reading, and charge and time since the reading before.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CellStep {
@@ -21,6 +19,19 @@ pub struct CellStep {
     pub ambient_c: f64,
     /// Terminal voltage, V.
     pub voltage_v: f64,
+}
+
+/// Outcome of an update with a voltage.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Update {
+    /// Measured less predicted voltage, V.
+    pub innovation: f64,
+    /// Predicted variance of the innovation, V^2.
+    pub innovation_variance: f64,
+    /// innovation^2 over its variance for the gate: beyond the gate's square the reading is an outlier.
+    pub test_ratio: f64,
+    /// Whether the innovation passed the gate and moved the state.
+    pub accepted: bool,
 }
 
 /// Outcome of a step.

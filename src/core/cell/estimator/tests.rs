@@ -1,9 +1,10 @@
 //! The estimator against its own model, driven by a small simulation without noise.
 
 mod robust;
+pub(super) mod textbook;
 
 use super::state_vector::UNKNOWN_SOC_VARIANCE;
-use super::{CellEstimator, CellStep};
+use super::{CellEstimator, CellStep, EstimatorBank, StepResult};
 use crate::cell::circuit::{self, BranchAt};
 use crate::cell::model::tests::small_model;
 use crate::cell::{
@@ -50,6 +51,18 @@ pub(crate) fn config() -> EstimatorConfig {
         sensor: SensorErrors::NONE,
         gate: GateSettings { sigma: 5.0, model_error_v: 0.06, soc_error: 0.02, lost_after_s: 30.0 },
         consistency: ConsistencySettings { window_s: 600.0, limit: 4.0 },
+    }
+}
+
+impl CellEstimator {
+    /// Makes a step in a bank of one cell.
+    pub(crate) fn step(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) -> StepResult {
+        let mut bank = EstimatorBank::new(model, config, 1);
+        bank.put(0, self);
+        bank.add(0, step);
+        bank.step();
+        *self = bank.cell(0);
+        *bank.result(0)
     }
 }
 

@@ -4,21 +4,16 @@
 
 use std::array::from_fn;
 
-use nalgebra::{SMatrix, SVector};
-
 use super::input::{BlockInput, CellSlot, WIDTH};
 use super::kernel::{
-    self, CURVE_AH, CURVE_STD_AH, DecayFactors, FilterState, INFORMATION_S, KernelConstants, LOAD_A, MEAN_NIS,
-    OFFSET_INFORMATION, OFFSET_SCORE, REST_S, SLOW_INFORMATION, SLOW_RATIO, SLOW_SCORE, SLOW_STD, at,
+    self, CURVE_AH, DecayFactors, FilterState, HotMemory, KernelConstants, StepInput, at, has_variances,
 };
 use super::tables::{LineCache, Tables};
-use crate::cell::estimator::filter::Filter;
-use crate::cell::estimator::memory::Memory;
-use crate::cell::estimator::state_vector::CAPACITY;
-use crate::cell::estimator::step::{CellStep, StepResult};
+use crate::cell::estimator::gaussian::Gaussian;
+use crate::cell::estimator::state_vector::{CAPACITY, CONSTANT_ERRORS, LOG_RESISTANCE};
+use crate::cell::estimator::step::{CellStep, StepResult, Update};
 use crate::cell::model::CellModel;
 use crate::filter::simd::Lanes;
-use crate::filter::{CONSTANT_ERRORS, Gaussian};
 
 /// Filters of N states, with T numbers of the covariance and tables of W columns.
 #[derive(Debug, Clone)]
@@ -29,6 +24,26 @@ pub(super) struct FilterArray<const N: usize, const T: usize, const W: usize> {
     cache: Vec<(LineCache<WIDTH, W>, [LineCache<1, W>; WIDTH])>,
     step_time: StepTime,
 }
+
+/// The filters of a pack, by number of branches.
+#[derive(Debug, Clone)]
+pub(super) enum FilterArrays {
+    One(FilterArray<4, 10, 16>),
+    Two(FilterArray<5, 15, 20>),
+    Three(FilterArray<6, 21, 24>),
+}
+
+/// Runs an expression for the pack's number of branches.
+macro_rules! each_array {
+    ($filters:expr, $x:ident => $body:expr) => {
+        match $filters {
+            FilterArrays::One($x) => $body,
+            FilterArrays::Two($x) => $body,
+            FilterArrays::Three($x) => $body,
+        }
+    };
+}
+pub(super) use each_array;
 
 /// The last step time, s, with its decay factors: readings mostly arrive at one interval.
 #[derive(Debug, Clone)]
@@ -158,57 +173,78 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         Some((ends.0.0, ends.1.0))
     }
 
-    pub(super) fn filter(
-        &self,
-        block: usize,
-        lane: usize,
-        make: fn(Gaussian<N>) -> Filter,
-    ) -> (Filter, [f64; kernel::MEMORY]) {
-        let state = FilterState::of_lane(&self.blocks[block], lane);
-        let mean = SVector::from_fn(|i, _| state.mean[i].0[0]);
-        let covariance = SMatrix::from_fn(|i, j| state.covariance[at(i.max(j), i.min(j))].0[0]);
-        let by_constant = SMatrix::from_fn(|i, k| state.by_constant[k][i].0[0]);
-        (make(Gaussian { mean, covariance, by_constant }), state.memory.map(|number| number.0[0]))
+    /// The state and the memory in a lane.
+    pub(super) fn lane(&self, cell: usize) -> (Gaussian, HotMemory) {
+        let state = FilterState::of_lane(&self.blocks[cell / WIDTH], cell % WIDTH);
+        (state.gaussian(), state.memory)
     }
 
-    /// Puts a filter into a lane, with the standard deviation of the slowest branch's ratio; returns true, the cell's new
-    /// `has_filter`.
-    pub(super) fn set(
-        &mut self,
-        block: usize,
-        lane: usize,
-        filter: &Gaussian<N>,
-        memory: &Memory,
-        slow_std: f64,
-    ) -> bool {
-        self.clear(block, lane, memory, slow_std);
-        let state = &mut self.blocks[block];
-        for i in 0..N {
-            state.mean[i].0[lane] = filter.mean[i];
-            for j in 0..=i {
-                state.covariance[at(i, j)].0[lane] = filter.covariance[(i, j)];
-            }
-            for k in 0..CONSTANT_ERRORS {
-                state.by_constant[k][i].0[lane] = filter.by_constant[(i, k)];
-            }
-        }
+    /// Replaces state and memory of a lane; returns whether the cell has a filter.
+    pub(super) fn set(&mut self, cell: usize, filter: Option<&Gaussian>, hot: HotMemory) -> bool {
+        let (block, lane) = (&mut self.blocks[cell / WIDTH], cell % WIDTH);
+        // The filter has as many branches as the model: states are checked when they are restored.
+        let Some(filter) = filter.filter(|filter| filter.states == N) else {
+            block.memory.iter_mut().zip(hot).for_each(|(all, one)| all.0[lane] = one.0[0]);
+            return false;
+        };
+        block.set_lane(lane, &FilterState::new(filter, hot));
         true
     }
 
-    /// Puts the memory of a cell without a filter into its lane; returns false, the cell's new `has_filter`.
-    pub(super) fn clear(&mut self, block: usize, lane: usize, memory: &Memory, slow_std: f64) -> bool {
-        let hot = &mut self.blocks[block].memory;
-        hot[LOAD_A].0[lane] = memory.load_a;
-        hot[MEAN_NIS].0[lane] = memory.mean_nis;
-        hot[INFORMATION_S].0[lane] = memory.information_s;
-        hot[REST_S].0[lane] = memory.rest_s;
-        hot[OFFSET_INFORMATION].0[lane] = memory.offset_information;
-        hot[OFFSET_SCORE].0[lane] = memory.offset_score;
-        (hot[SLOW_RATIO].0[lane], hot[SLOW_STD].0[lane]) = (memory.slow_branch.ratio, slow_std);
-        hot[SLOW_INFORMATION].0[lane] = memory.slow_branch.information;
-        hot[SLOW_SCORE].0[lane] = memory.slow_branch.score;
-        (hot[CURVE_AH].0[lane], hot[CURVE_STD_AH].0[lane]) = (memory.curve.mean, memory.curve.std());
-        false
+    /// Predicts a cell's state apart from its lane; `None`, with the state unchanged, when it cannot be computed.
+    #[inline(never)]
+    pub(super) fn predict(
+        &mut self,
+        c: &KernelConstants,
+        (cell, x, hot): (usize, &mut Gaussian, HotMemory),
+        input: &StepInput<1>,
+        soc_per_s: f64,
+    ) -> Option<()> {
+        let state = FilterState::<1, N, T>::new(x, hot);
+        let ratio = state.mean[LOG_RESISTANCE].exp();
+        let (tables, cache) = self.own_tables(cell, &hot, input);
+        let (new, has_factor) = kernel::predict(tables, cache, c, &state, input, (ratio, soc_per_s));
+        (has_factor & has_variances(&new, Lanes([0.0]))).all().then(|| *x = new.gaussian())
+    }
+
+    /// Updates a cell's state apart from its lane with a voltage, where that is within the gate; returns the memory too. `None`,
+    /// with the state unchanged, when it cannot be computed.
+    #[inline(never)]
+    pub(super) fn update(
+        &mut self,
+        c: &KernelConstants,
+        (cell, x, hot): (usize, &mut Gaussian, HotMemory),
+        input: &StepInput<1>,
+    ) -> Option<(Update, HotMemory)> {
+        let mut state = FilterState::<1, N, T>::new(x, hot);
+        let ratio = state.mean[LOG_RESISTANCE].exp();
+        let weight = (ratio, c.information_s(&hot));
+        let (tables, cache) = self.own_tables(cell, &hot, input);
+        let outcome = kernel::update(tables, cache, c, &mut state, input, weight);
+        let is_finite = (outcome.innovation_variance + outcome.test_ratio).is_finite();
+        if !(outcome.is_usable & is_finite).all() {
+            return None;
+        }
+        if outcome.is_accepted.all() {
+            if !has_variances(&state, Lanes([0.0])).all() {
+                return None;
+            }
+            *x = state.gaussian();
+        }
+        Some((outcome.lane(0), state.memory))
+    }
+
+    /// The tables, and a cell's own cache at its temperature and its curve's capacity.
+    fn own_tables(
+        &mut self,
+        cell: usize,
+        hot: &HotMemory,
+        input: &StepInput<1>,
+    ) -> (&mut Tables<W>, &mut LineCache<1, W>) {
+        let cache = &mut self.cache[cell / WIDTH].1[cell % WIDTH];
+        self.tables.refresh_temperatures(cache, &input.temperature_c);
+        self.tables.refresh_capacities(cache, &hot[CURVE_AH]);
+        (&mut self.tables, cache)
     }
 }
 

@@ -5,8 +5,7 @@
 
 use super::kernel::{DecayFactors, StepInput, StepOutcome};
 use crate::cell::estimator::memory::Memory;
-use crate::cell::estimator::step::{CellStep, StepResult};
-use crate::filter::Update;
+use crate::cell::estimator::step::{CellStep, StepResult, Update};
 use crate::filter::simd::{Lanes, Mask};
 
 /// Cells of a block: one AVX-512 vector, two AVX2 vectors (4 and 16 cells measured slower).
@@ -28,6 +27,19 @@ impl CellSlot {
             && self.memory.rejected == 0
             && !self.memory.is_soc_unknown
             && self.memory.downtime_std_if_any().is_none()
+    }
+}
+
+impl<const L: usize> StepOutcome<L> {
+    /// The outcome of a lane.
+    #[inline(always)]
+    pub(super) fn lane(&self, lane: usize) -> Update {
+        Update {
+            innovation: self.innovation_v.0[lane],
+            innovation_variance: self.innovation_variance.0[lane],
+            test_ratio: self.test_ratio.0[lane],
+            accepted: self.is_accepted.lane(lane),
+        }
     }
 }
 
@@ -108,12 +120,6 @@ impl StepInput<WIDTH> {
         cell.memory.last_current_a = self.current_a.0[lane];
         cell.memory.temperature_c = Some(self.temperature_c.0[lane]);
         cell.memory.end_downtime();
-        let update = Update {
-            innovation: outcome.innovation_v.0[from],
-            innovation_variance: outcome.innovation_variance.0[from],
-            test_ratio: outcome.test_ratio.0[from],
-            accepted: true,
-        };
-        *result = StepResult { update: Some(update), reset: false };
+        *result = StepResult { update: Some(outcome.lane(from)), reset: false };
     }
 }

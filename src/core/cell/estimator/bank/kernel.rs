@@ -1,6 +1,6 @@
 //! The ordinary step of L cells at once: predict over a measured time, update with a voltage that passes the gate.
 //!
-//! The same filter as [`Gaussian`](crate::filter::Gaussian) with the circuit of [`crate::cell::circuit`], to rounding.
+//! The filter of [`estimator`](crate::cell::estimator) with the circuit of [`crate::cell::circuit`], to rounding.
 //! It saves the following work, all exactly:
 //! * With the points in pairs x +- s L_k (s = sqrt(N + lambda)) and f's odd and even parts over each pair, o_k = (f+ - f-) / 2s
 //!   and e_k = ((f+ + f-) / 2 - f0) / s, the weighted sums become f0 + m with m = sum e_k / s for the mean, and
@@ -21,16 +21,15 @@ mod predict;
 mod types;
 mod update;
 
-use predict::predict;
+pub(super) use predict::predict;
 pub(super) use types::{
-    CURVE_AH, CURVE_STD_AH, DecayFactors, FilterState, INFORMATION_S, KernelConstants, LOAD_A, MEAN_NIS, MEMORY,
-    OFFSET_INFORMATION, OFFSET_SCORE, REST_S, SLOW_INFORMATION, SLOW_RATIO, SLOW_SCORE, SLOW_STD, StepInput,
+    CURVE_AH, CURVE_STD_AH, DecayFactors, FilterState, HotMemory, INFORMATION_S, KernelConstants, LOAD_A, MEAN_NIS,
+    MEMORY, OFFSET_INFORMATION, OFFSET_SCORE, REST_S, SLOW_INFORMATION, SLOW_RATIO, SLOW_SCORE, SLOW_STD, StepInput,
     StepOutcome, at,
 };
-use update::update;
+pub(super) use update::update;
 
 use super::tables::{LineCache, Tables};
-use crate::cell::estimator::memory::REST_REPEATS_S;
 use crate::cell::estimator::state_vector::{CAPACITY, LOG_RESISTANCE};
 use crate::filter::simd::{Lanes, Mask};
 use crate::quantity::bounds::{self, Bounds};
@@ -47,29 +46,35 @@ pub(super) fn step<const L: usize, const N: usize, const T: usize, const W: usiz
     tables.refresh_temperatures(cache, &input.temperature_c);
     let ratio = before.mean[LOG_RESISTANCE].exp();
     tables.refresh_capacities(cache, &before.memory[CURVE_AH]);
-    let (mut x, has_factor) = predict(tables, cache, c, before, input, ratio);
-    let information_s = update_memory(c, &mut x, input);
-    let mut outcome = update(tables, cache, c, &mut x, input, ratio, information_s);
+    let (mut x, has_factor) = predict(tables, cache, c, before, input, (ratio, c.process.soc_per_s));
+    update_memory(c, &mut x.memory, input);
+    let information_s = c.information_s(&x.memory);
+    let mut outcome = update(tables, cache, c, &mut x, input, (ratio, information_s));
     x.memory[INFORMATION_S] = Lanes::splat(0.0);
     let forget = Lanes::splat(1.0) - input.decay.consistency;
     x.memory[MEAN_NIS] = x.memory[MEAN_NIS] + forget * (outcome.test_ratio - x.memory[MEAN_NIS]);
-    // The sum is not finite when any of its numbers is not.
-    let mut sum = outcome.innovation_variance + outcome.test_ratio;
-    for i in 0..N {
-        sum = sum + x.mean[i];
-    }
-    for i in 0..T {
-        sum = sum + x.covariance[i];
-    }
-    for i in [OFFSET_INFORMATION, OFFSET_SCORE, SLOW_INFORMATION, SLOW_SCORE] {
-        sum = sum + x.memory[i];
-    }
-    let least = (1..N).fold(x.covariance[at(0, 0)], |least, i| least.smaller(x.covariance[at(i, i)]));
-    outcome.is_usable = outcome.is_usable & has_factor & sum.is_finite() & least.above_number(0.0) & is_possible(&x);
+    let evidence = EVIDENCE.iter().fold(outcome.innovation_variance + outcome.test_ratio, |sum, &i| sum + x.memory[i]);
+    outcome.is_usable =
+        outcome.is_usable & outcome.is_accepted & has_factor & has_variances(&x, evidence) & is_possible(&x);
     (x, outcome)
 }
 
-/// Whether the state is one that a cell can have, and its sums can be stored; see `filter::is_possible`.
+/// Evidence about the current's offset and the slowest branch.
+pub(super) const EVIDENCE: [usize; 4] = [OFFSET_INFORMATION, OFFSET_SCORE, SLOW_INFORMATION, SLOW_SCORE];
+
+/// Whether a state and the sum of `others` are finite, and all variances positive.
+#[inline(always)]
+pub(super) fn has_variances<const L: usize, const N: usize, const T: usize>(
+    x: &FilterState<L, N, T>,
+    others: Lanes<L>,
+) -> Mask<L> {
+    // The sum is not finite when any of its numbers is not.
+    let sum = x.mean.iter().chain(&x.covariance).fold(others, |sum, number| sum + *number);
+    let least = (1..N).fold(x.covariance[at(0, 0)], |least, i| least.smaller(x.covariance[at(i, i)]));
+    sum.is_finite() & least.above_number(0.0)
+}
+
+/// Whether the state is one that a cell can have, and its sums can be stored; see `Gaussian::is_possible`.
 #[inline(always)]
 fn is_possible<const L: usize, const N: usize, const T: usize>(x: &FilterState<L, N, T>) -> Mask<L> {
     let within = |value: Lanes<L>, bounds: Bounds| {
@@ -80,7 +85,7 @@ fn is_possible<const L: usize, const N: usize, const T: usize>(x: &FilterState<L
         & within(x.mean[LOG_RESISTANCE], bounds::LOG_RESISTANCE)
         & within(x.mean[CAPACITY], bounds::CAPACITY_AH)
         & !Lanes::splat(bounds::CAPACITY_AH.low).above(x.mean[CAPACITY]);
-    for i in [OFFSET_INFORMATION, OFFSET_SCORE, SLOW_INFORMATION, SLOW_SCORE] {
+    for i in EVIDENCE {
         is_possible = is_possible & within(x.memory[i], bounds::NUMBER);
     }
     for i in 0..N {
@@ -89,28 +94,31 @@ fn is_possible<const L: usize, const N: usize, const T: usize>(x: &FilterState<L
     is_possible
 }
 
-/// Updates the load's low-pass and the time at rest; returns the time that the reading stands for, s.
+/// Rest after which a cell's voltage adds little information, s: what still relaxes then is slower than the branches.
+const REST_REPEATS_S: f64 = 1000.0;
+
+/// Updates the load's low-pass, the time at rest, and the time that the reading stands for.
 #[inline(always)]
-fn update_memory<const L: usize, const N: usize, const T: usize>(
+pub(super) fn update_memory<const L: usize>(
     c: &KernelConstants,
-    x: &mut FilterState<L, N, T>,
+    memory: &mut [Lanes<L>; MEMORY],
     input: &StepInput<L>,
-) -> Lanes<L> {
+) {
     let dt = input.measured_s;
     let moved_as = input.charge_as.abs();
-    let load_a = x.memory[LOAD_A];
+    let load_a = memory[LOAD_A];
     let mean_a = moved_as * input.decay.per_s;
     let kept_a = mean_a + (load_a - mean_a) * input.decay.load;
-    x.memory[LOAD_A] = kept_a.or_else(dt.above_number(0.0), load_a);
+    memory[LOAD_A] = kept_a.or_else(dt.above_number(0.0), load_a);
 
     let is_loaded = moved_as.above(dt * c.rest_current_a);
-    let rested_s = x.memory[REST_S] + dt;
+    let rested_s = memory[REST_S] + dt;
     let mut new_s = dt;
     if (!is_loaded).any() {
         let repeats = Lanes::splat(REST_REPEATS_S);
-        let logarithm = ((repeats + rested_s) / (repeats + x.memory[REST_S])).ln();
+        let logarithm = ((repeats + rested_s) / (repeats + memory[REST_S])).ln();
         new_s = dt.or_else(is_loaded, logarithm * REST_REPEATS_S);
     }
-    x.memory[REST_S] = Lanes::splat(0.0).or_else(is_loaded, rested_s);
-    (x.memory[INFORMATION_S] + new_s).at_least(1e-3).at_most(c.max_information_s)
+    memory[REST_S] = Lanes::splat(0.0).or_else(is_loaded, rested_s);
+    memory[INFORMATION_S] = memory[INFORMATION_S] + new_s;
 }

@@ -2,6 +2,7 @@
 
 use super::super::tests::config;
 use super::*;
+use crate::cell::CellEstimator;
 use crate::cell::model::tests::small_model;
 
 fn step(current_a: f64, measured_s: f64, unmeasured_s: f64) -> CellStep {
@@ -21,43 +22,54 @@ fn near(a: f64, b: f64) -> bool {
     (a - b).abs() < 1e-9 * b.abs().max(1.0)
 }
 
+/// Passes a step without a current, whose voltage is not used; returns the time that counts as new information, s.
+fn new_information_s(estimator: &mut CellEstimator, step: CellStep) -> f64 {
+    let before_s = estimator.memory.information_s;
+    estimator.step(&small_model(), &config(), &CellStep { current_a: None, ..step });
+    estimator.memory.information_s - before_s
+}
+
+/// An estimator that has used a first voltage.
+fn started() -> CellEstimator {
+    let mut estimator = CellEstimator::new(&config());
+    estimator.step(&small_model(), &config(), &step(1.0, 1.0, 0.0));
+    estimator
+}
+
 #[test]
 fn a_rest_counts_the_logarithm_of_its_length_at_any_sample_rate() {
-    let config = config();
     for dt_s in [1.0, 60.0, 3600.0] {
-        let mut memory = Memory::new(&config);
+        let mut estimator = started();
         let steps = (36_000.0 / dt_s) as u32;
-        let information_s: f64 = (0..steps).map(|_| memory.new_information_s(&config, &step(0.0, dt_s, 0.0))).sum();
+        let information_s: f64 = (0..steps).map(|_| new_information_s(&mut estimator, step(0.0, dt_s, 0.0))).sum();
         // 10 h are worth 3.6 times 1000 s.
-        assert!(near(information_s, REST_REPEATS_S * libm::log(1.0 + 36.0)), "{dt_s}: {information_s}");
+        assert!(near(information_s, 1000.0 * libm::log(1.0 + 36.0)), "{dt_s}: {information_s}");
     }
 }
 
 #[test]
 fn under_load_and_after_a_gap_all_time_counts_and_the_rest_starts_again() {
-    let config = config();
-    let mut memory = Memory::new(&config);
-    let fresh_s = memory.new_information_s(&config, &step(0.0, 10.0, 0.0));
-    memory.new_information_s(&config, &step(0.0, 7200.0, 0.0));
-    let late_s = memory.new_information_s(&config, &step(config.gap.rest_current_a, 10.0, 0.0));
+    let (mut estimator, rest_a) = (started(), config().gap.rest_current_a);
+    let fresh_s = new_information_s(&mut estimator, step(0.0, 10.0, 0.0));
+    new_information_s(&mut estimator, step(0.0, 7200.0, 0.0));
+    let late_s = new_information_s(&mut estimator, step(rest_a, 10.0, 0.0));
     assert!(late_s < 0.15 * fresh_s, "{late_s} {fresh_s}");
-    for interruption in [step(1.0, 10.0, 0.0), step(-1.0, 10.0, 0.0), step(0.0, 0.0, 10.0)] {
-        assert_eq!(memory.new_information_s(&config, &interruption), 10.0);
-        assert_eq!(memory.new_information_s(&config, &step(0.0, 10.0, 0.0)), fresh_s);
+    for interruption in [step(1.0, 10.0, 0.0), step(-1.0, 10.0, 0.0), step(0.0, 0.0, 10.0), step(0.0, 4.0, 6.0)] {
+        assert!(near(new_information_s(&mut estimator, interruption), 10.0));
+        assert!(near(new_information_s(&mut estimator, step(0.0, 10.0, 0.0)), fresh_s));
     }
 }
 
 #[test]
 fn the_load_decays_exponentially_in_both_directions() {
-    let (config, model) = (config(), small_model());
-    let mut memory = Memory::new(&config);
+    let mut estimator = started();
     for current_a in [2.0, -2.0] {
-        memory.load_a = 0.5;
+        estimator.memory.load_a = 0.5;
         for _ in 0..60 {
-            memory.update_load(&model, &config, &step(current_a, 10.0, 0.0));
+            new_information_s(&mut estimator, step(current_a, 10.0, 0.0));
         }
-        let keep = libm::exp(-600.0 / config.voltage.load_memory_s);
-        assert!(near(memory.load_a, 2.0 + (0.5 - 2.0) * keep), "{}", memory.load_a);
+        let keep = libm::exp(-600.0 / config().voltage.load_memory_s);
+        assert!(near(estimator.memory.load_a, 2.0 + (0.5 - 2.0) * keep), "{}", estimator.memory.load_a);
     }
 }
 
@@ -66,11 +78,11 @@ fn a_gap_next_to_a_load_counts_as_the_heaviest_usual_load_and_a_gap_at_rest_as_r
     let (config, model) = (config(), small_model());
     let mut memory = Memory::new(&config);
     memory.load_a = 0.5;
-    memory.update_load(&model, &config, &step(0.0, 0.0, config.voltage.load_memory_s));
+    memory.pass_gap(&model, &config, &step(0.0, 0.0, config.voltage.load_memory_s));
     assert!(near(memory.load_a, 0.5 * libm::exp(-1.0)), "{}", memory.load_a);
-    memory.update_load(&model, &config, &step(1.0, 0.0, 60.0));
+    memory.pass_gap(&model, &config, &step(1.0, 0.0, 60.0));
     assert_eq!(memory.load_a, model.rated_capacity_ah * GAP_LOAD_PER_H);
-    memory.update_load(&model, &config, &step(5.0, 0.0, 60.0));
+    memory.pass_gap(&model, &config, &step(5.0, 0.0, 60.0));
     assert_eq!(memory.load_a, 5.0);
 }
 

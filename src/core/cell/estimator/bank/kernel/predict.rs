@@ -6,10 +6,13 @@
 use super::points::{COLUMNS, OddEvenParts, PartialCholesky, ResistanceRatios, sum};
 use super::types::{FilterState, KernelConstants, StepInput, at};
 use crate::cell::estimator::bank::tables::{LineCache, TablePoint, Tables};
-use crate::cell::estimator::noise::MAX_WALK_S;
-use crate::cell::estimator::state_vector::{BRANCHES, CAPACITY, CURRENT_GAIN, CURRENT_OFFSET, LOG_RESISTANCE};
-use crate::filter::CONSTANT_ERRORS;
+use crate::cell::estimator::state_vector::{
+    BRANCHES, CAPACITY, CONSTANT_ERRORS, CURRENT_GAIN, CURRENT_OFFSET, LOG_RESISTANCE,
+};
 use crate::filter::simd::{Lanes, Mask};
+
+/// Longest time of the resistance's random walk between two readings, s: it does not age in a gap.
+const MAX_WALK_S: f64 = 600.0;
 
 /// A branch at L table points, over the measured time.
 struct BranchStep<const L: usize> {
@@ -110,15 +113,16 @@ fn excess_as<const L: usize>(c: &KernelConstants, input: &StepInput<L>) -> [Lane
     excess_as
 }
 
-/// Predicts the state; the mask is true where the covariance before was positive definite.
+/// Predicts the state, whose SOC gains the variance `soc_per_s` per second; the mask is true where the covariance before was
+/// positive definite.
 #[inline(always)]
-pub(super) fn predict<const L: usize, const N: usize, const T: usize, const W: usize>(
+pub(in crate::cell::estimator::bank) fn predict<const L: usize, const N: usize, const T: usize, const W: usize>(
     tables: &mut Tables<W>,
     cache: &mut LineCache<L, W>,
     c: &KernelConstants,
     x: &FilterState<L, N, T>,
     input: &StepInput<L>,
-    ratio: Lanes<L>,
+    (ratio, soc_per_s): (Lanes<L>, f64),
 ) -> (FilterState<L, N, T>, Mask<L>) {
     let PartialCholesky { columns: l, is_positive, .. } = PartialCholesky::<L, N>::new(&x.covariance);
     let dt = input.measured_s;
@@ -138,7 +142,7 @@ pub(super) fn predict<const L: usize, const N: usize, const T: usize, const W: u
     }
     mean[0] = x.mean[0] - moved + soc_shift;
     let capacity_column = [l[0][CAPACITY], l[1][CAPACITY], l[2][CAPACITY]];
-    let soc_noise = dt * c.process.soc_per_s + moved.abs() * c.process.soc_per_charge;
+    let soc_noise = dt * soc_per_s + moved.abs() * c.process.soc_per_charge;
     p[at(0, 0)] = sum(soc.odd, soc.odd) + sum(soc.even, soc.even) + soc_shift.square() * c.excess + soc_noise;
     p[at(LOG_RESISTANCE, 0)] = soc.odd[0] * l[0][LOG_RESISTANCE] + soc.odd[1] * l[1][LOG_RESISTANCE];
     p[at(CAPACITY, 0)] = sum(soc.odd, capacity_column);

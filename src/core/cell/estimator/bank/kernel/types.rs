@@ -4,9 +4,11 @@
 
 use std::array::from_fn;
 
-use crate::cell::estimator::state_vector::{BRANCHES, square};
+use nalgebra::{SMatrix, SVector};
+
+use crate::cell::estimator::gaussian::Gaussian;
+use crate::cell::estimator::state_vector::{BRANCHES, CONSTANT_ERRORS, square};
 use crate::cell::{CellModel, Discretisation, EstimatorConfig, SensorErrors};
-use crate::filter::CONSTANT_ERRORS;
 use crate::filter::simd::{Lanes, Mask};
 
 /// Filter states of L cells: N means each, the T numbers of the covariance's lower triangle, and a memory.
@@ -21,6 +23,9 @@ pub(in crate::cell::estimator::bank) struct FilterState<const L: usize, const N:
     /// Part of the estimator's `Memory`, see [`LOAD_A`] to [`SLOW_STD`].
     pub(in crate::cell::estimator::bank) memory: [Lanes<L>; MEMORY],
 }
+
+/// The memory of one cell.
+pub(in crate::cell::estimator::bank) type HotMemory = [Lanes<1>; MEMORY];
 
 /// Number of memory values that steps change or read.
 pub(in crate::cell::estimator::bank) const MEMORY: usize = 12;
@@ -108,8 +113,10 @@ impl<const L: usize> DecayFactors<L> {
 /// Outcome of a step.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::cell::estimator::bank) struct StepOutcome<const L: usize> {
-    /// Whether the new state is usable.
+    /// Whether the covariance was positive definite, and the innovation's variance is positive.
     pub(in crate::cell::estimator::bank) is_usable: Mask<L>,
+    /// Whether the innovation is within the gate.
+    pub(in crate::cell::estimator::bank) is_accepted: Mask<L>,
     pub(in crate::cell::estimator::bank) innovation_v: Lanes<L>,
     pub(in crate::cell::estimator::bank) innovation_variance: Lanes<L>,
     pub(in crate::cell::estimator::bank) test_ratio: Lanes<L>,
@@ -123,7 +130,7 @@ pub(in crate::cell::estimator::bank) struct KernelConstants {
     /// beta - alpha^2.
     pub(super) excess: f64,
     pub(super) euler: bool,
-    pub(super) process: ProcessVariances,
+    pub(in crate::cell::estimator::bank) process: ProcessVariances,
     pub(super) reading: ReadingVariances,
     pub(in crate::cell::estimator::bank) sensor: SensorErrors,
     pub(super) rest_current_a: f64,
@@ -134,8 +141,8 @@ pub(in crate::cell::estimator::bank) struct KernelConstants {
 
 /// Variances that the states gain.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct ProcessVariances {
-    pub(super) soc_per_s: f64,
+pub(in crate::cell::estimator::bank) struct ProcessVariances {
+    pub(in crate::cell::estimator::bank) soc_per_s: f64,
     pub(super) soc_per_charge: f64,
     pub(super) branch_per_s: f64,
     pub(super) log_resistance_per_s: f64,
@@ -159,6 +166,15 @@ pub(super) struct ReadingVariances {
 }
 
 impl KernelConstants {
+    /// Time that a reading stands for, s.
+    #[inline(always)]
+    pub(in crate::cell::estimator::bank) fn information_s<const L: usize>(
+        &self,
+        memory: &[Lanes<L>; MEMORY],
+    ) -> Lanes<L> {
+        memory[INFORMATION_S].at_least(1e-3).at_most(self.max_information_s)
+    }
+
     pub(in crate::cell::estimator::bank) fn new(model: &CellModel, config: &EstimatorConfig) -> Self {
         let states = BRANCHES + model.branches.len();
         Self {
@@ -190,6 +206,37 @@ impl KernelConstants {
 }
 
 impl<const N: usize, const T: usize> FilterState<1, N, T> {
+    /// The state of one cell, with the numbers of its memory.
+    pub(in crate::cell::estimator::bank) fn new(x: &Gaussian, memory: [Lanes<1>; MEMORY]) -> Self {
+        let mut covariance = [Lanes([0.0]); T];
+        for i in 0..N {
+            for j in 0..=i {
+                covariance[at(i, j)] = Lanes([x.covariance[(i, j)]]);
+            }
+        }
+        Self {
+            mean: from_fn(|i| Lanes([x.mean[i]])),
+            covariance,
+            by_constant: from_fn(|k| from_fn(|i| Lanes([x.by_constant[(i, k)]]))),
+            memory,
+        }
+    }
+
+    /// The state apart from its lane.
+    pub(in crate::cell::estimator::bank) fn gaussian(&self) -> Gaussian {
+        let (mut mean, mut covariance, mut by_constant) = (SVector::zeros(), SMatrix::zeros(), SMatrix::zeros());
+        for i in 0..N {
+            mean[i] = self.mean[i].0[0];
+            for j in 0..N {
+                covariance[(i, j)] = self.covariance[at(i.max(j), i.min(j))].0[0];
+            }
+            for k in 0..CONSTANT_ERRORS {
+                by_constant[(i, k)] = self.by_constant[k][i].0[0];
+            }
+        }
+        Gaussian { states: N, mean, covariance, by_constant }
+    }
+
     /// Copies the states of one lane.
     pub(in crate::cell::estimator::bank) fn of_lane<const L: usize>(all: &FilterState<L, N, T>, lane: usize) -> Self {
         let take = |x: &Lanes<L>| Lanes([x.0[lane]]);

@@ -11,11 +11,11 @@ use super::types::{
 use crate::cell::aged_ocv::MIXES;
 use crate::cell::estimator::bank::tables::{ERROR_V, LineCache, Tables, branch};
 use crate::cell::estimator::state_vector::{
-    BRANCHES, CURRENT_GAIN, CURRENT_OFFSET, CURVE_CAPACITY, CURVE_MIXES, LOG_RESISTANCE, SLOW_BRANCH, VOLTAGE_OFFSET,
+    BRANCHES, CONSIDERED, CONSTANT_ERRORS, CURRENT_GAIN, CURRENT_OFFSET, CURVE_CAPACITY, CURVE_MIXES, LOG_RESISTANCE,
+    SLOW_BRANCH, VOLTAGE_OFFSET,
 };
 use crate::cell::model::ERROR_WINDOW_S;
 use crate::filter::simd::Lanes;
-use crate::filter::{CONSIDERED, CONSTANT_ERRORS};
 
 /// Predicted voltage.
 struct PredictedVoltage<const L: usize> {
@@ -124,14 +124,13 @@ fn by_constant<const L: usize, const N: usize, const T: usize>(
 
 /// The measurement update. Moves `x` in every lane; the outcome marks the usable ones.
 #[inline(always)]
-pub(super) fn update<const L: usize, const N: usize, const T: usize, const W: usize>(
+pub(in crate::cell::estimator::bank) fn update<const L: usize, const N: usize, const T: usize, const W: usize>(
     tables: &mut Tables<W>,
     cache: &mut LineCache<L, W>,
     c: &KernelConstants,
     x: &mut FilterState<L, N, T>,
     input: &StepInput<L>,
-    ratio: Lanes<L>,
-    information_s: Lanes<L>,
+    (ratio, information_s): (Lanes<L>, Lanes<L>),
 ) -> StepOutcome<L> {
     let PartialCholesky { columns: l, rest, is_positive } = PartialCholesky::<L, N>::new(&x.covariance);
     let predicted = PredictedVoltage::new(tables, cache, c, x, input, &l, ratio);
@@ -158,7 +157,7 @@ pub(super) fn update<const L: usize, const N: usize, const T: usize, const W: us
         variance = variance + weighed(x, i, others);
     }
 
-    // Measurement noise: see `noise::VoltageReading`.
+    // Measurement noise, deviation 4.
     let load_v = predicted.settled_ohm * ratio * x.memory[LOAD_A];
     let model = predicted.base_variance + predicted.lost_v.square() * c.reading.drop + load_v.square() * c.reading.load;
     let own_variance = variance + (model / information_s + c.reading.sensor);
@@ -200,6 +199,7 @@ pub(super) fn update<const L: usize, const N: usize, const T: usize, const W: us
             x.covariance[at(i, j)] = x.covariance[at(i, j)] + weighed * gain[j] - gain[i] * cross[j];
         }
     }
-    let is_usable = is_positive & total.above_number(0.0) & !test_ratio.above_number(c.reading.gate_limit);
-    StepOutcome { is_usable, innovation_v, innovation_variance: total, test_ratio }
+    let is_accepted = !test_ratio.above_number(c.reading.gate_limit);
+    let is_usable = is_positive & total.above_number(0.0);
+    StepOutcome { is_usable, is_accepted, innovation_v, innovation_variance: total, test_ratio }
 }

@@ -1,23 +1,15 @@
-//! Process noise of a step, and measurement noise of a voltage reading.
-//!
-//! In: steps and readings (V, A, s, degrees C). Out: variances in the units of the states, V^2 for the voltage. Inputs are
-//! not checked: a NaN gives a variance that the filter rejects.
-//!
-//! Deviation 4: model^2 = base^2 + (k drop)^2 + (k' load)^2. The base is the cell model's own error over SOC and
-//! temperature where its fit states one; the drop is the present voltage drop in the cell, the load that of the last
-//! minutes: model error is mostly error of the resistances and of diffusion slower than the branches. Effect: a record
-//! that begins under load, the constant-voltage part of a charge, and cold cells no longer count as exact.
-//! At rest the error repeats instead of averaging out: a rest of t counts as t_r ln(1 + t/t_r) under load.
+//! Process noise of a step, and measurement noise of a voltage reading, with the textbook filter.
 
 use nalgebra::{SMatrix, SVector};
 
-use super::state_vector::{
-    BRANCHES, CAPACITY, CURRENT_GAIN, CURRENT_OFFSET, CURVE_CAPACITY, CURVE_MIXES, LOG_RESISTANCE, SLOW_BRANCH,
-    VOLTAGE_OFFSET, square,
-};
+use super::unscented::{Gaussian, MeasurementNoise};
 use crate::cell::aged_ocv::MIXES;
+use crate::cell::estimator::state_vector::{
+    BRANCHES, CAPACITY, CONSTANT_ERRORS, CURRENT_GAIN, CURRENT_OFFSET, CURVE_CAPACITY, CURVE_MIXES, LOG_RESISTANCE,
+    SLOW_BRANCH, VOLTAGE_OFFSET, square,
+};
 use crate::cell::{CellModel, ERROR_WINDOW_S, EstimatorConfig, GridPosition, SensorErrors, TemperaturePosition};
-use crate::filter::{CONSTANT_ERRORS, Gaussian, MeasurementNoise, ScalarGaussian};
+use crate::filter::ScalarGaussian;
 
 /// Longest time of the resistance's random walk between two readings, s: it does not age in a gap.
 pub(super) const MAX_WALK_S: f64 = 600.0;
@@ -118,5 +110,4 @@ impl VoltageReading {
     }
 }
 
-#[cfg(test)]
 mod tests;

@@ -1,8 +1,8 @@
 //! Noise against its closed forms.
 
-use super::super::tests::config;
 use super::*;
 use crate::cell::Table;
+use crate::cell::estimator::tests::config;
 use crate::cell::model::tests::small_model;
 
 fn near(a: f64, b: f64) -> bool {

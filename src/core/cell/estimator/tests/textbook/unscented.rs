@@ -17,42 +17,33 @@
 
 use nalgebra::{SMatrix, SVector};
 
-use super::ScalarGaussian;
-
-/// Number of constant errors whose effect is followed.
-pub const CONSTANT_ERRORS: usize = 7;
-
-/// The first of them are considered in the weight of a measurement.
-pub const CONSIDERED: usize = 4;
+use crate::cell::Update;
+use crate::cell::estimator::state_vector::{CONSIDERED, CONSTANT_ERRORS};
+use crate::filter::ScalarGaussian;
 
 /// Mean and covariance of N numbers.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Gaussian<const N: usize> {
+pub(super) struct Gaussian<const N: usize> {
     /// Mean.
-    pub mean: SVector<f64, N>,
+    pub(super) mean: SVector<f64, N>,
     /// Covariance without the constant errors, symmetric and positive definite.
-    pub covariance: SMatrix<f64, N, N>,
+    pub(super) covariance: SMatrix<f64, N, N>,
     /// Column k: error of the mean (true less mean) by one standard deviation of constant error k.
-    pub by_constant: SMatrix<f64, N, CONSTANT_ERRORS>,
+    pub(super) by_constant: SMatrix<f64, N, CONSTANT_ERRORS>,
 }
 
 /// Reason why a step failed; the state is unchanged.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum FilterError {
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum FilterError {
     /// The covariance has no Cholesky factor.
-    #[error("covariance is not positive definite")]
     NotPositiveDefinite,
     /// The result contains a NaN or an infinity.
-    #[error("a number is not finite")]
     NotFinite,
-    /// The result is beyond what the filtered system can be.
-    #[error("a state is beyond its physical bounds")]
-    Impossible,
 }
 
 /// Scale and weights of the sigma points for N states.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct SigmaPointWeights {
+pub(super) struct SigmaPointWeights {
     scale: f64,
     mean_0: f64,
     covariance_0: f64,
@@ -61,7 +52,7 @@ pub struct SigmaPointWeights {
 
 impl SigmaPointWeights {
     /// From alpha (0 to 1], beta and kappa, for `n` states; `n` + `kappa` must be positive.
-    pub fn new(n: usize, alpha: f64, beta: f64, kappa: f64) -> Self {
+    pub(super) fn new(n: usize, alpha: f64, beta: f64, kappa: f64) -> Self {
         let total = alpha * alpha * (n as f64 + kappa); // n + lambda
         let mean_0 = (total - n as f64) / total;
         Self { scale: total.sqrt(), mean_0, covariance_0: mean_0 + 1.0 - alpha * alpha + beta, others: 0.5 / total }
@@ -70,30 +61,17 @@ impl SigmaPointWeights {
 
 /// Variances of one scalar measurement.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct MeasurementNoise {
+pub(super) struct MeasurementNoise {
     /// Variance that weighs the measurement.
-    pub variance: f64,
+    pub(super) variance: f64,
     /// Variance of a single reading's error, for the gate. Differs from `variance` where that one counts information
     /// per time.
-    pub gate_variance: f64,
+    pub(super) gate_variance: f64,
     /// Gate width in standard deviations.
-    pub gate_sigma: f64,
+    pub(super) gate_sigma: f64,
     /// Change of the measurement less its prediction by one standard deviation of each constant error: directly, and through
     /// the errors of the mean that it has caused.
-    pub by_constant: SVector<f64, CONSTANT_ERRORS>,
-}
-
-/// Outcome of a measurement update.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Update {
-    /// Measured minus predicted.
-    pub innovation: f64,
-    /// Predicted variance of the innovation: state and [`MeasurementNoise::variance`].
-    pub innovation_variance: f64,
-    /// innovation^2 over its variance with [`MeasurementNoise::gate_variance`]: beyond gate_sigma^2 the measurement is an outlier.
-    pub test_ratio: f64,
-    /// Whether the innovation passed the gate and moved the state.
-    pub accepted: bool,
+    pub(super) by_constant: SVector<f64, CONSTANT_ERRORS>,
 }
 
 /// The sigma points in pairs: centre, then plus and minus along each column of the factor.
@@ -123,7 +101,7 @@ impl<const N: usize> Gaussian<N> {
     ///
     /// # Errors
     /// When the covariance cannot be factored or the result is not finite; the state is then unchanged.
-    pub fn predict(
+    pub(super) fn predict(
         &mut self,
         spread: &SigmaPointWeights,
         f: impl Fn(&SVector<f64, N>) -> SVector<f64, N>,
@@ -150,7 +128,7 @@ impl<const N: usize> Gaussian<N> {
     ///
     /// # Errors
     /// When the covariance cannot be factored or the result is not finite; the state is then unchanged.
-    pub fn update(
+    pub(super) fn update(
         &mut self,
         spread: &SigmaPointWeights,
         z: f64,
@@ -211,7 +189,7 @@ impl<const N: usize> Gaussian<N> {
 
     /// Mean of state `i`, and its variance with the constant errors.
     #[inline]
-    pub fn marginal(&self, i: usize) -> ScalarGaussian {
+    pub(super) fn marginal(&self, i: usize) -> ScalarGaussian {
         let variance = self.covariance[(i, i)] + self.by_constant.row(i).norm_squared();
         ScalarGaussian { mean: self.mean[i], variance }
     }
@@ -230,7 +208,6 @@ fn add_outer<const N: usize>(p: &mut SMatrix<f64, N, N>, d: &SVector<f64, N>, we
     }
 }
 
-#[cfg(test)]
 mod tests {
     use super::*;
     use nalgebra::{matrix, vector};

@@ -1,80 +1,14 @@
-//! The filter of one cell: sigma-point prediction through the circuit, and the update with a voltage.
-//!
-//! In: a step, a voltage reading. Out: the moved state, or a [`FilterError`] that leaves it unchanged.
+//! The textbook filter of one cell: sigma-point prediction through the circuit, and the update with a voltage.
 
-use nalgebra::{SMatrix, SVector};
+use nalgebra::SVector;
 
 use super::noise::{self, VoltageReading};
-use super::state_vector::{
-    BRANCHES, CAPACITY, CURRENT_GAIN, CURRENT_OFFSET, KNOWN_VARIANCE, LOG_RESISTANCE, square, widened,
-};
-use super::step::CellStep;
+use super::unscented::{FilterError, Gaussian, SigmaPointWeights};
 use crate::cell::circuit::{self, BranchAt};
-use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES};
-use crate::filter::{CONSTANT_ERRORS, FilterError, Gaussian, ScalarGaussian, SigmaPointWeights, Update};
-use crate::quantity::bounds;
-
-/// One filter per number of branches: N = branches + 3.
-#[derive(Debug, Clone)]
-pub(super) enum Filter {
-    One(Gaussian<4>),
-    Two(Gaussian<5>),
-    Three(Gaussian<6>),
-}
-
-/// Runs an expression for the filter's number of states.
-macro_rules! each {
-    ($filter:expr, $x:ident => $body:expr) => {
-        match $filter {
-            Filter::One($x) => $body,
-            Filter::Two($x) => $body,
-            Filter::Three($x) => $body,
-        }
-    };
-}
-pub(super) use each;
-
-/// Learned quantities that a restart keeps.
-pub(super) struct LearnedState {
-    pub(super) log_resistance: ScalarGaussian,
-    pub(super) capacity: ScalarGaussian,
-    /// Covariance of both without the constant errors.
-    pub(super) covariance: f64,
-    /// Errors of ln rho and of the capacity by the constant errors.
-    pub(super) by_constant: SMatrix<f64, 2, CONSTANT_ERRORS>,
-}
-
-/// The state at a start: SOC and branches new, the rest as learned.
-pub(super) fn initial_state<const N: usize>(
-    soc: ScalarGaussian,
-    branch_variance: &[f64; MAX_BRANCHES],
-    kept: &LearnedState,
-) -> Gaussian<N> {
-    let mut mean = SVector::zeros();
-    let mut variance = SVector::<f64, N>::from_fn(|i, _| branch_variance[i.saturating_sub(BRANCHES)]);
-    (mean[0], variance[0]) = (soc.mean, soc.variance);
-    let mut by_constant = SMatrix::<f64, N, CONSTANT_ERRORS>::zeros();
-    for (k, (i, learned)) in [(LOG_RESISTANCE, kept.log_resistance), (CAPACITY, kept.capacity)].into_iter().enumerate()
-    {
-        let row = kept.by_constant.row(k);
-        (mean[i], variance[i]) = (learned.mean, (learned.variance - row.norm_squared()).max(KNOWN_VARIANCE));
-        by_constant.set_row(i, &row);
-    }
-    let mut covariance = SMatrix::from_diagonal(&variance);
-    (covariance[(LOG_RESISTANCE, CAPACITY)], covariance[(CAPACITY, LOG_RESISTANCE)]) =
-        (kept.covariance, kept.covariance);
-    Gaussian { mean, covariance, by_constant }
-}
-
-/// Whether the state is one that a cell can have; a filter that has left it starts again.
-pub(super) fn is_possible<const N: usize>(x: &Gaussian<N>) -> bool {
-    bounds::FILTER_SOC.has(x.mean[0])
-        && bounds::LOG_RESISTANCE.has(x.mean[LOG_RESISTANCE])
-        && bounds::CAPACITY_AH.has(x.mean[CAPACITY])
-        && (BRANCHES..N).all(|i| bounds::NUMBER.has(x.mean[i]))
-        && (0..N).all(|i| (1e-40..=bounds::NUMBER.high).contains(&x.covariance[(i, i)]))
-        && x.by_constant.iter().all(|error| bounds::NUMBER.has(*error))
-}
+use crate::cell::estimator::state_vector::{
+    BRANCHES, CAPACITY, CONSTANT_ERRORS, CURRENT_GAIN, CURRENT_OFFSET, LOG_RESISTANCE, square, widened,
+};
+use crate::cell::{CellModel, CellStep, EstimatorConfig, Update};
 
 fn spread<const N: usize>(config: &EstimatorConfig) -> SigmaPointWeights {
     SigmaPointWeights::new(N, config.points.alpha, config.points.beta, config.points.kappa)

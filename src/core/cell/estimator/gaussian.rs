@@ -1,0 +1,124 @@
+//! Mean and covariance of one cell's state, of any number of branches.
+//!
+//! In and out: numbers in the units of the states. Inputs are not checked; [`Gaussian::is_possible`] says whether a cell can
+//! have the state.
+
+use nalgebra::{SMatrix, SVector};
+
+use super::state_vector::{
+    BRANCHES, CAPACITY, CONSTANT_ERRORS, KNOWN_VARIANCE, LOG_RESISTANCE, UNKNOWN_SOC_VARIANCE, square, widened,
+};
+use crate::cell::MAX_BRANCHES;
+use crate::filter::ScalarGaussian;
+use crate::quantity::bounds;
+
+/// States of a cell with [`MAX_BRANCHES`].
+pub(super) const MAX_STATES: usize = BRANCHES + MAX_BRANCHES;
+
+pub(super) type Covariance = SMatrix<f64, MAX_STATES, MAX_STATES>;
+
+/// Mean and covariance of a cell's state. Numbers beyond `states` are 0.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Gaussian {
+    /// Number of states: 3, and one per branch.
+    pub(super) states: usize,
+    pub(super) mean: SVector<f64, MAX_STATES>,
+    /// Covariance without the constant errors, symmetric and positive definite.
+    pub(super) covariance: Covariance,
+    /// Column k: error of the mean (true less mean) by one standard deviation of constant error k.
+    pub(super) by_constant: SMatrix<f64, MAX_STATES, CONSTANT_ERRORS>,
+}
+
+/// Learned quantities that a restart keeps.
+pub(super) struct LearnedState {
+    pub(super) log_resistance: ScalarGaussian,
+    pub(super) capacity: ScalarGaussian,
+    /// Covariance of both without the constant errors.
+    pub(super) covariance: f64,
+    /// Errors of ln rho and of the capacity by the constant errors.
+    pub(super) by_constant: SMatrix<f64, 2, CONSTANT_ERRORS>,
+}
+
+impl Gaussian {
+    /// The state at a start: SOC and branches new, the rest as learned.
+    pub(super) fn at_start(soc: ScalarGaussian, branch_variance: &[f64], learned: &LearnedState) -> Self {
+        let states = BRANCHES + branch_variance.len();
+        let (mut mean, mut by_constant) = (SVector::zeros(), SMatrix::<f64, MAX_STATES, CONSTANT_ERRORS>::zeros());
+        let mut variance = SVector::<f64, MAX_STATES>::zeros();
+        variance.rows_mut(BRANCHES, branch_variance.len()).copy_from_slice(branch_variance);
+        (mean[0], variance[0]) = (soc.mean, soc.variance);
+        for (k, (i, kept)) in
+            [(LOG_RESISTANCE, learned.log_resistance), (CAPACITY, learned.capacity)].into_iter().enumerate()
+        {
+            let row = learned.by_constant.row(k);
+            (mean[i], variance[i]) = (kept.mean, (kept.variance - row.norm_squared()).max(KNOWN_VARIANCE));
+            by_constant.set_row(i, &row);
+        }
+        let mut x = Self { states, mean, covariance: SMatrix::from_diagonal(&variance), by_constant };
+        x.correlate(LOG_RESISTANCE, CAPACITY, learned.covariance);
+        x
+    }
+
+    /// Sets the covariance of two states.
+    pub(super) fn correlate(&mut self, i: usize, j: usize, covariance: f64) {
+        (self.covariance[(i, j)], self.covariance[(j, i)]) = (covariance, covariance);
+    }
+
+    /// Mean of state `i`, and its variance with the constant errors.
+    pub(super) fn marginal(&self, i: usize) -> ScalarGaussian {
+        let variance = self.covariance[(i, i)] + self.by_constant.row(i).norm_squared();
+        ScalarGaussian { mean: self.mean[i], variance }
+    }
+
+    /// Whether the state is one that a cell can have; a filter that has left it starts again.
+    pub(super) fn is_possible(&self) -> bool {
+        bounds::FILTER_SOC.has(self.mean[0])
+            && bounds::LOG_RESISTANCE.has(self.mean[LOG_RESISTANCE])
+            && bounds::CAPACITY_AH.has(self.mean[CAPACITY])
+            && self.mean.iter().chain(&self.by_constant).all(|x| bounds::NUMBER.has(*x))
+            && (0..self.states).all(|i| (1e-40..=bounds::NUMBER.high).contains(&self.covariance[(i, i)]))
+    }
+
+    /// Corrects the mean by `deviations` of a constant error, whose remaining deviation becomes `remains` times the one
+    /// before.
+    pub(super) fn absorb(&mut self, constant_error: usize, deviations: f64, remains: f64) {
+        let column = self.by_constant.column(constant_error).into_owned();
+        self.mean += column * deviations;
+        if remains <= 1.0 {
+            self.by_constant.set_column(constant_error, &(column * remains));
+        } else {
+            // A part of the larger error is new and has not moved any state.
+            self.by_constant.set_column(constant_error, &(column / remains));
+            self.covariance += column * column.transpose() * (1.0 - 1.0 / square(remains));
+        }
+    }
+
+    /// After a gap of unknown length: the SOC is unknown, the branches are anywhere between loaded and relaxed.
+    pub(super) fn widen_after_unknown_gap(&mut self) {
+        self.covariance[(0, 0)] = widened(self.covariance[(0, 0)], UNKNOWN_SOC_VARIANCE);
+        for i in BRANCHES..self.states {
+            self.mean[i] *= 0.5;
+            self.covariance[(i, i)] += square(self.mean[i]);
+        }
+    }
+
+    /// Drops all correlations of state `i` and its constant errors.
+    pub(super) fn isolate(&mut self, i: usize) {
+        let variance = self.covariance[(i, i)];
+        self.covariance.row_mut(i).fill(0.0);
+        self.covariance.column_mut(i).fill(0.0);
+        self.covariance[(i, i)] = variance;
+        self.by_constant.row_mut(i).fill(0.0);
+    }
+
+    /// Becomes mean and covariance of the mixture with another Gaussian that has `weight`. The difference of their constant
+    /// errors is left out: it is small against the difference of their means.
+    pub(super) fn merge(&mut self, other: &Self, weight: f64) {
+        let apart = other.mean - self.mean;
+        let between = apart * apart.transpose();
+        self.covariance =
+            self.covariance * (1.0 - weight) + other.covariance * weight + between * (weight * (1.0 - weight));
+        self.by_constant = self.by_constant * (1.0 - weight) + other.by_constant * weight;
+        self.mean += apart * weight;
+    }
+}
