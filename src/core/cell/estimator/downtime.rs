@@ -35,7 +35,7 @@ pub(super) fn update_after_downtime(
     (model, config): (&CellModel, &EstimatorConfig),
     step: &CellStep,
 ) -> Option<Update> {
-    let mut update = |x: &mut Gaussian| kernel.update((x, &mut memory.clone()), step);
+    let mut update = |x: &mut Gaussian| kernel.update((x, &mut { *memory }), step);
     let (before_soc, ratio) = (x.mean[0], libm::exp(x.mean[LOG_RESISTANCE]));
     let mut used = used_prior(x, config, memory.downtime_std);
     // The load of the reading may have begun at any time: its branches are anywhere between relaxed and settled.
