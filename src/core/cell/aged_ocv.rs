@@ -1,21 +1,21 @@
-//! How a cell type's open-circuit curve changes as capacity is lost: offsets of the voltage over SOC and capacity.
+//! Change of a cell type's open-circuit curve with lost capacity: voltage offsets over SOC and capacity.
 //!
-//! In: the electrodes of the new cell, or a shift, and the SOC breakpoints of the model. Out: V to be added to the new
-//! cell's open-circuit voltage. Between SOC breakpoints and between capacities the offsets are linear; beyond the outer
-//! capacities they are constant, beyond SOC 0 and 1 they continue.
+//! In: the electrodes of the new cell, or a shift, and the SOC breakpoints of the model. Out: offsets, V, to add to the new
+//! cell's open-circuit voltage. Offsets are interpolated linearly over SOC and capacity. Beyond the outer capacities they stay
+//! constant; beyond SOC 0 and 1 they continue linearly.
 //!
 //! # One curve per capacity
-//! Which losses have taken a capacity is not measured. Assumed: per part of capacity lost, each electrode has lost
-//! [`MATERIAL_SHARE`] of its active material and the rest is lithium. [`OffsetLine::mixes_v`] is what another mix within
-//! [`MATERIAL_SHARE_STD`] would change.
+//! No measurement separates the losses behind a lost capacity. Assumption: per part of capacity lost, each electrode has lost
+//! [`MATERIAL_SHARE`] of its active material, and lithium makes up the rest. [`OffsetLine::mixes_v`] is the change by another mix
+//! within [`MATERIAL_SHARE_STD`].
 
 use super::electrodes::{Electrodes, LostMaterial};
 use crate::filter::locate;
 
-/// What says how the curve ages.
+/// Source of the curve's ageing.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum AgeingLaw {
-    /// A shift; 0 = the curve shrinks evenly.
+    /// A shift of the SOC axis; 0 = the curve shrinks evenly.
     Shift(f64),
     /// The electrodes of the new cell.
     Electrodes(Electrodes),
@@ -27,34 +27,34 @@ impl Default for AgeingLaw {
     }
 }
 
-/// Active material lost of either electrode per part of capacity lost. Between no loss of material (a calendar life) and
-/// loss in proportion; graphite cells with layered oxides that cycle at moderate temperature lose mostly lithium
-/// (Birkl et al. 2017; Dubarry et al. 2012).
+/// Active material that each electrode loses per part of capacity lost. Calendar ageing loses none, proportional loss is 1;
+/// graphite cells with layered oxides that cycle at moderate temperature lose mostly lithium (Birkl et al. 2017; Dubarry et
+/// al. 2012).
 pub const MATERIAL_SHARE: f64 = 0.3;
 
-/// Standard deviation of [`MATERIAL_SHARE`], of each electrode.
+/// Standard deviation of [`MATERIAL_SHARE`] per electrode.
 pub const MATERIAL_SHARE_STD: f64 = 0.3;
 
 /// Standard deviation of a shift.
 pub const SHIFT_STD: f64 = 0.3;
 
-/// Capacities of aged cells in the table, parts of the new cell's, rising. Further above the new one's capacity a cell is
-/// a larger one, whose curve no longer changes.
+/// Capacities of aged cells in the table, relative to the new cell's, rising. Above the table's last capacity the curve stays
+/// constant: such a cell is a larger cell, not a newer one.
 const LOST_CAPACITIES: [f64; 10] = [0.4, 0.5, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95];
 
-/// Capacity down to which the electrodes must say how the cell ages, part of the new cell's: a usual end of life.
+/// The electrodes must give curves down to this capacity, relative to the new cell's: a usual end of life.
 const LEAST_KNOWN: f64 = 0.7;
 
-/// Offsets of the open-circuit voltage over capacity and SOC; without capacities it never changes.
+/// Offsets of the open-circuit voltage over capacity and SOC; an empty table means no change.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct AgedOcv {
     /// Capacities, Ah, rising.
     capacity_ah: Vec<f64>,
     /// `offset_v[c][s]`, V: row per capacity, column per SOC breakpoint.
     offset_v: Vec<Vec<f64>>,
-    /// Change of the offsets by one standard deviation of each mix, V, likewise; empty = unknown.
+    /// Change of the offsets by one standard deviation of each mix, V, same shape; empty = unknown.
     mixes_v: [Vec<Vec<f64>>; MIXES],
-    /// Lithium lost, part of the new cell's, and its change by one standard deviation of each mix, per capacity; empty = no
+    /// Per capacity: lithium lost, relative to the new cell's, and its change by one standard deviation of each mix. Empty without
     /// electrodes.
     lithium: Vec<Vec<f64>>,
     is_shift: bool,
@@ -63,7 +63,7 @@ pub struct AgedOcv {
     spread_v: [Vec<f64>; MIXES],
 }
 
-/// Number of mixes of losses that may be other than assumed: more material of the negative, of the positive electrode.
+/// Number of uncertain mixes of losses: more material lost from the negative electrode, or from the positive one.
 pub const MIXES: usize = 2;
 
 /// A quantity over one interval of SOC: its value at SOC 0 and its slope per unit of SOC.
@@ -77,40 +77,40 @@ impl SocLine {
     }
 }
 
-/// How the curve differs from the new cell's near one capacity, over one interval of SOC.
+/// Difference of the curve from the new cell's near one capacity, over one interval of SOC.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct OffsetLine {
     /// Offset, V.
     pub offset_v: SocLine,
-    /// Its change with the capacity, V per Ah.
+    /// Change of the offset with the capacity, V per Ah.
     pub per_ah_v: SocLine,
-    /// Its change by one standard deviation of each mix, V.
+    /// Change of the offset by one standard deviation of each mix, V.
     pub mixes_v: [SocLine; MIXES],
 }
 
-/// Lithium lost at one capacity, parts of the new cell's.
+/// Lithium lost at one capacity, relative to the new cell's.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LithiumLoss {
-    /// Lost.
+    /// Lithium lost.
     pub lost: f64,
-    /// Its change with the capacity, per Ah.
+    /// Change of the loss with the capacity, per Ah.
     pub per_ah: f64,
-    /// Its change by one standard deviation of each mix.
+    /// Change of the loss by one standard deviation of each mix.
     pub mixes: [f64; MIXES],
-    /// The changes of these with the capacity, per Ah.
+    /// Change of `mixes` with the capacity, per Ah.
     pub mixes_per_ah: [f64; MIXES],
 }
 
 impl AgedOcv {
-    /// By the electrodes of the new cell; `None` when they do not say how it ages down to [`LEAST_KNOWN`]. `rows` are the new
-    /// cell's open-circuit voltages, V, by temperature.
+    /// Ageing by the electrodes of the new cell; `None` when they give no curve down to [`LEAST_KNOWN`]. `rows` are the new cell's
+    /// open-circuit voltages, V, by temperature.
     pub fn of_electrodes(
         electrodes: &Electrodes,
         soc: &[f64],
         new_capacity_ah: f64,
         rows: &[Vec<f64>],
     ) -> Option<Self> {
-        // The offsets, and behind them the lithium lost.
+        // The offsets, then the lithium lost.
         let curve = |negative: f64, positive: f64, part: f64| {
             let lost = LostMaterial { negative: negative * (1.0 - part), positive: positive * (1.0 - part) };
             let aged = electrodes.aged(lost, part)?;
@@ -125,7 +125,7 @@ impl AgedOcv {
             let positive = half_width(curve(MATERIAL_SHARE, low, part)?, curve(MATERIAL_SHARE, high, part)?);
             Some([offset_v, negative, positive])
         };
-        // From the new cell down, as far as there are such cells.
+        // From the new cell down to the last capacity for which the electrodes give a cell.
         let aged: Vec<_> = LOST_CAPACITIES.iter().rev().map_while(|&part| Some((part, row(part)?))).collect();
         if aged.last().is_none_or(|(part, _)| *part > LEAST_KNOWN) {
             return None;
@@ -143,8 +143,8 @@ impl AgedOcv {
         Some(table)
     }
 
-    /// By a shift: OCV(s + a s (1 - s)) with a = shift (1 - C / C_new) and the middle one of the new cell's `rows`, V, by
-    /// temperature. 1 = the top keeps its ampere-hours, 0 = the curve shrinks evenly.
+    /// Ageing by a shift: OCV(s + a s (1 - s)) with a = shift (1 - C / C_new), on the middle of the new cell's `rows`, V, by
+    /// temperature. Shift 1: the top of the curve keeps its ampere-hours; shift 0: the curve shrinks evenly.
     pub fn of_shift(shift: f64, soc: &[f64], new_capacity_ah: f64, rows: &[Vec<f64>]) -> Self {
         let mut table = Self { law: AgeingLaw::Shift(shift), ..Self::default() };
         let middle_v = &rows[rows.len() / 2];
@@ -165,8 +165,8 @@ impl AgedOcv {
         table
     }
 
-    /// Adds the new cell, and a little above it the opposite of the first loss: round the capacity at which cells start the
-    /// curve changes smoothly.
+    /// Adds the new cell, and above it the mirror image of the first loss, so that the curve changes smoothly around the new
+    /// cell's capacity.
     fn finish(&mut self, new_capacity_ah: f64, rows: &[Vec<f64>]) {
         let Some((&aged_ah, aged_v)) = self.capacity_ah.last().zip(self.offset_v.last().cloned()) else { return };
         self.mixes_v.iter_mut().for_each(|table| table.extend(vec![vec![0.0; aged_v.len()]; 2]));
@@ -174,8 +174,8 @@ impl AgedOcv {
         self.push(2.0 * new_capacity_ah - aged_ah, aged_v.iter().map(|offset_v| -offset_v).collect(), rows);
     }
 
-    /// Adds a row of offsets, made smaller where the aged curve would not rise with the SOC at every temperature: the tables
-    /// of the new cell differ from its electrodes' curve.
+    /// Adds a row of offsets. Scales the row down if the aged curve would not rise with the SOC at every temperature, because the
+    /// new cell's tables differ from its electrodes' curve.
     fn push(&mut self, capacity_ah: f64, mut offset_v: Vec<f64>, rows: &[Vec<f64>]) {
         let factor = rows.iter().flat_map(|row| row.windows(2).zip(offset_v.windows(2))).fold(
             1.0_f64,
@@ -190,15 +190,15 @@ impl AgedOcv {
         self.offset_v.push(offset_v);
     }
 
-    /// Sets the standard deviation of the shift, [`SHIFT_STD`] until then; electrodes have none.
+    /// Sets the standard deviation of the shift (initially [`SHIFT_STD`]). Does nothing with electrodes.
     pub fn set_shift_std(&mut self, std: f64) {
         if self.is_shift {
             self.mixes_v[0].iter_mut().flatten().for_each(|mix_v| *mix_v *= std / SHIFT_STD);
         }
     }
 
-    /// Adds to each mix of losses a mode of the curve's spread between cells, V per standard deviation at the SOC breakpoints: it
-    /// is there at every capacity. Where mix and mode have the same direction they add, so that neither hides the other.
+    /// Adds a mode of the curve's spread between cells to each mix of losses, V per standard deviation at the SOC breakpoints, at
+    /// every capacity. The mix's sign is chosen so that mix and mode do not cancel.
     pub fn add_spread(&mut self, modes_v: &[Vec<f64>; MIXES]) {
         self.is_shift = false;
         self.spread_v.clone_from(modes_v);
@@ -211,12 +211,12 @@ impl AgedOcv {
         }
     }
 
-    /// What it was made from.
+    /// The source of the ageing.
     pub fn law(&self) -> AgeingLaw {
         self.law
     }
 
-    /// Modes of the curve's spread between cells, V per standard deviation at the SOC breakpoints; empty = none.
+    /// Modes of the curve's spread between cells, V per standard deviation at the SOC breakpoints; empty = no spread.
     pub fn spread_v(&self) -> &[Vec<f64>; MIXES] {
         &self.spread_v
     }
@@ -236,8 +236,8 @@ impl AgedOcv {
         }
     }
 
-    /// Lithium lost at a capacity, above that of a new cell as there; `None` without electrodes, and below the least capacity
-    /// of which they say it.
+    /// Lithium lost at a capacity; above the new cell's capacity, the new cell's. `None` without electrodes, and below their
+    /// smallest capacity.
     pub fn lithium_loss(&self, capacity_ah: f64) -> Option<LithiumLoss> {
         let [least_ah, .., new_ah, _] = self.capacity_ah[..] else { return None };
         let found = self.between(&self.lithium, [0, 1, 2], capacity_ah.min(new_ah));
@@ -250,7 +250,7 @@ impl AgedOcv {
         })
     }
 
-    /// Values of `rows`, one per capacity, at SOC breakpoints, and their change per Ah: linear between the capacities,
+    /// Values of `rows` (one per capacity) at the SOC breakpoints `at`, and their change per Ah: linear between the capacities,
     /// constant outside.
     fn between<const K: usize>(&self, rows: &[Vec<f64>], at: [usize; K], capacity_ah: f64) -> Option<[(f64, f64); K]> {
         let last = rows.len().checked_sub(1)?;

@@ -1,11 +1,11 @@
-//! A cell that was never measured: a cell model from what is on the label, with the spread of cells of that chemistry.
+//! Cell model of a cell that was never measured: from its label, with the spread between cells of its chemistry.
 //!
-//! In: chemistry, rated capacity (Ah), cut-off voltages (V). Out: a [`CellModel`] whose [`ModelSpread`] and curve modes say how
-//! far a cell may be from it. No measured cell is needed, and none of those that judge it has been used for its curve.
+//! In: chemistry, rated capacity (Ah), cut-off voltages (V). Out: a [`CellModel`]; its [`ModelSpread`] and curve modes state how
+//! far a cell may differ from it. The curve uses no measured cell, so the measured cells can judge it.
 //!
-//! * Open-circuit voltage: mean and covariance over cells of published half-cell potentials ([`curve`]).
-//! * Resistances: in proportion to 1 / capacity. Medians and deviations per chemistry-independent class of cell, found on five
-//!   fitted cells of 2.9 to 280 Ah ([`RESISTANCE`]); between temperatures by [`arrhenius`](super::arrhenius).
+//! * Open-circuit voltage: mean and covariance over cells built from published half-cell potentials ([`curve`]).
+//! * Resistances: proportional to 1 / capacity, for every chemistry. Medians and deviations come from five fitted cells of 2.9 to
+//!   280 Ah ([`RESISTANCE`]); [`arrhenius`](super::arrhenius) gives other temperatures.
 
 pub mod curve;
 
@@ -17,19 +17,19 @@ use super::model::{Branch, CellModel, ModelSpread, Table, arrhenius};
 use crate::filter::{ScalarGaussian, interpolate, median};
 use curve::{CellType, CurvePrior, PositiveElectrode};
 
-/// Materials of both electrodes, by what is on the label or in a data sheet.
+/// Materials of both electrodes, as a label or a data sheet names them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Chemistry {
     /// Nickel-rich NMC (811).
     Nmc811Graphite,
-    /// NMC, its nickel content not known.
+    /// NMC of unknown nickel content.
     NmcGraphite,
     /// NCA.
     NcaGraphite,
     /// LCO: consumer cells.
     LcoGraphite,
-    /// LMO blended with a layered oxide: cars of the first generations.
+    /// LMO blended with a layered oxide: early electric cars.
     LmoGraphite,
     /// LFP.
     LfpGraphite,
@@ -46,12 +46,12 @@ impl Chemistry {
         (Self::LfpGraphite, "lfp-graphite"),
     ];
 
-    /// Its name in a configuration.
+    /// Name in a configuration.
     pub fn name(self) -> &'static str {
         Self::ALL.iter().find(|(chemistry, _)| *chemistry == self).map_or("", |found| found.1)
     }
 
-    /// Usual cut-off voltages of such cells, lowest and highest, V.
+    /// Usual cut-off voltages, lowest and highest, V.
     pub fn usual_voltages_v(self) -> (f64, f64) {
         match self {
             Self::LfpGraphite => (2.5, 3.65),
@@ -60,8 +60,8 @@ impl Chemistry {
         }
     }
 
-    /// Positive electrodes of such cells. Cells of one label differ in their materials: NMC without a number is of any nickel
-    /// content, LMO is blended.
+    /// Possible positive electrodes. Cells with one label differ in material: NMC without a number has any nickel content, LMO is
+    /// blended.
     fn positives(self) -> Vec<PositiveElectrode> {
         let blend = |share: f64| PositiveElectrode::blend(Positive::Lmo, share, Positive::Nco);
         match self {
@@ -74,20 +74,20 @@ impl Chemistry {
         }
     }
 
-    /// How far the open-circuit voltage of a full cell is below the highest voltage, least and most, V: a charge ends with some
-    /// current, and on a steep end the voltage falls much as the cell relaxes.
+    /// Smallest and largest distance of a full cell's open-circuit voltage below the highest voltage, V. A charge ends with some
+    /// current, so the voltage falls when the cell relaxes, most where the curve ends steeply.
     fn full_below_v(self) -> [f64; 2] {
         if self == Self::LfpGraphite { [0.05, 0.22] } else { [0.005, 0.035] }
     }
 
-    /// Hysteresis of the open-circuit voltage between charge and discharge, half of the difference, V: Dreyer et al., Nature
+    /// Half of the open-circuit voltage's hysteresis between charge and discharge, V: Dreyer et al., Nature
     /// Mater. 9 (2010) 448 for LFP; silicon in graphite for the others.
     fn hysteresis_v(self) -> f64 {
         if self == Self::LfpGraphite { 0.010 } else { 0.004 }
     }
 }
 
-/// What is on the label of a cell.
+/// The label of a cell.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Label {
@@ -101,14 +101,14 @@ pub struct Label {
     pub voltage_max_v: f64,
 }
 
-/// What is known of a cell by its label.
+/// Knowledge of a cell from its label alone.
 #[derive(Debug, Clone)]
 pub struct LabelPrior {
     /// The label.
     pub label: Label,
     /// Model of the mean cell.
     pub model: CellModel,
-    /// Its open-circuit curve with the covariance between cells.
+    /// Open-circuit curve with the covariance between cells.
     pub curve: CurvePrior,
 }
 
@@ -116,9 +116,9 @@ pub struct LabelPrior {
 pub(super) const SOC: [f64; 21] =
     [0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.9, 0.95, 1.0];
 
-/// Temperature breakpoints, degrees C: Arrhenius' law holds between them.
+/// Temperature breakpoints, degrees C; Arrhenius' law interpolates between them.
 pub(super) const TEMPERATURE_C: [f64; TEMPERATURE_NODES] = [-30.0, 0.0, 25.0, 60.0];
-/// Their number.
+/// Number of temperature breakpoints.
 pub const TEMPERATURE_NODES: usize = 4;
 
 /// One resistance of a usual cell at 25 degrees C.
@@ -134,7 +134,7 @@ struct UsualResistance {
 /// SOC of [`UsualResistance::shape`].
 const SHAPE_SOC: [f64; 5] = [0.0, 0.05, 0.1, 0.2, 1.0];
 
-/// Number of resistances: in series, and one per branch.
+/// Number of resistances: the series resistance and one per branch.
 pub const RESISTANCES: usize = 4;
 
 /// Time constants of the branches, s.
@@ -143,35 +143,35 @@ pub const TAU_S: [f64; RESISTANCES - 1] = [RESISTANCE[1].tau_s, RESISTANCE[2].ta
 /// SOC nodes of [`ResistanceFactors`].
 pub const FACTOR_SOC: [f64; 9] = [0.0, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0];
 
-/// Resistances of a cell relative to those of its label.
+/// Resistances of a cell relative to the model of its label.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ResistanceFactors {
     /// ln of each resistance's ratio at 25 degrees C, at [`FACTOR_SOC`].
     pub ln: [[f64; FACTOR_SOC.len()]; RESISTANCES],
-    /// Deviation of each from the usual law of temperature: part of its activation energy.
+    /// Deviation of each resistance's activation energy from the usual one, fraction.
     pub by_temperature: [f64; RESISTANCES],
 }
 
 impl ResistanceFactors {
-    /// Ratio of resistance `j` to that of the label.
+    /// Ratio of resistance `j` to the label's.
     fn ratio(&self, j: usize, soc: f64, arrhenius: f64) -> f64 {
         libm::exp(interpolate(&FACTOR_SOC, &self.ln[j], soc) + self.by_temperature[j] * libm::log(arrhenius))
     }
 }
 
-/// An open-circuit curve with what is not known of it, at the SOC breakpoints of a model from a label.
+/// An open-circuit curve and its uncertainty, at the SOC breakpoints of a label's model.
 #[derive(Debug, Clone)]
 pub struct CurveOfCells {
     /// Mean, V, rising.
     pub mean_v: Vec<f64>,
-    /// Largest modes of its spread, V per standard deviation.
+    /// Largest modes of the spread, V per standard deviation.
     pub modes_v: [Vec<f64>; MIXES],
     /// Standard deviation of the rest, V.
     pub rest_v: Vec<f64>,
-    /// How far it is lower at 0 degrees C than at 25, V ([`cold_share`]).
+    /// Drop of the curve from 25 to 0 degrees C, V ([`cold_share`]).
     pub cold_sag_v: ScalarGaussian,
-    /// Electrodes of a cell like it; `None` when they are blends.
+    /// Electrodes that give such a curve; `None` for blends.
     pub electrodes: Option<Electrodes>,
 }
 
@@ -183,15 +183,17 @@ const RESISTANCE: [UsualResistance; RESISTANCES] = [
     UsualResistance { ohm_ah: 0.030, tau_s: 1000.0, shape: [3.0, 2.2, 1.6, 1.1, 1.0] },
 ];
 
-/// The curve's sag at a temperature, in parts of that at 0 degrees C.
+/// Sag of the curve at a temperature, relative to the sag at 0 degrees C.
 pub(super) fn cold_share(temperature_c: f64) -> f64 {
     ((25.0 - temperature_c) / 25.0).max(0.0)
 }
 
-/// How far the curve under load is lower at 0 degrees C than at 25, mean and standard deviation, V: the resistance of charge transfer
-/// is larger at small currents than at large ones (Butler-Volmer), and in the cold much larger; beside the resistances, which are those
-/// of large currents, this is nearly a constant. By the errors of the label's SOC at 10, 0 and -10 degrees C: LG HG2 0.03 V,
-/// Panasonic 0.03 V with 0.01 of ageing in it, Leaf cell -0.01 V (10 degrees C alone), LG M50 simulated 0.
+/// Sag of the curve under load from 25 to 0 degrees C, mean and standard deviation, V.
+///
+/// The charge-transfer resistance is larger at small currents than at large ones (Butler-Volmer), most of all in the cold. The
+/// model's resistances hold at large currents, so the difference is nearly a constant voltage. Found from the SOC errors of the
+/// label's model at 10, 0 and -10 degrees C: LG HG2 0.03 V, Panasonic 0.03 V (0.01 V of it ageing), Leaf cell -0.01 V (only at
+/// 10 degrees C), LG M50 simulated 0.
 pub(super) fn usual_cold_sag_v() -> ScalarGaussian {
     ScalarGaussian::from_std(0.015, 0.015)
 }
@@ -203,10 +205,10 @@ impl Label {
         Self { chemistry, rated_ah, voltage_min_v, voltage_max_v }
     }
 
-    /// The label with another chemistry: between the same voltages where these are usual of it, else between its usual ones.
+    /// The label with another chemistry. Keeps the cut-off voltages if they suit that chemistry, else takes its usual ones.
     pub fn with_chemistry(&self, chemistry: Chemistry) -> Self {
         let (low_v, high_v) = chemistry.usual_voltages_v();
-        // A highest voltage within 0.2 V of a chemistry's usual one is one of that chemistry.
+        // A highest voltage within 0.2 V of the usual one suits the chemistry.
         let is_usual = (self.voltage_max_v - high_v).abs() <= 0.2;
         let (voltage_min_v, voltage_max_v) =
             if is_usual { (self.voltage_min_v, self.voltage_max_v) } else { (low_v, high_v) };
@@ -218,7 +220,7 @@ impl Label {
         let full_v = self.chemistry.full_below_v().map(|below_v| self.voltage_max_v - below_v);
         let cell_type = CellType {
             positives: &self.chemistry.positives(),
-            // Those of the library whose plateaus are those of graphite against lithium.
+            // The library's electrodes with the plateaus of graphite against lithium.
             negatives: &[Negative::GraphiteSiox, Negative::Graphite, Negative::GraphiteStaged],
             empty_v: self.voltage_min_v,
             full_v: &full_v,
@@ -238,13 +240,13 @@ impl Label {
         let (modes_v, rest_v) = curve.modes_v();
         let spread = ModelSpread {
             curve_v: median(rest_v.iter().copied()).unwrap_or_default(),
-            // Between the five fitted cells; the temperature's law adds to it away from 25 degrees C.
+            // Spread of the five fitted cells; away from 25 degrees C the temperature law adds to it.
             log_resistance: 0.45,
-            // Between the same five.
+            // Spread of the same five cells.
             slow_branch: 0.5,
-            // Tolerance, and age of the cell.
+            // Tolerance and age of the cell.
             capacity: 0.1,
-            // 40 % that repeats itself over 100 s: how resistance is spread over time, SOC and temperature differs between cells.
+            // 40 % that repeats over 100 s: cells differ in how their resistance depends on time, SOC and temperature.
             // Chosen on LG HG2 from 0 to -10 degrees C.
             drop_sqrt_s: 4.0,
         };
@@ -255,8 +257,8 @@ impl Label {
         Some(LabelPrior { label: *self, model, curve })
     }
 
-    /// The model of a cell with this present capacity, Ah, curve and these resistances. `drop_std`: standard deviation of ln(voltage drop) at each
-    /// temperature of the tables, counted in the model's error at a usual load.
+    /// The model of a cell with this present capacity, Ah, this curve and these resistances. `drop_std` is the standard deviation
+    /// of ln(voltage drop) at each temperature of the tables; at a usual load it counts as voltage error of the model.
     pub fn model_of(
         &self,
         capacity_ah: f64,
@@ -270,7 +272,7 @@ impl Label {
         let mut aged_ocv = curve
             .electrodes
             .and_then(|electrodes| AgedOcv::of_electrodes(&electrodes, &SOC, capacity_ah, &rows))
-            // The shift of a cell whose electrodes are not in the library.
+            // The library lacks the electrodes.
             .unwrap_or_else(|| AgedOcv::of_shift(0.5, &SOC, capacity_ah, &rows));
         aged_ocv.add_spread(&curve.modes_v);
         let table = |j: usize| {
@@ -320,7 +322,7 @@ impl Label {
     }
 }
 
-/// Load at which an error of the resistances counts as one of the model, per rated capacity: C/2.
+/// Load at which an error of the resistances counts as voltage error of the model, per rated capacity: C/2.
 pub const USUAL_LOAD_PER_H: f64 = 0.5;
 
 #[cfg(test)]

@@ -41,7 +41,7 @@ impl BranchAt {
     }
 }
 
-/// Terminal voltage of a new cell under `current_a` with the branches' voltages summed in `branches_v`.
+/// Terminal voltage, V, of a new cell under `current_a`; `branches_v` is the sum of the branch voltages.
 pub fn terminal_v(
     model: &CellModel,
     position: &GridPosition,
@@ -52,8 +52,8 @@ pub fn terminal_v(
     model.ocv_v(position) - branches_v - model.r0_ohm(position) * resistance_ratio * current_a
 }
 
-/// Terminal voltage under `current_a` of an aged cell at `state` = (SOC, resistance ratio, capacity in Ah) with the branches'
-/// voltages summed in `branches_v`.
+/// Terminal voltage, V, of an aged cell under `current_a` at `state` = (SOC, resistance ratio, capacity in Ah); `branches_v` is
+/// the sum of the branch voltages.
 pub fn aged_terminal_v(
     model: &CellModel,
     state: (f64, f64, f64),

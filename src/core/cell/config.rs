@@ -1,4 +1,4 @@
-//! Settings of the per-cell estimator. `config` checks their ranges; the estimator uses them as they are.
+//! Settings of the per-cell estimator. The configuration checks their ranges; the estimator does not.
 
 use crate::filter::ScalarGaussian;
 
@@ -14,7 +14,7 @@ pub enum Discretisation {
 /// Whether the sample-by-sample filter carries the capacity as a state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum CapacityState {
-    /// Estimated with the SOC, so that their correlation is known.
+    /// Estimated together with the SOC, with their correlation.
     Joint,
     /// Held at the last learned value, as in the paper.
     Held,
@@ -29,11 +29,11 @@ pub struct EstimatorConfig {
     pub discretisation: Discretisation,
     /// Joint or held capacity.
     pub capacity_state: CapacityState,
-    /// State of a cell without any history.
+    /// State of a cell without history.
     pub initial: InitialState,
     /// Noise of the states while the current is measured.
     pub process: ProcessNoise,
-    /// Possible change of the SOC without measurement.
+    /// Possible change of the SOC while no current is measured.
     pub gap: GapSettings,
     /// Error of a voltage reading against the cell model.
     pub voltage: VoltageError,
@@ -41,7 +41,7 @@ pub struct EstimatorConfig {
     pub sensor: SensorErrors,
     /// Rejection of outliers.
     pub gate: GateSettings,
-    /// Check of the innovations against their covariance.
+    /// Check of the innovations against their variance.
     pub consistency: ConsistencySettings,
 }
 
@@ -59,19 +59,19 @@ pub struct SigmaPointSettings {
 /// State that a filter starts from, with its uncertainty.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct InitialState {
-    /// SOC to start from; `None` = from the first voltage through the OCV curve.
+    /// First SOC, fraction; `None` = from the first voltage through the OCV curve.
     pub soc: Option<f64>,
     /// Standard deviation of the first SOC, fraction.
     pub soc_std: f64,
     /// Standard deviation of the first branch voltages, V.
     pub branch_std_v: f64,
-    /// Capacity to start from, Ah.
+    /// First capacity, Ah.
     pub capacity_ah: f64,
-    /// Its standard deviation, Ah.
+    /// Standard deviation of the first capacity, Ah.
     pub capacity_std_ah: f64,
     /// Capacity of the open-circuit curve before the first half-cycle, Ah.
     pub curve: ScalarGaussian,
-    /// Standard deviation of ln(resistance relative to new) at the start.
+    /// Standard deviation of the first ln(resistance relative to new).
     pub log_resistance_std: f64,
 }
 
@@ -80,7 +80,7 @@ pub struct InitialState {
 pub struct ProcessNoise {
     /// SOC process noise, fraction per sqrt(s).
     pub soc_per_sqrt_s: f64,
-    /// SOC process noise per charge moved, fraction per sqrt(SOC): errors of the current reading.
+    /// SOC process noise per charge moved, fraction per sqrt(SOC): random errors of the current.
     pub charge_per_sqrt_soc: f64,
     /// Branch voltage process noise, V per sqrt(s).
     pub branch_v_per_sqrt_s: f64,
@@ -88,77 +88,77 @@ pub struct ProcessNoise {
     pub log_resistance_per_sqrt_s: f64,
 }
 
-/// Possible change of the SOC while the current is not measured.
+/// Possible change of the SOC while no current is measured.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GapSettings {
-    /// SOC process noise while the current is not measured, fraction per sqrt(s).
+    /// SOC process noise, fraction per sqrt(s).
     pub noise_per_sqrt_s: f64,
     /// Largest self-discharge, fraction of SOC per s.
     pub self_discharge_per_s: f64,
-    /// Largest rate at which the cell may be used or charged while the program does not run, fraction of SOC per s.
+    /// Largest rate of use or charge while the program does not run, fraction of SOC per s.
     pub away_use_per_s: f64,
-    /// A current above this next to a gap may have continued through the gap; below it the cell rested. A per cell.
+    /// Largest current of a resting cell, A per cell. A larger current before or after a gap may have flowed through the gap.
     pub rest_current_a: f64,
-    /// Whether the cell rested in every longer gap without any reading, whatever the current next to it.
+    /// Whether the cell rests in every longer gap without readings, whatever the current before and after it.
     pub silence_is_rest: bool,
 }
 
 /// Error of a voltage reading against the cell model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct VoltageError {
-    /// White part of a voltage reading's error, V (sensor noise), per sample.
+    /// White sensor noise of a voltage reading, V, per sample.
     pub noise_v: f64,
-    /// Slow model error as information per second: standard deviation of a 1 s average, V. Used where the cell model
-    /// states no error of its own.
+    /// Slow model error as information per second: standard deviation of a 1 s average, V. Used if the cell model states no
+    /// error.
     pub model_error_v_sqrt_s: f64,
-    /// Model error in proportion to the voltage drop in the cell at the reading: fraction of it, over one second.
+    /// Model error proportional to the voltage drop in the cell at the reading: fraction of the drop, over one second.
     pub drop_error_sqrt_s: f64,
-    /// Model error in proportion to the voltage that the load of the last minutes drops in the cell, over one second.
+    /// Model error proportional to the voltage drop of the last minutes' load: fraction of the drop, over one second.
     pub load_error_sqrt_s: f64,
-    /// Time constant of the model error after its load has ended (slow diffusion), s.
+    /// Time constant of the model error after a load has ended (slow diffusion), s.
     pub load_memory_s: f64,
-    /// Longest time that one voltage reading stands for, s: readings further apart count no more than this.
+    /// Longest time that one voltage reading stands for, s; readings further apart count as this time.
     pub max_information_s: f64,
 }
 
-/// Constant errors of the sensors: standard deviations. The filter considers them, so that they never average out.
+/// Standard deviations of the sensors' constant errors. The filter considers them, so they never average out.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SensorErrors {
-    /// Offset of a cell's voltage, V, with that of its open-circuit curve against the model.
+    /// Offset of a cell's voltage, V, including the offset of its open-circuit curve from the model.
     pub voltage_offset_v: f64,
-    /// Offset of the current, per cell, A, as far as it has not been learned.
+    /// Offset of the current per cell, A, that has not been learned.
     pub current_offset_a: f64,
     /// Gain error of the current, fraction.
     pub current_gain: f64,
-    /// Error of the slowest branch's resistance in the model, beside that of all resistances, as far as it has not been
-    /// learned: fraction.
+    /// Error of the slowest branch's resistance in the model that has not been learned, in addition to the common error of all
+    /// resistances: fraction.
     pub slow_branch: f64,
 }
 
 impl SensorErrors {
-    /// Sensors without constant errors, as in the paper.
+    /// No constant errors, as in the paper.
     pub const NONE: Self = Self { voltage_offset_v: 0.0, current_offset_a: 0.0, current_gain: 0.0, slow_branch: 0.0 };
 }
 
-/// Rejection of outliers among the voltage readings.
+/// Rejection of outliers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GateSettings {
-    /// Gate: a voltage innovation beyond this many standard deviations is rejected.
+    /// Largest accepted innovation, standard deviations.
     pub sigma: f64,
-    /// Model error of a single reading, V (standard deviation). Used by the gate and the consistency monitor, where the
+    /// Model error of a single reading, V (standard deviation). The gate and the consistency monitor use it, because the
     /// information-per-second variance would accept every reading at high sample rates.
     pub model_error_v: f64,
     /// Model error of a single reading along the OCV curve, fraction of SOC.
     pub soc_error: f64,
-    /// The filter restarts from the voltage after every reading has been beyond the gate for this time, s.
+    /// The filter restarts from the voltage after all readings of this time, s, were beyond the gate.
     pub lost_after_s: f64,
 }
 
-/// Check of the innovations against their covariance.
+/// Check of the innovations against their variance.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ConsistencySettings {
     /// Window of the consistency monitor, s.
     pub window_s: f64,
-    /// Mean normalised innovation squared above which the estimate is not trusted.
+    /// Largest mean normalised innovation squared of a trusted estimate.
     pub limit: f64,
 }

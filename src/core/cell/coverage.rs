@@ -1,26 +1,27 @@
-//! Which parts of the SOC and which temperatures of a cell the data have seen.
+//! The ranges of SOC and temperature that the data cover.
 //!
-//! In: SOC (fraction) and temperature (degrees C) of readings or of rows; what is not a number is left out. Out: shares and ranges.
+//! In: SOC (fraction) and temperature (degrees C) of readings or notebook rows; NaN and infinities are ignored. Out: shares and
+//! ranges.
 
 use std::collections::BTreeMap;
 
 use super::notebook::Row;
 
-/// Parts of the SOC.
+/// Number of equal parts of the SOC range.
 const PARTS: usize = 10;
-/// Width of a class of temperature, K.
+/// Width of a temperature class, K.
 const CLASS_K: f64 = 10.0;
 
-/// Counts by part of the SOC and by class of temperature.
+/// Readings per part of the SOC range and per temperature class.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Coverage {
     soc: [u64; PARTS],
-    /// By the lower end of the class over [`CLASS_K`].
+    /// Key: lower end of the class divided by [`CLASS_K`].
     temperature: BTreeMap<i32, u64>,
 }
 
 impl Coverage {
-    /// Of the rows of a notebook.
+    /// Counts the rows of a notebook.
     pub fn of_rows(rows: &[Row]) -> Self {
         let mut coverage = Self::default();
         rows.iter().for_each(|row| coverage.note(row.soc(), f64::from(row.temperature_c)));
@@ -30,7 +31,7 @@ impl Coverage {
     /// Counts one reading.
     pub fn note(&mut self, soc: f64, temperature_c: f64) {
         if soc.is_finite() {
-            // A cast of a float saturates.
+            // The cast saturates.
             let part = (soc * PARTS as f64).max(0.0) as usize;
             self.soc[part.min(PARTS - 1)] += 1;
         }
@@ -39,31 +40,31 @@ impl Coverage {
         }
     }
 
-    /// Whether nothing was seen.
+    /// Whether no SOC was counted.
     pub fn is_empty(&self) -> bool {
         self.soc.iter().all(|count| *count == 0)
     }
 
-    /// Share of the SOC that was seen, in tenths.
+    /// Covered share of the SOC range, in steps of a tenth.
     pub fn soc_share(&self) -> f64 {
         self.soc.iter().filter(|count| **count > 0).count() as f64 / PARTS as f64
     }
 
-    /// Ranges of the SOC that were seen, fractions.
+    /// Covered ranges of the SOC, fractions.
     pub fn soc_ranges(&self) -> Vec<[f64; 2]> {
         let parts = (0..PARTS).filter(|part| self.soc[*part] > 0);
         let whole = |value: usize| i32::try_from(value).unwrap_or(i32::MAX);
         ranges(parts.map(whole)).into_iter().map(|range| range.map(|end| f64::from(end) / PARTS as f64)).collect()
     }
 
-    /// Ranges of temperature that were seen, degrees C.
+    /// Covered ranges of temperature, degrees C.
     pub fn temperature_ranges_c(&self) -> Vec<[f64; 2]> {
         let classes = self.temperature.iter().filter(|(_, count)| **count > 0).map(|(class, _)| *class);
         ranges(classes).into_iter().map(|range| range.map(|end| CLASS_K * f64::from(end))).collect()
     }
 }
 
-/// Neighbouring classes joined: first, and one past the last.
+/// Joins neighbouring classes into ranges: the first class, and one past the last.
 fn ranges(classes: impl Iterator<Item = i32>) -> Vec<[i32; 2]> {
     let mut ranges: Vec<[i32; 2]> = Vec::new();
     for class in classes {
@@ -80,7 +81,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn neighbouring_classes_are_one_range_and_the_ends_count_inwards() {
+    fn neighbouring_classes_join_into_one_range() {
         let mut coverage = Coverage::default();
         assert!(coverage.is_empty() && coverage.soc_share() == 0.0);
         for (soc, t) in [(-0.02, -3.0), (0.31, 4.0), (0.49, 12.0), (1.0, 41.0), (f64::NAN, f64::INFINITY)] {

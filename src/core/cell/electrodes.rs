@@ -2,15 +2,15 @@
 //!
 //! V(z) = U_p(y) - U_n(x): x and y are the lithium contents (stoichiometry, 0 to 1) of the negative and the positive
 //! electrode, both linear in the charge. With the electrodes' capacities Q_n, Q_p and the cyclable lithium n, all relative
-//! to the new cell's capacity: Q_p y + Q_n x = n. A cell is full and empty where V reaches the voltages at which it was
-//! when new; its capacity is Q_n (x_full - x_empty).
+//! to the new cell's capacity: Q_p y + Q_n x = n. An aged cell is full and empty at the same voltages V as the new cell; its
+//! capacity is Q_n (x_full - x_empty).
 //!
 //! An ageing cell loses lithium (n falls) and active material of either electrode (Q_n, Q_p fall): Birkl et al., J. Power
-//! Sources 341 (2017) 373; Dubarry et al., J. Power Sources 219 (2012) 204. The lithium that lost material takes
-//! along need not be known: it changes n alone, and n follows from the capacity.
+//! Sources 341 (2017) 373; Dubarry et al., J. Power Sources 219 (2012) 204. The lithium in lost material need not be known: it
+//! only changes n, and n follows from the capacity.
 //!
-//! In: materials and lithium contents of the new cell. Out: V, and capacity as a fraction of the new cell's. Nothing
-//! outside the contents 0 to 1 is returned; a loss that leaves no cell has no curve. An ageing cell never gains lithium.
+//! In: materials and lithium contents of the new cell. Out: V, and capacity as a fraction of the new cell's. Contents stay
+//! within 0 to 1. A loss after which no cell remains has no curve. An ageing cell never gains lithium.
 
 use crate::filter::crossing;
 
@@ -68,7 +68,7 @@ impl PositiveMaterial {
         (Self::Lfp, "lfp"),
     ];
 
-    /// Least lithium content at which its function holds: below it the published fits rise, or have poles.
+    /// Smallest valid lithium content of the function: below it the published fits rise or have poles.
     pub const fn least_content(self) -> f64 {
         match self {
             Self::Nca => 0.3,
@@ -78,7 +78,7 @@ impl PositiveMaterial {
         }
     }
 
-    /// Potential against lithium, V, at a lithium content; beyond the contents where the function holds, that at their end.
+    /// Potential against lithium, V, at a lithium content; outside the valid contents, the potential at their end.
     pub fn potential_v(self, y: f64) -> f64 {
         use libm::{exp, pow, tanh};
         let y = y.clamp(self.least_content(), 1.0 - EDGE);
@@ -139,7 +139,7 @@ impl NegativeMaterial {
         (Self::McmbRamadass, "mcmb_ramadass"),
     ];
 
-    /// Potential against lithium, V, at a lithium content; beyond [`EDGE`], that at the edge.
+    /// Potential against lithium, V, at a lithium content; beyond [`EDGE`], the potential at the edge.
     pub fn potential_v(self, x: f64) -> f64 {
         use libm::{exp, tanh};
         let x = x.clamp(EDGE, 1.0 - EDGE);
@@ -209,18 +209,18 @@ pub struct Electrodes {
     pub positive: PositiveMaterial,
     /// Negative material.
     pub negative: NegativeMaterial,
-    /// Lithium content of the positive electrode of the empty and of the full cell; falls.
+    /// Lithium content of the positive electrode in the empty and in the full cell, falling.
     pub positive_content: [f64; 2],
-    /// Lithium content of the negative electrode of the empty and of the full cell; rises.
+    /// Lithium content of the negative electrode in the empty and in the full cell, rising.
     pub negative_content: [f64; 2],
 }
 
 /// Active material lost, as a fraction of the new electrode's.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct LostMaterial {
-    /// Of the negative electrode.
+    /// Loss of the negative electrode.
     pub negative: f64,
-    /// Of the positive electrode.
+    /// Loss of the positive electrode.
     pub positive: f64,
 }
 
@@ -257,9 +257,9 @@ impl Electrodes {
         [negative, positive, negative * self.negative_content[1] + positive * self.positive_content[1]]
     }
 
-    /// The cell that has lost this material and so much lithium that this part of the capacity is left. `None` when there
-    /// is no such cell, when it cannot reach its end voltages, or when the new cell holds more lithium than it can use: then
-    /// the capacity does not say how much is lost.
+    /// The cell that has lost this material, and lithium until this part of the capacity remains. `None` if there is no such cell,
+    /// if it cannot reach its end voltages, or if the new cell holds more lithium than it can use, because the capacity then does
+    /// not determine the loss.
     pub fn aged(&self, lost: LostMaterial, capacity: f64) -> Option<AgedElectrodes> {
         let [negative, positive, new_lithium] = self.new_contents();
         let ends_v = [0.0, 1.0].map(|soc| self.voltage_v(soc));
@@ -275,7 +275,7 @@ impl Electrodes {
             cell
         };
         let new = |lithium: f64| cell(LostMaterial::default(), lithium).capacity();
-        // With a little less lithium, a cell without an excess of it has less capacity.
+        // A cell without excess lithium loses capacity with a little less lithium.
         if new(0.995 * new_lithium) >= new(new_lithium) {
             return None;
         }
@@ -288,7 +288,7 @@ impl Electrodes {
 }
 
 impl AgedElectrodes {
-    /// Voltage at a lithium content of the negative electrode, V; rises with it.
+    /// Voltage at a lithium content of the negative electrode, V, rising with the content.
     fn voltage_at(&self, x: f64) -> f64 {
         let y = (self.lithium - self.negative_capacity * x) / self.positive_capacity;
         self.electrodes.positive.potential_v(y) - self.electrodes.negative.potential_v(x)

@@ -1,13 +1,13 @@
-//! Loss modes of an aged cell: lithium inventory (LLI) and active material of either electrode (LAM), by its capacity.
+//! Loss modes of an aged cell from its capacity: lithium inventory (LLI) and active material of each electrode (LAM).
 //!
-//! In: the learned capacity (Ah) and the table of lithium inventories of [`super::aged_ocv`]. Out: parts of the model's new
+//! In: the learned capacity (Ah) and the table of lithium inventories of [`super::aged_ocv`]. Out: fractions of the model's new
 //! cell, 0 to 1, each with its standard deviation. With d = 1 - C / C_new, the share s of material lost per part of capacity
 //! and the inventory L(C, s_n, s_p) of [`super::electrodes`]:
 //!
 //! LAM_NE = s_n d,  LAM_PE = s_p d,  LLI = 1 - L(C, s_n, s_p) / L(C_new, 0, 0)
 //!
-//! The capacity, s_n and s_p are independent; deviations include the products of their errors. The split between material
-//! and lithium is an assumption ([`MATERIAL_SHARE`], its deviation [`MATERIAL_SHARE_STD`]), the size is learned.
+//! The capacity, s_n and s_p are independent; the standard deviations include the products of their errors. The split between
+//! material and lithium is an assumption ([`MATERIAL_SHARE`], standard deviation [`MATERIAL_SHARE_STD`]); the total is learned.
 //!
 //! Source: Birkl et al., J. Power Sources 341 (2017) 373 (modes and their names).
 //!
@@ -17,7 +17,7 @@
 use super::aged_ocv::{AgedOcv, LithiumLoss, MATERIAL_SHARE, MATERIAL_SHARE_STD};
 use crate::filter::ScalarGaussian;
 
-/// What a cell has lost, parts of the model's new cell.
+/// Losses of a cell, fractions of the model's new cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LossModes {
     /// Loss of lithium inventory, LLI.
@@ -29,7 +29,7 @@ pub struct LossModes {
 }
 
 impl LossModes {
-    /// Losses of a cell with this capacity, Ah. `None` = the model has no electrodes, or not down to this capacity.
+    /// Losses of a cell with this capacity, Ah. `None` if the model has no electrodes, or no curve down to this capacity.
     pub fn of_capacity(aged_ocv: &AgedOcv, new_capacity_ah: f64, capacity: ScalarGaussian) -> Option<Self> {
         let LithiumLoss { lost, per_ah, mixes, mixes_per_ah } = aged_ocv.lithium_loss(capacity.mean)?;
         let by_mixes =
@@ -43,7 +43,7 @@ impl LossModes {
             mean: MATERIAL_SHARE * part,
             variance: (MATERIAL_SHARE * MATERIAL_SHARE + share_variance) * part_variance + share_variance * part * part,
         };
-        // A loss is a part of what there was.
+        // A loss is between nothing and all.
         let lithium = ScalarGaussian { mean: lithium.mean.clamp(0.0, 1.0), ..lithium };
         Some(Self { lithium, negative: material, positive: material })
     }
@@ -67,7 +67,7 @@ mod tests {
         LossModes::of_capacity(&table(&M50), NEW_AH, capacity)
     }
 
-    /// Of electrodes that have lost these shares of material, computed without the table.
+    /// Losses of electrodes that have lost these shares of material, computed without the table.
     fn lithium(part: f64, negative: f64, positive: f64) -> f64 {
         let lost = LostMaterial { negative: negative * (1.0 - part), positive: positive * (1.0 - part) };
         M50.aged(lost, part).expect("such a cell").lithium_lost()
@@ -86,8 +86,8 @@ mod tests {
         }
     }
 
-    /// Lives of such a cell simulated with PyBaMM 26.10 (OKane2022): capacity left, LLI, LAM_NE, LAM_PE. The first five lose
-    /// lithium to the SEI and material by stress, the last one loses lithium alone.
+    /// Lives of such a cell simulated with PyBaMM 26.10 (OKane2022): remaining capacity, LLI, LAM_NE, LAM_PE. The first five lose
+    /// lithium to the SEI and material by stress; the last one loses only lithium.
     const SIMULATED: [[f64; 4]; 6] = [
         [0.9365, 0.0496, 0.0214, 0.0100],
         [0.8723, 0.0985, 0.0440, 0.0233],

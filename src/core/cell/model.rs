@@ -1,31 +1,29 @@
 //! Equivalent-circuit model of one cell type: OCV, R0 and 1 to 3 RC branches over SOC x temperature.
 //!
-//! Between two SOC breakpoints every value is interpolated linearly. Between two temperatures the OCV and the time
-//! constants are interpolated linearly, resistances by an Arrhenius law of [`ACTIVATION_ENERGY_J_PER_MOL`] through both
-//! values: linear interpolation would be up to 15 % too high in the middle of a 20 K interval.
-//! Outside the grid the nearest edge value holds (no extrapolation) in temperature; in SOC the OCV continues
-//! with the slope of its last interval, so that a wrong SOC beyond 0 or 1 is still corrected, while
-//! resistances hold their edge value.
+//! All values are interpolated linearly over SOC. Over temperature, the OCV and the time constants are interpolated linearly,
+//! and resistances by an Arrhenius law of [`ACTIVATION_ENERGY_J_PER_MOL`] through both values: linear interpolation would be up
+//! to 15 % too high in the middle of a 20 K interval. Outside the temperatures of the grid the edge value holds. Outside SOC 0
+//! to 1, resistances hold their edge value and the OCV continues with the slope of its last interval, so that a wrong SOC beyond
+//! 0 or 1 is still corrected.
 //!
-//! Deviation: the paper interpolates R1 and C1; this model interpolates their product, the time constant. Reason:
-//! between nodes whose resistances differ the product of two interpolated values is up to twice that of either node.
-//! Effect: none where both are constant.
+//! Deviation: the paper interpolates R1 and C1; this model interpolates their product, the time constant. Reason: between nodes
+//! with different resistances, the product of two interpolated values is up to twice the product at either node. Effect: none
+//! where both are constant.
 
 use super::aged_ocv::{AgedOcv, AgeingLaw, MIXES, OffsetLine};
 use super::loss_modes::LossModes;
 use crate::filter::{ScalarGaussian, crossing, interpolation, locate};
 
-/// Most RC branches a model may have.
+/// Largest number of RC branches.
 pub const MAX_BRANCHES: usize = 3;
 
-/// Activation energy of the resistances between two temperature breakpoints, J/mol (15 to 35 kJ/mol are measured on
-/// cells of this kind).
+/// Activation energy of the resistances between two temperature breakpoints, J/mol (measured on such cells: 15 to 35 kJ/mol).
 pub const ACTIVATION_ENERGY_J_PER_MOL: f64 = 25_000.0;
 
 /// Resistance at a temperature, relative to that at 25 degrees C.
 pub fn arrhenius(temperature_c: f64) -> f64 {
     let per_kelvin = 1.0 / (temperature_c + 273.15) - 1.0 / (25.0 + 273.15);
-    // Over the gas constant, J/(mol K) (CODATA 2018).
+    // Divided by the gas constant, J/(mol K) (CODATA 2018).
     libm::exp(ACTIVATION_ENERGY_J_PER_MOL / 8.314_462_618 * per_kelvin)
 }
 
@@ -54,13 +52,13 @@ pub struct Thermal {
     pub resistance_k_per_w: f64,
 }
 
-/// A checked cell model: breakpoints strictly rising, OCV strictly rising over SOC, all resistances and
-/// capacitances positive and finite, tables without holes. Made by `config::cell_model`.
+/// A checked cell model: breakpoints and OCV rise strictly, all resistances and capacitances are positive and finite, and the
+/// tables are complete. Created by `config::cell_model`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CellModel {
     /// Display name.
     pub name: String,
-    /// Label capacity, Ah: what SOH is relative to.
+    /// Label capacity, Ah: the reference of SOH.
     pub rated_capacity_ah: f64,
     /// Capacity of a new cell between its full and empty open-circuit voltages at the reference temperature, Ah.
     pub capacity_ah: f64,
@@ -74,7 +72,7 @@ pub struct CellModel {
     pub temperature_c: Vec<f64>,
     /// Open-circuit voltage, V.
     pub ocv_v: Table,
-    /// How the open-circuit curve changes with lost capacity.
+    /// Change of the open-circuit curve with lost capacity.
     pub aged_ocv: AgedOcv,
     /// Series resistance, ohm.
     pub r0_ohm: Table,
@@ -82,30 +80,30 @@ pub struct CellModel {
     pub branches: Vec<Branch>,
     /// Standard deviation of the model's voltage error, averaged over [`ERROR_WINDOW_S`], V; `None` = unknown.
     pub voltage_error_v: Option<Table>,
-    /// Thermal parameters; `None` = no temperature fallback.
+    /// Thermal parameters; `None` = no estimate of a missing temperature.
     pub thermal: Option<Thermal>,
-    /// How far a cell may be from the model; `None` = as cells of one type are.
+    /// Spread of cells around the model; `None` = the usual spread of one cell type.
     pub spread: Option<ModelSpread>,
 }
 
-/// Standard deviations of a cell from a model that is not of its own type. The modes of its open-circuit curve are with those of
-/// ageing ([`AgedOcv::add_spread`]).
+/// Standard deviations of a cell from a model that was not fitted to its type. The modes of the open-circuit curve are stored with
+/// the modes of ageing ([`AgedOcv::add_spread`]).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ModelSpread {
-    /// Constant error of the open-circuit curve beside its modes, V.
+    /// Constant error of the open-circuit curve in addition to its modes, V.
     pub curve_v: f64,
     /// ln(resistance relative to the model).
     pub log_resistance: f64,
-    /// Resistance of the slowest branch beside the others, fraction.
+    /// Resistance of the slowest branch relative to the others, fraction.
     pub slow_branch: f64,
     /// Capacity, fraction.
     pub capacity: f64,
-    /// Voltage drop: fraction of it over one second, in the present and in the load of the last minutes.
+    /// Voltage drop, present and by the load of the last minutes: fraction of the drop over one second.
     pub drop_sqrt_s: f64,
 }
 
 impl ModelSpread {
-    /// Of cells of the model's own type.
+    /// Spread of cells of the model's own type.
     pub fn usual(branches: usize) -> Self {
         let slow_branch = if branches > 1 { 0.2 } else { 0.1 };
         Self { curve_v: 0.0, log_resistance: 0.2, slow_branch, capacity: 0.1, drop_sqrt_s: 0.0 }
@@ -115,7 +113,7 @@ impl ModelSpread {
 /// Time over which [`CellModel::voltage_error_v`] is averaged, s.
 pub const ERROR_WINDOW_S: f64 = 100.0;
 
-/// Position of a temperature in the grid, shared by every SOC.
+/// Position of a temperature in the grid, for every SOC.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TemperaturePosition {
     /// Index of the lower temperature.
@@ -126,19 +124,19 @@ pub struct TemperaturePosition {
     pub(super) along_arrhenius: f64,
 }
 
-/// The four grid corners around one (SOC, temperature) and their weights, shared by every table.
+/// The four grid corners around one (SOC, temperature) and their weights, for every table.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GridPosition {
     s: usize,
     /// Weight of the upper SOC column, in [0, 1].
     along_s: f64,
-    /// Weight of the upper SOC column without that limit: the OCV continues beyond 0 and 1.
+    /// The same weight without the limits: the OCV continues beyond 0 and 1.
     beyond_s: f64,
     temperature: TemperaturePosition,
 }
 
 impl TemperaturePosition {
-    /// Interpolates `value` between the lower and the upper row with weight `along`. Reads the upper row only if needed.
+    /// Interpolates `value` between the lower and the upper row with weight `along`. Does not read the upper row at weight 0.
     fn between(&self, along: f64, value: impl Fn(usize) -> f64) -> f64 {
         let low = value(self.t);
         if along == 0.0 { low } else { low + along * (value(self.t + 1) - low) }
@@ -184,12 +182,12 @@ impl CellModel {
         self.ocv_v.at(position, position.beyond_s, position.temperature.along_t)
     }
 
-    /// Open-circuit voltage of a cell that has aged to a capacity, V.
+    /// Open-circuit voltage of a cell aged to a capacity, V.
     pub fn aged_ocv_v(&self, position: &GridPosition, capacity_ah: f64) -> f64 {
         self.ocv_v(position) + self.offset(position, capacity_ah).offset_v.at(self.soc_at(position))
     }
 
-    /// Change of that voltage per Ah of capacity, V, and by one standard deviation of each mix of losses, V.
+    /// Change of the aged open-circuit voltage per Ah of capacity, V, and by one standard deviation of each mix of losses, V.
     pub fn aged_ocv_changes_v(&self, position: &GridPosition, capacity_ah: f64) -> (f64, [f64; MIXES]) {
         let (line, soc) = (self.offset(position, capacity_ah), self.soc_at(position));
         (line.per_ah_v.at(soc), line.mixes_v.map(|mix_v| mix_v.at(soc)))
@@ -208,8 +206,8 @@ impl CellModel {
             + self.offset(position, capacity_ah).offset_v.0[1]
     }
 
-    /// The model of new cells of this capacity, Ah, whose curve is that of these cells when they have aged to it. How it changes
-    /// further follows from the same electrodes.
+    /// Takes the cells aged to this capacity, Ah, as new: their curve becomes the new cells' curve. Further ageing follows from the
+    /// same electrodes.
     pub fn rebased(&self, capacity_ah: f64) -> Self {
         let last = self.soc.len() - 2;
         let offset_v = |s: usize| self.aged_ocv.line(&self.soc, s.min(last), capacity_ah).offset_v.at(self.soc[s]);
@@ -232,7 +230,7 @@ impl CellModel {
         self.aged_ocv.line(&self.soc, position.s, capacity_ah)
     }
 
-    /// What a cell of this capacity, Ah, has lost; `None` = not known of this cell type.
+    /// Losses of a cell of this capacity, Ah; `None` if unknown for this cell type.
     pub fn loss_modes(&self, capacity: ScalarGaussian) -> Option<LossModes> {
         LossModes::of_capacity(&self.aged_ocv, self.capacity_ah, capacity)
     }
@@ -263,17 +261,17 @@ impl CellModel {
         Some(self.voltage_error_v.as_ref()?.at(position, position.along_s, position.temperature.along_t))
     }
 
-    /// Resistance of a new cell once every branch has settled, ohm.
+    /// Resistance of a new cell after all branches have settled, ohm.
     pub fn settled_ohm(&self, position: &GridPosition) -> f64 {
         (0..self.branches.len()).fold(self.r0_ohm(position), |sum, i| sum + self.branch_r_ohm(i, position))
     }
 
-    /// SOC at which a new cell has an open-circuit voltage, by bisection over [-0.5, 1.5]; outside, the nearest end.
+    /// SOC of a new cell at an open-circuit voltage, by bisection over -0.5 to 1.5; outside, the nearer end.
     pub fn soc_of_ocv(&self, voltage_v: f64, temperature_c: f64) -> f64 {
         self.soc_of_aged_ocv(&self.temperature_position(temperature_c), self.capacity_ah, voltage_v)
     }
 
-    /// SOC at which a cell that has aged to a capacity has an open-circuit voltage, see [`Self::soc_of_ocv`].
+    /// SOC of a cell aged to a capacity at an open-circuit voltage; see [`Self::soc_of_ocv`].
     pub fn soc_of_aged_ocv(&self, temperature: &TemperaturePosition, capacity_ah: f64, voltage_v: f64) -> f64 {
         let is_below = |soc| voltage_v > self.aged_ocv_v(&self.grid_position_at(temperature, soc), capacity_ah);
         crossing((-0.5, 1.5), is_below)

@@ -1,20 +1,21 @@
-//! Checks, in windows of an hour of use, whether the configured model is that of the cell.
+//! Checks in windows of an hour of use whether the configured model fits the cell.
 //!
 //! In: innovations (V) with their variances (V^2), SOC and the learned resistance, every 10 s of use. Out:
-//! [`ModelCheck::mismatch`], above 1 when the model is another cell's, after 10 minutes of use. Readings without an update, after
-//! a gap or beyond the gate are no evidence.
+//! [`ModelCheck::mismatch`], above 1 if the model belongs to another cell, after 10 minutes of use. Readings without an update,
+//! after a gap or beyond the gate do not count as evidence.
 //!
-//! A filter hides a wrong model from its innovations: it corrects the resistance and then the SOC by them. Two witnesses remain:
+//! A filter hides a wrong model from its innovations, because it corrects first the resistance and then the SOC. Two witnesses
+//! remain:
 //! * r^2, the square of ln(resistance relative to new) over its configured standard deviation,
-//! * c^2, what a constant a and a slope b over SOC explain of the innovations v: with the sums A and g of `h h' / R` and `h v / R`,
+//! * c^2, the part of the innovations v that a constant a and a slope b over SOC explain: with the sums A and g of `h h' / R` and `h v / R`,
 //!   h = (1, SOC - 0.5) and R the variance over the time that a reading stands for, c^2 = g' (A + P^-1)^-1 g (the score test;
 //!   Cox and Hinkley, Theoretical Statistics, 1974, section 9.3), P the variances of a and b in another chemistry.
 //!
-//! Each witness counts at most [`CORROBORATED`] times as much as the other: an aged cell has a higher resistance and fitting
-//! voltages, and a local error of a cell's own curve leaves its resistance as it is. Another cell differs in both.
+//! Each witness counts at most [`CORROBORATED`] times as much as the other. An aged cell has a higher resistance and fitting
+//! voltages; a local error of a cell's own curve does not change its resistance; another cell differs in both.
 //!
-//! The check ends after [`WINDOW_S`] without a mismatch: a cell ages, but does not become another one. With one, the next window is
-//! judged by itself, and so on until one passes: an aged cell whose capacity and resistance have been learned is trusted again.
+//! The check ends after [`WINDOW_S`] without a mismatch: a cell ages, but does not become another cell. After a mismatch the next
+//! windows are judged one by one until one passes: an aged cell is trusted again after its capacity and resistance were learned.
 
 use serde::{Deserialize, Serialize};
 
@@ -22,22 +23,22 @@ use crate::cell::{CellModel, Update};
 use crate::filter::square;
 use crate::quantity::InvalidState;
 
-/// Time of use that is judged, s. Half of it shows another cell on drives from -10 to 40 degrees C; later, ageing counts as well.
+/// Time of use in a window, s. Half of it shows another cell on drives from -10 to 40 degrees C; a longer window includes ageing.
 const WINDOW_S: f64 = 3600.0;
 
-/// Standard deviations of what another cell's curve adds to the voltage: a constant, V, and a slope, V per unit of SOC.
+/// Standard deviations of the voltage that another cell's curve adds: a constant, V, and a slope, V per unit of SOC.
 const CURVE_STD_V: [f64; 2] = [0.2, 0.4];
 
-/// How many times as much as the other a witness counts at most.
+/// Largest weight of a witness relative to the other one.
 const CORROBORATED: f64 = 4.0;
 
-/// Sum of the witnesses that is a mismatch: three deviations (constant, slope, resistance) of 1.4 standard deviations each.
+/// Smallest sum of the witnesses in a mismatch: three parts (constant, slope, resistance) of 1.4 standard deviations each.
 const LIMIT: f64 = 6.0;
 
 /// Evidence about one cell's model.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct ModelCheck {
-    /// The model that is checked ([`model_id`]); 0 = nothing is checked.
+    /// The checked model ([`model_id`]); 0 = no check.
     model: u64,
     /// Time of use judged so far, s.
     use_s: f64,
@@ -49,18 +50,18 @@ pub struct ModelCheck {
     voltages: VoltageSums,
     /// Largest sum of the witnesses over [`LIMIT`] in this window.
     mismatch: f64,
-    /// That of the window before, if it was a mismatch.
+    /// The same of the previous window, if that was a mismatch.
     before: f64,
 }
 
-/// Sums over the readings of a window, about their mean SOC: sums about a fixed SOC are differences of large numbers while the SOC
-/// hardly changes, and a checkpoint keeps six digits of a number.
+/// Sums over the readings of a window, about their mean SOC. Sums about a fixed SOC would be differences of large numbers while
+/// the SOC hardly changes, and a checkpoint keeps only six digits of a number.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(from = "[f64; 5]", into = "[f64; 5]")]
 struct VoltageSums {
     /// Sum of 1 / R, V^-2.
     weight: f64,
-    /// Mean SOC, each reading weighed by 1 / R.
+    /// Mean SOC, weighted by 1 / R.
     mean_soc: f64,
     /// Sum of (SOC - mean)^2 / R, V^-2.
     spread: f64,
@@ -93,8 +94,8 @@ impl VoltageSums {
         self.score[0] += weight * innovation;
     }
 
-    /// What a constant and a slope over SOC explain of the innovations: c^2. The products of the module's formula that cancel are
-    /// left out, so no term is negative.
+    /// c^2, the part of the innovations that a constant and a slope over SOC explain. Omits the products that cancel in the module's
+    /// formula, so no term is negative.
     fn explained(&self) -> f64 {
         let Self { weight, mean_soc, spread, score: [constant, slope] } = *self;
         let [prior_constant, prior_slope] = CURVE_STD_V.map(|std| 1.0 / square(std));
@@ -113,20 +114,20 @@ impl VoltageSums {
     }
 }
 
-/// What the filter says about a cell when evidence is due.
+/// State of a cell's filter when evidence is due.
 #[derive(Debug, Clone, Copy)]
 pub struct ModelEvidence {
     /// The latest update.
     pub update: Update,
-    /// State of charge after it, fraction.
+    /// State of charge after the update, fraction.
     pub soc: f64,
     /// ln(resistance relative to new).
     pub log_resistance: f64,
-    /// Its configured standard deviation before the first voltage.
+    /// Configured standard deviation of `log_resistance` before the first voltage.
     pub log_resistance_std: f64,
 }
 
-/// Identifies a cell model, with the spread of resistances that is expected of its cells: FNV-1a of what the check depends on.
+/// Identifies a cell model and the expected spread of resistances: FNV-1a of everything the check depends on.
 pub fn model_id(model: &CellModel, log_resistance_std: f64) -> u64 {
     let CellModel { soc, temperature_c, ocv_v, r0_ohm, branches, rated_capacity_ah, .. } = model;
     let text =
@@ -135,22 +136,22 @@ pub fn model_id(model: &CellModel, log_resistance_std: f64) -> u64 {
 }
 
 impl ModelCheck {
-    /// A check of a model, [`model_id`], that begins.
+    /// Starts a check of a model ([`model_id`]).
     pub fn new(model: u64) -> Self {
         Self { model, ..Self::default() }
     }
 
-    /// A check that has ended without a mismatch: for states stored by programs without one.
+    /// A check that has ended without a mismatch.
     pub fn ended() -> Self {
         Self { use_s: WINDOW_S, ..Self::default() }
     }
 
-    /// This check when it is of the model, else a new one.
+    /// This check if it checks the model, else a new check.
     pub fn or_new(self, model: u64) -> Self {
         if self.model == model || self.model == 0 { self } else { Self::new(model) }
     }
 
-    /// Whether it is of another model than this one.
+    /// Whether this check belongs to another model.
     pub fn is_of_other(&self, model: u64) -> bool {
         self.model != 0 && self.model != model
     }
@@ -179,18 +180,18 @@ impl ModelCheck {
     /// Whether evidence is due.
     #[inline]
     pub fn is_due(&self) -> bool {
-        // Every 10 s: short against the 100 s over which a model states its error.
+        // Every 10 s: short compared with the 100 s over which a model states its error.
         self.since_s >= 10.0 && self.is_open()
     }
 
     /// Takes due evidence of a cell of rated capacity `rated_ah`, Ah; `None` when the filter has none.
     pub fn judge(&mut self, evidence: Option<ModelEvidence>, rated_ah: f64) {
-        // One reading stands for at most 90 s. Below C/50 the resistance shows nothing.
+        // One reading stands for at most 90 s. Currents below C/50 do not show the resistance.
         let (elapsed_s, charge_as) = (self.since_s.min(90.0), self.since_as);
         let is_used = charge_as.abs() >= 0.02 * rated_ah * self.since_s;
         (self.since_s, self.since_as) = (0.0, 0.0);
         let Some(ModelEvidence { update, soc, log_resistance, log_resistance_std }) = evidence else { return };
-        // A reading's variance is that of the step before it.
+        // The variance of a reading belongs to the step before it.
         let variance = update.innovation_variance * (self.step_s / elapsed_s).min(1.0);
         let is_number = (update.innovation / variance).is_finite() && soc.is_finite() && log_resistance.is_finite();
         if !is_used || !update.accepted || !is_number {
@@ -199,10 +200,10 @@ impl ModelCheck {
         self.use_s += elapsed_s;
         self.voltages.add(soc, update.innovation, variance);
         if self.check().is_err() {
-            // Sums that cannot be stored are evidence of nothing.
+            // Discard sums that cannot be stored.
             *self = Self::new(self.model);
         }
-        // In the first minutes the filter still settles, and one wrong reading weighs much.
+        // In the first minutes the filter still settles, and one wrong reading has much weight.
         if self.use_s < 600.0 {
             return;
         }
@@ -217,13 +218,13 @@ impl ModelCheck {
         }
     }
 
-    /// Largest evidence of this window and the one before that the model is another cell's, relative to the limit.
+    /// Largest evidence of this and the previous window for another cell, relative to the limit.
     #[inline]
     pub fn mismatch(&self) -> f64 {
         self.mismatch.max(self.before)
     }
 
-    /// Whether the model is another cell's.
+    /// Whether the model belongs to another cell.
     #[inline]
     pub fn is_mismatched(&self) -> bool {
         self.mismatch() > 1.0
@@ -250,7 +251,7 @@ mod tests {
     use super::*;
     use crate::cell::model::tests::small_model;
 
-    /// The check after `use_s` of steps of 1 s at 1 C, the SOC falling from 0.9; `voltage` gives the innovation by SOC, V.
+    /// The check after `use_s` of steps of 1 s at 1 C from SOC 0.9 down; `voltage` gives the innovation by SOC, V.
     fn after(use_s: u32, ratio: f64, voltage: impl Fn(f64) -> f64) -> ModelCheck {
         let mut check = ModelCheck::default();
         for second in 0..use_s {

@@ -1,7 +1,7 @@
-//! How far two cell models are apart: open-circuit curves in V, resistances as a fraction, and what both mean for the SOC.
+//! Differences between two cell models: open-circuit curves in V, resistances as a fraction, and the resulting SOC errors.
 //!
-//! In: two [`CellModel`]s. Out: differences of the second from the first. Resistances are compared per rated capacity, and the load
-//! is C/2 of either, so that cells of different size can be compared.
+//! In: two [`CellModel`]s. Out: differences of the second from the first. Resistances are compared per rated capacity under a load
+//! of each cell's C/2, so cells of different size can be compared.
 
 use super::chemistry::USUAL_LOAD_PER_H;
 use super::model::CellModel;
@@ -9,9 +9,9 @@ use super::model_bands::CURVE_C;
 
 /// Steps of SOC over the curve.
 const CURVE_STEPS: u32 = 100;
-/// Steps of SOC in which a voltage under load is looked up: a multiple of the others.
+/// Steps of SOC for looking up a voltage under load: a multiple of the curve's steps.
 const READ_STEPS: u32 = 400;
-/// SOC between which an error of the SOC counts: beyond, curves are so steep that any model is good.
+/// SOC range in which SOC errors count: outside, curves are so steep that any model is good.
 const MIDDLE: (f64, f64) = (0.05, 0.95);
 
 /// A quantity at one SOC.
@@ -28,20 +28,20 @@ pub struct AtSoc {
 pub struct Difference {
     /// Root mean square.
     pub rms: f64,
-    /// Largest, with its sign, and where.
+    /// Largest difference, with its sign, and its SOC.
     pub worst: AtSoc,
 }
 
 /// Differences at one temperature.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AtTemperature {
-    /// Degrees C.
+    /// Temperature, degrees C.
     pub temperature_c: f64,
     /// Series resistance per rated capacity, fraction.
     pub series: Difference,
     /// Resistance with all branches settled, per rated capacity, fraction.
     pub settled: Difference,
-    /// SOC by a voltage under C/2, fraction.
+    /// SOC read from a voltage under C/2, fraction.
     pub load_soc: Difference,
 }
 
@@ -50,18 +50,18 @@ pub struct AtTemperature {
 pub struct ModelComparison {
     /// Open-circuit voltage at 25 degrees C over SOC, V.
     pub curve_v: Vec<AtSoc>,
-    /// Summary of it.
+    /// Summary of `ocv_v`.
     pub curve: Difference,
-    /// SOC by a voltage at rest, fraction.
+    /// SOC read from a voltage at rest, fraction.
     pub rest_soc: Difference,
     /// Capacity, fraction.
     pub capacity: f64,
-    /// Resistances, and the SOC under load, by temperature; empty = the models share no temperature.
+    /// Resistances and SOC under load, by temperature; empty if the models share no temperature.
     pub temperatures: Vec<AtTemperature>,
 }
 
 impl Difference {
-    /// Of these values; 0 of none.
+    /// Summary of values; 0 without values.
     fn of(values: &[AtSoc]) -> Self {
         let squares: f64 = values.iter().map(|at| at.value * at.value).sum();
         let largest = values.iter().copied().max_by(|a, b| a.value.abs().total_cmp(&b.value.abs()));
@@ -95,7 +95,7 @@ fn ocv_v(model: &CellModel, soc: f64) -> f64 {
     model.ocv_v(&model.grid_position(soc, CURVE_C))
 }
 
-/// Whether a temperature is within the tables of a model; a table of one temperature has that of its curve.
+/// Whether a temperature is within the tables of a model; a table with one temperature counts as measured at its curve's.
 fn has(model: &CellModel, temperature_c: f64) -> bool {
     match model.temperature_c[..] {
         [_] => temperature_c == CURVE_C,
@@ -121,7 +121,7 @@ fn at_temperature(first: &CellModel, second: &CellModel, temperature_c: f64) -> 
     }
 }
 
-/// SOC that the second model reads in a voltage of the first, less the true one, under a settled load relative to the rated
+/// SOC that the second model reads from a voltage of the first, minus the true SOC, under a settled load relative to the rated
 /// capacity.
 fn soc_difference(first: &CellModel, second: &CellModel, temperature_c: f64, load_per_h: f64) -> Difference {
     let drop_v = |model: &CellModel, soc: f64| {
@@ -139,8 +139,8 @@ fn soc_difference(first: &CellModel, second: &CellModel, temperature_c: f64, loa
     Difference::of(&middle.collect::<Vec<_>>())
 }
 
-/// SOC nearest to `soc` at which a model reads a voltage; where it reads it nowhere, that of the nearest voltage. Under load a voltage
-/// may be read at several: a resistance that rises with the SOC turns the curve over.
+/// SOC nearest to `soc` at which a model has a voltage; if it has the voltage nowhere, the SOC of the nearest voltage. Under load
+/// several SOCs may have one voltage, because a resistance that rises with the SOC bends the curve down.
 fn nearest(places: &[f64], readings_v: &[f64], voltage_v: f64, soc: f64) -> f64 {
     let crossings = places.windows(2).zip(readings_v.windows(2)).filter_map(|(place, reading)| {
         let (low, high) = (reading[0] - voltage_v, reading[1] - voltage_v);

@@ -1,12 +1,12 @@
-//! What a vehicle notes of its cells between two rests: the rows from which a model is fitted on board.
+//! Condensed readings of a vehicle's cells between two rests: the rows from which a model is fitted on board.
 //!
 //! In: one [`CellStep`] per voltage reading of any cell (A, V, s, degrees C). Out: at most [`MAX_ROWS`] rows of the mean cell.
 //!
-//! A row is the mean over a time in which the SOC hardly moves. Beside the voltage it has all that its prediction needs in linear
-//! form: the charge since the stretch began, the current, and the current through first-order filters with the time constants of
-//! the branches. So rows can be left out and a stretch still hangs together. Steps of the current, which a mean hides, are
-//! summed as a small regression. When the notebook is full the oldest row of the fullest class (SOC, temperature, direction)
-//! goes: what is rarely seen stays.
+//! A row is the mean over a time in which the SOC hardly moves. In addition to the voltage it holds everything that its
+//! prediction needs in linear form: the charge since the start of the stretch, the current, and the current through first-order
+//! filters with the time constants of the branches. Rows can therefore be dropped without breaking a stretch. A mean hides steps
+//! of the current, so these are summed as a small regression. A full notebook drops the oldest row of the fullest class (SOC,
+//! temperature, direction) and keeps rare rows.
 
 use serde::{Deserialize, Serialize};
 
@@ -14,7 +14,7 @@ use super::CellStep;
 use super::chemistry::TAU_S;
 use crate::quantity::InvalidState;
 
-/// Most rows: with 64 bytes each below 8 kB.
+/// Largest number of rows: below 8 kB at 64 bytes each.
 pub const MAX_ROWS: usize = 120;
 /// Below this SOC, fraction, rows and classes are narrower, because curves are steep and resistances rise.
 const LOW_SOC: f64 = 0.15;
@@ -22,19 +22,19 @@ const LOW_SOC: f64 = 0.15;
 const LOW_SOC_PART: f64 = 0.25;
 /// Width of a class of rows in SOC, fraction.
 const CLASS_SOC: f64 = 0.1;
-/// Currents below this part of the rated capacity per hour are rest.
+/// Largest current at rest, relative to the rated capacity per hour.
 const REST_PER_H: f64 = 0.02;
 
-/// Filters of the current, as many as a model from a label has branches.
+/// Filters of the current: one per branch of a label's model.
 pub const FILTERS: usize = 3;
 
 /// The mean cell over a short time.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Row {
-    /// Which stretch it is of.
+    /// Number of its stretch.
     pub stretch: u32,
-    /// SOC as estimated then, for its class alone.
+    /// SOC estimate at that time; only selects the class.
     soc: f32,
     /// Duration, s.
     pub seconds: f32,
@@ -50,7 +50,7 @@ pub struct Row {
     pub filtered_a: [f32; FILTERS],
     /// Temperature, degrees C.
     pub temperature_c: f32,
-    /// Steps within it.
+    /// Steps of the current within the row.
     pub steps: CurrentSteps,
 }
 
@@ -71,7 +71,7 @@ pub struct CurrentSteps {
     pub xv: f32,
 }
 
-/// Readings of all cells that are not yet one of the mean cell.
+/// Readings of the cells that do not yet form a reading of the mean cell.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct Readings {
     count: u32,
@@ -95,28 +95,28 @@ struct RowSums {
     filtered_a: [f64; FILTERS],
     temperature_c: f64,
     steps: [f64; 5],
-    /// Charge and temperature at its beginning.
+    /// Charge and temperature at the start of the row.
     first: Option<(f64, f64)>,
 }
 
-/// The present stretch: a time with a measured current throughout.
+/// The present stretch: a time with a continuously measured current.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 struct Stretch {
     charge_ah: f64,
     /// Time since it began, s.
     elapsed_s: f64,
     filtered_a: [f64; FILTERS],
-    /// Current, fastest filter and voltage of the reading before.
+    /// Current, fastest filter and voltage of the previous reading.
     last: [f64; 3],
     /// Time of rest so far, s.
     rest_s: f64,
     row: RowSums,
 }
 
-/// Where the present stretch stands.
+/// Position in the present stretch.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PresentStretch {
-    /// Its number.
+    /// Number of the stretch.
     pub number: u32,
     /// Charge taken out so far, Ah.
     pub charge_ah: f64,
@@ -149,7 +149,7 @@ pub struct NotebookConfig {
 }
 
 impl NotebookConfig {
-    /// For a pack of cells known by their label.
+    /// Settings for a pack of cells known by their label.
     pub fn new(cells: u32, rated_ah: f64) -> Self {
         Self { cells, rated_ah, tau_s: TAU_S }
     }
@@ -161,32 +161,32 @@ impl NotebookConfig {
 }
 
 impl Notebook {
-    /// The rows, those of a stretch together and in their order.
+    /// The rows, grouped by stretch in their order.
     pub fn rows(&self) -> &[Row] {
         &self.rows
     }
 
-    /// Rows that came after the last [`Self::mark_read`].
+    /// Rows added since the last [`Self::mark_read`].
     pub fn unread(&self) -> usize {
         self.unread as usize
     }
 
-    /// All present rows have been used.
+    /// Marks all present rows as used.
     pub fn mark_read(&mut self) {
         self.unread = 0;
     }
 
-    /// The same rows, none of them used.
+    /// The same rows, all unused.
     pub fn all_unread(self) -> Self {
         Self { unread: u32::try_from(self.rows.len()).unwrap_or(u32::MAX), ..self }
     }
 
-    /// Rows that came after the last [`Self::mark_read`] and are still there.
+    /// Rows added since the last [`Self::mark_read`] that are still present.
     pub fn new_rows(&self) -> &[Row] {
         &self.rows[self.rows.len().saturating_sub(self.unread as usize)..]
     }
 
-    /// Charge moved in these, Ah, to and fro.
+    /// Charge moved in either direction in the unread rows, Ah.
     pub fn new_charge_ah(&self) -> f64 {
         let first = self.rows.len() - self.new_rows().len();
         let moved = |pair: &[Row]| {
@@ -196,25 +196,25 @@ impl Notebook {
         self.rows[first.saturating_sub(1)..].windows(2).map(moved).sum()
     }
 
-    /// Number of these that are of a class of SOC, temperature and direction without any earlier row.
+    /// Number of unread rows whose class of SOC, temperature and direction has no earlier row.
     pub fn rows_of_new_classes(&self, rated_ah: f64) -> usize {
         let (old, new) = self.rows.split_at(self.rows.len() - self.new_rows().len());
         new.iter().filter(|row| old.iter().all(|old| old.class(rated_ah) != row.class(rated_ah))).count()
     }
 
-    /// The present stretch as it is now.
+    /// Position in the present stretch.
     pub fn present(&self) -> Option<PresentStretch> {
         let of =
             |it: &Stretch| PresentStretch { number: self.number, charge_ah: it.charge_ah, elapsed_s: it.elapsed_s };
         self.present.as_ref().map(of)
     }
 
-    /// Present current through the filters, A; `None` = no stretch is under way.
+    /// Present current through the filters, A; `None` outside a stretch.
     pub fn filtered_a(&self) -> Option<[f64; FILTERS]> {
         self.present.as_ref().map(|stretch| stretch.filtered_a)
     }
 
-    /// Takes a reading; whether a row is complete: [`Self::close_row`] then ends it.
+    /// Adds a reading. Returns whether a row is complete; the caller then calls [`Self::close_row`].
     #[inline]
     pub fn add(&mut self, config: &NotebookConfig, step: &CellStep) -> bool {
         let readings = &mut self.readings;
@@ -237,7 +237,7 @@ impl Notebook {
         (is_due || begins) && self.close_readings(config, step.ambient_c)
     }
 
-    /// Makes the readings one of the mean cell.
+    /// Turns the readings into one reading of the mean cell.
     fn close_readings(&mut self, config: &NotebookConfig, ambient_c: f64) -> bool {
         let Readings { count, temperatures, measured_s, unmeasured_s, charge_as, current_a, voltage_v, temperature_c } =
             std::mem::take(&mut self.readings);
@@ -252,7 +252,7 @@ impl Notebook {
         let last_soc = last.map(|row| (f64::from(row.soc), f64::from(row.charge_ah)));
         let Some(stretch) = &mut self.present else {
             self.number = self.number.wrapping_add(1);
-            // Under load the branches are taken as settled: the load before is not known.
+            // The previous load is unknown, so the branches count as settled.
             let filtered_a = [current_a; FILTERS];
             let last = [current_a, current_a, voltage_v];
             self.present = Some(Stretch {
@@ -273,7 +273,7 @@ impl Notebook {
         let charge_before_ah = stretch.charge_ah;
         stretch.charge_ah += charge_as / cells / 3600.0;
         stretch.elapsed_s += dt_s;
-        // A single reading is of the end of its interval, several are of its middle.
+        // A single reading stands for the end of its interval, several for its middle.
         let late = if count > cells { 0.5 } else { 1.0 };
         let along = |before: f64, after: f64| before + late * (after - before);
         let filtered_a: [f64; FILTERS] = std::array::from_fn(|i| along(before_a[i], stretch.filtered_a[i]));
@@ -282,7 +282,7 @@ impl Notebook {
         let [i, x, v] = [current_a, filtered_a[0], voltage_v];
         let [last_i, last_x, last_v] = std::mem::replace(&mut stretch.last, [i, x, v]);
         let row = &mut stretch.row;
-        // Over a longer time a difference is not a step of the current.
+        // A difference over a longer time does not count as a step.
         if dt_s <= 3.0 {
             let [di, dx, dv] = [i - last_i, x - last_x, v - last_v];
             let products = [di * di, di * dx, dx * dx, di * dv, dx * dv];
@@ -299,12 +299,12 @@ impl Notebook {
         let soc = last_soc.map_or(1.0, |(soc, last_ah)| soc - (charge_ah - last_ah) / config.rated_ah);
         let part = if soc < LOW_SOC { LOW_SOC_PART } else { 1.0 };
         (charge_ah - first_ah).abs() >= part * 0.02 * config.rated_ah
-            // In rest a row is at least half as long as the rest so far: a night is a few rows.
+            // A row at rest is at least half as long as the rest so far, so a night takes a few rows.
             || row.seconds >= f64::max(300.0, 0.5 * stretch.rest_s)
             || (temperature_c - first_c).abs() >= 4.0
     }
 
-    /// Ends the present row, at an estimated SOC.
+    /// Ends the present row at an estimated SOC.
     pub fn close_row(&mut self, config: &NotebookConfig, soc: f64) {
         let Some(stretch) = &mut self.present else { return };
         let sums = std::mem::take(&mut stretch.row);
@@ -330,7 +330,7 @@ impl Notebook {
         self.make_room(config);
     }
 
-    /// Ends the present row where it is long enough: the vehicle rests, or the stretch ends.
+    /// Ends the present row if it is long enough, when the vehicle rests or the stretch ends.
     pub fn finish_row(&mut self, config: &NotebookConfig) {
         let before = self.rows.last().filter(|row| row.stretch == self.number).copied();
         if let (Some(stretch), Some(before)) = (&self.present, before)
@@ -341,7 +341,7 @@ impl Notebook {
         }
     }
 
-    /// Ends the present stretch: what follows does not hang together with it.
+    /// Ends the present stretch: the following readings do not continue it.
     pub fn end_stretch(&mut self, config: &NotebookConfig) {
         self.finish_row(config);
         (self.readings, self.present) = (Readings::default(), None);
@@ -350,7 +350,7 @@ impl Notebook {
     /// Drops rows beyond the bounds.
     fn make_room(&mut self, config: &NotebookConfig) {
         let class_of = |row: &Row| row.class(config.rated_ah);
-        // Each stretch has an SOC of its own to be found.
+        // The fit must find one SOC per stretch.
         if self.rows.chunk_by(|a, b| a.stretch == b.stretch).count() > 16
             && let Some(dropped) = self.least_missed(config)
         {
@@ -371,7 +371,7 @@ impl Notebook {
         }
     }
 
-    /// The stretch, but the present one, with the fewest rows of a class that no other stretch has; the oldest of these.
+    /// The oldest of the past stretches with the fewest rows in classes that no other stretch has.
     fn least_missed(&self, config: &NotebookConfig) -> Option<u32> {
         let class_of = |row: &Row| row.class(config.rated_ah);
         let alone = |stretch: &[Row]| {
@@ -423,7 +423,7 @@ impl Notebook {
 }
 
 impl Row {
-    /// SOC as estimated then, fraction.
+    /// SOC estimate at that time, fraction.
     pub fn soc(&self) -> f64 {
         f64::from(self.soc)
     }

@@ -1,7 +1,7 @@
-//! A model of this pack's own cells: that of the label, corrected by what the vehicle has noted.
+//! Model of this pack's own cells: the label's model, corrected by the readings of the vehicle.
 //!
-//! In: a [`Label`] and a [`Notebook`](super::notebook::Notebook). Out: an [`OwnModel`], from which the [`CellModel`] of the
-//! filters is made. Where the notes say nothing it is the label's, with the label's spread.
+//! In: a [`Label`] and a [`Notebook`](super::notebook::Notebook). Out: an [`OwnModel`], which gives the filters' [`CellModel`].
+//! Where the notebook has no readings, the label's model and spread remain.
 
 pub mod fit;
 pub mod task;
@@ -15,7 +15,7 @@ use super::notebook::Row;
 use crate::filter::{ScalarGaussian, median};
 use crate::quantity::InvalidState;
 
-/// SOC breakpoints of such a model.
+/// SOC breakpoints of a fitted model.
 pub const SOC_NODES: usize = 21;
 
 /// A fitted model.
@@ -24,7 +24,7 @@ pub const SOC_NODES: usize = 21;
 pub struct OwnModel {
     /// Open-circuit curve, V, rising.
     pub curve_v: [f64; SOC_NODES],
-    /// Modes of its uncertainty, V per standard deviation.
+    /// Modes of the curve's uncertainty, V per standard deviation.
     pub modes_v: [[f64; SOC_NODES]; 2],
     /// Standard deviation of the rest, V.
     pub rest_v: [f64; SOC_NODES],
@@ -32,7 +32,7 @@ pub struct OwnModel {
     pub factors: ResistanceFactors,
     /// Standard deviation of ln(voltage drop) at the temperatures of the tables.
     pub drop_std: [f64; TEMPERATURE_NODES],
-    /// How far the curve is lower at 0 degrees C than at 25, V.
+    /// Sag of the curve from 25 to 0 degrees C, V.
     pub cold_sag_v: ScalarGaussian,
     /// Capacity, Ah.
     pub capacity: ScalarGaussian,
@@ -52,11 +52,11 @@ impl OwnModel {
         };
         let spread = ModelSpread {
             curve_v: median(self.rest_v.iter().copied()).unwrap_or_default(),
-            // Cells of one pack are of one kind.
+            // The cells of a pack are alike.
             log_resistance: 0.1,
             slow_branch: 0.2,
             capacity: self.capacity.std() / self.capacity.mean,
-            // 10 % that repeats itself over 100 s, which no table of resistances removes.
+            // 10 % that repeats over 100 s; no table of resistances removes it.
             drop_sqrt_s: 1.0,
         };
         let mut model = label.model_of(self.capacity.mean, &curve, &self.factors, &self.drop_std, spread);
@@ -64,10 +64,10 @@ impl OwnModel {
         Some(model)
     }
 
-    /// The estimator's settings for the learned `model`, by those for the label's.
+    /// The estimator's settings for the learned `model`, from the settings for the label's.
     pub fn estimator_config(&self, base: &EstimatorConfig, label: &CellModel, model: &CellModel) -> EstimatorConfig {
         let (Some(old), Some(new)) = (label.spread, model.spread) else { return *base };
-        // A key of the configuration stands in place of the label's.
+        // A key in the configuration replaces the label's value.
         let instead = |value: f64, old: f64, new: f64| if value == old { new } else { value };
         let parts = |value: f64, old: f64, new: f64| (value * value - old * old).max(0.0).sqrt().hypot(new);
         let mut config = *base;
@@ -84,7 +84,7 @@ impl OwnModel {
         config
     }
 
-    /// Whether what is left unknown is small: capacity within 3 %.
+    /// Whether the remaining uncertainty is small: capacity within 3 %.
     pub fn is_settled(&self) -> bool {
         self.capacity.std() < 0.03 * self.capacity.mean
     }
@@ -116,7 +116,7 @@ impl OwnModel {
     }
 }
 
-/// Cost of rows by a model, `None` = that of the label: minus the logarithm of their density; `None` when there are no rows.
+/// Cost of rows with a model (`None` = the label's): minus the logarithm of their density. `None` without rows.
 pub fn rows_cost(prior: &LabelPrior, own: Option<&OwnModel>, rows: &[Row]) -> Option<f64> {
     fit::rows_cost(prior, own, rows)
 }

@@ -2,9 +2,9 @@
 //!
 //! In: positive and negative materials, cut-off voltages (V). Out: mean (V) and covariance (V^2) over SOC breakpoints.
 //!
-//! A cell is a pair of materials, the lithium content of its full negative and of its empty positive electrode; the other two
-//! contents follow from the cut-off voltages. Every pair and every content of a grid is equally likely. What no pair of the
-//! library has is a smooth deviation of 10 mV and half of the hysteresis.
+//! A cell is a pair of materials with a lithium content of the full negative and of the empty positive electrode; the other two
+//! contents follow from the cut-off voltages. All pairs and all contents of a grid are equally likely. A smooth deviation of
+//! 10 mV and half of the hysteresis cover cells that no pair of the library describes.
 
 use nalgebra::{DMatrix, SymmetricEigen};
 
@@ -65,7 +65,7 @@ impl PositiveElectrode {
     }
 }
 
-/// What cells of one chemistry and label have in common.
+/// Common properties of the cells of one chemistry and label.
 #[derive(Debug, Clone, Copy)]
 pub struct CellType<'a> {
     /// Positive electrodes.
@@ -89,7 +89,7 @@ pub struct CurvePrior {
     pub mean_v: Vec<f64>,
     /// Covariance between breakpoints, V^2.
     pub covariance: DMatrix<f64>,
-    /// The electrodes of the cell nearest to the mean; `None` when these are blends.
+    /// The electrodes of the cell nearest to the mean; `None` for blends.
     pub electrodes: Option<Electrodes>,
 }
 
@@ -100,13 +100,13 @@ struct PossibleCell {
 }
 
 impl CurvePrior {
-    /// From every pair of materials; `None` when no pair has a cell between the voltages.
+    /// Curves of all pairs of materials; `None` if no pair gives a cell between the voltages.
     pub fn new(cell_type: &CellType<'_>, soc: &[f64]) -> Option<Self> {
         let CellType { positives, negatives, empty_v, full_v, hysteresis_v } = *cell_type;
         let pairs = positives.iter().flat_map(|p| negatives.iter().map(move |&n| (p, n)));
         let with_contents = |(p, n)| {
-            // Contents of the full negative electrode: designs between fast charging and high energy; of the empty positive one: lithium
-            // lost in the first cycles.
+            // Full negative electrode: designs between fast charging and high energy. Empty positive electrode: lithium lost in the
+            // first cycles.
             let contents =
                 [0.78, 0.84, 0.90, 0.95].iter().flat_map(|&x| [0.84, 0.88, 0.92, 0.97].iter().map(move |&y| (x, y)));
             let ends = contents.flat_map(|contents| full_v.iter().map(move |&full_v| (contents, full_v)));
@@ -122,8 +122,8 @@ impl CurvePrior {
         let mean_v: Vec<f64> =
             (0..soc.len()).map(|s| cells.iter().map(|(_, cell)| cell.curve_v[s]).sum::<f64>() / count).collect();
         let off_v = |cell: &PossibleCell, s: usize| cell.curve_v[s] - mean_v[s];
-        // Smooth deviation of a cell's own materials from those of one name, larger where curves fall steeply (the deviations that
-        // the fit of electrodes allows, `ident::electrodes`).
+        // Smooth deviation of a cell's materials from the library's materials of that name, larger where curves fall steeply (the
+        // deviations that the fit of electrodes allows, `ident::electrodes`).
         let material_v = |s: usize| if soc[s] < 0.05 { 0.030 } else { 0.010 };
         let covariance = DMatrix::from_fn(soc.len(), soc.len(), |a, b| {
             let between: f64 = cells.iter().map(|(_, cell)| off_v(cell, a) * off_v(cell, b)).sum::<f64>() / count;
@@ -151,7 +151,7 @@ impl CurvePrior {
         let n = self.soc.len();
         let slope_v = |s: usize| {
             let (a, b) = (s.saturating_sub(1), (s + 1).min(n - 1));
-            // On a flatter curve any voltage is of every SOC.
+            // On a flatter curve a voltage says nothing about the SOC.
             ((self.mean_v[b] - self.mean_v[a]) / (self.soc[b] - self.soc[a])).max(0.1)
         };
         let width = |s: usize| 0.5 * (self.soc[(s + 1).min(n - 1)] - self.soc[s.saturating_sub(1)]);
@@ -162,14 +162,14 @@ impl CurvePrior {
         order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));
         let mode = |k: usize| {
             let (column, scale) = (eigen.eigenvectors.column(order[k]), eigen.eigenvalues[order[k]].max(0.0).sqrt());
-            // The sign of an eigenvector is free: that of its largest part is positive.
+            // The sign of an eigenvector is arbitrary: make its largest part positive.
             let largest = column.iter().copied().fold(0.0, |m: f64, v| if v.abs() > m.abs() { v } else { m });
             (0..n).map(|s| largest.signum() * scale * column[s] / weight[s]).collect::<Vec<f64>>()
         };
         let modes_v: [Vec<f64>; MIXES] = std::array::from_fn(mode);
         let rest = |s: usize| {
             let explained: f64 = modes_v.iter().map(|mode_v| mode_v[s] * mode_v[s]).sum();
-            // Least error of a curve, V.
+            // Smallest error of a curve, V.
             (self.covariance[(s, s)] - explained).max(0.0).sqrt().max(0.004)
         };
         let rest_v = (0..n).map(rest).collect();
@@ -177,7 +177,7 @@ impl CurvePrior {
     }
 }
 
-/// The cell of a pair with these contents (full negative, empty positive) between the cut-off voltages, if there is one.
+/// The cell of a pair with these contents (full negative, empty positive) between the cut-off voltages, if any.
 fn possible_cell(
     (positive, negative): (&PositiveElectrode, NegativeMaterial),
     (negative_full, positive_empty): (f64, f64),

@@ -1,29 +1,29 @@
-//! Which measurement would make the SOC of a cell model more certain: computed from its bands.
+//! Finds the measurements that reduce the SOC error of a cell model most, from its bands.
 //!
-//! In: [`ModelBands`]. Out: up to [`MOST`] measurements, the one that helps most first, each with what is left after it and those
-//! before it.
+//! In: [`ModelBands`]. Out: up to [`MOST`] measurements, the most useful first, each with the error that remains after it and the
+//! measurements before it.
 //!
-//! The expected error is the mean square error of the SOC over SOC and the temperatures of [`USE_C`], by one voltage under a usual
-//! load and by counting charge since the last sure voltage, with the capacity as uncertain as it is. A measurement is a linear
-//! observation of the curve, of ln(resistance) or of the capacity; covariances fall with the distance in SOC and temperature, so that
-//! it shows something of its neighbours too (Gaussian conditioning: p - c^2 / (v + r)).
+//! The expected error is the mean square error of the SOC over SOC and the temperatures of [`USE_C`]: from one voltage under a
+//! usual load, and from counting charge since the last sure voltage with an uncertain capacity. A measurement is a linear
+//! observation of the curve, of ln(resistance) or of the capacity. Covariances fall with the distance in SOC and temperature, so a
+//! measurement also informs about its neighbours (Gaussian conditioning: p - c^2 / (v + r)).
 
 use std::fmt;
 
 use super::{ModelBands, ResistanceBand, soc_variance};
 use crate::filter::{bell, square};
 
-/// Most measurements named.
+/// Largest number of measurements.
 const MOST: usize = 3;
 
 /// Temperatures of use, degrees C, with their weights: a car outdoors in a temperate climate.
 const USE_C: [(f64, f64); 4] = [(-7.0, 0.15), (3.0, 0.25), (20.0, 0.4), (35.0, 0.2)];
 /// SOC over which errors are averaged.
 const USE_SOC: [f64; 10] = [0.05, 0.15, 0.25, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85, 0.95];
-/// SOC of possible rests.
+/// Possible SOC of a rest.
 const REST_SOC: [f64; 9] = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9];
 
-/// A measurement that the vehicle makes.
+/// A measurement that the vehicle can make.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Measurement {
     /// A rest of an hour at this SOC.
@@ -38,7 +38,7 @@ impl fmt::Display for Measurement {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Rest(soc) => write!(f, "one rest of an hour near {:.0} %", 100.0 * soc),
-            // A cold drive may be colder, or warmer by 2 K.
+            // A cold drive may be colder, or up to 2 K warmer.
             Self::Drive(temperature_c) if *temperature_c < 10.0 => {
                 write!(f, "a drive below {:.0} \u{b0}C", temperature_c + 2.0)
             }
@@ -48,17 +48,17 @@ impl fmt::Display for Measurement {
     }
 }
 
-/// A measurement and what it would bring.
+/// A measurement and its benefit.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Advice {
     /// The measurement.
     pub measurement: Measurement,
-    /// Expected error of the SOC after it and those before it in the list, points.
+    /// Expected SOC error after this measurement and those before it in the list, points.
     pub left_points: f64,
 }
 
-/// Expected error of the SOC by the model, points, and the measurements that would make it smaller; `None` = the model states no
-/// error. An empty list: no measurement would change much.
+/// Expected SOC error with the model, points, and the measurements that reduce it; `None` if the model states no error. The list is
+/// empty if no measurement helps much.
 pub fn advise(bands: &ModelBands<'_>) -> Option<(f64, Vec<Advice>)> {
     let mut belief = Belief::of(bands)?;
     let first_points = belief.points();
@@ -71,7 +71,7 @@ pub fn advise(bands: &ModelBands<'_>) -> Option<(f64, Vec<Advice>)> {
         let tried = candidates.iter().map(|measurement| (*measurement, belief.after(measurement)));
         let best = tried.map(|(measurement, after)| (after.points(), measurement, after));
         let Some((left_points, measurement, after)) = best.min_by(|a, b| a.0.total_cmp(&b.0)) else { break };
-        // Gains below 0.1 points and below 5 % of the error are not worth a measurement.
+        // A measurement must gain at least 0.1 points and 5 % of the first error.
         if points - left_points < f64::max(0.1, 0.05 * first_points) {
             break;
         }
@@ -81,7 +81,7 @@ pub fn advise(bands: &ModelBands<'_>) -> Option<(f64, Vec<Advice>)> {
     Some((first_points, advice))
 }
 
-/// What is believed of a model: covariances over the grid of use and the places of possible measurements.
+/// Belief about a model: covariances over the grid of use and the possible measurements.
 #[derive(Clone)]
 struct Belief {
     /// Slope of the curve at [`USE_SOC`], V per unit of SOC, and at [`REST_SOC`].
@@ -89,7 +89,7 @@ struct Belief {
     rest_slope_v: Vec<f64>,
     /// Covariance of the curve, V^2, over [`USE_SOC`] and then [`REST_SOC`].
     curve: Vec<Vec<f64>>,
-    /// Voltage dropped by a usual load, V, by temperature of [`USE_C`] and SOC of [`USE_SOC`].
+    /// Voltage drop of a usual load, V, by temperature of [`USE_C`] and SOC of [`USE_SOC`].
     drop_v: Vec<Vec<f64>>,
     /// Covariance of ln(resistance) between temperatures of [`USE_C`], at each SOC of [`USE_SOC`].
     resistance: Vec<Vec<Vec<f64>>>,
@@ -104,7 +104,7 @@ impl Belief {
         let modes_v: Vec<[f64; 2]> = places.iter().map(|&soc| bands.modes_v(soc)).collect();
         let covariance = |i: usize, k: usize| {
             let modes: f64 = modes_v[i].iter().zip(modes_v[k]).map(|(a, b)| a * b).sum();
-            // Deviations of a curve change over 15 % of SOC, those of resistances over 20 K.
+            // Correlation lengths: 15 % of SOC for the curve, 20 K for resistances.
             modes + rest_v[i] * rest_v[k] * bell((places[i] - places[k]) / 0.15)
         };
         let all = 0..places.len();
@@ -129,8 +129,8 @@ impl Belief {
 
     /// Expected error of the SOC, points.
     fn points(&self) -> f64 {
-        // Half of the capacity was moved since the last sure voltage. By a right capacity the counted SOC errs by 6 %: its beginning and
-        // the current sensor.
+        // Half of the capacity has been moved since the last sure voltage. With the right capacity the counted SOC still errs by 6 %:
+        // its start and the current sensor.
         let counted = square(0.06) + square(0.5 * self.capacity_std);
         let at = |t: usize, s: usize| {
             let of_drop = self.resistance[s][t][t] * square(self.drop_v[t][s]);
@@ -147,7 +147,7 @@ impl Belief {
         match measurement {
             Measurement::Rest(soc) => {
                 let place = REST_SOC.iter().position(|known| known == soc).unwrap_or(0);
-                // Errors of the voltage after a rest of an hour, and of the SOC counted from another rest.
+                // Errors of the voltage after an hour of rest, and of the SOC counted from another rest.
                 let noise_v = f64::hypot(0.005, 0.02 * self.rest_slope_v[place]);
                 condition(&mut after.curve, USE_SOC.len() + place, square(noise_v));
             }

@@ -1,14 +1,15 @@
-//! Fits a model to the rows of a notebook, with the capacity as the parameter on which all else hangs.
+//! Fits a model to the rows of a notebook over a grid of capacities.
 //!
-//! In: a [`Label`] and rows. Out: a [`Fit`]. For each capacity of a grid the most likely other parameters are found by Gauss-Newton
+//! In: a [`Label`] and rows. Out: a [`Fit`]. For each capacity of the grid, Gauss-Newton finds the most likely other parameters
 //! (maximum a posteriori): the open-circuit curve at the SOC breakpoints, the resistances relative to the label's over SOC and by
-//! temperature, and the SOC at which each stretch began: SOC = s_k - q / C. The density of the capacity is then that of its best
-//! fit times the volume of the others round it (Laplace): where the rows allow two capacities, it has two maxima and says so.
+//! temperature, and the SOC s_k at which each stretch began: SOC = s_k - q / C. The density of a capacity is the density of its
+//! best fit times the volume of the other parameters around it (Laplace). If the rows allow two capacities, the density has two
+//! maxima.
 //!
 //! # Errors of a row
-//! What a circuit gets wrong repeats: at one SOC its voltage, its drop and the place on the curve are wrong alike. So the errors
-//! of rows are correlated over 12 % of SOC, in proportion to a constant, to the slope of the curve and to the voltage drop. The
-//! drop's error grows with the drop: charge transfer is not linear (Butler-Volmer).
+//! A circuit's errors repeat: near one SOC its voltage, its drop and its place on the curve have the same error. The errors of
+//! rows are therefore correlated over 12 % of SOC, with parts proportional to a constant, to the slope of the curve and to the
+//! voltage drop. The drop's error grows with the drop, because charge transfer is not linear (Butler-Volmer).
 //!
 //! The numbers were chosen on LG HG2, LG M50 (simulated) and the Leaf cell, all at 25 degrees C.
 
@@ -30,11 +31,11 @@ use noise::{NormalEquations, RepeatedErrors};
 /// Damping of a search.
 const DAMPING: Damping =
     Damping { first: 1e-3, fall: 0.2, fall_after_growth: 0.2, growth: 8.0, least: 1e-9, most: 8e6 };
-/// Capacities of the grid, in steps of this part of the rated one from 0.52 of it; the search begins at the rated one.
+/// Step of the capacity grid, relative to the rated capacity. The grid starts at 0.52, the search at the rated capacity.
 const CAPACITY_STEP: f64 = 0.04;
 const CAPACITIES: usize = 20;
 const FIRST_CAPACITY: usize = 12;
-/// Cost above the least beyond which no further capacity is tried.
+/// The search ends at a cost this far above the least.
 const HOPELESS: f64 = 25.0;
 /// Points between two capacities of the grid at which the density is evaluated.
 const FINE: usize = 20;
@@ -44,18 +45,18 @@ const FINE: usize = 20;
 pub struct Fit {
     /// The model.
     pub own: OwnModel,
-    /// Root mean square of the rows' residuals in standard deviations: about 1 when the cells are of the label's chemistry and the
-    /// errors of a circuit model as assumed.
+    /// Root mean square of the rows' residuals in standard deviations: about 1 if the cells have the label's chemistry and the
+    /// circuit model errs as assumed.
     pub misfit: f64,
-    /// Where the last stretch began; `None` without rows.
+    /// Start of the last stretch; `None` without rows.
     beginning: Option<Beginning>,
 }
 
-/// Where a stretch began. SOC after a charge q and a time t: soc - (q - t offset) / capacity.
+/// Start of a stretch. The SOC after a charge q and a time t is soc - (q - t offset) / capacity.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Beginning {
     stretch: u32,
-    /// SOC then and offset of the current sensor, A; their covariance at the most likely capacity.
+    /// SOC at the start and offset of the current sensor, A, with their covariance at the most likely capacity.
     means: [f64; 2],
     covariance: [[f64; 2]; 2],
     /// Change of both with one standard deviation of the capacity.
@@ -63,7 +64,7 @@ struct Beginning {
 }
 
 impl Fit {
-    /// Present SOC, fraction, and its covariance with the capacity, Ah; `None` = the present stretch has no rows.
+    /// Present SOC, fraction, and its covariance with the capacity, Ah; `None` if the present stretch has no rows.
     pub fn soc(&self, present: Option<PresentStretch>) -> Option<(ScalarGaussian, f64)> {
         let (present, beginning) = present.zip(self.beginning)?;
         let Beginning { stretch, means, covariance, by_capacity } = beginning;
@@ -85,11 +86,11 @@ impl Fit {
 #[derive(Debug, Clone)]
 struct Conditional {
     theta: DVector<f64>,
-    /// Information about the other parameters; the capacity has none here.
+    /// Information about the other parameters, without the capacity.
     normal: DMatrix<f64>,
     /// Minus the logarithm of the capacity's density, up to the prior's constant.
     cost: f64,
-    /// Root mean square of the rows' deviations from what is expected of them.
+    /// Root mean square of the rows' residuals in standard deviations.
     misfit: f64,
 }
 
@@ -102,12 +103,12 @@ struct Search<'a> {
     rated_ah: f64,
 }
 
-/// Whether rows are enough for a fit.
+/// Whether the rows suffice for a fit.
 pub fn says_enough(label: &Label, rows: &[Row]) -> bool {
     rows.len() >= 12 && span_ah(rows) >= 0.15 * label.rated_ah
 }
 
-/// Fits; `None` when the rows say too little or are those of a capacity far from the label's.
+/// Fits a model; `None` if the rows say too little, or their capacity is far from the label's.
 pub fn fit(prior: &LabelPrior, rows: &[Row]) -> Option<Fit> {
     if !says_enough(&prior.label, rows) {
         return None;
@@ -117,16 +118,15 @@ pub fn fit(prior: &LabelPrior, rows: &[Row]) -> Option<Fit> {
     search.finish(capacity, &start)
 }
 
-/// Minus the logarithm of the probability of rows by a label, at the capacity that suits it best of some, Ah: comparable between
-/// labels.
+/// Minus the logarithm of the rows' probability with a label, at the best of some capacities, Ah. Comparable between labels.
 pub fn label_cost(prior: &LabelPrior, rows: &[Row], capacities_ah: &[f64]) -> Option<f64> {
     let (search, start) = Search::new(prior, rows)?;
     let costs = capacities_ah.iter().filter_map(|&ah| search.conditional(ah, &start).map(|found| found.cost));
     Some(costs.min_by(f64::total_cmp)? - 0.5 * prior::log_determinant(&search.prior)?)
 }
 
-/// Cost of rows by a model, `None` = that of the label: minus the logarithm of their density, with the most likely SOC at the
-/// beginning of each stretch. `None` when there are no rows.
+/// Cost of rows with a model (`None` = the label's): minus the logarithm of their density, with the most likely SOC at the start of
+/// each stretch. `None` without rows.
 pub(super) fn rows_cost(prior: &LabelPrior, own: Option<&OwnModel>, rows: &[Row]) -> Option<f64> {
     let basis = Basis::new(prior, rows);
     let theta = basis.parameters(own);
@@ -137,7 +137,7 @@ pub(super) fn rows_cost(prior: &LabelPrior, own: Option<&OwnModel>, rows: &[Row]
     (!rows.is_empty()).then_some(sums.cost)
 }
 
-/// Charge over which the longest stretch spans, Ah.
+/// Charge range of the longest stretch, Ah.
 fn span_ah(rows: &[Row]) -> f64 {
     let of_stretch = |rows: &[Row]| {
         let charges = rows.iter().map(|row| f64::from(row.charge_ah));
@@ -148,7 +148,7 @@ fn span_ah(rows: &[Row]) -> f64 {
 }
 
 impl<'a> Search<'a> {
-    /// With the parameters from which it begins.
+    /// A fit with its first parameters.
     fn new(prior: &'a LabelPrior, rows: &'a [Row]) -> Option<(Self, DVector<f64>)> {
         let rated_ah = prior.label.rated_ah;
         let basis = Basis::new(prior, rows);
@@ -160,7 +160,7 @@ impl<'a> Search<'a> {
         Some((Self { basis, prior, expected, rated_ah }, start))
     }
 
-    /// Sums of rows and prior at `theta`, without the capacity's.
+    /// Sums of rows and prior at `theta`, without the capacity's prior.
     fn sums(&self, theta: &DVector<f64>, errors: &RepeatedErrors) -> Option<NormalEquations> {
         let off = theta - &self.expected;
         let gradient = &self.prior * &off;
@@ -174,7 +174,7 @@ impl<'a> Search<'a> {
         sums.cost.is_finite().then_some(sums)
     }
 
-    /// The most likely other parameters at a capacity, Ah, from `start` on (Levenberg-Marquardt).
+    /// The most likely other parameters at a capacity, Ah, starting from `start` (Levenberg-Marquardt).
     fn conditional(&self, capacity_ah: f64, start: &DVector<f64>) -> Option<Conditional> {
         self.conditional_with(&RepeatedErrors::USUAL, capacity_ah, start)
     }
@@ -218,7 +218,7 @@ impl<'a> Search<'a> {
                 theta = next.theta;
             }
         }
-        // What is most likely beyond the grid is not of this label.
+        // A maximum beyond the grid does not fit this label.
         let is_open = |end: Option<f64>| end.is_some_and(|cost| cost < least + 3.0);
         if is_open(found[0]) || is_open(found[CAPACITIES - 1]) {
             return None;
@@ -228,17 +228,17 @@ impl<'a> Search<'a> {
         let (mean, variance) = moments(&costs, least);
         let step_ah = CAPACITY_STEP * self.rated_ah;
         let capacity_ah = at(first) + step_ah * mean;
-        // What the fit does not know of its own errors; at least those of the current sensor's gain and offset.
+        // Errors that the fit does not see, at least the current sensor's gain and offset.
         let std_ah = (1.4 * step_ah * variance.sqrt()).hypot(0.015 * capacity_ah);
         Some(ScalarGaussian::from_std(capacity_ah, std_ah))
     }
 
-    /// Model, beginning of the last stretch and their deviations at the capacity that was found.
+    /// Model, start of the last stretch and their standard deviations at the capacity found.
     fn finish(&self, capacity: ScalarGaussian, start: &DVector<f64>) -> Option<Fit> {
         let Conditional { theta, normal, misfit, .. } = self.conditional(capacity.mean, start)?;
         let std_ah = capacity.std();
         let [low, high] = [-0.5, 0.5].map(|part| self.conditional(capacity.mean + part * std_ah, &theta));
-        // Change of all with one standard deviation of the capacity; its own entry is that of ln(capacity).
+        // Change of all parameters with one standard deviation of the capacity, whose own entry is for ln(capacity).
         let by_capacity = high?.theta - low?.theta;
         let theta = self.conditional_with(&RepeatedErrors::IN_TABLES, capacity.mean, &theta)?.theta;
         let mut covariance = normal.cholesky()?.inverse();
@@ -288,7 +288,7 @@ impl<'a> Search<'a> {
     }
 }
 
-/// Mean and variance (steps) of the density exp(least - cost) over a grid of steps, the costs joined by a cubic through neighbours
+/// Mean and variance (steps) of the density exp(least - cost) over a grid of steps; a cubic through neighbours joins the costs
 /// (Catmull-Rom).
 fn moments(costs: &[f64], least: f64) -> (f64, f64) {
     let last = costs.len() - 1;

@@ -1,46 +1,46 @@
-//! A fit of the on-board model as a task: what it needs, and what it finds.
+//! A fit of the on-board model as a task: its inputs and its result.
 //!
-//! It takes hundreds of times as long as a tick may, and depends on nothing but the task. So a live host can run it on a thread
-//! beside the monitor; a replay runs it in place and finds the same.
+//! A fit takes hundreds of times longer than a tick may, and depends only on its inputs. A live host runs it on its own thread; a
+//! replay runs it in place, with the same result.
 
 use super::fit::{self, Fit};
 use super::{OwnModel, rows_cost};
 use crate::cell::chemistry::{Chemistry, Label, LabelPrior};
 use crate::cell::notebook::{Notebook, Row};
 
-/// What a fit is made from.
+/// Inputs of a fit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FitTask {
     label: Label,
     rows: Vec<Row>,
-    /// How many of them, the last ones, no model has seen.
+    /// Number of last rows that no model has seen.
     new_rows: usize,
-    /// The model in force and the one before; `None` = the label's.
+    /// The current and the previous model; `None` = the label's.
     own: Option<OwnModel>,
     before: Option<OwnModel>,
 }
 
-/// What a task finds.
+/// Result of a task.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FitFindings {
-    /// The model before predicts the new rows better than that in force.
+    /// The previous model predicts the new rows better than the current one.
     pub is_before_better: bool,
-    /// The rows were enough for a fit.
+    /// The rows sufficed for a fit.
     pub is_enough: bool,
-    /// The fit to all rows; `None` = they are too few, or those of a capacity far from the label's.
+    /// The fit to all rows; `None` if there are too few rows, or their capacity is far from the label's.
     pub fit: Option<Fit>,
-    /// The chemistry that explains the rows clearly better than that on the label.
+    /// The chemistry that explains the rows clearly better than the label's.
     pub chemistry: Option<Chemistry>,
 }
 
 impl FitTask {
-    /// For the rows of a notebook, the model in force and the one before.
+    /// A task for the rows of a notebook, the current and the previous model.
     pub fn new(label: Label, notebook: &Notebook, own: Option<&OwnModel>, before: Option<&OwnModel>) -> Self {
         let new_rows = notebook.new_rows().len();
         Self { label, rows: notebook.rows().to_vec(), new_rows, own: own.cloned(), before: before.cloned() }
     }
 
-    /// Runs it.
+    /// Runs the fit.
     pub fn run(&self) -> FitFindings {
         let is_enough = fit::says_enough(&self.label, &self.rows);
         let nothing = FitFindings { is_before_better: false, is_enough, fit: None, chemistry: None };
@@ -59,12 +59,12 @@ impl FitTask {
         costs.is_some_and(|(present, before)| before < present - 4.0)
     }
 
-    /// The chemistry that explains the rows clearly better than that of the label, if there is one; each at the capacity of the
-    /// fit, if there is one, or the rated one, as suits it better.
+    /// The chemistry that explains the rows clearly better than the label's, if any. Each chemistry is judged at the fit's capacity
+    /// or at the rated capacity, whichever suits it better.
     fn better_chemistry(&self, prior: &LabelPrior, fitted: Option<&Fit>) -> Option<Chemistry> {
         let Self { label, rows, .. } = self;
-        // 50 times more likely; more where the rows deviate from either by more than drives that a circuit describes (0.45). NCA and NMC
-        // differ by 4 to 9 on the drives of four cells, LFP from all others by hundreds.
+        // 50 times more likely; more if the rows deviate from both by more than drives that a circuit describes (0.45). NCA and NMC
+        // differ by 4 to 9 on the drives of four cells; LFP differs from all others by hundreds.
         let margin = 4.0 * fitted.map_or(1.0, |it| (it.misfit / 0.45).max(1.0));
         let fitted_ah = fitted.map(|it| it.own.capacity.mean);
         let capacities_ah: Vec<f64> = [label.rated_ah].into_iter().chain(fitted_ah).collect();

@@ -1,4 +1,4 @@
-//! The voltage of a notebook's rows by the parameters of a fit, and their derivatives.
+//! Predicted voltages of a notebook's rows from the parameters of a fit, with derivatives.
 //!
 //! In: parameters ([`Layout`](super) of indices below), rows. Out: V. A row's voltage is linear in the curve and in all resistances.
 
@@ -11,9 +11,9 @@ use crate::cell::notebook::Row;
 use crate::cell::own_model::{FACTOR_NODES, OwnModel, SOC_NODES};
 use crate::filter::interpolation::{between, locate_clamped};
 
-/// First indices of the parameters: the curve's deviations from the label's, V, at the SOC breakpoints; ln of the resistances'
-/// factors over SOC; their deviation from the law of temperature; the curve's sag in the cold less the label's, V; ln of the capacity,
-/// Ah; the offset of the current sensor, A (measured less true); the SOC at which each stretch began.
+/// First indices of the parameters: difference of the curve from the label's, V, at the SOC breakpoints; ln of the resistance
+/// factors over SOC; their deviation from the temperature law; difference of the cold sag from the label's, V; ln of the capacity,
+/// Ah; offset of the current sensor, A (measured minus true); SOC at the start of each stretch.
 pub(super) const FACTORS: usize = SOC_NODES;
 pub(super) const BY_TEMPERATURE: usize = FACTORS + RESISTANCES * FACTOR_NODES;
 pub(super) const COLD_SAG: usize = BY_TEMPERATURE + RESISTANCES;
@@ -23,7 +23,7 @@ pub(super) const BEGINNINGS: usize = OFFSET + 1;
 /// Parameters of curve and SOC among those of a row.
 pub(super) const CURVE_AND_SOC: usize = 6;
 
-/// Limits of the SOC at a beginning.
+/// Limits of the SOC at the start of a stretch.
 pub(super) const BEGINNING: (f64, f64) = (-0.05, 1.05);
 
 /// The label as the fit uses it.
@@ -35,7 +35,7 @@ pub(super) struct Basis<'a> {
     pub(super) stretch: Vec<usize>,
 }
 
-/// The voltage of a row by parameters, and its derivatives.
+/// Predicted voltage of a row, with derivatives.
 pub(super) struct Prediction {
     pub(super) voltage_v: f64,
     /// Voltage drop in the cell, V.
@@ -46,7 +46,7 @@ pub(super) struct Prediction {
     pub(super) ohm: [f64; RESISTANCES],
     /// Change of ln of a resistance with each of its three parameters.
     pub(super) by_factor: [f64; 3],
-    /// Parameters on which the voltage depends: six of curve and SOC, then three of each resistance.
+    /// Indices of the parameters that change the voltage: six of curve and SOC, then three of each resistance.
     pub(super) index: Vec<usize>,
     pub(super) slope: Vec<f64>,
 }
@@ -63,7 +63,7 @@ impl<'a> Basis<'a> {
         BEGINNINGS + self.stretch.last().map_or(0, |last| last + 1)
     }
 
-    /// The parameters of a model, `None` = that of the label, with the SOC at which each stretch most likely began.
+    /// The parameters of a model (`None` = the label's), with the most likely SOC at the start of each stretch.
     pub(super) fn parameters(&self, own: Option<&OwnModel>) -> DVector<f64> {
         let mut theta = DVector::zeros(self.size());
         theta[LOG_CAPACITY] = libm::log(own.map_or(self.model.rated_capacity_ah, |own| own.capacity.mean));
@@ -81,7 +81,7 @@ impl<'a> Basis<'a> {
         theta
     }
 
-    /// Limits the parameters to what they can be.
+    /// Limits the parameters to possible values.
     pub(super) fn bound(theta: &mut DVector<f64>) {
         for (i, value) in theta.iter_mut().enumerate().skip(FACTORS) {
             let (low, high) = match i {
@@ -135,7 +135,7 @@ impl<'a> Basis<'a> {
         Prediction { voltage_v, drop_v, soc, slope_v, ohm, by_factor, index, slope }
     }
 
-    /// The SOC at which the stretch of parameter `k` most likely began, with the other parameters as they are.
+    /// The most likely SOC at the start of the stretch of parameter `k`, with all other parameters fixed.
     fn likeliest_beginning(&self, theta: &DVector<f64>, k: usize) -> f64 {
         let mut theta = theta.clone();
         let rows: Vec<usize> = (0..self.rows.len()).filter(|&at| BEGINNINGS + self.stretch[at] == k).collect();
@@ -145,7 +145,7 @@ impl<'a> Basis<'a> {
                 let Prediction { voltage_v, drop_v, .. } = self.predict(&theta, at);
                 let deviations =
                     (voltage_v - f64::from(self.rows[at].voltage_v)).abs() / f64::hypot(0.02, 0.1 * drop_v);
-                // Beyond three deviations linearly.
+                // Linear beyond three standard deviations.
                 if deviations <= 3.0 { 0.5 * deviations * deviations } else { 3.0 * (deviations - 1.5) }
             };
             rows.iter().map(row_cost).sum::<f64>()

@@ -1,4 +1,4 @@
-//! Errors of a notebook's rows: their covariance, and the cost of residuals by it.
+//! Errors of a notebook's rows: their covariance, and the cost of residuals.
 //!
 //! In: predictions and rows. Out: whitened residuals with their derivatives, and their cost (minus the logarithm of their density).
 
@@ -10,10 +10,10 @@ use crate::filter::bell;
 
 /// Standard deviation of a row's voltage, V.
 const ROW_V: f64 = 0.006;
-/// Residual, in standard deviations, from which on it counts linearly (Huber).
+/// Residuals beyond this many standard deviations count linearly (Huber).
 const HUBER: f64 = 3.0;
 
-/// Standard deviations of the part of the errors that repeats: of the voltage, V; of the SOC; of the drop, fraction.
+/// Standard deviations of the repeating errors: voltage, V; SOC; drop, fraction.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct RepeatedErrors {
     voltage_v: f64,
@@ -22,9 +22,9 @@ pub(super) struct RepeatedErrors {
 }
 
 impl RepeatedErrors {
-    /// As circuits have them: for what the rows say of the capacity.
+    /// Errors of circuits, for fitting the capacity.
     pub(super) const USUAL: Self = Self { voltage_v: 0.012, soc: 0.01, drop: 0.2 };
-    /// A third of these, for the tables: what the rows have in common is then in the tables and not in the errors.
+    /// A third of them, for fitting the tables, so that common differences of the rows go into the tables and not into the errors.
     pub(super) const IN_TABLES: Self = Self { voltage_v: 0.004, soc: 0.004, drop: 0.05 };
 }
 
@@ -33,7 +33,7 @@ pub(super) struct NormalEquations {
     pub(super) normal: DMatrix<f64>,
     pub(super) gradient: DVector<f64>,
     pub(super) cost: f64,
-    /// Sum of the rows' squared deviations from what is expected of them.
+    /// Sum of the rows' squared residuals, in standard deviations.
     pub(super) squares: f64,
 }
 
@@ -48,7 +48,7 @@ impl NormalEquations {
         }
     }
 
-    /// Adds all rows at the parameters `theta`; `None` when their errors have no covariance: something is no number.
+    /// Adds all rows at the parameters `theta`; `None` if a number is not finite.
     pub(super) fn add_rows(&mut self, basis: &Basis<'_>, theta: &DVector<f64>, errors: &RepeatedErrors) -> Option<()> {
         let predictions: Vec<Prediction> = (0..basis.rows.len()).map(|at| basis.predict(theta, at)).collect();
         let (count, size) = (predictions.len(), theta.len());
@@ -86,13 +86,14 @@ impl NormalEquations {
         Some(())
     }
 
-    /// Adds what the steps of the current within a row say of the series resistance and the fastest branch.
+    /// Adds the evidence of a row's current steps about the series resistance and the fastest branch.
     ///
-    /// The least squares v = - R0 i - R1 x, of which the row has the sums, in two rows (Cholesky factor of the sums of i and x).
+    /// The row holds the sums of the least squares problem v = - R0 i - R1 x; the Cholesky factor of the sums of i and x turns them
+    /// into two rows.
     fn add_steps(&mut self, row: &Row, prediction: &Prediction) {
         let CurrentSteps { ii, ix, xx, iv, xv } = row.steps;
         let [ii, ix, xx, iv, xv] = [ii, ix, xx, iv, xv].map(f64::from);
-        // Smaller steps say nothing.
+        // Ignore smaller steps.
         if ii <= 1e-12 {
             return;
         }
@@ -100,7 +101,7 @@ impl NormalEquations {
         let of_x = (xx - of_i[1] * of_i[1]).max(0.0).sqrt();
         let v_i = iv / of_i[0];
         let v_x = if of_x > 0.0 { (xv - of_i[1] * v_i) / of_x } else { 0.0 };
-        // The steps' voltage errs by 10 mV; the steps of one row say no more of a resistance than 20 %.
+        // The voltage of the steps errs by 10 mV; the steps of one row determine a resistance to 20 % at best.
         let weight = f64::min(1.0 / (0.01 * 0.01), 1.0 / (0.2 * 0.2 * v_i * v_i));
         let Prediction { ohm: [series_ohm, fast_ohm, ..], by_factor, index, .. } = prediction;
         let residuals_v = [v_i + of_i[0] * series_ohm + of_i[1] * fast_ohm, v_x + of_x * fast_ohm];
@@ -121,12 +122,12 @@ fn covariance(predictions: &[Prediction], errors: &RepeatedErrors) -> DMatrix<f6
     let drop_v: Vec<f64> = predictions.iter().map(|it| it.drop_v * (1.0 + 3.0 * it.drop_v.abs())).collect();
     DMatrix::from_fn(predictions.len(), predictions.len(), |a, b| {
         let (x, y) = (&predictions[a], &predictions[b]);
-        // The part that repeats changes over 12 % of SOC.
+        // Repeating errors change over 12 % of SOC.
         let near = bell((x.soc - y.soc) / 0.12);
         let of = |v: f64, soc: f64, drop: f64| {
             v * v + soc * soc * x.slope_v * y.slope_v + drop * drop * drop_v[a] * drop_v[b]
         };
-        // Errors of one row alone.
+        // Independent errors of each row.
         let own = if a == b { of(ROW_V, 0.01, 0.08) } else { 0.0 };
         own + near * of(errors.voltage_v, errors.soc, errors.drop)
     })

@@ -1,4 +1,4 @@
-//! What is known of a cell's parameters by its label: their covariance, and the information in it.
+//! Prior of a cell's parameters from its label: covariance and information matrix.
 
 use nalgebra::DMatrix;
 
@@ -18,10 +18,10 @@ const SHAPE_LOG_STD: f64 = 0.15;
 /// Standard deviation of ln(resistance) of all parts at the first nodes, near empty: where the curve turns steep, diffusion counts as resistance.
 const LOW_LOG_STD: [f64; 3] = [0.7, 0.6, 0.5];
 
-/// Information matrix about the label's values; `None` when a covariance has no factor.
+/// Information matrix about the label's values; `None` if a covariance is not positive definite.
 pub(super) fn information(curve: &CurvePrior, rated_ah: f64, size: usize) -> Option<DMatrix<f64>> {
     let mut prior = DMatrix::zeros(size, size);
-    // Roughness of a curve beside the modes of its prior: 2 mV.
+    // Roughness of a curve in addition to the modes of its prior: 2 mV.
     let own = DMatrix::from_diagonal_element(SOC_NODES, SOC_NODES, 0.002 * 0.002);
     let curve = (&curve.covariance + own).cholesky()?.inverse();
     prior.view_mut((0, 0), (SOC_NODES, SOC_NODES)).copy_from(&curve);
@@ -34,7 +34,7 @@ pub(super) fn information(curve: &CurvePrior, rated_ah: f64, size: usize) -> Opt
     near(LOG_CAPACITY, 0.1);
     // The rated capacity in 700 h.
     near(OFFSET, rated_ah / 700.0);
-    // The SOC at which a stretch begins is found from the voltages.
+    // The voltages determine the SOC at the start of a stretch.
     (BEGINNINGS..size).for_each(|i| near(i, 0.5));
     Some(prior)
 }
