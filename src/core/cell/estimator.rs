@@ -1,35 +1,35 @@
 //! Estimates one cell's state, sample by sample, with an unscented Kalman filter.
 //!
 //! State x = [SOC, ln rho, C, U_1 .. U_n]: state of charge (fraction), logarithm of the resistance relative to a new
-//! cell, capacity (Ah), branch voltages (V); n = 1 to 3 branches. States in which the circuit is not linear come first, so
-//! that the sigma points of the branches are moved by a linear map.
+//! cell, capacity (Ah), branch voltages (V); n = 1 to 3 branches. The nonlinear states come first, so that a linear map moves the
+//! sigma points of the branches.
 //! Predict over the charge q (A s) and time dt since the last sample:
 //! SOC -= q / (3600 C); U_i by `circuit::BranchAt` with the mean current q/dt; ln rho and C stay.
 //! Update with the voltage: V = OCV(SOC, T) - sum U_i - rho R0(SOC, T) I. Source: the paper, section 3.3.3.
 //!
 //! Deviation 1: ln rho is a state (random walk). Reason: a fixed model attributes grown resistance to lost charge in an
 //! aged cell. Effect: without it the end of life of the measured cells comes 14-23 cycles early.
-//! Deviation 2: C is a state ([`CapacityState::Joint`]). Reason: SOC error grows with the capacity's error in
-//! proportion to the charge moved, and is correlated with it; a filter without that correlation counts its own
-//! assumption as a measurement. `Held` gives the paper's filter (C known, variance 1e-12 Ah^2).
+//! Deviation 2: C is a state ([`CapacityState::Joint`]). Reason: the SOC error grows with the capacity's error in proportion to the
+//! moved charge, so both are correlated; a filter without that correlation takes its own assumption for a measurement. `Held`
+//! gives the paper's filter (C known, variance 1e-12 Ah^2).
 //! Deviation 3: process noises are densities per second, and the measurement variance is
 //! sensor^2 + model^2 / dt: model error is slow, so information is counted per second, not per sample.
 //! Effect: the sample rate does not change the result.
 //!
-//! Deviation 4: model^2 = base^2 + (k drop)^2 + (k' load)^2. The base is the cell model's own error over SOC and
-//! temperature where its fit states one; the drop is the present voltage drop in the cell, the load that of the last
-//! minutes: model error is mostly error of the resistances and of diffusion slower than the branches. Effect: a record
-//! that begins under load, the constant-voltage part of a charge, and cold cells no longer count as exact.
-//! At rest the error repeats instead of averaging out: a rest of t counts as t_r ln(1 + t/t_r) under load.
+//! Deviation 4: model^2 = base^2 + (k drop)^2 + (k' load)^2. The base is the cell model's stated error over SOC and temperature, or
+//! a configured constant. The drop is the present voltage drop in the cell, the load the voltage drop of the last minutes' load.
+//! Reason: most model error is error of the resistances and of diffusion slower than the branches. Effect: a record that begins
+//! under load, the constant-voltage part of a charge, and cold cells no longer count as exact. At rest the error repeats instead
+//! of averaging out: a rest of t counts as t_r ln(1 + t/t_r) under load.
 //! Deviation 5: the OCV curve changes with the capacity lost by the last half-cycle ([`AgedOcv`](crate::cell::AgedOcv)).
 //! Effect: the top and the bottom of an aged cell's curve give the same capacity.
 //!
-//! Use of the cell while the program does not run (deviation 6): [`downtime`].
+//! Deviation 6: use of the cell while the program does not run, see [`downtime`].
 //!
-//! Deviation 7: constant errors of sensors and model are followed, those of [`SensorErrors`](crate::cell::SensorErrors) also
-//! considered (see below); deviation 8: the current's offset is learned ([`crate::health::offset`]).
-//! Deviation 9: the slowest branch has a resistance ratio of its own, also learned ([`slow_branch`]): U_n counts in the voltage
-//! with that ratio.
+//! Deviation 7: the filter follows the effect of constant errors of sensors and model; it also considers the errors of
+//! [`SensorErrors`](crate::cell::SensorErrors) in the gain (see below).
+//! Deviation 8: the current's offset is learned ([`crate::health::offset`]).
+//! Deviation 9: the slowest branch has its own learned resistance ratio ([`slow_branch`]), which multiplies U_n in the voltage.
 //!
 //! The filter is unscented, with additive noise and a scalar measurement. Sigma points are x and x +/- sqrt(N + lambda) L_i with L
 //! the lower Cholesky factor of P and lambda = alpha^2 (N + kappa) - N; weights as in Wan and van der Merwe (2000), equations
@@ -39,8 +39,8 @@
 //! 1966): an update weighs the voltage by the covariance with them, and P is updated in Joseph's form, as the gain is not the best
 //! one for P alone. The others change no mean (Friedland 1969).
 //!
-//! A reading beyond the gate leaves the state unchanged. After every reading has been beyond it for `lost_after_s`, the
-//! filter restarts: SOC and branches from the voltage, resistance and capacity are kept.
+//! A reading beyond the gate leaves the state unchanged. If all readings of `lost_after_s` were beyond the gate, the filter
+//! restarts: it takes SOC and branches from the voltage, and keeps resistance and capacity.
 
 mod bank;
 mod cell_estimator;

@@ -14,8 +14,8 @@ pub struct Lanes<const L: usize>(pub [f64; L]);
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Mask<const L: usize>([u64; L]);
 
-/// An array of what `lane` gives for each index. A plain loop: the standard library's `from_fn` stays a call for each lane where the
-/// caller is long (9 % of a replay of one cell).
+/// An array of the results of `lane` for each index. A plain loop, because the standard library's `from_fn` is not inlined into long
+/// callers (9 % of a replay of one cell).
 #[inline(always)]
 fn from_fn<T: Copy + Default, const L: usize>(mut lane: impl FnMut(usize) -> T) -> [T; L] {
     let mut lanes = [T::default(); L];
@@ -197,8 +197,8 @@ impl<const L: usize> Lanes<L> {
         Self(from_fn(|i| if mask.0[i] != 0 { self.0[i] } else { other.0[i] }))
     }
 
-    /// e^x with a relative error below 3 x 2^-52; 0 from -708 down, e^709 above 709 and for NaN. A caller
-    /// that must detect NaN checks the argument.
+    /// e^x with a relative error below 3 x 2^-52; 0 at -708 and below, e^709 above 709 and for NaN. To detect NaN, check the
+    /// argument.
     #[inline(always)]
     pub fn exp(self) -> Self {
         let x = self.at_most(709.0);
@@ -207,7 +207,7 @@ impl<const L: usize> Lanes<L> {
         scaled.or_else(x.above_number(LEAST), Self::splat(0.0))
     }
 
-    /// e^x and e^-x, with a relative error below 3 x 2^-52; x is held within 708, and is 708 where it is NaN.
+    /// e^x and e^-x, with a relative error below 3 x 2^-52; x is limited to +-708, and NaN counts as 708.
     #[inline(always)]
     pub fn exp_of_both_signs(self) -> (Self, Self) {
         let series = ExpSeries::new(self.at_most(-LEAST).at_least(LEAST));
@@ -217,7 +217,7 @@ impl<const L: usize> Lanes<L> {
         )
     }
 
-    /// ln x for a normal, positive x, to within two units in the last place of the larger of it and 1e-3.
+    /// ln x for a normal, positive x, to within two units in the last place (of 1e-3 if |ln x| is smaller).
     #[inline(always)]
     pub fn ln(self) -> Self {
         Self(from_fn(|i| ln(self.0[i])))
@@ -262,7 +262,7 @@ fn ln(x: f64) -> f64 {
     let above = x.to_bits().wrapping_sub(SQRT_HALF_BITS);
     let exponent = above & 0xFFF0_0000_0000_0000;
     let m = f64::from_bits(x.to_bits().wrapping_sub(exponent));
-    // e as a float without an integer conversion: its low bits go into the mantissa of a large number.
+    // Convert e to a float without an integer conversion: put its low bits into the mantissa of a large number.
     let biased = (exponent >> 52).wrapping_add(2048) & 0xFFF;
     let e = f64::from_bits(LARGE.to_bits() | biased) - (LARGE + 2048.0);
     let s = (m - 1.0) / (m + 1.0);

@@ -1,6 +1,6 @@
-//! The estimators of all cells of a pack, stepped together.
+//! The estimators of all cells of one type, stepped together.
 //!
-//! In: one [`CellStep`] per cell and batch (V, A, s, degrees C). Out: a [`StepResult`] per cell, and its estimates.
+//! In: one [`CellStep`] per cell and batch (V, A, s, degrees C). Out: a [`StepResult`] and estimates per cell.
 //!
 //! Almost every step is ordinary: the current was measured all the time since the last voltage, and the voltage is
 //! within the gate. The [`kernel`] makes these steps, [`WIDTH`] cells at a time, over structures of arrays; it selects
@@ -36,7 +36,7 @@ pub struct EstimatorBank {
     model: CellModel,
     config: EstimatorConfig,
     constants: KernelConstants,
-    /// Smallest and largest capacity that is believed, Ah.
+    /// Smallest and largest plausible capacity, Ah.
     plausible_ah: (f64, f64),
     filters: FilterArrays,
     cells: Vec<CellSlot>,
@@ -107,10 +107,10 @@ impl EstimatorBank {
         &self.config
     }
 
-    /// Adds a cell's voltage reading to the batch: each cell's at most once.
+    /// Adds a cell's voltage reading to the batch, at most one per cell.
     ///
     /// # Panics
-    /// When there is no such cell.
+    /// If there is no such cell.
     #[inline]
     pub fn add(&mut self, cell: usize, step: &CellStep) {
         let (Some(current_a), true) = (step.current_a, step.unmeasured_s == 0.0 && self.cells[cell].is_ordinary())
@@ -132,7 +132,7 @@ impl EstimatorBank {
         input.voltage_v.0[lane] = step.voltage_v;
     }
 
-    /// Makes the steps of the batch; their outcomes: [`Self::result`].
+    /// Makes the steps of the batch; [`Self::result`] returns their outcomes.
     pub fn step(&mut self) {
         #[cfg(feature = "wide")]
         let machine = self.machine;
@@ -172,7 +172,7 @@ impl EstimatorBank {
         self.cells[cell].has_filter
     }
 
-    /// State of charge in the filter's state, without the widening by downtime and the bounds.
+    /// State of charge of the filter, not widened by downtime and not bounded.
     pub fn filtered_soc(&self, cell: usize) -> Option<ScalarGaussian> {
         self.is_started(cell).then(|| self.marginal(cell, 0))
     }
@@ -189,7 +189,7 @@ impl EstimatorBank {
         })
     }
 
-    /// State of charge of the emptiest and the fullest cell; `None` when a cell's is unknown or from before a downtime.
+    /// State of charge of the emptiest and the fullest cell; `None` if a cell has none yet, or none since a downtime.
     pub fn extremes(&self) -> Option<(ScalarGaussian, ScalarGaussian)> {
         if !self.cells.iter().all(|cell| cell.has_filter && !cell.memory.is_carried_over()) {
             return None;
@@ -210,14 +210,14 @@ impl EstimatorBank {
         self.cell(cell).branch_v()
     }
 
-    /// Mean normalised innovation squared over the consistency window: about 1 or less when the filter is consistent.
+    /// Mean normalised innovation squared over the consistency window: about 1 or less for a consistent filter.
     #[inline]
     pub fn mean_nis(&self, cell: usize) -> f64 {
         let (block, lane) = (cell / WIDTH, cell % WIDTH);
         each_array!(&self.filters, x => x.blocks[block].memory[MEAN_NIS].0[lane])
     }
 
-    /// Whether a cell's SOC, resistance and capacity are ones that a cell of the model can have.
+    /// Whether a cell of the model can have this cell's SOC, resistance and capacity.
     #[inline]
     pub fn is_plausible(&self, cell: usize) -> bool {
         let (block, lane) = (cell / WIDTH, cell % WIDTH);
@@ -257,7 +257,7 @@ impl EstimatorBank {
         self.cells[cell].memory.temperature_c
     }
 
-    /// Whether the SOC is still the one from before a downtime or sleep: no voltage has been used since.
+    /// Whether the SOC is from before a downtime or sleep, because no voltage has been used since.
     pub fn is_carried_over(&self, cell: usize) -> bool {
         self.cells[cell].memory.is_carried_over()
     }
@@ -285,9 +285,9 @@ impl EstimatorBank {
         result
     }
 
-    /// What the voltages since the last correction say about the current sensor's offset: sums of d^2 / R and of
-    /// d x innovation / R, with d the effect of its standard deviation on an innovation of variance R. Means over the cells,
-    /// whose models err alike.
+    /// Evidence about the current sensor's offset since the last correction: sums of d^2 / R and of d x innovation / R, with d the
+    /// effect of one standard deviation of the offset on an innovation of variance R. Means over the cells, because their models
+    /// have common errors.
     pub fn offset_evidence(&self) -> (f64, f64) {
         let cells = self.cells.len();
         let mean = |i: usize| {
@@ -298,7 +298,7 @@ impl EstimatorBank {
         (mean(OFFSET_INFORMATION), mean(OFFSET_SCORE))
     }
 
-    /// Corrects all cells by `deviations` of the current's offset, whose deviation becomes `offset_std_a`.
+    /// Corrects all cells by `deviations` standard deviations of the current's offset, which becomes known to `offset_std_a`.
     pub fn absorb_current_offset(&mut self, deviations: f64, offset_std_a: f64) {
         let before_a = self.config.sensor.current_offset_a;
         let remains = if before_a > 0.0 { offset_std_a / before_a } else { 1.0 };
@@ -306,7 +306,7 @@ impl EstimatorBank {
         self.set_current_offset_std(offset_std_a);
     }
 
-    /// Corrects every cell's slowest branch by the voltages since the last correction.
+    /// Corrects every cell's slowest branch by the evidence since the last correction.
     pub fn learn_slow_branches(&mut self) {
         let config = self.config;
         self.change_all(|cell| cell.learn_slow_branch(&config));
@@ -335,7 +335,7 @@ impl EstimatorBank {
     }
 }
 
-/// Smallest and largest capacity that is believed, Ah: by the model's and the configured one.
+/// Smallest and largest plausible capacity, Ah, from the model's and the configured capacity.
 fn plausible_ah(model: &CellModel, config: &EstimatorConfig) -> (f64, f64) {
     let (model_ah, initial_ah) = (model.capacity_ah, config.initial.capacity_ah);
     (bounds::TRUSTED_CAPACITY.low * model_ah.min(initial_ah), bounds::TRUSTED_CAPACITY.high * model_ah.max(initial_ah))

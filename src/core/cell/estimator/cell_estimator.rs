@@ -1,4 +1,4 @@
-//! The estimator of one cell: steps its filter, restarts it, and reads its state.
+//! The estimator of one cell apart from its bank: rare steps, restarts, learning and estimates.
 //!
 //! In: one [`CellStep`] per voltage reading. Out: a [`StepResult`], and estimates with their variances. A reading beyond
 //! the gate leaves the state unchanged; a step that cannot be computed restarts the filter.
@@ -23,7 +23,7 @@ use crate::quantity::bounds;
 /// State in which a cell continues with another model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdoptedState {
-    /// SOC, fraction; `None` = from the next voltage.
+    /// SOC, fraction; `None` = start from the next voltage.
     pub soc: Option<ScalarGaussian>,
     /// Covariance of SOC and capacity, Ah.
     pub soc_by_capacity: f64,
@@ -65,7 +65,7 @@ impl CellEstimator {
             self.start(model, config, &step);
         }
         if let (None, Some(x)) = (&result, &mut self.filter) {
-            // The correlation may have prevented the factorisation.
+            // The correlation may have made the covariance indefinite.
             x.correlate(LOG_RESISTANCE, CAPACITY, 0.0);
             x.by_constant.fill(0.0);
         }
@@ -125,7 +125,7 @@ impl CellEstimator {
             let load_v =
                 model.r0_ohm(&guess) * libm::exp(self.memory.log_resistance.mean) * step.current_a.unwrap_or(0.0);
             let temperature = model.temperature_position(temperature_c);
-            // On a flat curve a voltage just beyond its end would be of any SOC.
+            // A voltage just beyond the end of a flat curve could give any SOC.
             model.soc_of_aged_ocv(&temperature, self.memory.curve.mean, step.voltage_v + load_v).clamp(-0.05, 1.05)
         });
         let soc = ScalarGaussian { mean: soc, variance: square(config.initial.soc_std).max(KNOWN_VARIANCE) };
@@ -137,7 +137,7 @@ impl CellEstimator {
             by_constant: self.learned_by_constant(),
         };
         self.filter = Some(Gaussian::at_start(soc, &branch_variance[..model.branches.len()], &kept));
-        // Trust returns through the window, not by a restart.
+        // A restart does not restore trust; the window does.
         self.memory.mean_nis = self.memory.mean_nis.min(config.consistency.limit * std::f64::consts::E);
         self.memory.information_s = config.voltage.max_information_s;
         (self.memory.downtime_std, self.memory.used_prior, self.memory.noted_s) = (0.0, 0.0, 0.0);
@@ -145,7 +145,7 @@ impl CellEstimator {
         self.memory.is_soc_unknown = false;
     }
 
-    /// Continues with another `model` from a state that was found with it: what was estimated with the old one is left.
+    /// Continues with another `model` from a state found with that model; discards estimates of the old model.
     pub fn adopt(&mut self, model: &CellModel, config: &EstimatorConfig, state: &AdoptedState) {
         let temperature_c = self.memory.temperature_c;
         self.memory.capacity = state.capacity;
@@ -163,7 +163,7 @@ impl CellEstimator {
             covariance: 0.0,
             by_constant: SMatrix::zeros(),
         };
-        // A cell whose temperature was never known counts as at 25 degrees C.
+        // Without any known temperature, assume 25 degrees C.
         let position = model.grid_position(soc.mean, temperature_c.unwrap_or(25.0));
         let ratio = libm::exp(state.log_resistance);
         let filtered_a = state.filtered_a.unwrap_or_default();
@@ -181,7 +181,7 @@ impl CellEstimator {
         self.filter = Some(x);
     }
 
-    /// Variance of each branch's voltage at a start, V^2: under load, a usual load of unknown duration has filled it.
+    /// Variance of each branch's voltage at a start, V^2. Under load, a usual load of unknown duration may have charged it.
     fn first_branch_variance(
         &self,
         model: &CellModel,
@@ -202,7 +202,7 @@ impl CellEstimator {
         variance
     }
 
-    /// The sensor's value, or the thermal model's prediction from the last known one, degrees C.
+    /// The sensor's temperature, else the thermal model's prediction from the last known temperature, degrees C.
     fn temperature(&self, model: &CellModel, step: &CellStep) -> f64 {
         step.temperature_c.unwrap_or_else(|| {
             let soc = self.soc().map_or(0.5, |soc| soc.mean);
@@ -251,20 +251,20 @@ impl CellEstimator {
         self.filter.as_ref().map(|x| x.marginal(state))
     }
 
-    /// Errors of ln rho and of the capacity by the constant errors.
+    /// Errors of ln rho and of the capacity caused by the constant errors.
     fn learned_by_constant(&self) -> SMatrix<f64, 2, CONSTANT_ERRORS> {
         let rows = |x: &Gaussian| x.by_constant.fixed_rows::<2>(LOG_RESISTANCE).into_owned();
         self.filter.as_ref().map_or_else(SMatrix::zeros, rows)
     }
 
-    /// Corrects the state by `deviations` of the current's offset, whose remaining deviation becomes `remains` times the
-    /// one before.
+    /// Corrects the state by `deviations` standard deviations of the current's offset. The offset's remaining standard deviation is
+    /// `remains` times the old one.
     pub fn absorb_current_offset(&mut self, deviations: f64, remains: f64) {
         (self.memory.offset_information, self.memory.offset_score) = (0.0, 0.0);
         self.absorb(CURRENT_OFFSET, deviations, remains);
     }
 
-    /// Corrects the slowest of several branches by the voltages since the last correction.
+    /// Corrects the slowest of several branches by the evidence since the last correction.
     pub fn learn_slow_branch(&mut self, config: &EstimatorConfig) {
         if self.filter.as_ref().is_none_or(|x| x.states == BRANCHES + 1) {
             (self.memory.slow_branch.information, self.memory.slow_branch.score) = (0.0, 0.0);
@@ -280,15 +280,14 @@ impl CellEstimator {
         ScalarGaussian::from_std(slow_branch.ratio, slow_branch.std(config.sensor.slow_branch))
     }
 
-    /// Corrects the state by `deviations` of a constant error, whose remaining deviation becomes `remains` times the one
-    /// before.
+    /// Corrects the state by `deviations` standard deviations of a constant error; see [`Gaussian::absorb`].
     fn absorb(&mut self, constant_error: usize, deviations: f64, remains: f64) {
         if let Some(x) = &mut self.filter {
             x.absorb(constant_error, deviations, remains);
         }
     }
 
-    /// Restates the errors by constant errors for other deviations of them.
+    /// Rescales the effects of the constant errors to other standard deviations of these errors.
     pub(super) fn restate_constant_errors(&mut self, old: &SensorErrors, new: &SensorErrors) {
         let Some(x) = &mut self.filter else { return };
         let deviations =
@@ -316,10 +315,10 @@ impl CellEstimator {
         self.filter.as_ref().map_or(0.0, |x| by_curve(x.by_constant[(CAPACITY, CURVE_CAPACITY)]))
     }
 
-    /// Replaces the capacity estimate, and the open-circuit curve by that of this capacity (at transitions only). The state
-    /// moves as if the curve had been that one since the last call.
+    /// Replaces the capacity estimate and sets the open-circuit curve to this capacity (only at transitions). The state moves as if
+    /// the curve had been in use since the last call.
     ///
-    /// The filter's variance never falls by that: the evidence since the last call may have counted for too much.
+    /// The filter's variance does not fall: the evidence since the last call may have had too much weight.
     pub fn restate_capacity(&mut self, capacity: ScalarGaussian) {
         self.memory.capacity = capacity;
         let before = self.memory.curve;
@@ -329,7 +328,7 @@ impl CellEstimator {
         if before.variance > 0.0 {
             x.mean += column * ((before.mean - capacity.mean) / before.std());
         }
-        // What is left of the curve's error is the capacity's, and no longer apart from it.
+        // The remaining error of the curve is now an error of the capacity.
         x.covariance += column * column.transpose();
         x.by_constant.column_mut(CURVE_CAPACITY).fill(0.0);
         x.mean[CAPACITY] = capacity.mean;
@@ -338,12 +337,12 @@ impl CellEstimator {
         x.covariance[(CAPACITY, CAPACITY)] += missing.max(0.0);
     }
 
-    /// Sets ln of the resistance relative to new with which the filter begins.
+    /// Sets ln of the resistance relative to new for the filter's start.
     pub fn relearn_resistance(&mut self, log_resistance: ScalarGaussian) {
         self.memory.log_resistance = log_resistance;
     }
 
-    /// Sets the capacity that the filter uses ([`CapacityState::Held`]), Ah.
+    /// Sets the filter's capacity, Ah ([`CapacityState::Held`]).
     pub fn hold_capacity(&mut self, capacity_ah: f64) {
         self.memory.capacity.mean = capacity_ah;
         self.memory.curve = ScalarGaussian { mean: capacity_ah, variance: 0.0 };
@@ -352,12 +351,12 @@ impl CellEstimator {
         }
     }
 
-    /// Notes a sleep: until a voltage has been used, the SOC is the one from before.
+    /// Notes a sleep: the SOC counts as carried over until a voltage has been used.
     pub fn note_sleep(&mut self) {
         self.memory.is_unseen = self.filter.is_some();
     }
 
-    /// Adds a downtime of `downtime_s`: widens the SOC by the charge that may have been moved, in either direction.
+    /// Adds a downtime of `downtime_s`: widens the SOC by the charge that may have been moved in either direction.
     pub fn note_downtime(&mut self, config: &EstimatorConfig, downtime_s: f64) {
         let downtime_s = downtime_s.max(0.0);
         self.memory.note_downtime(config.gap.away_use_per_s * downtime_s, USED_PRIOR);
@@ -365,7 +364,7 @@ impl CellEstimator {
     }
 }
 
-/// Predicts the temperature of a cell without a sensor value, degrees C, from the last known one.
+/// Predicts the temperature of a cell without a sensor value, degrees C, from the last known temperature.
 pub(super) fn thermal_c(model: &CellModel, last_c: Option<f64>, soc: f64, log_resistance: f64, step: &CellStep) -> f64 {
     let (Some(last_c), Some(thermal)) = (last_c, &model.thermal) else { return last_c.unwrap_or(step.ambient_c) };
     let mean_current_a = if step.measured_s > 0.0 { step.charge_as / step.measured_s } else { 0.0 };
@@ -373,6 +372,6 @@ pub(super) fn thermal_c(model: &CellModel, last_c: Option<f64>, soc: f64, log_re
     let loaded_c =
         circuit::temperature_after(thermal, last_c, step.ambient_c, square(mean_current_a) * ohm, step.measured_s);
     let predicted_c = circuit::temperature_after(thermal, loaded_c, step.ambient_c, 0.0, step.unmeasured_s);
-    // A current that no cell survives says nothing of its temperature.
+    // An impossible current gives an impossible temperature.
     predicted_c.clamp(bounds::TEMPERATURE_C.low, bounds::TEMPERATURE_C.high)
 }

@@ -25,7 +25,7 @@ pub(super) struct Gaussian {
     pub(super) mean: SVector<f64, MAX_STATES>,
     /// Covariance without the constant errors, symmetric and positive definite.
     pub(super) covariance: Covariance,
-    /// Column k: error of the mean (true less mean) by one standard deviation of constant error k.
+    /// Column k: error of the mean (true minus mean) caused by one standard deviation of constant error k.
     pub(super) by_constant: SMatrix<f64, MAX_STATES, CONSTANT_ERRORS>,
 }
 
@@ -35,12 +35,12 @@ pub(super) struct LearnedState {
     pub(super) capacity: ScalarGaussian,
     /// Covariance of both without the constant errors.
     pub(super) covariance: f64,
-    /// Errors of ln rho and of the capacity by the constant errors.
+    /// Errors of ln rho and of the capacity caused by the constant errors.
     pub(super) by_constant: SMatrix<f64, 2, CONSTANT_ERRORS>,
 }
 
 impl Gaussian {
-    /// The state at a start: SOC and branches new, the rest as learned.
+    /// The state at a start: new SOC and branches, learned resistance and capacity.
     pub(super) fn at_start(soc: ScalarGaussian, branch_variance: &[f64], learned: &LearnedState) -> Self {
         let states = BRANCHES + branch_variance.len();
         let (mut mean, mut by_constant) = (SVector::zeros(), SMatrix::<f64, MAX_STATES, CONSTANT_ERRORS>::zeros());
@@ -70,7 +70,7 @@ impl Gaussian {
         ScalarGaussian { mean: self.mean[i], variance }
     }
 
-    /// Whether the state is one that a cell can have; a filter that has left it starts again.
+    /// Whether a cell can have the state; otherwise the filter restarts.
     pub(super) fn is_possible(&self) -> bool {
         bounds::FILTER_SOC.has(self.mean[0])
             && bounds::LOG_RESISTANCE.has(self.mean[LOG_RESISTANCE])
@@ -79,21 +79,21 @@ impl Gaussian {
             && (0..self.states).all(|i| (1e-40..=bounds::NUMBER.high).contains(&self.covariance[(i, i)]))
     }
 
-    /// Corrects the mean by `deviations` of a constant error, whose remaining deviation becomes `remains` times the one
-    /// before.
+    /// Corrects the mean by `deviations` standard deviations of a constant error. The error's remaining standard deviation is
+    /// `remains` times the old one.
     pub(super) fn absorb(&mut self, constant_error: usize, deviations: f64, remains: f64) {
         let column = self.by_constant.column(constant_error).into_owned();
         self.mean += column * deviations;
         if remains <= 1.0 {
             self.by_constant.set_column(constant_error, &(column * remains));
         } else {
-            // A part of the larger error is new and has not moved any state.
+            // The added part of the error is new and has not moved any state.
             self.by_constant.set_column(constant_error, &(column / remains));
             self.covariance += column * column.transpose() * (1.0 - 1.0 / square(remains));
         }
     }
 
-    /// After a gap of unknown length: the SOC is unknown, the branches are anywhere between loaded and relaxed.
+    /// Widens the state after a gap of unknown length: unknown SOC, branches anywhere between loaded and relaxed.
     pub(super) fn widen_after_unknown_gap(&mut self) {
         self.covariance[(0, 0)] = widened(self.covariance[(0, 0)], UNKNOWN_SOC_VARIANCE);
         for i in BRANCHES..self.states {
@@ -111,8 +111,8 @@ impl Gaussian {
         self.by_constant.row_mut(i).fill(0.0);
     }
 
-    /// Becomes mean and covariance of the mixture with another Gaussian that has `weight`. The difference of their constant
-    /// errors is left out: it is small against the difference of their means.
+    /// Sets mean and covariance to the mixture with another Gaussian that has `weight`. Ignores the difference of their constant
+    /// errors, which is small compared with the difference of their means.
     pub(super) fn merge(&mut self, other: &Self, weight: f64) {
         let apart = other.mean - self.mean;
         let between = apart * apart.transpose();

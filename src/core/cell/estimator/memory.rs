@@ -1,4 +1,4 @@
-//! The estimator's memory: rest, load, consistency, rejected readings, and what survives a restart of the filter.
+//! The estimator's memory: rest, load, consistency, rejected readings, and the estimates that survive a restart of the filter.
 //!
 //! In: steps (A, s) and the outcomes of updates. Out: the time that a reading stands for, s, the load, A, and whether the
 //! filter must restart. Stored numbers are checked ([`Memory::check`]).
@@ -13,20 +13,20 @@ use crate::filter::ScalarGaussian;
 use crate::quantity::InvalidState;
 use crate::quantity::bounds::{self, Bounds};
 
-/// Assumed load in a gap that has a load next to it, per rated capacity: 1 C.
+/// Assumed load in a gap with a load before or after it, per rated capacity: 1 C.
 const GAP_LOAD_PER_H: f64 = 1.0;
 
 /// Prior probability that a cell was used while the program did not run.
 pub(super) const USED_PRIOR: f64 = 0.2;
 
-/// The same in a gap with a load next to it: it continued or ended, neither is more likely.
+/// The same for a gap with a load before or after it: the load continued or ended with equal probability.
 const LOADED_PRIOR: f64 = 0.5;
 
-/// The same in a gap of half a day and more with rest on both sides: a charger may come without the bus, but a bus in use wakes
-/// its listeners.
+/// The same for a gap of at least half a day with rest on both sides: a charger may work without the bus, but a bus in use wakes its
+/// listeners.
 const CHARGER_PRIOR: f64 = 0.05;
 
-/// Deviation of the SOC below which downtime is ignored, fraction.
+/// Largest negligible standard deviation of the SOC by downtime, fraction.
 const NEGLIGIBLE_STD: f64 = 0.002;
 
 /// State of the estimator in addition to its filter.
@@ -44,14 +44,14 @@ pub(super) struct Memory {
     pub(super) load_a: f64,
     /// Mean normalised innovation squared over the consistency window.
     pub(super) mean_nis: f64,
-    /// Time that the next voltage reading stands for, s: since the last one used.
+    /// Time that the next voltage reading stands for, s: the time since the last used reading.
     pub(super) information_s: f64,
-    /// How long the cell has rested, s.
+    /// Duration of the present rest, s.
     pub(super) rest_s: f64,
-    /// Information about the current sensor's offset in the voltages since it was last corrected, in units of its standard
-    /// deviation: sum of d^2 / R with d its effect on an innovation of variance R without it.
+    /// Information about the current sensor's offset since its last correction, in units of its standard deviation: sum of
+    /// d^2 / R, with d the offset's effect on an innovation of variance R without it.
     pub(super) offset_information: f64,
-    /// What these voltages say: sum of d x innovation / R.
+    /// Evidence about the offset from the same voltages: sum of d x innovation / R.
     pub(super) offset_score: f64,
     pub(super) slow_branch: SlowBranch,
     /// Standard deviation of the SOC change during downtime, until a voltage has been used.
@@ -62,13 +62,13 @@ pub(super) struct Memory {
     pub(super) used_prior: f64,
     /// No voltage has been used since the last sleep or unknown gap.
     pub(super) is_unseen: bool,
-    /// After a gap of unknown length the SOC says nothing: the filter restarts from the next voltage.
+    /// The SOC is unknown after a gap of unknown length: the filter restarts from the next voltage.
     pub(super) is_soc_unknown: bool,
     /// Consecutive readings beyond the gate.
     pub(super) rejected: u32,
-    /// Duration of that run, s.
+    /// Duration of the run of rejected readings, s.
     pub(super) rejected_s: f64,
-    /// Whether the first of that run followed a gap: then the gap is the cause, not the sensor.
+    /// The run started after a gap: then the gap is the cause, not the sensor.
     pub(super) rejected_after_gap: bool,
 }
 
@@ -100,14 +100,14 @@ impl Memory {
         }
     }
 
-    /// Notes a downtime in which the cell was used with probability `used`, by a charge of up to `most`, fraction of SOC.
+    /// Adds a downtime in which the cell was used with probability `used`, by up to `most`, fraction of SOC.
     pub(super) fn note_downtime(&mut self, most: f64, used: f64) {
         self.downtime_std = (self.downtime_std + most / 3.0_f64.sqrt()).min(1.0);
         self.used_prior = 1.0 - (1.0 - self.used_prior) * (1.0 - used);
     }
 
-    /// Notes the unmeasured time of a step: a load next to it may have continued, or a charger come. What counts as downtime
-    /// is left to the next voltage; for a short load returns the deviation of the SOC, fraction.
+    /// Notes the unmeasured time of a step: the load before or after it may have continued, or a charger may have been connected. The
+    /// next voltage decides about downtime. For a short load, returns the standard deviation of the SOC, fraction.
     pub(super) fn note_gap(&mut self, config: &EstimatorConfig, step: &CellStep, capacity_ah: f64) -> f64 {
         let noted_s = std::mem::take(&mut self.noted_s).min(step.unmeasured_s);
         let adjacent_a = self.gap_load_a(config, step);
@@ -118,7 +118,7 @@ impl Memory {
         }
         let load_per_s = if is_loaded { adjacent_a / (3600.0 * capacity_ah) } else { 0.0 };
         let away_per_s = config.gap.away_use_per_s;
-        // In less than an hour slow relaxation would be taken for a charger.
+        // Within an hour, slow relaxation would be mistaken for a charger.
         let charger_per_s = if unnoted_s < 3600.0 { 0.0 } else { away_per_s };
         let most = load_per_s.max(charger_per_s) * step.unmeasured_s - away_per_s * noted_s;
         if most <= 0.0 {
@@ -134,7 +134,7 @@ impl Memory {
         0.0
     }
 
-    /// The load next to a step's gap, A: it may have continued through the gap. 0 where a silent bus means rest.
+    /// The load before or after a step's gap, A, which may have continued through the gap. 0 if a silent bus means rest.
     fn gap_load_a(&self, config: &EstimatorConfig, step: &CellStep) -> f64 {
         if is_silent_rest(config, step) {
             return 0.0;
@@ -142,8 +142,8 @@ impl Memory {
         self.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs())
     }
 
-    /// Updates load and rest for the unmeasured time of a step, after its measured time. A gap with a load next to it counts
-    /// as the heaviest usual load.
+    /// Updates load and rest for the unmeasured time of a step, which follows its measured time. A gap with a load before or after it
+    /// counts as the heaviest usual load.
     pub(super) fn pass_gap(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
         self.rest_s = 0.0;
         self.load_a *= libm::exp(-step.unmeasured_s / config.voltage.load_memory_s);
@@ -153,19 +153,19 @@ impl Memory {
         }
     }
 
-    /// Standard deviation of the SOC change during downtime until a voltage has been used; `None` when it is negligible.
+    /// Standard deviation of the SOC change during downtime, until a voltage has been used; `None` if negligible.
     #[inline]
     pub(super) fn downtime_std_if_any(&self) -> Option<f64> {
         (self.downtime_std > NEGLIGIBLE_STD).then_some(self.downtime_std)
     }
 
-    /// A voltage has been used: it has decided what happened.
+    /// Ends the downtime hypotheses: a voltage has resolved them.
     #[inline]
     pub(super) fn end_downtime(&mut self) {
         (self.downtime_std, self.used_prior, self.noted_s, self.is_unseen) = (0.0, 0.0, 0.0, false);
     }
 
-    /// Whether the SOC is still the one from before a downtime or sleep: no voltage has been used since.
+    /// Whether the SOC is from before a downtime or sleep, because no voltage has been used since.
     #[inline]
     pub(super) fn is_carried_over(&self) -> bool {
         self.is_unseen || self.downtime_std_if_any().is_some()
@@ -190,7 +190,7 @@ impl Memory {
         }
     }
 
-    /// Whether the filter must restart: too many consecutive readings were beyond the gate.
+    /// Whether the filter must restart, because too many consecutive readings were beyond the gate.
     #[inline]
     pub(super) fn has_lost_cell(&self, config: &EstimatorConfig) -> bool {
         // One or two readings can be glitches.
@@ -199,8 +199,7 @@ impl Memory {
         long_enough || (self.rejected_after_gap && self.rejected >= 2)
     }
 
-    /// Resets an unusable capacity or resistance to its configured value: the filter would otherwise restart at every
-    /// reading.
+    /// Resets an unusable capacity or resistance to its configured value; otherwise the filter would restart at every reading.
     pub(super) fn reset_unusable(&mut self, config: &EstimatorConfig) {
         let (capacity, log_resistance) = configured(config);
         let is_usable = |x: &ScalarGaussian, bounds: Bounds| {
@@ -248,7 +247,7 @@ impl Memory {
     }
 }
 
-/// Whether the configuration says that the cells rested in the unmeasured time of a step.
+/// Whether, by the configuration, the cells rested in the unmeasured time of a step.
 fn is_silent_rest(config: &EstimatorConfig, step: &CellStep) -> bool {
     // After 5 s without a current the bus counts as silent.
     config.gap.silence_is_rest && step.unmeasured_s > 5.0

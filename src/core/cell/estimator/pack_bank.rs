@@ -1,7 +1,7 @@
-//! The estimators of a pack whose modules may be of different cells: an [`EstimatorBank`] for each kind of cell.
+//! The estimators of a pack whose modules may have different cells: one [`EstimatorBank`] per kind of cell.
 //!
-//! In: one [`CellStep`] per cell and batch, by the cell's place in the pack. Out: as a bank's. All kinds share the current sensor:
-//! what is learned of its offset is of the whole pack.
+//! In: one [`CellStep`] per cell and batch, by the cell's index in the pack. Out: results and estimates per cell, as from a bank.
+//! All kinds share the current sensor, so its offset is learned for the whole pack.
 
 use super::bank::EstimatorBank;
 use super::cell_estimator::CellEstimator;
@@ -10,20 +10,20 @@ use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES};
 use crate::filter::ScalarGaussian;
 use crate::quantity::CellIndex;
 
-/// Cells of a pack that are of another kind than the others: a replaced module.
+/// A replaced module, whose cells are of another kind than the pack's.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CellModule {
     /// The cells, ascending; no cell is in two modules.
     pub cells: Vec<CellIndex>,
-    /// Their model.
+    /// Model of the cells.
     pub model: CellModel,
-    /// Estimator settings: those of the pack, with the initial capacity of this model.
+    /// The pack's estimator settings with the initial capacity of this model.
     pub estimator: EstimatorConfig,
-    /// The model is of a file; if not, of the label.
+    /// The model is from a file, not from the label.
     pub is_given: bool,
 }
 
-/// Where a cell's estimator is.
+/// Place of a cell's estimator.
 #[derive(Debug, Clone, Copy)]
 struct Place {
     bank: usize,
@@ -33,21 +33,21 @@ struct Place {
 /// The estimators of a pack's cells.
 #[derive(Debug, Clone)]
 pub struct PackBank {
-    /// That of the pack's own cells, then one per module.
+    /// The bank of the pack's own cells, then one bank per module.
     banks: Vec<EstimatorBank>,
     /// One per cell of the pack.
     places: Vec<Place>,
     /// The pack's own cells, ascending.
     own: Vec<usize>,
-    /// Per module: its model is of a file.
+    /// Per module: its model is from a file.
     is_given: Vec<bool>,
 }
 
 impl PackBank {
-    /// Estimators of `cells` cells before their first measurement; those in no module are of `model`.
+    /// Estimators of `cells` cells before their first measurement; cells outside the modules have `model`.
     ///
     /// # Panics
-    /// When a module has a cell that the pack does not have.
+    /// If a module has a cell that the pack does not have.
     pub fn new(model: &CellModel, config: &EstimatorConfig, cells: usize, modules: &[CellModule]) -> Self {
         let mut places: Vec<Option<Place>> = vec![None; cells];
         for (bank, module) in (1..).zip(modules) {
@@ -94,28 +94,28 @@ impl PackBank {
         self.places.len()
     }
 
-    /// The cells that are in no module, ascending.
+    /// The cells outside the modules, ascending.
     pub fn own_cells(&self) -> &[usize] {
         &self.own
     }
 
-    /// Whether a cell is in no module.
+    /// Whether a cell is outside the modules.
     #[inline]
     pub fn is_own(&self, cell: usize) -> bool {
         self.places[cell].bank == 0
     }
 
-    /// Model and settings of each kind of cell; the first is the pack's own.
+    /// Model and settings of each kind of cell, the pack's own first.
     pub fn kinds(&self) -> impl Iterator<Item = (&CellModel, &EstimatorConfig)> {
         self.banks.iter().map(|bank| (bank.model(), bank.config()))
     }
 
-    /// Which of the [kinds](Self::kinds) a cell is.
+    /// Index of a cell's [kind](Self::kinds).
     pub fn kind(&self, cell: usize) -> usize {
         self.places[cell].bank
     }
 
-    /// Whether a cell is in a module whose model is of a file.
+    /// Whether a cell is in a module whose model is from a file.
     pub fn has_given_model(&self, cell: usize) -> bool {
         let of_module = self.kind(cell).checked_sub(1).and_then(|module| self.is_given.get(module));
         of_module.copied().unwrap_or(false)
@@ -144,7 +144,7 @@ impl PackBank {
     /// As [`EstimatorBank::add`].
     ///
     /// # Panics
-    /// When there is no such cell.
+    /// If there is no such cell.
     #[inline]
     pub fn add(&mut self, cell: usize, step: &CellStep) {
         let (bank, cell) = self.at_mut(cell);

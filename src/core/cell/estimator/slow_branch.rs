@@ -1,34 +1,33 @@
-//! The slowest branch's resistance beside those of the cell's other parts: a ratio to the model's, learned per cell.
+//! Resistance of the slowest branch relative to the cell's other resistances: a ratio to the model, learned per cell.
 //!
-//! In: the effect of one standard deviation of the ratio on innovations, V, and these, V. Out: the ratio and its standard
-//! deviation. Diffusion and the electrolyte vary from cell to cell and age apart from the contacts and the charge transfer,
-//! which [`LOG_RESISTANCE`](super::state_vector::LOG_RESISTANCE) follows; a slow voltage that is not there is mistaken for
-//! charge.
+//! In: evidence from innovations. Out: the ratio and its standard deviation. Diffusion and the electrolyte vary between cells and
+//! age differently from the contacts and the charge transfer, which
+//! [`LOG_RESISTANCE`](super::state_vector::LOG_RESISTANCE) follows. A wrong slow voltage would be mistaken for charge.
 //!
 //! Source: Friedland (1969), separate estimation of a bias, as for the current's offset ([`crate::health::offset`]). The ratio is
-//! corrected at changes of mode. In a model with one branch, that branch stands for all of them, and its ratio stays 1.
+//! corrected at changes of mode. The branch of a model with one branch covers all time constants; its ratio stays 1.
 
 use serde::{Deserialize, Serialize};
 
 use crate::quantity::InvalidState;
 
-/// Least standard deviation, part of the first one: the ratio changes with temperature and SOC, and no evidence is for good.
+/// Smallest standard deviation, relative to the first one: the ratio changes with temperature and SOC, so evidence does not last.
 const LEAST_PART: f64 = 0.5;
 
-/// Most information of the voltages between two corrections, in that of the ratio's own standard deviation: the model's errors in
-/// them are the same from voltage to voltage, so that many voltages are hardly more than one.
+/// Largest information between two corrections, relative to the information of the ratio's own standard deviation. The model's errors
+/// repeat from voltage to voltage, so many voltages hardly say more than one.
 const MAX_INFORMATION: f64 = 0.3;
 
-/// Least and largest ratio.
+/// Smallest and largest ratio.
 const RANGE: (f64, f64) = (0.05, 3.0);
 
-/// The learned ratio, and the evidence since it was last corrected.
+/// The learned ratio, and the evidence since its last correction.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct SlowBranch {
     /// Voltage of the slowest branch relative to the model's with the cell's resistance ratio.
     pub(super) ratio: f64,
-    /// Its standard deviation relative to the configured one.
+    /// Standard deviation of the ratio, relative to the configured one.
     pub(super) part: f64,
     /// Sum of d^2 / R, with d the effect of one standard deviation on an innovation of variance R without it.
     pub(super) information: f64,
@@ -36,13 +35,13 @@ pub(super) struct SlowBranch {
     pub(super) score: f64,
 }
 
-/// A correction of the ratio, in standard deviations from before.
+/// A correction of the ratio, in standard deviations before the correction.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Correction {
     pub(super) deviations: f64,
-    /// Standard deviation that the evidence leaves, relative to that before.
+    /// Standard deviation after the evidence, relative to the one before.
     pub(super) remains: f64,
-    /// Standard deviation now, relative to that.
+    /// New standard deviation, relative to the one after the evidence.
     pub(super) widened: f64,
 }
 
@@ -53,13 +52,13 @@ impl Default for SlowBranch {
 }
 
 impl SlowBranch {
-    /// Standard deviation of the ratio, with `configured` before any evidence.
+    /// Standard deviation of the ratio; `configured` is the one before any evidence.
     #[inline]
     pub(super) fn std(&self, configured: f64) -> f64 {
         self.part * configured
     }
 
-    /// Corrects the ratio by the evidence, which is then used; `None` when there is none.
+    /// Corrects the ratio by the evidence and clears the evidence; `None` without evidence.
     pub(super) fn correct(&mut self, configured: f64) -> Option<Correction> {
         let (information, score) = (self.information, self.score);
         (self.information, self.score) = (0.0, 0.0);
@@ -67,7 +66,7 @@ impl SlowBranch {
         if !(information > 0.0 && information.is_finite() && score.is_finite() && std > 0.0) {
             return None;
         }
-        // Beyond two standard deviations of what is to be expected something else is wrong.
+        // Beyond two standard deviations of the expectation, something else is wrong.
         let most = 2.0 * (information * (1.0 + information)).sqrt();
         let counted = information.min(MAX_INFORMATION) / information;
         let (information, score) = (counted * information, counted * score.clamp(-most, most));
@@ -109,7 +108,7 @@ mod tests {
     fn evidence_corrects_the_ratio_once_and_leaves_a_least_deviation() {
         let mut slow = SlowBranch { information: 0.25, score: -0.25, ..SlowBranch::default() };
         let correction = slow.correct(0.4).expect("evidence");
-        // A quarter of the prior's information says one deviation: a fifth of it.
+        // Evidence for one deviation with a quarter of the prior's information moves the ratio by a fifth of a deviation.
         assert!((correction.deviations + 0.2).abs() < 1e-12, "{correction:?}");
         assert!((correction.remains - 0.8_f64.sqrt()).abs() < 1e-12 && correction.widened == 1.0, "{correction:?}");
         assert!((slow.ratio - 0.92).abs() < 1e-12, "{slow:?}");

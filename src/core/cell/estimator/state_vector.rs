@@ -5,7 +5,7 @@
 use crate::filter::ScalarGaussian;
 pub(super) use crate::filter::square;
 
-/// Variance of a known value: small against any noise, large against rounding.
+/// Variance of a known value: smaller than any noise, larger than rounding errors.
 pub(super) const KNOWN_VARIANCE: f64 = 1e-12;
 
 /// Variance of an unknown SOC: uniform over 0 to 1.
@@ -18,32 +18,32 @@ pub(super) const CAPACITY: usize = 2;
 /// Index of the first branch voltage in the state.
 pub(super) const BRANCHES: usize = 3;
 
-/// A SOC variance grown by `by`, at most to that of an unknown SOC.
+/// A SOC variance grown by `by`, at most to the variance of an unknown SOC.
 #[inline]
 pub(super) fn widened(variance: f64, by: f64) -> f64 {
     variance.max((variance + by).min(UNKNOWN_SOC_VARIANCE))
 }
 
-/// A state of charge that a cell can have: what lies beyond empty or full is an error of the model.
+/// Limits a state of charge to empty and full: anything beyond is an error of the model.
 #[inline]
 pub(super) fn within_bounds(soc: ScalarGaussian) -> ScalarGaussian {
     ScalarGaussian { mean: soc.mean.clamp(0.0, 1.0), ..soc }
 }
 
-/// Number of constant errors whose effect is followed.
+/// Number of constant errors whose effect the filter follows.
 pub(super) const CONSTANT_ERRORS: usize = 7;
-/// The first of them are considered in the weight of a measurement.
+/// Number of constant errors, the first ones, that the gain considers.
 pub(super) const CONSIDERED: usize = 4;
 
-/// Index of the voltage sensor's offset among the constant errors: measured less true.
+/// Index of the voltage sensor's offset among the constant errors: measured minus true.
 pub(super) const VOLTAGE_OFFSET: usize = 0;
-/// Index of the current sensor's offset: measured less true.
+/// Index of the current sensor's offset: measured minus true.
 pub(super) const CURRENT_OFFSET: usize = 1;
-/// Index of the current sensor's gain error: measured over true, less 1.
+/// Index of the current sensor's gain error: measured over true, minus 1.
 pub(super) const CURRENT_GAIN: usize = 2;
-/// Index of the error of the slowest branch's ratio ([`super::slow_branch`]): true less estimated.
+/// Index of the error of the slowest branch's ratio ([`super::slow_branch`]): true minus estimated.
 pub(super) const SLOW_BRANCH: usize = 3;
-/// Index of the error of the open-circuit curve's capacity: that of the curve less the true one.
+/// Index of the error of the open-circuit curve's capacity: the curve's minus the true one.
 pub(super) const CURVE_CAPACITY: usize = 4;
-/// Index of the first mix of losses that may be other than assumed.
+/// Index of the first uncertain mix of losses.
 pub(super) const CURVE_MIXES: usize = 5;

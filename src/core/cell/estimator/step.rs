@@ -1,19 +1,19 @@
 //! Input and outcome of one step of the estimator.
 
-/// A voltage reading, and charge and time since the reading before.
+/// A voltage reading, with charge and time since the previous reading.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CellStep {
     /// Time with a measured current, s.
     pub measured_s: f64,
     /// Charge taken out in that time, A s.
     pub charge_as: f64,
-    /// Part of that time in which the current sensor's offset is in the charge, s: a reading of exactly zero has none.
+    /// Part of that time in which the charge contains the current sensor's offset, s: readings of exactly zero have no offset.
     pub offset_s: f64,
     /// Time without a current measurement, s (asleep, sensor lost).
     pub unmeasured_s: f64,
-    /// Cell current at the reading, A; `None` = unknown, then the voltage is not used.
+    /// Cell current at the reading, A; `None` = unknown; the voltage is then not used.
     pub current_a: Option<f64>,
-    /// Cell temperature, degrees C; `None` = unknown, then the thermal model predicts it.
+    /// Cell temperature, degrees C; `None` = unknown; the thermal model then predicts it.
     pub temperature_c: Option<f64>,
     /// Temperature of the surroundings for the thermal model, degrees C.
     pub ambient_c: f64,

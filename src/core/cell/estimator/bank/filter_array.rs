@@ -1,6 +1,6 @@
 //! The filters of a pack with one number of branches, in blocks of [`WIDTH`] lanes, and the steps of a batch over them.
 //!
-//! In: inputs of the blocks. Out: moved states and results; cells whose step the kernel did not make stay in `others`.
+//! In: inputs of the blocks. Out: moved states and results; steps that were not ordinary are added to `others`.
 
 use std::array::from_fn;
 
@@ -45,7 +45,7 @@ macro_rules! each_array {
 }
 pub(super) use each_array;
 
-/// The last step time, s, with its decay factors: readings mostly arrive at one interval.
+/// The last step time, s, with its decay factors, because most readings arrive at one interval.
 #[derive(Debug, Clone)]
 struct StepTime {
     time_s: f64,
@@ -85,12 +85,12 @@ impl<const N: usize, const T: usize, const W: usize> pulp::WithSimd for BatchSte
 }
 
 impl<const N: usize, const T: usize, const W: usize> BatchStep<'_, N, T, W> {
-    /// Makes the steps. Without wide instructions the same kernel steps the lanes one by one, with the same bits.
+    /// Makes the steps. Without wide instructions, the same kernel steps the lanes one by one and gives the same bits.
     #[inline(always)]
     pub(super) fn run<const WIDE: bool>(self) {
         self.lanes.step::<WIDE>(self.constants, self.inputs, self.cells, self.results);
         for (block, input) in self.inputs.iter_mut().enumerate().filter(|(_, input)| input.is_present.any()) {
-            // The input was ordinary, but the kernel's outcome was not usable.
+            // The input was ordinary, but the outcome was not usable.
             for lane in 0..WIDTH {
                 if input.is_present.lane(lane) {
                     input.is_present.set_lane(lane, false);
@@ -104,7 +104,7 @@ impl<const N: usize, const T: usize, const W: usize> BatchStep<'_, N, T, W> {
 impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
     pub(super) fn new(model: &CellModel, blocks: usize) -> Self {
         let zero = Lanes::splat(0.0);
-        // Every lane can be stepped, even one without a cell.
+        // The kernel can step every lane, including lanes without a cell.
         let mut covariance = [zero; T];
         (0..N).for_each(|i| covariance[at(i, i)] = Lanes::splat(1.0));
         let mut mean = [zero; N];
@@ -120,7 +120,7 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         }
     }
 
-    /// Steps every block that has inputs. Cells whose steps were made are no longer present afterwards.
+    /// Steps every block with inputs. Clears `is_present` of each cell that made its step.
     #[inline(always)]
     fn step<const WIDE: bool>(
         &mut self,
@@ -163,7 +163,7 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         }
     }
 
-    /// The first of the cells with the lowest and of those with the highest SOC.
+    /// Indices of the cells with the lowest and the highest SOC; the first of several.
     pub(super) fn extremes(&self, cells: usize) -> Option<(usize, usize)> {
         let all = self.blocks.iter().flat_map(|state| state.mean[0].0).take(cells).enumerate();
         let first = all.clone().next()?;

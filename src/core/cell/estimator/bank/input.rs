@@ -1,7 +1,6 @@
 //! Inputs of the cells of a block, and the results of their steps.
 //!
-//! In: steps, lane by lane (V, A, s, degrees C). Out: the kernel's inputs, or the original step where the kernel's outcome
-//! is not usable.
+//! In: steps, lane by lane (V, A, s, degrees C). Out: the kernel's inputs, or the original step if the outcome is not usable.
 
 use super::kernel::{DecayFactors, StepInput, StepOutcome};
 use crate::cell::estimator::memory::Memory;
@@ -14,13 +13,13 @@ pub(super) const WIDTH: usize = 8;
 /// State of a cell in addition to its lane.
 #[derive(Debug, Clone)]
 pub(super) struct CellSlot {
-    /// Load, consistency, information and rest are in the lane, not here.
+    /// The lane holds the present load, consistency, information, rest and evidence; the values here are stale.
     pub(super) memory: Memory,
     pub(super) has_filter: bool,
 }
 
 impl CellSlot {
-    /// Whether a step that measured the current all the time can be an ordinary one.
+    /// Whether a step with a continuously measured current can be ordinary.
     #[inline]
     pub(super) fn is_ordinary(&self) -> bool {
         self.has_filter
@@ -64,8 +63,8 @@ impl BlockInput {
         },
     };
 
-    /// Gives lanes without a step the time of the others, so that one set of decay factors serves all. Their results are
-    /// discarded.
+    /// Copies the step time of another lane into lanes without a step, so that one set of decay factors serves all. Their results
+    /// are discarded.
     #[inline(always)]
     pub(super) fn fill_absent(&mut self) {
         if !self.is_present.all() {
@@ -85,7 +84,7 @@ impl BlockInput {
             unmeasured_s: 0.0,
             current_a: Some(input.current_a.0[lane]),
             temperature_c: Some(input.temperature_c.0[lane]),
-            // Not used where the temperature is known.
+            // Unused, because the temperature is known.
             ambient_c: input.temperature_c.0[lane],
             voltage_v: input.voltage_v.0[lane],
         }

@@ -1,19 +1,19 @@
 //! The ordinary step of L cells at once: predict over a measured time, update with a voltage that passes the gate.
 //!
 //! The filter of [`estimator`](crate::cell::estimator) with the circuit of [`crate::cell::circuit`], to rounding.
-//! It saves the following work, all exactly:
-//! * With the points in pairs x +- s L_k (s = sqrt(N + lambda)) and f's odd and even parts over each pair, o_k = (f+ - f-) / 2s
-//!   and e_k = ((f+ + f-) / 2 - f0) / s, the weighted sums become f0 + m with m = sum e_k / s for the mean, and
-//!   sum (o_k o_k' + e_k e_k') plus beta - alpha^2 times m m' for the covariance. For a pair moved by a linear map, o_k is
-//!   its image and e_k = 0.
-//! * The state is ordered so that only the first three columns of the Cholesky factor L move states in which the circuit
-//!   is not linear. The columns of the branches add up to P less the first three columns: they are never computed.
-//! * SOC differs in one pair only, so each phase looks up the tables at three places instead of 2 N + 1.
-//! * A cell's lines of the tables are cached from step to step: [`LineCache`].
+//! It saves work by exact rearrangements:
+//! * Points come in pairs x +- s L_k (s = sqrt(N + lambda)). With f's odd and even parts over each pair, o_k = (f+ - f-) / 2s and
+//!   e_k = ((f+ + f-) / 2 - f0) / s, the weighted sums become f0 + m with m = sum e_k / s for the mean, and
+//!   sum (o_k o_k' + e_k e_k') plus beta - alpha^2 times m m' for the covariance. For a pair that a linear map moves, o_k is the
+//!   pair's image and e_k = 0.
+//! * The order of the states lets only the first three columns of the Cholesky factor L move nonlinear states. The columns of the
+//!   branches add up to P minus the first three columns, and are never computed.
+//! * Only one pair has a different SOC, so each phase reads the tables at three points instead of 2 N + 1.
+//! * The lines of the tables are cached from step to step: [`LineCache`].
 //! * exp(x + d) = exp(x) exp(d), and exp(-2x) = exp(-x)^2 for the branches' noise.
 //!
 //! In: states, and for each the charge, time, current, temperature and voltage. Out: the new states, and a mask of
-//! the usable ones: all numbers finite, the covariance positive definite, the reading within the gate.
+//! usable states: all numbers finite, the covariance positive definite, the reading within the gate.
 #![expect(clippy::needless_range_loop, reason = "indices of states say more than iterators over parts of a matrix")]
 
 mod points;
@@ -74,7 +74,7 @@ pub(super) fn has_variances<const L: usize, const N: usize, const T: usize>(
     sum.is_finite() & least.above_number(0.0)
 }
 
-/// Whether the state is one that a cell can have, and its sums can be stored; see `Gaussian::is_possible`.
+/// Whether a cell can have the state, and its evidence can be stored; see `Gaussian::is_possible`.
 #[inline(always)]
 fn is_possible<const L: usize, const N: usize, const T: usize>(x: &FilterState<L, N, T>) -> Mask<L> {
     let within = |value: Lanes<L>, bounds: Bounds| {

@@ -15,7 +15,7 @@ use crate::cell::estimator::step::{CellStep, Update};
 use crate::filter::simd::Lanes;
 use crate::quantity::bounds;
 
-/// The kernel for one cell. Its steps have a temperature.
+/// The kernel for one cell. Every step must have a temperature.
 pub(in crate::cell::estimator) struct SingleCell<'a> {
     filters: &'a mut FilterArrays,
     constants: &'a KernelConstants,

@@ -1,12 +1,12 @@
 //! A cell model's tables in the form the kernel reads.
 //!
-//! Each interval of SOC has one row with the line of every quantity (value at SOC 0 and slope), so that one position gives
-//! all of them without a division. Temperatures change slowly and are shared by cells: the rows of a temperature are
-//! computed once and stay until their room is needed ([`MAX_ISOTHERMS`]). A cell stays in its interval for thousands of
-//! steps: its lines are cached lane by lane ([`LineCache`]), and a look-up is one comparison. Cached values depend on
-//! temperature, SOC and capacity alone, so results do not depend on the state of the cache.
+//! Each SOC interval has one row with the line of every quantity (value at SOC 0 and slope), so one position gives all quantities
+//! without a division. Temperatures change slowly and several cells share them: the rows of a temperature are computed once and
+//! stay until their slot is needed ([`MAX_ISOTHERMS`]). A cell stays in its interval for thousands of steps: its lines are cached
+//! lane by lane ([`LineCache`]), and a look-up is one comparison. Cached values depend only on temperature, SOC and capacity, so
+//! results do not depend on the state of the cache.
 //!
-//! In: states of charge, degrees C. Out: V, ohm, s. A NaN gives NaN in its own lane alone: such a step is not usable.
+//! In: states of charge, degrees C. Out: V, ohm, s. A NaN gives NaN in its own lane only; such a step is not usable.
 
 use crate::cell::aged_ocv::{MIXES, OffsetLine};
 use crate::cell::model::CellModel;
@@ -14,16 +14,16 @@ use crate::filter::simd::Lanes;
 
 /// Index of the open-circuit voltage, V, in a row. The slope of every quantity (per unit of SOC) follows its value.
 pub(super) const OCV_V: usize = 0;
-/// Index of its change with the capacity, V per Ah; 0 where the curve does not age. Those by the mixes of losses follow.
+/// Index of the voltage's change with the capacity, V per Ah; 0 if the curve does not age. The changes by the mixes of losses follow.
 pub(super) const OCV_PER_AH: usize = 2;
 /// Index of the series resistance, ohm.
 pub(super) const R0_OHM: usize = OCV_PER_AH + 2 + 2 * MIXES;
-/// Index of the voltage error, V; 0 where the model has none.
+/// Index of the voltage error, V; 0 if the model states none.
 pub(super) const ERROR_V: usize = R0_OHM + 2;
 /// Index of the first branch's resistance, ohm; its time constant, s, follows, then the next branch.
 const BRANCHES: usize = ERROR_V + 2;
 
-/// Temperatures with cached rows: more than packs have sensors. Beyond that, rows are computed again with equal results.
+/// Number of temperatures with cached rows: more than a pack has sensors. Further temperatures are computed again, with equal results.
 const MAX_ISOTHERMS: usize = 64;
 
 /// Index of the resistance of branch `i`; its time constant follows.
@@ -37,8 +37,8 @@ pub(super) struct Tables<const W: usize> {
     model: CellModel,
     /// Borders between intervals of SOC; the outer intervals are unbounded.
     borders: Vec<f64>,
-    /// Rows at the model's temperatures, temperature by temperature; the highest one twice, so that each has an upper
-    /// neighbour.
+    /// Rows at the model's temperatures, temperature by temperature. The highest temperature is stored twice, so that each has an
+    /// upper neighbour.
     nodes: Vec<[f64; W]>,
     /// Rows at `temperatures_c`.
     rows: Vec<[f64; W]>,
@@ -68,7 +68,7 @@ struct CachedLines<const L: usize, const W: usize> {
     /// Upper ends of the intervals.
     to: Lanes<L>,
     row: [Lanes<L>; W],
-    /// The part of the open-circuit voltage's line, in `row` too, that follows from the capacity.
+    /// The part of the open-circuit voltage's line that follows from the capacity; `row` includes it.
     offset_v: [Lanes<L>; 2],
 }
 
@@ -146,7 +146,7 @@ impl<const W: usize> Tables<W> {
         self.borders[1..self.intervals()].iter().filter(|&&border| soc >= border).count()
     }
 
-    /// Brings the lines of `cache` to these temperatures.
+    /// Updates the lines of `cache` to these temperatures.
     #[inline(always)]
     pub(super) fn refresh_temperatures<const L: usize>(
         &mut self,
@@ -172,7 +172,7 @@ impl<const W: usize> Tables<W> {
         }
     }
 
-    /// Brings the lines of `cache` to the open-circuit curves of these capacities, Ah. They change at half-cycles.
+    /// Updates the lines of `cache` to the open-circuit curves of these capacities, Ah, which change at half-cycles.
     #[inline(always)]
     pub(super) fn refresh_capacities<const L: usize>(&mut self, cache: &mut LineCache<L, W>, capacity_ah: &Lanes<L>) {
         let same = (0..L).fold(true, |same, lane| same & (cache.capacity_ah[lane] == capacity_ah.0[lane]));
@@ -234,7 +234,7 @@ impl<const W: usize> Tables<W> {
         }
     }
 
-    /// Brings what follows from a lane's capacity, Ah, to its interval. [`Self::copy`] adds it to the open-circuit voltage.
+    /// Updates the lines that follow from a lane's capacity, Ah. [`Self::copy`] adds them to the open-circuit voltage.
     fn age<const L: usize>(&self, capacity_ah: f64, lines: &mut CachedLines<L, W>, lane: usize) {
         let OffsetLine { offset_v, per_ah_v, mixes_v } =
             self.model.aged_ocv.line(&self.model.soc, lines.interval[lane], capacity_ah);
@@ -246,7 +246,7 @@ impl<const W: usize> Tables<W> {
         }
     }
 
-    /// Copies the lines of a lane's interval into the cache, at an isotherm.
+    /// Copies the lines of a lane's interval at an isotherm into the cache.
     fn copy<const L: usize>(&self, isotherm: usize, lines: &mut CachedLines<L, W>, lane: usize) {
         let row = &self.rows[isotherm * self.intervals() + lines.interval[lane]];
         for k in 0..2 {
@@ -277,7 +277,7 @@ impl<const L: usize, const W: usize> LineCache<L, W> {
 }
 
 impl<const L: usize, const W: usize> CachedLines<L, W> {
-    /// Whether the lines are those of a lane's state of charge.
+    /// Whether the lines hold at a lane's state of charge.
     #[inline(always)]
     fn holds(&self, soc: &Lanes<L>, lane: usize) -> bool {
         (soc.0[lane] >= self.from.0[lane]) & (soc.0[lane] < self.to.0[lane])

@@ -1,7 +1,7 @@
 //! Sigma points in pairs: columns of the Cholesky factor, and odd and even parts of a function over each pair.
 //!
-//! In: covariances. Out: columns, resistance ratios, odd and even parts (see [`super`]), in the units of the states. NaN
-//! where the covariance has no factor.
+//! In: covariances. Out: columns, resistance ratios, odd and even parts (see [`super`]), in the units of the states. NaN if the
+//! covariance has no factor.
 
 use super::types::{KernelConstants, at};
 use crate::cell::estimator::state_vector::LOG_RESISTANCE;
@@ -49,8 +49,8 @@ struct CholeskyColumn<const L: usize, const N: usize> {
 }
 
 impl<const L: usize, const N: usize> CholeskyColumn<L, N> {
-    /// Column K, from those before it, without waiting for their square roots. NaN where there is no factor; it
-    /// propagates into every result.
+    /// Column K from the columns before it, without waiting for their square roots. NaN if there is no factor; the NaN propagates
+    /// into every result.
     #[inline(always)]
     fn new<const T: usize, const K: usize>(covariance: &[Lanes<L>; T], done: [&Self; K]) -> Self {
         let mut left = [Lanes::splat(0.0); N];
@@ -92,7 +92,7 @@ fn is_positive<const L: usize, const N: usize>(rest: &[[Lanes<L>; N]; N]) -> Mas
     positive
 }
 
-/// Resistance ratios of the sigma points relative to the centre's: those of the first two pairs differ from it.
+/// Resistance ratios of the sigma points relative to the centre. Only the first two pairs differ from it.
 pub(super) struct ResistanceRatios<const L: usize> {
     /// Factor of the first pair's plus and minus point.
     pub(super) first: [Lanes<L>; 2],

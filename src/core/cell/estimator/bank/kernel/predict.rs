@@ -1,7 +1,7 @@
 //! The prediction: the circuit's equations over a measured time.
 //!
-//! In: the state before, charge (A s) and time (s). Out: mean and covariance after it, in the units of the states, and
-//! where the covariance before was positive definite.
+//! In: a state, charge (A s) and time (s). Out: mean and covariance after the time, in the units of the states, and a mask of the
+//! lanes whose covariance was positive definite.
 
 use super::points::{COLUMNS, OddEvenParts, PartialCholesky, ResistanceRatios, sum};
 use super::types::{FilterState, KernelConstants, StepInput, at};
@@ -11,7 +11,7 @@ use crate::cell::estimator::state_vector::{
 };
 use crate::filter::simd::{Lanes, Mask};
 
-/// Longest time of the resistance's random walk between two readings, s: it does not age in a gap.
+/// Longest time of the resistance's random walk between two readings, s: a cell does not age in a gap.
 const MAX_WALK_S: f64 = 600.0;
 
 /// A branch at L table points, over the measured time.
@@ -36,15 +36,15 @@ impl<const L: usize> BranchStep<L> {
         Self { r_ohm, tau_s, decay, exact }
     }
 
-    /// Voltage of a branch that starts at `u`, under a current that would settle a new cell's branch at `r_ohm` x `drive`.
+    /// Voltage of a branch that starts at `u`, under a current that settles a new cell's branch at `r_ohm` x `drive`.
     #[inline(always)]
     fn voltage_v(&self, drive: Lanes<L>, u: Lanes<L>) -> Lanes<L> {
         self.r_ohm * drive * (Lanes::splat(1.0) - self.decay) + u * self.decay
     }
 }
 
-/// Effect of a discharge of `charge_ah` on the SOC: the loss at the centre, and the parts over the pairs, linear except for
-/// the charge over the capacity.
+/// Effect of a discharge of `charge_ah` on the SOC: the loss at the centre, and the parts over the pairs. Linear except for the
+/// charge over the capacity.
 #[inline(always)]
 fn soc_parts<const L: usize, const N: usize>(
     c: &KernelConstants,
@@ -76,8 +76,8 @@ struct BranchPrediction<const L: usize> {
     parts: OddEvenParts<L>,
 }
 
-/// Predicts branch `i` under a current that would settle a new cell's at its resistance times `drive`: the pair of the
-/// first column has other table points, that of the second another resistance.
+/// Predicts branch `i` under a current that settles a new cell's branch at its resistance times `drive`. The pair of the first column
+/// has other table points, the pair of the second column another resistance.
 #[inline(always)]
 fn predict_branch<const L: usize, const N: usize, const W: usize>(
     c: &KernelConstants,
@@ -164,7 +164,7 @@ pub(in crate::cell::estimator::bank) fn predict<const L: usize, const N: usize, 
         p[at(i, CAPACITY)] = sum(capacity_column, odd);
         for j in BRANCHES..=i {
             let (other, other_decay) = &done[j];
-            // All columns beyond the second are moved by the same factor.
+            // One factor moves all columns beyond the second.
             let others = x.covariance[at(i, j)] - l[0][i] * l[0][j] - l[1][i] * l[1][j];
             p[at(i, j)] = odd[0] * other.odd[0]
                 + odd[1] * other.odd[1]

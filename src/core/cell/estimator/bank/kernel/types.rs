@@ -39,20 +39,20 @@ pub(in crate::cell::estimator::bank) const INFORMATION_S: usize = 2;
 pub(in crate::cell::estimator::bank) const REST_S: usize = 3;
 /// Information about the current's offset.
 pub(in crate::cell::estimator::bank) const OFFSET_INFORMATION: usize = 4;
-/// What it says.
+/// Evidence about the current's offset.
 pub(in crate::cell::estimator::bank) const OFFSET_SCORE: usize = 5;
 /// Capacity of the open-circuit curve, Ah. No step changes it.
 pub(in crate::cell::estimator::bank) const CURVE_AH: usize = 6;
-/// Its standard deviation, Ah. No step changes it.
+/// Standard deviation of the curve's capacity, Ah. No step changes it.
 pub(in crate::cell::estimator::bank) const CURVE_STD_AH: usize = 7;
 
 /// Information about the ratio of the slowest branch.
 pub(in crate::cell::estimator::bank) const SLOW_INFORMATION: usize = 8;
-/// What it says.
+/// Evidence about the ratio of the slowest branch.
 pub(in crate::cell::estimator::bank) const SLOW_SCORE: usize = 9;
-/// Ratio of the slowest branch's resistance to the model's, beside the others. No step changes it.
+/// Ratio of the slowest branch's resistance to the model's. No step changes it.
 pub(in crate::cell::estimator::bank) const SLOW_RATIO: usize = 10;
-/// Its standard deviation. No step changes it.
+/// Standard deviation of the ratio. No step changes it.
 pub(in crate::cell::estimator::bank) const SLOW_STD: usize = 11;
 
 /// Index of the covariance of `i` and `j` <= `i`.
@@ -76,11 +76,11 @@ pub(in crate::cell::estimator::bank) struct StepInput<const L: usize> {
 /// Decay factors of a step time.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::cell::estimator::bank) struct DecayFactors<const L: usize> {
-    /// Of the load's low-pass.
+    /// Decay of the load's low-pass.
     pub(super) load: Lanes<L>,
-    /// Of the consistency monitor.
+    /// Decay of the consistency monitor.
     pub(super) consistency: Lanes<L>,
-    /// 1 / time, 1/s; 0 where no time passed.
+    /// 1 / time, 1/s; 0 if no time passed.
     pub(super) per_s: Lanes<L>,
 }
 
@@ -152,7 +152,7 @@ pub(in crate::cell::estimator::bank) struct ProcessVariances {
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct ReadingVariances {
     pub(super) sensor: f64,
-    /// One-second variance of the model's error, where the tables state none.
+    /// One-second variance of the model's error, if the tables state none.
     pub(super) model: f64,
     /// Per square of the voltage drop, over one second.
     pub(super) drop: f64,

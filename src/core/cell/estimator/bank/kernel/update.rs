@@ -1,7 +1,7 @@
 //! The measurement update.
 //!
-//! In: the state before it, and the reading, V. Out: the state after it, innovation, V, its variance, V^2, and the test
-//! ratio, which is 1 for an innovation of one standard deviation. A lane outside the gate is marked as not usable.
+//! In: a state and the reading, V. Out: the updated state, the innovation, V, its variance, V^2, and the test ratio, which is 1 for
+//! an innovation of one standard deviation. Masks mark usable lanes and lanes within the gate.
 
 use super::points::{COLUMNS, OddEvenParts, PartialCholesky, ResistanceRatios};
 use super::types::{
@@ -25,15 +25,15 @@ struct PredictedVoltage<const L: usize> {
     parts: OddEvenParts<L>,
     /// Slope of the open-circuit voltage, V per unit of SOC.
     slope_v: Lanes<L>,
-    /// Changes of that voltage with the capacity, V per Ah, and by the mixes of losses, V.
+    /// Changes of the open-circuit voltage with the capacity, V per Ah, and by the mixes of losses, V.
     changes_v: [Lanes<L>; 1 + MIXES],
     /// Present voltage drop in the cell, V.
     lost_v: Lanes<L>,
     /// Series resistance, ohm.
     r0_ohm: Lanes<L>,
-    /// Standard deviation of the model's error over one second, squared.
+    /// Variance of the model's error over one second, V^2.
     base_variance: Lanes<L>,
-    /// Resistance of new cells once every branch has settled, ohm.
+    /// Resistance of new cells after all branches have settled, ohm.
     settled_ohm: Lanes<L>,
 }
 
@@ -85,7 +85,7 @@ impl<const L: usize> PredictedVoltage<L> {
     }
 }
 
-/// A part of branch `i`'s voltage as it counts in the cell's: that of the slowest with its ratio.
+/// Contribution of a part of branch `i`'s voltage to the cell's voltage; the slowest branch counts with its ratio.
 #[inline(always)]
 fn weighed<const L: usize, const N: usize, const T: usize>(
     x: &FilterState<L, N, T>,
@@ -95,7 +95,7 @@ fn weighed<const L: usize, const N: usize, const T: usize>(
     if i == N - 1 { part_v * x.memory[SLOW_RATIO] } else { part_v }
 }
 
-/// Effect of one standard deviation of each constant error on the voltage less its prediction, V.
+/// Effect of one standard deviation of each constant error on the innovation, V.
 #[inline(always)]
 fn by_constant<const L: usize, const N: usize, const T: usize>(
     c: &KernelConstants,
