@@ -87,7 +87,7 @@ mod tests {
     use crate::cell::model::tests::small_model;
 
     #[test]
-    fn exact_branch_is_independent_of_the_step_and_euler_converges_to_it() {
+    fn exact_branch_is_independent_of_step_size() {
         let model = small_model();
         let position = model.grid_position(0.5, 0.0);
         let branch = BranchAt::new(&model, 0, &position, 1.5);
@@ -100,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn temperature_settles_at_ambient_plus_losses_times_resistance() {
+    fn temperature_settles_at_losses_times_resistance() {
         let thermal = small_model().thermal.expect("has one");
         let t = temperature_after(&thermal, 20.0, 20.0, 1.0, 1e6);
         assert!((t - 28.0).abs() < 1e-9);

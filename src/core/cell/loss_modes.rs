@@ -74,7 +74,7 @@ mod tests {
     }
 
     #[test]
-    fn losses_of_a_known_capacity_are_those_of_the_electrodes_and_vary_with_the_shares() {
+    fn losses_match_electrodes_and_shares() {
         for part in [0.95, 0.8, 0.7] {
             let found = losses(ScalarGaussian::from_std(part * NEW_AH, 0.0)).expect("known");
             assert!((found.lithium.mean - lithium(part, 0.3, 0.3)).abs() < 1e-9, "{found:?}");
@@ -108,7 +108,7 @@ mod tests {
     }
 
     #[test]
-    fn an_uncertain_capacity_widens_every_loss() {
+    fn uncertain_capacity_widens_all_losses() {
         let [sure, vague] = [0.0, 0.2].map(|std_ah| losses(ScalarGaussian::from_std(4.0, std_ah)).expect("known"));
         let slope = (lithium(0.85, 0.3, 0.3) - lithium(0.8, 0.3, 0.3)) / 0.05;
         let least = slope.abs() * 0.2 / NEW_AH;
@@ -118,14 +118,14 @@ mod tests {
     }
 
     #[test]
-    fn a_cell_above_its_new_capacity_has_lost_nothing_and_is_no_more_certain_than_its_capacity() {
+    fn cell_above_new_capacity_has_no_losses() {
         let found = losses(ScalarGaussian::from_std(5.1, 0.1)).expect("known");
         assert_eq!((found.lithium.mean, found.negative.mean, found.positive.mean), (0.0, 0.0, 0.0));
         assert!(found.lithium.std() > 0.01 && found.negative.std() > 0.005, "{found:?}");
     }
 
     #[test]
-    fn without_electrodes_or_below_the_last_known_cell_losses_are_unknown() {
+    fn losses_are_unknown_outside_the_table() {
         let capacity = ScalarGaussian::from_std(4.0, 0.1);
         assert_eq!(LossModes::of_capacity(&AgedOcv::default(), NEW_AH, capacity), None);
         let rows = [vec![3.0, 3.6, 4.1]];

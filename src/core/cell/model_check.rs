@@ -268,13 +268,13 @@ mod tests {
     }
 
     #[test]
-    fn resistance_and_voltages_of_another_cell_are_a_mismatch_within_half_an_hour() {
+    fn other_cell_mismatches_within_half_an_hour() {
         assert!(after(1800, 0.65, |_| 0.02).is_mismatched());
         assert!(after(1800, 1.6, |soc| 0.15 * (soc - 0.65)).is_mismatched());
     }
 
     #[test]
-    fn one_witness_alone_is_no_mismatch() {
+    fn single_witness_does_not_mismatch() {
         let aged = after(3600, 1.8, |_| 0.0);
         assert!(!aged.is_mismatched() && !aged.is_open(), "{aged:?}");
         let local = after(3600, 1.0, |_| 0.03);
@@ -282,7 +282,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mismatch_lasts_until_a_window_passes_and_a_cell_that_has_passed_does_not_become_another() {
+    fn mismatch_lasts_until_a_window_passes() {
         let mut check = after(1800, 0.6, |_| 0.03);
         let judge_an_hour = |check: &mut ModelCheck, innovation, log_resistance| {
             let update = Update { innovation, innovation_variance: 0.09, test_ratio: 0.0, accepted: true };
@@ -301,7 +301,7 @@ mod tests {
     }
 
     #[test]
-    fn another_model_is_checked_anew_and_a_state_without_a_check_is_not() {
+    fn new_model_restarts_the_check() {
         let found = ModelCheck { model: 1, ..after(1800, 0.6, |_| 0.03) };
         assert_eq!((found.or_new(1), found.or_new(2)), (found, ModelCheck::new(2)));
         assert_eq!(ModelCheck::ended().or_new(2), ModelCheck::ended());
@@ -321,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn the_sums_explain_what_the_score_test_does() {
+    fn sums_match_the_score_test() {
         let readings: Vec<[f64; 3]> = (0..90)
             .map(f64::from)
             .map(|i| [0.8 - 0.004 * i, 0.03 + 0.02 * (0.3 * i).sin(), 1e-4 * (1.0 + i)])
@@ -341,7 +341,7 @@ mod tests {
 
     /// A delta of the store keeps 20 bits of a number.
     #[test]
-    fn rounded_sums_of_a_soc_that_hardly_changes_are_accepted_and_explain_as_much() {
+    fn rounded_sums_keep_their_evidence() {
         let mut sums = VoltageSums::default();
         for i in 0..360 {
             sums.add(0.2 + 1e-7 * f64::from(i), 0.002, 1e-7);
@@ -359,7 +359,7 @@ mod tests {
     }
 
     #[test]
-    fn rest_gaps_rejected_and_unusable_readings_are_no_evidence() {
+    fn rests_gaps_and_outliers_are_not_evidence() {
         let update = Update { innovation: 0.1, innovation_variance: 0.01, test_ratio: 0.0, accepted: true };
         let good = ModelEvidence { update, soc: 0.5, log_resistance: 1.0, log_resistance_std: 0.2 };
         let mut check = ModelCheck::default();

@@ -166,7 +166,7 @@ mod tests {
     use crate::cell::{Chemistry, Label};
 
     #[test]
-    fn a_model_is_no_different_from_itself() {
+    fn model_equals_itself() {
         for model in [small_model(), Label::usual(Chemistry::LfpGraphite, 100.0).model().expect("a model")] {
             let found = ModelComparison::new(&model, &model);
             assert_eq!((found.curve.rms, found.capacity), (0.0, 0.0));
@@ -180,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn a_raised_curve_and_doubled_resistances_are_stated_in_volts_percent_and_soc() {
+    fn raised_curve_and_resistances_are_reported() {
         let first = small_model();
         let mut second = first.clone();
         second.ocv_v.values.iter_mut().flatten().for_each(|v| *v += 0.012);
@@ -198,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn cells_of_different_size_are_compared_per_capacity() {
+    fn sizes_are_compared_per_capacity() {
         let of = |rated_ah: f64| Label::usual(Chemistry::NcaGraphite, rated_ah).model().expect("a model");
         let found = ModelComparison::new(&of(2.9), &of(60.0));
         assert!(found.capacity > 19.0);

@@ -30,7 +30,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn values_lie_on_the_line_between_two_breakpoints_and_stay_beyond_the_ends() {
+    fn interpolation_is_linear_and_constant_outside() {
         let (x, y) = ([0.0, 1.0, 3.0], [10.0, 20.0, 0.0]);
         let found = [-1.0, 0.0, 0.5, 1.0, 2.0, 3.0, 4.0].map(|at| interpolate(&x, &y, at));
         assert_eq!(found, [10.0, 10.0, 15.0, 20.0, 10.0, 0.0, 0.0]);

@@ -84,14 +84,14 @@ mod tests {
     }
 
     #[test]
-    fn a_curved_valley_is_followed_to_its_end() {
+    fn curved_valley_is_followed_to_its_end() {
         let found = minimise(&DAMPING, 100, [-1.2, 1.0], step, |from, to, _| cost(*from) - cost(*to) < 1e-20);
         assert!(found.has_converged && found.steps < 50, "{found:?}");
         assert!(found.best.iter().all(|x| (x - 1.0).abs() < 1e-8), "{found:?}");
     }
 
     #[test]
-    fn a_step_that_never_helps_ends_at_the_most_damping() {
+    fn useless_steps_end_at_most_damping() {
         let found = minimise(&DAMPING, 100, 1.0, |_, _| None, |_, _, _| false);
         assert_eq!(found, Minimum { best: 1.0, steps: 10, has_converged: true });
     }

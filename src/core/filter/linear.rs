@@ -93,7 +93,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn information_between_two_estimates_is_the_measurement_between_them() {
+    fn information_recovers_the_measurement() {
         let before = ScalarGaussian::from_std(2.0, 0.2);
         let taken = Measurement { value: 1.7, variance: 0.01 };
         let mut after = before;

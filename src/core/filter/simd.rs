@@ -309,7 +309,7 @@ mod tests {
     }
 
     #[test]
-    fn exp_of_both_signs_agrees_with_the_library() {
+    fn exp_of_both_signs_agrees_with_libm() {
         let mut x = -708.0;
         while x <= 708.0 {
             let (up, down) = Lanes([x]).exp_of_both_signs();
@@ -354,7 +354,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lane_is_independent_of_its_neighbours() {
+    fn lane_is_independent_of_its_neighbours() {
         let x = [0.3, -2.0, f64::NAN, 1e9, 7.5, 0.0, -1e-9, 55.0];
         let all = Lanes(x).exp() * Lanes(x).sqrt() + Lanes(x).at_most(3.0).reciprocal();
         for (i, x) in x.into_iter().enumerate() {

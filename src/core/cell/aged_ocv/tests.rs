@@ -18,7 +18,7 @@ fn m50() -> AgedOcv {
 }
 
 #[test]
-fn nothing_changes_without_capacities_and_for_a_new_cell() {
+fn new_cell_has_no_offset() {
     let none = AgedOcv::default();
     assert_eq!(none.line(&SOC, 2, 1.0), OffsetLine::default());
     for s in 0..5 {
@@ -31,7 +31,7 @@ fn nothing_changes_without_capacities_and_for_a_new_cell() {
 }
 
 #[test]
-fn offsets_are_the_aged_curve_less_the_new_one_and_continuous_over_capacity() {
+fn offsets_match_aged_curves_and_are_continuous() {
     let table = m50();
     let lost = LostMaterial { negative: 0.3 * 0.2, positive: 0.3 * 0.2 };
     let aged = M50.aged(lost, 0.8).expect("a cell");
@@ -58,7 +58,7 @@ fn offsets_are_the_aged_curve_less_the_new_one_and_continuous_over_capacity() {
 }
 
 #[test]
-fn a_shift_moves_the_inside_of_the_curve_only() {
+fn shift_keeps_both_ends() {
     let table = AgedOcv::of_shift(0.8, &SOC, 2.0, &rows(|z| 3.0 + z));
     // A quarter lost: a = 0.8 x 0.25 = 0.2.
     assert!((offset_v(&table, 2, 1.5) - 0.2 * 0.4 * 0.6).abs() < 1e-12);
@@ -75,7 +75,7 @@ fn a_shift_moves_the_inside_of_the_curve_only() {
 }
 
 #[test]
-fn an_aged_curve_rises_even_where_the_new_one_hardly_does() {
+fn aged_curve_rises_on_flat_parts() {
     // Flat in the middle, at one of two temperatures.
     let flat: Vec<f64> = vec![2.5, 3.28, 3.281, 3.2815, 3.33, 3.6];
     let both = [rows(|z| LFP.voltage_v(z)).remove(0), flat.clone()];

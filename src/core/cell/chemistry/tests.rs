@@ -4,7 +4,7 @@ use super::*;
 use crate::cell::TemperaturePosition;
 
 #[test]
-fn every_chemistry_has_a_model_with_its_cut_offs() {
+fn all_chemistries_have_a_model() {
     for (chemistry, name) in Chemistry::ALL {
         let label = Label::usual(chemistry, 60.0);
         let model = label.model().expect(name);
@@ -19,7 +19,7 @@ fn every_chemistry_has_a_model_with_its_cut_offs() {
 }
 
 #[test]
-fn the_aged_curve_rises_at_every_capacity_and_temperature() {
+fn aged_curve_rises_everywhere() {
     for (chemistry, name) in Chemistry::ALL {
         let model = Label::usual(chemistry, 3.0).model().expect(name);
         for capacity_ah in [1.2, 1.8, 2.4, 3.0, 3.3] {
@@ -32,7 +32,7 @@ fn the_aged_curve_rises_at_every_capacity_and_temperature() {
 }
 
 #[test]
-fn resistances_are_those_of_a_cell_of_that_size() {
+fn resistances_scale_with_cell_size() {
     let model = |rated_ah: f64| Label::usual(Chemistry::NmcGraphite, rated_ah).model().expect("a model");
     let settled_ohm = |rated_ah: f64| {
         let model = model(rated_ah);
@@ -44,7 +44,7 @@ fn resistances_are_those_of_a_cell_of_that_size() {
 }
 
 #[test]
-fn the_modes_explain_the_spread() {
+fn modes_explain_the_spread() {
     for (chemistry, name) in Chemistry::ALL {
         let curve = Label::usual(chemistry, 3.0).curve().expect(name);
         let (modes_v, rest_v) = curve.modes_v();
@@ -58,7 +58,7 @@ fn the_modes_explain_the_spread() {
 }
 
 #[test]
-fn cut_offs_of_another_chemistry_have_no_cell() {
+fn foreign_cut_offs_give_no_model() {
     let label = Label { voltage_min_v: 3.9, voltage_max_v: 4.4, ..Label::usual(Chemistry::LfpGraphite, 100.0) };
     assert!(label.model().is_none());
 }

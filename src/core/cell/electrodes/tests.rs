@@ -33,7 +33,7 @@ fn materials_fall_with_their_lithium_content() {
 }
 
 #[test]
-fn an_unaged_cell_is_the_new_one() {
+fn unaged_cell_equals_new_cell() {
     let same = M50.aged(LostMaterial::default(), 1.0).expect("a cell");
     assert!(same.lithium_lost().abs() < 1e-6, "{same:?}");
     for k in 0..=20 {
@@ -51,7 +51,7 @@ fn proportional_loss_of_everything_keeps_the_curve() {
 }
 
 #[test]
-fn lost_lithium_alone_slides_the_electrodes_and_keeps_both_ends() {
+fn lithium_loss_slides_electrodes() {
     let aged = M50.aged(LostMaterial::default(), 0.8).expect("a cell");
     assert!((aged.capacity() - 0.8).abs() < 1e-6);
     for end in [0.0, 1.0] {
@@ -63,7 +63,7 @@ fn lost_lithium_alone_slides_the_electrodes_and_keeps_both_ends() {
 }
 
 #[test]
-fn a_loss_that_leaves_no_such_cell_has_no_curve() {
+fn impossible_loss_gives_no_curve() {
     assert!(M50.aged(LostMaterial { negative: 0.5, positive: 0.0 }, 0.9).is_none());
     assert!(M50.aged(LostMaterial::default(), 3.0).is_none());
     // An excess of lithium: less of it leaves more capacity.

@@ -105,7 +105,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn evidence_corrects_the_ratio_once_and_leaves_a_least_deviation() {
+    fn evidence_corrects_ratio_once() {
         let mut slow = SlowBranch { information: 0.25, score: -0.25, ..SlowBranch::default() };
         let correction = slow.correct(0.4).expect("evidence");
         // Evidence for one deviation with a quarter of the prior's information moves the ratio by a fifth of a deviation.
@@ -122,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn one_half_cycle_is_one_witness_however_many_voltages_it_has_and_a_contradiction_counts_in_part() {
+    fn information_and_contradiction_are_limited() {
         let ratio = |information: f64, score: f64| {
             let mut slow = SlowBranch { information, score, ..SlowBranch::default() };
             slow.correct(0.4).expect("evidence");
@@ -133,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn the_ratio_stays_within_its_range_whatever_the_evidence() {
+    fn ratio_stays_in_range_for_any_evidence() {
         let mut slow = SlowBranch::default();
         for (information, score) in
             [(1.0, f64::NAN), (1.0, f64::INFINITY), (f64::INFINITY, 1.0), (0.0, 1.0), (f64::NAN, 1.0)]

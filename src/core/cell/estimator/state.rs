@@ -153,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unusable_capacity_is_reset_once() {
+    fn unusable_capacity_is_reset_once() {
         for (mean, variance) in [(2.0, -0.04), (2.0, f64::NAN), (0.0, 0.04)] {
             let mut state = settled();
             let last = state.covariance.len() - 1;

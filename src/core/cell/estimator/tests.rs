@@ -119,7 +119,7 @@ fn soc(estimator: &CellEstimator) -> ScalarGaussian {
 }
 
 #[test]
-fn capacity_and_resistance_converge_from_a_wrong_start_and_the_intervals_cover() {
+fn wrong_capacity_and_resistance_converge() {
     let (config, mut truth) = (config(), truth());
     let mut estimator = CellEstimator::new(&config);
     cycle(&mut estimator, &config, &mut truth, 1.0, 12.0);
@@ -131,7 +131,7 @@ fn capacity_and_resistance_converge_from_a_wrong_start_and_the_intervals_cover()
 }
 
 #[test]
-fn the_sample_rate_does_not_change_the_result() {
+fn result_is_independent_of_sample_rate() {
     let config = config();
     let run = |dt_s| {
         let (mut estimator, mut truth) = (CellEstimator::new(&config), truth());
@@ -145,7 +145,7 @@ fn the_sample_rate_does_not_change_the_result() {
 }
 
 #[test]
-fn a_start_thirty_points_wrong_recovers() {
+fn wrong_initial_soc_recovers() {
     let mut config = config();
     config.initial.soc = Some(0.6);
     let (mut estimator, mut truth) = (CellEstimator::new(&config), truth());
@@ -154,7 +154,7 @@ fn a_start_thirty_points_wrong_recovers() {
 }
 
 #[test]
-fn a_glitch_is_rejected_and_its_time_is_still_counted() {
+fn rejected_glitch_still_counts_its_charge() {
     let (config, mut truth, model) = (config(), truth(), small_model());
     let mut estimator = CellEstimator::new(&config);
     cycle(&mut estimator, &config, &mut truth, 1.0, 1.0);
@@ -168,7 +168,7 @@ fn a_glitch_is_rejected_and_its_time_is_still_counted() {
 }
 
 #[test]
-fn a_lost_filter_restarts_from_the_voltage_and_keeps_capacity_and_resistance() {
+fn lost_filter_restarts_and_keeps_capacity() {
     let (config, mut truth, model) = (config(), truth(), small_model());
     let mut estimator = CellEstimator::new(&config);
     cycle(&mut estimator, &config, &mut truth, 1.0, 6.0);
@@ -184,7 +184,7 @@ fn a_lost_filter_restarts_from_the_voltage_and_keeps_capacity_and_resistance() {
 }
 
 #[test]
-fn an_unmeasured_load_widens_the_deviation() {
+fn unmeasured_load_widens_soc() {
     let (config, mut truth, model) = (config(), truth(), small_model());
     let mut estimator = CellEstimator::new(&config);
     cycle(&mut estimator, &config, &mut truth, 1.0, 1.0);
@@ -197,7 +197,7 @@ fn an_unmeasured_load_widens_the_deviation() {
 }
 
 #[test]
-fn the_slowest_branch_is_learned_and_no_longer_mistaken_for_charge() {
+fn slowest_branch_ratio_is_learned() {
     let mut model = small_model();
     let mut slow = model.branches[0].clone();
     slow.r_ohm.values.iter_mut().flatten().for_each(|r_ohm| *r_ohm *= 5.0);
@@ -234,7 +234,7 @@ fn the_slowest_branch_is_learned_and_no_longer_mistaken_for_charge() {
 }
 
 #[test]
-fn an_unknown_soc_stays_at_its_largest_variance_through_any_gap() {
+fn unknown_soc_variance_is_limited() {
     let (config, mut truth, model) = (config(), truth(), small_model());
     let mut estimator = CellEstimator::new(&config);
     cycle(&mut estimator, &config, &mut truth, 1.0, 0.1);
@@ -248,7 +248,7 @@ fn an_unknown_soc_stays_at_its_largest_variance_through_any_gap() {
 }
 
 #[test]
-fn charge_that_nobody_saw_moves_the_soc_and_not_the_capacity() {
+fn unseen_charge_moves_soc_not_capacity() {
     let (mut config, model) = (config(), small_model());
     config.gap.away_use_per_s = 0.5 / 3600.0;
     // Discharges of a tenth on record, the charges between them not, and a load of C/20 next to the gaps.
@@ -270,7 +270,7 @@ fn charge_that_nobody_saw_moves_the_soc_and_not_the_capacity() {
 }
 
 #[test]
-fn a_load_may_continue_through_a_silent_gap_unless_silence_is_rest() {
+fn silent_gap_is_rest_if_configured() {
     let after = |silence_is_rest: bool, unmeasured_s: f64| {
         let (mut config, mut truth, model) = (config(), truth(), small_model());
         config.gap.silence_is_rest = silence_is_rest;
@@ -286,7 +286,7 @@ fn a_load_may_continue_through_a_silent_gap_unless_silence_is_rest() {
 }
 
 #[test]
-fn without_a_sensor_the_thermal_model_warms_the_cell() {
+fn thermal_model_replaces_missing_sensor() {
     let (config, mut truth, model) = (config(), truth(), small_model());
     let mut estimator = CellEstimator::new(&config);
     estimator.step(&model, &config, &truth.step(&model, 2.0, 1.0));
@@ -299,7 +299,7 @@ fn without_a_sensor_the_thermal_model_warms_the_cell() {
 }
 
 #[test]
-fn a_restored_estimator_continues_bit_for_bit() {
+fn restored_estimator_continues_with_equal_bits() {
     let (config, mut truth, model) = (config(), truth(), small_model());
     let mut estimator = CellEstimator::new(&config);
     cycle(&mut estimator, &config, &mut truth, 1.0, 0.3);
@@ -343,7 +343,7 @@ fn two_and_three_branches_estimate_the_soc() {
 }
 
 #[test]
-fn a_restated_capacity_moves_the_mean_and_never_lowers_the_variance() {
+fn restated_capacity_never_lowers_the_variance() {
     let (config, mut truth) = (config(), truth());
     let mut estimator = CellEstimator::new(&config);
     estimator.restate_capacity(ScalarGaussian::from_std(1.9, 0.1));
@@ -357,7 +357,7 @@ fn a_restated_capacity_moves_the_mean_and_never_lowers_the_variance() {
 }
 
 #[test]
-fn an_aged_cell_starts_on_its_aged_curve() {
+fn aged_cell_starts_on_aged_curve() {
     let mut model = small_model();
     model.aged_ocv = crate::cell::AgedOcv::of_shift(0.8, &model.soc, model.capacity_ah, &model.ocv_v.values);
     let mut config = config();

@@ -27,14 +27,14 @@ pub(crate) fn small_model() -> CellModel {
 }
 
 #[test]
-fn tables_are_bilinear_inside_and_exact_at_the_nodes() {
+fn tables_are_bilinear_and_exact_at_nodes() {
     let model = small_model();
     assert_eq!(model.ocv_v(&model.grid_position(0.5, 40.0)), 3.7);
     assert!((model.ocv_v(&model.grid_position(0.25, 20.0)) - 3.325).abs() < 1e-12);
 }
 
 #[test]
-fn resistances_between_temperatures_follow_arrhenius_and_a_constant_time_constant_stays() {
+fn resistances_follow_arrhenius_and_time_constants_stay() {
     let mut model = small_model();
     let ratio = arrhenius(0.0) / arrhenius(40.0);
     for (cold, warm) in [(0.08, 0), (0.06, 1), (0.06, 2)] {
@@ -53,7 +53,7 @@ fn resistances_between_temperatures_follow_arrhenius_and_a_constant_time_constan
 }
 
 #[test]
-fn outside_the_grid_ocv_continues_in_soc_and_all_else_holds_its_edge() {
+fn only_ocv_continues_outside_the_grid() {
     let model = small_model();
     assert!((model.ocv_v(&model.grid_position(1.1, 0.0)) - 4.32).abs() < 1e-12);
     assert!((model.ocv_v(&model.grid_position(-0.1, 0.0)) - 2.88).abs() < 1e-12);
@@ -71,7 +71,7 @@ fn soc_of_ocv_inverts_the_curve() {
 }
 
 #[test]
-fn an_aged_cells_voltage_and_slope_agree_and_invert() {
+fn aged_voltage_agrees_with_slope_and_inverse() {
     let mut model = small_model();
     model.aged_ocv = AgedOcv::of_shift(0.8, &model.soc, model.capacity_ah, &[vec![3.0, 3.5, 4.0]]);
     let temperature = model.temperature_position(17.0);
@@ -87,7 +87,7 @@ fn an_aged_cells_voltage_and_slope_agree_and_invert() {
 }
 
 #[test]
-fn a_rebased_model_has_the_curve_of_the_aged_cell_as_its_own() {
+fn rebased_model_has_the_aged_curve() {
     let model = crate::cell::Label::usual(crate::cell::Chemistry::NcaGraphite, 3.0).model().expect("a model");
     for capacity_ah in [2.7, 3.0, 3.1] {
         let rebased = model.rebased(capacity_ah);

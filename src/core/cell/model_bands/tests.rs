@@ -32,7 +32,7 @@ fn bands_of_every_chemistry_are_positive_numbers() {
 }
 
 #[test]
-fn a_model_that_states_no_error_has_no_band_of_its_curve_and_no_advice() {
+fn model_without_error_has_no_band() {
     let model = small_model();
     let bands = ModelBands::new(&model);
     assert_eq!((bands.curve_std_v(0.5), bands.rest_soc_std(0.5), bands.load_soc_std(0.5, 20.0)), (None, None, None));
@@ -42,7 +42,7 @@ fn a_model_that_states_no_error_has_no_band_of_its_curve_and_no_advice() {
 }
 
 #[test]
-fn an_error_that_is_larger_in_the_cold_is_one_of_the_resistances_there() {
+fn cold_error_counts_as_resistance_error() {
     let errors = vec![vec![0.03; 3], vec![0.005; 3]];
     let model = CellModel { voltage_error_v: Some(Table { values: errors }), ..small_model() };
     let bands = ModelBands::new(&model);
@@ -59,7 +59,7 @@ fn an_error_that_is_larger_in_the_cold_is_one_of_the_resistances_there() {
 }
 
 #[test]
-fn each_measurement_of_the_advice_leaves_less_than_the_one_before() {
+fn advice_reduces_the_error_step_by_step() {
     for (chemistry, name) in Chemistry::ALL {
         let model = of_label(chemistry);
         let (points, advice) = advise(&ModelBands::new(&model)).expect("stated");
@@ -76,7 +76,7 @@ fn each_measurement_of_the_advice_leaves_less_than_the_one_before() {
 }
 
 #[test]
-fn a_well_known_model_needs_nothing() {
+fn certain_model_needs_no_measurement() {
     let errors = vec![vec![0.001; 3], vec![0.001; 3]];
     let spread = ModelSpread { log_resistance: 0.05, capacity: 0.01, ..ModelSpread::usual(1) };
     let model = CellModel { voltage_error_v: Some(Table { values: errors }), spread: Some(spread), ..small_model() };

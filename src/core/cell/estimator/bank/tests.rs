@@ -183,7 +183,7 @@ fn differences<const N: usize>(model: &CellModel, config: &EstimatorConfig, roun
 }
 
 #[test]
-fn soc_agrees_with_the_textbook_filter_within_1e_9_over_100_000_steps() {
+fn kernel_agrees_with_textbook_over_100_000_steps() {
     let agrees = |(soc, others): (f64, f64)| assert!(soc < 1e-9 && others < 1e-8, "{soc} {others}");
     agrees(differences::<4>(&model(1), &config(), 100_000));
     agrees(differences::<5>(&model(2), &config(), 100_000));
@@ -191,7 +191,7 @@ fn soc_agrees_with_the_textbook_filter_within_1e_9_over_100_000_steps() {
 }
 
 #[test]
-fn every_setting_that_changes_the_filter_changes_the_kernel() {
+fn kernel_agrees_with_textbook_for_all_settings() {
     let plain = model(2);
     let aged = {
         let aged_ocv = AgedOcv::of_shift(0.6, &plain.soc, plain.capacity_ah, &plain.ocv_v.values);
@@ -229,7 +229,7 @@ fn every_setting_that_changes_the_filter_changes_the_kernel() {
 }
 
 #[test]
-fn a_cells_estimate_does_not_depend_on_other_cells() {
+fn estimate_is_independent_of_other_cells() {
     let (model, config) = (model(1), config());
     let mut together = EstimatorBank::new(&model, &config, 11);
     let mut alone: Vec<_> = (0..11).map(|_| EstimatorBank::new(&model, &config, 1)).collect();
@@ -249,7 +249,7 @@ fn a_cells_estimate_does_not_depend_on_other_cells() {
 }
 
 #[test]
-fn a_cell_in_another_interval_finds_its_temperature_after_its_rows_were_replaced() {
+fn evicted_isotherm_is_computed_again() {
     let (model, config) = (model(1), config());
     let mut together = EstimatorBank::new(&model, &config, 2);
     let mut alone = EstimatorBank::new(&model, &config, 1);
@@ -269,7 +269,7 @@ fn a_cell_in_another_interval_finds_its_temperature_after_its_rows_were_replaced
 }
 
 #[test]
-fn an_estimator_put_into_the_bank_is_returned_unchanged() {
+fn bank_returns_stored_estimator_unchanged() {
     let (model, config) = (model(3), config());
     let mut bank = EstimatorBank::new(&model, &config, 9);
     let mut pack = Pack::new(&model, 9);
@@ -287,7 +287,7 @@ fn an_estimator_put_into_the_bank_is_returned_unchanged() {
 
 /// Cells of two kinds, mixed in one pack, give the bits that each kind gives alone.
 #[test]
-fn modules_of_another_cell_are_estimated_as_if_they_were_alone() {
+fn mixed_modules_match_separate_banks() {
     let (model, other) = (small_model(), CellModel { capacity_ah: 3.0, ..small_model() });
     let config = config();
     let other_config =

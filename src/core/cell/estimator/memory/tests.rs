@@ -37,7 +37,7 @@ fn started() -> CellEstimator {
 }
 
 #[test]
-fn a_rest_counts_the_logarithm_of_its_length_at_any_sample_rate() {
+fn rest_counts_logarithm_of_its_length() {
     for dt_s in [1.0, 60.0, 3600.0] {
         let mut estimator = started();
         let steps = (36_000.0 / dt_s) as u32;
@@ -48,7 +48,7 @@ fn a_rest_counts_the_logarithm_of_its_length_at_any_sample_rate() {
 }
 
 #[test]
-fn under_load_and_after_a_gap_all_time_counts_and_the_rest_starts_again() {
+fn load_and_gap_end_the_rest() {
     let (mut estimator, rest_a) = (started(), config().gap.rest_current_a);
     let fresh_s = new_information_s(&mut estimator, step(0.0, 10.0, 0.0));
     new_information_s(&mut estimator, step(0.0, 7200.0, 0.0));
@@ -61,7 +61,7 @@ fn under_load_and_after_a_gap_all_time_counts_and_the_rest_starts_again() {
 }
 
 #[test]
-fn the_load_decays_exponentially_in_both_directions() {
+fn load_decays_exponentially() {
     let mut estimator = started();
     for current_a in [2.0, -2.0] {
         estimator.memory.load_a = 0.5;
@@ -74,7 +74,7 @@ fn the_load_decays_exponentially_in_both_directions() {
 }
 
 #[test]
-fn a_gap_next_to_a_load_counts_as_the_heaviest_usual_load_and_a_gap_at_rest_as_rest() {
+fn gap_after_load_counts_as_heavy_load() {
     let (config, model) = (config(), small_model());
     let mut memory = Memory::new(&config);
     memory.load_a = 0.5;
@@ -87,7 +87,7 @@ fn a_gap_next_to_a_load_counts_as_the_heaviest_usual_load_and_a_gap_at_rest_as_r
 }
 
 #[test]
-fn what_may_have_been_used_in_a_gap_follows_from_the_load_next_to_it_and_its_length() {
+fn possible_use_depends_on_load_and_gap_length() {
     let mut config = config();
     config.gap.away_use_per_s = 0.5 / 3600.0;
     let after = |config: &EstimatorConfig, current_a: f64, gap_s: f64| {
@@ -114,7 +114,7 @@ fn what_may_have_been_used_in_a_gap_follows_from_the_load_next_to_it_and_its_len
 }
 
 #[test]
-fn a_noted_downtime_counts_once_but_its_load_may_be_more_than_was_noted() {
+fn noted_downtime_counts_once() {
     let mut config = config();
     config.gap.away_use_per_s = 0.5 / 3600.0;
     let noted = || {

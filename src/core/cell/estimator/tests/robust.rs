@@ -87,7 +87,7 @@ fn three_days(slow_ohm: f64, offset_a: f64) -> StretchErrors {
 }
 
 #[test]
-fn an_offset_of_the_current_sensor_does_not_walk_the_soc_away_in_three_days() {
+fn current_offset_does_not_drift_soc() {
     // 0.5 % of 1 C of 2 Ah: 10 mA; in 72 h 0.72 Ah, 36 points.
     for offset_a in [-0.01, 0.01] {
         let worst = three_days(0.0, offset_a);
@@ -102,7 +102,7 @@ fn an_offset_of_the_current_sensor_does_not_walk_the_soc_away_in_three_days() {
 }
 
 #[test]
-fn an_error_of_thirty_points_recovers_within_minutes_of_load_and_within_a_rest() {
+fn thirty_point_error_recovers_within_minutes() {
     for current_a in [1.0, -1.0, 0.0] {
         for wrong in [-0.3, 0.3] {
             let mut bench = Bench::new(0.5, Some((0.5 + wrong, 0.3)), SLOW_OHM, 0.0);
@@ -114,7 +114,7 @@ fn an_error_of_thirty_points_recovers_within_minutes_of_load_and_within_a_rest()
 }
 
 #[test]
-fn the_interval_covers_the_error_in_a_rest_that_still_relaxes() {
+fn interval_covers_error_while_cell_relaxes() {
     for current_a in [1.0, -1.0] {
         // Starts with the load: the estimate has only the voltages that relax towards rest.
         let mut bench = Bench::new(0.5 + 0.3 * current_a, None, SLOW_OHM, 0.0);

@@ -3,7 +3,7 @@
 use super::*;
 
 #[test]
-fn moments_of_a_parabola_are_those_of_its_gaussian() {
+fn parabola_gives_moments_of_gaussian() {
     let cost = |k: f64| 0.5 * (k - 4.3) * (k - 4.3) / 1.44;
     let costs: Vec<f64> = (0..11).map(|k| cost(f64::from(k))).collect();
     let least = costs.iter().copied().fold(f64::MAX, f64::min);

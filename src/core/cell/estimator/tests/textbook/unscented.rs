@@ -230,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn a_linear_model_gives_the_kalman_filter() {
+    fn linear_model_gives_kalman_filter() {
         let spread = SigmaPointWeights::new(2, 0.5, 2.0, 1.0);
         let f = matrix![1.0, 0.1; 0.0, 0.9];
         let q = matrix![1e-3, 0.0; 0.0, 2e-3];
@@ -250,7 +250,7 @@ mod tests {
     }
 
     #[test]
-    fn considered_errors_give_the_filter_that_has_them_as_states_without_correcting_them() {
+    fn considered_errors_match_augmented_filter() {
         // States [x0, x1, b] with b constant and never corrected, against two states and a column.
         let spread = SigmaPointWeights::new(2, 1.0, 2.0, 0.0);
         let (f, h, hb, r) = (matrix![1.0, 0.1; 0.0, 0.9], matrix![1.0, 0.4], 0.3, 0.02);
@@ -286,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn a_constant_error_does_not_average_out() {
+    fn constant_error_does_not_average_out() {
         let spread = SigmaPointWeights::new(1, 1.0, 2.0, 0.0);
         let mut ukf = gaussian(vector![0.0], matrix![1.0]);
         for _ in 0..1000 {
@@ -298,7 +298,7 @@ mod tests {
     }
 
     #[test]
-    fn an_outlier_is_reported_and_leaves_the_state_unchanged() {
+    fn outlier_leaves_state_unchanged() {
         let spread = SigmaPointWeights::new(2, 1.0, 2.0, 0.0);
         let mut ukf = start();
         let update = ukf.update(&spread, 8.4, |x| x[0], &noise(1e-3, 5.0)).expect("update");
@@ -308,7 +308,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bad_covariance_is_an_error_and_changes_nothing() {
+    fn bad_covariance_leaves_state_unchanged() {
         let spread = SigmaPointWeights::new(2, 1.0, 2.0, 0.0);
         let mut ukf = start();
         ukf.covariance[(0, 0)] = -1.0;
@@ -321,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn noise_that_matches_the_model_gives_consistent_innovations() {
+    fn matched_noise_gives_consistent_innovations() {
         // Random walk observed in noise, both drawn by a small fixed generator: mean NIS must be 1 within 3 sigma.
         let spread = SigmaPointWeights::new(1, 1.0, 2.0, 0.0);
         let mut seed = 0x2545_F491_4F6C_DD1D_u64;

@@ -10,7 +10,7 @@ fn near(a: f64, b: f64) -> bool {
 }
 
 #[test]
-fn the_resistance_does_not_walk_through_a_long_step_and_branches_settle() {
+fn process_noise_is_bounded_in_long_steps() {
     let (config, model) = (config(), small_model());
     let position = model.grid_position(0.5, 25.0);
     let q = process::<4>(&model, &config, &position, 1e6);
@@ -20,7 +20,7 @@ fn the_resistance_does_not_walk_through_a_long_step_and_branches_settle() {
 }
 
 #[test]
-fn the_variance_of_a_reading_sums_sensor_model_drop_and_load() {
+fn reading_variance_sums_its_parts() {
     let (mut config, mut model) = (config(), small_model());
     config.voltage.noise_v = 0.0;
     let mut x =
