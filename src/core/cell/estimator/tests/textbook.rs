@@ -110,7 +110,8 @@ impl<const N: usize> Textbook<N> {
             memory.rest_s = 0.0;
             memory.information_s += elapsed_s;
         } else {
-            let before_s = std::mem::replace(&mut memory.rest_s, memory.rest_s + elapsed_s);
+            let before_s = memory.rest_s;
+            memory.rest_s += elapsed_s;
             let ratio = (REST_REPEATS_S + memory.rest_s) / (REST_REPEATS_S + before_s);
             memory.information_s += REST_REPEATS_S * libm::log(ratio);
         }
