@@ -52,7 +52,7 @@ pub struct LogOptions {
 /// Counts of lines, of frames, and of everything that did not become a record.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct LogCounts {
-    /// Lines and CSV rows read, including bad ones.
+    /// Number of lines and CSV rows read, including bad lines.
     pub lines: u64,
     /// Frames returned.
     pub frames: u64,
@@ -60,7 +60,7 @@ pub struct LogCounts {
     pub bad_lines: u64,
     /// The first bad line: file, line, found and allowed.
     pub first_bad_line: Option<String>,
-    /// Lines without a record: headers, comments, blank ones.
+    /// Lines without a record: headers, comments and blank lines.
     pub ignored_lines: u64,
     /// CAN XL frames, which are not supported.
     pub xl_frames: u64,
@@ -70,7 +70,7 @@ pub struct LogCounts {
     pub dropped_frames: u64,
     /// Frames and events of unconfigured interfaces, by name.
     pub foreign: BTreeMap<String, u64>,
-    /// Records with a stamp before the preceding one.
+    /// Records whose stamp is before the stamp of the preceding record.
     pub time_backwards: u64,
     /// Number of parts that follow an unknown gap.
     pub unknown_gaps: u64,

@@ -117,7 +117,7 @@ pub(super) fn next_log(files: &mut VecDeque<PathBuf>) -> io::Result<Option<LogPa
     Ok(Some(LogParts { paths, deleted }))
 }
 
-/// Files that are read as one, opened one at a time.
+/// Files that are read as one file. They are opened one at a time.
 pub(super) struct JoinedFiles {
     open: File,
     rest: VecDeque<PathBuf>,

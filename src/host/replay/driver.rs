@@ -1,8 +1,9 @@
 //! Drives a monitor. The caller feeds it rows of values or frames, and the driver adds the ticks of a replay between
 //! them.
 //!
-//! In: rows (A, positive = discharge; V; degrees C) or frames, with their times. Out: the monitor's [`Outputs`], which the
-//! caller clears. Promise: `packwatch replay` with a log of the same inputs gives the same outputs.
+//! In: rows or frames, with their times. Rows are in A (positive = discharge), V and degrees C. Out: the monitor's
+//! [`Outputs`], which the caller clears. Promise: `packwatch replay` with a log of the same inputs gives the same
+//! outputs.
 
 use super::reading::RowFrames;
 use crate::can::Frame;

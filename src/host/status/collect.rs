@@ -24,7 +24,7 @@ use crate::sample::ReadingCounts;
 pub const MAX_EVENTS: usize = 32;
 
 /// The latest events. Events that occur once per cell and half-cycle are left out, because they would displace all
-/// others.
+/// other events.
 #[derive(Debug, Default)]
 pub struct RecentEvents(VecDeque<Event>);
 

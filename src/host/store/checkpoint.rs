@@ -7,8 +7,8 @@ use crate::quantity::Timestamp;
 
 /// Bytes of states written per day. In total 20 MB may be written per day; history and file system take the rest.
 const BYTES_PER_DAY: f64 = 15e6;
-/// Bytes that a commit without a state writes: three pages of SQLite, first in its log and later in its file, rounded
-/// up to whole pages of the system.
+/// Bytes that a commit without a state writes: three pages of SQLite, first in its log and later in its file. Both are
+/// rounded up to whole pages of the system.
 const COMMIT_BYTES: f64 = 8e3;
 /// Longest time without a checkpoint, s, regardless of what else was written.
 const MAX_PERIOD_S: f64 = 3600.0;

@@ -47,8 +47,8 @@ pub(crate) fn guards(raw: &RawTables, found: &[ResolvedSignal<'_>], inputs_whole
     guards
 }
 
-/// A new pack identity puts all learned values aside, so its message must be protected unless the configuration accepts
-/// an unprotected one.
+/// A new pack identity sets all learned values aside. Its message must therefore be protected, unless the configuration
+/// accepts an unprotected message.
 fn check_identity(raw: &RawTables, found: &[ResolvedSignal<'_>], guards: &[GuardConfig]) {
     let Some(keys) = raw.pack_identity.as_ref().filter(|keys| !keys.accept_unprotected) else { return };
     let is_protected =

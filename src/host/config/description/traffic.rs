@@ -90,7 +90,7 @@ pub(crate) fn intake(config: &Config, found: &[ResolvedSignal<'_>]) -> Vec<Strin
             None => "missing frames are not counted, because the DBC has no cycle time".to_owned(),
         };
         words.push(format!(
-            "{name} ({} on {interface}): end-to-end protected, profile {}, data id {data_id:#06X}, up to {} lost frames in a row are allowed, {missed}",
+            "{name} ({} on {interface}): end-to-end protected, profile {}, data id {data_id:#06X}, allowed lost frames in a row: {}, {missed}",
             guard.id,
             profile.name(),
             guard.check.max_delta_counter_init,

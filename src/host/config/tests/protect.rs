@@ -83,7 +83,7 @@ fn check_lists_protected_messages() {
         [
             "at most 2000 frames a second of one identifier, a tenth of them at once",
             "commands of other ECUs are not executed",
-            "Status (100 on can0): end-to-end protected, profile 1A, data id 0x0123, up to 1 lost frames in a row are allowed, a missing frame is counted every 100 ms"
+            "Status (100 on can0): end-to-end protected, profile 1A, data id 0x0123, allowed lost frames in a row: 1, a missing frame is counted every 100 ms"
         ]
     );
     let (_, description) = read(PACK).unwrap();

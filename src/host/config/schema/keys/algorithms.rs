@@ -64,7 +64,7 @@ section! {
         slow_branch_std: Option<f64>, "fraction", DEVIATION, Optional("the cell model's `spread.slow_branch`, else 0.2 (0.1 with one branch)");
         /// Slow error of the cell model: standard deviation of its average over one second. More samples per second do not reduce it. A cell model's `voltage_error_v` replaces this key.
         model_error_v_sqrt_s: f64, "V sqrt(s)", DEVIATION, Default("0.15");
-        /// Slow error of the cell model that is proportional to the present voltage drop in the cell: standard deviation of its average over one second, relative to this drop.
+        /// Slow error of the cell model that is proportional to the present voltage drop in the cell. The value is the standard deviation of its average over one second, relative to this drop.
         drop_error_sqrt_s: f64, "sqrt(s)", DEVIATION, Default("0.3");
         /// Slow error of the cell model under load: standard deviation of its average over one second. It is relative to the voltage drop that the load of the last minutes causes.
         load_error_sqrt_s: f64, "sqrt(s)", DEVIATION, Default("0.5");

@@ -141,7 +141,7 @@ frame_section! {
 }
 
 section! {
-    /// The key of all authenticated frames: 16 bytes, raw or as 32 hex digits, in a systemd credential or in a file. packwatch reads the key when it starts, refuses to start without the key, and never writes it anywhere.
+    /// The key of all authenticated frames: 16 bytes, raw or as 32 hex digits, in a systemd credential or in a file. At its start, packwatch reads the key. It does not start without the key, and never writes the key anywhere.
     Authentication at "authentication" {
         /// Name of the credential: a file in `$CREDENTIALS_DIRECTORY` (`LoadCredential=NAME:PATH` in the unit).
         credential: Option<String>, "", NotEmpty, Optional("required without `key_file`");
