@@ -12,7 +12,7 @@ use crate::cell::{CellModel, ERROR_WINDOW_S, EstimatorConfig, GridPosition, Sens
 use crate::filter::ScalarGaussian;
 
 /// Longest time of the resistance's random walk between two readings, s: it does not age in a gap.
-pub(super) const MAX_WALK_S: f64 = 600.0;
+const MAX_WALK_S: f64 = 600.0;
 
 /// Covariance that the random walks gain in `dt_s`; the capacity's is added at transitions.
 pub(super) fn process<const N: usize>(
