@@ -209,7 +209,7 @@ fn inconsistent_parts_are_not_merged() {
     let fleet = Fleet::new();
     fleet.run("first", &["--shard", "1/2"]);
     let merge = |folders: &[&str]| fleet.refused(&[&["fleet", "merge", "-o", "merged"], folders].concat());
-    assert!(merge(&["logs"]).contains("logs/six: not complete"), "{}", merge(&["logs"]));
+    assert!(merge(&["logs"]).contains("logs/six: incomplete"), "{}", merge(&["logs"]));
     assert!(merge(&["nowhere"]).contains("nowhere: cannot be read"));
     let mut command = fleet.command(&["fleet", "run", "fleet.jsonl", "--shard", "2/2", "-o", "second", "-c"]);
     command.arg(config()).assert().success();
