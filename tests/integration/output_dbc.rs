@@ -711,7 +711,7 @@ fn dbc_command_writes_configured_dbc() {
     assert_eq!(std::fs::read(&path).unwrap(), shown, "an existing file must be replaced");
     let written = Database::parse_bytes(&shown).unwrap();
     assert_eq!(written, packwatch::config::load(&config).unwrap().output_layout.unwrap());
-    let silent = std::fs::read_to_string(&config).unwrap().replace("[output]", "[output]\nenabled = false");
+    let silent = std::fs::read_to_string(&config).unwrap().replace("\n[output]\n", "\n[output]\nenabled = false\n");
     let silent = silent.replace("cells/", &format!("{}/config/cells/", root.display()));
     let silent = silent.replace("\"pack96.dbc\"", &format!("\"{}/config/pack96.dbc\"", root.display()));
     let silent_path = folder.path().join("silent.toml");
