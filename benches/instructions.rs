@@ -1,4 +1,4 @@
-//! Work whose instructions `tests/instructions` counts: parser, decoder, estimator.
+//! Workloads for `tests/instructions`, which counts their instructions: parser, decoder, estimator.
 //!
 //! `instructions WORK PASSES` runs one of [`WORKS`] PASSES times over the same inputs. It prints the number of units
 //! per pass and the wide instructions that the processor offers, because these select the estimator's code. The

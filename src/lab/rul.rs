@@ -4,9 +4,9 @@
 //! The forecast is the monitor's own ([`crate::health::forecast`]), fed reading by reading; it uses no reading after its
 //! moment.
 //!
-//! Terms: *use* is counted by the axis from the first reading on (discharges if the file lists them, otherwise days). The
-//! *end of life* is the use at which the non-increasing least-squares line through all capacities finally passes the
-//! threshold, interpolated between the readings on both sides. A temporary recovery after a rest neither delays
+//! Terms: *use* is the number of discharges since the first reading, or of days if the file lists no discharges. The *end of
+//! life* is the use at which the isotonic (non-increasing least-squares) fit of all capacities falls below the threshold,
+//! interpolated between the readings on both sides. A temporary recovery after a rest neither delays
 //! nor advances it.
 
 mod baseline;

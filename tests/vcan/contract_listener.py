@@ -1,4 +1,4 @@
-"""A listening ECU, written only from the DBC and the page docs/src/ecu/contract.md: the table of raised alarms.
+"""An independent ECU that listens to packwatch and keeps the table of raised alarms. It follows only the DBC and docs/src/ecu/contract.md.
 
     listener = ContractListener("out.dbc", loss=0.1, seed=1)
     listener.handle(time_s, frame_id, data)     each frame of the bus; drops a random part

@@ -18,7 +18,7 @@ const VERSION: u32 = 1;
 /// A column of the CSV: name and value.
 type Column = (&'static str, fn(&LogResult, &ThresholdScore) -> String);
 
-/// Columns of the CSV after those of the values set.
+/// Fixed columns of the CSV. One column per varied setting follows them.
 #[rustfmt::skip]
 const COLUMNS: [Column; 23] = [
     ("log", |log, _| log.log.display().to_string()),

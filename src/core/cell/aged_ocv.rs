@@ -5,9 +5,9 @@
 //! constant; beyond SOC 0 and 1 they continue linearly.
 //!
 //! # One curve per capacity
-//! No measurement separates the losses behind a lost capacity. Assumption: per part of capacity lost, each electrode has lost
-//! [`MATERIAL_SHARE`] of its active material, and lithium makes up the rest. [`OffsetLine::mixes_v`] is the change by another mix
-//! within [`MATERIAL_SHARE_STD`].
+//! The capacity alone does not show how much lithium and how much active material was lost. Assumption: when the cell has lost a
+//! fraction x of its capacity, each electrode has lost [`MATERIAL_SHARE`] x of its active material; lost lithium explains the
+//! rest. [`OffsetLine::mixes_v`] is the change of the offset if an electrode's share is one [`MATERIAL_SHARE_STD`] higher.
 
 use super::electrodes::{Electrodes, LostMaterial};
 use crate::filter::locate;
@@ -27,8 +27,8 @@ impl Default for AgeingLaw {
     }
 }
 
-/// Active material that each electrode loses per part of capacity lost. Calendar ageing loses none, proportional loss is 1;
-/// graphite cells with layered oxides that cycle at moderate temperature lose mostly lithium (Birkl et al. 2017; Dubarry et
+/// Fraction of active material that each electrode loses, divided by the fraction of capacity lost: 0 for calendar ageing alone, 1
+/// if material and capacity shrink equally. Graphite cells with layered oxides that cycle at moderate temperature lose mostly lithium (Birkl et al. 2017; Dubarry et
 /// al. 2012).
 pub const MATERIAL_SHARE: f64 = 0.3;
 
@@ -125,7 +125,7 @@ impl AgedOcv {
             let positive = half_width(curve(MATERIAL_SHARE, low, part)?, curve(MATERIAL_SHARE, high, part)?);
             Some([offset_v, negative, positive])
         };
-        // From the new cell down to the last capacity for which the electrodes give a cell.
+        // From the new cell down to the lowest capacity for which the electrodes still form a cell.
         let aged: Vec<_> = LOST_CAPACITIES.iter().rev().map_while(|&part| Some((part, row(part)?))).collect();
         if aged.last().is_none_or(|(part, _)| *part > LEAST_KNOWN) {
             return None;
@@ -143,8 +143,8 @@ impl AgedOcv {
         Some(table)
     }
 
-    /// Ageing by a shift: OCV(s + a s (1 - s)) with a = shift (1 - C / C_new), on the middle of the new cell's `rows`, V, by
-    /// temperature. Shift 1: the top of the curve keeps its ampere-hours; shift 0: the curve shrinks evenly.
+    /// Ageing by a shift: OCV(s + a s (1 - s)) with a = shift (1 - C / C_new). It is applied to the middle row of
+    /// `rows`, the new cell's open-circuit voltage, V, by temperature. Shift 1: the top of the curve keeps its ampere-hours; shift 0: the curve shrinks evenly.
     pub fn of_shift(shift: f64, soc: &[f64], new_capacity_ah: f64, rows: &[Vec<f64>]) -> Self {
         let mut table = Self { law: AgeingLaw::Shift(shift), ..Self::default() };
         let middle_v = &rows[rows.len() / 2];
@@ -197,8 +197,8 @@ impl AgedOcv {
         }
     }
 
-    /// Adds a mode of the curve's spread between cells to each mix of losses, V per standard deviation at the SOC breakpoints, at
-    /// every capacity. The mix's sign is chosen so that mix and mode do not cancel.
+    /// Adds the spread of the curve between cells: `modes_v[i]` (V per standard deviation, one value per SOC breakpoint) is added
+    /// to mix i at every capacity. The mix's sign is chosen so that mix and mode do not cancel.
     pub fn add_spread(&mut self, modes_v: &[Vec<f64>; MIXES]) {
         self.is_shift = false;
         self.spread_v.clone_from(modes_v);
@@ -236,8 +236,8 @@ impl AgedOcv {
         }
     }
 
-    /// Lithium lost at a capacity; above the new cell's capacity, the new cell's. `None` without electrodes, and below their
-    /// smallest capacity.
+    /// Lithium lost at a capacity. Above the new cell's capacity, returns the new cell's loss. Returns `None` without electrodes
+    /// or below the smallest capacity of the table.
     pub fn lithium_loss(&self, capacity_ah: f64) -> Option<LithiumLoss> {
         let [least_ah, .., new_ah, _] = self.capacity_ah[..] else { return None };
         let found = self.between(&self.lithium, [0, 1, 2], capacity_ah.min(new_ah));

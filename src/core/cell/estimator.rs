@@ -10,7 +10,7 @@
 //! Deviation 1: ln rho is a state (random walk). Reason: a fixed model attributes grown resistance to lost charge in an
 //! aged cell. Effect: without it the end of life of the measured cells comes 14-23 cycles early.
 //! Deviation 2: C is a state ([`CapacityState::Joint`]). Reason: the SOC error grows with the capacity's error in proportion to the
-//! moved charge, so both are correlated; a filter without that correlation takes its own assumption for a measurement. `Held`
+//! moved charge, so both are correlated; without the correlation the filter treats its assumed capacity as if it had been measured. `Held`
 //! gives the paper's filter (C known, variance 1e-12 Ah^2).
 //! Deviation 3: process noises are densities per second, and the measurement variance is
 //! sensor^2 + model^2 / dt: model error is slow, so information is counted per second, not per sample.
@@ -20,7 +20,7 @@
 //! a configured constant. The drop is the present voltage drop in the cell, the load the voltage drop of the last minutes' load.
 //! Reason: most model error is error of the resistances and of diffusion slower than the branches. Effect: a record that begins
 //! under load, the constant-voltage part of a charge, and cold cells no longer count as exact. At rest the error repeats instead
-//! of averaging out: a rest of t counts as t_r ln(1 + t/t_r) under load.
+//! of averaging out, so a rest of duration t gives only as much information as t_r ln(1 + t/t_r) under load, t_r = 1000 s.
 //! Deviation 5: the OCV curve changes with the capacity lost by the last half-cycle ([`AgedOcv`](crate::cell::AgedOcv)).
 //! Effect: the top and the bottom of an aged cell's curve give the same capacity.
 //!
@@ -34,8 +34,8 @@
 //! The filter is unscented, with additive noise and a scalar measurement. Sigma points are x and x +/- sqrt(N + lambda) L_i with L
 //! the lower Cholesky factor of P and lambda = alpha^2 (N + kappa) - N; weights as in Wan and van der Merwe (2000), equations
 //! 15. An update **redraws** the points from the predicted mean and covariance. (Reusing the propagated points, as some
-//! packages do, differs by up to 3e-4 of SOC on drive data.) Each constant error has a column: the error of every state that one
-//! standard deviation of it has caused. The first [`CONSIDERED`](state_vector::CONSIDERED) are considered in the gain (Schmidt
+//! packages do, differs by up to 3e-4 of SOC on drive data.) For each constant error the filter keeps a column: how far
+//! one standard deviation of that error has shifted each state. The first [`CONSIDERED`](state_vector::CONSIDERED) are considered in the gain (Schmidt
 //! 1966): an update weighs the voltage by the covariance with them, and P is updated in Joseph's form, as the gain is not the best
 //! one for P alone. The others change no mean (Friedland 1969).
 //!

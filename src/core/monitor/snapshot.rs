@@ -133,7 +133,7 @@ impl Snapshot {
         self.diagnosis.as_ref()
     }
 
-    /// Cost of the differences between the cells; `None` without a cell-fault detector.
+    /// Capacity that the pack loses to differences between its cells; `None` without a cell-fault detector.
     pub fn imbalance(&self) -> Option<Result<Imbalance, UnknownImbalance>> {
         let mut capacities: Vec<ScalarGaussian> =
             (0..self.cells.len()).map(|cell| self.learning.learner.capacity(cell)).collect();

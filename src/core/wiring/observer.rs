@@ -80,7 +80,7 @@ pub struct WiringObserver {
     listener: Listener,
     /// Indexes of the signals in the answer to each diagnostic question.
     by_question: BTreeMap<Question, Vec<(SignalList, usize)>>,
-    /// Statistics of the current's message on each other interface that carries it.
+    /// Statistics of the message with the configured current's identifier, for each other interface that carries it.
     pub(crate) other_currents: BTreeMap<BusIndex, OtherCurrent>,
     guards: Guards,
     pub(crate) protected: BTreeMap<(BusIndex, CanId), ProtectionStats>,
@@ -91,7 +91,7 @@ pub struct WiringObserver {
     latest: Option<Timestamp>,
     /// Sum of the times between frames, s. Gaps above 30 s are left out, because the buses sleep during them.
     pub(crate) awake_s: f64,
-    /// Time listened on live interfaces, s; `None` for a recording, where `awake_s` counts.
+    /// Time listened on live interfaces, s; `None` for a recording, which uses `awake_s` instead.
     listened_s: Option<f64>,
     pub(crate) frames: u64,
 }
@@ -248,7 +248,7 @@ impl WiringObserver {
         }
     }
 
-    /// Ends the current blocks and steady runs.
+    /// Ends the open blocks and steady runs.
     pub(super) fn end_blocks(&mut self) {
         self.responses.iter_mut().for_each(VoltageResponse::pause);
         self.other_currents.values_mut().for_each(OtherCurrent::pause);

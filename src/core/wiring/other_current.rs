@@ -1,7 +1,7 @@
 //! Statistics of a message on another interface that has the identifier of the configured current.
 //!
 //! Buses of one vehicle may use the same identifier for different messages, or carry the messages of several packs.
-//! Decoded as the configured current, such a message may be the current that the voltages follow.
+//! If the voltages follow the message on the other interface, the configured interface is wrong.
 
 use super::evidence::Series;
 use super::evidence::Slope;

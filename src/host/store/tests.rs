@@ -266,7 +266,7 @@ fn database_damaged_while_running_is_set_aside() {
     };
     let ticket = learn(&mut store, 1.0);
     assert!(answer(&store, ticket).works);
-    // Simulates disk corruption: zero pages in the database and the log.
+    // Simulates disk corruption: other bytes in the database and its log.
     for name in ["packwatch.db", "packwatch.db-wal"] {
         let path = place.path().join(name);
         let length = std::fs::metadata(&path).map_or(0, |file| file.len());
@@ -348,7 +348,7 @@ fn unfit_state_waits_for_matching_start() {
     finish(store, 3.0);
     let (store, found) = open();
     assert_eq!(states(&found), [(STATE_SOURCE, 3.0), (ASIDE, 1.0)]);
-    // The start fits the first state again, so the two states change places.
+    // The pack matches the state that was set aside first, so that state becomes current and the other one is set aside.
     store.set_state_aside("snapshot is of 5 cells", Timestamp::from_secs(4.0));
     finish(store, 4.0);
     let (store, found) = open();

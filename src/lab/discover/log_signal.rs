@@ -8,7 +8,7 @@ use crate::import::DiagnosticSignal;
 use crate::quantity::BusIndex;
 use crate::wiring::evidence::{Series, SignalLabel};
 
-/// A field of a message: its identifier, and the value of the first byte if that is a page.
+/// A field of a message: its identifier and, if the first byte selects a page (multiplexer), the value of that byte.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct MessageField {
     pub(super) id: CanId,
@@ -23,9 +23,9 @@ pub(super) enum SignalOrigin {
     Dbc(usize),
     /// A definition of diagnostic answers, by the number of its table.
     Defined(usize),
-    /// None: a field of an answer.
+    /// No description: a field found in a diagnostic answer.
     Raw(AnswerKey, Box<DiagnosticSignal>),
-    /// None: a field of a message.
+    /// No description: a field found in a message.
     Field(Box<MessageField>),
 }
 
@@ -60,7 +60,8 @@ impl LogSignal {
     }
 }
 
-/// The longest run of items that go with the first of the run; of several, the last. `None` ends a run.
+/// Returns the longest run in which `goes_with` holds between every item and the first one. If several are equally long, returns
+/// the last. `None` ends a run.
 pub(super) fn longest_run<T>(items: impl Iterator<Item = Option<T>>, goes_with: impl Fn(&T, &T) -> bool) -> Vec<T> {
     let (mut best, mut run) = (Vec::new(), Vec::new());
     for item in items.chain([None]) {

@@ -2,14 +2,15 @@
 //!
 //! 1. A part must start with a full cell: its first voltage is within [`REST_SAG_V`] of the highest, or within
 //!    [`LOAD_SAG_V`] of it if current already flows.
-//! 2. With the cycler's counter, SOC = 1 - counter / capacity if the counter starts within [`COUNTER_NEAR`] of 0: that
-//!    small charge was really taken out. A counter that starts lower was reset before the charge: only differences count.
-//!    A counter that starts higher was reset at full, so the cell is no longer full: the part is rejected.
+//! 2. The cycler's counter rises on discharge and falls on charge. If it starts within [`COUNTER_NEAR`] of 0,
+//!    SOC = 1 - counter / capacity. If it starts below, it was reset before the charge, so its first value is subtracted.
+//!    If it starts above, charge was already taken out of the full cell, so the part is rejected.
 //! 3. Without a counter, the current is integrated from SOC 1.
 
 use super::{MeasuredPart, charge_ah};
 
-/// Largest voltage of a resting full cell below the highest, V: it relaxes, and a cold charge ends early.
+/// How far a resting full cell may be below the highest voltage, V. The voltage relaxes after a charge, and a charge in the cold
+/// ends early.
 const REST_SAG_V: f64 = 0.1;
 /// The same for a full cell under load, V.
 const LOAD_SAG_V: f64 = 0.35;

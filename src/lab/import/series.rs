@@ -1,4 +1,4 @@
-//! Joins signals whose names differ only in a number to one line with `{n}`.
+//! Joins signals to one line with `{n}` if their names differ only in a number.
 //!
 //! A series is a run of signals at rising positions of one answer. They are equal except for one number in their names, which counts
 //! by one, and their bits, which have a constant distance. Leading zeros of the number are dropped, because `{n}` in a pattern matches

@@ -1,4 +1,4 @@
-//! End of a life: where the non-increasing least-squares line through its capacities passes the threshold.
+//! End of a life: where the isotonic (non-increasing least-squares) fit of its capacities falls below the threshold.
 
 use super::History;
 

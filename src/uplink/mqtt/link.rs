@@ -2,8 +2,8 @@
 //!
 //! Input: the daemon's documents and the [`Queue`]. Output: messages with QoS 1. Each connection starts without messages in memory, so
 //! no value of an earlier connection is repeated. Current values come from the newest document. A message leaves the queue only after
-//! the broker has acknowledged it. After a lost connection the pause doubles up to `retry_max_s`; after a longer connection it restarts
-//! at 1 s. A message that the broker rejects does not end the connection: a queued message is retried after `retry_max_s`, a current
+//! the broker has acknowledged it. After a lost connection the pause doubles up to `retry_max_s`; after a connection of more than
+//! `retry_max_s` it starts again at 1 s. A message that the broker rejects does not end the connection: a queued message is retried after `retry_max_s`, a current
 //! value with the next document.
 
 use std::convert::Infallible;
@@ -27,7 +27,7 @@ use crate::status_stream::Documents;
 
 /// First pause after a lost connection.
 const RETRY: Duration = Duration::from_secs(1);
-/// Most unacknowledged messages of the queue; most brokers accept this number.
+/// Maximum number of unacknowledged messages of the queue; most brokers accept this number.
 const WINDOW: usize = 20;
 /// Longest wait for an acknowledgement. A connection that acknowledges nothing is closed then.
 const ACKNOWLEDGEMENT: Duration = Duration::from_secs(120);
@@ -63,7 +63,7 @@ pub struct Link<'a> {
 }
 
 impl Link<'_> {
-    /// Connects repeatedly until `stopped` changes, then disconnects in order.
+    /// Connects repeatedly until `stopped` changes, then disconnects cleanly.
     pub async fn run(&self, mut stopped: watch::Receiver<bool>) {
         let most = Duration::from_secs(self.settings.retry_max_s);
         let (mut pause, mut latest) = (RETRY, String::new());

@@ -250,7 +250,8 @@ fn heading() {
 /// has learned.
 const NEAR_AH: f64 = 0.006;
 
-/// Margin by which the best peer may lead on the voltages, Ah. Its memory is chosen afterwards by the result. Equals an
+/// Margin by which the best peer may beat packwatch on voltage swings, Ah. The peer has an advantage: its memory factor is the one
+/// with the best result. Equals an
 /// eighth of a percent of the capacity.
 const LEVEL_AH: f64 = 0.0025;
 

@@ -7,7 +7,7 @@
 //! maxima.
 //!
 //! # Errors of a row
-//! A circuit's errors repeat: near one SOC its voltage, its drop and its place on the curve have the same error. The errors of
+//! The errors of the circuit repeat: rows at nearly the same SOC share one error of the voltage, of the drop and of the SOC. The errors of
 //! rows are therefore correlated over 12 % of SOC, with parts proportional to a constant, to the slope of the curve and to the
 //! voltage drop. The drop's error grows with the drop, because charge transfer is not linear (Butler-Volmer).
 //!
@@ -228,7 +228,7 @@ impl<'a> Search<'a> {
         let (mean, variance) = moments(&costs, least);
         let step_ah = CAPACITY_STEP * self.rated_ah;
         let capacity_ah = at(first) + step_ah * mean;
-        // Errors that the fit does not see, at least the current sensor's gain and offset.
+        // Adds errors that the fit cannot detect, such as the current sensor's gain and offset.
         let std_ah = (1.4 * step_ah * variance.sqrt()).hypot(0.015 * capacity_ah);
         Some(ScalarGaussian::from_std(capacity_ah, std_ah))
     }
@@ -238,7 +238,7 @@ impl<'a> Search<'a> {
         let Conditional { theta, normal, misfit, .. } = self.conditional(capacity.mean, start)?;
         let std_ah = capacity.std();
         let [low, high] = [-0.5, 0.5].map(|part| self.conditional(capacity.mean + part * std_ah, &theta));
-        // Change of all parameters with one standard deviation of the capacity, whose own entry is for ln(capacity).
+        // Change of each parameter per standard deviation of the capacity. The capacity's entry is the change of ln(capacity).
         let by_capacity = high?.theta - low?.theta;
         let theta = self.conditional_with(&RepeatedErrors::IN_TABLES, capacity.mean, &theta)?.theta;
         let mut covariance = normal.cholesky()?.inverse();

@@ -84,7 +84,7 @@ impl Alarming {
         self.state = stored.state;
     }
 
-    /// Applies other rules. Returns the number of raised or past alarms that ended.
+    /// Replaces the rules. Returns how many of the dropped alarms were pending or had been raised.
     pub(crate) fn reconfigure(&mut self, now: Timestamp, config: &MonitorConfig) -> usize {
         self.missing_after_s = missing_after_s(&config.rules);
         self.state.knows_all_valid = false;

@@ -1,4 +1,4 @@
-//! Which samples and events are queued, each once, also across restarts of the daemon.
+//! Tests which samples and events are queued, and that each is queued once, even after a restart.
 
 use super::super::settings::HistorySettings;
 use super::*;
