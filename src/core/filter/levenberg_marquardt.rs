@@ -1,40 +1,40 @@
-//! Levenberg-Marquardt: damped steps towards the least cost.
+//! Levenberg-Marquardt: finds the minimum of a cost with damped steps.
 //!
-//! The damping falls after a step that lowers the cost and grows after one that does not. How a step is computed from the damping
-//! is the caller's: dense, bounded, over differences or derivatives.
+//! The damping is reduced after a step that lowers the cost and increased after any other step. The caller computes the
+//! step for a given damping, by any method (dense or bounded, with differences or derivatives).
 
 /// Damping, relative to the diagonal of the normal matrix.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Damping {
-    /// At the start.
+    /// Initial damping.
     pub first: f64,
-    /// Factor after a step that lowers the cost.
+    /// Factor on the damping after a step that lowers the cost.
     pub fall: f64,
-    /// Factor after such a step that first needed more damping.
+    /// Factor on the damping after a step that lowers the cost, if the step before it did not lower the cost.
     pub fall_after_growth: f64,
-    /// Factor after a step that does not lower the cost.
+    /// Factor on the damping after a step that does not lower the cost.
     pub growth: f64,
-    /// Least damping.
+    /// Minimum damping.
     pub least: f64,
-    /// Damping beyond which no step is expected to help.
+    /// Maximum damping. If an even larger damping would be needed, the search ends.
     pub most: f64,
 }
 
 /// Outcome of [`minimise`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct Minimum<T> {
-    /// The best point.
+    /// The point with the lowest cost.
     pub best: T,
-    /// Steps tried.
+    /// Number of steps tried, including steps that did not lower the cost.
     pub steps: usize,
-    /// Whether the cost no longer falls: by the caller's criterion, or because even the most damped step does not lower it.
+    /// Whether the search has converged: by the caller's criterion, or because the damping exceeds its maximum.
     pub has_converged: bool,
 }
 
 /// Tries at most `steps` damped steps from `start`.
 ///
-/// `step` returns the point after a step from the best one with a damping, or `None` when its cost is not lower.
-/// `has_converged` judges an accepted step: from, to, damping.
+/// `step(point, damping)` returns the point after one step from `point`, or `None` if its cost is not lower.
+/// `has_converged(from, to, damping)` is called after every step that lowers the cost.
 pub fn minimise<T>(
     damping: &Damping,
     steps: usize,
@@ -65,7 +65,7 @@ mod tests {
     const DAMPING: Damping =
         Damping { first: 1e-3, fall: 0.2, fall_after_growth: 0.2, growth: 8.0, least: 1e-9, most: 1e6 };
 
-    /// Rosenbrock's valley: residuals 10 (y - x^2) and 1 - x.
+    /// Cost of Rosenbrock's valley, with the residuals 10 (y - x^2) and 1 - x.
     fn cost([x, y]: [f64; 2]) -> f64 {
         50.0 * (y - x * x) * (y - x * x) + 0.5 * (1.0 - x) * (1.0 - x)
     }

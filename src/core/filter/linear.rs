@@ -1,8 +1,8 @@
 //! Scalar linear Kalman filter with A = C = 1: a random walk that is measured directly.
 //!
-//! State x (any unit), variance P. Predict: P += Q. Update with z, R: K = P / (P + R),
-//! x += K (z - x), P = (1 - K) P. Source: the paper's capacity filter (section 3.3.4), where x is the
-//! capacity in Ah and a step is a charge/discharge transition. Inputs are not checked: a NaN stays a NaN.
+//! State x (any unit), variance P. Predict: P += Q. Update with the measurement z and its variance R: K = P / (P + R),
+//! x += K (z - x), P = (1 - K) P. Source: the paper's capacity filter (section 3.3.4), in which x is the capacity in Ah
+//! and each charge/discharge transition is a step. Inputs are not checked: a NaN gives a NaN.
 
 use serde::{Deserialize, Serialize};
 
@@ -33,7 +33,7 @@ impl From<ScalarGaussian> for Estimate {
 }
 
 impl ScalarGaussian {
-    /// From an estimate and its standard deviation.
+    /// Creates the value from a mean and its standard deviation.
     pub fn from_std(mean: f64, std: f64) -> Self {
         Self { mean, variance: std * std }
     }
@@ -55,13 +55,14 @@ impl ScalarGaussian {
         self.variance *= 1.0 - gain;
     }
 
-    /// Measurement that leads from the estimate `self` to `after`: 1/R = 1/P1 - 1/P0, z = R (x1/P1 - x0/P0).
+    /// Returns the measurement (value z, variance R) that would change this estimate (x0, P0) to `after` (x1, P1): 1/R
+    /// = 1/P1 - 1/P0, z = R (x1/P1 - x0/P0).
     ///
-    /// The result is independent of the prior `self`, so a prior assumption does not count as evidence. `None` when the
-    /// variance has not fallen (P1 >= P0).
+    /// The result contains only the information gained since `self`, so the assumptions in `self` do not count as
+    /// evidence. `None` if the variance has not fallen (P1 >= P0).
     pub fn information_until(&self, after: &Self) -> Option<Measurement> {
         let information = 1.0 / after.variance - 1.0 / self.variance;
-        // A gain below a millionth of the prior information is rounding, not evidence.
+        // If the information gained is less than a millionth of the information in `self`, it is a rounding error.
         if !information.is_finite() || information <= 1e-6 / self.variance {
             return None;
         }
@@ -72,7 +73,7 @@ impl ScalarGaussian {
 
 /// Updates N states `x` and their covariance `p` with an innovation.
 ///
-/// `ph` is the covariance of the states with the measurement; the gain is `ph` / `innovation_variance`.
+/// `ph` is the covariance of the states with the measurement. The gain is `ph / innovation_variance`.
 pub fn update_states<const N: usize>(
     x: &mut [f64; N],
     p: &mut [[f64; N]; N],

@@ -1,6 +1,7 @@
-//! Scalar Kalman filter, interpolation, statistics and minimisation on plain numbers, independent of batteries.
+//! Scalar Kalman filter, interpolation, statistics and minimisation. This module knows nothing about batteries.
 //!
-//! In: means, (co)variances and measurements in any unit. Out: the same after a prediction or an update.
+//! In: means, (co)variances and measurements in any unit. Out: the means and (co)variances after a prediction or an
+//! update.
 
 pub mod bisection;
 pub mod interpolation;

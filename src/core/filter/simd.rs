@@ -1,8 +1,9 @@
 //! Arithmetic on L numbers at once, for filters that step several cells together.
 //!
-//! Every operation works on each lane alone, in one order of IEEE 754 operations (no fused multiply-add, no library
-//! function), so a lane gives the same bits for every L, neighbour and instruction width. The compiler
-//! vectorises the loops. NaN and infinities follow IEEE 754 unless a method states otherwise.
+//! Every operation treats each lane separately, with a fixed order of IEEE 754 operations (no fused multiply-add, no
+//! library function). A lane therefore gives the same bits for every L, every content of the other lanes and every
+//! instruction width. The compiler vectorises the loops. NaN and infinities follow IEEE 754 unless a method states
+//! otherwise.
 
 use std::ops::{Add, BitAnd, Div, Mul, Neg, Not, Sub};
 
@@ -10,12 +11,12 @@ use std::ops::{Add, BitAnd, Div, Mul, Neg, Not, Sub};
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Lanes<const L: usize>(pub [f64; L]);
 
-/// L booleans: all bits set for true, none for false, as wide as the numbers they select.
+/// L booleans. In a true lane, all 64 bits are set; in a false lane, no bit is set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Mask<const L: usize>([u64; L]);
 
-/// An array of the results of `lane` for each index. A plain loop, because the standard library's `from_fn` is not inlined into long
-/// callers (9 % of a replay of one cell).
+/// Array of the results of `lane` for each index. It is a plain loop, because the standard library's `from_fn` is not
+/// inlined into long callers; with `from_fn`, a replay of one cell takes 9 % longer.
 #[inline(always)]
 fn from_fn<T: Copy + Default, const L: usize>(mut lane: impl FnMut(usize) -> T) -> [T; L] {
     let mut lanes = [T::default(); L];
@@ -80,7 +81,7 @@ impl<const L: usize> Not for Mask<L> {
 }
 
 impl<const L: usize> Mask<L> {
-    /// Fills the mask from a predicate of the lane index.
+    /// Sets each lane to the result of a predicate of the lane index.
     #[inline(always)]
     fn from_fn(mut predicate: impl FnMut(usize) -> bool) -> Self {
         Self(from_fn(|i| if predicate(i) { u64::MAX } else { 0 }))
@@ -113,7 +114,7 @@ impl<const L: usize> Mask<L> {
     /// Whether exactly one lane is true.
     #[inline(always)]
     pub fn is_one(self) -> bool {
-        // True is -1.
+        // As an integer, a true lane is -1.
         self.0.iter().fold(0, |sum: u64, lane| sum.wrapping_add(*lane)) == u64::MAX
     }
 
@@ -155,7 +156,7 @@ impl<const L: usize> Lanes<L> {
         Self(from_fn(|i| self.0[i].abs()))
     }
 
-    /// Lane-wise minimum; the other's lane where this lane is NaN.
+    /// The smaller value of `self` and `other` in each lane; the value of `other` if the lane of `self` is NaN.
     #[inline(always)]
     pub fn smaller(self, other: Self) -> Self {
         Self(from_fn(|i| if self.0[i] < other.0[i] { self.0[i] } else { other.0[i] }))
@@ -173,13 +174,13 @@ impl<const L: usize> Lanes<L> {
         Self(from_fn(|i| if self.0[i] > limit { self.0[i] } else { limit }))
     }
 
-    /// Whether each lane is above the other's; false where one is NaN.
+    /// Whether each lane of `self` is greater than the lane of `other`; false if either lane is NaN.
     #[inline(always)]
     pub fn above(self, other: Self) -> Mask<L> {
         Mask::from_fn(|i| self.0[i] > other.0[i])
     }
 
-    /// Whether each lane is above `limit`; false where it is NaN.
+    /// Whether each lane is greater than `limit`; false if the lane is NaN.
     #[inline(always)]
     pub fn above_number(self, limit: f64) -> Mask<L> {
         Mask::from_fn(|i| self.0[i] > limit)
@@ -191,14 +192,14 @@ impl<const L: usize> Lanes<L> {
         Mask::from_fn(|i| self.0[i].abs() < f64::INFINITY)
     }
 
-    /// Selects each lane of `self` where the mask is true, else of `other`.
+    /// Takes each lane from `self` where the mask is true, otherwise from `other`.
     #[inline(always)]
     pub fn or_else(self, mask: Mask<L>, other: Self) -> Self {
         Self(from_fn(|i| if mask.0[i] != 0 { self.0[i] } else { other.0[i] }))
     }
 
-    /// e^x with a relative error below 3 x 2^-52; 0 at -708 and below, e^709 above 709 and for NaN. To detect NaN, check the
-    /// argument.
+    /// e^x with a relative error below 3 x 2^-52. If x <= -708, returns 0; if x > 709 or x is NaN, returns e^709. To
+    /// detect NaN, check the argument.
     #[inline(always)]
     pub fn exp(self) -> Self {
         let x = self.at_most(709.0);
@@ -207,7 +208,7 @@ impl<const L: usize> Lanes<L> {
         scaled.or_else(x.above_number(LEAST), Self::splat(0.0))
     }
 
-    /// e^x and e^-x, with a relative error below 3 x 2^-52; x is limited to +-708, and NaN counts as 708.
+    /// e^x and e^-x, with a relative error below 3 x 2^-52. x is first limited to -708 to 708; a NaN counts as 708.
     #[inline(always)]
     pub fn exp_of_both_signs(self) -> (Self, Self) {
         let series = ExpSeries::new(self.at_most(-LEAST).at_least(LEAST));
@@ -217,20 +218,22 @@ impl<const L: usize> Lanes<L> {
         )
     }
 
-    /// ln x for a normal, positive x, to within two units in the last place (of 1e-3 if |ln x| is smaller).
+    /// ln x for a normal, positive x. The error is at most two units in the last place of the result, or of 1e-3 if |ln
+    /// x| is smaller than 1e-3.
     #[inline(always)]
     pub fn ln(self) -> Self {
         Self(from_fn(|i| ln(self.0[i])))
     }
 }
 
-/// x = n ln 2 + r with |r| <= ln 2 / 2, and e^r by its Taylor series to r^12 / 12! (the rest is below 2e-16).
+/// Parts of e^x: x = n ln 2 + r with |r| <= ln 2 / 2. e^r is computed from its Taylor series up to r^12 / 12!
+/// (truncation error below 2e-16).
 struct ExpSeries<const L: usize> {
-    /// A number with n in its lowest bits.
+    /// A floating-point number whose lowest bits contain n.
     shifted: Lanes<L>,
-    /// Even powers of r.
+    /// Sum of the terms with even powers of r.
     even: Lanes<L>,
-    /// Odd powers of r.
+    /// Sum of the terms with odd powers of r.
     odd: Lanes<L>,
 }
 
@@ -240,14 +243,15 @@ impl<const L: usize> ExpSeries<L> {
         let shifted = x * std::f64::consts::LOG2_E + ROUNDER;
         let n = shifted - ROUNDER;
         let r = (x - n * LN_2_HIGH) - n * LN_2_LOW;
-        // Separate even and odd powers: two short dependency chains instead of a long one.
+        // Even and odd powers are summed separately, because two short dependency chains are faster than one long
+        // chain.
         let r2 = r.square();
         let even = EXP_EVEN.iter().fold(Lanes::splat(1.0 / 479_001_600.0), |sum, factor| sum * r2 + *factor);
         let odd = EXP_ODD.iter().fold(Lanes::splat(1.0 / 39_916_800.0), |sum, factor| sum * r2 + *factor);
         Self { shifted, even, odd: odd * r }
     }
 
-    /// A sum with n added to, or subtracted from, the bits of its exponent.
+    /// Applies `change` (add or subtract) to the bits of `sum` and the bits of n, shifted to the exponent.
     #[inline(always)]
     fn scaled(&self, sum: Lanes<L>, change: fn(u64, u64) -> u64) -> Lanes<L> {
         // The shift drops the bits above n.
@@ -255,14 +259,15 @@ impl<const L: usize> ExpSeries<L> {
     }
 }
 
-/// x = m 2^e with sqrt(1/2) <= m < sqrt(2); with s = (m - 1) / (m + 1) ln m = 2 (s + s^3/3 + s^5/5 ..).
+/// ln x from x = m 2^e with sqrt(1/2) <= m < sqrt(2). With s = (m - 1) / (m + 1), ln m = 2 (s + s^3/3 + s^5/5 + ...).
 #[inline(always)]
 fn ln(x: f64) -> f64 {
     // Subtracting the bits of sqrt(1/2) leaves e in the exponent field.
     let above = x.to_bits().wrapping_sub(SQRT_HALF_BITS);
     let exponent = above & 0xFFF0_0000_0000_0000;
     let m = f64::from_bits(x.to_bits().wrapping_sub(exponent));
-    // Convert e to a float without an integer conversion: put its low bits into the mantissa of a large number.
+    // Converts the exponent e to a float without an integer conversion: puts its low bits into the mantissa of a large
+    // number.
     let biased = (exponent >> 52).wrapping_add(2048) & 0xFFF;
     let e = f64::from_bits(LARGE.to_bits() | biased) - (LARGE + 2048.0);
     let s = (m - 1.0) / (m + 1.0);
@@ -271,23 +276,23 @@ fn ln(x: f64) -> f64 {
     2.0 * s * series + e * std::f64::consts::LN_2
 }
 
-/// Below this e^x counts as 0: smaller results would be subnormal.
+/// At and below this x, e^x counts as 0, because smaller results would be subnormal.
 const LEAST: f64 = -708.0;
-/// Adding it rounds a number below 2^51 to a whole one.
+/// Adding this number to a number below 2^51 rounds the latter to an integer.
 const ROUNDER: f64 = 6_755_399_441_055_744.0; // 1.5 * 2^52
 /// 2^52.
 const LARGE: f64 = 4_503_599_627_370_496.0;
 const SQRT_HALF_BITS: u64 = std::f64::consts::FRAC_1_SQRT_2.to_bits();
-/// ln 2 in two parts, the first with 32 bits, so that its product with a small whole number is exact.
+/// ln 2 in two parts. The first part has only 32 significant bits, so its product with a small integer is exact.
 const LN_2_HIGH: f64 = f64::from_bits(0x3FE6_2E42_FEE0_0000);
 const LN_2_LOW: f64 = f64::from_bits(0x3DEA_39EF_3579_3C76);
 
-/// 1/10!, 1/8! .. 1/0!.
+/// 1/10!, 1/8!, ..., 1/0!.
 const EXP_EVEN: [f64; 6] = [1.0 / 3_628_800.0, 1.0 / 40_320.0, 1.0 / 720.0, 1.0 / 24.0, 0.5, 1.0];
-/// 1/9!, 1/7! .. 1/1!.
+/// 1/9!, 1/7!, ..., 1/1!.
 const EXP_ODD: [f64; 5] = [1.0 / 362_880.0, 1.0 / 5_040.0, 1.0 / 120.0, 1.0 / 6.0, 1.0];
 
-/// 1/19, 1/17 .. 1/1.
+/// 1/19, 1/17, ..., 1/1.
 const LN_SERIES: [f64; 10] =
     [1.0 / 19.0, 1.0 / 17.0, 1.0 / 15.0, 1.0 / 13.0, 1.0 / 11.0, 1.0 / 9.0, 1.0 / 7.0, 1.0 / 5.0, 1.0 / 3.0, 1.0];
 

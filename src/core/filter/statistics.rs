@@ -1,8 +1,8 @@
-//! Statistics of plain numbers.
+//! Statistics of numbers without a unit.
 
 /// Median of the finite values (the upper of the two middle ones); `None` if there is no finite value.
 pub fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
-    // One allocation: `collect` of a filtered iterator starts small and grows.
+    // Allocates once. Collecting a filtered iterator would start with a small buffer and grow it.
     let mut finite = Vec::with_capacity(values.size_hint().1.unwrap_or_default());
     finite.extend(values.filter(|value| value.is_finite()));
     let middle = finite.len() / 2;
@@ -12,22 +12,23 @@ pub fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
     Some(*finite.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
-/// Least and largest of the values; infinity and minus infinity without one.
+/// Minimum and maximum of the values; infinity and minus infinity if there are no values.
 pub fn ends(values: impl Iterator<Item = f64>) -> (f64, f64) {
     values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| (low.min(value), high.max(value)))
 }
 
-/// Probability that a standard normal value is below.
+/// Probability that a standard normal variable is below `value`.
 pub fn normal_cdf(value: f64) -> f64 {
     probability_below(value, 1.0)
 }
 
-/// Probability that a normal value of mean 0 and standard deviation `std` is below `value`.
+/// Probability that a normal variable with mean 0 and standard deviation `std` is below `value`.
 pub fn probability_below(value: f64, std: f64) -> f64 {
     0.5 * libm::erfc(-value / (std * std::f64::consts::SQRT_2))
 }
 
-/// Bell curve of height and width 1: correlation of two places that are `distance` apart, in lengths over which a quantity changes.
+/// exp(-distance^2 / 2): correlation of a quantity at two points. `distance` is the distance between the points divided
+/// by the correlation length.
 pub fn bell(distance: f64) -> f64 {
     libm::exp(-0.5 * distance * distance)
 }
