@@ -1,24 +1,25 @@
-//! Settings for learning at charge/discharge transitions. `config` checks their ranges.
+//! Settings for learning at charge/discharge transitions. The `config` module checks their ranges.
 
 /// Classification of the current as charge, rest or discharge.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TransitionConfig {
     /// The pack rests while |pack current| is at most this, A.
     pub dead_band_a: f64,
-    /// A new mode is entered only if the current exceeds the dead band by this much, A.
+    /// Charge or discharge is entered only if the current exceeds the dead band by this much, A.
     pub hysteresis_a: f64,
-    /// Shortest duration of a mode, s.
+    /// Minimum duration of a charge, rest or discharge, s.
     pub min_duration_s: f64,
-    /// A half-cycle that moves less charge than this fraction of the rated capacity is joined to the next one.
+    /// A half-cycle that moves less charge than this fraction of the rated capacity is merged with the next half-cycle.
     pub min_swing: f64,
 }
 
 /// Source of a half-cycle's capacity measurement.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum CapacityMethod {
-    /// Charge divided by the SOC swing from the voltages; the variance follows from the swing's uncertainty.
+    /// Charge divided by the SOC swing that follows from the voltages; the variance follows from the uncertainty of the
+    /// swing.
     Swing,
-    /// As in the paper: charge divided by a nominal swing, with a fixed measurement variance.
+    /// As in the paper: charge divided by a fixed nominal swing; the variance is also fixed.
     Nominal {
         /// Assumed swing, fraction (paper: 0.6).
         swing: f64,
@@ -34,24 +35,25 @@ pub struct CapacityConfig {
     pub method: CapacityMethod,
     /// Process noise: standard deviation gained per equivalent full cycle (Swing) or per event (Nominal), Ah.
     pub noise_ah_per_cycle: f64,
-    /// Process noise of rest: standard deviation gained in a day without current, Ah. Rest adds noise because capacity
-    /// recovers. At most one day counts per half-cycle. Not used by `Nominal`.
+    /// Process noise of rest: standard deviation gained per day without current, Ah. Rest adds noise because capacity
+    /// recovers during rest. At most one day per half-cycle counts. Not used by `Nominal`.
     pub noise_ah_per_rest_day: f64,
-    /// Constant error of the open-circuit curve at the ends of a half-cycle, V; `None` = half of the model's own error
-    /// there. Not used by `Nominal`.
+    /// Constant error of the open-circuit curve at the ends of a half-cycle, V. `None` = half of the error that the
+    /// cell model states for these points. Not used by `Nominal`.
     pub end_error_v: Option<f64>,
-    /// Standard deviation of the current sensor's gain, fraction: a lower bound on the capacity's relative
-    /// uncertainty.
+    /// Standard deviation of the current sensor's gain, fraction. It is a lower bound of the capacity's relative
+    /// standard deviation.
     pub current_gain_std: f64,
-    /// Initial standard deviation of the current sensor's offset, per cell, A; 0 = not learned. Not used by `Nominal`.
+    /// Initial standard deviation of the current sensor's offset per cell, A; 0 = the offset is not learned. Not used
+    /// by `Nominal`.
     pub current_offset_std_a: f64,
-    /// Initial standard deviation of the fade, Ah per full cycle; 0 = not learned. Not used by `Nominal`.
+    /// Initial standard deviation of the fade, Ah per full cycle; 0 = the fade is not learned. Not used by `Nominal`.
     pub fade_std_ah_per_cycle: f64,
     /// Process noise of the fade: standard deviation gained per equivalent full cycle, Ah per full cycle.
     pub fade_noise_ah_per_cycle: f64,
 }
 
-/// Recharge period that the alarm rule uses.
+/// Which recharge period the alarm rule uses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RechargeAlarm {
     /// The raw period, measured with the actual charger.
@@ -69,9 +71,9 @@ pub struct RechargeConfig {
     pub to_soc: f64,
     /// Current of the reference charger per cell, A, positive.
     pub reference_current_a: f64,
-    /// Part of the window that a charge must cover before its normalised period is reported, fraction.
+    /// Fraction of the window that a charge must cover; otherwise its normalised period is not reported.
     pub min_coverage: f64,
-    /// Period that the alarm rule uses.
+    /// Which period the alarm rule uses.
     pub alarm_on: RechargeAlarm,
 }
 
@@ -93,7 +95,7 @@ pub struct UsableConfig {
 /// Settings for learning at charge/discharge transitions.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HealthConfig {
-    /// Settings of the mode detection.
+    /// Settings for detecting charge, rest and discharge.
     pub transition: TransitionConfig,
     /// Settings of the capacity filter.
     pub capacity: CapacityConfig,

@@ -4,12 +4,13 @@
 //! (`ScalarGaussian::information_until`). At the end of a charge of w full cycles, C -= w fade. The capacity also
 //! follows a random walk; the caller passes its variance.
 //!
-//! The lasting errors of the measurement ([`super::end_errors`]) do not change with time. The filter considers them
-//! but does not estimate them (Schmidt; Woodbury and Junkins 2010). In addition to P, it keeps the change of x per
-//! standard deviation of each error. The lasting errors enter the gain and the published variance, and never average
-//! out.
+//! The cell model has errors that do not change with time (lasting errors, [`super::end_errors`]). The filter considers
+//! these errors but does not estimate them (Schmidt; Woodbury and Junkins 2010). In addition to the covariance P, it
+//! stores how much x changes per standard deviation of each lasting error. The lasting errors increase the published
+//! variance and reduce the gain, so they never average out.
 //!
-//! Assumed: all fade happens at the end of a charge. `check` checks a stored filter; inputs are not checked.
+//! Assumed: all fade happens at the end of a charge. `check` checks the numbers of a stored filter; other inputs are
+//! not checked.
 
 use serde::{Deserialize, Serialize};
 
@@ -35,7 +36,7 @@ pub struct DriftFilter {
 }
 
 impl DriftFilter {
-    /// Creates a filter that starts from `capacity`, Ah.
+    /// Creates a filter with the initial capacity `capacity`, Ah.
     pub fn new(config: &CapacityConfig, capacity: ScalarGaussian) -> Self {
         let mut p = [[0.0; N]; N];
         p[C][C] = capacity.variance;
@@ -49,7 +50,7 @@ impl DriftFilter {
         ScalarGaussian { mean: self.x[C], variance: self.p[C][C] + lasting }
     }
 
-    /// Checks a stored filter; the error is the first impossible number.
+    /// Checks the numbers of a stored filter. The error names the first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         InvalidState::unless_capacity("a learned capacity", self.x[C])?;
         let all = self.x.iter().chain(self.p.iter().flatten()).chain(self.by_end.iter().flatten());
@@ -59,7 +60,7 @@ impl DriftFilter {
             InvalidState::unless_natural("a variance of a learned capacity's filter", self.p[i][i])?;
             for j in 0..i {
                 let (covariance, most) = (self.p[i][j], (self.p[i][i] * self.p[j][j]).sqrt());
-                // Tolerates the rounding of stored numbers.
+                // Tolerates rounding of the stored numbers.
                 let fits = covariance.abs() <= most * (1.0 + 1e-5) && (covariance - self.p[j][i]).abs() <= most * 1e-5;
                 InvalidState::unless(
                     fits,
@@ -75,7 +76,8 @@ impl DriftFilter {
     /// Updates with the capacity `z` measured by a half-cycle. `effects_ah`: change of `z` per standard deviation of
     /// each lasting error.
     pub fn update(&mut self, z: Measurement, effects_ah: &[f64; END_ERRORS]) {
-        // Lasting errors of the innovation: the sum of C's and the measurement's.
+        // Effect of the lasting errors on the innovation: their effect on the estimate C plus their effect on the
+        // measurement.
         let by_end: [f64; END_ERRORS] = std::array::from_fn(|k| self.by_end[k][C] + effects_ah[k]);
         let lasting: f64 = by_end.iter().map(|b| b * b).sum();
         let own_variance = self.p[C][C] + z.variance;
@@ -96,23 +98,25 @@ impl DriftFilter {
         }
     }
 
-    /// Whether the capacity is plausible for the model's cell (capacity `cell_ah`) and every number can be stored.
+    /// Whether the capacity is plausible for a cell model of capacity `cell_ah`, and all numbers of the filter can be
+    /// stored.
     pub(super) fn is_possible(&self, cell_ah: f64) -> bool {
         bounds::TRUSTED_CAPACITY.has(self.x[C] / cell_ah) && self.check().is_ok()
     }
 
-    /// Raises the capacity's variance to at least `variance`, Ah^2, after new voltages contradicted the measurements.
+    /// Raises the variance of the capacity to at least `variance`, Ah^2, because new voltages have contradicted earlier
+    /// measurements.
     pub fn doubt(&mut self, variance: f64) {
         self.p[C][C] = self.p[C][C].max(variance);
     }
 
-    /// Raises the capacity to at least `charge_ah`, the charge moved in one half-cycle.
+    /// Raises the capacity to at least `charge_ah`, because the cell has moved this charge in one half-cycle.
     pub fn at_least(&mut self, charge_ah: f64) {
         self.x[C] = self.x[C].max(charge_ah);
     }
 
-    /// Predicts over a half-cycle. `cycles`: its length in full cycles; `charged`: full cycles that cause fade;
-    /// `capacity_variance`: process noise of the capacity, Ah^2.
+    /// Predicts the state after a half-cycle. `cycles`: length of the half-cycle in full cycles; `charged`: full cycles
+    /// that cause fade; `capacity_variance`: process noise of the capacity, Ah^2.
     pub fn predict(&mut self, config: &CapacityConfig, cycles: f64, charged: f64, capacity_variance: f64) {
         self.x[C] -= charged * self.x[FADE];
         for j in 0..N {
@@ -144,7 +148,7 @@ mod tests {
     };
 
     /// Runs cycles with a swing of 60 % on a cell that loses `loss_ah` at the end of each charge. Returns the filter
-    /// and the true capacity, Ah.
+    /// and the cell's true capacity, Ah.
     fn cycle(config: &CapacityConfig, loss_ah: f64) -> (DriftFilter, f64) {
         let mut drift = DriftFilter::new(config, ScalarGaussian::from_std(2.5, 0.1));
         let mut true_ah = 2.6;
@@ -195,7 +199,8 @@ mod tests {
             }
             drift.capacity()
         };
-        // Expected: the deviation after one noise-free reading with a lasting error of 0.05 Ah and a prior of 0.2 Ah.
+        // Expected standard deviation after one noise-free measurement with a lasting error of 0.05 Ah, from a prior of
+        // 0.2 Ah.
         let (kept, expected) = (measured(0.05).std(), 0.05 * 0.2 / f64::hypot(0.05, 0.2));
         assert!((kept - expected).abs() < 1e-3, "{kept} {expected}");
         assert!(measured(0.0).std() < 0.001);

@@ -1,25 +1,26 @@
-//! Errors of the cell model at the ends of half-cycles. Half-cycles with the same ends have the same errors, so
-//! averaging over many half-cycles does not remove the errors.
+//! Errors of the cell model at the start and end of half-cycles. Two half-cycles between the same SOC values have the
+//! same errors, so averaging over many half-cycles does not remove these errors.
 //!
-//! In: a half-cycle's ends. Out: the change of its capacity, Ah, per standard deviation of each error.
+//! In: SOC at the start and end of a half-cycle. Out: change of the capacity, Ah, that the half-cycle gives, per
+//! standard deviation of each error.
 //!
-//! A half-cycle's capacity is charge / (s_high - s_low). An error e (V) of the open-circuit curve at one end moves the
-//! SOC there by e / slope, and the capacity by (C / swing) (e / slope). The errors are defined at SOC nodes, are
-//! independent of each other and are interpolated linearly between the nodes. Their size follows from the error that
-//! the model's fit reports. If the model reports no error, the voltage offset that the filter considers also covers
-//! the curve.
+//! A half-cycle's capacity is charge / (s_high - s_low). An error e (V) of the open-circuit curve at one end changes
+//! the SOC at this end by e / slope, and the capacity by (C / swing) (e / slope). The errors are defined at SOC nodes.
+//! They are independent of each other and are interpolated linearly between the nodes. Their size follows from the
+//! voltage error that the cell model states. If the model states no error, the errors are 0 here; the filter's constant
+//! voltage offset then also covers errors of the curve.
 
 use super::CapacityConfig;
 use super::half_cycle::HalfCycle;
 use crate::cell::CellModel;
 use crate::quantity::Mode;
 
-/// Number of errors, one per SOC node; the nodes are evenly spaced from empty to full. In real cells, curve errors a
-/// quarter of the SOC range apart differ.
+/// Number of errors, one per SOC node. The nodes are evenly spaced from SOC 0 to 1. In real cells, errors of the curve
+/// differ if they are a quarter of the SOC range apart.
 pub(super) const END_ERRORS: usize = 5;
 
-/// Change of a half-cycle's capacity, Ah, per standard deviation of each error; zero if the half-cycle's ends are
-/// unknown.
+/// Change of a half-cycle's capacity, Ah, per standard deviation of each error; zero if the SOC at the half-cycle's
+/// ends is unknown.
 pub(super) fn effects_ah(
     model: &CellModel,
     config: &CapacityConfig,
@@ -29,15 +30,15 @@ pub(super) fn effects_ah(
     let mut effects = [0.0; END_ERRORS];
     let Some(ends) = &half_cycle.ends else { return effects };
     let temperature_c = half_cycle.mean_temperature_c.unwrap_or(25.0);
-    // Limits the effect. Below a swing of 2 %, the measurement is useless.
+    // Limits the effect: below a swing of 2 %, the measurement is useless.
     let swing = (half_cycle.charge_ah / capacity_ah).max(0.02);
-    // A discharge starts at its fuller end, a charge at its emptier end.
+    // A discharge starts at its higher SOC, a charge at its lower SOC.
     let sign = if half_cycle.mode == Mode::Charge { -1.0 } else { 1.0 };
     for (soc, fuller) in ends.iter().zip([sign, -sign]) {
         let position = model.grid_position(*soc, temperature_c);
         let per_volt = -fuller * capacity_ah / (swing * model.ocv_slope_v(&position, capacity_ah));
-        // Half of the model's own error comes from the curve and does not change. The other half depends on the
-        // history of the current, so it differs between half-cycles.
+        // Half of the error stated by the model is an error of the curve and does not change. The other half depends on
+        // the history of the current, so it differs between half-cycles.
         let own_v = || model.voltage_error_v(&position).map_or(0.0, |error_v| 0.5 * error_v);
         let error_v = config.end_error_v.unwrap_or_else(own_v);
         let along = soc.clamp(0.0, 1.0) * (END_ERRORS - 1) as f64;
@@ -83,7 +84,8 @@ mod tests {
     fn curve_error_moves_capacity_by_slope_and_swing() {
         let model = small_model();
         let found = effects_ah(&model, &CONFIG, &discharge(0.9, 1.0, 0.375), 1.8);
-        // Slopes at 25 C, interpolated 5/8 of the way from 0 to 40 C: 1.075 V above SOC 0.5, 1.325 V below. Swing 0.5.
+        // Slopes at 25 C, which is 5/8 of the way from 0 to 40 C: 1.075 V above SOC 0.5, 1.325 V below. The swing is
+        // 0.5.
         let per_volt = 1.8 / 0.5 * 0.004;
         let lower = 0.5 * per_volt / 1.325;
         let expected = [0.0, lower, lower, 0.0, -per_volt / 1.075];

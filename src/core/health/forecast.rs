@@ -1,35 +1,39 @@
-//! Remaining useful life: use and days until a cell's capacity falls below the end-of-life threshold.
+//! Remaining useful life: the further use (in equivalent full cycles and days) until a cell's capacity falls below the
+//! end-of-life threshold.
 //!
-//! In: use (equivalent full cycles, days) and learned capacities (Ah) with variances. Out: median and 90 % interval,
-//! or the reason why there is no forecast ([`InsufficientData`]). Negative and non-finite readings are ignored.
+//! In: use between readings (equivalent full cycles, days) and learned capacities (Ah) with their variances. Out:
+//! median and 90 % interval, or the reason why there is no forecast ([`InsufficientData`]). Negative and non-finite
+//! numbers are ignored.
 //!
 //! The forecast is a linear Kalman filter over the learned capacities, with one step per reading. Cost and memory do
 //! not grow with the history. State x = [level, rate, recovery, first], with capacities as fractions of a reference
 //! capacity:
 //! * level: the capacity without recovery, which only falls; level -= rate dt. The use t counts equivalent full
 //!   cycles, or days if the cycles are unknown;
-//! * rate: loss per unit of use. Its logarithm follows a random walk: `RATE_WALK` per square root of capacity lost
-//!   (`KNEE_WALK` in the knee, see [`knee`]), and `RATE_WALK_USE` per e-fold of use. Both are relative, so the same
-//!   numbers serve cells that live for 50 cycles and for 5,000. In the linear filter,
-//!   Q = (w1^2 rate dt + w2^2 ln(t1 / t0)) (rate^2 + P_rate);
+//! * rate: loss per unit of use. Its logarithm follows a random walk with two parts. The first part has the standard
+//!   deviation w1 = `RATE_WALK` per square root of capacity lost (`KNEE_WALK` in the knee, see [`knee`]), the second
+//!   part w2 = `RATE_WALK_USE` per square root of an e-fold of use. Both parts are relative, so the same constants suit
+//!   cells that live for 50 cycles and for 5,000. In the linear filter, Q = (w1^2 rate dt + w2^2 ln(t1 / t0)) (rate^2 +
+//!   P_rate);
 //! * recovery: capacity that returns during rest and is used up again (an Ornstein-Uhlenbeck process; measured cells
-//!   show 1 to 5 % after days of rest). It correlates successive readings, so that ten readings within one cycle do
-//!   not count as ten independent readings;
-//! * first: the level at the first reading, which later readings refine. The loss since the first reading is
-//!   first - level.
+//!   show 1 to 5 % after days of rest). Because successive readings share the recovery, ten readings within one cycle
+//!   do not count as ten independent readings;
+//! * first: the level at the first reading. Later readings improve this estimate too. The loss since the first reading
+//!   is first - level.
 //!
-//! A reading is level + recovery + noise; outliers get less weight. The forecast integrates over the loss, not over
-//! time: the use until the level has fallen by L is the integral of 1 / rate over the loss. This sum of lognormals is
-//! approximated by one lognormal of the same mean and variance (see [`distribution`]). Because the level only falls,
-//! it passes a threshold once, so the integral needs no sampling of first-passage times.
+//! A reading is level + recovery + noise; outliers get less weight. The forecast integrates over the loss instead of
+//! over time: the use until the level has fallen by L is the integral of 1 / rate over the loss. This integral is a sum
+//! of lognormals. It is approximated by one lognormal with the same mean and variance (see [`distribution`]). The level
+//! only falls, so it passes a threshold once; no first-passage times have to be sampled.
 //!
-//! Assumed: outside the knee, fade may slow down or speed up, so the median keeps the current rate. In the knee,
-//! between 10 and 20 % of loss, fade accelerates in many cells: resistance and current per active area grow with
-//! the loss, and lithium plates. The forecast expects the knee before a reading shows it.
+//! Assumed: outside the knee, fade may slow down or speed up, so the median keeps the present rate. The knee is the
+//! range from 10 to 20 % of loss. There, fade accelerates in many cells: resistance and current per active area grow
+//! with the loss, and lithium plates. The forecast expects this acceleration before a reading shows it.
 //!
-//! Deviation: the expected acceleration changes the variance of the filter but not its mean. Reason: otherwise the
-//! filter overestimates the rate of cells without a knee (the NASA cells) after each recovery. Effect: only the
-//! readings show that a knee has begun. `tests/rul.md` lists the alternatives and figures.
+//! Deviation: the expected acceleration increases the variance of the rate in the filter, but not its mean. Reason:
+//! otherwise, for cells without a knee (the NASA cells), the filter would overestimate the rate after each recovery.
+//! Effect: the filter's mean shows that a knee has begun only after readings show it. `tests/rul.md` lists the
+//! alternatives and figures.
 
 mod distribution;
 #[cfg(test)]
@@ -42,8 +46,8 @@ use crate::filter::bisect;
 use crate::filter::update_states;
 use crate::quantity::InvalidState;
 
-/// Standard deviation of the rate's logarithm per square root of capacity lost (fraction of the reference): over a
-/// loss of 10 %, one standard deviation is a factor of e^0.32.
+/// Standard deviation of the rate's logarithm per square root of capacity lost (fraction of the reference capacity).
+/// Over a loss of 10 %, one standard deviation is a factor of e^0.32.
 const RATE_WALK: f64 = 1.0;
 /// Standard deviation of the rate's logarithm per square root of an e-fold of use since the first reading.
 const RATE_WALK_USE: f64 = 0.3;
@@ -51,28 +55,29 @@ const RATE_WALK_USE: f64 = 0.3;
 const KNEE: (f64, f64) = (0.1, 0.2);
 /// Expected growth of the rate's logarithm in the knee, per fraction of the reference lost: e^0.9 over the whole knee.
 const KNEE_DRIFT: f64 = 9.0;
-/// `RATE_WALK` in the knee: one standard deviation is a factor of e^0.47 over the whole knee, so that the interval also
+/// `RATE_WALK` in the knee. Over the whole knee, one standard deviation is a factor of e^0.47, so the interval also
 /// covers cells with hardly any knee.
 const KNEE_WALK: f64 = 1.5;
 /// Standard deviation of the recovery while the cell is used, fraction of the reference.
 const RECOVERY_IN_USE: f64 = 0.01;
 /// Standard deviation of the recovery gained by rest, fraction of the reference.
 const RECOVERY_IN_REST: f64 = 0.02;
-/// Time constant of the recovery during rest, days. On the axis of days, it is also the time constant of the decay.
+/// Time constant of the recovery during rest, days. On the axis of days, it is also the time constant with which the
+/// recovery decays.
 const RECOVERY_DAYS: f64 = 1.0;
 const DAY_S: f64 = 86_400.0;
 
-/// Fewest readings of a forecast: two give a rate, the third can contradict it.
+/// Minimum number of readings for a forecast: two readings give a rate, and the third can contradict it.
 pub const MIN_READINGS: u32 = 3;
-/// Smallest capacity loss of a forecast, in standard deviations of that loss.
+/// A forecast requires a loss of at least this many of its own standard deviations.
 pub const MIN_FADE_DEVIATIONS: f64 = 1.0;
-/// Largest ratio of the interval's upper end to the median. It does not apply if the upper end is below the use since
+/// Maximum ratio of the interval's upper end to the median. It does not apply if the upper end is below the use since
 /// the first reading.
 pub const MAX_SPREAD: f64 = 10.0;
-/// Time constant of the recent rate of use, days.
+/// Time constant of the average that gives the recent rate of use, days.
 const RECENT_DAYS: f64 = 30.0;
 
-/// Quantiles of the interval: 5, 50 and 95 %.
+/// Quantiles of the forecast: 5, 50 and 95 %.
 const QUANTILES: [f64; 3] = [0.05, 0.5, 0.95];
 
 const LEVEL: usize = 0;
@@ -87,18 +92,18 @@ const N: usize = 4;
 pub enum Axis {
     /// Equivalent full cycles.
     Cycles,
-    /// Days, for a history that does not record cycles. Any of these days may have been a day of rest.
+    /// Days, for a history that does not record cycles. Whether the cell rested on a day is then unknown.
     Days,
 }
 
 /// Use since the previous reading.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Usage {
-    /// Equivalent full cycles (charge moved / twice the rated capacity); ignored on the axis of days.
+    /// Equivalent full cycles (charge moved / twice the rated capacity). Ignored on the axis of days.
     pub cycles: f64,
     /// Days, rest included.
     pub days: f64,
-    /// Days without current; ignored on the axis of days.
+    /// Days without current. Ignored on the axis of days.
     pub rest_days: f64,
 }
 
@@ -183,7 +188,7 @@ pub struct FanPoint {
     pub high_ah: f64,
 }
 
-/// The forecast filter of one cell. Its size does not depend on the length of the history.
+/// The forecast filter of one cell. Its size does not depend on the number of readings.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Forecast {
@@ -195,32 +200,33 @@ pub struct Forecast {
     x: [f64; N],
     p: [[f64; N]; N],
     shared_variance: f64,
-    /// Recent equivalent full cycles and days.
+    /// Equivalent full cycles and days, averaged with the time constant `RECENT_DAYS`.
     recent: [f64; 2],
 }
 
 impl Usage {
-    /// Use of a half-cycle that moved `charge_ah` in `duration_s`. `since_before_s`: time from the end of the previous
-    /// half-cycle to the end of this one. If that time is unknown (`None`), a long rest is assumed.
+    /// Use during a half-cycle that moved `charge_ah` in `duration_s`, and during the rest before it. `since_before_s`:
+    /// time from the end of the previous half-cycle to the end of this one. If this time is unknown (`None`), a long
+    /// rest is assumed.
     pub fn in_half_cycle(charge_ah: f64, duration_s: f64, since_before_s: Option<f64>, rated_capacity_ah: f64) -> Self {
         let used_days = duration_s / DAY_S;
         let known = since_before_s.map(|seconds| (seconds / DAY_S - used_days).max(0.0));
         Self {
             cycles: charge_ah / (2.0 * rated_capacity_ah),
-            // An unknown rest does not change the recent rate of use.
+            // A rest of unknown duration does not change the recent rate of use.
             days: used_days + known.unwrap_or(0.0),
-            // After a long rest the recovery is complete.
+            // After a long rest, the recovery is complete.
             rest_days: known.unwrap_or(30.0),
         }
     }
 }
 
 impl Forecast {
-    /// Creates a filter for a cell with the capacity `reference_ah` when new, Ah. An approximate value suffices,
-    /// because it only sets the range of the knee, 10 to 20 % below it.
+    /// Creates a filter for a cell that had the capacity `reference_ah`, Ah, when new. An approximate value suffices,
+    /// because it only sets the range of the knee: 10 to 20 % below `reference_ah`.
     pub fn new(axis: Axis, reference_ah: f64) -> Self {
         let mut p = [[0.0; N]; N];
-        // Wide priors: the level is practically unknown, the rate lies within 2 % per cycle.
+        // Wide priors: the level is practically unknown, and the rate has a standard deviation of 2 % per cycle.
         p[LEVEL][LEVEL] = 1.0;
         p[RATE][RATE] = 0.02 * 0.02;
         let rest = if axis == Axis::Days { RECOVERY_IN_REST } else { 0.0 };
@@ -233,8 +239,8 @@ impl Forecast {
         Self { axis, reference_ah, readings: 0, used: 0.0, x, p, shared_variance: 0.0, recent: [0.0; 2] }
     }
 
-    /// Predicts over use and rest, then updates with `reading`, the capacity learned at the end. NaN, infinite and
-    /// negative numbers are ignored.
+    /// Predicts the state after the use `passed`, then updates it with `reading`, the capacity learned at the end of
+    /// that use. NaN, infinite and negative numbers are ignored.
     pub fn update(&mut self, passed: Usage, reading: Option<CapacityReading>) {
         let natural = |value: f64| if value.is_finite() { value.max(0.0) } else { 0.0 };
         let Usage { cycles, days, rest_days } = passed;
@@ -252,7 +258,7 @@ impl Forecast {
         }
     }
 
-    /// Adds use and days to the exponential window; exact for any step length.
+    /// Adds use and days to the exponential average. The result does not depend on how a period is divided into steps.
     fn count_recent(&mut self, passed: &Usage) {
         let ages = passed.days / RECENT_DAYS;
         let kept = libm::exp(-ages);
@@ -261,7 +267,7 @@ impl Forecast {
         self.recent = [cycles * kept + share * passed.cycles, days * kept + share * passed.days];
     }
 
-    /// Checks the numbers of a stored forecast on this axis.
+    /// Checks the numbers of a stored forecast, which must belong to `axis`.
     ///
     /// # Errors
     /// The first impossible number.
@@ -337,7 +343,8 @@ impl Forecast {
         Ok(Remaining { low, median, high })
     }
 
-    /// Predicted capacity at `points` amounts of further use, evenly spaced from 0 to `ahead`. Too slow for online use.
+    /// Predicted capacity at `points` evenly spaced amounts of further use from 0 to `ahead`. Too slow to call while
+    /// data are processed live.
     ///
     /// # Errors
     /// The reason why no forecast is given.
@@ -352,7 +359,8 @@ impl Forecast {
         Ok((0..points).map(at).collect())
     }
 
-    /// Predicts: the recovery relaxes, the level falls at the rate, and rate and recovery become less certain.
+    /// Predicts the state after the use `passed`: the recovery relaxes, the level falls at the rate, and rate and
+    /// recovery become less certain.
     fn advance(&mut self, passed: &Usage) {
         let (used, rest_days, relaxation) = match self.axis {
             // During use, the recovery decays by a factor of e in ten cycles.
@@ -371,7 +379,7 @@ impl Forecast {
             row[LEVEL] -= used * row[RATE];
             row[RECOVERY] *= kept;
         }
-        // The rate also walks during the step, which makes the level less certain.
+        // The rate also changes randomly during the step, which makes the level less certain.
         p[RATE][RATE] += walk;
         p[LEVEL][RATE] -= walk * used / 2.0;
         p[RATE][LEVEL] = p[LEVEL][RATE];
@@ -379,7 +387,7 @@ impl Forecast {
         let (in_use, in_rest) = (RECOVERY_IN_USE * RECOVERY_IN_USE, RECOVERY_IN_REST * RECOVERY_IN_REST);
         let recovery = &mut p[RECOVERY][RECOVERY];
         *recovery += in_use * (1.0 - kept * kept);
-        // A second rest adds only the part of the recovery that the first rest did not complete.
+        // A rest adds only the part of the recovery that is still missing after the rests before it.
         *recovery += (1.0 - libm::exp(-2.0 * rest_days / RECOVERY_DAYS)) * (in_use + in_rest - *recovery).max(0.0);
         self.used += used;
     }
@@ -387,7 +395,7 @@ impl Forecast {
     /// Variance that the rate gains over `used` units of use.
     fn rate_walk(&self, used: f64) -> f64 {
         let rate = self.x[RATE].max(0.0);
-        // The first step counts as one e-fold.
+        // Before any use, the first step counts as one e-fold.
         let e_folds = if self.used > 0.0 { libm::log1p(used / self.used) } else { 1.0 };
         let lost = self.lost();
         let relative = walk_variance(lost, lost + rate * used) + RATE_WALK_USE * RATE_WALK_USE * e_folds;
@@ -397,10 +405,10 @@ impl Forecast {
     fn observe(&mut self, reading: &CapacityReading) {
         let scale = self.reference_ah * self.reference_ah;
         let ph: [f64; N] = std::array::from_fn(|i| self.p[i][LEVEL] + self.p[i][RECOVERY]);
-        // Assumes an error of 0.3 % beyond the reading's stated variance.
+        // Assumes an error of 0.3 % in addition to the reading's variance.
         let noise = 0.003 * 0.003 + reading.variance_ah2 / scale;
         let innovation = reading.capacity_ah / self.reference_ah - self.x[LEVEL] - self.x[RECOVERY];
-        // Raises the innovation variance of an outlier until its innovation is five standard deviations.
+        // If the innovation is an outlier, raises its variance until the innovation is five standard deviations.
         let miss = innovation / 5.0;
         let innovation_variance = (ph[LEVEL] + ph[RECOVERY] + noise).max(miss * miss);
         update_states(&mut self.x, &mut self.p, &ph, innovation, innovation_variance);
@@ -442,8 +450,8 @@ impl Forecast {
         1.0 - self.x[LEVEL]
     }
 
-    /// Quantile of the capacity after `ahead` units of use: the threshold that the level passes within that use with
-    /// this probability.
+    /// Quantile of the capacity after `ahead` units of use. It is the threshold that the level passes within this use
+    /// with the probability `quantile`.
     fn capacity_ah(&self, ahead: f64, quantile: f64) -> f64 {
         let (level, std) = (self.x[LEVEL], self.level_variance().sqrt());
         let is_below = |threshold_ah: f64| self.crossing(threshold_ah).probability(ahead) < quantile;
@@ -451,12 +459,12 @@ impl Forecast {
     }
 }
 
-/// Part of the knee that a cell with this loss has passed, fraction of the reference.
+/// Part of the knee that lies below the loss `lost`, fraction of the reference.
 fn knee(lost: f64) -> f64 {
     lost.clamp(KNEE.0, KNEE.1) - KNEE.0
 }
 
-/// Variance that the rate's logarithm gains between two losses, fractions of the reference.
+/// Variance that the rate's logarithm gains while the loss grows from `from` to `to`, fractions of the reference.
 fn walk_variance(from: f64, to: f64) -> f64 {
     let in_knee = knee(to) - knee(from);
     RATE_WALK * RATE_WALK * (to - from - in_knee) + KNEE_WALK * KNEE_WALK * in_knee

@@ -1,4 +1,4 @@
-//! A half-cycle: the charge or discharge of a cell between two changes of mode.
+//! A half-cycle: one charge or one discharge of a cell.
 
 use crate::filter::ScalarGaussian;
 use crate::quantity::Mode;
@@ -15,12 +15,12 @@ pub struct HalfCycle {
     pub swing: Option<ScalarGaussian>,
     /// SOC at the end, fraction; `None` if it was not estimated.
     pub end_soc: Option<f64>,
-    /// SOC at start and end, fractions; `None` if the SOC at the end was not estimated. If only the start is unknown,
-    /// both values are the SOC at the end.
+    /// SOC at the start and the end, fractions; `None` if the SOC at the end was not estimated. If only the SOC at the
+    /// start is unknown, both values are the SOC at the end.
     pub ends: Option<[f64; 2]>,
     /// Duration, s.
     pub duration_s: f64,
-    /// Mean current, A, positive = discharge.
+    /// Mean current, A; positive = discharge.
     pub mean_current_a: f64,
     /// Mean temperature, degrees C; `None` without a temperature reading.
     pub mean_temperature_c: Option<f64>,

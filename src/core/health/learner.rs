@@ -1,17 +1,18 @@
-//! Learns from every completed half-cycle of every cell: charge moved, SOC swing, capacity.
+//! Learns from every completed half-cycle of every cell: charge moved, SOC swing and capacity.
 //!
-//! In: times and temperatures of samples, SOC of the cells at the ends of half-cycles, charge (A s). Out: half-cycles
-//! and capacity updates (Ah). A half-cycle without an estimated SOC gives no capacity.
+//! In: times and temperatures of samples, SOC of the cells at the start and end of half-cycles, charge (A s). Out:
+//! half-cycles and capacity updates (Ah). A half-cycle without an estimated SOC gives no capacity.
 //!
-//! A half-cycle lasts from the beginning of a charge or discharge to its end. The transition detector dates both. A
-//! *mark* is a copy of all totals at such a time. The *sample filter* of a cell ([`CellEstimator`]) steps with every
-//! sample; the *event filter* steps once per half-cycle and holds the published capacity (paper, section 3.3.4: random
-//! walk). With `Swing`, the event filter also estimates the fade ([`super::drift`]). The event filter gets its
+//! A half-cycle lasts from the beginning of a charge or discharge to its end; the transition detector determines both
+//! times. A *mark* is a copy of all totals at such a time. Two filters estimate the capacity of a cell. The *sample
+//! filter* ([`CellEstimator`]) takes a step at every sample. The *event filter* takes one step per half-cycle and holds
+//! the published capacity (a random walk; paper, section 3.3.4). With `Swing`, the event filter also estimates the fade
+//! ([`super::drift`]). Its measurement is computed by one of two methods:
 //! measurement in one of two ways:
-//! * `Swing`: the information about the capacity in the voltages since the last half-cycle. The sample filter
-//!   estimates the capacity and its correlation with the SOC. The measurement is the step from the sample filter's
-//!   previous estimate to its current estimate, `ScalarGaussian::information_until`. Dividing the charge by the swing
-//!   of the sample filter's SOC would only return the capacity that this filter assumed.
+//! * `Swing`: the information about the capacity in all voltages since the last half-cycle. The sample filter estimates
+//!   the capacity together with its correlation with the SOC. The measurement is computed from the sample filter's
+//!   previous estimate and its present estimate (`ScalarGaussian::information_until`). Dividing the charge by the swing
+//!   of the sample filter's SOC would be circular: that SOC was computed with the assumed capacity.
 //! * `Nominal`: as in the paper, charge divided by a nominal swing, with a fixed variance.
 
 use serde::{Deserialize, Serialize};
@@ -29,13 +30,13 @@ use crate::quantity::{InvalidState, Mode, Timestamp};
 /// Result of the capacity filter's step over a half-cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CapacityUpdate {
-    /// Measurement from this half-cycle alone; `None` = no information.
+    /// Measurement from this half-cycle alone; `None` if the half-cycle contains no information about the capacity.
     pub measurement: Option<Measurement>,
-    /// The published capacity; its variance includes the gain error of the current sensor.
+    /// The published capacity. Its variance includes the gain error of the current sensor.
     pub capacity: ScalarGaussian,
 }
 
-/// Cumulative totals of one cell, and its SOC, at one time.
+/// Totals of one cell since the start, and its SOC, at one time.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct CellMark {
     soc: Option<ScalarGaussian>,
@@ -44,7 +45,8 @@ struct CellMark {
 }
 
 impl CellMark {
-    /// The SOC; `None` if its numbers cannot be stored, for example the variance after a damaged state was restored.
+    /// Returns the SOC, or `None` if its numbers cannot be stored (for example, a variance that came from a damaged
+    /// stored state).
     fn storable(soc: Option<ScalarGaussian>) -> Option<ScalarGaussian> {
         soc.filter(|soc| bounds::STORED_SOC.has(soc.mean) && (0.0..=bounds::NUMBER.high).contains(&soc.variance))
     }
@@ -71,29 +73,30 @@ struct Mark {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Learner {
     totals: Vec<CellMark>,
-    /// Start of the current half-cycle.
+    /// Start of the present half-cycle.
     start: Option<Mark>,
-    /// Start of a mode that the transition detector has not confirmed yet.
+    /// Start of the candidate: a mode that the transition detector has not confirmed yet.
     candidate: Option<Mark>,
-    /// Capacity in each sample filter after the event filter's last step.
+    /// Per cell: capacity in the sample filter after the event filter's last step.
     prior: Vec<ScalarGaussian>,
-    /// Capacity in the event filter.
+    /// Per cell: capacity in the event filter.
     capacity: Vec<ScalarGaussian>,
     /// Time without current since the last half-cycle, s.
     rest_s: f64,
-    /// Start of the current mode.
+    /// Start of the present mode.
     mode_since: Option<Timestamp>,
-    /// Whether the current half-cycle continues the previous one, which moved too little charge. `start` then stays.
+    /// Whether the present half-cycle continues the previous one, which moved too little charge. `start` then keeps its
+    /// value.
     joining: bool,
     /// Whether each cell has a measured capacity.
     learned: Vec<bool>,
-    /// Filters of capacity and fade (`Swing`).
+    /// Per cell: filter of capacity and fade (`Swing`).
     drift: Vec<DriftFilter>,
-    /// Cells whose sample filter was restarted in this half-cycle.
+    /// Cells whose sample filter was restarted in the present half-cycle.
     in_doubt: Vec<usize>,
     /// Offset of the current sensor.
     offset: CurrentOffset,
-    /// Per cell: whether half-cycles leave the capacity unchanged.
+    /// Per cell: whether its capacity stays unchanged by half-cycles.
     #[serde(skip)]
     is_held: Vec<bool>,
 }
@@ -112,7 +115,8 @@ impl Learner {
         }
     }
 
-    /// Restores a cell's capacity that was measured in an earlier run. The sample filter must already have it.
+    /// Restores the capacity of a cell that was learned in an earlier run. The caller must already have set it in the
+    /// sample filter.
     pub fn relearn(
         &mut self,
         config: &CapacityConfig,
@@ -126,7 +130,8 @@ impl Learner {
         self.learned[cell] = true;
     }
 
-    /// Restarts a replaced cell with `capacity`, because the learned values belong to the previous cell.
+    /// Restarts the learning for a replaced cell with `capacity`, because the learned values belong to the previous
+    /// cell.
     pub fn begin(&mut self, config: &CapacityConfig, cell: usize, capacity: ScalarGaussian) {
         self.drift[cell] = DriftFilter::new(config, capacity);
         (self.prior[cell], self.capacity[cell], self.learned[cell]) = (capacity, capacity, false);
@@ -136,7 +141,7 @@ impl Learner {
         }
     }
 
-    /// A copy with the learned values only, without the current half-cycle.
+    /// A copy with the learned values only, without the present half-cycle.
     pub fn learned_only(&self) -> Self {
         Self {
             totals: vec![CellMark::default(); self.totals.len()],
@@ -151,9 +156,10 @@ impl Learner {
 
     /// Adds a cell's sample to its totals.
     ///
-    /// `measured_s` and `gap_s` are the times since the previous sample with and without a measured current, s. The
-    /// gap is infinite before the first sample and after an unknown gap. Returns whether the candidate's mark lies in
-    /// that gap. If so, the caller sets the candidate's SOC to the SOC after the gap ([`Self::move_mark`]).
+    /// `measured_s` and `gap_s` are the times since the previous sample with and without a measured current, s. The gap
+    /// is infinite before the first sample and after a gap of unknown length. Returns whether the candidate began
+    /// within that gap. If so, the caller sets the SOC at the candidate's mark to the SOC after the gap
+    /// ([`Self::move_mark`]).
     #[inline]
     pub fn observe(
         &mut self,
@@ -171,19 +177,19 @@ impl Learner {
         gap_s > 0.0 && self.candidate.as_ref().is_some_and(|mark| time.since(mark.time) < gap_s)
     }
 
-    /// Sets the SOC at the candidate's mark to the cell's current SOC.
+    /// Sets the SOC at the candidate's mark to `soc`, the cell's present SOC.
     pub fn move_mark(&mut self, cell: usize, soc: Option<ScalarGaussian>) {
         if let Some(mark) = &mut self.candidate {
             mark.cells[cell].soc = CellMark::storable(soc);
         }
     }
 
-    /// Ends the current half-cycle after all cells have learned from it.
+    /// Ends the present half-cycle after all cells have learned from it.
     pub fn finish(&mut self) {
         self.rest_s = 0.0;
     }
 
-    /// Marks the start of an unconfirmed mode; `soc` returns the SOC of each cell.
+    /// Marks the start of the candidate, an unconfirmed mode. `soc` returns the SOC of each cell.
     pub fn mark_candidate(&mut self, time: Timestamp, charge_as: f64, soc: impl Fn(usize) -> Option<ScalarGaussian>) {
         let mut cells = self.candidate.take().map(|mark| mark.cells).unwrap_or_default();
         cells.clone_from(&self.totals);
@@ -191,10 +197,10 @@ impl Learner {
         self.candidate = Some(Mark { time, charge_as, cells });
     }
 
-    /// Completes the mode `from` after the detector confirmed the candidate.
+    /// Ends the mode `from` after the detector has confirmed the candidate.
     ///
-    /// If the charge moved since the last half-cycle reaches the configured swing, appends each cell's half-cycle to
-    /// `half_cycles` in cell order. Joins a smaller charge or discharge to the next half-cycle.
+    /// If the charge moved since the last half-cycle reaches the configured swing, appends one half-cycle per cell to
+    /// `half_cycles`, in cell order. A charge or discharge that moved less is merged with the next half-cycle.
     pub fn complete(
         &mut self,
         config: &TransitionConfig,
@@ -225,12 +231,12 @@ impl Learner {
         }
     }
 
-    /// Selects the cells whose capacity stays unchanged by half-cycles, because their model is not known well enough.
+    /// Selects the cells whose capacity half-cycles do not change, because their cell model is still too uncertain.
     pub fn hold(&mut self, is_held: impl Fn(usize) -> bool) {
         self.is_held = (0..self.capacity.len()).map(is_held).collect();
     }
 
-    /// Steps the event filter of one cell over its completed half-cycle.
+    /// Steps the event filter of one cell after its half-cycle is complete.
     pub fn learn(
         &mut self,
         model: &CellModel,
@@ -259,9 +265,9 @@ impl Learner {
         CapacityUpdate { measurement, capacity: self.capacity(cell) }
     }
 
-    /// Handles a restart of a cell's sample filter, after the voltages contradicted the learned values. The capacity
-    /// becomes at most as certain as the capacity of a new cell (`new_variance_ah2`). The current half-cycle then only
-    /// gives a lower bound: the cell holds at least the charge that was moved.
+    /// Handles a restart of a cell's sample filter, which happens if the voltages contradict the learned values. Raises
+    /// the variance of the capacity to at least that of a new cell (`new_variance_ah2`). From the present half-cycle,
+    /// only a lower bound is then learned: the capacity is at least the charge moved.
     pub fn doubt(
         &mut self,
         config: &CapacityConfig,
@@ -282,8 +288,8 @@ impl Learner {
         self.prior[cell] = estimator.capacity();
     }
 
-    /// Handles a new cell model that the estimator has adopted. The current half-cycle restarts at `soc`. If `capacity`
-    /// is given, it replaces the capacity (Ah) and the flag that says whether the capacity was learned.
+    /// Handles a new cell model that the estimator has adopted. The present half-cycle restarts at `soc`. If `capacity`
+    /// is given, it replaces the capacity (Ah) and the flag that says whether the capacity has been learned.
     pub fn adopt(
         &mut self,
         config: &CapacityConfig,
@@ -298,7 +304,7 @@ impl Learner {
         }
         self.prior[cell] = estimator.capacity();
         self.in_doubt.retain(|&other| other != cell);
-        // The SOC at the start of a joined half-cycle was estimated with the old model.
+        // The SOC at the start of a merged half-cycle was estimated with the old model, so it becomes unknown.
         let soc = CellMark::storable(soc);
         let at_start = soc.filter(|_| !self.joining);
         for (mark, soc) in [(&mut self.start, at_start), (&mut self.candidate, soc)] {
@@ -306,12 +312,12 @@ impl Learner {
         }
     }
 
-    /// Whether a cell's capacity has been measured since its configured start.
+    /// Whether a cell's capacity has been measured since it started with the configured capacity.
     pub fn has_learned(&self, cell: usize) -> bool {
         self.learned.get(cell).copied().unwrap_or(false)
     }
 
-    /// Whether every cell's capacity has been measured since its configured start.
+    /// Whether the capacity of every cell has been measured since it started with the configured capacity.
     pub fn has_learned_all(&self) -> bool {
         self.learned.iter().all(|&learned| learned)
     }
@@ -330,9 +336,10 @@ impl Learner {
         let is_held = self.is_held.get(cell).copied().unwrap_or(false);
         let evidence = self.prior[cell].information_until(&after).filter(|_| !is_in_doubt && !is_held);
         let measurement = evidence.map(|z| {
-            // The model's curve depends on its own capacity C_curve: z = C + s (C_curve - C). Solve for C.
+            // The open-circuit curve assumes a capacity C_curve, which influences the measurement z: z = C + s (C_curve
+            // - C). Solve for C.
             let weight = 1.0 - after.variance / self.prior[cell].variance;
-            // Limits the share s of the curve's capacity.
+            // Limits s, the influence of the curve's capacity.
             let by_curve = (estimator.capacity_by_curve() / weight).clamp(-0.8, 0.8);
             let (own, curve_ah) = (1.0 - by_curve, estimator.curve().mean);
             Measurement { value: curve_ah + (z.value - curve_ah) / own, variance: z.variance / (own * own) }
@@ -344,7 +351,7 @@ impl Learner {
         } else if is_in_doubt {
             drift.at_least(half_cycle.charge_ah);
         }
-        // Discard a step that makes the capacity impossible for this cell.
+        // Discards a measurement that makes the capacity impossible for this cell.
         let is_possible = drift.is_possible(model.capacity_ah);
         if !is_possible {
             *drift = before;
@@ -361,7 +368,7 @@ impl Learner {
         if !drift.is_possible(model.capacity_ah) {
             *drift = learned;
         }
-        // The sample filter continues with the capacity of the event filter.
+        // The sample filter continues with the event filter's capacity.
         estimator.restate_capacity(drift.capacity());
         self.prior[cell] = estimator.capacity();
         measurement
@@ -372,18 +379,18 @@ impl Learner {
         self.capacity[cell]
     }
 
-    /// Offset of the current, per cell, A: measured minus true.
+    /// Learned offset of the current per cell, A: measured minus true.
     #[inline]
     pub fn current_offset(&self) -> &CurrentOffset {
         &self.offset
     }
 
-    /// The offset of the current, mutable.
+    /// The learned offset of the current, for changes.
     pub fn current_offset_mut(&mut self) -> &mut CurrentOffset {
         &mut self.offset
     }
 
-    /// Whether this stored learner has `cells` cells in all its parts.
+    /// Whether a stored learner has entries for `cells` cells in all its lists.
     pub fn fits(&self, cells: usize) -> bool {
         [self.totals.len(), self.prior.len(), self.capacity.len(), self.learned.len(), self.drift.len()] == [cells; 5]
             && [&self.start, &self.candidate].into_iter().flatten().all(|mark| mark.cells.len() == cells)
@@ -412,7 +419,7 @@ impl Learner {
         [&self.start, &self.candidate].into_iter().flatten().map(|mark| (mark.time, mark.charge_as))
     }
 
-    /// Shifts stored timestamps to another clock.
+    /// Shifts all timestamps by `by_nanos`, to another clock.
     pub fn rebase(&mut self, by_nanos: i64) {
         for mark in [&mut self.start, &mut self.candidate].into_iter().flatten() {
             mark.time = mark.time.plus_nanos(by_nanos);
@@ -421,7 +428,7 @@ impl Learner {
     }
 }
 
-/// One cell's half-cycle between two marks; `moved_ah` is positive for a discharge.
+/// One cell's half-cycle between the marks `a` and `b`. `moved_ah` is positive for a discharge.
 fn half_cycle(moved_ah: f64, duration_s: f64, a: &CellMark, b: &CellMark) -> HalfCycle {
     let (mode, sign) = if moved_ah > 0.0 { (Mode::Discharge, 1.0) } else { (Mode::Charge, -1.0) };
     let temperature_s = b.temperature_s - a.temperature_s;

@@ -1,8 +1,8 @@
 //! Battery ageing: half-cycles, capacity, recharge period, usable capacity, remaining life.
 //!
-//! In: currents (A), samples and estimates of the cells. Out: one [`HalfCycle`] and [`CapacityUpdate`] per cell and
-//! half-cycle, pack values, recharge periods (s), usable capacity (Ah), [`Forecast`]s. Stored states are checked
-//! before use. A half-cycle without estimates updates nothing.
+//! In: currents (A), samples and estimates of the cells. Out: one [`HalfCycle`] and one [`CapacityUpdate`] per cell and
+//! half-cycle, values of the pack, recharge periods (s), usable capacity (Ah) and [`Forecast`]s. Stored states are
+//! checked before they are used. A half-cycle without estimates updates nothing.
 
 pub mod config;
 pub mod drift;

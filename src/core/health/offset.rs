@@ -1,12 +1,13 @@
-//! Learns the offset of the current sensor, which all cells share.
+//! Learns the offset of the current sensor. All cells share this sensor.
 //!
 //! In: the evidence in the voltages of all cells ([`EstimatorBank::offset_evidence`]) and the elapsed time, s. Out:
-//! mean and standard deviation of the offset, A per cell, measured minus true. The offset shows best at rest, when the
-//! counted charge drifts but the voltage does not. Current readings of exactly zero are ignored: a sensor that sends
-//! them suppresses small currents.
+//! mean and standard deviation of the offset, A per cell, measured minus true. The offset is best observed at rest,
+//! when the counted charge drifts but the voltage does not. Current readings of exactly zero are ignored, because a
+//! sensor that sends them suppresses small currents.
 //!
-//! Source: Friedland (1969), separate estimation of a bias: the innovations of a filter that ignores the bias measure
-//! the bias. Deviation: here the filter considers the bias, and the correction is applied at changes of mode.
+//! Source: Friedland (1969), separate estimation of a bias: the innovations of a filter that ignores the bias are used
+//! to estimate it. Deviation: here the filter considers the bias in its gain, and the correction is applied only when
+//! the mode changes.
 //!
 //! [`EstimatorBank::offset_evidence`]: crate::cell::EstimatorBank::offset_evidence
 
@@ -21,7 +22,8 @@ use crate::quantity::InvalidState;
 pub struct CurrentOffset {
     /// Mean, A per cell; subtracted from the current.
     mean_a: f64,
-    /// Standard deviation as a fraction of the configured standard deviation; `None` = nothing learned (counts as 1).
+    /// Standard deviation as a fraction of the configured standard deviation. `None` = no offset has been learned; the
+    /// fraction is then 1.
     part: Option<f64>,
 }
 
@@ -31,12 +33,12 @@ impl CurrentOffset {
         self.mean_a
     }
 
-    /// Standard deviation, A per cell; `configured_a` before any evidence.
+    /// Standard deviation, A per cell; `configured_a` if there has been no evidence.
     pub fn std_a(&self, configured_a: f64) -> f64 {
         self.part() * configured_a
     }
 
-    /// The learned offset, A per cell; `None` before any evidence, or if learning is off (`configured_a` is 0).
+    /// The learned offset, A per cell; `None` if there has been no evidence or learning is off (`configured_a` is 0).
     pub fn learned(&self, configured_a: f64) -> Option<ScalarGaussian> {
         let part = self.part.filter(|_| configured_a > 0.0)?;
         Some(ScalarGaussian::from_std(self.mean_a, part * configured_a))
@@ -46,15 +48,16 @@ impl CurrentOffset {
         self.part.unwrap_or(1.0)
     }
 
-    /// Updates with evidence: the sums of d^2 / R and d x innovation / R, with d the effect of one standard deviation.
-    /// Returns the correction in units of the previous standard deviation.
+    /// Updates with the evidence (information, score): the sums of d^2 / R and of d x innovation / R over the
+    /// innovations. d is the effect of one standard deviation of the offset on an innovation, R the variance of the
+    /// innovation. Returns the correction in units of the previous standard deviation.
     pub fn update(&mut self, configured_a: f64, (information, score): (f64, f64)) -> f64 {
         let std_a = self.std_a(configured_a);
         if !(information > 0.0 && score.is_finite() && std_a > 0.0) {
             return 0.0;
         }
         let most_a = 5.0 * configured_a;
-        // Evidence beyond three standard deviations has a cause other than an offset.
+        // Evidence beyond three standard deviations must have another cause than an offset.
         let deviations = (score / (1.0 + information)).clamp(-3.0, 3.0);
         let mean_a = (self.mean_a + deviations * std_a).clamp(-most_a, most_a);
         let corrected = (mean_a - self.mean_a) / std_a;
@@ -63,15 +66,15 @@ impl CurrentOffset {
         corrected
     }
 
-    /// Adds the uncertainty of a drift over `seconds`: a tenth of the initial standard deviation per day. Sensors
-    /// drift that much with temperature.
+    /// Adds the uncertainty of a drift over `seconds`: a tenth of the initial standard deviation per day. Sensors drift
+    /// this much with temperature.
     pub fn drift(&mut self, seconds: f64) {
         if let Some(part) = &mut self.part {
             *part = (*part * *part + 0.1 * 0.1 * seconds.max(0.0) / 86_400.0).sqrt().min(1.0);
         }
     }
 
-    /// Checks a stored offset; the error is the first impossible number.
+    /// Checks the numbers of a stored offset. The error names the first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         InvalidState::unless_number("the offset of the current", self.mean_a)?;
         let part = self.part();
@@ -92,13 +95,13 @@ mod tests {
     fn evidence_is_weighted_by_deviation_and_counts_once() {
         let mut offset = CurrentOffset::default();
         assert_eq!((offset.mean_a(), offset.std_a(0.05), offset.learned(0.05)), (0.0, 0.05, None));
-        // Evidence for an offset of one standard deviation, with three times the information of the prior.
+        // Evidence for an offset of one standard deviation; it contains three times the information of the prior.
         let corrected = offset.update(0.05, (3.0, 3.0));
         assert!((corrected - 0.75).abs() < 1e-12 && (offset.mean_a() - 0.0375).abs() < 1e-12, "{offset:?}");
         assert!((offset.std_a(0.05) - 0.025).abs() < 1e-12);
         assert_eq!(offset.learned(0.05), Some(ScalarGaussian::from_std(offset.mean_a(), offset.std_a(0.05))));
         assert_eq!(offset.learned(0.0), None, "offset learning is off");
-        // Evidence for the remaining half of a standard deviation.
+        // Evidence for an offset of the remaining half of a standard deviation.
         offset.update(0.05, (99.0, 50.0));
         assert!((offset.mean_a() - 0.05).abs() < 1e-12 && (offset.std_a(0.05) - 0.0025).abs() < 1e-12, "{offset:?}");
     }

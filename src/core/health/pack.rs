@@ -1,4 +1,4 @@
-//! Computes the pack's values from the limiting cells, never from a mean.
+//! Computes the pack's values from its limiting cells, never from the mean of the cells.
 //!
 //! A series pack stops discharging when its weakest cell is empty and stops charging when its fullest cell is full.
 //! * dischargeable charge = min_i SOC_i C_i
@@ -6,7 +6,8 @@
 //! * pack capacity = dischargeable + chargeable charge
 //! * pack SOC = dischargeable charge / pack capacity
 //!
-//! A pack of one cell has the values of that cell. Without cells or without capacity, there are no pack values.
+//! For a pack of one cell, these are the values of that cell. Without cells or without capacity, the pack has no
+//! values.
 
 use serde::{Deserialize, Serialize};
 
@@ -32,7 +33,8 @@ pub struct PackState {
     pub soc: f64,
     /// Standard deviation of the limiting cell's SOC.
     pub soc_std: f64,
-    /// Charge that the pack delivers from the point where its fullest cell is full until its weakest cell is empty, Ah.
+    /// Charge, Ah, that the pack delivers if its discharge starts when the fullest cell is full and ends when the
+    /// weakest cell is empty.
     pub capacity_ah: f64,
     /// Standard deviation of the limiting cell's capacity, Ah.
     pub capacity_std_ah: f64,
@@ -40,7 +42,7 @@ pub struct PackState {
     pub limiting_cell: CellIndex,
 }
 
-/// Combines the cells. Returns `None` if there are no cells or the pack has no capacity, because one cell is full
+/// Combines the cells. Returns `None` if there are no cells, or if the pack has no capacity because one cell is full
 /// while another is empty.
 pub fn combine(cells: impl Iterator<Item = CellShare>) -> Option<PackState> {
     let mut weakest: Option<(f64, CellShare)> = None;
@@ -70,7 +72,7 @@ impl PackState {
     /// The first impossible number.
     pub fn check(&self) -> Result<(), InvalidState> {
         bounds::STORED_SOC.check("the pack's SOC", self.soc)?;
-        // The capacity is 0 while one cell is full and another empty.
+        // The capacity is 0 while one cell is full and another is empty.
         let capacity_ah = self.capacity_ah;
         let is_possible = (0.0..=bounds::CAPACITY_AH.high).contains(&capacity_ah);
         InvalidState::unless(is_possible, "the pack's capacity", capacity_ah, "0 to 1e9 Ah")?;
@@ -97,7 +99,7 @@ mod tests {
 
     #[test]
     fn weakest_cell_limits_discharge_and_fullest_limits_charge() {
-        // Cell 1 has 1.0 Ah left, cell 0 accepts only 0.5 Ah: an unbalanced pack of 1.5 Ah at 2/3.
+        // Cell 1 has 1.0 Ah left, and cell 0 accepts only 0.5 Ah: an unbalanced pack of 1.5 Ah with a SOC of 2/3.
         let pack = combine([share(0, 0.8, 2.5), share(1, 0.4, 2.5)].into_iter()).expect("two cells");
         assert!((pack.capacity_ah - 1.5).abs() < 1e-12);
         assert!((pack.soc - 1.0 / 1.5).abs() < 1e-12);

@@ -1,32 +1,33 @@
 //! Recharge period: duration of a charge between two SOC values (paper, section 3.3.5), raw and normalised.
 //!
-//! In: the estimated SOC with its time, the mode, the learned capacity (Ah). Out: periods, s. If the SOC jumps, the
-//! caller discards the timer's current charge.
+//! In: the estimated SOC with its time, the mode, the learned capacity (Ah). Out: periods, s. If the estimated SOC
+//! jumps, the caller discards the charge that is being timed.
 //!
-//! Raw: the time between the two estimated SOC values, if one uninterrupted charge covers the whole window. Both a
-//! stronger charger and a faded cell shorten the raw period.
+//! Raw: the time between the two estimated SOC values, if one uninterrupted charge covers the whole window. The raw
+//! period becomes shorter with a stronger charger, but also with a faded cell.
 //!
-//! Normalised: the time that a reference charger would need for the same window of the same pack,
-//! `t = 3600 (to - from) C / I_ref`, with C the pack's capacity (Ah) learned up to the end of this charge and I_ref the
-//! reference current per cell (A). The standard deviation of t is that of C, scaled by the same factor. It therefore
-//! includes the gain error of the current sensor.
+//! Normalised: the time that a reference charger would need for the same window of the same pack, `t = 3600 (to - from)
+//! C / I_ref`. C is the pack's capacity (Ah), learned up to the end of this charge; I_ref is the reference current per
+//! cell (A). The standard deviation of t is the standard deviation of C times the same factor. It therefore includes
+//! the gain error of the current sensor.
 //!
-//! Why t uses C, not the charge moved within the window: within the window, the estimated SOC moves by the charge
-//! divided by the assumed capacity. The charge moved is therefore the window times the assumed capacity, corrected
-//! only by the voltages within the window. C uses these voltages and all earlier ones, weighted by their information.
-//! Over the fleet of `tests/recharge_fleet.rs`, which prints both, the RMS error is 0.57 % for C and 0.78 % for the
-//! charge moved. C also has a standard deviation and does not require a charge that covers the window.
+//! Why t uses C instead of the charge moved within the window: the estimated SOC moves by the charge divided by the
+//! assumed capacity. The charge moved within the window is therefore the width of the window times the assumed
+//! capacity, corrected only by the voltages within the window. C uses these voltages and all earlier ones, weighted by
+//! their information. Over the fleet of `tests/recharge_fleet.rs`, which prints both results, the RMS error is 0.57 %
+//! with C and 0.78 % with the charge moved. Further advantages of C: it has a standard deviation, and it does not
+//! require a charge that covers the whole window.
 //!
-//! Assumed: the reference charger holds its current over the whole window, so resistance, temperature and tapering
-//! have no effect. C is the capacity between the open-circuit ends at the model's reference temperature, whatever the
-//! temperature during the charge; there is no reference temperature to configure. The charge that a cold or worn cell
-//! accepts within a charger's voltage limit is a different quantity. (`usable` computes the corresponding quantity for
-//! discharges.)
+//! Assumed: the reference charger holds its current over the whole window, so resistance, temperature and tapering have
+//! no effect. C is the capacity between the open-circuit voltages of the full and the empty cell at the model's
+//! reference temperature, whatever the temperature during the charge. A separate reference temperature cannot be
+//! configured. The charge that a cold or worn cell accepts within a charger's voltage limit is a different quantity;
+//! the module `usable` computes the corresponding quantity for discharges.
 //!
-//! Deviation 1: the paper's script counts from the first charging sample at any SOC. Here a raw period requires one
-//! uninterrupted charge over the whole window. Reason: periods become comparable.
-//! Deviation 2: the paper has no normalised period. It is reported once, at the end of a charge that covered enough of
-//! the window ([`RechargeConfig::min_coverage`]). Reason: a short charge adds no information.
+//! Deviation 1: the paper's script counts from the first charging sample, at any SOC. Here, a raw period requires one
+//! uninterrupted charge over the whole window. Reason: the periods are then comparable.
+//! Deviation 2: the paper has no normalised period. Here, a normalised period is reported once, at the end of a charge
+//! that covered enough of the window ([`RechargeConfig::min_coverage`]). Reason: a short charge adds no information.
 
 use serde::{Deserialize, Serialize};
 
@@ -35,14 +36,14 @@ use crate::filter::ScalarGaussian;
 use crate::quantity::bounds;
 use crate::quantity::{InvalidState, Mode, Timestamp};
 
-/// Times the pack's SOC through the window during charges.
+/// Measures the time that the pack's SOC takes through the window during a charge.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct RechargeTimer {
     last: Option<(Timestamp, f64)>,
     entered: Option<Timestamp>,
-    /// Lowest and highest SOC during this charge.
+    /// Lowest and highest SOC during the present charge.
     range: Option<(f64, f64)>,
-    /// Raw period of this charge, s.
+    /// Raw period of the present charge, s.
     raw_s: Option<f64>,
 }
 
@@ -73,7 +74,7 @@ impl RechargeTimer {
         Some(period_s)
     }
 
-    /// Stops timing the window; keeps the raw period and the SOC range of this charge.
+    /// Stops timing the window. Keeps the raw period and the SOC range of the present charge.
     pub fn interrupt(&mut self) {
         (self.last, self.entered) = (None, None);
     }
@@ -103,7 +104,7 @@ impl RechargeTimer {
         bounds::TIME_S.check_all("the time of the current charge", self.raw_s)
     }
 
-    /// Shifts stored timestamps to another clock.
+    /// Shifts all timestamps by `by_nanos`, to another clock.
     pub fn rebase(&mut self, by_nanos: i64) {
         self.last = self.last.map(|(time, soc)| (time.plus_nanos(by_nanos), soc));
         self.entered = self.entered.map(|time| time.plus_nanos(by_nanos));
@@ -119,7 +120,7 @@ pub fn normalised_period(config: &RechargeConfig, capacity: ScalarGaussian) -> S
     }
 }
 
-/// Time at which the line between two points rises through `level`.
+/// Time at which a straight line from `a` to `b` rises through `level`.
 fn rising_crossing(a: (Timestamp, f64), b: (Timestamp, f64), level: f64) -> Option<Timestamp> {
     (a.1 < level && b.1 >= level).then(|| a.0.plus_secs(b.0.since(a.0) * (level - a.1) / (b.1 - a.1)))
 }

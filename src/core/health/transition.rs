@@ -1,14 +1,14 @@
-//! Detects charge, rest or discharge from the pack's current: dead band, hysteresis, minimum duration.
+//! Detects charge, rest or discharge from the pack current, with dead band, hysteresis and minimum duration.
 //!
-//! In: pack current in A (positive = discharge), `None` if stale. Out: a change of mode, reported once the new mode
-//! has held for its minimum duration, with the time at which the new mode began.
+//! In: pack current in A (positive = discharge), `None` if stale. Out: changes of mode. A change is reported after the
+//! new mode has lasted for the minimum duration; it is dated at the time at which the new mode began.
 
 use serde::{Deserialize, Serialize};
 
 use super::TransitionConfig;
 use crate::quantity::{Mode, Timestamp};
 
-/// A mode that has not yet held for its minimum duration.
+/// A mode that has not yet lasted for the minimum duration.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 struct ModeCandidate {
     mode: Mode,
@@ -18,9 +18,9 @@ struct ModeCandidate {
 /// A confirmed change of mode.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ModeChange {
-    /// Mode left.
+    /// The mode that ended.
     pub from: Mode,
-    /// Mode entered.
+    /// The mode that began.
     pub to: Mode,
     /// Beginning of the new mode.
     pub since: Timestamp,
@@ -29,9 +29,10 @@ pub struct ModeChange {
 /// Outcome of one observation.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct TransitionOutcome {
-    /// The mode change that this observation confirms, if any.
+    /// The change of mode that this observation confirms, if any.
     pub change: Option<ModeChange>,
-    /// Whether a new candidate mode begins with this observation. If so, the caller marks the cells' state.
+    /// Whether a new candidate mode begins with this observation. If so, the caller stores the present state of the
+    /// cells as the candidate's mark.
     pub candidate_begins: bool,
 }
 
@@ -48,7 +49,7 @@ impl TransitionDetector {
         self.mode
     }
 
-    /// Handles the current at `time`. If the candidate has held long enough by then, confirms it first.
+    /// Handles the current at `time`. If the candidate has lasted long enough by then, it is confirmed first.
     pub fn observe(&mut self, config: &TransitionConfig, time: Timestamp, current_a: Option<f64>) -> TransitionOutcome {
         let change = self.poll(config, time);
         let observed = self.classify(config, current_a);
@@ -56,8 +57,8 @@ impl TransitionDetector {
         let mut candidate_begins = false;
         self.candidate = match self.candidate {
             _ if observed == self.mode => None,
-            // If the current becomes stale soon after a load ends, both count as one change, dated at the end of the
-            // load.
+            // If the current becomes stale soon after a load ends, rest and unknown mode count as one change, dated at
+            // the end of the load.
             Some(before) if before.mode == observed || (idle(before.mode) && idle(observed)) => {
                 Some(ModeCandidate { mode: observed, since: before.since })
             }
@@ -69,7 +70,7 @@ impl TransitionDetector {
         TransitionOutcome { change, candidate_begins }
     }
 
-    /// Confirms the candidate if it has held long enough by `time`.
+    /// Confirms the candidate if it has lasted long enough by `time`.
     pub fn poll(&mut self, config: &TransitionConfig, time: Timestamp) -> Option<ModeChange> {
         self.candidate.filter(|candidate| time.since(candidate.since) >= config.min_duration_s)?;
         self.settle()
@@ -83,8 +84,8 @@ impl TransitionDetector {
         Some(ModeChange { from, to: candidate.mode, since: candidate.since })
     }
 
-    /// Mode of a current. To enter charge or discharge, the current must exceed dead band plus hysteresis; to stay
-    /// there, it must exceed only the dead band.
+    /// Mode of a current. Charge or discharge begins only if the current exceeds the dead band plus the hysteresis. It
+    /// continues while the current exceeds the dead band.
     fn classify(&self, config: &TransitionConfig, current_a: Option<f64>) -> Mode {
         let Some(current_a) = current_a else { return Mode::Unknown };
         let enter = config.dead_band_a + config.hysteresis_a;
@@ -98,7 +99,7 @@ impl TransitionDetector {
         }
     }
 
-    /// Shifts stored timestamps to another clock.
+    /// Shifts all timestamps by `by_nanos`, to another clock.
     pub fn rebase(&mut self, by_nanos: i64) {
         if let Some(candidate) = &mut self.candidate {
             candidate.since = candidate.since.plus_nanos(by_nanos);

@@ -1,12 +1,13 @@
 //! Usable capacity: charge that a full cell delivers at a given current and temperature until its voltage under load
-//! falls to a cut-off. It depends on capacity and resistance.
+//! falls to a cut-off voltage. It depends on the cell's capacity and resistance.
 //!
-//! In: model, load, SOC when full, capacity (Ah) and resistance ratios. Out: Ah, with variance. If the cell is below
+//! In: model, load, SOC when full, capacity (Ah) and resistance ratios. Out: Ah, with variance. If the voltage is below
 //! the cut-off from the start, the usable capacity is 0.
 //!
 //! The discharge is simulated with the circuit's equations at constant current until the voltage falls to the cut-off.
 //! It starts from the SOC after a full charge, with relaxed branches. The variance is propagated to first order from
-//! the slow ratio, the capacity and ln rho (rho is the resistance ratio), with the covariance of the last two.
+//! three quantities: the slow ratio (additional resistance ratio of the slowest branch), the capacity and ln rho (rho
+//! is the resistance ratio). Capacity and ln rho are correlated.
 
 use super::UsableConfig;
 use crate::cell::circuit::{BranchAt, aged_terminal_v, soc_after};
@@ -19,8 +20,8 @@ const MAX_STEPS: u32 = 2000;
 /// Step of the forward differences in ln rho, ln capacity and slow ratio.
 const LOG_STEP: f64 = 0.01;
 
-/// Charge, Ah, that a cell of `capacity_ah` delivers from `full_soc` until its voltage falls to the cut-off. The two
-/// ratios are the cell's resistance ratio and the additional ratio of its slowest branch.
+/// Charge, Ah, that a cell of capacity `capacity_ah` delivers from `full_soc` until its voltage falls to the cut-off.
+/// The two ratios are the resistance ratio of the cell and the additional ratio of its slowest branch.
 pub fn usable_ah(
     model: &CellModel,
     config: &UsableConfig,
@@ -52,7 +53,7 @@ pub fn usable_ah(
         }
         let after_v = voltage(next, &branch_v);
         if next <= 0.0 {
-            // The cell is empty before it reaches the cut-off: it delivers all its charge.
+            // The cell is empty before its voltage reaches the cut-off: it delivers all its charge.
             return capacity_ah * full_soc;
         }
         if after_v <= config.cutoff_v {
@@ -64,7 +65,7 @@ pub fn usable_ah(
     step_ah * f64::from(MAX_STEPS)
 }
 
-/// Usable capacity, Ah, with its variance. `capacity` is the published estimate; its variance may exceed the variance
+/// Usable capacity, Ah, with its variance. `capacity` is the published estimate; its variance may be larger than that
 /// in the cell's filter.
 pub fn usable_capacity(
     model: &CellModel,
@@ -99,7 +100,7 @@ mod tests {
 
     #[test]
     fn usable_capacity_without_resistance_follows_open_circuit_curve() {
-        // OCV 3.0 + 1.2 s up to s = 0.5: 3.3 V at s = 0.25, so 75 % of 2 Ah.
+        // OCV = 3.0 + 1.2 s up to s = 0.5, so 3.3 V at s = 0.25: the cell delivers 75 % of 2 Ah.
         let usable = usable_ah(&small_model(), &CONFIG, 1.0, 2.0, (1e-12, 1.0));
         assert!((usable - 1.5).abs() < 1e-6, "{usable}");
         assert!((usable_ah(&small_model(), &CONFIG, 0.9, 2.0, (1e-12, 1.0)) - 1.3).abs() < 1e-6);
@@ -113,7 +114,8 @@ mod tests {
 
     #[test]
     fn resistance_lowers_the_usable_capacity() {
-        // At 0.2 A, every branch (time constant 20 to 40 s) settles: 3.0 + 1.2 s - 0.2 rho (0.12 - 0.08 s) = 3.3.
+        // At 0.2 A, every branch (time constant 20 to 40 s) settles. The cut-off is reached at 3.0 + 1.2 s - 0.2 rho
+        // (0.12 - 0.08 s) = 3.3.
         for ratio in [1.0, 3.0] {
             let end = (0.3 + 0.2 * ratio * 0.12) / (1.2 + 0.2 * ratio * 0.08);
             let usable = usable_ah(&small_model(), &CONFIG, 1.0, 2.0, (ratio, 1.0));

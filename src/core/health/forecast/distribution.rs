@@ -1,54 +1,57 @@
-//! Distribution of the use until a level has fallen by a given loss.
+//! Distribution of the use until a cell's level has fallen by a given loss.
 //!
-//! In: mean and covariance of loss and rate (fractions of the reference, per unit of use). Out: probabilities and
-//! quantiles of the use. Extreme inputs saturate within [`LOG_RANGE`].
+//! In: mean and covariance of the remaining loss (fraction of the reference capacity) and the rate (the same fraction
+//! per unit of use). Out: probabilities and quantiles of the use. Extreme inputs are limited to [`LOG_RANGE`].
 //!
-//! Given the loss L and the rate r, the use is T = integral over l from 0 to L of exp(-g(l) - W(l)) / r. Here, g is the
-//! growth that the knee adds to the rate's logarithm. W is the random walk of that logarithm, a Brownian motion of
+//! Given the loss L and the initial rate r, the use is T = integral over l from 0 to L of exp(-g(l) - W(l)) / r. g(l)
+//! is the growth of the rate's logarithm in the knee. W(l) is the random walk of this logarithm, a Brownian motion with
 //! variance v(l). With m = exp(v / 2 - g):
 //! * E T = (1 / r) integral of m(l);
 //! * E T^2 = (2 / r^2) integral over l of m(l) (integral over s from 0 to l of m(s) e^v(s)).
 //!
-//! Both integrals use the midpoint rule. T is approximated by a lognormal with these moments. The rate is a lognormal
-//! with the mean and variance of the rate's normal distribution truncated to positive values. Its walk with use adds
-//! variance. The loss is normal. A loss of 0 or less means a crossing in the past, so T = 0 with the probability of
-//! such a loss. The remaining range of the loss is divided into slices of equal width. Each slice is a lognormal at its
-//! middle loss, with the rate conditional on that loss. The width w of the slice adds a variance of (w / L)^2 / 12.
+//! Both integrals use the midpoint rule. T is approximated by a lognormal with these moments. The rate r is
+//! approximated by a lognormal with the mean and variance of the rate's normal distribution, truncated to positive
+//! values. The random walk of the rate with use adds variance.
+//!
+//! The loss L is normal. If L <= 0, the level has already fallen that far: T = 0, with the probability of L <= 0. The
+//! range L > 0 is divided into slices of equal width. Each slice is a lognormal for the loss at the slice's centre,
+//! with the rate conditional on this loss. The width w of the slice adds a variance of (w / L)^2 / 12.
 
 use super::{KNEE_DRIFT, RATE_WALK_USE, knee, walk_variance};
 use crate::filter::{bell, bisect, normal_cdf};
 
 /// Number of slices of the loss.
 const SLICES: usize = 10;
-/// Half-width of the sliced range of the loss, standard deviations; the last slice includes the upper tail.
+/// Half-width of the range that is divided into slices, in standard deviations of the loss. The last slice also
+/// contains the upper tail.
 const SLICED: f64 = 3.5;
 
-/// Steps of a bisection: they narrow a range of about 20 e-folds to 1 part in 10^6.
+/// Number of bisection steps: they narrow a range of about 20 e-folds to 1 part in 10^6.
 pub(super) const HALVINGS: u32 = 24;
 
-/// Range of the logarithm of use and rate.
+/// Allowed range of the logarithms of use and rate.
 const LOG_RANGE: (f64, f64) = (-20.0, 40.0);
 
-/// Steps of an integral over the loss.
+/// Number of steps of an integral over the loss.
 const STEPS: usize = 16;
 
-/// A slice: its probability, and mean and standard deviation of its use's logarithm.
+/// A slice: its probability, and the mean and standard deviation of the logarithm of its use.
 type Slice = (f64, (f64, f64));
 
 /// The distribution of the use until the crossing.
 #[derive(Debug, Clone)]
 pub(super) struct Crossing {
-    /// Probability that the crossing lies in the past.
+    /// Probability that the level has already passed the threshold.
     passed: f64,
     slices: [Slice; SLICES],
 }
 
 impl Crossing {
     /// `mean`: [remaining loss, rate]. `covariance`: [variance of the loss, covariance of loss and rate, variance of
-    /// the rate]. `lost` and `used`: loss and use up to now.
+    /// the rate]. `lost` and `used`: loss and use until now.
     pub(super) fn new(mean: [f64; 2], covariance: [f64; 3], lost: f64, used: f64) -> Self {
         let [loss_variance, both, rate_variance] = covariance;
-        // The minimum avoids a division by 0 for an exactly known loss; all slices are then equal.
+        // The minimum avoids a division by 0 if the loss is known exactly; all slices are then equal.
         let loss_std = loss_variance.max(1e-24).sqrt();
         let by_loss = both / (loss_std * loss_std);
         let left = (rate_variance - by_loss * both).max(0.0);
@@ -68,7 +71,8 @@ impl Crossing {
             let (log_rate, log_rate_variance) = positive(mean[1] + by_loss * loss_std * deviation, left);
             let (log_use, walked) = use_of_loss(lost, loss);
             let log_mean = log_use - log_rate;
-            // The rate keeps walking with use. The use averages over that walk, so about half of its variance counts.
+            // The rate also walks with use. The crossing depends on the rate averaged over the use, so about half of
+            // the walk's variance counts.
             let ahead = libm::log1p(libm::exp(log_mean.min(LOG_RANGE.1)) / used.max(f64::MIN_POSITIVE));
             let own_width = loss_std * width / loss;
             let variance =
@@ -78,7 +82,7 @@ impl Crossing {
         Self { passed, slices }
     }
 
-    /// Probability of the crossing within `ahead` units of use.
+    /// Probability that the level passes the threshold within `ahead` units of use.
     pub(super) fn probability(&self, ahead: f64) -> f64 {
         self.probability_of_log(libm::log(ahead))
     }
@@ -88,7 +92,7 @@ impl Crossing {
         self.passed + self.slices.iter().map(of_slice).sum::<f64>()
     }
 
-    /// Use within which the crossing has this probability.
+    /// Use within which the level passes the threshold with this probability.
     pub(super) fn quantile(&self, probability: f64) -> f64 {
         if self.passed >= probability {
             return 0.0;
@@ -102,14 +106,14 @@ impl Crossing {
     }
 }
 
-/// Mean and variance of the logarithm of a lognormal with the moments of the normal (mean, variance) truncated to
-/// values above 0.
+/// Mean and variance of the logarithm of a lognormal. The lognormal has the same moments as the normal distribution
+/// (`mean`, `variance`) truncated to values above 0.
 fn positive(mean: f64, variance: f64) -> (f64, f64) {
     let std = variance.max(1e-24 * mean * mean).sqrt();
     if std == 0.0 {
         return (LOG_RANGE.0, 0.0);
     }
-    // Below -8, the ratio of density to tail cannot be computed in f64. The rate is close to 0 there anyway.
+    // Below -8, the ratio of density to tail probability cannot be computed in f64. The rate is then close to 0 anyway.
     let place = (mean / std).max(-8.0);
     let density = bell(place) / (2.0 * std::f64::consts::PI).sqrt();
     let hazard = density / normal_cdf(place);
@@ -119,10 +123,10 @@ fn positive(mean: f64, variance: f64) -> (f64, f64) {
     (libm::log(first) - 0.5 * log_variance, log_variance)
 }
 
-/// Mean and variance of the logarithm of the use until a further `loss`, for an initial rate of 1.
+/// Mean and variance of the logarithm of the use until a further loss of `loss`, for an initial rate of 1.
 fn use_of_loss(lost: f64, loss: f64) -> (f64, f64) {
     let step = loss / STEPS as f64;
-    // Sums over the loss: m, m e^v, and the second moment.
+    // Integrals over the loss: of m, of m e^v, and the second moment.
     let (mut mean, mut inner, mut second) = (0.0, 0.0, 0.0);
     for index in 0..STEPS {
         let at = lost + (index as f64 + 0.5) * step;
@@ -145,7 +149,7 @@ mod tests {
     #[test]
     fn moments_of_use_agree_with_sampled_walk() {
         // A generator with a fixed seed makes the test reproducible; antithetic pairs make the first moment nearly
-        // exact. The loss starts before the knee and ends beyond it.
+        // exact. The loss starts before the knee and ends after it.
         let (lost, loss, steps, paths) = (0.05, 0.3, 200, 4000);
         let mut seed = 1_u64;
         let mut uniform = || {

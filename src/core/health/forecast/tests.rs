@@ -2,8 +2,8 @@
 
 use super::*;
 
-/// A forecast that has received `capacity(efc)`, Ah, every `step` equivalent full cycles up to `until`. A cycle lasts a
-/// quarter of a day.
+/// A forecast that has received the capacity `capacity(efc)`, Ah, after every `step` equivalent full cycles (efc) up to
+/// `until`. One cycle takes a quarter of a day.
 fn fed(capacity: impl Fn(f64) -> f64, step: f64, until: f64) -> Forecast {
     let mut forecast = Forecast::new(Axis::Cycles, 2.0);
     let mut efc = 0.0;
@@ -25,7 +25,7 @@ fn linear_fade_before_knee_is_extrapolated() {
     let forecast = fed(|efc| 2.0 - 0.001 * efc, 1.0, 100.0);
     let life = forecast.remaining(1.8).expect("enough is known");
     let cycles = life.cycles.expect("cycles are counted");
-    // 1.9 Ah now, 0.1 Ah above the threshold.
+    // The cell has 1.9 Ah now, 0.1 Ah above the threshold.
     assert!((cycles.median - 100.0).abs() < 10.0, "{cycles:?}");
     assert!(cycles.low < 100.0 && cycles.high > 100.0 && cycles.high < 8.0 * cycles.low, "{cycles:?}");
     let days = life.days.expect("the rate of use is known");
@@ -36,7 +36,8 @@ fn linear_fade_before_knee_is_extrapolated() {
 fn interval_covers_fade_with_and_without_knee() {
     let forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
     let cycles = forecast.remaining(1.6).expect("enough is known").cycles.expect("cycles are counted");
-    // 1.8 Ah now, 0.2 Ah above the threshold: 100 cycles at the current rate, 41 if the rate grew by e^0.9 at once.
+    // The cell has 1.8 Ah now, 0.2 Ah above the threshold: 100 cycles at the present rate, 41 if the rate grew by a
+    // factor of e^0.9 at once.
     assert!((45.0..90.0).contains(&cycles.median) && cycles.low < 45.0 && cycles.high > 100.0, "{cycles:?}");
 }
 
@@ -107,7 +108,7 @@ fn days_axis_gives_days_only() {
     }
     let life = forecast.remaining(1.2).expect("enough is known");
     assert_eq!(life.cycles, None);
-    // 1.45 Ah now, 0.25 Ah above the threshold, at 0.01 Ah a day.
+    // The cell has 1.45 Ah now, 0.25 Ah above the threshold, and loses 0.01 Ah per day.
     assert!(life.days.is_some_and(|days| (days.median - 25.0).abs() < 5.0), "{life:?}");
 }
 
@@ -177,7 +178,7 @@ fn nightly_rest_does_not_hide_the_fade() {
     }
     let recovery_std = forecast.p[RECOVERY][RECOVERY].sqrt();
     assert!(recovery_std < 1.1 * RECOVERY_IN_REST.hypot(RECOVERY_IN_USE), "{recovery_std}");
-    // 1.6 Ah now, 0.1 Ah above the threshold, at 0.004 Ah a cycle.
+    // The cell has 1.6 Ah now, 0.1 Ah above the threshold, and loses 0.004 Ah per cycle.
     let cycles = forecast.remaining(1.5).expect("enough is known").cycles.expect("cycles");
     assert!(cycles.low < 25.0 && cycles.high > 25.0 && cycles.median > 15.0 && cycles.median < 35.0, "{cycles:?}");
 }
@@ -226,7 +227,8 @@ fn long_rest_hardly_changes_recent_use() {
     (0..20).for_each(|_| forecast.update(passed(1.0), None));
     let life = forecast.remaining(1.5).expect("enough is known");
     let days_per_cycle = life.days.expect("days").median / life.cycles.expect("cycles").median;
-    // 5 days for 20 cycles, plus up to 25 days of rest within the window of 30 days: far below 300.
+    // 20 cycles take 5 days, plus at most 25 days of rest within the window of 30 days. The total is far below 300
+    // days.
     assert!((0.25..2.0).contains(&days_per_cycle), "{days_per_cycle}");
 }
 

@@ -64,7 +64,7 @@ fn half_cycle_without_new_voltages_measures_nothing() {
     assert!(!learner.has_learned_all());
     let first = learner.learn(&small_model(), &config, 0, &mut estimator, &moved);
     assert!(first.measurement.is_some() && learner.has_learned_all());
-    // Without new voltages, the same information must not count again.
+    // Without new voltages, the information that has already been used must not count again.
     let second = learner.learn(&small_model(), &config, 0, &mut estimator, &moved);
     assert_eq!(second.measurement, None);
     assert_eq!(moved.swing.map(|swing| swing.mean), Some(0.5));
@@ -107,7 +107,7 @@ fn half_cycle_with_filter_restart_measures_nothing() {
     let in_doubt = learn(&mut learner, &mut estimator);
     assert_eq!((in_doubt.measurement, in_doubt.capacity.mean), (None, sure.mean));
     assert!(learn(&mut learner, &mut estimator).measurement.is_some());
-    // The capacity is at least the charge moved in one half-cycle.
+    // The capacity is at least the charge that was moved in one half-cycle.
     learner.doubt(&config, 0, new_variance, &mut estimator);
     let much = HalfCycle { charge_ah: 2.5, ..moved };
     assert_eq!(learner.learn(&small_model(), &config, 0, &mut estimator, &much).capacity.mean, 2.5);
@@ -146,7 +146,8 @@ fn lasting_errors_of_equal_half_cycles_stay_in_interval() {
     let sensor = SensorErrors { voltage_offset_v: 0.004, current_gain: 0.005, ..SensorErrors::NONE };
     let deviations = deviations_after_thousand_half_cycles(&config, sensor);
     assert!(deviations.abs() < 1.96, "{deviations}");
-    // If the filter treats these errors as noise, they average out and the interval excludes the true capacity.
+    // If the filter treated these errors as noise, they would average out, and the interval would exclude the true
+    // capacity.
     let without =
         deviations_after_thousand_half_cycles(&CapacityConfig { end_error_v: Some(0.0), ..config }, SensorErrors::NONE);
     assert!(without.abs() > 3.0, "{without}");
