@@ -1,12 +1,14 @@
-//! Tables of capacities over a life: CSV (plain, gzip or zstd), columns by name.
+//! Reads tables of capacities over the life of a cell: CSV files (plain, gzip or zstd) whose columns are found by name.
 //!
 //! | column | value |
 //! | --- | --- |
-//! | `time_s`, `start`, `date` or `time` | time: seconds, or like 2008-04-02T13:08:17 |
-//! | `capacity_ah` or `capacity_ah_source` | Ah, above 0; empty = not measured |
-//! | `soc` | fraction; empty = not measured |
+//! | `time_s`, `start`, `date` or `time` | time in seconds, or as text such as 2008-04-02T13:08:17 |
+//! | `capacity_ah` or `capacity_ah_source` | capacity, Ah, above 0; empty = not measured |
+//! | `soc` | SOC, fraction; empty = not measured |
 //! | `cell` | number of the cell, from 0 |
-//! | `cycle`, `type`, `duration_s` | part of a measured file, its kind (`discharge` or another), duration of use, s |
+//! | `cycle` | number of the part of a measured file |
+//! | `type` | kind of the cycle: `discharge` or another word |
+//! | `duration_s` | time in use, s |
 
 use std::borrow::Cow;
 use std::path::Path;
@@ -24,11 +26,11 @@ pub(crate) struct CapacityTable {
     cycle: Option<usize>,
     kind: Option<usize>,
     duration: Option<usize>,
-    /// Time of the last row, if rows must be in order.
+    /// Time of the last row; `None` = the rows may have any order.
     last: Option<Timestamp>,
 }
 
-/// A row of the table; `None` = not stated.
+/// A row of the table. A field is `None` if the table does not state it.
 pub(crate) struct CapacityRow<'t> {
     pub(crate) line: u64,
     pub(crate) time: Timestamp,
@@ -44,8 +46,7 @@ pub(crate) struct CapacityRow<'t> {
 impl CapacityTable {
     /// Opens a table whose rows may have any order.
     ///
-    /// # Errors
-    /// The file cannot be read, or lacks the time, or both capacity and SOC.
+    /// The file cannot be read, the column of times is missing, or the file has neither capacities nor SOC.
     pub(crate) fn open(path: &Path) -> Result<Self, TableError> {
         let table = Table::open(path)?;
         let header = table.header();
@@ -73,10 +74,10 @@ impl CapacityTable {
         self.table.header()
     }
 
-    /// The next row; `None` at the end.
+    /// Returns the next row, or `None` at the end of the file.
     ///
     /// # Errors
-    /// The file cannot be read, or a field is wrong: file, line, column, found, allowed.
+    /// The file cannot be read, or a field is wrong. The error names the file, line and column, what was found and what is allowed.
     pub(crate) fn next_row(&mut self) -> Result<Option<CapacityRow<'_>>, TableError> {
         let Some(row) = self.table.next_row()? else { return Ok(None) };
         let time = row.stamp(self.time)?;
@@ -93,7 +94,7 @@ impl CapacityTable {
             line: row.line,
             time,
             capacity_ah: number(self.capacity, f64::MIN_POSITIVE, f64::MAX, "Ah above 0 or nothing")?,
-            // The SOC may be slightly outside 0 to 1; values up to 100 would be percent.
+            // The SOC may be slightly outside 0 to 1. The limit of 1.5 detects a column in percent.
             soc: number(self.soc, -0.5, 1.5, "a fraction, 0 to 1")?,
             cell: self.cell.map(|column| cell(&row, column)).transpose()?,
             cycle: self.cycle.map_or_else(Cow::default, |column| row.text(column)),

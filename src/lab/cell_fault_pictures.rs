@@ -1,6 +1,6 @@
-//! Pictures of a cell fault detector: each cell's difference from the median of its pack, one picture per state.
+//! Pictures of a cell fault detector. For each estimated state, one picture shows how far each cell is from the median of its pack.
 //!
-//! A bar is a 95 % interval. Cells with a finding that the picture shows are red.
+//! A bar is a 95 % interval. A cell is red if the detector has reported one of the findings that the picture shows.
 
 use crate::cell_faults::difference::{CAPACITY, CHANNEL, CONTACT, LEAK, RESISTANCE, SOC, STATES};
 use crate::cell_faults::fault;
@@ -9,25 +9,25 @@ use crate::chart::{Axis, Chart, Ink, Layer, Picture, Point, Shape};
 use crate::filter::ScalarGaussian;
 use crate::quantity::CellIndex;
 
-/// Half the width of a bar, in cells.
+/// Half of the width of a bar; 1 is the distance between two cells on the axis.
 const HALF_BAR: f64 = 0.3;
 
-/// Description of a picture.
+/// Description of one picture.
 struct Shown {
     state: usize,
-    /// Name of its file.
+    /// Name of the picture's file.
     name: &'static str,
     title: &'static str,
     label: &'static str,
-    /// Factor from the state's unit to the label's.
+    /// Factor from the unit of the state to the unit of the axis label.
     scale: f64,
-    /// Sizes from which on a cell is reported, in the state's unit.
+    /// Differences, in the unit of the state, at which a cell is reported.
     limits: &'static [f64],
-    /// Kinds of findings that the picture shows.
+    /// Kinds of findings that this picture shows.
     kinds: &'static [CellFaultKind],
 }
 
-/// In the order of a report; charge is first, because it has no finding.
+/// The pictures in the order of a report. Charge is first, because it has no finding.
 const SHOWN: [Shown; STATES] = [
     Shown {
         state: SOC,
@@ -101,7 +101,7 @@ pub const NAMES: [&str; STATES] = {
     names
 };
 
-/// All pictures with the names of their files.
+/// Returns all pictures, each with the name of its file.
 pub fn all(diagnosis: &CellFaultDetector) -> Vec<(String, Picture)> {
     let cells: Vec<[Option<ScalarGaussian>; STATES]> =
         (0..).map(CellIndex).map_while(|cell| diagnosis.relative(cell)).collect();
@@ -112,7 +112,7 @@ fn picture(shown: &Shown, cells: &[[Option<ScalarGaussian>; STATES]], findings: 
     let is_found = |cell: usize| {
         findings.iter().any(|found| shown.kinds.contains(&found.kind) && found.is_of(CellIndex(cell as u16)))
     };
-    // Number, value and half interval of each cell.
+    // Number, value and half of the interval of each cell.
     let shown_of = |wanted: bool| {
         let of_one = move |(cell, states): (usize, &[Option<ScalarGaussian>; STATES])| {
             let size = states[shown.state].filter(|_| is_found(cell) == wanted)?;
@@ -121,7 +121,7 @@ fn picture(shown: &Shown, cells: &[[Option<ScalarGaussian>; STATES]], findings: 
         cells.iter().enumerate().filter_map(of_one).collect::<Vec<_>>()
     };
     let bars = |wanted: bool| {
-        // A gap separates a bar from the next one.
+        // Each bar ends with a gap, so that the next bar is not connected to it.
         let bar = |(x, y, half): (f64, f64, f64)| {
             [(x - HALF_BAR, y - half, y + half), (x + HALF_BAR, y - half, y + half), (x + HALF_BAR, f64::NAN, f64::NAN)]
         };

@@ -1,9 +1,9 @@
 //! Pictures as SVG: lines, bands, points and thresholds over an axis of numbers or dates; bands of states; heat maps.
 //!
-//! Input: values in the units that the labels name; a value that is not finite interrupts a line. Output: SVG in one style. Colours are
-//! classes that a page or a file defines, for light and dark ([`style`]). A long series is reduced to its extremes per pixel column, so
-//! that peaks survive and files stay small. Labels are above the drawing area, never on the data; `<title>` elements are tool tips
-//! without a script.
+//! Input: values in the units that the labels name. Output: SVG in one style. A value that is not finite interrupts a line. Colours are
+//! classes, which the page or file defines for a light and a dark background ([`style`]). A long series is reduced to the lowest and
+//! highest value of each pixel column, so peaks stay visible and files stay small. Labels are above the drawing area and never cover
+//! the data. Tool tips are `<title>` elements and need no script.
 
 mod axis;
 mod files;
@@ -30,9 +30,9 @@ pub struct Size {
 }
 
 impl Size {
-    /// For a screen or a page.
+    /// Size for a screen or a page.
     pub const WIDE: Self = Self { width: 840.0, height: 290.0 };
-    /// For a phone.
+    /// Size for a phone.
     pub const NARROW: Self = Self { width: 350.0, height: 270.0 };
 }
 
@@ -45,7 +45,7 @@ pub enum Picture {
 }
 
 impl Picture {
-    /// The elements inside an `<svg>`, and their height.
+    /// Returns the elements inside the `<svg>`, and their height in pixels.
     pub fn draw(&self, size: Size) -> (String, f64) {
         match self {
             Self::Chart(chart) => chart.draw(size),

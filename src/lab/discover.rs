@@ -1,12 +1,12 @@
 //! Finds the signals of the traction battery in a log: pack current and voltage, cell voltages, temperatures, and the battery
 //! controller's own SOC and SOH.
 //!
-//! Input: frames with times; optionally DBC files and definitions of diagnostic answers. Output: ranked candidates for each
-//! quantity, each with its reasons in plain words. Answers to diagnostic requests are read, whichever device sent the request. Answers
-//! without a definition are searched for rows of cell voltages and other fields. Memory is bounded, and any frames are accepted.
+//! Input: frames with times; optionally DBC files and definitions of diagnostic answers. Output: for each quantity, ranked candidates
+//! with their reasons in plain words. Answers to diagnostic requests are read, no matter which device sent the requests. In answers
+//! without a definition, the search looks for rows of cell voltages and other fields. Memory is bounded. Any frames are accepted.
 //!
-//! The result is a proposal for the owner to confirm: names mislead, and a car at rest shows little. The scale of a field without a
-//! definition is a guess from plausible values.
+//! The owner must confirm the result, because names can mislead and a parked car shows little. If a field has no definition, its scale
+//! is guessed from plausible values.
 
 mod capture;
 mod configuration;
@@ -34,13 +34,13 @@ use signals::Descriptions;
 
 pub use configuration::{PackConfiguration, PackSettings};
 
-/// Meaning of a positive current.
+/// Direction of a positive current.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PositiveDirection {
-    /// Charge.
+    /// A positive current charges the pack.
     Charge,
-    /// Discharge.
+    /// A positive current discharges the pack.
     Discharge,
 }
 
@@ -51,11 +51,11 @@ pub struct Candidate {
     pub quantity: PackQuantity,
     /// Rank among the candidates of the quantity; 1 = best.
     pub rank: usize,
-    /// Interface that carries it.
+    /// Interface on which the signal was received.
     pub interface: String,
-    /// `Message.Signal`; with `{n}` for a group.
+    /// `Message.Signal`; the name of a group contains `{n}` in place of the number.
     pub signal: String,
-    /// Number of signals of the group; 1 = no group.
+    /// Number of signals of the group; 1 = a single signal.
     pub signals: usize,
     /// Smallest value in the log, in V, A, degrees Celsius or %.
     pub low: f64,
@@ -63,7 +63,7 @@ pub struct Candidate {
     pub high: f64,
     /// Weight of the evidence; only the order of candidates matters.
     pub points: f64,
-    /// For a current: the direction that the voltage shows.
+    /// Direction of a positive current, found from the response of the voltage; `None` = unknown, or not a current.
     pub positive: Option<PositiveDirection>,
     /// Reasons, in plain words.
     pub reasons: Vec<String>,
@@ -78,15 +78,15 @@ pub struct Discovery {
     pub candidates: Vec<Candidate>,
     /// Number of frames in the log.
     pub frames: u64,
-    /// Number of frames ignored because there were too many identifiers.
+    /// Number of frames that were ignored because the log has too many identifiers.
     pub ignored_frames: u64,
-    /// Number of kinds of diagnostic answers in the log.
+    /// Number of different diagnostic answers in the log (sender, service and identifier).
     pub answers: usize,
     /// Length of the log, s.
     pub seconds: f64,
     /// Number of signals with values in the log.
     pub signals: usize,
-    /// Remarks on described voltages and currents of the battery that never have a valid value in the log.
+    /// Remarks on battery voltages and currents that are described but never have a valid value in the log.
     pub remarks: Vec<String>,
     #[serde(skip)]
     log_signals: Vec<LogSignal>,
@@ -115,10 +115,10 @@ impl Discoverer {
         self.descriptions.databases.push(database);
     }
 
-    /// Adds the answers of an OBDb signal set.
+    /// Adds the diagnostic answers of an OBDb signal set.
     ///
     /// # Errors
-    /// As [`obdb::import`].
+    /// The errors of [`obdb::import`].
     pub fn add_obdb(&mut self, text: &str, settings: &ObdbSettings) -> Result<(), LabError> {
         self.descriptions.tables.extend(obdb::tables(text, settings)?);
         Ok(())
@@ -129,17 +129,17 @@ impl Discoverer {
         self.capture.handle(time, bus, frame);
     }
 
-    /// Number of frames so far.
+    /// Returns the number of frames received so far.
     pub fn frames(&self) -> u64 {
         self.capture.frames
     }
 
-    /// Length of the log so far, s.
+    /// Returns the length of the log so far, s.
     pub fn seconds(&self) -> f64 {
         self.capture.seconds()
     }
 
-    /// Ranks the candidates; `interfaces` are the names of the interfaces by number.
+    /// Ranks the candidates. `interfaces` are the names of the interfaces in the order of their numbers.
     pub fn finish(&self, interfaces: &[String]) -> Discovery {
         let (signals, remarks) = signals::signals(&self.capture, &self.descriptions);
         Discovery {
@@ -154,10 +154,10 @@ impl Discoverer {
         }
     }
 
-    /// A configuration from the best candidates of [`finish`](Self::finish).
+    /// Writes a configuration that uses the best candidates of [`finish`](Self::finish).
     ///
     /// # Errors
-    /// Questions that neither the log nor the settings answer, one per line.
+    /// Neither the log nor the settings answer some questions. The error contains these questions, one per line.
     pub fn configuration(&self, discovery: &Discovery, settings: &PackSettings) -> Result<PackConfiguration, LabError> {
         let Self { capture, descriptions } = self;
         let writer = Writer { discovery, capture, descriptions, settings };

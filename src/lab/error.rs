@@ -1,4 +1,4 @@
-//! The error of offline work: a text with the place, what was found and what is allowed.
+//! Errors of offline commands: a text that states the place, what was found and what is allowed.
 
 use std::path::Path;
 
@@ -8,7 +8,7 @@ use crate::chart::PlotError;
 use crate::config::ConfigFaults;
 use crate::io::table::TableError;
 
-/// Why offline work failed: one line per fault.
+/// Why an offline command failed; one line per fault.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum LabError {
     /// Data or arguments that cannot be used.
@@ -19,18 +19,18 @@ pub enum LabError {
     File(String),
 }
 
-/// Why a request for offline work was rejected.
+/// Why a request was rejected.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum RequestError {
-    /// Its configuration is faulty: one line per fault.
+    /// The configuration is faulty; one line per fault.
     #[error(transparent)]
     Config(#[from] ConfigFaults),
-    /// Another error: a file or an argument.
+    /// A file or an argument is wrong.
     #[error(transparent)]
     Lab(#[from] LabError),
 }
 
-/// Converts errors that already name their place.
+/// Implements the conversion of errors whose text already names the place.
 macro_rules! convert {
     ($variant:ident: $($error:ty),+ $(,)?) => {
         $(impl From<$error> for LabError {
@@ -52,19 +52,19 @@ convert!(
 convert!(File: PlotError);
 
 impl LabError {
-    /// A failed read or write, classified as by [`TableError::of_io`].
+    /// Creates the error of a failed read or write. [`TableError::of_io`] decides the kind.
     pub fn of_io(text: String, error: &std::io::Error) -> Self {
         TableError::of_io(text, error).into()
     }
 }
 
-/// Creates a folder for results, with the folders above it.
+/// Creates a folder for results, and its parent folders if they are missing.
 pub(crate) fn create_folder(folder: &Path) -> Result<(), LabError> {
     std::fs::create_dir_all(folder)
         .map_err(|error| LabError::File(format!("{}: cannot be created: {error}", folder.display())))
 }
 
-/// Rejects the first value that is not allowed.
+/// Returns an error for the first value that is not allowed.
 pub(crate) fn check_values(
     name: &str,
     values: impl IntoIterator<Item = f64>,

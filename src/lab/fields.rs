@@ -1,7 +1,7 @@
-//! The values of an event or of a history row, by name.
+//! Values of an event or of a history row, found by name.
 //!
-//! Events and the rows of a store use the same names for the same values. An unknown value (null, or a number that is not finite) reads
-//! as `None`; numbers keep every bit.
+//! Events and the rows of a store use the same names for the same values. An unknown value is null or a number that is not finite; it
+//! is returned as `None`. Finite numbers are returned unchanged.
 
 use serde_json::{Map, Value};
 
@@ -28,33 +28,33 @@ impl Fields {
         Self(names.zip(entry.values.iter().cloned()).collect())
     }
 
-    /// A number.
+    /// Returns a number.
     pub(crate) fn number(&self, name: &str) -> Option<f64> {
         self.0.get(name)?.as_f64()
     }
 
-    /// A whole number.
+    /// Returns a whole number.
     pub(crate) fn whole(&self, name: &str) -> Option<u32> {
         self.0.get(name)?.as_u64()?.try_into().ok()
     }
 
-    /// A mean with its standard deviation.
+    /// Returns a mean with its standard deviation.
     pub(crate) fn pair(&self, mean: &str, std: &str) -> Option<(f64, f64)> {
         self.number(mean).zip(self.number(std))
     }
 
-    /// A quantity with its standard deviation.
+    /// Returns a quantity with its standard deviation.
     pub(crate) fn quantity(&self, quantity: Quantity) -> Option<(f64, f64)> {
         let row = quantity.row();
         self.pair(row.key, row.std_key?)
     }
 
-    /// A text; empty if it is missing.
+    /// Returns a text, or an empty text if it is missing.
     pub(crate) fn text(&self, name: &str) -> &str {
         self.0.get(name).and_then(Value::as_str).unwrap_or_default()
     }
 
-    /// Whether a flag is set; a store contains flags as 0 and 1.
+    /// Returns whether a flag is set. A store writes flags as 0 and 1.
     pub(crate) fn flag(&self, name: &str) -> bool {
         self.0.get(name).is_some_and(|value| value.as_bool().unwrap_or_else(|| value.as_f64().unwrap_or(0.0) != 0.0))
     }

@@ -1,8 +1,8 @@
 //! Fits a cell model to measured files: the work of `packwatch fit` without the terminal.
 //!
-//! Input: measured CSVs ([`super::measured`]), slow tests, and the cell's data from the command line. Output: a
-//! [`FitOutcome`] with the model's tables, residuals per file, and all values of the written TOML ([`toml`]).
-//! If the SOC of files cannot be determined, one error lists all of them with the reasons.
+//! Input: measured CSV files ([`super::measured`]), slow tests, and the data of the cell from the command line. Output: a
+//! [`FitOutcome`] with the tables of the model, the residuals of each file, and all values for the TOML file ([`toml`]). If the SOC of
+//! some files cannot be determined, a single error lists these files with the reasons.
 
 mod cells;
 mod chemistry;
@@ -43,38 +43,40 @@ use crate::ident::prior::PriorDeviations;
 use crate::ident::record::{self, Record};
 use crate::ident::{ageing, error_table, fit, thermal};
 
-/// Least share of the SOC range that the data must cover.
+/// Smallest share of the SOC range that the data must cover.
 const MIN_SOC_RANGE: f64 = 0.5;
-/// Default SOC breakpoints: closer where the OCV bends.
+/// Default SOC breakpoints. They are closer together where the open-circuit voltage (OCV) bends.
 const SOC_NODES: [f64; 24] = [
     0.0, 0.025, 0.05, 0.075, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85,
     0.9, 0.95, 0.975, 1.0,
 ];
-/// SOC breakpoints if slow tests give the shape of the OCV; [`nodes`] adds more where it bends.
+/// SOC breakpoints if slow tests give the shape of the OCV. [`nodes`] adds more where the OCV bends.
 const SLOW_TEST_SOC_NODES: [f64; 15] = [0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0];
-/// SOC breakpoints for an ageing cell's full discharges, whose knee is sharp.
+/// SOC breakpoints for the full discharges of an ageing cell, which have a sharp knee.
 const AGEING_SOC_NODES: [f64; 25] = [
     0.0, 0.03, 0.045, 0.06, 0.075, 0.09, 0.105, 0.12, 0.14, 0.17, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.85,
     0.9, 0.93, 0.96, 0.98, 1.0,
 ];
-/// SOC interval above the cut-off whose slope an ageing cell's curve keeps below the cut-off.
+/// Width of the SOC interval above the cut-off. The curve of an ageing cell continues below the cut-off with the slope of this
+/// interval.
 const LOW_END_SOC: f64 = 0.03;
-/// Starting time constants by number of branches, s.
+/// Initial time constants, s, for models with 1, 2 and 3 branches.
 const TAU_S: [&[f64]; 3] = [&[60.0], &[10.0, 150.0], &[5.0, 50.0, 500.0]];
 
-/// Temperature at which the electrodes are identified, degrees C.
+/// Temperature at which the electrodes are identified, degrees Celsius.
 const ELECTRODES_C: f64 = 25.0;
 
-/// Default shift of an ageing cell's open-circuit curve (see `AgedOcv::of_shift`): 0 = the curve shrinks evenly, 1 = pure loss of
-/// lithium. It is a prior, not a result, because no fit of a new cell determines it. The value was chosen on two measured lives.
+/// Default shift of the open-circuit curve of an ageing cell (see `AgedOcv::of_shift`). With 0, the curve shrinks evenly; 1 is a pure
+/// loss of lithium. No fit of a new cell determines the shift, so this value is a prior and not a result. It was chosen on two measured
+/// lives.
 pub const AGEING_SHIFT: f64 = 0.5;
 
 /// Progress of the fit, for a progress bar.
 #[derive(Debug, Clone, Copy)]
 pub enum FitProgress {
-    /// Number of files read, and of all files.
+    /// Number of files read so far, and number of all files.
     Read(usize, usize),
-    /// Pass number and cost.
+    /// Number of the pass, and the cost after it.
     Pass(usize, f64),
 }
 
@@ -87,7 +89,7 @@ pub struct FileResidual {
     pub rows: usize,
     /// Seconds of data.
     pub seconds: f64,
-    /// Rows left out because their voltage is impossible.
+    /// Number of rows left out because no cell of this type can have their voltage.
     pub outliers: usize,
     /// Residual of the model.
     pub residual: Residual,
@@ -115,23 +117,23 @@ pub struct FitOutcome {
     pub capacity_ah: f64,
     /// Lowest and highest voltage, V.
     pub voltage_v: (f64, f64),
-    /// Electrodes, unless a shift of the curve is given or no known electrodes fit.
+    /// Electrodes; `None` = a shift of the curve is given, or no known electrodes fit.
     pub electrodes: Option<FittedElectrodes>,
-    /// Thermal parameters where the data determine them.
+    /// Thermal parameters; `None` = the data do not determine them.
     pub thermal: Option<Thermal>,
-    /// Standard deviation of the model's error, averaged over 100 s, V, in node order.
+    /// Standard deviation of the model's voltage error, averaged over 100 s, V, in node order.
     pub voltage_error_v: Vec<f64>,
     /// Ranges in which the cell was measured.
     pub measured: MeasuredRange,
-    /// For an ageing cell: residuals of discharges and of charges.
+    /// Residuals of the discharges and of the charges of an ageing cell; `None` = the cell is not ageing.
     pub by_kind: Option<(Residual, Residual)>,
-    /// Residuals per file, slow tests last.
+    /// Residuals of each file; slow tests come last.
     pub files: Vec<FileResidual>,
     /// The records fitted, in the order of the files; for plots.
     pub records: Vec<Record>,
-    /// The file of each record, as an index into `files`.
+    /// For each record, the index of its file in `files`.
     pub file_of_record: Vec<usize>,
-    /// Additional results of a fit to logs.
+    /// Additional results of a fit to logs; `None` = measured files were fitted.
     pub logs: Option<LogsOutcome>,
     /// Notes and warnings to print.
     pub notes: Vec<String>,
@@ -144,14 +146,15 @@ pub struct FitOutcome {
 pub struct LogsOutcome {
     /// Standard deviation of the capacity, Ah.
     pub capacity_std_ah: f64,
-    /// Deviation of every cell from the mean cell; empty for a pack of few cells.
+    /// Deviation of every cell from the mean cell; empty if the pack has too few cells.
     pub cells: Vec<CellDeviation>,
 }
 
 /// Reads and prepares the files, and fits the model.
 ///
 /// # Errors
-/// [`FitRequest::check`] rejects the request, files cannot be read or used, or the data do not support a fit: one line each.
+/// [`FitRequest::check`] rejects the request, files cannot be read or used, or the data do not support a fit. The error has one line
+/// per fault.
 pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Result<FitOutcome, LabError> {
     request.check()?;
     let (files, slow) = read_all(request, &mut progress)?;
@@ -171,7 +174,7 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
     let by_kind = request.first_cycles.map(|_| prepared.by_kind(&records, &fitted));
     let all: Vec<&MeasuredFile> = files.iter().chain(&slow).collect();
     let files = by_file(&all, &prepared, &records, &fitted);
-    // Full discharges under load give too coarse a curve.
+    // Full discharges under load give only a coarse curve.
     let has_curve = !prepared.ocv.is_empty() && request.ageing_shift.is_none();
     let electrodes = if has_curve { ageing_electrodes(&fitted, prepared.capacity_ah) } else { None };
     let mut outcome = FitOutcome {
@@ -196,7 +199,7 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
     Ok(outcome)
 }
 
-/// Electrodes of the fitted curve, if its ageing can be computed from them.
+/// Returns the electrodes of the fitted curve, if the ageing of the curve can be computed from them.
 fn ageing_electrodes(fitted: &FittedTables, capacity_ah: f64) -> Option<FittedElectrodes> {
     let soc = &fitted.grid.soc;
     let rows: Vec<Vec<f64>> = fitted.tables.ocv_v.chunks(soc.len()).map(<[f64]>::to_vec).collect();
@@ -204,9 +207,9 @@ fn ageing_electrodes(fitted: &FittedTables, capacity_ah: f64) -> Option<FittedEl
         .filter(|found| AgedOcv::of_electrodes(&found.electrodes, soc, capacity_ah, &rows).is_some())
 }
 
-/// Extends the open-circuit curve of an ageing cell below the cut-off of its discharges, where there are no data, by a straight
-/// line with the slope of [`LOW_END_SOC`] above the cut-off. A curve that falls to the cut-off voltage there, or as far as the last rows
-/// under load pull it, is so steep that the gates reject the first rest of an aged cell.
+/// Extends the open-circuit curve of an ageing cell below the cut-off of its discharges, where there are no data. The extension is a
+/// straight line with the slope of the curve in the [`LOW_END_SOC`] above the cut-off. Without it, the last rows under load would make
+/// the curve so steep that the gates reject the first rest of an aged cell.
 fn continue_low_end(fitted: &mut FittedTables) {
     let soc = &fitted.grid.soc;
     let cut_off = soc.partition_point(|&node| node < ageing::SOC_LEFT);
@@ -256,7 +259,8 @@ fn settings(request: &FitRequest, prepared: &prepare::FitInputs) -> FitSettings 
         tau_s,
         voltage_v: prepared.voltage_v,
         ocv: prepared.ocv.clone(),
-        // Smallest slope of an ageing cell's OCV: relaxation slower than its branch would bend the top of the curve down.
+        // Smallest slope of the OCV of an ageing cell. Without this limit, relaxation that is slower than the branch would bend the top
+        // of the curve down.
         min_slope_v: if ageing { [(0.0, 0.2), (0.9, 1.0)].to_vec() } else { vec![] },
         deviations,
     }

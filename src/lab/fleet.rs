@@ -1,8 +1,9 @@
-//! Processes many logs at once: alarms under other settings ([`whatif`]), tables of the results ([`export`]), and the same tables for a
-//! fleet of vehicles on several machines ([`vehicles`]).
+//! Processes many logs at once. [`whatif`] evaluates the alarms under other settings, [`export`] writes the results as tables, and
+//! [`vehicles`] writes the same tables for a fleet of vehicles on several machines.
 //!
-//! Input: a configuration and logs in any format that `replay` reads. Each log is replayed separately, on all cores; a log that fails is
-//! reported, and the others continue. Memory is bounded by the results per log, not by its length.
+//! Input: a configuration, and logs in any format that `replay` reads. Each log is replayed separately, and all cores are used. If a
+//! log fails, the error is reported and the other logs continue. Memory depends on the size of the results of a log, not on the length
+//! of the log.
 
 pub mod drive;
 pub mod export;
@@ -21,7 +22,7 @@ use rayon::prelude::*;
 
 use crate::error::LabError;
 
-/// Runs `work` for every item on `jobs` threads (`None` = all cores); returns the results in the order of the items.
+/// Runs `work` for every item on `jobs` threads (`None` = all cores). Returns the results in the order of the items.
 ///
 /// # Errors
 /// The threads cannot be started.
@@ -33,6 +34,6 @@ pub fn in_parallel<T: Sync, R: Send>(
     let threads = jobs.unwrap_or(0).min(items.len().max(1));
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
     let pool = pool.map_err(|error| LabError::Data(format!("threads cannot be started: {error}")))?;
-    // One item at a time, because logs differ much in length.
+    // One item at a time, because the lengths of logs differ greatly.
     Ok(pool.install(|| items.par_iter().enumerate().with_max_len(1).map(|(index, item)| work(index, item)).collect()))
 }

@@ -1,8 +1,8 @@
 //! Gaussian process regression on files: tables, cross-validation, trained models, predictions, forecasts, pictures.
 //!
-//! [`ColumnTable`] reads columns of CSV files; [`cross_validate`] runs the paper's experiment; [`TrainedModel`] is a model with the
-//! names of its columns, saved and loaded; [`forecast`] forecasts future rows from past rows, without future inputs.
-//! The arithmetic is in [`crate::regress`]. Nothing here prints.
+//! [`ColumnTable`] reads columns of CSV files. [`cross_validate`] runs the experiment of the paper. [`TrainedModel`] is a model that
+//! can be saved and loaded, with the names of its columns. [`forecast`] predicts future rows from past rows, without future inputs. The
+//! arithmetic is in [`crate::regress`]. This module prints nothing.
 
 pub mod forecast;
 mod pictures;
@@ -31,11 +31,11 @@ pub struct CrossValidation {
     pub score: PredictionScore,
     /// Duration of the experiment with this kernel, s.
     pub seconds: f64,
-    /// Peak memory of the process during the experiment, KiB; `None` = unknown to the system.
+    /// Peak memory of the process during the experiment, KiB; `None` = the system does not report it.
     pub peak_kib: Option<u64>,
 }
 
-/// Inputs (all columns except the last, row by row) and targets (the last column).
+/// Returns the inputs (all columns except the last, row by row) and the targets (the last column).
 pub fn split(table: &ColumnTable) -> (Vec<f64>, Vec<f64>) {
     let width = table.width();
     let inputs = table.values.chunks_exact(width).flat_map(|row| row[..width - 1].iter().copied()).collect();
@@ -45,7 +45,7 @@ pub fn split(table: &ColumnTable) -> (Vec<f64>, Vec<f64>) {
 /// Cross-validates one kernel on a table whose last column is the output.
 ///
 /// # Errors
-/// There are too few rows for the folds, settings are out of range, or the watcher stopped the work.
+/// There are too few rows for the folds, a setting is out of range, or the watcher stopped the work.
 pub fn cross_validate(
     table: &ColumnTable,
     settings: &GprSettings,
@@ -62,7 +62,7 @@ pub fn cross_validate(
     Ok(CrossValidation { kernel: settings.kernel.to_string(), folds, score, seconds, peak_kib: peak_kib() })
 }
 
-/// Writes the predictions of every row in cross-validation, by kernel.
+/// Writes the cross-validated prediction of every row for each kernel.
 ///
 /// # Errors
 /// The file cannot be written.
@@ -81,7 +81,7 @@ pub fn write_validated(path: &Path, table: &ColumnTable, all: &[CrossValidation]
     write_csv(path, own.into_iter().chain([output.clone()]).chain(named).collect(), rows)
 }
 
-/// Writes a CSV file completely or not at all.
+/// Writes a CSV file. If writing fails, no partial file is left.
 fn write_csv(path: &Path, heads: Vec<String>, rows: impl Iterator<Item = Vec<String>>) -> Result<(), LabError> {
     let mut out = csv::Writer::from_writer(ResultFile::create(path)?);
     out.write_record(heads)?;
@@ -92,18 +92,18 @@ fn write_csv(path: &Path, heads: Vec<String>, rows: impl Iterator<Item = Vec<Str
     Ok(file.finish()?)
 }
 
-/// Mean, standard deviation and both ends of a prediction's interval.
+/// Formats a prediction: mean, standard deviation, and both ends of the interval.
 fn interval(p: &Prediction) -> [String; 4] {
     [p.mean, p.measurement_variance.sqrt(), p.low_95, p.high_95].map(|number| number.to_string())
 }
 
-/// Resets the kernel's record of the peak memory, so that the next peak belongs to the next kernel. If this fails, peaks
-/// count from the start of the process and are still upper bounds.
+/// Resets the peak memory that the operating system has recorded, so that the next peak belongs to the next Gaussian-process kernel. If
+/// this fails, the recorded peaks cover the time since the process started and are still upper bounds.
 fn reset_peak() {
     let _ = std::fs::write("/proc/self/clear_refs", "5");
 }
 
-/// Peak memory of the process, KiB: VmHWM of /proc/self/status.
+/// Returns the peak memory of the process, KiB (VmHWM of /proc/self/status).
 pub fn peak_kib() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?.trim().strip_suffix("kB")?.trim().parse().ok()

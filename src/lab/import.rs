@@ -1,7 +1,7 @@
-//! Converts other descriptions of a car's signals or of a cell to parts of a packwatch configuration.
+//! Converts descriptions of a car's signals or of a cell from other formats to parts of a packwatch configuration.
 //!
-//! Input: the text of a file. Output: TOML that a person can read and edit, and a list of everything that was left out, with place and
-//! reason. Nothing is read or written here.
+//! Input: the text of a file. Output: TOML that a person can read and edit, and a list of the parts that were left out, each with its
+//! path in the file and the reason. This module reads and writes no files.
 
 pub mod bpx;
 pub mod dbc;
@@ -17,22 +17,22 @@ pub(crate) use diagnostic::{DiagnosticSignal, DiagnosticTable, NumberRange};
 /// A converted file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ImportResult {
-    /// The part of a configuration, TOML; comments at its end list the exclusions.
+    /// The part of a configuration as TOML. Comments at its end list the exclusions.
     pub text: String,
-    /// Exclusions, in the order of the file.
+    /// Parts that were left out, in the order of the file.
     pub exclusions: Vec<Exclusion>,
-    /// Unknown fields that were ignored: place and name.
+    /// Unknown fields that were ignored, each with its path and name.
     pub warnings: Vec<String>,
-    /// Number of converted signals; each signal of a numbered series counts.
+    /// Number of converted signals. In a numbered series, each signal counts.
     pub signals: usize,
 }
 
 /// A part of the file that was left out.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Exclusion {
-    /// Class, for counts.
+    /// Kind of reason, used to count the exclusions.
     pub reason: ExclusionReason,
-    /// Place in the file.
+    /// Path of the part in the file.
     pub place: String,
     /// What was found and what is allowed.
     pub detail: String,
@@ -41,7 +41,7 @@ pub struct Exclusion {
 /// Why a part of the file was left out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum ExclusionReason {
-    /// The command belongs to other model years.
+    /// The command exists only in other model years.
     OtherYear,
     /// The command's service is not 0x01, 0x21 or 0x22.
     OtherService,
@@ -84,7 +84,7 @@ impl fmt::Display for Exclusion {
 }
 
 impl ImportResult {
-    /// Number of exclusions by reason.
+    /// Counts the exclusions by reason.
     pub fn counts(&self) -> BTreeMap<ExclusionReason, usize> {
         let mut counts = BTreeMap::new();
         for exclusion in &self.exclusions {

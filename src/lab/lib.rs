@@ -1,5 +1,5 @@
-//! Offline work on measured files: fit of cell models, scores against truth, remaining useful life, Gaussian
-//! processes, reports and plots.
+//! Offline work on measured files: fits of cell models, scores against a known truth, remaining useful life, Gaussian processes,
+//! reports and plots.
 
 pub use packwatch_core::{alarm, can, cell, cell_faults, filter, health, monitor, quantity, sample, sim, wiring};
 pub use packwatch_host::{config, io, replay, status, store};
@@ -27,10 +27,10 @@ pub mod single_cell;
 
 pub use packwatch_host::io::result_file::write_file;
 
-/// A file name without the ending of its compression.
+/// Returns a file name without the ending of its compression (`.gz` or `.zst`).
 fn without_compression(name: &str) -> &str {
     [".gz", ".zst"].iter().find_map(|ending| name.strip_suffix(ending)).unwrap_or(name)
 }
 
-/// Half of a normal distribution's 95 % interval, in standard deviations.
+/// Half of the 95 % interval of a normal distribution, in standard deviations.
 const OF_95: f64 = 1.96;

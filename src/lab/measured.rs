@@ -1,10 +1,11 @@
-//! Measured files: CSV (plain, gzip or zstd) of time, current, voltage, temperature and ampere-hours from a cycler.
+//! Reads the files of a cycler: CSV (plain, gzip or zstd) with time, current, voltage, temperature and ampere-hours.
 //!
-//! Columns by name: `time_s`, `current_a` (positive = discharge), `voltage_v`, and optionally `temperature_c`,
-//! `discharged_ah` (positive = taken out), `type` or `status`, and a part column (`cycle`, `segment` or `ref`); the time restarts
-//! at each new value of the part column. An empty field is NaN. A field that is not a number is an error with its line.
+//! Columns are found by name. Required are `time_s`, `current_a` (positive = discharge) and `voltage_v`. Optional are `temperature_c`,
+//! `discharged_ah` (positive = taken out), `type` or `status`, and a part column (`cycle`, `segment` or `ref`). The time restarts at
+//! each new value of the part column. An empty field becomes NaN. A field that is not a number is an error that names the line.
 //!
-//! Files of the Battery Data Format are read by its columns ([`BDF_COLUMNS`]); the sign of their current and charge is inverted.
+//! Files in the Battery Data Format are recognised by their columns ([`BDF_COLUMNS`]). The signs of their current and charge are
+//! inverted.
 
 use std::path::{Path, PathBuf};
 
@@ -18,9 +19,9 @@ use crate::io::table::{Header, Row, Table, TableError};
 pub struct MeasuredFile {
     /// Path of the file.
     pub path: PathBuf,
-    /// Parts in the order of the file; a single one without part column.
+    /// Parts in the order of the file; without a part column, the file is one part.
     pub parts: Vec<MeasuredPart>,
-    /// Whether the file has the Battery Data Format.
+    /// Whether the file is in the Battery Data Format.
     pub is_bdf: bool,
 }
 
@@ -33,7 +34,7 @@ struct Columns {
     discharged: Option<usize>,
     part: Option<usize>,
     kind: Option<usize>,
-    /// Sign of current and charge: 1, or -1 if positive means charge.
+    /// Factor for current and charge: 1, or -1 if a positive current in the file charges the cell.
     sign: f64,
 }
 
@@ -41,7 +42,8 @@ impl MeasuredFile {
     /// Reads a whole file.
     ///
     /// # Errors
-    /// The file cannot be read, a column is missing, a field is not a number, or there are no rows: with place and what was found.
+    /// The file cannot be read, a column is missing, a field is not a number, or there are no rows. The error states the place and what
+    /// was found.
     pub fn read(path: &Path) -> Result<Self, TableError> {
         let mut table = Table::open(path)?;
         let columns = Columns::find(table.header())?;
@@ -76,12 +78,12 @@ impl Columns {
         })
     }
 
-    /// Converts the sign; 0 stays a positive 0.
+    /// Converts the sign; the result is never -0.
     fn signed(&self, value: f64) -> f64 {
         self.sign * value + 0.0
     }
 
-    /// Adds a row to the last part, or to a new one if the key differs.
+    /// Adds a row to the last part, or to a new part if the key of the row differs.
     fn add_row(&self, row: &Row<'_>, parts: &mut Vec<MeasuredPart>) -> Result<(), TableError> {
         let text = |column: Option<usize>| column.map_or_else(Default::default, |column| row.text(column));
         let number = |column: usize| Ok(row.number(column)?.unwrap_or(f64::NAN));

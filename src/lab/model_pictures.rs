@@ -1,8 +1,9 @@
-//! Pictures of a cell model: open-circuit curve, its slope, resistances over SOC and over temperature, and the resulting error of the
-//! SOC.
+//! Pictures of a cell model: open-circuit curve, slope of the curve, resistances over SOC and over temperature, and the SOC error that
+//! follows from them.
 //!
-//! Bands are 95 % intervals ([`ModelBands`]). The curve of a model that states no error has no band, and its description says so. Lines
-//! are dashed where nothing was measured: outside the measured range, and for a prior.
+//! Bands are 95 % intervals ([`ModelBands`]). If a model does not state the error of its curve, the curve has no band, and the
+//! description of the picture says so. A line is dashed where nothing was measured: outside the measured range, and where it is a
+//! prior.
 
 use crate::cell::model_bands::CURVE_C;
 use crate::cell::{CellModel, ModelBands};
@@ -11,14 +12,14 @@ use crate::config::cell_model::{KnownBy, SourcedModel};
 
 /// Points of a line over SOC or temperature.
 const POINTS: u32 = 200;
-/// Temperature range of the picture over temperature, within the tables, degrees C.
+/// Range of the picture over temperature, degrees Celsius; the picture ends earlier if the tables do.
 const SHOWN_C: (f64, f64) = (-20.0, 50.0);
-/// A cold temperature in addition to the curve's, degrees C.
+/// Second, cold temperature that is drawn with the temperature of the curve, degrees Celsius.
 const COLD_C: f64 = 0.0;
-/// SOC below which a curve or a resistance may leave its picture, percent: both rise steeply there.
+/// Below this SOC, percent, a curve or resistance may leave the picture, because both rise steeply there.
 const STEEP_PERCENT: f64 = 12.0;
 
-/// All pictures with the names of their files.
+/// Returns all pictures, each with the name of its file.
 pub fn all(sourced: &SourcedModel) -> Vec<(String, Picture)> {
     let pictures = [
         ("model_curve", Some(curve(sourced))),
@@ -34,7 +35,7 @@ fn along(low: f64, high: f64) -> impl Iterator<Item = f64> + Clone {
     (0..=POINTS).map(move |k| low + (high - low) * f64::from(k) / f64::from(POINTS))
 }
 
-/// An axis from 0 with room for the layers above [`STEEP_PERCENT`].
+/// Creates an axis that starts at 0 and has room for the points above [`STEEP_PERCENT`].
 fn from_0(label: &str, layers: &[Layer]) -> Axis {
     let highest = layers.iter().flat_map(|layer| match &layer.shape {
         Shape::Line(points) | Shape::Dashed(points) => points.clone(),
@@ -53,7 +54,7 @@ fn soc_axis() -> Axis {
     Axis::number("SOC, %").within(0.0, 100.0)
 }
 
-/// A line that is dashed where nothing was measured; both parts share the point at which they meet.
+/// Draws a line that is dashed where nothing was measured. The solid and the dashed part share the point at which they meet.
 fn line(label: &str, ink: Ink, points: &[(f64, f64)], is_measured: impl Fn(f64) -> bool) -> Vec<Layer> {
     let part = |wanted: bool| -> Vec<(f64, f64)> {
         let near = |k: usize| {
@@ -115,7 +116,7 @@ fn slope(sourced: &SourcedModel) -> Picture {
     )
 }
 
-/// Settled resistance in milliohm with its 95 % interval over `x`; `place` converts `x` to SOC and temperature.
+/// Draws the settled resistance over `x`, in milliohms, with its 95 % interval. `place` converts `x` to SOC and temperature.
 fn resistance_layers(
     sourced: &SourcedModel,
     (label, ink): (&str, Ink),
@@ -148,7 +149,7 @@ fn resistance_over_soc(sourced: &SourcedModel) -> Picture {
     chart(title, "Settled resistance, milliohm, over SOC", soc_axis(), from_0("m\u{3a9}", &layers), layers)
 }
 
-/// First and last temperature of tables with several temperatures.
+/// Returns the first and last temperature of the tables; `None` = the tables have a single temperature.
 fn ends_c(model: &CellModel) -> Option<(f64, f64)> {
     match model.temperature_c[..] {
         [low, .., high] => Some((low, high)),
@@ -221,7 +222,7 @@ mod tests {
         };
         assert_eq!(shapes(|_| true), [('-', 10)]);
         assert_eq!(shapes(|_| false), [('.', 10)]);
-        // Points 4 to 9 were measured; the dashed line reaches the first of them.
+        // Points 4 to 9 were measured. The dashed line ends at point 4.
         assert_eq!(shapes(|x| x > 3.5), [('-', 6), ('.', 5)]);
     }
 

@@ -1,4 +1,4 @@
-//! The cost of differences between cells for their pack, in words: name and value of each line.
+//! Formats the cost of the differences between cells for their pack: lines with a name and a value.
 //!
 //! Cells count from 1. Every "±" is one standard deviation. Ah and kWh refer to one string.
 
@@ -8,7 +8,7 @@ use crate::cell_faults::{Imbalance, UnknownImbalance};
 use crate::filter::ScalarGaussian;
 use crate::quantity::CellIndex;
 
-/// The lines; without a `model`, energies are missing.
+/// Returns the lines. Without a `model`, the energies are missing.
 pub fn lines(imbalance: &Result<Imbalance, UnknownImbalance>, model: Option<&CellModel>) -> Vec<(String, String)> {
     let pack = match imbalance {
         Ok(pack) => pack,
@@ -31,7 +31,7 @@ pub fn lines(imbalance: &Result<Imbalance, UnknownImbalance>, model: Option<&Cel
             pack.left_out.iter().filter(|it| it.1 == *reason).map(|it| number(it.0).to_string()).collect();
         match cells.len() {
             0 => None,
-            // Most omitted cells listed by number: more do not fit into a line.
+            // Maximum number of omitted cells that are listed by number: more do not fit into a line.
             count if count > 12 => Some(("left out", format!("{words}: {count} cells"))),
             _ => Some(("left out", format!("{words}: cell {}", cells.join(", ")))),
         }
@@ -39,7 +39,7 @@ pub fn lines(imbalance: &Result<Imbalance, UnknownImbalance>, model: Option<&Cel
     lines.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
 }
 
-/// Energy of a share of the mean cell's capacity in all cells of a string, kWh.
+/// Returns the energy, kWh, of the share `part` of the mean cell's capacity, summed over all cells of a string.
 pub fn energy_kwh(pack: &Imbalance, part: ScalarGaussian, model: &CellModel) -> ScalarGaussian {
     let string_v = mean_ocv_v(model, pack.mean_ah.mean) * (pack.cells + pack.left_out.len()) as f64;
     let ScalarGaussian { mean, variance } = pack.ah(part);
@@ -79,7 +79,7 @@ fn spread(spread: &CellSpread, unit: &str) -> String {
     )
 }
 
-/// Converts to percent with one digit; a zero is positive.
+/// Converts a fraction to percent with one decimal. A zero is never negative.
 fn percent(part: f64) -> f64 {
     (1000.0 * part).round() / 10.0 + 0.0
 }

@@ -1,13 +1,13 @@
-//! Remaining useful life from measured capacity histories: the forecast at the end, and forecasts made at parts of the life,
-//! scored against the truth.
+//! Remaining useful life from measured capacity histories: a forecast at the end of a history, and forecasts at earlier points of the
+//! life, which are scored against the truth.
 //!
-//! The forecast is the monitor's own ([`crate::health::forecast`]), fed reading by reading; it uses no reading after its
-//! moment.
+//! The forecast is the one of the monitor ([`crate::health::forecast`]). It receives one reading after the other, and uses no reading
+//! that is later than the time of the forecast.
 //!
-//! Terms: *use* is the number of discharges since the first reading, or of days if the file lists no discharges. The *end of
-//! life* is the use at which the isotonic (non-increasing least-squares) fit of all capacities falls below the threshold,
-//! interpolated between the readings on both sides. A temporary recovery after a rest neither delays
-//! nor advances it.
+//! Terms: *use* is the number of discharges since the first reading, or the number of days if the file lists no discharges. The
+//! capacities are fitted by the non-increasing curve with the least squared error (isotonic fit). The *end of life* is the use at which
+//! this curve falls below the threshold, interpolated between the two readings around it. A temporary recovery after a rest therefore
+//! hardly moves the end of life.
 
 mod baseline;
 mod document;
@@ -24,24 +24,24 @@ pub use document::{now_json, scored_json};
 pub use history::{History, MeasuredCapacity};
 pub use truth::end_of_life;
 
-/// Upper limit of an error, as a part of the life: a baseline that never ends must not dominate a mean.
+/// Upper limit of an error, as a share of the life. Without it, a baseline that never reaches the end of life would dominate the mean.
 pub const WORST_ERROR: f64 = 1.0;
 
 /// The capacity at which a life ends.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Threshold {
-    /// Ah.
+    /// Capacity, Ah.
     AmpereHours(f64),
-    /// Part of the first reading of the history.
+    /// Share of the capacity in the first reading of the history.
     OfFirst(f64),
 }
 
-/// A forecast made at a part of the life, and its errors.
+/// A forecast made after a share of the life, and its errors.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ForecastScore {
-    /// Part of the life that has passed.
+    /// Share of the life that has passed at the time of the forecast.
     pub at: f64,
-    /// Number of readings until then.
+    /// Number of readings up to this time.
     pub readings: usize,
     /// True remaining life, units of use.
     pub truth: f64,
@@ -50,36 +50,36 @@ pub struct ForecastScore {
     /// Why there is no forecast.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub refused: Option<String>,
-    /// Whether the median is within alpha of the truth.
+    /// Whether the median is within a relative error of alpha of the truth.
     pub within_alpha: bool,
-    /// Whether the truth is in the interval.
+    /// Whether the interval contains the truth.
     pub covered: bool,
-    /// |median - truth| as a part of the life, at most [`WORST_ERROR`], which also counts for a rejected forecast.
+    /// |median - truth| as a share of the life, at most [`WORST_ERROR`]. A rejected forecast has this maximum.
     pub error: f64,
-    /// Forecast of a straight line through the last points; `None` = it never reaches the threshold.
+    /// Remaining life from a straight line through the last points; `None` = the line never reaches the threshold.
     pub straight: Option<f64>,
-    /// Error of that forecast, as `error`.
+    /// Error of the straight line, computed like `error`.
     pub straight_error: f64,
-    /// Forecast of a least-squares double exponential; `None` = it never reaches the threshold.
+    /// Remaining life from a double exponential fitted by least squares; `None` = the curve never reaches the threshold.
     pub double_exponential: Option<f64>,
-    /// Error of that forecast, as `error`.
+    /// Error of the double exponential, computed like `error`.
     pub double_exponential_error: f64,
 }
 
-/// A file's forecasts.
+/// All scored forecasts of one file.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct HistoryScore {
     /// Name of the file.
     pub name: String,
     /// Unit of use.
     pub axis: Axis,
-    /// Ah.
+    /// Capacity at which the life ends, Ah.
     pub threshold_ah: f64,
-    /// Use at the end of life; `None` = not reached, so nothing is judged.
+    /// Use at the end of life; `None` = the file ends before, so its forecasts are not scored.
     pub end_of_life: Option<f64>,
     /// Smallest capacity of the file, Ah.
     pub least_capacity_ah: f64,
-    /// In the order of the requested parts.
+    /// Scores in the order of the requested shares of the life.
     pub judged: Vec<ForecastScore>,
 }
 
@@ -90,11 +90,11 @@ pub struct ScoreTotal {
     pub forecasts: usize,
     /// Number of rejected forecasts.
     pub refused: usize,
-    /// Share of forecasts whose interval contains the truth; a rejected one does not.
+    /// Share of forecasts whose interval contains the truth. A rejected forecast counts as a miss.
     pub coverage: f64,
-    /// Share of forecasts whose median is within alpha of the truth; a rejected one is not.
+    /// Share of forecasts whose median is within a relative error of alpha of the truth. A rejected forecast counts as a miss.
     pub within_alpha: f64,
-    /// Mean error, as a part of the life.
+    /// Mean error, as a share of the life.
     pub mean_error: f64,
     /// Mean error of the straight line.
     pub straight_mean_error: f64,
@@ -102,22 +102,22 @@ pub struct ScoreTotal {
     pub double_exponential_mean_error: f64,
 }
 
-/// The forecast at a history's end.
+/// The forecast at the end of a history.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct CurrentForecast {
     /// Name of the file.
     pub name: String,
     /// Unit of use.
     pub axis: Axis,
-    /// Ah.
+    /// Capacity at which the life ends, Ah.
     pub threshold_ah: f64,
     /// Number of readings.
     pub readings: usize,
     /// Use at the last reading.
     pub used: f64,
-    /// Capacity without recovery during rests, mean and standard deviation, Ah.
+    /// Capacity without the recovery during rests, Ah: mean and standard deviation.
     pub level_ah: (f64, f64),
-    /// Loss per unit of use, mean and standard deviation, Ah.
+    /// Capacity loss per unit of use, Ah: mean and standard deviation.
     pub rate_ah: (f64, f64),
     /// Remaining life; `None` = no forecast.
     pub remaining: Option<RemainingLife>,
@@ -144,7 +144,7 @@ impl FromStr for Threshold {
 }
 
 impl Threshold {
-    /// Capacity in Ah for this history.
+    /// Converts the threshold to Ah for this history.
     pub fn ampere_hours(self, history: &History) -> f64 {
         match self {
             Self::AmpereHours(ah) => ah,
@@ -153,7 +153,7 @@ impl Threshold {
     }
 }
 
-/// Forecasts at the end of the history.
+/// Makes the forecast at the end of the history.
 pub fn now(history: &History, name: &str, threshold: Threshold) -> CurrentForecast {
     let forecast = forecast_until(history, f64::INFINITY);
     let threshold_ah = threshold.ampere_hours(history);
@@ -171,7 +171,7 @@ pub fn now(history: &History, name: &str, threshold: Threshold) -> CurrentForeca
     }
 }
 
-/// Forecasts at these parts of the life, and judges them. `progress` is called before each; it may unwind to abort.
+/// Makes forecasts after these shares of the life and scores them. `progress` is called before each forecast; it may unwind to abort.
 pub fn score(
     history: &History,
     name: &str,
@@ -197,7 +197,7 @@ pub fn score(
     }
 }
 
-/// Returns the totals; `None` = nothing was judged.
+/// Returns the totals; `None` = no forecast was scored.
 pub fn total(scored: &[HistoryScore]) -> Option<ScoreTotal> {
     let judged: Vec<&ForecastScore> = scored.iter().flat_map(|file| &file.judged).collect();
     let mean = |of: &dyn Fn(&ForecastScore) -> f64| judged.iter().map(|one| of(one)).sum::<f64>() / judged.len() as f64;
@@ -213,7 +213,7 @@ pub fn total(scored: &[HistoryScore]) -> Option<ScoreTotal> {
     })
 }
 
-/// Judges one forecast, made at the part `at` of the life.
+/// Scores one forecast, made after the share `at` of the life.
 fn judge(history: &History, threshold_ah: f64, end: f64, at: f64, alpha: f64) -> ForecastScore {
     let moment = at * end;
     let truth = end - moment;
@@ -224,7 +224,7 @@ fn judge(history: &History, threshold_ah: f64, end: f64, at: f64, alpha: f64) ->
         Ok(forecast) => (forecast, None),
         Err(why) => (None, Some(why.to_string())),
     };
-    // Counted from the moment, like the forecast; 0 for a line that is already below the threshold.
+    // Remaining use, counted from the time of the forecast; 0 if the line is already below the threshold.
     let ahead = |crossing: Option<f64>| crossing.map(|used| (used - moment).max(0.0));
     let straight = ahead(baseline::straight(&known, threshold_ah));
     let double_exponential = ahead(baseline::double_exponential(&known, threshold_ah));
@@ -259,7 +259,7 @@ fn forecast_until(history: &History, moment: f64) -> Forecast {
     for row in &history.rows {
         let passed = row.since(&before);
         if row.used > moment {
-            // Part of the use until the next reading, without that reading.
+            // Adds the share of use up to the forecast, but not the capacity of the next reading.
             let part = (moment - before.used) / (row.used - before.used);
             let (cycles, days, rest_days) = (part * passed.cycles, part * passed.days, part * passed.rest_days);
             forecast.update(Usage { cycles, days, rest_days }, None);

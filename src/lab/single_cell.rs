@@ -1,7 +1,7 @@
-//! The configuration of one measured cell: a given one, or the built-in one with another cell model or label.
+//! The configuration of one measured cell: a given configuration, or the built-in one with another cell model or label.
 //!
-//! Input: paths, or the data of a label. Output: a checked configuration with the input signals of `measured.dbc`. Every
-//! estimator key has its default unless the given configuration states it. Faults name their file.
+//! Input: paths, or the data of a label. Output: a checked configuration with the input signals of `measured.dbc`. Estimator keys have
+//! their defaults unless the given configuration states them. A fault names its file.
 
 use std::path::{Path, PathBuf};
 
@@ -14,7 +14,7 @@ const BUILT_IN: [(&str, &[u8]); 2] =
 /// The label of a cell without a model, as in the keys of `[pack]`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LabelKeys {
-    /// Chemistry, by its name.
+    /// Name of the chemistry.
     pub chemistry: String,
     /// Capacity, Ah; the configuration requires it.
     pub rated_ah: Option<f64>,
@@ -24,7 +24,7 @@ pub struct LabelKeys {
     pub voltage_max_v: Option<f64>,
 }
 
-/// Source of a cell's configuration. A label has priority; otherwise the model replaces the configuration's.
+/// Source of a cell's configuration. A label has priority. Otherwise, `cell` replaces the cell model that the configuration names.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct CellSource {
     /// Configuration; `None` = the built-in one.
@@ -38,8 +38,7 @@ pub struct CellSource {
 impl CellSource {
     /// Loads the configuration.
     ///
-    /// # Errors
-    /// All faults of the files, or voltages that no cell of this chemistry has.
+    /// The files are faulty, or no cell of this chemistry has the given voltages. The error contains all faults.
     pub fn load(&self) -> Result<Config, ConfigFaults> {
         if let Some(label) = &self.label {
             return label.configuration();
@@ -61,7 +60,7 @@ impl CellSource {
 }
 
 impl LabelKeys {
-    /// The built-in configuration with this label in place of the cell model.
+    /// Returns the built-in configuration, with this label in place of the cell model.
     ///
     /// # Errors
     /// No cell of this chemistry has these voltages, or the capacity is missing.
@@ -80,7 +79,7 @@ impl LabelKeys {
         config::load_with(&ConfigFiles::alone(Path::new(BUILT_IN[0].0)), &read)
     }
 
-    /// The keys of `[pack]`.
+    /// Writes the keys of `[pack]`.
     fn text(&self) -> String {
         let mut text = format!("chemistry = {}\n", toml::Value::from(self.chemistry.as_str()));
         let numbers = [
@@ -95,13 +94,13 @@ impl LabelKeys {
     }
 }
 
-/// The path of the cell model that a configuration names.
+/// Returns the path of the cell model that a configuration names.
 fn named_cell(files: &ConfigFiles, read: config::ReadFile<'_>) -> Result<PathBuf, ConfigFaults> {
     let text = config::merged_with(files, read)?;
     let named = text.parse::<toml::Table>().ok().and_then(|table| {
         let model = table.get("pack")?.get("cell_model")?.as_str()?.to_owned();
         Some(files.main.parent().unwrap_or(Path::new("")).join(model))
     });
-    // If it names none, reading the configuration reports the fault.
+    // If the configuration names no cell model, reading it reports the fault.
     Ok(named.unwrap_or_default())
 }

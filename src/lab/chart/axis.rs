@@ -7,14 +7,14 @@ use crate::quantity::Timestamp;
 const MINUTE: f64 = 60.0;
 const HOUR: f64 = 3600.0;
 const DAY: f64 = 86_400.0;
-/// Steps of a date axis below a month: unit, s, and counts.
+/// Steps of a date axis that are shorter than a month: unit of the step, s, and the allowed multiples of the unit.
 const STEPS: [(f64, &[f64]); 4] = [
     (1.0, &[1.0, 5.0, 15.0, 30.0]),
     (MINUTE, &[1.0, 5.0, 15.0, 30.0]),
     (HOUR, &[1.0, 2.0, 3.0, 4.0, 6.0, 12.0]),
     (DAY, &[1.0, 2.0, 5.0, 10.0, 20.0]),
 ];
-/// Days of an average month.
+/// Length of an average month, s.
 const MONTH_S: f64 = 30.44 * DAY;
 
 /// Scale of an axis.
@@ -32,7 +32,7 @@ pub struct Axis {
     /// Label with unit.
     pub label: String,
     pub scale: Scale,
-    /// Ends; `None` = from the data.
+    /// Ends of the axis; `None` = the data determine them.
     pub range: Option<(f64, f64)>,
 }
 
@@ -43,7 +43,7 @@ impl<T: Into<String>> From<T> for Axis {
 }
 
 impl Axis {
-    /// An axis of numbers whose range comes from the data.
+    /// Creates an axis of numbers whose range comes from the data.
     pub fn number(label: &str) -> Self {
         label.into()
     }
@@ -52,13 +52,13 @@ impl Axis {
         Self { range: Some((low, high)), ..self }
     }
 
-    /// Ends of the axis for these values, with room at both ends if `margin`; never empty.
+    /// Returns the ends of the axis for these values. They always differ. If `margin` is set, both ends get additional room.
     pub(super) fn ends(&self, values: impl Iterator<Item = f64>, margin: bool) -> (f64, f64) {
         if let Some(range) = self.range {
             return widened(range, 0.0);
         }
         let ends = ends(values.filter(|value| value.is_finite()));
-        // Room above and below the data, as a part of their range.
+        // Room above and below the data, as a share of their range.
         widened(ends, if margin { 0.06 } else { 0.0 })
     }
 
@@ -70,7 +70,7 @@ impl Axis {
         }
     }
 
-    /// The label; for dates with the days at both ends, because the ticks may be hours.
+    /// Returns the label of the axis. For dates, it includes the days at both ends, because the ticks may be hours.
     pub(super) fn caption(&self, ends: (f64, f64)) -> String {
         match self.scale {
             Scale::Number => self.label.clone(),
@@ -79,13 +79,13 @@ impl Axis {
     }
 }
 
-/// The range of an axis: not empty, with room at both ends.
+/// Widens a range so that it is not empty and has room at both ends.
 fn widened((low, high): (f64, f64), margin: f64) -> (f64, f64) {
     if low > high {
         return (0.0, 1.0);
     }
     let width = high - low;
-    // A range too narrow for distinct ticks gets some room around the value.
+    // If the range is too narrow for distinct ticks, add room around the value.
     let room = if width <= 1e-9 * low.abs().max(1e-3) { 0.5 * low.abs().clamp(1.0, 3600.0) } else { margin * width };
     (low - room, high + room)
 }
@@ -96,7 +96,7 @@ fn number_ticks((low, high): (f64, f64), count: f64) -> Vec<(f64, String)> {
     let step = [1.0, 2.0, 5.0, 10.0].into_iter().find(|m| m * power >= raw).unwrap_or(10.0) * power;
     let decimals = (-step.log10().floor()).max(0.0) as usize;
     let first = (low / step).ceil();
-    // The step limits the number of ticks to `count` and one.
+    // The step is chosen so that there are at most `count` + 1 ticks.
     (0..=count.ceil() as usize)
         .map(|index| (first + index as f64) * step)
         .take_while(|value| *value <= high + 1e-9 * step)

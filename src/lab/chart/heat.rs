@@ -1,4 +1,4 @@
-//! Heat maps: a value per row and column of time, as one of nine colours, with a legend.
+//! Heat maps: values over rows and columns of time, each drawn in one of nine colours, with a legend.
 
 use super::Size;
 use super::axis::Axis;
@@ -9,12 +9,12 @@ use super::svg::{Svg, short, text_width};
 /// Smallest and largest height of a row, pixels.
 const ROW: (f64, f64) = (4.0, 20.0);
 
-/// Values over rows (cells, from 1) and columns of equal width.
+/// Values over rows and columns. A row is a cell (counted from 1); columns have equal width.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Heat {
     pub title: String,
     pub description: String,
-    /// Its `range` is where the columns start and end.
+    /// Axis of time; its `range` gives the start of the first and the end of the last column.
     pub x: Axis,
     /// Meaning of the values, with unit.
     pub label: String,
@@ -27,7 +27,7 @@ pub struct Heat {
 }
 
 impl Heat {
-    /// The elements, and their height.
+    /// Returns the elements and their height in pixels.
     pub(super) fn draw(&self, size: Size) -> (String, f64) {
         let mut svg = Svg::default();
         let top = title(&mut svg, &self.title, size.width);
@@ -58,7 +58,7 @@ impl Heat {
         (svg.0, top + height + 40.0)
     }
 
-    /// One path per colour: rectangles over neighbours of the same colour.
+    /// Returns one path per colour. Neighbouring fields of the same colour are joined to one rectangle.
     fn paths(&self, width: f64, row: f64, ends: (f64, f64)) -> Vec<String> {
         let mut paths = vec![String::new(); STEPS.len()];
         for (index, values) in self.rows.iter().enumerate() {
@@ -98,7 +98,7 @@ impl Heat {
     }
 }
 
-/// Colour step of a value; `None` = unknown.
+/// Returns the colour step of a value; `None` = the value is unknown.
 fn step(value: Option<f64>, (low, high): (f64, f64)) -> Option<usize> {
     let part = (value.filter(|value| value.is_finite())? - low) / (high - low);
     Some(((part * STEPS.len() as f64) as usize).min(STEPS.len() - 1))

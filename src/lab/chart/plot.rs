@@ -21,19 +21,19 @@ pub struct Point {
     pub tip: String,
 }
 
-/// Shape of a layer; x must not fall.
+/// Shape of a layer. The x values must not decrease.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Shape {
-    /// (x, y).
+    /// Line through points (x, y).
     Line(Vec<(f64, f64)>),
-    /// Dashed line of (x, y).
+    /// Dashed line through points (x, y).
     Dashed(Vec<(f64, f64)>),
-    /// (x, lower, upper).
+    /// Band of (x, lower, upper).
     Band(Vec<(f64, f64, f64)>),
     Points(Vec<Point>),
-    /// A threshold: a line over the whole width at this y.
+    /// Threshold: a horizontal line at this y.
     Level(f64),
-    /// Events: lines over the whole height at these x, with tool tips.
+    /// Events: vertical lines at these x, with tool tips.
     Moments(Vec<Point>),
 }
 
@@ -51,12 +51,12 @@ impl Layer {
         Self { label: label.to_owned(), ink, shape }
     }
 
-    /// A line of (x, y).
+    /// Creates a line through points (x, y).
     pub fn line(label: &str, ink: Ink, points: impl IntoIterator<Item = (f64, f64)>) -> Self {
         Self::new(label, ink, Shape::Line(points.into_iter().collect()))
     }
 
-    /// A band of (x, lower, upper).
+    /// Creates a band of (x, lower, upper).
     pub fn band(label: &str, ink: Ink, points: impl IntoIterator<Item = (f64, f64, f64)>) -> Self {
         Self::new(label, ink, Shape::Band(points.into_iter().collect()))
     }
@@ -66,7 +66,7 @@ impl Layer {
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Chart {
     pub title: String,
-    /// For readers who cannot see the picture.
+    /// Description for readers who cannot see the picture.
     pub description: String,
     pub x: Axis,
     pub y: Axis,
@@ -85,21 +85,21 @@ pub(super) struct Area {
 }
 
 impl Area {
-    /// Pixels from the area's left edge.
+    /// Converts x to pixels from the left edge of the area.
     pub(super) fn px(&self, x: f64) -> f64 {
         self.width * (x - self.x.0) / (self.x.1 - self.x.0)
     }
 
-    /// Pixels from the area's upper edge.
+    /// Converts y to pixels from the upper edge of the area.
     fn py(&self, y: f64) -> f64 {
         self.height * (self.y.1 - y) / (self.y.1 - self.y.0)
     }
 
-    /// As many ticks as there is room for their labels.
+    /// Returns as many ticks as their labels leave room for.
     fn x_ticks(&self, axis: &Axis) -> Vec<(f64, String)> {
         let fits = |ticks: &[(f64, String)]| {
             let widest = ticks.iter().map(|(_, word)| text_width(word, SMALL)).fold(0.0, f64::max);
-            // Room between two labels.
+            // Distance between two labels, pixels: at least 16.
             ticks.windows(2).all(|pair| self.px(pair[1].0) - self.px(pair[0].0) >= widest + 16.0)
         };
         let counts = (1..=10).rev().map(f64::from);
@@ -107,7 +107,7 @@ impl Area {
         choices.find(|ticks| fits(ticks)).unwrap_or_default()
     }
 
-    /// The x axis: grid, ticks, label.
+    /// Draws the x axis: grid lines, ticks and label.
     pub(super) fn draw_x(&self, svg: &mut Svg, axis: &Axis) {
         let bottom = self.top + self.height;
         for (x, word) in self.x_ticks(axis) {
@@ -121,12 +121,12 @@ impl Area {
 }
 
 impl Chart {
-    /// A chart without a description.
+    /// Creates a chart without a description.
     pub fn new(title: impl Into<String>, x: impl Into<Axis>, y: impl Into<Axis>, layers: Vec<Layer>) -> Self {
         Self { title: title.into(), description: String::new(), x: x.into(), y: y.into(), layers }
     }
 
-    /// The elements, and their height.
+    /// Returns the elements and their height in pixels.
     pub(super) fn draw(&self, size: Size) -> (String, f64) {
         let mut svg = Svg::default();
         let mut top = title(&mut svg, &self.title, size.width);
@@ -136,7 +136,7 @@ impl Chart {
         let height = size.height - 60.0 - FOOT;
         let y_ticks = self.y.ticks(y, height / 28.0);
         let left = y_ticks.iter().map(|(_, word)| text_width(word, SMALL)).fold(16.0, f64::max) + 8.0;
-        // Room at the right, pixels: half of the last tick's label.
+        // The margin at the right, pixels, has room for half of the last tick label.
         let area = Area { left, top, width: size.width - left - 22.0, height, x, y };
         for (y, word) in y_ticks {
             let at = top + area.py(y);
@@ -177,7 +177,7 @@ pub(super) fn title(svg: &mut Svg, text: &str, width: f64) -> f64 {
     if y > 0.0 { y + 6.0 } else { 0.0 }
 }
 
-/// Words in lines of at most this width.
+/// Splits a text into lines of at most this width.
 pub(super) fn wrapped(text: &str, width: f64, size: f64) -> Vec<String> {
     let mut lines: Vec<String> = Vec::new();
     for word in text.split_whitespace() {
@@ -216,7 +216,7 @@ impl Layer {
         }
     }
 
-    /// Draws the layer's sign in the legend, 20 pixels wide around `y`.
+    /// Draws the legend symbol of the layer, 20 pixels wide and centred at `y`.
     fn key(&self, svg: &mut Svg, x: f64, y: f64) {
         let line = format!("M{} {}h20", short(x), short(y));
         match &self.shape {
@@ -257,10 +257,10 @@ impl Layer {
 
     fn draw_points(&self, svg: &mut Svg, area: &Area, points: &[Point]) {
         let finite = || points.iter().filter(|point| point.x.is_finite() && point.y.is_finite());
-        // Most points with a tool tip; larger layers have dots without tool tips.
+        // Maximum number of points with tool tips. In larger layers, the points have none.
         if finite().count() <= 400 {
             return finite().for_each(|point| {
-                // A point at the edge is moved inwards, so that it is not cut in half.
+                // A point at the edge is moved inwards, because half of it would be cut off.
                 let x = area.px(point.x);
                 let x = if (-0.5..=area.width + 0.5).contains(&x) { x.clamp(DOT, area.width - DOT) } else { x };
                 svg.circle((x, area.py(point.y)), DOT, &self.ink.fill(), &point.tip);
@@ -343,7 +343,7 @@ mod tests {
         let layers = (0..6).map(|i| Layer::new(&format!("a rather long label {i}"), Ink::Blue, Shape::Level(1.0)));
         let chart = chart(layers.collect());
         let more = chart.draw(Size::NARROW).1 - chart.draw(Size { width: 2000.0, ..Size::NARROW }).1;
-        // One label next to the name of the axis, then two per row.
+        // One label next to the name of the axis, then two labels per row.
         assert!((more - 3.0 * ROW).abs() < 0.1, "{more} pixels");
     }
 }

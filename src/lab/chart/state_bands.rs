@@ -1,4 +1,4 @@
-//! Bands of states over time: when each alarm was raised.
+//! Bands of states over time; they show when each alarm was raised.
 
 use super::Size;
 use super::axis::Axis;
@@ -6,10 +6,10 @@ use super::plot::{Area, title};
 use super::style::Ink;
 use super::svg::{Svg, text_width};
 
-/// Height of a band's name and of its spans, pixels.
+/// Height of the name of a band, and of its spans, pixels.
 const NAME: f64 = 16.0;
 const BAR: f64 = 12.0;
-/// Smallest width of a span, pixels: the shortest alarm stays visible.
+/// Minimum width of a span, pixels, so that even the shortest alarm is visible.
 const LEAST: f64 = 3.0;
 
 /// A state with its start and end.
@@ -41,7 +41,7 @@ pub struct StateBands {
 }
 
 impl StateBands {
-    /// The elements, and their height.
+    /// Returns the elements and their height in pixels.
     pub(super) fn draw(&self, size: Size) -> (String, f64) {
         let mut svg = Svg::default();
         let mut top = title(&mut svg, &self.title, size.width);

@@ -1,27 +1,27 @@
 //! Colours: classes for strokes, fills and text, and their values in light and dark.
 //!
-//! The inks are from Okabe and Ito: distinguishable with any colour vision, lighter on a dark page.
-//! The steps of heat maps are from cividis (Nuñez, Anderton, Renslow 2018), with the same property.
+//! The inks are those of Okabe and Ito, which people with any colour vision can distinguish; they are lighter on a dark page. The steps
+//! of heat maps are from cividis (Nuñez, Anderton, Renslow 2018), which has the same property.
 
 use std::fmt::Write as _;
 
 /// Colour of a drawn element.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Ink {
-    /// Colour of text: truth, measurement.
+    /// Colour of text; used for the truth and for measurements.
     Plain,
     Blue,
     Orange,
     Green,
     Purple,
-    /// Thresholds, worst alarms.
+    /// Used for thresholds and for the most severe alarms.
     Red,
-    /// Warnings.
+    /// Used for warnings.
     Amber,
     Grey,
 }
 
-/// Names and colours, light and dark.
+/// Name, light value and dark value of each colour.
 const COLOURS: [(&str, &str, &str); 14] = [
     ("plain", "#1c1d20", "#eceef2"),
     ("blue", "#0072b2", "#5ab8f0"),
@@ -39,7 +39,7 @@ const COLOURS: [(&str, &str, &str); 14] = [
     ("none", "#e6e8ec", "#2a2e36"),
 ];
 
-/// Steps of a heat map from the lowest to the highest value.
+/// Colours of a heat map, from the lowest to the highest value.
 pub(super) const STEPS: [&str; 9] =
     ["#00224e", "#123570", "#3b496c", "#575d6d", "#707173", "#8a8678", "#a59c74", "#c3b369", "#fee838"];
 
@@ -51,28 +51,28 @@ impl Ink {
         COLOURS[self as usize].0
     }
 
-    /// Class of a stroke.
+    /// Returns the class of a stroke.
     pub fn stroke(self) -> String {
         format!("k-{}", self.name())
     }
 
-    /// Class of a solid fill.
+    /// Returns the class of a solid fill.
     pub fn fill(self) -> String {
         format!("f-{}", self.name())
     }
 
-    /// Class of a translucent fill.
+    /// Returns the class of a translucent fill.
     pub fn band(self) -> String {
         format!("b-{}", self.name())
     }
 }
 
-/// Class of a step of a heat map.
+/// Returns the class of a heat map step.
 pub(super) fn step_class(step: usize) -> String {
     format!("h-{step}")
 }
 
-/// The colours as variables of a page or a file: light, and dark if the screen prefers it.
+/// Returns the colours as variables of a page or a file. The dark values apply if the viewer prefers a dark background.
 pub fn variables() -> String {
     let list = |pick: fn(&(&str, &'static str, &'static str)) -> &'static str| {
         COLOURS.iter().fold(String::new(), |text, colour| text + &format!("--{}:{};", colour.0, pick(colour)))

@@ -1,4 +1,4 @@
-//! SVG text: elements with few digits.
+//! SVG text: elements whose coordinates have few digits.
 
 use std::fmt::Write as _;
 
@@ -11,7 +11,7 @@ pub fn escape(text: &str) -> String {
             '<' => out.push_str("&lt;"),
             '>' => out.push_str("&gt;"),
             '"' => out.push_str("&quot;"),
-            // Not allowed in XML.
+            // XML does not allow this character.
             c if c.is_control() && c != '\n' && c != '\t' => out.push('\u{fffd}'),
             c => out.push(c),
         }
@@ -19,16 +19,16 @@ pub fn escape(text: &str) -> String {
     out
 }
 
-/// Approximate width of a text in a font of this size, pixels.
+/// Returns the approximate width of a text in a font of this size, pixels.
 pub(super) fn text_width(text: &str, size: f64) -> f64 {
-    // Average width of a character, as a part of the font size.
+    // Average width of a character, as a share of the font size.
     text.chars().count() as f64 * size * 0.56
 }
 
-/// A coordinate with at most one decimal.
+/// Formats a coordinate with at most one decimal.
 pub(super) fn short(value: f64) -> String {
     let tenths = (value * 10.0).round();
-    // Larger than any picture; keeps the text short for any input.
+    // This limit is larger than any picture and keeps the text short for any input.
     let tenths = tenths.clamp(-1e6, 1e6) as i64;
     match (tenths / 10, tenths.abs() % 10) {
         (whole, 0) => whole.to_string(),
@@ -67,7 +67,7 @@ impl Svg {
         self.close("path", tip);
     }
 
-    /// Opens an area that clips its content; its origin is its own upper left corner.
+    /// Opens an area that clips its content. The origin of the content is the upper left corner of the area.
     pub(super) fn open_area(&mut self, (x, y): (f64, f64), (width, height): (f64, f64)) {
         let (x, y, width, height) = (short(x), short(y), short(width), short(height));
         self.push(format_args!(
@@ -95,7 +95,8 @@ impl Svg {
     }
 }
 
-/// A path through points: absolute at its start, then relative, which is short; rounding does not accumulate.
+/// A path through points. The start is absolute and the steps are relative, which keeps the text short. Rounding errors do not
+/// accumulate.
 #[derive(Debug, Default)]
 pub(super) struct PathBuilder {
     pub(super) d: String,

@@ -1,6 +1,7 @@
 //! Reduces long series to the resolution of a picture.
 
-/// First, lowest, highest and last point of each of `bins` bins along x, in order; a short series unchanged.
+/// Divides a line into `bins` bins along x, and keeps the first, lowest, highest and last point of each bin, in order. A short line is
+/// returned unchanged.
 pub(super) fn line(points: &[(f64, f64)], bins: usize) -> Vec<(f64, f64)> {
     let mut kept = Vec::with_capacity(points.len().min(4 * bins));
     if points.len() <= 4 * bins {
@@ -19,7 +20,8 @@ pub(super) fn line(points: &[(f64, f64)], bins: usize) -> Vec<(f64, f64)> {
     kept
 }
 
-/// Lowest lower and highest upper end of each bin, at the bin's first and last x; a short band unchanged.
+/// Returns the lowest lower end and the highest upper end of each bin, at the first and last x of the bin. A short band is returned
+/// unchanged.
 pub(super) fn band(points: &[(f64, f64, f64)], bins: usize) -> Vec<(f64, f64, f64)> {
     if points.len() <= 2 * bins {
         return points.to_vec();
@@ -35,12 +37,12 @@ pub(super) fn band(points: &[(f64, f64, f64)], bins: usize) -> Vec<(f64, f64, f6
     kept
 }
 
-/// Bin of an x; the series must not fall in x.
+/// Returns the function that gives the bin of an x. The x values of the series must not decrease.
 fn binning(mut xs: impl DoubleEndedIterator<Item = f64>, bins: usize) -> impl Fn(f64) -> f64 {
     let first = xs.next().unwrap_or(0.0);
     let last = xs.next_back().unwrap_or(first);
     let width = ((last - first) / bins.max(1) as f64).max(f64::MIN_POSITIVE);
-    // The last point belongs to the last bin, not to an additional one.
+    // The last point belongs to the last bin and does not open another one.
     move |x| ((x - first) / width).floor().min(bins.max(1) as f64 - 1.0)
 }
 

@@ -1,8 +1,9 @@
 //! Frames and diagnostic answers of a log, within a memory limit.
 //!
-//! All frames are kept until they exceed [`MAX_BYTES`]. Then whole windows of [`WINDOW_S`] are dropped: first every second one, then
-//! three of four, and so on. The remaining data contain all identifiers of the same times, including pages of multiplexers.
-//! Answers are reassembled from all frames; each kind keeps at most [`MAX_ANSWER_BYTES`], halved in the same way.
+//! All frames are kept until they exceed [`MAX_BYTES`]. Then whole windows of [`WINDOW_S`] are dropped: first every second window, then
+//! three of four, and so on. All identifiers keep the same windows, so the pages of multiplexed messages stay complete. Answers are
+//! reassembled from all frames, before any are dropped. Each kind of answer keeps at most [`MAX_ANSWER_BYTES`] and is halved in the
+//! same way.
 
 use std::collections::BTreeMap;
 
@@ -10,15 +11,16 @@ use crate::can::isotp::{Progress, Receiver};
 use crate::can::{CanId, Frame, FrameKind};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// Most bytes of frames kept: about two million classic frames.
+/// Maximum number of bytes of frames that are kept: about two million classic frames.
 const MAX_BYTES: usize = 48 << 20;
-/// Most bytes kept per kind of answer: a thousand answers of 64 bytes.
+/// Maximum number of bytes kept per kind of answer: a thousand answers of 64 bytes.
 const MAX_ANSWER_BYTES: usize = 64 << 10;
-/// Length of a window, s: long relative to the period of a page, short relative to a drive.
+/// Length of a window, s. It is long relative to the period of a multiplexer page, and short relative to a drive.
 const WINDOW_S: f64 = 2.0;
-/// Most messages (identifiers on an interface) kept; a car has a few hundred, a flood of random identifiers more.
+/// Maximum number of messages (identifiers on an interface) that are kept. A car has a few hundred messages; a flood of random
+/// identifiers has more.
 const MAX_MESSAGES: usize = 4096;
-/// First data byte of BMW's answers: extended addressing that is recognised without a definition.
+/// First data byte of the answers of BMW controllers. Their extended addressing is recognised without a definition.
 const TESTER: u8 = 0xF1;
 
 /// An identifier on an interface.
@@ -34,7 +36,7 @@ pub(super) struct Payloads {
     ends: Vec<usize>,
 }
 
-/// Kind of answer: its sender, service, and identifier of the values.
+/// Kind of answer: its sender, its service, and the identifier of the values in it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct AnswerKey {
     pub(super) bus: BusIndex,
@@ -44,15 +46,15 @@ pub(super) struct AnswerKey {
     pub(super) identifier: u16,
 }
 
-/// A request: time, s, identifier, and first byte if addressing is extended.
+/// A request: time, s; CAN identifier; and the first data byte if addressing is extended.
 type HeardRequest = (f64, CanId, Option<u8>);
 
 /// Answers of one kind.
 #[derive(Debug, Default)]
 pub(super) struct Answers {
-    /// Identifier of the requests, and their first byte if addressing is extended; `None` = none was heard.
+    /// CAN identifier of the requests, and their first data byte if addressing is extended; `None` = no request was received.
     pub(super) request: Option<(CanId, Option<u8>)>,
-    /// Data after the echoed service and identifier.
+    /// Data of the answers after the echoed service and identifier.
     pub(super) payloads: Payloads,
     /// Number of answers seen.
     pub(super) seen: u64,
@@ -66,26 +68,26 @@ pub(super) struct Capture {
     pub(super) answers: BTreeMap<AnswerKey, Answers>,
     /// Number of frames received.
     pub(super) frames: u64,
-    /// Number of frames of messages beyond [`MAX_MESSAGES`].
+    /// Number of frames that were ignored because [`MAX_MESSAGES`] was exceeded.
     pub(super) ignored: u64,
     receivers: BTreeMap<(MessageKey, Option<u8>), Receiver>,
     requests: BTreeMap<(BusIndex, u8, u16), HeardRequest>,
     start: Option<Timestamp>,
     latest_s: f64,
     bytes: usize,
-    /// One window in every `mask` + 1 is kept; values are 0, 1, 3, 7, ...
+    /// Of every `mask` + 1 windows, one is kept. Values are 0, 1, 3, 7, ...
     mask: u64,
 }
 
 impl Payloads {
-    /// Times and payloads.
+    /// Iterates over times and payloads.
     pub(super) fn iter(&self) -> impl Iterator<Item = (f64, &[u8])> {
         let starts = std::iter::once(0).chain(self.ends.iter().copied());
         let ranges = starts.zip(&self.ends).map(|(start, end)| &self.data[start..*end]);
         self.times.iter().copied().zip(ranges)
     }
 
-    /// Number of payloads.
+    /// Returns the number of payloads.
     pub(super) fn len(&self) -> usize {
         self.times.len()
     }
@@ -96,7 +98,7 @@ impl Payloads {
         self.ends.push(self.data.len());
     }
 
-    /// Keeps payloads selected by number and time.
+    /// Keeps the payloads for which `is_kept` returns true; it receives the number and the time of a payload.
     fn retain(&mut self, mut is_kept: impl FnMut(usize, f64) -> bool) {
         let mut kept = Self::default();
         for (index, (time_s, payload)) in self.iter().enumerate() {
@@ -119,7 +121,7 @@ impl Capture {
             return;
         }
         let start = *self.start.get_or_insert(time);
-        // Seconds since the start of the log: exact to a microsecond for centuries.
+        // Seconds since the start of the log; exact to a microsecond, even over centuries.
         let time_s = time.nanos().saturating_sub(start.nanos()) as f64 * 1e-9;
         self.latest_s = self.latest_s.max(time_s);
         self.frames += 1;
@@ -138,7 +140,7 @@ impl Capture {
         self.receive(time, time_s, key, frame.data());
     }
 
-    /// Length of the log, s.
+    /// Returns the length of the log, s.
     pub(super) fn seconds(&self) -> f64 {
         self.latest_s
     }
@@ -151,14 +153,14 @@ impl Capture {
     }
 
     fn receive(&mut self, time: Timestamp, time_s: f64, key: MessageKey, data: &[u8]) {
-        // BMW sends requests from 6F1 with the target in the first byte; the first byte of the answer is the tester.
+        // BMW testers send requests from 6F1 with the target in the first byte; in the answer, the first byte is the tester.
         let is_extended = |byte: &u8| *byte == TESTER || key.1 == CanId::Standard(0x600 | u16::from(TESTER));
         let extensions = [None, data.first().copied().filter(is_extended)];
         for (index, extension) in extensions.into_iter().enumerate() {
             if index > 0 && extension.is_none() {
                 continue;
             }
-            // Single, first and consecutive frames; other frames are not part of a message.
+            // Only single, first and consecutive frames contain parts of a message.
             let control = data.get(usize::from(extension.is_some())).copied().unwrap_or(u8::MAX);
             if control >> 4 > 2 {
                 continue;
@@ -188,10 +190,10 @@ impl Capture {
         let service = first.wrapping_sub(0x40);
         let Some((number, length)) = identifier(service) else { return };
         let request = self.requests.get(&(bus, service, number));
-        // Longest P2* of ISO 14229-2.
+        // Largest P2* of ISO 14229-2 (time until an answer), s.
         let request = request.filter(|(at, _, _)| time_s - at <= 5.0).map(|(_, id, first)| (*id, *first));
         let key = AnswerKey { bus, response: id, extension, service, identifier: number };
-        // A single frame without a request may be any message that starts with these bytes.
+        // If no request was received, a single frame may be any message that starts with the same bytes.
         let is_known = self.answers.contains_key(&key) || is_long || request.is_some();
         if is_known && (self.answers.contains_key(&key) || self.answers.len() < 1024) {
             self.answers.entry(key).or_default().push(time_s, request, &rest[length..]);
@@ -214,7 +216,7 @@ impl Answers {
     }
 }
 
-/// Number of the window of a time; negative times (before the first stamp) are in window 0.
+/// Returns the number of the window of a time. Negative times (before the first stamp) belong to window 0.
 fn window(time_s: f64) -> u64 {
     (time_s / WINDOW_S) as u64
 }

@@ -1,7 +1,8 @@
 //! Writes the best candidates as a configuration, or returns the questions that prevent it.
 //!
-//! Everything that the log determines is written; the rest (cell model, assignment of sensors to cells, limits and alarms) is listed.
-//! The sign of the current and the number of cells are never guessed: without evidence they become questions.
+//! Everything that the log determines is written. The configuration lists what remains to be decided: the cell model, the assignment of
+//! sensors to cells, limits and alarms. The sign of the current and the number of cells are never guessed. Without evidence, they
+//! become questions.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -19,17 +20,17 @@ use crate::wiring::evidence::PackQuantity;
 /// Decisions of the user.
 #[derive(Debug, Clone, Default)]
 pub struct PackSettings {
-    /// Name of the log, for the first line.
+    /// Name of the log, for the first line of the configuration.
     pub source: String,
-    /// DBC files as named in the configuration, in the order in which they were added.
+    /// Paths of the DBC files in the configuration, in the order in which they were added.
     pub databases: Vec<String>,
-    /// DBC as named in the configuration, for fields that no given DBC describes.
+    /// Path, in the configuration, of the new DBC for fields that no given DBC describes.
     pub own_database: String,
-    /// Cell model as named in the configuration.
+    /// Path of the cell model in the configuration.
     pub cell_model: String,
-    /// Cells in series, for a pack that publishes only its total voltage.
+    /// Number of cells in series, for a pack that sends only its total voltage.
     pub cells: Option<u16>,
-    /// Meaning of a positive current, if the log does not show it.
+    /// Direction of a positive current; needed if the log does not show it.
     pub positive: Option<PositiveDirection>,
 }
 
@@ -38,9 +39,9 @@ pub struct PackSettings {
 pub struct PackConfiguration {
     /// TOML.
     pub text: String,
-    /// DBC of the fields that no given DBC describes; it belongs in the file that [`PackSettings::own_database`] names.
+    /// DBC of the fields that no given DBC describes. It must be saved as the file that [`PackSettings::own_database`] names.
     pub database: Option<String>,
-    /// Questions that the log does not answer.
+    /// Questions that the log does not answer; the user must decide them.
     pub open: Vec<String>,
 }
 
@@ -54,7 +55,7 @@ struct Selection<'a> {
     reported: Vec<(&'static str, &'a Candidate)>,
 }
 
-/// Sources of the text.
+/// Everything from which the text is written.
 pub(super) struct Writer<'a> {
     pub(super) discovery: &'a Discovery,
     pub(super) capture: &'a Capture,
@@ -63,7 +64,7 @@ pub(super) struct Writer<'a> {
 }
 
 impl Writer<'_> {
-    /// Writes the configuration.
+    /// Writes the configuration, or returns the questions that prevent it.
     pub(super) fn write(&self) -> Result<PackConfiguration, Vec<String>> {
         let selection = self.select()?;
         let mut open = Vec::new();
@@ -90,7 +91,7 @@ impl Writer<'_> {
         Ok(PackConfiguration { text, database, open })
     }
 
-    /// Used fields of messages without a DBC.
+    /// Returns the used fields whose message no DBC describes.
     fn fields(&self, selection: &Selection<'_>) -> Vec<&MessageField> {
         let members = self.candidates(selection).into_iter().flat_map(|candidate| &candidate.members);
         let found = members.filter_map(|index| match &self.signal(*index).origin {
@@ -141,7 +142,7 @@ impl Writer<'_> {
         let (Some(current), Some(positive), Some((voltage, cells))) = (current, positive, voltage) else {
             return Err(questions);
         };
-        // An unnamed field may be a temperature or something else.
+        // A field without a name may be a temperature or something else.
         let temperature = self.best(PackQuantity::Temperature).filter(|candidate| !self.is_raw(candidate));
         let soc = self.best(PackQuantity::Soc).map(|candidate| ("reported_soc", candidate));
         let soh = self.best(PackQuantity::Soh).map(|candidate| ("reported_soh", candidate));
@@ -159,7 +160,7 @@ impl Writer<'_> {
         candidate.members.iter().any(is_raw)
     }
 
-    /// Number of cells of a group that is numbered without gaps.
+    /// Returns the number of cells of a group; `None` if its numbers have gaps.
     fn row(&self, group: &Candidate) -> Option<u16> {
         let numbers = self.numbers(group)?;
         let first = *numbers.first()?;
@@ -167,7 +168,7 @@ impl Writer<'_> {
         u16::try_from(numbers.len()).ok().filter(|count| *count >= 2 && has_no_gap)
     }
 
-    /// Numbers of the cells of a group, ascending.
+    /// Returns the cell numbers of a group, ascending.
     fn numbers(&self, group: &Candidate) -> Option<Vec<u32>> {
         let before = group.signal.split_once("{n}").filter(|(before, _)| !before.contains("{m}"));
         let mut numbers = Vec::new();
@@ -175,7 +176,7 @@ impl Writer<'_> {
             let name = &self.signal(*index).name;
             let rest = match before {
                 Some((before, _)) => name.strip_prefix(before)?,
-                // Another number comes first: cells are counted by the last one.
+                // If a name has several numbers, the last one counts the cells.
                 None => name.rsplit(|c: char| !c.is_ascii_digit()).find(|text| !text.is_empty())?,
             };
             let digits = rest.bytes().take_while(u8::is_ascii_digit).count();
@@ -281,7 +282,7 @@ impl Writer<'_> {
         }
     }
 
-    /// Tables of definitions reduced to the used signals, and used fields without a definition.
+    /// Writes the tables of used signals, reduced from the definitions, and the used fields without a definition.
     fn used_tables(
         &self,
         selection: &Selection<'_>,
@@ -353,7 +354,7 @@ impl Writer<'_> {
         }
     }
 
-    /// Writes the largest ages, from the periods of the readings: answers are rare.
+    /// Writes the maximum ages of readings. They follow from the periods in the log, because diagnostic answers are rare.
     fn limits(&self, selection: &Selection<'_>, text: &mut String) {
         let named = [
             ("current", Some(selection.current)),
@@ -367,7 +368,7 @@ impl Writer<'_> {
                 .iter()
                 .map(|index| self.signal(*index).series.period_s().unwrap_or(0.0))
                 .fold(0.0, f64::max);
-            // Not below the defaults of the configuration.
+            // At least the default of the configuration.
             let age_s = (3.0 * period_s).max(2.0).ceil();
             let _ = write!(text, "\n[limits.{name}]\nmax_age_s = {age_s:.1}\n");
         }
@@ -376,9 +377,9 @@ impl Writer<'_> {
 
 fn guessed_request(response: CanId) -> CanId {
     match response {
-        // As ISO 15765-4 defines it.
+        // ISO 15765-4: the identifier of the request is 8 below the identifier of the answer.
         CanId::Standard(id) => CanId::Standard(id.saturating_sub(8)),
-        // Normal fixed addressing: the two addresses are swapped.
+        // Normal fixed addressing: request and answer swap the two addresses.
         CanId::Extended(id) => {
             let [low, high, ..] = id.to_le_bytes();
             CanId::Extended(id & !0xFFFF | u32::from(low) << 8 | u32::from(high))
@@ -386,7 +387,7 @@ fn guessed_request(response: CanId) -> CanId {
     }
 }
 
-/// Text for one line of a comment.
+/// Makes a text that fits into one comment line.
 fn plain(text: &str) -> String {
     text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect()
 }

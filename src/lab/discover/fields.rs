@@ -1,13 +1,13 @@
 //! Finds bit fields that behave like pack voltage, current or cell voltages, in messages that no DBC describes.
 //!
-//! * Voltage: 16 bits at every byte and 12 bits at every half byte, both byte orders, common scales. The value is
+//! * Voltage: fields of 16 bits at every byte and of 12 bits at every half byte, in both byte orders, with common scales. The value is
 //!   plausible for a pack, changes slightly, and its last digits vary.
-//! * Current: the same positions, signed; its changes match the changes of a voltage across a resistance. Of the common scales, the
-//!   one with the most typical resistance is guessed.
-//! * Cells: neighbouring fields of 8, 12 or 16 bits with similar values, at least three in each message or page (first byte),
-//!   and at least eight in total.
+//! * Current: the same positions, but signed. The changes of the field match the changes of a voltage across a resistance. Of the
+//!   common scales, the one that gives the most typical resistance is guessed.
+//! * Cells: neighbouring fields of 8, 12 or 16 bits with similar values. Each message or page (selected by the first byte) has at least
+//!   three of them, and all together at least eight.
 //!
-//! Temperatures and SOC have no characteristic behaviour within minutes, so they are not searched for.
+//! Temperatures and SOC are not searched for, because they show no characteristic behaviour within minutes.
 
 use std::collections::BTreeSet;
 
@@ -19,25 +19,25 @@ use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 use crate::can::unit::Quantity;
 use crate::wiring::evidence::{Series, Slope};
 
-/// Most payloads evaluated of a message, or of each of its pages.
+/// Maximum number of payloads that are evaluated per message, or per page of a message.
 const MAX_PAYLOADS: usize = 1500;
-/// Plausible voltages of a pack, V, and scales, V per code.
+/// Plausible voltages of a pack, V. The scales below are in V per code.
 const PACK_V: (f64, f64) = (100.0, 950.0);
 const PACK_SCALES: [f64; 5] = [0.1, 0.01, 0.05, 0.25, 0.5];
 /// Scales of a current, A per code.
 const CURRENT_SCALES: [f64; 7] = [0.1, 0.01, 0.05, 0.025, 0.25, 0.5, 1.0];
-/// Plausible voltages of a cell, V, and largest difference between cells of a pack.
+/// Plausible voltages of a cell, V. The next constant is the largest difference between cells of a pack, V.
 const CELL_V: (f64, f64) = (2.5, 4.4);
 const MAX_SPREAD_V: f64 = 0.25;
-/// Number of bits of a cell voltage, with scales, V per code.
+/// For each length of a cell voltage in bits: the scales to try, V per code.
 const CELL_FORMS: [(u16, &[f64]); 3] = [(16, &[0.001, 0.0001, 0.002, 0.0005]), (12, &[0.001, 0.002]), (8, &[0.02])];
 
-/// Name of a message without a DBC. The identifier is decimal, so that its digits form one number.
+/// Name of a message that no DBC describes. The identifier is decimal, so that its digits form one number.
 pub(super) fn message_name(id: CanId) -> String {
     format!("Message{}", id.raw())
 }
 
-/// Fields that behave like a voltage, a current or cells.
+/// Returns the fields that behave like a voltage, a current or cells.
 pub(super) fn signals(capture: &Capture) -> Vec<LogSignal> {
     let diagnostic: BTreeSet<CanId> = capture
         .answers
@@ -62,12 +62,12 @@ pub(super) fn signals(capture: &Capture) -> Vec<LogSignal> {
     found
 }
 
-/// Payloads of a message, as many as the evaluation needs.
+/// Payloads of a message, limited to what the evaluation needs.
 struct Samples<'a> {
     key: MessageKey,
-    /// Length of the shortest payload, at most 8.
+    /// Length of the shortest payload, at most 8 bytes.
     bytes: usize,
-    /// Values of the first byte if they number pages; otherwise one `None`.
+    /// Values of the first byte if this byte numbers pages; otherwise a single `None`.
     pages: Vec<Option<u8>>,
     payloads: Vec<(f64, &'a [u8])>,
 }
@@ -77,7 +77,7 @@ impl<'a> Samples<'a> {
         let bytes = payloads.iter().map(|(_, data)| data.len()).min().unwrap_or(0).min(8);
         let pages = pages(payloads);
         let payloads = if pages.len() > 1 {
-            // Even thinning might drop whole pages.
+            // Taking every n-th payload might drop whole pages.
             payloads.iter().take(MAX_PAYLOADS * pages.len()).collect()
         } else {
             payloads.iter().step_by(payloads.len().div_ceil(MAX_PAYLOADS).max(1)).collect()
@@ -96,7 +96,7 @@ fn swing(series: &Series) -> f64 {
     series.extent.range() / series.extent.max
 }
 
-/// Layouts of 16 bits at every byte and of 12 bits at every half byte, in both byte orders.
+/// Returns the layouts of 16 bits at every byte and of 12 bits at every half byte, in both byte orders.
 fn layouts(bytes: usize, signed: bool) -> Vec<SignalLayout> {
     let last = u16::try_from(8 * bytes).unwrap_or(0);
     let mut found = Vec::new();
@@ -112,7 +112,7 @@ fn layouts(bytes: usize, signed: bool) -> Vec<SignalLayout> {
     found
 }
 
-/// Layout of a field by its first bit in wire order; for little-endian fields, bits are counted up from bit 0 of each byte.
+/// Returns the layout of a field from its first bit in wire order. Bits of little-endian fields are counted up from bit 0 of each byte.
 fn layout(first: u16, bits: u16, byte_order: ByteOrder, value_type: ValueType, factor: f64) -> SignalLayout {
     let start_bit = match byte_order {
         ByteOrder::LittleEndian => first,
@@ -153,7 +153,7 @@ fn signal(
     LogSignal::unnamed(full_name, key.0, origin, quantity, series)
 }
 
-/// Position of a field in its name: first bit and byte order.
+/// Returns the position of a field for its name: first bit and byte order.
 fn place(layout: &SignalLayout) -> String {
     let order = if layout.byte_order == ByteOrder::LittleEndian { "little" } else { "big" };
     format!("{}bits_at_{}_{order}", layout.length_bits, layout.start_bit)
@@ -163,7 +163,7 @@ fn voltages_of(samples: &Samples<'_>) -> Vec<LogSignal> {
     let mut found = Vec::new();
     for layout in layouts(samples.bytes, false) {
         let codes = samples.values(&layout, None);
-        // The voltage of a pack moves by less within a log.
+        // Within a log, the voltage of a pack changes by at most this share.
         let is_alive = codes.bad() == 0 && codes.distinct() >= 5 && swing(&codes) <= 0.35;
         if !is_alive || codes.is_counter() {
             continue;
@@ -186,7 +186,7 @@ fn voltages_of(samples: &Samples<'_>) -> Vec<LogSignal> {
     found
 }
 
-/// The fields whose changes correlate best with the changes of a pack or cell voltage.
+/// Finds the fields whose changes correlate best with the changes of a pack voltage or cell voltage.
 fn currents<'a>(messages: impl Iterator<Item = &'a Samples<'a>>, voltages: &[&LogSignal]) -> Vec<LogSignal> {
     let mut found: Vec<(f64, LogSignal)> = Vec::new();
     for samples in messages {
@@ -199,14 +199,14 @@ fn currents<'a>(messages: impl Iterator<Item = &'a Samples<'a>>, voltages: &[&Lo
             let related = others
                 .filter_map(|voltage| Some((Slope::between(&voltage.series, &codes)?, voltage.series.extent.mean())));
             let best = related
-                // Thousands of fields are compared, so the limits are high.
+                // The limits are high, because thousands of fields are compared.
                 .filter(|(slope, _)| slope.correlation().abs() >= 0.6 && slope.strength() >= 7.0)
                 .max_by(|a, b| a.0.correlation().abs().total_cmp(&b.0.correlation().abs()));
             let Some((slope, mean_v)) = best else { continue };
             let distance = |factor: &f64| {
-                // Typical pack: 0.1 ohm at 400 V.
+                // A typical pack has 0.1 ohm at 400 V.
                 let unusual = (slope.ohm.abs() / factor / mean_v / 2.5e-4).ln().abs();
-                // The first scale is the most common one.
+                // The first scale is preferred, because it is the most common one.
                 if *factor == CURRENT_SCALES[0] { unusual - 0.25 } else { unusual }
             };
             let factor = CURRENT_SCALES.iter().copied().min_by(|a, b| distance(a).total_cmp(&distance(b)));
@@ -220,13 +220,13 @@ fn currents<'a>(messages: impl Iterator<Item = &'a Samples<'a>>, voltages: &[&Lo
     found.into_iter().take(12).map(|(_, signal)| signal).collect()
 }
 
-/// Whether a field overlaps a layout of the same message, on any interface: gateways repeat messages.
+/// Whether a field overlaps a layout of the same message on any interface. Gateways repeat messages on other interfaces.
 fn shares_bits(field: &LogSignal, id: CanId, layout: &SignalLayout) -> bool {
     matches!(&field.origin, SignalOrigin::Field(own) if own.id == id && own.signal.layout.overlaps(layout))
 }
 
 impl LogSignal {
-    /// The message of a field without a DBC.
+    /// Returns the message of a field that no DBC describes.
     fn message(&self) -> Option<MessageKey> {
         match &self.origin {
             SignalOrigin::Field(field) => Some((self.bus, field.id)),
@@ -235,7 +235,7 @@ impl LogSignal {
     }
 }
 
-/// Rows of neighbouring cells in messages and pages, all with one form, numbered consecutively.
+/// Finds rows of neighbouring cells in messages and pages. All rows have the same form, and the cells are numbered consecutively.
 fn cells(messages: &[Samples<'_>]) -> Vec<LogSignal> {
     let mut best: Vec<LogSignal> = Vec::new();
     for (bits, scales) in CELL_FORMS {
@@ -256,7 +256,7 @@ fn cells_of_form(messages: &[Samples<'_>], bits: u16, factor: f64, byte_order: B
     for samples in messages {
         let end = u16::try_from(8 * samples.bytes).unwrap_or(0);
         for page in &samples.pages {
-            // The page, and possibly a byte of flags.
+            // Skip the page byte; a byte of flags may follow it.
             let first = if page.is_some() { 8 } else { 0 };
             let starts = (first..first + 16).step_by(if bits == 12 { 4 } else { 8 });
             let rows = starts.map(|start| {
@@ -275,14 +275,15 @@ fn cells_of_form(messages: &[Samples<'_>], bits: u16, factor: f64, byte_order: B
     found
 }
 
-/// Whether a row may belong to the same pack as the cells so far.
+/// Whether a row may belong to the same pack as the cells found so far.
 fn continues(cells: &[LogSignal], key: MessageKey, row: &[(SignalLayout, Series)]) -> bool {
     cells.first().is_none_or(|first| {
         first.bus == key.0 && (first.series.extent.mean() - row[0].1.extent.mean()).abs() <= MAX_SPREAD_V
     })
 }
 
-/// Pages of a message: the values of its first byte if they are consecutive; otherwise the message as a whole.
+/// Returns the pages of a message: the values of the first byte if they are consecutive, otherwise a single `None` for the whole
+/// message.
 fn pages(payloads: &Payloads) -> Vec<Option<u8>> {
     let values: BTreeSet<u8> = payloads.iter().filter_map(|(_, data)| data.first().copied()).collect();
     let span = values.first().zip(values.last()).map_or(0, |(first, last)| usize::from(last - first) + 1);
@@ -290,7 +291,7 @@ fn pages(payloads: &Payloads) -> Vec<Option<u8>> {
     if is_counter { values.into_iter().map(Some).collect() } else { vec![None] }
 }
 
-/// The longest run of plausible neighbours with similar values.
+/// Finds the longest run of plausible neighbouring fields with similar values.
 fn row(
     samples: &Samples<'_>,
     page: Option<u8>,
@@ -304,12 +305,12 @@ fn row(
     let row = longest_run(neighbours, |(_, first), (_, next)| {
         (next.extent.mean() - first.extent.mean()).abs() <= MAX_SPREAD_V
     });
-    // Bytes that never change are more likely text or constants.
+    // Bytes that never change are more likely to be text or constants.
     let is_alive = row.iter().any(|(_, series)| !series.is_constant());
     if is_alive { row } else { Vec::new() }
 }
 
-/// A DBC of these fields; pages become a multiplexor.
+/// Writes a DBC of these fields. Pages become values of a multiplexor.
 pub(super) fn database(fields: &[&MessageField]) -> Database {
     let mut messages: Vec<Message> = Vec::new();
     for field in fields {
@@ -327,7 +328,7 @@ pub(super) fn database(fields: &[&MessageField]) -> Database {
     Database { nodes: Vec::new(), comment: Some(comment), messages }
 }
 
-/// A message with its multiplexor, if it has pages.
+/// Creates a message without fields; if it has pages, it gets a multiplexor.
 fn empty_message(field: &MessageField) -> Message {
     let layout = layout(0, 8, ByteOrder::LittleEndian, ValueType::Unsigned, 1.0);
     let page =

@@ -1,20 +1,21 @@
-//! Groups signals whose names differ only in numbers: cells, sensors.
+//! Groups signals whose names are equal except for their numbers, for example cells or sensors.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 /// A group.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct SignalGroup {
-    /// Name with `{n}` for the counted number, and `{m}` for other varying numbers.
+    /// Name with `{n}` in place of the number that counts the members, and `{m}` in place of other varying numbers.
     pub(crate) pattern: String,
-    /// Signals with their numbers.
+    /// Number of each member, and its index among all signals.
     pub(crate) members: Vec<(u32, usize)>,
 }
 
 /// A name: its index among all names, and the numbers in it.
 type NumberedName<'a> = (usize, Vec<&'a str>);
 
-/// Groups of at least two names in one partition. The number that varies most counts the group; of several such, the last.
+/// Returns the groups of at least two names within one partition. The number that varies most counts the members; if several vary
+/// equally, the last one does.
 pub(crate) fn groups(names: &[(String, &str)]) -> Vec<SignalGroup> {
     let mut found: BTreeMap<(&str, Vec<&str>), Vec<NumberedName<'_>>> = BTreeMap::new();
     for (index, (partition, name)) in names.iter().enumerate() {
@@ -45,7 +46,7 @@ fn group(texts: &[&str], members: &[NumberedName<'_>]) -> Option<SignalGroup> {
     (numbered.len() == members.len()).then_some(SignalGroup { pattern, members: numbered })
 }
 
-/// The texts between the numbers of a name (one more than numbers), and the numbers.
+/// Splits a name into the texts between its numbers (one text more than numbers), and the numbers.
 fn split_numbers(name: &str) -> (Vec<&str>, Vec<&str>) {
     let (mut texts, mut numbers, mut rest) = (Vec::new(), Vec::new(), name);
     while let Some(start) = rest.find(|c: char| c.is_ascii_digit()) {

@@ -1,8 +1,9 @@
-//! Scores which signal is which quantity: points for names and units ([`SignalLabel`](crate::wiring::evidence::SignalLabel)), ranges
-//! and behaviour, each with its reason in words.
+//! Decides which signal carries which quantity. Points are given for names and units
+//! ([`SignalLabel`](crate::wiring::evidence::SignalLabel)), for ranges and for behaviour, each with a reason in words.
 //!
-//! The points are weights of evidence, chosen on three cars. A contradiction excludes a quantity (range); a unit or a name counts 1 to
-//! 3 points; behaviour that hardly any other signal shows (a voltage that falls with current, a sum of cells) counts 3 to 4.
+//! The points are weights of evidence that were chosen on three cars. A value outside the range of a quantity excludes that quantity. A
+//! unit or a name gives 1 to 3 points. Behaviour that hardly any other signal shows gives 3 to 4 points, for example a voltage that
+//! falls with the current, or one that equals the sum of the cells.
 
 use super::groups::{SignalGroup, groups};
 use super::log_signal::{LogSignal, SignalOrigin};
@@ -29,11 +30,11 @@ pub(super) struct Evidence {
 }
 
 impl Evidence {
-    /// Evidence from the label; `None` = it names another quantity, or values are outside the range (ends included).
+    /// Creates the evidence from the label; `None` = the label names another quantity, or values are outside the range (ends included).
     fn new(index: usize, signal: &LogSignal, quantity: PackQuantity, range: (f64, f64)) -> Option<Self> {
         let (low, high) = (signal.series.extent.min, signal.series.extent.max);
         let mut score = signal.label.score(quantity).filter(|_| low >= range.0 && high <= range.1)?;
-        // An unnamed field was selected by its values.
+        // A field without a name was already selected by its values.
         if signal.is_unnamed() {
             score = Score::default();
         }
@@ -53,7 +54,7 @@ impl Evidence {
         self.score.add(points, holds, reason);
     }
 
-    /// Whether the values stay within the range of a pack in use.
+    /// Whether all values are in the range of a pack in use.
     fn is_steady(&self) -> bool {
         self.high - self.low <= 0.35 * self.high
     }
@@ -63,7 +64,7 @@ impl Evidence {
     }
 }
 
-/// Candidates of every quantity, best first.
+/// Returns the candidates of every quantity, best first.
 pub(super) fn candidates(signals: &[LogSignal], interfaces: &[String]) -> Vec<Candidate> {
     let groups = groups(&signals.iter().map(|signal| (partition(signal), signal.name.as_str())).collect::<Vec<_>>());
     let usable: Vec<usize> = (0..signals.len()).filter(|index| signals[*index].is_mostly_valid()).collect();
@@ -94,7 +95,8 @@ pub(super) fn candidates(signals: &[LogSignal], interfaces: &[String]) -> Vec<Ca
     all.into_iter().flat_map(|(quantity, evidence)| ranked(quantity, evidence, interfaces)).collect()
 }
 
-/// Only signals with the same partition form groups: one interface and one source. Numbers in the name of an answer do not count cells.
+/// Returns the partition of a signal: its interface and source. Only signals of one partition form groups. Numbers in the name of an
+/// answer do not count cells.
 fn partition(signal: &LogSignal) -> String {
     let source = match &signal.origin {
         SignalOrigin::Dbc(_) => String::new(),
@@ -114,7 +116,7 @@ fn sort(evidence: &mut [Evidence]) {
 
 fn ranked(quantity: PackQuantity, mut evidence: Vec<Evidence>, interfaces: &[String]) -> Vec<Candidate> {
     sort(&mut evidence);
-    // A field appears once, with its best scale.
+    // Each field appears once, with its best scale.
     let mut known = std::collections::BTreeSet::new();
     evidence.retain(|evidence| known.insert((evidence.bus, evidence.name.clone())));
     let good = evidence.into_iter().filter(|evidence| evidence.score.points >= 2.5).take(10);
@@ -144,7 +146,7 @@ fn voltage(index: usize, signal: &LogSignal) -> Option<Evidence> {
     Some(evidence)
 }
 
-/// Adds evidence that an unnamed field looks like a pack voltage.
+/// Adds the evidence that a field without a name is a pack voltage.
 fn raw_voltage(mut evidence: Evidence, signal: &LogSignal) -> Evidence {
     let (series, low, high) = (&signal.series, evidence.low, evidence.high);
     evidence.add(2.0, (250.0..=850.0).contains(&series.extent.mean()), "typical voltage of a pack");
@@ -156,21 +158,21 @@ fn raw_voltage(mut evidence: Evidence, signal: &LogSignal) -> Evidence {
     evidence
 }
 
-/// Adds evidence that an unnamed field looks like a pack current.
+/// Adds the evidence that a field without a name is a pack current.
 fn raw_current(mut evidence: Evidence, signal: &LogSignal) -> Evidence {
     let Some(field) = signal.field() else {
-        // A field of a message was selected because it moves with a voltage.
+        // A field of a message was selected because it changes with a voltage.
         evidence.add(1.0, true, "its scale is a guess");
-        // A shorter field may be a part of a longer one.
+        // A field of 12 bits may be a part of a longer field.
         let is_long = matches!(&signal.origin, SignalOrigin::Field(own) if own.signal.layout.length_bits > 12);
         evidence.add(0.5, is_long, "");
         evidence.add(1.0, evidence.has_both_signs(), "has both signs");
         return evidence;
     };
-    // A signed field of 24 or 32 bits whose values fit into 16 is sign-extended, so it is a real number.
+    // The values of a signed field of 24 or 32 bits fit into 16 bits, so the upper bits repeat the sign. This is hardly a coincidence.
     let needed = 32_768.0 * field.factor;
     let is_extended = field.length > 16 && evidence.low >= -needed && evidence.high <= needed && evidence.low < 0.0;
-    // A longer form contains the shorter ones.
+    // The 32-bit field contains the shorter fields, so it gets more points.
     let points = if field.length == 32 { 3.0 } else { 2.0 };
     evidence.add(points, is_extended, &format!("a signed number of {} bits", field.length));
     evidence.add(-1.0, evidence.high - evidence.low < 1.0, "hardly moves");
@@ -185,7 +187,7 @@ impl LogSignal {
         good >= 0.8 * (good + bad)
     }
 
-    /// Whether the signal is known only by its values.
+    /// Whether no name or unit of the signal is known, only its values.
     fn is_unnamed(&self) -> bool {
         matches!(self.origin, SignalOrigin::Raw(..) | SignalOrigin::Field(_))
     }
@@ -202,7 +204,7 @@ impl LogSignal {
         own == others && spans.is_some_and(|(a, b)| a.0 <= b.1 && b.0 <= a.1)
     }
 
-    /// Field of an answer without a definition.
+    /// Returns the field of an answer without a definition.
     fn field(&self) -> Option<&crate::import::DiagnosticSignal> {
         match &self.origin {
             SignalOrigin::Raw(_, field) => Some(field),
@@ -264,7 +266,8 @@ fn cell_group(group: &SignalGroup, signals: &[LogSignal]) -> Option<Evidence> {
     Some(Evidence { members, name, bus, score, low, high, positive: None, is_sum: false })
 }
 
-/// Mean correlation of the first members' changes with the first member, and whether there are changes.
+/// Returns the mean correlation between the changes of the first few members and the changes of the first one, and whether it is at
+/// least 0.3.
 fn moves_together(members: &[usize], signals: &[LogSignal]) -> (f64, bool) {
     let first = &signals[members[0]].series;
     let others = members.iter().skip(1).take(8);
@@ -311,7 +314,7 @@ fn soh(index: usize, signal: &LogSignal) -> Option<Evidence> {
     Evidence::new(index, signal, PackQuantity::Soh, (40.0, 110.0))
 }
 
-/// Compares every pack voltage with the sum of every group of cells.
+/// Compares every pack voltage with the sum of each group of cells.
 fn compare_sums(voltages: &mut [Evidence], cells: &mut [Evidence], signals: &[LogSignal]) {
     for group in cells.iter_mut().filter(|group| group.members.len() >= 8) {
         let sum: f64 = group.members.iter().map(|index| signals[*index].series.extent.mean()).sum();
@@ -330,15 +333,15 @@ fn compare_sums(voltages: &mut [Evidence], cells: &mut [Evidence], signals: &[Lo
     }
 }
 
-/// Finds for each current the voltage with the best response, and vice versa; the direction of the response gives the sign.
-/// A group of cells is represented by its first cell.
+/// Finds for each current the voltage that responds best, and for each voltage the best current. The direction of the response gives
+/// the sign of the current. A group of cells is represented by its first cell.
 fn compare_currents(
     voltages: &mut [Evidence],
     cells: &mut [Evidence],
     currents: &mut [Evidence],
     signals: &[LogSignal],
 ) {
-    // An unnamed field is compared only if no better voltage is known.
+    // A voltage without a name is compared only if no better voltage is known.
     let is_known =
         |voltage: &Evidence| voltage.is_sum || !signals[voltage.members[0]].is_unnamed() || voltage.members.len() > 1;
     let has_known = voltages.iter().chain(cells.iter()).any(is_known);
@@ -347,7 +350,7 @@ fn compare_currents(
         let compared = voltages.iter_mut().take(40).chain(cells.iter_mut().take(5));
         let compared = compared.filter(|voltage| !has_known || is_known(voltage));
         let found = compared.filter_map(|voltage| Some((related(voltage)?, voltage)));
-        // A voltage with more evidence is preferred.
+        // Prefer a voltage with more evidence.
         let weight = |slope: Slope, voltage: &Evidence| slope.correlation().abs() + 0.05 * voltage.score.points;
         let best = found.max_by(|a, b| weight(a.0, a.1).total_cmp(&weight(b.0, b.1)));
         let Some((slope, voltage)) = best else { continue };
@@ -371,13 +374,13 @@ fn compare_currents(
     }
 }
 
-/// Response of a voltage to a current, if it is plausible for a pack and significant.
+/// Returns the response of a voltage to a current, if the response is significant and plausible for a pack.
 fn response(voltage: &LogSignal, current: &LogSignal) -> Option<Slope> {
     let shares_bits = voltage.shares_bits(current);
     let slope = Slope::between(&voltage.series, &current.series).filter(|_| !shares_bits)?;
-    // At 400 V: 4 milliohm to 4 ohm.
+    // 4 milliohms to 4 ohms at 400 V.
     let is_plausible = (1e-5..=1e-2).contains(&(slope.ohm.abs() / voltage.series.extent.mean()));
-    // Among many unnamed fields, some agree by chance.
+    // Among many fields without names, some agree by chance.
     let is_raw = voltage.is_unnamed() || current.is_unnamed();
     let correlation = slope.correlation().abs();
     let is_significant = slope.strength() >= if is_raw { 4.0 } else { 2.0 };

@@ -8,7 +8,7 @@ use crate::import::DiagnosticSignal;
 use crate::quantity::BusIndex;
 use crate::wiring::evidence::{Series, SignalLabel};
 
-/// A field of a message: its identifier and, if the first byte selects a page (multiplexer), the value of that byte.
+/// A field of a message: the key of the message and, if the first byte selects a page (multiplexer), the value of this byte.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct MessageField {
     pub(super) id: CanId,
@@ -19,9 +19,9 @@ pub(super) struct MessageField {
 /// Origin of a signal's description.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum SignalOrigin {
-    /// A DBC file, by its number.
+    /// A DBC file, given by its number.
     Dbc(usize),
-    /// A definition of diagnostic answers, by the number of its table.
+    /// A definition of diagnostic answers, given by the number of its table.
     Defined(usize),
     /// No description: a field found in a diagnostic answer.
     Raw(AnswerKey, Box<DiagnosticSignal>),
@@ -36,11 +36,11 @@ pub(super) struct LogSignal {
     pub(super) name: String,
     pub(super) bus: BusIndex,
     pub(super) origin: SignalOrigin,
-    /// Meaning of its names and unit.
+    /// Meaning of the signal's names and unit.
     pub(super) label: SignalLabel,
-    /// Values in V, A, degrees Celsius or percent, otherwise unconverted.
+    /// Values in V, A, degrees Celsius or percent; other units are not converted.
     pub(super) series: Series,
-    /// Whether it is read as signed although its definition says unsigned.
+    /// Whether the signal is read as signed although its definition says unsigned.
     pub(super) is_read_signed: bool,
     /// Factor and offset from the description's unit to V, A, degrees Celsius or percent.
     pub(super) conversion: (f64, f64),
@@ -60,8 +60,8 @@ impl LogSignal {
     }
 }
 
-/// Returns the longest run in which `goes_with` holds between every item and the first one. If several are equally long, returns
-/// the last. `None` ends a run.
+/// Returns the longest run of items in which `goes_with` holds between the first item and every other one. If several runs are equally
+/// long, the last one is returned. A `None` in `items` ends a run.
 pub(super) fn longest_run<T>(items: impl Iterator<Item = Option<T>>, goes_with: impl Fn(&T, &T) -> bool) -> Vec<T> {
     let (mut best, mut run) = (Vec::new(), Vec::new());
     for item in items.chain([None]) {

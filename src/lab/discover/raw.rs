@@ -1,9 +1,8 @@
-//! Finds the bytes that behave like cell voltages, pack voltage, current or temperatures, in diagnostic answers without a
-//! definition.
+//! Searches diagnostic answers without a definition for bytes that behave like cell voltages, pack voltage, current or temperatures.
 //!
-//! A row of cell voltages is a run of at least [`MIN_CELLS`] neighbouring values of 8 or 16 bits that are all plausible and similar
-//! voltages at one of the common scales. Other fields are tried at every byte with common scales; their values decide what they
-//! are, as for named signals.
+//! A row of cell voltages is a run of at least [`MIN_CELLS`] neighbouring values of 8 or 16 bits. At one of the common scales, all of
+//! them are plausible voltages and similar to each other. Other fields are tried at every byte with common scales. As for named
+//! signals, the values decide which quantity a field is.
 
 use std::collections::BTreeMap;
 
@@ -15,32 +14,32 @@ use crate::import::{DiagnosticSignal, NumberRange};
 use crate::quantity::{BusIndex, Fault};
 use crate::wiring::evidence::Series;
 
-/// Name of a cell, before its number.
+/// Part of a cell's name before its number.
 pub(super) const CELL: &str = "Cell";
 /// Smallest number of cells in a row.
 const MIN_CELLS: usize = 8;
 /// Plausible voltages of a cell in use, V.
 const CELL_V: (f64, f64) = (2.0, 4.5);
-/// Number of bits of a cell voltage, with scales, V per code.
+/// For each length of a cell voltage in bits: the scales to try, V per code.
 const CELL_SCALES: [(u32, &[f64]); 2] = [(16, &[0.001, 0.0001, 0.002, 0.005, 0.01]), (8, &[0.02, 0.01, 0.05])];
 /// Plausible voltages of a pack, V.
 const PACK_V: (f64, f64) = (100.0, 950.0);
 /// Scales of a pack voltage of 16 bits, V per code.
 const PACK_SCALES: [f64; 5] = [0.1, 0.01, 0.5, 0.25, 1.0];
-/// Number of bits of a current, with scales, A per code.
+/// For each length of a current in bits: the scales to try, A per code.
 const CURRENT_FORMS: [(u32, &[f64]); 3] =
     [(16, &[0.1, 0.01, 0.05, 0.5, 0.025]), (24, &[0.001, 0.01]), (32, &[1.0 / 1024.0, 0.001])];
-/// Smallest number of answers for a field.
+/// Smallest number of answers in which a field is searched.
 const MIN_ANSWERS: usize = 3;
 
-/// Number of cells so far in rows of each form; a row of the same form in the next answer continues the numbers.
+/// Number of cells found so far in rows of each form. A row of the same form in the next answer continues the cell numbers.
 #[derive(Debug, Default)]
 pub(super) struct CellRows(BTreeMap<RowForm, u32>);
 
-/// Form of a row: controller, first bit, length, and bits of the scale.
+/// Form of a row: controller (bus, CAN identifier, address byte), first bit, length, and the bits of the scale.
 type RowForm = (BusIndex, CanId, Option<u8>, u32, u32, u64);
 
-/// Possible signals in these answers, outside the described bits (first, last).
+/// Returns the possible signals in these answers. The bits in `described` (first, last) are left out.
 pub(super) fn signals(
     key: &AnswerKey,
     answers: &Answers,
@@ -76,14 +75,14 @@ pub(super) fn signals(
 }
 
 impl LogSignal {
-    /// First and last bit of a field without a definition.
+    /// Returns the first and last bit of a field without a definition.
     pub(super) fn span(&self) -> Option<(u32, u32)> {
         let SignalOrigin::Raw(_, field) = &self.origin else { return None };
         Some((field.bit, field.bit + field.length - 1))
     }
 }
 
-/// A field whose name contains its position.
+/// Creates a field whose name contains its position.
 fn field(what: &str, bit: u32, length: u32, signed: bool, factor: f64) -> DiagnosticSignal {
     let unit = match what {
         "Temperature" | "Sensor" => "degC",
@@ -113,7 +112,7 @@ fn signal(key: &AnswerKey, answers: &Answers, form: DiagnosticSignal) -> Option<
         "A" => Quantity::Current,
         _ => Quantity::Voltage,
     };
-    // Cells are numbered across all answers; other fields contain the name of their answer.
+    // Cells are numbered across all answers. The names of other fields contain the name of their answer.
     let mut form = form;
     if !form.name.starts_with(CELL) {
         form.name = format!("D{:02X}{:02X}_{}", key.service, key.identifier, form.name);
@@ -123,7 +122,7 @@ fn signal(key: &AnswerKey, answers: &Answers, form: DiagnosticSignal) -> Option<
     is_known.then(|| LogSignal::unnamed(name, key.bus, SignalOrigin::Raw(*key, Box::new(form)), quantity, series))
 }
 
-/// Table name of a controller's answers, for example `Answer7BB`.
+/// Returns the name of the table of a controller's answers, for example `Answer7BB`.
 pub(super) fn table_name(key: &AnswerKey) -> String {
     let extension = key.extension.map(|byte| format!("_{byte:02X}")).unwrap_or_default();
     format!("Answer{}{extension}", key.response)
@@ -133,7 +132,7 @@ fn is_plausible(signal: &LogSignal) -> bool {
     let (SignalOrigin::Raw(_, field), LogSignal { label, series, .. }) = (&signal.origin, signal) else { return false };
     let within = |low: f64, high: f64| series.extent.min >= low && series.extent.max <= high;
     if label.has_unit_of(Quantity::Voltage) {
-        // Larger values are the sign of a longer number, or mean "no value".
+        // Larger codes mean "no value", or they are the sign of a longer number.
         within(PACK_V.0, PACK_V.1) && series.extent.max < 65_280.0 * field.factor
     } else if label.has_unit_of(Quantity::Current) {
         within(-1500.0, 1500.0) && !series.is_constant()
@@ -144,7 +143,7 @@ fn is_plausible(signal: &LogSignal) -> bool {
     }
 }
 
-/// The best row of temperatures: bytes at a constant distance with similar, slowly changing values. A missing sensor
+/// Finds the best row of temperatures: bytes at a constant distance with similar values that change slowly. Bytes of missing sensors
 /// (0xFF) may lie between them.
 fn temperatures(key: &AnswerKey, answers: &Answers, bytes: usize) -> Vec<LogSignal> {
     let mut best: Vec<LogSignal> = Vec::new();
@@ -154,7 +153,7 @@ fn temperatures(key: &AnswerKey, answers: &Answers, bytes: usize) -> Vec<LogSign
             let row = temperature_row(key, answers, (first, bytes), distance, offset);
             let values: std::collections::BTreeSet<u64> =
                 row.iter().flat_map(|signal| signal.series.values.kept()).map(|value| value.to_bits()).collect();
-            // Equal constants are more likely bytes of other numbers.
+            // Equal constants are more likely to be bytes of other numbers.
             let weight = if values.len() > 1 { 2 * row.len() + usize::from(distance > 1) } else { 0 };
             if row.len() >= 3 && weight > best_weight {
                 (best, best_weight) = (row, weight);
@@ -177,7 +176,7 @@ fn temperature_row(
         if is_absent(byte) && !row.is_empty() {
             continue;
         }
-        // Skip records with missing bytes.
+        // The row ends if the step to this byte jumps over a missing sensor.
         if !row.is_empty() && (byte + 1 - distance..byte).any(is_absent) {
             break;
         }
@@ -186,7 +185,7 @@ fn temperature_row(
         let next = signal(key, answers, form).filter(is_plausible);
         let is_near = |signal: &LogSignal| {
             row.first()
-                // Largest difference between sensors of a pack.
+                // Largest difference between temperature sensors of a pack, K.
                 .is_none_or(|first| (signal.series.extent.mean() - first.series.extent.mean()).abs() <= 12.0)
         };
         match next.filter(is_near) {
@@ -197,7 +196,7 @@ fn temperature_row(
     row
 }
 
-/// The longest row of cell voltages, with one signal per cell.
+/// Finds the longest row of cell voltages; returns one signal per cell.
 fn cells(key: &AnswerKey, answers: &Answers, bytes: usize, rows: &mut CellRows) -> Vec<LogSignal> {
     let mut best: Option<(usize, DiagnosticSignal)> = None;
     for (length, scales) in CELL_SCALES {
@@ -225,7 +224,7 @@ fn cells(key: &AnswerKey, answers: &Answers, bytes: usize, rows: &mut CellRows) 
     (0..count).filter_map(|n| signal(key, answers, form.of_series(n))).collect()
 }
 
-/// Length and first byte of the longest run of plausible neighbours that start at `first`, `first + width`, ...
+/// Returns length and first byte of the longest run of plausible neighbours that start at `first`, `first + width`, ...
 fn row(answers: &Answers, bytes: usize, first: usize, width: usize, scale: f64) -> Option<(usize, usize)> {
     let code = |data: &[u8], start: usize| {
         data[start..start + width].iter().fold(0_u32, |code, byte| code << 8 | u32::from(*byte))
@@ -239,7 +238,7 @@ fn row(answers: &Answers, bytes: usize, first: usize, width: usize, scale: f64) 
         is_cell.then_some((start, value))
     };
     let starts = (first..bytes).step_by(width).filter(|start| start + width <= bytes);
-    // Largest difference between cells of a pack.
+    // Largest difference between cells of a pack, V.
     let run = longest_run(starts.map(cell), |(_, first_v), (_, next_v)| (next_v - first_v).abs() <= 0.35);
     Some((run.len(), run.first()?.0))
 }

@@ -21,7 +21,7 @@ pub(super) struct Descriptions {
     pub(super) tables: Vec<DiagnosticTable>,
 }
 
-/// All signals of the log with values, in a fixed order, and remarks on described battery signals without values.
+/// Returns all signals of the log that have values, in a fixed order, and remarks on described battery signals without values.
 pub(super) fn signals(capture: &Capture, descriptions: &Descriptions) -> (Vec<LogSignal>, Vec<String>) {
     let mut signals = Vec::new();
     let mut rows = raw::CellRows::default();
@@ -49,7 +49,7 @@ pub(super) fn signals(capture: &Capture, descriptions: &Descriptions) -> (Vec<Lo
     (usable, remarks)
 }
 
-/// Remark on a voltage or current of the battery that is in the log but never has a valid value.
+/// Returns a remark on a battery voltage or current that is in the log but never has a valid value.
 fn remark(signal: &LogSignal) -> Option<String> {
     let LogSignal { label, series, .. } = signal;
     let is_wanted = label.has_unit_of(Quantity::Voltage) || label.has_unit_of(Quantity::Current);
@@ -65,14 +65,14 @@ fn is_answer(table: &DiagnosticTable, key: &AnswerKey) -> bool {
         == (key.response, key.extension, key.service, key.identifier)
 }
 
-/// Factor and offset from a unit to V, A, degrees Celsius or percent.
+/// Returns factor and offset that convert a unit to V, A, degrees Celsius or percent.
 fn conversion(unit: &str) -> (f64, f64) {
     SignalUnit::parse(unit).map_or((1.0, 0.0), |unit| (unit.factor, unit.offset))
 }
 
 fn of_message(key: MessageKey, payloads: &Payloads, file: usize, message: &Message) -> Vec<LogSignal> {
     let of_signal = |signal: &Signal| {
-        // The channel does not affect the reading.
+        // The channel has no effect here.
         let mut binding = Binding::new(key.0, message, signal, Channel::Current).ok()?;
         let conversion = conversion(&signal.unit);
         (binding.scale, binding.offset) = conversion;
@@ -116,8 +116,8 @@ fn of_definition(
     each.collect()
 }
 
-/// Values of a defined signal. An unsigned current is read as signed if this brings values at both ends of its range together:
-/// read as unsigned, a few negative amperes look like thousands.
+/// Returns the values of a defined signal. An unsigned current is read as signed if this reduces the range of its values to less than a
+/// quarter. Read as unsigned, a few negative amperes look like thousands.
 fn values(answers: &Answers, signal: &DiagnosticSignal, conversion: (f64, f64), is_current: bool) -> (Series, bool) {
     let collect = |signal: &DiagnosticSignal| {
         let value = |data: &[u8]| {
