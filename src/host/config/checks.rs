@@ -1,4 +1,5 @@
-//! Converts the parsed tables to settings: looks up signals in the DBC files and checks keys that must fit together.
+//! Converts the parsed tables to settings: looks up signals in the DBC files, and checks keys that depend on each
+//! other.
 //!
 //! | file | content |
 //! | --- | --- |

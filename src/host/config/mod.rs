@@ -5,7 +5,7 @@
 //! consistent settings for the other modules, or [`ConfigFaults`], one line per fault. In this module, to "note" a
 //! fault means to add it to the list of faults and to continue.
 //!
-//! The module has six layers. Each layer uses only the layers above it in this table, and none uses this file.
+//! The module has six layers. Each layer uses only the layers listed above it. No layer uses this file.
 //!
 //! | layer | content |
 //! | --- | --- |

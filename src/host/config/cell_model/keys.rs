@@ -101,7 +101,7 @@ section! {
     }
 }
 
-/// Makes the names of the materials the choices of a key.
+/// Declares that the names of the materials are the allowed words of a key.
 macro_rules! material {
     ($material:ty) => {
         impl Setting for $material {
@@ -128,7 +128,7 @@ const fn names<T, const N: usize>(all: &[(T, &'static str); N]) -> [&'static str
     names
 }
 
-/// The first and the last value. The number of values is checked elsewhere.
+/// Returns the first and the last value. The caller checks that there are exactly two values.
 pub(crate) fn ends(values: &[f64]) -> [f64; 2] {
     [values.first().copied().unwrap_or(f64::NAN), values.last().copied().unwrap_or(f64::NAN)]
 }

@@ -1,4 +1,5 @@
-//! The model of a cell without a model file: made from its label, or learned on board with that model as the start.
+//! Makes the model of a cell that has no model file. The model is made from the cell's label; on board it is then
+//! improved by learning.
 
 use super::source::{LearnedFrom, MeasuredRange, ModelSource, SourcedModel};
 use crate::cell::{Coverage, Label};
@@ -16,7 +17,7 @@ pub fn of_label(label: &Label) -> Option<SourcedModel> {
     label.model().map(|model| SourcedModel { model, source })
 }
 
-/// The current model of a pack that learns its model; `None` = the model comes from a file.
+/// The present model of a pack that learns its model on board; `None` = the pack's model comes from a file.
 pub fn of_view(view: &ModelView<'_>) -> Option<SourcedModel> {
     let label = view.label?;
     let SourcedModel { model: prior, source } = of_label(&label)?;
@@ -39,7 +40,7 @@ pub fn of_view(view: &ModelView<'_>) -> Option<SourcedModel> {
     Some(SourcedModel { model: own.unwrap_or(prior), source })
 }
 
-/// The range from the lowest to the highest observed value.
+/// Returns the lowest and highest temperature, current and SOC that the data covered.
 fn seen_range(seen: &Coverage) -> MeasuredRange {
     let whole = |ranges: Vec<[f64; 2]>| Some([ranges.first()?[0], ranges.last()?[1]]);
     MeasuredRange {

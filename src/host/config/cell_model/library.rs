@@ -1,4 +1,4 @@
-//! The available cell models: files in the usual folders or in named folders.
+//! The available cell models: the files in the usual folders, or in folders that the caller names.
 
 use std::path::{Path, PathBuf};
 
@@ -18,7 +18,7 @@ pub struct LibraryEntry {
     pub model: Result<SourcedModel, ConfigFaults>,
 }
 
-/// Those of the usual folders that exist. `program` is the path of the program's executable.
+/// Returns the usual model folders that exist. `program` is the path of the program's executable.
 pub fn usual_folders(program: Option<&Path>) -> Vec<PathBuf> {
     let shipped = program.and_then(Path::parent).map(|folder| folder.join("../share/packwatch/cells"));
     // Resolves the ".." in the path.

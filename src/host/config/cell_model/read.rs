@@ -183,7 +183,7 @@ fn check_spread(spread: &SpreadKeys, tables: &Tables) {
     }
 }
 
-/// Checks that there is one row per temperature and one column per SOC breakpoint.
+/// Checks that the table `key` has one row per temperature and one column per SOC breakpoint.
 fn check_shape(place: &TablePlace, key: &str, rows: &[Vec<f64>], tables: &Tables) {
     let (temperatures, socs) = (tables.temperature_c.len(), tables.soc.len());
     if rows.len() != temperatures {
@@ -196,7 +196,7 @@ fn check_shape(place: &TablePlace, key: &str, rows: &[Vec<f64>], tables: &Tables
     }
 }
 
-/// The first pair of neighbours that does not increase.
+/// Returns the first two adjacent values of which the second is not larger than the first.
 fn first_not_rising(values: &[f64]) -> Option<(f64, f64)> {
     values.windows(2).find(|pair| pair[1] <= pair[0]).map(|pair| (pair[0], pair[1]))
 }

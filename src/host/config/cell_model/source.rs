@@ -6,7 +6,7 @@ use crate::cell::model_bands::CURVE_C;
 use crate::cell::{CellModel, Chemistry, Coverage, ModelBands};
 use crate::monitor::{ModelChange, ModelState};
 
-/// Largest rounding error of the ends of a measured range.
+/// Largest rounding error of the ends of a measured range, in the unit of the range.
 const ROUNDED: f64 = 0.01;
 
 /// A model state in words.
@@ -100,7 +100,7 @@ pub struct SourcedModel {
     pub source: ModelSource,
 }
 
-/// The basis of one part of a model.
+/// What the values of one part of a model (the open-circuit curve or the resistances) are based on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum KnownBy {
@@ -130,28 +130,28 @@ impl KnownBy {
 }
 
 impl SourcedModel {
-    /// The basis of the open-circuit curve at a SOC.
+    /// What the open-circuit curve at a SOC is based on.
     pub fn curve_known_by(&self, soc: f64) -> KnownBy {
         let std_v = |model: &CellModel| ModelBands::new(model).curve_std_v(soc);
         self.by_prior(&std_v).unwrap_or_else(|| self.source.by_range(self.source.measured.soc, soc))
     }
 
-    /// The basis of the resistances at a temperature.
+    /// What the resistances at a temperature are based on.
     pub fn resistances_known_by(&self, temperature_c: f64) -> KnownBy {
         let std = |model: &CellModel| Some(ModelBands::new(model).resistance(0.5, temperature_c).std());
         self.by_prior(&std).unwrap_or_else(|| self.source.by_range(self.source.measured.temperature_c, temperature_c))
     }
 
-    /// The basis of a part of a model learned from a label; `None` for other models. The basis is `Data` if the data
-    /// have reduced the standard deviation clearly below the label's, else `Prior`.
+    /// What a part of a model learned from a label is based on; `None` for other models. `std` computes the standard
+    /// deviation of the part for a model. The result is `Data` if `std(learned) <= 0.7 * std(label)`, else `Prior`.
     fn by_prior(&self, std: &dyn Fn(&CellModel) -> Option<f64>) -> Option<KnownBy> {
         let learned = self.source.learned.as_ref()?;
         let (left, before) = (std(&self.model)?, std(&learned.prior)?);
-        // A ratio of 0.7 means that the data carry as much information as the label.
+        // At a ratio of 0.7 (about 1/sqrt 2), the data carry as much information as the label.
         Some(if left <= 0.7 * before { KnownBy::Data } else { KnownBy::Prior })
     }
 
-    /// Root mean square of the model's voltage error over SOC, at the temperature of its open-circuit curve, V. `None`
+    /// Root mean square over SOC of the model's voltage error, at the temperature of its open-circuit curve, V. `None`
     /// = the model states no error.
     pub fn error_v(&self) -> Option<f64> {
         let errors =

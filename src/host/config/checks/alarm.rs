@@ -7,7 +7,7 @@ use crate::config::schema::{Level, Threshold};
 use crate::alarm::{Comparison, Direction, Rule, RuleConfig, Severity, Unit};
 use crate::health::RechargeAlarm;
 
-/// The values of a new cell that relative thresholds refer to.
+/// The values of a new cell. Relative thresholds such as "80 %" refer to these values.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct RatedCell {
     /// Rated capacity, Ah.
@@ -53,11 +53,11 @@ impl Alarm {
         all.into_iter().filter_map(|(key, severity, threshold)| Some((key, severity, threshold?)))
     }
 
-    /// The value at which an alarm clears.
+    /// The value at which the alarm of a threshold `set` clears.
     fn clear(&self, rated: &RatedCell, set: f64, threshold: &Threshold) -> Option<f64> {
         match threshold.clear {
             Some(clear) => rated.value(self.rule, clear),
-            // These values are durations of a fault: they are 0 only after the fault has ended.
+            // The value of such a rule is the duration of a fault. It is 0 only after the fault has ended.
             None if value_is_fault_duration(self.rule) => Some(0.0),
             None => {
                 let hysteresis = self.hysteresis.unwrap_or(0.02 * set.abs());
@@ -98,7 +98,7 @@ fn beyond_sign(rule: Rule) -> f64 {
     }
 }
 
-/// Notes keys of the alarms that contradict each other.
+/// Notes alarms whose keys contradict each other.
 pub(crate) fn check(raw: &RawTables, rated: Option<&RatedCell>) {
     for (index, alarm) in raw.alarms.iter().enumerate() {
         let place = &alarm.place;
@@ -122,7 +122,7 @@ pub(crate) fn check(raw: &RawTables, rated: Option<&RatedCell>) {
     }
 }
 
-/// Notes whatever a rule requires but the file does not contain.
+/// Notes inputs and tables that the alarm's rule requires but the file does not contain.
 fn check_needs(alarm: &Alarm, raw: &RawTables) {
     let cells = raw.pack.as_ref().map_or(2, |pack| if raw.is_pack_total() { 1 } else { pack.cells });
     let is_reported = raw.is_written::<ReportedSocInput>() || raw.is_written::<ReportedSohInput>();
@@ -151,7 +151,8 @@ fn check_needs(alarm: &Alarm, raw: &RawTables) {
     }
 }
 
-/// Checks that each clear threshold is on the healthy side, and that more severe thresholds are farther from it.
+/// Checks that each clear threshold lies on the healthy side of its set threshold, and that a more severe threshold
+/// lies farther from the healthy side than a milder one.
 fn check_thresholds(alarm: &Alarm, rated: &RatedCell) {
     let (place, sign) = (&alarm.place, beyond_sign(alarm.rule));
     let side = if sign > 0.0 { "below" } else { "above" };
@@ -178,7 +179,7 @@ fn check_thresholds(alarm: &Alarm, rated: &RatedCell) {
     }
 }
 
-/// Notes a threshold whose alarm no value can clear. Such an alarm would stay raised for ever.
+/// Notes a threshold whose alarm would stay raised for ever, because no value can clear it.
 fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, threshold: &Threshold) {
     let written = if threshold.clear.is_some() { key } else { "hysteresis" };
     if value_is_fault_duration(alarm.rule) {
@@ -193,14 +194,15 @@ fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, thresh
         Unit::AmpereHours | Unit::Seconds | Unit::Ratio | Unit::Cycles => (0.0, f64::INFINITY),
         Unit::Celsius => return,
     };
-    let is_within = (0.0..=high).contains(&set); // otherwise it is already a fault, or no value reaches it
+    let is_within = (0.0..=high).contains(&set); // a threshold outside this range is already a fault, or no value reaches it
     if is_within && !(low..=high).contains(&clear) {
         let range = if high.is_finite() { format!("{low} to {high}") } else { format!("{low} or more") };
         alarm.place.fault(written, format!("must clear {key} at {range}, not at {clear}"));
     }
 }
 
-/// Notes a percentage without its percent sign. Such a threshold is always or never exceeded.
+/// Notes a threshold of a fraction that is not between 0 and 1, because its percent sign is probably missing. Values
+/// would always or never exceed this threshold.
 fn check_unit(alarm: &Alarm, key: &str, set: f64) {
     let is_fraction = matches!(alarm.rule.spec().unit, Unit::Fraction | Unit::FractionPerDay);
     if is_fraction && !(0.0..=1.0).contains(&set) {

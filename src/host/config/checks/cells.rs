@@ -1,8 +1,8 @@
 //! The cells of the pack: the pack's own cells, described by a model file or a label, and modules of other cells
 //! (`[[pack.module]]`).
 //!
-//! In: the tables and the cell model files they name. Out: the models. Notes missing and contradicting keys. Notes
-//! cells of a module if they do not exist, belong to two modules, or have no known type.
+//! In: the tables and the cell model files they name. Out: the models. Notes missing keys and keys that contradict each
+//! other. Notes cells of a module that do not exist, belong to two modules, or have no known type.
 
 use std::path::Path;
 
@@ -69,7 +69,8 @@ fn check_label(place: &TablePlace, chemistry: Option<Chemistry>, rated_ah: Optio
     None
 }
 
-/// Notes label keys given together with a model file, which states the same values; returns whether there are any.
+/// Notes label keys that are given together with a model file, because the file states the same values. Returns whether
+/// any such key is given.
 fn check_file(place: &TablePlace, cell_model: Option<&String>) -> bool {
     let of_label = ["chemistry", "voltage_min_v", "voltage_max_v"].into_iter();
     let given: Vec<&str> = of_label.filter(|key| cell_model.is_some() && place.has(key)).collect();
@@ -114,7 +115,7 @@ pub(crate) fn modules<'a>(path: &Path, raw: &'a RawTables, file: ReadFile<'_>) -
     raw.modules.iter().filter_map(of_keys).collect()
 }
 
-/// Notes, at the key `cells`, cells that do not exist and cells of an earlier table.
+/// Notes, at the key `cells`, cells that do not exist and cells that an earlier module contains.
 pub(crate) fn check_cells<'a>(
     place: &TablePlace,
     cells: &[u16],
@@ -147,7 +148,8 @@ fn model(path: &Path, keys: &PackModule, file: ReadFile<'_>) -> Option<CellModel
     Some(CellModel { rated_capacity_ah: keys.rated_capacity_ah.unwrap_or(model.rated_capacity_ah), ..model })
 }
 
-/// The pack's own model with the voltage range of all cells, for limits that apply to every cell.
+/// Returns the pack's own model with the lowest and highest voltage of all cells' models, for limits that apply to
+/// every cell.
 pub(crate) fn with_voltages_of(model: &CellModel, modules: &[Module<'_>]) -> CellModel {
     let lowest = modules.iter().map(|module| module.model.voltage_min_v).fold(model.voltage_min_v, f64::min);
     let highest = modules.iter().map(|module| module.model.voltage_max_v).fold(model.voltage_max_v, f64::max);

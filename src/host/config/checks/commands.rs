@@ -9,8 +9,8 @@ use crate::config::schema::RawTables;
 use crate::config::schema::keys::Output;
 use crate::monitor::{CommandConfig, OutputConfig};
 
-/// The plan that decodes commands, and the guard that checks commands without authentication. `None` = commands are
-/// off, or faults are noted.
+/// Returns the plan that decodes commands, and the guard that checks commands without authentication. `None` = commands
+/// are disabled, or a fault was noted.
 pub(crate) fn commands(
     raw: &RawTables,
     found: &[ResolvedSignal<'_>],

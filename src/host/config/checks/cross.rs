@@ -35,7 +35,8 @@ pub(crate) fn check(raw: &RawTables, model: Option<&CellModel>) {
     output(raw);
 }
 
-/// Checks that the texts fit a label, a title and a line.
+/// Checks the lengths and characters of the vehicle's and pack's names, so that each name fits on one line of a label
+/// or title.
 fn vehicle(raw: &RawTables) {
     let Some(keys) = &raw.vehicle else { return };
     for (key, text) in [("name", &keys.name), ("id", &keys.id), ("pack", &keys.pack)] {
@@ -108,7 +109,7 @@ fn balancing(raw: &RawTables, model: Option<&CellModel>) {
     }
 }
 
-/// Checks that the configuration has a DBC file or answer with signals.
+/// Checks that the configuration has a source of signals: a DBC file, or a diagnostic answer with signals.
 fn sources(raw: &RawTables) {
     let Some(input) = raw.input.as_ref().filter(|input| input.dbc.is_empty()) else { return };
     if !raw.broken && !raw.is_written::<DiagnosticInput>() {
@@ -171,8 +172,8 @@ fn health(raw: &RawTables, model: Option<&CellModel>) {
         recharge.place.fault(key, if key == "to_soc" { &what } else { &other });
     }
     if let (Some(capacity), Some(estimator)) = (&raw.capacity, &raw.estimator) {
-        // The paper's filter holds the capacity between half-cycles; packwatch's filter estimates it. Mixing the two is
-        // not supported.
+        // The paper's filter keeps the capacity constant between half-cycles, while packwatch's filter estimates it. A
+        // combination of the two methods is not supported.
         let (key, needed) = match (capacity.method, estimator.capacity_state) {
             (MethodKey::Swing, CapacityState::Joint) | (MethodKey::Nominal, CapacityState::Held) => ("", ""),
             (MethodKey::Swing, CapacityState::Held) => ("swing", "joint"),

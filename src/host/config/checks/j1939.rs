@@ -58,7 +58,7 @@ fn name(keys: &J1939) -> Option<Name> {
     Name::new(&fields).map_err(|error| keys.place.fault(error.field, error)).ok()
 }
 
-/// The code of every threshold; `None` if one is faulty (noted).
+/// Returns the code of every threshold; `None` = a code is faulty (noted).
 fn codes(alarms: &[Alarm]) -> Option<Vec<AlarmCode>> {
     let mut codes: Vec<(&Alarm, AlarmCode)> = Vec::new();
     let mut is_good = true;
@@ -84,8 +84,8 @@ fn codes(alarms: &[Alarm]) -> Option<Vec<AlarmCode>> {
 }
 
 fn code(alarm: &Alarm, severity: Severity) -> Option<AlarmCode> {
-    // Alarm frames use the same number for the rule. Unverified (from memory of J1939-73): 520192 is the first
-    // manufacturer-assignable number.
+    // The rule's code is also its number in alarm frames. Unverified (from memory of J1939-73): 520192 is the first
+    // number that manufacturers may assign.
     let spn = alarm.spn.unwrap_or(520_192 + u32::from(alarm.rule as u8));
     let fmi = alarm.fmi.unwrap_or_else(|| failure_mode(alarm.rule, severity));
     match TroubleCode::new(spn, fmi, 0) {
@@ -100,8 +100,8 @@ fn code(alarm: &Alarm, severity: Severity) -> Option<AlarmCode> {
 /// The default failure mode identifier of an alarm, from J1939-73, appendix A.
 fn failure_mode(rule: Rule, severity: Severity) -> u8 {
     match rule {
-        // These FMIs mean: 9 abnormal update rate, 19 received network data in error, 2 data erratic, intermittent or
-        // incorrect, 31 condition exists.
+        // FMI 9: abnormal update rate. FMI 19: received network data in error. FMI 2: data erratic, intermittent or
+        // incorrect. FMI 31: condition exists.
         Rule::InputMissing => 9,
         Rule::BusFault => 19,
         Rule::InputImplausible | Rule::BmsDisagrees | Rule::ChannelFaulty => 2,
@@ -116,7 +116,8 @@ fn failure_mode(rule: Rule, severity: Severity) -> u8 {
         | Rule::RemainingLifeLow
         | Rule::CellLeak
         | Rule::ConnectionResistance => match (rule.spec().direction, severity) {
-            // Data valid, but beyond normal: least, moderately, most severe.
+            // These FMIs mean that the data are valid but outside the normal range: least severe, moderately severe,
+            // most severe.
             (Direction::Below, Severity::Info) => 17,
             (Direction::Below, Severity::Warning) => 18,
             (Direction::Below, Severity::Severe) => 1,

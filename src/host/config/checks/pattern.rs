@@ -40,7 +40,8 @@ impl Pattern {
         self.0.contains(&PatternPiece::Cell)
     }
 
-    /// The cell's number if `name` matches; `Some(None)` if it matches a pattern without a cell number.
+    /// Returns the cell's number if `name` matches the pattern. `Some(None)` = the name matches, but the pattern has no
+    /// cell number.
     pub(crate) fn fits(&self, name: &str) -> Option<Option<u32>> {
         fits(&self.0, name, None)
     }

@@ -1,8 +1,8 @@
-//! Checks for settings that parse but cannot be intended. Examples are signals that extend beyond their message or
-//! share bits, wrong units, empty ranges, and the capacity of another cell.
+//! Checks for settings that parse but cannot be intended. Examples: a signal extends beyond its message, two signals
+//! share bits, a unit is wrong, a range is empty, the capacity belongs to another cell.
 //!
-//! In: the tables, the signals found, the cell model. Out: faults for certain errors, warnings for unlikely
-//! values. A configured `scale` or `offset` overrides the DBC's unit.
+//! In: the tables, the signals found, the cell model. Out: faults for certain errors, warnings for unlikely values. A
+//! DBC unit that contradicts a configured `scale` or `offset` gives only a warning.
 
 use super::cells::Module;
 use super::signals::{self, ResolvedSignal};
@@ -15,8 +15,8 @@ use crate::config::schema::RawTables;
 use crate::quantity::{Channel, bounds};
 use crate::sample::Limits;
 
-/// If the ratio of two rated capacities (or its reciprocal) is larger than this, the cells count as different. The
-/// estimator learns resistances up to this multiple of the model's.
+/// Two cells count as different if the ratio of their rated capacities (larger over smaller) is at least this number.
+/// The estimator learns resistances up to the same multiple of the model's resistances.
 const OTHER_CELL: f64 = 3.0;
 
 /// Notes implausible signals.
@@ -34,7 +34,8 @@ pub(crate) fn signals(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Opti
     overlaps(raw, found);
 }
 
-/// Range of values, in the channel's unit, that the channel must be able to report at least in part; `None` = any.
+/// Range of values, in the channel's unit. The channel must be able to report at least a part of this range. `None` =
+/// any range is good.
 fn needed_values(channel: Channel, (model, series): (Option<&CellModel>, u16)) -> Option<(f64, f64)> {
     // Without a model, the range is that of any lithium-ion cell.
     let (low, high) = model.map_or((1.2, 4.6), |model| (model.voltage_min_v, model.voltage_max_v));
@@ -46,13 +47,13 @@ fn needed_values(channel: Channel, (model, series): (Option<&CellModel>, u16)) -
     }
 }
 
-/// The values that a signal's bits can carry after a conversion.
+/// Returns the smallest and largest value that a signal's bits can encode, after `scale` and `offset`.
 fn held(resolved: &ResolvedSignal<'_>, scale: f64, offset: f64) -> (f64, f64) {
     let (low, high) = resolved.signal.layout.extent();
     (low * scale + offset, high * scale + offset)
 }
 
-/// Notes the first signal of a table whose bits cannot carry any value that the pack has.
+/// Notes the first signal of a table whose bits cannot encode any value that occurs in the pack.
 fn reach(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&CellModel>, u16)) {
     let beyond = signals.iter().filter(|resolved| resolved.binding().is_ok()).find_map(|resolved| {
         let needed = needed_values(resolved.channel, pack)?;
@@ -149,7 +150,7 @@ fn ends(place: &TablePlace, signals: &[&ResolvedSignal<'_>]) {
     place.fault("signal", &what);
 }
 
-/// The layout with the other byte order and its DBC notation; `None` for a one-bit signal.
+/// Returns the layout with the other byte order, and the DBC notation of that order; `None` for a one-bit signal.
 fn other_order(layout: &SignalLayout) -> Option<(&'static str, SignalLayout)> {
     let (order, byte_order) = match layout.byte_order {
         ByteOrder::LittleEndian => ("@0", ByteOrder::BigEndian),
@@ -164,7 +165,7 @@ fn selectors<'r>(resolved: &'r ResolvedSignal<'_>) -> impl Iterator<Item = (&'r 
     conditions.filter_map(|condition| Some((condition, resolved.message.signals.get(condition.selector)?)))
 }
 
-/// Notes inputs of one message that share bits with each other or with a multiplexor: one fault per table.
+/// Notes inputs that share bits of one message with each other or with a multiplexor: one fault per table.
 fn overlaps(raw: &RawTables, found: &[ResolvedSignal<'_>]) {
     for (place, signals) in by_table(raw, found) {
         let mut pairs: Vec<(String, String)> = Vec::new();
@@ -186,7 +187,7 @@ fn overlaps(raw: &RawTables, found: &[ResolvedSignal<'_>]) {
     }
 }
 
-/// Whether two inputs are different signals that one payload of the same message can carry.
+/// Whether two inputs are different signals that the same frame can contain.
 fn is_beside(a: &ResolvedSignal<'_>, b: &ResolvedSignal<'_>) -> bool {
     let is_other_page = |condition: &MuxCondition| {
         let same = b.signal.conditions.iter().find(|other| other.selector == condition.selector);
@@ -200,7 +201,8 @@ fn is_beside(a: &ResolvedSignal<'_>, b: &ResolvedSignal<'_>) -> bool {
         && !a.signal.conditions.iter().any(is_other_page)
 }
 
-/// Whether two inputs of one message share bits. The layouts of an answer's signals begin at their own first bytes.
+/// Whether two inputs of one message share bits. In an answer, each layout is counted from the signal's own first byte,
+/// so the first bytes are added.
 fn has_bits_of(a: &ResolvedSignal<'_>, b: &ResolvedSignal<'_>) -> bool {
     let bits = |resolved: &ResolvedSignal<'_>| {
         let first = resolved.answer?.bit(&resolved.signal.layout);
@@ -217,7 +219,7 @@ fn ranges_overlap(a: (u64, u64), b: (u64, u64)) -> bool {
     a.0 <= b.1 && b.0 <= a.1
 }
 
-/// The quantity a channel needs and its unit; `None` = any.
+/// Returns the quantity that a channel needs, and its unit; `None` = any.
 fn needed(channel: Channel) -> Option<(Quantity, &'static str)> {
     match channel {
         Channel::Current => Some((Quantity::Current, "A")),
@@ -228,7 +230,7 @@ fn needed(channel: Channel) -> Option<(Quantity, &'static str)> {
     }
 }
 
-/// Notes DBC units that differ from the unit of the input, each unit once.
+/// Notes DBC units that differ from the input's unit; each unit is noted once.
 fn units(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&CellModel>, u16)) {
     let mut seen: Vec<&str> = Vec::new();
     for resolved in signals {
@@ -256,7 +258,7 @@ fn units(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&Cel
     }
 }
 
-/// Whether the configuration sets a conversion of the DBC's values.
+/// Whether the configuration converts the DBC's values by `scale` or `offset`.
 fn is_converted(place: &TablePlace) -> bool {
     place.has("scale") || place.has("offset")
 }
@@ -278,15 +280,15 @@ fn other_quantity(place: &TablePlace, found: Quantity, (name, unit, wanted): (&s
     }
 }
 
-/// Checks the conversion from the DBC's unit. If `is_held`, the bits can carry a plausible value in that unit;
-/// otherwise the DBC's unit is wrong.
+/// Checks that `scale` and `offset` convert the DBC's unit to the input's unit. `is_held` states whether the bits can
+/// encode a plausible value in the DBC's unit. If they cannot, the DBC's unit is wrong.
 fn conversion(
     place: &TablePlace,
     (resolved, unit, is_held): (&ResolvedSignal<'_>, SignalUnit, bool),
     (name, wanted): (&str, &str),
 ) {
     let (scale, offset) = (resolved.scale.abs(), resolved.offset);
-    // Smaller differences are calibration.
+    // A smaller difference is a calibration of the sensor.
     let is_scale = (scale / unit.factor - 1.0).abs() <= 0.1;
     let is_offset = unit.quantity != Quantity::Temperature || (offset - unit.offset).abs() <= 20.0;
     if is_scale && is_offset {
@@ -317,7 +319,7 @@ fn toml(value: f64) -> String {
     format!("{:?}", digits(value, 9))
 }
 
-/// Rounds to `decimals` digits after the first.
+/// Rounds to 1 + `decimals` significant digits.
 fn digits(value: f64, decimals: usize) -> f64 {
     format!("{value:.decimals$e}").parse().unwrap_or(value)
 }
@@ -327,7 +329,7 @@ struct AllowedRange<'a> {
     place: &'a TablePlace,
     keys: [&'static str; 2],
     limits: Limits,
-    /// Limits of the DBC after `scale`.
+    /// Limits stated by the DBC, after `scale`.
     dbc: (f64, f64),
     unit: &'static str,
     /// Input whose DBC states the range.
@@ -398,7 +400,7 @@ impl AllowedRange<'_> {
     }
 }
 
-/// Notes limits that exclude every voltage of the cell model.
+/// Notes limits that exclude the whole voltage range of the cell model.
 fn voltages_of_model(range: &AllowedRange<'_>, model: &CellModel) {
     let Limits { min, max, .. } = range.limits;
     let (low, high) = (model.voltage_min_v, model.voltage_max_v);
@@ -420,8 +422,8 @@ pub(crate) fn initial_capacity(raw: &RawTables, model: Option<&CellModel>) {
     initial_of(&pack.place, pack.initial_capacity_ah, model);
 }
 
-/// Notes an implausible initial or rated capacity of a module. Also notes cells whose size differs much from the pack's
-/// own cells, which have `own_ah`.
+/// Notes an implausible initial or rated capacity of a module. Also notes a module whose rated capacity differs much
+/// from `own_ah`, the rated capacity of the pack's own cells.
 pub(crate) fn module(Module { keys, model, .. }: &Module<'_>, own_ah: Option<f64>) {
     let beside = own_ah.map_or(1.0, |own_ah| model.rated_capacity_ah / own_ah);
     if let Some(own_ah) = own_ah.filter(|_| beside.max(1.0 / beside) >= OTHER_CELL) {
@@ -476,9 +478,9 @@ pub(crate) fn rated_capacity(raw: &RawTables, model: Option<&CellModel>) {
     }
 }
 
-/// A hint whether parallel cells explain a capacity of `ratio` cells.
+/// Returns a hint if parallel cells explain why the capacity is `ratio` times that of one cell.
 fn parallel_cells(ratio: f64, strings: u16) -> String {
-    // The stated capacities of one cell differ by less than 5 %.
+    // Different sources state capacities of the same cell that differ by less than 5 %.
     let is_about = |cells: f64| (ratio / cells - 1.0).abs() <= 0.05;
     let whole = ratio.round();
     if strings > 1 && is_about(f64::from(strings)) {

@@ -7,7 +7,7 @@ use crate::can::uds::{Answer, AnswerSignal};
 use crate::config::schema::RawTables;
 use crate::quantity::Channel;
 
-/// The answers to decode: those with a signal that an input uses.
+/// Returns the answers to decode: the answers that contain at least one signal of an input.
 pub(crate) fn answers(found: &[ResolvedSignal<'_>]) -> Result<Vec<Answer>, LayoutFault> {
     let mut answers: Vec<Answer> = Vec::new();
     for (resolved, place) in found.iter().filter_map(|resolved| Some((resolved, resolved.answer?))) {

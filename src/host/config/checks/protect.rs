@@ -9,8 +9,8 @@ use crate::config::schema::did_you_mean;
 use crate::config::schema::keys::ProtectedInput;
 use crate::quantity::{BusIndex, Channel};
 
-/// The guards of the protected messages; faults are noted. `inputs_whole` states whether every configured signal was
-/// found. If it is true, a message that is not found has a wrong name.
+/// Returns the guards of the protected messages; faults are noted. `inputs_whole` states whether every configured
+/// signal was found. Only then does a missing message mean that its name is wrong.
 pub(crate) fn guards(raw: &RawTables, found: &[ResolvedSignal<'_>], inputs_whole: bool) -> Vec<GuardConfig> {
     let mut guards: Vec<(GuardConfig, &ProtectedInput)> = Vec::new();
     for keys in &raw.protected {
@@ -47,8 +47,8 @@ pub(crate) fn guards(raw: &RawTables, found: &[ResolvedSignal<'_>], inputs_whole
     guards
 }
 
-/// A new pack identity sets all learned values aside. Its message must therefore be protected, unless the configuration
-/// accepts an unprotected message.
+/// A reading with a new pack identity sets all learned values aside. The message with the identity must therefore be
+/// protected, unless the configuration sets `accept_unprotected`.
 fn check_identity(raw: &RawTables, found: &[ResolvedSignal<'_>], guards: &[GuardConfig]) {
     let Some(keys) = raw.pack_identity.as_ref().filter(|keys| !keys.accept_unprotected) else { return };
     let is_protected =
@@ -90,7 +90,8 @@ fn check_profile(keys: &ProtectedInput) {
     }
 }
 
-/// Checks that the header fits into the message and that no input, nor a multiplexor of an input, overlaps it.
+/// Checks that the protection header fits into the message, and that no input and no multiplexor of an input overlaps
+/// it.
 fn check_layout(keys: &ProtectedInput, inputs: &[&ResolvedSignal<'_>]) {
     let (profile, Some(first)) = (keys.profile, inputs.first()) else { return };
     let (shortest, longest) = (profile.header_bytes(), profile.max_bytes());

@@ -21,7 +21,8 @@ use crate::quantity::{BusIndex, CellIndex, Channel};
 /// Largest number of cell numbers listed in one fault.
 const MAX_NAMED_CELLS: usize = 8;
 
-/// Largest length of a pack identity, bits. A reading represents integers of up to this length exactly.
+/// Largest length of a pack identity, bits. A reading is a 64-bit float, which represents integers of up to 53 bits
+/// exactly.
 const MAX_IDENTITY_BITS: u16 = 53;
 
 /// The DBC files and diagnostic answers of a configuration.
@@ -31,7 +32,7 @@ pub(crate) struct Databases {
     answers: Vec<AnswerDefinition>,
 }
 
-/// A signal that can be named.
+/// A signal that the configuration may name.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct NamedSignal<'d> {
     /// DBC file, or table of the answer.
@@ -92,7 +93,7 @@ pub(crate) struct DbcRanges {
     pub voltage_step_v: f64,
 }
 
-/// A range that accepts every value.
+/// A range that contains every value.
 pub(crate) const UNLIMITED: (f64, f64) = (f64::NEG_INFINITY, f64::INFINITY);
 
 impl Databases {
@@ -110,7 +111,7 @@ impl Databases {
         (are_all_usable && !(files.is_empty() && answers.is_empty())).then_some(Self { files, answers })
     }
 
-    /// Every signal that can be named.
+    /// Returns every signal that the configuration may name.
     pub(crate) fn signals(&self) -> impl Iterator<Item = NamedSignal<'_>> {
         let messages = self.files.iter().flat_map(|(file, db)| db.messages.iter().map(move |m| (file.as_str(), m)));
         let of_files = messages.flat_map(|(file, message)| {
@@ -157,14 +158,14 @@ pub(crate) fn resolve<'d>(raw: &RawTables, databases: &'d Databases) -> Vec<Reso
     search.found
 }
 
-/// Notes a signal that is in none of the files.
+/// Notes a signal name that is in none of the files.
 pub(crate) fn check_name(raw: &RawTables, databases: &Databases, source: &SignalSource<'_>) {
     if !databases.signals().any(|signal| signal.is_named(source.signal)) {
         Search { raw, databases, found: Vec::new() }.not_found(source);
     }
 }
 
-/// Factor from the sign of the current on the bus to packwatch's sign.
+/// Returns 1 or -1: the factor from the sign of the current on the bus to packwatch's sign.
 fn current_sign(raw: &RawTables) -> f64 {
     match raw.current.as_ref().map(|keys| keys.positive) {
         Some(PositiveCurrent::Charge) => -1.0,
@@ -347,7 +348,8 @@ pub(crate) fn input_map(found: &[ResolvedSignal<'_>]) -> Option<InputMap> {
     bindings.ok().map(InputMap::new)
 }
 
-/// The widest range that the DBC states for each kind of value; a total voltage is converted to volts per cell.
+/// Returns the widest range that the DBC states for each kind of value. If the signal is the pack's total voltage, the
+/// range is divided by the number of cells (`series`).
 pub(crate) fn ranges(found: &[ResolvedSignal<'_>], series: u16) -> DbcRanges {
     let widest = |belongs: fn(Channel) -> bool, divisor: f64| {
         let ranges = found.iter().filter(|resolved| belongs(resolved.channel)).map(ResolvedSignal::range);

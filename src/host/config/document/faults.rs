@@ -22,7 +22,8 @@ pub(crate) struct SourceLine {
 }
 
 impl SourceLine {
-    /// Refers to this line in a fault at `other`; the file name is left out if both are in the same file.
+    /// Words that refer to this line in a fault at `other`. The file name is left out if both lines are in the same
+    /// file.
     pub(crate) fn beside(&self, other: &Self) -> String {
         if self.file == other.file { format!("line {}", self.line) } else { self.to_string() }
     }
@@ -58,7 +59,7 @@ impl Faults {
         note(&mut self.0.borrow_mut().faults, at, text);
     }
 
-    /// Notes a value that is allowed but unlikely; it does not make the configuration bad.
+    /// Notes a value that is allowed but unlikely. The configuration remains valid.
     fn warn(&self, at: &SourceLine, text: impl fmt::Display) {
         note(&mut self.0.borrow_mut().warnings, at, text);
     }

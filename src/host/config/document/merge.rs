@@ -18,7 +18,7 @@ const MAX_SYNTAX_FAULTS: usize = 10;
 pub(crate) struct Document<'t> {
     /// The main file, as the user named it.
     pub file: String,
-    /// Whether the syntax is broken somewhere. If so, a missing key may be in the broken part.
+    /// Whether a file has a syntax fault. If so, a key that was not found may be in the part that could not be parsed.
     pub broken: bool,
     /// Where faults are noted.
     pub faults: Faults,
@@ -82,7 +82,7 @@ impl<'t> Document<'t> {
         shorten(&words.join(" "))
     }
 
-    /// The text that a fault at `span` quotes as the found value; `span` lies within `value`.
+    /// The text that a fault at `span` quotes as the value found. `span` is the position of `value` or of a part of it.
     pub(crate) fn found(&self, value: &Spanned<DeValue<'_>>, span: &Range<usize>) -> String {
         let is_inline = self.written(&value.span()).starts_with('{');
         if value.get_ref().is_table() && !is_inline { "a table".to_owned() } else { self.quote(span) }
@@ -112,8 +112,9 @@ fn note_syntax(source: &SourceFile, errors: &[toml::de::Error], faults: &Faults)
     }
 }
 
-/// Merges `over` into `under`. Tables are merged key by key, lists of tables are appended, and any other value replaces
-/// the earlier value. An empty list also replaces the earlier list, so that a drop-in can remove tables.
+/// Merges the later file `over` into the earlier file `under`. Tables are merged key by key, and lists of tables are
+/// appended. Any other value replaces the earlier value. An empty list also replaces the earlier list, so that a
+/// drop-in can remove tables.
 fn merge<'t>(under: &mut DeTable<'t>, over: DeTable<'t>) {
     for (key, new) in over {
         let Some((old_key, mut old)) = under.remove_entry(&key) else {

@@ -1,7 +1,7 @@
 //! The configuration file, its drop-ins, and their texts.
 //!
-//! The drop-ins of `FILE` are the files `FILE.d/*.toml`, sorted by name. In: paths. Out: the texts in this order. A byte
-//! position in the texts identifies a file and a line.
+//! The drop-ins of `FILE` are the files `FILE.d/*.toml`, sorted by name. In: paths. Out: the texts, the main file
+//! first. Positions count the bytes of all texts together, so a position identifies a file and a line.
 
 use std::ffi::OsString;
 use std::io;
@@ -13,7 +13,7 @@ use super::faults::{ConfigFaults, Faults, SourceLine};
 /// Largest number of drop-ins of one file. One per table is enough, and a file has about 30 tables.
 const MAX_DROP_INS: usize = 100;
 
-/// Reads the bytes of a file: from disk or, in the demo and in tests, from memory.
+/// Reads the bytes of a file. The function reads from disk or, in the demo and in tests, from memory.
 pub type ReadFile<'a> = &'a dyn Fn(&Path) -> std::io::Result<Vec<u8>>;
 
 /// A configuration file and its drop-ins.
@@ -79,7 +79,8 @@ pub(crate) struct SourceFile {
     name: String,
     /// Position of the file's first byte in the sequence of all texts.
     start: usize,
-    /// The text, preceded by `start` blanks, so that positions in it are positions in the sequence of all texts.
+    /// The text, preceded by `start` blanks. Positions in this string are therefore positions in the sequence of all
+    /// texts.
     placed: String,
 }
 
@@ -119,7 +120,8 @@ impl Sources {
     fn new(texts: Vec<(String, String)>) -> Self {
         let (mut files, mut start) = (Vec::new(), 0);
         for (name, text) in texts {
-            // A byte order mark is allowed only at the very beginning, where the blanks are.
+            // A byte order mark is valid only at the start of a text. In the padded text it would follow the blanks, so
+            // it is removed.
             let text = text.strip_prefix('\u{feff}').unwrap_or(&text);
             let placed = " ".repeat(start) + text;
             let end = placed.len();

@@ -40,7 +40,7 @@ fn text(document: &Document<'_>) -> String {
 fn table(document: &Document<'_>, path: &str, table: &DeTable<'_>, page: &mut String) {
     let mut entries: Vec<_> = table.iter().collect();
     entries.sort_by_key(|(key, _)| key.span().start);
-    // Values come first: after the header of a subtable they would belong to that subtable.
+    // Values are written before tables: after the header of a subtable they would belong to that subtable.
     let (tables, values): (Vec<_>, Vec<_>) = entries.into_iter().partition(|(_, value)| has_header(document, value));
     for (key, value) in values {
         let (name, text) = (document.written(&key.span()), document.written(&value.span()));
@@ -72,7 +72,7 @@ fn has_header(document: &Document<'_>, value: &Spanned<DeValue<'_>>) -> bool {
     (value.get_ref().is_table() || is_list_of_tables(value)) && !is_inline(document, value)
 }
 
-/// Whether a value is written inline, `{ ... }` or `[ ... ]`, and no other file adds to it.
+/// Whether a value is written inline, `{ ... }` or `[ ... ]`, and no other file adds keys or elements to it.
 fn is_inline(document: &Document<'_>, value: &Spanned<DeValue<'_>>) -> bool {
     let (span, written) = (value.span(), document.written(&value.span()));
     let is_within = |part: std::ops::Range<usize>| span.start <= part.start && part.end <= span.end;

@@ -35,7 +35,7 @@ impl PartialConfig {
             Ok(config) => (Some(config), Vec::new()),
             Err(faults) => (None, faults.0),
         };
-        // The second reading finds the same faults again, so it gets a list that is not used.
+        // The tables are read a second time here, which finds the same faults again. This list of faults is not used.
         let again = Faults::default();
         let read = || {
             let sources = Sources::read(&ConfigFiles::find(path).ok()?, &read_file, &again)?;

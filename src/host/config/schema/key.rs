@@ -12,7 +12,7 @@ use crate::quantity::bounds::Bounds;
 /// The range of a key's value; for a list, the range of each element.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum ValueRange {
-    /// Any value of the type (numbers must still be finite).
+    /// Any value of the type. Numbers must be finite.
     Any,
     /// A number between the two bounds, both included.
     Between(f64, f64),
@@ -85,13 +85,13 @@ pub(crate) trait Setting: Sized {
     fn read_tables(_: &TableReader<'_>, _: &Key, _: &Spanned<DeValue<'_>>) -> Option<Option<Self>> {
         None
     }
-    /// Value of an optional key that is absent; `None` if the type has no such value.
+    /// Value of an optional key that is absent; `None` = this type has no value for an absent key.
     fn absent() -> Option<Self> {
         None
     }
 }
 
-/// What happens if a key is absent.
+/// What happens if the file does not contain a key.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Presence {
     /// The absence is a fault.
@@ -141,7 +141,7 @@ impl Key {
         }
     }
 
-    /// The allowed values, for a fault of a value that has the right type.
+    /// The allowed values, without the type, for a fault of a value that has the right type.
     fn must_be_in_range(&self) -> String {
         match self.range() {
             range if range.is_empty() || self.allowed == ValueRange::NotEmpty => self.must_be(),
@@ -153,7 +153,7 @@ impl Key {
 /// Reads the keys of one table.
 pub(crate) struct TableReader<'a> {
     pub document: &'a Document<'a>,
-    /// Whether the table may be incomplete. If so, missing keys are not reported.
+    /// Whether a part of the table may be unreadable. If so, missing keys are not reported.
     pub broken: bool,
     /// The table; `None` = the file does not contain it.
     pub table: Option<&'a DeTable<'a>>,

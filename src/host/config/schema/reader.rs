@@ -1,4 +1,5 @@
-//! Reads the declared tables of a document. Unknown keys are faults, with the most similar known key as a hint.
+//! Reads the declared tables of a document. An unknown key is a fault; the fault suggests the known key with the most
+//! similar name.
 
 use std::collections::BTreeSet;
 
@@ -12,7 +13,7 @@ use crate::config::document::{Document, SourceLine};
 /// Reads the declared tables of one document.
 pub(crate) struct SchemaReader<'a> {
     document: &'a Document<'a>,
-    /// Whether syntax or tables are broken somewhere. If so, a key that was not found may still exist, so no key is
+    /// Whether a part of the document is unreadable. If so, a key that was not found may still exist, so no key is
     /// reported as missing.
     pub broken: bool,
 }
@@ -61,7 +62,7 @@ impl<'a> SchemaReader<'a> {
         sections
     }
 
-    /// How often the table at `path` is present; a value that is not a list counts once.
+    /// How often the file contains the table at `path`. A value that is not a list counts as one table.
     pub(crate) fn count(&self, path: &str) -> usize {
         match self.document.find(path).map(Spanned::get_ref) {
             None => 0,
@@ -148,7 +149,7 @@ fn join(path: &str, key: &str) -> String {
 
 /// Returns `, did you mean X` for the most similar of `names`, or an empty text if no name is similar enough.
 pub(crate) fn did_you_mean<'n>(found: &str, names: impl Iterator<Item = &'n str>) -> String {
-    /// Jaro-Winkler similarity below which a hint confuses more than it helps.
+    /// Smallest Jaro-Winkler similarity of a suggested name. A less similar name would confuse the user.
     const NEAR: f64 = 0.8;
     let near = |name: &'n str| (strsim::jaro_winkler(&found.to_lowercase(), &name.to_lowercase()), name);
     let best = names.map(near).max_by(|a, b| a.0.total_cmp(&b.0));

@@ -1,9 +1,9 @@
-//! Declares tables and keys: one line of [`section!`] defines a key's type, how it is read, its fault messages and its
-//! reference text.
+//! Declares tables and keys. One line of [`section!`] defines a key's type, how the key is read, its fault messages,
+//! and its text in the reference.
 //!
 //! [`section!`] declares a table of a file and, if the table `gives` a parameter struct, builds that struct from the keys.
-//! [`tables!`] lists the tables of a file. [`SchemaReader`] reads the declared tables from a document and notes every
-//! fault: missing, unknown, of the wrong type, out of range.
+//! [`tables!`] lists the tables of a file. [`SchemaReader`] reads the declared tables from a document. It notes missing
+//! and unknown keys, and values of the wrong type or out of range.
 
 use toml::Spanned;
 use toml::de::DeValue;
@@ -31,7 +31,7 @@ pub(crate) struct SectionInfo {
     pub many: bool,
     /// Purpose of the table.
     pub about: &'static str,
-    /// The keys of the table; `None` = any key is allowed (a table of notes for people).
+    /// The keys of the table; `None` = any key is allowed, because the table contains notes for people.
     pub keys: Option<&'static [Key]>,
 }
 
@@ -150,7 +150,7 @@ macro_rules! section {
 }
 pub(crate) use section;
 
-/// The field type in [`tables!`]: a list if the table is repeatable.
+/// The field type in [`tables!`]: a list for a repeatable table.
 macro_rules! table_field {
     (many $section:ty) => { Vec<$section> };
     ($kind:ident $section:ty) => { Option<$section> };
@@ -160,9 +160,9 @@ pub(crate) use table_field;
 /// Lists the tables of a file in the order of the reference page. The macro generates the struct of these tables and
 /// the function that reads it.
 ///
-/// A table is `one`, `optional` or `many`. `one` is always read: if the table is absent, its defaults apply and its
-/// required keys are missing. `optional` is read if it is present. `many` is repeatable (`[[path]]`). `with` names the
-/// tables inside a key of the table.
+/// A table is `one`, `optional` or `many`. A table `one` is always read: if the file does not contain it, its keys have
+/// their defaults, and missing required keys are noted. A table `optional` is read only if the file contains it. A
+/// table `many` is repeatable (`[[path]]`). `with` names further tables that a key of the table contains.
 macro_rules! tables {
     ($(#[$about:meta])* $name:ident, $sections:ident { $($field:ident: $kind:ident $section:ident $(with $below:ident)?),+ $(,)? }) => {
         $(#[$about])*
@@ -174,7 +174,7 @@ macro_rules! tables {
             pub faults: $crate::config::document::Faults,
             /// Whether the file's syntax or a table is broken. If so, a table that was not found may still exist.
             pub broken: bool,
-            /// How often each table is present, including faulty ones.
+            /// How often the file contains each table, including faulty tables.
             written: std::collections::BTreeMap<&'static str, usize>,
             $( pub $field: $crate::config::schema::table_field!($kind $section), )+
         }
@@ -198,7 +198,7 @@ macro_rules! tables {
                 self.count::<S>() > 0
             }
 
-            /// How often a table is present, including faulty ones.
+            /// How often the file contains a table, including faulty tables.
             pub(crate) fn count<S: $crate::config::schema::Section>(&self) -> usize {
                 self.written.get(S::PATH).copied().unwrap_or_default()
             }

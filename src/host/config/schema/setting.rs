@@ -7,7 +7,7 @@ use toml::de::{DeInteger, DeValue};
 
 use super::key::{Setting, ValueFault, ValueRange, in_range, typed};
 
-/// Largest number of entries in a sequence; no pack has more cells.
+/// Maximum number of entries in a list of numbers. No pack has more cells.
 const MAX_ROW: usize = 2048;
 
 impl<T: Setting> Setting for Option<T> {
@@ -128,7 +128,7 @@ impl Setting for NumberRange {
     }
 }
 
-/// Makes an enum a choice between words.
+/// Declares that the values of an enum are the allowed words of a key.
 macro_rules! choice {
     ($type:ty { $($word:literal => $value:expr),+ $(,)? }) => {
         impl $crate::config::schema::Setting for $type {

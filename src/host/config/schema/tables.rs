@@ -13,7 +13,7 @@ use crate::config::document::TablePlace;
 use crate::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
 
 tables! {
-    /// The tables of a file; `None` = absent, or faulty (the fault is noted).
+    /// The tables of a file; `None` = the table is absent or faulty (the fault is noted).
     RawTables, SECTIONS {
         vehicle: one Vehicle,
         pack: one Pack,
@@ -96,8 +96,8 @@ impl RawTables {
         u8::try_from(index).ok().map(BusIndex)
     }
 
-    /// The interface of a table that must use exactly one. Returns `None` and notes a fault if the name is unknown, or
-    /// if it is missing although there are several interfaces.
+    /// Returns the interface of a table that uses exactly one interface. Returns `None` and notes a fault if the name
+    /// is unknown, or if no name is given although there are several interfaces.
     pub(crate) fn one_bus(&self, interface: Option<&str>, place: &TablePlace) -> Option<BusIndex> {
         let is_clear = interface.is_some() || self.interfaces.len() <= 1;
         let bus = self.bus_of(interface).filter(|_| is_clear);
