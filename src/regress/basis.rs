@@ -1,10 +1,12 @@
 //! The mean function and its generalised least-squares coefficients.
 //!
-//! Input: `G` (below). Output: coefficients with covariance. Functions that the rows cannot separate are an error.
+//! Input: the matrix `G = [y H]' K^-1 [y H]`, with the targets `y`, the values `H` of the mean function's terms at
+//! every row, and the covariance `K` of the measurements. Output: the coefficients beta and their covariance. If the
+//! rows cannot separate the terms, the result is an error.
 //!
-//! With W a square root of the inverse covariance, the coefficients are the ordinary least-squares solution of `W y` on `W H`.
-//! Every form of the process provides `G = [y H]' K^-1 [y H]`, which determines the coefficients, their covariance and the squared norm
-//! of the residual.
+//! Let W be a square root of `K^-1`. The coefficients are then the ordinary least-squares solution of `W y` on `W H`.
+//! `G` determines the coefficients, their covariance and the squared norm of the residual. The exact and the
+//! nearest-neighbour form of the process both compute `G`.
 
 use serde::{Deserialize, Serialize};
 
@@ -15,11 +17,11 @@ use super::linear_algebra::solve_upper;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Basis {
-    /// Zero.
+    /// The mean is zero.
     Zero,
-    /// A constant.
+    /// The mean is a constant.
     Constant,
-    /// A constant and a slope for every input.
+    /// The mean is a constant plus a slope for every input.
     Linear,
 }
 
@@ -33,7 +35,7 @@ impl Basis {
         }
     }
 
-    /// Value of the k-th function at a (standardised) row.
+    /// Value of the mean function's k-th term at a (standardised) row.
     pub(super) fn value(self, row: &[f64], k: usize) -> f64 {
         if k == 0 { 1.0 } else { row[k - 1] }
     }
@@ -43,19 +45,20 @@ impl Basis {
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Coefficients {
     pub beta: Vec<f64>,
-    /// Inverse of `H' K^-1 H`, row after row.
+    /// Inverse of `H' K^-1 H`, row-major.
     pub covariance: Vec<f64>,
     /// `(y - H beta)' K^-1 (y - H beta)`.
     pub squared_norm: f64,
 }
 
 impl Coefficients {
-    /// Solves `G`: symmetric, row-major, of size (1 + coefficients)^2, target first.
+    /// Solves for the coefficients. `g` is the matrix `G`: symmetric, row-major, `(1 + size)^2` elements. Its first row
+    /// and column belong to the targets, the others to the `size` terms of the mean function.
     pub(super) fn solve(g: &[f64], size: usize) -> Result<Self, RegressionError> {
         let width = size + 1;
         let fault =
             || RegressionError::range("basis", format!("{size} functions"), "functions that the rows can separate");
-        // Cholesky factor of the basis block, scaled by its diagonal.
+        // The Cholesky factor of the block `H' K^-1 H`, which is first scaled to ones on its diagonal.
         let scale: Vec<f64> = (1..width).map(|k| g[k * width + k].sqrt()).collect();
         if scale.iter().any(|s| !(*s > 0.0 && s.is_finite())) {
             return Err(fault());
@@ -82,8 +85,8 @@ impl Coefficients {
         Ok(Self { beta, covariance, squared_norm: squared_norm.max(0.0) })
     }
 
-    /// Solves the factor's upper half for the targets and the functions in `right`. Returns the weights of the targets without the
-    /// contribution of the functions, and the weights of the functions.
+    /// Completes the solution with the covariance matrix: `right` holds `L^-1 [y H]` and `factor` holds `L`, with `K =
+    /// L L'`. Returns `K^-1 (y - H beta)` and `K^-1 H`.
     pub(super) fn weights(&self, factor: &[f64], n: usize, mut right: Vec<f64>) -> (Vec<f64>, Vec<f64>) {
         solve_upper(factor, n, &mut right);
         let functions = right.split_off(n);
@@ -93,19 +96,21 @@ impl Coefficients {
         (right, functions)
     }
 
-    /// Returns the mean function at a row.
+    /// Returns the mean function's value at a row.
     pub(super) fn mean(&self, basis: Basis, row: &[f64]) -> f64 {
         (0..self.beta.len()).map(|k| self.beta[k] * basis.value(row, k)).sum()
     }
 
-    /// Variance due to the uncertainty of the coefficients; `rest` = h(x) - H' K^-1 k(x).
+    /// Variance of a prediction that is due to the uncertainty of the coefficients. `rest` is `h(x) - H' K^-1 k(x)`,
+    /// where `h(x)` are the terms of the mean function at the row x, and `k(x)` are the covariances of x with the
+    /// training rows.
     pub(super) fn variance(&self, rest: &[f64]) -> f64 {
         let size = self.beta.len();
         (0..size * size).map(|at| rest[at / size] * self.covariance[at] * rest[at % size]).sum::<f64>().max(0.0)
     }
 }
 
-/// `(L L')^-1`, row after row.
+/// Returns `(L L')^-1`, row-major.
 fn inverse_from_factor(l: &[f64], size: usize) -> Vec<f64> {
     let mut inverse = vec![0.0; size * size];
     for column in 0..size {
@@ -130,7 +135,7 @@ mod tests {
 
     #[test]
     fn coefficients_agree_with_least_squares() {
-        // y = 2 + 3 x at x = 0, 1, 2, 3 with unit covariance; the last y is off by 1.
+        // y = 2 + 3 x at x = 0, 1, 2, 3 with unit covariance. Only the last y is 1 too large.
         let rows = [(2.0, 0.0), (5.0, 1.0), (8.0, 2.0), (12.0, 3.0)];
         let mut g = vec![0.0; 9];
         for (y, x) in rows {

@@ -1,29 +1,38 @@
 //! Calibrates the width of the interval that contains a given fraction of the measurements.
 //!
-//! A Gaussian interval has its nominal coverage only if the residuals are Gaussian and have the predicted width everywhere. Measured
-//! residuals rarely do: those of a cell's voltage are twice as wide at rest as during a charge. So training rows calibrate the interval.
-//! Each row of a seeded selection is predicted from all others, which gives a ratio |residual| / standard deviation. The *spread* at a
-//! row is the mean ratio of its nearest rows, shrunk towards the mean of all and divided by it. The factor is the quantile of
-//! ratio / spread (with the correction of split conformal prediction for few rows). The half width of the interval is
-//! factor x spread x standard deviation. Held-out rows are not used. With too few rows, the interval stays Gaussian.
+//! A Gaussian interval contains its nominal fraction of the measurements only if the residuals are Gaussian and have
+//! the predicted width everywhere. Measured residuals rarely meet this condition. For example, the residuals of a
+//! cell's voltage are twice as wide at rest as during a charge. The interval is therefore calibrated with training
+//! rows:
+//!
+//! 1. A seeded selection of training rows is predicted, each row from all other training rows. Each prediction gives a
+//!    `ratio = |residual| / standard deviation`.
+//! 2. The *spread* at a row is the mean ratio of the nearest selected rows, shrunk towards the mean ratio of all
+//!    selected rows, and divided by this overall mean.
+//! 3. The factor is the 95 % quantile of `ratio / spread`. For few rows, the quantile has the correction of split
+//!    conformal prediction.
+//! 4. The half width of the interval is `factor * spread * standard deviation`.
+//!
+//! Held-out rows of a cross-validation are not used. If there are too few rows, the interval stays Gaussian.
 
 use super::kd_tree::KdTree;
 use super::scale::StandardisedRows;
 
-/// Nominal coverage of the interval.
+/// Nominal coverage of the interval, as a fraction.
 pub(super) const LEVEL: f64 = 0.95;
-/// Half width of the Gaussian interval of that level, standard deviations.
+/// Half width of a Gaussian interval with the coverage [`LEVEL`], in standard deviations.
 pub const GAUSSIAN: f64 = 1.959_963_984_540_054;
-/// Rows to leave out, one at a time; the standard error of the factor is then below 1 %.
+/// Maximum number of rows that are left out, one at a time. With this number, the standard error of the factor is below
+/// 1 %.
 pub(super) const CALIBRATION_ROWS: usize = 8000;
-/// Weight of the overall mean in the spread at a row, in rows.
+/// Weight of the overall mean in the spread at a row, as a number of rows.
 const SHRINKAGE: f64 = 20.0;
 
-/// The factor, and the data of the spread.
+/// The factor, and the data from which the spread is computed.
 #[derive(Debug, Clone)]
 pub(super) struct Calibration {
     pub factor: f64,
-    /// Numbers of the rows left out, and their ratios.
+    /// Numbers of the selected rows. `ratios` has one ratio for each of them.
     pub rows: Vec<u32>,
     pub ratios: Vec<f64>,
     near: usize,
@@ -32,19 +41,19 @@ pub(super) struct Calibration {
 }
 
 impl Calibration {
-    /// Returns a Gaussian calibration.
+    /// Returns the calibration of a Gaussian interval.
     pub(super) fn none() -> Self {
         Self { factor: GAUSSIAN, rows: vec![], ratios: vec![], near: 0, mean: 1.0, tree: None }
     }
 
-    /// Calibrates with rows and their leave-one-out ratios. Without rows, the interval is Gaussian.
+    /// Calibrates with the selected rows and their leave-one-out ratios. Without rows, the interval is Gaussian.
     pub(super) fn new(data: &StandardisedRows, rows: Vec<u32>, ratios: Vec<f64>) -> Self {
-        // Rows in the spread at a row: a twentieth of all, at most 200.
+        // The spread at a row is computed from a twentieth of the selected rows, but from at most 200.
         let near = (ratios.len() / 20).min(200);
         let mean = ratios.iter().sum::<f64>() / ratios.len() as f64;
         let inputs: Vec<f64> = rows.iter().flat_map(|row| data.row(*row as usize).to_vec()).collect();
         let tree =
-            // If fewer than 20 rows would enter the spread, it is 1 everywhere.
+            // If the spread would be computed from fewer than 20 rows, it is 1 everywhere.
             (near >= 20 && mean > 0.0).then(|| KdTree::new(&inputs, &inverse_deviations(&inputs, data)));
         let mut calibration = Self { factor: GAUSSIAN, rows, ratios, near, mean, tree };
         let d = data.dimensions;
@@ -52,14 +61,15 @@ impl Calibration {
         let mut relative: Vec<f64> = calibration.ratios.iter().enumerate().map(relative).collect();
         relative.sort_by(f64::total_cmp);
         let rank = ((relative.len() + 1) as f64 * LEVEL).ceil() as usize;
-        // With too few rows, the Gaussian factor stays.
+        // If there are too few rows, the factor stays Gaussian.
         if rank > 0 && rank <= relative.len() {
             calibration.factor = relative[rank - 1];
         }
         calibration
     }
 
-    /// Width of the residuals at a standardised row, relative to the mean over all rows.
+    /// Width of the residuals at a standardised row, relative to the mean width over all selected rows. `excluded` is
+    /// the index of a selected row that is not used.
     fn spread(&self, row: &[f64], excluded: Option<usize>) -> f64 {
         let Some(tree) = &self.tree else { return 1.0 };
         let near = tree.nearest(row, self.near, self.ratios.len(), excluded);
@@ -67,13 +77,13 @@ impl Calibration {
         (sum + SHRINKAGE * self.mean) / (near.len() as f64 + SHRINKAGE) / self.mean
     }
 
-    /// Half width of the interval at a standardised row, standard deviations of a measurement.
+    /// Half width of the interval at a standardised row, in standard deviations of a measurement.
     pub(super) fn half_width(&self, row: &[f64]) -> f64 {
         self.factor * self.spread(row, None)
     }
 }
 
-/// Weights that give all inputs the same standard deviation.
+/// Returns the weights that give all weighted inputs the same standard deviation.
 fn inverse_deviations(inputs: &[f64], data: &StandardisedRows) -> Vec<f64> {
     let (d, n) = (data.dimensions, inputs.len() as f64 / data.dimensions as f64);
     let of = |column: usize| {

@@ -1,13 +1,14 @@
 //! Evaluates the kernel over pairs of rows, in blocks.
 //!
-//! Input: rows, column-major, and a point. Output: squared differences and kernel values. Inputs are checked by the caller.
+//! Input: rows in column-major order, and one point. Output: squared differences and kernel values. The caller checks
+//! the inputs.
 
 use super::plan::{Covariance, Work};
 
-/// Pairs per block; their memory fits the nearest cache.
+/// Number of pairs per block. The memory of one block fits the first-level cache.
 pub(super) const BLOCK_PAIRS: usize = 1024;
 
-/// Converts row-major to column-major.
+/// Converts row-major inputs to column-major order.
 pub(super) fn by_column(inputs: &[f64], dimensions: usize) -> Vec<f64> {
     (0..dimensions).flat_map(|d| inputs.iter().skip(d).step_by(dimensions).copied()).collect()
 }
@@ -30,7 +31,8 @@ impl Covariance {
     }
 }
 
-/// Writes the squared differences of the rows `from..from + count` to a point to `out`, input by input.
+/// Writes the squared differences between the rows `from..from + count` and a point to `out`: first those of the first
+/// input, then those of the second input, and so on.
 pub(super) fn squares(columns: &[f64], from: usize, count: usize, point: &[f64], out: &mut Vec<f64>) {
     let n = columns.len() / point.len();
     out.resize(count * point.len(), 0.0);

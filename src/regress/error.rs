@@ -3,7 +3,7 @@
 /// Reason why a model or a prediction failed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum RegressionError {
-    /// The text is not a kernel.
+    /// The text is not a valid kernel.
     #[error("kernel {text:?}, column {column}: found {found}, allowed: {allowed}")]
     Kernel {
         /// The complete text.
@@ -18,11 +18,11 @@ pub enum RegressionError {
     /// A number in the rows is not finite.
     #[error("line {line}: {what} = {found}, must be a finite number")]
     NotFinite {
-        /// Line of the file, or number of the row from 1.
+        /// Line of the row in its file or, if the row is not from a file, the number of the row from 1.
         line: u64,
         /// `input 2` or `target`.
         what: String,
-        /// The value.
+        /// The value that is not finite.
         found: f64,
     },
     /// A setting or a length is out of range.

@@ -1,11 +1,11 @@
-//! Exact Gaussian process over all pairs of rows: n^3 time, n^2 memory.
+//! Exact Gaussian process: uses all pairs of the n rows. Needs time proportional to n^3 and memory proportional to n^2.
 //!
-//! Input: standardised rows and hyperparameters. Output: likelihood, gradient, predictions. A matrix that is not positive definite even
-//! with the largest jitter is an error.
+//! Input: standardised rows and hyperparameters. Output: likelihood, gradient and predictions. If the covariance matrix
+//! is not positive definite even with the largest jitter, the result is an error.
 //!
-//! With `K = k(X, X) + noise` and `a = K^-1 (y - H beta)`:
+//! With `K = k(X, X) + noise`, the residuals `r = y - H beta` and `a = K^-1 r`:
 //!
-//! `-log p = 1/2 (y - H beta)' a + 1/2 ln |K| + n/2 ln 2 pi`, `-d log p = 1/2 tr((K^-1 - a a') dK)`.
+//! `-log p = 1/2 r' a + 1/2 ln |K| + n/2 ln 2 pi`, `-d log p = 1/2 tr((K^-1 - a a') dK)`.
 
 use std::f64::consts::TAU;
 
@@ -22,7 +22,7 @@ use super::linear_algebra::{add, cholesky, dot, log_determinant, parallelism, so
 use super::plan::{Covariance, Plan, Work};
 use super::scale::StandardisedRows;
 
-/// Queries per block of a prediction.
+/// Maximum number of rows that are predicted in one block.
 const BLOCK_QUERIES: usize = 256;
 
 /// State for predictions.
@@ -31,7 +31,7 @@ pub(super) struct Posterior {
     pub data: StandardisedRows,
     pub covariance: Covariance,
     pub coefficients: Coefficients,
-    /// Inputs, column-major.
+    /// Inputs of the training rows, column-major.
     columns: Vec<f64>,
     /// Lower Cholesky factor, column-major.
     factor: Vec<f64>,
@@ -42,7 +42,7 @@ pub(super) struct Posterior {
     /// Negative log likelihood.
     pub value: f64,
     pub jitter: Jitter,
-    /// Jitter on the diagonal, as a fraction of the prior variance.
+    /// Jitter on the diagonal, as a fraction of the prior variance; 0 = no jitter was necessary.
     used_jitter: f64,
 }
 
@@ -72,7 +72,7 @@ impl Posterior {
         Ok(Self { data, covariance, coefficients, columns, factor, alpha, basis_solved, value, jitter, used_jitter })
     }
 
-    /// Derivatives of the negative log likelihood by every parameter.
+    /// Derivatives of the negative log likelihood with respect to every parameter.
     pub(super) fn gradient(&self) -> Vec<f64> {
         let n = self.data.len();
         let par = parallelism();
@@ -134,7 +134,8 @@ impl Posterior {
         all
     }
 
-    /// Mean at a row, and the part of its basis that the training rows do not explain.
+    /// Returns the mean at a row, and the `rest` for [`Coefficients::variance`]: the terms of the mean function at the
+    /// row minus the part that the training rows predict.
     fn mean(&self, row: &[f64], cross: &[f64]) -> (f64, Vec<f64>) {
         let n = self.data.len();
         let rest = |k: usize| self.data.basis.value(row, k) - dot(&self.basis_solved[k * n..][..n], cross);
@@ -142,7 +143,8 @@ impl Posterior {
         (self.coefficients.mean(self.data.basis, row) + dot(&self.alpha, cross), rest)
     }
 
-    /// Leave-one-out residual and measurement variance of some rows, with the present coefficients.
+    /// Returns the residual and the measurement variance of each given row when this row is left out. The coefficients
+    /// of the mean function are not fitted again.
     pub(super) fn left_out(&self, rows: &[u32]) -> Vec<(f64, f64)> {
         let n = self.data.len();
         let mut all = Vec::with_capacity(rows.len());
@@ -163,7 +165,7 @@ impl Posterior {
 fn fill(covariance: &Covariance, data: &StandardisedRows, columns: &[f64], jitter: f64, matrix: &mut [f64]) {
     let n = data.len();
     let diagonal = covariance.prior_variance * (1.0 + jitter) + covariance.noise_variance;
-    // At most 8 columns per task.
+    // Each task fills at most 8 columns.
     matrix.par_chunks_mut(n).enumerate().with_max_len(8).for_each_init(Default::default, |scratch, (j, column)| {
         column[j] = diagonal;
         covariance.cross(columns, j + 1, data.row(j), scratch, &mut column[j + 1..]);

@@ -1,7 +1,7 @@
-//! k-fold cross-validation: every row is predicted by a model fitted without it.
+//! k-fold cross-validation: every row is predicted by a model that was fitted without this row.
 //!
-//! Input: rows, settings, number of folds. Output: predictions of all rows, and their errors in units of the target. Fails if the number
-//! of folds is out of range, or if a fit fails.
+//! Input: rows, settings and the number of folds. Output: a prediction of every row, and the errors of the predictions
+//! in units of the target. The cross-validation fails if the number of folds is out of range or if a fit fails.
 
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
@@ -19,28 +19,29 @@ use super::settings::{FitProgress, GprSettings, ProgressCallback, TrainingRows};
 pub struct Fold {
     /// Number of held-out rows.
     pub held_out: usize,
-    /// Time of the fit by the caller's clock, s.
+    /// Duration of the fit, measured with the caller's clock, s.
     pub fit_s: f64,
-    /// Time of the predictions, s.
+    /// Duration of the predictions, s.
     pub predict_s: f64,
     /// Fitted hyperparameters.
     pub hyperparameters: Vec<Hyperparameter>,
     /// Log marginal likelihood of the training rows.
     pub log_marginal_likelihood: f64,
-    /// Half width of the 95 % interval in standard deviations.
+    /// Half width of the 95 % interval, in standard deviations of a measurement.
     pub interval_factor: f64,
-    /// Jitter on diagonals.
+    /// Jitter that the fit needed.
     pub jitter: Jitter,
 }
 
 /// Result of a cross-validation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Folds {
-    /// Prediction of every row in order, by the model of the fold that held it out.
+    /// Prediction of every row, in the order of the rows. Each row is predicted by the model of the fold that held it
+    /// out.
     pub predictions: Vec<Prediction>,
     /// Fold that held out each row, from 0.
     pub fold_of_row: Vec<usize>,
-    /// Each fold.
+    /// The result of each fold.
     pub folds: Vec<Fold>,
 }
 
@@ -53,9 +54,10 @@ pub struct PredictionScore {
     pub mean_absolute_error: f64,
     /// Fraction of the rows inside the 95 % interval.
     pub coverage_95: f64,
-    /// Fraction of the rows within 1.96 standard deviations of a measurement: the coverage of a Gaussian interval.
+    /// Fraction of the rows whose residual is at most 1.96 standard deviations of a measurement. This is the coverage
+    /// of an interval that is not calibrated.
     pub gaussian_coverage_95: f64,
-    /// Mean width of the 95 % interval.
+    /// Mean width of the 95 % interval, from its lower to its upper end.
     pub mean_width_95: f64,
 }
 
@@ -77,7 +79,8 @@ pub fn score(predictions: &[Prediction], targets: &[f64]) -> PredictionScore {
     }
 }
 
-/// Assigns each row to the fold that holds it out: a seeded shuffle into folds whose sizes differ by at most one row.
+/// Returns, for each row, the fold that holds it out. The rows are shuffled with the seed and divided into folds whose
+/// sizes differ by at most one row.
 pub fn assign(rows: usize, folds: usize, seed: u64) -> Vec<usize> {
     let mut order: Vec<usize> = (0..rows).collect();
     order.shuffle(&mut ChaCha8Rng::seed_from_u64(seed));
@@ -86,7 +89,8 @@ pub fn assign(rows: usize, folds: usize, seed: u64) -> Vec<usize> {
     fold_of_row
 }
 
-/// Cross-validates. `clock` returns seconds from any origin, for the times of the folds.
+/// Cross-validates. `clock` returns the time in seconds since an arbitrary origin; it measures the durations of the
+/// folds.
 pub fn cross_validate(
     rows: &TrainingRows,
     settings: &GprSettings,

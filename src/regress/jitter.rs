@@ -1,22 +1,25 @@
-//! Jitter: an addition to the diagonal of a covariance matrix without a Cholesky factor.
+//! Jitter: a small number that is added to the diagonal of a covariance matrix if the matrix has no Cholesky factor
+//! without it.
 //!
-//! Input: a factorisation to try. Output: the smallest sufficient jitter as a fraction of the signal variance, or an error.
+//! Input: a function that tries to factorise with a given jitter. Output: the smallest jitter that is sufficient, as a
+//! fraction of the signal variance, or an error.
 
 use serde::{Deserialize, Serialize};
 
 use super::error::RegressionError;
 
-/// Jitter of successive tries, as a fraction of the signal variance.
+/// The jitters that are tried one after another, as fractions of the signal variance.
 const TRIES: [f64; 5] = [0.0, 1e-10, 1e-8, 1e-6, LAST];
 pub(super) const LAST: f64 = 1e-4;
 
-/// Summary of the jitter of matrices that were not positive definite.
+/// How much jitter a model needed, because some of its covariance matrices were not positive definite.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Jitter {
-    /// Number of matrices with jitter in the final model's likelihood. Jitter in predictions is not counted.
+    /// Number of matrices that needed jitter when the final model's likelihood was computed. Jitter in predictions is
+    /// not counted.
     pub matrices: usize,
-    /// Largest jitter, as a fraction of the signal variance.
+    /// Largest jitter that was needed, as a fraction of the signal variance.
     pub largest: f64,
 }
 
@@ -27,7 +30,8 @@ impl Jitter {
     }
 }
 
-/// Calls `factorise` with increasing jitter, 0 first, until it returns true; returns the jitter of that call.
+/// Calls `factorise` with increasing jitter, starting with 0, until it returns true. Returns the jitter of the last
+/// call.
 pub(super) fn until_positive(mut factorise: impl FnMut(f64) -> bool) -> Result<f64, RegressionError> {
     TRIES.into_iter().find(|added| factorise(*added)).ok_or(RegressionError::NotPositiveDefinite { jitter: LAST })
 }

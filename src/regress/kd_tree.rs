@@ -1,19 +1,21 @@
-//! A k-d tree: finds the nearest rows to a point, optionally among the rows before a given one.
+//! A k-d tree, which finds the rows that are nearest to a point. The search may be limited to rows with numbers below a
+//! given number.
 //!
-//! Input: rows, weights of the inputs, a point. Output: row numbers, nearest first. Inputs are finite (checked by the caller).
+//! Input: rows, a weight for each input, and a point. Output: row numbers, nearest first. The caller checks that all
+//! inputs are finite.
 //!
-//! Distances are Euclidean in weighted inputs. At equal distance, the lower row number is taken, so that the result does not depend on
-//! the layout of the tree.
+//! The distance is Euclidean after each input is multiplied by its weight. Of two rows at the same distance, the row
+//! with the lower number counts as nearer, so the result does not depend on the layout of the tree.
 
 use std::collections::BinaryHeap;
 
-/// A tree over rows, numbered from 0.
+/// A tree of rows. Rows are numbered from 0.
 #[derive(Debug, Clone)]
 pub(super) struct KdTree {
     weights: Vec<f64>,
-    /// Weighted inputs; rows in leaf order.
+    /// Inputs multiplied by their weights. The rows are in the order of the leaves.
     points: Vec<f64>,
-    /// Row numbers in leaf order.
+    /// Row numbers in the order of the leaves.
     numbers: Vec<u32>,
     nodes: Vec<TreeNode>,
 }
@@ -22,15 +24,17 @@ pub(super) struct KdTree {
 struct TreeNode {
     first: usize,
     end: usize,
-    /// Lowest row number below this node.
+    /// Lowest row number in the subtree of this node.
     minimum: u32,
-    /// Axis, position of the cut, and right child (the left child follows the node); `None` = a leaf.
+    /// Axis, position of the cut, and index of the right child. The left child is the next node. `None` = this node is
+    /// a leaf.
     cut: Option<(usize, f64, usize)>,
 }
 
-/// Heap of the nearest rows so far; the farthest is on top.
+/// A heap of the nearest rows found. Its top is the farthest of these rows.
 struct NearestHeap {
-    /// Bits of the squared distance, and the row. For non-negative distances, the bits have the same order.
+    /// Bit pattern of the squared distance, and the row number. Non-negative floats and their bit patterns have the
+    /// same order.
     heap: BinaryHeap<(u64, u32)>,
     wanted: usize,
 }
@@ -50,7 +54,7 @@ impl NearestHeap {
 }
 
 impl KdTree {
-    /// Builds a tree over rows of `weights.len()` inputs.
+    /// Builds a tree of rows that have `weights.len()` inputs each.
     pub(super) fn new(inputs: &[f64], weights: &[f64]) -> Self {
         let d = weights.len();
         let weighted: Vec<f64> = inputs.iter().enumerate().map(|(at, x)| x * weights[at % d]).collect();
@@ -75,7 +79,7 @@ impl KdTree {
             ends.1 - ends.0
         };
         let axis = (0..d).max_by(|a, b| spread(*a).total_cmp(&spread(*b))).unwrap_or(0);
-        // At most 16 rows per leaf.
+        // A leaf has at most 16 rows.
         if rows.len() <= 16 || spread(axis) <= 0.0 {
             return;
         }
@@ -89,7 +93,7 @@ impl KdTree {
         self.nodes[here].cut = Some((axis, place, right_child));
     }
 
-    /// Returns the `wanted` nearest rows with numbers below `before` and other than `excluded`, nearest first.
+    /// Returns up to `wanted` rows, nearest first, whose numbers are below `before` and differ from `excluded`.
     pub(super) fn nearest(&self, point: &[f64], wanted: usize, before: usize, excluded: Option<usize>) -> Vec<u32> {
         let point: Vec<f64> = point.iter().zip(&self.weights).map(|(x, w)| x * w).collect();
         let before = u32::try_from(before).unwrap_or(u32::MAX);
@@ -138,7 +142,7 @@ mod tests {
         let mut state = 1_u64;
         let mut draw = || {
             state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
-            // Coarse values, to get equal distances and equal rows.
+            // The coordinates have few different values, so that some distances and some rows are equal.
             f64::from((state >> 40) as u32 % 25)
         };
         let inputs: Vec<f64> = (0..3 * 700).map(|_| draw()).collect();

@@ -1,8 +1,8 @@
-//! Covariance functions as text and as a tree: five shapes, and their sums and products.
+//! Covariance functions as text and as a tree. There are five shapes, which can be added and multiplied.
 //!
-//! Input: text. Output: a [`Kernel`], or an error with the column. A kernel can be formatted as text again.
+//! Input: text. Output: a [`Kernel`], or an error with the column in the text. A kernel can be converted to text again.
 //!
-//! With r the distance in units of the length scale(s):
+//! In this table, r is the distance between two rows after each input is divided by its length scale:
 //!
 //! | name | k(r) |
 //! | --- | --- |
@@ -12,8 +12,9 @@
 //! | `squared_exponential` | exp(-r^2 / 2) |
 //! | `rational_quadratic` | (1 + r^2 / (2 alpha))^-alpha |
 //!
-//! Operators have their usual precedence, as in `a + b * (c + d)`. In names, a dash stands for an underscore. Every shape has its own
-//! length scales and, where it can be identified, its own standard deviation (in a product, only the first factor has one).
+//! Operators have their usual precedence, as in `a + b * (c + d)`. A name may contain dashes instead of underscores.
+//! Every shape has its own length scales. It also has its own standard deviation, except that in a product only the
+//! first factor has one, because several could not be distinguished.
 
 use std::fmt;
 use std::str::FromStr;
@@ -22,23 +23,23 @@ use serde::{Deserialize, Serialize};
 
 use super::error::RegressionError;
 
-/// Deepest nesting of brackets; the parser is recursive.
+/// Maximum nesting depth of brackets. The limit is necessary because the parser is recursive.
 const MAX_DEPTH: usize = 16;
-/// Most shapes in one kernel; each has its own parameters.
+/// Maximum number of shapes in one kernel. Each shape has its own parameters.
 const MAX_SHAPES: usize = 16;
 
-/// One covariance function of the distance.
+/// One covariance function that depends on the distance only.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Shape {
-    /// Rough: an Ornstein-Uhlenbeck process.
+    /// Functions that are rough: an Ornstein-Uhlenbeck process.
     Exponential,
-    /// Once differentiable.
+    /// Functions that are once differentiable.
     Matern32,
-    /// Twice differentiable.
+    /// Functions that are twice differentiable.
     Matern52,
-    /// Infinitely smooth.
+    /// Functions that are infinitely often differentiable.
     SquaredExponential,
-    /// A mixture of squared exponentials of many length scales.
+    /// A mixture of squared exponentials with different length scales.
     RationalQuadratic,
 }
 
@@ -47,7 +48,7 @@ impl Shape {
     pub const ALL: [Self; 5] =
         [Self::Exponential, Self::SquaredExponential, Self::Matern32, Self::Matern52, Self::RationalQuadratic];
 
-    /// Name in text.
+    /// Name of the shape in the text of a kernel.
     pub fn name(self) -> &'static str {
         match self {
             Self::Exponential => "exponential",
@@ -59,7 +60,8 @@ impl Shape {
     }
 }
 
-/// A covariance function: shapes, sums and products. Parse it with `parse`, format it with `to_string`.
+/// A covariance function: a tree of shapes, sums and products. `parse` creates it from text; `to_string` converts it to
+/// text.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct Kernel {
@@ -166,7 +168,7 @@ impl KernelParser<'_> {
         }
         let start = self.rest.trim_start();
         let word = start.split(|c: char| !c.is_ascii_alphanumeric() && c != '_' && c != '-').next().unwrap_or("");
-        // Kernels have no minus sign, so a dash can join words.
+        // Kernels have no minus sign, so a dash in a name is not ambiguous.
         let name = word.replace('-', "_");
         let Some(shape) = Shape::ALL.into_iter().find(|shape| shape.name() == name) else {
             let names: Vec<&str> = Shape::ALL.iter().map(|shape| shape.name()).collect();
@@ -193,7 +195,8 @@ impl KernelParser<'_> {
     }
 }
 
-/// Flattens sums in a sum, and products in a product.
+/// Replaces each sum that is a term of a sum by its terms, and each product that is a factor of a product by its
+/// factors.
 fn flat(nodes: Vec<Node>, is_sum: bool) -> Vec<Node> {
     let mut all = Vec::new();
     for node in nodes {

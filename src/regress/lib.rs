@@ -1,28 +1,39 @@
-//! Gaussian process regression on plain numbers, independent of batteries.
+//! Gaussian process regression on numbers. This crate is independent of batteries.
 //!
-//! Models a target y at inputs x as `h(x)' beta + f(x) + noise`: a basis `h` (none, a constant, a plane) with generalised least-squares
-//! coefficients, a Gaussian process `f` with a covariance function ([`Kernel`]), and white noise. Hyperparameters maximise the marginal
-//! likelihood with its exact gradient. (Rasmussen and Williams, *Gaussian Processes for Machine Learning*, 2006, chapters 2, 5 and 8.)
+//! The model of a target y at the inputs x is `y = h(x)' beta + f(x) + noise`. It has three parts: a mean function
+//! `h(x)' beta` (zero, a constant or a plane) with generalised least-squares coefficients beta, a Gaussian process `f`
+//! with a covariance function ([`Kernel`]), and white noise. The hyperparameters maximise the marginal likelihood; the
+//! search uses its exact gradient. Source: Rasmussen and Williams, *Gaussian Processes for Machine Learning*, 2006,
+//! chapters 2, 5 and 8.
 //!
-//! Data flow: [`TrainingRows`] are checked and standardised ([`scale`]) -> one of two forms computes the likelihood, its gradient, the
-//! coefficients and predictions ([`exact`]: all pairs of rows; [`nearest`]: each row with its nearest rows) -> [`search`] maximises the
-//! likelihood -> [`Model`] predicts, is saved and loaded. [`folds`] cross-validates. Bad rows, settings and saved models are a
-//! [`RegressionError`].
+//! Data flow:
+//!
+//! 1. [`scale`] checks the [`TrainingRows`] and standardises them.
+//! 2. One of two forms computes the likelihood, its gradient, the coefficients and the predictions. [`exact`] uses all
+//!    pairs of rows; [`nearest`] uses each row with its nearest rows.
+//! 3. [`search`] maximises the likelihood.
+//! 4. [`Model`] predicts. It can be saved and loaded.
+//!
+//! [`folds`] cross-validates. Invalid rows, settings and saved models give a [`RegressionError`].
+//!
+//! In this table, n is the number of rows and m is the number of neighbours of a row:
 //!
 //! | form | memory | time of one likelihood | suitable for |
 //! | --- | --- | --- | --- |
 //! | [`Form::Exact`] | n^2 | n^3 | up to a few thousand rows |
 //! | [`Form::Nearest`] | n m | n m^3 | any number of rows, few inputs |
 //!
-//! Deviation 1: the paper used a fully independent conditional (inducing points) for its 30,723 rows. Here [`Form::Nearest`] is the
-//! default for that many rows, because a few hundred points cannot represent a rough function over months.
-//! Deviation 2: the variance of a prediction includes the uncertainty of the basis' coefficients.
+//! Deviations from the paper:
 //!
-//! Deviation 3: the 95 % interval is not 1.96 standard deviations. Its width is calibrated row by row with leave-one-out predictions of
-//! training rows ([`GprSettings::calibrate`]).
+//! 1. The paper used a fully independent conditional (inducing points) for its 30,723 rows. Here, [`Form::Nearest`] is
+//!    the default for that many rows, because a few hundred inducing points cannot represent a rough function over
+//!    months.
+//! 2. The variance of a prediction includes the uncertainty of the mean function's coefficients.
+//! 3. The half width of the 95 % interval is not fixed at 1.96 standard deviations. It is calibrated for each predicted
+//!    row with leave-one-out predictions of training rows ([`GprSettings::calibrate`]).
 //!
-//! The same rows, settings and seed give the same results on one machine. Between machines and numbers of threads, linear algebra may
-//! differ in the last bits.
+//! The same rows, settings and seed give the same results if they are computed on the same machine with the same number
+//! of threads. Otherwise, results of the linear algebra may differ in the last bits.
 
 mod basis;
 mod calibration;

@@ -1,13 +1,13 @@
-//! Dense linear algebra on column-major slices, with the threads of the current pool.
+//! Dense linear algebra on column-major slices. It uses the threads of the thread pool in which it is called.
 //!
-//! Input and output: plain numbers. [`cholesky`] reports a matrix that is not positive definite; NaN stays NaN.
+//! [`cholesky`] reports a matrix that is not positive definite. If an input is NaN, the result is NaN.
 
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::llt;
 use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
 use faer::{MatMut, MatRef, Par};
 
-/// Parallelism of the current thread pool, for faer.
+/// The number of threads of the present thread pool, as faer needs it.
 pub(super) fn parallelism() -> Par {
     match rayon::current_num_threads() {
         0 | 1 => Par::Seq,
@@ -15,7 +15,8 @@ pub(super) fn parallelism() -> Par {
     }
 }
 
-/// Factorises in place; returns `false` if the matrix is not positive definite.
+/// Replaces the lower triangle of a matrix by its Cholesky factor. Returns `false` if the matrix is not positive
+/// definite.
 pub(super) fn cholesky(matrix: &mut [f64], n: usize) -> bool {
     let par = parallelism();
     let mut memory = MemBuffer::new(llt::factor::cholesky_in_place_scratch::<f64>(n, par, Default::default()));
@@ -25,31 +26,31 @@ pub(super) fn cholesky(matrix: &mut [f64], n: usize) -> bool {
     done.is_ok()
 }
 
-/// Solves `L X = right` in place, with the lower factor `l` of size `n`.
+/// Solves `L X = right` in place. `l` is a lower Cholesky factor of size `n`.
 pub(super) fn solve_lower(l: &[f64], n: usize, right: &mut [f64]) {
     let columns = right.len() / n;
     let right = MatMut::from_column_major_slice_mut(right, n, columns);
     solve_lower_triangular_in_place(MatRef::from_column_major_slice(l, n, n), right, parallelism());
 }
 
-/// Solves `L' X = right` in place, with the lower factor `l` of size `n`.
+/// Solves `L' X = right` in place. `l` is a lower Cholesky factor of size `n`.
 pub(super) fn solve_upper(l: &[f64], n: usize, right: &mut [f64]) {
     let columns = right.len() / n;
     let right = MatMut::from_column_major_slice_mut(right, n, columns);
     solve_upper_triangular_in_place(MatRef::from_column_major_slice(l, n, n).transpose(), right, parallelism());
 }
 
-/// Scalar product.
+/// Scalar product of two vectors.
 pub(super) fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(x, y)| x * y).sum()
 }
 
-/// Adds a vector to another.
+/// Adds the vector `part` to `total`.
 pub(super) fn add(total: &mut [f64], part: &[f64]) {
     total.iter_mut().zip(part).for_each(|(total, part)| *total += part);
 }
 
-/// Logarithm of the determinant of the matrix with this factor.
+/// Logarithm of the determinant of the matrix `L L'`, where `L` is the lower factor `l`.
 pub(super) fn log_determinant(l: &[f64], n: usize) -> f64 {
     (0..n).map(|k| l[k * n + k].ln()).sum::<f64>() * 2.0
 }

@@ -1,9 +1,10 @@
-//! Quasi-Newton minimisation (BFGS) of a smooth function of a few variables within bounds.
+//! Minimises a smooth function of a few variables within bounds, by a quasi-Newton method (BFGS).
 //!
-//! Input: a start, bounds, a function with its gradient. Output: the lowest point found.
+//! Input: a start, bounds, and a function that returns its value and gradient. Output: the lowest point found.
 //!
-//! A variable at a bound whose gradient points outward stays fixed for the step. The step is shortened until the function decreases
-//! enough (Armijo), and is projected onto the bounds. A point without a value counts as infinite.
+//! A variable that is at a bound stays fixed during a step if the descent would move it beyond the bound. Each step is
+//! projected onto the bounds and shortened until the function decreases enough (Armijo condition). A point at which the
+//! function has no value counts as infinitely high.
 
 /// Value and gradient of the objective; `None` = no value at this point.
 pub(super) type Evaluation = Option<(f64, Vec<f64>)>;
@@ -23,11 +24,12 @@ pub(super) struct SearchLimits<'a> {
     pub low: &'a [f64],
     pub high: &'a [f64],
     pub max_iterations: usize,
-    /// Stop after two successive steps that lower the value by less than this.
+    /// The search ends after two successive steps that each lower the value by less than this.
     pub tolerance: f64,
 }
 
-/// Minimises from `start`. Errors of the objective end the search. `Ok(None)` = no value at the start.
+/// Minimises from `start`. An error of the objective ends the search and is returned. `Ok(None)` = the objective has no
+/// value at the start.
 pub(super) fn minimise<E>(
     start: &[f64],
     limits: &SearchLimits,
@@ -75,20 +77,21 @@ fn line_search<E>(
     if longest == 0.0 {
         return Ok(None);
     }
-    // Limits of the first step and of any step in one variable. Variables are logarithms, so 2 is a factor of 7.
+    // A step changes no variable by more than 2. Variables are logarithms, so this is a factor of about 7.
     let mut step = (2.0 / longest).min(1.0);
-    // At most 12 reductions of a step.
+    // A step is shortened at most 12 times.
     for _ in 0..12 {
         let x: Vec<f64> =
             (0..at.x.len()).map(|k| (at.x[k] + step * direction[k]).clamp(limits.low[k], limits.high[k])).collect();
         let slope: f64 = (0..x.len()).map(|k| at.gradient[k] * (x[k] - at.x[k])).sum();
         let found = objective(&x)?;
         if let Some((value, gradient)) = found.filter(is_finite) {
-            // Smallest decrease of a step, as a fraction of its linear prediction.
+            // A step is accepted if the value decreases by at least this fraction of the decrease that the gradient
+            // predicts.
             if slope < 0.0 && value <= at.value + 1e-4 * slope {
                 return Ok(Some(Minimum { x, value, gradient, iterations: at.iterations + 1 }));
             }
-            // Minimum of the parabola through both points, within limits.
+            // The next step leads to the minimum of the parabola through both points, within limits.
             let bend = 2.0 * (value - at.value - slope);
             step *= if bend > 0.0 { (-slope / bend).clamp(0.1, 0.5) } else { 0.5 };
         } else {

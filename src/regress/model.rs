@@ -1,6 +1,7 @@
-//! A fitted process: fit, predictions, hyperparameters.
+//! A fitted process, with its fit, its predictions and its hyperparameters.
 //!
-//! Input: checked rows and settings. Output: a [`Model`] that predicts in units of the target. Rows and settings out of range are errors.
+//! Input: rows and settings. Output: a [`Model`] that predicts in units of the target. Invalid rows, and settings out
+//! of range, give an error.
 
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
@@ -22,35 +23,36 @@ use super::search::{SearchMonitor, descend, first_start, log_bounds, random_star
 use super::settings::{FitProgress, Form, GprSettings, ProgressCallback, TrainingRows};
 use super::{exact, nearest};
 
-/// Rows over which the search of [`Form::Nearest`] sums. Using more does not change predictions noticeably.
+/// Maximum number of rows that the search of [`Form::Nearest`] uses. More rows do not change predictions noticeably.
 const SEARCH_ROWS: usize = 6000;
-/// Most threads.
+/// Maximum number of threads.
 const MAX_THREADS: usize = 1024;
-/// Most additional searches.
+/// Maximum number of additional searches.
 const MAX_RESTARTS: usize = 1000;
 
-/// One hyperparameter. Length scales are in (standardised) inputs, standard deviations in units of the target.
+/// One hyperparameter. Length scales have the unit of the inputs, or no unit if the inputs are standardised. Standard
+/// deviations have the unit of the target.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Hyperparameter {
-    /// Name, for example `matern32_1.length_scale_2`: first shape of the kernel, second input.
+    /// Name, for example `matern32_1.length_scale_2` for the first shape of the kernel and the second input.
     pub name: String,
-    /// Its value.
+    /// Value of the hyperparameter.
     pub value: f64,
 }
 
 /// Prediction at one row.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Prediction {
-    /// Mean of the function and of a measurement.
+    /// Mean of the function. It is also the mean of a measurement, because noise has mean zero.
     pub mean: f64,
-    /// Variance of the function's value; more rows reduce it.
+    /// Variance of the function's value. More training rows reduce it.
     pub function_variance: f64,
-    /// Variance of a new measurement: function plus noise.
+    /// Variance of a new measurement: the variance of the function plus the variance of the noise.
     pub measurement_variance: f64,
-    /// Lower end of the interval for 95 % of new measurements, see [`Model::interval_factor`]. It differs from 1.96 standard deviations if
-    /// residuals are not Gaussian or their width varies.
+    /// Lower end of the interval that contains 95 % of new measurements (see [`Model::interval_factor`]). Its half
+    /// width is not 1.96 standard deviations if residuals are not Gaussian or if their width varies.
     pub low_95: f64,
-    /// Its upper end.
+    /// Upper end of the interval that contains 95 % of new measurements.
     pub high_95: f64,
 }
 
@@ -60,7 +62,7 @@ pub struct Model {
     /// Structure of the model.
     pub spec: ModelSpec,
     pub(super) scale: Scale,
-    /// Logarithms of the hyperparameters, in standardised units.
+    /// Natural logarithms of the hyperparameters, in standardised units.
     pub(super) theta: Vec<f64>,
     pub(super) posterior: Posterior,
     /// Result of the fit.
@@ -69,7 +71,7 @@ pub struct Model {
     pub(super) pool: ThreadPool,
 }
 
-/// Structure of a model without its numbers.
+/// The structure of a model, without fitted values.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelSpec {
@@ -89,11 +91,11 @@ pub struct ModelSpec {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FitOutcome {
-    /// Log likelihood of the standardised targets.
+    /// Log marginal likelihood of the standardised targets.
     pub log_likelihood: f64,
-    /// Jitter on diagonals.
+    /// Jitter that the final model needed.
     pub jitter: Jitter,
-    /// Steps of the best search, over all its neighbour selections.
+    /// Number of steps of the best search, summed over all its selections of neighbours.
     pub iterations: usize,
 }
 
@@ -118,7 +120,7 @@ impl Posterior {
         }
     }
 
-    /// Leave-one-out residual and measurement variance of some rows.
+    /// Returns the residual and the measurement variance of each given row when this row is left out.
     fn left_out(&self, rows: &[u32], noise_variance: f64) -> Result<Vec<(f64, f64)>, RegressionError> {
         match self {
             Self::Exact(posterior) => Ok(posterior.left_out(rows)),
@@ -133,7 +135,7 @@ impl Posterior {
     }
 }
 
-/// Fits a process to rows. Calls `watcher` after every step; `watcher` can cancel the fit.
+/// Fits a process to rows. Calls `watcher` after every step of a search. `watcher` can cancel the fit.
 pub fn fit(
     rows: &TrainingRows,
     settings: &GprSettings,
@@ -152,7 +154,7 @@ struct FitJob<'a> {
     data: StandardisedRows,
     plan: Plan,
     pool: ThreadPool,
-    /// Typical standard deviation of an input; 1 if standardised.
+    /// Geometric mean of the inputs' standard deviations; 1 if the inputs are standardised.
     spread: f64,
 }
 
@@ -195,7 +197,7 @@ impl<'a> FitJob<'a> {
         Ok(given.iter().zip(&self.plan.parameters).map(|(value, p)| (value / p.role.unit(&self.scale)).ln()).collect())
     }
 
-    /// Returns the result of the best search, and its steps.
+    /// Runs all searches. Returns the hyperparameters that the best search found, and its number of steps.
     fn search(&self, watcher: &mut ProgressCallback) -> Result<(Vec<f64>, usize), RegressionError> {
         let searches = self.settings.restarts + 1;
         let mut best: Option<Minimum> = None;
@@ -225,11 +227,12 @@ impl<'a> FitJob<'a> {
         best.map(|best| (best.x, best.iterations)).ok_or(RegressionError::NotPositiveDefinite { jitter: jitter::LAST })
     }
 
-    /// Runs one search; selects neighbours again until the metric is stable.
+    /// Runs one search. For [`Form::Nearest`], the search is repeated with newly selected neighbours until the length
+    /// scales no longer change the order of distances.
     fn one_search(&self, mut start: Vec<f64>, monitor: &mut SearchMonitor) -> Result<Option<Minimum>, RegressionError> {
         let (low, high) = log_bounds(&self.plan, self.spread);
         let mut found: Option<Minimum> = None;
-        // At most 4 neighbour selections while the length scales change.
+        // Neighbours are selected at most 4 times.
         for _ in 0..4 {
             let metric = self.metric(&start);
             let Some(mut minimum) = self.one_round(&start, &metric, (&low, &high), monitor)? else { break };
@@ -311,13 +314,14 @@ impl<'a> FitJob<'a> {
     }
 }
 
-/// Returns at most `most` row numbers, evenly from `0..n` (rows of [`Form::Nearest`] are in random order).
+/// Returns at most `most` row numbers, evenly spaced in `0..n`. This is a random sample for [`Form::Nearest`], whose
+/// rows are in random order.
 fn evenly_spaced(n: usize, most: usize) -> Vec<u32> {
     let count = n.min(most);
     (0..count).map(|k| u32::try_from(k * n / count).unwrap_or(u32::MAX)).collect()
 }
 
-/// Whether two metrics are nearly proportional, so that they rank rows alike.
+/// Whether the weights of two metrics are nearly proportional, so that the metrics order rows in the same way.
 fn is_same_metric(a: &[f64], b: &[f64]) -> bool {
     let ratios = || a.iter().zip(b).map(|(a, b)| (a / b).ln());
     let (low, high) = ratios().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), r| (l.min(r), h.max(r)));
@@ -355,7 +359,7 @@ impl Model {
         let queries = self.scale.inputs(inputs);
         self.pool.install(|| {
             let found = self.posterior.predict(&queries)?;
-            // The square of a very distant input overflows.
+            // The square of a very distant input may overflow.
             if let Some(row) = found.iter().position(|(mean, variance)| !mean.is_finite() || !variance.is_finite()) {
                 let far = format!("{:?}", &inputs[row * d..(row + 1) * d]);
                 return Err(RegressionError::range(
@@ -388,21 +392,23 @@ impl Model {
         }
     }
 
-    /// Fitted hyperparameters; the noise is last. [`GprSettings::start`] uses the same order.
+    /// Fitted hyperparameters. The standard deviation of the noise is last. [`GprSettings::start`] has the same order.
     pub fn hyperparameters(&self) -> Vec<Hyperparameter> {
         let plan = Plan::new(&self.spec.kernel, self.spec.dimensions, self.spec.ard);
         let named = plan.parameters.into_iter().zip(&self.theta);
         named.map(|(p, value)| Hyperparameter { name: p.name, value: value.exp() * p.role.unit(&self.scale) }).collect()
     }
 
-    /// Natural logarithm of the density of the training targets in their units. For [`Form::Nearest`], its approximate density.
+    /// Natural logarithm of the density of the training targets, in their units. For [`Form::Nearest`], this is the
+    /// density of the approximation.
     pub fn log_marginal_likelihood(&self) -> f64 {
         self.outcome.log_likelihood - self.rows() as f64 * self.scale.target_deviation.ln()
     }
 
-    /// Half width of the 95 % interval in standard deviations of a measurement, where residuals have their mean width; 1.96 for Gaussian
-    /// residuals. With [`GprSettings::calibrate`] it comes from leave-one-out predictions of training rows, and nearby rows widen or narrow
-    /// the interval.
+    /// Half width of the 95 % interval in standard deviations of a measurement, at a row where residuals have their
+    /// mean width. It is 1.96 for Gaussian residuals. With [`GprSettings::calibrate`], the factor comes from
+    /// leave-one-out predictions of training rows. The interval of a prediction is wider or narrower than this if the
+    /// residuals of nearby training rows are.
     pub fn interval_factor(&self) -> f64 {
         self.calibration.factor
     }

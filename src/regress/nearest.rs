@@ -1,22 +1,28 @@
-//! Gaussian process with nearest neighbours (Vecchia's approximation; Vecchia 1988, Datta et al. 2016).
+//! Gaussian process with nearest neighbours: Vecchia's approximation (Vecchia 1988, Datta et al. 2016).
 //!
-//! In a seeded random order, the density of all rows is the product of the densities of each row given its predecessors. The
-//! approximation uses only the nearest `m` predecessors. It is a proper density and exact for `m` = all. Each term needs a Cholesky
-//! factor of size `m`, regardless of the number of rows. Terms condition on measurements, including their noise.
+//! The rows are put in a seeded random order. The density of all rows is then a product with one term per row: the
+//! density of the row given all its predecessors. The approximation uses only the `m` nearest predecessors. It is a
+//! proper density, and exact if `m` includes all predecessors. Each term needs a Cholesky factor of a matrix with about
+//! `m` rows, regardless of the number of training rows. The predecessors are given as measurements, which include
+//! noise.
 //!
-//! For one term, with K the covariance of the neighbours and the row (last), `q = K^-1 e_last`, `A = K^-1 [y H]` and
-//! `a = A (1, -beta)'`: the conditional variance is `1/q_n`, the residual `a_n/q_n`, so
+//! For one term, let K be the covariance matrix of the neighbours and the row, with the row last. Let `q = K^-1
+//! e_last`, `A = K^-1 [y H]` and `a = A (1, -beta)'`. The conditional variance of the row is then `1/q_n`, and its
+//! residual is `a_n/q_n`. Therefore:
 //!
 //! `-log p = -1/2 ln q_n + 1/2 a_n^2 / q_n + 1/2 ln 2 pi`,
-//! `-d log p = c q' dK q - (a_n/q_n) q' dK a`, with `c = 1/2 (1 + a_n^2/q_n) / q_n`;
 //!
-//! beta are the generalised least-squares coefficients, where the derivative by them is 0.
+//! `-d log p = c q' dK q - (a_n/q_n) q' dK a`, with `c = 1/2 (1 + a_n^2/q_n) / q_n`.
 //!
-//! The search for hyperparameters may use a seeded subset of the terms (each with neighbours among all rows), which gives an unbiased
-//! estimate of the sum. It selects neighbours again when the length scales have changed.
+//! The coefficients beta are generalised least-squares coefficients. The derivative with respect to beta is therefore
+//! 0.
 //!
-//! Input: standardised rows and hyperparameters. Output: likelihood, gradient, predictions. A matrix that is not positive definite even
-//! with the largest jitter is an error.
+//! The search for hyperparameters may use a seeded subset of the terms. The neighbours of these terms are selected
+//! among all rows, so the sum over the subset gives an unbiased estimate of the sum over all terms. When the length
+//! scales have changed, neighbours are selected again.
+//!
+//! Input: standardised rows and hyperparameters. Output: likelihood, gradient and predictions. If a covariance matrix
+//! is not positive definite even with the largest jitter, the result is an error.
 
 use std::f64::consts::TAU;
 
@@ -30,10 +36,10 @@ use super::linear_algebra::add;
 use super::plan::{Covariance, Plan, Work};
 use super::scale::StandardisedRows;
 
-/// Rows per task; fixed, so that sums do not depend on the number of threads.
+/// Number of rows per task. It is fixed, so that the rounding of sums does not depend on the number of threads.
 const CHUNK: usize = 64;
 
-/// The terms: rows and their neighbours.
+/// The rows of the terms, and the neighbours of each row.
 #[derive(Debug, Clone)]
 pub(super) struct ConditionalFactors {
     pub rows: Vec<u32>,
@@ -42,30 +48,31 @@ pub(super) struct ConditionalFactors {
 
 /// Sums over the terms.
 pub(super) struct LikelihoodSums {
-    /// Negative log density.
+    /// Negative log density of the rows.
     pub value: f64,
     pub gradient: Vec<f64>,
     pub coefficients: Coefficients,
     pub jitter: Jitter,
 }
 
-/// A batch of terms with their contribution to `[y H]' K^-1 [y H]` and to the logarithms of the variances.
+/// A batch of terms, the sum of their contributions to `[y H]' K^-1 [y H]`, and the sum of the logarithms of their
+/// variances.
 struct FactorBatch {
     factors: Vec<ConditionalFactor>,
     g: Vec<f64>,
     log: f64,
 }
 
-/// Result of the first pass, used by the second.
+/// What the first pass computes for one term. The second pass, which computes the gradient, uses it.
 struct ConditionalFactor {
     q: Vec<f64>,
-    /// `K^-1` applied to targets and basis, column-major.
+    /// `K^-1 [y H]`, column-major.
     a: Vec<f64>,
     jitter: f64,
 }
 
 impl ConditionalFactors {
-    /// Finds the neighbours of the given rows among the rows before each.
+    /// Finds the neighbours of each given row among its predecessors.
     pub(super) fn new(data: &StandardisedRows, rows: Vec<u32>, metric: &[f64], neighbours: usize) -> Self {
         let tree = KdTree::new(&data.inputs, metric);
         let of = |row: &u32| tree.nearest(data.row(*row as usize), neighbours, *row as usize, None);
@@ -73,7 +80,7 @@ impl ConditionalFactors {
         Self { rows, neighbours }
     }
 
-    /// Returns the negative log density of the rows given their neighbours, its gradient (if requested) and the coefficients.
+    /// Returns the sums over all terms. The gradient is computed only if it is requested.
     pub(super) fn sums(
         &self,
         data: &StandardisedRows,
@@ -136,7 +143,7 @@ impl ConditionalFactors {
 struct Scratch<'a> {
     data: &'a StandardisedRows,
     covariance: &'a Covariance,
-    /// Squared differences of all pairs (lower triangle, column-major), and one pair of equal rows at the end.
+    /// Squared differences of all pairs (lower triangle, column-major). The last pair consists of two equal rows.
     squares: Vec<f64>,
     matrix: Vec<f64>,
     weights: Vec<f64>,
@@ -224,8 +231,9 @@ impl<'a> Scratch<'a> {
     }
 }
 
-/// Factorises the kernel's lower triangle with prior and noise on the diagonal (lower Cholesky factor, column-major). Returns the
-/// jitter as a fraction of the prior variance.
+/// Replaces `matrix` by the lower Cholesky factor (column-major) of the covariance matrix. The matrix consists of the
+/// kernel's lower triangle, with the prior variance and the noise on the diagonal. Returns the jitter, as a fraction of
+/// the prior variance.
 fn factorise(matrix: &mut Vec<f64>, kernel: &[f64], n: usize, covariance: &Covariance) -> Result<f64, RegressionError> {
     matrix.resize(n * n, 0.0);
     until_positive(|jitter| {
@@ -239,13 +247,14 @@ fn factorise(matrix: &mut Vec<f64>, kernel: &[f64], n: usize, covariance: &Covar
     })
 }
 
-/// Factorises in place, lower, column-major; returns `false` if not positive definite.
+/// Replaces a lower triangle (column-major) by its Cholesky factor. Returns `false` if the matrix is not positive
+/// definite.
 #[inline(always)]
 fn cholesky(matrix: &mut [f64], n: usize) -> bool {
     for j in 0..n {
         let (before, rest) = matrix.split_at_mut(j * n);
         let column = &mut rest[j..n];
-        // Four columns at a time, because loads and stores of this column dominate the cost.
+        // Four columns are processed at a time, because loading and storing this column dominates the cost.
         let mut k = 0;
         while k + 4 <= j {
             let c = |i: usize| &before[(k + i) * n + j..(k + i + 1) * n];
@@ -272,7 +281,7 @@ fn cholesky(matrix: &mut [f64], n: usize) -> bool {
     true
 }
 
-/// Solves `L x = b` in place.
+/// Solves `L x = b` in place, with the lower factor in `matrix`.
 fn forward(matrix: &[f64], b: &mut [f64]) {
     let n = b.len();
     for j in 0..n {
@@ -283,7 +292,7 @@ fn forward(matrix: &[f64], b: &mut [f64]) {
     }
 }
 
-/// Solves `L' x = b` in place.
+/// Solves `L' x = b` in place, with the lower factor in `matrix`.
 fn backward(matrix: &[f64], b: &mut [f64]) {
     let n = b.len();
     for j in (0..n).rev() {
@@ -316,7 +325,8 @@ impl Posterior {
         Self { data, covariance, coefficients, neighbours, tree }
     }
 
-    /// Mean and variance of the function at standardised rows; query `k` leaves out row `excluded[k]`.
+    /// Returns mean and variance of the function at standardised rows. If `excluded` is given, the prediction of row
+    /// `k` does not use the training row `excluded[k]`.
     pub(super) fn predict(
         &self,
         queries: &[f64],

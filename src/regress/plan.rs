@@ -1,9 +1,10 @@
-//! A kernel prepared for evaluation: its parameters in one vector, its values over a block of row pairs, and the exact derivatives of
-//! any weighted sum of the values by every parameter (reverse mode).
+//! A kernel prepared for evaluation. All parameters are in one vector. The plan computes the kernel's values over a
+//! block of row pairs. It also computes the exact derivatives of a weighted sum of these values with respect to every
+//! parameter (reverse-mode differentiation).
 //!
-//! A block of pairs is given as *squares*: for every input a stripe of `count` squared differences. Parameters are natural logarithms of
-//! length scales, of `alpha`, and of standard deviations (signal, then the noise, which is always last). Inputs are not checked: NaN stays
-//! NaN.
+//! A block of `count` pairs is given as *squares*: for each input in turn, `count` squared differences. The parameters
+//! are natural logarithms of length scales, of `alpha`, and of standard deviations. The standard deviation of the noise
+//! is always the last parameter. Inputs are not checked; NaN gives NaN.
 
 use faer::traits::pulp::Arch;
 
@@ -21,13 +22,13 @@ pub(super) enum ParameterRole {
 }
 
 impl ParameterRole {
-    /// Unit in standardised targets.
+    /// The value in standardised units is multiplied by this number to get the value in the caller's units.
     pub(super) fn unit(self, scale: &Scale) -> f64 {
         if matches!(self, Self::Signal | Self::Noise) { scale.target_deviation } else { 1.0 }
     }
 }
 
-/// One parameter: kind and reported name.
+/// The kind of a parameter, and its name in reports.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Parameter {
     pub role: ParameterRole,
@@ -37,7 +38,7 @@ pub(super) struct Parameter {
 #[derive(Debug, Clone)]
 struct Leaf {
     shape: Shape,
-    /// Index of the first length scale; one for all inputs, or one per input.
+    /// Index of the first length scale. There is either one length scale for all inputs, or one per input.
     lengths: usize,
     alpha: Option<usize>,
     signal: Option<usize>,
@@ -64,7 +65,7 @@ pub(super) struct Plan {
 #[derive(Debug, Clone)]
 pub(super) struct Covariance {
     pub plan: Plan,
-    /// Parameters of the leaves in the form used by the loops.
+    /// The parameters of each shape, converted to the form that the loops use.
     leaves: Vec<LeafValues>,
     /// Variance of the function at a point.
     pub prior_variance: f64,
@@ -85,7 +86,7 @@ struct LeafValues {
 pub(super) struct Work {
     values: Vec<Vec<f64>>,
     adjoints: Vec<Vec<f64>>,
-    /// For each leaf: derivatives of the value by the squared distance and by ln alpha.
+    /// For each shape: derivatives of the value with respect to the squared distance and, in `alphas`, to ln alpha.
     slopes: Vec<Vec<f64>>,
     alphas: Vec<Vec<f64>>,
 }
@@ -98,7 +99,8 @@ impl Plan {
         plan
     }
 
-    /// Adds a node after its children; `scaled` = it has its own standard deviation.
+    /// Adds the node's children and then the node. `scaled` states whether the node has its own standard deviation.
+    /// Returns the index of the node.
     fn add(&mut self, node: &Node, scaled: bool) -> usize {
         let step = match node {
             Node::Leaf(shape) => PlanStep::Leaf(self.add_leaf(*shape, scaled)),
@@ -154,7 +156,8 @@ impl Covariance {
         covariance
     }
 
-    /// Weights of the inputs in the distance between rows, from the shortest length scale of each.
+    /// Weights of the inputs for the distance between rows. The weight of an input follows from its shortest length
+    /// scale.
     pub(super) fn metric(&self) -> Vec<f64> {
         let of = |d: usize| self.leaves.iter().map(|leaf| leaf.inverse_squares[d].sqrt()).fold(0.0, f64::max);
         (0..self.plan.dimensions).map(of).collect()
@@ -166,7 +169,8 @@ impl Covariance {
         &work.values[self.plan.steps.len() - 1][..count]
     }
 
-    /// Adds the derivatives of `sum of weight * kernel` over a block of pairs to `gradient`, by every parameter except the noise.
+    /// Adds derivatives to `gradient`: those of `sum of weight * kernel` over a block of pairs, with respect to every
+    /// parameter except the noise.
     pub(super) fn add_gradient(&self, squares: &[f64], weights: &[f64], work: &mut Work, gradient: &mut [f64]) {
         let count = weights.len();
         self.forward(squares, count, work, true);
@@ -231,7 +235,7 @@ impl Covariance {
 
 #[inline(always)]
 fn dot_product(a: &[f64], b: &[f64]) -> f64 {
-    // Eight partial sums, so that the compiler can vectorise them.
+    // Eight partial sums let the compiler vectorise the loop.
     let mut sums = [0.0; 8];
     let (a_chunks, b_chunks) = (a.chunks_exact(8), b.chunks_exact(8));
     let rest: f64 = a_chunks.remainder().iter().zip(b_chunks.remainder()).map(|(x, y)| x * y).sum();
@@ -252,7 +256,7 @@ fn combine(below: &[Vec<f64>], children: &[usize], out: &mut [f64], join: impl F
     }
 }
 
-/// Adjoint of a factor: the product's adjoint times all other factors.
+/// Sets the adjoint of each factor to the adjoint of the product times the values of all other factors.
 fn product_adjoints(at: usize, children: &[usize], work: &mut Work) {
     let (below, here) = work.adjoints.split_at_mut(at);
     for child in children {
@@ -265,7 +269,7 @@ fn product_adjoints(at: usize, children: &[usize], work: &mut Work) {
     }
 }
 
-/// Squared distances in units of the length scales.
+/// Computes squared distances, after each difference is divided by the length scale of its input.
 fn distances(inverse_squares: &[f64], squares: &[f64], out: &mut [f64]) {
     let count = out.len();
     out.fill(0.0);
@@ -279,9 +283,9 @@ fn distances(inverse_squares: &[f64], squares: &[f64], out: &mut [f64]) {
     });
 }
 
-/// Replaces squared distances by kernel values; fills slopes and alphas unless empty.
+/// Replaces squared distances by kernel values. Fills `slopes` and `alphas`, unless they are empty.
 fn shape_values(shape: Shape, values: &LeafValues, out: &mut [f64], slopes: &mut [f64], alphas: &mut [f64]) {
-    /// Keeps the division by a distance finite; the slope is multiplied by zero squares afterwards.
+    /// Avoids a division by zero at distance 0. The result is later multiplied by squared differences that are also 0.
     const TINY: f64 = 1e-150;
     let (s, a) = (values.variance, values.alpha);
     match shape {

@@ -1,8 +1,9 @@
 //! Saves models as text and loads them.
 //!
-//! The text has two lines of JSON: a header with the version and a checksum of the second line, and the model: its (standardised) rows,
-//! hyperparameters and outcome. Loading recomputes everything else, in n^3 operations for an exact model. A damaged text or another
-//! version is an error.
+//! The text has two lines of JSON. The first line is a header with the version and a checksum of the second line. The
+//! second line is the model: its (standardised) rows, its hyperparameters and the result of its fit. Loading computes
+//! everything else again, which needs time proportional to n^3 for an exact model with n rows. A damaged text and a
+//! text of another version give an error.
 
 use serde::{Deserialize, Serialize};
 
@@ -15,9 +16,9 @@ use super::scale::{Scale, StandardisedRows};
 use super::settings::{Form, MAX_DIMENSIONS};
 use super::{exact, nearest};
 
-/// Format name in the header.
+/// Name of the format in the header.
 const FORMAT: &str = "packwatch gaussian process";
-/// Version of the format; loading rejects others.
+/// Version of the format. A text of any other version is rejected.
 const VERSION: u32 = 1;
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -37,19 +38,19 @@ struct Body {
     outcome: FitOutcome,
     inputs: Vec<f64>,
     targets: Vec<f64>,
-    /// Coefficients and their covariance, if loading does not recompute them.
+    /// Coefficients; empty if loading computes them again. The same holds for their covariance.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     beta: Vec<f64>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     beta_covariance: Vec<f64>,
-    /// Rows left out to calibrate the intervals, and their ratios.
+    /// Numbers of the rows that were left out to calibrate the intervals. `ratios` has a ratio for each of them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     left_out: Vec<u32>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     ratios: Vec<f64>,
 }
 
-/// FNV-1a with 64 bits: detects damage; it is not a signature.
+/// Computes a 64-bit FNV-1a hash. It detects damage, but does not protect against deliberate changes.
 fn checksum(text: &str) -> String {
     let hash = text
         .bytes()
@@ -62,7 +63,7 @@ fn damaged(what: impl std::fmt::Display) -> RegressionError {
 }
 
 impl Model {
-    /// Returns the model as text of two lines.
+    /// Converts the model to a text of two lines.
     pub fn save(&self) -> Result<String, RegressionError> {
         let data = self.posterior.data();
         let mut body = Body {
@@ -87,7 +88,7 @@ impl Model {
         Ok(format!("{}\n{body}\n", serde_json::to_string(&header).map_err(json)?))
     }
 
-    /// Loads a model from its text, with a pool of `thread_count` threads.
+    /// Loads a model from its text. The model uses `thread_count` threads.
     pub fn load(text: &str, thread_count: usize) -> Result<Self, RegressionError> {
         let (header, rest) = text.split_once('\n').ok_or_else(|| damaged("has one line, must have two"))?;
         let header: Header = serde_json::from_str(header).map_err(|e| damaged(format!("line 1: {e}")))?;
@@ -113,7 +114,7 @@ impl Model {
 }
 
 impl Body {
-    /// Checks lengths and finite numbers, so that no index is out of bounds later.
+    /// Checks that all lengths fit together and all numbers are finite, so that later code cannot use an invalid index.
     fn check(&self) -> Result<(), RegressionError> {
         let (d, n) = (self.spec.dimensions, self.targets.len());
         let same = |what: &str, found: usize, expected: usize| {

@@ -1,6 +1,7 @@
 //! Checks rows, and standardises inputs and targets by mean and standard deviation.
 //!
-//! Input: rows. Output: standardised rows. Wrong lengths and bad numbers are errors with the line of the row.
+//! Input: rows. Output: standardised rows. Wrong lengths and numbers that are not finite give an error, which names the
+//! line of the row.
 
 use serde::{Deserialize, Serialize};
 
@@ -8,7 +9,7 @@ use super::basis::Basis;
 use super::error::RegressionError;
 use super::settings::{MAX_DIMENSIONS, TrainingRows};
 
-/// Shift and scale of every input and of the target.
+/// Mean and standard deviation of every input and of the target.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Scale {
@@ -49,10 +50,10 @@ pub(super) fn check(rows: &TrainingRows) -> Result<(), RegressionError> {
     }
 }
 
-/// Mean and standard deviation; the deviation of equal values is 1.
+/// Mean and standard deviation of the values. If all values are equal, the result has a standard deviation of 1.
 fn moments(values: impl Iterator<Item = f64> + Clone) -> (f64, f64) {
     let count = values.clone().count() as f64;
-    // Relative to the first value, because the sum of many equal values would not be exact.
+    // The mean is computed relative to the first value, because the sum of many equal values would be rounded.
     let first = values.clone().next().unwrap_or(0.0);
     let mean = first + values.clone().map(|v| v - first).sum::<f64>() / count;
     let deviation = (values.map(|v| (v - mean) * (v - mean)).sum::<f64>() / count).sqrt();
@@ -60,7 +61,7 @@ fn moments(values: impl Iterator<Item = f64> + Clone) -> (f64, f64) {
     (mean, if flat { 1.0 } else { deviation })
 }
 
-/// Standardised rows in the order of conditioning.
+/// Standardised rows. [`Form::Nearest`](super::Form::Nearest) keeps them in random order.
 #[derive(Debug, Clone)]
 pub(super) struct StandardisedRows {
     pub dimensions: usize,
@@ -80,7 +81,7 @@ impl StandardisedRows {
 }
 
 impl Scale {
-    /// Scale of checked rows. The zero basis does not shift the target.
+    /// Computes the scale of checked rows. With the zero basis, the target is not shifted.
     pub(super) fn of(rows: &TrainingRows, standardise: bool, basis: Basis) -> Self {
         let column = |d: usize| rows.inputs.iter().skip(d).step_by(rows.dimensions).copied();
         let inputs: Vec<(f64, f64)> =
@@ -94,7 +95,7 @@ impl Scale {
         }
     }
 
-    /// First column whose mean or deviation overflows: `input 2` or `target`.
+    /// Returns the first column whose mean or standard deviation overflows, as `input 2` or `target`.
     pub(super) fn too_wide(&self) -> Option<String> {
         let target = (!self.target_deviation.is_finite() || !self.target_mean.is_finite()).then(|| "target".to_owned());
         let is_wide = |(mean, deviation): (&f64, &f64)| !mean.is_finite() || !deviation.is_finite();

@@ -1,7 +1,7 @@
-//! Hyperparameters by maximum marginal likelihood: starts, bounds and the search from each start.
+//! Finds hyperparameters with maximum marginal likelihood: starts, bounds, and the search from each start.
 //!
-//! Input: a plan and an objective over the logarithms of its parameters. Output: the best point, or `None` if the objective has no value at
-//! the start.
+//! Input: a plan and an objective, which is a function of the logarithms of the plan's parameters. Output: the best
+//! point, or `None` if the objective has no value at the start.
 
 use std::ops::ControlFlow;
 
@@ -13,19 +13,22 @@ use super::minimise::{Evaluation, Minimum, SearchLimits, minimise};
 use super::plan::{Parameter, ParameterRole, Plan};
 use super::settings::{FitProgress, ProgressCallback};
 
-/// Bounds of a parameter and range of its random starts, in standardised units, before the logarithm.
+/// Returns the bounds of a parameter and the range of its random starts, in standardised units. These are the values
+/// themselves, not their logarithms.
 fn ranges(role: ParameterRole) -> [(f64, f64); 2] {
     match role {
         ParameterRole::Length => [(1e-4, 1e4), (0.05, 5.0)],
         ParameterRole::Alpha => [(1e-2, 1e3), (0.2, 5.0)],
-        // Larger values act as a mean function, along a ridge that slows the search.
+        // With larger values, the process would act like a mean function. The likelihood would then have a long ridge,
+        // which slows the search.
         ParameterRole::Signal => [(1e-3, 2e1), (0.3, 3.0)],
         // The lower bound keeps the matrix of a smooth kernel positive definite despite rounding.
         ParameterRole::Noise => [(1e-4, 1e1), (0.03, 0.8)],
     }
 }
 
-/// Logarithms of the bounds; `spread` is the standard deviation of the inputs (1 if standardised).
+/// Returns the logarithms of the bounds. `spread` is the typical standard deviation of an input (1 if the inputs are
+/// standardised).
 pub(super) fn log_bounds(plan: &Plan, spread: f64) -> (Vec<f64>, Vec<f64>) {
     let of = |parameter: &Parameter| {
         let [(low, high), _] = ranges(parameter.role);
@@ -35,7 +38,8 @@ pub(super) fn log_bounds(plan: &Plan, spread: f64) -> (Vec<f64>, Vec<f64>) {
     plan.parameters.iter().map(of).unzip()
 }
 
-/// Default start: length scales of one standard deviation, noise 30 % of the targets' deviation.
+/// Returns the default start: length scales of one standard deviation of the inputs, and noise of 30 % of the target's
+/// standard deviation.
 pub(super) fn first_start(plan: &Plan, spread: f64) -> Vec<f64> {
     let signals = plan.parameters.iter().filter(|p| p.role == ParameterRole::Signal).count().max(1);
     let of = |parameter: &Parameter| match parameter.role {
@@ -47,7 +51,7 @@ pub(super) fn first_start(plan: &Plan, spread: f64) -> Vec<f64> {
     plan.parameters.iter().map(of).collect()
 }
 
-/// The `k`-th random start of a seed, k from 1.
+/// Returns the `k`-th random start that belongs to a seed; `k` counts from 1.
 pub(super) fn random_start(plan: &Plan, spread: f64, seed: u64, k: usize) -> Vec<f64> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     random.set_stream(k as u64);
@@ -60,7 +64,7 @@ pub(super) fn random_start(plan: &Plan, spread: f64, seed: u64, k: usize) -> Vec
     plan.parameters.iter().map(&mut of).collect()
 }
 
-/// Progress of one search, reported to the callback.
+/// Reports the progress of one search to the callback.
 pub(super) struct SearchMonitor<'a, 'w> {
     pub watcher: &'a mut ProgressCallback<'w>,
     pub progress: FitProgress,
@@ -78,7 +82,7 @@ impl SearchMonitor<'_, '_> {
     }
 }
 
-/// Searches from one start. A matrix that cannot be factorised counts as a missing value.
+/// Searches from one start. A point at which a matrix cannot be factorised counts as a point without a value.
 pub(super) fn descend(
     start: &[f64],
     (low, high): (&[f64], &[f64]),
@@ -86,10 +90,10 @@ pub(super) fn descend(
     monitor: &mut SearchMonitor,
     mut objective: impl FnMut(&[f64]) -> Result<(f64, Vec<f64>), RegressionError>,
 ) -> Result<Option<Minimum>, RegressionError> {
-    // Work per row, so that the first step has the length of the gradient.
+    // The objective is divided by the number of rows, because the first step is as long as the gradient.
     let rows = monitor.rows as f64;
     let scale = 1.0 / rows;
-    // The search ends after two successive decreases of the negative log likelihood per row below this tolerance.
+    // The search ends after two successive steps that each lower the negative log likelihood per row by less than 5e-6.
     let limits = SearchLimits { low, high, max_iterations, tolerance: 5e-6 * rows * scale };
     let evaluate = |theta: &[f64]| -> Result<Evaluation, RegressionError> {
         match objective(theta) {

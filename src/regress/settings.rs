@@ -1,6 +1,6 @@
 //! Training rows, settings of a fit, its progress, and limits.
 //!
-//! Input: values from the caller. [`fit`](super::fit) checks them all and rejects values out of range.
+//! Input: values from the caller. [`fit`](super::fit) checks all of them and rejects values that are out of range.
 
 use std::ops::ControlFlow;
 
@@ -10,34 +10,35 @@ use super::basis::Basis;
 use super::error::RegressionError;
 use super::kernel::Kernel;
 
-/// Most inputs per row.
+/// Maximum number of inputs per row.
 pub const MAX_DIMENSIONS: usize = 256;
-/// Most rows of an exact fit: the matrix then has 3.2 GB, and a search needs three of them.
+/// Maximum number of rows of an exact fit. With this number a covariance matrix has 3.2 GB, and a search needs three
+/// matrices of this size.
 pub const MAX_EXACT_ROWS: usize = 20_000;
-/// Most neighbours per row.
+/// Maximum number of neighbours per row.
 pub const MAX_NEIGHBOURS: usize = 500;
 
-/// Rows to train on.
+/// The rows that a model is fitted to.
 #[derive(Debug, Clone, Copy)]
 pub struct TrainingRows<'a> {
     /// Inputs, row-major.
     pub inputs: &'a [f64],
     /// Number of inputs per row.
     pub dimensions: usize,
-    /// Value to predict, one per row.
+    /// The values that the model predicts, one per row.
     pub targets: &'a [f64],
-    /// Line of each row in its file, for errors; empty = rows count from 1.
+    /// Line of each row in its file, for error messages. If it is empty, error messages count the rows from 1.
     pub lines: &'a [u64],
 }
 
-/// Approximation of the covariance of many rows.
+/// How the covariance of the rows is computed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Form {
-    /// No approximation.
+    /// Uses the covariance of all pairs of rows, without approximation.
     Exact,
-    /// Each row is conditioned on its nearest rows among those before it in a seeded order (Vecchia's approximation); a prediction is
-    /// conditioned on the nearest of all rows.
+    /// Vecchia's approximation. The rows are put in a seeded order, and the density of each row depends only on the
+    /// nearest of the rows before it. A prediction depends only on the nearest of all rows.
     Nearest {
         /// Number of neighbours, 1 to 500.
         neighbours: usize,
@@ -45,7 +46,7 @@ pub enum Form {
 }
 
 impl Form {
-    /// Checks its numbers and the number of rows against the limits.
+    /// Checks the number of neighbours and the number of rows against the limits.
     pub(super) fn check(self, rows: usize) -> Result<(), RegressionError> {
         let (what, found, most, advice) = match self {
             Self::Exact => ("rows of an exact fit", rows, MAX_EXACT_ROWS, "; use the form nearest"),
@@ -67,26 +68,30 @@ pub struct GprSettings {
     pub basis: Basis,
     /// Whether every input has its own length scale.
     pub ard: bool,
-    /// Whether inputs are standardised to mean 0 and standard deviation 1; length scales are then in standard deviations.
+    /// Whether inputs are standardised to mean 0 and standard deviation 1. If so, length scales are multiples of the
+    /// inputs' standard deviations.
     pub standardise: bool,
     /// Exact, or by nearest neighbours.
     pub form: Form,
-    /// Additional searches from seeded random starts.
+    /// Number of additional searches, each from a seeded random start.
     pub restarts: usize,
-    /// Seed of starts, order and folds.
+    /// Seed of the random starts, of the order of the rows, and of the folds.
     pub seed: u64,
-    /// Most steps of one search; 0 = keep the start.
+    /// Maximum number of steps of one search; 0 = the start is not changed.
     pub max_iterations: usize,
-    /// Initial hyperparameters in the order and units of [`Model::hyperparameters`](super::Model::hyperparameters); empty = derived from the rows.
+    /// Initial hyperparameters, in the order and units of [`Model::hyperparameters`](super::Model::hyperparameters). If
+    /// this list is empty, the start is derived from the rows.
     pub start: Vec<f64>,
-    /// Whether nearby training rows, each predicted from all others, calibrate the 95 % interval; otherwise it is Gaussian.
+    /// Whether the 95 % interval is calibrated by nearby training rows, each predicted from all other training rows.
+    /// Otherwise, the interval is Gaussian.
     pub calibrate: bool,
     /// Number of threads, at least 1.
     pub threads: usize,
 }
 
 impl GprSettings {
-    /// Default settings: constant basis, one length scale, standardised inputs, one search; exact up to 2,000 rows.
+    /// Default settings: constant mean function, one length scale for all inputs, standardised inputs, one search. The
+    /// form is exact for up to 2,000 rows.
     pub fn new(kernel: Kernel, rows: usize) -> Self {
         Self {
             kernel,
@@ -107,21 +112,22 @@ impl GprSettings {
 /// Progress of a fit.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FitProgress {
-    /// Fold being fitted, from 1; 1 of 1 outside a cross-validation.
+    /// Number of the fold that is being fitted, from 1. It is 1 outside a cross-validation.
     pub fold: usize,
-    /// Number of folds.
+    /// Number of folds. It is 1 outside a cross-validation.
     pub folds: usize,
-    /// Current search, from 1.
+    /// Number of the running search, from 1.
     pub search: usize,
     /// Number of searches.
     pub searches: usize,
-    /// Steps of this search so far.
+    /// Number of steps that this search has already made.
     pub iteration: usize,
-    /// Most steps of a search.
+    /// Maximum number of steps of a search.
     pub max_iterations: usize,
-    /// Best log marginal likelihood of this search per row, for standardised targets.
+    /// Best log marginal likelihood of this search, divided by the number of rows, for standardised targets.
     pub log_likelihood_per_row: f64,
 }
 
-/// Callback after each step of a search; `Break` cancels the fit with [`RegressionError::Cancelled`](super::RegressionError::Cancelled).
+/// A callback that is called after each step of a search. If it returns `Break`, the fit ends with
+/// [`RegressionError::Cancelled`](super::RegressionError::Cancelled).
 pub type ProgressCallback<'a> = dyn FnMut(FitProgress) -> ControlFlow<()> + 'a;

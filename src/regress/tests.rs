@@ -1,4 +1,4 @@
-//! Compares both forms with each other and with finite differences; tests whole fits.
+//! Compares the exact and the nearest-neighbour form with each other and with finite differences, and tests whole fits.
 
 use std::ops::ControlFlow;
 
@@ -7,7 +7,7 @@ use super::plan::Plan;
 use super::scale::StandardisedRows;
 use super::*;
 
-/// Numbers between -1 and 1.
+/// Returns a generator of random numbers between -1 and 1.
 fn noise(seed: u64) -> impl FnMut() -> f64 {
     let mut state = seed;
     move || {
@@ -16,7 +16,7 @@ fn noise(seed: u64) -> impl FnMut() -> f64 {
     }
 }
 
-/// A wavy plane of two inputs with noise.
+/// Returns rows of a function of two inputs: a plane plus a wave plus noise.
 fn wavy_plane(rows: usize, seed: u64) -> (Vec<f64>, Vec<f64>) {
     let mut draw = noise(seed);
     let inputs: Vec<f64> = (0..2 * rows).map(|_| 2.0 * draw()).collect();
@@ -95,7 +95,7 @@ fn nearest_with_all_rows_agrees_with_exact() {
         let exact = fitted(Form::Exact, fixed);
         let queries: Vec<f64> = wavy_plane(40, 77).0;
         let expected = exact.predict(&queries).expect("finite");
-        // A prediction conditions on one more row than a term.
+        // A prediction is conditioned on one row more than any term of the likelihood.
         let nearest = fitted(Form::Nearest { neighbours: 120 }, fixed);
         let likelihoods = (nearest.log_marginal_likelihood(), exact.log_marginal_likelihood());
         assert!((likelihoods.0 - likelihoods.1).abs() < 1e-5, "{likelihoods:?}");
@@ -127,7 +127,7 @@ fn search_recovers_noise_and_function() {
         let model = fitted(form, |settings| settings.restarts = 1);
         let hyperparameters = model.hyperparameters();
         let noise_sd = hyperparameters.last().expect("the noise is there").value;
-        // The exact noise of these 120 rows is 0.086.
+        // The standard deviation of the noise in these 120 rows is 0.086.
         assert!((0.075..0.1).contains(&noise_sd), "{form:?}: {hyperparameters:?}");
         let (queries, targets) = wavy_plane(400, 99);
         let predictions = model.predict(&queries).expect("finite");
@@ -269,7 +269,7 @@ fn numbers_too_large_to_square_are_rejected() {
     for form in [Form::Exact, Form::Nearest { neighbours: 30 }] {
         let model = fitted(form, |_| ());
         let predicted = model.predict(&[1.0, 1.0, 1e160, 0.0]).map(|all| all[1]);
-        // Either so distant that the prior applies, or rejected with the row.
+        // The result is either the prior, because the row is very distant, or an error that names the row.
         match predicted {
             Ok(one) => assert!(one.mean.is_finite() && one.function_variance > 0.0, "{form:?}: {one:?}"),
             Err(fault) => assert!(fault.to_string().starts_with("inputs of row 2 = [1e160, 0.0]"), "{fault}"),

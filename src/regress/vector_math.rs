@@ -1,15 +1,16 @@
 //! Branch-free exponential and logarithm, which the compiler can vectorise.
 //!
-//! Input and output: plain numbers, accurate to a few 1e-16 of the result in the stated range; outside it, the result is meaningless.
-//! The calling loops run inside `pulp`'s dispatcher (part of faer), which selects the widest instructions of the machine at run time. No
-//! operation is fused, so the results are the same on every machine.
+//! The results are accurate to a few 1e-16 of their value within the stated range of the argument. Outside this range,
+//! they are meaningless. The calling loops run inside `pulp`'s dispatcher (part of faer), which selects the widest
+//! vector instructions of the machine at run time. Multiplications and additions are not fused, so the results are the
+//! same on every machine.
 
 use std::f64::consts::LOG2_E;
 
-/// ln 2 in two parts. The first has so few bits that its products with an exponent are exact.
+/// ln 2 as the sum of two numbers. The first number has so few bits that its product with an exponent is exact.
 const LN2_HIGH: f64 = 6.931_471_803_691_238e-1;
 const LN2_LOW: f64 = 1.908_214_929_270_587_7e-10;
-/// Adding this to a small number leaves the nearest integer in the low bits.
+/// If this number is added to a small number, the low bits of the sum contain the nearest integer.
 const ROUNDER: f64 = 6_755_399_441_055_744.0;
 /// 1/k! for k = 13 down to 0.
 const EXP_SERIES: [f64; 14] = [
@@ -29,10 +30,10 @@ const EXP_SERIES: [f64; 14] = [
     1.0,
 ];
 
-/// exp(x) for x <= 0.
+/// exp(x) for x <= 0. The result for x < -700 is that for -700.
 #[inline(always)]
 pub(crate) fn exp(x: f64) -> f64 {
-    // Lower limit of the argument of exp; the result, about 1e-304, is far above the subnormal numbers.
+    // The result for -700 is about 1e-304, which is far above the subnormal numbers.
     let x = x.max(-700.0);
     let rounded = x * LOG2_E + ROUNDER;
     let whole = rounded - ROUNDER;
@@ -44,12 +45,12 @@ pub(crate) fn exp(x: f64) -> f64 {
     series * f64::from_bits(rounded.to_bits().wrapping_add(1023) << 52)
 }
 
-/// ln(x) for x >= 1, finite.
+/// ln(x) for x >= 1 that is finite.
 #[inline(always)]
 pub(crate) fn ln(x: f64) -> f64 {
     const MANTISSA: u64 = (1 << 52) - 1;
     let bits = x.to_bits();
-    // Convert the exponent to a number through the bits of 2^52 + exponent.
+    // The bits of the number 2^52 + exponent contain the exponent. Subtracting 2^52 gives the exponent as a number.
     let exponent = f64::from_bits((bits >> 52) | 0x4330_0000_0000_0000) - (4_503_599_627_370_496.0 + 1023.0);
     let mantissa = f64::from_bits((bits & MANTISSA) | 0x3ff0_0000_0000_0000);
     let halve = mantissa > std::f64::consts::SQRT_2;

@@ -194,7 +194,7 @@ fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, thresh
         Unit::AmpereHours | Unit::Seconds | Unit::Ratio | Unit::Cycles => (0.0, f64::INFINITY),
         Unit::Celsius => return,
     };
-    let is_within = (0.0..=high).contains(&set); // a threshold outside this range is already a fault, or no value reaches it
+    let is_within = (0.0..=high).contains(&set); // otherwise it is a fault noted elsewhere, or unreachable
     if is_within && !(low..=high).contains(&clear) {
         let range = if high.is_finite() { format!("{low} to {high}") } else { format!("{low} or more") };
         alarm.place.fault(written, format!("must clear {key} at {range}, not at {clear}"));
