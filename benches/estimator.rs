@@ -8,7 +8,7 @@ use packwatch_host::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
 
 mod common;
 
-/// Shows that a step allocates nothing.
+/// Counts allocations, so that the output shows that a step allocates nothing.
 #[global_allocator]
 static ALLOCATOR: divan::AllocProfiler = divan::AllocProfiler::system();
 

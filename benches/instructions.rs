@@ -1,9 +1,9 @@
 //! Workloads for `tests/instructions`, which counts their instructions: parser, decoder, estimator.
 //!
 //! `instructions WORK PASSES` runs one of [`WORKS`] PASSES times over the same inputs. It prints the number of units
-//! per pass and the wide instructions that the processor offers, because these select the estimator's code. The
-//! difference between two counts, one with twice the passes of the other, excludes start-up. Without arguments, as
-//! under `cargo bench`, it prints the time of each work.
+//! per pass and the processor's SIMD extensions (such as AVX2), which select the estimator's code. `tests/instructions`
+//! counts the instructions of two such runs, the second with twice the passes. The difference of the two counts
+//! excludes start-up. Without arguments, as under `cargo bench`, the program prints the time of each work.
 #![expect(clippy::print_stdout, reason = "a program whose output is read by tests/instructions")]
 
 use std::hint::black_box;
@@ -60,7 +60,7 @@ fn main() {
     }
 }
 
-/// Processor features that select the code at run time.
+/// SIMD extensions of this processor that select the estimator's code at run time.
 fn features() -> String {
     #[cfg(target_arch = "x86_64")]
     let found = [

@@ -17,7 +17,7 @@ use packwatch::io::log::{LogOptions, LogSource};
 use packwatch::io::ticks::Ticks;
 use packwatch::monitor::{Monitor, Outputs, Record, TICK_PERIOD_MS};
 
-/// A longer gap in the log means that the recorder was asleep, s.
+/// A gap in the log that is longer than this means that the recorder was asleep, s.
 const SLEEP_GAP_S: f64 = 5.0;
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -28,7 +28,7 @@ fn main() -> Result<(), Box<dyn Error>> {
 
 /// Passes a log through the core.
 pub(crate) fn monitor_log(config: &Path, log: &Path, out: &mut impl Write) -> Result<(), Box<dyn Error>> {
-    // The shell reads the files, checks the settings and returns the records.
+    // Outside the core: read the files, check the settings and convert the lines of the log to records.
     let config = config::load(config)?;
     let options = LogOptions {
         interfaces: config.interface_names(),
@@ -38,7 +38,7 @@ pub(crate) fn monitor_log(config: &Path, log: &Path, out: &mut impl Write) -> Re
     };
     let mut source = LogSource::new([log.to_owned()], options);
 
-    // The core is one function, called with every record and every tick in the order of time.
+    // The core is a state machine: pass it every record and every tick in time order.
     let mut monitor = Monitor::new(config.monitor);
     let (mut outputs, mut frames) = (Outputs::default(), 0);
     let mut handle = |monitor: &mut Monitor, record: &Record| -> io::Result<()> {

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""An ECU that listens to packwatch, in Python: shows the state of charge and keeps the table of alarms.
+"""An example ECU in Python that listens to packwatch: it shows the state of charge and maintains the table of alarms.
 
     examples/listen.py vcan0                     listens on an interface until Ctrl-C
     examples/listen.py frames.log                reads a candump log, such as one of `packwatch replay --frames`
@@ -72,7 +72,7 @@ class Listener:
             print(f"{now:.1f} alarm {' '.join(key)} {signals['State']}: {value}, threshold {threshold}", flush=True)
 
     def handle_digest(self, now: float, signals: dict[str, str]) -> None:
-        """Removes the alarms whose rule the digest no longer reports as raised: their last frame was lost."""
+        """Removes the alarms whose rule the digest reports as not raised. (The frame that announced their end was lost.)"""
         if signals.get("PassTime", "not available") != "not available":
             self.pass_time_s = float(signals["PassTime"])
         for key in list(self.alarms):
@@ -80,7 +80,7 @@ class Listener:
                 self.remove(now, key, "digest")
 
     def check_time(self, now: float) -> None:
-        """Discards the status and the alarms that are no longer repeated."""
+        """Discards the status if status frames have stopped, and each alarm whose frames have stopped."""
         if self.status_at is not None and now - self.status_at > STATUS_TIMEOUT_S:
             self.status_at, self.validity = None, "unavailable"
             print(f"{now:.1f} status lost: all values unknown", flush=True)
@@ -94,7 +94,7 @@ class Listener:
 
 
 def text(value: object) -> str:
-    """The name that the DBC gives to a code, or the number."""
+    """The DBC's name for a value or, if it has none, the number."""
     return f"{value:g}" if isinstance(value, int | float) else str(value)
 
 

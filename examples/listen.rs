@@ -1,4 +1,4 @@
-//! An ECU that listens to packwatch, in Rust: shows the state of charge and keeps the table of alarms.
+//! An example ECU in Rust that listens to packwatch: it shows the state of charge and maintains the table of alarms.
 //!
 //! ```sh
 //! candump -L vcan0 | cargo run --example listen                # a live bus
@@ -16,9 +16,10 @@ use std::io::{self, BufRead, Write};
 use packwatch::can::dbc::{Database, Message, Signal};
 use packwatch::can::{CanId, Frame};
 
-/// After this time without a status frame, all values are unknown, s.
+/// If no status frame arrives for this time, all values are unknown, s.
 const STATUS_TIMEOUT_S: f64 = 0.3;
-/// An alarm that is not repeated within this number of passes is over. One pass sends each raised alarm once.
+/// If no frame of an alarm arrives for this number of passes, the alarm is no longer raised. In one pass packwatch
+/// sends a frame of each raised alarm.
 const PASSES: f64 = 7.0;
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -55,7 +56,8 @@ struct Listener {
     database: Database,
     /// Time of the latest frame of each raised alarm.
     alarms: BTreeMap<Key, f64>,
-    /// Duration of a pass according to the latest digest. Before the first digest: the alarm frame's cycle time.
+    /// Duration of a pass according to the latest digest, s. Before the first digest: the cycle time of the alarm
+    /// frames.
     pass_time_s: f64,
     status_at_s: Option<f64>,
     validity: String,
@@ -111,7 +113,7 @@ impl Listener {
         Ok(())
     }
 
-    /// Removes the alarms whose rule the digest no longer reports as raised: their last frame was lost.
+    /// Removes the alarms whose rule the digest reports as not raised. (The frame that announced their end was lost.)
     fn handle_digest(&mut self, now_s: f64, signals: &Signals, out: &mut impl Write) -> io::Result<()> {
         if let Some(Ok(pass_time_s)) = signals.get("PassTime").map(|text| text.parse()) {
             self.pass_time_s = pass_time_s;
@@ -125,7 +127,7 @@ impl Listener {
         Ok(())
     }
 
-    /// Discards the status and the alarms that are no longer repeated.
+    /// Discards the status if status frames have stopped, and each alarm whose frames have stopped.
     fn check_time(&mut self, now_s: f64, out: &mut impl Write) -> io::Result<()> {
         if self.status_at_s.is_some_and(|at_s| now_s - at_s > STATUS_TIMEOUT_S) {
             (self.status_at_s, self.validity) = (None, "unavailable".to_owned());
@@ -167,7 +169,7 @@ fn decode(message: &Message, data: &[u8]) -> Signals {
     present.filter_map(|signal| Some((signal.name.clone(), value(signal, data)?))).collect()
 }
 
-/// The DBC's name of a code, or the number. `None` if the frame is too short.
+/// The DBC's name for the value or, if it has none, the number. `None` if the frame is too short for the signal.
 fn value(signal: &Signal, data: &[u8]) -> Option<String> {
     let plan = signal.layout.plan().ok()?;
     let code = i64::try_from(plan.raw(data).ok()?).ok();
