@@ -9,7 +9,7 @@ use super::world::{self, CELL, DBC, PACK};
 
 const REFERENCE: &str = include_str!("../../../docs/src/reference/keys.md");
 
-/// Tables and keys with a numeric value in the reference page.
+/// Pairs (table, key) of the reference page whose value is a number.
 fn keys() -> &'static [(&'static str, &'static str)] {
     static KEYS: std::sync::OnceLock<Vec<(&str, &str)>> = std::sync::OnceLock::new();
     KEYS.get_or_init(|| {
@@ -59,7 +59,7 @@ pub fn configuration(data: &[u8]) {
     }
 }
 
-/// An arbitrary cell model, or one with changed numbers.
+/// An arbitrary cell model file, or the example's with some numbers changed.
 pub fn cell_model(data: &[u8]) {
     let mut source = Source::new(data);
     let model = if source.byte().is_multiple_of(4) { source.rest().to_vec() } else { changed(&mut source) };

@@ -1,5 +1,6 @@
-//! The core. The bytes determine a small vehicle with its driver, faults, testers and attackers, for up to some
-//! thousand inputs. A cut replaces the monitor by one restored from its snapshot.
+//! Fuzz entry points of the core. The bytes determine what happens in a small simulated vehicle: its driver, faults,
+//! diagnostic testers and attackers, in up to some thousand inputs. At a cut, the monitor is replaced by a new one that
+//! is restored from its snapshot.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -27,15 +28,15 @@ static CUTS: AtomicU64 = AtomicU64::new(0);
 /// Number of inputs between two printed counts.
 const REPORT_EVERY: u64 = 100_000;
 const BUS: BusIndex = BusIndex(0);
-/// Identifiers sent by the configuration: output messages and diagnostic requests.
+/// CAN identifiers that the monitor uses with this configuration: output messages and diagnostic requests.
 const OWN: [u16; 8] = [0x6B0, 0x6B1, 0x6B2, 0x6B4, 0x6B5, 0x6B6, 0x79B, 0x7DF];
 /// Address of the J1939 node, and the address it uses until it has claimed one.
 const OWN_ADDRESSES: [u32; 2] = [249, 254];
 const MS: i64 = 1_000_000;
-/// After a longer time without input, a restored monitor assumes that the program was off, s.
+/// If there is no input for longer than this, a restored monitor assumes that the program was off, s.
 const BREAK_S: f64 = 30.0;
 
-/// Feeds frames, gaps and commands; a second run must give the same outputs.
+/// Feeds frames, gaps and commands to a monitor. A second run with the same inputs must give the same outputs.
 pub fn core(data: &[u8]) {
     let mut source = Source::new(data);
     let is_repeated = source.byte().is_multiple_of(8);
@@ -46,7 +47,8 @@ pub fn core(data: &[u8]) {
     }
 }
 
-/// Feeds two monitors; one of them is regularly replaced by its own stored state.
+/// Feeds the same inputs to two monitors. One of them is regularly replaced by a monitor restored from its stored
+/// state. Both must give the same outputs.
 pub fn cuts(data: &[u8]) {
     let mut source = Source::new(data);
     let steps = [1 + usize::from(source.byte()), 1 + usize::from(source.byte())];
@@ -55,7 +57,8 @@ pub fn cuts(data: &[u8]) {
     let (mut expected, mut found) = (outputs(), outputs());
     let (mut until_cut, mut cuts) = (steps[0], 0);
     for (nth, record) in records.iter().enumerate() {
-        // Use the monitor's clock: after a time stamp in the far future, it does not follow earlier stamps at once.
+        // Measure the break from the monitor's clock, not from the previous stamp: after a stamp in the far future, the
+        // monitor does not immediately set its clock back to earlier stamps.
         let is_break = record.time.since(whole.now()).abs() > BREAK_S;
         if until_cut == 0 && cuts < MAX_CUTS && !is_break {
             cuts += 1;

@@ -1,4 +1,4 @@
-//! Files that are read in pieces: logs, journals, tables. They are written to a folder in memory if possible.
+//! Files that are read in blocks: logs, journals, tables. The test files are written to a folder in memory if possible.
 
 use std::path::Path;
 
@@ -50,7 +50,7 @@ fn options(strict: bool) -> LogOptions {
     }
 }
 
-/// Reading one by one and in batches must give the same records; a strict reader gives a prefix of them.
+/// Reading records one by one and in batches must give the same records. A strict reader must give a prefix of them.
 fn compare(path: &Path) {
     let one_by_one = |strict: bool| -> (Vec<Record>, bool) {
         let mut log = LogSource::new([path.to_owned()], options(strict));

@@ -8,7 +8,7 @@ use super::core::{check, records};
 use super::source::Source;
 use super::world;
 
-/// Bytes of a drive that fills every part of the state: use, rest, an alarm, a test, an answer.
+/// Fuzz input for a drive that fills every part of the state: load, rest, an alarm, a test alarm, a diagnostic answer.
 const DRIVE: &[u8] = &[
     7, 0xE8, 3, 6, 31, 6, 31, 15, 0, 7, 0x18, 0xFC, 6, 31, 6, 31, 8, 120, 0, 31, 23, 5, 14, 1, 0, 0, 0, 0, 0, 3, 0, 31,
 ];

@@ -1,4 +1,5 @@
-//! Splits bytes into values: numbers, choices, times. Past the end every value is zero, so any length is valid.
+//! Splits bytes into values: numbers, choices, times. After the last byte every value is zero, so an input of any
+//! length is valid.
 
 /// The remaining bytes.
 pub(super) struct Source<'a> {
@@ -45,7 +46,7 @@ impl<'a> Source<'a> {
         choices[usize::from(self.byte()) % choices.len()]
     }
 
-    /// Returns a plausible number, one of random magnitude, a special value, or arbitrary bits.
+    /// Returns a plausible number, a number of random magnitude, a special value, or a number from arbitrary bits.
     pub(super) fn number(&mut self) -> f64 {
         match self.byte() % 4 {
             0 => f64::from(self.i16()) / 100.0,
