@@ -20,7 +20,8 @@ EXTERNALSRC ?= "${@os.path.realpath(d.getVar('THISDIR') + '/../../../../..')}"
 # `include`, not `require`: the file is missing when the task that writes it runs for the first time.
 include ${BPN}-crates.inc
 
-# The profile and the features of the Debian package. The symbols stay here: bitbake itself moves them to packwatch-dbg.
+# Profile and features are those of the Debian package. The program keeps its debug symbols, because bitbake moves them to
+# packwatch-dbg.
 CARGO_PROFILE = "vehicle"
 export CARGO_PROFILE_VEHICLE_STRIP = "false"
 CARGO_BUILD_FLAGS:append = " --package packwatch --no-default-features"
