@@ -4,9 +4,9 @@
 //! tables, units, cycle times, frame formats and end-to-end protection. Multiplexing is resolved to conditions on raw
 //! selector codes. [`Database::to_dbc`] writes a database as text, and parsing this text gives an equal database.
 //!
-//! The parser returns a [`DbcError`] with the line for a file that is not a DBC, an identifier out of range, a name
-//! that is defined twice, and multiplexing that cannot be resolved. It accepts a signal that extends beyond its
-//! message, whose decoding gives [`Fault::ShortFrame`](crate::quantity::Fault::ShortFrame). It also accepts an invalid
+//! The parser returns a [`DbcError`] with the line in four cases: the file is not a DBC, an identifier is out of range,
+//! a name is defined twice, or multiplexing cannot be resolved. It accepts a signal that extends beyond its message;
+//! decoding this signal gives [`Fault::ShortFrame`](crate::quantity::Fault::ShortFrame). It also accepts an invalid
 //! layout, which [`SignalLayout::plan`] rejects.
 
 use std::collections::{HashMap, HashSet};
@@ -58,7 +58,7 @@ pub enum FrameFormat {
 /// How a message is repeated after an event; `None` = not stated in the DBC.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Repetition {
-    /// Number of frames after the first one (`GenMsgNrOfRepetition`).
+    /// Number of frames after the first frame (`GenMsgNrOfRepetition`).
     pub count: Option<u32>,
     /// Time between these frames, ms (`GenMsgCycleTimeFast`).
     pub period_ms: Option<u32>,
@@ -106,7 +106,7 @@ pub struct Signal {
     pub receivers: Vec<String>,
     /// Conditions that must all hold for the signal to be present, outermost multiplexor first.
     pub conditions: Vec<MuxCondition>,
-    /// Whether the presence of other signals depends on this one.
+    /// Whether the presence of other signals depends on this signal.
     pub is_multiplexor: bool,
     /// Raw values (signed for signed signals) and their names (`VAL_`).
     pub values: Vec<(i64, String)>,
@@ -416,7 +416,8 @@ fn number(value: &can_dbc::NumericValue) -> f64 {
 }
 
 /// The conditions from the outermost multiplexor down to this signal. `SG_MUL_VAL_` names the parent and the ranges,
-/// and takes precedence over the number after `m`. Without it, the parent is the message's only `M`.
+/// and takes precedence over the number after `m`. Without `SG_MUL_VAL_`, the parent is the only multiplexor (`M`) of
+/// the message.
 fn conditions<'a>(
     details: &DetailTable<'a>,
     message: &'a can_dbc::Message,

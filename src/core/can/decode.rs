@@ -44,8 +44,8 @@ pub struct Binding {
     pub mux: Vec<MuxTest>,
     /// Channel of the signal's readings.
     pub channel: Channel,
-    /// Applied after the DBC's factor and offset: value x scale + offset. For a bus that counts charging positive, the
-    /// scale of the current is -1.
+    /// Applied after the DBC's factor and offset: value x scale + offset. If the current on the bus is positive for
+    /// charging, the scale of the current is -1.
     pub scale: f64,
     /// Added after `scale`, in the program's unit.
     pub offset: f64,

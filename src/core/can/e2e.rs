@@ -43,7 +43,7 @@ pub enum Profile {
     /// Profile 1, variant A: the data identifier is included in the CRC and not sent.
     #[serde(rename = "1A")]
     P01A,
-    /// Profile 1, variant C: four bits of the data identifier are sent, its low byte is included in the CRC.
+    /// Profile 1, variant C: four bits of the data identifier are sent, and its low byte is included in the CRC.
     #[serde(rename = "1C")]
     P01C,
     /// Profile 5.
@@ -102,7 +102,7 @@ impl Profile {
         }
     }
 
-    /// The counter after `counter`. The largest counter, and any invalid one, is followed by 0.
+    /// The counter after `counter`. The largest counter and any invalid counter are followed by 0.
     pub const fn next_counter(self, counter: u8) -> u8 {
         if counter < self.max_counter() { counter + 1 } else { 0 }
     }
@@ -123,7 +123,7 @@ pub struct ProtectError(String);
 pub struct Protection {
     /// Layout, CRC and counter.
     pub profile: Profile,
-    /// Data identifier, unique among messages. 1C uses 12 bits of it.
+    /// Data identifier, unique among messages. Variant 1C uses only its lower 12 bits.
     pub data_id: u16,
 }
 
@@ -131,8 +131,8 @@ impl Protection {
     /// Writes counter, identifier nibble (1C) and CRC to a payload whose other bytes are final.
     ///
     /// # Errors
-    /// The payload is shorter than the header, or the counter is above the profile's largest. The payload is then
-    /// unchanged.
+    /// The payload is shorter than the header, or the counter is above the profile's largest counter. The payload is
+    /// then unchanged.
     pub fn protect(&self, payload: &mut [u8], counter: u8) -> Result<(), ProtectError> {
         let (found, needed, max) = (payload.len(), self.profile.header_bytes(), self.profile.max_counter());
         if found < needed {

@@ -51,7 +51,7 @@ pub struct FloodCount {
     pub dropped: u64,
 }
 
-/// Spent budget and current flood of one message, for a snapshot from which the monitor resumes without a gap.
+/// Spent budget and present flood of one message, for a snapshot from which the monitor resumes without a gap.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FloodProgress {
     bus: BusIndex,
@@ -69,7 +69,7 @@ struct LeakyBucket {
     /// Time up to which the allowed rate is spent.
     spent_until: Option<Timestamp>,
     dropped: u64,
-    /// The current flood: number of dropped frames, and time of the last dropped frame.
+    /// The flood in progress: number of dropped frames, and time of the last dropped frame.
     flood: Option<(u64, Timestamp)>,
 }
 
@@ -151,7 +151,7 @@ impl FloodGate {
         dropped.map(|bucket| FloodCount { bus: bucket.bus, id: bucket.id, dropped: bucket.dropped })
     }
 
-    /// Spent budgets and current floods.
+    /// Spent budgets and floods in progress.
     pub fn progress(&self) -> Vec<FloodProgress> {
         let is_used = |bucket: &&LeakyBucket| bucket.spent_until.is_some() || bucket.flood.is_some();
         let of = |bucket: &LeakyBucket| FloodProgress {

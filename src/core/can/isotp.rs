@@ -26,7 +26,7 @@ pub enum IsoTpFault {
     WrongSequence,
     /// No consecutive frame within a second.
     Timeout,
-    /// Another message started before the last one ended, because there are two senders or the sender gave up.
+    /// Another message started before the previous message ended, because there are two senders or the sender gave up.
     Overlap,
     /// The requester refused the message by flow control (buffer overflow, reserved state).
     Refused,
@@ -81,7 +81,7 @@ pub struct Received {
 /// Effect of a frame on a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Progress {
-    /// No effect: the frame does not belong to a message, or belongs to a lost one.
+    /// No effect: the frame does not belong to a message, or belongs to a lost message.
     #[default]
     None,
     /// The frame started a message of several frames.
@@ -98,14 +98,15 @@ pub struct Receiver {
     /// First data byte of every frame, for extended addressing.
     extension: Option<u8>,
     message: Vec<u8>,
-    /// Length of the message being received; 0 = none.
+    /// Length of the message being received; 0 = no message.
     length: usize,
     /// Sequence number of the next consecutive frame, 0 to 15.
     next: u8,
     /// Payload length of the first frame (RX_DL), without the extension.
     frame_len: usize,
     latest: Timestamp,
-    /// Whether the current message is lost and the loss is reported. Its further frames then cause no further fault.
+    /// Whether the message being received is lost and the loss is reported. Its further frames then cause no further
+    /// fault.
     is_discarding: bool,
 }
 
@@ -258,7 +259,7 @@ impl Received {
     }
 }
 
-/// The payload after the extension; `None` = the extension is another address.
+/// The payload after the extension; `None` = the extension belongs to another address.
 fn without_extension(extension: Option<u8>, payload: &[u8]) -> Option<&[u8]> {
     match extension {
         None => Some(payload),

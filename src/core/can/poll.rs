@@ -56,7 +56,7 @@ pub struct PollConfig {
     pub requests: Vec<PollRequest>,
     /// Maximum number of requests per second, over all requests.
     pub max_requests_per_s: f64,
-    /// Whether a supply voltage is configured. If so, nothing is sent without a good reading of it.
+    /// Whether a supply voltage is configured. If so, nothing is sent without a good reading of the supply voltage.
     pub watches_supply: bool,
 }
 
@@ -221,14 +221,15 @@ impl Poller {
         }
         self.progress.state = state;
         for index in 0..self.progress.items.len() {
-            // A shorter period starts now, not after the longer one.
+            // A shorter period applies from now on, without waiting for the end of the longer period.
             if let Some(period_s) = self.period_s(index) {
                 self.progress.items[index].due = self.progress.items[index].due.min(now.plus_secs(period_s));
             }
         }
     }
 
-    /// Handles a reading of the supply voltage: `good_until` is the time up to which it is valid; `None` = low or bad.
+    /// Handles a reading of the supply voltage: `good_until` is the time up to which the reading is valid; `None` = the
+    /// voltage is low or the reading is bad.
     pub fn set_supply(&mut self, good_until: Option<Timestamp>) {
         self.progress.supply_good_until = good_until.unwrap_or(Timestamp::LONG_AGO);
     }
@@ -420,7 +421,7 @@ impl Poller {
         let period_s = self.period_s(index).unwrap_or(0.0);
         let item = &mut self.progress.items[index];
         let next = item.due.plus_secs(period_s);
-        // A request that was sent on time keeps its rhythm.
+        // If a request was sent on time, its next due time is one period after the last due time.
         item.due = if item.due <= now && next > now { next } else { now.plus_secs(period_s) };
     }
 

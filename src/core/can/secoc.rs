@@ -20,7 +20,7 @@
 //! and width of the authenticated fields. The lengths of the profiles `fd` and `announcement` are packwatch's own.
 //!
 //! Deviation: AUTOSAR leaves the management of freshness to the manufacturer. Here, the receiver of commands announces
-//! it ([`FreshnessWindow`]); the values that packwatch sends increase by one with each frame.
+//! the freshness ([`FreshnessWindow`]); the values that packwatch sends increase by one with each frame.
 
 mod window;
 
@@ -36,7 +36,7 @@ const MAX_INPUT: usize = 2 + MAX_DATA + 8;
 /// A complete authenticator (AES-128-CMAC).
 pub type Mac = [u8; 16];
 
-/// Number of bits sent of freshness and authenticator.
+/// Defines how many bits of the freshness and of the authenticator are sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum Profile {
     /// AUTOSAR profile 1.

@@ -21,7 +21,7 @@ pub const PENDING: u8 = 0x78;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[repr(u8)]
 pub enum Service {
-    /// Current data of OBD, with an identifier of one byte.
+    /// Service 01 of OBD (live data), with an identifier of one byte.
     CurrentData = 0x01,
     /// `ReadDataByLocalIdentifier` of KWP 2000, with an identifier of one byte.
     ByLocalIdentifier = 0x21,
@@ -188,12 +188,12 @@ pub struct Refusal {
 pub enum FrameOutcome<'a> {
     /// There is nothing to decode.
     Nothing,
-    /// The frame is the first one of a response, whose values were measured now.
+    /// The frame starts a response. The values of the response count as measured now.
     Begun {
         /// Index in [`Listener::counts`].
         controller: usize,
     },
-    /// The frame is a further one of a response.
+    /// The frame continues a response.
     Continued {
         /// Index in [`Listener::counts`].
         controller: usize,

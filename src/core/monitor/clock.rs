@@ -1,5 +1,5 @@
-//! The monitor's clock, which follows the times of the inputs. It never runs backwards, and detects time asleep and a
-//! driver's clock that was set back.
+//! The monitor's clock, which follows the times of the inputs. It never runs backwards. It detects that the computer
+//! was asleep, and that the driver's clock was set back.
 //!
 //! In: the time of each input. Out: the time that the stages use, and a [`TimeJump`] if an input does not closely
 //! follow the previous input. An input that is late by at most [`MERGE_TOLERANCE_NS`] is counted and treated as if it

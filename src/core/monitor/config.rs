@@ -47,9 +47,9 @@ pub struct MonitorConfig {
     pub model: CellModel,
     /// Cells of another kind, with their own models.
     pub modules: Vec<CellModule>,
-    /// Label of the cells, from which their model is learned; `None` = the model is given.
+    /// Label of the cells, from which their model is learned; `None` = the model comes from a model file.
     pub label: Option<Label>,
-    /// Whether the BMS bleeds fuller cells after a charge.
+    /// Whether the BMS discharges fuller cells after a charge (passive balancing).
     pub is_balanced: bool,
     /// Meaning of the balancing bits in `input`; `None` = `input` has no balancing bits.
     pub balancing: Option<BalancingConfig>,
@@ -150,8 +150,8 @@ pub struct ReconfigureError {
 }
 
 impl MonitorConfig {
-    /// Whether the daemon must receive every frame of an interface. It must if it sends requests on the interface,
-    /// because it sends them only while the bus is awake.
+    /// Whether the daemon must receive every frame of an interface. This is necessary if the daemon sends requests on
+    /// the interface, because it sends requests only while the bus is awake.
     pub fn wants_all(&self, bus: BusIndex) -> bool {
         self.poll.as_ref().is_some_and(|poll| poll.requests.iter().any(|it| it.question.controller.bus == bus))
     }
@@ -174,7 +174,7 @@ impl MonitorConfig {
     }
 
     /// Identifiers to receive on an interface, ascending. They include the identifiers of the daemon's own frames,
-    /// because another node may use these too.
+    /// because another node may also use these identifiers.
     pub fn wanted_ids(&self, bus: BusIndex) -> Vec<CanId> {
         let mut ids = self.listened_ids(bus);
         ids.extend(self.own_ids().filter(|(other, _)| *other == bus).map(|(_, id)| id));
@@ -183,7 +183,7 @@ impl MonitorConfig {
         ids
     }
 
-    /// Identifiers of the frames of `[output]`, with each of its interfaces.
+    /// Identifiers of the frames of `[output]`, each paired with each output interface.
     pub(crate) fn own_ids(&self) -> impl Iterator<Item = (BusIndex, CanId)> + '_ {
         let of = |output: &OutputConfig| {
             let ids = output.plan.ids();
@@ -192,8 +192,8 @@ impl MonitorConfig {
         self.output.iter().flat_map(of)
     }
 
-    /// Unprotected input messages with the cycle time of their frames, s, if known. For a multiplexed message it counts
-    /// as unknown, because the stated cycle time may be the cycle time of each page.
+    /// Unprotected input messages with the cycle time of their frames, s, if known. For a multiplexed message, the
+    /// cycle time counts as unknown, because the stated cycle time may be the cycle time of each page.
     pub(crate) fn unprotected(&self) -> impl Iterator<Item = (BusIndex, CanId, Option<f64>)> + '_ {
         let is_protected = |bus, id| self.guards.iter().any(|guard| (guard.bus, guard.id) == (bus, id));
         let cycle_s = |bus, id| self.cycle_times_s.iter().find(|of| (of.0, of.1) == (bus, id)).map(|of| of.2);
@@ -205,7 +205,7 @@ impl MonitorConfig {
         messages.map(move |(bus, id, _)| (bus, id, cycle_s(bus, id).filter(|_| !has_pages(bus, id))))
     }
 
-    /// Identifiers decoded on an interface, ascending.
+    /// Identifiers whose frames are decoded on an interface, ascending.
     pub fn listened_ids(&self, bus: BusIndex) -> Vec<CanId> {
         let mut ids = self.input.ids(bus);
         ids.extend(uds::wanted(&self.answers).into_iter().filter(|(other, _)| *other == bus).map(|(_, id)| id));

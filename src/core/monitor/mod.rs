@@ -14,7 +14,7 @@
 //!   packs;
 //! * `snapshot`: the stored state;
 //! * `lifecycle`: restores a stored state, relearns from a history, and applies a new configuration;
-//! * `clock`, `config`, `view`: time, configuration and current values of the whole monitor.
+//! * `clock`, `config`, `view`: time, configuration and present values of the whole monitor.
 
 mod clock;
 mod config;

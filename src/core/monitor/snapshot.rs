@@ -23,9 +23,9 @@ use crate::monitor::stages::pack_memory::{PackMemory, StoredCell};
 use crate::quantity::{InvalidState, Timestamp, bounds};
 use crate::sample::{CellSample, SampleConfig};
 
-/// Name in error messages of the charge that [`Snapshot::check_charges`] checks.
+/// Name of the charge that [`Snapshot::check_charges`] checks, for error messages.
 const CHARGE: &str = "the charge since a cell's latest voltage or half-cycle";
-/// Tolerances for current limits that were wider when the charge was counted, and for a clock that was set.
+/// Tolerances for two cases: the limits of the current were wider when the charge was counted, or the clock was set.
 const CHARGE_TOLERANCE: f64 = 2.0;
 const CHARGE_TOLERANCE_S: f64 = 1000.0;
 
@@ -47,7 +47,7 @@ pub struct Snapshot {
     pub(crate) sampling: SamplingState,
     pub(crate) estimation: EstimationState,
     pub(crate) cells: Vec<StoredCell>,
-    /// State of the modelling stage; `None` if the cells' model is given.
+    /// State of the modelling stage; `None` if the cells' model comes from a model file.
     pub(crate) modelling: Option<ModellingState>,
     pub(crate) learning: LearningState,
     /// State of the cell-fault detector; `None` if the pack is too small for a comparison.
@@ -55,7 +55,7 @@ pub struct Snapshot {
     pub(crate) alarming: StoredAlarming,
     pub(crate) sending: SendingState,
     pub(crate) statistics: Statistics,
-    /// Start of the current bus sleep; `None` if the buses are awake.
+    /// Start of the present bus sleep; `None` if the buses are awake.
     pub(crate) asleep_since: Option<Timestamp>,
     pub(crate) packs: PackMemory,
 }
@@ -107,8 +107,8 @@ pub(crate) struct PendingRestore {
 }
 
 impl Snapshot {
-    /// Drops everything that is valid only if the same clock continues. The result is smaller. A program that will be
-    /// restarted stores it.
+    /// Drops everything that is valid only if the same clock continues. A program stores the (smaller) result before it
+    /// restarts.
     #[must_use]
     pub fn for_restart(self) -> Self {
         let mut restarted = Self { may_continue: false, ..self };
@@ -123,7 +123,7 @@ impl Snapshot {
         restarted
     }
 
-    /// Repeats the changes of alarms that were recorded after the state was taken.
+    /// Applies the alarm changes that were recorded after the snapshot was taken.
     pub fn repeat_alarms(&mut self, changes: &[(Timestamp, AlarmChange)]) {
         changes.iter().for_each(|(time, change)| self.alarming.alarms.repeat(*time, change));
     }
@@ -178,8 +178,8 @@ impl Snapshot {
         Ok(stored.stored_view(label))
     }
 
-    /// Whether the waiting samples belong to different cells of the snapshot, all of which have reported in the current
-    /// batch.
+    /// Whether the waiting samples belong to different cells of the snapshot, all of which have reported in the
+    /// unfinished batch.
     pub(crate) fn waiting_fits(&self) -> bool {
         let mut has_come: Vec<bool> = self.cells.iter().map(|cell| cell.updated_in_round).collect();
         let mut is_first = |cell: usize| has_come.get_mut(cell).is_some_and(std::mem::take);
@@ -202,8 +202,9 @@ impl Snapshot {
         Ok(self.learning.check()?)
     }
 
-    /// Checks the charge that moved between past marks and the time of the state: the largest plausible current must be
-    /// able to move it. Only differences are checked, because the absolute charges are arbitrary.
+    /// Checks the charge that moved between each mark (a cell's latest voltage or half-cycle) and the time of the
+    /// state. The largest plausible current must be able to move this charge. Only differences are checked, because the
+    /// absolute charges are arbitrary.
     pub(crate) fn check_charges(&self, config: &SampleConfig) -> Result<(), RestoreError> {
         let (strings, limits) = (f64::from(config.strings.max(1)), &config.current);
         let most_a = limits.min.abs().max(limits.max.abs()) / strings;

@@ -1,7 +1,7 @@
 //! Connects the stages after the intake: readings → samples → estimates → health → alarms → frames.
 //!
-//! Each stage owns its configuration and state; only this file knows the order of the stages. `now` is the time of the
-//! current input in all functions.
+//! Each stage owns its configuration and state; only this file knows the order of the stages. In all functions, `now`
+//! is the time of the input that is being handled.
 
 pub(crate) mod pack_memory;
 pub(crate) mod watch;
@@ -407,7 +407,7 @@ impl Stages {
             // A cell without a fresh voltage may be the weakest.
             self.forget_pack_state();
         }
-        // A frozen current, or a message with a second sender, makes the estimates doubtful.
+        // A frozen reading of the current, or a message with a second sender, makes the estimates doubtful.
         let is_current_frozen = self.sampling.sampler.is_current_frozen();
         self.estimation.is_current_doubtful = self.sampling.has_second_sender || is_current_frozen;
         self.findings.watch_current(now, is_current_frozen, out);

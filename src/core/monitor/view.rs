@@ -1,4 +1,4 @@
-//! Current values of cells and pack for status, tables and reports. `None` = not known yet, or no longer known.
+//! Present values of cells and pack for status, tables and reports. `None` = not known yet, or no longer known.
 
 use super::Monitor;
 use super::config::CommandConfig;
@@ -98,7 +98,7 @@ impl Monitor {
         self.stages.sending.poller.as_ref().map(|poller| (poller.silence(), poller.refused()))
     }
 
-    /// Start of the current bus sleep; `None` if the buses are awake.
+    /// Start of the present bus sleep; `None` if the buses are awake.
     pub fn asleep_since(&self) -> Option<Timestamp> {
         self.stages.sleep.since
     }
@@ -220,7 +220,7 @@ impl Monitor {
         &self.stages.statistics
     }
 
-    /// Current values of every cell.
+    /// Present values of every cell.
     pub fn cell_views(&self) -> impl ExactSizeIterator<Item = CellView> + '_ {
         self.stages.estimation.cell_indices().map(|cell| self.cell_view(cell))
     }
@@ -262,7 +262,7 @@ impl Monitor {
         }
     }
 
-    /// Current values of the pack.
+    /// Present values of the pack.
     pub fn pack_view(&self) -> PackView {
         let Stages { sampling, estimation, learning, .. } = &self.stages;
         let (sampler, now, pack) = (&sampling.sampler, self.now(), self.pack());

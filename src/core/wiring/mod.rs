@@ -4,13 +4,13 @@
 //! events, and the estimates of a [`Monitor`](crate::monitor::Monitor) if the configuration allows one. Out: a
 //! [`WiringReport`] with findings (each with evidence, reason and the line to change), checks that passed, and checks
 //! that were not possible. The observer has its own decoder, which applies no limits to readings. It therefore also
-//! works with a configuration that the estimator cannot use. Its memory is bounded, however long it listens.
+//! works with a configuration that the estimator cannot use. Its memory use is bounded for any duration.
 //!
 //! | file | purpose |
 //! | --- | --- |
 //! | `plan` | expected interfaces, messages and signals |
 //! | [`evidence`] | evidence about signals from values, names and bits; `discover` also scores its candidates with it |
-//! | `other_current` | the message of the current, received on another interface |
+//! | `other_current` | statistics of the message with the configured current, if another interface also receives this message |
 //! | `observer` | [`WiringObserver`]: collects frames, events and estimates |
 //! | `judge` | turns everything received into a [`WiringReport`] |
 //! | `report` | findings with their evidence, and the lines to change |

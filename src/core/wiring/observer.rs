@@ -80,7 +80,8 @@ pub struct WiringObserver {
     listener: Listener,
     /// Indexes of the signals in the answer to each diagnostic question.
     by_question: BTreeMap<Question, Vec<(SignalList, usize)>>,
-    /// Statistics of the message with the configured current's identifier, for each other interface that carries it.
+    /// For each other interface that carries the identifier of the configured current's message: statistics of the
+    /// message.
     pub(crate) other_currents: BTreeMap<BusIndex, OtherCurrent>,
     guards: Guards,
     pub(crate) protected: BTreeMap<(BusIndex, CanId), ProtectionStats>,
@@ -107,7 +108,8 @@ impl WiringObserver {
         ];
         let mut by_question: BTreeMap<Question, Vec<(SignalList, usize)>> = BTreeMap::new();
         for (name, list) in lists {
-            // Ordered by channel, so that a frame's current is handled before its voltages.
+            // Ordered by channel, so that the electric current in a frame is handled before the voltages in the same
+            // frame.
             let mut order: Vec<usize> = (0..list.len()).collect();
             order.sort_by_key(|&index| list[index].binding.channel);
             for index in order {
@@ -156,7 +158,7 @@ impl WiringObserver {
         self.frames += 1;
         let Some(stats) = self.buses.get_mut(bus.index()) else { return };
         stats.frames += 1;
-        // Bounds the memory: a vehicle's bus has a few hundred identifiers.
+        // Limits the memory. A vehicle's bus carries only a few hundred identifiers.
         if stats.ids.len() < 4096 || stats.ids.contains_key(&frame.id()) {
             let stats = stats.ids.entry(frame.id()).or_insert(IdStats { first: time, ..IdStats::default() });
             stats.count += 1;
@@ -171,7 +173,8 @@ impl WiringObserver {
         }
     }
 
-    /// Reads the configured current's message if it arrives on another interface.
+    /// If the frame has the identifier of the configured current's message but arrives on another interface, reads the
+    /// current from it.
     fn read_other_current(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
         let is_current = |signal: &&SignalPlan| signal.binding.channel == Channel::Current;
         let Some(signal) = self.plan.signals.iter().find(is_current) else { return };
@@ -259,12 +262,13 @@ impl WiringObserver {
         &self.responses[0]
     }
 
-    /// Slope of the pack's voltage over its current, from the block length that gives the more certain slope.
+    /// Slope of the pack's voltage against its current. Of the two block lengths, uses the length that gives the more
+    /// certain slope.
     pub(super) fn slope(&self) -> Option<Slope> {
         best_response(&self.responses).slope()
     }
 
-    /// Slope of one cell's voltage over the current, from the block length that [`Self::slope`] uses.
+    /// Slope of one cell's voltage against the current, with the block length that [`Self::slope`] uses.
     pub(super) fn slope_of(&self, cell: usize) -> Option<Slope> {
         best_response(&self.responses).slope_of(cell)
     }

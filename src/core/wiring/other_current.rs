@@ -35,7 +35,7 @@ impl OtherCurrent {
         &mut self.responses
     }
 
-    /// Slope of the pack's voltage over this current.
+    /// Slope of the pack's voltage against this current.
     pub(crate) fn slope(&self) -> Option<Slope> {
         best_response(&self.responses).slope()
     }

@@ -17,8 +17,9 @@ pub struct Plan {
     pub signals: Vec<SignalPlan>,
     /// Signals of the DBC that look like voltages of cells beyond `pack.cells`, in the order of their numbers.
     pub more_cells: Vec<SignalPlan>,
-    /// Signals of the DBC that are not configured but look like the pack's voltage (if cell voltages are configured)
-    /// or a state of charge. Their binding names that channel. A signal has one entry per interface.
+    /// Signals of the DBC that are not configured but look like the pack's voltage (if cell voltages are configured) or
+    /// a state of charge. The binding of each entry names the channel that the signal probably carries. A signal has
+    /// one entry per interface.
     pub unconfigured: Vec<SignalPlan>,
     /// The pack.
     pub pack: PackPlan,
@@ -52,7 +53,7 @@ pub struct PackPlan {
     pub capacity_ah: f64,
     /// Ambient temperature, degrees C.
     pub ambient_c: f64,
-    /// The pack counts as resting up to this current, A.
+    /// Largest absolute current at which the pack counts as resting, A.
     pub dead_band_a: f64,
     /// White noise of a voltage reading that the estimator assumes, V.
     pub voltage_noise_v: f64,

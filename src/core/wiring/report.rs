@@ -14,7 +14,8 @@ pub enum Severity {
     Note,
 }
 
-/// Subject of a finding. Ordered by cause: an earlier subject can cause a later one.
+/// Subject of a finding. The variants are ordered from causes to effects: a fault of an earlier variant can cause a
+/// fault of a later variant.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Topic {
@@ -36,7 +37,7 @@ pub enum Topic {
     CellCount,
     /// A configured signal was never received.
     Silent,
-    /// A signal is configured in place of another.
+    /// A signal is configured as the wrong quantity.
     Swapped,
     /// Byte order, sign or position of the bits is wrong.
     Layout,
@@ -75,7 +76,7 @@ pub struct Change {
     pub proposed: String,
     /// File and line. The caller sets it, because only the caller has read the file.
     pub place: Option<String>,
-    /// Current value in the file; `None` = not set.
+    /// Present value in the file; `None` if the key is not set.
     pub now: Option<String>,
 }
 
@@ -150,7 +151,7 @@ impl WiringFinding {
 }
 
 impl WiringReport {
-    /// Inserts a finding at its place in `findings` and returns it.
+    /// Inserts a finding into `findings`, keeps the list in order, and returns the inserted finding.
     pub fn add(&mut self, finding: WiringFinding) -> &mut WiringFinding {
         let key = |f: &WiringFinding| (f.severity, f.topic);
         let at = self.findings.partition_point(|other| key(other) <= key(&finding));
@@ -158,8 +159,9 @@ impl WiringReport {
         &mut self.findings[at]
     }
 
-    /// Folds all further findings on `cause`, and its consequences, into the first finding on `cause`. Keeps the title
-    /// of every folded finding, and the advice of those on `cause`.
+    /// Merges findings into the first finding on `cause`: all later findings on `cause`, and all findings for which
+    /// `is_consequence` is true. Keeps the title of every merged finding. Keeps the advice only of merged findings on
+    /// `cause`.
     pub(super) fn fold(&mut self, cause: Topic, is_consequence: impl Fn(&WiringFinding) -> bool) {
         let Some(first) = self.findings.iter().position(|finding| finding.topic == cause) else { return };
         let is_moved = |finding: &mut WiringFinding| finding.topic == cause || is_consequence(finding);

@@ -17,7 +17,7 @@ pub(super) const REPETITIONS: &str = "GenMsgNrOfRepetition";
 pub(super) const FAST_CYCLE_TIME: &str = "GenMsgCycleTimeFast";
 /// Smallest mean time between two frames, ms.
 pub(super) const DELAY_TIME: &str = "GenMsgDelayTime";
-/// Standard or extended, classic or FD.
+/// Kind of the frames: standard or extended identifier, classic or FD.
 pub(super) const FRAME_FORMAT: &str = "VFrameFormat";
 pub(super) const FRAME_FORMATS: [&str; 16] = {
     let mut words = ["reserved"; 16];

@@ -104,7 +104,7 @@ impl Database {
         }
     }
 
-    /// Defines an attribute and writes its values, if any message has one.
+    /// Defines an attribute and writes its values, if any message has a value.
     fn attribute(
         &self,
         name: &str,
@@ -207,7 +207,7 @@ fn indicator(signal: &Signal) -> String {
 }
 
 /// Whether the message needs `SG_MUL_VAL_` lines because the indicators are not sufficient: it has ranges, nested
-/// multiplexors, or several multiplexors side by side.
+/// multiplexors, or several multiplexors on the same level.
 fn needs_ranges(message: &Message) -> bool {
     let mut conditions = message.signals.iter().map(|signal| signal.conditions.as_slice());
     let plain = message.signals.iter().filter(|signal| signal.is_multiplexor && signal.conditions.is_empty());

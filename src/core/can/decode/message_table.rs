@@ -90,10 +90,9 @@ impl BitPosition {
 struct LinearSignal {
     channel: Channel,
     position: BitPosition,
-    /// The sign bit of a signed signal; 0 for an unsigned signal. XOR with this bit, followed by its subtraction,
-    /// extends the sign.
+    /// The sign bit of a signed signal; 0 for an unsigned signal. `(code ^ sign) - sign` extends the sign.
     sign: u64,
-    /// Good codes are within the DBC's and the configured range. `first_good` is the first one, with its sign bit
+    /// Good codes are within the DBC's and the configured range. `first_good` is the first good code, with its sign bit
     /// flipped; `more_good` is the number of codes after it.
     first_good: u64,
     more_good: u64,
@@ -248,8 +247,8 @@ impl MessageGroups {
 }
 
 impl PageTable {
-    /// Creates the table for the selector that most runs depend on; `None` = no selector, or the table would be too
-    /// large.
+    /// Creates the table for the selector on which more runs depend than on any other selector; `None` = no selector,
+    /// or the table would be too large.
     fn new(bindings: &[Binding], runs: &[Range<usize>], all: &[SignalGroup]) -> Option<Self> {
         let tests = |run: &Range<usize>| bindings[run.start].mux.as_slice();
         let dependents = |plan: SignalPlan| runs.iter().flat_map(tests).filter(|test| test.plan == plan).count();
@@ -302,7 +301,7 @@ impl LinearSignal {
         let Binding { channel, scale, offset: shift, .. } = *binding;
         let never_good = Self {
             channel,
-            // Any position of one bit; no code is good.
+            // An arbitrary position of one bit, because no code is good.
             position: BitPosition { word: 0, window: 0, up: 0, down: 63 },
             sign: 0,
             first_good: u64::MAX,
@@ -343,7 +342,7 @@ impl LinearSignal {
 }
 
 /// The longest run of good codes without a "not available" code. "Not available" codes are nearly always at the ends of
-/// the range. If one is in the middle, the binding decodes the shorter part.
+/// the range. If such a code is in the middle, the binding decodes the shorter part.
 fn available_codes(binding: &Binding, sign: u64, (first, last): (i64, i64)) -> Option<(i64, i64)> {
     let possible = binding.not_available.iter().filter(|code| **code <= binding.plan.all_ones());
     let signed = possible.map(|code| (code ^ sign).wrapping_sub(sign).cast_signed());
@@ -355,8 +354,9 @@ fn available_codes(binding: &Binding, sign: u64, (first, last): (i64, i64)) -> O
     begins.zip(ends).filter(|(begin, end)| begin <= end).max_by_key(|(begin, end)| begin.abs_diff(*end))
 }
 
-/// The first and the last code with a value in both ranges. Every step from code to value is monotonic, rounding
-/// included. Therefore the good codes are consecutive, and bisection finds their ends exactly.
+/// The first and the last code whose value is in the DBC's range and in the configured range. Every step from code to
+/// value is monotonic, rounding included. Therefore the good codes are consecutive, and bisection finds their ends
+/// exactly.
 fn good_codes(binding: &Binding) -> Option<(i64, i64)> {
     let plan = &binding.plan;
     let physical = |code: i64| float_of_signed(code) * plan.factor + plan.offset;

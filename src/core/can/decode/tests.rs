@@ -7,8 +7,8 @@ use crate::can::dbc::Database;
 use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 use crate::quantity::CellIndex;
 
-/// Three messages. The first one is plain, with the voltage first and the current last. The second one is multiplexed,
-/// with one signal on every page. The third one has nested pages.
+/// Three messages. The first message is plain, with the voltage first and the current last. The second message is
+/// multiplexed, with one signal on every page. The third message has nested pages.
 pub(crate) const DBC: &str = r#"VERSION ""
 BU_: BMS
 BO_ 256 Pack: 6 BMS
@@ -51,7 +51,7 @@ pub(crate) const fn sensor(n: u16) -> Channel {
     Channel::Temperature(SensorIndex(n))
 }
 
-/// The first two messages, bound in no particular order. The bus counts charging positive.
+/// The first two messages, bound in no particular order. On the bus, the current is positive for charging.
 pub(crate) fn map() -> InputMap {
     InputMap::new(vec![
         bind("Cells.Cell3", cell(2)),

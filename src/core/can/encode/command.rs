@@ -2,7 +2,7 @@
 //! replaced.
 //!
 //! In: a frame whose end-to-end protection the caller has checked. Out: the command; a selector is `None` if it selects
-//! all. An undefined code is an error, so that a command is applied completely or not at all.
+//! all alarms. An undefined code is an error, so that a command is applied completely or not at all.
 
 use super::layout::LayoutMessage;
 use super::message::{PlanFaults, RULES};
@@ -22,7 +22,7 @@ pub enum Command {
     PackReplaced,
 }
 
-/// A command and the alarms that it selects; `None` = all.
+/// A command and the alarms that it selects. A selector that is `None` does not restrict the selection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct CommandFields {
     pub command: Command,

@@ -13,7 +13,7 @@ use crate::quantity::CellIndex;
 
 const RULE_COUNT: usize = RULES.len();
 
-/// State of a rule; the number is the wire code.
+/// State of a rule; the values are the wire codes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[repr(u8)]
 pub enum RuleState {

@@ -1,11 +1,11 @@
 //! Encodes channel values as input frames, for CSV replay and the simulator.
 //!
 //! Each message and multiplexer page with at least one value gives one frame. In that frame, a signal without a value
-//! is encoded as its "not available" code. If it has none, it is encoded as a code that the receiver rejects (NaN, out
-//! of range). If no such code exists, the whole frame is omitted, and its values count as not carried. A frame without
-//! any value is sent only if one of its signals has a "not available" code. Values beyond the signal's bits saturate.
-//! Values outside the DBC's range stay outside, so that the receiver detects the fault. A diagnostic response is
-//! encoded with its request and flow control, as on a bus with a tester.
+//! is encoded as its "not available" code. If the signal has no such code, it is encoded as a code that the receiver
+//! rejects (NaN, out of range). If no such code exists, the whole frame is omitted, and its values count as not
+//! carried. A frame without any value is sent only if one of its signals has a "not available" code. Values beyond the
+//! signal's bits saturate. Values outside the DBC's range stay outside, so that the receiver detects the fault. A
+//! diagnostic response is encoded with its request and flow control, as on a bus with a tester.
 //!
 //! The rows of a log usually have the same channels in the same order. Therefore the encoder finds the position of each
 //! signal's value in a row once and keeps it until the channels change.
@@ -49,7 +49,7 @@ struct RowChannel {
     channel: Channel,
     /// Whether a later position has the same channel. The later value counts.
     is_overridden: bool,
-    /// Whether a frame carries the value of the current row.
+    /// Whether a frame carries the value of the row that is being encoded.
     is_carried: bool,
 }
 
@@ -58,7 +58,7 @@ struct AnswerPage {
     question: Question,
     /// The response message, with all signals 0.
     template: Vec<u8>,
-    /// Each signal, after the byte of the message at which its layout starts.
+    /// Each signal of the response, paired with the byte of the message at which the signal's layout starts.
     fields: Vec<(usize, InputField)>,
 }
 

@@ -2,8 +2,9 @@
 //!
 //! Any DBC with the message and signal names of the shipped `config/packwatch.dbc` can be used. An unknown value is
 //! sent as the code that the DBC's value table calls "not available". If the table has no such code, an unknown value
-//! is sent as all ones (unsigned), the lowest code (signed) or NaN (float). A known value never has that code, because
-//! it saturates before it. End-to-end headers use the counters that the caller keeps ([`SendCounters`]).
+//! is sent as all ones (unsigned), the lowest code (signed) or NaN (float). A known value never gets this code, because
+//! the encoding saturates before it reaches the code. End-to-end headers use the counters that the caller keeps
+//! ([`SendCounters`]).
 //!
 //! A DBC is rejected with all its faults if signals are missing. It is also rejected if a value could be mistaken for
 //! the value of another rule or page.
@@ -77,7 +78,7 @@ pub struct StatusFields {
     pub active_alarms: Option<u16>,
     /// The cell that limits discharge.
     pub limiting_cell: Option<CellIndex>,
-    /// Wire code of the rules that are unknown: 0 none, 1 some, 2 all.
+    /// Wire code for the number of rules that are unknown: 0 none, 1 some, 2 all.
     pub unknown_rules: Option<u8>,
 }
 
@@ -100,8 +101,8 @@ pub struct HealthFields {
     pub usable_capacity_std_ah: Option<f64>,
     /// Resistance relative to new (1 = as new).
     pub resistance_ratio: Option<f64>,
-    /// Equivalent full cycles until the end of life, median. This value and all following ones are sent only if the DBC
-    /// has their signal.
+    /// Equivalent full cycles until the end of life, median. This value and all following values are sent only if the
+    /// DBC has signals for them.
     pub remaining_cycles: Option<f64>,
     /// 5 % quantile of `remaining_cycles`.
     pub remaining_cycles_low: Option<f64>,

@@ -105,7 +105,7 @@ impl AddressClaim {
         }
     }
 
-    /// Whether both claim the same address for the same NAME.
+    /// Whether `self` and `other` claim the same address for the same NAME.
     pub(super) fn is_same(&self, other: &Self) -> bool {
         (self.name, self.address) == (other.name, other.address)
     }

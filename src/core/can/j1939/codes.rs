@@ -23,7 +23,7 @@ pub struct ActiveCode {
     pub lamp: Lamp,
 }
 
-/// A code that is or was active, with its current state and its state on the bus.
+/// A code that is or was active, with its present state and its state on the bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 struct FollowedCode {
     code: TroubleCode,
@@ -179,7 +179,8 @@ impl Codes {
         }
     }
 
-    /// Handles the end of a message at `now`, which starts the second without changes.
+    /// Handles the end of a message at `now`. From then on, each code that the message changed stays unchanged on the
+    /// bus for one second.
     pub(super) fn sent(&mut self, now: Timestamp) {
         for followed in self.followed.iter_mut().filter(|followed| followed.is_in_flight) {
             followed.changed_at = Some(now);

@@ -45,7 +45,7 @@ pub(super) struct Header {
 }
 
 impl Header {
-    /// Splits an extended identifier; `None` for a standard one.
+    /// Splits an extended identifier; `None` for a standard identifier.
     pub(super) fn of(id: CanId) -> Option<Self> {
         let CanId::Extended(raw) = id else { return None };
         let [page, format, specific, source] = (raw & WITHOUT_PRIORITY).to_be_bytes();
@@ -55,7 +55,7 @@ impl Header {
     }
 }
 
-/// The identifier of a frame. `destination` is used only for groups that have one.
+/// The identifier of a frame. `destination` is used only for groups with a destination.
 pub(super) fn can_id(priority: u8, pgn: u32, destination: u8, source: u8) -> CanId {
     let [_, page, format, low] = pgn.to_be_bytes();
     let specific = if format < FIRST_BROADCAST_FORMAT { destination } else { low };
@@ -63,8 +63,8 @@ pub(super) fn can_id(priority: u8, pgn: u32, destination: u8, source: u8) -> Can
     CanId::Extended(u32::from_be_bytes([((priority & 7) << 2) | (page & 3), format, specific, source]))
 }
 
-/// Identifier and mask of one group from any source with any priority. `destination` is used only for groups that have
-/// one.
+/// Identifier and mask of one group from any source with any priority. `destination` is used only for groups with a
+/// destination.
 pub(super) fn filter(pgn: u32, destination: u8) -> (u32, u32) {
     (can_id(0, pgn, destination, 0).raw(), WITHOUT_PRIORITY & !0xFF)
 }

@@ -19,11 +19,12 @@
 //!
 //! Deviations from the standard:
 //! 1. The arbitrary address capability is not used: a node that loses its address falls silent instead of claiming
-//!    another. If addresses changed, a consumer that identifies battery monitors by address could not distinguish them.
-//! 2. Every payload of more than 8 bytes is sent by BAM, even if a single node requested it (the standard uses a
-//!    connection with flow control for that). That node receives the broadcast, too. The effect is a higher bus load,
-//!    which [`MAX_CODES`] limits.
-//! 3. The delay before "cannot claim" is derived from the NAME instead of random, so that a replay gives the same
+//!    another address. If addresses changed, a consumer that identifies battery monitors by address could not
+//!    distinguish them.
+//! 2. Every payload of more than 8 bytes is sent by BAM, even if a single node requested it (for a single node, the
+//!    standard uses a connection with flow control). That node also receives the broadcast. The effect is a higher bus
+//!    load, which [`MAX_CODES`] limits.
+//! 3. The delay before "cannot claim" is derived from the NAME instead of being random, so that a replay gives the same
 //!    frames.
 
 mod address;

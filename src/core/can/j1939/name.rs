@@ -39,9 +39,9 @@ pub struct OutOfRange {
     /// Name of the number.
     pub field: &'static str,
     pub found: u64,
-    /// Smallest allowed.
+    /// Smallest allowed value.
     pub lowest: u64,
-    /// Largest allowed.
+    /// Largest allowed value.
     pub highest: u64,
 }
 

@@ -3,8 +3,8 @@
 //! * DM1 is sent once a second, even without codes, and at once on a change. `codes` limits how often one code changes.
 //! * DM2 is sent only on request.
 //! * Messages of more than 8 bytes are transferred one after the other, so a changed DM1 waits for the end of a
-//!   transfer. If both wait, DM1 and DM2 alternate, so that neither a flood of requests stops DM1 nor a long DM1 stops
-//!   DM2. A single-frame DM1 is sent even while a DM2 is being transferred.
+//!   transfer. If a DM1 and a DM2 wait, they are sent alternately, so that neither a flood of requests stops DM1 nor a
+//!   long DM1 stops DM2. A single-frame DM1 is sent even while a DM2 is being transferred.
 //! * If a node requests a group that is not supported, the answer depends on the destination. A request to the node's
 //!   own address is rejected, and a request to all nodes is ignored.
 
@@ -124,8 +124,9 @@ impl Node {
         self.poll(now, out);
     }
 
-    /// Sets the codes that the next [`poll`](Self::poll) sends. The most severe active code and the latest previously
-    /// active code come first. `all_known` says whether every value that could activate a code is known.
+    /// Sets the codes that the next [`poll`](Self::poll) sends. The caller lists the most severe active code first, and
+    /// the latest previously active code first. `all_known` says whether every value that could activate a code is
+    /// known.
     pub fn set_codes(
         &mut self,
         now: Timestamp,
@@ -220,7 +221,7 @@ impl Node {
         let is_cyclic = self.next_dm1 <= now;
         let has_changed = self.codes.change_due().is_some_and(|due| due <= now);
         if (is_cyclic || has_changed) && self.can_start(now, PGN_DM1) {
-            // If this DM1 is on time, the next one keeps the cycle. After a change, a new cycle starts now.
+            // If this DM1 is on time, the next DM1 keeps the cycle. After a change, a new cycle starts now.
             let next = self.next_dm1.plus_nanos(DM1_PERIOD_NS);
             self.next_dm1 = if is_cyclic && now < next { next } else { now.plus_nanos(DM1_PERIOD_NS) };
             self.send_dm1(now, out);

@@ -1,6 +1,6 @@
 //! Broadcasts a payload of more than 8 bytes in packets (BAM of J1939-21): an announcement, then 7 bytes per packet.
 //!
-//! The standard requires 50 to 200 ms between packets. The next frame is due 50 ms after the last one was sent, so
+//! The standard requires 50 to 200 ms between packets. The next frame is due 50 ms after the last frame was sent, so
 //! packets keep their spacing after a late poll.
 
 use serde::{Deserialize, Serialize};

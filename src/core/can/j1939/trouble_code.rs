@@ -16,7 +16,8 @@ use super::name::OutOfRange;
 
 /// Maximum number of codes in one message. 27 codes are 110 bytes in 16 packets. The packets are sent every 50 ms, each
 /// up to one tick of 10 ms late. So a transfer ends within 0.96 s, before the next DM1 is due. 17 rules need only 17
-/// codes if the thresholds of each rule share a parameter number, because only the most severe one is sent.
+/// codes if the thresholds of each rule share a parameter number, because only the code of the most severe threshold is
+/// sent.
 pub const MAX_CODES: usize = 27;
 
 pub(super) const MAX_PAYLOAD: usize = 2 + 4 * MAX_CODES;
@@ -74,7 +75,7 @@ impl TroubleCode {
         self.occurrence_count
     }
 
-    /// Whether both are the same failure, regardless of their counts.
+    /// Whether the two codes report the same failure, regardless of their counts.
     pub const fn is_same_failure(self, other: Self) -> bool {
         self.spn == other.spn && self.fmi == other.fmi
     }
@@ -98,7 +99,7 @@ pub enum Lamp {
     Red,
 }
 
-/// State of a lamp; the numbers are the wire codes.
+/// State of a lamp; the values are the wire codes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 #[repr(u8)]
 pub enum LampState {

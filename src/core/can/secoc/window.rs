@@ -1,11 +1,11 @@
-//! Decides which freshness values a command may have. The receiver announces them, accepts none twice, and lets them
-//! expire after two announcements.
+//! Decides which freshness values a command may have. The receiver announces the values, accepts no value twice, and
+//! lets a value expire after two announcements.
 //!
 //! The receiver announces a value once a second, each time [`ANNOUNCEMENT_STEP`] higher. A command carries the
-//! announced value or a higher one below the next announcement. The sender uses each value once and in rising order.
-//! The receiver accepts a value if it is higher than all values accepted before, not older than the previous
-//! announcement, and already announced. If an attacker delays a command, it expires after two seconds. A command with
-//! an invented value is useless until the receiver announces that value.
+//! announced value, or a higher value that is below the next announcement. The sender uses each value once and in
+//! rising order. The receiver accepts a value if it is higher than all values accepted before, not older than the
+//! previous announcement, and already announced. If an attacker delays a command, it expires after two seconds. A
+//! command with an invented value is useless until the receiver announces that value.
 //!
 //! The sender stores nothing: after a restart, it waits for an announcement. The receiver stores its state. After a
 //! restart it begins [`RESTART_STEPS`] announcements beyond the stored state, and at least at the value that
@@ -18,7 +18,8 @@ use crate::quantity::Timestamp;
 
 /// Difference between two announcements, and the number of commands that one announcement allows.
 pub const ANNOUNCEMENT_STEP: u64 = 16;
-/// Number of announcements skipped at a start. They cover more than an hour in which the state could not be stored.
+/// Number of announcements skipped at a start. At one announcement a second, they cover more than an hour in which the
+/// state could not be stored.
 const RESTART_STEPS: u64 = 4096;
 /// A stored value above this limit is damaged, because reaching it takes 10^9 years.
 const MAX_FRESHNESS: u64 = 1 << 60;
@@ -61,8 +62,8 @@ impl FreshnessWindow {
         self.announced.saturating_sub(ANNOUNCEMENT_STEP).max(self.accepted.saturating_add(1))
     }
 
-    /// The values that a payload's freshness may represent. There are none if the freshness is expired or the payload
-    /// is too short.
+    /// The values that a payload's freshness may represent. The result is empty if the freshness is expired or the
+    /// payload is too short.
     pub fn check(&self, authentication: Authentication, payload: &[u8]) -> MacCheck {
         let mut candidates = [None; MAX_CANDIDATES];
         if let Some(sent) = authentication.sent_freshness(payload) {
@@ -78,7 +79,7 @@ impl FreshnessWindow {
         self.announced
     }
 
-    /// Accepts a value. Afterwards, neither this value nor a lower one is acceptable.
+    /// Accepts a value. Afterwards, neither this value nor a lower value is acceptable.
     pub fn accept(&mut self, freshness: u64) {
         self.accepted = self.accepted.max(freshness);
     }

@@ -212,7 +212,7 @@ proptest! {
     ) {
         let plan = l.plan().unwrap();
         let code = code & plan.all_ones();
-        // The shortest payload that carries the signal, and the longest possible one.
+        // The shortest payload that carries the signal, and the longest possible payload.
         for length in [plan.bytes_needed(), 64] {
             let mut after = before[..length].to_vec();
             plan.encode_raw(&mut after, code).unwrap();

@@ -1,13 +1,13 @@
 //! Applies a new configuration to a running monitor.
 //!
 //! In: a checked configuration. Out: the changes, with the resulting events and frames. If a restart is needed, the
-//! result is the reason, and nothing changes. Limits, thresholds, modes, noises and outputs change. The monitor keeps
-//! filters, learned values, counters, schedules, and alarms whose rule and severity are still configured. Estimates
-//! therefore change only if their settings change.
+//! result is the reason, and nothing changes. The new limits, thresholds, modes, noise values and outputs apply. The
+//! monitor keeps filters, learned values, counters, schedules, and alarms whose rule and severity are still configured.
+//! Estimates therefore change only if their settings change.
 //!
 //! A measured value keeps its definition. If the recharge window or the usable load changes, the value becomes unknown,
-//! unless it can be converted exactly. Initial values only affect cells of which nothing is known, so changed ones
-//! apply when the next pack is connected.
+//! unless it can be converted exactly. Initial values only affect cells about which nothing is known. Changed initial
+//! values therefore apply when the next pack is connected.
 
 use crate::alarm::{Observation, Rule};
 use crate::health::HealthConfig;

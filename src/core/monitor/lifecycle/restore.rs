@@ -47,9 +47,9 @@ impl Monitor {
         }
     }
 
-    /// Restores a stored state in a monitor that has not received an input. The first input gives the current time; the
-    /// snapshot was taken `downtime` before that time. The snapshot's timestamps are shifted to the current clock, and
-    /// the downtime counts as a gap.
+    /// Restores a stored state in a monitor that has not received an input. The first input gives the present time; the
+    /// snapshot was taken `downtime` before that time. The snapshot's timestamps are shifted to the clock of the
+    /// present run, and the downtime counts as a gap.
     ///
     /// [`Downtime::AsStamped`] means that the same clock continues. Frames, events and estimates are then, byte for
     /// byte, those of a monitor that had not stopped. This does not apply if the downtime exceeds half a minute, or if

@@ -17,7 +17,7 @@ pub enum Command {
     PackReplaced,
     /// Stop or resume diagnostic requests.
     Poll {
-        /// Whether to stop.
+        /// `true` = stop, `false` = resume.
         standby: bool,
     },
     /// Send a rule's alarm frame, marked as a test, for a while.

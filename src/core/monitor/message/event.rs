@@ -63,8 +63,8 @@ pub enum EventKind {
         #[serde(flatten)]
         values: RecordedValues,
     },
-    /// Losses of a cell after a half-cycle, as fractions of the model's new cell. Sent once the cell's capacity has
-    /// been measured.
+    /// Losses of a cell after a half-cycle, as fractions of the model's new cell. Not sent before the cell's capacity
+    /// has been measured.
     LossModes {
         /// Index of the cell.
         cell: CellIndex,
@@ -203,7 +203,7 @@ pub enum EventKind {
         /// Value of the identity signal.
         identity: f64,
     },
-    /// Writing the files of the learned state and the records started to fail, or works again.
+    /// Writing the files (learned state and records) started to fail, or works again.
     Store {
         /// Whether the files can be written.
         works: bool,
@@ -223,7 +223,8 @@ pub enum EventKind {
         bad_readings: u64,
     },
     /// A protected message started to fail its check, or became usable again. Further results are only counted. The
-    /// first frame is not a change. Lost frames are a change only if more frames are lost than the check allows.
+    /// result of the first frame is not reported as a change. Lost frames are reported only if more frames are lost
+    /// than the check allows.
     Protection(GuardChange),
     /// A message started or stopped exceeding its frame limit.
     Flood(FloodChange),
@@ -292,8 +293,8 @@ pub enum EventKind {
         cell: CellIndex,
         /// Whether the cell's innovations agree with their covariance and the model fits the cell.
         trusted: bool,
-        /// Mean normalised innovation squared over the consistency window. If the model does not fit the cell, at least
-        /// the mismatch on the same scale.
+        /// Mean normalised innovation squared over the consistency window. If the model does not fit the cell, the
+        /// value is at least the model's mismatch, converted to the same scale.
         mean_nis: f64,
     },
 }
@@ -309,7 +310,7 @@ impl EventKind {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ModelState {
-    /// The model is the label's; nothing has been learned yet.
+    /// The model is derived from the label; nothing has been learned yet.
     Prior,
     /// The model is partly learned.
     Learning,

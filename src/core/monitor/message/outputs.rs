@@ -45,7 +45,7 @@ impl Secured {
     }
 }
 
-/// Validity of the published estimates; the numbers are those in CAN frames.
+/// Validity of the published estimates. CAN frames contain the same values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
@@ -71,7 +71,7 @@ pub struct Estimate {
     pub soc: f64,
     /// Standard deviation of the SOC.
     pub soc_std: f64,
-    /// Branch voltages, V; NaN beyond the model's branches.
+    /// Voltages of the model's RC branches, V; NaN in unused elements.
     pub branch_v: [f64; crate::cell::MAX_BRANCHES],
     /// Learned capacity, Ah.
     pub capacity_ah: f64,

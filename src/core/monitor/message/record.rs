@@ -57,7 +57,7 @@ pub enum RecordKind {
         /// The command.
         command: Command,
     },
-    /// Writing the files of the learned state and the records started to fail, or works again.
+    /// Writing the files (learned state and records) started to fail, or works again.
     Store {
         /// Whether the files can be written.
         works: bool,
@@ -201,6 +201,6 @@ impl std::str::FromStr for Downtime {
 /// Period of the driver's ticks, ms: a tenth of the shortest sensible period of a cyclic frame.
 pub const TICK_PERIOD_MS: u32 = 10;
 
-/// Largest step back in time that counts as frames of several interfaces merged out of order, ns. A larger step means
-/// that the clock was set back.
+/// Largest step back in time, ns, that can result from merging the frames of several interfaces out of order. A larger
+/// step means that the clock was set back.
 pub const MERGE_TOLERANCE_NS: i64 = 1_000_000_000;

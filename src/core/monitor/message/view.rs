@@ -1,4 +1,4 @@
-//! Current values of cells and pack for status, tables and reports. `None` = not known yet, or no longer known.
+//! Present values of cells and pack for status, tables and reports. `None` = not known yet, or no longer known.
 
 use serde::{Deserialize, Serialize};
 
@@ -8,7 +8,7 @@ use crate::cell::Chemistry;
 use crate::quantity::catalogue::{CellValues, PackValues};
 use crate::quantity::{CellIndex, Mode};
 
-/// Current values of one cell.
+/// Present values of one cell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CellView {
     /// Index of the cell.
@@ -25,7 +25,7 @@ pub struct CellView {
     pub trusted: Option<bool>,
 }
 
-/// Current values of the pack, from its limiting cells.
+/// Present values of the pack, from its limiting cells.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct PackView {
     /// Validity of the estimates.

@@ -20,7 +20,7 @@ pub(crate) struct Alarming {
     pub(crate) missing_after_s: Option<f64>,
     /// Changes that wait to be published.
     pub(crate) changes: Vec<AlarmChange>,
-    /// Cells whose voltage channel is faulty, so that nothing is known about them. The cell-fault detector finds them.
+    /// Cells whose voltage channel is faulty according to the cell-fault detector. Nothing is known about these cells.
     pub(crate) faulty_channels: Vec<CellIndex>,
     pub(crate) state: AlarmingState,
 }
@@ -123,7 +123,7 @@ impl StoreHealth {
         is_change
     }
 
-    /// Value for the rule about files: how long the files could not be written, s; 0 while they can be written.
+    /// Value for the rule about files: time for which the files could not be written, s; 0 while they can be written.
     pub(crate) fn failing(&self, now: Timestamp) -> Observation {
         let failing_s = self.failing_since.map_or(0.0, |since| now.since(since).max(0.0));
         Observation::new(self.is_known.then_some(failing_s))

@@ -98,7 +98,7 @@ impl Estimation {
         }
     }
 
-    /// Applies other settings to the same cells.
+    /// Applies the settings of a new configuration that has the same cells.
     pub(crate) fn reconfigure(&mut self, config: &MonitorConfig, modelling: &Modelling, learner: &Learner) {
         self.modules.clone_from(&config.modules);
         self.use_model(modelling, learner);
@@ -108,7 +108,7 @@ impl Estimation {
         self.ambient_c = config.sample.ambient_c;
     }
 
-    /// Applies the current model to the same cells.
+    /// Applies the present model to the existing cells.
     pub(crate) fn use_model(&mut self, modelling: &Modelling, learner: &Learner) {
         let (model, estimator) = modelling.in_force();
         self.reconfigure_bank(&model, &estimator, learner);
@@ -303,7 +303,7 @@ impl Estimation {
         self.any_mismatched = self.checks.iter().any(ModelCheck::is_mismatched);
     }
 
-    /// Whether the stored check belongs to another cell than the cell that the module now has.
+    /// Whether a cell belongs to a module and its stored `check` was made with another cell model than the present one.
     pub(crate) fn is_other_cell(&self, index: usize, check: &ModelCheck) -> bool {
         let id = || model_id(self.bank.model(index), self.bank.config(index).initial.log_resistance_std);
         !self.bank.is_own(index) && check.is_of_other(id())

@@ -22,7 +22,7 @@ pub(crate) struct Findings {
     cells: usize,
     /// The cells that are compared: the pack's own kind, without the modules of another kind.
     compared: Vec<usize>,
-    /// Whether the BMS bleeds fuller cells after a charge.
+    /// Whether the BMS discharges fuller cells after a charge (passive balancing).
     is_balanced: bool,
     /// Meaning of the balancing bits; `None` without balancing bits.
     balancing: Option<BalancingConfig>,
@@ -37,7 +37,7 @@ impl Findings {
         Self { diagnosis: CellFaultDetector::among(cells, &compared), cells, compared, is_balanced, balancing }
     }
 
-    /// Applies other settings to the same cells.
+    /// Applies the settings of a new configuration that has the same cells.
     pub(crate) fn reconfigure(&mut self, config: &MonitorConfig) {
         (self.is_balanced, self.balancing) = (config.is_balanced, config.balancing);
     }
@@ -79,7 +79,7 @@ impl Findings {
     }
 
     /// Adds or withdraws the finding that the reading of the current is frozen. This cannot wait for the end of a row,
-    /// because no row ends without a current.
+    /// because no row ends without readings of the current.
     pub(crate) fn watch_current(&mut self, now: Timestamp, is_frozen: bool, out: &mut Outputs) {
         let is_found = || self.diagnosis.findings().iter().any(|found| found.kind == CellFaultKind::CurrentFrozen);
         if self.diagnosis.is_active() && is_frozen != is_found() {

@@ -43,7 +43,7 @@ pub(crate) struct Intake {
     pub(crate) controllers: Vec<Controller>,
     /// Reassembles diagnostic answers.
     pub(crate) listener: Listener,
-    /// Per controller: moment at which its current answer started.
+    /// Per controller: moment at which the answer that is now being received started.
     pub(crate) moments: Vec<Option<Moment>>,
     /// Time of the last report of a rejected command frame.
     pub(crate) bad_command_at: Option<Timestamp>,
@@ -54,7 +54,8 @@ pub(crate) struct Intake {
 pub(crate) struct ReceivedFrame<'a> {
     pub(crate) bus: BusIndex,
     pub(crate) frame: &'a Frame,
-    /// The freshness that the frame's authenticator confirms; `None` = no value fits, or it was not checked.
+    /// The freshness that the frame's authenticator confirms; `None` = no value fits, or the authenticator was not
+    /// checked.
     pub(crate) freshness: Option<u64>,
 }
 
@@ -80,7 +81,8 @@ pub(crate) struct IntakeState {
     pub(crate) commands: CommandGate,
     senders: Vec<MessageRate>,
     pub(crate) buses: Buses,
-    /// State of partially received messages; `None` in a state for a restart, because frames are missed meanwhile.
+    /// State of partially received messages; `None` in a state for a restart, because frames are missed during the
+    /// restart.
     progress: Option<Box<IntakeProgress>>,
 }
 
@@ -109,7 +111,7 @@ pub struct ControllerCount {
     /// The controller.
     #[serde(flatten)]
     pub controller: Controller,
-    /// Counts of its answers.
+    /// Counts of the controller's answers.
     #[serde(flatten)]
     pub counts: ControllerCounts,
 }
@@ -133,7 +135,8 @@ impl Intake {
         }
     }
 
-    /// Applies other limits and checks to the same messages; keeps the counts and the state of current floods.
+    /// Applies the limits and checks of a new configuration that has the same messages. Keeps the counts and the state
+    /// of floods in progress.
     pub(crate) fn reconfigure(&mut self, config: &MonitorConfig) {
         let new = Self::new(config);
         self.gate = new.gate.inheriting(&self.gate);
@@ -163,8 +166,8 @@ impl Intake {
         admitted.then_some(Admission(status))
     }
 
-    /// The fields of a command frame that could be decoded, and the command. Rejections are reported at most once a
-    /// second.
+    /// Decodes a command frame. Returns the decoded fields, if there are any, and the command. Rejections are reported
+    /// at most once a second.
     ///
     /// # Errors
     /// The reason why the command is not executed.
@@ -206,7 +209,7 @@ impl Intake {
         out.events.push(Event { time: now, kind: EventKind::Bus { bus, what: event } });
     }
 
-    /// Value for the rule about interfaces: how long the worst interface has been out of order, s.
+    /// Value for the rule about interfaces: time for which the interface with the longest fault has been faulty, s.
     pub(crate) fn bus_fault(&self, now: Timestamp, interfaces: usize) -> Observation {
         let (fault_s, is_whole) = self.buses.worst_s(now, interfaces);
         let foreign_s = Some(self.own.longest_s(now)).filter(|seconds| *seconds > 0.0);

@@ -42,7 +42,7 @@ pub(crate) struct Learning {
     pub(crate) state: LearningState,
     pub(crate) cells: Vec<CellHealth>,
     pub(crate) lives: PackLife,
-    /// Buffer for the half-cycles of the current change of mode; reused to avoid allocations.
+    /// Buffer for the half-cycles that a change of mode completes; reused to avoid allocations.
     half_cycles: Vec<HalfCycle>,
 }
 
@@ -67,7 +67,7 @@ pub(crate) struct LearningState {
 pub(crate) struct CellHealth {
     /// SOC after the last full charge; 1 before the first full charge.
     pub(crate) full_soc: f64,
-    /// Whether the current charge has tapered off at the highest voltage.
+    /// Whether the charge in progress has tapered off at the highest voltage.
     tapered: bool,
     pub(crate) usable: Option<ScalarGaussian>,
     /// Resistance relative to a new cell, after the last discharge.
@@ -209,7 +209,8 @@ impl Learning {
         let teaches = |cell| if bank.is_own(cell) { teaches_capacity } else { bank.has_given_model(cell) };
         self.state.learner.hold(|cell| !teaches(cell));
         to.event(EventKind::Mode { from: change.from, to: change.to });
-        // If the current is lost, keep the evidence for the offset and the slow branches until the next change of mode.
+        // If readings of the current stop, keep the evidence for the offset and the slow branches until the next change
+        // of mode.
         if change.to != Mode::Unknown {
             self.learn_offset(bank, to.now);
             bank.learn_slow_branches();
@@ -274,8 +275,8 @@ impl Learning {
         if half_cycle.mode == Mode::Charge && health.tapered {
             health.full_soc = half_cycle.end_soc.unwrap_or(health.full_soc);
         }
-        // Discharges update the usable capacity. A charge only sets the first value, because the resistance after a
-        // charge is that of charging.
+        // Discharges update the usable capacity. A charge only sets the first value, because a charge measures the
+        // charging resistance.
         let is_discharge = half_cycle.mode == Mode::Discharge;
         let is_restated = is_discharge || health.usable.is_none();
         if let Some(usable) = config.usable.as_ref().filter(|_| is_restated) {

@@ -8,9 +8,9 @@
 //! The estimators change to the new model during the rest, never while driving. The fit is a [`FitTask`] that starts
 //! some time before the change, so that a host can run it on another thread.
 //!
-//! Before the change, the task compares the current model and the previous model on the new rows, which neither of them
-//! has seen, and the worse model is dropped. A settled model is fitted again only if the pack has reached another range
-//! of temperature or charge. The half-cycles then continue to learn the capacity.
+//! Before the change, the task compares the present model and the previous model on the new rows. Neither model was
+//! fitted to these rows. The worse model is dropped. A settled model is fitted again only if the pack has reached
+//! another range of temperature or state of charge. The half-cycles then continue to learn the capacity.
 
 use serde::{Deserialize, Serialize};
 
@@ -37,7 +37,7 @@ const FIT_S: f64 = 30.0;
 /// Largest misfit of a usable fit. With typical sensors, the misfit is at most 0.65. Heavy load in the cold, a faulty
 /// sensor, or a pack that was exchanged between the rows cause a larger misfit.
 const MOST_MISFIT: f64 = 0.7;
-/// Misfit above which the current model is dropped, because the rows deviate more than they should.
+/// Misfit above which the present model is dropped, because the rows deviate from it by more than their errors explain.
 const HOPELESS_MISFIT: f64 = 1.0;
 
 /// Largest relative standard deviation of a usable fit's capacity. For the label's capacity, it is 0.1. Rows that
@@ -95,7 +95,7 @@ pub(crate) struct Modelling {
     estimator: EstimatorConfig,
     notebook: NotebookConfig,
     pub(crate) state: ModellingState,
-    /// Whether the host has not yet been offered the current fit.
+    /// Whether the fit in progress waits for the host to take it.
     is_offered: bool,
     /// A task that the host has run, with its findings.
     given: Option<(FitTask, FitFindings)>,
@@ -121,7 +121,7 @@ pub(crate) struct ModellingState {
     /// The label with which the state was learned.
     label: Option<Label>,
     notebook: Notebook,
-    /// The current learned model.
+    /// The present learned model.
     own: Option<OwnModel>,
     /// The previous model; `None` = the label's.
     before: Option<OwnModel>,
@@ -129,9 +129,9 @@ pub(crate) struct ModellingState {
     fits: u32,
     taken_back: u32,
     changes: Vec<ModelChange>,
-    /// Start of the current rest.
+    /// Start of the present rest.
     rest_since: Option<Timestamp>,
-    /// Start of the current fit. No row is closed during a fit.
+    /// Start of the fit in progress. No row is closed during a fit.
     fit_since: Option<Timestamp>,
     /// Whether a row is complete.
     has_row: bool,
@@ -213,7 +213,7 @@ impl Modelling {
         }
     }
 
-    /// Applies other settings to the same cells.
+    /// Applies the settings of a new configuration that has the same cells.
     pub(crate) fn reconfigure(&mut self, config: &MonitorConfig) {
         (self.model, self.estimator) = (config.model.clone(), config.estimator);
     }
@@ -233,7 +233,7 @@ impl Modelling {
         };
     }
 
-    /// The current model and its settings.
+    /// The present model and its settings.
     pub(crate) fn in_force(&self) -> (CellModel, EstimatorConfig) {
         let own = self.label.as_ref().zip(self.state.own.as_ref());
         let learned = own.and_then(|(label, own)| {
@@ -264,7 +264,8 @@ impl Modelling {
         self.state.notebook.close_row(&self.notebook, soc);
     }
 
-    /// Handles the pack's mode. Returns whether the current fit is due to end. If so, the caller calls [`Self::refit`].
+    /// Handles the pack's mode. Returns whether the fit in progress is due to end. If so, the caller calls
+    /// [`Self::refit`].
     pub(crate) fn observe_mode(&mut self, now: Timestamp, mode: Mode) -> bool {
         if self.label.is_none() || mode != Mode::Rest {
             (self.state.rest_since, self.state.fit_since) = (None, None);
@@ -281,7 +282,7 @@ impl Modelling {
         false
     }
 
-    /// Returns the current fit once, for a host that runs it on another thread.
+    /// Returns the fit in progress once, for a host that runs it on another thread.
     pub(crate) fn take_task(&mut self) -> Option<FitTask> {
         let is_new = std::mem::take(&mut self.is_offered) && self.state.fit_since.is_some();
         is_new.then(|| self.task()).flatten()
@@ -313,7 +314,7 @@ impl Modelling {
             && (!is_settled || notebook.rows_of_new_classes(self.notebook.rated_ah) >= LEAST_NEW_ROWS)
     }
 
-    /// Compares the current and the previous model on the new rows, then fits a model to all rows. Returns the model
+    /// Compares the present and the previous model on the new rows, then fits a model to all rows. Returns the model
     /// that the estimators must adopt; `None` if there is no such model.
     pub(crate) fn refit(&mut self) -> Option<Adoption> {
         let label = self.label?;
@@ -360,7 +361,7 @@ impl Modelling {
         Some(Adoption { model, config, mean, with_capacity: !was_settled, is_learned: true })
     }
 
-    /// Returns to the label's model, unless the current model is settled. Called if the rows contradict the current
+    /// Returns to the label's model, unless the present model is settled. Called if the rows contradict the present
     /// model. `None` if the model does not change.
     fn return_to_label(&mut self) -> Option<Adoption> {
         self.state.own.take_if(|own| !own.is_settled())?;

@@ -46,7 +46,7 @@ impl Publisher<'_> {
         self.alarming.engine.apply(self.now, &input, &mut self.alarming.changes)
     }
 
-    /// Publishes waiting alarm changes, and sends the current state of each changed alarm.
+    /// Publishes waiting alarm changes, and sends the present state of each changed alarm.
     pub(crate) fn publish_alarms(&mut self) {
         if self.alarming.changes.is_empty() {
             return;
@@ -63,7 +63,7 @@ impl Publisher<'_> {
         self.sending.poll_j1939(self.now, self.out);
     }
 
-    /// Passes the current alarms to the J1939 node.
+    /// Passes the present alarms to the J1939 node.
     pub(crate) fn update_trouble_codes(&mut self) {
         self.sending.update_trouble_codes(self.now, &self.alarming.engine);
     }

@@ -1,8 +1,9 @@
 //! Sampling stage: turns readings into cell samples, and detects which pack is connected.
 //!
 //! In: judged readings. Out: a [`CellSample`] for each good voltage, an event for each signal that turns bad or good,
-//! and the pack's identity once enough consecutive readings agree. Bad readings and single odd identities change
-//! nothing. The identity is stored, so that an exchange of the pack during a downtime is detected.
+//! and the pack's identity once enough consecutive readings agree. A bad reading changes nothing, and neither does a
+//! single reading of another identity. The identity is stored, so that an exchange of the pack during a downtime is
+//! detected.
 
 use serde::{Deserialize, Serialize};
 
@@ -21,7 +22,7 @@ pub(crate) struct Sampling {
     pub(crate) has_usable_reading: bool,
     /// Whether an input message has a second sender.
     pub(crate) has_second_sender: bool,
-    /// Buffer for the signal changes of the current input; reused to avoid allocations.
+    /// Buffer for the signal changes of the input that is being handled; reused to avoid allocations.
     changes: Vec<SignalChange>,
 }
 
@@ -47,7 +48,7 @@ impl SamplingState {
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(crate) struct Identity {
     pub(crate) known: Option<f64>,
-    /// Another number than the known one, and how many consecutive readings have given it.
+    /// A number that differs from the known number, and the number of consecutive readings that have given it.
     candidate: Option<(f64, u32)>,
 }
 
@@ -71,7 +72,8 @@ impl Identity {
 }
 
 impl Identity {
-    /// Whether a reading gives another number than that of the connected pack; `None` if either number is unknown.
+    /// Whether a reading gives a number that differs from the number of the connected pack; `None` if either number is
+    /// unknown.
     pub(crate) fn is_other(&self, reading: Result<f64, Fault>) -> Option<bool> {
         let value = reading.ok().filter(|value| value.is_finite())?;
         Some(self.known? != value)
@@ -107,7 +109,7 @@ impl Sampling {
         (self.has_usable_reading, self.has_second_sender) = (state.has_usable_reading, state.has_second_sender);
     }
 
-    /// Applies other limits to the same signals.
+    /// Applies the limits of a new configuration that has the same signals.
     pub(crate) fn reconfigure(&mut self, config: &MonitorConfig) {
         self.sampler.reconfigure(&config.sample);
         self.identity_readings = config.identity_readings;

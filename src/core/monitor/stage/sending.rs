@@ -27,7 +27,7 @@ use crate::quantity::{BusIndex, Fault, Timestamp};
 
 /// Period of a test's frames, s: a receiver that reads once a second still gets several frames.
 const TEST_PERIOD_S: f64 = 0.1;
-/// Longest test, s, so that a forgotten test ends.
+/// Longest duration of a test, s. It ensures that a forgotten test ends.
 pub const MAX_TEST_S: f64 = 600.0;
 
 /// Number of immediate replies after a pause; further replies are at least [`REPLY_DELAY_MS`] apart. A small number
@@ -36,7 +36,7 @@ const REPLY_BURST: i64 = 5;
 const REPLY_DELAY_NS: i64 = REPLY_DELAY_MS as i64 * 1_000_000;
 
 /// Number of freshness values skipped at a start. It exceeds the number of frames in three hours at the highest rate,
-/// because an earlier process may have sent that many since the state was stored.
+/// because an earlier process may have sent so many frames after the state was stored.
 const RESTART_FRESHNESS: u64 = 1 << 20;
 /// Minimum freshness per second of the clock. It exceeds the number of frames in a second.
 const FRESHNESS_PER_S: u64 = 256;
@@ -121,7 +121,7 @@ impl Schedule {
         [housekeeping, status, health, alarm, digest, freshness]
     }
 
-    /// Applies other periods; a shorter period takes effect immediately.
+    /// Applies the periods of a new configuration. A shorter period takes effect immediately.
     fn reconfigure(&mut self, now: Timestamp, before: &OutputConfig, after: &OutputConfig) {
         let periods_s =
             |of: &OutputConfig| [of.status_period_s, of.health_period_s, of.alarm_period_s, of.digest_period_s];
@@ -367,7 +367,7 @@ impl Sending {
         }
     }
 
-    /// Sends the current state of changed alarms within the budget. The remaining alarms and the repetitions follow
+    /// Sends the present state of changed alarms within the budget. The remaining alarms and the repetitions follow
     /// later.
     pub(crate) fn send_changed_alarms(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
         while let Some(key) = self.schedule.alarms.take_changed(now) {
@@ -381,7 +381,7 @@ impl Sending {
         std::mem::take(&mut self.is_rescheduled)
     }
 
-    /// Sends the current state of an alarm. If the alarm no longer has a threshold, sends its state as unknown.
+    /// Sends the present state of an alarm. If the alarm no longer has a threshold, sends its state as unknown.
     fn send_key(&mut self, now: Timestamp, key: AlarmKey, engine: &AlarmEngine, out: &mut Outputs) {
         let (rule, severity, cell) = key.parts();
         if let Some(alarm) = engine.find(rule, severity, cell) {
@@ -564,7 +564,7 @@ impl Sending {
         }
     }
 
-    /// Passes the current alarms to the J1939 node.
+    /// Passes the present alarms to the J1939 node.
     pub(crate) fn update_trouble_codes(&mut self, now: Timestamp, engine: &AlarmEngine) {
         if let Some(j1939) = &mut self.j1939 {
             j1939.update_trouble_codes(now, engine, self.test.is_some());

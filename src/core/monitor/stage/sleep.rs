@@ -16,7 +16,7 @@ pub(crate) const QUIET_S: f64 = 0.25;
 pub(crate) struct BusSleep {
     /// Silence after which the buses count as asleep, s; `None` = never.
     pub(crate) after_s: Option<f64>,
-    /// Start of the current sleep.
+    /// Start of the present sleep.
     pub(crate) since: Option<Timestamp>,
 }
 
@@ -40,7 +40,7 @@ impl BusSleep {
         Self { after_s: config.asleep_after_s.map(|after_s| after_s.max(oldest_s)), since: None }
     }
 
-    /// Applies another time-out; a current sleep continues.
+    /// Applies the time-out of a new configuration; a sleep in progress continues.
     pub(crate) fn reconfigure(&mut self, config: &MonitorConfig) {
         self.after_s = Self::new(config).after_s;
     }

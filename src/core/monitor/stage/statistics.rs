@@ -139,7 +139,7 @@ impl AlarmCounts {
 }
 
 impl Statistics {
-    /// The counts since `before`.
+    /// Differences between these counts and the earlier counts `before`.
     pub fn since(&self, before: &Self) -> Self {
         let of = |count: fn(&Self) -> u64| count(self).saturating_sub(count(before));
         let buses = self.buses.iter().enumerate();

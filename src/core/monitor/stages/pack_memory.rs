@@ -5,8 +5,8 @@
 //! once it is confirmed. Out: the stored values of the pack with that number, if there are any.
 //!
 //! Stored are capacities, resistances, remaining lives, recharge periods and the current offset (a pack often has its
-//! own sensor). The current half-cycle and the state of charge are not stored; the first voltage determines the state
-//! of charge. A pack without learned values is not stored, so that bogus numbers do not displace real packs.
+//! own sensor). The unfinished half-cycle and the state of charge are not stored; the first voltage determines the
+//! state of charge. A pack without learned values is not stored, so that bogus numbers do not displace real packs.
 
 use serde::{Deserialize, Serialize};
 
@@ -18,7 +18,7 @@ use crate::monitor::stage::learning::{CellHealth, LearningState, Throughput, che
 use crate::monitor::stage::modelling::ModellingState;
 use crate::quantity::{InvalidState, bounds};
 
-/// Maximum number of stored packs, without the connected pack: more than a vehicle uses in turn.
+/// Maximum number of stored packs, without the connected pack: a vehicle alternates between fewer packs.
 const MAX_PACKS: usize = 8;
 /// Maximum number of cells in all stored packs together. One pack is stored even if it has more cells. A cell takes
 /// 2.6 kB of the stored state.
@@ -29,7 +29,7 @@ const MAX_CELLS: usize = 384;
 #[serde(deny_unknown_fields)]
 pub(crate) struct PackMemory {
     packs: Vec<StoredPack>,
-    /// The connected pack as it was before the first reading of another number.
+    /// Learned values that the connected pack had before readings started to show another pack number.
     aside: Option<Box<StoredPack>>,
 }
 

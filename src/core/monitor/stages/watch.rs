@@ -1,4 +1,4 @@
-//! Passes current values to their alarm rules every 0.1 s. (The learning stage passes learned values when it learns
+//! Passes present values to their alarm rules every 0.1 s. (The learning stage passes learned values when it learns
 //! them.)
 //!
 //! In: all stages. Out: values for the [alarming](crate::monitor::stage::alarming) stage. If a part of a value is
@@ -21,7 +21,7 @@ use crate::sample::CellSample;
 const CELL_LEARNED: [Rule; 5] =
     [Rule::CapacityLow, Rule::UsableCapacityLow, Rule::ResistanceHigh, Rule::CellLeak, Rule::ConnectionResistance];
 
-/// Values of the two rules about an input.
+/// Values for the two alarm rules about an input.
 #[derive(Debug, Clone, Copy)]
 struct InputObservation {
     silence_s: Observation,
@@ -55,7 +55,7 @@ struct SocSpread {
 }
 
 impl Stages {
-    /// Passes the values that are not learned at a change of mode to their rules.
+    /// Passes all values to their rules, except the values that are learned at a change of mode.
     pub(crate) fn watch(&mut self, now: Timestamp, out: &mut Outputs) {
         let any_lost = self.sampling.sampler.any_lost();
         let worst = self.sampling.sampler.worst_input(now);
@@ -214,7 +214,7 @@ impl Stages {
         let (mut spread, mut known): (Option<SocSpread>, usize) = (None, 0);
         for cell in self.estimation.cell_indices() {
             let is_fresh = self.sampling.sampler.is_fresh(self.sampling.voltage_channel(cell), now);
-            // A voltage received before the first current cannot be used yet.
+            // A voltage that arrived before the first reading of the current cannot be used yet.
             let is_of_cell = !bank.is_carried_over(cell.index()) && !self.alarming.faulty_channels.contains(&cell);
             let is_present = is_fresh && is_of_cell;
             let Some(soc) = bank.soc(cell.index()).filter(|_| is_present) else { continue };
@@ -288,12 +288,13 @@ impl Stages {
         }
     }
 
-    /// Judges whether a cell's innovations agree with their covariance, and reports a change as an event. If
-    /// `is_current`, also passes the innovations to their rule.
+    /// Judges whether a cell's innovations agree with their covariance, and reports a change as an event. `is_current`:
+    /// whether the innovations are recent; if so, also passes them to their rule.
     pub(crate) fn judge_trust(&mut self, now: Timestamp, cell: CellIndex, is_current: bool, out: &mut Outputs) {
         let mean_nis = self.estimation.contradiction(cell.index());
         let change = self.estimation.judge_trust(cell);
-        // Without a current, the filter continues, but its innovations say nothing about the cell's model.
+        // Without readings of the current, the filter continues, but its innovations say nothing about the cell's
+        // model.
         let is_observed = is_current && self.sampling.inputs_valid(cell, now);
         let mut publisher = self.publisher(now, out);
         if let Some(trusted) = change {
@@ -340,8 +341,9 @@ impl Stages {
         learning.lives.observe(is_new, &mut publisher);
     }
 
-    /// Passes the results of a row to the rules about single cells. `is_new`: whether the rules have not seen the
-    /// results before. If so, the results of a cell whose inputs are lost are skipped until the next row.
+    /// Passes the results of a row (a few minutes of samples) of the cell-fault detector to the rules about single
+    /// cells. `is_new`: whether the rules have not seen the results before. If so, the results of a cell whose inputs
+    /// are lost are skipped until the next row.
     pub(crate) fn publish_diagnosis(&mut self, now: Timestamp, is_new: bool, out: &mut Outputs) {
         self.note_faulty_channels();
         let diagnosis = &self.findings.diagnosis;
@@ -361,7 +363,7 @@ impl Stages {
         }
     }
 
-    /// Updates the list of cells with a faulty channel, whose other alarms are suppressed.
+    /// Updates the list of cells with a faulty channel. The other alarms of these cells are suppressed.
     pub(crate) fn note_faulty_channels(&mut self) {
         let faulty = self.findings.faulty_channels();
         if faulty != self.alarming.faulty_channels {

@@ -70,7 +70,7 @@ const NO_MEASUREMENT: &str = "limit target request =req avail possible set allow
     =num count delta =dev deviation fault offset reserve initial";
 
 impl Score {
-    /// If `holds` is true, adds the points and, unless it is empty, their reason.
+    /// If `holds` is true, adds `points`, and adds `reason` unless it is empty.
     pub fn add(&mut self, points: f64, holds: bool, reason: &str) {
         if holds {
             self.points += points;
@@ -98,7 +98,7 @@ impl PackQuantity {
         }
     }
 
-    /// Unit of its values.
+    /// Unit of the quantity's values.
     pub fn unit(self) -> &'static str {
         match self {
             Self::Current => "A",

@@ -102,7 +102,7 @@ impl OpenRun {
         (self.v, self.vv, self.tv) = (self.v + v, self.vv + v * v, self.tv + t * v);
     }
 
-    /// The line through the evaluated part; `None` if it is too short.
+    /// Fits a line to the evaluated part of the run; `None` if this part is too short.
     fn finish(&self) -> Option<SteadyRun> {
         let (n, (first_s, first_v)) = (self.n, self.first?);
         let seconds = self.last.since(self.from) - first_s;
@@ -246,18 +246,19 @@ impl VoltageResponse {
         self.block_s
     }
 
-    /// Slope of the pack's voltage over its current, from the largest steps.
+    /// Slope of the pack's voltage against its current, from the largest steps.
     pub(crate) fn slope(&self) -> Option<Slope> {
         self.slope_over(|step| Some(step.voltage_v))
     }
 
-    /// Slope of one cell's voltage over the current, from the largest steps.
+    /// Slope of one cell's voltage against the current, from the largest steps.
     pub(crate) fn slope_of(&self, cell: usize) -> Option<Slope> {
         self.slope_over(|step| step.cells_v.get(cell).map(|v| f64::from(*v)))
     }
 
-    /// Slope from the steps of at least a fifth of the largest step, because smaller steps are mostly noise. If there
-    /// are fewer than five of them, the smaller steps are included, because they show how large the noise is.
+    /// Slope from the steps that are at least a fifth as large as the largest step, because smaller steps are mostly
+    /// noise. If there are fewer than five such steps, the smaller steps are included, because they show how large the
+    /// noise is.
     fn slope_over(&self, voltage_v: impl Fn(&CurrentStep) -> Option<f64>) -> Option<Slope> {
         let largest = self.steps.iter().map(|step| step.current_a.abs()).fold(0.0, f64::max);
         let points = |least_a: f64| {

@@ -73,7 +73,7 @@ impl Series {
 
     /// Creates the statistics of a recorded signal from its values and their times, s.
     pub fn of(readings: impl Iterator<Item = (f64, Result<f64, Fault>)>) -> Self {
-        // Enough for a correlation, small enough for thousands of signals.
+        // 4096 values suffice for a correlation, and the memory suffices for thousands of signals.
         let sample = ThinnedSample::of_at_most(4096);
         let mut series = Self { values: sample.clone(), times_s: sample, ..Self::default() };
         for (time_s, value) in readings {
@@ -160,7 +160,7 @@ impl Series {
     /// Standard deviation of the white noise, from the changes between readings. Real steps do not affect it if fewer
     /// than half of the changes are steps.
     pub(crate) fn noise(&self) -> Option<f64> {
-        // 0.6745 sqrt(2): median of the absolute difference of two normal variables over their standard deviation.
+        // The absolute difference of two normal variables with standard deviation s has the median 0.6745 sqrt(2) s.
         Some(self.changes.median()? / (0.6745 * std::f64::consts::SQRT_2))
     }
 
@@ -184,7 +184,7 @@ impl Series {
         self.values.kept().iter().take(100).map(|value| value.to_bits()).collect::<BTreeSet<u64>>().len()
     }
 
-    /// Whether the signal is a counter: most of its steps have the same size, other than 0.
+    /// Whether the signal is a counter: most of its steps have the same non-zero size.
     pub fn is_counter(&self) -> bool {
         let values = self.values.kept();
         let mut steps: BTreeMap<u64, usize> = BTreeMap::new();

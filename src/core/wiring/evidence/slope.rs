@@ -1,4 +1,5 @@
-//! Fits voltage steps over current steps: a slope through the origin, with its certainty.
+//! Fits a line through the origin to voltage steps against current steps. The result is the slope of the line, with its
+//! certainty.
 //!
 //! In: steps of a current (A) and of a voltage (V), from blocks of a stream ([`response`](super::response)) or from
 //! the kept readings of two recorded signals. Out: the resistance with its sign, its standard deviation, and the share
@@ -49,7 +50,8 @@ impl Slope {
         self.correlation().abs() * (self.points as f64).sqrt()
     }
 
-    /// Slope of a recorded voltage over a recorded current, or of any two signals; `None` if there are too few steps.
+    /// Slope of a recorded voltage against a recorded current, or of any two signals; `None` if there are too few
+    /// steps.
     pub fn between(voltage: &Series, current: &Series) -> Option<Self> {
         let pairs = pairs(voltage, current);
         // Over longer times, the state of charge also changes the voltage.
@@ -85,7 +87,8 @@ impl Slope {
         Some(Self {
             points: points.len(),
             ohm: -xy / xx,
-            // The minimum accounts for the resolution of the readings, with which few steps may fit a line by chance.
+            // The minimum is necessary because of the limited resolution of the readings: a few steps may lie exactly
+            // on a line by chance.
             std_ohm: (rest / xx).sqrt().max(1e-7),
             r2,
             largest_a: largest,
@@ -93,8 +96,8 @@ impl Slope {
     }
 }
 
-/// Pairs (time in s, voltage, current): each reading of the slower series with the nearest reading of the other one
-/// within 0.3 s.
+/// Pairs (time in s, voltage, current): each reading of the slower series with the nearest reading of the faster
+/// series, if the two are at most 0.3 s apart.
 fn pairs(voltage: &Series, current: &Series) -> Vec<(f64, f64, f64)> {
     let period_s = |series: &Series| series.period_s().unwrap_or(0.0);
     if period_s(voltage) < period_s(current) {

@@ -34,11 +34,12 @@ fn messages_of<'d>(judge: &Judge<'d>, bus: BusIndex) -> Vec<&'d MessagePlan> {
     judge.plan.messages.iter().filter(|message| message.bus == bus).collect()
 }
 
-/// The other interface that has received most of the wanted identifiers, with their number.
+/// The other interface that has received more of the wanted identifiers than any other, and the number of these
+/// identifiers.
 fn best_other<'d>(judge: &Judge<'d>, index: usize, wanted: &[&MessagePlan]) -> Option<(&'d BusStats, usize)> {
     let others = judge.observed.buses.iter().enumerate().filter(|(other, _)| *other != index);
     let counted = others.map(|(_, bus)| (bus, wanted.iter().filter(|m| bus.ids.contains_key(&m.id)).count()));
-    // If several have the same number, the first one counts.
+    // If several interfaces have received the same number, returns the first of them.
     counted.filter(|(_, count)| *count > 0).rev().max_by_key(|(_, count)| *count)
 }
 
@@ -197,7 +198,7 @@ fn protection(judge: &mut Judge<'_>) {
         let message = plan.messages.iter().find(|message| (message.bus, message.id) == key);
         let name = message.map_or("commands", |message| message.name.as_str());
         let all = stats.good + stats.bad;
-        // A few frames fail at every start.
+        // After every start, the checks of a few frames fail.
         if all == 0 || stats.bad as f64 <= 0.05 * all as f64 {
             if stats.good > 0 {
                 judge.fine(format!("{name}: {} of {all} frames pass their end-to-end check", stats.good));
@@ -239,7 +240,7 @@ fn why_failing<'f>(
         Some((profile, id))
     });
     match found {
-        // A checksum of eight bits does not distinguish all data identifiers: 256 of them fit.
+        // An 8-bit checksum cannot identify the 16-bit data identifier: 256 data identifiers fit.
         Some((Profile::P01A, id)) => finding
             .why(format!("the checksums fit profile 1A with another data identifier ({id:#X} and 255 others fit)"))
             .change(table, "data_id", "the number in the sender's documentation"),

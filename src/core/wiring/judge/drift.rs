@@ -7,13 +7,13 @@ use crate::wiring::evidence::response::SteadyRun;
 /// Smallest significance of a drift that counts, standard deviations.
 const SURE: f64 = 6.0;
 
-/// Voltage drift over all steady runs, per cell.
+/// Voltage drift during all steady runs together, per cell.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Drift {
     pub(super) seconds: f64,
-    /// Sum of the drifts that the model expects, as absolute values, V.
+    /// Sum of the absolute drifts that the model expects, V.
     pub(super) expected_v: f64,
-    /// Measured drift in the direction opposite to the expected one, as an absolute value, V.
+    /// Absolute measured drift opposite to the direction that the model expects, V.
     pub(super) against_v: f64,
     /// Ratio of measured to expected drift, weighted by the expected drift.
     pub(super) ratio: f64,

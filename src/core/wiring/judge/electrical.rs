@@ -11,7 +11,7 @@ use crate::wiring::report::{Severity, Topic, WiringFinding};
 
 /// Smallest step of the current that is judged, as a fraction of the capacity per hour.
 const SMALLEST_STEP: f64 = 0.02;
-/// Ratio of the resistance to the model's, or its reciprocal, from which the resistance is a finding.
+/// The resistance is reported if it is larger or smaller than the model's resistance by at least this factor.
 const ODD_RATIO: f64 = 2.5;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
@@ -134,7 +134,7 @@ fn likely_strings(configured: u16, ohm: f64, (fast, slow): (f64, f64)) -> Option
     let by_string = ohm / f64::from(configured);
     // At most `ODD_RATIO` x 1024.
     let strings = (((fast * slow).sqrt() / by_string).round() as u16).max(1);
-    // A cell's resistance usually differs from its model's by less than this factor.
+    // A cell's resistance usually differs from its model's resistance by a factor of less than 1.3.
     let is_like = (fast / 1.3..=slow * 1.3).contains(&(by_string * f64::from(strings)));
     (is_like && strings != configured).then_some(strings)
 }

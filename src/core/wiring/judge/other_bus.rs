@@ -36,7 +36,7 @@ fn is_clear(slope: &Slope) -> bool {
     slope.certainty() >= 1.0 && slope.r2 >= EXPLAINED
 }
 
-/// Whether a gateway repeats the message: both series then have the same extent.
+/// Whether the two series have the same extent. If so, a gateway probably repeats the message on the second interface.
 fn is_alike(a: &Series, b: &Series) -> bool {
     let (a, b) = (&a.extent, &b.extent);
     let tolerance = 0.02 * a.range().max(b.range()) + 1e-9;
@@ -58,7 +58,8 @@ fn followed(judge: &mut Judge<'_>, signal: &SignalPlan, (bus, there): (BusIndex,
         .change(&signal.table, "interface", format!("{other:?}"));
 }
 
-/// Reports that current and voltages are read from two interfaces that both have the current's message.
+/// Reports that the current is read from one interface and the voltages from another, while both interfaces carry the
+/// current's message.
 fn two_buses(judge: &mut Judge<'_>, signal: &SignalPlan, (bus, other): (BusIndex, &OtherCurrent)) {
     let (configured, name) = (judge.interface(signal.binding.bus), judge.interface(bus));
     let (low, high) = (number(other.series.extent.min), number(other.series.extent.max));

@@ -53,7 +53,7 @@ fn absence(judge: &Judge<'_>, signal: &SignalPlan, series: &Series) -> Option<Ab
     let last = series.extent.last;
     let is_still = series.extent.changes == 0 && series.count() > 1;
     let median_v = judge.cell_voltage()?.abs();
-    // If a pack has fewer cells than its DBC, the signals of the missing cells are often zero.
+    // If a pack has fewer cells than its DBC describes, the signals of the missing cells are often zero.
     let is_cell = matches!(signal.binding.channel, Channel::CellVoltage(_));
     let is_unused = is_cell && judge.plan.pack.cells > 1 && last.abs() < 0.05 * median_v;
     // The pack is switched off, or the identifier belongs to another message.
@@ -66,8 +66,8 @@ fn cell_number(signal: &SignalPlan) -> Option<u16> {
 }
 
 /// If exactly the last cells are absent, reports that too many cells are configured. Returns the signals that are still
-/// to be reported. If a message or its values are missing, the last module may also be dead, so its signals stay in the
-/// list.
+/// to be reported. If a message or its values are missing, the last module may also be dead, so the signals of these
+/// cells stay in the list.
 fn fewer_cells<'d>(judge: &mut Judge<'d>, absent: Vec<Absent<'d>>) -> Vec<Absent<'d>> {
     let mut cells: Vec<u16> = absent.iter().filter_map(|(signal, _)| cell_number(signal)).collect();
     cells.sort_unstable();

@@ -62,7 +62,7 @@ fn by_unit(judge: &mut Judge<'_>) -> bool {
     !misfits.is_empty()
 }
 
-/// Finds a current that equals the sum of the cell voltages.
+/// Finds a signal that is configured as the current but has the value of the sum of the cell voltages.
 fn pack_voltage_as_current(judge: &mut Judge<'_>) -> bool {
     let (Some((signal, series)), Some(cell_v)) = (judge.current(), judge.cell_voltage()) else { return false };
     let (Some(median), Some((from, to))) = (series.values.median(), series.values.bulk()) else { return false };

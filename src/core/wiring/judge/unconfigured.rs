@@ -33,7 +33,7 @@ fn pack_voltage(judge: &mut Judge<'_>, is_clear: bool) {
         return;
     }
     let candidates = unconfigured(judge, Channel::PackVoltage).into_iter();
-    // Other ratios belong to an auxiliary battery, or to a DC link behind open contactors.
+    // Voltages outside this range belong to an auxiliary battery, or to a DC link behind open contactors.
     let candidates = candidates.filter(|(_, pack_v)| (0.2..20.0).contains(&(pack_v / sum_v)));
     let off = |pack_v: f64| (pack_v / sum_v).ln().abs();
     let Some(((signal, _), pack_v)) = candidates.min_by(|a, b| off(a.1).total_cmp(&off(b.1))) else { return };
@@ -77,7 +77,7 @@ fn states_of_charge(judge: &mut Judge<'_>) {
             judge.fine(format!("{} and {} agree: {own_percent} and {percent} %", own.name, signal.name));
             continue;
         }
-        // If a dashboard hides a reserve at both ends, the difference is smaller.
+        // A smaller difference can be explained: a dashboard's state of charge hides a reserve at both ends.
         let severity = if difference > 0.1 { Severity::Warning } else { Severity::Note };
         find(judge, severity, Topic::ReportedSoc, format!("{} and {} disagree", own.name, signal.name))
             .seen(format!("the configured state of charge is {own_percent} %, the other is {percent} %"))

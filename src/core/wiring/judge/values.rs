@@ -17,7 +17,7 @@ const UNIT_FACTORS: [f64; 6] = [1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0];
 const PLAUSIBLE_C: std::ops::RangeInclusive<f64> = -40.0..=60.0;
 /// Possible temperatures of a pack, even on fire or in extreme cold, degrees C.
 const POSSIBLE_C: std::ops::RangeInclusive<f64> = -60.0..=120.0;
-/// Share of implausible readings above which single disturbances do not explain them.
+/// If the share of implausible readings is above this value, single disturbances do not explain these readings.
 const MANY: f64 = 0.01;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
@@ -242,7 +242,7 @@ pub(super) fn is_impossible(series: &Series) -> bool {
     series.values.share(|c| !POSSIBLE_C.contains(&c)) > MANY
 }
 
-/// Reports impossible readings that no unit explains, because other readings or other sensors are plausible.
+/// Reports impossible readings that a wrong unit cannot explain, because other readings or other sensors are plausible.
 fn impossible_sensors(judge: &mut Judge<'_>, sensors: &[SignalSeries<'_>], all: usize) {
     let list: Vec<Channel> = sensors.iter().map(|(signal, _)| signal.binding.channel).collect();
     let (signal, series) = sensors[0];

@@ -94,8 +94,8 @@ prop_compose! {
     }
 }
 
-/// How a signal depends on an earlier one: by which multiplexor and codes, and whether the signal is a
-/// multiplexor itself.
+/// How a signal depends on an earlier signal: the multiplexor and its codes, and whether the signal itself is a
+/// multiplexor.
 type MuxLink = (Option<(prop::sample::Index, Vec<(u64, u64)>)>, bool);
 
 fn mux_links() -> impl Strategy<Value = MuxLink> {

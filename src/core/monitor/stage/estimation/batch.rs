@@ -51,7 +51,7 @@ impl CellBatch {
         self.reported == self.has_reported.len()
     }
 
-    /// Starts the next batch, after the samples of the last one have been stepped.
+    /// Starts the next batch, after the samples of the last batch have been stepped.
     pub(crate) fn begin(&mut self) {
         debug_assert!(self.waiting.is_empty(), "{} samples without their step", self.waiting.len());
         self.has_reported.fill(false);

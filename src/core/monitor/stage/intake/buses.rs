@@ -1,12 +1,12 @@
 //! State of the interfaces, for the alarm rule about interfaces.
 //!
-//! An interface is out of order in three cases:
+//! An interface counts as faulty in three cases:
 //! * while it is down or missing;
 //! * from bus-off until the interface is up again or receives a frame;
 //! * while the daemon's frames cannot be sent.
 //!
 //! Its state is unknown before its first report. After a restart, a fault continues until the interface reports that it
-//! is in order.
+//! works.
 
 use serde::{Deserialize, Serialize};
 
@@ -63,8 +63,8 @@ impl Buses {
         (state.is_known, state.off_since) = (true, None);
     }
 
-    /// How long the worst interface has been out of order, s, and whether all `interfaces` have reported. The time is 0
-    /// if all interfaces that have reported are in order, and `None` if no interface has reported.
+    /// Time for which the interface with the longest fault has been faulty, s, and whether all `interfaces` have
+    /// reported. The time is 0 if no interface that has reported is faulty, and `None` if no interface has reported.
     pub(crate) fn worst_s(&self, now: Timestamp, interfaces: usize) -> (Option<f64>, bool) {
         let known = self.states.iter().filter(|state| state.is_known);
         let worst_s = known.clone().map(|state| state.fault_s(now)).max_by(f64::total_cmp);

@@ -4,7 +4,7 @@
 //! command, or the reason for the refusal; the freshness to announce.
 //!
 //! With many attempts, an attacker can guess a short authenticator. After [`FORGED_BURST`] wrong authenticators, and
-//! for [`FORGED_PERIOD_NS`] after each further wrong one, the gate is *under attack*. A command with a right
+//! for [`FORGED_PERIOD_NS`] after each further wrong authenticator, the gate is *under attack*. A command with a right
 //! authenticator must then be sent again within [`REPEAT_NS`], with another freshness, before it is executed. A genuine
 //! sender repeats a refused command, so its commands are executed even during an attack. An attacker must guess right
 //! twice.
@@ -27,7 +27,7 @@ const REPEAT_NS: i64 = 1_000_000_000;
 /// Age at which an announced freshness is outdated, ns: two announcement periods.
 const STALE_NS: i64 = 2 * FRESHNESS_PERIOD_MS as i64 * 1_000_000;
 
-/// The gate with its counts. All of it is stored.
+/// The gate with its counts. The whole structure is stored.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct CommandGate {
@@ -56,7 +56,7 @@ pub struct CommandCounts {
 }
 
 impl CommandCounts {
-    /// The counts since `before`.
+    /// Differences between these counts and the earlier counts `before`.
     pub fn since(&self, before: &Self) -> Self {
         Self {
             authentic: self.authentic.saturating_sub(before.authentic),

@@ -1,9 +1,9 @@
 //! Remaining useful life: half-cycles update each cell's forecast. The pack has the remaining life of the cell whose
 //! life is shortest.
 //!
-//! A forecast uses the measurement from each half-cycle alone, not the learned capacity, because successive learned
-//! capacities share most of their evidence. The error that all half-cycles share (the current sensor's gain) enters as
-//! the shared variance.
+//! A forecast uses the capacity measured by each single half-cycle, not the learned capacity, because successive
+//! learned capacities share most of their evidence. The error that all half-cycles share (the current sensor's gain)
+//! enters as the shared variance.
 
 use crate::alarm::{Observation, Rule};
 use crate::cell::{CellModel, PackBank};
@@ -36,8 +36,8 @@ impl CellLife {
         Self { forecast, remaining }
     }
 
-    /// Updates with a half-cycle. `since_before_s`: time from the end of the previous half-cycle to the end of this
-    /// one; `None` = unknown. `update`: the capacity update of this half-cycle.
+    /// Updates the forecast with a half-cycle. `since_before_s`: time from the end of the previous half-cycle to the
+    /// end of this one; `None` = unknown. `update`: the capacity update of this half-cycle.
     pub(crate) fn learn(
         &mut self,
         model: &CellModel,
@@ -75,7 +75,7 @@ impl CellLife {
     }
 }
 
-/// The lives of all cells.
+/// The remaining lives of all cells.
 #[derive(Debug)]
 pub(crate) struct PackLife {
     pub(crate) cells: Vec<CellLife>,
@@ -97,7 +97,7 @@ impl PackLife {
         self.shortest().filter(|_| all_known)
     }
 
-    /// The cell with the shortest remaining life among those whose life is known.
+    /// The cell with the shortest remaining life among the cells whose remaining life is known.
     fn shortest(&self) -> Option<(CellIndex, RemainingLife)> {
         let median = |cell: &CellLife| cell.cycles().map(|cycles| cycles.median);
         let known = (0..).map(CellIndex).zip(&self.cells).filter_map(|(index, cell)| Some((median(cell)?, index)));

@@ -212,14 +212,15 @@ impl AlarmQueue {
         repeated.fold(turns, u64::saturating_add)
     }
 
-    /// Limits all due times to `now`. Called after a start, after a sleep, and after the clock was set back.
+    /// Moves every due time that is later than `now` to `now`. Called after a start, after a sleep, and after the clock
+    /// was set back.
     pub(crate) fn restart(&mut self, now: Timestamp) {
         self.free = self.free.min(now);
         self.turn = self.turn.map(|turn| turn.min(now));
         self.changed.iter_mut().for_each(|changed| changed.due = changed.due.min(now));
     }
 
-    /// Limits all due times of a stored state to the times that a frame sent at `now` would give.
+    /// Limits every due time of a stored state to the due time that would follow from a frame sent at `now`.
     pub(crate) fn limit(&mut self, now: Timestamp, period_s: f64) {
         self.free = self.free.min(now.plus_nanos(DELAY_NS));
         self.turn = self.turn.map(|turn| turn.min(now.plus_secs(period_s)));

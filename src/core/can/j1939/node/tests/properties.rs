@@ -82,7 +82,7 @@ fn perform(bench: &mut Bench, act: &Act) {
     bench.take();
 }
 
-/// Gives the same inputs to two nodes. The first one is polled only when something is due, the second one every
+/// Gives the same inputs to two nodes. The first node is polled only when something is due, the second node every
 /// millisecond.
 fn sleeping_and_polled(acts: &[Act]) -> (Bench, Bench) {
     let (mut sleeper, mut busy) = (Bench::new(), Bench::new());
