@@ -33,7 +33,7 @@ fn pack_voltage(judge: &mut Judge<'_>, is_clear: bool) {
         return;
     }
     let candidates = unconfigured(judge, Channel::PackVoltage).into_iter();
-    // Voltages outside this range belong to an auxiliary battery, or to a DC link behind open contactors.
+    // Ratios outside this range belong to voltages of an auxiliary battery, or to a DC link behind open contactors.
     let candidates = candidates.filter(|(_, pack_v)| (0.2..20.0).contains(&(pack_v / sum_v)));
     let off = |pack_v: f64| (pack_v / sum_v).ln().abs();
     let Some(((signal, _), pack_v)) = candidates.min_by(|a, b| off(a.1).total_cmp(&off(b.1))) else { return };
