@@ -139,7 +139,8 @@ impl Findings {
     }
 }
 
-/// Probability that the current sensor is off, and its learned offset as a fraction of the rated capacity per hour.
+/// Probability that the current sensor's offset is larger than [`OFFSET_PER_H`], and the learned offset as a fraction
+/// of the rated capacity per hour.
 fn current_offset(learning: &Learning, rated_ah: f64) -> (f64, ScalarGaussian) {
     let offset = learning.state.learner.current_offset().learned(learning.config.capacity.current_offset_std_a);
     let offset = offset.unwrap_or(ScalarGaussian { mean: 0.0, variance: 1.0 });

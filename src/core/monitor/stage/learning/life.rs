@@ -58,7 +58,7 @@ impl CellLife {
         });
         self.forecast.update(usage, reading);
         if self.forecast.check(Axis::Cycles).is_err() {
-            // Restarts the forecast after impossible use or readings.
+            // Restarts a forecast whose state has become impossible, because the use or the readings were impossible.
             self.forecast = Forecast::new(Axis::Cycles, model.rated_capacity_ah);
         }
         self.restate(config);
