@@ -1,9 +1,9 @@
-//! Measures how long the BMS bled one cell, from its balancing bits.
+//! Measures from the BMS's balancing bits how long the BMS bled one cell.
 //!
-//! In: bits with their time and validity; starts and ends of rows. Out: for the time between the middles of two rows,
-//! how long the cell was bled, how long its state was unknown, and how long no bits were received. A row shows the
-//! charge at its middle, so half of its bleed time counts in the next row. Bleed time between two rows, while the
-//! buses sleep, counts in the later row.
+//! In: balancing bits with their time and validity; starts and ends of rows. Out: for the time between the middles of
+//! two rows, how long the cell was bled, how long the state was unknown, and how long no bits were received. The charge
+//! that a row shows is the charge at its middle, so half of the row's bleed time counts in the next row. If the cell is
+//! bled between two rows, while the buses sleep, this time counts in the later row.
 
 use serde::{Deserialize, Serialize};
 
@@ -12,15 +12,16 @@ use crate::quantity::{InvalidState, Timestamp};
 /// Meaning of a BMS's balancing bits.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BalancingConfig {
-    /// Current that a balancing resistor takes from one cell, A.
+    /// Current that the balancing resistor of one cell takes, A.
     pub bleed_a: f64,
-    /// Longest validity of a bit, s.
+    /// Maximum validity of a bit, s.
     pub max_age_s: f64,
-    /// Whether the BMS bleeds no cell while it sends no bits. If false, the state is unknown while no bits are sent.
+    /// Whether the BMS bleeds no cell while it sends no bits. If false, it is unknown whether cells are bled while no
+    /// bits are sent.
     pub is_only_while_sent: bool,
 }
 
-/// Parts of a time span, s. In the rest of the span, the cell was not bled.
+/// Parts of a period, s. During the rest of the period, the cell was not bled.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct BleedTime {
@@ -70,7 +71,8 @@ pub(super) struct BleedTimer {
 }
 
 impl BleedTimer {
-    /// Handles a bit that is valid until `holds_until` or the next bit. `is_bled` is `None` if the bit cannot be read.
+    /// Handles a balancing bit. The bit is valid until `holds_until` or until the next bit. `is_bled` is `None` if the
+    /// bit cannot be read.
     pub(super) fn take(&mut self, time: Timestamp, is_bled: Option<bool>, holds_until: Timestamp) {
         self.count(time);
         self.counted_until.get_or_insert(time);
@@ -78,14 +80,14 @@ impl BleedTimer {
         self.bit = Some(Bit { is_bled, holds_until });
     }
 
-    /// Handles a period in which the daemon did not run, so that it received no bits.
+    /// Handles a period in which the daemon did not run, so it received no bits.
     pub(super) fn note_missed_bits(&mut self, from: Timestamp, to: Timestamp) {
         if self.has_bits {
             self.take(from, None, to);
         }
     }
 
-    /// Counts the time up to `now`. Time before the first bit does not count.
+    /// Adds the time up to `now` to the counters. Time before the first bit does not count.
     fn count(&mut self, now: Timestamp) {
         if !self.has_bits && self.bit.is_none() {
             return;
@@ -102,7 +104,7 @@ impl BleedTimer {
         self.counted_until = Some(from.max(now));
     }
 
-    /// Starts or restarts a row.
+    /// Starts a row; if a row has already started, restarts it.
     pub(super) fn begin_row(&mut self, now: Timestamp) {
         self.count(now);
         self.before = self.before.plus(std::mem::take(&mut self.row));

@@ -1,28 +1,30 @@
-//! Finds voltage channels that do not show their own cell: they are frozen at one value or show another cell.
+//! Finds voltage channels that do not show the voltage of their own cell: they are frozen at one value or show another
+//! cell.
 
 use serde::{Deserialize, Serialize};
 
 use super::row::CellSums;
 use crate::quantity::InvalidState;
 
-/// A channel is frozen if it does not change while the other cells change by more than this, V.
+/// A channel is frozen if its value stays the same while the middle voltage of the pack changes by more than this, V.
 const FROZEN_V: f64 = 0.03;
-/// Fewest voltage changes within a row for a comparison with other channels. `doubled` also requires this many
-/// consecutive rows that agree: with a resolution of 2.5 mV, two of 96 healthy cells agreed in three rows.
+/// Minimum number of voltage changes within a row; with fewer changes, channels are not compared. `doubled` also
+/// requires ten consecutive rows that agree: with a resolution of 2.5 mV, two of 96 healthy cells agreed in three rows.
 const LEAST_CHANGES: u32 = 10;
 
 /// State of one voltage channel.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct Channel {
-    /// Middle voltage of the pack, V, in the row in which the channel last changed; before a change, in the first row.
+    /// Middle voltage of the pack, V, in the row in which the channel's value last changed. If it has not changed yet,
+    /// the middle voltage in the first row.
     middle_v: Option<f64>,
     pub(super) is_frozen: bool,
-    /// The channel with the same values, and the number of consecutive rows in which they agreed.
+    /// The channel that shows the same values, and the number of consecutive rows in which the two channels agreed.
     same_as: Option<(u16, u8)>,
 }
 
 impl Channel {
-    /// Ends a row; `middle_v` is the middle voltage of the pack, V.
+    /// Ends a row. `middle_v` is the middle voltage of the pack, V.
     pub(super) fn end_row(&mut self, sums: &CellSums, middle_v: f64) {
         if sums.changes > 0 {
             (self.middle_v, self.is_frozen) = (Some(middle_v), false);
@@ -32,12 +34,12 @@ impl Channel {
         }
     }
 
-    /// Handles a gap in the samples, during which all voltages may have changed.
+    /// Handles a gap in the samples: all voltages may have changed during the gap.
     pub(super) fn interrupt(&mut self) {
         self.middle_v = None;
     }
 
-    /// The other channel that shows the same values; `None` unless enough rows agree.
+    /// The other channel that shows the same values; `None` if too few rows agree.
     pub(super) fn doubled(&self) -> Option<u16> {
         self.same_as.filter(|(_, rows)| *rows >= 10).map(|(other, _)| other)
     }
@@ -55,8 +57,9 @@ impl Channel {
     }
 }
 
-/// Compares the channels of a row and pairs two channels if all their values are identical. If the values hardly
-/// distinguish the pack's cells, no channel counts as doubled.
+/// Compares the channels of a row. Two channels form a pair if they show the same sequence of values and no third
+/// channel shows it. If there are too few different sequences (at most half as many as cells), no channel counts as
+/// doubled.
 pub(super) fn compare(channels: &mut [Channel], sums: &[CellSums]) {
     let compared = |cell: &usize| sums[*cell].changes >= LEAST_CHANGES;
     let mut order: Vec<usize> = (0..sums.len()).filter(compared).collect();

@@ -1,8 +1,8 @@
-//! Detector for all cells of a pack: adds samples to rows, compares the cells once per row and derives findings
-//! (`judge`).
+//! Detector for all cells of a pack. It adds samples to rows, compares the cells once per row and derives findings from
+//! the comparison (`judge`).
 //!
-//! The assumed errors of a row are rounded values for a circuit model and a typical cell monitor. They were checked on
-//! a simulated pack of ten cells and on the simulator's other packs. No measured pack was used to choose them.
+//! The assumed errors of a row are rounded values for a circuit model and a typical cell monitor. They were checked
+//! with a simulated pack of ten cells and with the simulator's other packs. No measured pack was used to choose them.
 
 mod balancing;
 mod judge;
@@ -24,34 +24,39 @@ use balancing::Bleed;
 use judge::Population;
 
 /// Length of a row. A row ends when `ROW_SOC` of the capacity has moved, or after `ROW_S` seconds. During a long rest,
-/// it ends after `REST_PART` of the time at rest, because further samples add no information. Shorter rows would find a
-/// bad contact sooner, but mistake an aged cell for a bad contact and miss exchanged channels.
+/// it ends after `REST_PART` of the time at rest, because more samples add no information. With shorter rows, the
+/// detector would find a bad contact sooner, but it would mistake an aged cell for a bad contact and miss exchanged
+/// channels.
 const ROW_SOC: f64 = 0.02;
 const ROW_S: f64 = 300.0;
 const REST_PART: f64 = 0.5;
-/// Fewest cells for a comparison.
+/// Minimum number of cells for a comparison.
 pub(super) const LEAST_CELLS: usize = 3;
-/// Standard deviations of a row's errors: of the voltage, V; of the voltage drop, fraction; of the SOC on the curve.
+/// Standard deviations of the errors of a row: of the voltage, V; of the voltage drop, fraction of the drop; of the SOC
+/// on the open-circuit curve, fraction.
 const ROW_V: f64 = 0.002;
 const ROW_DROP: f64 = 0.03;
 const ROW_CURVE: f64 = 0.001;
-/// Additional errors of a cell whose SOC differs from the mean cell's, per unit of SOC difference: of the curve, V, and
-/// of the voltage drop, fraction. `MOST_ELSEWHERE` limits the ratio of the model's resistances at the two SOCs.
+/// Additional errors of a cell per unit of SOC difference from the mean cell: of the open-circuit curve, V, and of the
+/// voltage drop, fraction. `MOST_ELSEWHERE` limits the ratio between the model's resistances at the two SOC values.
 const FAR_V: f64 = 0.05;
 const FAR_DROP: f64 = 1.0;
 const MOST_ELSEWHERE: f64 = 3.0;
-/// Standard deviations of a resistance from current steps, fraction, and of a step's voltage, V.
+/// Standard deviations for a resistance measured from current steps: of the resistance, fraction, and of the voltage of
+/// one step, V.
 const STEP_PART: f64 = 0.05;
 const STEP_V: f64 = 0.003;
-/// Smallest sum of squared current steps that gives a resistance, in squares of the capacity per hour.
+/// Minimum sum of squared current steps; with a smaller sum, no resistance is measured. Unit: square of the 1 C
+/// current.
 const LEAST_STEPS: f64 = 0.02;
-/// Largest difference between the change of the mean cell's SOC and the counted charge between two rows.
+/// If the change of the mean cell's SOC between two rows differs from the counted charge by this much or more,
+/// fraction, the counted charge is used.
 const SOC_JUMP: f64 = 0.02;
 const DAY_S: f64 = 86_400.0;
-/// Number of kinds up to the temperature sensor, which include all kinds that apply to cells.
+/// Number of fault kinds up to `TemperatureSensor`. They include all kinds that apply to single cells.
 const CELL_KINDS: usize = CellFaultKind::TemperatureSensor as usize;
 
-/// Estimates of the mean cell at one moment.
+/// Estimates of the mean cell at one time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeanCell {
     /// SOC, fraction.
@@ -62,7 +67,7 @@ pub struct MeanCell {
     pub drop_v: f64,
     /// Temperature, degrees C.
     pub temperature_c: f64,
-    /// Charge taken out since any fixed time, Ah. Only differences are used.
+    /// Charge taken out since any fixed time, Ah. Only differences of this value are used.
     pub charge_ah: f64,
 }
 
@@ -70,11 +75,11 @@ pub struct MeanCell {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct WatchedCell {
-    /// Whether the cell is of the pack's main kind. Other cells are not compared.
+    /// Whether the cell is of the pack's main kind. Cells of another kind are not compared.
     #[serde(default = "yes", skip_serializing_if = "Clone::clone")]
     is_compared: bool,
     difference: Difference,
-    /// Means of the states before consecutive rows contradicted them.
+    /// Means of the states before the rows that contradict the prediction.
     settled: [f64; STATES],
     /// Means of the states before the last sudden change.
     before_jump: [f64; STATES],
@@ -83,7 +88,7 @@ struct WatchedCell {
     #[serde(default, skip_serializing_if = "Bleed::is_unused")]
     bleed: Bleed,
     temperature: WarmingRatio,
-    /// Per kind: time since which the fault has been more likely than not.
+    /// Per kind of fault: time since which the fault has been more likely than not.
     suspected: [Option<Timestamp>; CELL_KINDS],
     /// Time of the last sudden change.
     jumped: Option<Timestamp>,
@@ -110,7 +115,7 @@ impl WatchedCell {
         }
     }
 
-    /// Discards the samples of the current row, because the next sample follows after a gap.
+    /// Discards the samples of the present row, because the next sample follows a gap.
     fn interrupt(&mut self) {
         self.sums.interrupt();
         self.channel.interrupt();
@@ -125,22 +130,22 @@ pub struct CellFaultDetector {
     pack: PackSums,
     /// Middle time, SOC and charge (Ah) of the last row.
     last_row: Option<(Timestamp, f64, f64)>,
-    /// Duration of the current rest, s.
+    /// Duration of the present rest, s.
     rest_s: f64,
-    /// Series resistance of the mean cell in this row, ohm.
+    /// Series resistance of the mean cell in the present row, ohm.
     ohm: f64,
-    /// The middle cell: the cell closest to the median in SOC and resistance.
+    /// The middle cell: the cell whose SOC and resistance are closest to the medians.
     middle: usize,
-    /// Whether a BMS may bleed all cells except the lowest cell.
+    /// Whether a BMS may bleed every cell except the lowest one.
     is_balanced: bool,
-    /// The cell with the lowest charge, if it is unambiguous.
+    /// The cell with the lowest charge; `None` if no cell is clearly the lowest.
     lowest: Option<usize>,
     gain: Gain,
     findings: Vec<CellFault>,
 }
 
 impl CellFaultDetector {
-    /// Creates a detector for a pack in which only the cells `compared` are of one kind. The caller may
+    /// Creates a detector for a pack in which only the cells `compared` are of the same kind. The caller may
     /// [add](Self::add) samples of these cells only.
     pub fn among(cells: usize, compared: &[usize]) -> Self {
         let mut diagnosis = Self::new(if compared.len() < LEAST_CELLS { 0 } else { cells });
@@ -148,7 +153,7 @@ impl CellFaultDetector {
         diagnosis
     }
 
-    /// Selects the cells to compare. Resets cells that are no longer compared or were not compared before.
+    /// Selects the cells to compare. Resets the state of every cell that is newly compared or no longer compared.
     pub fn compare_only(&mut self, compared: &[usize]) {
         for (index, cell) in self.cells.iter_mut().enumerate() {
             let is_compared = compared.contains(&index);
@@ -164,7 +169,7 @@ impl CellFaultDetector {
         }
     }
 
-    /// Creates a detector without history. With fewer than three cells, it is inactive.
+    /// Creates a detector without history. If the pack has fewer than three cells, the detector is inactive.
     pub fn new(cells: usize) -> Self {
         Self {
             cells: vec![WatchedCell::new(true); if cells < LEAST_CELLS { 0 } else { cells }],
@@ -186,19 +191,19 @@ impl CellFaultDetector {
         !self.cells.is_empty()
     }
 
-    /// The findings, in the order of the cells.
+    /// The findings, ordered by cell.
     pub fn findings(&self) -> &[CellFault] {
         &self.findings
     }
 
-    /// Filter of a cell's difference; `None` if the cell is not compared.
+    /// Filter of the difference between a cell and the middle of the pack; `None` if the cell is not compared.
     pub fn difference(&self, cell: CellIndex) -> Option<&Difference> {
         self.cells.get(cell.index()).filter(|cell| cell.is_compared).map(|cell| &cell.difference)
     }
 
-    /// A cell's states minus the median of the pack. `None` if the detector is inactive or the pack has no such cell.
-    /// A single state is `None` if it is unknown. This applies to every state of a cell of another kind, and to the
-    /// leak of a cell that the BMS may bleed.
+    /// A cell's states minus the median of the pack. `None` if the detector is inactive or the pack has no such cell. A
+    /// state that is unknown is `None`: every state of a cell of another kind, and the leak of a cell that the BMS may
+    /// bleed.
     pub fn relative(&self, cell: CellIndex) -> Option<[Option<ScalarGaussian>; STATES]> {
         let WatchedCell { is_compared, difference, .. } = self.cells.get(cell.index())?;
         Some(std::array::from_fn(|state| {
@@ -209,7 +214,7 @@ impl CellFaultDetector {
         }))
     }
 
-    /// The cell whose estimate represents the mean cell in the current row.
+    /// The cell whose estimate represents the mean cell in the present row.
     #[inline]
     pub fn middle(&self) -> usize {
         self.middle
@@ -220,7 +225,7 @@ impl CellFaultDetector {
         self.last_row.map(|(time, soc, _)| (time, soc))
     }
 
-    /// Adds a sample of a cell. If `current_a` is `None`, discards the cell's samples in this row.
+    /// Adds a sample of a cell. If `current_a` is `None`, discards the cell's samples in the present row.
     #[inline]
     pub fn add(
         &mut self,
@@ -237,8 +242,8 @@ impl CellFaultDetector {
         }
     }
 
-    /// Adds the mean cell after all samples of one moment. Returns whether the row is complete. If so, the caller ends
-    /// the row with [`Self::close_row`].
+    /// Adds the mean cell after all samples of the same time. Returns whether the row is complete. If so, the caller
+    /// ends the row with [`Self::close_row`].
     pub fn note(&mut self, time: Timestamp, mean: &MeanCell, capacity_ah: f64) -> bool {
         if ![mean.soc, mean.current_a, mean.drop_v, mean.temperature_c, mean.charge_ah].iter().all(|it| it.is_finite())
         {
@@ -269,7 +274,8 @@ impl CellFaultDetector {
             || time.since(begun) >= ROW_S.max(REST_PART * self.rest_s)
     }
 
-    /// Handles the probability and size of a fault of a sensor that all cells share. Returns the finding if it is new.
+    /// Handles the probability and size of a fault of a sensor that all cells share. Returns the finding if it is a new
+    /// one.
     pub fn note_sensor(
         &mut self,
         time: Timestamp,
@@ -283,8 +289,8 @@ impl CellFaultDetector {
         find(&self.findings).filter(|_| !was_known)
     }
 
-    /// Handles the learned values of all cells, once a day. Returns a finding if it has newly found a risen gain of the
-    /// current sensor.
+    /// Handles the learned values of all cells, once per day. If a rise of the current sensor's gain has been newly
+    /// found, returns the finding.
     pub fn note_day(
         &mut self,
         time: Timestamp,
@@ -332,7 +338,7 @@ impl CellFaultDetector {
         let before = self.findings.clone();
         if self.observe(time, seconds, &row) {
             self.observe_temperatures(time, seconds);
-            // A BMS bleeds near the end of a charge.
+            // A BMS bleeds cells near the end of a charge.
             let slope_v = || model.ocv_slope_v(&model.grid_position(0.9, row.temperature_c), capacity_ah);
             self.judge(time, is_balanced.then(slope_v));
         }
@@ -343,19 +349,20 @@ impl CellFaultDetector {
         self.findings.iter().filter(is_new).copied().collect()
     }
 
-    /// Predicts all cells over the time and the charge since the last row.
+    /// Predicts the state of all cells from the time and the charge since the last row.
     fn pass(&mut self, time: Timestamp, row: &Row<'_>) {
         let Some((last, last_soc, last_ah)) = self.last_row.replace((time, row.soc, row.charge_ah)) else { return };
         let counted = (last_ah - row.charge_ah) / row.capacity_ah;
         let estimated = row.soc - last_soc;
-        // If the estimated SOC jumped, the filter has converged, but no charge has moved: use the counted charge.
+        // If the estimated SOC jumped, the filter has converged without any charge being moved: use the counted charge
+        // instead.
         let change = if (estimated - counted).abs() < SOC_JUMP { estimated } else { counted };
         let days = (time.since(last) / DAY_S).max(0.0);
         self.cells.iter_mut().for_each(|cell| cell.difference.pass(days, change));
     }
 
     /// Compares every cell with the middle voltage of the pack, `seconds` after the previous row. Returns whether there
-    /// were enough cells.
+    /// were enough cells for the comparison.
     fn observe(&mut self, time: Timestamp, seconds: f64, row: &Row<'_>) -> bool {
         let voltages_v: Vec<Option<f64>> = self.cells.iter().map(|cell| cell.sums.mean_v()).collect();
         let Some(middle_v) = middle(voltages_v.iter().flatten().copied()) else { return false };
@@ -388,7 +395,7 @@ impl CellFaultDetector {
         true
     }
 
-    /// Compares the cells' series resistances, as measured from current steps.
+    /// Compares the series resistances of the cells, as measured from current steps.
     fn observe_steps(&mut self, row: &Row<'_>) {
         let least_a2 = LEAST_STEPS * row.capacity_ah * row.capacity_ah;
         let ohms: Vec<Option<(f64, f64)>> = self.cells.iter().map(|cell| cell.sums.ohm(least_a2)).collect();
@@ -400,7 +407,8 @@ impl CellFaultDetector {
             let mean = cell.difference.mean();
             ohm - middle_ohm - slope[RESISTANCE] * mean[RESISTANCE] - slope[CONTACT] * mean[CONTACT]
         };
-        // The scatter between cells includes the noise of their channels, which is large for coarse channels.
+        // The scatter between the cells includes the noise of their channels, which is large if the channels have a
+        // coarse resolution.
         let innovations =
             self.cells.iter().zip(&ohms).filter_map(|(cell, ohm)| Some(innovation_ohm(cell, ohm.as_ref()?.0)));
         let scatter_ohm = Population::of(innovations).std;
@@ -469,7 +477,7 @@ impl CellFaultDetector {
         }
     }
 
-    /// Discards the samples of the current row, because the next sample follows after a gap.
+    /// Discards the samples of the present row, because the next sample follows a gap.
     pub fn interrupt(&mut self) {
         self.pack = PackSums::default();
         self.rest_s = 0.0;
@@ -541,7 +549,8 @@ struct Row<'a> {
 }
 
 impl Row<'_> {
-    /// Observation of a cell's voltage difference, `difference_v`, linearised at the means of the cell's states.
+    /// Observation of `difference_v`, a cell's voltage minus the middle voltage of the pack, linearised at the means of
+    /// the cell's states.
     fn observation(&self, means: &[f64; STATES], difference_v: f64) -> Observation {
         let (model, temperature) = (self.model, self.model.temperature_position(self.temperature_c));
         let at = |soc: f64| model.grid_position_at(&temperature, soc.clamp(0.0, 1.0));
@@ -550,7 +559,7 @@ impl Row<'_> {
         let contact_v = self.current_a * self.contact_ohm();
         let slope = [slope_v, 0.0, -self.drop_v, -contact_v, 1.0, 0.0];
         let curve_v = model.aged_ocv_v(&own, self.capacity_ah) - model.aged_ocv_v(&middle, self.capacity_ah);
-        // The resistance depends on the SOC, so at another SOC even a healthy cell has another resistance.
+        // The resistance depends on the SOC, so even a healthy cell has another resistance at another SOC.
         let elsewhere = (model.r0_ohm(&own) / model.r0_ohm(&middle)).clamp(1.0 / MOST_ELSEWHERE, MOST_ELSEWHERE) - 1.0;
         let expected_v = curve_v - self.drop_v * elsewhere
             + slope[RESISTANCE] * means[RESISTANCE]
@@ -563,21 +572,21 @@ impl Row<'_> {
         Observation { innovation: difference_v - expected_v, slope, variance }
     }
 
-    /// Series resistance of the mean cell in this row, ohm.
+    /// Series resistance of the mean cell in the row, ohm.
     fn ohm(&self) -> f64 {
         self.model.r0_ohm(&self.model.grid_position(self.soc, self.temperature_c))
     }
 
-    /// Series resistance at SOC 0.5 and 25 degrees C, ohm. It is the unit of the contact resistance, which depends on
-    /// neither SOC nor temperature.
+    /// Series resistance at SOC 0.5 and 25 degrees C, ohm. Contact resistance is stated as a fraction of this value,
+    /// because it depends on neither SOC nor temperature.
     fn contact_ohm(&self) -> f64 {
         self.model.r0_ohm(&self.model.grid_position(0.5, 25.0))
     }
 }
 
-/// Mean of the middle half of the values, which one outlier hardly changes. `None` for fewer than three values.
+/// Mean of the middle half of the values, which a single outlier hardly changes. `None` for fewer than three values.
 fn middle(values: impl Iterator<Item = f64>) -> Option<f64> {
-    // One allocation: `collect` of a filtered iterator starts small and grows.
+    // Allocates once. Collecting a filtered iterator would start with a small buffer and grow it.
     let mut kept = Vec::with_capacity(values.size_hint().1.unwrap_or_default());
     kept.extend(values);
     if kept.len() < LEAST_CELLS {
@@ -587,7 +596,7 @@ fn middle(values: impl Iterator<Item = f64>) -> Option<f64> {
     Some(inner.iter().sum::<f64>() / inner.len() as f64)
 }
 
-/// Sorts the values and returns them without the lowest and the highest quarter.
+/// Sorts the values and returns them without the lowest quarter and the highest quarter.
 fn inner_half<T>(values: &mut [T], by: impl Fn(&T) -> f64) -> &[T] {
     values.sort_by(|a, b| by(a).total_cmp(&by(b)));
     let cut = values.len() / 4;

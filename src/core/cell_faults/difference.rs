@@ -1,8 +1,8 @@
 //! Filter of the difference between one cell and the middle of its pack.
 //!
-//! In: per row, the cell's voltage minus the middle voltage of the pack. Out: the states that explain the difference.
-//! The filter is a linear Kalman filter; its observation is linearised at the cell's own SOC. The states have different
-//! effects, so the filter can distinguish them:
+//! In: per row, the cell's voltage minus the middle voltage of the pack. Out: the states that explain this voltage
+//! difference. The filter is a linear Kalman filter, linearised at the cell's own SOC. It can distinguish the states
+//! because they have different effects:
 //!
 //! | state | effect on the voltage difference |
 //! | --- | --- |
@@ -13,9 +13,9 @@
 //! | channel | constant |
 //! | leak | grows with time |
 //!
-//! Sources: the estimation of a mean cell and of the differences from it is Plett's bar-delta filtering (Battery
-//! Management Systems II, section 4.11).
-//! Contact resistance of one cell in a vehicle: Zheng et al., J. Power Sources 241 (2013) 181.
+//! Sources: the filter estimates a mean cell and the differences of the other cells from it, as in Plett's bar-delta
+//! filtering (Battery Management Systems II, section 4.11). For the contact resistance of one cell in a vehicle: Zheng
+//! et al., J. Power Sources 241 (2013) 181.
 
 use serde::{Deserialize, Serialize};
 
@@ -32,31 +32,33 @@ pub const RESISTANCE: usize = 2;
 pub const CONTACT: usize = 3;
 /// State: offset of the voltage channel, V.
 pub const CHANNEL: usize = 4;
-/// State: leak, fraction of the capacity per day.
+/// State: charge that the cell loses through a leak, fraction of the capacity per day.
 pub const LEAK: usize = 5;
 /// Number of states.
 pub const STATES: usize = 6;
 const PAIRS: usize = STATES * (STATES + 1) / 2;
 
-/// Standard deviations before the first row. The value for the channel is typical of cell monitors.
+/// Standard deviations before the first row. The value for the voltage channel is typical of cell monitors.
 const FIRST_STD: [f64; STATES] = [0.05, 0.1, 0.2, 0.5, 0.005, 0.05];
-/// Growth of the standard deviations per day; `MOVED_STD` is the growth for the SOC per unit of SOC moved.
+/// Growth of the standard deviations per day. `MOVED_STD` is the growth of the SOC's standard deviation per unit of SOC
+/// moved.
 const DAILY_STD: [f64; STATES] = [1e-4, 3e-4, 5e-3, 5e-3, 3e-4, 1e-4];
 const MOVED_STD: f64 = 5e-4;
-/// Standard deviations added after a sudden change of one cell: its contact, its channel or the cell itself has
-/// changed. The value for the SOC is small, because the SOC cannot change without a current.
+/// Standard deviations added after a sudden change of a single cell: its contact or its channel has changed, or the
+/// cell has been replaced. The value for the SOC is small, because the SOC cannot change without a current.
 const ALONE_STD: [f64; STATES] = [0.005, 0.05, 0.2, 0.5, 0.04, 0.01];
-/// Standard deviations added if the cell was replaced together with its neighbours.
+/// Standard deviations added after a sudden change of neighbouring cells: a module was replaced.
 const REPLACED_STD: [f64; STATES] = [0.05, 0.1, 0.3, 0.1, 0.005, 0.01];
-/// Standard deviations added if only the resistance has changed. Ageing takes weeks, so the contact must have changed.
+/// Standard deviations added if only the resistance has changed suddenly. Resistance grows by ageing over weeks, so the
+/// cause must be the contact.
 const RESISTANCE_STD: [f64; STATES] = [0.0, 0.0, 0.01, 0.5, 0.0, 0.0];
-/// Typical loss of a cell that a BMS may bleed: standard deviation, fraction of the capacity per day. After a time
-/// without rows, the loss may be larger; `open_charge` handles this. With 0.01 per day, the detector would miss
-/// exchanged channels and modules.
+/// Standard deviation of the charge that a cell loses because a BMS may bleed it, fraction of the capacity per day.
+/// After a time without rows, the loss may be larger; `open_charge` handles this case. With 0.01 per day, the detector
+/// would miss exchanged channels and modules.
 const BLED_PER_DAY: f64 = 0.002;
-/// Limits of the innovation, in standard deviations. Beyond `HUBER`, a row has less weight. Beyond `JUMP` (mean
-/// voltage) or `STEPS_JUMP` (resistance from steps), a row is odd. Three consecutive odd rows on the same side are a
-/// jump.
+/// Limits of the innovation, in standard deviations. Above `HUBER`, a row has a reduced weight. Above `JUMP` (for the
+/// mean voltage) or `STEPS_JUMP` (for the resistance from current steps), a row is odd. Three consecutive odd rows
+/// whose innovations have the same sign are a jump.
 const HUBER: f64 = 3.0;
 const JUMP: f64 = 4.0;
 const STEPS_JUMP: f64 = 3.0;
@@ -77,14 +79,14 @@ pub struct Difference {
 /// Kind of a sudden change.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Jump {
-    /// One cell changed.
+    /// A single cell changed.
     Alone,
-    /// A cell and its neighbours changed.
+    /// A cell changed together with a neighbour.
     Replaced,
 }
 
-/// Counts consecutive deviations on the same side. If there are enough of them for a jump, restarts the count and
-/// returns true.
+/// Counts consecutive deviations with the same sign that reach `limit`. If there are enough of them for a jump, resets
+/// the count and returns true.
 fn count_odd(odd: &mut i8, deviations: f64, limit: f64) -> bool {
     let side = if deviations.abs() < limit { 0 } else { deviations.signum() as i8 };
     *odd = if side == 0 || odd.signum() * side < 0 { side } else { *odd + side };
@@ -95,7 +97,8 @@ fn count_odd(odd: &mut i8, deviations: f64, limit: f64) -> bool {
     is_jump
 }
 
-/// An observation: value minus expected value, derivatives with respect to the states, and error variance.
+/// An observation: observed value minus expected value, derivatives with respect to the states, and variance of the
+/// error.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Observation {
     pub(super) innovation: f64,
@@ -103,7 +106,7 @@ pub(super) struct Observation {
     pub(super) variance: f64,
 }
 
-/// Index of a pair of states in the triangle.
+/// Index of the covariance of the states `i` and `j` in the upper triangle.
 const fn pair(i: usize, j: usize) -> usize {
     let (a, b) = if i < j { (i, j) } else { (j, i) };
     a * STATES - a * (a + 1) / 2 + b
@@ -119,7 +122,7 @@ impl Difference {
         Self { mean: [0.0; STATES], covariance, odd_rows: 0, odd_steps: 0 }
     }
 
-    /// Estimate of a state.
+    /// Mean and variance of a state.
     pub fn state(&self, state: usize) -> ScalarGaussian {
         ScalarGaussian { mean: self.mean[state], variance: self.covariance[pair(state, state)] }
     }
@@ -128,7 +131,7 @@ impl Difference {
         &self.mean
     }
 
-    /// Predicts over `days` in which the mean cell's SOC changes by `soc_change`.
+    /// Predicts the states after `days` in which the mean cell's SOC changes by `soc_change`.
     pub(super) fn pass(&mut self, days: f64, soc_change: f64) {
         // charge += (1 / (1 + capacity) - 1) * soc_change - leak * days
         let part = 1.0 / (1.0 + self.mean[CAPACITY]).max(0.1);
@@ -152,15 +155,15 @@ impl Difference {
         self.keep_possible();
     }
 
-    /// Removes charge that the current sensor does not measure. `soc`: the charge as a fraction of the capacity;
-    /// `variance`: the variance of `soc`.
+    /// Subtracts charge that left the cell without passing the current sensor. `soc`: this charge as a fraction of the
+    /// capacity; `variance`: its variance.
     pub(super) fn remove_charge(&mut self, soc: f64, variance: f64) {
         self.mean[SOC] -= soc;
         self.covariance[pair(SOC, SOC)] += variance;
         self.keep_possible();
     }
 
-    /// Resets the charge to unknown.
+    /// Resets the cell's charge to unknown.
     pub(super) fn forget_charge(&mut self) {
         for j in 0..STATES {
             self.covariance[pair(SOC, j)] = 0.0;
@@ -168,12 +171,12 @@ impl Difference {
         self.covariance[pair(SOC, SOC)] = FIRST_STD[SOC] * FIRST_STD[SOC];
     }
 
-    /// Resets the leak when the BMS may begin to bleed the cell.
+    /// Resets the leak, because the BMS may bleed the cell from now on.
     pub(super) fn forget_leak(&mut self) {
         self.begin_leak(BLED_PER_DAY);
     }
 
-    /// Resets the leak when the BMS no longer bleeds the cell. Any further loss is a leak.
+    /// Resets the leak, because the BMS no longer bleeds the cell. Any further loss is therefore a leak.
     pub(super) fn watch_leak(&mut self) {
         self.begin_leak(FIRST_STD[LEAK]);
     }
@@ -206,12 +209,12 @@ impl Difference {
         ScalarGaussian { mean, variance: variance.max(0.0) }
     }
 
-    /// The innovation in standard deviations.
+    /// The innovation, in standard deviations.
     pub(super) fn deviations(&self, observed: &Observation) -> f64 {
         observed.innovation / self.by_slope(observed).1.sqrt()
     }
 
-    /// Covariances of the innovation with the states, and variance of the innovation.
+    /// Covariance of the innovation with each state, and variance of the innovation.
     fn by_slope(&self, observed: &Observation) -> ([f64; STATES], f64) {
         let Observation { slope, variance, .. } = observed;
         let with: [f64; STATES] =
@@ -221,7 +224,7 @@ impl Difference {
     }
 
     /// Updates with a row's mean voltage. Returns true if the cell has changed suddenly, that is, if consecutive rows
-    /// contradict the prediction. In that case the update is left to [`Self::open`].
+    /// contradict the prediction. In this case the states stay unchanged, and the caller calls [`Self::open`].
     pub(super) fn observe(&mut self, observed: &Observation) -> bool {
         let off = self.deviations(observed);
         let is_jump = count_odd(&mut self.odd_rows, off, JUMP);
@@ -231,7 +234,7 @@ impl Difference {
         is_jump
     }
 
-    /// Updates with a row's series resistance, measured from current steps.
+    /// Updates with a row's series resistance, which is measured from current steps.
     pub(super) fn observe_steps(&mut self, observed: &Observation) {
         let off = self.deviations(observed);
         if count_odd(&mut self.odd_steps, off, STEPS_JUMP) {
@@ -256,7 +259,8 @@ impl Difference {
         });
     }
 
-    /// Updates with the innovation variance multiplied by `beyond`, which limits the weight of an outlier (Huber).
+    /// Updates the states. The innovation variance is multiplied by `beyond`, which limits the weight of an outlier
+    /// (Huber).
     fn update(&mut self, observed: &Observation, beyond: f64) {
         let (with, total) = self.by_slope(observed);
         let total = total * beyond;
@@ -271,15 +275,15 @@ impl Difference {
         self.keep_possible();
     }
 
-    /// Keeps variances positive despite rounding. If a number is impossible, restarts the filter, because the readings
-    /// cannot come from a cell.
+    /// Keeps the variances positive despite rounding. If a number is impossible, restarts the filter, because the
+    /// readings cannot come from a cell.
     fn keep_possible(&mut self) {
         for i in 0..STATES {
             let variance = &mut self.covariance[pair(i, i)];
             *variance = variance.max(1e-12);
         }
         let numbers = self.mean.iter().chain(&self.covariance);
-        // The limit is a thousand times the value of a cell.
+        // The limit is a thousand times larger than any plausible value.
         if !numbers.clone().all(|number| number.abs() <= 1e3) {
             *self = Self::new();
         }
@@ -290,7 +294,7 @@ impl Difference {
         self.odd_rows == 0
     }
 
-    /// Sets the means and restarts the count of odd rows.
+    /// Sets the means and resets the count of odd rows.
     pub(super) fn settle(&mut self, mean: &[f64; STATES]) {
         (self.mean, self.odd_rows) = (*mean, 0);
     }
@@ -318,7 +322,7 @@ mod tests {
     use super::*;
 
     /// Simulates days of driving and rest for a cell with the differences `truth` and an ideal voltage channel. Returns
-    /// the filter.
+    /// the filter afterwards.
     fn watched(truth: [f64; STATES], days: usize) -> Difference {
         let (mut filter, mut charge, mut soc) = (Difference::new(), truth[SOC], 0.8);
         for row in 0..days * 60 {
@@ -331,7 +335,7 @@ mod tests {
             soc += change;
             charge += (1.0 / (1.0 + truth[CAPACITY]) - 1.0) * change - truth[LEAK] * passed_days;
             filter.pass(passed_days, change);
-            // The slope of the open-circuit curve depends on the SOC; the voltage drop has a slow part.
+            // The slope of the open-circuit curve depends on the SOC, and a part of the voltage drop is slow.
             let slope_v = 0.4 + 12.0 * (soc - 0.5) * (soc - 0.5);
             let drop_v = 3.0 * current + if row % 2 == 0 { 0.02 } else { 0.0 };
             let slope = [slope_v, 0.0, -drop_v, -1.5 * current, 1.0, 0.0];

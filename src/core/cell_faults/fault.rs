@@ -1,4 +1,4 @@
-//! Kinds of findings, and the limits for reporting and withdrawing them.
+//! Kinds of findings, and the limits at which a finding is reported or withdrawn.
 
 use std::fmt;
 
@@ -7,44 +7,47 @@ use serde::{Deserialize, Serialize};
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Kind of a finding. The number identifies the kind in CAN frames; it is never reused.
+/// Kind of a finding. CAN frames contain this number, so a number is never reused. The unit of the finding's size is
+/// stated for each kind.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
 pub enum CellFaultKind {
-    /// The cell loses charge relative to the others; fraction of its capacity per day.
+    /// The cell loses more charge than the other cells; fraction of its capacity per day.
     Leak = 1,
-    /// The contact resistance of the cell's connection is higher than that of the other cells; fraction of the cell's
-    /// series resistance.
+    /// The contact resistance of the cell is higher than that of the other cells; fraction of the cell's series
+    /// resistance.
     Contact = 2,
     /// The cell's capacity is lower than that of the other cells; fraction.
     WeakCell = 3,
     /// The cell's resistance is higher than that of the other cells, as in an aged cell; fraction.
     HighResistance = 4,
-    /// The cell's capacity is higher than that of the other cells, because the cell is of another age; fraction.
+    /// The cell's capacity is higher than that of the other cells, because the cell is newer or of another type;
+    /// fraction.
     ForeignCell = 5,
-    /// Neighbouring cells have changed suddenly: a module was replaced; mean change of their capacity, fraction.
+    /// Neighbouring cells have changed suddenly, because a module was replaced. The size is the mean change of their
+    /// capacity, fraction.
     Module = 6,
-    /// The cell's voltage channel has a constant offset; V.
+    /// The cell's voltage channel has a constant offset, V.
     VoltageChannel = 7,
-    /// The cell's voltage channel stays at one value; the value is 1.
+    /// The cell's voltage channel stays at one value. The size is 1.
     VoltageFrozen = 8,
-    /// Two voltage channels show the same cell; the value is 1.
+    /// Two voltage channels show the voltage of the same cell. The size is 1.
     DoubledChannels = 9,
-    /// Two voltage channels have been exchanged; the value is 1.
+    /// Two voltage channels have been exchanged. The size is 1.
     SwappedChannels = 10,
     /// The current sensor has a constant offset; fraction of the rated capacity per hour.
     CurrentOffset = 11,
-    /// The current reading stays at one value; the value is 1.
+    /// The current reading stays at one value. The size is 1.
     CurrentFrozen = 12,
-    /// The temperature sensor of these cells does not follow the load; the value is 1.
+    /// The temperature sensor of these cells does not follow the load. The size is 1.
     TemperatureSensor = 13,
     /// The gain of the current sensor has risen; fraction.
     CurrentGain = 14,
 }
 
 impl CellFaultKind {
-    /// Every kind, in the order of the numbers in CAN frames.
+    /// All kinds, ordered by their numbers in CAN frames.
     pub const ALL: [Self; 14] = [
         Self::Leak,
         Self::Contact,
@@ -127,13 +130,13 @@ impl CellFaultKind {
         }
     }
 
-    /// Whether the two cells of a finding are a pair, not the ends of a range.
+    /// Whether the two cells of a finding are a pair. Otherwise, they are the ends of a range.
     pub const fn is_of_pair(self) -> bool {
         matches!(self, Self::DoubledChannels | Self::SwappedChannels)
     }
 
-    /// Probability below which a finding is withdrawn. It is lower for a leak: while the BMS bleeds the other cells, a
-    /// known leak is hidden.
+    /// If the probability is below this value, the finding is withdrawn. The value is lower for a leak, because a known
+    /// leak is hidden while the BMS bleeds the other cells.
     pub(super) const fn withdrawn_below(self) -> f64 {
         match self {
             Self::Leak => 0.01,
@@ -141,17 +144,18 @@ impl CellFaultKind {
         }
     }
 
-    /// Whether the voltage measurement fails, so that nothing is known about the cell.
+    /// Whether the voltage measurement of the cell fails, so that nothing is known about the cell.
     pub const fn is_of_channel(self) -> bool {
         matches!(self, Self::VoltageChannel | Self::VoltageFrozen | Self::DoubledChannels)
     }
 
-    /// Whether the readings under a cell's name are wrong or belong to another cell.
+    /// Whether the voltage shown for a cell is wrong or belongs to another cell.
     pub const fn is_channel_fault(self) -> bool {
         self.is_of_channel() || matches!(self, Self::SwappedChannels)
     }
 
-    /// Size beyond which the finding applies, in the unit of the kind; 0.5 for kinds that are either present or not.
+    /// Size above which a finding of this kind applies, in the unit of the kind. 0.5 for kinds that are either present
+    /// or absent.
     pub(super) const fn limit(self) -> f64 {
         match self {
             Self::Leak => LEAK_PER_DAY,
@@ -171,28 +175,29 @@ impl CellFaultKind {
 pub struct CellFault {
     /// Kind of the fault.
     pub kind: CellFaultKind,
-    /// First and last cell of a range, or the lower and the upper channel of a pair; `None` = the whole pack.
+    /// First and last cell of a range, or the lower and the upper channel of a pair. `None` = the whole pack.
     pub cells: Option<(CellIndex, CellIndex)>,
     /// Time since which the fault has been more likely than not.
     pub since: Timestamp,
     /// Time of the first report.
     pub reported: Timestamp,
-    /// Probability that the size is beyond the limit of the kind.
+    /// Probability that the size exceeds the limit of the kind.
     pub probability: f64,
     /// Size, in the unit of the kind.
     pub size: ScalarGaussian,
 }
 
 impl CellFault {
-    /// Whether the finding concerns the cell.
+    /// Whether the finding affects the cell.
     pub fn is_of(&self, cell: CellIndex) -> bool {
         let Some((first, last)) = self.cells else { return false };
         if self.kind.is_of_pair() { first == cell || last == cell } else { (first..=last).contains(&cell) }
     }
 }
 
-/// Writes the finding with cells counted from 1:
-/// `cell 7: loses charge by itself, 18.24 ± 0.43 % of its capacity a day`. The deviation is one standard deviation.
+/// Writes the finding; cells are counted from 1. Example:
+/// `cell 7: loses charge by itself, 18.24 ± 0.43 % of its capacity a day`.
+/// The number after ± is one standard deviation.
 impl fmt::Display for CellFault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let number = |cell: CellIndex| cell.0 + 1;
@@ -215,7 +220,8 @@ impl fmt::Display for CellFault {
     }
 }
 
-/// Leak limit, fraction of the capacity per day. Healthy cells of one pack differ by less than 0.5 % per month.
+/// Limit of the leak, fraction of the capacity per day. The losses of healthy cells in one pack differ by less than 0.5
+/// % per month.
 pub const LEAK_PER_DAY: f64 = 5e-4;
 /// Limit of the contact resistance, fraction of the cell's series resistance.
 pub const CONTACT: f64 = 0.1;
@@ -226,17 +232,17 @@ pub const RESISTANCE: f64 = 0.1;
 /// Limit of the voltage channel's offset, V.
 pub const CHANNEL_V: f64 = 0.015;
 
-/// Limit of the current sensor's offset, fraction of the rated capacity per hour. At the limit, the SOC drifts by a
-/// quarter per day.
+/// Limit of the current sensor's offset, fraction of the rated capacity per hour. At this limit, the counted SOC drifts
+/// by 24 % per day.
 pub const OFFSET_PER_H: f64 = 0.01;
 
 /// Limit of the rise of the current sensor's gain, fraction.
 pub const GAIN: f64 = 0.02;
 
-/// Probabilities from which a finding is reported, and below which it is withdrawn.
+/// Probability from which on a finding is reported, and probability below which it is withdrawn.
 pub(super) const REPORTED: f64 = 0.999;
 pub(super) const WITHDRAWN: f64 = 0.5;
 
-/// Smallest distance of a finding from the median of the pack, in robust standard deviations of the pack's cells. It
-/// accounts for the spread of healthy cells.
+/// Minimum distance of a finding from the median of the pack, in robust standard deviations of the pack's cells. It
+/// accounts for the normal spread of healthy cells.
 pub(super) const OUTLIER: f64 = 3.5;

@@ -1,10 +1,10 @@
 //! Detects that the gain of the current sensor, which all cells share, has risen.
 //!
-//! In: once a day, the learned capacity and resistance of all cells. Out: the rise of the gain.
+//! In: once per day, the learned capacity and resistance of all cells. Out: the rise of the gain.
 //!
-//! If a sensor shows `g` times the current, every learned resistance changes by the factor `1/g` at once, and every
-//! learned capacity by the factor `g` as new readings arrive. In no real battery does the capacity rise while the
-//! resistance falls. A falling gain looks like ageing and is not reported.
+//! If the sensor begins to show `g` times the true current, every learned resistance changes by the factor `1/g` at
+//! once. Every learned capacity changes by the factor `g` as new half-cycles are measured. In a real battery, the
+//! capacity never rises while the resistance falls. A falling gain looks like ageing and is not reported.
 
 use serde::{Deserialize, Serialize};
 
@@ -12,16 +12,16 @@ use super::fault::{GAIN, REPORTED};
 use crate::filter::{ScalarGaussian, median, normal_cdf};
 use crate::quantity::{InvalidState, Timestamp};
 
-/// Number of days that are compared. Slower changes are seasons or ageing.
+/// Maximum number of days that are compared with each other. Slower changes are caused by the seasons or by ageing.
 const DAYS: usize = 10;
 const DAY_S: f64 = 86_400.0;
-/// Longest time within which the resistances must fall, s. The estimated resistance follows within hours, so two daily
-/// checks may each see a part of the fall.
+/// Maximum time within which the resistances must fall, s. The estimated resistances follow within hours, so two
+/// consecutive daily checks may each see a part of the fall.
 const APART_S: f64 = 2.5 * DAY_S;
-/// Standard deviation of a healthy change within these days, fraction.
+/// Standard deviation of a change that is not caused by the gain, within these days, fraction.
 const ERROR: f64 = 0.005;
-/// Largest relative standard deviation (median of the cells) of the capacities on a day that counts. Capacities that
-/// are still being learned change too much.
+/// Maximum relative standard deviation of the capacities (median of the cells) on a day that is compared. Capacities
+/// that are still being learned change too much.
 const KNOWN: f64 = 0.03;
 
 /// Median values of the cells on one day.
@@ -31,7 +31,7 @@ struct Day {
     time: Timestamp,
     /// Logarithm of the capacity in Ah.
     log_capacity: f64,
-    /// Logarithm of the resistance ratio to the model.
+    /// Logarithm of the resistance ratio (cell to model).
     log_resistance: f64,
     /// Temperature, degrees C.
     temperature_c: f64,
@@ -42,7 +42,7 @@ struct Day {
 pub struct CellAgeing {
     /// Capacity, Ah.
     pub capacity_ah: ScalarGaussian,
-    /// Logarithm of the resistance ratio to the model.
+    /// Logarithm of the resistance ratio (cell to model).
     pub log_resistance: f64,
 }
 
@@ -61,8 +61,8 @@ impl Gain {
         self.last.is_none_or(|last| !(0.0..DAY_S).contains(&now.since(last)))
     }
 
-    /// Adds a day. Returns the probability that the gain has risen by more than [`GAIN`], and the rise, fraction. While
-    /// a rise is reported, the days before the rise are kept for comparison.
+    /// Adds the values of a day. Returns the probability that the gain has risen by more than [`GAIN`], and the rise,
+    /// fraction. While a rise is reported, the days before the rise are kept for comparison.
     pub(super) fn take(&mut self, time: Timestamp, temperature_c: f64, cells: &[CellAgeing]) -> (f64, ScalarGaussian) {
         let none = (0.0, ScalarGaussian { mean: 0.0, variance: ERROR * ERROR });
         let part = |cell: &CellAgeing| cell.capacity_ah.std() / cell.capacity_ah.mean;
@@ -102,7 +102,7 @@ impl Gain {
         stamps.for_each(|stamp| *stamp = stamp.plus_nanos(by_nanos));
     }
 
-    /// Checks the numbers of stored days.
+    /// Checks the numbers of the stored days.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         let numbers = self.days.iter().flat_map(|day| [day.log_capacity, day.log_resistance, day.temperature_c]);
         InvalidState::unless_numbers("a day of the current's gain", numbers)?;
@@ -111,8 +111,8 @@ impl Gain {
     }
 }
 
-/// Rise of the gain between two days, fraction, if it still lasts at `now`. The rise is the smaller of the fall in
-/// resistance and the rise in capacity. `None` if the days cannot be compared.
+/// Rise of the gain between two days, fraction, if it still exists at `now`. It is the smaller of two values: the fall
+/// of the resistance and the rise of the capacity. `None` if the days cannot be compared.
 fn rise(before: &Day, after: &Day, now: &Day) -> Option<f64> {
     let is_near = |day: &Day| (day.temperature_c - before.temperature_c).abs() <= 5.0;
     let is_next = after.time.since(before.time) <= APART_S;
@@ -124,8 +124,8 @@ fn rise(before: &Day, after: &Day, now: &Day) -> Option<f64> {
 mod tests {
     use super::*;
 
-    /// Probability and size after each day. `gains`: the gain on each day. Each day, the learned capacity moves a third
-    /// of the way to its new value.
+    /// Probability and size after each day. `gains`: the gain on each day. Each day, the learned capacity moves by a
+    /// third of its distance from the new value.
     fn after_days(gains: &[f64], temperatures_c: impl Fn(usize) -> f64) -> Vec<(f64, f64)> {
         let (mut watch, mut capacity_ah) = (Gain::default(), 60.0);
         gains

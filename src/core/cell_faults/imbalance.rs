@@ -1,9 +1,9 @@
-//! Computes what the differences between cells cost: charge lost by imbalance and by the weakest cell, and the cells
-//! that limit the pack.
+//! Computes how much charge the pack loses because its cells differ: by imbalance and by the weakest cell. Also finds
+//! the cells that limit the pack.
 //!
 //! In: each cell's difference from the middle of the pack in SOC, capacity and resistance; SOC and capacity of the
 //! middle cell. Out: [`Imbalance`], in fractions of the mean of the cells' capacities. A charge ends when the first
-//! cell is full, a discharge when the first cell is empty. With a cell's SOC s and capacity C:
+//! cell is full, a discharge when the first cell is empty. With the SOC s and the capacity C of each cell:
 //!
 //! ```text
 //! usable            = min s C + min (1 - s) C
@@ -13,14 +13,14 @@
 //!
 //! Standard deviations are propagated to first order from the states of the limiting cells. Assumptions:
 //! * the errors of different cells, and the errors of one cell's SOC and capacity, are independent;
-//! * the middle cell's SOC is exact. An error e would change `usable` by e times the difference between the capacities
-//!   of the two limiting cells.
+//! * the middle cell's SOC is exact. An error e of this SOC would change `usable` by e times the difference between the
+//!   capacities of the two limiting cells.
 //!
-//! The minimum of many uncertain values lies below the true minimum. If the cells differ by no more than their standard
-//! deviations, the losses are therefore overestimated.
+//! The minimum of many uncertain values tends to lie below the true minimum. If the cells differ by no more than their
+//! standard deviations, the losses are therefore overestimated.
 //!
-//! Cells with a faulty channel or a still uncertain difference are left out. If fewer than three cells, or fewer than
-//! half of the cells, remain, the imbalance is unknown.
+//! Cells whose channel is faulty or whose difference is still uncertain are left out. If fewer than three cells, or
+//! fewer than half of the cells, remain, the imbalance is unknown.
 
 use serde::Serialize;
 
@@ -31,8 +31,8 @@ use crate::cell::CellModel;
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Standard deviations from which a cell's SOC or capacity is unknown: half of the standard deviations before the first
-/// row.
+/// A cell's SOC or capacity counts as unknown from this standard deviation on. It is half of the standard deviation
+/// before the first row.
 const UNKNOWN_SOC_STD: f64 = 0.025;
 const UNKNOWN_CAPACITY_STD: f64 = 0.05;
 const OCV_PARTS: u32 = 100;
@@ -46,13 +46,14 @@ pub struct Imbalance {
     pub cells: usize,
     /// Mean of the cells' capacities, Ah.
     pub mean_ah: ScalarGaussian,
-    /// Charge that the pack delivers from the time its first cell is full until its first cell is empty, fraction.
+    /// Charge that the pack delivers from the time when its first cell is full until its first cell is empty, fraction.
     pub usable: ScalarGaussian,
     /// Charge that balancing would recover, fraction.
     pub lost_by_imbalance: ScalarGaussian,
-    /// Charge that a balanced pack of mean cells would deliver beyond this pack after balancing, fraction.
+    /// Additional charge, fraction, that a balanced pack of mean cells would deliver compared with this pack after
+    /// balancing.
     pub lost_by_weakest: ScalarGaussian,
-    /// The cell with the least capacity.
+    /// The cell with the smallest capacity.
     pub weakest: CellIndex,
     /// The cell that is empty first.
     pub discharge_limit: LimitingCell,
@@ -64,20 +65,20 @@ pub struct Imbalance {
     pub capacity: CellSpread,
     /// Differences of resistance, fraction of the middle cell's resistance.
     pub resistance: CellSpread,
-    /// Cells that are not compared, with the reason.
+    /// Cells that are not compared, each with the reason.
     pub left_out: Vec<(CellIndex, LeftOut)>,
 }
 
-/// A cell that is full or empty first.
+/// The first cell to be full or empty.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LimitingCell {
     /// Index of the cell.
     pub cell: CellIndex,
-    /// The larger of the two causes, SOC and capacity.
+    /// Reason that corresponds to the larger of the two causes: SOC or capacity.
     pub reason: LimitReason,
-    /// Charge missing relative to the mean cell because of this cell's SOC, fraction of the mean capacity.
+    /// Charge that the cell lacks relative to the mean cell because of its SOC, fraction of the mean capacity.
     pub by_charge: f64,
-    /// Charge missing relative to the mean cell because of this cell's capacity, fraction of the mean capacity.
+    /// Charge that the cell lacks relative to the mean cell because of its capacity, fraction of the mean capacity.
     pub by_capacity: f64,
 }
 
@@ -110,17 +111,17 @@ impl LimitReason {
     }
 }
 
-/// Spread of the cells' values of one state.
+/// Spread of one quantity between the cells.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CellSpread {
     /// Standard deviation of the cells' estimates.
     pub std: f64,
-    /// Root mean square of the standard deviations of the single estimates. If `std` is below it, the spread is not
-    /// significant.
+    /// Root mean square of the standard deviations of the single estimates. If `std` is below this value, the spread is
+    /// not significant.
     pub error: f64,
-    /// Cell with the lowest value, and its difference from the middle.
+    /// Cell with the lowest value, and the difference of this value from the middle of the pack.
     pub lowest: (CellIndex, f64),
-    /// Cell with the highest value, and its difference from the middle.
+    /// Cell with the highest value, and the difference of this value from the middle of the pack.
     pub highest: (CellIndex, f64),
 }
 
@@ -137,17 +138,17 @@ pub enum LeftOut {
 /// Reason why a pack's imbalance is unknown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum UnknownImbalance {
-    /// No row has ended since the start, or since a gap of unknown length.
+    /// No row has ended since the start or since a gap of unknown length.
     #[error("the cells have not been compared yet")]
     NotCompared,
     /// Too few cells can be compared.
     #[error("{known} of {cells} cells can be compared, at least {least} are required")]
     TooFewCells {
-        /// Cells that can be compared.
+        /// Number of cells that can be compared.
         known: usize,
-        /// Cells of the pack.
+        /// Number of cells of the pack.
         cells: usize,
-        /// Fewest cells required.
+        /// Minimum number of cells required.
         least: usize,
     },
 }
@@ -203,7 +204,7 @@ pub fn mean_ocv_v(model: &CellModel, capacity_ah: f64) -> f64 {
     (0..OCV_PARTS).map(ocv_v).sum::<f64>() / f64::from(OCV_PARTS)
 }
 
-/// A cell relative to the middle cell.
+/// Differences of a cell from the middle cell.
 #[derive(Debug, Clone, Copy)]
 struct ComparedCell {
     cell: CellIndex,
@@ -229,17 +230,17 @@ impl ComparedCell {
         self.middle_soc + self.soc.mean
     }
 
-    /// Charge until empty, fraction of the middle cell's capacity.
+    /// Charge that the cell delivers until it is empty, fraction of the middle cell's capacity.
     fn dischargeable(&self) -> f64 {
         self.own_soc() * self.capacity()
     }
 
-    /// Charge until full, fraction of the middle cell's capacity.
+    /// Charge that the cell accepts until it is full, fraction of the middle cell's capacity.
     fn chargeable(&self) -> f64 {
         (1.0 - self.own_soc()) * self.capacity()
     }
 
-    /// The reason that corresponds to the larger cause.
+    /// The reason that corresponds to the larger of the two causes.
     fn reason(&self, by_charge: f64, by_capacity: f64, charge: LimitReason) -> LimitReason {
         match (by_capacity > by_charge, charge) {
             (true, _) if self.is_weak => LimitReason::WeakCell,
@@ -250,7 +251,7 @@ impl ComparedCell {
     }
 }
 
-/// Imbalance of at least one cell.
+/// Imbalance of the cells. `cells` must not be empty.
 fn imbalance(time: Timestamp, cells: &[ComparedCell], middle_ah: ScalarGaussian) -> Imbalance {
     let mean = |value: fn(&ComparedCell) -> f64| cells.iter().map(value).sum::<f64>() / cells.len() as f64;
     let (mean_capacity, each) = (mean(ComparedCell::capacity), 1.0 / cells.len() as f64);
@@ -270,7 +271,7 @@ fn imbalance(time: Timestamp, cells: &[ComparedCell], middle_ah: ScalarGaussian)
         mean: mean / mean_capacity,
         variance: variance / (mean_capacity * mean_capacity),
     };
-    // Charge missing at one end = missing capacity + charge in excess at the other end.
+    // Charge missing at one end = missing capacity + excess charge at the other end.
     let less = |it: &ComparedCell, other_end: fn(&ComparedCell) -> f64, charge| {
         let by_capacity = (mean_capacity - it.capacity()) / mean_capacity;
         let by_charge = (other_end(it) - mean(other_end)) / mean_capacity;
@@ -301,7 +302,7 @@ fn least(cells: &[ComparedCell], value: fn(&ComparedCell) -> f64) -> &ComparedCe
     cells.iter().fold(&cells[0], |least, it| if value(it) < value(least) { it } else { least })
 }
 
-/// 1 for the same cell, else 0.
+/// 1 if `a` and `b` are the same cell, otherwise 0.
 fn is(a: &ComparedCell, b: &ComparedCell) -> f64 {
     f64::from(u8::from(a.cell == b.cell))
 }
@@ -336,7 +337,8 @@ mod tests {
 
     const MIDDLE_AH: ScalarGaussian = ScalarGaussian { mean: 50.0, variance: 1.0 };
 
-    /// Ten cells; the middle cell has a SOC of 0.6. `others`: cell, difference in SOC and in capacity (fractions).
+    /// Ten cells; the middle cell has the SOC 0.6. `others`: cell, difference in SOC, difference in capacity
+    /// (fractions).
     fn pack(others: &[(u16, f64, f64)]) -> Vec<ComparedCell> {
         let known = |mean, std| ScalarGaussian::from_std(mean, std);
         let cell = |cell| {
@@ -374,12 +376,12 @@ mod tests {
 
     #[test]
     fn cell_with_least_charge_limits_discharge() {
-        // The pack delivers 0.55 until this cell is empty and accepts 0.4 until the others are full.
+        // The pack delivers 0.55 until cell 3 is empty, and accepts 0.4 until the other cells are full.
         let found = of(&pack(&[(3, -0.05, 0.0)]));
         assert_near(found.usable.mean, 0.95);
         assert_near(found.lost_by_imbalance.mean, 0.05);
         assert_near(found.lost_by_weakest.mean, 0.0);
-        // Errors of this cell and of the first full cell: SOC with weight 1, capacity with weights 0.55 and 0.4.
+        // Errors of cell 3 and of the first full cell: SOC with weight 1, capacity with the weights 0.55 and 0.4.
         let expected: f64 = 2.0 * 0.003f64.powi(2) + (0.55f64.powi(2) + 0.4f64.powi(2)) * 0.006f64.powi(2);
         assert_near(found.usable.variance, expected);
         let LimitingCell { cell, reason, by_charge, by_capacity } = found.discharge_limit;
@@ -391,7 +393,7 @@ mod tests {
 
     #[test]
     fn weak_cell_full_with_others_loses_nothing_by_imbalance() {
-        // This cell, of capacity 0.9, accepts 0.4 like the others, so its SOC is 1 - 0.4 / 0.9 = 5 / 9.
+        // Cell 3 has the capacity 0.9 and accepts 0.4 like the other cells, so its SOC is 1 - 0.4 / 0.9 = 5 / 9.
         let found = of(&pack(&[(3, 5.0 / 9.0 - 0.6, -0.1)]));
         assert_near(found.usable.mean, 0.9 / 0.99);
         assert_near(found.lost_by_imbalance.mean, 0.0);
@@ -402,7 +404,8 @@ mod tests {
 
     #[test]
     fn limit_reason_is_larger_cause_or_finding() {
-        // Capacity 0.9 and SOC 0.05 below the balanced value: 0.9 * (5/9 - 0.05) until empty, 0.4 until full.
+        // Capacity 0.9, and SOC 0.05 below the balanced value: the cell delivers 0.9 * (5/9 - 0.05) and the pack
+        // accepts 0.4.
         let mut cells = pack(&[(3, 5.0 / 9.0 - 0.6 - 0.05, -0.1)]);
         let found = of(&cells);
         assert_near(found.usable.mean, (0.5 - 0.045 + 0.4) / 0.99);
@@ -421,7 +424,7 @@ mod tests {
         let found = of(&pack(&[(7, 0.04, 0.0)]));
         assert_near(found.lost_by_imbalance.mean, 0.04);
         assert_eq!((found.charge_limit.cell, found.charge_limit.reason), (CellIndex(7), LimitReason::MostCharge));
-        // A weak cell that is empty together with the others is full first.
+        // A weak cell that becomes empty together with the other cells is full first.
         let found = of(&pack(&[(7, 0.6 / 0.9 - 0.6, -0.1)]));
         assert_near(found.lost_by_imbalance.mean, 0.0);
         assert_eq!((found.charge_limit.cell, found.charge_limit.reason), (CellIndex(7), LimitReason::LeastCapacity));

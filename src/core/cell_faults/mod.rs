@@ -1,13 +1,13 @@
 //! Finds failing cells by comparing each cell with the others of its pack.
 //!
-//! In: samples of the cells of one series pack, and the estimators' values of the mean cell. Out: [`CellFault`]s. All
+//! In: samples of the cells of one series pack, and the estimators' values for the mean cell. Out: [`CellFault`]s. All
 //! cells carry the same current. Errors that all cells share (model, SOC, current sensor) therefore cancel in the
-//! differences between cells, and a failing cell stands out by a few millivolts. With fewer than three cells, the
-//! detector is inactive.
+//! differences between cells, and a failing cell can be recognised by a few millivolts. With fewer than three cells,
+//! the detector is inactive.
 //!
-//! Terms: a *row* is the sum of each cell's samples over a few minutes. The *mean cell* is an imaginary cell with the
-//! typical values of the pack. The *middle cell* is the real cell closest to the pack's median; its estimates stand
-//! for the mean cell. A cell is *bled* while a balancing resistor discharges it.
+//! Terms: a *row* contains the sums of each cell's samples over a few minutes. The *mean cell* is an imaginary cell
+//! with the typical values of the pack. The *middle cell* is the real cell closest to the pack's median; its estimates
+//! are used as those of the mean cell. A cell is *bled* while a balancing resistor discharges it.
 //!
 //! | file | purpose |
 //! | --- | --- |

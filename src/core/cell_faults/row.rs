@@ -8,8 +8,8 @@ use crate::quantity::Timestamp;
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct CellSums {
     pub(super) count: u32,
-    /// Sum of the voltages. Each is corrected by the mean cell's ohmic drop at the current of its sample, because the
-    /// cells are sampled at different times.
+    /// Sum of the voltages. Because the cells are sampled at different times, each voltage is corrected by the mean
+    /// cell's ohmic drop at the current of the sample.
     voltage_v: f64,
     /// Sum of the squared current steps between samples.
     steps_a2: f64,
@@ -19,14 +19,14 @@ pub(super) struct CellSums {
     last: Option<(Timestamp, f64, f64)>,
     temperature_c: f64,
     temperatures: u32,
-    /// Hash of the sequence of voltages.
+    /// Hash of the sequence of voltages in the row.
     pub(super) digest: u64,
     /// Number of voltage changes.
     pub(super) changes: u32,
 }
 
 impl CellSums {
-    /// Adds a sample, V and A; `ohm` is the mean cell's series resistance.
+    /// Adds a sample (V, A). `ohm` is the series resistance of the mean cell.
     #[inline]
     pub(super) fn add(
         &mut self,
@@ -37,7 +37,7 @@ impl CellSums {
         ohm: f64,
     ) {
         let apart_ns = |before: Timestamp| time.nanos().wrapping_sub(before.nanos());
-        // Uses about one sample per second at most, because more samples add no information.
+        // Uses at most about one sample per second, because more samples add no information.
         if self.last.is_some_and(|(before, ..)| (0..900_000_000).contains(&apart_ns(before))) {
             return;
         }
@@ -58,18 +58,18 @@ impl CellSums {
         self.digest = (self.digest.rotate_left(5) ^ voltage_v.to_bits()).wrapping_mul(0x9E37_79B9_7F4A_7C15);
     }
 
-    /// Mean voltage, V; `None` = no sample.
+    /// Mean voltage, V; `None` if the row has no sample.
     pub(super) fn mean_v(&self) -> Option<f64> {
         (self.count > 0).then(|| self.voltage_v / f64::from(self.count))
     }
 
-    /// Mean temperature, degrees C; `None` = not measured.
+    /// Mean temperature, degrees C; `None` if it was not measured.
     pub(super) fn mean_c(&self) -> Option<f64> {
         (self.temperatures > 0).then(|| self.temperature_c / f64::from(self.temperatures))
     }
 
-    /// Series resistance from the steps, ohm, and the sum of squared current steps; `None` if that sum is below
-    /// `least_a2`.
+    /// Series resistance computed from current steps, ohm, and the sum of squared current steps, A^2. `None` if this
+    /// sum is below `least_a2`.
     pub(super) fn ohm(&self, least_a2: f64) -> Option<(f64, f64)> {
         (self.steps_a2 >= least_a2).then(|| (-self.steps_va / self.steps_a2, self.steps_a2))
     }
@@ -79,7 +79,7 @@ impl CellSums {
         *self = Self { last: self.last, ..Self::default() };
     }
 
-    /// Discards the samples of this row, because the next sample follows after a gap.
+    /// Discards the samples of the present row, because the next sample follows a gap.
     pub(super) fn interrupt(&mut self) {
         *self = Self::default();
     }
@@ -100,8 +100,8 @@ pub(super) struct PackSums {
     pub(super) drop_v: f64,
     pub(super) soc: f64,
     pub(super) temperature_c: f64,
-    /// Sum of the charges, each minus `first_ah`, Ah.
+    /// Sum over the samples of the charge minus `first_ah`, Ah.
     pub(super) charge_ah: f64,
-    /// First charge of the row, Ah.
+    /// Charge at the first sample of the row, Ah.
     pub(super) first_ah: f64,
 }

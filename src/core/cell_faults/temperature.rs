@@ -1,15 +1,15 @@
-//! Finds temperature sensors that do not follow the load, because they are frozen or detached.
+//! Finds temperature sensors that do not follow the load because they are frozen or detached.
 //!
 //! In: per row, the temperature at each cell and the median warming of the pack. Cells that share a sensor show the
-//! same temperature, so a faulty sensor appears as a range of cells. If all cells share one or two sensors, no sensor
-//! stands out.
+//! same temperature, so a faulty sensor appears as a fault of a range of cells. If the pack has only one or two
+//! sensors, a faulty sensor cannot be recognised.
 
 use serde::{Deserialize, Serialize};
 
-/// Sum of the pack's squared warmings from which a sensor is judged, K^2.
+/// A sensor is judged only if the sum of the pack's squared warmings is at least this, K^2.
 const LEAST_K2: f64 = 30.0;
-/// A sensor counts as detached if it shows less than `DETACHED` of the pack's warming, and as attached again if it
-/// shows more than `ATTACHED`.
+/// A sensor counts as detached if it shows less than the fraction `DETACHED` of the pack's warming. It counts as
+/// attached again if it shows more than the fraction `ATTACHED`.
 const DETACHED: f64 = 0.35;
 const ATTACHED: f64 = 0.6;
 
@@ -27,17 +27,17 @@ pub(super) struct WarmingRatio {
 
 impl WarmingRatio {
     /// Handles the temperature of a row, `seconds` after the previous row. Returns the warming, K: the temperature
-    /// minus its slow mean, in which a constant sensor offset cancels.
+    /// minus the slow mean of the temperature. A constant sensor offset cancels in this difference.
     pub(super) fn warming_k(&mut self, seconds: f64, here_c: f64) -> f64 {
         let slow_c = self.slow_c.get_or_insert(here_c);
-        // Two hours, the time constant of warming by the load.
+        // The slow mean has a time constant of two hours, which is the time constant of warming by the load.
         *slow_c = here_c + libm::exp(-seconds.max(0.0) / 7200.0) * (*slow_c - here_c);
         here_c - *slow_c
     }
 
     /// Compares the warming at a cell with the median warming of the pack in the same row.
     pub(super) fn compare(&mut self, seconds: f64, middle_k: f64, here_k: f64) {
-        // The weight of a row halves in five days.
+        // The weight of a row halves every five days.
         let older = libm::exp2(-seconds.max(0.0) / (5.0 * 86_400.0));
         self.squares_k2 = older * self.squares_k2 + middle_k * middle_k;
         self.products_k2 = older * self.products_k2 + middle_k * here_k;
@@ -56,7 +56,8 @@ impl WarmingRatio {
 mod tests {
     use super::*;
 
-    /// Runs two days of a pack that warms by 8 K several times; the sensor shows `part` of the warming.
+    /// Simulates two days of a pack that warms by 8 K several times. The sensor shows the fraction `part` of this
+    /// warming.
     fn after_days(part: f64) -> WarmingRatio {
         let (mut pack, mut following) = (WarmingRatio::default(), WarmingRatio::default());
         for row in 0..2 * 288 {

@@ -6,10 +6,11 @@
 //! Raw: the time between the two estimated SOC values, if one uninterrupted charge covers the whole window. The raw
 //! period becomes shorter with a stronger charger, but also with a faded cell.
 //!
-//! Normalised: the time that a reference charger would need for the same window of the same pack, `t = 3600 (to - from)
-//! C / I_ref`. C is the pack's capacity (Ah), learned up to the end of this charge; I_ref is the reference current per
-//! cell (A). The standard deviation of t is the standard deviation of C times the same factor. It therefore includes
-//! the gain error of the current sensor.
+//! Normalised: the time that a reference charger would need for the same window of the same pack:
+//! `t = 3600 (to - from) C / I_ref`.
+//! C is the pack's capacity (Ah), learned up to the end of this charge; I_ref is the reference current per cell (A).
+//! The standard deviation of t is the standard deviation of C times the same factor. It therefore includes the gain
+//! error of the current sensor.
 //!
 //! Why t uses C instead of the charge moved within the window: the estimated SOC moves by the charge divided by the
 //! assumed capacity. The charge moved within the window is therefore the width of the window times the assumed

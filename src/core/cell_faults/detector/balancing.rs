@@ -6,14 +6,15 @@ use super::{CellFaultDetector, inner_half};
 use crate::cell_faults::bleed_timer::{BalancingConfig, BleedTime, BleedTimer};
 use crate::quantity::{InvalidState, Timestamp};
 
-/// Relative standard deviation of the bled charge that the bits give. The resistors of one BMS are equal, but their
-/// current depends on the voltage.
+/// Relative standard deviation of the bled charge as computed from the bits. The balancing resistors of one BMS are
+/// equal, but the bleed current depends on the cell voltage.
 const BLEED_PART: f64 = 0.2;
-/// Largest SOC that bleeding takes from a cell relative to the others. It is limited because a BMS bleeds a cell only
-/// down to the lowest cell.
+/// Maximum SOC that bleeding can take from a cell relative to the other cells. There is a maximum because a BMS bleeds
+/// a cell only down to the level of the lowest cell.
 const MOST_BESIDE: f64 = 0.1;
 
-/// Correlated errors: while their cause lasts, they have the same sign, so the errors add up instead of their squares.
+/// Correlated errors. While their cause lasts, they have the same sign, so the errors are added linearly, not as
+/// squares.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct CorrelatedError {
@@ -22,7 +23,7 @@ struct CorrelatedError {
 
 impl CorrelatedError {
     /// Adds the error of one row. Returns the increase of the squared sum, which is bounded because the sum is bounded.
-    /// A row without loss resets the sum.
+    /// A row with the error 0 resets the sum.
     fn add(&mut self, part: f64) -> f64 {
         let before = std::mem::take(&mut self.sum);
         let part = part.clamp(-MOST_BESIDE, MOST_BESIDE);
@@ -39,9 +40,9 @@ impl CorrelatedError {
 #[serde(deny_unknown_fields)]
 pub(super) struct Bleed {
     pub(super) timer: BleedTimer,
-    /// SOC bled relative to the middle cells, while the BMS bleeds this cell or the middle cells.
+    /// SOC bled from this cell minus the SOC bled from the middle cells, while the BMS bleeds any of them.
     bled: CorrelatedError,
-    /// Largest SOC that may have been bled while the state was unknown.
+    /// Maximum SOC that may have been bled while it was unknown whether the cell was bled.
     unseen: CorrelatedError,
 }
 
@@ -66,11 +67,11 @@ impl Bleed {
 }
 
 impl CellFaultDetector {
-    /// Handles a balancing bit of a cell, valid until `holds_until` or the next bit. `is_bled` is `None` if the bit
-    /// cannot be read.
+    /// Handles a balancing bit of a cell. The bit is valid until `holds_until` or until the next bit. `is_bled` is
+    /// `None` if the bit cannot be read.
     pub fn handle_balancing(&mut self, cell: usize, time: Timestamp, is_bled: Option<bool>, holds_until: Timestamp) {
         let Some(watched) = self.cells.get(cell) else { return };
-        // After the first bit, any loss that the bits do not explain is a leak.
+        // From the first bit on, any loss that the bits do not explain is a leak.
         let begins = is_bled.is_some() && !watched.bleed.timer.has_bits && self.may_be_bled(cell);
         let watched = &mut self.cells[cell];
         watched.bleed.timer.take(time, is_bled, holds_until);
@@ -79,13 +80,13 @@ impl CellFaultDetector {
         }
     }
 
-    /// Handles a period in which the daemon did not run, so that it received no bits.
+    /// Handles a period in which the daemon did not run, so it received no bits.
     pub fn note_missed_bits(&mut self, from: Timestamp, to: Timestamp) {
         self.cells.iter_mut().for_each(|cell| cell.bleed.timer.note_missed_bits(from, to));
     }
 
     /// Subtracts the charge bled since the last row, relative to the middle cells, from each cell's difference. If
-    /// `balancing` is `None`, discards all bits.
+    /// `balancing` is `None`, discards everything learned from balancing bits.
     pub(super) fn remove_bled_charge(&mut self, time: Timestamp, capacity_ah: f64, balancing: Option<BalancingConfig>) {
         let Some(balancing) = balancing else {
             return self.cells.iter_mut().for_each(|cell| cell.bleed = Bleed::default());
@@ -97,20 +98,20 @@ impl CellFaultDetector {
             let has_bits = cell.bleed.timer.has_bits;
             let soc = if has_bits { soc_per_s * (time.bled_s - middle_s) } else { 0.0 };
             let silent_s = if balancing.is_only_while_sent { 0.0 } else { time.silent_s };
-            // A BMS never bleeds the lowest cell. A cell without bits may have lost as much as the middle cells.
+            // A BMS never bleeds the lowest cell. A cell without bits may have been bled as long as the middle cells.
             let unseen_s = match has_bits {
                 _ if self.lowest == Some(index) => 0.0,
                 true => time.unknown_s + silent_s,
                 false => middle_s,
             };
             let variance = BLEED_PART * BLEED_PART * cell.bleed.bled.add(soc)
-                // The mean square of a value that is uniform between -1 and 1.
+                // 1/3 is the mean square of a value that is uniformly distributed between -1 and 1.
                 + (1.0 / 3.0) * cell.bleed.unseen.add(soc_per_s * unseen_s);
             cell.difference.remove_charge(soc, variance);
         }
     }
 
-    /// Mean time, s, for which the cells in the middle half of the voltages were bled.
+    /// Mean bleed time, s, of the cells whose voltages are in the middle half.
     fn bled_in_middle_s(&self, times: &[BleedTime]) -> f64 {
         let known = self.cells.iter().zip(times).filter(|(cell, _)| cell.bleed.timer.has_bits);
         let mut by_voltage: Vec<(f64, f64)> =
@@ -132,14 +133,14 @@ mod tests {
         Timestamp::from_secs(seconds)
     }
 
-    /// Three cells of 60 Ah that each received a bit of 0 at time 0.
+    /// Three cells of 60 Ah. Each cell received a bit with the value 0 at time 0.
     fn diagnosis() -> CellFaultDetector {
         let mut diagnosis = CellFaultDetector::new(3);
         (0..3).for_each(|cell| diagnosis.handle_balancing(cell, at(0.0), Some(false), at(10.0)));
         diagnosis
     }
 
-    /// Standard deviation that cell 0's SOC gains from possible bleeding until `end_s`.
+    /// Standard deviation that cell 0's SOC gains until `end_s` because the cell may have been bled.
     fn lost_std(diagnosis: &mut CellFaultDetector, end_s: f64, balancing: BalancingConfig) -> f64 {
         let variance = |diagnosis: &CellFaultDetector| diagnosis.cells[0].difference.state(SOC).variance;
         let before = variance(diagnosis);
@@ -150,7 +151,7 @@ mod tests {
 
     #[test]
     fn time_without_bits_is_unknown_unless_configured_otherwise() {
-        // Standard deviation of the SOC lost in 8 h at 0.06 A / 60 Ah, as a uniform distribution.
+        // Standard deviation of the SOC lost in 8 h at 0.06 A / 60 Ah, for a uniform distribution.
         let unknown = 0.008 / 3.0_f64.sqrt();
         let silent = BalancingConfig { is_only_while_sent: false, ..BALANCING };
         let near = |a: f64, b: f64| (a - b).abs() < 0.01 * unknown;
@@ -177,7 +178,7 @@ mod tests {
         let silent = BalancingConfig { is_only_while_sent: false, ..BALANCING };
         let std = lost_std(&mut year, 8760.0 * HOUR, silent);
         assert!((std - MOST_BESIDE / 3.0_f64.sqrt()).abs() < 1e-6, "{std}");
-        // Each further hour may take another thousandth of the capacity, with the same sign.
+        // Each further hour may take another thousandth of the capacity, always with the same sign.
         let mut last = std;
         for row in 1..100 {
             last = lost_std(&mut year, (8760.0 + f64::from(row)) * HOUR, silent);

@@ -1,4 +1,4 @@
-//! Turns the states of the cells into findings, and decides when to report and when to withdraw a finding.
+//! Derives findings from the states of the cells, and decides when to report and when to withdraw a finding.
 
 use super::CellFaultDetector;
 use crate::cell_faults::difference::{self, CHANNEL, CONTACT, Jump, LEAK, RESISTANCE, SOC, STATES};
@@ -6,12 +6,13 @@ use crate::cell_faults::fault::{self, CellFault, CellFaultKind, OUTLIER, REPORTE
 use crate::filter::{ScalarGaussian, normal_cdf};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Longest time between the findings of more capacity for cells of the same replaced module, s.
+/// If cells of one replaced module are found to have more capacity, the findings are at most this far apart, s.
 const SAME_MODULE_S: f64 = 3.0 * DAY_S;
-/// Largest standard deviation of a size that counts as known, in multiples of the limit of its kind.
+/// A size counts as known if its standard deviation is at most this many times the limit of its kind.
 const KNOWN_LIMITS: f64 = 2.0;
 
-/// Difference in SOC beyond which resistance and channel of a cell cannot be compared with the others.
+/// If a cell's SOC differs from that of the other cells by this much or more, its resistance and channel cannot be
+/// judged.
 const TOO_FAR: f64 = 0.1;
 const DAY_S: f64 = 86_400.0;
 
@@ -21,11 +22,11 @@ struct Judgement {
     kind: CellFaultKind,
     size: ScalarGaussian,
     probability: f64,
-    /// Whether the cell's SOC is close enough to the others to judge this kind.
+    /// Whether the cell's SOC is close enough to that of the other cells to judge this kind of fault.
     is_comparable: bool,
 }
 
-/// Median and robust standard deviation of the cells (from the median absolute deviation).
+/// Median of the cells, and a robust standard deviation computed from the median absolute deviation.
 pub(super) struct Population {
     pub(super) middle: f64,
     pub(super) std: f64,
@@ -33,7 +34,7 @@ pub(super) struct Population {
 
 impl Population {
     pub(super) fn of(of_cells: impl Iterator<Item = f64>) -> Self {
-        // Allocates once. `collect` would allocate the lower bound of the size hint, which is 0 for a filter.
+        // Allocates once. `collect` would allocate only the lower bound of the size hint, which is 0 for a filter.
         let mut values: Vec<f64> = Vec::with_capacity(of_cells.size_hint().1.unwrap_or_default());
         values.extend(of_cells);
         values.sort_by(f64::total_cmp);
@@ -53,8 +54,8 @@ impl CellFaultDetector {
         Population::of(compared.map(|cell| cell.difference.state(state).mean))
     }
 
-    /// Judges all cells. `bled_slope_v`: slope of the open-circuit curve at the SOC where the BMS bleeds cells, V;
-    /// `None` if the BMS bleeds no cells.
+    /// Judges all cells. `bled_slope_v`: slope of the open-circuit curve, V per unit of SOC, at the SOC at which the
+    /// BMS bleeds cells; `None` if the BMS bleeds no cells.
     pub(super) fn judge(&mut self, time: Timestamp, bled_slope_v: Option<f64>) {
         self.is_balanced = bled_slope_v.is_some();
         let lowest = bled_slope_v.and_then(|slope_v| self.clearly_lowest(slope_v));
@@ -75,7 +76,8 @@ impl CellFaultDetector {
                 continue;
             }
             let judged = self.judged(index, &populations);
-            // If the cell has a channel fault, only the first such fault counts: nothing else is known about the cell.
+            // If the cell has a channel fault, only the first channel fault counts, because nothing else is known about
+            // the cell.
             let fault =
                 judged.iter().find(|it| it.kind.is_of_channel() && it.probability >= REPORTED).map(|it| it.kind);
             for it in judged {
@@ -90,8 +92,9 @@ impl CellFaultDetector {
         self.find_modules(time, &foreign);
     }
 
-    /// Size per cell and kind relative to the median of the pack, in the unit of the kind. `None` if the size cannot be
-    /// judged: the cell's SOC is too far from the others, its channel is faulty, or the size is still too uncertain.
+    /// Size of each fault, per cell and kind, relative to the median of the pack and in the unit of the kind. `None` if
+    /// the size cannot be judged: the cell's SOC is too far from that of the other cells, its channel is faulty, or the
+    /// size is still too uncertain.
     pub fn sizes<const N: usize>(&self, kinds: [CellFaultKind; N]) -> Vec<[Option<ScalarGaussian>; N]> {
         let populations = self.populations();
         (0..self.cells.len()).map(|cell| kinds.map(|kind| self.size(cell, kind, &populations))).collect()
@@ -108,7 +111,7 @@ impl CellFaultDetector {
         (judged.is_comparable && is_known && self.has_channel_fault(cell) == Some(false)).then_some(judged.size)
     }
 
-    /// Whether a cell's voltage reading is wrong or belongs to another cell. `None` if the cell is not compared, or if
+    /// Whether a cell's voltage reading is wrong or belongs to another cell. `None` if the cell is not compared or if
     /// no row has ended yet.
     pub fn has_channel_fault(&self, cell: CellIndex) -> Option<bool> {
         self.cells.get(cell.index()).filter(|cell| cell.is_compared)?;
@@ -120,9 +123,9 @@ impl CellFaultDetector {
         std::array::from_fn(|state| self.population(state))
     }
 
-    /// The cell whose channel clearly reads lowest at the SOC where a BMS bleeds cells; `None` if no cell clearly reads
-    /// lowest. A BMS never bleeds this cell, because the BMS follows its own readings, whatever their errors. The cell
-    /// remains the lowest until another cell reads lower.
+    /// The cell whose channel clearly reads lowest at the SOC at which a BMS bleeds cells; `None` if no cell clearly
+    /// reads lowest. A BMS never bleeds this cell, because it follows its own readings, including their errors. The
+    /// cell counts as the lowest until another cell reads lower.
     fn clearly_lowest(&self, slope_v: f64) -> Option<usize> {
         let (mut lowest, mut next): (Option<(usize, ScalarGaussian)>, Option<ScalarGaussian>) = (None, None);
         let compared = self.cells.iter().enumerate().filter(|(_, cell)| cell.is_compared);
@@ -140,9 +143,9 @@ impl CellFaultDetector {
         (next.mean - shown.mean > 2.0 * shown.std().hypot(next.std())).then_some(lowest)
     }
 
-    /// Whether a BMS may bleed the cell without a bit that shows it. This applies to every cell of a balanced pack
-    /// without bits, except the lowest cell and cells with a reported leak. A reported leak continues while the BMS
-    /// bleeds the other cells.
+    /// Whether a BMS may bleed the cell without sending a bit that shows it. This applies to every cell of a balanced
+    /// pack without bits, with two exceptions: the lowest cell, and cells with a reported leak. A leaking cell loses
+    /// charge even while the BMS bleeds the other cells instead.
     pub(super) fn may_be_bled(&self, index: usize) -> bool {
         let is_found = |found: &CellFault| found.kind == CellFaultKind::Leak && found.is_of(CellIndex(index as u16));
         let is_open = self.is_balanced && !self.cells[index].bleed.timer.has_bits;
@@ -174,14 +177,15 @@ impl CellFaultDetector {
         let channel = if channel[0].1 >= channel[1].1 { channel[0] } else { channel[1] };
         let mut leak = beyond(LEAK, fault::LEAK_PER_DAY, 1.0);
         if self.may_be_bled(index) {
-            // A leak soon makes this cell the lowest. Until then, the leak does no harm.
+            // A leak soon makes this cell the lowest cell, which can be judged. Until then, the leak does no harm.
             leak = (ScalarGaussian { mean: 0.0, variance: 0.0 }, 0.0);
         } else if !cell.bleed.timer.has_bits && cell.difference.mean()[SOC] >= populations[SOC].middle {
-            // The BMS bleeds a cell above the others until it matches them.
+            // The BMS bleeds a cell with more charge than the others until it matches them.
             leak = (ScalarGaussian { mean: leak.0.mean.min(0.0), ..leak.0 }, 0.0);
         }
-        // A leak explains a deviating voltage by the cell's charge. While a leak is likely, report neither an offset of
-        // the channel, which would leave the charge unchanged, nor a foreign cell.
+        // A leak explains a deviating voltage by a deviating charge. While a leak is likely, do not report an offset of
+        // the voltage channel, which would explain the voltage without a change of the charge. Do not report a foreign
+        // cell either.
         let unless_leaking =
             |(size, probability): (ScalarGaussian, f64)| (size, if leak.1 >= WITHDRAWN { 0.0 } else { probability });
         let is_comparable = cell.difference.mean()[SOC].abs() < TOO_FAR;
@@ -201,7 +205,7 @@ impl CellFaultDetector {
         ]
     }
 
-    /// Updates the list of findings with a judgement. Returns the judgement as a finding, whether or not it is listed.
+    /// Updates the list of findings with a judgement. Returns the judgement as a finding, even if it is not listed.
     fn take(&mut self, time: Timestamp, index: usize, judged: &Judgement) -> CellFault {
         let Judgement { kind, size, probability, .. } = *judged;
         let cell = &mut self.cells[index];
@@ -218,16 +222,17 @@ impl CellFaultDetector {
         let cells = other.map_or((own, own), |other| (own.min(CellIndex(other)), own.max(CellIndex(other))));
         let finding = CellFault { kind, cells: Some(cells), since, reported: time, probability, size };
         let is_in_module = kind == CellFaultKind::ForeignCell && self.module_of(index).is_some();
-        // Two doubled channels share one finding, which is listed under the lower channel.
+        // Two doubled channels share one finding. It is listed under the channel with the lower index.
         if cells.0 == own && !is_in_module {
             self.put(finding);
         }
         finding
     }
 
-    /// Whether a kind has been likely for long enough to be reported. Two kinds must wait. In a balanced pack, the leak
-    /// is unknown at first, so other changes look like a leak until the cell has completed a cycle. A cell with more
-    /// capacity than the others may belong to a module, whose other cells are found later.
+    /// Whether a fault of this kind has been likely for long enough to be reported. Two kinds have a waiting time. In a
+    /// balanced pack, the leak is unknown at first, so other changes look like a leak until the cell has completed a
+    /// cycle. A cell with more capacity than the others may belong to a replaced module, whose other cells are found
+    /// later.
     fn has_lasted(&self, kind: CellFaultKind, since: Timestamp, now: Timestamp) -> bool {
         let settling_s = match kind {
             CellFaultKind::Leak if self.is_balanced => DAY_S,
@@ -237,7 +242,8 @@ impl CellFaultDetector {
         now.since(since) >= settling_s
     }
 
-    /// Lists a finding: replaces the finding of the same kind and first cell, or removes it if it is no longer likely.
+    /// Lists a finding. It replaces the finding of the same kind and first cell. If the finding is no longer likely,
+    /// removes it.
     pub(super) fn put(&mut self, finding: CellFault) {
         let first = |found: &CellFault| found.cells.map(|cells| cells.0);
         let is_same = |found: &CellFault| found.kind == finding.kind && first(found) == first(&finding);
@@ -255,20 +261,20 @@ impl CellFaultDetector {
         }
     }
 
-    /// Inserts a new finding in the order of the cells.
+    /// Inserts a new finding at its position in the order of the cells.
     pub(super) fn insert(&mut self, finding: CellFault) {
         let at = self.findings.partition_point(|found| (found.cells, found.kind) < (finding.cells, finding.kind));
         self.findings.insert(at, finding);
     }
 
-    /// The module finding that includes the cell.
+    /// The module finding whose range includes the cell.
     fn module_of(&self, index: usize) -> Option<&CellFault> {
         let is_of = |found: &&CellFault| found.kind == CellFaultKind::Module && found.is_of(CellIndex(index as u16));
         self.findings.iter().find(is_of)
     }
 
-    /// Joins neighbouring cells into a replaced module if they have had more capacity than the others since about the
-    /// same time. `foreign`: per cell, its module finding or its certain finding of more capacity.
+    /// Joins neighbouring cells into a replaced module, if they have had more capacity than the other cells since about
+    /// the same time. `foreign`: per cell, its module finding or its certain finding of more capacity.
     fn find_modules(&mut self, time: Timestamp, foreign: &[Option<CellFault>]) {
         let is_same_event = |a: &Option<CellFault>, b: &Option<CellFault>| {
             a.zip(*b).is_some_and(|(a, b)| a.since.since(b.since).abs() <= SAME_MODULE_S)
@@ -283,7 +289,7 @@ impl CellFaultDetector {
         }
     }
 
-    /// Replaces the findings of the cells by one module finding.
+    /// Replaces the findings of single cells by one module finding.
     fn put_module(&mut self, time: Timestamp, cells: (CellIndex, CellIndex), group: &[Option<CellFault>]) {
         let found = || group.iter().flatten();
         let (count, kind) = (group.len() as f64, CellFaultKind::Module);
@@ -301,7 +307,8 @@ impl CellFaultDetector {
         self.findings.retain(|it| !is_within(it));
         self.insert(CellFault { kind, cells: Some(cells), since, reported, probability: 1.0, size });
         if earlier.is_none() {
-            // Adjacent cells with a smaller change may also belong to the module, so raise their uncertainty.
+            // The cells next to the module may belong to it too, even though they changed less. Raise their
+            // uncertainty.
             let edges = [cells.0.index().checked_sub(1), Some(cells.1.index() + 1)];
             for edge in edges.into_iter().flatten() {
                 self.cells.get_mut(edge).into_iter().for_each(|cell| cell.difference.widen_as(Jump::Replaced));

@@ -6,14 +6,15 @@ use crate::cell_faults::fault::{CellFault, CellFaultKind};
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Longest time between jumps of several cells that count as one event, s.
+/// Jumps of several cells count as one event if they are at most this far apart, s.
 const SAME_EVENT_S: f64 = 1800.0;
-/// Largest innovation, V, with which two exchanged channels explain each other.
+/// Two channels count as exchanged only if each cell's previous state explains the voltage of the other channel with an
+/// innovation of at most this size, V.
 const SWAP_V: f64 = 0.008;
 
 impl CellFaultDetector {
-    /// Handles the cells that have changed suddenly: exchanges the states of two exchanged channels, or raises the
-    /// uncertainty of single or neighbouring cells.
+    /// Handles the cells that have changed suddenly. If two channels have been exchanged, exchanges their states.
+    /// Otherwise, raises the uncertainty of the changed cells: single cells or a group of neighbours.
     pub(super) fn handle_jumps(
         &mut self,
         time: Timestamp,
@@ -39,7 +40,8 @@ impl CellFaultDetector {
         }
     }
 
-    /// If the voltages of two cells have been exchanged, exchanges the cells' states and returns true.
+    /// If the channels of the cells `a` and `b` have been exchanged, exchanges the states of the cells and returns
+    /// true.
     fn exchange_if_swapped(
         &mut self,
         time: Timestamp,
