@@ -75,7 +75,7 @@ pub struct HistoryScore {
     pub axis: Axis,
     /// Capacity at which the life ends, Ah.
     pub threshold_ah: f64,
-    /// Use at the end of life; `None` = the file ends before, so its forecasts are not scored.
+    /// Use at the end of life; `None` = it is not reached, or was passed before the first reading, so nothing is scored.
     pub end_of_life: Option<f64>,
     /// Smallest capacity of the file, Ah.
     pub least_capacity_ah: f64,

@@ -1,9 +1,11 @@
-//! Deviations of a pack's cells from their mean: capacity, resistance and charge of each cell, and outliers.
+//! Deviations of the cells of a pack from their mean: capacity, resistance and charge of each cell, and notes on outliers.
 //!
-//! Input: the difference between every cell's voltage and the mean (V) at some rows, and the fitted records of the mean cell. Output: a
-//! [`CellDeviation`] per cell. All cells share one curve and one current sensor, so errors of the model and of the current cancel. The
-//! difference d is linear in the cell's deviations:
-//! d = slope (dSOC + (q / C) dlnC - (t / C) leakage) - drop dlnR + offset. One least-squares solution per cell determines them.
+//! Input: for some rows, the difference between the voltage of every cell and the mean voltage (V); and the fitted records of the mean
+//! cell. Output: a [`CellDeviation`] per cell. All cells share one curve and one current sensor, so errors of the model and of the
+//! current cancel. The difference d is linear in the deviations of the cell:
+//! `d = slope (dSOC + (q / C) dlnC - (t / C) leakage) - drop dlnR + offset`
+//! Here `slope` is the slope of the OCV over SOC, q the charge taken out, t the time, C the capacity and `drop` the voltage drop under
+//! load. One least-squares solution per cell gives the deviations.
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
@@ -13,34 +15,35 @@ use crate::ident::parameters::ParameterTables;
 use crate::ident::pass::residuals;
 use crate::ident::record::Record;
 
-/// Shortest time between two rows of differences, s; differences change only with the SOC.
+/// Shortest time between two recorded differences, s. Differences change only with the SOC, so closer ones add no information.
 const PERIOD_S: f64 = 5.0;
 /// Standard deviations before the fit: ln capacity, ln resistance, sensor offset (V), leakage (share of the capacity per h), SOC.
 const PRIOR: [f64; OWN + 1] = [0.15, 0.4, 0.003, 0.002, 0.15];
-/// Number of a cell's unknowns in addition to its SOC.
+/// Number of unknowns of a cell without the SOC at the start of each stretch.
 const OWN: usize = 4;
-/// Error of a difference, V, and its correlation time, s.
+/// Error of a difference, V. The next constant is the correlation time of the error, s.
 const DISTANCE_V: f64 = 0.002;
 const REPEATS_S: f64 = 50.0;
-/// Smallest number of cells that are compared.
+/// Smallest number of cells for a comparison.
 const LEAST_CELLS: usize = 4;
-/// An outlier is further from the median than this many robust deviations, than this many of its own standard deviations, and than
-/// the smallest relevant difference: of capacity, of resistance, of the residual (V), of the leakage (share of the capacity per h).
+/// A cell is an outlier if its distance from the median exceeds three limits: this many robust standard deviations, the second constant
+/// times the standard deviation of its own value, and the smallest relevant difference. The smallest relevant differences are those of
+/// capacity, of resistance, of the residual (V) and of the leakage (share of the capacity per h).
 const SPREADS: f64 = 5.0;
 const OWN_DEVIATIONS: f64 = 3.0;
 const FLOOR: [f64; 4] = [0.03, 0.15, 0.004, 0.0005];
 
-/// Differences of all cells from their mean over one stretch.
+/// Differences of all cells from their mean during one stretch.
 #[derive(Debug, Clone, Default)]
 pub(super) struct CellDistances {
     /// Time, s.
     pub(super) time_s: Vec<f64>,
-    /// Differences at each time, cell after cell, V; NaN = no reading.
+    /// Differences, V: for each time, the values of all cells; NaN = no reading.
     pub(super) distance_v: Vec<f32>,
 }
 
 impl CellDistances {
-    /// Records the cells' voltages and their mean `mean_v`, unless the last entry is less than [`PERIOD_S`] ago.
+    /// Records the differences of the cells from their mean `mean_v`, unless the last recorded time is less than [`PERIOD_S`] ago.
     pub(super) fn push(&mut self, time_s: f64, mean_v: f64, voltage_v: &[f64]) {
         if voltage_v.len() >= LEAST_CELLS && self.time_s.last().is_none_or(|last_s| time_s - last_s >= PERIOD_S) {
             self.time_s.push(time_s);
@@ -64,7 +67,7 @@ pub struct CellDeviation {
     pub residual_v: f64,
 }
 
-/// Coefficients of the unknowns at one time.
+/// Factors with which the unknowns act on the differences at one time.
 struct Factors {
     stretch: usize,
     weight: f64,
@@ -74,7 +77,7 @@ struct Factors {
     drop_v: f64,
 }
 
-/// Deviations of all cells; empty for fewer than [`LEAST_CELLS`] or without differences.
+/// Returns the deviations of all cells. The list is empty if there are fewer than [`LEAST_CELLS`] cells or no differences.
 pub(super) fn fit(
     cells: usize,
     distances: &[&CellDistances],
@@ -98,7 +101,7 @@ pub(super) fn fit(
     (0..cells).into_par_iter().map(|cell| fit_cell(cell, distances.len(), &factors, &all_v)).collect()
 }
 
-/// Coefficients at the times of the differences, from the latest row before each.
+/// Returns the factors at the times of the differences, each from the latest row before.
 fn factors(
     stretch: usize,
     distances: &CellDistances,
@@ -149,7 +152,7 @@ fn fit_cell(cell: usize, stretches: usize, factors: &[Factors], all_v: &[&[f32]]
             }
         }
     }
-    // The prior makes the diagonal positive, so the matrix has an inverse.
+    // The prior makes every diagonal element positive, so the matrix has an inverse.
     let Some(inverse) = normal.cholesky().map(|factor| factor.inverse()) else { return CellDeviation::unknown() };
     let x = &inverse * right;
     let (mut squares, mut weights) = (0.0, 0.0);
@@ -162,7 +165,7 @@ fn fit_cell(cell: usize, stretches: usize, factors: &[Factors], all_v: &[&[f32]]
         return CellDeviation::unknown();
     }
     let residual_v = (squares / weights).sqrt();
-    // Larger residuals than expected: every row carries less information.
+    // If residuals are larger than expected, every row carries less information.
     let scale = (residual_v / DISTANCE_V).max(1.0);
     let ratio = |i: usize| {
         let ratio = libm::exp(x[i]);
@@ -179,7 +182,7 @@ fn fit_cell(cell: usize, stretches: usize, factors: &[Factors], all_v: &[&[f32]]
 }
 
 impl Factors {
-    /// Indices and coefficients of the unknowns on which the difference depends.
+    /// Returns the indices of the unknowns on which the difference depends, each with its factor.
     fn terms(&self) -> [(usize, f64); OWN + 1] {
         let soc = (OWN + self.stretch, self.slope_v);
         [(0, self.charge_v), (1, -self.drop_v), (2, 1.0), (3, -self.hours_v), soc]
@@ -200,7 +203,7 @@ impl CellDeviation {
     }
 }
 
-/// Sentences about the spread of the cells and about each outlier. Cells count from 1.
+/// Returns sentences about the spread of the cells and about each outlier. Cells are counted from 1.
 pub(super) fn notes(cells: &[CellDeviation]) -> Vec<String> {
     if cells.is_empty() {
         return vec![];
@@ -255,7 +258,7 @@ impl Spread {
     fn of(values: impl Iterator<Item = f64> + Clone) -> Self {
         let centre = median(values.clone()).unwrap_or(f64::NAN);
         let distance = median(values.map(|value| (value - centre).abs())).unwrap_or(f64::NAN);
-        // Ratio of a normal distribution's standard deviation to its median distance.
+        // Ratio of the standard deviation of a normal distribution to its median absolute deviation.
         Self { median: centre, deviation: 1.4826 * distance }
     }
 
@@ -286,7 +289,7 @@ mod tests {
         assert!(found[2].starts_with("cell 8 is an outlier: resistance +4"), "{found:?}");
         assert!(found[3].starts_with("cell 10 is an outlier: voltage differs from the others by 20.0 mV"), "{found:?}");
         assert_eq!(found.len(), 4);
-        // A difference within the cell's own uncertainty does not count.
+        // A difference that is within the uncertainty of the cell's own value does not count.
         cells[3].capacity_ratio.1 = 0.05;
         assert_eq!(notes(&cells).len(), 3);
     }

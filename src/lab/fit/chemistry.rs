@@ -1,17 +1,17 @@
-//! Tests whether another chemistry than the label's explains the logs better.
+//! Tests whether another chemistry explains the logs better than the chemistry on the label.
 //!
 //! Input: stretches of the mean cell, and the label. Output: a sentence if another chemistry is clearly better. All chemistries are
-//! compared on the same rows, by the daemon's own notebook and fit.
+//! compared on the same rows, with the recording and the fit that the daemon uses.
 
 use crate::cell::notebook::Row;
 use crate::cell::own_model::fit;
 use crate::cell::{CellModel, CellStep, Chemistry, Label, Notebook, NotebookConfig};
 use crate::ident::MeasuredPart;
 
-/// Difference of the log posterior densities from which on another chemistry is reported; same value as in the daemon.
+/// Difference of the log posterior densities above which another chemistry is reported; the daemon uses the same value.
 const MARGIN: f64 = 12.0;
 
-/// The label from which a model was derived; `None` = the model comes from a file.
+/// Returns the label from which a model was derived; `None` = the model comes from a file.
 pub(super) fn label_of(model: &CellModel) -> Option<Label> {
     let of = |chemistry: Chemistry| Label {
         chemistry,
@@ -23,7 +23,8 @@ pub(super) fn label_of(model: &CellModel) -> Option<Label> {
     model.spread.and(labels.into_iter().find(|label| label.model().as_ref() == Some(model)))
 }
 
-/// Rows that the daemon would record of these stretches; each stretch has its initial SOC, and the sensor's offset is removed.
+/// Returns the rows that the daemon would record of these stretches. Each stretch has its initial SOC. The offset of the sensor is
+/// removed.
 fn rows<'a>(label: &Label, offset_a: f64, stretches: impl Iterator<Item = (&'a MeasuredPart, f64)>) -> Vec<Row> {
     let config = NotebookConfig::new(1, label.rated_ah);
     let mut notebook = Notebook::default();
@@ -54,8 +55,9 @@ fn rows<'a>(label: &Label, offset_a: f64, stretches: impl Iterator<Item = (&'a M
     notebook.rows().to_vec()
 }
 
-/// Compares the chemistries with the capacity (Ah) and the current offset (A) of a fit; `None` = the label's chemistry is confirmed.
-/// `error_ratio`: error of a circuit relative to its error when warm. Log likelihoods shrink with its square.
+/// Compares the chemistries, using the capacity (Ah) and the current offset (A) of a fit; `None` = the chemistry of the label is
+/// confirmed. `error_ratio` is the error of the circuit model relative to its error when warm. Log likelihoods shrink with the square
+/// of this ratio.
 pub(super) fn note<'a>(
     label: &Label,
     (capacity_ah, offset_a): (f64, f64),
@@ -67,7 +69,7 @@ pub(super) fn note<'a>(
         let of = if chemistry == label.chemistry { *label } else { label.with_chemistry(chemistry) };
         Some((chemistry, fit::label_cost(&of.prior()?, &rows, &[capacity_ah])?))
     };
-    // Smallest number of compared rows.
+    // Smallest number of rows for a comparison.
     let Some((_, own)) = cost(label.chemistry).filter(|_| rows.len() >= 12) else {
         return Some(format!("too little charge moved to compare {} with other chemistries", label.chemistry.name()));
     };

@@ -2,7 +2,7 @@
 
 use super::{FileResidual, FitOutcome};
 
-/// The result as JSON; `seconds`: duration of the fit.
+/// Returns the result as JSON. `seconds` is the duration of the fit.
 pub fn document(outcome: &FitOutcome, seconds: f64) -> serde_json::Value {
     let of_file = |file: &FileResidual| {
         let r = &file.residual;

@@ -1,6 +1,6 @@
-//! Sentences about missing information in logs: where a fit keeps the model that it started from.
+//! Sentences about information that is missing in logs. There, the fit keeps the values of the initial model.
 //!
-//! Input: stretches and fitted records of the mean cell, capacities (Ah). Output: notes.
+//! Input: stretches and fitted records of the mean cell, capacities (Ah). Output: notes for the user.
 
 use crate::filter::{ends, median};
 use crate::ident::MeasuredPart;
@@ -16,7 +16,7 @@ pub(super) struct Capacity {
 /// Returns the sentences.
 pub(super) fn notes(parts: &[&MeasuredPart], records: &[Record], before: Capacity, after: Capacity) -> Vec<String> {
     let mut notes = Vec::new();
-    // Remaining share of the capacity's relative deviation above which the logs do not show the capacity.
+    // The logs do not show the capacity if more than this share of its relative standard deviation remains after the fit.
     let is_unshown = after.std_ah / after.mean_ah > 0.7 * before.std_ah / before.mean_ah;
     if is_unshown {
         notes.push(
@@ -31,7 +31,7 @@ pub(super) fn notes(parts: &[&MeasuredPart], records: &[Record], before: Capacit
             100.0 * span
         ));
     }
-    // A current below the capacity over 50 h counts as rest.
+    // A current counts as rest if it would need more than 50 h to discharge the cell.
     let rest_a = after.mean_ah / 50.0;
     let (mut rest_s, mut moved) = (0.0, [0.0; 2]);
     for row in records.iter().flat_map(|record| &record.rows) {
@@ -69,13 +69,13 @@ pub(super) fn notes(parts: &[&MeasuredPart], records: &[Record], before: Capacit
     notes
 }
 
-/// SOC range of the judged rows.
+/// Returns the width of the SOC range of the judged rows.
 fn span(record: &Record) -> f64 {
     let (low, high) = record.judged_ends();
     (high - low).max(0.0)
 }
 
-/// Smallest difference between two unequal voltages, V.
+/// Returns the smallest difference between two unequal voltages, V.
 fn step_v(parts: &[&MeasuredPart]) -> f64 {
     let of_part = |part: &&MeasuredPart| {
         let pairs = part.voltage_v.windows(2).take(2000).map(|pair| (pair[1] - pair[0]).abs());

@@ -1,20 +1,21 @@
-//! Voltage limits of a cell from its measured data, each with the row that shows it.
+//! Finds the voltage limits of a cell in its measured data, with the row that shows each limit.
 //!
-//! Input: measured files, V. Output: lowest and highest voltage, V, and a note for each with file, row, value and option.
-//! Pulses do not count as limits: a row counts only after the current has kept its direction, or rested, for [`HELD_S`]. For whole
-//! cycles, the ends count: the first row of a discharge below its cut-off, and the voltage at which charges are held.
+//! Input: measured files. Output: lowest and highest voltage, V, each with a note that states file, row, value and the option to change
+//! it. Pulses do not count as limits: a row counts only if the current has kept its direction, or been at rest, for [`HELD_S`]. If the
+//! data are whole cycles, two voltages count: the first row of a discharge below its cut-off, and the voltage at which charges are
+//! held.
 
 use super::FitRequest;
 use crate::error::LabError;
 use crate::measured::{MeasuredFile, MeasuredPart};
 
-/// Voltages below this value come from a disconnected sensor, V.
+/// A voltage below this value comes from a disconnected sensor, V.
 pub(super) const DISCONNECTED_V: f64 = 0.5;
-/// A current that keeps its direction for a shorter time is a pulse, s; pulse tests use 10 to 18 s.
+/// A current that keeps its direction for less than this time is a pulse, s. Pulse tests use 10 to 18 s.
 const HELD_S: f64 = 30.0;
-/// Current below which a cell rests, as a share of the largest of its part.
+/// Current below which a cell rests, as a share of the largest current of its part.
 const REST_SHARE: f64 = 0.02;
-/// One row in this many may be a stray value.
+/// One row in this number may have a stray value.
 const STRAY: usize = 10_000;
 /// Error of a reading at a limit, V.
 const READING_V: f64 = 0.005;
@@ -34,7 +35,7 @@ impl Reading<'_> {
     }
 }
 
-/// Lowest and highest voltage, V, with notes on those taken from the data.
+/// Returns the lowest and highest voltage, V, with notes on the limits that were taken from the data.
 pub(super) fn voltage_limits(
     request: &FitRequest,
     files: &[MeasuredFile],
@@ -50,7 +51,7 @@ pub(super) fn voltage_limits(
     if request.voltage_max_v.is_none() {
         notes.push(format!("voltage_max_v = {high_v} by {}; --voltage-max sets another", high.place()));
         let highest = readings(all(), 0.0).into_iter().rev().nth(strays(all()));
-        // Smallest excess over the limit at which pulses are mentioned, V.
+        // Smallest excess over the limit at which pulses are reported, V.
         if let Some(pulse) = highest.filter(|pulse| pulse.voltage_v > high_v + 0.02) {
             notes.push(format!("pulses above voltage_max_v do not count: {}", pulse.place()));
         }
@@ -64,7 +65,7 @@ pub(super) fn voltage_limits(
 
 type Limit<'a> = (f64, Reading<'a>);
 
-/// Range of the rows outside pulses, in steps of 10 mV; if there are only pulses, of all rows.
+/// Returns the voltage range of the rows outside pulses, in steps of 10 mV. If there are only pulses, all rows count.
 fn held_limits<'a>(files: impl Iterator<Item = &'a MeasuredFile> + Clone) -> Option<(Limit<'a>, Limit<'a>)> {
     let held = readings(files.clone(), HELD_S);
     let all = if held.is_empty() { readings(files, 0.0) } else { held };
@@ -78,7 +79,7 @@ fn strays<'a>(files: impl Iterator<Item = &'a MeasuredFile>) -> usize {
     files.map(MeasuredFile::rows).sum::<usize>() / STRAY
 }
 
-/// Readings whose current has kept its direction for `held_s`, by rising voltage.
+/// Returns the readings at which the current has kept its direction for `held_s`, by rising voltage.
 fn readings<'a>(files: impl Iterator<Item = &'a MeasuredFile>, held_s: f64) -> Vec<Reading<'a>> {
     let mut all = Vec::new();
     for file in files {
@@ -108,9 +109,11 @@ fn held_rows(part: &MeasuredPart, held_s: f64) -> Vec<usize> {
     (0..part.len()).filter(|k| held(k)).collect()
 }
 
-/// Returns the voltage limits of whole cycles. A discharge ends with its first row below the cut-off, and cut-offs are multiples of
-/// 0.1 V, so the highest of these rows gives the lower limit; aborted discharges do not count. Charges hold their voltage, so the
-/// median of their highest voltages gives the upper limit.
+/// Returns the voltage limits of whole cycles.
+///
+/// A discharge ends with its first row below the cut-off. Cut-offs are multiples of 0.1 V. The lower limit is therefore the highest of
+/// these rows, rounded up to 0.1 V; aborted discharges do not count. Charges hold their voltage, so the upper limit is the median of
+/// their highest voltages.
 fn cycle_limits(files: &[MeasuredFile], first: usize) -> Option<(Limit<'_>, Limit<'_>)> {
     let (mut ends, mut tops) = (Vec::new(), Vec::new());
     for file in files {
@@ -127,7 +130,7 @@ fn cycle_limits(files: &[MeasuredFile], first: usize) -> Option<(Limit<'_>, Limi
     for list in [&mut ends, &mut tops] {
         list.sort_by(|a, b| a.voltage_v.total_cmp(&b.voltage_v));
     }
-    // A discharge that ends further above the median end was aborted, V.
+    // A discharge that ends this far above the median end was aborted, V.
     let broken_off_v = ends.get(ends.len() / 2)?.voltage_v + 0.3;
     let low = *ends.iter().rfind(|end| end.voltage_v < broken_off_v)?;
     let high = tops.get(tops.len() / 2).copied();
@@ -136,7 +139,7 @@ fn cycle_limits(files: &[MeasuredFile], first: usize) -> Option<(Limit<'_>, Limi
     Some(((cut_off_v, low), ((high.voltage_v * 20.0).round() / 20.0, high)))
 }
 
-/// The loaded row with the lowest (`sign` = 1: a discharge) or highest voltage.
+/// Returns the row under load with the lowest voltage of a discharge (`sign` = 1) or the highest voltage of a charge (`sign` = -1).
 fn extreme(part: &MeasuredPart, sign: f64) -> Option<usize> {
     let most_a = part.current_a.iter().fold(0.0_f64, |most, i| most.max(i * sign));
     let loaded = (0..part.len()).filter(|&k| part.current_a[k] * sign > REST_SHARE * most_a);

@@ -1,10 +1,11 @@
-//! Fits a cell model to logs of a whole pack: ordinary drives and charges that start anywhere.
+//! Fits a cell model to logs of a whole pack: ordinary drives and charges that start at any SOC.
 //!
-//! Input: a configuration with a cell model or a label, and logs as the daemon reads them. Output: a [`FitOutcome`]; where the logs
-//! contain no information, its tables stay as in the configured model.
+//! Input: a configuration with a cell model or a label, and logs as the daemon reads them. Output: a [`FitOutcome`]. Where the logs
+//! contain no information, the tables stay as in the configured model.
 //!
-//! Every log is replayed through the monitor, so limits, decoding and faults are the daemon's. The pack's own cells are of one kind:
-//! their mean voltage is fitted as one cell. After a gap in the record, a new stretch starts with another unknown SOC.
+//! Every log is replayed through the monitor, so limits, decoding and fault handling are the same as in the daemon. Only cells of the
+//! configured kind are used, and their mean voltage is fitted like the voltage of a single cell. After a gap in the record, a new
+//! stretch starts; its SOC is another unknown.
 
 use std::cell::RefCell;
 use std::path::{Path, PathBuf};
@@ -36,32 +37,33 @@ use crate::monitor::{Estimate, Monitor, MonitorConfig};
 use crate::quantity::CellIndex;
 use crate::replay::{self, OutputWatch, ReplaySettings, Sinks};
 
-/// Smallest number of rows of a stretch that is used.
+/// A stretch with fewer rows is not used.
 const LEAST_ROWS: usize = 20;
 /// Smallest standard deviation of the SOC at the start of a stretch.
 const BEGINNING_STD: f64 = 0.02;
-/// A stretch starts full if its open-circuit voltage is at least the voltage at this SOC.
+/// A stretch starts full if its open-circuit voltage is at least the OCV at this SOC.
 const FULL_SOC: f64 = 0.975;
-/// Share of the usual series resistance for that open-circuit voltage: the smallest of a cell.
+/// Share of the usual series resistance with which the open-circuit voltage at the start is computed. No cell has a smaller share.
 const LEAST_RESISTANCE: f64 = 0.4;
-/// Standard deviation of the SOC of a stretch that starts full.
+/// Standard deviation of the initial SOC of a stretch that starts full.
 const FULL_STD: f64 = 0.01;
-/// Diffusion limits a cold cell below this SOC, per unit of the Arrhenius factor above 1. No circuit models the voltage there, which
-/// would be mistaken for lost capacity. Chosen on Panasonic 18650PF.
+/// A cold cell is limited by diffusion below this SOC times (Arrhenius factor - 1). No circuit models the voltage there, so its error
+/// would be mistaken for lost capacity. Chosen on Panasonic 18650PF cells.
 const KNEE_SOC: f64 = 0.13;
-/// Upper limit of that SOC.
+/// Upper limit of this SOC.
 const MOST_KNEE_SOC: f64 = 0.35;
-/// A cold cell does not settle within a drive: its voltage is off by this SOC, per unit of the Arrhenius factor above 1. Rests of
-/// 20 min of Panasonic 18650PF at 10 to -20 degrees C show 0.013 to 0.024; rests in drives are shorter.
+/// A cold cell does not settle within a drive. Its voltage is therefore wrong by the equivalent of this SOC times (Arrhenius factor -
+/// 1). Rests of 20 min of Panasonic 18650PF cells at 10 to -20 degrees C show 0.013 to 0.024; rests during drives are shorter.
 const COLD_SOC: f64 = 0.03;
-/// Residual above which the logs do not come from one kind of cell, V; it grows with cold by the power of the Arrhenius factor.
-/// Fits of the cells of `tests/label` leave 5 to 20 mV when warm and 27 mV at 0 degrees C.
+/// If the residual is above this value, V, the logs do not come from one kind of cell. In the cold, the limit is multiplied by a power
+/// of the Arrhenius factor. Fits of the cells of `tests/label` leave 5 to 20 mV when warm and 27 mV at 0 degrees C.
 const UNFIT_V: f64 = 0.04;
-/// A charge is complete when the voltage is at most this far below the highest, V, and the current is below the rated capacity
-/// over this time, h.
+/// A charge is complete when two conditions hold: the voltage is at most this far below the highest voltage, V, and the current would
+/// need more than the next constant, h, to charge the rated capacity.
 const HELD_V: f64 = 0.012;
 const FADED_H: f64 = 15.0;
-/// Smallest error of the configured model's curve, V: smooth over [`CURVE_SOC`], and of each breakpoint alone.
+/// Smallest error of the configured model's curve, V: first the error that is smooth over [`CURVE_SOC`], then the error of each
+/// breakpoint alone.
 const CURVE_V: (f64, f64) = (0.004, 0.002);
 const CURVE_SOC: f64 = 0.1;
 /// SOC breakpoints of the fitted tables.
@@ -72,25 +74,25 @@ const SOC: [f64; 26] = [
 
 /// Logs of a pack, and the settings to read them.
 pub struct LogRequest<'a> {
-    /// Configuration of the monitor; the fit starts from its cell model.
+    /// Configuration of the monitor. The fit starts from its cell model.
     pub monitor: &'a MonitorConfig,
     /// Names of the interfaces.
     pub interfaces: Vec<String>,
-    /// A longer gap means that the recorder was asleep, s.
+    /// A gap in a log that is longer than this means that the recorder was asleep, s.
     pub sleep_gap_s: f64,
-    /// Creates the options to read one log.
+    /// Creates the options for reading one log.
     pub options: &'a (dyn Fn() -> LogOptions + Sync),
     /// Logs; each is replayed separately.
     pub logs: Vec<PathBuf>,
 }
 
-/// The mean of all cells over a part of a log without a gap.
+/// The mean of all cells in a part of a log without a gap.
 #[derive(Debug, Clone, Default)]
 struct Stretch {
     log: usize,
     part: MeasuredPart,
     cells: CellDistances,
-    /// SOC at the first row with its standard deviation.
+    /// SOC at the first row, with its standard deviation.
     beginning: (f64, f64),
 }
 
@@ -98,7 +100,7 @@ struct Stretch {
 #[derive(Debug, Default)]
 struct MeanCell {
     stretches: Vec<Stretch>,
-    /// Voltage of each cell in the sums; NaN = not in the sums yet.
+    /// Latest voltage of each cell; NaN = this cell is not yet part of the sums.
     voltage_v: Vec<f64>,
     count: f64,
     sums: [f64; 6],
@@ -148,7 +150,7 @@ impl MeanCell {
             return;
         }
         let last_s = self.stretches.last().and_then(|stretch| stretch.part.time_s.last().copied());
-        // A longer gap starts a new stretch, s: more than any logger's interval, less than a stop.
+        // A gap longer than this starts a new stretch, s. It is longer than the interval of any logger, and shorter than a stop.
         let has_hole = last_s.is_none_or(|last_s| time_s - last_s > 120.0 || time_s < last_s);
         if std::mem::take(&mut self.begins) || has_hole {
             let beginning = (soc, soc_std.hypot(BEGINNING_STD));
@@ -165,7 +167,7 @@ impl MeanCell {
 /// Reads the logs and fits the model.
 ///
 /// # Errors
-/// The logs cannot be read, or the data do not support a fit: one line each.
+/// The logs cannot be read, or the data do not support a fit. The error has one line per fault.
 pub fn run(request: &LogRequest<'_>, mut progress: impl FnMut(FitProgress)) -> Result<FitOutcome, LabError> {
     let numbered: Vec<(usize, &PathBuf)> = request.logs.iter().enumerate().collect();
     let read: Result<Vec<_>, LabError> =
@@ -199,7 +201,7 @@ fn fit_stretches(
     let known = known(model, &grid, request.monitor);
     let fit = unanchored::fit(&settings, &known, &records, |pass, cost| progress(FitProgress::Pass(pass, cost)))
         .map_err(LabError::Data)?;
-    // The logs may come from two packs, or from cells of an unknown kind: the fit describes neither.
+    // The logs may come from two packs or from cells of an unknown kind. Then the fit describes neither.
     let unfit_v = Some(fit.fitted.total.rmse_v).filter(|rmse_v| *rmse_v > unfit_v(&grid));
     let fit =
         if unfit_v.is_some() { unanchored::prior(&settings, &known, &records).map_err(LabError::Data)? } else { fit };
@@ -241,7 +243,7 @@ fn fit_stretches(
     Ok(outcome)
 }
 
-/// Notes on the capacity, on missing information in the logs, and on the chemistry.
+/// Returns notes on the capacity, on information that is missing in the logs, and on the chemistry.
 fn notes(model: &CellModel, stretches: &[Stretch], fit: &UnanchoredFit, known: &Known) -> Vec<String> {
     let (capacity_ah, std_ah) = (fit.capacity_ah, fit.capacity_std_ah);
     let mut notes = vec![format!(
@@ -260,18 +262,18 @@ fn notes(model: &CellModel, stretches: &[Stretch], fit: &UnanchoredFit, known: &
     notes
 }
 
-/// Residual above which the logs do not come from one kind of cell, V.
+/// Returns the residual, V, above which the logs do not come from one kind of cell.
 fn unfit_v(grid: &Grid) -> f64 {
     UNFIT_V * error_ratio(grid)
 }
 
-/// Error of a circuit at the coldest node, relative to its error when warm.
+/// Returns the error of the circuit model at the coldest node, relative to its error when warm.
 fn error_ratio(grid: &Grid) -> f64 {
     let coldest_c = grid.temperature_c.first().copied().unwrap_or(ELECTRODES_C);
     libm::pow(1.0 + colder(coldest_c), COLD_POWER)
 }
 
-/// Voltage error of a cold cell that does not settle, V, in node order.
+/// Returns the voltage error of a cold cell that has not settled, V, in node order.
 fn unsettled_v(fitted: &FittedTables) -> Vec<f64> {
     let (soc, columns) = (&fitted.grid.soc, fitted.grid.soc.len());
     let of_node = |node: usize| {
@@ -284,16 +286,16 @@ fn unsettled_v(fitted: &FittedTables) -> Vec<f64> {
     (0..fitted.tables.ocv_v.len()).map(of_node).collect()
 }
 
-/// Arrhenius factor minus 1; 0 when warm.
+/// Returns the Arrhenius factor minus 1, but at least 0.
 fn colder(temperature_c: f64) -> f64 {
     (arrhenius(temperature_c) - 1.0).max(0.0)
 }
 
-/// The stretches of one log.
+/// Returns the stretches of one log.
 fn stretches(request: &LogRequest<'_>, log: usize, path: &Path) -> Result<Vec<Stretch>, LabError> {
     let mean = Rc::new(RefCell::new(MeanCell::new(usize::from(request.monitor.sample.cells))));
     let watched = Rc::clone(&mean);
-    // Cells of a module of another kind have another curve.
+    // Cells in modules of another kind have another open-circuit curve.
     let is_own: Vec<bool> =
         (0..request.monitor.sample.cells).map(|cell| request.monitor.is_own(CellIndex(cell))).collect();
     let watch: OutputWatch = Box::new(move |record, out| {
@@ -306,7 +308,7 @@ fn stretches(request: &LogRequest<'_>, log: usize, path: &Path) -> Result<Vec<St
     let sinks = Sinks { watch: Some(watch), ..Sinks::default() };
     let mut source = LogSource::new([path.to_owned()], (request.options)());
     let settings = ReplaySettings::plain(request.sleep_gap_s, request.interfaces.clone());
-    // The fitted model must not change during the replay.
+    // The model that is fitted must not change during the replay.
     let monitor = Monitor::new(MonitorConfig { label: None, ..request.monitor.clone() });
     replay::run(&mut source, monitor, sinks, settings, &mut |_| ())
         .map_err(|error| LabError::Data(error.to_string()))?;
@@ -316,7 +318,7 @@ fn stretches(request: &LogRequest<'_>, log: usize, path: &Path) -> Result<Vec<St
     Ok(stretches.into_iter().map(|stretch| Stretch { log, ..stretch }).collect())
 }
 
-/// Converts a stretch to rows of the fit; their SOC is minus the charge taken out, Ah.
+/// Converts a stretch to rows of the fit. Their `soc` is minus the charge taken out, Ah.
 fn unanchored(stretch: &Stretch, grid: &Grid, model: &CellModel) -> UnanchoredRecord {
     let mut part = stretch.part.clone();
     let first_s = part.time_s[0];
@@ -336,14 +338,15 @@ fn unanchored(stretch: &Stretch, grid: &Grid, model: &CellModel) -> UnanchoredRe
     UnanchoredRecord { record, scale, beginning, full }
 }
 
-/// Whether a stretch starts with a full cell: it has the open-circuit voltage of a full cell even with the least resistance.
+/// Whether a stretch starts with a full cell: even with the smallest possible resistance, its open-circuit voltage is that of a full
+/// cell.
 fn begins_full(part: &MeasuredPart, model: &CellModel) -> bool {
     let (voltage_v, current_a, temperature_c) = (part.voltage_v[0], part.current_a[0], part.temperature_c[0]);
     let drop_v = LEAST_RESISTANCE * model.r0_ohm(&model.grid_position(1.0, temperature_c)) * current_a;
     voltage_v + drop_v >= model.ocv_v(&model.grid_position(FULL_SOC, temperature_c))
 }
 
-/// Voltage below which rows of a cold cell are not judged, V.
+/// Returns the voltage, V, below which rows of a cold cell are not judged.
 fn knee_v(model: &CellModel, current_a: f64, temperature_c: f64) -> f64 {
     let soc = (KNEE_SOC * colder(temperature_c)).min(MOST_KNEE_SOC);
     if soc <= 0.0 {
@@ -353,7 +356,8 @@ fn knee_v(model: &CellModel, current_a: f64, temperature_c: f64) -> f64 {
     model.ocv_v(&position) - model.settled_ohm(&position) * current_a.max(0.0)
 }
 
-/// Charge taken out, Ah, and time, h, of the last row at which the current of a charge at the highest voltage has faded: the cell is full.
+/// Finds the last row at which a charge is complete: the voltage is at its highest and the current has faded. Returns the charge taken
+/// out, Ah, and the time, h, of this row.
 fn full(part: &MeasuredPart, model: &CellModel) -> Option<(f64, f64)> {
     let most_a = model.rated_capacity_ah / FADED_H;
     let is_full = |&k: &usize| {
@@ -362,17 +366,17 @@ fn full(part: &MeasuredPart, model: &CellModel) -> Option<(f64, f64)> {
     (0..part.len()).rev().find(is_full).map(|k| (-part.soc[k], part.time_s[k] / 3600.0))
 }
 
-/// One node per group of temperatures; stretches without a temperature have the ambient one.
+/// Returns one node per group of similar temperatures. Stretches without a measured temperature have the ambient temperature.
 fn temperature_nodes(stretches: &[Stretch]) -> Vec<f64> {
     let of_stretch = |stretch: &Stretch| median(stretch.part.temperature_c.iter().copied());
     let mut medians: Vec<f64> = stretches.iter().filter_map(of_stretch).collect();
     medians.sort_by(f64::total_cmp);
-    // Temperatures of stretches that differ by less share a node, K.
+    // Stretches share a node if their temperatures differ by less than this, K.
     let groups = medians.chunk_by(|a, b| b - a < 5.0);
     groups.map(|group| (10.0 * group.iter().sum::<f64>() / group.len() as f64).round() / 10.0).collect()
 }
 
-/// Prior knowledge from the configured model.
+/// Returns the prior knowledge from the configured model.
 fn known(model: &CellModel, grid: &Grid, monitor: &MonitorConfig) -> Known {
     let per_node = |value: &dyn Fn(f64, f64) -> f64| -> Vec<f64> {
         grid.temperature_c
@@ -407,7 +411,7 @@ fn known(model: &CellModel, grid: &Grid, monitor: &MonitorConfig) -> Known {
         curve_row,
         capacity_ah: initial.capacity_ah,
         capacity_std: initial.capacity_std_ah / initial.capacity_ah,
-        // Smallest standard deviation of the current sensor's offset: the rated capacity over this time, h.
+        // Smallest standard deviation of the current sensor's offset: the current that discharges the rated capacity in this time, h.
         offset_std_a: monitor.estimator.sensor.current_offset_a.max(model.rated_capacity_ah / 1000.0),
     }
 }

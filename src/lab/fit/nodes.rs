@@ -1,18 +1,18 @@
-//! SOC breakpoints where the open-circuit curve of the slow tests bends.
+//! Places SOC breakpoints where the open-circuit curve of the slow tests bends.
 //!
-//! Input: slow tests (SOC, V). Output: breakpoints, fraction. A model is linear between breakpoints. A node is added where this causes
-//! the largest error of the SOC, until the error is below [`MOST_POINTS`] everywhere.
+//! Input: slow tests (SOC, V). Output: breakpoints, fraction. A model is linear between breakpoints, which causes an error of the SOC.
+//! A breakpoint is added where this error is largest, until it is below [`MOST_POINTS`] everywhere.
 
 use crate::ident::fit::{MIN_SLOPE_V, OcvCurve};
 use crate::ident::grid::interpolate;
 
-/// Largest error of the SOC from linear interpolation, fraction.
+/// Maximum SOC error of the linear interpolation, fraction.
 const MOST_POINTS: f64 = 0.005;
-/// Width over which the slope is taken, SOC: an estimate moves across the steps of a plateau.
+/// Width over which the slope is computed, SOC. It is this wide because an estimate moves across the steps of a plateau.
 const SLOPE_WIDTH: f64 = 0.04;
-/// Smallest distance between breakpoints, and between the points tested.
+/// Smallest distance between breakpoints, and between the SOC values at which the error is computed.
 const LEAST_DISTANCE: f64 = 0.01;
-/// Most breakpoints: the time of a fit grows with their square.
+/// Maximum number of breakpoints. The time of a fit grows with the square of their number.
 const MOST_NODES: usize = 31;
 
 /// Adds nodes to `first` where the curves bend.
@@ -29,13 +29,13 @@ pub(super) fn by_curvature(first: &[f64], curves: &[OcvCurve]) -> Vec<f64> {
     nodes
 }
 
-/// Largest error of the SOC over the curves at `at` if the curves are linear between `nodes`, fraction.
+/// Returns the largest SOC error of any curve at the SOC `at`, fraction, if the curves are linear between `nodes`.
 fn misread(curves: &[OcvCurve], nodes: &[f64], at: f64) -> f64 {
     let of_curve = |curve: &OcvCurve| {
         let voltage_v = |soc: f64| interpolate(&curve.soc, &curve.voltage_v, soc);
         let above = nodes.partition_point(|&node| node < at);
         let (low, high) = (nodes[above - 1], nodes[above]);
-        // A cold test contains no information below its end.
+        // A test in the cold contains no information below the SOC at which it ended.
         if low < curve.soc[0] {
             return 0.0;
         }
@@ -43,7 +43,7 @@ fn misread(curves: &[OcvCurve], nodes: &[f64], at: f64) -> f64 {
         let error_v = (voltage_v(low) + along * (voltage_v(high) - voltage_v(low)) - voltage_v(at)).abs();
         let (from, to) = ((at - 0.5 * SLOPE_WIDTH).max(0.0), (at + 0.5 * SLOPE_WIDTH).min(1.0));
         let slope_v = ((voltage_v(to) - voltage_v(from)) / (to - from)).max(MIN_SLOPE_V);
-        // Smallest voltage error that adds a node, V: no model is more accurate.
+        // A node is added only above this voltage error, V. No model is more accurate.
         if error_v > 0.001 { error_v / slope_v } else { 0.0 }
     };
     curves.iter().map(of_curve).fold(0.0, f64::max)
@@ -53,7 +53,7 @@ fn misread(curves: &[OcvCurve], nodes: &[f64], at: f64) -> f64 {
 mod tests {
     use super::*;
 
-    /// A straight curve with a step of 50 mV at 0.63.
+    /// A straight curve with a step of 50 mV at SOC 0.63.
     fn stepped() -> OcvCurve {
         let soc: Vec<f64> = (0..=1000).map(|k| f64::from(k) / 1000.0).collect();
         let voltage_v = soc.iter().map(|z| 3.0 + z + 0.025 * ((z - 0.63) / 0.01).tanh()).collect();

@@ -1,4 +1,4 @@
-//! The residual plot: one panel per file, measured minus model voltage over time.
+//! The plot of residuals: one panel per file with the measured voltage minus the model's voltage over time.
 
 use std::path::Path;
 
@@ -12,12 +12,12 @@ use crate::ident::pass::residuals;
 /// # Errors
 /// The file cannot be written.
 pub fn write(path: &Path, outcome: &FitOutcome) -> Result<(), LabError> {
-    // Most panels that a reader can use.
+    // Maximum number of panels: a reader cannot use more.
     let panels: Vec<Picture> = (0..outcome.files.len()).take(40).map(|number| panel(outcome, number)).collect();
     Ok(chart::write_stack(path, &panels)?)
 }
 
-/// Panel of one file; its parts follow each other.
+/// Draws the panel of one file. The parts of the file follow each other.
 fn panel(outcome: &FitOutcome, number: usize) -> Picture {
     let file = &outcome.files[number];
     let mut points = Vec::new();

@@ -1,4 +1,4 @@
-//! Converts measured files to records: voltage limits, capacity, slow tests, SOC, temperature.
+//! Converts measured files to records. This determines voltage limits, capacity, slow tests, SOC and temperature.
 
 use super::FitRequest;
 use super::limits::{DISCONNECTED_V, voltage_limits};
@@ -9,18 +9,19 @@ use crate::ident::grid::Grid;
 use crate::ident::record::{self, Limits, Record};
 use crate::measured::{MeasuredFile, MeasuredPart};
 
-/// Voltages further outside the cell's limits are not credible, V.
+/// A voltage is not credible if it is this far below the lowest or above the highest voltage of the cell, V.
 pub(super) const CREDIBLE_BEYOND_V: (f64, f64) = (1.0, 0.3);
-/// Weight of a charge relative to a discharge of an ageing cell: its voltage contains slower relaxation.
+/// Weight of a charge of an ageing cell relative to a discharge. It is smaller because the voltage of a charge contains slower
+/// relaxation.
 const AGEING_CHARGE_SCALE: f64 = 0.6;
 
-/// A part of a file with its SOC, not yet positioned in the grid.
+/// A part of a file with its SOC, before it has a position in the grid.
 pub(super) struct AnchoredPart {
-    /// Number of its file.
+    /// Number of the file.
     pub(super) file: usize,
     part: MeasuredPart,
     judged: Vec<bool>,
-    /// Weight of each second; `None` = from the covered SOC and the kind of test.
+    /// Weight of each second; `None` = computed from the covered SOC and the kind of test.
     scale: Option<f64>,
 }
 
@@ -33,10 +34,10 @@ pub(super) struct FitInputs {
     pub(super) notes: Vec<String>,
 }
 
-/// Removes rows that lack current or voltage or whose time runs backwards; a missing temperature repeats the previous one.
+/// Removes rows without current or voltage, and rows whose time runs backwards. A missing temperature repeats the previous one.
 fn clean(part: &MeasuredPart) -> MeasuredPart {
     let known = part.temperature_c.iter().copied().find(|t| t.is_finite());
-    // Assumed temperature of a file without one, degrees C.
+    // Assumed temperature of a file without temperatures, degrees Celsius.
     let mut temperature_c = known.unwrap_or(25.0);
     let mut clean = MeasuredPart { key: part.key.clone(), kind: part.kind.clone(), ..MeasuredPart::default() };
     for k in 0..part.len() {
@@ -100,10 +101,10 @@ pub(super) fn prepare(
     Ok(FitInputs { sources, capacity_ah, voltage_v, ocv, notes })
 }
 
-/// Number of the file, a part of it, and the charge taken out since full at every row, Ah.
+/// Number of the file, a part of it, and for every row the charge taken out since the cell was full, Ah.
 type PartDischarge = (usize, MeasuredPart, Vec<f64>);
 
-/// Returns the charge taken out of every part of every file; one error lists all files that do not start full.
+/// Returns the charge taken out for every part of every file. If files do not start full, a single error lists all of them.
 fn taken_out(request: &FitRequest, files: &[MeasuredFile], voltage_max_v: f64) -> Result<Vec<PartDischarge>, LabError> {
     let (mut taken, mut refused) = (Vec::new(), Vec::new());
     for (number, file) in files.iter().enumerate() {
@@ -130,7 +131,7 @@ fn rough_capacity(part: &MeasuredPart) -> f64 {
 /// The discharge of a slow test.
 struct SlowDischarge {
     temperature_c: f64,
-    /// Rising.
+    /// Charge taken out, Ah, rising.
     out_ah: Vec<f64>,
     voltage_v: Vec<f64>,
 }
@@ -162,7 +163,7 @@ fn slow_test(file: &MeasuredFile, voltage_max_v: f64) -> Result<SlowDischarge, L
         }
     }
     let whole_ah = out_ah.iter().fold(0.0_f64, |most, ah| most.max(*ah));
-    // Smallest share of the capacity that a slow test must discharge.
+    // A slow test must discharge at least this share of the capacity.
     if test.out_ah.len() < 10 || test.out_ah[test.out_ah.len() - 1] < 0.5 * whole_ah {
         return Err(fail(format!("its first discharge has {} rows, expected a whole slow one", test.out_ah.len())));
     }
@@ -181,7 +182,7 @@ fn slow_source(
     let out_ah = part.taken_out_ah(voltage_max_v, capacity_ah);
     let out_ah = out_ah.map_err(|e| LabError::Data(format!("{}: {e}", file.path.display())))?;
     let most = out_ah.iter().enumerate().fold(0, |most, (k, ah)| if *ah > out_ah[most] { k } else { most });
-    // Rows after the discharge are not judged.
+    // Rows after the end of the discharge are not judged.
     let judged = (0..out_ah.len()).map(|k| k <= most).collect();
     part.soc = out_ah.iter().map(|ah| 1.0 - ah / capacity_ah).collect();
     Ok(AnchoredPart { file: number, part, judged, scale: None })
@@ -224,7 +225,7 @@ fn ageing_sources(
 }
 
 impl FitInputs {
-    /// Returns the records placed in `grid`, and the weight of each.
+    /// Returns the records with their positions in `grid`, and the weight of each record.
     pub(super) fn records(&self, grid: &Grid) -> (Vec<Record>, Vec<f64>) {
         let limits = Limits {
             voltage_low_v: (self.voltage_v.0 - CREDIBLE_BEYOND_V.0).max(DISCONNECTED_V),
@@ -233,7 +234,7 @@ impl FitInputs {
         };
         let record = |source: &AnchoredPart| Record::prepare(&source.part, &source.judged, grid, &limits);
         let records: Vec<Record> = self.sources.iter().map(record).collect();
-        // Without drives, the tests count in full.
+        // Without drives, slow tests and pulse tests have full weight.
         let most = records.iter().map(record::share).fold(0.0, f64::max);
         let by_share = |r: &Record| record::weight(r) * record::share(r) / most;
         let scale = self.sources.iter().zip(&records).map(|(s, r)| s.scale.unwrap_or_else(|| by_share(r)));
@@ -241,7 +242,7 @@ impl FitInputs {
         (records, scale)
     }
 
-    /// Residuals of the discharges and of the charges.
+    /// Returns the residuals of the discharges and of the charges.
     pub(super) fn by_kind(&self, records: &[Record], fitted: &FittedTables) -> (Residual, Residual) {
         let of_kind = |discharge: bool| {
             let own = self.sources.iter().zip(records).filter(|(s, _)| s.part.is_discharge() == discharge);
@@ -251,7 +252,8 @@ impl FitInputs {
         (of_kind(true), of_kind(false))
     }
 
-    /// Returns the temperatures of the files, close ones joined: the coldest decile of each file, because cells warm up under load.
+    /// Returns the temperatures of the files; similar temperatures are averaged. The temperature of a file is the lower decile of its
+    /// rows, because cells warm up under load.
     pub(super) fn temperature_nodes(&self) -> Vec<f64> {
         let coldest = |source: &AnchoredPart| {
             let mut seen = source.part.temperature_c.clone();
@@ -264,7 +266,7 @@ impl FitInputs {
         let mut last = f64::NEG_INFINITY;
         for t in all {
             match nodes.last_mut() {
-                // Temperatures of files that differ by less share a node, K.
+                // Files share a node if their temperatures differ by less than this, K.
                 Some((sum, count)) if t - last < 5.0 => (*sum, *count) = (*sum + t, *count + 1.0),
                 _ => nodes.push((t, 1.0)),
             }

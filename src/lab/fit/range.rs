@@ -1,9 +1,9 @@
-//! The measured range of a model, and its tables outside the measured temperatures.
+//! The measured range of a model, and the extension of its tables beyond the measured temperatures.
 //!
-//! Input: the records of a fit, and the fitted tables. Output: the ranges of temperature (degrees C), current (A) and SOC, and the
-//! tables with one more row [`REACH_K`] below and one above the measured temperatures. In these rows, the open-circuit curve and the
-//! time constants repeat the nearest measured row, and the resistances follow Arrhenius' law. The voltage error grows with the
-//! distance, because the law is only approximate.
+//! Input: the records of a fit, and the fitted tables. Output: the measured ranges of temperature (degrees Celsius), current (A) and
+//! SOC, and extended tables. The extended tables have an additional row [`REACH_K`] below the lowest measured temperature, and another
+//! above the highest. In these rows, the open-circuit curve and the time constants repeat the nearest measured row, and the resistances
+//! follow Arrhenius' law. This law is only approximate, so the voltage error grows with the distance.
 
 use crate::cell::arrhenius;
 use crate::filter::ends;
@@ -13,13 +13,14 @@ use crate::ident::parameters::ParameterTables;
 use crate::ident::pass::COLD_POWER;
 use crate::ident::record::Record;
 
-/// Distance of the additional rows from the measured temperatures, K.
+/// Distance of an additional row from the measured temperatures, K.
 const REACH_K: f64 = 40.0;
-/// Standard deviation of the activation energy of a cell's resistances, J/mol: uniform from 15 to 35 kJ/mol.
+/// Standard deviation of the activation energy of a cell's resistances, J/mol. The energy is assumed to be uniformly distributed from
+/// 15 to 35 kJ/mol.
 const ENERGY_STD_J_PER_MOL: f64 = 6_000.0;
-/// 0 degrees C in K.
+/// 0 degrees Celsius in K.
 const ZERO_CELSIUS_K: f64 = 273.15;
-/// Share of the time at either end of the temperature range that does not count: settling sensors and stray values.
+/// Share of the time that is ignored at either end of the temperature range, because sensors settle and have stray values.
 const STRAY: f64 = 0.005;
 
 /// Ranges of a fit's data.
@@ -36,7 +37,7 @@ pub struct MeasuredRange {
 }
 
 impl MeasuredRange {
-    /// The ranges of the judged rows.
+    /// Returns the ranges of the judged rows.
     pub(super) fn of(records: &[Record]) -> Self {
         let rows = || records.iter().flat_map(|record| &record.rows).filter(|row| row.weight_s > 0.0);
         let mut by_temperature: Vec<(f64, f64)> = rows().map(|row| (row.temperature_c, row.weight_s)).collect();
@@ -62,19 +63,19 @@ impl MeasuredRange {
 pub(super) struct ModelTables {
     pub(super) grid: Grid,
     pub(super) tables: ParameterTables,
-    /// Standard deviation of the error, averaged over 100 s, V.
+    /// Standard deviation of the voltage error, averaged over 100 s, V.
     pub(super) voltage_error_v: Vec<f64>,
 }
 
 impl ModelTables {
-    /// The fitted tables without additional rows.
+    /// Returns the fitted tables without additional rows.
     pub(super) fn fitted(fitted: &FittedTables, voltage_error_v: &[f64]) -> Self {
         let (grid, tables) = (fitted.grid.clone(), fitted.tables.clone());
         Self { grid, tables, voltage_error_v: voltage_error_v.to_vec() }
     }
 
-    /// The fitted tables with rows outside the measured temperatures. If `is_scaled`, the fitted resistances hold only at the nodes, and
-    /// Arrhenius' law applies from there; otherwise they hold out to the measured temperatures.
+    /// Returns the fitted tables with rows outside the measured temperatures. Arrhenius' law applies from the first and last node on if
+    /// `is_scaled` is set, otherwise from the ends of the measured temperatures on.
     pub(super) fn beyond(
         fitted: &FittedTables,
         voltage_error_v: &[f64],
@@ -109,7 +110,7 @@ impl ModelTables {
         all
     }
 
-    /// Adds a fitted row, which holds at `from_c`, for the temperature `to_c`.
+    /// Adds a row for the temperature `to_c`: a fitted row, which holds at `from_c`, scaled by Arrhenius' law.
     fn add_row(
         &mut self,
         (fitted, voltage_error_v): (&FittedTables, &[f64]),
@@ -132,12 +133,12 @@ impl ModelTables {
             to_r.extend(r[nodes.clone()].iter().map(|ohm| ohm * factor));
             to_tau.extend(&tau[nodes.clone()]);
         }
-        // Warmth does not make a model better than measured.
+        // At a higher temperature, a model is not more accurate than measured.
         let colder = factor.max(1.0);
         self.voltage_error_v.extend(nodes.map(|node| {
             let settled_ohm = r_ohm.iter().fold(r0_ohm[node], |sum, r| sum + r[node]);
             let arrhenius_v = log_std * rms_a * settled_ohm * colder;
-            // Upper limit of the errors, V: an estimate hardly follows such a voltage.
+            // Upper limit of the errors, V: an estimate hardly follows a voltage with such an error.
             libm::hypot(voltage_error_v[node] * libm::pow(colder, COLD_POWER), arrhenius_v).min(0.5)
         }));
     }

@@ -1,6 +1,6 @@
-//! A request for a fit, for the command line and the Python module.
+//! A request for a fit; the command line and the Python module use it.
 //!
-//! Input: files and known data of the cell. Output: a checked request: only [`FitRequest::check`] defines the allowed ranges. Errors
+//! Input: files, and known data of the cell. Output: a checked request. Only [`FitRequest::check`] defines the allowed ranges. Errors
 //! name the argument of the command.
 
 use std::path::PathBuf;
@@ -9,38 +9,39 @@ use crate::cell::MAX_BRANCHES;
 use crate::error::{LabError, check_values as check};
 use crate::quantity::bounds;
 
-/// Most SOC breakpoints: one per percent. The duration of a fit grows with the cube of their number.
+/// Maximum number of SOC breakpoints: one per percent. The duration of a fit grows with the cube of their number.
 pub const MAX_SOC_NODES: usize = 101;
 
-/// What to fit.
+/// What is fitted.
 #[derive(Debug, Clone, Default)]
 pub struct FitRequest {
     /// Name of the cell.
     pub name: String,
-    /// Capacity that defines SOC, Ah; `None` = from the slow test or the deepest discharge.
+    /// Capacity that defines the SOC, Ah; `None` = the capacity of the slow test or of the deepest discharge.
     pub capacity_ah: Option<f64>,
-    /// Capacity on the label, Ah; `None` = the capacity.
+    /// Capacity on the label, Ah; `None` = `capacity_ah`.
     pub rated_ah: Option<f64>,
     /// Lowest voltage under load, V; `None` = from the data.
     pub voltage_min_v: Option<f64>,
     /// Highest voltage under charge, V; `None` = from the data.
     pub voltage_max_v: Option<f64>,
-    /// Shift of the open-circuit curve with lost capacity; `None` = by the electrodes found in a slow test, or without them 0, for an
-    /// ageing cell [`super::AGEING_SHIFT`].
+    /// Shift of the open-circuit curve with lost capacity. `None` = determined by the electrodes found in a slow test; if none were
+    /// found, 0, or for an ageing cell [`super::AGEING_SHIFT`].
     pub ageing_shift: Option<f64>,
     /// Slow tests.
     pub ocv: Vec<PathBuf>,
-    /// RC branches, 1 to 3; `None` = 2, for an ageing cell 1.
+    /// Number of RC branches, 1 to 3; `None` = 2, or 1 for an ageing cell.
     pub branches: Option<usize>,
-    /// Starting time constants, s, rising: one per branch; `None` = defaults.
+    /// Initial time constants, s, one per branch, rising; `None` = the defaults.
     pub tau_s: Option<Vec<f64>>,
     /// Temperature breakpoints, degrees C, rising; `None` = from the data.
     pub temperature_c: Option<Vec<f64>>,
-    /// SOC breakpoints, rising from 0 to 1; `None` = defaults.
+    /// SOC breakpoints, rising from 0 to 1; `None` = the defaults.
     pub soc: Option<Vec<f64>>,
-    /// Number of first half-cycles of an ageing cell to use, without slow tests and capacity; `None` = the cell is not ageing.
+    /// Number of half-cycles at the start of an ageing cell's life that are used, without slow tests and capacity; `None` = the cell is
+    /// not ageing.
     pub first_cycles: Option<usize>,
-    /// Files to fit, at least one.
+    /// Files to fit; at least one.
     pub files: Vec<PathBuf>,
 }
 
@@ -103,7 +104,7 @@ impl FitRequest {
     fn check_nodes(&self) -> Result<(), LabError> {
         if let Some(temperatures_c) = &self.temperature_c {
             let allowed = bounds::TEMPERATURE_C;
-            // Most temperature breakpoints; data never have more.
+            // Maximum number of temperature breakpoints. Data never have more.
             check_list("--temperatures", temperatures_c, 1..=32)?;
             check("--temperatures", temperatures_c.iter().copied(), |found| allowed.has(found), allowed.allowed)?;
         }
@@ -118,13 +119,13 @@ fn is_above_0(value: f64) -> bool {
     value.is_finite() && value > 0.0
 }
 
-/// Rejects a list of wrong length or one that does not rise.
+/// Rejects a list that has the wrong length or does not rise.
 fn check_list(key: &str, list: &[f64], allowed: std::ops::RangeInclusive<usize>) -> Result<(), LabError> {
     if !allowed.contains(&list.len()) {
         let (found, least, most) = (list.len(), allowed.start(), allowed.end());
         return Err(LabError::Data(format!("{key} has {found} values, must have {least} to {most}")));
     }
-    // Not a >= b, which would accept NaN.
+    // The comparison a >= b would accept NaN.
     let falling = list.array_windows().find(|[a, b]| a.partial_cmp(b) != Some(std::cmp::Ordering::Less));
     falling.map_or(Ok(()), |[a, b]| Err(LabError::Data(format!("{key}: {b} follows {a}, must rise"))))
 }

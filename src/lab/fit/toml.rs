@@ -1,4 +1,4 @@
-//! Writes the cell model file: tables, thermal parameters, provenance. The file contains no date, so the same data give the same bytes.
+//! Writes the file of a cell model: tables, thermal parameters, provenance. It contains no date, so the same data give the same bytes.
 
 use std::fmt::Write as _;
 
@@ -6,7 +6,7 @@ use super::range::ModelTables;
 use super::{AGEING_SHIFT, FitOutcome, FitRequest, FittedElectrodes};
 use crate::cell::Electrodes;
 
-/// Returns the whole file.
+/// Returns the text of the whole file.
 pub fn text(request: &FitRequest, outcome: &FitOutcome) -> String {
     let mut out = String::new();
     head(&mut out, request, outcome);
@@ -101,14 +101,15 @@ fn measured(out: &mut String, outcome: &FitOutcome) {
     line(out, &format!("soc = [{:.3}, {:.3}]", range.soc.0, range.soc.1));
 }
 
-/// Returns the file name with its folder, which identifies the file without revealing the machine.
+/// Returns the file name with its folder. They identify the file and reveal nothing about the machine.
 fn file_name(path: &std::path::Path) -> String {
     let parts: Vec<_> = path.components().map(|part| part.as_os_str().to_string_lossy().into_owned()).collect();
     parts[parts.len().saturating_sub(2)..].join("/")
 }
 
 fn tables(out: &mut String, request: &FitRequest, outcome: &FitOutcome) {
-    // A model of an ageing cell describes that cell under its own conditions: its cycles cannot separate temperature from age.
+    // The model of an ageing cell describes this cell under its own conditions. Its cycles cannot separate the effect of temperature
+    // from the effect of age.
     let is_ageing = request.first_cycles.is_some();
     let (fit, errors) = (&outcome.fit, &outcome.voltage_error_v);
     let ModelTables { grid, tables, voltage_error_v } = match is_ageing {
@@ -132,7 +133,7 @@ fn tables(out: &mut String, request: &FitRequest, outcome: &FitOutcome) {
     }
 }
 
-/// Numbers in a TOML list, without the brackets.
+/// Formats numbers as a TOML list, without the brackets.
 pub(crate) fn list(values: &[f64]) -> String {
     values.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
 }

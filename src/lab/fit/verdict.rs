@@ -1,16 +1,18 @@
-//! Accuracy of a fitted model, in plain words.
+//! Describes the accuracy of a fitted model in plain words.
 //!
-//! Input: the model's error table (V, for data outside the fit), the slopes of its open-circuit curve, the fitted rows. Output:
-//! sentences. The error of the SOC is the voltage error over the slope, as root mean square over [`MIDDLE`]: the error if voltage alone
-//! determines the SOC. Counting charge between readings reduces it; sensor errors increase it.
+//! Input: the error table of the model (V, for data outside the fit), the slopes of its open-circuit curve, and the fitted rows.
+//! Output: sentences. The SOC error at a breakpoint is the voltage error divided by the slope; the root mean square over [`MIDDLE`] is
+//! stated. This is the error if the SOC is determined by voltage alone. Counting charge between readings reduces it; sensor errors
+//! increase it.
 
 use super::{FitOutcome, MeasuredRange};
 use crate::ident::fit::{FittedTables, MIN_SLOPE_V, SUPPORTED_S};
 
-/// SOC range over which errors are averaged: below it, curves are so steep that any model is accurate, and few cells go there.
+/// SOC range over which errors are averaged. Below it, the curve is so steep that any model is accurate, and cells are rarely used
+/// there.
 const MIDDLE: std::ops::RangeInclusive<f64> = 0.1..=0.95;
 
-/// Returns the sentences, for the end of the output.
+/// Returns the sentences for the end of the output.
 pub(super) fn verdict(outcome: &FitOutcome) -> Vec<String> {
     let FitOutcome { fit, voltage_error_v, .. } = outcome;
     let columns = fit.grid.soc.len();
@@ -26,7 +28,7 @@ pub(super) fn verdict(outcome: &FitOutcome) -> Vec<String> {
     said
 }
 
-/// Error of a SOC from voltage alone at every node, points.
+/// Returns the error of a SOC from voltage alone at every node, points.
 fn soc_points(fit: &FittedTables, voltage_error_v: &[f64]) -> Vec<f64> {
     let (soc, columns) = (&fit.grid.soc, fit.grid.soc.len());
     let of_node = |node: usize| {
@@ -44,14 +46,14 @@ fn mean_points(soc: &[f64], points: &[f64]) -> f64 {
     (middle.iter().sum::<f64>() / middle.len().max(1) as f64).sqrt()
 }
 
-/// Points rounded to halves, at least one half.
+/// Formats points, rounded to halves and at least one half.
 fn rounded(points: f64) -> String {
     let halves = ((2.0 * points).round() / 2.0).max(0.5);
     format!("{halves} {}", if halves == 1.0 { "point" } else { "points" })
 }
 
 fn accuracy(rows: &[(f64, f64)]) -> Vec<String> {
-    // Largest error of the SOC at which a temperature counts as good, points.
+    // A temperature counts as good up to this SOC error, points.
     let (good, poor): (Vec<_>, Vec<_>) = rows.iter().partition(|(_, points)| *points <= 2.0);
     let mut said = Vec::new();
     if let (Some((low_c, _)), Some((high_c, _))) = (good.first(), good.last()) {
@@ -66,9 +68,9 @@ fn accuracy(rows: &[(f64, f64)]) -> Vec<String> {
     said
 }
 
-/// Where the curve is too flat for the model's error at every temperature.
+/// States the SOC range in which the curve is too flat for the model's error at every temperature.
 fn flat(soc: &[f64], points: &[f64], columns: usize) -> Option<String> {
-    // Error of the SOC at a breakpoint above which its voltage is useless, points.
+    // Above this SOC error, points, the voltage at a breakpoint is useless.
     let is_flat = |s: &usize| points.iter().skip(*s).step_by(columns).all(|points| *points > 5.0);
     let flat: Vec<String> = (0..columns).filter(is_flat).map(|s| soc[s].to_string()).collect();
     let list = flat.join(", ");
@@ -81,7 +83,7 @@ fn ranges(range: &MeasuredRange) -> String {
     let (charge_a, discharge_a) = range.current_a;
     let (empty, full) = range.soc;
     let charges = if charge_a < 0.0 { format!("charges up to {:.1} A", -charge_a) } else { "no charge".to_owned() };
-    // Adding 0 makes a zero of either sign positive.
+    // Adding 0 changes -0 to 0.
     format!(
         "measured: {:.0} to {:.0} degrees C, discharges up to {discharge_a:.1} A, {charges}, SOC {:.2} to {:.2}; outside this range the model \
          is extrapolated",

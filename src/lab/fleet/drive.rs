@@ -1,7 +1,7 @@
-//! Replays one log through one monitor: the loop of `packwatch replay` without its files.
+//! Replays one log through one monitor, like `packwatch replay` but without its output files.
 //!
-//! Input: a log and a monitor without earlier input. Output: the monitor's outputs after each input, passed to a closure. The monitor
-//! receives the same inputs and ticks as from `packwatch replay`, so the results are the same.
+//! Input: a log, and a monitor that has received nothing. Output: after each input, the outputs of the monitor are passed to a closure.
+//! The monitor receives the same inputs and ticks as from `packwatch replay`, so the results are the same.
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
@@ -13,15 +13,15 @@ use crate::io::ticks::Ticks;
 use crate::monitor::{Monitor, Outputs, Record, RecordKind, TICK_PERIOD_MS};
 use crate::quantity::Timestamp;
 
-/// An opened log, with a note for the user on how it is read.
+/// An opened log, and a note for the user on how it is read.
 pub type OpenedLog = (LogSource, Option<String>);
 
 /// How to read logs.
 #[derive(Clone, Copy)]
 pub struct LogAccess<'a> {
-    /// Opens logs with a configuration and reads one recording after the other.
+    /// Opens logs with a configuration. The logs are read one after the other, as one recording.
     pub open: &'a (dyn Fn(&Config, &[PathBuf]) -> OpenedLog + Sync),
-    /// A longer gap means that the recorder was asleep, s.
+    /// A gap in a log that is longer than this means that the recorder was asleep, s.
     pub sleep_gap_s: f64,
 }
 
@@ -43,8 +43,8 @@ impl DriveSummary {
     }
 }
 
-/// Replays a log. `each` receives the outputs after every input and must clear them; `report` receives the bytes read since its last
-/// call.
+/// Replays a log. `each` receives the outputs after every input and must clear them. `report` receives the number of bytes read since
+/// its last call.
 ///
 /// # Errors
 /// The log cannot be read, or `each` fails.
@@ -97,7 +97,7 @@ impl DriveSummary {
     /// Returns the first and last stamp of `log`.
     ///
     /// # Errors
-    /// The log contains no record; the error includes the notes.
+    /// The log contains no record. The error includes the notes.
     pub fn span_of(&self, log: &Path) -> Result<(Timestamp, Timestamp), LabError> {
         let why = || self.notes.iter().map(|note| format!(": {note}")).collect::<String>();
         self.span.ok_or_else(|| LabError::Data(format!("{}: contains no record{}", log.display(), why())))

@@ -1,9 +1,9 @@
-//! Exports the results of logs as tables: estimates, half-cycles and alarms, in Parquet or CSV.
+//! Exports the results of logs as tables of estimates, half-cycles and alarms, in Parquet or CSV format.
 //!
-//! Input: a configuration and logs. Output: per log a folder `NAME/` with `estimates`, `half_cycles` and `alarms` (`.parquet` or
-//! `.csv`; columns and units in [`columns`]) and `about.json`. `about.json` is written last, so if it exists, the tables are complete.
-//! A file gets its final name only when it is complete. Memory is bounded by one row group per table and log, independent of the length
-//! of the log. A log that fails leaves no file, and the others continue.
+//! Input: a configuration and logs. Output: for each log, a folder `NAME/` with `estimates`, `half_cycles` and `alarms` (`.parquet` or
+//! `.csv`; see [`columns`] for columns and units), and with `about.json`. `about.json` is written last: if it exists, the tables are
+//! complete. A file gets its final name only when it is complete. Memory holds one row group per table and log, no matter how long the
+//! log is. If a log fails, its folder contains no file, and the other logs continue.
 
 mod columns;
 pub mod merge;
@@ -31,7 +31,7 @@ use crate::status::document::ConfigFile;
 
 pub use columns::reference;
 
-/// File that is written after a log's tables.
+/// File that is written after the tables of a log.
 pub(super) const ABOUT: &str = "about.json";
 
 /// Format of the tables.
@@ -61,11 +61,12 @@ pub struct ExportSettings<'a> {
     pub format: TableFormat,
     /// Folder that contains the folders of the logs.
     pub out: PathBuf,
-    /// At most one estimate per cell in each period, s; 0 = all estimates, `None` = no table of estimates.
+    /// Maximum frequency of estimates: one per cell in each period of this length, s. 0 = all estimates; `None` = no table of
+    /// estimates.
     pub period_s: Option<f64>,
-    /// Threads; `None` = all cores.
+    /// Number of threads; `None` = all cores.
     pub jobs: Option<usize>,
-    /// Settings for reading logs, as text; two texts differ if the settings differ.
+    /// Settings for reading logs, as text. The texts of two exports differ if these settings differ.
     pub reading: String,
 }
 
@@ -74,9 +75,9 @@ pub struct ExportSettings<'a> {
 pub struct ExportResult {
     /// The log.
     pub log: PathBuf,
-    /// Folder of its tables.
+    /// Folder of the log's tables.
     pub folder: PathBuf,
-    /// Rows of each table.
+    /// Number of rows of each table.
     pub rows: BTreeMap<&'static str, u64>,
     /// Time from the first stamp to the last, days.
     pub days: f64,
@@ -84,7 +85,7 @@ pub struct ExportResult {
     pub notes: Vec<String>,
 }
 
-/// Exports all logs; returns the result or the error of each log. `report` receives the bytes read since its last call.
+/// Exports all logs. Returns the result or the error of each log. `report` receives the number of bytes read since its last call.
 ///
 /// # Errors
 /// No threads can be started.
@@ -103,7 +104,7 @@ pub fn run(
 /// Exports the logs of one recording.
 ///
 /// # Errors
-/// A log cannot be read or a table cannot be written; then no table is left.
+/// A log cannot be read or a table cannot be written. In this case, no table remains.
 pub(super) fn export(
     config: &Config,
     logs: &[PathBuf],
@@ -134,8 +135,8 @@ pub(super) fn export(
     Ok(exported)
 }
 
-/// Removes the `about.json` of an earlier export, because its tables are replaced one by one; returns a note if they came from
-/// another log.
+/// Removes the `about.json` of an earlier export, because the tables are then replaced one by one. Returns a note if the earlier tables
+/// came from another log.
 fn remove_about(folder: &Path, log: &Path) -> Result<Option<String>, LabError> {
     let path = folder.join(ABOUT);
     let Ok(text) = std::fs::read(&path) else { return Ok(None) };
@@ -146,7 +147,7 @@ fn remove_about(folder: &Path, log: &Path) -> Result<Option<String>, LabError> {
     Ok(other.map(|other| format!("replaced the tables of {other}")))
 }
 
-/// Metadata of the files.
+/// Returns the metadata of the files.
 fn metadata(
     config: &Config,
     log: &Path,
@@ -191,8 +192,8 @@ fn write_about(
     Ok(crate::write_file(&exported.folder.join(ABOUT), &serde_json::to_vec_pretty(&document)?)?)
 }
 
-/// Returns a folder name per log: the file name without endings. If several logs share it, the name of their folder comes before it, or
-/// a number after it.
+/// Returns a folder name per log: the file name without endings. If several logs have the same name, the name of their folder is put in
+/// front, or a number is appended.
 pub(super) fn names(logs: &[PathBuf]) -> Vec<String> {
     let text = |name: Option<&std::ffi::OsStr>| name.unwrap_or_default().to_string_lossy().into_owned();
     let short = |log: &PathBuf| {
@@ -224,7 +225,7 @@ pub(super) fn clean(name: &str) -> String {
     if name.starts_with('.') { format!("_{name}") } else { name }
 }
 
-/// The three tables of one log.
+/// Writers of the three tables of one log.
 struct LogTables {
     log: Arc<str>,
     estimates: Option<TableFile<EstimateRow>>,
@@ -232,11 +233,11 @@ struct LogTables {
     alarms: TableFile<AlarmRow>,
     period_ns: i64,
     first: Option<Timestamp>,
-    /// Period of the last estimate written, per cell.
+    /// For each cell, the period of the last estimate that was written.
     periods: Vec<Option<i64>>,
     rated_ah: f64,
     moved_ah: Vec<f64>,
-    /// A half-cycle that waits for its capacity event.
+    /// Values of a half-cycle for which the capacity event has not yet been received.
     half_cycle: Option<(CellIndex, Fields)>,
 }
 
@@ -317,7 +318,7 @@ impl LogTables {
         time.nanos().saturating_sub(first.nanos())
     }
 
-    /// Completes the files with their metadata; returns the rows of each.
+    /// Completes the files and writes their metadata. Returns the number of rows of each table.
     fn finish(self, metadata: &[(&'static str, String)]) -> Result<BTreeMap<&'static str, u64>, LabError> {
         let mut rows = BTreeMap::from([
             ("half_cycles", self.half_cycles.finish(metadata)?),

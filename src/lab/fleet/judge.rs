@@ -1,19 +1,20 @@
-//! Scores the alarms of one threshold in one log: lead time before the end of life, missed and false alarms.
+//! Scores the alarms of one threshold in one log: lead time before the end of life, missed alarms and false alarms.
 //!
-//! The terms come from `tests/alarm_tradeoff.md`, extended to records that end before the life does:
+//! The terms come from `tests/alarm_tradeoff.md`. Here they also cover records that end before the life does:
 //!
-//! * **end of life**: with a truth, the first time at which a cell's capacity is below the limit; without a truth, the time after
-//!   which the weakest learned capacity stayed below the limit until the end of the record.
-//! * **true raise**: a raise before the end of life, at most the horizon before it (if a horizon is given).
-//! * **false alarm**: a raise that is not followed by the end of life within the horizon; without a horizon, any raise in a
-//!   record without an end of life. Raises at or after the end of life are neither true nor false.
-//! * **open**: a raise less than the horizon before the end of a record without an end of life: it cannot be judged.
+//! * **end of life**: if the true capacities are known, the first time at which the capacity of a cell is below the limit. Otherwise,
+//!   the time from which the weakest learned capacity stays below the limit until the end of the record.
+//! * **true raise**: a raise before the end of life; with a horizon, at most the horizon before it.
+//! * **false alarm**: with a horizon, a raise that is not followed by the end of life within the horizon. Without a horizon, any raise
+//!   in a record without an end of life. Raises at or after the end of life are neither true nor false.
+//! * **open**: in a record without an end of life, a raise less than the horizon before the end of the record. It cannot be judged.
 //! * **lead**: time from the first true raise to the end of life, in days and in equivalent full cycles.
-//! * **missed**: the end of life came without a true raise before it.
-//! * **false raise**: a raise of `capacity_low` while the true capacity of its cell was above the threshold; only with a truth.
+//! * **missed**: the end of life was reached without a true raise.
+//! * **false raise**: a raise of `capacity_low` while the true capacity of the cell was above the threshold; counted only if the true
+//!   capacities are known.
 //! * **flickers**: clears before the end of life.
 //!
-//! Only rules about ageing (those on learned values) are judged; for other rules the raises are counted.
+//! Only rules about ageing (rules on learned values) are judged. For other rules, the raises are counted.
 
 use serde::Serialize;
 
@@ -28,64 +29,64 @@ use crate::quantity::Timestamp;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Horizon {
-    /// In equivalent full cycles.
+    /// Number of equivalent full cycles.
     Cycles(f64),
-    /// In days.
+    /// Number of days.
     Days(f64),
 }
 
-/// Use, truth and end of life of a log, by which its alarms are judged.
+/// Use, truth and end of life of a log. Its alarms are judged by them.
 #[derive(Debug, Clone, Copy)]
 pub struct LogLife<'a> {
-    /// Charge moved.
+    /// Charge moved, and learned capacities.
     pub track: &'a Track,
-    /// True capacities.
+    /// True capacities; `None` = unknown.
     pub truth: Option<&'a Truth>,
     /// First and last stamp.
     pub span: (Timestamp, Timestamp),
     /// End of life; `None` = not reached.
     pub end: Option<Timestamp>,
-    /// Longest time from a true raise to `end`.
+    /// Longest time from a true raise to `end`; `None` = unlimited.
     pub horizon: Option<Horizon>,
 }
 
 /// The first raise of a threshold.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct FirstRaise {
-    /// Stamp of the log, s.
+    /// Time of the raise on the clock of the log, s.
     pub time_s: f64,
-    /// Days after the log's first stamp.
+    /// Days from the first stamp of the log to the raise.
     pub days: f64,
-    /// Equivalent full cycles so far.
+    /// Equivalent full cycles up to the raise.
     pub cycles: f64,
-    /// Counted from 0; `None` = the pack.
+    /// Cell, counted from 0; `None` = the pack.
     pub cell: Option<u16>,
-    /// The value that raised it, in the rule's unit.
+    /// Value that raised the alarm, in the unit of the rule.
     pub value: Option<f64>,
 }
 
 /// Score of one threshold's alarms in one log.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct AlarmScore {
-    /// The first raise.
+    /// First raise of the threshold, at any time; `None` = the alarm was never raised.
     pub first: Option<FirstRaise>,
-    /// Number of raises, at any time.
+    /// Number of all raises.
     pub raises: usize,
     /// Lead time, days.
     pub lead_days: Option<f64>,
     /// Lead time, equivalent full cycles.
     pub lead_cycles: Option<f64>,
-    /// The end of life came without a true raise; `None` = it was not reached, or the rule is not about ageing.
+    /// Whether the end of life was reached without a true raise; `None` = it was not reached, or the rule is not about ageing.
     pub missed: Option<bool>,
-    /// False alarms; `None` = the rule is not about ageing.
+    /// Number of false alarms; `None` = the rule is not about ageing.
     pub false_alarms: Option<usize>,
     /// Number of raises that cannot be judged.
     pub open: Option<usize>,
-    /// Number of raises while the true capacity was above the threshold; `None` = no truth.
+    /// Number of raises while the true capacity was above the threshold; `None` = the true capacities are unknown.
     pub false_raises: Option<usize>,
     /// Number of clears before the end of life.
     pub flickers: usize,
-    /// Number of raises and clears beyond those stored.
+    /// Number of raises and clears that exceeded the limit of stored changes.
     pub not_kept: u64,
 }
 
@@ -101,7 +102,7 @@ enum RaiseClass {
 pub fn judge(config: &RuleConfig, history: &AlarmHistory, life: &LogLife<'_>) -> AlarmScore {
     let verdicts: Vec<(RaiseClass, &Raise)> = history.raises.iter().map(|raise| (life.verdict(raise), raise)).collect();
     let count = |wanted| verdicts.iter().filter(|(verdict, _)| *verdict == wanted).count();
-    // An alarm cannot be missed in a log that starts after the end of life.
+    // If a log starts after the end of life, no alarm in it can be missed.
     let is_ageing = config.rule.spec().is_learned && life.end.is_none_or(|end| end > life.span.0);
     let first_true = verdicts.iter().find(|(verdict, _)| *verdict == RaiseClass::True).map(|(_, raise)| raise.time);
     let lead = life.end.zip(first_true).filter(|_| is_ageing);
@@ -170,7 +171,7 @@ mod tests {
         Timestamp::from_secs(day * DAY_S)
     }
 
-    /// Use of one equivalent full cycle per day.
+    /// Creates the use of one equivalent full cycle per day.
     fn track() -> Track {
         let mut track = Track::new(1.0, EndOfLifeSource::Learned);
         for end in 1..=100 {
@@ -222,7 +223,7 @@ mod tests {
         let found = judged(&[10.0, 60.0], Some(90.0), None);
         assert_eq!((found.lead_days, found.lead_cycles, found.missed), (Some(80.0), Some(80.0), Some(false)));
         assert_eq!((found.false_alarms, found.flickers, found.raises), (Some(0), 1, 2));
-        // With a horizon of 40, the raise at 10 is false, and the lead starts at 60.
+        // With a horizon of 40, the raise at 10 is false, and the lead starts at the raise at 60.
         for horizon in [Horizon::Days(40.0), Horizon::Cycles(40.0)] {
             let found = judged(&[10.0, 60.0], Some(90.0), Some(horizon));
             assert_eq!((found.lead_days, found.false_alarms, found.missed), (Some(30.0), Some(1), Some(false)));

@@ -1,7 +1,8 @@
-//! Use and wear over a log: charge moved, and the weakest learned capacity.
+//! Use and wear during a log: charge moved, and the weakest learned capacity.
 //!
-//! Input: the monitor's events. Output: equivalent full cycles (charge moved over twice the rated capacity) and learned capacities.
-//! Both are known at the ends of half-cycles; between them, cycles are interpolated and capacities held.
+//! Input: events of the monitor. Output: equivalent full cycles (charge moved divided by twice the rated capacity), and learned
+//! capacities. Both values are known at the ends of half-cycles. Between the ends, the cycles are interpolated, and the capacities keep
+//! their last value.
 
 use std::collections::BTreeMap;
 
@@ -17,9 +18,9 @@ pub struct Track {
     learned: EndOfLifeSource,
     moved_ah: BTreeMap<CellIndex, f64>,
     capacity_ah: BTreeMap<CellIndex, f64>,
-    /// Ends of half-cycles: time and equivalent full cycles so far.
+    /// For each end of a half-cycle: time, and equivalent full cycles up to this time.
     cycles: Vec<(Timestamp, f64)>,
-    /// After each half-cycle, the weakest learned capacity and its cell.
+    /// For each end of a half-cycle: time, weakest learned capacity, Ah, and its cell.
     weakest: Vec<(Timestamp, f64, CellIndex)>,
 }
 
@@ -50,7 +51,7 @@ impl Track {
         *moved_ah += charge_ah;
         let cycles = *moved_ah / (2.0 * self.rated_ah);
         let most = self.cycles.last().map_or(0.0, |last| last.1);
-        // The cells of a string move the same charge; a cell that was without estimates for a time has counted less.
+        // All cells of a string move the same charge. A cell that had no estimates for a time has counted too little.
         if cycles > most {
             self.cycles.pop_if(|last| last.0 == time);
             self.cycles.push((time, cycles));
@@ -66,7 +67,7 @@ impl Track {
         self.weakest.push((time, ah, cell));
     }
 
-    /// Equivalent full cycles up to `time`.
+    /// Returns the equivalent full cycles up to `time`.
     pub fn cycles_at(&self, time: Timestamp) -> f64 {
         let after = self.cycles.partition_point(|(at, _)| *at <= time);
         let before = after.checked_sub(1).and_then(|index| self.cycles.get(index));
@@ -77,24 +78,24 @@ impl Track {
         }
     }
 
-    /// Total equivalent full cycles.
+    /// Returns the equivalent full cycles of the whole log.
     pub fn cycles(&self) -> f64 {
         self.cycles.last().map_or(0.0, |last| last.1)
     }
 
-    /// Which learned capacity is tracked.
+    /// Returns which learned capacity is tracked.
     pub fn learned(&self) -> EndOfLifeSource {
         self.learned
     }
 
-    /// Returns the time and cell from which the weakest learned capacity stayed below `end_ah` until the end of the log; `None` = it is
-    /// not below at the end, or nothing was learned.
+    /// Returns the time from which the weakest learned capacity stays below `end_ah` until the end of the log, and the cell. `None` =
+    /// it is not below `end_ah` at the end, or nothing was learned.
     pub fn stays_below(&self, end_ah: f64) -> Option<(Timestamp, CellIndex)> {
         let below = self.weakest.iter().rev().take_while(|(_, ah, _)| *ah < end_ah).last();
         below.map(|&(time, _, cell)| (time, cell))
     }
 
-    /// Weakest learned capacity at the end, Ah.
+    /// Returns the weakest learned capacity at the end of the log, Ah.
     pub fn last_ah(&self) -> Option<f64> {
         self.weakest.last().map(|last| last.1)
     }

@@ -1,9 +1,11 @@
 //! The true capacities of a log, from a CSV file in the same folder.
 //!
-//! The columns identify the two formats. A table with `cell` is written by `simulate --truth`: capacity between the open-circuit voltages
-//! of every cell. A table with `cycle` and `type` is the one of `score --cycles`: published capacities of one cell's discharges, at their
-//! load. For `NAME.log`, `NAME.csv` etc., the search looks for `NAME.truth.csv`, `NAME_truth.csv` and `NAME_cycles.csv`, and for `truth.csv`
-//! if no other given log is in that folder; each also with `.gz` and `.zst`.
+//! There are two formats, which are recognised by their columns. A table with a column `cell` was written by `simulate --truth`; it
+//! contains the capacity of every cell between the open-circuit voltages of a full and an empty cell. A table with `cycle` and `type`
+//! has the format of `score --cycles`; it contains published capacities of the discharges of one cell, at the load of those discharges.
+//!
+//! For a log `NAME.log`, `NAME.csv` etc., these files are searched in its folder: `NAME.truth.csv`, `NAME_truth.csv` and
+//! `NAME_cycles.csv`, and also `truth.csv` if no other given log is in this folder. Each may end in `.gz` or `.zst`.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -15,12 +17,12 @@ use crate::io::table::TableError;
 use crate::quantity::{CellIndex, Timestamp};
 use crate::score::CycleTable;
 
-/// Endings of the file names searched for.
+/// Endings of the file names that are searched.
 const ENDINGS: [&str; 3] = [".truth.csv", "_truth.csv", CYCLES];
 const CYCLES: &str = "_cycles.csv";
 const COMPRESSED: [&str; 3] = ["", ".gz", ".zst"];
 
-/// Source of the capacity that determines the end of a life.
+/// Source of the capacity that determines the end of life.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 pub enum EndOfLifeSource {
     /// The true capacity.
@@ -38,7 +40,7 @@ pub enum EndOfLifeSource {
 }
 
 impl EndOfLifeSource {
-    /// Name for tables.
+    /// Returns the name for tables.
     pub const fn words(self) -> &'static str {
         match self {
             Self::Truth => "the true capacity",
@@ -61,9 +63,9 @@ pub struct Truth {
 
 impl Truth {
     /// Reads a truth in either format.
-    ///
     /// # Errors
-    /// The file cannot be read, has neither format, or a field is wrong: file, line, found, allowed.
+    /// The file cannot be read, has neither format, or a field is wrong. The error states file, line, what was found and what is
+    /// allowed.
     pub fn read(path: &Path) -> Result<Self, TableError> {
         let table = CapacityTable::open_in_order(path)?;
         if table.header().find("cell").is_some() { read_simulated(table) } else { Self::of_table(path) }
@@ -77,7 +79,7 @@ impl Truth {
         Ok(Self { kind: EndOfLifeSource::Published, cells: BTreeMap::from([(CellIndex(0), points)]), span })
     }
 
-    /// Returns when the first cell fell below `end_ah`, and which cell.
+    /// Returns the first time at which the capacity of a cell is below `end_ah`, and this cell.
     pub fn falls_below(&self, end_ah: f64) -> Option<(Timestamp, CellIndex)> {
         let of_cell = |(&cell, points): (&CellIndex, &Vec<(Timestamp, f64)>)| {
             points.iter().find(|(_, ah)| *ah < end_ah).map(|(time, _)| (*time, cell))
@@ -122,7 +124,7 @@ pub fn find_next_to(logs: &[PathBuf]) -> Vec<Option<PathBuf>> {
     logs.iter().map(|log| find(log, alone(log))).collect()
 }
 
-/// Finds the table of cycles that dates the cycles of a CSV log.
+/// Finds the table that states the start time of each cycle of a CSV log.
 pub fn cycles_next_to(log: &Path) -> Option<PathBuf> {
     let (stem, ending) = stem_of(log)?;
     (ending == "csv").then(|| existing(log, [format!("{stem}{CYCLES}")])).flatten()
@@ -137,14 +139,14 @@ fn find(log: &Path, alone: bool) -> Option<PathBuf> {
     existing(log, names.chain(alone.then(|| "truth.csv".to_owned())))
 }
 
-/// Returns the name of a log without its endings, and the ending before a compression's.
+/// Returns the name of a log without its endings, and the ending before that of a compression.
 fn stem_of(log: &Path) -> Option<(&str, &str)> {
     let name = log.file_name()?.to_str()?;
     let name = crate::without_compression(name);
     Some(name.rsplit_once('.').unwrap_or((name, "")))
 }
 
-/// Returns the first of these names, compressed or not, that is a file in the log's folder.
+/// Returns the first of these names that is a file in the folder of the log, compressed or not.
 fn existing(log: &Path, names: impl IntoIterator<Item = String>) -> Option<PathBuf> {
     let paths =
         names.into_iter().flat_map(|name| COMPRESSED.map(|ending| log.with_file_name(format!("{name}{ending}"))));

@@ -1,14 +1,14 @@
 //! Evaluates the alarms of many settings in one replay.
 //!
-//! Estimates do not depend on alarm thresholds, and the alarms of one threshold do not depend on other thresholds. So the alarm
-//! inputs of one monitor are passed to further engines, the *lanes*: lane n watches the n-th distinct threshold of each rule
-//! and severity. A grid of five thresholds of one rule by five of another needs five lanes instead of twenty-five, and every
-//! threshold of the grid is watched in some lane.
+//! Estimates do not depend on alarm thresholds, and the alarms of one threshold do not depend on other thresholds. So the alarm inputs
+//! of one monitor are passed to additional alarm engines, the *lanes*. Lane n watches the n-th distinct threshold of each rule and
+//! severity. For example, a grid of five thresholds of one rule by five thresholds of another rule needs five lanes instead of
+//! twenty-five; still, every threshold of the grid is watched in a lane.
 
 use crate::alarm::{AlarmChange, AlarmEngine, AlarmInput, Change, Rule, RuleConfig, Severity};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Most raises, and most clears, stored per threshold and log; further ones are only counted.
+/// Maximum number of raises, and of clears, that are stored per threshold and log. Further ones are only counted.
 const MAX_KEPT: usize = 20_000;
 
 /// A raised alarm.
@@ -16,24 +16,24 @@ const MAX_KEPT: usize = 20_000;
 pub struct Raise {
     /// Time of the raise.
     pub time: Timestamp,
-    /// Cell; `None` = the pack.
+    /// Cell with the alarm; `None` = the pack.
     pub cell: Option<CellIndex>,
-    /// The value that raised it, in the rule's unit.
+    /// Value that raised the alarm, in the unit of the rule.
     pub value: Option<f64>,
 }
 
 /// Raises and clears of one threshold in one log.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct AlarmHistory {
-    /// In order of time.
+    /// Raises in the order of time.
     pub raises: Vec<Raise>,
-    /// In order of time.
+    /// Times of the clears, in order.
     pub clears: Vec<Timestamp>,
-    /// Number of raises and clears beyond those stored.
+    /// Number of raises and clears that exceeded the limit of stored changes.
     pub not_kept: u64,
 }
 
-/// One threshold in its lane.
+/// A threshold in its lane.
 #[derive(Debug, Clone)]
 struct BatchThreshold {
     config: RuleConfig,
@@ -41,7 +41,7 @@ struct BatchThreshold {
     history: AlarmHistory,
 }
 
-/// Thresholds of the settings that share a replay, with the lane of each.
+/// Thresholds of all settings that share a replay, each with its lane.
 #[derive(Debug, Clone, Default)]
 pub(super) struct VariantBatch {
     watched: Vec<BatchThreshold>,
@@ -59,7 +59,7 @@ impl VariantBatch {
         self.watched.len() - 1
     }
 
-    /// The engines of all lanes.
+    /// Creates the alarm engines of all lanes.
     pub(super) fn engines(&self, cells: u16) -> LaneEngines {
         let batch = self.watched.iter().map(|watched| watched.lane + 1).max().unwrap_or(0);
         let rules = |lane| self.watched.iter().filter(move |watched| watched.lane == lane);
@@ -98,16 +98,16 @@ fn has_rule(watched: &BatchThreshold, rule: Rule, severity: Severity) -> bool {
     (watched.config.rule, watched.config.severity) == (rule, severity)
 }
 
-/// The lanes' engines in one replay.
+/// The alarm engines of all lanes during one replay.
 #[derive(Debug)]
 pub(super) struct LaneEngines {
-    /// Each engine with the rules it watches, one bit per wire number.
+    /// Each engine with the rules that it watches, one bit per wire number of a rule.
     engines: Vec<(AlarmEngine, u32)>,
     changes: Vec<AlarmChange>,
 }
 
 impl LaneEngines {
-    /// Applies the monitor's alarm inputs to all lanes, and records the alarm changes.
+    /// Passes the alarm inputs of the monitor to all lanes and records the changes of their alarms.
     pub(super) fn take(&mut self, inputs: &[(Timestamp, AlarmInput)], batch: &mut VariantBatch) {
         for (time, input) in inputs {
             for (lane, (engine, watches)) in self.engines.iter_mut().enumerate() {
@@ -120,7 +120,7 @@ impl LaneEngines {
     }
 }
 
-/// Whether an input concerns an engine that watches these rules.
+/// Whether an input is relevant for an engine that watches these rules.
 fn concerns(input: &AlarmInput, watches: u32) -> bool {
     match input {
         AlarmInput::Observe { rule, .. } | AlarmInput::InputsValid { rule, .. } => watches & 1 << (*rule as u8) != 0,

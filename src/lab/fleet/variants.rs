@@ -1,12 +1,13 @@
-//! `--set KEY=V1,V2`: other values in a configuration, and the grid of all their combinations.
+//! `--set KEY=V1,V2`: replaces values of a configuration, and builds all combinations of the replaced values.
 //!
-//! Input: the text of a configuration, and choices. Output: one checked configuration per combination, the original first, and
-//! which of them can share a replay: those that differ only in `[[alarm]]` tables (except tables of `input_missing`, whose
-//! time-outs act before the alarms). A combination that is not a valid configuration is left out and reported.
+//! Input: the text of a configuration, and choices. Output: one checked configuration per combination, with the original first, and the
+//! information which of them can share a replay. Configurations can share a replay if they differ only in `[[alarm]]` tables. Tables of
+//! the rule `input_missing` are an exception, because their time-outs also affect the inputs of the alarms. A combination that is not a
+//! valid configuration is left out and reported.
 //!
-//! Keys: `RULE.info`, `.warning`, `.severe` (each also with `.set` or `.clear`), `RULE.threshold` for the most severe level in the
-//! file, `RULE.probability` for `when = { probability = ... }`, and any other key of the rule's `[[alarm]]` tables;
-//! or any dotted key, with `[n]` from 1 for tables that occur several times.
+//! Keys for alarms: `RULE.info`, `.warning` and `.severe` (each also with `.set` or `.clear`); `RULE.threshold` for the most severe
+//! level in the file; `RULE.probability` for `when = { probability = ... }`; and any other key of the rule's `[[alarm]]` tables. All
+//! other keys are dotted keys of the configuration. A table that occurs several times is selected by `[n]`, counted from 1.
 
 mod target;
 
@@ -18,12 +19,12 @@ use self::target::{Target, name_rules, rule_of, targets};
 use crate::alarm::Rule;
 use crate::config::{self, Config, ConfigFiles};
 
-/// Most combinations: a longer table is not readable.
+/// Maximum number of combinations: a longer table is not readable.
 pub const MAX_COMBINATIONS: usize = 1000;
-/// One `--set`.
+/// One `--set` option.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Choice {
-    /// As written.
+    /// The key as written.
     pub key: String,
     values: Vec<(String, Value)>,
 }
@@ -47,7 +48,7 @@ impl std::str::FromStr for Choice {
     }
 }
 
-/// Splits at the commas outside quotes and brackets.
+/// Splits a text at the commas outside quotes and brackets.
 fn split(text: &str) -> Vec<&str> {
     let (mut parts, mut from, mut depth, mut quote) = (Vec::new(), 0, 0_i32, None);
     for (at, letter) in text.char_indices() {
@@ -67,7 +68,7 @@ fn split(text: &str) -> Vec<&str> {
     parts
 }
 
-/// Parses a value as TOML; other text becomes a string (`80 %`, `mean`).
+/// Parses a value as TOML. A text that is not TOML becomes a string (`80 %`, `mean`).
 fn value(text: &str) -> Value {
     let parsed = format!("value = {text}").parse::<Table>().ok();
     parsed.and_then(|mut table| table.remove("value")).unwrap_or_else(|| Value::String(text.to_owned()))
@@ -76,7 +77,7 @@ fn value(text: &str) -> Value {
 /// One combination.
 #[derive(Debug, Clone)]
 pub struct Variant {
-    /// Values set, as written, in the order of the choices; empty = the original configuration.
+    /// Replaced values as written, in the order of the choices; empty = the original configuration.
     pub values: Vec<String>,
     /// The configuration with these values.
     pub config: Config,
@@ -89,13 +90,13 @@ pub struct Variant {
 pub struct VariantGrid {
     /// The keys, as written.
     pub keys: Vec<String>,
-    /// The original configuration, then every combination.
+    /// The original configuration, followed by every combination.
     pub variants: Vec<Variant>,
     /// Number of replays per log.
     pub replays: usize,
     /// Rules named by the choices.
     pub rules: Vec<Rule>,
-    /// Whether other keys were set.
+    /// Whether keys outside `[[alarm]]` tables were replaced.
     pub other_keys: bool,
     /// Notes for the user.
     pub notes: Vec<String>,
@@ -104,7 +105,7 @@ pub struct VariantGrid {
 /// Builds the grid.
 ///
 /// # Errors
-/// The configuration is faulty, a key is unknown, there are too many combinations, or none of them is valid.
+/// The configuration is faulty, a key is unknown, there are too many combinations, or no combination is valid.
 pub fn grid(path: &Path, choices: &[Choice]) -> Result<VariantGrid, Vec<String>> {
     let plain = config::load(path).map_err(|faults| faults.0)?;
     let root = read(path)?;
@@ -151,7 +152,7 @@ pub fn grid(path: &Path, choices: &[Choice]) -> Result<VariantGrid, Vec<String>>
     Ok(grid)
 }
 
-/// Returns the configuration of a combination, and the key of its replay.
+/// Returns the configuration of a combination, and the key of the replay that it can share.
 fn variant(
     path: &Path,
     root: &Table,
@@ -165,7 +166,7 @@ fn variant(
     let text = toml::to_string(&root).map_err(|error| vec![error.to_string()])?;
     let read = |file: &Path| if file == path { Ok(text.clone().into_bytes()) } else { std::fs::read(file) };
     let config = config::load_with(&ConfigFiles::alone(path), &read).map_err(|faults| {
-        // The line numbers refer to a generated text.
+        // The line numbers of these faults would refer to a generated text.
         let file = format!("{}:", path.display());
         let without_line = |fault: &String| {
             let rest = fault.strip_prefix(&file).map(|rest| rest.trim_start_matches(|c: char| c.is_ascii_digit()));
@@ -176,7 +177,7 @@ fn variant(
     Ok((config, replay_key(&root)))
 }
 
-/// The merged tables of the configuration and its drop-ins.
+/// Returns the merged tables of the configuration and its drop-ins.
 fn read(path: &Path) -> Result<Table, Vec<String>> {
     let text = config::merged(path).map_err(|faults| faults.0)?;
     text.parse::<Table>().map_err(|error| vec![format!("{}: {}", path.display(), error.message())])
@@ -188,11 +189,11 @@ fn replay_key(root: &Table) -> String {
     if let Some(Value::Array(alarms)) = root.get_mut("alarm") {
         alarms.retain(|alarm| rule_of(alarm) == Some(Rule::InputMissing.name()));
     }
-    // A parsed table can always be written; if it could not, no replay would be shared.
+    // A parsed table can always be written. If it could not, no replay would be shared.
     toml::to_string(&root).unwrap_or_else(|error| format!("{error} {root:?}"))
 }
 
-/// Every combination, the last choice changing fastest; empty without choices.
+/// Returns every combination. The last choice changes fastest. Without choices, the list is empty.
 fn combinations(choices: &[Choice]) -> Result<Vec<Vec<&(String, Value)>>, String> {
     if choices.is_empty() {
         return Ok(Vec::new());

@@ -1,4 +1,4 @@
-//! A vehicle of a fleet: its line in the manifest, and the `vehicle.json` in its folder.
+//! A vehicle of a fleet: its line in the manifest, and the file `vehicle.json` in its folder.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -7,20 +7,20 @@ use serde::{Deserialize, Serialize};
 
 /// Version of `vehicle.json`.
 pub(super) const VERSION: u32 = 1;
-/// Name of the record in a vehicle's folder.
+/// Name of the file in a vehicle's folder that contains the result.
 pub(super) const RECORD: &str = "vehicle.json";
 
 /// A vehicle: a line of the manifest.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Vehicle {
-    /// Name of the vehicle, of its folder, and in the first column of its tables.
+    /// Name of the vehicle and of its folder; the first column of its tables contains it.
     pub vehicle: String,
-    /// Size of its logs.
+    /// Size of the vehicle's logs, bytes.
     pub bytes: u64,
-    /// Its logs, in the order of recording.
+    /// Logs of the vehicle, in the order of recording.
     pub logs: Vec<PathBuf>,
-    /// Its configuration; `None` = the common one.
+    /// Configuration of the vehicle; `None` = the common configuration.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub config: Option<PathBuf>,
 }
@@ -34,13 +34,14 @@ pub struct VehicleRecord {
     pub packwatch: String,
     /// The line of the manifest.
     pub line: Vehicle,
-    /// SHA-256 of all settings (configuration with DBC and cell model, reading options); `None` = the configuration cannot be read.
+    /// SHA-256 of all settings (configuration with its DBC files and cell model, and the options for reading logs); `None` = the
+    /// configuration cannot be read.
     pub settings_sha256: Option<String>,
     /// Period of the estimates, s; `None` = no table of estimates.
     pub period_s: Option<f64>,
     /// Why there are no tables; `None` = there are tables.
     pub error: Option<String>,
-    /// Rows of each table.
+    /// Number of rows of each table.
     pub rows: BTreeMap<String, u64>,
     /// Number of cells of the pack.
     pub cells: u32,
@@ -48,18 +49,18 @@ pub struct VehicleRecord {
     pub rated_ah: Option<f64>,
     /// Time from the first stamp to the last, days.
     pub days: f64,
-    /// Notes on its logs.
+    /// Notes on the logs.
     pub notes: Vec<String>,
 }
 
 impl VehicleRecord {
-    /// Reads the record from a vehicle's folder; `None` = the vehicle is incomplete.
+    /// Reads the result from a vehicle's folder; `None` = the vehicle is incomplete.
     pub fn read(folder: &Path) -> Option<Self> {
         let text = std::fs::read(folder.join(RECORD)).ok()?;
         serde_json::from_slice(&text).ok().filter(|record: &Self| record.version == VERSION)
     }
 
-    /// Whether the inputs of `other` give the same tables.
+    /// Whether `other` has the same inputs, which would give the same tables.
     pub(super) fn has_inputs_of(&self, other: &Self) -> bool {
         let key = |record: &Self| {
             let Self { packwatch, line, settings_sha256, period_s, .. } = record;

@@ -1,14 +1,14 @@
-//! Replays a fleet in parts: the manifest of its vehicles, the vehicles of one part, and their tables.
+//! Replays the vehicles of a fleet, in one or several parts.
 //!
-//! | | in | out |
+//! | function | input | output |
 //! | --- | --- | --- |
-//! | [`plan`] | logs, and folders that each hold the logs of one vehicle | the vehicles by name |
-//! | [`Shard::choose`] | the vehicles | the vehicles of one part; parts have similar size and are the same on every machine |
-//! | [`run`] | vehicles | a folder for each: tables as [`export`](super::export) writes them, and `vehicle.json` |
+//! | [`plan`] | logs, and folders that each contain the logs of one vehicle | the vehicles, sorted by name |
+//! | [`Shard::choose`] | all vehicles | the vehicles of one part; parts have similar sizes and are the same on every machine |
+//! | [`run`] | vehicles | a folder for each vehicle with `vehicle.json` and the tables of [`export`](super::export) |
 //!
 //! `vehicle.json` is written last. If it exists for the same manifest line, settings and program, the vehicle is complete and is not
-//! replayed again. For a vehicle that fails, it contains the reason, and the others continue. The folder of a vehicle is locked during
-//! its replay: a second process waits and then finds it complete.
+//! replayed again. If a vehicle fails, its `vehicle.json` contains the reason, and the other vehicles continue. The folder of a vehicle
+//! is locked during its replay: a second process waits, and then finds that the vehicle is complete.
 
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
@@ -25,11 +25,11 @@ use crate::error::LabError;
 
 /// File that is locked while a vehicle is replayed.
 const LOCK: &str = ".lock";
-/// Most parts of a fleet.
+/// Maximum number of parts of a fleet.
 const MAX_SHARDS: usize = 100_000;
 
-/// Lists the vehicles of `paths` by name. A log is a vehicle, and so is a folder with logs, which are read in the order of their names.
-/// Paths are made absolute, because the vehicles may be replayed from other folders.
+/// Lists the vehicles in `paths`, sorted by name. A log is a vehicle. A folder with logs is also a vehicle; its logs are read in the
+/// order of their names. Paths are made absolute, because the vehicles may be replayed from other folders.
 ///
 /// # Errors
 /// A path cannot be read, or a folder contains no log.
@@ -50,7 +50,7 @@ pub fn plan(paths: &[PathBuf]) -> Result<Vec<Vehicle>, LabError> {
     Ok(vehicles)
 }
 
-/// Logs in a folder, by name.
+/// Returns the logs in a folder, sorted by name.
 fn logs_in(folder: &Path) -> Result<Vec<PathBuf>, LabError> {
     let failed = |error: std::io::Error| LabError::File(format!("{}: cannot be read: {error}", folder.display()));
     let mut logs = Vec::new();
@@ -70,7 +70,7 @@ fn logs_in(folder: &Path) -> Result<Vec<PathBuf>, LabError> {
     Ok(logs)
 }
 
-/// Whether a file, compressed or not, is a log by its name. Truth and cycle tables are not logs.
+/// Whether the name of a file, compressed or not, is that of a log. Truth tables and cycle tables are not logs.
 fn is_log(name: &OsStr) -> bool {
     let name = name.to_string_lossy();
     let name = crate::without_compression(&name);
@@ -78,7 +78,7 @@ fn is_log(name: &OsStr) -> bool {
     !name.starts_with('.') && !is_table && [".log", ".journal", ".csv"].iter().any(|ending| name.ends_with(ending))
 }
 
-/// The manifest: a JSON document on each line.
+/// Writes the manifest: one JSON document per line.
 ///
 /// # Errors
 /// A path is not valid UTF-8.
@@ -93,7 +93,7 @@ pub fn manifest(vehicles: &[Vehicle]) -> Result<String, LabError> {
 /// Reads a manifest.
 ///
 /// # Errors
-/// The file cannot be read, a line is not a vehicle, or two lines have the same name; the error names the line.
+/// The file cannot be read, a line is not a vehicle, or two lines have the same vehicle name. The error names the line.
 pub fn read_manifest(path: &Path) -> Result<Vec<Vehicle>, LabError> {
     let shown = path.display();
     let text = std::fs::read_to_string(path)
@@ -122,7 +122,7 @@ pub fn read_manifest(path: &Path) -> Result<Vec<Vehicle>, LabError> {
     Ok(vehicles)
 }
 
-/// One of several parts of a fleet, written `I/N`.
+/// One of several parts of a fleet, written as `I/N`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Shard {
     /// Number of the part, from 1.
@@ -144,7 +144,8 @@ impl FromStr for Shard {
 }
 
 impl Shard {
-    /// Returns the vehicles of this part: the largest vehicle first, each goes to the part with the fewest bytes so far.
+    /// Returns the vehicles of this part. The vehicles are distributed by falling size; each goes to the part with the fewest bytes so
+    /// far.
     pub fn choose<'v>(&self, vehicles: &'v [Vehicle]) -> Vec<&'v Vehicle> {
         let mut largest: Vec<&Vehicle> = vehicles.iter().collect();
         largest.sort_by(|a, b| b.bytes.cmp(&a.bytes).then_with(|| a.vehicle.cmp(&b.vehicle)));
@@ -162,16 +163,16 @@ impl Shard {
 /// Result of a vehicle's replay.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Outcome {
-    /// Replayed in this run.
+    /// The vehicle was replayed in this run.
     Replayed(VehicleRecord),
-    /// Completed in an earlier run.
+    /// The vehicle was completed in an earlier run.
     Complete(VehicleRecord),
-    /// Failed without tables; the record contains the reason.
+    /// The vehicle failed and has no tables. The record contains the reason.
     Failed(VehicleRecord),
 }
 
-/// Replays the vehicles; returns the outcomes in the same order. `config_of` reads the configuration of a vehicle. `report` receives
-/// the bytes read since its last call; for a complete vehicle, the bytes of its logs.
+/// Replays the vehicles. Returns the outcomes in the same order. `config_of` reads the configuration of a vehicle. `report` receives
+/// the number of bytes read since its last call; for a complete vehicle, this is the size of its logs.
 ///
 /// # Errors
 /// No threads can be started, or a record cannot be written.
@@ -219,14 +220,14 @@ fn replay(
         report(vehicle.bytes);
         return Ok(Outcome::Complete(earlier));
     }
-    // From here on the folder is incomplete.
+    // The folder is incomplete from here on.
     for file in [RECORD, export::ABOUT] {
         match std::fs::remove_file(folder.join(file)) {
             Err(error) if error.kind() != std::io::ErrorKind::NotFound => return Err(named(&folder, &error)),
             _ => {}
         }
     }
-    // A defect of the program that one vehicle triggers must not end the others.
+    // A defect of the program that one vehicle triggers must not stop the other vehicles.
     let replayed = catch_unwind(AssertUnwindSafe(|| {
         let config = config?;
         export::export(&config, &vehicle.logs, &vehicle.vehicle, settings, report)
@@ -283,7 +284,7 @@ mod tests {
             let (least, most) = (sizes.iter().min().unwrap(), sizes.iter().max().unwrap());
             assert!(most - least <= 4700, "no more than the largest vehicle: {sizes:?}");
         }
-        // The order of the manifest does not matter.
+        // The order of the vehicles in the manifest has no effect.
         let reversed: Vec<Vehicle> = vehicles.iter().rev().cloned().collect();
         assert_eq!(Shard { number: 2, of: 3 }.choose(&vehicles), Shard { number: 2, of: 3 }.choose(&reversed));
     }

@@ -1,8 +1,8 @@
-//! The alarms of every combination of settings, log by log.
+//! Evaluates the alarms of every combination of settings in each log.
 //!
-//! Input: a [`VariantGrid`], logs, and their truths. Output: for each log its life, and an [`AlarmScore`] per combination and threshold.
-//! Combinations that differ only in alarms share one replay per log ([`VariantBatch`]). The life (charge moved, learned capacity)
-//! comes from the original configuration.
+//! Input: a [`VariantGrid`], logs, and their true capacities. Output: for each log, its life, and an [`AlarmScore`] per combination and
+//! threshold. Combinations that differ only in alarms share one replay per log ([`VariantBatch`]). The life (charge moved, learned
+//! capacity) comes from the original configuration.
 
 use std::path::PathBuf;
 
@@ -20,12 +20,12 @@ use crate::config::Config;
 use crate::error::LabError;
 use crate::monitor::{Monitor, Outputs};
 
-/// A log and its truth.
+/// A log, and the file with its true capacities.
 #[derive(Debug, Clone)]
 pub struct WhatifJob {
     /// The log.
     pub log: PathBuf,
-    /// CSV file of its true capacities.
+    /// CSV file of the true capacities; `None` = there is no such file.
     pub truth: Option<PathBuf>,
 }
 
@@ -34,26 +34,26 @@ pub struct WhatifJob {
 pub struct WhatifSettings<'a> {
     /// How to read the logs.
     pub access: LogAccess<'a>,
-    /// Capacity below which a cell's life is over, Ah.
+    /// Capacity at which the life of a cell ends, Ah.
     pub end_of_life_ah: f64,
-    /// Whether the limit applies to the usable capacity, if that is configured.
+    /// Whether the limit applies to the usable capacity, if its computation is configured.
     pub judges_usable: bool,
-    /// Longest time from a true raise to the end of life.
+    /// Longest time from a true raise to the end of life; `None` = unlimited.
     pub horizon: Option<Horizon>,
-    /// Threads; `None` = all cores.
+    /// Number of threads; `None` = all cores.
     pub jobs: Option<usize>,
 }
 
-/// End of a life.
+/// The end of a life.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct EndOfLife {
-    /// Stamp of the log, s.
+    /// Time on the clock of the log, s.
     pub time_s: f64,
-    /// Days since the log's first stamp.
+    /// Days since the first stamp of the log.
     pub days: f64,
-    /// Equivalent full cycles so far.
+    /// Equivalent full cycles up to this time.
     pub cycles: f64,
-    /// The cell that reached the end, counted from 0.
+    /// The cell whose life ended, counted from 0.
     pub cell: u16,
 }
 
@@ -64,11 +64,11 @@ pub struct ThresholdScore {
     pub setting: usize,
     /// The rule.
     pub rule: Rule,
-    /// Its severity.
+    /// Severity of the threshold.
     pub severity: Severity,
-    /// The threshold, in the rule's unit.
+    /// The threshold, in the unit of the rule.
     pub threshold: f64,
-    /// Score of its alarms.
+    /// Score of the alarms.
     #[serde(flatten)]
     pub judged: AlarmScore,
 }
@@ -78,17 +78,17 @@ pub struct ThresholdScore {
 pub struct LogResult {
     /// The log.
     pub log: PathBuf,
-    /// Its truth.
+    /// CSV file of the true capacities.
     pub truth: Option<PathBuf>,
-    /// Source of the end of life.
+    /// Capacity that determined the end of life.
     pub judged_by: EndOfLifeSource,
     /// Time from the first stamp to the last, days.
     pub days: f64,
-    /// Equivalent full cycles.
+    /// Equivalent full cycles of the whole log.
     pub cycles: f64,
     /// Weakest learned capacity at the end, Ah.
     pub learned_ah: Option<f64>,
-    /// `None` = not reached.
+    /// End of life; `None` = not reached.
     pub end_of_life: Option<EndOfLife>,
     /// Scores of every threshold in every combination.
     pub alarms: Vec<ThresholdScore>,
@@ -101,11 +101,11 @@ struct ReplayResult {
     driven: DriveSummary,
     track: Track,
     batch: VariantBatch,
-    /// Only read for the log's first replay.
+    /// True capacities; read only for the first replay of a log.
     truth: Option<Truth>,
 }
 
-/// Replays all logs; returns the result or error of each log. `report` receives the bytes read since its last call.
+/// Replays all logs. Returns the result or the error of each log. `report` receives the number of bytes read since its last call.
 ///
 /// # Errors
 /// No threads can be started.
@@ -115,14 +115,14 @@ pub fn run(
     settings: &WhatifSettings<'_>,
     report: &(dyn Fn(u64) + Sync),
 ) -> Result<Vec<Result<LogResult, LabError>>, LabError> {
-    // The replays of one log are independent too, so even a single log uses all cores.
+    // The replays of one log are independent, so even a single log uses all cores.
     let tasks: Vec<(usize, usize)> = (0..jobs.len()).flat_map(|job| (0..grid.replays).map(move |r| (job, r))).collect();
     let replays = super::in_parallel(&tasks, settings.jobs, |_, &(job, number)| {
         replay(grid, number, &jobs[job], settings, report)
     })?;
     let mut replays = replays.into_iter();
     let of_job = |job: &WhatifJob| {
-        // Takes all of them, even after a failed one, because the results of the next job follow.
+        // Consumes all results of this job, even after a failed one, because the results of the next job follow.
         let own: Vec<Result<ReplayResult, LabError>> = replays.by_ref().take(grid.replays).collect();
         judge_log(grid, job, own.into_iter().collect::<Result<_, _>>()?, settings)
     };
@@ -150,7 +150,7 @@ fn replay(
 ) -> Result<ReplayResult, LabError> {
     let variant = grid.variants.iter().find(|variant| variant.replay == number);
     let config: &Config = &variant.ok_or("a replay without a setting")?.config;
-    // Read before the replay, which may take hours, so that an unreadable table is reported immediately.
+    // The truth is read before the replay, which may take hours, so that an unreadable table is reported immediately.
     let truth = job.truth.as_deref().filter(|_| number == 0).map(Truth::read).transpose()?;
     let monitor = &config.monitor;
     let (mut batch, _) = watch(grid, number);

@@ -1,15 +1,15 @@
 //! Forecasts future rows from past rows, without future inputs.
 //!
-//! Input: a table of outputs, then other columns, in order of time, in independent parts. A *window* at row t contains the data
-//! known then: the value and the last differences of every column ([`ForecastPlan::lags`] values in total). For every output and
-//! every horizon h, a separate process predicts the change from t to t + h (a direct forecast): errors of one step do not feed
-//! the next, and each horizon has its own noise. Without information, the forecast is the mean change, and thus close to
-//! persistence.
+//! Input: a table in the order of time, with the outputs in its first columns; it may consist of independent parts. A *window* at row t
+//! contains what is known at this row: for every column, the value and the last differences ([`ForecastPlan::lags`] values in total).
+//! For every output and every horizon h, a separate Gaussian process predicts the change from row t to row t + h (a direct forecast).
+//! Errors of one step therefore do not enter the next step, and each horizon has its own noise. Without information, the forecast is
+//! the mean change, which is close to persistence (the value stays constant).
 //!
-//! The interval is calibrated on real forecasts: the process is fitted again to the first training rows and judged on the
-//! block that follows, block after block. The width of the interval at each place follows from |error| / standard deviation
-//! of these forecasts ([`spread`]). (Leaving out single rows would not work: windows overlap, so the neighbours of a row reveal it.)
-//! No row after the origin is used.
+//! The interval is calibrated on real forecasts. The process is fitted again to the first training rows and forecasts the block of rows
+//! after them; this is repeated block by block. The ratios |error| / standard deviation of these forecasts determine the local width of
+//! the interval ([`spread`]). Leaving out single rows would not work, because windows overlap and the neighbours of a row reveal its
+//! value. No row after the origin is used.
 
 mod spread;
 mod windows;
@@ -28,29 +28,29 @@ use crate::regress::{
 
 pub use windows::{LagWindows, RowSpacing};
 
-/// Most values of a column in a window.
+/// Maximum number of values per column in a window.
 pub const MAX_LAGS: usize = 200;
-/// Most rows ahead.
+/// Maximum number of rows between the origin and a forecast.
 pub const MAX_STEPS: usize = 10_000;
-/// Most horizons with a process; there are no forecasts between them.
+/// Maximum number of horizons with a process. There are no forecasts between these horizons.
 pub const MAX_HORIZONS: usize = 10;
-/// Ends of the blocks for the interval, as parts of the training rows.
+/// Ends of the blocks for the calibration of the interval, as shares of the training rows.
 const BLOCKS: [f64; 5] = [0.4, 0.55, 0.7, 0.85, 1.0];
 
-/// What to forecast.
+/// What is forecast.
 #[derive(Debug, Clone)]
 pub struct ForecastPlan {
-    /// Number of the table's first columns to forecast.
+    /// Number of output columns; they are the first columns of the table.
     pub outputs: usize,
-    /// Values of each column in a window, 1 or more.
+    /// Number of values per column in a window, at least 1.
     pub lags: usize,
-    /// Rows ahead, 1 or more.
+    /// Largest number of rows ahead, at least 1.
     pub steps: usize,
-    /// Known part of the rows: above 0, up to 1.
+    /// Share of the rows that is known: above 0, at most 1. The origin is the end of this share.
     pub origin: f64,
-    /// Most windows to which a process is fitted, taken evenly from all windows, at changing phases.
+    /// Maximum number of windows to which a process is fitted. They are selected evenly from all windows, at varying phases.
     pub rows: usize,
-    /// Kernel and search.
+    /// Kernel of the processes, and settings of the search for hyperparameters.
     pub settings: GprSettings,
 }
 
@@ -59,9 +59,9 @@ pub struct ForecastPlan {
 pub struct TableForecast {
     /// Number of known rows.
     pub origin: usize,
-    /// Row of the forecast at the origin: the last known row with a window.
+    /// Row from which the forecast at the origin is made: the last known row that has a window.
     pub from: usize,
-    /// By output.
+    /// Forecasts of each output.
     pub outputs: Vec<OutputForecast>,
 }
 
@@ -72,37 +72,37 @@ pub struct OutputForecast {
     pub name: String,
     /// Index of the column in the table.
     pub column: usize,
-    /// By rows ahead, rising.
+    /// Forecasts of each horizon, by rising number of rows ahead.
     pub horizons: Vec<HorizonForecast>,
 }
 
 /// Forecasts of one column, `steps` rows ahead.
 #[derive(Debug, Clone)]
 pub struct HorizonForecast {
-    /// Rows ahead.
+    /// Number of rows ahead.
     pub steps: usize,
-    /// Number of training windows.
+    /// Number of windows to which the process was fitted.
     pub trained: usize,
-    /// Number of forecasts from which the interval's factor was computed.
+    /// Number of forecasts on which the interval was calibrated.
     pub calibrated: usize,
-    /// Half width of the interval in standard deviations, where errors are of average size.
+    /// Half of the interval in standard deviations, at windows whose errors have average size.
     pub factor: f64,
     /// Duration of fit and calibration, s.
     pub fit_s: f64,
-    /// Jitter added to diagonals.
+    /// Jitter that was added to diagonals of matrices.
     pub jitter: Jitter,
     /// The forecast made at the origin.
     pub at_origin: Prediction,
-    /// Rows after the origin at which forecasts were made, with the forecasts.
+    /// Forecasts after the origin, each with the row from which it was made.
     pub held_out: Vec<(usize, Prediction)>,
-    /// Errors of these forecasts; `None` without rows after the origin.
+    /// Errors of these forecasts; `None` = there are no rows after the origin.
     pub score: Option<PredictionScore>,
-    /// Root mean squared error of persistence (the value stays constant) over the same rows.
+    /// Root mean squared error, over the same rows, of persistence (the value stays constant).
     pub persistence_rmse: Option<f64>,
 }
 
-/// Returns the horizons with a process: all up to [`MAX_HORIZONS`], otherwise that many with constant ratios, including the first
-/// and the last.
+/// Returns the horizons that get a process: all horizons up to [`MAX_HORIZONS`]. If there are more, this number of horizons with
+/// constant ratios, including the first and the last.
 pub fn horizons(steps: usize) -> Vec<usize> {
     if steps <= MAX_HORIZONS {
         return (1..=steps).collect();
@@ -114,10 +114,10 @@ pub fn horizons(steps: usize) -> Vec<usize> {
     all
 }
 
-/// Makes the forecasts. `done` receives the number of finished horizons, and the number of all.
+/// Makes the forecasts. `done` receives the number of finished horizons and the number of all horizons.
 ///
 /// # Errors
-/// Numbers are out of range, there are too few rows for the lags and steps, or a matrix is not positive definite.
+/// A number of the plan is out of range, there are too few rows for the lags and steps, or a matrix is not positive definite.
 pub fn run(
     table: &ColumnTable,
     plan: &ForecastPlan,
@@ -177,7 +177,7 @@ impl HorizonTask<'_> {
         let fit_s = begin.elapsed().as_secs_f64();
         let predict = |rows: &[usize]| self.predict(&model, rows, &spread);
         let at_origin = predict(&[from])?.remove(0);
-        // Most windows after the origin that are judged.
+        // Maximum number of windows after the origin that are scored.
         let later = chosen(&self.windows.between(self.origin - 1, usize::MAX, self.steps), 5000);
         let held_out: Vec<(usize, Prediction)> = later.iter().copied().zip(predict(&later)?).collect();
         let (score, persistence_rmse) = self.judge(&held_out);
@@ -196,14 +196,14 @@ impl HorizonTask<'_> {
         Ok((horizon, model))
     }
 
-    /// Smallest number of windows for a process: more than it has features.
+    /// Returns the smallest number of windows for a process. It is larger than the number of features.
     fn fewest(&self) -> usize {
         // Smallest number of training windows.
         (self.windows.width() + 2).max(20)
     }
 
-    /// A process fitted to windows that end before row `end`, with their number; `None` if there are too few. With
-    /// `fixed` hyperparameters, nothing is searched.
+    /// Fits a process to windows that end before row `end`. Returns it with the number of windows, or `None` if there are too few. If
+    /// `fixed` hyperparameters are given, they are not searched.
     fn fitted(
         &self,
         end: usize,
@@ -223,7 +223,7 @@ impl HorizonTask<'_> {
             (settings.start, settings.max_iterations, settings.restarts) = (fixed.to_vec(), 0, 0);
         } else if !start.is_empty() {
             settings.start = start.to_vec();
-            // Most steps of a search that starts at the result of the previous horizon.
+            // Maximum number of steps of a search that starts at the result of the previous horizon.
             settings.max_iterations = settings.max_iterations.min(20);
             settings.restarts = 0;
         }
@@ -231,7 +231,7 @@ impl HorizonTask<'_> {
         Ok(Some((fit(&rows, &settings, watcher)?, targets.len())))
     }
 
-    /// Calibrates the interval on blocks, each forecast by a process fitted to the rows before it.
+    /// Calibrates the interval on blocks. Each block is forecast by a process fitted to the rows before it.
     fn spread(&self, model: &Model, watcher: &mut ProgressCallback<'_>) -> Result<Spread, LabError> {
         let fixed: Vec<f64> = model.hyperparameters().into_iter().map(|h| h.value).collect();
         let at = |part: f64| ((self.origin as f64) * part).round() as usize;
@@ -241,7 +241,7 @@ impl HorizonTask<'_> {
             // The forecast row may lie beyond the block, because a block may be shorter than the horizon.
             let mut rows = self.windows.between(begin, self.origin, self.steps);
             rows.retain(|row| *row < end);
-            // Most windows of a block that are judged for the interval.
+            // Maximum number of windows of a block that are used for the calibration.
             let rows = chosen(&rows, 750);
             if rows.is_empty() {
                 continue;
@@ -258,7 +258,7 @@ impl HorizonTask<'_> {
         Ok(Spread::new(judged, &features, ratios, self.steps + self.plan.lags))
     }
 
-    /// Forecasts of the value at some rows.
+    /// Returns the forecasts of the value that are made at these rows.
     fn predict(&self, model: &Model, rows: &[usize], spread: &Spread) -> Result<Vec<Prediction>, LabError> {
         if rows.is_empty() {
             return Ok(Vec::new());
@@ -309,11 +309,11 @@ pub fn write(path: &Path, data: &ColumnTable, forecast: &TableForecast) -> Resul
     write_csv(path, heads.map(str::to_owned).to_vec(), rows)
 }
 
-/// Returns at most `most` rows, one from each of as many equal stretches, at a position that differs between
-/// stretches: a fixed stride would always select repeating rows, for example of cycles, at the same phase.
+/// Divides the rows into equal stretches and returns one row of each, at most `most` rows. Its position differs between stretches. A
+/// fixed distance would always select rows of the same phase if rows repeat, for example in cycles.
 fn chosen(all: &[usize], most: usize) -> Vec<usize> {
     let count = all.len().min(most);
-    // Fractions of multiples of the golden ratio fill a stretch evenly and never repeat.
+    // The fractional parts of multiples of the golden ratio fill a stretch evenly and never repeat.
     let place = |k: usize| if count == all.len() { 0.0 } else { (k as f64 * 0.618_033_988_749_894_9).fract() };
     let at = |k: usize| ((k as f64 + place(k)) * all.len() as f64 / count as f64) as usize;
     (0..count).map(|k| all[at(k).min(all.len() - 1)]).collect()
@@ -336,7 +336,7 @@ mod tests {
         let all: Vec<usize> = (100..10_100).collect();
         let some = chosen(&all, 100);
         assert!(some.len() == 100 && some.is_sorted_by(|a, b| a < b) && some[0] == 100 && some[99] >= 10_000);
-        // Rows that repeat every hundred: all tenths of the phase are selected about equally often.
+        // The phase repeats every hundred rows. Each tenth of the phase is selected about equally often.
         let mut met = [0; 10];
         some.iter().for_each(|row| met[row % 100 / 10] += 1);
         assert!(met.iter().all(|count| (8..=12).contains(count)), "{met:?}");

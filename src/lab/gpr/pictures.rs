@@ -1,4 +1,4 @@
-//! Pictures of regressions (predicted against measured, a stretch of rows with its interval, the error of every row) and of
+//! Pictures of regressions (predicted over measured values, a stretch of rows with its interval, the error of every row) and of
 //! forecasts (the fan at the origin, error and coverage over the horizon).
 
 use std::path::Path;
@@ -7,10 +7,10 @@ use super::forecast::{HorizonForecast, OutputForecast, TableForecast};
 use super::{ColumnTable, CrossValidation, table};
 use crate::chart::{self, Axis, Chart, Ink, Layer, Picture, PlotError, Point, Shape};
 
-/// Number of rows in the stretch that is drawn with its interval: single rows are visible.
+/// Number of rows of the stretch that is drawn with its interval; single rows are visible.
 const STRETCH: usize = 150;
 
-/// Draws the cross-validation of every kernel, as SVG.
+/// Draws the cross-validation of every kernel as SVG files.
 ///
 /// # Errors
 /// A file cannot be written.
@@ -25,7 +25,7 @@ pub fn write_cross_validation(folder: &Path, data: &ColumnTable, all: &[CrossVal
     Ok(())
 }
 
-/// Draws the forecasts of every output.
+/// Draws the forecasts of every output as SVG files.
 ///
 /// # Errors
 /// A file cannot be written.
@@ -45,7 +45,7 @@ fn write_charts(folder: &Path, name: &str, charts: Vec<Chart>) -> Result<(), Plo
     chart::write_stack(&folder.join(format!("{name}.svg")), &pictures)
 }
 
-/// Letters and digits, for a file name.
+/// Replaces characters that are not letters or digits, for a file name.
 fn slug(text: &str) -> String {
     let words: Vec<&str> = text.split(|c: char| !c.is_ascii_alphanumeric()).filter(|word| !word.is_empty()).collect();
     let joined = match text.contains('*') {
@@ -65,7 +65,7 @@ fn band(all: impl Iterator<Item = (f64, f64, f64)>) -> Layer {
 }
 
 fn scatter(validated: &CrossValidation, truth: &[f64], output: &str) -> Chart {
-    // Most points of predicted against measured.
+    // Maximum number of points in the picture of predicted over measured values.
     let every = truth.len().div_ceil(3000).max(1);
     let pairs = truth.iter().zip(&validated.folds.predictions).step_by(every);
     let mut pairs: Vec<(f64, f64)> = pairs.map(|(y, p)| (*y, p.mean)).collect();
@@ -131,7 +131,7 @@ fn fan(data: &ColumnTable, forecast: &TableForecast, output: &OutputForecast) ->
     let most = output.horizons.last().map_or(1, |horizon| horizon.steps);
     let from = forecast.from;
     let value = |row: usize| data.row(row)[output.column];
-    // Smallest number of rows before the origin in a fan.
+    // Smallest number of rows before the origin that a fan shows.
     let rows = from.saturating_sub((2 * most).max(60))..(from + most + 1).min(data.len());
     let x = |row: usize| row as f64 - from as f64;
     let at = |horizon: &HorizonForecast| horizon.steps as f64;
@@ -179,7 +179,7 @@ fn coverage(output: &OutputForecast) -> Chart {
     Chart::new(title, "rows ahead", Axis::number("inside, %").within(0.0, 100.0), layers)
 }
 
-/// Forecasts of the last horizon and measured values, at the rows they are for.
+/// Draws forecasts of the last horizon and measured values, at the rows that were forecast.
 fn held_out(data: &ColumnTable, output: &OutputForecast) -> Chart {
     let Some(horizon) = output.horizons.iter().rfind(|h| h.score.is_some()) else { return Chart::default() };
     let for_row = |row: usize| (row + horizon.steps) as f64 + 1.0;

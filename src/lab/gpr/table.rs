@@ -1,26 +1,26 @@
-//! Columns of CSV files by name, for regressions: any column may be an output or an input.
+//! Columns of CSV files, found by name, for regressions. Any column may be an output or an input.
 //!
-//! Input: CSV, plain, gzip or zstd, with one header line and numbers in the requested columns. Output: these columns, row by row,
-//! with the file and line of each row. An empty field or NaN is a missing value: either an error with its place, or the row is left
-//! out and counted. Any other field that is not a finite number is always an error.
+//! Input: CSV (plain, gzip or zstd) with one header line and numbers in the requested columns. Output: the values of these columns, row
+//! by row, with the file and line of each row. An empty field or NaN is a missing value. It causes an error that names its place, or
+//! the row is left out and counted. Any other field that is not a finite number is always an error.
 
 use std::path::{Path, PathBuf};
 
 use crate::error::LabError;
 use crate::io::table::{PART_COLUMNS, Row, Table as CsvTable, TableError};
 
-/// Endings of column names that are units: `voltage` matches `voltage_v`.
+/// Endings of column names that are units. For example, the name `voltage` matches the column `voltage_v`.
 const UNITS: [&str; 36] = [
     "a", "ma", "ah", "mah", "v", "mv", "w", "kw", "wh", "kwh", "c", "k", "f", "s", "ms", "us", "ns", "min", "h", "d",
     "days", "cycles", "hz", "ohm", "mohm", "percent", "pct", "ppm", "kg", "m", "mm", "pa", "bar", "n", "nm", "rpm",
 ];
-/// Most rows of a regression; they take some gigabytes.
+/// Maximum number of rows of a regression; they need some gigabytes.
 const MAX_ROWS: usize = 5_000_000;
 
-/// Treatment of a row with a missing required value.
+/// What happens to a row with a missing required value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MissingPolicy {
-    /// An error with file and line.
+    /// An error that names file and line.
     Rejected,
     /// The row is left out and counted.
     Skipped,
@@ -37,12 +37,12 @@ pub struct ColumnSelection<'a> {
     pub missing: MissingPolicy,
 }
 
-/// The column whose values separate parts.
+/// The column whose values divide the rows into parts.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum PartColumn {
     /// No column: every file is one part.
     None,
-    /// This one.
+    /// The column with this name.
     Named(String),
     /// The first of `cycle`, `segment` and `ref` that exists.
     Default,
@@ -58,31 +58,31 @@ impl PartColumn {
     }
 }
 
-/// Columns of one or more files, one after the other.
+/// Columns of one or more files. The rows of the files follow each other.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ColumnTable {
-    /// Full names of the columns in the requested order; a missing optional column has its requested name.
+    /// Full names of the columns in the requested order. An optional column that is missing has the requested name.
     pub names: Vec<String>,
     /// Values, row by row.
     pub values: Vec<f64>,
     /// Line of each row in its file.
     pub lines: Vec<u64>,
-    /// The files, each with the number of rows up to its end.
+    /// The files, each with the number of rows up to the end of the file.
     pub files: Vec<(PathBuf, usize)>,
     /// Number of rows left out because a value is missing.
     pub skipped: usize,
-    /// Whether each optional column is in every file.
+    /// For each optional column, whether every file has it.
     pub has: Vec<bool>,
-    /// First row of each part: parts are separated by files and by values of the part column.
+    /// First row of each part. A new part starts with each file and with each new value of the part column.
     pub parts: Vec<usize>,
 }
 
 impl ColumnTable {
-    /// Reads files one after the other.
+    /// Reads files and appends their rows.
     ///
     /// # Errors
-    /// A file cannot be read, a column is unknown or ambiguous, a value is missing or not a number, or there are too many rows:
-    /// with file, line, column, what was found and what is allowed.
+    /// A file cannot be read, a column is unknown or ambiguous, a value is missing or not a number, or there are too many rows. The
+    /// error states file, line, column, what was found and what is allowed.
     pub fn read(paths: &[PathBuf], wanted: &ColumnSelection<'_>, part: &PartColumn) -> Result<Self, LabError> {
         let mut table = Self { has: vec![true; wanted.optional.len()], ..Self::default() };
         for path in paths {
@@ -93,7 +93,7 @@ impl ColumnTable {
         Ok(table)
     }
 
-    /// Ignores a default part column that differs in every row, because it counts the rows.
+    /// Ignores a default part column whose values differ in every row, because such a column counts the rows.
     fn ignore_row_counter(&mut self, part: &PartColumn) {
         if *part == PartColumn::Default && self.parts.len() == self.len() {
             let begins = [0].into_iter().chain(self.files.iter().map(|(_, end)| *end));
@@ -102,7 +102,7 @@ impl ColumnTable {
         }
     }
 
-    /// Number of rows.
+    /// Returns the number of rows.
     pub fn len(&self) -> usize {
         self.lines.len()
     }
@@ -112,40 +112,40 @@ impl ColumnTable {
         self.lines.is_empty()
     }
 
-    /// Number of columns.
+    /// Returns the number of columns.
     pub fn width(&self) -> usize {
         self.names.len()
     }
 
-    /// One row.
+    /// Returns the values of one row.
     pub fn row(&self, row: usize) -> &[f64] {
         &self.values[row * self.width()..][..self.width()]
     }
 
-    /// One column.
+    /// Returns the values of one column.
     pub fn column(&self, column: usize) -> impl Iterator<Item = f64> + Clone + '_ {
         self.values.iter().skip(column).step_by(self.width().max(1)).copied()
     }
 
-    /// File of a row.
+    /// Returns the file of a row.
     pub fn file_of(&self, row: usize) -> &Path {
         let at = self.files.partition_point(|(_, end)| *end <= row);
         self.files.get(at).map_or(Path::new(""), |(path, _)| path)
     }
 
-    /// File and line of a row, for messages.
+    /// Returns file and line of a row, for messages.
     pub fn place(&self, row: usize) -> String {
         format!("{}:{}", self.file_of(row).display(), self.lines[row])
     }
 
-    /// Returns the row `steps` after this one in the same part.
+    /// Returns the number of the row `steps` after this one; `None` = it is not in the same part.
     pub fn after(&self, row: usize, steps: usize) -> Option<usize> {
         let at = self.parts.partition_point(|begin| *begin <= row);
         let end = self.parts.get(at).copied().unwrap_or(self.len());
         Some(row + steps).filter(|later| *later < end)
     }
 
-    /// Every n-th row of each part, including the first.
+    /// Returns a table with the first row of each part and every n-th row after it.
     pub fn every(&self, n: usize) -> Self {
         let mut thin = Self { values: vec![], lines: vec![], files: vec![], parts: vec![], ..self.clone() };
         let mut end_of_file = self.files.iter();
@@ -190,7 +190,7 @@ impl ColumnTable {
         Ok(())
     }
 
-    /// Indices of the columns; later files must have the names of the first file.
+    /// Returns the indices of the columns. Later files must have the same names as the first file.
     fn columns(&mut self, header: &[String], wanted: &ColumnSelection<'_>) -> Result<Vec<Option<usize>>, String> {
         let first = self.names.is_empty();
         let mut columns = Vec::new();
@@ -215,7 +215,7 @@ impl ColumnTable {
     }
 }
 
-/// Returns the values of a row; `None` = a required value is missing, and such rows are skipped.
+/// Returns the values of a row; `None` = a required value is missing and such rows are left out.
 fn row_values(
     row: &Row<'_>,
     columns: &[Option<usize>],
@@ -235,7 +235,7 @@ fn row_values(
     Ok(Some(values))
 }
 
-/// A number; NaN if the field is empty.
+/// Reads a number; an empty field becomes NaN.
 fn number(row: &Row<'_>, column: usize) -> Result<f64, TableError> {
     let text = row.text(column);
     if text.is_empty() {
@@ -245,7 +245,7 @@ fn number(row: &Row<'_>, column: usize) -> Result<f64, TableError> {
     number.ok_or_else(|| row.fault(column, "a finite number"))
 }
 
-/// Finds a column by its name with or without unit.
+/// Finds a column by its name, with or without the unit.
 fn find(header: &[String], name: &str) -> Result<usize, String> {
     let all = |fits: &dyn Fn(&str) -> bool| -> Vec<usize> {
         header.iter().enumerate().filter(|(_, column)| fits(column)).map(|(at, _)| at).collect()
@@ -254,7 +254,7 @@ fn find(header: &[String], name: &str) -> Result<usize, String> {
     let found = if exact.is_empty() { all(&|column| stem(column) == Some(name)) } else { exact };
     let list = |columns: &mut dyn Iterator<Item = &String>| {
         let names: Vec<&str> = columns.map(String::as_str).collect();
-        // Most columns listed in an error.
+        // Maximum number of column names in an error.
         let more = names.len().saturating_sub(40);
         let shown = names[..names.len() - more].join(", ");
         if more > 0 { format!("{shown} and {more} more") } else { shown }
@@ -269,7 +269,7 @@ fn find(header: &[String], name: &str) -> Result<usize, String> {
     }
 }
 
-/// The name without its unit.
+/// Returns the name of a column without its unit.
 fn stem(column: &str) -> Option<&str> {
     split(column).map(|(stem, _)| stem)
 }
@@ -278,7 +278,7 @@ fn split(column: &str) -> Option<(&str, &str)> {
     column.rsplit_once('_').filter(|(stem, unit)| !stem.is_empty() && UNITS.contains(&unit.to_lowercase().as_str()))
 }
 
-/// A name made from a column's name and a word, with the unit last: `voltage_mean_v`.
+/// Combines the name of a column with a word; the unit stays last: `voltage_mean_v`.
 pub(super) fn derived(column: &str, word: &str) -> String {
     split(column).map_or_else(|| format!("{column}_{word}"), |(stem, unit)| format!("{stem}_{word}_{unit}"))
 }

@@ -1,7 +1,7 @@
-//! A model with the names of its columns: trained on a table, saved, loaded, applied to other files.
+//! A model with the names of its columns. It is trained on a table, saved, loaded, and applied to other files.
 //!
-//! The file is one line of JSON with the names of the columns, followed by the two lines of the model itself (see [`Model`]), which
-//! have a checksum.
+//! The file has one line of JSON with the names of the columns, followed by the two lines of the model itself. These two lines have a
+//! checksum (see [`Model`]).
 
 use std::path::Path;
 
@@ -16,7 +16,7 @@ use crate::regress::{GprSettings, Model, Prediction, ProgressCallback, TrainingR
 const FORMAT: &str = "packwatch gpr";
 /// Version of the format; other versions are rejected.
 const VERSION: u32 = 1;
-/// Largest file read, bytes: enough for the largest model.
+/// Maximum size of a file, bytes; the largest model is smaller.
 const MAX_BYTES: u64 = 1 << 32;
 
 /// A fitted model and the names of its columns.
@@ -43,7 +43,7 @@ impl TrainedModel {
     /// Fits a model to a table whose last column is the output.
     ///
     /// # Errors
-    /// There are too few rows, settings are out of range, a matrix is not positive definite, or the watcher stopped the work.
+    /// There are too few rows, a setting is out of range, a matrix is not positive definite, or the watcher stopped the work.
     pub fn fit(
         table: &ColumnTable,
         settings: &GprSettings,
@@ -71,10 +71,10 @@ impl TrainedModel {
         Ok(crate::write_file(path, format!("{names}\n{}", self.model.save()?).as_bytes())?)
     }
 
-    /// Reads a model; it uses `threads` threads.
+    /// Reads a model. Its predictions use `threads` threads.
     ///
     /// # Errors
-    /// The file cannot be read, is not such a model, is damaged, or has another version.
+    /// The file cannot be read, is not a model of this kind, is damaged, or has another version.
     pub fn load(path: &Path, threads: usize) -> Result<Self, LabError> {
         let fail = |what: String| LabError::Data(format!("{}: {what}", path.display()));
         let unread = |error: std::io::Error| LabError::of_io(format!("{}: {error}", path.display()), &error);
@@ -110,7 +110,7 @@ impl TrainedModel {
     }
 }
 
-/// Writes predictions of a table's rows; the last column is the output, NaN if unknown.
+/// Writes predictions of the rows of a table. The last column of the table is the output; its value is NaN if it is unknown.
 ///
 /// # Errors
 /// The file cannot be written.

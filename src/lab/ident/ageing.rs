@@ -1,22 +1,23 @@
 //! Determines the SOC of the first cycles of an ageing cell: full charges alternating with full discharges, without a counter.
 //!
-//! Anchors: SOC 1 at the end of every full charge (the state in which this charger leaves the cell), and one common SOC at the knee of
-//! each discharge. At the knee the voltage falls fastest and little charge is left, so the knee marks a point on the SOC axis. The
-//! anchors keep the fade from cycle to cycle and the charger's gain error out of the curves. The charge left below the cut-off under
-//! load is assumed to be [`SOC_LEFT`]. Half-cycles before the first discharge start at an unknown SOC and are left out.
+//! The SOC is anchored at two points. At the end of every full charge, the SOC is 1; this is the state in which the charger leaves the
+//! cell. At the knee of each discharge, the SOC has one common value, because the voltage falls fastest there and little charge is
+//! left. With these anchors, neither the fade from cycle to cycle nor the gain error of the charger's current distorts the curves. The
+//! charge that remains below the cut-off under load is assumed to be [`SOC_LEFT`]. Half-cycles before the first discharge start at an
+//! unknown SOC and are left out.
 
 use super::{MeasuredPart, charge_ah};
 use crate::filter::median;
 
-/// SOC left at the cut-off under load when new.
+/// SOC of a new cell at the cut-off under load.
 pub(crate) const SOC_LEFT: f64 = 0.045;
-/// Voltage of the knee, as a share of the range from the lowest to the highest voltage: 3.0 V for 2.7 to 4.2 V.
+/// Voltage of the knee, as a share of the range between lowest and highest voltage: 3.0 V for 2.7 to 4.2 V.
 const KNEE_SHARE: f64 = 0.2;
-/// Current that counts as discharge, as a share of the discharge's median.
+/// Current above which a row counts as under load, as a share of the median current of the discharge.
 const LOADED_SHARE: f64 = 0.5;
-/// Change of current between two rows above which voltage and current may not belong to the same instant, A per Ah.
+/// If the current changes by more than this between two rows, A per Ah, voltage and current may not belong to the same instant.
 const STEP_PER_AH: f64 = 0.25;
-/// SOC below which rows after the cut-off, with the load off, are not judged: the voltage recovers more slowly than any branch here.
+/// Rows after the cut-off, without load, are not judged below this SOC, because the voltage recovers more slowly than any branch.
 const RECOVERY_SOC: f64 = 0.5;
 
 /// A half-cycle with its SOC.
@@ -26,22 +27,22 @@ pub struct AnchoredHalfCycle {
     pub index: usize,
     /// Current without the load pulses of a charger, A.
     pub current_a: Vec<f64>,
-    /// SOC of every row.
+    /// SOC of each row.
     pub soc: Vec<f64>,
-    /// Whether the row's voltage is judged.
+    /// For each row, whether its voltage is judged.
     pub judged: Vec<bool>,
 }
 
-/// Charge that a full charge puts in, as a share of the missing charge; other charges are left out.
+/// Charge of a full charge, as a share of the charge that was missing. Other charges are left out.
 const FULL_CHARGE: std::ops::RangeInclusive<f64> = 0.8..=1.25;
 
-/// Points of one discharge, Ah from its start.
+/// Points of one discharge, as charge since its start, Ah.
 struct Marks {
     knee_ah: f64,
     cut_off_ah: f64,
 }
 
-/// Capacity (Ah, mean of the discharges) and every half-cycle from the first discharge on, with its SOC.
+/// Returns the capacity (Ah, mean of the discharges), and every half-cycle from the first discharge on with its SOC.
 ///
 /// # Errors
 /// There is no discharge, or a discharge has no knee.
@@ -77,7 +78,7 @@ pub fn anchor(cycles: &[MeasuredPart], voltage_v: (f64, f64)) -> Result<(f64, Ve
             out_ah.iter().map(|ah| 1.0 - ah * per_ah).collect()
         } else {
             let all_ah = out_ah[out_ah.len() - 1];
-            // An aborted charge, or one of only two samples, does not fill the cell.
+            // A charge that was aborted, or that has only two samples, does not fill the cell.
             if !FULL_CHARGE.contains(&(-all_ah / ((1.0 - left) * capacity_ah))) {
                 continue;
             }
@@ -104,7 +105,8 @@ fn marks(cycle: &MeasuredPart, knee_v: f64, cut_off_v: f64) -> Option<Marks> {
     Some(Marks { knee_ah: crossing(knee_v)?, cut_off_ah: crossing(cut_off_v).unwrap_or(last_ah) })
 }
 
-/// Ignores the short loads with which chargers test themselves: they move almost no charge, and the rows are seconds apart.
+/// Sets the short loads with which chargers test themselves to 0. They move almost no charge, but the rows are seconds apart, so an
+/// integral would count too much.
 fn without_load_pulses(cycle: &MeasuredPart, capacity_ah: f64) -> Vec<f64> {
     let pulse = |i: f64| !cycle.is_discharge() && i > STEP_PER_AH * capacity_ah;
     cycle.current_a.iter().map(|&i| if pulse(i) { 0.0 } else { i }).collect()

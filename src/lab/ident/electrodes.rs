@@ -1,33 +1,34 @@
 //! Identifies the electrodes of a new cell from its open-circuit curve: materials, and lithium contents at empty and at full.
 //!
-//! Input: OCV, V, over SOC, fraction. Output: the pair of materials that fits best, with its residual, V. For each pair, damped
-//! Gauss-Newton steps fit the four contents. A weak prior holds the contents of commercial cells, because a curve without stages
-//! does not determine the size of an electrode. On identifiability: Lee et al., J. Electrochem. Soc. 167 (2020) 090509.
+//! Input: OCV, V, over SOC, fraction. Output: the pair of materials that fits best, with the residual, V. For each pair, damped
+//! Gauss-Newton steps fit the four lithium contents (of two electrodes, at empty and at full). A curve without steps does not determine
+//! the size of an electrode, so a weak prior keeps the contents near those of commercial cells. On identifiability: Lee et al., J.
+//! Electrochem. Soc. 167 (2020) 090509.
 
 use nalgebra::{Matrix4, Vector4};
 
 use crate::cell::{Electrodes, NegativeMaterial, PositiveMaterial};
 use crate::filter::levenberg_marquardt::{Damping, minimise};
 
-/// Points at which the curves are compared.
+/// Number of SOC values at which the curves are compared.
 const POINTS: u32 = 51;
-/// Deviation of a real cell from a library potential, V: materials of one name differ.
+/// Deviation of a real cell from a potential in the library, V. Materials with the same name differ.
 const MATERIAL_V: f64 = 0.01;
-/// The same below [`LOW_SOC`], where curves fall steeply.
+/// Deviation below [`LOW_SOC`], V, where curves fall steeply.
 const LOW_SOC_V: f64 = 0.03;
 /// Upper end of the steep part of the curves, SOC.
 const LOW_SOC: f64 = 0.05;
-/// Mean and standard deviation of the contents [negative empty, negative full, positive empty, positive full].
+/// Prior mean and standard deviation of the lithium contents [negative empty, negative full, positive empty, positive full].
 const PRIOR: [(f64, f64); 4] = [(0.02, 0.03), (0.88, 0.12), (0.92, 0.10), (0.32, 0.12)];
 /// Bounds of the same contents.
 const BOUNDS: [(f64, f64); 4] = [(0.0005, 0.25), (0.4, 0.999), (0.55, 0.9995), (0.005, 0.6)];
-/// Steps of the fit; it converges within 20.
+/// Maximum number of steps of the fit; it converges within 20.
 const STEPS: usize = 60;
 const DAMPING: Damping =
     Damping { first: 1e-2, fall: 0.3, fall_after_growth: 0.3, growth: 10.0, least: 1e-9, most: f64::INFINITY };
-/// Largest accepted residual, V; above it the library lacks the cell's materials. Curves of published cells fit their own materials
-/// within 5 mV and other materials mostly beyond 10 mV. A pair of wrong materials within the limit can predict ageing better or worse
-/// than a shifted curve, so the limit is a compromise.
+/// Largest accepted residual, V. A larger residual means that the library lacks the materials of the cell. Curves of published cells
+/// fit their own materials within 5 mV, and most other materials only beyond 10 mV. Wrong materials within this limit can predict
+/// ageing better or worse than a shifted curve, so the limit is a compromise.
 pub const MAX_RESIDUAL_V: f64 = 0.008;
 
 /// The electrodes found.
@@ -39,7 +40,7 @@ pub struct FittedElectrodes {
     pub residual_v: f64,
 }
 
-/// Pair of materials that fits the curve best; `None` if none fits within [`MAX_RESIDUAL_V`].
+/// Returns the pair of materials that fits the curve best; `None` = no pair fits within [`MAX_RESIDUAL_V`].
 pub fn identify(ocv_v: impl Fn(f64) -> f64) -> Option<FittedElectrodes> {
     let curve: Vec<(f64, f64)> =
         (0..POINTS).map(|k| f64::from(k) / f64::from(POINTS - 1)).map(|soc| (soc, ocv_v(soc))).collect();
@@ -64,7 +65,7 @@ fn electrodes((positive, negative): (PositiveMaterial, NegativeMaterial), conten
     }
 }
 
-/// Best contents of a pair, with their cost.
+/// Returns the best contents for a pair of materials, and their cost.
 fn fit_pair(curve: &[(f64, f64)], pair: (PositiveMaterial, NegativeMaterial)) -> (Electrodes, f64) {
     let residuals = |x: &Vector4<f64>| {
         let cell = electrodes(pair, x);

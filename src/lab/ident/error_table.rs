@@ -1,10 +1,12 @@
-//! Error of the fitted model over SOC and temperature: the standard deviation of its voltage error averaged over [`BLOCK_S`].
+//! Error of the fitted model over SOC and temperature: the standard deviation of its voltage error, averaged over [`BLOCK_S`].
 //!
-//! Model error repeats itself within minutes, so it is averaged over blocks of 100 s. A block is weighted by the charge moved in
-//! it and shared among the nodes around it; a node with little charge follows the mean of its temperature. The residuals of a fit
-//! understate the error on a new drive, so the variance is multiplied by 1 + 3 / (files that visit the node). A pulse or slow test
-//! counts as 0.3 of a file, because it says little about a drive; the life of an ageing cell counts as one file, however many
-//! cycles it has. A temperature without data takes the errors of the nearest one with data, scaled by a power of the Arrhenius factor.
+//! Errors of a model are correlated over minutes, so they are averaged over blocks of 100 s. A block is weighted by the charge that was
+//! moved in it, and is shared among the nodes around it. A node with little charge follows the mean of its temperature.
+//!
+//! The residuals of a fit understate the error on a new drive. Therefore the variance is multiplied by 1 + 3 / n, where n is the number
+//! of files that visit the node. A pulse test or slow test counts as 0.3 of a file, because it says little about a drive. The life of
+//! an ageing cell counts as one file, no matter how many cycles it has. A temperature without data takes the errors of the nearest
+//! temperature with data, scaled by a power of the Arrhenius factor.
 
 use std::collections::BTreeMap;
 
@@ -15,13 +17,13 @@ use super::record::Record;
 
 /// Length of a block, s.
 const BLOCK_S: f64 = 100.0;
-/// Upper limit of the errors, V.
+/// Upper limit of the error of a block, V; also the error if no temperature has data.
 const MOST_V: f64 = 0.1;
-/// Charge, as SOC, with which the mean of a temperature is added to each of its nodes.
+/// Weight, as SOC moved, with which the mean of a temperature is added to each of its nodes.
 const LEAN_SOC: f64 = 1.0;
-/// Growth of the variance on data outside the fit: 1 + this / files.
+/// Growth of the variance on data outside the fit: 1 + this constant / number of files.
 const UNSEEN: f64 = 3.0;
-/// Charge moved near a node from which a file counts as visiting it, as SOC.
+/// A file visits a node if it has moved more than this charge near the node, as SOC.
 const VISIT_SOC: f64 = 0.005;
 
 /// Sums per node.
@@ -31,18 +33,18 @@ struct NodeSums {
     files: Vec<f64>,
 }
 
-/// A record and its source.
+/// A record with its file and weight.
 #[derive(Debug, Clone, Copy)]
 pub struct WeightedRecord<'a> {
-    /// The rows.
+    /// Rows of the record.
     pub record: &'a Record,
-    /// Number of its file: all records of a file describe one cell on one day.
+    /// Number of the file. All records of a file describe one cell on one day.
     pub file: usize,
-    /// Its weight: 1 for a drive.
+    /// Weight of the record: 1 for a drive.
     pub share: f64,
 }
 
-/// The error table in node order, V.
+/// Returns the error table in node order, V.
 pub fn table(fit: &FittedTables, records: &[WeightedRecord<'_>], capacity_ah: f64) -> Vec<f64> {
     let nodes = fit.grid.nodes();
     let mut sums = NodeSums { square: vec![0.0; nodes], weight: vec![0.0; nodes], files: vec![0.0; nodes] };
@@ -84,7 +86,7 @@ fn add_record(sums: &mut NodeSums, fit: &FittedTables, record: &Record, share: f
     block.close(sums, &fit.grid, share);
 }
 
-/// Weighted sums over a block.
+/// Weighted sums over one block.
 #[derive(Default)]
 struct ErrorBlock {
     error: f64,
@@ -110,7 +112,7 @@ impl ErrorBlock {
     }
 }
 
-/// Errors of one temperature; `None` = no data.
+/// Returns the errors of one temperature; `None` = there are no data.
 fn row(sums: &NodeSums, t: usize, columns: usize) -> Option<Vec<f64>> {
     let range = t * columns..(t + 1) * columns;
     let weight: f64 = sums.weight[range.clone()].iter().sum();
@@ -122,7 +124,7 @@ fn row(sums: &NodeSums, t: usize, columns: usize) -> Option<Vec<f64>> {
     let of_node = |node: usize| {
         let files = if sums.files[node] > 0.0 { sums.files[node] } else { most_files };
         let variance = (sums.square[node] + LEAN_SOC * mean) / (sums.weight[node] + LEAN_SOC);
-        // Least error assumed of a model, V.
+        // Smallest error that a model is assumed to have, V.
         (variance * (1.0 + UNSEEN / files)).sqrt().max(0.001)
     };
     Some(range.map(of_node).collect())
@@ -173,7 +175,8 @@ mod tests {
             let judged = files.map(|file| WeightedRecord { record: &record, file, share });
             table(&fit, &judged, 2.0)
         };
-        // 10 mV everywhere: variance times four for one drive, times 1.75 for four, times 11 for one pulse test.
+        // The error is 10 mV everywhere. The variance is multiplied by 4 for one drive, by 1.75 for four drives, and by 11 for one
+        // pulse test.
         let cases = [([7; 4], 1.0, 4.0_f64), ([0, 1, 2, 3], 1.0, 1.75), ([7; 4], 0.3, 11.0)];
         for (files, share, growth) in cases {
             let (found, expected_v) = (error_v(files, share), 0.01 * growth.sqrt());

@@ -10,12 +10,12 @@ use super::record::Record;
 use super::solve::{Space, minimise};
 use crate::filter::median;
 
-/// Number of groups of records. Each group is summed separately, then the groups are added in order, so that the result does not
-/// depend on the number of cores.
+/// Number of groups of records. Each group is summed separately, and then the sums of the groups are added in order. The result
+/// therefore does not depend on the number of cores.
 const GROUPS: usize = 4;
 /// Smallest number of judged rows for a fit.
 pub const MIN_ROWS: usize = 50;
-/// A node with fewer seconds of data nearby is reported as unsupported.
+/// A node with fewer seconds of data nearby is reported as not supported by data.
 pub const SUPPORTED_S: f64 = 30.0;
 /// A time constant stays within this factor of its starting value.
 const TAU_FACTOR: f64 = 5.0;
@@ -48,7 +48,8 @@ pub struct FitSettings {
     pub voltage_v: (f64, f64),
     /// Slow tests, by rising temperature; empty = the data alone determine the OCV.
     pub ocv: Vec<OcvCurve>,
-    /// Smallest rise of the OCV, V per unit of SOC, above a SOC: `(from, slope)`; the last that applies wins.
+    /// Smallest rise of the OCV, V per unit of SOC, as `(from, slope)`: `slope` applies above the SOC `from`. If several entries apply,
+    /// the last one counts.
     pub min_slope_v: Vec<(f64, f64)>,
     /// Standard deviations of the prior.
     pub deviations: PriorDeviations,
@@ -61,9 +62,9 @@ pub struct Residual {
     pub seconds: f64,
     /// Root mean square, V, weighted by time.
     pub rmse_v: f64,
-    /// Mean, measured less model, V.
+    /// Mean residual (measured minus model), V.
     pub mean_v: f64,
-    /// Largest by size, V.
+    /// Residual with the largest absolute value, V.
     pub worst_v: f64,
 }
 
@@ -78,18 +79,18 @@ pub struct FittedTables {
     pub total: Residual,
     /// Seconds of data near each node.
     pub visits_s: Vec<f64>,
-    /// Passes over the data.
+    /// Number of passes over the data.
     pub passes: usize,
     /// Whether the cost stopped falling.
     pub converged: bool,
 }
 
-/// Error if the cost is not finite at the starting values.
+/// Error: the cost is not finite at the starting values.
 const NOT_FINITE: &str = "the data or the starting values are not finite: two slow tests at one temperature, or a value that is not a number";
-/// Error if the current never changes enough to determine a resistance.
+/// Error: the current never changes enough to determine a resistance.
 const NO_EXCITATION: &str = "the current does not change: no resistance can be separated from the open-circuit voltage";
 
-/// Fits tables to `records` with weights `scale` per record; `progress` receives the pass number and the cost.
+/// Fits tables to `records`; `scale` is the weight of each record. `progress` receives the pass number and the cost.
 ///
 /// # Errors
 /// There are too few rows, or the current never changes.
@@ -133,7 +134,8 @@ pub fn fit(
 
 type Group<'a> = Vec<(&'a Record, f64)>;
 
-/// Distributes records over [`GROUPS`], each to the emptiest group, the longest first, so that all groups take about equally long.
+/// Distributes the records over [`GROUPS`], the longest first, each to the group with the fewest rows. All groups then take about
+/// equally long.
 fn groups<'a>(records: &'a [Record], scale: &[f64]) -> Vec<Group<'a>> {
     let mut order: Vec<usize> = (0..records.len()).collect();
     order.sort_by_key(|&i| std::cmp::Reverse(records[i].rows.len()));
@@ -156,7 +158,7 @@ fn sum_of_groups(groups: &[Group<'_>], layout: &Layout, theta: &[f64]) -> Normal
         }
         normal
     };
-    // Added in the order of the groups, so that the sum does not depend on the threads.
+    // The sums are added in the order of the groups, so the result does not depend on the threads.
     let sums: Vec<NormalEquations> = groups.par_iter().map(of_group).collect();
     sums.iter().fold(NormalEquations::new(layout.len()), |mut sum, group| {
         sum.add_all(group);
@@ -164,7 +166,7 @@ fn sum_of_groups(groups: &[Group<'_>], layout: &Layout, theta: &[f64]) -> Normal
     })
 }
 
-/// Starting values: OCV of the slow test or a straight line, resistances from steps of current.
+/// Returns the starting values: the OCV of the slow test or a straight line, and resistances from steps of the current.
 fn start(settings: &FitSettings, layout: &Layout, records: &[Record]) -> Result<Vec<f64>, String> {
     let grid = &settings.grid;
     let mut theta = match settings.ocv.is_empty() {
@@ -186,7 +188,8 @@ fn straight_ocv(settings: &FitSettings) -> Vec<f64> {
     settings.grid.soc.iter().map(|s| low + s * (high - low)).collect()
 }
 
-/// OCV at every node from slow tests: linear between their temperatures, the nearest test beyond them.
+/// Returns the OCV at every node from slow tests. Between the temperatures of the tests it is linear; outside, the nearest test
+/// applies.
 pub fn ocv_nodes(grid: &Grid, curves: &[OcvCurve]) -> Vec<f64> {
     let temperatures: Vec<f64> = curves.iter().map(|c| c.temperature_c).collect();
     let at = |t: f64, soc: f64| {
@@ -200,7 +203,8 @@ pub fn ocv_nodes(grid: &Grid, curves: &[OcvCurve]) -> Vec<f64> {
         .collect()
 }
 
-/// Voltage of a curve. Below the SOC at which a cold test ended, the next warmer curve continues its shape.
+/// Returns the voltage of a curve. Below the SOC at which a test in the cold ended, the curve continues with the shape of the next
+/// warmer one.
 fn curve_at(curves: &[OcvCurve], which: usize, soc: f64) -> f64 {
     let curve = &curves[which];
     let end = curve.soc[0];
@@ -210,7 +214,7 @@ fn curve_at(curves: &[OcvCurve], which: usize, soc: f64) -> f64 {
     curve.voltage_v[0] + curve_at(curves, which + 1, soc) - curve_at(curves, which + 1, end)
 }
 
-/// Median resistance at 25 degrees C from steps of the current between rows; `None` = no steps.
+/// Returns the median resistance at 25 degrees C from steps of the current between rows; `None` = there are no steps.
 fn resistance_of_steps(records: &[Record]) -> Option<f64> {
     let mut found = Vec::new();
     for record in records {
@@ -254,7 +258,7 @@ pub(super) fn space(settings: &FitSettings, layout: &Layout, start: &[f64]) -> S
     Space { low, high, rising }
 }
 
-/// Residual over all records.
+/// Returns the residual over all records.
 pub fn judge(records: &[Record], tables: &ParameterTables) -> Residual {
     let mut total = ResidualSums::default();
     for record in records {
@@ -310,14 +314,14 @@ impl ResidualSums {
 }
 
 impl FittedTables {
-    /// Returns temperature and SOC of the nodes that no data support.
+    /// Returns temperature and SOC of the nodes that are not supported by data.
     pub fn unsupported(&self) -> Vec<(f64, f64)> {
         let columns = self.grid.soc.len();
         let weak = self.visits_s.iter().enumerate().filter(|(_, seconds)| **seconds < SUPPORTED_S);
         weak.map(|(node, _)| (self.grid.temperature_c[node / columns], self.grid.soc[node % columns])).collect()
     }
 
-    /// Open-circuit voltage averaged over the SOC range and the temperatures, V.
+    /// Returns the open-circuit voltage averaged over the SOC range and the temperatures, V.
     pub fn mean_ocv_v(&self) -> f64 {
         let of_row = |row: &[f64]| -> f64 {
             let pairs = row.windows(2).zip(self.grid.soc.windows(2));
@@ -327,7 +331,7 @@ impl FittedTables {
         rows.map(of_row).sum::<f64>() / self.grid.temperature_c.len() as f64
     }
 
-    /// Open-circuit voltage, V, of the temperature row nearest `temperature_c`.
+    /// Returns the open-circuit voltage, V, of the temperature row nearest to `temperature_c`.
     pub fn ocv_v(&self, soc: f64, temperature_c: f64) -> f64 {
         let distance = |t: usize| (self.grid.temperature_c[t] - temperature_c).abs();
         let rows = 0..self.grid.temperature_c.len();

@@ -1,8 +1,8 @@
-//! The grid of the tables, and the position of a SOC and a temperature in it.
+//! The grid of the tables, and the position of a point (SOC, temperature) in it.
 //!
-//! Same rules as [`CellModel::grid_position`](crate::cell::CellModel::grid_position). Along SOC everything is linear; beyond 0 and 1
-//! the OCV is extrapolated and other values keep their edge value. Along temperature the OCV and the time constants are linear and
-//! resistances follow Arrhenius' law; beyond the temperature range the nearest edge applies.
+//! The rules are those of [`CellModel::grid_position`](crate::cell::CellModel::grid_position). Along SOC, all values are linear. Below
+//! 0 and above 1, the OCV is extrapolated and the other values stay constant. Along temperature, the OCV and the time constants are
+//! linear, and resistances follow Arrhenius' law. Outside the temperature range, the values of the nearest temperature apply.
 
 pub use crate::cell::arrhenius;
 use crate::filter::{self, locate};
@@ -16,7 +16,7 @@ pub struct Grid {
     pub temperature_c: Vec<f64>,
 }
 
-/// The two SOC columns and two temperature rows around one point, with the weights of the upper ones.
+/// The two SOC columns and two temperature rows around one point, with the weights of the upper column and row.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GridPoint {
     /// Lower SOC column.
@@ -25,18 +25,18 @@ pub struct GridPoint {
     pub t: usize,
     /// Weight of the upper column, in [0, 1].
     pub along_s: f64,
-    /// The same without limits, for the OCV.
+    /// Weight of the upper column without these limits, for the OCV.
     pub beyond_s: f64,
     /// Weight of the upper row for the OCV, in [0, 1]; 0 with a single temperature.
     pub along_t: f64,
-    /// The same for resistances.
+    /// Weight of the upper row for resistances.
     pub warped_t: f64,
 }
 
 /// Nodes with their weights; the first `len` are valid.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Corners {
-    /// Node numbers: temperature row times columns plus column.
+    /// Node numbers: temperature row times number of columns, plus column.
     pub node: [usize; 4],
     /// Weights, summing to 1.
     pub weight: [f64; 4],
@@ -50,19 +50,19 @@ impl Corners {
         (0..self.len).map(|i| (self.node[i], self.weight[i]))
     }
 
-    /// Interpolated value of a table in node order.
+    /// Returns the interpolated value of a table in node order.
     pub fn at(&self, values: &[f64]) -> f64 {
         self.iter().map(|(node, weight)| weight * values[node]).sum()
     }
 }
 
 impl Grid {
-    /// Number of nodes of a table.
+    /// Returns the number of nodes of a table.
     pub fn nodes(&self) -> usize {
         self.soc.len() * self.temperature_c.len()
     }
 
-    /// Position of a SOC and a temperature.
+    /// Returns the position of a SOC and a temperature.
     pub fn place(&self, soc: f64, temperature_c: f64) -> GridPoint {
         let (s, beyond_s) = locate(&self.soc, soc);
         let temperatures = &self.temperature_c;
@@ -78,17 +78,17 @@ impl Grid {
         GridPoint { s, t, along_s: beyond_s.clamp(0.0, 1.0), beyond_s, along_t, warped_t }
     }
 
-    /// Corners for the OCV.
+    /// Returns the nodes and weights for the OCV.
     pub fn ocv_corners(&self, place: &GridPoint) -> Corners {
         self.corners(place, place.beyond_s, place.along_t)
     }
 
-    /// Corners for time constants.
+    /// Returns the nodes and weights for time constants.
     pub fn tau_corners(&self, place: &GridPoint) -> Corners {
         self.corners(place, place.along_s, place.along_t)
     }
 
-    /// Corners for resistances.
+    /// Returns the nodes and weights for resistances.
     pub fn resistance_corners(&self, place: &GridPoint) -> Corners {
         self.corners(place, place.along_s, place.warped_t)
     }
@@ -112,7 +112,7 @@ impl Grid {
     }
 }
 
-/// Linear interpolation of `y` over rising `x`; outside the range, the value at the nearest end.
+/// Interpolates `y` linearly over rising `x`. Outside the range of `x`, the nearest value applies.
 pub fn interpolate(x: &[f64], y: &[f64], at: f64) -> f64 {
     if x.len() == 1 { y[0] } else { filter::interpolate(x, y, at) }
 }

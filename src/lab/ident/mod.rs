@@ -1,10 +1,11 @@
-//! Fits cell models to measured data (paper, section 3.3.2): pure arithmetic, no files, no printing.
+//! Fits cell models to measured data (paper, section 3.3.2). This module only computes: it reads no files and prints nothing.
 //!
-//! Data flow: raw rows of one file -> [`anchor`] (SOC of every row) -> [`record`] (coarser rows, positions in
-//! the tables, weights) -> [`pass`] (residuals and their exact Jacobian by sensitivity recursion) with [`prior`]
-//! (smoothness) -> [`solve`] (projected Levenberg-Marquardt) -> [`fit`] (whole fit, residuals per file, nodes without data).
-//! Records that start at an unknown SOC: [`unanchored`] estimates that SOC together with the tables.
-//! Afterwards [`error_table`] estimates the model's error, and [`thermal`] fits heat capacity and thermal resistance.
+//! Data flow: raw rows of one file -> [`anchor`] (SOC of every row) -> [`record`] (coarser rows with positions in the tables and
+//! weights) -> [`pass`] (residuals, and their exact Jacobian from recursive sensitivities) with [`prior`] (smoothness) -> [`solve`]
+//! (projected Levenberg-Marquardt) -> [`fit`] (whole fit, residuals per file, nodes without data).
+//!
+//! For records that start at an unknown SOC, [`unanchored`] estimates the SOC together with the tables. After a fit, [`error_table`]
+//! estimates the model's error, and [`thermal`] fits heat capacity and thermal resistance.
 
 pub mod ageing;
 pub mod anchor;
@@ -20,10 +21,10 @@ pub mod solve;
 pub mod thermal;
 pub mod unanchored;
 
-/// Consecutive rows with running time.
+/// Consecutive rows whose time does not restart.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct MeasuredPart {
-    /// Key in the part column; empty without one.
+    /// Value of the part column; empty without this column.
     pub key: String,
     /// Value of the `type` column in the first row, `charge` or `discharge`; empty without that column.
     pub kind: String,
@@ -42,7 +43,7 @@ pub struct MeasuredPart {
 }
 
 impl MeasuredPart {
-    /// Whether the column `type` says that it is a discharge.
+    /// Whether the column `type` says that this part is a discharge.
     pub(crate) fn is_discharge(&self) -> bool {
         self.kind == "discharge"
     }
@@ -61,13 +62,13 @@ impl MeasuredPart {
         self.discharged_ah.push(discharged_ah);
     }
 
-    /// Charge, Ah, that the tester took after the load by holding the lowest voltage while the current fell; 0 if the discharge has no
-    /// such end.
+    /// Returns the charge, Ah, that the tester took out after the load by holding the lowest voltage while the current fell. Returns 0
+    /// if the discharge does not end in this way.
     pub(crate) fn held_ah(&self) -> f64 {
         let Some(last) = self.current_a.iter().rposition(|&current_a| current_a > 0.0) else { return 0.0 };
         let charge_ah = charge_ah(&self.time_s[..=last], &self.current_a[..=last]);
         let half_ah = 0.5 * charge_ah[last];
-        // Current at half of the charge.
+        // Current when half of the charge has been taken out.
         let load_a = self.current_a[charge_ah.partition_point(|&ah| ah < half_ah).min(last)];
         let lowest_v = self.voltage_v[..=last].iter().copied().fold(f64::INFINITY, f64::min);
         let is_held = |row: usize| {
@@ -85,7 +86,7 @@ impl MeasuredPart {
     }
 }
 
-/// Charge taken out since the first row, for every row, Ah, by the trapezoidal rule; a gap counts like any other step.
+/// Returns the charge taken out since the first row, for every row, Ah, by the trapezoidal rule. A gap counts like any other step.
 pub fn charge_ah(time_s: &[f64], current_a: &[f64]) -> Vec<f64> {
     let mut sum = 0.0;
     let mut charges = Vec::with_capacity(time_s.len());
@@ -115,7 +116,7 @@ mod tests {
         let mut held = load.to_vec();
         held.extend([(1900.0, 1.8, 2.502), (2260.0, 0.2, 2.498), (2300.0, 0.0, 2.6)]);
         assert!((discharge(&held).held_ah() - 0.1).abs() < 1e-12, "360 s at 1 A");
-        // Under a varying load the voltage moves, so it is not held.
+        // Under a varying load, the voltage changes, so it does not count as held.
         assert_eq!(
             discharge(&[(0.0, 3.0, 3.4), (600.0, 3.0, 3.2), (1200.0, 1.0, 3.3), (1800.0, 2.0, 3.1)]).held_ah(),
             0.0

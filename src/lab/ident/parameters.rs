@@ -1,7 +1,7 @@
 //! The parameter vector: for every node the OCV (V), ln R0, and ln R and ln tau of each branch.
 //!
-//! The kinds follow each other, each in node order (temperature row by temperature row). The capacitance of a node
-//! follows as C = tau / R.
+//! The kinds of parameters follow each other. Each kind is in node order (temperature row by temperature row). The capacitance of a
+//! node is C = tau / R.
 
 use super::grid::Grid;
 use crate::cell::{Branch, Table};
@@ -18,12 +18,12 @@ pub struct Layout {
 }
 
 impl Layout {
-    /// For `branches` branches on `grid`.
+    /// Creates the layout for `branches` branches on `grid`.
     pub fn new(grid: &Grid, branches: usize) -> Self {
         Self { nodes: grid.nodes(), columns: grid.soc.len(), branches }
     }
 
-    /// Number of parameters.
+    /// Returns the number of parameters.
     pub fn len(&self) -> usize {
         self.nodes * (2 + 2 * self.branches)
     }
@@ -33,17 +33,17 @@ impl Layout {
         self.len() == 0
     }
 
-    /// Index of the first ln R0.
+    /// Returns the index of the first ln R0.
     pub fn r0(&self) -> usize {
         self.nodes
     }
 
-    /// Index of the first ln R of branch `i`.
+    /// Returns the index of the first ln R of branch `i`.
     pub fn branch_r(&self, i: usize) -> usize {
         self.nodes * (2 + 2 * i)
     }
 
-    /// Index of the first ln tau of branch `i`.
+    /// Returns the index of the first ln tau of branch `i`.
     pub fn branch_tau(&self, i: usize) -> usize {
         self.nodes * (3 + 2 * i)
     }
@@ -63,7 +63,7 @@ pub struct ParameterTables {
 }
 
 impl ParameterTables {
-    /// The tables of `theta`.
+    /// Returns the tables of the parameter vector `theta`.
     pub fn new(layout: &Layout, theta: &[f64]) -> Self {
         let exp = |first: usize| theta[first..first + layout.nodes].iter().map(|&x| libm::exp(x)).collect::<Vec<_>>();
         Self {
@@ -74,7 +74,7 @@ impl ParameterTables {
         }
     }
 
-    /// The tables of a cell model: OCV, R0, branches.
+    /// Returns the tables of a cell model: OCV, R0, branches.
     pub fn model(&self, columns: usize) -> (Table, Table, Vec<Branch>) {
         let table = |values: &[f64]| Table { values: values.chunks(columns).map(<[f64]>::to_vec).collect() };
         let farad = |(r, tau): (&Vec<f64>, &Vec<f64>)| r.iter().zip(tau).map(|(r, tau)| tau / r).collect::<Vec<f64>>();

@@ -1,40 +1,46 @@
 //! One pass over the data: residuals, their exact Jacobian, and the normal equations.
 //!
-//! The residual of a row is e = V - (OCV(s,T) - sum U_i - R0(s,T) I). A branch is solved exactly over the step of each row,
-//! U' = R I + x (U - R I) with x = exp(-dt / tau), and so are its derivatives:
-//! dU' = x dU + (1 - x) I dR + (U - R I) x dt / tau^2 dtau. Derivatives decay with the branch and are dropped below
-//! [`FADED_V`], so a row touches only a few nodes, and the work per row does not grow with the tables.
-//! Beyond [`HUBER_V`] the cost grows linearly (Huber), so that errors no circuit can explain do not distort the tables.
-//! Where the SOC is unknown ([`FreeScale`]), residuals are compared with the error of a circuit at this voltage drop and temperature
-//! ([`circuit_error_v`]), so that the circuit's error in the cold is not mistaken for lost capacity.
+//! The residual of a row is e = V - (OCV(s,T) - sum U_i - R0(s,T) I). Over the step of a row, the voltage U of a branch is solved
+//! exactly:
+//! `U' = R I + x (U - R I)` with `x = exp(-dt / tau)`.
+//! Its derivatives are exact too:
+//! `dU' = x dU + (1 - x) I dR + (U - R I) x dt / tau^2 dtau`.
+//! Derivatives decay with the branch and are dropped below [`FADED_V`]. A row therefore touches only a few nodes, and the work per row
+//! does not grow with the tables.
+//!
+//! Beyond [`HUBER_V`], the cost grows linearly (Huber), so that errors that no circuit can explain do not distort the tables. If the
+//! SOC is unknown ([`FreeScale`]), each residual is compared with the error of a circuit at this voltage drop and temperature
+//! ([`circuit_error_v`]), so that the error of the circuit in the cold is not mistaken for lost capacity.
 
 use super::grid::{Corners, Grid, arrhenius};
 use super::parameters::{Layout, ParameterTables};
 use super::record::{FitRow, Record};
 
-/// Derivative, V per unit of a log parameter, below which it is dropped: a thousandth of the voltage resolution.
+/// Derivatives below this value are dropped, V per unit of a log parameter. It is a thousandth of the voltage resolution.
 const FADED_V: f64 = 1e-6;
 /// Residual above which the cost grows linearly, V.
 pub const HUBER_V: f64 = 0.05;
-/// Residual that costs one half if independent, V: the model error of a good circuit.
+/// Size of an independent residual that costs one half, V: the error of a good circuit model.
 const SIGMA_V: f64 = 0.010;
-/// Correlation time of the model error, s: one independent residual per period.
+/// Correlation time of the model error, s. Residuals count as one independent residual per correlation time.
 const REPEATS_S: f64 = 50.0;
-/// The same where the SOC is unknown. From 50 to 500 s, and for a wide range of the next two constants, the SOC errors of Panasonic
-/// 18650PF and a simulated LG M50 change by less than 0.1 points on average; EVE, with its flat curve, needs at least this value.
+/// Correlation time if the SOC is unknown, s. Between 50 and 500 s, and for a wide range of the next two constants, the SOC errors of
+/// Panasonic 18650PF and of a simulated LG M50 change by less than 0.1 points on average. The EVE cell with its flat curve needs at
+/// least this value.
 const FREE_REPEATS_S: f64 = 250.0;
 /// Error of a circuit, as a share of the voltage drop.
 const DROP_ERROR: f64 = 0.05;
 /// Power of the Arrhenius factor with which a circuit's error grows in the cold.
 pub const COLD_POWER: f64 = 0.7;
-/// The cost grows linearly beyond this many circuit errors.
+/// Beyond this multiple of the circuit's error, the cost grows linearly.
 const HUBER_ERRORS: f64 = 3.0;
 
-/// Normal equations in the node parameters.
+/// Normal equations of the node parameters.
 #[derive(Debug, Clone)]
 pub struct NormalEquations {
     n: usize,
-    /// Row-major; the product of a pair is in either of its two places until [`NormalEquations::symmetric`] adds them.
+    /// Matrix, row-major. The product of a pair of parameters is in one of its two symmetric places until
+    /// [`NormalEquations::symmetric`] adds them.
     h: Vec<f64>,
     /// Gradient of the cost.
     pub g: Vec<f64>,
@@ -48,7 +54,7 @@ impl NormalEquations {
         Self { n, h: vec![0.0; n * n], g: vec![0.0; n], cost: 0.0 }
     }
 
-    /// Adds an observation with derivatives `j` = de/dtheta of the residual e = measured - model by the parameters `index`.
+    /// Adds an observation. `j` contains the derivatives de/dtheta of the residual e = measured - model by the parameters in `index`.
     pub fn add(&mut self, index: &[usize], j: &[f64], residual: f64, weight: f64) {
         for (a, &row) in index.iter().enumerate() {
             let weighted = weight * j[a];
@@ -67,7 +73,7 @@ impl NormalEquations {
         self.cost += other.cost;
     }
 
-    /// The full symmetric matrix, row-major.
+    /// Returns the full symmetric matrix, row-major.
     pub fn symmetric(&self) -> Vec<f64> {
         let n = self.n;
         let mut full = self.h.clone();
@@ -103,7 +109,7 @@ impl BranchRun {
         }
     }
 
-    /// Advances the voltage by the step of a row, without derivatives. Returns the decay and dU'/dtau.
+    /// Advances the voltage by the step of a row, without derivatives. Returns the decay x and dU'/dtau.
     fn step_voltage(&mut self, row: &FitRow, r_ohm: &[f64], tau_s: &[f64]) -> (f64, f64) {
         let (r, tau) = (row.resistance.at(r_ohm), row.tau.at(tau_s));
         let settled = r * row.mean_current_a;
@@ -148,7 +154,7 @@ impl BranchRun {
     }
 }
 
-/// Residuals of a record, V, one per row (also of rows that are not judged).
+/// Returns the residuals of a record, V: one per row, including rows that are not judged.
 pub fn residuals(record: &Record, tables: &ParameterTables) -> Vec<f64> {
     let mut branches: Vec<_> = tables.r_ohm.iter().map(|_| BranchRun::new(0)).collect();
     let of_row = |row: &FitRow| {
@@ -185,7 +191,7 @@ pub struct FreeScale<'a> {
 }
 
 impl FreeScale<'_> {
-    /// Adds the derivatives of a row's residual; only the effect of the SOC on the open-circuit voltage counts.
+    /// Adds the derivatives of a row's residual. Only the effect of the SOC on the open-circuit voltage is included.
     fn derivatives(&self, row: &FitRow, tables: &ParameterTables, index: &mut Vec<usize>, j: &mut Vec<f64>) {
         let place = self.grid.place(row.soc, row.temperature_c);
         let columns = self.grid.soc.len();
@@ -202,8 +208,8 @@ impl FreeScale<'_> {
     }
 }
 
-/// Adds residuals and derivatives of a record to `normal`, with its rows' weights times `scale`; with `free`, also the derivatives
-/// by the unknowns of its SOC.
+/// Adds the residuals and derivatives of a record to `normal`. The weights of its rows are multiplied by `scale`. If `free` is given,
+/// the derivatives by the unknowns of the SOC are added too.
 pub fn accumulate(
     record: &Record,
     scale: f64,
@@ -244,7 +250,7 @@ pub fn accumulate(
     }
 }
 
-/// Derivatives of the residual by every parameter that affects the row.
+/// Collects the derivatives of the residual by every parameter that affects the row.
 fn derivatives(
     row: &FitRow,
     layout: &Layout,
@@ -273,13 +279,13 @@ fn derivatives(
     }
 }
 
-/// Voltage error of a circuit at a voltage drop and a temperature, V.
+/// Returns the voltage error of a circuit at a voltage drop and a temperature, V.
 fn circuit_error_v(drop_v: f64, temperature_c: f64) -> f64 {
     SIGMA_V.hypot(DROP_ERROR * drop_v) * libm::pow(arrhenius(temperature_c).max(1.0), COLD_POWER)
 }
 
-/// Cost per second of a residual with this error, and the weight of its square in the normal equations. The cost includes the logarithm
-/// of the error, because the error grows with the drop, which the parameters determine.
+/// Returns the cost per second of a residual with this error, and the weight of its square in the normal equations. The cost includes
+/// the logarithm of the error, because the error grows with the voltage drop, which depends on the parameters.
 fn free_cost(residual: f64, error_v: f64) -> (f64, f64) {
     let errors = residual.abs() / error_v;
     let (cost, robust) = if errors <= HUBER_ERRORS {
@@ -290,13 +296,13 @@ fn free_cost(residual: f64, error_v: f64) -> (f64, f64) {
     ((cost + libm::log(error_v / SIGMA_V)) / FREE_REPEATS_S, robust / (error_v * error_v * FREE_REPEATS_S))
 }
 
-/// Cost of a residual, and the weight of its square in the normal equations.
+/// Returns the cost of a residual, and the weight of its square in the normal equations.
 fn huber(residual: f64) -> (f64, f64) {
     let size = residual.abs();
     if size <= HUBER_V { (0.5 * residual * residual, 1.0) } else { (HUBER_V * (size - 0.5 * HUBER_V), HUBER_V / size) }
 }
 
-/// Seconds of judged rows near each node.
+/// Returns the seconds of judged rows near each node.
 pub fn visits(records: &[&Record], nodes: usize) -> Vec<f64> {
     let mut seconds = vec![0.0; nodes];
     let mut visit = |corners: &Corners, weight_s: f64| {

@@ -1,7 +1,7 @@
-//! The prior: smooth tables, Arrhenius' law between temperatures, an OCV near the slow test.
+//! The prior of a fit: smooth tables, Arrhenius' law between temperatures, and an OCV near the slow test.
 //!
-//! Each term is a linear combination of node parameters with a target and a standard deviation. The curvature at a node is the
-//! change of the slope times the mean of its two spacings.
+//! Each term is a linear combination of node parameters with a target and a standard deviation. The curvature at a node is the change
+//! of the slope, multiplied by the mean of the distances to both neighbours.
 
 use super::grid::{Grid, arrhenius};
 use super::parameters::Layout;
@@ -10,8 +10,8 @@ use super::pass::NormalEquations;
 /// Standard deviations of the prior's terms.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PriorDeviations {
-    /// Second difference of the OCV over SOC, scaled to the node spacing, V: of the correction to the slow test, or without
-    /// one of the curve itself.
+    /// Second difference of the OCV over SOC, scaled to the node spacing, V. With a slow test, it applies to the correction of the slow
+    /// test; otherwise to the curve itself.
     pub ocv_curvature_v: f64,
     /// Difference of the OCV, or of its correction, between neighbouring temperatures, V.
     pub ocv_by_temperature_v: f64,
@@ -34,7 +34,7 @@ pub struct PriorDeviations {
 }
 
 impl PriorDeviations {
-    /// Without a slow test: the data alone determine the OCV.
+    /// Prior without a slow test: the data alone determine the OCV.
     pub const FREE_OCV: Self = Self {
         ocv_curvature_v: 0.2,
         ocv_by_temperature_v: 0.01,
@@ -48,8 +48,8 @@ impl PriorDeviations {
         tau_level: 0.7,
     };
 
-    /// With a slow test: a smooth correction that fades away from the drives. Tuned by leaving out one drive at a time, on
-    /// two cells at five and six temperatures.
+    /// Prior with a slow test: a smooth correction that fades away from the drives. Tuned by leaving out one drive at a time, on two
+    /// cells at five and six temperatures.
     pub const SLOW_TEST: Self = Self {
         ocv_curvature_v: 0.025,
         ocv_by_temperature_v: 0.02,
@@ -61,7 +61,8 @@ impl PriorDeviations {
         ..Self::FREE_OCV
     };
 
-    /// Around the resistances of a chemistry: the spread of five fitted cells (`cell::chemistry`), common to the nodes of a table.
+    /// Prior around the resistances of a chemistry. It is the spread of five fitted cells (`cell::chemistry`), which is common to all
+    /// nodes of a table.
     pub const CHEMISTRY: Self = Self {
         ocv_by_temperature_v: 0.006,
         r0_curvature: 0.15,
@@ -74,9 +75,10 @@ impl PriorDeviations {
         ..Self::FREE_OCV
     };
 
-    /// For an ageing cell. With one current per discharge and charge, only their first rows separate R0 from the branch: R0 hardly
-    /// bends, and the time constant stays fixed. The branch cannot be separated from the OCV at the empty end either, where both are
-    /// steep: the branch bends no more than drives allow ([`PriorDeviations::SLOW_TEST`]), so that the knee goes to the OCV.
+    /// Prior for an ageing cell. Each discharge and charge has one current, so only the first rows separate R0 from the branch. R0
+    /// therefore hardly bends, and the time constant stays fixed. At the empty end, OCV and branch are both steep and cannot be
+    /// separated either. The branch bends no more than drives allow ([`PriorDeviations::SLOW_TEST`]), so that the knee belongs to the
+    /// OCV.
     pub const AGEING: Self = Self {
         ocv_curvature_v: 0.5,
         r0_curvature: 0.005,
@@ -87,7 +89,7 @@ impl PriorDeviations {
     };
 }
 
-/// One term: the sum of factor x parameter equals the target, within sigma.
+/// One term: the sum of factor x parameter equals the target, with standard deviation sigma.
 #[derive(Debug, Clone, PartialEq)]
 struct PriorDensity {
     terms: Vec<(usize, f64)>,
@@ -100,7 +102,7 @@ struct PriorDensity {
 pub struct Prior(Vec<PriorDensity>);
 
 impl Prior {
-    /// Creates the prior around the starting values `start`; with `slow_test`, their OCV was measured.
+    /// Creates the prior around the starting values `start`. If `slow_test` is set, their OCV was measured.
     pub fn new(grid: &Grid, layout: &Layout, start: &[f64], slow_test: bool, deviations: &PriorDeviations) -> Self {
         let mut prior = Self(Vec::new());
         let reference = if slow_test { &start[..layout.nodes] } else { &vec![0.0; layout.nodes] };
@@ -127,8 +129,8 @@ impl Prior {
         prior
     }
 
-    /// Creates the prior around known resistances and time constants `start`, in shape and in size; of the OCV, it constrains only the
-    /// differences between temperatures.
+    /// Creates the prior around known resistances and time constants in `start`; it constrains their shape and their size. Of the OCV,
+    /// it constrains only the differences between temperatures.
     pub fn about(grid: &Grid, layout: &Layout, start: &[f64], deviations: &PriorDeviations) -> Self {
         let mut prior = Self(Vec::new());
         let of = |first: usize| &start[first..first + layout.nodes];
@@ -203,7 +205,7 @@ impl Prior {
     }
 }
 
-/// Repeats a value per temperature for every node.
+/// Returns a value for every node, computed from the temperature of the node.
 pub fn per_node(grid: &Grid, value: impl Fn(f64) -> f64) -> Vec<f64> {
     grid.temperature_c.iter().flat_map(|&t| vec![value(t); grid.soc.len()]).collect()
 }

@@ -1,27 +1,28 @@
-//! Prepares measured rows for the fit: joins them to blocks, positions them in the tables, weights them by time.
+//! Prepares measured rows for the fit: joins them to blocks, positions them in the tables, and weights them by time.
 //!
-//! A block collects raw rows until it is [`BLOCK_S`] long. Its last row is kept as measured (voltage, current, temperature and SOC
-//! at that instant), because the series resistance acts immediately. The branches use the mean current of the block, so no charge is
-//! lost. A block ends early at a gap and before a current step that follows a steady current, so that both sides of a pulse's edge are
-//! kept. If charge moved during a gap without rows, the branches start relaxed after it.
+//! A block collects raw rows until it is [`BLOCK_S`] long. Voltage, current, temperature and SOC of the block are those of its last
+//! row, because the series resistance acts immediately. The branches use the mean current of the block, so no charge is lost. A block
+//! ends early at a gap. It also ends before a current step that follows a steady current, so that both sides of the edge of a pulse are
+//! kept. If charge moved during a gap without rows, the branches are relaxed after the gap.
 
 use super::MeasuredPart;
 use super::grid::{Corners, Grid};
 use crate::filter::ends;
 
-/// Longest block, s: the branches' time constants are several times longer, and drives change about once a second.
+/// Maximum length of a block, s. The time constants of the branches are several times longer, and the current of drives changes about
+/// once a second.
 const BLOCK_S: f64 = 1.0;
 /// Current step that ends a block early after a steady current, as a share of the largest current.
 const EDGE_SHARE: f64 = 0.1;
 /// Time with steady current before an edge, s; drives are rarely steady that long.
 const STEADY_S: f64 = 3.0;
-/// Most seconds that one row represents: rests logged once a minute must not outweigh drives.
+/// Maximum number of seconds that one row represents. Without it, rests logged once a minute would outweigh drives.
 const MAX_WEIGHT_S: f64 = 20.0;
 /// Shortest gap that may hide charge, s.
 const GAP_S: f64 = 60.0;
-/// Hidden charge, as SOC, above which the state of the branches is unknown.
+/// If the charge moved during a gap exceeds this SOC, the state of the branches is unknown.
 const HIDDEN_SOC: f64 = 0.002;
-/// Time without judged rows after such a gap under current, s: the branches are still wrong.
+/// If current flows after such a gap, rows are not judged for this time, s, because the branches are still wrong.
 const UNKNOWN_S: f64 = 600.0;
 /// Current below which a cell rests, as a share of the largest current.
 const REST_SHARE: f64 = 0.02;
@@ -33,11 +34,11 @@ pub struct FitRow {
     pub time_s: f64,
     /// Seconds since the previous row.
     pub dt_s: f64,
-    /// The branches are relaxed at this row, regardless of earlier rows.
+    /// Whether the branches are relaxed at this row, regardless of earlier rows.
     pub relaxed: bool,
     /// Mean current since the previous row, A.
     pub mean_current_a: f64,
-    /// Current at this instant, A.
+    /// Current at the time of the row, A.
     pub current_a: f64,
     /// Measured voltage, V.
     pub voltage_v: f64,
@@ -58,7 +59,7 @@ pub struct FitRow {
 /// Rows of one part of a file.
 #[derive(Debug, Clone, Default)]
 pub struct Record {
-    /// In time order.
+    /// Rows in the order of time.
     pub rows: Vec<FitRow>,
     /// Number of raw rows.
     pub raw_rows: usize,
@@ -73,12 +74,12 @@ pub struct Limits {
     pub voltage_low_v: f64,
     /// Highest credible voltage, V.
     pub voltage_high_v: f64,
-    /// Capacity that turns current into SOC, Ah.
+    /// Capacity that converts charge to SOC, Ah.
     pub capacity_ah: f64,
 }
 
 impl Record {
-    /// Prepares a part. If `judged[k]` is false, only the current of raw row k is used; an empty `judged` judges all rows.
+    /// Prepares a part. If `judged[k]` is false, only the current of raw row k is used. If `judged` is empty, all rows are judged.
     pub fn prepare(raw: &MeasuredPart, judged: &[bool], grid: &Grid, limits: &Limits) -> Self {
         let largest_a = raw.current_a.iter().fold(0.0_f64, |most, i| most.max(i.abs()));
         let ends = block_ends(raw, largest_a);
@@ -105,25 +106,26 @@ impl Record {
         record
     }
 
-    /// Least and largest SOC of the judged rows.
+    /// Returns the smallest and largest SOC of the judged rows.
     pub fn judged_ends(&self) -> (f64, f64) {
         ends(self.rows.iter().filter(|row| row.weight_s > 0.0).map(|row| row.soc))
     }
 
-    /// Seconds from the first row to the last.
+    /// Returns the seconds from the first row to the last.
     pub fn seconds(&self) -> f64 {
         self.rows.iter().map(|row| row.dt_s).sum()
     }
 }
 
-/// Time that a whole discharge counts, s: the length of a drive. A longer test holds no more information.
+/// Weight of a whole discharge, s: the length of a drive. A longer test contains no more information.
 const WHOLE_S: f64 = 8000.0;
 /// Weight of slow tests and pulse tests relative to drives: the model should follow drives.
 const TEST_SHARE: f64 = 0.3;
-/// A drive has current for more than this share of the time, and its size varies by more than this share of the mean.
+/// In a drive, current flows for more than the first share of the time, and its standard deviation is more than the second share of its
+/// mean.
 const DRIVE: (f64, f64) = (0.5, 0.3);
 
-/// 1 for a drive (varying current most of the time), less for pulse tests with rests and for constant current.
+/// Returns 1 for a drive (varying current for a large part of the time), and less for pulse tests with rests and for constant current.
 pub fn share(record: &Record) -> f64 {
     let largest = record.rows.iter().fold(0.0_f64, |most, row| most.max(row.current_a.abs()));
     let (mut all, mut flowing, mut first, mut second) = (0.0, 0.0, 0.0, 0.0);
@@ -140,14 +142,14 @@ pub fn share(record: &Record) -> f64 {
     if flowing > DRIVE.0 * all && variation > DRIVE.1 { 1.0 } else { TEST_SHARE }
 }
 
-/// Returns the weight of a second of the record: the record counts by the SOC that it covers, not by its length.
+/// Returns the weight of a second of the record. A record counts by the SOC range that it covers, not by its length.
 pub fn weight(record: &Record) -> f64 {
     let (low, high) = record.judged_ends();
     let seconds: f64 = record.rows.iter().filter(|row| row.weight_s > 0.0).map(|row| row.weight_s).sum();
     if seconds > 0.0 { (high - low) * WHOLE_S / seconds } else { 0.0 }
 }
 
-/// Indices of the raw rows that end a block; the first row is a block by itself.
+/// Returns the indices of the raw rows that end a block. The first row is a block by itself.
 fn block_ends(raw: &MeasuredPart, largest_a: f64) -> Vec<usize> {
     let (time_s, current_a) = (&raw.time_s, &raw.current_a);
     let (mut ends, mut last, mut last_step_s) = (vec![0], 0, f64::NEG_INFINITY);
@@ -191,7 +193,7 @@ fn block_row(raw: &MeasuredPart, before: usize, end: usize, grid: &Grid) -> FitR
     }
 }
 
-/// Whether the SOC change over a gap differs from the charge expected from the current at its ends.
+/// Whether the SOC change during a gap differs from the charge that the currents at both ends of the gap would move.
 fn hides_charge(raw: &MeasuredPart, before: usize, end: usize, capacity_ah: f64) -> bool {
     (before + 1..=end).any(|k| {
         let dt_s = raw.time_s[k] - raw.time_s[k - 1];
@@ -200,7 +202,7 @@ fn hides_charge(raw: &MeasuredPart, before: usize, end: usize, capacity_ah: f64)
     })
 }
 
-/// Weights each row by half the time to both neighbours, at most [`MAX_WEIGHT_S`]; rows with a negative weight get 0.
+/// Weights each row by half of the time to both neighbours, at most [`MAX_WEIGHT_S`]. Rows with a negative weight get 0.
 fn weigh(rows: &mut [FitRow]) {
     for k in 0..rows.len() {
         let after_s = rows.get(k + 1).map_or(0.0, |row| row.dt_s);

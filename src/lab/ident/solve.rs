@@ -1,30 +1,31 @@
 //! Projected Levenberg-Marquardt on normal equations, with bounds.
 //!
-//! Where a block is *rising* (the OCV over SOC), the solver uses its first value and the rises from node to node instead of node values.
-//! A bound on a rise keeps the curve monotone. The damped quadratic model is minimised within the bounds by block pivoting: the set of
-//! parameters held at a bound changes, and a Cholesky factorisation solves for the free ones each time. A step is taken if it lowers the
-//! true cost.
+//! Some parameters form a *rising* block (the OCV over SOC). For such a block, the solver uses its first value and the rises from node
+//! to node instead of the node values. A bound on each rise keeps the curve monotone. The damped quadratic model is minimised within
+//! the bounds by block pivoting: in each iteration, the set of parameters held at a bound changes, and a Cholesky factorisation solves
+//! for the free parameters. A step is taken if it lowers the true cost.
 
 use nalgebra::{DMatrix, DVector};
 
 use super::pass::NormalEquations;
 use crate::filter::levenberg_marquardt::{self, Damping};
 
-/// Most passes over the data.
+/// Maximum number of passes over the data.
 const MAX_PASSES: usize = 60;
-/// Relative fall of the cost below which the fit has converged, two steps in a row.
+/// The fit has converged if the relative fall of the cost is below this value twice in a row.
 const CONVERGED: f64 = 3e-4;
-/// Damping; a step that first needed more of it lowers it less, because the limit is near.
+/// Damping of the steps. If a step needed more damping before it succeeded, the damping is then lowered less, because it is close to
+/// its limit.
 const DAMPING: Damping = Damping { first: 0.3, fall: 0.1, fall_after_growth: 0.6, growth: 8.0, least: 1e-4, most: 1e8 };
-/// Damping below which a step is nearly the undamped one.
+/// With less damping than this, a step is nearly undamped.
 const DAMPING_WEAK: f64 = 0.02;
-/// Most changes of the held set per step; afterwards the step is clamped to the bounds.
+/// Maximum number of changes of the held set per step. After them, the step is clamped to the bounds.
 const MAX_EXCHANGES: usize = 30;
 
 /// Bounds and structure of the parameters.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Space {
-    /// Lowest values; in a rising block: of the first value, then of each rise.
+    /// Lowest values. In a rising block: lowest first value, then lowest rises.
     pub low: Vec<f64>,
     /// Highest values.
     pub high: Vec<f64>,
@@ -64,7 +65,7 @@ impl Space {
         self.to_nodes(&y)
     }
 
-    /// Gradient and matrix by first values and rises: a rise affects all nodes above it.
+    /// Converts gradient and matrix to first values and rises. A rise affects all nodes above it.
     fn pull_back(&self, normal: &NormalEquations) -> (DMatrix<f64>, DVector<f64>) {
         let n = normal.g.len();
         let mut h = DMatrix::from_vec(n, n, normal.symmetric());
@@ -91,9 +92,9 @@ impl Space {
 pub struct Solution {
     /// Node values.
     pub theta: Vec<f64>,
-    /// Cost there.
+    /// Cost at these values.
     pub cost: f64,
-    /// Passes over the data.
+    /// Number of passes over the data.
     pub passes: usize,
     /// Whether the cost stopped falling.
     pub converged: bool,
@@ -126,7 +127,7 @@ pub fn minimise(
     };
     let has_converged = |from: &(_, NormalEquations), to: &(_, NormalEquations), damping: f64| {
         let fall = (from.1.cost - to.1.cost) / from.1.cost;
-        // Under strong damping a small fall does not show convergence.
+        // Under strong damping, a small fall of the cost does not mean convergence.
         unchanged = if fall < CONVERGED && damping <= DAMPING_WEAK { unchanged + 1 } else { 0 };
         unchanged >= 2
     };
@@ -189,7 +190,7 @@ fn solve_free(
         };
     }
     let pushed = damped * &*d + g;
-    // Scaled to a unit diagonal, because volts and logarithms differ by orders of magnitude.
+    // The matrix is scaled to a unit diagonal, because volts and logarithms differ by orders of magnitude.
     let scale: Vec<f64> = free.iter().map(|&k| 1.0 / damped[(k, k)].sqrt()).collect();
     let matrix = DMatrix::from_fn(free.len(), free.len(), |a, b| damped[(free[a], free[b])] * scale[a] * scale[b]);
     let right = DVector::from_fn(free.len(), |a, _| -pushed[free[a]] * scale[a]);
@@ -200,7 +201,8 @@ fn solve_free(
     d.iter().all(|d| d.is_finite()).then_some(())
 }
 
-/// Holds parameters that left their bounds and frees those that the gradient pushes inwards; returns whether anything changed.
+/// Holds free parameters that left their bounds, and frees held parameters that the gradient pushes inwards. Returns whether anything
+/// changed.
 fn exchange(
     damped: &DMatrix<f64>,
     g: &DVector<f64>,
@@ -230,7 +232,7 @@ fn exchange(
 mod tests {
     use super::*;
 
-    /// Fits a line through points by first value and rises, each rise at least 0.5.
+    /// Fits a line through points, with its first value and rises as parameters; each rise is at least 0.5.
     #[test]
     fn rising_block_reaches_the_bounded_optimum() {
         let points = [0.0, 2.0, 1.9, 4.0];

@@ -1,26 +1,27 @@
-//! Heat capacity and thermal resistance: C dT/dt = I (OCV - V) - (T - Ta)/R, integrated, by linear least squares.
+//! Heat capacity C and thermal resistance R of a cell: C dT/dt = I (OCV - V) - (T - Ta)/R, integrated and solved by linear least
+//! squares.
 //!
-//! The surroundings are assumed to have the temperature at which a record starts. Some records start with a cell that is still
-//! warm or cold, so each discharge is fitted alone, and the medians of the credible results are used. Reversible heat is left out:
-//! the values are effective ones for the duty cycle of the data.
+//! The surroundings are assumed to have the temperature at which a record starts. Some records start while the cell is still warm or
+//! cold. Therefore each discharge is fitted alone, and the medians of the credible results are used. Reversible heat is left out, so
+//! the values are effective values for the duty cycle of the data.
 
 use super::parameters::ParameterTables;
 use super::record::Record;
 use crate::cell::Thermal;
 use crate::filter::{ends, median};
 
-/// Ranges of credible values: J/K, K/W.
+/// Ranges of credible values: heat capacity, J/K, and thermal resistance, K/W.
 const CREDIBLE: [(f64, f64); 2] = [(5.0, 1e5), (0.05, 200.0)];
 
-/// Heat capacity per stored energy of a cell, J/K per Wh: from 300 Wh/kg with 0.8 kJ/(kg K) to 80 Wh/kg with 1 kJ/(kg K). A sensor
-/// between cell and moving air sees only a share of the warming. It gives too large a capacity and too small a resistance, by that share,
-/// without a trace in the residuals; this range detects it.
+/// Credible heat capacity divided by stored energy, J/K per Wh: from 300 Wh/kg with 0.8 kJ/(kg K) to 80 Wh/kg with 1 kJ/(kg K). A
+/// sensor between cell and moving air sees only a share of the warming. The fitted capacity is then too large and the resistance too
+/// small by this share, and the residuals do not show it. This range detects the error.
 const CELL_J_PER_K_WH: (f64, f64) = (2.5, 12.5);
 
-/// Fits both values; `energy_wh` = energy that the cell stores.
+/// Fits heat capacity and thermal resistance. `energy_wh` is the energy that the cell stores.
 ///
 /// # Errors
-/// No discharge warms the cell enough, or the result is not credible for a cell.
+/// No discharge warms the cell enough, or no cell has the resulting values.
 pub fn fit(records: &[Record], tables: &ParameterTables, energy_wh: f64) -> Result<Thermal, String> {
     let thermal = medians(records, tables).ok_or("no thermal parameters: no file warms enough to determine them")?;
     let found_j_per_k = thermal.heat_capacity_j_per_k;
@@ -44,12 +45,12 @@ fn medians(records: &[Record], tables: &ParameterTables) -> Option<Thermal> {
     })
 }
 
-/// T - T0 = heat / C + (-above) / (R C): normal equations of two unknowns.
+/// Solves the normal equations of T - T0 = heat / C + (-above) / (R C) for two unknowns.
 fn of_record(record: &Record, tables: &ParameterTables) -> Option<Thermal> {
     let (mut hh, mut ha, mut aa, mut ht, mut at) = (0.0, 0.0, 0.0, 0.0, 0.0);
     let start_c = record.rows[0].temperature_c;
     let (mut heat, mut above) = (0.0, 0.0);
-    // After charge moved without rows, the heat it produced is unknown.
+    // If charge moved during a gap without rows, the heat that it produced is unknown.
     for row in record.rows.iter().skip(1).take_while(|row| !row.relaxed) {
         let rise = row.temperature_c - start_c;
         heat += row.mean_current_a * (row.ocv.at(&tables.ocv_v) - row.voltage_v) * row.dt_s;
@@ -95,7 +96,7 @@ mod tests {
             let soc: Vec<f64> = time_s.iter().map(|t| 1.0 - t / 3600.0).collect();
             let warm = |t: f64| 25.0 + 4.0 + (start_c - 29.0) * libm::exp(-t / 400.0);
             let temperature_c: Vec<f64> = time_s.iter().map(|&t| warm(t)).collect();
-            // 0.4 W through 10 K/W with 40 J/K.
+            // 0.4 W, 10 K/W and 40 J/K.
             let (current_a, voltage_v) = (vec![2.0; 3000], vec![3.4; 3000]);
             let raw = MeasuredPart { time_s, current_a, voltage_v, temperature_c, soc, ..MeasuredPart::default() };
             Record::prepare(&raw, &[], &grid, &limits)

@@ -1,11 +1,12 @@
-//! Fits tables to records whose SOC is unknown: ordinary drives and charges that start anywhere.
+//! Fits tables to records whose SOC is unknown: ordinary drives and charges that start at any SOC.
 //!
-//! Input: records with the charge taken out since their first row, priors of the open-circuit curve (V, V^2) and of the
-//! resistances, the label's capacity (Ah). Output: tables, capacity, and the SOC at which each record starts.
+//! Input: records with the charge taken out since their first row, priors of the open-circuit curve (V, V^2) and of the resistances,
+//! and the capacity on the label (Ah). Output: tables, capacity, and the SOC at which each record starts.
 //!
-//! SOC = s_k - (q - o t) / C. The SOC s_k at the start of record k, ln C and the offset o of the current sensor (A) are parameters
-//! besides the tables. All are estimated together (maximum a posteriori, Gauss-Newton in [`super::solve`]). Values that
-//! the records do not show stay at the prior. Every pass positions the rows in the tables again.
+//! `SOC = s_k - (q - o t) / C`. Here q is the charge taken out and t the time since the first row. The SOC s_k at the start of record
+//! k, ln C, and the offset o of the current sensor (A) are parameters in addition to the tables. All parameters are estimated together
+//! (maximum a posteriori, Gauss-Newton in [`super::solve`]). If the records contain no information on a value, it stays at the prior.
+//! The positions of the rows in the tables depend on the SOC, so every pass computes them again.
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
@@ -20,10 +21,10 @@ use super::solve::{Solution, Space, minimise};
 
 /// Smallest and largest SOC at the start of a record.
 const BEGINNING: (f64, f64) = (-0.05, 1.05);
-/// Largest factor between the fitted capacity and the label's.
+/// Largest factor between the fitted capacity and the capacity on the label, in either direction.
 const CAPACITY_FACTOR: f64 = 1.6;
 
-/// Largest offset of the current, in standard deviations.
+/// Largest offset of the current, in standard deviations of its prior.
 const MOST_OFFSETS: f64 = 4.0;
 
 /// Standard deviation of the SOC at the end of a full charge.
@@ -34,28 +35,29 @@ const FULL_STD: f64 = 0.01;
 pub struct Known {
     /// Means of the tables' parameters, in node order.
     pub tables: ParameterTables,
-    /// Covariance of the open-circuit voltage between SOC breakpoints, V^2, for the temperature row `curve_row`.
+    /// Covariance of the open-circuit voltage between SOC breakpoints, V^2, at the temperature row `curve_row`.
     pub curve_covariance: DMatrix<f64>,
-    /// Temperature row of the covariance.
+    /// Temperature row to which the covariance belongs.
     pub curve_row: usize,
     /// Capacity, Ah.
     pub capacity_ah: f64,
-    /// Its standard deviation, fraction.
+    /// Standard deviation of the capacity, fraction.
     pub capacity_std: f64,
     /// Standard deviation of the current sensor's offset, A.
     pub offset_std_a: f64,
 }
 
-/// A record with the charge of its rows.
+/// A record, and the charge of its rows.
 #[derive(Debug, Clone)]
 pub struct UnanchoredRecord {
-    /// Rows; their `soc` is minus the charge taken out since the first row, Ah.
+    /// Rows. Their `soc` is minus the charge taken out since the first row, Ah.
     pub record: Record,
-    /// Weight of a second.
+    /// Weight of each second.
     pub scale: f64,
     /// Estimated SOC at the first row, with its standard deviation.
     pub beginning: (f64, f64),
-    /// Charge taken out, Ah, and time since the first row, h, at which a charge ended with a full cell (SOC 1).
+    /// Charge taken out, Ah, and time since the first row, h, at the end of a full charge (SOC 1); `None` = the record has no full
+    /// charge.
     pub full: Option<(f64, f64)>,
 }
 
@@ -66,9 +68,9 @@ pub struct UnanchoredFit {
     pub fitted: FittedTables,
     /// Capacity, Ah.
     pub capacity_ah: f64,
-    /// Its standard deviation, Ah.
+    /// Standard deviation of the capacity, Ah.
     pub capacity_std_ah: f64,
-    /// Offset of the current sensor, A: measured less true.
+    /// Offset of the current sensor, A: measured minus true current.
     pub offset_a: f64,
     /// Remaining standard deviation of the open-circuit voltage, V, in node order.
     pub ocv_std_v: Vec<f64>,
@@ -76,7 +78,7 @@ pub struct UnanchoredFit {
     pub records: Vec<Record>,
 }
 
-/// Whitened prior of the curve: residual = row . (ocv - mean).
+/// Prior of the curve, scaled to unit variance: residual = row . (ocv - mean).
 struct CurvePriorRows {
     first: usize,
     whitening: DMatrix<f64>,
@@ -105,7 +107,7 @@ impl CurvePriorRows {
     }
 }
 
-/// All unknowns in one vector, the tables first, and the cost of their values.
+/// All unknowns in one vector, with the tables first.
 struct Problem<'a> {
     settings: &'a FitSettings,
     known: &'a Known,
@@ -160,13 +162,13 @@ impl<'a> Problem<'a> {
         self.layout.len() + 2 + k
     }
 
-    /// Record `k` with its SOC.
+    /// Returns record `k` with the SOC of its rows.
     fn placed(&self, theta: &[f64], k: usize) -> Record {
         let of_all = [theta[self.log_capacity()], theta[self.offset()]];
         place(&self.records[k].record, self.settings, theta[self.beginning(k)], of_all)
     }
 
-    /// Cost and derivatives.
+    /// Returns cost and derivatives.
     fn evaluate(&self, theta: &[f64]) -> NormalEquations {
         let tables = ParameterTables::new(&self.layout, theta);
         let of_record = |k: usize| {
@@ -183,7 +185,7 @@ impl<'a> Problem<'a> {
             accumulate(&self.placed(theta, k), scale, &self.layout, &tables, Some(&free), &mut normal);
             normal
         };
-        // Added in the order of the records, so that the sum does not depend on the threads.
+        // The sums are added in the order of the records, so the result does not depend on the threads.
         let sums: Vec<NormalEquations> = (0..self.records.len()).into_par_iter().map(of_record).collect();
         let mut normal = NormalEquations::new(theta.len());
         sums.iter().for_each(|sum| normal.add_all(sum));
@@ -193,7 +195,7 @@ impl<'a> Problem<'a> {
         normal
     }
 
-    /// Converts a solution; `std` returns the standard deviation of an unknown: a table's open-circuit voltage or ln(capacity).
+    /// Converts a solution. `std` returns the standard deviation of an unknown by its index (open-circuit voltage or ln(capacity)).
     fn outcome(&self, solution: &Solution, std: impl Fn(usize) -> f64) -> UnanchoredFit {
         let theta = &solution.theta;
         let tables = ParameterTables::new(&self.layout, theta);
@@ -217,7 +219,7 @@ impl<'a> Problem<'a> {
         }
     }
 
-    /// Adds the priors of the capacity, of the offset, and of the SOC at the records' starts and full charges.
+    /// Adds the priors of the capacity, of the current offset, and of the SOC at the start and at the full charge of each record.
     fn add_capacity_and_beginnings(&self, theta: &[f64], normal: &mut NormalEquations) {
         let (log_capacity, offset) = (self.log_capacity(), self.offset());
         let mut near = |at: usize, mean: f64, std: f64| {
@@ -244,7 +246,7 @@ impl<'a> Problem<'a> {
 /// Fits tables, capacity, offset and the SOC at the records' starts; `progress` receives the pass number and the cost.
 ///
 /// # Errors
-/// There are too few rows, or numbers that are not finite.
+/// There are too few rows, or values are not finite.
 pub fn fit(
     settings: &FitSettings,
     known: &Known,
@@ -293,7 +295,7 @@ fn place(record: &Record, settings: &FitSettings, beginning_soc: f64, [log_capac
         let place = grid.place(row.soc, row.temperature_c);
         (row.ocv, row.resistance, row.tau) =
             (grid.ocv_corners(&place), grid.resistance_corners(&place), grid.tau_corners(&place));
-        // A driven cell warms up. Beyond the nodes its resistances follow Arrhenius' law, as between them.
+        // A cell warms up during a drive. Its resistances follow Arrhenius' law outside the nodes as well as between them.
         let inside_c = row.temperature_c.clamp(coldest_c, warmest_c);
         let factor = arrhenius(row.temperature_c) / arrhenius(inside_c);
         row.resistance.weight.iter_mut().for_each(|weight| *weight *= factor);

@@ -1,9 +1,9 @@
 //! Converts a BPX file (Battery Parameter eXchange, JSON) to a cell model.
 //!
-//! Input: the text of a file of version 0.x or 1.x with the model SPM, SPMe or DFN. Output: the TOML of a cell model. Its open-circuit
-//! curve is the difference of the electrodes' potentials (`curve.rs`), its resistances are derived from the physical parameters
-//! (`circuit.rs`), and `[provenance]` states each derivation. On bad input, every fault is reported with its path in the JSON, what was
-//! found and what is allowed.
+//! Input: the text of a BPX file of version 0.x or 1.x with the model SPM, SPMe or DFN. Output: the TOML of a cell model. The
+//! open-circuit curve is the difference of the electrodes' potentials (`curve.rs`). The resistances are derived from the physical
+//! parameters (`circuit.rs`). `[provenance]` states each derivation. If the input is wrong, every fault is reported with its path in
+//! the JSON, what was found and what is allowed.
 //!
 //! Source: BPX standard, Faraday Institution (https://bpxstandard.com).
 
@@ -32,13 +32,14 @@ const GAS_J_PER_MOL_K: f64 = 8.314_462_618;
 /// Temperatures of the tables relative to the file's reference temperature, K.
 const TEMPERATURES_K: [f64; 6] = [-35.0, -25.0, -15.0, 0.0, 15.0, 30.0];
 
-/// Standard deviation of the voltage error at rest and reference temperature, V: a cell differs from its parameters.
+/// Standard deviation of the voltage error at rest and at the reference temperature, V. It covers the difference between a real cell
+/// and its parameters.
 const ERROR_AT_REST_V: f64 = 0.010;
 
-/// Share of the voltage drop at a one-hour current that counts as error: the closed forms hold for small currents.
+/// Share of the voltage drop at a one-hour current that is added to the error, because the formulas hold for small currents.
 const ERROR_OF_DROP: f64 = 0.3;
 
-/// What to convert.
+/// Settings of a conversion.
 #[derive(Debug, Clone, Default)]
 pub struct BpxSettings {
     /// Name of the file, for messages and provenance.
@@ -72,7 +73,8 @@ struct Model {
 /// Converts the text of a BPX file.
 ///
 /// # Errors
-/// Not valid JSON, or not a BPX file that can be converted: one line per fault with path, what was found and what is allowed.
+/// The text is not valid JSON, or not a BPX file that can be converted. Each fault has one line with path, what was found and what is
+/// allowed.
 pub fn import(text: &str, settings: &BpxSettings) -> Result<BpxImport, LabError> {
     let source = &settings.source;
     let text = text.strip_prefix('\u{feff}').unwrap_or(text);
@@ -117,13 +119,13 @@ impl Model {
         Ok(Self { temperature_c, curve: table, resistances, voltage_error_v })
     }
 
-    /// Number of branches of a node, 2 without electrolyte, 3 with it.
+    /// Returns the number of branches of a node: 2 without electrolyte, 3 with it.
     fn branch_count(&self) -> usize {
         self.resistances.first().and_then(|row| row.first()).map_or(0, |of| of.branches.len().min(MAX_BRANCHES))
     }
 }
 
-/// Notes on the conversion for the user.
+/// Returns notes on the conversion for the user.
 fn notes(cell: &BpxCell, curve: &Curve<'_>, model: &Model) -> Vec<String> {
     let mut notes = cell.notes.clone();
     let electrodes = [&cell.negative, &cell.positive];

@@ -1,8 +1,9 @@
-//! Writes the likely battery signals of a DBC as the `[input]` part of a configuration, judged only by name, unit and range.
+//! Finds the signals of a DBC that are probably battery signals, and writes them as the `[input]` part of a configuration. Only name,
+//! unit and range are considered.
 //!
-//! Input: a parsed DBC and its name. Output: TOML with the best candidate for each input and the next ones as comments. The values in a
-//! log are judged by `packwatch discover` and the owner. The sign of the current is therefore left open, and the part is not a valid
-//! configuration until it is completed.
+//! Input: a parsed DBC and its name. Output: TOML with the best candidate for each input; the next candidates are comments. `packwatch
+//! discover` can check the values in a log, and the owner must confirm the result. A DBC does not show the sign of the current, so the
+//! sign is left open. The part is not a valid configuration until it is completed.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -14,13 +15,13 @@ use crate::error::LabError;
 use crate::fit::quoted;
 use crate::wiring::evidence::{PackQuantity, SignalLabel};
 
-/// A candidate: points and name.
+/// A candidate: points, and name of the signal.
 type Ranked = (f64, String);
 
-/// Writes the part.
+/// Writes the `[input]` part.
 ///
 /// # Errors
-/// No signal looks like a current or a voltage of a battery.
+/// No signal looks like the current or a voltage of a battery.
 pub fn import(database: &Database, file: &str) -> Result<String, LabError> {
     let mut candidates: BTreeMap<PackQuantity, Vec<Ranked>> = BTreeMap::new();
     for message in &database.messages {
@@ -43,33 +44,33 @@ pub fn import(database: &Database, file: &str) -> Result<String, LabError> {
     Ok(text(file, &candidates))
 }
 
-/// The quantities that a signal may carry, with points.
+/// Returns the quantities that a signal may carry, with points.
 fn judge(message: &Message, signal: &Signal) -> Vec<(PackQuantity, f64)> {
     let label = SignalLabel::new(&message.name, &signal.name, &signal.unit);
     let largest = largest(signal) * SignalUnit::parse(&signal.unit).map_or(1.0, |unit| unit.factor);
     let points = |quantity| {
         let points = label.score(quantity)?.points;
         let (fits, points) = match quantity {
-            // A larger value is a sum of cells.
+            // A larger value is the sum of several cells.
             PackQuantity::CellVoltage if label.says_extreme() => (largest <= 10.0, points - 1.0),
             PackQuantity::CellVoltage => (largest <= 10.0, points),
             PackQuantity::PackVoltage => (largest > 60.0 && !label.says_cell(), points),
             PackQuantity::Current | PackQuantity::Temperature | PackQuantity::Soc | PackQuantity::Soh => (true, points),
         };
-        // Three points: a unit, and a name that contains the quantity or the battery.
+        // Three points are given for example for a unit, and a name that contains the quantity or the battery.
         (fits && points >= 3.0 && signal.layout.length_bits >= 4).then_some((quantity, points))
     };
     PackQuantity::ALL.into_iter().filter_map(points).collect()
 }
 
-/// Largest value: as stated, or else by the number of bits.
+/// Returns the largest value: as stated in the DBC, or else as limited by the number of bits.
 fn largest(signal: &Signal) -> f64 {
     let layout = &signal.layout;
     let top = 2_f64.powi(i32::from(layout.length_bits)) * layout.factor.abs() + layout.offset;
     if layout.has_range() { layout.maximum.min(top) } else { top }
 }
 
-/// Joins signals whose names differ in a number to one pattern, placed before single signals.
+/// Joins signals whose names differ only in a number to one pattern. Patterns come before single signals.
 fn with_patterns(cells: Vec<Ranked>) -> Vec<Ranked> {
     let names: Vec<(String, &str)> = cells.iter().map(|(_, name)| (String::new(), name.as_str())).collect();
     let found = groups(&names);
@@ -77,7 +78,7 @@ fn with_patterns(cells: Vec<Ranked>) -> Vec<Ranked> {
     let mut grouped = std::collections::BTreeSet::new();
     for group in found.iter().filter(|group| group.members.len() >= 3) {
         let first = group.members[0].1;
-        // Many similar signals are probably cells.
+        // A group of many similar signals probably contains cells.
         ranked.push((cells[first].0 + 4.0, group.pattern.clone()));
         grouped.extend(group.members.iter().map(|member| member.1));
     }
@@ -98,7 +99,7 @@ fn text(file: &str, candidates: &BTreeMap<PackQuantity, Vec<Ranked>>) -> String 
         .get(&PackQuantity::CellVoltage)
         .is_some_and(|found| found.iter().any(|(_, name)| name.contains("{n}")));
     for (kind, ranked) in candidates {
-        // Only one of the two voltages may be active.
+        // Only one of cell voltage and pack voltage may be active.
         let is_active = match kind {
             PackQuantity::CellVoltage => has_cells,
             PackQuantity::PackVoltage => !has_cells,

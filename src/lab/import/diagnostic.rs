@@ -1,6 +1,6 @@
-//! `[[input.diagnostic]]` as TOML: one answer with its signals, one signal per line.
+//! Writes `[[input.diagnostic]]` tables as TOML: one answer with its signals, one signal per line.
 //!
-//! Numbers are written with the shortest decimals that read back as equal. Values have the unit that the signal states.
+//! Numbers are written with the fewest digits from which the same number is read. Values have the unit that the signal states.
 
 use std::fmt;
 
@@ -13,21 +13,21 @@ pub(crate) struct DiagnosticTable {
     pub(crate) name: String,
     /// Identifier of requests.
     pub(crate) request: CanId,
-    /// Identifier of answers.
+    /// Identifier of the answers.
     pub(crate) response: CanId,
-    /// First data byte of requests and of answers, if addressing is extended.
+    /// First data byte of requests and of answers; `None` = addressing is not extended.
     pub(crate) extension: Option<(u8, u8)>,
-    /// 0x01, 0x21 or 0x22.
+    /// Service: 0x01, 0x21 or 0x22.
     pub(crate) service: u8,
-    /// 2 bytes for 0x22, otherwise 1.
+    /// Identifier of the values: 2 bytes for service 0x22, otherwise 1 byte.
     pub(crate) identifier: u16,
     /// Comment lines inside the table, without `#`.
     pub(crate) remarks: Vec<String>,
-    /// In the order of their bits.
+    /// Signals in the order of their bits.
     pub(crate) signals: Vec<DiagnosticSignal>,
 }
 
-/// One signal, or a numbered series of equal ones.
+/// One signal, or a numbered series of signals with equal properties.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct DiagnosticSignal {
     /// Name, with `{n}` if `numbers` is given.
@@ -36,11 +36,11 @@ pub(crate) struct DiagnosticSignal {
     pub(crate) bit: u32,
     /// Number of bits, 1 to 64.
     pub(crate) length: u32,
-    /// Two's complement.
+    /// Whether the value is in two's complement.
     pub(crate) signed: bool,
-    /// Least significant byte first.
+    /// Whether the least significant byte is first.
     pub(crate) little_endian: bool,
-    /// Units per code.
+    /// Units of the value per code.
     pub(crate) factor: f64,
     /// Value of code 0.
     pub(crate) offset: f64,
@@ -61,43 +61,43 @@ pub(crate) struct NumberRange {
     pub(crate) first: u32,
     /// Last number.
     pub(crate) last: u32,
-    /// Bits from one signal to the next.
+    /// Number of bits from the start of one signal to the start of the next.
     pub(crate) step: u32,
 }
 
 impl DiagnosticTable {
-    /// Number of signals, including each signal of a series.
+    /// Returns the number of signals; each signal of a series counts.
     pub(crate) fn signal_count(&self) -> usize {
         self.signals.iter().map(|signal| signal.count() as usize).sum()
     }
 }
 
 impl DiagnosticSignal {
-    /// Number of signals of the series; 1 without a series.
+    /// Returns the number of signals of the series; 1 without a series.
     pub(crate) fn count(&self) -> u32 {
         self.numbers.map_or(1, |numbers| numbers.last - numbers.first + 1)
     }
 
-    /// First and last bit of each signal of the series.
+    /// Returns the first and last bit of each signal of the series.
     pub(crate) fn spans(&self) -> impl Iterator<Item = (u32, u32)> {
         let step = self.numbers.map_or(0, |numbers| numbers.step);
         (0..self.count()).map(move |n| (self.bit + n * step, self.bit + n * step + self.length - 1))
     }
 
-    /// A signal of the series, counted from 0.
+    /// Returns one signal of the series; `index` counts from 0.
     pub(crate) fn of_series(&self, index: u32) -> Self {
         let Some(NumberRange { first, step, .. }) = self.numbers else { return self.clone() };
         let name = self.name.replace("{n}", &(first + index).to_string());
         Self { name, bit: self.bit + index * step, numbers: None, ..self.clone() }
     }
 
-    /// The same bits in two's complement, without a range.
+    /// Returns the same bits read in two's complement, without a range.
     pub(crate) fn as_signed(&self) -> Self {
         Self { signed: true, range: None, ..self.clone() }
     }
 
-    /// Value in the data after the echoed service and identifier; `None` = the data are too short, or the value is not available or out of
-    /// range.
+    /// Returns the value in the data after the echoed service and identifier; `None` = the data are too short, or the value is not
+    /// available or out of range.
     pub(crate) fn value(&self, data: &[u8]) -> Option<f64> {
         let (first, last) = (self.bit / 8, (self.bit + self.length - 1) / 8);
         let bytes = data.get(usize::try_from(first).ok()?..=usize::try_from(last).ok()?)?;
@@ -108,7 +108,7 @@ impl DiagnosticSignal {
         let unused = 64 - self.length;
         let number = if self.signed { ((code << unused).cast_signed() >> unused) as f64 } else { code as f64 };
         let value = number * self.factor + self.offset;
-        // Half a code of tolerance, because limits are rounded decimals.
+        // Half a code of tolerance, because the limits are rounded decimals.
         let room = self.factor.abs() / 2.0;
         let is_inside = self.range.is_none_or(|(low, high)| value >= low - room && value <= high + room);
         (is_inside && !self.not_available.contains(&code)).then_some(value)

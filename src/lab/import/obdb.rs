@@ -1,10 +1,10 @@
 //! Converts an OBDb signal set (one JSON file per car model) to `[[input.diagnostic]]` tables.
 //!
-//! Input: the text of the JSON, a model year, a name. Output: TOML with one table per command, in the order of controllers, and one
-//! signal per line. The licence of the source, CC BY-SA 4.0, also applies to the TOML, which states it.
+//! Input: the text of the JSON, a model year, and a name. Output: TOML with one table per command and one signal per line. The tables
+//! are in the order of the controllers. The licence of the source, CC BY-SA 4.0, also applies to the TOML; the TOML states it.
 //!
-//! Signals are named `NAME.REST`. REST is the `id` without the word with which all ids of the file start; NAME is that word or
-//! the given name. A file that is not such JSON is an error. A command or signal that cannot be converted becomes an
+//! Signals are named `NAME.REST`. All ids of a file start with the same word. REST is the `id` without this word; NAME is this word or
+//! the given name. A file that is not an OBDb signal set is an error. A command or signal that cannot be converted becomes an
 //! [`Exclusion`], and the rest is converted. An unknown field is a warning.
 
 mod address;
@@ -23,10 +23,10 @@ use crate::error::LabError;
 use address::Addresses;
 use document::{CommandDocument, SignalDocument, SignalSetDocument};
 
-/// What to convert.
+/// Settings of a conversion.
 #[derive(Debug, Clone, Default)]
 pub struct ObdbSettings {
-    /// Name of the file, for messages and the head.
+    /// Name of the file, for messages and the first comment.
     pub source: String,
     /// Model year; commands of other years are left out. `None` = all commands are converted.
     pub year: Option<i64>,
@@ -37,7 +37,7 @@ pub struct ObdbSettings {
 /// Converts the text of a signal set.
 ///
 /// # Errors
-/// The text is not such JSON, or nothing in it can be converted; the error has place, found and allowed.
+/// The text is not an OBDb signal set, or nothing in it can be converted. The error states place, what was found and what is allowed.
 pub fn import(text: &str, settings: &ObdbSettings) -> Result<ImportResult, LabError> {
     let (document, converter) = convert(text, settings)?;
     let Converter { tables, exclusions, warnings, .. } = converter;
@@ -51,7 +51,7 @@ pub fn import(text: &str, settings: &ObdbSettings) -> Result<ImportResult, LabEr
     Ok(result)
 }
 
-/// Only the tables.
+/// Returns only the tables.
 pub(crate) fn tables(text: &str, settings: &ObdbSettings) -> Result<Vec<DiagnosticTable>, LabError> {
     Ok(convert(text, settings)?.1.tables)
 }
@@ -86,12 +86,12 @@ fn is_name(text: &str) -> bool {
     !text.is_empty() && text.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
 }
 
-/// The tables so far, and the exclusions.
+/// The tables and exclusions of the conversion so far.
 #[derive(Debug, Default)]
 struct Converter {
     year: Option<i64>,
     tables: Vec<DiagnosticTable>,
-    /// Place that defined each signal id and each request.
+    /// For each signal id and each request, the place that defined it first.
     known: HashMap<String, String>,
     exclusions: Vec<Exclusion>,
     warnings: Vec<String>,
@@ -149,7 +149,7 @@ impl Converter {
         Ok(())
     }
 
-    /// Signals of one command in the order of their bits, without overlaps.
+    /// Returns the signals of one command in the order of their bits, without overlaps.
     fn signals(&mut self, place: &str, values: &[Value]) -> Vec<DiagnosticSignal> {
         let mut signals: Vec<DiagnosticSignal> = Vec::new();
         for (index, value) in values.iter().enumerate() {

@@ -1,7 +1,7 @@
 //! The columns of the exported tables: name, type, unit, meaning and value.
 //!
-//! The writers, the schema of the Parquet files and the page `docs/src/reference/export.md` come from these lines. An unknown value is
-//! null (an empty field in CSV), never NaN. Cells count from 0, current is positive for discharge.
+//! These lines define the writers, the schema of the Parquet files and the page `docs/src/reference/export.md`. An unknown value is
+//! null (an empty field in CSV), never NaN. Cells count from 0; a positive current discharges.
 
 use std::borrow::Cow;
 use std::fmt::Write as _;
@@ -19,7 +19,7 @@ use crate::quantity::catalogue::{Part, Quantity, RECORDED};
 /// Type of a column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ColumnType {
-    /// A time: microseconds since 1970, UTC; in CSV like 2008-04-02T13:08:17.921000Z.
+    /// A time: microseconds since 1970, UTC; in CSV written as 2008-04-02T13:08:17.921000Z.
     Time,
     /// A number.
     Real,
@@ -27,12 +27,12 @@ pub(super) enum ColumnType {
     Whole,
     /// Yes or no.
     Flag,
-    /// One of a few words, or a name.
+    /// A word from a fixed list, or a name.
     Word,
 }
 
 impl ColumnType {
-    /// Physical and logical type in a Parquet schema.
+    /// Returns the physical and the logical type in a Parquet schema.
     pub(super) const fn parquet(self) -> (&'static str, &'static str) {
         match self {
             Self::Time => ("INT64", " (TIMESTAMP(MICROS,true))"),
@@ -54,7 +54,7 @@ impl ColumnType {
     }
 }
 
-/// A value; `None` inside = unknown.
+/// A value of a column; a `None` in a variant means unknown.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum FieldValue<'r> {
     Time(Timestamp),
@@ -69,7 +69,7 @@ pub(super) struct Column<R> {
     pub(super) name: &'static str,
     pub(super) unit: &'static str,
     pub(super) kind: ColumnType,
-    /// Whether it may be null.
+    /// Whether the value may be null.
     pub(super) optional: bool,
     pub(super) about: &'static str,
     source: ColumnSource<R>,
@@ -78,12 +78,12 @@ pub(super) struct Column<R> {
 /// Source of a column's value.
 enum ColumnSource<R> {
     Value(for<'r> fn(&'r R) -> FieldValue<'r>),
-    /// The number in an event that has the column's name.
+    /// A number in the event, found by the name of the column.
     Field(fn(&R) -> &Fields),
 }
 
 impl<R> Column<R> {
-    /// Value of the column in a row.
+    /// Returns the value of the column in a row.
     pub(super) fn value<'r>(&self, row: &'r R) -> FieldValue<'r> {
         match self.source {
             ColumnSource::Value(value) => value(row),
@@ -92,7 +92,7 @@ impl<R> Column<R> {
     }
 }
 
-/// Columns: name, kind, unit, `null` if the value is optional, meaning, value.
+/// Defines columns. Each line states name, kind, unit, `null` if the value is optional, meaning and value.
 macro_rules! columns {
     ($row:ty; $( $name:literal $kind:ident $unit:literal $($null:ident)?, $about:literal, $get:expr; )+) => {
         [$( Column::<$row> {
@@ -131,7 +131,7 @@ pub(super) const ESTIMATES: &[Column<EstimateRow>] = &columns! { EstimateRow;
     "temperature_c" Real "degrees C" null, "temperature used", |row| real(row.estimate.measured.temperature_c);
 };
 
-/// Columns of `half_cycles`: the half-cycle, the recorded quantities after it, the cell's losses, its remaining life.
+/// Columns of `half_cycles`: the half-cycle, the recorded quantities after it, the losses of the cell, and its remaining life.
 pub(super) static HALF_CYCLES: LazyLock<Vec<Column<HalfCycleRow>>> = LazyLock::new(|| {
     let half_cycle = columns! { HalfCycleRow;
         "log" Word "", "name of the log and of its folder", |row| text(&row.log);
@@ -166,7 +166,7 @@ pub(super) static HALF_CYCLES: LazyLock<Vec<Column<HalfCycleRow>>> = LazyLock::n
     half_cycle.into_iter().chain(RECORDED.into_iter().flat_map(recorded)).chain(forecast).collect()
 });
 
-/// The columns of a recorded quantity.
+/// Returns the columns of a recorded quantity.
 fn recorded(quantity: Quantity) -> impl Iterator<Item = Column<HalfCycleRow>> {
     let row = quantity.row();
     let about = row.cell.map_or("", |it| it.about);
@@ -256,7 +256,7 @@ fn days(row: &HalfCycleRow, get: fn(Remaining) -> f64) -> FieldValue<'_> {
     maybe(row.remaining.and_then(|life| life.days).map(get))
 }
 
-/// The reference page of the columns, as Markdown.
+/// Returns the reference page of the columns as Markdown.
 pub fn reference() -> String {
     let mut page = String::from(
         "# Exported tables\n\nWritten by `packwatch export --columns-page`; the exported files use the same definition. An unknown value is null \

@@ -1,8 +1,10 @@
-//! Merges the vehicles' tables of several runs: one Parquet file per table, the vehicles by name, each in its own row groups.
+//! Merges the tables of vehicles from several runs into one Parquet file per table. Vehicles are sorted by name; each has its own row
+//! groups.
 //!
 //! Input: folders written by [`run`](crate::fleet::vehicles::run). Output: `vehicles.parquet` with a row for each vehicle, including
-//! those that failed, `half_cycles.parquet`, `alarms.parquet` and, if they were exported, `estimates.parquet`. The bytes do not depend
-//! on how the vehicles were split and in which order they were replayed. Column chunks are copied, so memory does not grow with the rows.
+//! vehicles that failed; `half_cycles.parquet`; `alarms.parquet`; and, if estimates were exported, `estimates.parquet`. The bytes do
+//! not depend on how the vehicles were distributed or in which order they were replayed. Column chunks are copied, so memory does not
+//! grow with the number of rows.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -16,25 +18,25 @@ use crate::fleet::vehicle::{RECORD, Vehicle, VehicleRecord};
 /// Summary of a merge.
 #[derive(Debug, Clone, Default, PartialEq, Eq, serde::Serialize)]
 pub struct MergeSummary {
-    /// Number of vehicles, including those that failed.
+    /// Number of vehicles, including failed vehicles.
     pub vehicles: usize,
-    /// Vehicles without tables, with the reasons.
+    /// Name of each vehicle without tables, with the reason.
     pub failed: BTreeMap<String, String>,
-    /// Rows of each table.
+    /// Number of rows of each table.
     pub rows: BTreeMap<String, u64>,
 }
 
-/// A replayed vehicle and the folder of its tables.
+/// A replayed vehicle, and the folder of its tables.
 struct VehicleFolder {
     folder: PathBuf,
     record: VehicleRecord,
 }
 
-/// Merges the vehicles in `folders` into `out`. `wanted`: the expected vehicles; others are an error.
+/// Merges the vehicles in `folders` into `out`. `wanted` lists the expected vehicles; any other vehicle is an error.
 ///
 /// # Errors
-/// A vehicle is missing, is found twice with different contents, or was replayed by another version or with another estimate period; a
-/// table cannot be read or written.
+/// A vehicle is missing, is found twice with different contents, was replayed by another version, or was replayed with another period
+/// of estimates; or a table cannot be read or written.
 pub fn merge(folders: &[PathBuf], wanted: Option<&[Vehicle]>, out: &Path) -> Result<MergeSummary, LabError> {
     let vehicles = read_all(folders)?;
     check(&vehicles, wanted)?;
@@ -65,7 +67,7 @@ pub fn merge(folders: &[PathBuf], wanted: Option<&[Vehicle]>, out: &Path) -> Res
     Ok(summary)
 }
 
-/// The vehicles of all folders by name.
+/// Returns the vehicles of all folders by name.
 fn read_all(folders: &[PathBuf]) -> Result<BTreeMap<String, VehicleFolder>, LabError> {
     let mut vehicles: BTreeMap<String, VehicleFolder> = BTreeMap::new();
     for folder in folders {
@@ -136,7 +138,7 @@ fn check(vehicles: &BTreeMap<String, VehicleFolder>, wanted: Option<&[Vehicle]>)
     Ok(())
 }
 
-/// The first few names.
+/// Formats the first few names.
 fn first_names(names: &[&str]) -> String {
     let shown: usize = 8;
     let more = if names.len() > shown { ", ..." } else { "" };

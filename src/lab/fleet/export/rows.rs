@@ -26,9 +26,9 @@ pub(super) struct HalfCycleRow {
     pub(super) half: Fields,
     /// Values of the event `Capacity`.
     pub(super) capacity: Fields,
-    /// `None` = unknown.
+    /// Losses of the cell; `None` = unknown.
     pub(super) losses: Option<LossModes>,
-    /// `None` = not enough data.
+    /// Remaining life of the cell; `None` = there are not enough data.
     pub(super) remaining: Option<RemainingLife>,
 }
 

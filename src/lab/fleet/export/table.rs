@@ -1,7 +1,7 @@
 //! Writes a table of rows as a Parquet or CSV file.
 //!
-//! Input: rows and the metadata of the file. Memory holds the rows of one row group. The file gets its name once it is complete
-//! ([`ResultFile`]). A missing value, or one of another type than its column, is an error and never written.
+//! Input: rows, and the metadata of the file. Memory holds the rows of one row group. The file gets its final name when it is complete
+//! ([`ResultFile`]). A missing value, or a value whose type is not that of the column, causes an error and is never written.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -21,10 +21,10 @@ use crate::error::LabError;
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
 
-/// Rows of a row group: about 10 MB of estimates in memory, and large enough for an engine to skip row groups.
+/// Number of rows of a row group. Estimates then need about 10 MB of memory, and readers can skip row groups.
 const GROUP_ROWS: usize = 65_536;
 
-/// A table of rows `R` being written.
+/// A table of rows `R` that is being written.
 pub(super) struct TableFile<R: 'static> {
     path: PathBuf,
     columns: &'static [Column<R>],
@@ -37,7 +37,7 @@ enum TableWriter {
     Parquet { out: Box<SerializedFileWriter<ResultFile>>, group: Vec<ColumnBuffer>, rows: usize },
 }
 
-/// Values of one column in the current row group, and which rows have one.
+/// Values of one column in the present row group, and which rows have a value.
 struct ColumnBuffer {
     present: Vec<i16>,
     list: ColumnValues,
@@ -52,10 +52,10 @@ enum ColumnValues {
 }
 
 impl<R> TableFile<R> {
-    /// Begins a file.
+    /// Starts a file.
     ///
     /// # Errors
-    /// The file cannot be created; the message names it.
+    /// The file cannot be created. The message names it.
     pub(super) fn create(path: &Path, format: TableFormat, columns: &'static [Column<R>]) -> Result<Self, LabError> {
         let file = ResultFile::create(path)?;
         let writer = match format {
@@ -82,7 +82,7 @@ impl<R> TableFile<R> {
     /// Writes a row.
     ///
     /// # Errors
-    /// The row cannot be written, or a value does not have its column's type.
+    /// The row cannot be written, or the type of a value is not that of its column.
     pub(super) fn push(&mut self, row: &R) -> Result<(), LabError> {
         self.rows += 1;
         match &mut self.writer {
@@ -108,7 +108,7 @@ impl<R> TableFile<R> {
         }
     }
 
-    /// Completes the file; returns the number of rows.
+    /// Completes the file. Returns the number of rows.
     ///
     /// # Errors
     /// The file cannot be written.
@@ -135,7 +135,7 @@ impl<R> TableFile<R> {
     }
 }
 
-/// Copies the row groups of Parquet files with these columns into one file, in order; returns the number of rows.
+/// Copies the row groups of Parquet files with these columns into one file, in order. Returns the number of rows.
 ///
 /// # Errors
 /// A file cannot be read or written, or has other columns.
@@ -186,7 +186,7 @@ fn append_group(
     copy.close().map(drop)
 }
 
-/// The schema in Parquet's own syntax.
+/// Returns the schema in the syntax of Parquet.
 fn schema<R>(columns: &[Column<R>]) -> String {
     let line = |column: &Column<R>| {
         let (physical, logical) = column.kind.parquet();
@@ -196,7 +196,7 @@ fn schema<R>(columns: &[Column<R>]) -> String {
     format!("message packwatch {{ {} }}", columns.iter().map(line).collect::<Vec<_>>().join(" "))
 }
 
-/// Returns the error with the name of the file, which an error of the operating system already contains.
+/// Adds the name of the file to an error. Errors of the operating system already contain it.
 fn named_error(path: &Path, error: &ParquetError) -> LabError {
     let (path, text) = (path.display().to_string(), error.to_string());
     LabError::Data(if text.contains(&path) { text } else { format!("{path}: cannot be written: {text}") })
@@ -205,7 +205,7 @@ fn named_error(path: &Path, error: &ParquetError) -> LabError {
 fn csv_field(field: &FieldValue<'_>) -> String {
     match field {
         FieldValue::Time(time) => stamp::format_utc_micros(*time),
-        // The shortest text that reads back as the same number.
+        // The shortest text that is read back as the same number.
         FieldValue::Real(value) => value.map(|value| format!("{value:?}")).unwrap_or_default(),
         FieldValue::Whole(value) => value.map(|value| value.to_string()).unwrap_or_default(),
         FieldValue::Flag(value) => value.to_string(),
@@ -225,7 +225,7 @@ impl ColumnBuffer {
         Self { present: Vec::new(), list }
     }
 
-    /// Adds a value; returns whether it fits the column.
+    /// Adds a value. Returns false if the value does not fit the column.
     fn push(&mut self, field: FieldValue<'_>, optional: bool) -> bool {
         let present = match (&mut self.list, field) {
             (ColumnValues::Micros(list), FieldValue::Time(time)) => put(list, Some(time.nanos().div_euclid(1000))),

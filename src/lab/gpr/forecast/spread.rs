@@ -1,18 +1,24 @@
-//! Calibrates the local width of an interval from judged forecasts.
+//! Calibrates the local width of an interval on forecasts whose errors are known (judged forecasts).
 //!
-//! The errors of a cell's voltage are tiny during a charge at constant voltage and large at the end of a discharge: one common
-//! factor would be right on average and wrong everywhere. So the spread at a window is the mean ratio |error| / standard
-//! deviation of the nearest judged windows, shrunk towards the mean ratio of all and relative to it. The factor is the 95 %
-//! quantile of ratio / spread over all judged windows; the spread of each is computed without it and the windows that overlap
-//! it. Half the interval is factor x spread x standard deviation.
+//! The errors of a cell's voltage are tiny during a charge at constant voltage and large at the end of a discharge. One factor for all
+//! windows would be right on average and wrong everywhere. The width is therefore computed in three steps:
+//!
+//! * ratio = |error| / standard deviation, for every judged window.
+//! * spread of a window = (sum of the ratios of its n nearest judged windows + k m) / ((n + k) m), where m is the mean of all ratios
+//!   and k is [`SHRINKAGE`].
+//! * factor = 95 % quantile of ratio / spread over all judged windows. The spread of a judged window is computed here without this
+//!   window and the windows that overlap it.
+//!
+//! Half of the interval at a window is factor x spread x standard deviation.
 
 use crate::regress::GAUSSIAN;
 
-/// Number of nearest judged windows that determine the spread at a window.
+/// Number of nearest judged windows that determine the spread of a window.
 const NEAR: usize = 20;
-/// Weight of the overall mean among them, in windows.
+/// Weight of the mean of all ratios relative to one window.
 const SHRINKAGE: f64 = 4.0;
-/// With fewer judged windows, the interval has the same width everywhere, at least the Gaussian one.
+/// If there are fewer judged windows, the interval has the same width everywhere. It is then at least as wide as that of a normal
+/// distribution.
 const FEWEST: usize = 100;
 
 /// Judged windows.
@@ -20,19 +26,20 @@ const FEWEST: usize = 100;
 pub(super) struct Spread {
     pub(super) factor: f64,
     width: usize,
-    /// Rows of the windows, rising, with their ratios.
+    /// Rows of the windows, rising. The ratios are in the same order.
     rows: Vec<usize>,
     ratios: Vec<f64>,
-    /// Mean ratio.
+    /// Mean of all ratios.
     mean: f64,
-    /// Windows, scaled by `units`.
+    /// Features of all windows, divided by `units`.
     windows: Vec<f64>,
     /// Standard deviation of every feature.
     units: Vec<f64>,
 }
 
 impl Spread {
-    /// Calibrates on judged windows: their rows (rising), features and ratios. Windows less than `overlap` rows apart share rows.
+    /// Calibrates on judged windows, given by their rows (rising), features and ratios. Windows overlap if they are less than `overlap`
+    /// rows apart.
     pub(super) fn new(rows: Vec<usize>, features: &[f64], ratios: Vec<f64>, overlap: usize) -> Self {
         let count = rows.len();
         let width = features.len().checked_div(count).unwrap_or(0);
@@ -48,12 +55,12 @@ impl Spread {
         spread
     }
 
-    /// Number of judged windows.
+    /// Returns the number of judged windows.
     pub(super) fn count(&self) -> usize {
         self.rows.len()
     }
 
-    /// Half of the interval at a window, in standard deviations.
+    /// Returns half of the interval at a window, in standard deviations.
     pub(super) fn half_width(&self, features: &[f64]) -> f64 {
         if self.rows.len() < FEWEST {
             return self.factor;
@@ -61,7 +68,8 @@ impl Spread {
         self.factor * self.at(&scaled(features, &self.units), None)
     }
 
-    /// Spread at a (scaled) window; `but` leaves out windows near a row.
+    /// Returns the spread of a window with scaled features. With `but` = (row, overlap), windows that overlap the window at this row
+    /// are left out.
     fn at(&self, window: &[f64], but: Option<(usize, usize)>) -> f64 {
         if self.rows.len() < FEWEST || self.mean <= 0.0 {
             return 1.0;
@@ -85,7 +93,7 @@ fn scaled(features: &[f64], units: &[f64]) -> Vec<f64> {
     features.iter().enumerate().map(|(at, value)| value / units[at % units.len()]).collect()
 }
 
-/// Standard deviation of the values; 1 if they do not differ.
+/// Returns the standard deviation of the values, or 1 if they are equal.
 fn deviation<'a>(values: impl Iterator<Item = &'a f64> + Clone) -> f64 {
     let count = values.clone().count() as f64;
     let mean = values.clone().sum::<f64>() / count;
@@ -93,8 +101,8 @@ fn deviation<'a>(values: impl Iterator<Item = &'a f64> + Clone) -> f64 {
     if deviation > 1e-12 * mean.abs() { deviation } else { 1.0 }
 }
 
-/// The 95 % quantile, corrected for small samples. With few ratios it is never below the Gaussian one, because chance could
-/// otherwise make the interval too narrow.
+/// Returns the 95 % quantile, corrected for small samples. If there are few ratios, chance could make the interval too narrow. The
+/// result is then at least the value of a normal distribution.
 fn factor(mut ratios: Vec<f64>) -> f64 {
     ratios.sort_by(f64::total_cmp);
     let rank = ((ratios.len() + 1) as f64 * 0.95).ceil() as usize;
@@ -122,7 +130,7 @@ mod tests {
 
     #[test]
     fn intervals_are_wide_where_errors_were_large() {
-        // Two regimes: in the second, one window of ten, errors are ten times larger.
+        // Two regimes: every tenth window belongs to the second, in which errors are ten times larger.
         let large = |k: usize| k % 10 == 3;
         let ratio = |k: usize| (k * 7919 % 1000) as f64 / 1000.0 * if large(k) { 10.0 } else { 1.0 };
         let features: Vec<f64> = (0..2000).flat_map(|k| [if large(k) { 5.0 } else { 0.0 }, (k % 7) as f64]).collect();

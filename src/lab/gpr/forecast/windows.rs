@@ -1,28 +1,28 @@
-//! Lag windows: values and differences of the rows up to a row, and the rows that have them.
+//! Lag windows: for a row, the value and the differences of the rows before it; and the rows that have such a window.
 
 use super::super::ColumnTable;
 
-/// Windows of a table.
+/// The windows of a table.
 #[derive(Debug)]
 pub struct LagWindows<'a> {
     table: &'a ColumnTable,
     columns: usize,
     lags: usize,
-    /// For each row, the first row of its part, and one past the last.
+    /// For each row, the first row of its part, and the first row after its part.
     part: Vec<(usize, usize)>,
 }
 
-/// Time between the rows.
+/// Steps of the time between consecutive rows.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RowSpacing {
-    /// Median, in the unit of the time column.
+    /// Median step, in the unit of the time column.
     pub median: f64,
-    /// 5 % and 95 % quantiles of the steps.
+    /// 5 % and 95 % quantile of the steps.
     pub range: (f64, f64),
 }
 
 impl RowSpacing {
-    /// Steps of a column of the table, within its parts; `None` without steps or times.
+    /// Returns the steps of a column within the parts of the table; `None` = there are no steps or no times.
     pub fn of(table: &ColumnTable, column: usize) -> Option<Self> {
         let times: Vec<f64> = table.column(column).collect();
         let steps = (1..times.len()).filter(|row| table.parts.binary_search(row).is_err());
@@ -49,12 +49,12 @@ impl<'a> LagWindows<'a> {
         Self { table, columns: table.width() - table.has.len(), lags, part }
     }
 
-    /// Number of values in a window.
+    /// Returns the number of values in a window.
     pub fn width(&self) -> usize {
         self.columns * self.lags
     }
 
-    /// Rows from `begin` on that have a window, and a row `steps` ahead in their part and before `end`.
+    /// Returns the rows from `begin` on that have a window, and for which the row `steps` ahead is in the same part and before `end`.
     pub fn between(&self, begin: usize, end: usize, steps: usize) -> Vec<usize> {
         let fits = |row: &usize| {
             let (first, last) = self.part[*row];
@@ -63,22 +63,22 @@ impl<'a> LagWindows<'a> {
         (begin..self.table.len()).filter(fits).collect()
     }
 
-    /// The last row before `end` that has a window.
+    /// Returns the last row before `end` that has a window.
     pub fn last_before(&self, end: usize) -> Option<usize> {
         (0..end.min(self.part.len())).rev().find(|row| *row + 1 >= self.part[*row].0 + self.lags)
     }
 
-    /// Value of a column in a row.
+    /// Returns the value of a column in a row.
     pub fn value(&self, row: usize, column: usize) -> f64 {
         self.table.row(row)[column]
     }
 
-    /// Returns the change of a column within `steps` rows.
+    /// Returns the change of a column from this row to the row `steps` ahead.
     pub fn change(&self, row: usize, column: usize, steps: usize) -> f64 {
         self.value(row + steps, column) - self.value(row, column)
     }
 
-    /// Windows of rows, one after the other: for every column the value, then the differences, the latest first.
+    /// Returns the windows of rows, one after the other: for every column the value, then the differences, the latest first.
     pub fn features(&self, rows: &[usize]) -> Vec<f64> {
         let mut all = Vec::with_capacity(rows.len() * self.width());
         for &row in rows {

@@ -1,4 +1,4 @@
-//! Fits of simulated records whose tables are known, and requests that a fit rejects.
+//! Fits of simulated records whose tables are known, and requests that a fit must reject.
 
 use super::*;
 use crate::cell::circuit::BranchAt;
@@ -16,7 +16,7 @@ fn scatter(k: usize) -> f64 {
     x - x.floor() - 0.5
 }
 
-/// Current at 1 Hz that steps every 40 s, rests, and takes 1.9 Ah in two hours.
+/// A current at 1 Hz that changes every 40 s, with rests. It takes out 1.9 Ah in two hours.
 fn currents() -> Vec<f64> {
     let level = |k: usize| match (k / 40) % 5 {
         0 => 0.0,
@@ -111,7 +111,7 @@ fn settings(grid: Grid) -> FitSettings {
 fn gradient_agrees_with_finite_differences() {
     let grid = grid();
     let layout = Layout::new(&grid, 2);
-    // Between the temperature nodes, so that all four corners contribute; offsets keep the residuals large.
+    // A point between the temperature nodes, so that all four corners contribute. The offsets keep the residuals large.
     let record = {
         let mut record = simulate(&truth(), 25.0, 0.005, &grid);
         for row in &mut record.rows {
@@ -150,13 +150,13 @@ fn known_parameters_are_recovered_from_noisy_data() {
     let grid = grid();
     let truth = truth();
     let records: Vec<Record> = [5.0, 25.0].iter().map(|&t| simulate(&truth, t, 0.002, &grid)).collect();
-    // The noise is white here, so a second holds more information than a second of real data.
+    // The noise is white here, so a second contains more information than in real data.
     let fitted = fit(&settings(grid.clone()), &records, &[10.0, 10.0], |_, _| {}).expect("a fit");
     assert!(fitted.converged && fitted.total.rmse_v < 0.002, "{:?}", fitted.total);
     let expected = truth_theta(&grid);
     let layout = Layout::new(&grid, 2);
     let true_tables = ParameterTables::new(&layout, &expected);
-    // Below SOC 0.3 there is little data.
+    // There is little data below SOC 0.3.
     for node in (0..10).filter(|node| node % 5 >= 2) {
         let ocv_error = fitted.tables.ocv_v[node] - true_tables.ocv_v[node];
         assert!(ocv_error.abs() < 0.015, "OCV node {node}: {ocv_error}");
@@ -174,7 +174,7 @@ fn ocv_rises_where_the_data_fall() {
     let grid = grid();
     let mut records = vec![simulate(&truth(), 25.0, 0.0, &grid)];
     for row in &mut records[0].rows {
-        // The top bends down by more than the curve rises.
+        // The measured voltage bends down by more than the curve rises.
         row.voltage_v -= 0.8 * (row.soc - 0.6).max(0.0);
     }
     let fitted = fit(&settings(grid), &records, &[1.0], |_, _| {}).expect("a fit");

@@ -1,4 +1,4 @@
-//! Tables as readers of Parquet and CSV see them.
+//! Tests that readers of Parquet and CSV can read the tables.
 
 use std::fs;
 
