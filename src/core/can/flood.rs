@@ -133,7 +133,7 @@ impl FloodGate {
         false
     }
 
-    /// Ends floods that are over.
+    /// Ends each flood whose frames have stopped.
     pub fn poll(&mut self, now: Timestamp) {
         // A flood is over after this time without a dropped frame, s. Shorter pauses belong to the same flood.
         self.end(|last| now.since(last) >= 1.0);

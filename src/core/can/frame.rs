@@ -77,7 +77,7 @@ pub enum FrameKind {
 }
 
 /// Payload bytes, followed by zeros. The alignment makes decoding faster: a word that is loaded soon after a copy of
-/// the frame comes from a single store. A load that spans two stores must wait for both.
+/// the frame comes from a single store. A load that spans two stores must wait for both stores.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(align(8))]
 struct Data([u8; MAX_DATA]);

@@ -4,10 +4,10 @@
 //! [`Status`] of each frame and counts per message. A [`GuardChange`] reports that a message starts to fail its check
 //! or becomes usable again.
 //!
-//! If a message's cycle time is known, each period without a frame counts as one NONEWDATA. The first is counted one
-//! and a half periods after the last frame (half a period allows for jitter), then one per period. As long as the check
-//! allows this number of lost frames, no change is reported. The next frame will be usable, and a sender with jitter
-//! would otherwise fill the log.
+//! If a message's cycle time is known, each period without a frame counts as one NONEWDATA. The first NONEWDATA is
+//! counted one and a half periods after the last frame, where half a period allows for jitter. Each further period
+//! counts one more. While the check allows this number of lost frames, no change is reported, because the next frame
+//! will be usable. Otherwise, a sender with jitter would fill the log.
 //!
 //! A time without listening is not the sender's fault. After sleep, a restart of the program or a clock step, the
 //! receivers wait for a first frame again ([`Guards::restart`]). For the same reason, a restarted program restores the
@@ -43,7 +43,8 @@ pub struct GuardChange {
     pub status: Status,
     /// Whether the message is usable now.
     pub usable: bool,
-    /// Number of failed checks since the message was last usable. When it becomes usable again, this is the total.
+    /// Number of failed checks since the message was last usable. When the message becomes usable again, this number is
+    /// the total.
     pub count: u64,
 }
 
@@ -95,12 +96,14 @@ impl Guards {
         configs.sort_by_key(|config| (config.bus, config.id));
         configs.dedup_by_key(|config| (config.bus, config.id));
         let guard = |config| Guard { config, receiver: Receiver::default(), missed_at: None, missed: 0, failed: 0 };
-        // A check adds at most one change, and a poll adds at most one per message, so nothing is allocated later.
+        // A check adds at most one change, and a poll adds at most one change per message, so nothing is allocated
+        // later.
         Self { changes: Vec::with_capacity(configs.len() + 1), guards: configs.into_iter().map(guard).collect() }
     }
 
-    /// Inherits the counts from `old` for the messages that are in both. If the configuration of a message is the same,
-    /// inherits its receiver, too. Otherwise, its next frame would be a first frame and not be used.
+    /// Inherits the counts from `old` for the messages that are in both `self` and `old`. If the configuration of a
+    /// message has not changed, also inherits the message's receiver. With a new receiver, the next frame would be a
+    /// first frame, which is not used.
     #[must_use]
     pub fn inheriting(mut self, old: &Self) -> Self {
         for guard in &mut self.guards {

@@ -1,7 +1,7 @@
 //! Finds the index of a message by interface and identifier.
 //!
 //! A look-up needs one load for a standard identifier and a binary search for an extended one. For a message that is
-//! not in the table, it returns an index beyond the table's end.
+//! not in the table, the look-up returns an index beyond the table's end.
 
 use crate::can::CanId;
 use crate::quantity::BusIndex;
@@ -32,8 +32,8 @@ impl BusTable {
 }
 
 impl IdTable {
-    /// Creates a table of messages. If several have the same interface and identifier, the table contains the first
-    /// one.
+    /// Creates a table of messages. If several messages have the same interface and identifier, the table contains the
+    /// first of these messages.
     pub(crate) fn new(messages: impl IntoIterator<Item = (BusIndex, CanId)>) -> Self {
         let mut table = Self::default();
         for ((bus, id), number) in messages.into_iter().zip(0..NONE) {

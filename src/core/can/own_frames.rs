@@ -1,8 +1,8 @@
 //! Detects other senders that use packwatch's own identifiers.
 //!
-//! In: sent frames, received frames. Out: an [`OwnIdChange`] at the first frame of another sender, and another one
-//! after [`GONE_S`] without such a frame. A socket does not receive its own frames. However, an adapter or a recorded
-//! log may return them. Therefore each sent frame may return once, unchanged, within [`ECHO_S`].
+//! In: sent frames, received frames. Out: an [`OwnIdChange`] at the first frame of another sender, and a second
+//! [`OwnIdChange`] after [`GONE_S`] without such a frame. A socket does not receive its own frames. However, an adapter
+//! or a recorded log may return them. Therefore each sent frame may return once, unchanged, within [`ECHO_S`].
 
 use std::collections::VecDeque;
 
@@ -91,7 +91,7 @@ impl OwnFrames {
         own_frames
     }
 
-    /// Whether an identifier is one of packwatch's.
+    /// Whether an identifier is one of packwatch's identifiers.
     #[inline]
     pub fn has(&self, bus: BusIndex, id: CanId) -> bool {
         self.numbers.number(bus, id) < self.count

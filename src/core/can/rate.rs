@@ -1,7 +1,8 @@
 //! Detects a second sender of an unprotected input message by comparing the frame rate with the message's cycle time.
 //!
-//! In: the time and identifier of each frame, and the battery current that it reports; between frames, the time
-//! ([`SecondSenders::poll`]). Out: a [`SenderChange`] when a second sender is found and when it is gone.
+//! In: the time and identifier of each frame, and the battery current that the frame reports; between frames, the time
+//! ([`SecondSenders::poll`]). Out: a [`SenderChange`] when a second sender is found, and when the second sender is
+//! gone.
 //!
 //! Frames are counted in windows of [`WINDOW_NS`]. A second sender is found if [`WINDOWS`] consecutive windows have
 //! more than [`EXCESS`] times the expected number of frames and one of two further signs. Either many intervals are
@@ -45,7 +46,7 @@ const STEADY: (f64, f64) = (0.2, 1.0);
 const LEAST_PER_S: f64 = 3.0;
 /// An interval shorter than this fraction of the mean is short.
 const SHORT: f64 = 0.5;
-/// Least number of short intervals or contradictions per expected frame that indicates a second sender.
+/// Minimum number of short intervals or contradictions per expected frame that indicates a second sender.
 const SIGNS: f64 = 0.4;
 /// Fraction of the frames that follow a short interval by chance, because other messages delay them.
 const CHANCE_SHORT: f64 = 0.02;
@@ -155,7 +156,7 @@ impl SecondSenders {
         rate.currents_a = [between, Some(current_a)];
     }
 
-    /// Ends the windows that are over. A window without frames is a normal window.
+    /// Ends the windows whose time has passed. A window without frames is a normal window.
     pub fn poll(&mut self, now: Timestamp) {
         let is_over = |from: Timestamp| now.nanos().saturating_sub(from.nanos()) >= WINDOW_NS;
         if !self.next_end.is_some_and(is_over) {
@@ -229,7 +230,7 @@ impl MessageRate {
         if self.window_from.is_none() {
             self.window_from = Some(now);
         } else if self.candidate > 0.0 {
-            // Uses the mean rate up to the previous window, because the rate of the current window is not known yet.
+            // Uses the mean rate up to the previous window, because the rate of the open window is not known yet.
             let interval_ns = now.nanos().saturating_sub(self.latest.nanos()) as f64;
             self.short = self.short.saturating_add(u32::from(interval_ns * self.candidate < SHORT * WINDOW_NS as f64));
         }
@@ -237,7 +238,7 @@ impl MessageRate {
         self.latest = now;
     }
 
-    /// Ends the current window if it is over.
+    /// Ends the open window if its time has passed.
     #[inline]
     fn end_windows(&mut self, now: Timestamp, configured: Option<f64>, changes: &mut Vec<SenderChange>) {
         let Some(from) = self.window_from else { return };

@@ -1,7 +1,7 @@
 //! The receiver of one protected message: E2E_P01Check of AUTOSAR. It is called once per frame, and once for each
 //! period without a frame.
 //!
-//! In: payloads in order of arrival. Out: a [`Status`] for each, and counts by status.
+//! In: payloads in order of arrival. Out: a [`Status`] for each payload, and counts by status.
 //!
 //! State, with AUTOSAR's names:
 //!
@@ -45,7 +45,7 @@ impl CheckConfig {
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
 pub enum Status {
-    /// The frame is intact and the next one in sequence.
+    /// The frame is intact, and it is the next frame in sequence.
     Ok = 0,
     /// No frame arrived within its period.
     NoNewData = 1,
@@ -53,7 +53,7 @@ pub enum Status {
     WrongCrc = 2,
     /// The frame is intact and in sequence, but it is one of the frames required after a broken sequence.
     Sync = 3,
-    /// The frame is the first intact one, so there is no previous counter to compare with.
+    /// The frame is the first intact frame, so there is no previous counter to compare with.
     Initial = 4,
     /// The frame is intact, but has the same counter as the last frame.
     Repeated = 5,

@@ -2,8 +2,8 @@
 //!
 //! In: a base (the built-in `config/packwatch.dbc`, or the user's own DBC) and settings per message. Out: the base's
 //! messages with the configured identifiers, frame formats, cycle times, end-to-end protection and authentication. They
-//! include the signals of header and trailer. The encoder is built from this database and `packwatch dbc` writes it, so
-//! they always agree.
+//! include the signals of header and trailer. The encoder is built from this database, and `packwatch dbc` writes this
+//! database, so the encoder and the written DBC always agree.
 //!
 //! The built-in base is adapted:
 //!
@@ -131,7 +131,7 @@ impl LayoutMessage {
 /// End-to-end protection of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum E2eSetting {
-    /// The protection of the base; the built-in base has none.
+    /// The protection of the base; the built-in base has no protection.
     #[default]
     AsBase,
     /// No protection.

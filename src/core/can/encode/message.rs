@@ -159,7 +159,7 @@ impl OutputMessage {
             let _ = field.plan.encode_raw(&mut payload, code);
         }
         if let (Some(protection), Some(payload)) = (self.protection, payload.get_mut(..self.data_len())) {
-            // A counter restored from another profile may exceed this profile's largest.
+            // A counter restored from another profile may exceed this profile's largest counter.
             let now = (*counter).min(protection.profile.max_counter());
             // Cannot fail: length and data id were checked when the plan was created.
             let _ = protection.protect(payload, now);
@@ -248,7 +248,7 @@ impl OutputField {
         }
     }
 
-    /// The code next to the "not available" code: below it, or above it if it is the lowest.
+    /// The code below the "not available" code; the code above it if the "not available" code is the lowest code.
     fn neighbour(&self, taken: u64) -> u64 {
         let lowest = match self.plan.value_type() {
             ValueType::Signed => 1 << (self.plan.length_bits() - 1),

@@ -1,7 +1,7 @@
 //! Protects generated input frames (CSV replay, simulator): the sender's side of end-to-end protection.
 //!
 //! In: frames in the order in which they are sent. Each frame of a protected message gets the next counter and its CRC.
-//! Other frames are unchanged. A frame that is too short for the header is unchanged, too, and the receiver detects the
+//! Other frames are unchanged. A frame that is too short for the header is also unchanged; the receiver detects the
 //! fault.
 
 use crate::can::e2e::Protection;

@@ -2,7 +2,7 @@
 //!
 //! In: the outcome of a command or the reason for its refusal, and the counter that the next command must have. Out:
 //! values for the signals of `PACKWATCH_Reply`. If the checksum of a command frame is wrong, the reply does not repeat
-//! its content.
+//! the content of the command.
 
 use serde::{Deserialize, Serialize};
 
@@ -16,7 +16,7 @@ use crate::can::e2e::Status;
 const REQUIRED: [&str; 9] =
     ["Result", "Reason", "Command", "Rule", "Severity", "Cell", "CounterExpected", "Changed", "Refused"];
 
-/// Reason why a command frame was not executed; the number is the wire code of `Reason`.
+/// Reason why a command frame was not executed; the values are the wire codes of the signal `Reason`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
@@ -41,7 +41,7 @@ pub enum CommandRefusal {
 }
 
 impl CommandRefusal {
-    /// The reason why a frame with this end-to-end status is not executed; `None` = it may be executed.
+    /// The reason why a frame with this end-to-end status is not executed; `None` = the frame may be executed.
     pub const fn of(status: Status) -> Option<Self> {
         match status {
             Status::Ok | Status::OkSomeLost | Status::Sync => None,
@@ -78,7 +78,7 @@ pub struct ReplyFields {
     /// Number of changed alarms and number of alarms that refused the change, or the reason why the command was not
     /// executed.
     pub outcome: Result<(u32, u32), CommandRefusal>,
-    /// The command; `None` = it could not be decoded.
+    /// The command; `None` = the command could not be decoded.
     pub command: Option<CommandFields>,
     /// Counter that the next command must have; `None` = any counter.
     pub counter_expected: Option<u8>,

@@ -6,7 +6,7 @@ use super::*;
 
 const LAST: u8 = 7;
 
-/// Classes of receiver states; LastValidCounter is 7 in all except the first.
+/// Classes of receiver states; LastValidCounter is 7 in all classes except the first.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum State {
     /// WaitForFirstData.
@@ -106,7 +106,7 @@ fn wanted(profile: Profile, state: State, what: Input, sync: u8) -> (Status, (Op
     let (last, grown) = (before.last_valid, before.max_delta + 1);
     let (repeated, syncing) = (before.no_new_or_repeated, before.sync);
     let at = |step: u8| Some(LAST + step);
-    // After too long a silence, synchronisation is required. This frame is its first.
+    // After too long a silence, synchronisation is required. This frame is the first frame of the synchronisation.
     let left = sync.saturating_sub(1);
     let after_silence = |normal| if sync > 0 { Status::Sync } else { normal };
     match (state, what) {
