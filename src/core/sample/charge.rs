@@ -4,8 +4,8 @@
 //! only their differences are meaningful. An interval between two current readings counts as follows:
 //! * up to the current's `max_age_s`: trapezoid over the elapsed time;
 //! * longer: the first reading is held for `max_age_s` (the longest time that a value may be used). The rest of the
-//!   interval is unmeasured. It is never interpolated, regardless of its cause (bad readings, lost frames, sleep, a
-//!   restart).
+//!   interval is unmeasured. Unmeasured time is never interpolated, regardless of its cause (bad readings, lost frames,
+//!   sleep, a restart).
 //!
 //! After the latest reading, the current is held in the same way. The next reading replaces the held value by the
 //! trapezoid. While the contactors' reading is valid and says that they are open, the current is zero, measured or not.
@@ -89,13 +89,13 @@ impl ChargeCounter {
         self.open_until.is_some_and(|until| now <= until)
     }
 
-    /// Handles open contactors: no current flows from `time` to `until`, unless they close earlier.
+    /// Handles open contactors: no current flows from `time` to `until`, unless the contactors close earlier.
     pub(super) fn open(&mut self, time: Timestamp, until: Timestamp, max_age_s: f64) {
         self.hold(time, Some(0.0), max_age_s);
         self.open_until = Some(until);
     }
 
-    /// Handles closed contactors. If they were open, the current is `measured_a` from `time` on.
+    /// Handles closed contactors. If the contactors were open, the current is `measured_a` from `time` on.
     pub(super) fn close(&mut self, time: Timestamp, measured_a: Option<f64>, max_age_s: f64) {
         if self.open_until.is_some() {
             self.hold(time, measured_a, max_age_s);

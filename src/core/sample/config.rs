@@ -14,7 +14,7 @@ pub struct Limits {
     pub max_rate_per_s: Option<f64>,
     /// A value that is unchanged for this long while it should change is stuck; `None` = not checked.
     pub stuck_after_s: Option<f64>,
-    /// A value older than this is stale.
+    /// Age above which a value is stale, s.
     pub max_age_s: f64,
 }
 

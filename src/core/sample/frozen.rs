@@ -1,7 +1,7 @@
 //! Detects a frozen current sensor: its reading stays bit-identical while the voltages show a changing load.
 //!
-//! In: good readings of the current, A, and of the cells' voltages, V. Out: whether the current is frozen. It stays
-//! frozen until its reading changes.
+//! In: good readings of the current, A, and of the cells' voltages, V. Out: whether the reading of the current is
+//! frozen. It counts as frozen until it changes.
 //!
 //! A constant reading alone proves nothing. A parked pack, a charger and a laboratory hold a current for hours, and a
 //! coarse sensor then shows one value. In these cases, the voltages rest or drift in one direction. A changing load
@@ -19,8 +19,8 @@ use crate::quantity::{InvalidState, Timestamp, bounds};
 
 /// Minimum number of equal current readings.
 const MIN_READINGS: u32 = 20;
-/// Time for which the reading must remain unchanged after the voltages turned back, s. A current reading is never this
-/// late.
+/// Time for which the reading must remain unchanged after the voltages turned back, s. No current reading arrives later
+/// than this after the voltages.
 const MIN_FROZEN_S: f64 = 5.0;
 /// Longest time between an extreme voltage and the return from it, s. The voltages of cells that rest, cool or balance
 /// turn more slowly.
@@ -50,9 +50,9 @@ struct Reversals {
     range_v: Option<(f64, f64)>,
     /// Whether the voltage has risen since the last turning point; `None` = no turning point yet.
     is_rising: Option<bool>,
-    /// Time of the extreme voltage in the current direction.
+    /// Time of the extreme voltage in the present direction.
     extreme_at: Timestamp,
-    /// Whether one reading shows a turn that the next one has to confirm.
+    /// Whether one reading shows a turn that the next reading must confirm.
     is_unconfirmed: bool,
     /// Whether the voltage has turned back within [`MAX_TURN_S`].
     has_turned: bool,
@@ -162,7 +162,7 @@ impl FrozenCheck {
     fn end_round(&mut self, now: Timestamp, step_v: f64) {
         self.round_v.sort_unstable_by(f64::total_cmp);
         let cells = self.round_v.len();
-        // Of the two middle cells, take the one that changed less, because a load moves both.
+        // Of the two middle cells, take the cell that changed less, because a load moves both cells.
         let (low, high) = (self.round_v[(cells - 1) / 2], self.round_v[cells / 2]);
         let is_low_nearer = (low - self.median_v).abs() <= (high - self.median_v).abs();
         let median = if is_low_nearer { low } else { high };

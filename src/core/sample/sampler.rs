@@ -1,8 +1,8 @@
 //! Combines the signals of all configured channels and the charge counter into samples.
 //!
-//! In: readings with their time (V, A, degrees C). Out: a [`CellSample`] per good voltage. It has the current and
-//! temperature that are fresh at that time, and the charge and unmeasured time up to that time. A bad voltage gives no
-//! sample. Readings of channels that are not used are counted ([`Sampler::reading_counts`]).
+//! In: readings with their time (V, A, degrees C). Out: a [`CellSample`] per good voltage. A sample contains the
+//! current and temperature that are fresh at that time, and the charge and unmeasured time up to that time. A bad
+//! voltage gives no sample. Readings of channels that are not used are counted ([`Sampler::reading_counts`]).
 //!
 //! The memory is one record per channel, allocated at the start. Handling a reading allocates nothing. The records are
 //! an array of structs, because a reading touches one whole record.
@@ -18,8 +18,8 @@ use super::frozen::{self, FrozenCheck};
 use super::signal::Signal;
 use crate::quantity::{CellIndex, Channel, Fault, InvalidState, Reading, SensorIndex, Timestamp};
 
-/// Smallest current that counts as flowing, as a fraction of the largest plausible current. It is above a sensor's
-/// noise and offset at rest. It is below any load under which a voltage or temperature must change.
+/// Smallest current that counts as flowing, as a fraction of the largest plausible current. A sensor's noise and offset
+/// at rest are below this current. Any load under which a voltage or temperature must change is above it.
 pub const FLOW_SHARE: f64 = 0.01;
 
 /// Reports that a signal turned bad (`Err` with the fault) or good again (`Ok` with the number of bad readings before).
@@ -96,8 +96,8 @@ pub struct Sampler {
     shared: SharedInputs,
 }
 
-/// Inputs shared by readings with the same time stamp. A new current invalidates all of them. A new temperature
-/// invalidates only `sensor`.
+/// Inputs shared by readings with the same time stamp. A new reading of the current invalidates all fields. A new
+/// temperature invalidates only `sensor`.
 #[derive(Debug, Clone, Copy, Default)]
 struct SharedInputs {
     /// Whether the other fields are valid.
@@ -322,7 +322,7 @@ impl Sampler {
         &self.channels
     }
 
-    /// The latest good reading of every channel that has one, regardless of its age: channel, time, value.
+    /// The latest good reading, at any age, of every channel that has had a good reading: channel, time, value.
     pub fn latest_readings(&self) -> impl Iterator<Item = (Channel, Timestamp, f64)> + '_ {
         let each = self.channels.iter().zip(&self.state.signals);
         each.filter_map(|(&channel, signal)| signal.good.map(|good| (channel, good.time, good.value())))
@@ -451,7 +451,7 @@ impl Sampler {
     }
 
     /// Restores a stored state. The caller has rebased its times and checked that it [`fits`](Self::fits). The downtime
-    /// is unmeasured, like any other time without a current.
+    /// counts as unmeasured, like any other time without readings of the current.
     pub fn restore(&mut self, state: SamplerState) {
         assert!(self.fits(&state), "the stored state must have the same signals");
         let signals = self.state.signals.len();

@@ -18,11 +18,11 @@ use super::config::Limits;
 use crate::quantity::bounds;
 use crate::quantity::{Fault, InvalidState, Timestamp};
 
-/// Number of consecutive readings that must agree on a new level. Two could be one disturbance.
+/// Number of consecutive readings that must agree on a new level. Two readings could come from one disturbance.
 pub const ACCEPT_AFTER: u32 = 3;
 
 /// Shortest interval for the rate check, s. Time stamps of consecutive frames jitter by about this much, and the rate
-/// over a zero interval would be infinite.
+/// in an interval of zero would be infinite.
 pub const MIN_RATE_INTERVAL_S: f64 = 1e-3;
 
 /// Number of readings after which a reading has lost most of its weight in the share of bad readings.
@@ -119,7 +119,7 @@ impl Signal {
         Some((self.received.filter(|&received| received >= began)?, self.bad_share))
     }
 
-    /// Share of bad readings, weighted towards recent ones; `None` = no reading yet.
+    /// Share of bad readings, weighted towards recent readings; `None` = no reading yet.
     pub(super) fn bad_share(&self) -> Option<f64> {
         (self.readings > 0).then_some(self.bad_share)
     }

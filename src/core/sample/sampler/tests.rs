@@ -84,7 +84,7 @@ fn open_contactors_force_zero_current_and_charge() {
     bench.ok(2.0, Channel::Current, 5.0);
     let open = bench.ok(9.0, CELL, 3.7).expect("a sample");
     assert_eq!((open.current_a, open.charge_as, open.offset_s, open.unmeasured_s), (Some(0.0), 2.0, 1.0, 0.0));
-    // The contactors stay open after a bad reading, and until the maximum age of the last good one.
+    // The contactors count as open after a bad reading, until the last good reading reaches its maximum age.
     bench.give(9.5, Channel::Contactor, Err(Fault::NotAvailable));
     let late = bench.ok(12.0, CELL, 3.7).expect("a sample");
     assert_eq!(
@@ -341,7 +341,7 @@ fn every_channel_has_its_own_slot() {
     assert!(slots.iter().enumerate().all(|(slot, found)| *found == Some(slot)));
 }
 
-/// Random readings of a cell, most of them plausible.
+/// Random readings of a cell; the majority is plausible.
 fn reading() -> impl Strategy<Value = (Channel, Result<f64, Fault>)> {
     let volts = prop_oneof![
         8 => (0_i32..30).prop_map(|step| Ok(3.6 + 0.002 * f64::from(step))),
