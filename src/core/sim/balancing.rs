@@ -1,8 +1,9 @@
 //! Simulates passive balancing: the BMS bleeds cells whose voltage is above the lowest cell voltage.
 //!
-//! The BMS bleeds near the end of a charge and during the first rest after it, even while the buses sleep. A drive
-//! between the charge and that rest pauses the balancing. The BMS compares the voltages that its own channels measure.
-//! They include the channels' constant offsets, but no noise, because a BMS averages.
+//! The BMS bleeds cells near the end of a charge and during the first rest after the charge, even while the buses
+//! sleep. A drive between the charge and that rest pauses the balancing. The BMS compares the voltages that its own
+//! channels measure. These voltages include the channels' constant offsets, but no noise, because a BMS averages its
+//! readings.
 
 use super::truth::Pack;
 

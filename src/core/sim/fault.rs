@@ -1,6 +1,6 @@
 //! Faults that a simulation injects: cells, contacts, a replaced module, sensors.
 //!
-//! A fault starts at a given time of the simulation and stays. Faults of cells change the true state
+//! A fault starts at a given time of the simulation and lasts until the end. Faults of cells change the true state
 //! ([`Pack`](super::Pack)); faults of sensors change only the readings. The text form is `KIND:...@WHEN` ([`Fault`]'s
 //! `FromStr`). In the text, cells and temperature sensors count from 1; internally, from 0.
 
@@ -12,7 +12,7 @@ use crate::quantity::{CellIndex, SensorIndex};
 /// One fault and its start.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Fault {
-    /// Kind, place and size.
+    /// Kind, location and size.
     pub kind: FaultKind,
     /// Start of the fault after the start of the simulation, s.
     pub from_s: f64,
@@ -37,7 +37,7 @@ pub enum ContactResistance {
     OfCell(f64),
 }
 
-/// Kind, place and size of a fault. Changes are relative: 0.1 = 10 % more.
+/// Kind, location and size of a fault. Changes are relative: 0.1 = 10 % more.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum FaultKind {
     /// The cell loses charge continuously, even at rest.

@@ -39,7 +39,7 @@ pub struct Moment {
     pub time: Timestamp,
     /// True cell current from this moment on, A, positive = discharge.
     pub current_a: f64,
-    /// Whether the cells were sampled, too.
+    /// Whether the cells were also sampled at this moment.
     pub cells_sampled: bool,
 }
 
@@ -97,7 +97,7 @@ pub struct Simulation {
     pending: (f64, i64),
     cells_due: bool,
     started: bool,
-    /// Faults that have not started, the next one last.
+    /// Faults that have not started; the fault that starts next is the last element.
     coming: Vec<Fault>,
     sensor_faults: SensorFaults,
     balancer: Option<Balancer>,
@@ -149,14 +149,14 @@ impl Simulation {
 
     /// Makes the BMS report for each cell whether it is bled (1) or not (0). It reports these bits together with the
     /// voltages. During sleep, it reports them every minute while it bleeds a cell, and once more when it no longer
-    /// bleeds any.
+    /// bleeds any cell.
     #[must_use]
     pub fn with_balancing_bits(mut self) -> Self {
         self.has_bits = true;
         self
     }
 
-    /// Advances to the next sampling moment; `None` = the scenario is over.
+    /// Advances to the next sampling moment; `None` = the scenario has ended.
     pub fn advance(&mut self) -> Option<Moment> {
         if self.started && self.asleep.is_none() {
             self.pass_period();
@@ -305,8 +305,8 @@ impl Simulation {
         }
     }
 
-    /// Measures the cell voltages and the pack voltage. A contact's resistance is between the taps, so its drop appears
-    /// in both.
+    /// Measures the cell voltages and the pack voltage. A contact's resistance is between the taps, so the voltage drop
+    /// appears in both voltages.
     fn measure_voltages(&mut self) {
         self.sensed_v.clear();
         let taps = self.pack.voltages_v(self.current_a).zip(self.pack.cells());

@@ -20,7 +20,7 @@ pub enum Scenario {
     Paper,
     /// The published 30 Ah example: random discharge pulses, -1 Ah per cycle.
     Reference,
-    /// Random 5-minute loads with reference cycles in between.
+    /// Random 5-minute loads, with reference cycles between blocks of loads.
     RandomWalk,
     /// A day of an electric car: drive, park, fast charge; 96 cells.
     EvDay,

@@ -59,7 +59,7 @@ pub struct Sensors {
 pub enum SensorQuality {
     /// Laboratory equipment, or the best vehicles.
     Good,
-    /// Most vehicles.
+    /// Typical vehicles.
     Usual,
     /// Cheap or old sensors.
     Poor,

@@ -3,8 +3,8 @@
 //! Each cell is the circuit of [`CellModel`] with its own capacity, resistance and temperature, and with effects that
 //! the estimator does not model. Current is positive for discharge. During a step of `dt` seconds, the current and the
 //! values from the tables are constant. Under this condition, every equation is solved exactly:
-//! * `SOC -= (I + I_leak) dt / (3600 C)`; not clamped, because 0 and 1 stand for open-circuit voltages and are not
-//!   limits.
+//! * `SOC -= (I + I_leak) dt / (3600 C)`; not clamped, because SOC 0 and SOC 1 are defined by two open-circuit voltages
+//!   and are not physical limits.
 //! * `U_i = U_i a + R_i I (1 - a)`, `a = exp(-dt / tau_i)`. Ageing scales every resistance but no time constant.
 //! * hysteresis, one state h in [-1, 1] (Plett): `h = h e - (1 - e) sign(I)`, `e = exp(-|I dt| gamma / (3600 C))`;
 //! * heat: `T = T_end + (T - T_end) exp(-dt / (R_th C_th))`, `T_end = T_ambient + R_th (I^2 R0 + sum U_i^2 / R_i)`.
@@ -85,7 +85,7 @@ const SPREAD_LIMIT: f64 = 3.0;
 pub struct TruthCell {
     /// State of charge, fraction.
     pub soc: f64,
-    /// Branch voltages, V; 0 beyond the model's branches.
+    /// Voltages of the model's RC branches, V; 0 in unused elements.
     pub branch_v: [f64; MAX_BRANCHES],
     /// Hysteresis state, from -1 (after discharge) to 1 (after charge).
     pub hysteresis: f64,

@@ -91,8 +91,8 @@ impl CycleCourse {
         Demand::Current(if self.charging { -self.charge_a } else { self.load.next_a(dt_s) })
     }
 
-    /// Whether the current cycle is the last. Allows half a loss of tolerance, because 47 losses of 0.05 Ah do not add
-    /// up to exactly 2.35 Ah in binary.
+    /// Whether the cycle in progress is the last cycle. The tolerance is half of the loss per cycle, because 47 losses
+    /// of 0.05 Ah do not add up to exactly 2.35 Ah in binary.
     fn is_last_cycle(&self, pack: &Pack) -> bool {
         self.cycles.is_some_and(|cycles| pack.cycles() + 1 >= cycles)
             || pack.lowest_capacity_ah() - 0.5 * self.loss_ah < self.end_capacity_ah

@@ -108,8 +108,8 @@ impl WalkCourse {
     }
 
     fn draw_load(&mut self, pack: &Pack, low_v: f64, high_v: f64) -> f64 {
-        // Draws until a load stays within the voltage range, at most 32 times; then rests. Half of the 12 loads have
-        // either sign.
+        // Draws until a load stays within the voltage range, at most 32 times; then rests. Six of the 12 loads are
+        // positive and six are negative.
         (0..32)
             .map(|_| self.scale * self.noise.choose(&LOADS_A))
             .find(|&a| pack.lowest_v(a) > low_v && pack.highest_v(a) < high_v)

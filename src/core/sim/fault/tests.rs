@@ -35,7 +35,7 @@ fn voltage_v(sim: &Simulation, cell: u16) -> f64 {
     reading(sim, Channel::CellVoltage(CellIndex(cell)))
 }
 
-/// Runs a pack with `faults` and a pack without; calls `each` with both at each moment.
+/// Runs a pack with `faults` and a pack without faults; calls `each` with both packs at each moment.
 fn compare(faults: &[&str], mut each: impl FnMut(Moment, &Simulation, &Simulation)) -> (Simulation, Simulation) {
     let (mut faulty, mut healthy) = (simulation(faults), simulation(&[]));
     while let Some((moment, _)) = faulty.advance().zip(healthy.advance()) {
@@ -164,7 +164,7 @@ fn weak_and_resistive_cells_keep_their_soc() {
     let cells = faulty.pack().cells();
     assert!((cells[1].capacity_ah - 2.34).abs() < 1e-12 && cells[0].capacity_ah == 2.6);
     assert!((cells[2].resistance_ratio - 1.2).abs() < 1e-12 && cells[1].resistance_ratio == 1.0);
-    // The two differ by one step of a second.
+    // The two packs differ by one step of a second.
     assert!((before[1] - at[1] - (before[0] - at[0])).abs() < 1e-12);
 }
 
