@@ -16,7 +16,7 @@ use super::rule::{Rule, Scope, Severity};
 use super::selector::{CommandOutcome, Selector};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Current state of an alarm.
+/// Present state of an alarm.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Alarm {
     pub rule: Rule,
@@ -99,7 +99,7 @@ pub struct AlarmSnapshot {
 }
 
 impl AlarmSnapshot {
-    /// Repeats a change that was published at `time`, after this state was taken. The alarm's debounce starts again.
+    /// Applies a change that was published at `time`, after this state was taken. The alarm's debounce starts again.
     pub fn repeat(&mut self, time: Timestamp, AlarmChange { change, alarm }: &AlarmChange) {
         let Alarm { rule, severity, cell, occurrences, is_acknowledged, .. } = *alarm;
         let is_same = |stored: &StoredAlarm| (stored.rule, stored.severity, stored.cell) == (rule, severity, cell);
@@ -238,7 +238,7 @@ impl AlarmEngine {
         }
     }
 
-    /// Advances the debounce of values that stay valid until the next one
+    /// Advances the debounce of values that stay valid until the next value arrives
     /// ([`RuleSpec::is_learned`](super::rule::RuleSpec::is_learned)).
     pub fn poll(&mut self, now: Timestamp, changes: &mut Vec<AlarmChange>) {
         let mut next = 0;
@@ -368,8 +368,8 @@ impl AlarmEngine {
     }
 
     /// Replaces the rules. An alarm whose rule, severity and cell are still watched is kept. If its threshold changed,
-    /// its value is compared again. All other alarms are forgotten. Returns how many of them were pending or had been
-    /// raised.
+    /// its value is compared again. All other alarms are forgotten. Returns how many of the forgotten alarms were
+    /// pending or had been raised.
     pub fn reconfigure(
         &mut self,
         now: Timestamp,

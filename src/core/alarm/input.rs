@@ -1,9 +1,9 @@
 //! Represents every input of an alarm engine as a value, so that another engine can replay the same inputs.
 //!
-//! In: values that the [`Monitor`](crate::monitor::Monitor) passes to its rules. Out: the same changes as the engine's
-//! own methods give. The values do not depend on thresholds. Therefore an engine with other thresholds gives the same
-//! changes as a monitor with those thresholds. Exception: for `input_missing`, the strictest threshold decides whether
-//! the monitor reports a silence to the engine at all.
+//! In: values that the [`Monitor`](crate::monitor::Monitor) passes to its rules. Out: the changes that the
+//! corresponding methods of the engine give. The values do not depend on thresholds. Therefore an engine with other
+//! thresholds gives the same changes as a monitor with those thresholds. Exception: for `input_missing`, the strictest
+//! threshold decides whether the monitor reports a silence to the engine at all.
 
 use super::engine::{AlarmChange, AlarmEngine};
 use super::limit::Observation;
@@ -36,8 +36,8 @@ pub enum AlarmInput {
     Gap,
     Acknowledge(Selector),
     /// Clears alarms. A latched alarm ends, and the history of a past alarm is forgotten. A raised alarm that is not
-    /// latched stays and counts as refused. So does a latched alarm whose value is beyond its threshold again. Learned
-    /// values do not change.
+    /// latched stays and counts as refused. A latched alarm whose value is beyond its threshold again also stays and
+    /// counts as refused. Learned values do not change.
     Clear(Selector),
     /// [`AlarmEngine::forget_learned`].
     ForgetLearned,

@@ -37,15 +37,16 @@ pub struct RuleConfig {
     pub rule: Rule,
     /// Severity of the alarm. A rule has at most one threshold per severity.
     pub severity: Severity,
-    /// The alarm is raised if the value is beyond this threshold (below for `*Low`, above for the others), in the
-    /// rule's unit.
+    /// The alarm is raised if the value is beyond this threshold (below for rules named `*Low`, above for all other
+    /// rules), in the rule's unit.
     pub threshold: f64,
     /// The alarm clears only if the value is at this threshold or on its healthy side. This threshold is never on the
     /// bad side of `threshold`.
     pub clear: f64,
     /// What is compared with the threshold.
     pub when: Comparison,
-    /// How long the value must be beyond before the alarm is raised, and healthy before it clears, s.
+    /// Time, s, for which the value must be beyond the threshold before the alarm is raised, and healthy before the
+    /// alarm clears.
     pub debounce_s: f64,
     /// Number of new values needed before the alarm is raised or cleared, at least 1.
     pub debounce_events: u32,
@@ -73,13 +74,14 @@ impl Observation {
         Self { value, is_new: true, ..Self::default() }
     }
 
-    /// Adds a standard deviation.
+    /// Returns the observation with a standard deviation.
     #[must_use]
     pub fn with_std(self, std: f64) -> Self {
         Self { std: Some(std), ..self }
     }
 
-    /// If `is_bound` is true, marks the value as known from some of its sources only; the other sources may be worse.
+    /// If `is_bound` is true, marks the value as a bound: only some of its sources are known, and the other sources may
+    /// be worse.
     #[must_use]
     pub fn of_part(self, is_bound: bool) -> Self {
         Self { is_bound, ..self }

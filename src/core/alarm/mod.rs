@@ -8,7 +8,7 @@
 //! * [`limit`] compares a value with a threshold;
 //! * [`machine`] is the state machine of one alarm;
 //! * [`engine`] holds one machine per threshold and cell;
-//! * [`input`] represents every input of an engine as a value, so that another engine can replay them;
+//! * [`input`] represents every input of an engine as a value, so that another engine can replay the inputs;
 //! * [`selector`] selects the alarms of a command.
 
 pub mod engine;

@@ -5,7 +5,7 @@
 
 use serde::{Deserialize, Serialize};
 
-/// An alarm rule. The number is the wire code (`config/packwatch.dbc`) and is never reused.
+/// An alarm rule. The value of a variant is the wire code (`config/packwatch.dbc`) and is never reused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
@@ -24,7 +24,8 @@ pub enum Rule {
     /// the mean normalised innovation squared, or the mismatch ([`ModelCheck`](crate::cell::ModelCheck)) on the same
     /// scale.
     EstimateUntrusted = 6,
-    /// The resistance relative to new is above the threshold. The value is the one learned in the last half-cycle.
+    /// The resistance relative to new is above the threshold. The value is the resistance that was learned in the last
+    /// half-cycle.
     ResistanceHigh = 7,
     /// The SOC of the cell that limits discharge is below the threshold, fraction.
     SocLow = 8,
@@ -112,7 +113,7 @@ pub struct RuleSpec {
     pub unit: Unit,
     /// Whether the value has a standard deviation, so that a probability can be compared.
     pub has_deviation: bool,
-    /// Whether a value stays valid until the next one, so that the time debounce runs on between values.
+    /// Whether a value stays valid until the next value arrives, so that the time debounce continues between values.
     ///
     /// A learned value stays valid: a capacity stays low until the next cycle. A measured value does not, because
     /// without new data, the old value proves nothing.
@@ -220,7 +221,7 @@ impl Rule {
     }
 }
 
-/// Severity; the number is the wire code.
+/// Severity; the values are the wire codes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]

@@ -11,7 +11,7 @@ use crate::quantity::CellIndex;
 pub struct Selector {
     pub rule: Option<Rule>,
     pub severity: Option<Severity>,
-    /// The cell, counted from 0. The pack's own alarms match only if this is not set.
+    /// The cell, counted from 0. If a cell is set, the pack's own alarms do not match.
     pub cell: Option<CellIndex>,
 }
 

@@ -57,7 +57,7 @@ fn observe(machine: &mut Machine, rule: &RuleConfig, seconds: f64, check: LimitC
     machine.observe(at(seconds), rule, &Observation::new(value))
 }
 
-/// A machine in `state` at 100 s. If its debounce is running, it starts at 100 s.
+/// A machine in `state` at 100 s. If the debounce of `state` is running, the debounce started at 100 s.
 fn machine_in(state: AlarmState) -> (Machine, RuleConfig) {
     use LimitCheck::{Beyond, Healthy, Unknown};
     let rule = rule(state == AlarmState::Latched);
@@ -139,7 +139,7 @@ fn transitions_match_table_for_all_inputs() {
     }
 }
 
-/// Whether the value is known after `input`. A command does not change whether it is known.
+/// Whether the value is known after `input`. A command does not change whether the value is known.
 fn is_known_in(state: AlarmState, input: MachineInput) -> bool {
     match input {
         MachineInput::Check(_) => true,
