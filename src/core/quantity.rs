@@ -53,7 +53,7 @@ impl Timestamp {
     /// Seconds from `earlier` to `self`; negative when `earlier` is later.
     #[inline]
     pub fn since(self, earlier: Self) -> f64 {
-        // A branch that is never taken costs less than saturating every time.
+        // A branch that is never taken costs less than a saturating subtraction in every call.
         let nanos = self.0.checked_sub(earlier.0).unwrap_or_else(|| self.0.saturating_sub(earlier.0));
         nanos as f64 * 1e-9
     }
@@ -90,7 +90,7 @@ impl InvalidState {
         bounds::NUMBER.check(what, found)
     }
 
-    /// Rejects negative numbers and those that [`Self::unless_number`] rejects.
+    /// Rejects negative numbers and the numbers that [`Self::unless_number`] rejects.
     pub fn unless_natural(what: &'static str, found: f64) -> Result<(), Self> {
         Self::unless((0.0..=1e20).contains(&found), what, found, "0 to 1e20")
     }
@@ -173,10 +173,10 @@ pub enum Channel {
     PackVoltage,
     /// One cell's voltage, V.
     CellVoltage(CellIndex),
-    /// SOC reported by the pack, fraction. Only compared with the estimate, never used by it.
+    /// SOC reported by the pack, fraction. The value is only compared with the estimate; the estimate never uses it.
     ReportedSoc,
-    /// SOH (capacity over rated capacity) reported by the pack, fraction. Only compared with the estimate, never used
-    /// by it.
+    /// SOH (capacity over rated capacity) reported by the pack, fraction. The value is only compared with the estimate;
+    /// the estimate never uses it.
     ReportedSoh,
     /// Voltage of the vehicle's 12 V (or 24 V) supply, V. If it is too low, no diagnostic requests are sent. Never used
     /// by an estimate.
@@ -193,7 +193,7 @@ pub enum Channel {
 pub enum Fault {
     /// The frame carries fewer bytes than the signal needs.
     ShortFrame,
-    /// The frame failed the end-to-end check: damaged, repeated, out of sequence, or the first of its sequence.
+    /// The frame failed the end-to-end check: damaged, repeated, out of sequence, or the first frame of a sequence.
     EndToEnd,
     /// The sender marks the signal as not available.
     NotAvailable,
@@ -222,7 +222,7 @@ pub struct Reading {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Mode {
-    /// There is no current reading yet, or the latest one is stale.
+    /// No reading of the current has arrived yet, or the latest reading is stale.
     #[default]
     Unknown,
     /// The current is negative, beyond the dead band.

@@ -15,7 +15,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Estimate {
     pub mean: f64,
-    /// Standard deviation; `None` = the value has none.
+    /// Standard deviation; `None` = the value has no standard deviation.
     pub std: Option<f64>,
 }
 
@@ -386,7 +386,7 @@ impl<const IS_PACK: bool> Values<IS_PACK> {
         self.0[quantity as usize] = value.map(Into::into).and_then(Estimate::known);
     }
 
-    /// Returns the values with one of them replaced.
+    /// Returns the values after replacing the value of `quantity`.
     #[must_use]
     pub fn with(mut self, quantity: Quantity, value: Option<impl Into<Estimate>>) -> Self {
         self.set(quantity, value);
@@ -427,7 +427,7 @@ impl RecordedValues {
         self.get(quantity).and_then(|estimate| Some((estimate.mean, estimate.std?)))
     }
 
-    /// Returns the values with one of them replaced. Ignores quantities that are not recorded.
+    /// Returns the values after replacing the value of `quantity`. Ignores quantities that are not recorded.
     #[must_use]
     pub fn with(mut self, quantity: Quantity, value: Option<impl Into<Estimate>>) -> Self {
         let value = value.map(Into::into).and_then(Estimate::known);
@@ -470,7 +470,7 @@ fn write<S: Serializer>(
     map.end()
 }
 
-/// Reads the keys of the catalogue and ignores all others.
+/// Reads the keys of the catalogue and ignores all other keys.
 struct ValuesVisitor<const IS_PACK: bool>;
 
 impl<'de, const IS_PACK: bool> Visitor<'de> for ValuesVisitor<IS_PACK> {
