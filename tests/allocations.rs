@@ -17,7 +17,7 @@ use packwatch::monitor::{Monitor, Outputs, Record, RecordKind, TICK_PERIOD_MS};
 #[global_allocator]
 static ALLOCATOR: dhat::Alloc = dhat::Alloc;
 
-/// A longer gap in the record means that the recorder was asleep, s. Here there is no gap.
+/// A gap in the record that is longer than this means that the recorder was asleep, s. Here there is no gap.
 const SLEEP_GAP_S: f64 = 30.0;
 /// Length of the log, s.
 const LOG_S: f64 = 160.0;
@@ -26,7 +26,8 @@ const WARM_S: f64 = 110.0;
 /// Minimum number of frames after the warm-up: 50 s of 10 currents and 32 other frames each 100 ms give more.
 const MIN_FRAMES: u64 = 20_000;
 
-/// Maximum number of blocks allocated at the end of a row of findings, for 96 cells.
+/// Maximum number of blocks that may be allocated when a row ends, for 96 cells. A row holds the sums of each cell's
+/// samples over a few minutes, from which findings are made.
 const BLOCKS_OF_A_ROW: u64 = 64;
 
 /// Serialises the tests, because each counts the allocations of the whole process.

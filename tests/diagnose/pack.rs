@@ -15,11 +15,12 @@ use packwatch_host::io::ticks::Ticks;
 
 use crate::finding::kind_of;
 
-/// A longer gap in the record means that the vehicle slept, s.
+/// A gap in the record that is longer than this means that the vehicle slept, s.
 const SLEEP_GAP_S: f64 = 30.0;
 /// Interval between two checks of the findings while the buses are awake, s.
 const LOOK_S: f64 = 300.0;
-/// Lowest current of a drive, as part of the capacity per hour, and the time without discharge that ends it, s.
+/// Minimum current of a drive, as a fraction of the capacity per hour; and the time without discharge that ends a
+/// drive, s.
 const DRIVE_PER_H: f64 = 0.05;
 const PARKED_S: f64 = 1800.0;
 /// Cells per temperature sensor.

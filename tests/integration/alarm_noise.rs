@@ -154,7 +154,8 @@ fn wander(t: f64) -> f64 {
     (0.6 * (t / 160.0).sin() + 0.4 * (t / 1340.0).sin()).clamp(-1.0, 1.0)
 }
 
-/// A sensor with 0.7 degrees of noise. Its cell stays within 1 C of 50 C during the day and is at 40 C at both ends.
+/// A day with a temperature sensor that has 0.7 degrees of noise. The cell stays within 1 C of 50 C during the day, and
+/// is at 40 C at the beginning and at the end.
 fn temperature_day(alarm: &str) -> Day {
     let mut noise = Noise::new(1);
     day(configuration(alarm), Rule::TemperatureHigh, |_, t| {

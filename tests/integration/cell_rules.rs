@@ -17,7 +17,7 @@ use packwatch::quantity::{CellIndex, Channel, Timestamp};
 use packwatch::sim::{Balancing, Scenario, SensorQuality, Sensors, Settings, Simulation, Wiring};
 
 const CELLS: u16 = 12;
-/// A longer gap in the record means that the vehicle slept, s.
+/// A gap in the record that is longer than this means that the vehicle slept, s.
 const SLEEP_GAP_S: f64 = 30.0;
 
 const PACK: &str = r#"
@@ -371,7 +371,8 @@ fn loss_explained_by_bleeding_raises_no_leak() {
     assert_eq!(found_in_balanced("", 1.0, without_a_bit), []);
 }
 
-/// The bits of the downtime were not received, even if the BMS bleeds only while it sends them.
+/// During the downtime no balancing bit is received, so a cell may have been bled. This holds even if the BMS bleeds
+/// only while it sends the bits.
 #[test]
 fn downtime_reduces_knowledge_of_leak() {
     let leak_std = |bleed_a: f64| {

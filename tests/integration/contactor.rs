@@ -1,5 +1,5 @@
-//! If the contactors report open, no current flows, even if the sensor reports one. A contactor state that is no longer
-//! received counts as unknown.
+//! If the contactors report open, the current counts as 0, even if the sensor reports another value. A contactor state
+//! that is no longer received counts as unknown.
 
 use packwatch::monitor::Downtime;
 use packwatch::quantity::catalogue::Quantity;
@@ -64,7 +64,7 @@ fn stale_contactor_state_uses_measured_current() {
     rig.seconds(3);
     assert_eq!(current_a(&rig), Some(1.0));
     assert!(rig.monitor.lost_inputs().eq([Channel::Contactor]));
-    // Invalid readings do not count: before the first valid reading, the measured current applies.
+    // Invalid readings of the contactors do not count: before the first valid one, the measured current applies.
     let mut silent = Rig::new(CONTACTOR);
     silent.current_a = Some(1.0);
     silent.seconds(10);

@@ -23,7 +23,7 @@ fn python() -> Option<OsString> {
     python
 }
 
-/// Lines that the oracle answers.
+/// Sends the lines to the oracle and returns its answers.
 fn ask(python: &OsString, lines: &[String]) -> Vec<String> {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/tools/e2e_oracle.py");
     let mut child = Command::new(python).arg(script).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();

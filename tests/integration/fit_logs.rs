@@ -12,7 +12,7 @@ use crate::support::measured;
 
 /// True capacity of the simulated cell, Ah; its label says 3.
 const TRUE_AH: f64 = 2.7;
-/// Its resistances relative to the chemistry prior.
+/// Resistances of the simulated cell, relative to the prior of its chemistry.
 const RESISTANCE: f64 = 1.4;
 
 fn run(args: &[&str]) -> (Option<i32>, String, String) {

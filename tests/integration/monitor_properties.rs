@@ -149,7 +149,8 @@ fn assert_same(found: &[String]) {
     assert!(found.is_empty(), "{} differences\n{}", found.len(), found.join("\n"));
 }
 
-/// Filters the differences: the core's results, or its frames, which also depend on the transmission schedule.
+/// If `frames` is set, keeps the differences of frames, which also depend on the transmission schedule. Otherwise keeps
+/// the differences of the core's results.
 fn results(found: Vec<String>, frames: bool) -> Vec<String> {
     found.into_iter().filter(|line| line.contains("frames differ") == frames).collect()
 }

@@ -93,7 +93,7 @@ fn silent_sensor_hides_highest_temperature() {
     rig.temperatures_c = [Some(25.0), Some(60.0)];
     rig.seconds(3);
     assert_eq!(rig.monitor.pack_view().values.mean(Quantity::TemperatureMax), Some(60.0));
-    // The hot sensor is silent: the other gives no upper bound.
+    // The hot sensor is silent. The other sensor gives no upper bound of the pack's temperature.
     rig.temperatures_c[1] = None;
     rig.seconds(10);
     assert_eq!(

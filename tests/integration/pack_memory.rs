@@ -1,5 +1,5 @@
-//! Learned values belong to a pack's identity number. When the pack returns, so do they, even after other
-//! packs and restarts.
+//! Learned values belong to a pack's identity number. When the pack is connected again, its values are restored, even
+//! after other packs and restarts.
 
 use packwatch::alarm::{Change, Rule};
 use packwatch::monitor::{CellView, Command, Downtime, EventKind, Record};

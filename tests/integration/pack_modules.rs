@@ -59,7 +59,7 @@ fn each_cell_kind_uses_its_own_model() {
     let [own, module] = socs(&mixed);
     assert!((own.0 - 0.15).abs() < 0.02, "{own:?}");
     assert!((module.0 - 0.15).abs() < 1.96 * module.1, "{module:?}");
-    // Without the module table, its cell is treated as one of the pack's own kind.
+    // Without the `[[pack.module]]` table, the second cell is treated as one of the pack's own kind.
     let mut alone = Rig::with(config_texts::load(PACK, DBC).monitor);
     discharge(&mut alone, models);
     let [own_alone, taken] = socs(&alone);

@@ -74,8 +74,8 @@ struct ChargeReport {
     raw_s: Option<f64>,
     normalised_s: Option<f64>,
     std_s: Option<f64>,
-    /// For comparison, from this charge alone: charge divided by estimated swing inside the window, at the reference
-    /// current.
+    /// For comparison, the period calculated from this charge alone: charge divided by estimated swing inside the
+    /// window, at the reference current, s.
     own_charge_s: Option<f64>,
 }
 

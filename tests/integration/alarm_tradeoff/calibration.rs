@@ -40,8 +40,8 @@ pub(crate) fn bins(fleet: &Fleet) -> Vec<(usize, f64, f64)> {
 /// Capacity errors and their stated standard deviation, over all evaluations at ageing cells.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Errors {
-    /// In percent of rated: mean error, standard deviation of each life's mean error, scatter within a life, stated
-    /// deviation.
+    /// In percent of the rated capacity: mean error, standard deviation of the lives' mean errors, scatter within a
+    /// life, stated standard deviation.
     pub(crate) mean: f64,
     pub(crate) between_lives: f64,
     pub(crate) within_life: f64,

@@ -6,7 +6,7 @@ use packwatch::quantity::CellIndex;
 
 use super::life::{Evaluation, Life, RATED_AH, THRESHOLD};
 
-/// The alarm clears this far above the threshold (the default hysteresis).
+/// Hysteresis relative to the threshold (the default): the alarm clears at 1.02 times the threshold.
 const HYSTERESIS: f64 = 0.02;
 
 /// A rule to compare.

@@ -347,7 +347,7 @@ impl Rig {
         self.pause(current_a, pauses_s[1]);
     }
 
-    /// Applies the fade curve's current slope to the next half-cycle.
+    /// Applies the present slope of the fade curve to the next half-cycle.
     fn age(&mut self) {
         let moved_ah = self.truth().throughput_ah;
         self.pack.set_ageing(self.fade.ageing(moved_ah, 0.5 * MOVED_PER_CYCLE * RATED_AH));

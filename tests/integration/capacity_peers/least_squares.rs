@@ -1,17 +1,18 @@
-//! Capacity from swings by least squares, as published: y = Q x, with x the change of SOC (fraction) and y the charge (Ah).
+//! Capacity from swings by least squares, as published: y = Q x, with x the change of SOC (fraction), y the charge (Ah)
+//! and Q the capacity (Ah). sx and sy are the standard deviations of x and y.
 //!
-//! G. L. Plett, "Recursive approximate weighted total least squares estimation of battery cell total capacity",
-//! J. Power Sources 196 (2011) 2319. All methods have fading memory:
+//! G. L. Plett, "Recursive approximate weighted total least squares estimation of battery cell total capacity", J.
+//! Power Sources 196 (2011) 2319. All methods have fading memory:
 //!
-//! - WLS: errors in y alone
-//! - TLS: errors in both, with one ratio of deviations
-//! - AWTLS: errors in both, with any deviations
+//! - WLS (weighted least squares): only y has errors
+//! - TLS (total least squares): x and y have errors, with the same ratio sx/sy for all swings
+//! - AWTLS (approximate weighted TLS): x and y have errors, with any sx and sy for each swing
 //!
-//! The running sums, over swings i = 1..n with weights gamma^(n-i), are
-//! c1 = x^2/sy^2, c2 = xy/sy^2, c3 = y^2/sy^2, c4 = x^2/sx^2, c5 = xy/sx^2, c6 = y^2/sx^2.
-//! AWTLS minimises sum (y - Q x)^2 / (Q^2 + 1)^2 (Q^2/sx^2 + 1/sy^2). Before that, y and sy are scaled by K = sx/sy, so
-//! that Q is near the diagonal, where the approximation holds. The minimum is a root of a quartic in Q. The variance is
-//! 2 over the cost's second derivative.
+//! The running sums, with the weight w = gamma^(n-i) for swing i of n, are c1 = sum w x^2/sy^2, c2 = sum w xy/sy^2, c3
+//! = sum w y^2/sy^2, c4 = sum w x^2/sx^2, c5 = sum w xy/sx^2, c6 = sum w y^2/sx^2. AWTLS minimises sum w (y - Q x)^2 /
+//! (Q^2 + 1)^2 (Q^2/sx^2 + 1/sy^2). Before that, y and sy are scaled by K = sx/sy, so that Q is near 1, where the
+//! approximation holds. The minimum is a root of a quartic in Q. The variance is 2 divided by the cost's second
+//! derivative at the minimum.
 
 use packwatch::filter::ScalarGaussian;
 
@@ -46,8 +47,8 @@ pub(crate) struct Peer {
 }
 
 impl Peer {
-    /// Starts from a prior capacity as Plett does: one full swing (x = 1) with that charge. The prior's deviation is
-    /// split between both sides.
+    /// Starts from a prior capacity as Plett does: one full swing (x = 1) with that charge. The prior's standard
+    /// deviation is split between x and y.
     pub(crate) fn new(method: Method, gamma: f64, start: ScalarGaussian) -> Self {
         let mut peer = Self { method, gamma, c: [0.0; 6], x_information: 0.0, y_information: 0.0 };
         let y_variance = 0.5 * start.variance;
@@ -88,37 +89,37 @@ impl Peer {
         }
     }
 
-    /// K: ratio of the deviations of x and y. If it varies between swings: the information-weighted ratio.
+    /// K = sx/sy. If this ratio differs between swings, the ratio that follows from the sums of their information.
     fn scale(&self) -> f64 {
         (self.y_information / self.x_information).sqrt()
     }
 
-    /// The sums of (x, K y).
+    /// The running sums after y has been scaled by `k`.
     fn scaled(&self, k: f64) -> [f64; 6] {
         let [c1, c2, c3, c4, c5, c6] = self.c;
         [c1 / (k * k), c2 / k, c3, c4, k * c5, k * k * c6]
     }
 }
 
-/// Minimum of (c3 - 2 c2 Q + c1 Q^2) / (1 + k^2 Q^2): errors in both variables with the fixed ratio k = sx/sy.
+/// TLS: minimum of (c3 - 2 c2 Q + c1 Q^2) / (1 + k^2 Q^2), for errors in x and y with the fixed ratio k = sx/sy.
 fn tls([c1, c2, c3]: [f64; 3], k: f64) -> ScalarGaussian {
     let k2 = k * k;
     let half = c1 - k2 * c3;
     let q = (-half + (half * half + 4.0 * k2 * c2 * c2).sqrt()) / (2.0 * k2 * c2);
-    // At the minimum the numerator of the slope, N = k2 c2 Q^2 + half Q - c2, vanishes, so the curvature is 2 N' / (1 +
-    // k2 Q^2)^2.
+    // The cost's slope is 2 N / (1 + k2 Q^2)^2 with N = k2 c2 Q^2 + half Q - c2. At the minimum N = 0, so the second
+    // derivative is 2 N' / (1 + k2 Q^2)^2.
     let spread = 1.0 + k2 * q * q;
     let curvature = 2.0 * (2.0 * k2 * c2 * q + half) / (spread * spread);
     ScalarGaussian { mean: q, variance: 2.0 / curvature }
 }
 
-/// (c4 Q^4 - 2 c5 Q^3 + (c1 + c6) Q^2 - 2 c2 Q + c3) / (Q^2 + 1)^2.
+/// The cost of AWTLS: (c4 Q^4 - 2 c5 Q^3 + (c1 + c6) Q^2 - 2 c2 Q + c3) / (Q^2 + 1)^2.
 fn awtls_cost([c1, c2, c3, c4, c5, c6]: &[f64; 6], q: f64) -> f64 {
     ((((c4 * q - 2.0 * c5) * q + (c1 + c6)) * q - 2.0 * c2) * q + c3) / (q * q + 1.0).powi(2)
 }
 
-/// Minimum of that cost over its stationary points. The cost's derivative is 2 P(Q) / (Q^2 + 1)^3 with the quartic P =
-/// c5 Q^4 + (2 c4 - c1 - c6) Q^3 + 3 (c2 - c5) Q^2 + (c1 - 2 c3 + c6) Q - c2; at a root its second derivative is 2 P' /
+/// Minimum of [`awtls_cost`] among its stationary points. The cost's derivative is 2 P(Q) / (Q^2 + 1)^3 with P = c5 Q^4
+/// + (2 c4 - c1 - c6) Q^3 + 3 (c2 - c5) Q^2 + (c1 - 2 c3 + c6) Q - c2. At a root of P the second derivative is 2 P' /
 /// (Q^2 + 1)^3.
 fn awtls(c: &[f64; 6]) -> ScalarGaussian {
     let [c1, c2, c3, c4, c5, c6] = *c;
@@ -132,7 +133,8 @@ fn awtls(c: &[f64; 6]) -> ScalarGaussian {
     ScalarGaussian { mean: q, variance: (q * q + 1.0).powi(3) / slope(q) }
 }
 
-/// Upward zero crossings of a polynomial over (0, inf). Searches in equal steps of angle, with Q = tan(angle).
+/// Upward zero crossings of a polynomial between 0 and infinity. Searches in equal steps of the angle, with Q =
+/// tan(angle).
 fn positive_roots(value: impl Fn(f64) -> f64, slope: impl Fn(f64) -> f64) -> Vec<f64> {
     const STEPS: u32 = 2000;
     let at = |k: u32| (f64::from(k) / f64::from(STEPS) * std::f64::consts::FRAC_PI_2).tan();

@@ -37,7 +37,7 @@ fn seconds(stamp: &str) -> f64 {
         + stamp[17..].parse::<f64>().unwrap()
 }
 
-/// The shipped configuration of `cell`, with this fraction of its capacity as the initial value.
+/// The shipped configuration of `cell`, with `start` times its capacity as the initial capacity.
 fn configuration(folder: &Path, cell: &str, start: f64, held: bool) -> PathBuf {
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     let mut text = std::fs::read_to_string(shipped.join("measured.toml")).unwrap();
@@ -156,7 +156,7 @@ impl Life {
         let number = |key: &str| event[key].as_f64().unwrap();
         let ours = ScalarGaussian::from_std(number("usable_capacity_ah"), number("usable_capacity_std_ah"));
         let (capacity_ah, ratio) = (number("capacity_ah"), number("resistance_ratio"));
-        // Find the initial SOC for which the monitor reports the same value again.
+        // Find the SOC of the full cell with which `usable_ah` gives the usable capacity that the monitor has reported.
         let (mut low, mut high) = (0.5, 1.5);
         for _ in 0..30 {
             let middle = 0.5 * (low + high);
@@ -246,13 +246,12 @@ fn heading() {
     println!("| --- | --- | --- | --- | --- | --- |");
 }
 
-/// Margin by which the best peer may lead on the filter's own SOC, Ah. That SOC contains the capacity that packwatch
-/// has learned.
+/// Margin by which the best peer may lead on swings of the filter's SOC, Ah. That SOC depends on the capacity that
+/// packwatch has learned, which helps the peer.
 const NEAR_AH: f64 = 0.006;
 
-/// Margin by which the best peer may beat packwatch on voltage swings, Ah. The peer has an advantage: its memory factor is the one
-/// with the best result. Equals an
-/// eighth of a percent of the capacity.
+/// Margin by which the best peer may lead on voltage swings, Ah: an eighth of a percent of the capacity. The peer has
+/// an advantage, because its memory factor is chosen afterwards by the result.
 const LEVEL_AH: f64 = 0.0025;
 
 #[test]
@@ -275,11 +274,12 @@ fn usable_capacity_of_whole_lives_matches_best_peer() {
     }
 }
 
-/// Factor by which the best peer may lead over all windows. Its memory is chosen afterwards by the result.
+/// Maximum ratio of packwatch's error to that of the best peer, over all windows. The peer's memory factor is chosen
+/// afterwards by the result.
 const LEVEL: f64 = 1.1;
 
-/// Here the filter's swings use the same ends as the voltage swings: after a gap, swing and charge of a `half_cycle`
-/// can disagree.
+/// Here the filter's swings use the same ends as the voltage swings, because swing and charge of a `half_cycle` event
+/// can disagree after a gap.
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn usable_capacity_from_windows_matches_best_peer() {
@@ -305,8 +305,8 @@ fn usable_capacity_from_windows_matches_best_peer() {
         best_ah = best_ah.min(score.mean_absolute);
     }
     assert!(ours.mean_absolute <= LEVEL * best_ah, "{ours:?}, the best peer {best_ah}");
-    // Coverage exceeds every peer's but is still too low: the interval does not include curve errors that differ
-    // between the ends.
+    // packwatch's coverage is higher than that of every peer but still too low, because the interval does not include
+    // errors of the open-circuit curve that differ between the two ends of a swing.
     assert!(ours.covered > 0.5, "{ours:?}");
 }
 

@@ -1,9 +1,11 @@
 //! Swings from the voltage alone: the SOC at both ends comes from the inverted open-circuit curve.
 //!
-//! The open-circuit voltage is V + I R0 rho + sum U. The branch voltages are stepped in open loop from rest (from 180 s
-//! on if the record begins under load); rho is the filter's resistance ratio. All readings of the first and the last 60
-//! s count, each with the charge that had flowed until that reading. The capacity is assumed only for the curve's
-//! change of shape. The deviation of an end is the product's own (`[capacity]`).
+//! The open-circuit voltage is V + I R0 rho + sum U, with V the cell's voltage, I the current (positive = discharge),
+//! R0 the series resistance, rho the filter's resistance ratio and U the voltages of the RC branches. The U are stepped
+//! in open loop from rest (from 180 s on if the record begins under load). All readings of the first and the last 60 s
+//! count, each with the charge that had flowed until that reading. A capacity is assumed only for the change of the
+//! curve's shape with ageing. The standard deviation of the SOC at an end is the one that packwatch uses
+//! (`[capacity]`).
 
 use packwatch::cell::aged_ocv::SHIFT_STD;
 use packwatch::cell::circuit::BranchAt;
@@ -12,7 +14,7 @@ use packwatch::health::CapacityConfig;
 
 use super::least_squares::Swing;
 
-/// A longer step between readings is a gap, in which the charge is unknown, s.
+/// An interval between readings that is longer than this is a gap, in which the charge is unknown, s.
 const GAP_S: f64 = 60.0;
 /// Below this current the cell rests, A.
 const REST_A: f64 = 0.05;
@@ -44,7 +46,7 @@ pub(crate) struct Reading {
 #[derive(Debug, Clone, Copy, Default)]
 struct Point {
     time_s: f64,
-    /// From the open-circuit curve of the new cell.
+    /// SOC according to the open-circuit curve of the new cell.
     new_soc: f64,
     /// Variance of `new_soc`.
     variance: f64,

@@ -246,7 +246,7 @@ fn counters(rig: &Rig, id: u32, protection: Protection) -> Vec<i64> {
 const KILLS: [(i64, i64); 5] = [(0, 3), (7, 0), (16, 2), (130, 25), (31, 600)];
 
 /// Kills a daemon with one raised alarm. Returns for each message of [`COUNTED`] the counter steps from the last frame
-/// before the kill to the first one after it, and the least and most steps for a daemon that never stopped.
+/// before the kill to the first one after it, and the minimum and maximum steps of a daemon that never stopped.
 fn steps_over_a_kill(profile: Profile, unstored_deci: i64, away_deci: i64) -> [(i64, [i64; 2]); 4] {
     let mut rig = protected_rig(profile);
     // Raise the alarm and send its repetitions. After that the alarm is sent only in its cycle.

@@ -10,7 +10,7 @@ pub(crate) fn root() -> PathBuf {
     std::env::var_os("PACKWATCH_DATA").map_or_else(default, PathBuf::from)
 }
 
-/// A file or folder in it.
+/// A file or folder of the measured data.
 pub(crate) fn path(name: &str) -> PathBuf {
     root().join(name)
 }

@@ -15,7 +15,7 @@ pub(crate) fn python() -> Option<OsString> {
     python
 }
 
-/// Lines that the oracle answers.
+/// Sends the lines to the oracle and returns its answers.
 pub(crate) fn ask(python: &OsString, dbc: &Path, arguments: &[&str], lines: &[String]) -> Vec<String> {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/tools/dbc_oracle.py");
     let mut command = Command::new(python);
