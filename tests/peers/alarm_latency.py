@@ -24,7 +24,7 @@ CELL, ALARM, ASK, ANSWER = 0x100, 0x6B2, 0x123, 0x321
 # Start and length of the alarm frame's bit fields, as in config/packwatch.dbc.
 RULE, STATE = (16, 5), (21, 3)
 CAPACITY_LOW, ACTIVE, CLEARED = 1, 1, 2
-# The first frame after 10 ms (min_duration_s of the configuration) confirms a new mode.
+# The first frame after 10 ms (min_duration_s of the configuration) confirms a new mode (charge or discharge).
 MODE_S = 0.012
 # A half-cycle has almost no current except in one pulse. A weak pulse gives 0.25 Ah with the configuration's swing, a strong one 2.1 Ah.
 IDLE_A, WEAK_A, STRONG_A, PULSE_S = 0.008, 0.35, 3.0, 0.03
@@ -120,8 +120,8 @@ def measure_alarm(count):
     """Alternates strong and weak half-cycles: the end of each clears or raises the alarm."""
     listener, sender = Listener(CELL, ALARM), raw()
     late_ns, without, stalled, strong, sign = [], 0, 0, True, 1
-    # Half-cycles until the next one is judged. A half-cycle with a wrong charge may change nothing, and then the next one
-    # cannot change it back.
+    # Number of half-cycles until the next one is judged. After a half-cycle with a wrong charge the alarm may not have changed,
+    # and then the next half-cycle cannot change it back.
     wait, cells = WARM_UP, []
     while len(late_ns) + without < count:
         sender.send(cell(sign * IDLE_A))
@@ -188,8 +188,8 @@ def at(late_ns, share):
 
 
 def decided_by_frame(folder, late_ns):
-    """Results decided by a frame. The daemon also checks the clock ten times a second; a check between the two frames confirms the
-    mode. The daemon's events state at which input's time each alarm changed."""
+    """Keeps the results in which a frame decided. The daemon also checks the clock ten times a second; if a check falls between
+    the two frames, the check confirms the mode. The daemon's events contain the time of the input at which each alarm changed."""
     stamp = re.compile(r"^\((\d+)\.(\d{9})\)", re.MULTILINE)
     frames = {int(a + b) for a, b in stamp.findall((folder / "watched.journal").read_text())}
     events = map(json.loads, (folder / "watched.events").read_text().splitlines())

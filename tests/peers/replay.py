@@ -63,7 +63,7 @@ class Model:
         return self.rows[temperature_c]
 
     def place(self, soc):
-        """Interval and position in it, and the same limited to the ends of the curve."""
+        """Index of the table interval, position in it, and this position limited to 0 to 1."""
         grid = self.soc
         s = min(max(bisect.bisect_right(grid, soc) - 1, 0), len(grid) - 2)
         beyond = (soc - grid[s]) / (grid[s + 1] - grid[s])

@@ -23,7 +23,8 @@ def install():
 
 
 def python(*modules):
-    """The first interpreter that has the modules: from `--install`, PACKWATCH_PYTHON, or the current one. None if all lack them."""
+    """The first interpreter that has the modules: from `--install`, PACKWATCH_PYTHON, or the running one. None if all lack
+    them."""
     for interpreter in (VENV / "bin/python3", os.environ.get("PACKWATCH_PYTHON", sys.executable)):
         command = [str(interpreter), "-c", "import " + ", ".join(modules)]
         try:

@@ -201,7 +201,8 @@ class Comparison:
         self.faults, self.printed = 0, []
         self.counters = {}
         self.unreported = 0  # recharge periods without an event in the log
-        # Resistances between a mode change, where the current's offset is learned, and the next rows: not in any report.
+        # Resistances that cannot be compared: a mode change, at which the current's offset is learned, changes them before the
+        # next rows report them.
         self.restated = 0
 
     def fault(self, time, message, what):
@@ -259,8 +260,8 @@ def compare(reader, life, estimates, events, frame_list):
             for signal, wanted in life.health().items():
                 if signal in values:
                     if signal == "RechargePeriod" and values[signal] is not None:
-                        # Sent as soon as the charge leaves the window. The event comes at the end of the charge, if the log
-                        # contains that.
+                        # The frame is sent as soon as the charge leaves the window. The event follows at the end of the charge,
+                        # if the log contains that end.
                         coming = periods[done] if done < len(periods) else None
                         if coming is not None and abs(values[signal] - coming) <= 1:
                             wanted = coming

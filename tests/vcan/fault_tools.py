@@ -112,7 +112,7 @@ class Truth:
 
 
 def within(errors: list[tuple[float, float]]) -> float:
-    """Part of the errors within two deviations plus a point."""
+    """Share of the errors that are at most two standard deviations plus one point of SOC."""
     return sum(error <= 2 * std + 0.01 for error, std in errors) / max(1, len(errors))
 
 
