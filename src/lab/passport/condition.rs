@@ -12,10 +12,10 @@ use crate::config::Config;
 use crate::monitor::{Downtime, ModelState, Monitor, Outputs, Snapshot};
 use crate::quantity::{CellIndex, Channel, Timestamp, catalogue};
 
-/// Stamps before 2001-01-01, s since 1970, are not dates. A clock that was not set starts in 1970, 1980 or 2000; a log that counts from
-/// its start is shorter than 30 years.
+/// An earlier time stamp (before 2001-01-01, s since 1970) is not a date. A clock that was not set starts in 1970, 1980 or 2000; a log
+/// that counts from its own start is shorter than 30 years.
 const FIRST_DATE_S: f64 = 978_307_200.0;
-/// Largest difference between two values of the new battery, fraction: they may be rounded.
+/// Largest accepted difference between two values of the same new battery, fraction; the values may be rounded.
 pub(super) const RATED_TOLERANCE: f64 = 0.01;
 
 /// Data from the command line that no record contains; `None` = not given.
@@ -50,7 +50,7 @@ pub struct Condition {
     rated: Rated,
 }
 
-/// The new battery according to configuration and command line; a passport with other values belongs to another battery.
+/// Values of the new battery from configuration and command line. A passport with other values belongs to another battery.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Rated {
     /// Capacity, Ah.
@@ -94,7 +94,7 @@ fn is_date(time: Timestamp) -> bool {
     time.secs() >= FIRST_DATE_S
 }
 
-/// Returns the value if its time is a date.
+/// Returns the value; if its time is not a date, returns the reason why it is unknown.
 fn dated(quantity: Quantity) -> Known {
     if is_date(quantity.time) {
         return Ok(quantity);
@@ -102,7 +102,7 @@ fn dated(quantity: Quantity) -> Known {
     Err("its time is unknown: the clock was not set when it was measured".to_owned())
 }
 
-/// Checks that a state was taken with this configuration of the pack, as far as the state shows.
+/// Checks that a state was recorded with this configuration of the pack, as far as the state shows.
 fn check_origin(state: &Snapshot, config: &Config) -> Result<(), String> {
     let sample = &config.monitor.sample;
     if let Some(module) = config.monitor.modules.first() {
@@ -300,7 +300,7 @@ impl<'a> Battery<'a> {
         Ok(Quantity { value: *mean, std: Some(*std), time: Timestamp::from_nanos(*at_ns) }.times(self.strings))
     }
 
-    /// Resistance, relative to new, of the cell with the highest.
+    /// Returns the highest resistance ratio of all cells (relative to new).
     fn worst_resistance(&self) -> Known {
         let learned = self.learned()?;
         let worst = learned.iter().max_by(|a, b| a.1.resistance.0.total_cmp(&b.1.resistance.0));
@@ -308,7 +308,8 @@ impl<'a> Battery<'a> {
         Ok(Quantity { value: *mean, std: Some(*std), time: Timestamp::from_nanos(*at_ns) })
     }
 
-    /// Mean of the cells' resistances relative to new. Their errors share the model's, so the deviation is a mean too.
+    /// Returns the mean of the cells' resistance ratios. All errors share the error of the model, so the standard deviation is also a
+    /// mean.
     fn mean_resistance(&self) -> Known {
         let learned = self.learned()?;
         let count = learned.len() as f64;

@@ -1,8 +1,9 @@
 //! Energy of a discharge at the configured load.
 //!
-//! Input: a cell's model, load, capacity (Ah) and resistance ratio. Output: Wh until a charge (Ah) has been delivered. The voltage under
-//! load follows from the usable capacity ([`usable_ah`]): a table holds the charge q(v) that a discharge delivers down to each voltage v,
-//! and the energy is the sum of v dq over it. Charge beyond the table is delivered at the cut-off voltage.
+//! Input: model, load, capacity (Ah) and resistance ratio of a cell. Output: the energy (Wh) until a given charge (Ah) has been
+//! delivered. The voltage under load follows from the usable capacity ([`usable_ah`]): a table contains the charge q(v) that a
+//! discharge delivers down to each voltage v. The energy is the sum of v dq over this table. Any additional charge is delivered at the
+//! cut-off voltage.
 
 use crate::cell::CellModel;
 use crate::health::UsableConfig;
@@ -27,7 +28,7 @@ impl Discharge {
         let point = |step: u32| {
             let cutoff_v = voltage_v(step);
             let load = UsableConfig { cutoff_v, ..*load };
-            // The slowest branch is taken as new: it changes the mean voltage by millivolts.
+            // The slowest branch counts as new: its ageing changes the mean voltage by millivolts only.
             (cutoff_v, usable_ah(model, &load, 1.0, capacity_ah, (resistance_ratio, 1.0)))
         };
         Self { points: (0..=VOLTAGES).map(point).collect(), cutoff_v: load.cutoff_v }

@@ -1,6 +1,6 @@
 //! The values of a battery passport that packwatch can determine: name, unit, definition and place in each standard.
 //!
-//! This table decides what is written where; `docs/src/lab/passport.md` explains it.
+//! This table decides which value is written to which member; `docs/src/lab/passport.md` explains it.
 
 use serde_json::Value;
 
@@ -42,11 +42,11 @@ pub enum Field {
     RemainingCapacity,
     /// Capacity lost, % of the rated capacity.
     CapacityFade,
-    /// Resistance increase of the cell with the largest, % of the new cell's.
+    /// Largest resistance increase of any cell, % of the resistance of a new cell.
     CellResistanceIncrease,
-    /// Resistance increase of all cells together, % of the new cells'.
+    /// Resistance increase of all cells together, % of the resistance of the new cells.
     PackResistanceIncrease,
-    /// Ohmic resistance of the cell with the highest, ohm.
+    /// Highest ohmic resistance of any cell, ohm.
     CellResistance,
     /// Ohmic resistance of all cells together, ohm.
     PackResistance,
@@ -59,7 +59,7 @@ pub enum Field {
 /// Place of a value in the JSON: member names that lead to the number and to its time.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Place {
-    /// Members above both.
+    /// Members that contain both the number and its time.
     pub(super) group: &'static str,
     /// Member with the number.
     pub(super) value: &'static str,

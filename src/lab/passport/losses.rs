@@ -1,4 +1,4 @@
-//! Charge that a replay did not see: times with unknown current.
+//! Charge that a replay did not see because the current was unknown.
 //!
 //! Input: events and estimates of a replay, in order. Output: lost seconds, or the first gap with unlimited charge. A replay reports
 //! a missing current in these ways:
@@ -32,7 +32,7 @@ pub(super) struct Losses {
     limits: ReadingLimits,
     /// Latest known current, A per string.
     current_a: Option<f64>,
-    /// Start of the current loss.
+    /// Start of the loss that has not ended; `None` = no loss is open.
     lost_since: Option<Timestamp>,
     is_asleep: bool,
     /// End of the latest time in which nothing was recorded and no charge moved.

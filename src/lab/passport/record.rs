@@ -17,7 +17,7 @@ pub(super) struct Learned {
     pub(super) at_ns: i64,
     /// Ah.
     pub(super) capacity: (f64, f64),
-    /// Ah, with its own time: from the latest half-cycle that gave one; `None` = no load is configured.
+    /// Usable capacity, Ah, with the time of the latest half-cycle that gave it; `None` = no load is configured.
     pub(super) usable: Option<(i64, (f64, f64))>,
     /// Relative to new.
     pub(super) resistance: (f64, f64),
@@ -45,7 +45,7 @@ struct Power {
 /// Energy of a replay: integral of the power of all cells of one string.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Energy {
-    /// Both directions added, Wh.
+    /// Energy of charges and discharges, Wh, added.
     pub(super) energy_wh: f64,
     /// Time of the last part.
     pub(super) until: Option<Timestamp>,
@@ -66,7 +66,7 @@ impl Energy {
 #[derive(Debug, Default)]
 pub struct Record {
     pub(super) cells: Vec<CellRecord>,
-    /// End of the last half-cycle; not the latest time if the clock was set back.
+    /// End of the last half-cycle. If the clock was set back, this is not the latest time.
     pub(super) moved_until_ns: Option<i64>,
     /// Why the half-cycles lack charge.
     pub(super) gap: Option<String>,
@@ -108,8 +108,8 @@ impl Record {
         Ok(record)
     }
 
-    /// Compares the half-cycles of a store with the number counted when they were written.
-    /// If the state is as old as the rows, its sums replace rows that the store deleted.
+    /// Compares the half-cycles in a store with the number that was counted when they were written. If the state is as old as the rows,
+    /// the sums in the state replace rows that the store has deleted.
     fn note_missing_rows(&mut self, extent: &HistoryExtent) {
         let HistoryExtent { half_cycles, deleted_half_cycles: deleted, written_half_cycles, .. } = *extent;
         let counted = self.snapshot().map_or(0, Snapshot::half_cycles);
@@ -151,7 +151,7 @@ impl Record {
 
     /// Receives the outputs of a replay, in order.
     pub fn take(&mut self, out: &Outputs) {
-        // An event may be a gap: earlier estimates show the current that flowed before it; estimates of its time follow it.
+        // An event may be a gap. Earlier estimates show the current before the gap, and estimates with its time follow the gap.
         let mut estimates = out.estimates.iter().peekable();
         for event in &out.events {
             while let Some(estimate) = estimates.next_if(|estimate| estimate.time < event.time) {
@@ -241,8 +241,9 @@ impl Record {
         cell.learned = Some(Learned { at_ns, capacity, usable, resistance });
     }
 
-    /// Charge moved by a pack of so many strings, Ah, and the difference between the durations of discharges and charges, h.
-    /// Taken from the cell that moved most, so that a missing row of another cell does not reduce it.
+    /// Returns the charge moved by a pack with this number of strings, Ah, and the difference between the durations of discharges and
+    /// charges, h. The values are those of the cell that moved the largest charge, so a missing row of another cell does not reduce
+    /// them.
     pub(super) fn moved(&self, strings: f64) -> (f64, f64) {
         let most = self.fullest();
         (strings * most.charge_ah, (most.discharging_s - most.charging_s).abs() / 3600.0)

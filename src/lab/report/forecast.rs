@@ -14,10 +14,11 @@ use crate::health::{Axis, CapacityReading, Forecast, InsufficientData, Remaining
 const DAY_S: f64 = 86_400.0;
 /// Number of points of a fan.
 const POINTS: usize = 60;
-/// Limits of the fan's length: multiples of the median time to the end of life, and of the record's length.
+/// Upper limits of the fan's length: this multiple of the median time to the end of life, and the next constant times the record's
+/// length.
 const MAX_MEDIANS: f64 = 2.5;
 const MAX_RECORDS: f64 = 2.0;
-/// Length of the fan if the median is near but the end may come late, as a multiple of the record's length.
+/// Length of the fan, as a multiple of the record's length, if the median is near but the end may come late.
 const LEAST_RECORDS: f64 = 0.2;
 
 /// Forecast of the capacity at a time.
@@ -62,7 +63,7 @@ pub(super) fn outlook(data: &Data, context: &PageContext<'_>) -> Result<Outlook,
     let known = lives.into_iter().enumerate().filter_map(|(cell, life)| Some((cell, life.ok()?)));
     match known.min_by(|a, b| median(&a.1).total_cmp(&median(&b.1))) {
         Some((cell, life)) => {
-            // No life is shorter than one that is over.
+            // If the life of one cell is already over, no other cell can have a shorter one.
             let unknown = unknown.filter(|_| !is_over(&life));
             Ok(Outlook { cell, fan: fan(data, &cells[cell], &life), end_ah, life, unknown })
         }
@@ -104,7 +105,7 @@ pub(super) fn cells(data: &Data, context: &PageContext<'_>) -> Vec<Forecast> {
         for half in halves {
             let rated_ah = rated_ah(half.cell);
             let usage = Usage::in_half_cycle(half.charge_ah, half.duration_s, since_before_s, rated_ah);
-            // Use without a reading counts too: a store omits capacities without new information.
+            // Use without a capacity counts too, because a store omits capacities without new information.
             let row = learned.get(&key(half.time_s, half.cell));
             cells[half.cell].update(usage, row.and_then(|row| reading(row, gain_std)));
         }
@@ -144,7 +145,7 @@ impl Outlook {
         is_over(&self.life)
     }
 
-    /// Returns for example "14 cycles"; as in the monitor, the life of a pack is unknown until every cell's life is known.
+    /// Returns for example "14 cycles". As in the monitor, the life of a pack is unknown until the life of every cell is known.
     pub(super) fn value(&self) -> String {
         match self.life.cycles {
             Some(left) if self.unknown.is_none() => median(left),

@@ -11,7 +11,7 @@ use crate::config::Config;
 use crate::io::stamp::format_utc;
 use crate::{cell_fault_pictures, pack_view};
 
-/// Most rows of a table; the pictures and `packwatch history` show all.
+/// Maximum number of rows of a table. The pictures and `packwatch history` show all rows.
 const MAX_ROWS: usize = 200;
 
 /// Section after which the alarms follow.
@@ -317,7 +317,7 @@ fn alarms(
     }
 }
 
-/// Groups alarm changes of many cells: the same change of a rule and severity within a second, each for another cell.
+/// Groups alarm changes of many cells. A group contains the same change of a rule and severity within a second, each for another cell.
 ///
 /// The groups are in the order of their first change.
 fn group_alike(alarms: &[AlarmRecord]) -> Vec<Vec<&AlarmRecord>> {
@@ -328,7 +328,7 @@ fn group_alike(alarms: &[AlarmRecord]) -> Vec<Vec<&AlarmRecord>> {
     };
     let mut groups: Vec<Vec<&AlarmRecord>> = Vec::new();
     for row in alarms {
-        // The alarms of several rules arrive cell by cell, so the matching group need not be the latest. But a change must not be
+        // The alarms of several rules arrive cell by cell, so the matching group is not always the latest one. But a change must not be
         // listed before an earlier change of the same alarm.
         let may_precede = |group: &&mut Vec<&AlarmRecord>| {
             (group[0].time_s - row.time_s).abs() < 1.0 && group.iter().all(|other| !is_same_alarm(other, row))

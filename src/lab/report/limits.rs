@@ -1,10 +1,10 @@
-//! Limits of the alarms: as configured, or else as in the record's alarms.
+//! Limits of the alarms: from the configuration, or without one from the alarms in the record.
 
 use super::context::PageContext;
 use super::data::Data;
 use crate::alarm::{Rule, Severity};
 
-/// The mildest threshold of a rule, as configured or else as in its alarms.
+/// Returns the mildest threshold of a rule, from the configuration or else from the alarms of the rule.
 pub(super) fn threshold(data: &Data, context: &PageContext<'_>, rule: Rule) -> Option<f64> {
     thresholds(data, context, rule).first().map(|(value, _)| *value)
 }

@@ -135,11 +135,12 @@ fn range(
     band.collect()
 }
 
-/// Filled bins; a visible gap keeps one empty bin, which interrupts the line.
+/// Returns the bins with data. A gap that must be visible keeps one empty bin, which interrupts the line.
 fn filled<'a>(bins: impl Iterator<Item = (f64, &'a TraceBin)>) -> Vec<(f64, &'a TraceBin)> {
     let all: Vec<(f64, &TraceBin)> = bins.collect();
     let width_s = all.windows(2).map(|pair| pair[1].0 - pair[0].0).fold(f64::INFINITY, f64::min).max(1.0);
-    // A gap interrupts a line if it is at least this share of the whole, 100 s and 3 bins long: some sensors are slow.
+    // A gap is visible if it is at least this share of all bins, 100 s and 3 bins long. It is not shorter because some sensors are
+    // slow.
     let hole = (all.len() / 100).max((100.0 / width_s) as usize).max(3);
     let mut empty = 0;
     let wanted = all.into_iter().filter(|(_, bin)| {
@@ -150,7 +151,7 @@ fn filled<'a>(bins: impl Iterator<Item = (f64, &'a TraceBin)>) -> Vec<(f64, &'a 
     wanted.collect()
 }
 
-/// One line through the low and the high value of each bin.
+/// Returns one line through the low and the high value of each bin.
 fn zigzag(band: &[(f64, f64, f64)]) -> Vec<(f64, f64)> {
     band.iter().flat_map(|(x, low, high)| [(*x, *low), (*x, *high)]).collect()
 }
@@ -171,7 +172,7 @@ fn soc(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
 fn soc_recent(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     let moments: Vec<(f64, &TraceBin)> = filled(data.trace.recent.iter().flat_map(|bins| bins.iter()));
     let (first_s, last_s) = data.ends_s()?;
-    // If the recent part covers almost the whole record, the picture above shows it.
+    // If the recent part covers almost the whole record, another picture already shows it.
     if moments.last()?.0 - moments.first()?.0 > 0.9 * (last_s - first_s) {
         return None;
     }
@@ -232,7 +233,7 @@ fn capacity(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -
     }
     let limits: Vec<Layer> = levels(data, context, Rule::CapacityLow).collect();
     let end = forecast::end_of_life_ah(data, context).map(Shape::Level);
-    // Hidden behind a limit at the same height.
+    // The end of life would be hidden behind a limit at the same value.
     let end = end.filter(|end| limits.iter().all(|limit| limit.shape != *end));
     layers.extend(end.map(|end| Layer::new("end of life", Ink::Grey, end)));
     layers.extend(limits);
@@ -242,7 +243,8 @@ fn capacity(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -
     chart(title, description, clock.axis, within_reason(&steps, &layers, "capacity, Ah"), layers)
 }
 
-/// Returns an axis over the filtered values with their interval, because single half-cycles may lie far outside.
+/// Returns an axis that shows the filtered values with their intervals. Single half-cycles may lie outside, because they can be far
+/// off.
 fn within_reason(steps: &[CellStep], layers: &[Layer], label: &str) -> Axis {
     let mut low = steps.iter().map(|s| s.range.0.min(s.worst.0 - OF_95 * s.worst.1)).fold(f64::INFINITY, f64::min);
     let mut high = steps.iter().map(|s| s.range.1.max(s.worst.0 + OF_95 * s.worst.1)).fold(0.0, f64::max);

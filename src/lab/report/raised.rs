@@ -1,4 +1,4 @@
-//! The state at the end of the record: raised alarms with their current values, and cells whose estimate is untrusted.
+//! The state at the end of the record: raised alarms with their values at this time, and cells whose estimate is untrusted.
 
 use std::collections::BTreeMap;
 
@@ -11,7 +11,7 @@ use super::series;
 use crate::alarm::{Direction, Rule};
 use crate::health::RechargeAlarm;
 
-/// Most cells listed by name in a group; of the rest only the number is stated.
+/// Maximum number of cells that a group lists; further cells are only counted.
 const MAX_NAMED: usize = 8;
 
 /// An alarm that is raised at the end of the data.
@@ -31,7 +31,7 @@ pub(super) fn raised(data: &Data) -> Vec<ActiveAlarm<'_>> {
     let mut last: BTreeMap<(&str, &str, Option<usize>), ActiveAlarm<'_>> = BTreeMap::new();
     for row in &data.alarms {
         let key = (row.rule.as_str(), row.severity.as_str(), row.cell);
-        // Only the row that raised it surely contains the value.
+        // Only the row that raised the alarm certainly contains the value.
         if row.is_active {
             last.entry(key).or_insert(ActiveAlarm { row, since_s: row.time_s });
         } else {

@@ -51,8 +51,8 @@ pub(super) fn resistance(row: &CapacityRecord) -> Option<(f64, f64)> {
     Some(row.resistance).filter(|value| value.0.is_finite())
 }
 
-/// The worst cell after every half-cycle: the lowest value, or the highest if `high_is_bad`. A cell keeps its value until it gets
-/// another.
+/// Returns the worst cell after every half-cycle: the cell with the lowest value, or with the highest if `high_is_bad`. A cell keeps
+/// its value until it gets a new one.
 pub(super) fn steps(data: &Data, pick: ValueSelector, high_is_bad: bool) -> Vec<CellStep> {
     let mut cells: Vec<Option<(f64, f64)>> = vec![None; data.cells()];
     let mut steps = Vec::new();
@@ -103,8 +103,8 @@ pub(super) fn temperatures(data: &Data) -> Vec<(f64, f64, f64)> {
     .collect()
 }
 
-/// Equivalent full cycles of the most used cell: charge moved over twice the rated capacity, or without one over twice the first
-/// learned capacity.
+/// Returns the equivalent full cycles of the cell that was used most: charge moved divided by twice the rated capacity. If the rated
+/// capacity is unknown, the first learned capacity replaces it.
 pub(super) fn full_cycles(data: &Data, rated_ah: Option<f64>) -> Option<f64> {
     let mut moved_ah = vec![0.0; data.cells()];
     data.halves.iter().for_each(|half| moved_ah[half.cell] += half.charge_ah.max(0.0));

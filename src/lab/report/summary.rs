@@ -51,7 +51,7 @@ pub(super) struct Tile {
     pub(super) name: &'static str,
     pub(super) value: String,
     pub(super) note: String,
-    /// Untrusted cells behind the estimate; `None` = it is trusted, or the figure is not an estimate.
+    /// Untrusted cells on which the figure depends; `None` = the estimate is trusted, or the figure is not an estimate.
     pub(super) doubt: Option<String>,
 }
 
@@ -95,7 +95,8 @@ pub(super) fn of(data: &Data, context: &PageContext<'_>, outlook: &Result<Outloo
     }
 }
 
-/// The worst alarm: among the cells for which a rule has raised the worst severity, the cell with the worst value now.
+/// Returns the worst alarm. Among the cells for which a rule has raised its highest severity, it is that of the cell with the worst
+/// value at the end.
 fn worst<'a>(
     alarms: &[&'a ActiveAlarm<'a>],
     value: impl Fn(&ActiveAlarm<'_>) -> Option<f64>,
@@ -121,7 +122,7 @@ fn knows_limits(data: &Data, context: &PageContext<'_>) -> bool {
     context.config.is_some() || !data.alarms.is_empty()
 }
 
-/// Returns why the battery cannot be called good, regardless of alarms; `None` = it can.
+/// Returns why the battery cannot be called good, regardless of alarms; `None` = there is no such reason.
 fn unknown(data: &Data, context: &PageContext<'_>) -> Option<String> {
     let cells = context.config.map_or(0, |config| usize::from(config.monitor.sample.cells)).max(data.cells());
     let measured: BTreeSet<usize> =
@@ -297,7 +298,7 @@ fn tiles(
     estimates
 }
 
-/// Marks a capacity that no half-cycle of the cell has measured: the configured value, aged since.
+/// Marks a capacity that no half-cycle of the cell has measured: it is the configured value, aged since then.
 fn assumed(data: &Data, cell: usize) -> &'static str {
     let is_measured = data.learned.iter().any(|row| row.cell == cell && row.measured_ah.is_some());
     if is_measured { "" } else { "; assumed, not measured yet" }

@@ -1,18 +1,18 @@
 //! Baselines for comparison with forecasts: a straight line through the last points, and a least-squares double
 //! exponential.
 //!
-//! Input: points of [use, capacity]. Output: the use at which the curve first passes the threshold.
+//! Input: points of [use, capacity]. Output: the use at which the curve first falls below the threshold.
 
-/// Number of steps in which the curve is followed.
+/// Number of steps in which the curve is evaluated.
 const STEPS: u32 = 20_000;
-/// First step of the search, and the step at which it ends.
+/// First step of the search, and the step below which the search ends.
 const SEARCH: (f64, f64) = (0.5, 1e-4);
-/// Largest exponents: e-folds over the use so far.
+/// Largest exponents, in e-folds over the use so far.
 const STEEPEST: f64 = 50.0;
 
 /// Least-squares line through the last points; `None` = it does not fall.
 pub(super) fn straight(points: &[[f64; 2]], threshold: f64) -> Option<f64> {
-    // Part of the points, the last ones, through which the line goes.
+    // Share of the points, counted from the last one, through which the line is fitted.
     let wanted = ((0.3 * points.len() as f64) as usize).max(5);
     let last = &points[points.len().saturating_sub(wanted)..];
     let count = last.len() as f64;
@@ -51,7 +51,7 @@ fn search(start: [f64; 2], fit: &dyn Fn([f64; 2]) -> Option<ExponentialFit>) -> 
     let neighbours: [[f64; 2]; 8] =
         [[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]];
     let (mut best, mut step) = (fit(start)?, SEARCH.0);
-    // Most moves of the search: one that needs more creeps along a flat valley.
+    // Maximum number of moves. A search that needs more moves creeps along a flat valley.
     for _ in 0..400 {
         if step < SEARCH.1 {
             break;
@@ -78,7 +78,7 @@ fn linear(points: &[[f64; 2]], scale: f64, exponents: [f64; 2]) -> Option<Expone
         yc += y * capacity;
     }
     let determinant = xx * yy - xy * xy;
-    // Too small a determinant, as a share of its terms: both exponentials coincide. The comparison also covers NaN.
+    // If the determinant is too small relative to its terms, both exponentials coincide. The comparison also rejects NaN.
     if !matches!(determinant.partial_cmp(&(1e-12 * xx * yy)), Some(std::cmp::Ordering::Greater)) {
         return None;
     }

@@ -1,7 +1,8 @@
 //! Capacity histories: a [`CapacityTable`] in order of time.
 //!
-//! With a column `type`, only discharges are readings, and each counts as a full cycle. Without it, the file does not contain the use,
-//! so days are counted. `duration_s` is the time of use between two readings; the remaining time counts as rest.
+//! With a column `type`, only discharges are readings, and each discharge counts as a full cycle. Without this column, the file does
+//! not contain the use, so days are counted. `duration_s` is the time in use that starts at a row; the time from its end to the next
+//! row counts as rest.
 
 use std::path::Path;
 
@@ -96,7 +97,7 @@ impl UseCounter {
         reading
     }
 
-    /// Counts the time since the previous line: time that the previous line did not use was rest.
+    /// Counts the time since the previous line. The part of it that the previous line did not use was rest.
     fn pass(&mut self, time: Timestamp) {
         if let Some(last) = self.last {
             self.rest_days += (time.since(last) / 86_400.0 - self.used_days).max(0.0);

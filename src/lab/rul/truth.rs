@@ -2,7 +2,8 @@
 
 use super::History;
 
-/// Use at which the capacity finally passes the threshold; `None` = it does not, or it was below from the first reading on.
+/// Returns the use at which the capacity finally falls below the threshold; `None` = it does not, or it was below from the first
+/// reading.
 pub fn end_of_life(history: &History, threshold_ah: f64) -> Option<f64> {
     let capacities: Vec<f64> = history.rows.iter().map(|row| row.capacity_ah).collect();
     let line = non_increasing(&capacities);
@@ -15,7 +16,7 @@ pub fn end_of_life(history: &History, threshold_ah: f64) -> Option<f64> {
     Some(before.used + (after.used - before.used) * (before.capacity_ah - threshold_ah) / drop)
 }
 
-/// The non-increasing sequence with the smallest sum of squared differences: rising neighbours are replaced by their mean.
+/// Returns the non-increasing sequence with the smallest sum of squared differences. Neighbours that rise are replaced by their mean.
 fn non_increasing(values: &[f64]) -> Vec<f64> {
     let mut blocks: Vec<(f64, usize)> = Vec::with_capacity(values.len());
     for &value in values {

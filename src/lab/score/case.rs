@@ -17,7 +17,7 @@ use crate::quantity::Timestamp;
 
 /// Number of rows between two progress reports.
 const REPORT_EVERY: usize = 4096;
-/// An initial SOC outside 0 to 1 by no more than this is clamped (a counter may not start at exactly 0).
+/// An initial SOC outside 0 to 1 by at most this value is clamped, because a counter may not start at exactly 0.
 const SOC_SLACK: f64 = 0.005;
 
 /// Where in a file the estimator starts.
@@ -26,7 +26,7 @@ const SOC_SLACK: f64 = 0.005;
 pub enum Start {
     /// At the first row.
     Full,
-    /// Where a share of the charge has been taken out; earlier rows are dropped.
+    /// At the row where a given share of the charge has been taken out; earlier rows are dropped.
     Middle,
 }
 
@@ -47,7 +47,7 @@ pub struct Case {
 }
 
 impl Case {
-    /// The case in words; the two names stand for an error of the capacity and of the current.
+    /// Returns the case in words. The two given names are used for the errors of capacity and current.
     pub fn words(&self, separator: &str, [capacity, current]: [&str; 2]) -> String {
         let mut words = vec![match self.start {
             Start::Full => "full".to_owned(),

@@ -6,7 +6,7 @@ use crate::OF_95;
 
 /// Largest error of a converged estimate, points (percent of full).
 pub const CONVERGED_POINTS: f64 = 2.0;
-/// The error must stay that small for this time, s: a wrong estimate that only crosses the truth has not converged.
+/// The error must stay below this limit for this time, s. A wrong estimate that only crosses the truth has not converged.
 pub const CONVERGED_HOLD_S: f64 = 600.0;
 
 /// An estimate with its truth.
@@ -59,8 +59,8 @@ pub struct SocScore {
     pub coverage: f64,
     /// Mean half-width of the interval, points.
     pub mean_half_width_points: f64,
-    /// Mean of (innovation / standard deviation) squared: at most about 1 if the filter's own statistics are right, and far below 1 at
-    /// high sample rates, because the filter counts information per second.
+    /// Mean of (innovation / standard deviation) squared. If the filter's statistics are right, it is at most about 1. At high sample
+    /// rates it is far below 1, because the filter counts information per second.
     pub mean_normalised_innovation_squared: f64,
 }
 

@@ -1,8 +1,8 @@
-//! Random windows: only a part of each half-cycle is visible, as in a vehicle that starts and stops anywhere.
+//! Random windows: the monitor sees only a part of each half-cycle, as in a vehicle that starts and stops at any time.
 //!
-//! The window covers a share of the charge that the part moves (|current| times time; a share of time would be dominated by the long
-//! taper of a charger). Share and position are uniformly distributed. Rows outside the window are dropped: the monitor sees a gap in
-//! its record.
+//! The window covers a share of the charge that the part moves (|current| times time). A share of the time would be dominated by the
+//! long taper of a charger. Share and position are uniformly distributed. Rows outside the window are dropped, so the monitor sees a
+//! gap in its record.
 
 use std::ops::Range;
 

@@ -38,7 +38,7 @@ impl Resistances {
         self.r0_ohm + self.branches.iter().map(|branch| branch.0).sum::<f64>()
     }
 
-    /// A value that no cell has, with what is allowed; `None` = all values are possible.
+    /// Returns a value that no cell has, with what is allowed; `None` = the values are possible.
     pub(super) fn fault(&self) -> Option<String> {
         let resistances = std::iter::once(self.r0_ohm).chain(self.branches.iter().map(|branch| branch.0));
         let capacitances = self.branches.iter().map(|(r_ohm, tau_s)| tau_s / r_ohm);
@@ -78,12 +78,12 @@ pub(super) fn resistances(cell: &BpxCell, curve: &Curve<'_>, soc: f64, temperatu
     Resistances { r0_ohm: at_least(r0_ohm), branches: branches.collect() }
 }
 
-/// At least [`LEAST`]; a negative value or NaN becomes NaN.
+/// Returns the value, but at least [`LEAST`]. A negative value or NaN becomes NaN.
 fn at_least(value: f64) -> f64 {
     if value >= 0.0 { value.max(LEAST) } else { f64::NAN }
 }
 
-/// A property at a temperature, relative to its value at the reference temperature.
+/// Returns a property at a temperature, relative to its value at the reference temperature.
 fn arrhenius(j_per_mol: Option<f64>, reference_k: f64, temperature_k: f64) -> f64 {
     let energy = j_per_mol.unwrap_or(USUAL_J_PER_MOL);
     libm::exp(energy / GAS_J_PER_MOL_K * (1.0 / reference_k - 1.0 / temperature_k))
@@ -107,7 +107,7 @@ fn particle(electrode: &Electrode, area_m2: f64, content: f64, diffusivity: f64)
     (slope_v / (FARADAY_C_PER_MOL * mol_per_s), radius_m * radius_m / (35.0 * diffusivity))
 }
 
-/// Sum over the layers of thickness / (property x transport efficiency); electrodes count one third.
+/// Sums thickness / (property x transport efficiency) over the layers. For electrodes, a third of the value counts.
 fn path(layers: &[Layer; 3], property: f64) -> f64 {
     let of = |layer: &Layer| layer.thickness_m / (property * layer.transport_efficiency);
     of(&layers[0]) / 3.0 + of(&layers[1]) + of(&layers[2]) / 3.0

@@ -1,15 +1,15 @@
 //! The open-circuit voltage of a BPX cell over SOC, and the charge between its cut-offs.
 //!
 //! `u(soc, T) = u_p(y) - u_n(x) + (T - T_ref) (du_p/dT(y) - du_n/dT(x))` with the lithium contents `x` (negative) and `y` (positive).
-//! The cyclable lithium follows from a full cell in the file: negative at its maximum, positive at its minimum. At the reference
-//! temperature, the voltage is the upper cut-off at SOC 1 and the lower one at SOC 0, as in PyBaMM's ElectrodeSOH
-//! (Mohtat et al., J. Power Sources 427 (2019) 101, eqs. 5 to 8). Units: V, Ah, K.
+//! The cyclable lithium follows from the full cell in the file: the negative electrode is at its maximum, the positive at its minimum.
+//! At the reference temperature, SOC 1 has the upper cut-off voltage and SOC 0 the lower one, as in PyBaMM's ElectrodeSOH (Mohtat et
+//! al., J. Power Sources 427 (2019) 101, eqs. 5 to 8). Units: V, Ah, K.
 
 use super::FARADAY_C_PER_MOL;
 use super::document::{BpxCell, Electrode};
 use crate::filter::bisect;
 
-/// Smallest rise of the open-circuit voltage between breakpoints, V; a voltage that falls is raised.
+/// Smallest rise of the open-circuit voltage between breakpoints, V. A voltage that rises by less, or falls, is raised.
 const LEAST_RISE_V: f64 = 2e-5;
 
 /// Number of points between two breakpoints at which the interpolation is checked.
@@ -33,7 +33,7 @@ pub(super) struct CurveTable {
     pub(super) soc: Vec<f64>,
     /// One row per temperature, V.
     pub(super) ocv_v: Vec<Vec<f64>>,
-    /// Largest amount by which a voltage was raised so that each row rises, V.
+    /// Largest amount by which a voltage was raised to make its row rise, V.
     pub(super) raised_v: f64,
 }
 
@@ -59,7 +59,7 @@ impl<'a> Curve<'a> {
         let ends = (((lithium_ah - q_p) / q_n).max(0.0) + 1e-9, (lithium_ah / q_n).min(1.0) - 1e-9);
         let mut faults = Vec::new();
         let mut content = |key: &str, cut_off_v: f64| {
-            // Search from the full end, so that a bend of a potential beyond the other end is not found.
+            // Search from the full end, so that a bend of a potential outside the other end is not found.
             let [full, empty] = [n.stoichiometry[1], n.stoichiometry[0]].map(|x| x.clamp(ends.0, ends.1));
             let near = if key == "Upper" { full } else { empty };
             let (low, high) = bracket(near, ends, |x| voltage_v(x) < cut_off_v);
@@ -126,7 +126,7 @@ impl<'a> Curve<'a> {
         Ok(table)
     }
 
-    /// SOC breakpoints: the interval with the largest error of a straight line is halved until no error exceeds the limit.
+    /// Returns the SOC breakpoints. The interval with the largest interpolation error is halved until no error exceeds the limit.
     fn nodes(&self) -> Vec<f64> {
         let mut nodes: Vec<f64> = (0..=10).map(|k| f64::from(k) / 10.0).collect();
         let mut errors: Vec<f64> = nodes.windows(2).map(|ends| self.line_error_v(ends[0], ends[1])).collect();
@@ -153,7 +153,7 @@ impl<'a> Curve<'a> {
     }
 }
 
-/// An interval around `near` in which the predicate changes from true to false; `ends` without such an interval.
+/// Returns an interval around `near` in which the predicate changes from true to false, or `ends` if there is none.
 fn bracket(near: f64, ends: (f64, f64), is_below: impl Fn(f64) -> bool) -> (f64, f64) {
     let mut step = 1e-4;
     while step < 1.0 {

@@ -29,7 +29,7 @@ pub(super) struct BpxCell {
     pub(super) area_m2: f64,
     pub(super) negative: Electrode,
     pub(super) positive: Electrode,
-    /// `None` for an SPM.
+    /// Transport in the electrolyte; `None` for the model SPM.
     pub(super) transport: Option<Transport>,
     /// Heat capacity, J/K, if density, volume and specific heat capacity are stated.
     pub(super) heat_capacity_j_per_k: Option<f64>,
@@ -85,7 +85,7 @@ pub(super) struct Layer {
     pub(super) transport_efficiency: f64,
 }
 
-/// Allowed values of a number: above the first, at most the second.
+/// Allowed values of a number: greater than the first value, at most the second.
 type Above = (f64, f64);
 
 const POSITIVE: Above = (0.0, f64::MAX);
@@ -104,7 +104,7 @@ pub(super) fn read(root: &Value) -> Result<BpxCell, Vec<String>> {
     }
 }
 
-/// An object of the JSON with its path; a missing object is reported once, without its keys.
+/// An object of the JSON with its path. If the object is missing, only the object is reported, not its keys.
 struct Section<'a> {
     path: String,
     keys: Option<&'a Map<String, Value>>,
@@ -157,7 +157,7 @@ impl<'a> Section<'a> {
         number
     }
 
-    /// A number; NaN if it is missing or invalid, which is reported.
+    /// Reads a number. If it is missing or invalid, this is reported and the result is NaN.
     fn number(&self, key: &str, range: Above, faults: &mut Vec<String>) -> f64 {
         self.require(key, "a number", faults);
         self.optional_number(key, range, faults).unwrap_or(f64::NAN)
@@ -169,7 +169,7 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// An activation energy, J/mol; 0 counts as not stated.
+    /// Reads an activation energy, J/mol; `None` = not stated, or stated as 0.
     fn energy(&self, key: &str, faults: &mut Vec<String>) -> Option<f64> {
         // The range includes 0.
         self.optional_number(key, (-f64::MIN_POSITIVE, 1e6), faults).filter(|energy| *energy > 0.0)
