@@ -107,7 +107,8 @@ impl Profile {
         if counter < self.max_counter() { counter + 1 } else { 0 }
     }
 
-    /// Number of steps from `from` to `to`, which must both be valid: 0 to the largest counter.
+    /// Number of steps from the counter `from` to the counter `to`, 0 to the largest counter. `from` and `to` must be
+    /// valid counters.
     const fn counter_delta(self, from: u8, to: u8) -> u8 {
         if to >= from { to - from } else { self.max_counter().wrapping_sub(from).wrapping_add(to).wrapping_add(1) }
     }

@@ -135,7 +135,7 @@ impl FloodGate {
 
     /// Ends each flood whose frames have stopped.
     pub fn poll(&mut self, now: Timestamp) {
-        // A flood is over after this time without a dropped frame, s. Shorter pauses belong to the same flood.
+        // A flood ends after this time without a dropped frame, s. Shorter pauses belong to the same flood.
         self.end(|last| now.since(last) >= 1.0);
     }
 

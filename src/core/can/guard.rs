@@ -11,8 +11,9 @@
 //!
 //! A time without listening is not the sender's fault. After sleep, a restart of the program or a clock step, the
 //! receivers wait for a first frame again ([`Guards::restart`]). For the same reason, a restarted program restores the
-//! counts but not the frame counters. The sender has continued, so a stored frame counter would reject good frames, or
-//! accept an old frame that fits by chance. Only a state that resumes without a gap restores both ([`Guards::resume`]).
+//! counts but not the frame counters. The sender has continued to send, so a stored frame counter would reject good
+//! frames, or accept an old frame that fits by chance. Only a state that resumes without a gap restores the counts and
+//! the frame counters ([`Guards::resume`]).
 
 use serde::{Deserialize, Serialize};
 
@@ -91,7 +92,7 @@ pub struct Guards {
 }
 
 impl Guards {
-    /// Creates guards for messages. If several entries are for the same message, the first one counts.
+    /// Creates guards for messages. If several entries are for the same message, the first entry is used.
     pub fn new(mut configs: Vec<GuardConfig>) -> Self {
         configs.sort_by_key(|config| (config.bus, config.id));
         configs.dedup_by_key(|config| (config.bus, config.id));

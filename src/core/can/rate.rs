@@ -5,12 +5,13 @@
 //! gone.
 //!
 //! Frames are counted in windows of [`WINDOW_NS`]. A second sender is found if [`WINDOWS`] consecutive windows have
-//! more than [`EXCESS`] times the expected number of frames and one of two further signs. Either many intervals are
-//! much shorter than the mean, because each frame of one sender falls between two frames of the other. Or the reported
-//! currents alternate. A single sender that becomes faster, as many do when the vehicle wakes, shows neither sign. Some
-//! messages always have short intervals, for example between the pages of a multiplexed message. These intervals are
-//! learned with the rate and do not count. The expected number is the highest steady rate so far, or the rate from the
-//! DBC's cycle time if it is higher. The learned rate is stored, so that a second sender is also found after a restart.
+//! more than [`EXCESS`] times the expected number of frames and one of two further signs. The first sign is that many
+//! intervals are much shorter than the mean, because each frame of one sender falls between two frames of the other
+//! sender. The second sign is that the reported currents alternate. A single sender that becomes faster, as many do
+//! when the vehicle wakes, shows neither sign. Some messages always have short intervals, for example between the pages
+//! of a multiplexed message. These intervals are learned with the rate and do not count. The expected number is the
+//! highest steady rate so far, or the rate from the DBC's cycle time if it is higher. The learned rate is stored, so
+//! that a second sender is also found after a restart.
 //!
 //! A second sender is not found in these cases:
 //! * the message has fewer than [`LEAST_PER_S`] frames a second, and the second sender is as slow as the first;
@@ -28,8 +29,8 @@ use crate::can::id_table::IdTable;
 use crate::quantity::{BusIndex, Timestamp};
 
 const WINDOW_NS: i64 = 1_000_000_000;
-/// Multiple of the expected number of frames above which a window has too many. A second sender with the same cycle
-/// time doubles the number.
+/// A window has too many frames if their number is above this multiple of the expected number. A second sender with the
+/// same cycle time doubles the number.
 const EXCESS: f64 = 1.5;
 /// Number of additional frames that are allowed, because arbitration may have delayed them into the window.
 const DELAYED: f64 = 1.5;

@@ -49,7 +49,7 @@ struct SignalGroup {
     bytes_needed: usize,
 }
 
-/// A length above that of any payload, bytes.
+/// A length that is greater than the length of any payload, bytes.
 const NEVER: usize = usize::MAX;
 
 /// Lists the groups that may be present for each code of the selector.

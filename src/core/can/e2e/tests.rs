@@ -130,7 +130,8 @@ fn undetected(protection: Protection, payload: &[u8], counter: u8, wrong_bits: u
         missed += usize::from(protection.verified_counter(&payload).is_some());
         tried += 1;
         flip(&mut payload);
-        // The next combination in ascending order: the last bit that can move up moves, and the bits above it follow.
+        // Makes the next combination in ascending order: moves up the last bit that can move, and places the bits above
+        // it directly after it.
         let last = 8 * payload.len() - wrong_bits;
         let Some(place) = (0..wrong_bits).rfind(|place| chosen[*place] < last + place) else { break };
         let first = chosen[place] + 1;

@@ -1,8 +1,8 @@
 //! Encodes the digest frame: number and checksum of all raised alarms, the state of every rule, and one threshold in
 //! full precision.
 //!
-//! In: alarms with the codes of their frames. Out: values for the signals of `PACKWATCH_Digest`. If a receiver lost
-//! alarm frames or started late, the checksum shows whether its table of raised alarms is complete.
+//! In: alarms with the codes of their frames. Out: values for the signals of `PACKWATCH_Digest`. The checksum shows a
+//! receiver whether its table of raised alarms is complete, for example after lost alarm frames or a late start.
 
 use super::layout::LayoutMessage;
 use super::message::{OutputMessage, RULES};

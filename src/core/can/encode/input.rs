@@ -230,7 +230,8 @@ impl AnswerPage {
         Self { question: answer.question, template, fields: answer.signals.iter().map(field).collect() }
     }
 
-    /// The response with these values; `None` = the response carries none of them, or a missing value has no code.
+    /// The response with these values; `None` = the response carries none of these values, or a missing value has no
+    /// code.
     fn message(&self, row: PlacedRow<'_>) -> Option<Vec<u8>> {
         if !self.fields.iter().any(|(_, field)| field.is_sent(row)) {
             return None;

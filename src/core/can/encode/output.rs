@@ -108,8 +108,8 @@ pub struct HealthFields {
     pub remaining_cycles_low: Option<f64>,
     /// Days until the end of life, median.
     pub remaining_days: Option<f64>,
-    /// Loss of lithium inventory of the cell with the least capacity, and its standard deviation. Both are fractions of
-    /// a new cell's inventory.
+    /// Loss of lithium inventory of the cell with the lowest capacity, and the standard deviation of this loss. The
+    /// loss and its standard deviation are fractions of a new cell's inventory.
     pub lli: [Option<f64>; 2],
     /// Loss of active material of the same cell's negative electrode, and its standard deviation, as fractions.
     pub lam_ne: [Option<f64>; 2],
