@@ -2,10 +2,10 @@
 //!
 //! In: good current readings, A, positive = discharge. Out: cumulative charge, As, and cumulative unmeasured time, s;
 //! only their differences are meaningful. An interval between two current readings counts as follows:
-//! * up to the current's `max_age_s`: trapezoid over the elapsed time;
-//! * longer: the first reading is held for `max_age_s` (the longest time that a value may be used). The rest of the
-//!   interval is unmeasured. Unmeasured time is never interpolated, regardless of its cause (bad readings, lost frames,
-//!   sleep, a restart).
+//! * at most the current's `max_age_s`: the charge is the mean of the two readings times the elapsed time (trapezoid);
+//! * longer than `max_age_s`, the longest time for which a value may be used: the first reading is held for
+//!   `max_age_s`. The rest of the interval is unmeasured. Unmeasured time is never interpolated, regardless of its
+//!   cause (bad readings, lost frames, sleep, a restart).
 //!
 //! After the latest reading, the current is held in the same way. The next reading replaces the held value by the
 //! trapezoid. While the contactors' reading is valid and says that they are open, the current is zero, measured or not.

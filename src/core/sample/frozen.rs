@@ -5,10 +5,10 @@
 //!
 //! A constant reading alone proves nothing. A parked pack, a charger and a laboratory hold a current for hours, and a
 //! coarse sensor then shows one value. In these cases, the voltages rest or drift in one direction. A changing load
-//! moves the voltages back and forth. The median of the cells moves in one direction and turns back within
-//! [`MAX_TURN_S`]. Both movements exceed the noise of the median. The sensor is frozen if its reading is still the same
-//! [`MIN_FROZEN_S`] after the turn and at least [`MIN_READINGS`] readings were equal. The delay allows for a reading
-//! that arrives later than the voltages.
+//! moves the voltages back and forth. The check requires that the median of the cells moves in one direction and turns
+//! back within [`MAX_TURN_S`], and that both movements exceed the noise of the median. The sensor is frozen if its
+//! reading is still the same [`MIN_FROZEN_S`] after the turn and at least [`MIN_READINGS`] readings were equal. The
+//! delay allows for a reading that arrives later than the voltages.
 //!
 //! Limits: the check does not detect a load that does not turn back or moves the voltages by less than the step. Nor
 //! does it detect a sensor whose last digits still change. In that case, the voltages contradict the estimate.
@@ -22,16 +22,16 @@ const MIN_READINGS: u32 = 20;
 /// Time for which the reading must remain unchanged after the voltages turned back, s. No current reading arrives later
 /// than this after the voltages.
 const MIN_FROZEN_S: f64 = 5.0;
-/// Longest time between an extreme voltage and the return from it, s. The voltages of cells that rest, cool or balance
-/// turn more slowly.
+/// Longest time between an extreme voltage and the return from this extreme, s. The voltages of cells that rest, cool
+/// or balance turn more slowly.
 const MAX_TURN_S: f64 = 60.0;
 /// Step that exceeds a voltage's noise, in configured standard deviations.
 const STEP_SIGMA: f64 = 5.0;
-/// The same step as a multiple of the median change of the voltage per round. It applies if the real noise exceeds the
-/// configured noise. The value corresponds to 8 standard deviations, so that two consecutive readings do not reach it
-/// by chance within a day.
+/// Step that exceeds a voltage's noise, as a multiple of the median change of the voltage per round. It applies if the
+/// real noise exceeds the configured noise. The multiple corresponds to 8 standard deviations, so that two consecutive
+/// readings do not exceed the step by chance within a day.
 const STEP_MOVES: f64 = 8.4;
-/// Maximum and minimum number of voltage changes from which their median is calculated.
+/// Maximum and minimum number of voltage changes from which the median change is calculated.
 const MAX_MOVES: usize = 32;
 const MIN_MOVES: usize = 8;
 /// Smallest step, V. A smaller step may be a charger's ripple, or a load within one step of a coarse current sensor.

@@ -22,7 +22,8 @@ use crate::quantity::{CellIndex, Channel, Fault, InvalidState, Reading, SensorIn
 /// at rest are below this current. Any load under which a voltage or temperature must change is above it.
 pub const FLOW_SHARE: f64 = 0.01;
 
-/// Reports that a signal turned bad (`Err` with the fault) or good again (`Ok` with the number of bad readings before).
+/// Reports that a signal turned bad (`Err` with the fault) or good again (`Ok` with the number of preceding bad
+/// readings).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SignalChange {
     pub channel: Channel,
@@ -332,7 +333,7 @@ impl Sampler {
     pub fn all_silent_s(&self, now: Timestamp, quiet_s: f64) -> Option<f64> {
         let received = |signal: &Signal| signal.received;
         let is_recent = |at: Timestamp| now.since(at) <= quiet_s;
-        // Check the current first: it arrives most often and usually decides.
+        // Check the current first, because it arrives more often than any other input and usually decides the result.
         if received(&self.state.signals[0]).is_some_and(is_recent) {
             return None;
         }
@@ -432,8 +433,8 @@ impl Sampler {
         self.bad_signals > 0
     }
 
-    /// Whether a stored state has this sampler's number of signals. Only the contactor signal, the last one, may be
-    /// missing.
+    /// Whether a stored state has this sampler's number of signals. Only the last signal, which is the contactor
+    /// signal, may be missing.
     pub fn fits(&self, state: &SamplerState) -> bool {
         let (own, stored) = (self.state.signals.len(), state.signals.len());
         stored == own || (self.config.contactor.is_some() && stored + 1 == own)

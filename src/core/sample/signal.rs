@@ -1,6 +1,7 @@
 //! Checks the readings of one signal: range, rate, stuck, stale.
 //!
-//! In: readings in the channel's unit, with their time. Out: the value or its fault, and changes between good and bad.
+//! In: readings in the channel's unit, with their time. Out: the value or its fault, and each change of the signal
+//! between good and bad.
 //!
 //! * **Range**: a value outside the limits is bad.
 //! * **Rate**: a value is bad if its distance from the last good value exceeds the fastest plausible change. Once
@@ -62,8 +63,8 @@ pub(super) struct Signal {
     bad_share: f64,
 }
 
-/// Outcome of a reading: the checked value, and the signal's new state if the state changed. `Ok` means good again and
-/// contains the number of bad readings before.
+/// Outcome of a reading: the checked value, and the signal's new state if the state changed. `Ok` means that the signal
+/// is good again; it contains the number of preceding bad readings.
 pub(super) struct SignalUpdate {
     pub(super) value: Result<f64, Fault>,
     pub(super) change: Option<Result<u64, Fault>>,
