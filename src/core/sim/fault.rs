@@ -21,7 +21,7 @@ pub struct Fault {
 /// Path of a leak inside a cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Leak {
-    /// A constant current, A.
+    /// A constant leakage current, A.
     Current(f64),
     /// A soft short circuit with this resistance, ohm. The current is the unloaded cell voltage divided by the
     /// resistance.

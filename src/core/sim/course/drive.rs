@@ -14,7 +14,8 @@ const ACCELERATION_M_S2: (f64, f64) = (1.2, 1.5);
 const CURRENT_LIMIT_C: (f64, f64) = (0.8, 2.5);
 /// SOC at which fast charging ends.
 const CHARGE_TO_SOC: f64 = 0.80;
-/// Fast charging current, C: the first value up to SOC 0.4, then falling linearly to the second value at SOC 0.8.
+/// Fast charging current, C: the first value applies up to SOC 0.4; from there, the current falls linearly to the
+/// second value at SOC 0.8.
 const CHARGE_C: (f64, f64) = (1.5, 0.6);
 
 /// One part of the day.
