@@ -11,8 +11,9 @@
 //!
 //! where c is 0.05 for a learned value and 0.5 otherwise. Therefore only a value at the clear threshold or better
 //! clears an alarm; a growing uncertainty does not. The clear threshold is on the healthy side of the set threshold.
-//! Therefore the second probability is the larger one, and no value is both beyond and healthy. With p = 0.5, the
-//! result is the same as for `when = "mean"`. If the standard deviation is needed but missing, the result is unknown.
+//! Therefore the second probability is the larger of the two, and no value is beyond and healthy at the same time. With
+//! p = 0.5, the result is the same as for `when = "mean"`. If the standard deviation is needed but missing, the result
+//! is unknown.
 //!
 //! A learned value (a capacity, a resistance, a remaining life) does not recover by itself. Therefore c also applies to
 //! `when = "mean"`: an estimate that fluctuates around its threshold must not clear its alarm.

@@ -20,7 +20,8 @@
 //! An alarm is raised while it is active, clearing, suppressed or latched.
 //!
 //! Time counts only between two observations of known values on the same side. Time before or after an unknown value
-//! does not count. It does not reset the count either, because a flickering input could then prevent an alarm forever.
+//! does not count. An unknown value does not reset the count either; otherwise, a flickering input could prevent an
+//! alarm forever.
 
 use serde::{Deserialize, Serialize};
 use strum::IntoStaticStr;

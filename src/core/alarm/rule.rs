@@ -44,7 +44,7 @@ pub enum Rule {
     BusFault = 14,
     /// A cell's self-discharge in excess of the other cells is above the threshold, fraction of the capacity per day.
     CellLeak = 15,
-    /// A cell's contact resistance in excess of the other cells is above the threshold. The unit is the fraction of a
+    /// A cell's contact resistance in excess of the other cells is above the threshold. The unit is a fraction of the
     /// cell's series resistance at medium SOC and 25 degrees C.
     ConnectionResistance = 16,
     /// A voltage channel does not show its own cell. The value is 1 in this case, else 0. While it is 1, the rules that
