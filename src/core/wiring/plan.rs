@@ -11,7 +11,7 @@ use crate::quantity::{BusIndex, Channel};
 /// Everything expected on the buses. Parts missing from a broken configuration are not judged.
 #[derive(Debug, Clone, Default)]
 pub struct Plan {
-    /// Configured interfaces in the order of their numbers; frames of other interfaces may be received too.
+    /// Configured interfaces in the order of their numbers; frames of other interfaces may also be received.
     pub interfaces: Vec<InterfacePlan>,
     /// Configured signals that were found in a DBC.
     pub signals: Vec<SignalPlan>,

@@ -51,7 +51,7 @@ pub enum Topic {
     PackVoltage,
     /// Readings are outside the configured limits.
     Range,
-    /// One cell or sensor differs from the others.
+    /// One cell or sensor differs from the other cells or sensors.
     Cell,
     /// Readings arrive too slowly or too unevenly.
     Period,
@@ -108,7 +108,7 @@ pub struct WiringReport {
     pub seconds: f64,
     /// Frames seen on all interfaces.
     pub frames: u64,
-    /// Findings: most severe first; among equally severe ones, causes before effects.
+    /// Findings, most severe first. Among equally severe findings, causes come before effects.
     pub findings: Vec<WiringFinding>,
     /// Checks that passed.
     pub fine: Vec<String>,

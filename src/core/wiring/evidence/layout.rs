@@ -50,7 +50,8 @@ impl AlternativeReading {
     }
 }
 
-/// The same start bit with the other byte order (`@0` for `@1` in the DBC); `None` if the signal lies within a byte.
+/// The layout with the same start bit and the opposite byte order (`@0` for `@1` in the DBC); `None` if the signal lies
+/// within a byte.
 fn order_flipped(layout: &SignalLayout) -> Option<SignalLayout> {
     let byte_order = match layout.byte_order {
         ByteOrder::LittleEndian => ByteOrder::BigEndian,
@@ -59,7 +60,8 @@ fn order_flipped(layout: &SignalLayout) -> Option<SignalLayout> {
     (layout.length_bits > 8).then_some(SignalLayout { byte_order, ..*layout })
 }
 
-/// The same whole bytes in the other order; `None` if the signal does not fill at least two whole bytes.
+/// The layout of the same whole bytes in the opposite order; `None` if the signal does not fill at least two whole
+/// bytes.
 fn byte_swapped(layout: &SignalLayout) -> Option<SignalLayout> {
     let whole = layout.length_bits.is_multiple_of(8) && layout.length_bits > 8;
     let (byte, bit) = (layout.start_bit / 8, layout.start_bit % 8);

@@ -113,7 +113,7 @@ impl Series {
         }
     }
 
-    /// Reads the bits with the other layouts.
+    /// Reads the signal's bits with the alternative layouts.
     fn read_otherwise(&mut self, payload: &[u8], binding: &Binding) {
         self.alternatives.iter_mut().for_each(|other| other.handle(payload, binding.scale, binding.offset));
     }

@@ -91,7 +91,7 @@ pub(super) fn check_equal(judge: &mut Judge<'_>) {
     }
 }
 
-/// Finds cells whose voltage does not follow the current as the others do.
+/// Finds cells whose voltage does not follow the current as the voltages of the other cells do.
 pub(super) fn check_response(judge: &mut Judge<'_>) {
     let is_clear = |slope: &Slope| slope.ohm > 0.0 && slope.certainty() >= 1.0 && slope.r2 >= EXPLAINED;
     let Some(common) = judge.observed.slope().filter(is_clear) else { return };

@@ -18,7 +18,7 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     }
 }
 
-/// Finds signals whose values differ from those of all other signals of their kind.
+/// Finds signals whose values differ from the values of all other signals of the same kind.
 pub(super) fn check_odd(judge: &mut Judge<'_>) {
     odd_cells(judge);
     odd_sensors(judge);
@@ -139,7 +139,7 @@ fn is_current_like(temperature: &Series, current: &Series) -> bool {
     temperature.jumps >= 3 && current.jumps == 0 && (5.0..=60.0).contains(&level)
 }
 
-/// Finds cells whose voltage differs from those of all other cells.
+/// Finds cells whose voltage differs from the voltages of all other cells.
 fn odd_cells(judge: &mut Judge<'_>) {
     let voltages = judge.signals(Kind::Voltage);
     let Some(median_v) = judge.cell_voltage().filter(|_| voltages.len() >= 4) else { return };
@@ -161,7 +161,7 @@ fn odd_cells(judge: &mut Judge<'_>) {
     }
 }
 
-/// Finds temperature sensors whose value differs from those of all other sensors.
+/// Finds temperature sensors whose value differs from the values of all other sensors.
 fn odd_sensors(judge: &mut Judge<'_>) {
     let sensors = judge.signals(Kind::Temperature);
     // `values` reports the sensors with impossible values.
