@@ -99,7 +99,7 @@ pub(crate) enum Beginning {
     RestoredAgeless,
 }
 
-/// A restore that waits for the first input, which gives the current time.
+/// A restore that waits for the first input, which gives the present time.
 #[derive(Debug)]
 pub(crate) struct PendingRestore {
     pub(crate) snapshot: Box<Snapshot>,

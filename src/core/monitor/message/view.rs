@@ -34,7 +34,7 @@ pub struct PackView {
     pub mode: Mode,
     /// The cell that is empty first.
     pub limiting_cell: Option<CellIndex>,
-    /// The cell with the least capacity, once every cell's capacity has been learned.
+    /// The cell with the lowest capacity, once every cell's capacity has been learned.
     pub weakest_cell: Option<CellIndex>,
     /// The cell with the shortest remaining life, once every cell's remaining life is known.
     #[serde(default)]

@@ -64,7 +64,7 @@ impl J1939 {
         self.dispatch_outputs(now, out);
     }
 
-    /// Sets the node's active and previously active codes from the current alarms.
+    /// Sets the node's active and previously active codes from the present alarms.
     pub(crate) fn update_trouble_codes(&mut self, now: Timestamp, engine: &AlarmEngine, is_test_running: bool) {
         self.active.clear();
         self.previously_active.clear();
