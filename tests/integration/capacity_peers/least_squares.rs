@@ -8,11 +8,14 @@
 //! - TLS (total least squares): x and y have errors, with the same ratio sx/sy for all swings
 //! - AWTLS (approximate weighted TLS): x and y have errors, with any sx and sy for each swing
 //!
-//! The running sums, with the weight w = gamma^(n-i) for swing i of n, are c1 = sum w x^2/sy^2, c2 = sum w xy/sy^2, c3
-//! = sum w y^2/sy^2, c4 = sum w x^2/sx^2, c5 = sum w xy/sx^2, c6 = sum w y^2/sx^2. AWTLS minimises sum w (y - Q x)^2 /
-//! (Q^2 + 1)^2 (Q^2/sx^2 + 1/sy^2). Before that, y and sy are scaled by K = sx/sy, so that Q is near 1, where the
-//! approximation holds. The minimum is a root of a quartic in Q. The variance is 2 divided by the cost's second
-//! derivative at the minimum.
+//! The running sums, with the weight w = gamma^(n-i) for swing i of n, are:
+//!
+//! - c1 = sum w x^2/sy^2, c2 = sum w xy/sy^2, c3 = sum w y^2/sy^2
+//! - c4 = sum w x^2/sx^2, c5 = sum w xy/sx^2, c6 = sum w y^2/sx^2
+//!
+//! AWTLS minimises sum w (y - Q x)^2 / (Q^2 + 1)^2 (Q^2/sx^2 + 1/sy^2). Before that, y and sy are scaled by K = sx/sy,
+//! so that Q is near 1, where the approximation holds. The minimum is a root of a quartic in Q. The variance is 2
+//! divided by the cost's second derivative at the minimum.
 
 use packwatch::filter::ScalarGaussian;
 
