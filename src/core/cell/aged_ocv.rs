@@ -1,23 +1,25 @@
 //! Change of a cell type's open-circuit curve with lost capacity: voltage offsets over SOC and capacity.
 //!
-//! In: the electrodes of the new cell, or a shift, and the SOC breakpoints of the model. Out: offsets, V, to add to the new
-//! cell's open-circuit voltage. Offsets are interpolated linearly over SOC and capacity. Beyond the outer capacities they stay
-//! constant; beyond SOC 0 and 1 they continue linearly.
+//! In: the electrodes of the new cell, or a shift of the SOC axis, and the SOC breakpoints of the model. Out: offsets,
+//! V, to be added to the new cell's open-circuit voltage. Offsets are interpolated linearly over SOC and capacity.
+//! Outside the range of capacities in the table, they are constant; below SOC 0 and above SOC 1, they continue
+//! linearly.
 //!
 //! # One curve per capacity
-//! The capacity alone does not show how much lithium and how much active material was lost. Assumption: when the cell has lost a
-//! fraction x of its capacity, each electrode has lost [`MATERIAL_SHARE`] x of its active material; lost lithium explains the
-//! rest. [`OffsetLine::mixes_v`] is the change of the offset if an electrode's share is one [`MATERIAL_SHARE_STD`] higher.
+//! The capacity alone does not show how much lithium and how much active material was lost. Assumption: if the cell has
+//! lost a fraction x of its capacity, each electrode has lost the fraction [`MATERIAL_SHARE`] x of its active material.
+//! The rest of the lost capacity is explained by lost lithium. [`OffsetLine::mixes_v`] is the change of the offset if
+//! the share of one electrode is higher by [`MATERIAL_SHARE_STD`].
 
 use super::electrodes::{Electrodes, LostMaterial};
 use crate::filter::locate;
 
-/// Source of the curve's ageing.
+/// How the curve's change with ageing is computed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum AgeingLaw {
-    /// A shift of the SOC axis; 0 = the curve shrinks evenly.
+    /// From a shift of the SOC axis; 0 = the curve shrinks evenly.
     Shift(f64),
-    /// The electrodes of the new cell.
+    /// From the electrodes of the new cell.
     Electrodes(Electrodes),
 }
 
@@ -27,9 +29,9 @@ impl Default for AgeingLaw {
     }
 }
 
-/// Fraction of active material that each electrode loses, divided by the fraction of capacity lost: 0 for calendar ageing alone, 1
-/// if material and capacity shrink equally. Graphite cells with layered oxides that cycle at moderate temperature lose mostly lithium (Birkl et al. 2017; Dubarry et
-/// al. 2012).
+/// Fraction of active material that each electrode loses, divided by the fraction of capacity lost. It is 0 for
+/// calendar ageing alone, and 1 if material and capacity shrink equally. Graphite cells with layered oxides lose mostly
+/// lithium if they are cycled at moderate temperature (Birkl et al. 2017; Dubarry et al. 2012).
 pub const MATERIAL_SHARE: f64 = 0.3;
 
 /// Standard deviation of [`MATERIAL_SHARE`] per electrode.
@@ -38,11 +40,11 @@ pub const MATERIAL_SHARE_STD: f64 = 0.3;
 /// Standard deviation of a shift.
 pub const SHIFT_STD: f64 = 0.3;
 
-/// Capacities of aged cells in the table, relative to the new cell's, rising. Above the table's last capacity the curve stays
-/// constant: such a cell is a larger cell, not a newer one.
+/// Capacities of aged cells in the table, relative to the new cell's capacity, rising. Above the highest capacity in
+/// the table, the curve stays constant: such a cell is a larger cell, not a newer one.
 const LOST_CAPACITIES: [f64; 10] = [0.4, 0.5, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95];
 
-/// The electrodes must give curves down to this capacity, relative to the new cell's: a usual end of life.
+/// The electrodes must give curves down to this fraction of the new cell's capacity, which is a usual end of life.
 const LEAST_KNOWN: f64 = 0.7;
 
 /// Offsets of the open-circuit voltage over capacity and SOC; an empty table means no change.
@@ -63,7 +65,8 @@ pub struct AgedOcv {
     spread_v: [Vec<f64>; MIXES],
 }
 
-/// Number of uncertain mixes of losses: more material lost from the negative electrode, or from the positive one.
+/// Number of uncertain mixes of losses: additional material lost from the negative electrode, and from the positive
+/// electrode.
 pub const MIXES: usize = 2;
 
 /// A quantity over one interval of SOC: its value at SOC 0 and its slope per unit of SOC.
@@ -102,15 +105,15 @@ pub struct LithiumLoss {
 }
 
 impl AgedOcv {
-    /// Ageing by the electrodes of the new cell; `None` when they give no curve down to [`LEAST_KNOWN`]. `rows` are the new cell's
-    /// open-circuit voltages, V, by temperature.
+    /// Ageing that follows from the electrodes of the new cell. `None` if they give no curve down to [`LEAST_KNOWN`].
+    /// `rows` contains the new cell's open-circuit voltages, V; one row per temperature.
     pub fn of_electrodes(
         electrodes: &Electrodes,
         soc: &[f64],
         new_capacity_ah: f64,
         rows: &[Vec<f64>],
     ) -> Option<Self> {
-        // The offsets, then the lithium lost.
+        // A row of offsets, and the lithium lost.
         let curve = |negative: f64, positive: f64, part: f64| {
             let lost = LostMaterial { negative: negative * (1.0 - part), positive: positive * (1.0 - part) };
             let aged = electrodes.aged(lost, part)?;
@@ -143,8 +146,9 @@ impl AgedOcv {
         Some(table)
     }
 
-    /// Ageing by a shift: OCV(s + a s (1 - s)) with a = shift (1 - C / C_new). It is applied to the middle row of
-    /// `rows`, the new cell's open-circuit voltage, V, by temperature. Shift 1: the top of the curve keeps its ampere-hours; shift 0: the curve shrinks evenly.
+    /// Ageing that follows from a shift: OCV(s + a s (1 - s)) with a = shift (1 - C / C_new). The offsets are computed
+    /// for the middle row of `rows`, the new cell's open-circuit voltages, V, with one row per temperature. With shift
+    /// 1, the top of the curve keeps its ampere-hours; with shift 0, the curve shrinks evenly.
     pub fn of_shift(shift: f64, soc: &[f64], new_capacity_ah: f64, rows: &[Vec<f64>]) -> Self {
         let mut table = Self { law: AgeingLaw::Shift(shift), ..Self::default() };
         let middle_v = &rows[rows.len() / 2];
@@ -165,8 +169,8 @@ impl AgedOcv {
         table
     }
 
-    /// Adds the new cell, and above it the mirror image of the first loss, so that the curve changes smoothly around the new
-    /// cell's capacity.
+    /// Adds two rows: the new cell, and above it the mirror image of the smallest loss. The curve then changes smoothly
+    /// around the new cell's capacity.
     fn finish(&mut self, new_capacity_ah: f64, rows: &[Vec<f64>]) {
         let Some((&aged_ah, aged_v)) = self.capacity_ah.last().zip(self.offset_v.last().cloned()) else { return };
         self.mixes_v.iter_mut().for_each(|table| table.extend(vec![vec![0.0; aged_v.len()]; 2]));
@@ -174,14 +178,14 @@ impl AgedOcv {
         self.push(2.0 * new_capacity_ah - aged_ah, aged_v.iter().map(|offset_v| -offset_v).collect(), rows);
     }
 
-    /// Adds a row of offsets. Scales the row down if the aged curve would not rise with the SOC at every temperature, because the
-    /// new cell's tables differ from its electrodes' curve.
+    /// Adds a row of offsets. The new cell's tables can differ from the curve of its electrodes, so the aged curve
+    /// might not rise with the SOC at every temperature. In that case, scales the row down.
     fn push(&mut self, capacity_ah: f64, mut offset_v: Vec<f64>, rows: &[Vec<f64>]) {
         let factor = rows.iter().flat_map(|row| row.windows(2).zip(offset_v.windows(2))).fold(
             1.0_f64,
             |factor, (new, offset)| {
                 let (rise_v, change_v) = (new[1] - new[0], offset[1] - offset[0]);
-                // An aged curve keeps a tenth of the new curve's slope everywhere.
+                // The slope of an aged curve is at least a tenth of the new curve's slope everywhere.
                 if change_v < 0.0 { factor.min(0.9 * rise_v / -change_v) } else { factor }
             },
         );
@@ -190,15 +194,16 @@ impl AgedOcv {
         self.offset_v.push(offset_v);
     }
 
-    /// Sets the standard deviation of the shift (initially [`SHIFT_STD`]). Does nothing with electrodes.
+    /// Sets the standard deviation of the shift, initially [`SHIFT_STD`]. Does nothing if the ageing follows from
+    /// electrodes.
     pub fn set_shift_std(&mut self, std: f64) {
         if self.is_shift {
             self.mixes_v[0].iter_mut().flatten().for_each(|mix_v| *mix_v *= std / SHIFT_STD);
         }
     }
 
-    /// Adds the spread of the curve between cells: `modes_v[i]` (V per standard deviation, one value per SOC breakpoint) is added
-    /// to mix i at every capacity. The mix's sign is chosen so that mix and mode do not cancel.
+    /// Adds the spread of the curve between cells: adds `modes_v[i]` (V per standard deviation, one value per SOC
+    /// breakpoint) to mix i at every capacity. The sign of the mix is chosen so that mix and mode do not cancel.
     pub fn add_spread(&mut self, modes_v: &[Vec<f64>; MIXES]) {
         self.is_shift = false;
         self.spread_v.clone_from(modes_v);
@@ -236,8 +241,8 @@ impl AgedOcv {
         }
     }
 
-    /// Lithium lost at a capacity. Above the new cell's capacity, returns the new cell's loss. Returns `None` without electrodes
-    /// or below the smallest capacity of the table.
+    /// Lithium lost at a capacity. Above the new cell's capacity, returns the new cell's loss. Returns `None`
+    /// without electrodes or below the smallest capacity in the table.
     pub fn lithium_loss(&self, capacity_ah: f64) -> Option<LithiumLoss> {
         let [least_ah, .., new_ah, _] = self.capacity_ah[..] else { return None };
         let found = self.between(&self.lithium, [0, 1, 2], capacity_ah.min(new_ah));
@@ -250,8 +255,8 @@ impl AgedOcv {
         })
     }
 
-    /// Values of `rows` (one per capacity) at the SOC breakpoints `at`, and their change per Ah: linear between the capacities,
-    /// constant outside.
+    /// Values of `rows` (one row per capacity) at the SOC breakpoints `at`, and their change per Ah. The values are
+    /// linear between the capacities and constant outside.
     fn between<const K: usize>(&self, rows: &[Vec<f64>], at: [usize; K], capacity_ah: f64) -> Option<[(f64, f64); K]> {
         let last = rows.len().checked_sub(1)?;
         let above = self.capacity_ah.iter().take_while(|&&border| capacity_ah >= border).count();

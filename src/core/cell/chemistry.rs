@@ -1,7 +1,8 @@
-//! Cell model of a cell that was never measured: from its label, with the spread between cells of its chemistry.
+//! Cell model of a cell that was never measured, from its label and the spread between cells of its chemistry.
 //!
-//! In: chemistry, rated capacity (Ah), cut-off voltages (V). Out: a [`CellModel`]; its [`ModelSpread`] and curve modes state how
-//! far a cell may differ from it. The curve uses no measured cell, so the measured cells can judge it.
+//! In: chemistry, rated capacity (Ah), cut-off voltages (V). Out: a [`CellModel`]. Its [`ModelSpread`] and the modes of
+//! its curve state how much a cell may differ from it. No measured cell was used for the curve, so measured cells can
+//! be used to test it.
 //!
 //! * Open-circuit voltage: mean and covariance over cells built from published half-cell potentials ([`curve`]).
 //! * Resistances: proportional to 1 / capacity, for every chemistry. Medians and deviations come from five fitted cells of 2.9 to
@@ -17,21 +18,21 @@ use super::model::{Branch, CellModel, ModelSpread, Table, arrhenius};
 use crate::filter::{ScalarGaussian, interpolate, median};
 use curve::{CellType, CurvePrior, PositiveElectrode};
 
-/// Materials of both electrodes, as a label or a data sheet names them.
+/// Materials of the two electrodes, as a label or a data sheet states them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Chemistry {
-    /// Nickel-rich NMC (811).
+    /// Nickel-rich NMC (811) with graphite.
     Nmc811Graphite,
-    /// NMC of unknown nickel content.
+    /// NMC of unknown nickel content with graphite.
     NmcGraphite,
-    /// NCA.
+    /// NCA with graphite.
     NcaGraphite,
-    /// LCO: consumer cells.
+    /// LCO with graphite: consumer cells.
     LcoGraphite,
-    /// LMO blended with a layered oxide: early electric cars.
+    /// LMO blended with a layered oxide, and graphite: cells of early electric cars.
     LmoGraphite,
-    /// LFP.
+    /// LFP with graphite.
     LfpGraphite,
 }
 
@@ -60,8 +61,8 @@ impl Chemistry {
         }
     }
 
-    /// Possible positive electrodes. Cells with one label differ in material: NMC without a number has any nickel content, LMO is
-    /// blended.
+    /// Possible materials of the positive electrode. Cells with the same label can have different materials: NMC
+    /// without a number can have any nickel content, and LMO is blended with other materials.
     fn positives(self) -> Vec<PositiveElectrode> {
         let blend = |share: f64| PositiveElectrode::blend(Positive::Lmo, share, Positive::Nco);
         match self {
@@ -74,8 +75,9 @@ impl Chemistry {
         }
     }
 
-    /// Smallest and largest distance of a full cell's open-circuit voltage below the highest voltage, V. A charge ends with some
-    /// current, so the voltage falls when the cell relaxes, most where the curve ends steeply.
+    /// Minimum and maximum distance of a full cell's open-circuit voltage below its highest voltage, V. A charge ends
+    /// while some current still flows, so the voltage falls when the cell relaxes. It falls most if the curve is steep
+    /// at its upper end.
     fn full_below_v(self) -> [f64; 2] {
         if self == Self::LfpGraphite { [0.05, 0.22] } else { [0.005, 0.035] }
     }
@@ -101,7 +103,7 @@ pub struct Label {
     pub voltage_max_v: f64,
 }
 
-/// Knowledge of a cell from its label alone.
+/// What is known about a cell from its label alone.
 #[derive(Debug, Clone)]
 pub struct LabelPrior {
     /// The label.
@@ -154,7 +156,7 @@ pub struct ResistanceFactors {
 }
 
 impl ResistanceFactors {
-    /// Ratio of resistance `j` to the label's.
+    /// Ratio of resistance `j` to the resistance of the label's model.
     fn ratio(&self, j: usize, soc: f64, arrhenius: f64) -> f64 {
         libm::exp(interpolate(&FACTOR_SOC, &self.ln[j], soc) + self.by_temperature[j] * libm::log(arrhenius))
     }
@@ -169,9 +171,9 @@ pub struct CurveOfCells {
     pub modes_v: [Vec<f64>; MIXES],
     /// Standard deviation of the rest, V.
     pub rest_v: Vec<f64>,
-    /// Drop of the curve from 25 to 0 degrees C, V ([`cold_share`]).
+    /// Fall of the curve from 25 to 0 degrees C, V ([`cold_share`]).
     pub cold_sag_v: ScalarGaussian,
-    /// Electrodes that give such a curve; `None` for blends.
+    /// Electrodes that give a curve like the mean; `None` for blends.
     pub electrodes: Option<Electrodes>,
 }
 
@@ -190,10 +192,10 @@ pub(super) fn cold_share(temperature_c: f64) -> f64 {
 
 /// Sag of the curve under load from 25 to 0 degrees C, mean and standard deviation, V.
 ///
-/// The charge-transfer resistance is larger at small currents than at large ones (Butler-Volmer), most of all in the cold. The
-/// model's resistances hold at large currents, so the difference is nearly a constant voltage. Found from the SOC errors of the
-/// label's model at 10, 0 and -10 degrees C: LG HG2 0.03 V, Panasonic 0.03 V (0.01 V of it ageing), Leaf cell -0.01 V (only at
-/// 10 degrees C), LG M50 simulated 0.
+/// The charge-transfer resistance is larger at small currents than at large currents (Butler-Volmer), especially in the
+/// cold. The model's resistances hold at large currents, so the difference is nearly a constant voltage. It was
+/// determined from the SOC errors of the label's model at 10, 0 and -10 degrees C: LG HG2 0.03 V, Panasonic 0.03 V
+/// (0.01 V of this is ageing), Leaf cell -0.01 V (only at 10 degrees C), simulated LG M50 0.
 pub(super) fn usual_cold_sag_v() -> ScalarGaussian {
     ScalarGaussian::from_std(0.015, 0.015)
 }
@@ -205,17 +207,19 @@ impl Label {
         Self { chemistry, rated_ah, voltage_min_v, voltage_max_v }
     }
 
-    /// The label with another chemistry. Keeps the cut-off voltages if they suit that chemistry, else takes its usual ones.
+    /// The label with another chemistry. Keeps the cut-off voltages if they suit the new chemistry; otherwise uses the
+    /// usual cut-off voltages of the new chemistry.
     pub fn with_chemistry(&self, chemistry: Chemistry) -> Self {
         let (low_v, high_v) = chemistry.usual_voltages_v();
-        // A highest voltage within 0.2 V of the usual one suits the chemistry.
+        // The cut-off voltages suit the chemistry if the highest voltage is within 0.2 V of the usual one.
         let is_usual = (self.voltage_max_v - high_v).abs() <= 0.2;
         let (voltage_min_v, voltage_max_v) =
             if is_usual { (self.voltage_min_v, self.voltage_max_v) } else { (low_v, high_v) };
         Self { chemistry, voltage_min_v, voltage_max_v, ..*self }
     }
 
-    /// Mean and spread of the open-circuit curves of such cells; `None` when no cell of this chemistry has these cut-offs.
+    /// Mean and spread of the open-circuit curves of cells with this label; `None` if no cell of this chemistry has
+    /// these cut-off voltages.
     pub fn curve(&self) -> Option<CurvePrior> {
         let full_v = self.chemistry.full_below_v().map(|below_v| self.voltage_max_v - below_v);
         let cell_type = CellType {
@@ -229,25 +233,25 @@ impl Label {
         CurvePrior::new(&cell_type, &SOC)
     }
 
-    /// The model of such a cell; `None` when no cell of this chemistry has these cut-offs.
+    /// Model of a cell with this label; `None` if no cell of this chemistry has these cut-off voltages.
     pub fn model(&self) -> Option<CellModel> {
         self.prior().map(|prior| prior.model)
     }
 
-    /// Model and curve of such a cell; `None` when no cell of this chemistry has these cut-offs.
+    /// Model and curve of a cell with this label; `None` if no cell of this chemistry has these cut-off voltages.
     pub fn prior(&self) -> Option<LabelPrior> {
         let curve = self.curve()?;
         let (modes_v, rest_v) = curve.modes_v();
         let spread = ModelSpread {
             curve_v: median(rest_v.iter().copied()).unwrap_or_default(),
-            // Spread of the five fitted cells; away from 25 degrees C the temperature law adds to it.
+            // Spread of the five fitted cells. Away from 25 degrees C, the temperature law adds to it.
             log_resistance: 0.45,
             // Spread of the same five cells.
             slow_branch: 0.5,
             // Tolerance and age of the cell.
             capacity: 0.1,
-            // 40 % that repeats over 100 s: cells differ in how their resistance depends on time, SOC and temperature.
-            // Chosen on LG HG2 from 0 to -10 degrees C.
+            // 40 % of the drop, repeating over 100 s: cells differ in how their resistance depends on time, SOC and
+            // temperature. Chosen on LG HG2 from 0 to -10 degrees C.
             drop_sqrt_s: 4.0,
         };
         let CurvePrior { mean_v, electrodes, .. } = curve.clone();
@@ -272,7 +276,7 @@ impl Label {
         let mut aged_ocv = curve
             .electrodes
             .and_then(|electrodes| AgedOcv::of_electrodes(&electrodes, &SOC, capacity_ah, &rows))
-            // The library lacks the electrodes.
+            // The electrodes of this cell are not in the library.
             .unwrap_or_else(|| AgedOcv::of_shift(0.5, &SOC, capacity_ah, &rows));
         aged_ocv.add_spread(&curve.modes_v);
         let table = |j: usize| {

@@ -2,8 +2,8 @@
 //!
 //! State: SOC (fraction) and one voltage per RC branch (V). I > 0 is discharge.
 //! dSOC/dt = -I / (3600 C); dU/dt = -U/(R1 C1) + I/C1; V = OCV(SOC, T) - sum U - I R0.
-//! Ageing multiplies R0 and every branch resistance by one ratio; the time constants stay. Inputs are not checked: a NaN
-//! stays a NaN.
+//! Ageing multiplies R0 and every branch resistance by the same ratio; the time constants do not change. Inputs are not
+//! checked: a NaN gives a NaN.
 
 use super::config::Discretisation;
 use super::model::{CellModel, GridPosition, TemperaturePosition};
@@ -28,8 +28,8 @@ impl BranchAt {
         Self { r_ohm: model.branch_r_ohm(i, position) * resistance_ratio, tau_s: model.branch_tau_s(i, position) }
     }
 
-    /// The branch's voltage after `dt_s` at a constant `current_a`. Euler's rule is unstable in steps longer than the
-    /// time constant (gaps): such a step is always exact.
+    /// The branch's voltage after `dt_s` at a constant `current_a`. With Euler's rule, steps longer than the time
+    /// constant (gaps) would be unstable, so such steps are always exact.
     pub fn voltage_after(&self, rule: Discretisation, branch_v: f64, current_a: f64, dt_s: f64) -> f64 {
         let settled_v = self.r_ohm * current_a;
         match rule {

@@ -2,34 +2,34 @@
 
 use crate::filter::ScalarGaussian;
 
-/// How the circuit's equations are stepped.
+/// How the circuit's equations are integrated over a step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Discretisation {
-    /// exp(-dt/RC): exact for a current constant over the step.
+    /// exp(-dt/RC): exact if the current is constant during the step.
     Exact,
     /// Forward Euler, as in the paper.
     Euler,
 }
 
-/// Whether the sample-by-sample filter carries the capacity as a state.
+/// Whether the sample-by-sample filter estimates the capacity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum CapacityState {
-    /// Estimated together with the SOC, with their correlation.
+    /// The capacity is a state, estimated together with the SOC and their correlation.
     Joint,
-    /// Held at the last learned value, as in the paper.
+    /// The capacity is held at the last learned value, as in the paper.
     Held,
 }
 
-/// Checked settings of the estimator. Noises are densities: per square root of a second.
+/// Checked settings of the estimator. Process noises are densities: standard deviations per square root of a second.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct EstimatorConfig {
     /// Spread of the sigma points.
     pub points: SigmaPointSettings,
-    /// Exact or Euler.
+    /// Exact or Euler integration.
     pub discretisation: Discretisation,
-    /// Joint or held capacity.
+    /// Estimated or held capacity.
     pub capacity_state: CapacityState,
-    /// State of a cell without history.
+    /// Initial state of a cell without history.
     pub initial: InitialState,
     /// Noise of the states while the current is measured.
     pub process: ProcessNoise,
@@ -56,22 +56,22 @@ pub struct SigmaPointSettings {
     pub kappa: f64,
 }
 
-/// State that a filter starts from, with its uncertainty.
+/// Initial state of a filter, with its uncertainty.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct InitialState {
-    /// First SOC, fraction; `None` = from the first voltage through the OCV curve.
+    /// Initial SOC, fraction; `None` = from the first voltage and the OCV curve.
     pub soc: Option<f64>,
-    /// Standard deviation of the first SOC, fraction.
+    /// Standard deviation of the initial SOC, fraction.
     pub soc_std: f64,
-    /// Standard deviation of the first branch voltages, V.
+    /// Standard deviation of the initial branch voltages, V.
     pub branch_std_v: f64,
-    /// First capacity, Ah.
+    /// Initial capacity, Ah.
     pub capacity_ah: f64,
-    /// Standard deviation of the first capacity, Ah.
+    /// Standard deviation of the initial capacity, Ah.
     pub capacity_std_ah: f64,
     /// Capacity of the open-circuit curve before the first half-cycle, Ah.
     pub curve: ScalarGaussian,
-    /// Standard deviation of the first ln(resistance relative to new).
+    /// Standard deviation of the initial ln(resistance relative to new).
     pub log_resistance_std: f64,
 }
 
@@ -95,11 +95,12 @@ pub struct GapSettings {
     pub noise_per_sqrt_s: f64,
     /// Largest self-discharge, fraction of SOC per s.
     pub self_discharge_per_s: f64,
-    /// Largest rate of use or charge while the program does not run, fraction of SOC per s.
+    /// Maximum rate at which the SOC changes by use or charging while the program does not run, fraction of SOC per s.
     pub away_use_per_s: f64,
     /// Largest current of a resting cell, A per cell. A larger current before or after a gap may have flowed through the gap.
     pub rest_current_a: f64,
-    /// Whether the cell rests in every longer gap without readings, whatever the current before and after it.
+    /// Whether the cell counts as resting in every longer gap without readings, regardless of the current before and
+    /// after the gap.
     pub silence_is_rest: bool,
 }
 
@@ -108,30 +109,32 @@ pub struct GapSettings {
 pub struct VoltageError {
     /// White sensor noise of a voltage reading, V, per sample.
     pub noise_v: f64,
-    /// Slow model error as information per second: standard deviation of a 1 s average, V. Used if the cell model states no
-    /// error.
+    /// Slow model error, stated as the standard deviation of a 1 s average, V: information is counted per second. Used
+    /// if the cell model states no error.
     pub model_error_v_sqrt_s: f64,
-    /// Model error proportional to the voltage drop in the cell at the reading: fraction of the drop, over one second.
+    /// Model error proportional to the present voltage drop in the cell: fraction of the drop, for an average over one
+    /// second.
     pub drop_error_sqrt_s: f64,
-    /// Model error proportional to the voltage drop of the last minutes' load: fraction of the drop, over one second.
+    /// Model error proportional to the voltage drop caused by the load of the last minutes: fraction of this drop, for
+    /// an average over one second.
     pub load_error_sqrt_s: f64,
     /// Time constant of the model error after a load has ended (slow diffusion), s.
     pub load_memory_s: f64,
-    /// Longest time that one voltage reading stands for, s; readings further apart count as this time.
+    /// Maximum time that one voltage reading represents, s. If readings are further apart, this time is used.
     pub max_information_s: f64,
 }
 
 /// Standard deviations of the sensors' constant errors. The filter considers them, so they never average out.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SensorErrors {
-    /// Offset of a cell's voltage, V, including the offset of its open-circuit curve from the model.
+    /// Offset of a cell's voltage, V. It includes a constant error of the model's open-circuit curve.
     pub voltage_offset_v: f64,
-    /// Offset of the current per cell, A, that has not been learned.
+    /// Remaining uncertainty of the current sensor's offset per cell, A, after learning.
     pub current_offset_a: f64,
     /// Gain error of the current, fraction.
     pub current_gain: f64,
-    /// Error of the slowest branch's resistance in the model that has not been learned, in addition to the common error of all
-    /// resistances: fraction.
+    /// Remaining uncertainty of the resistance of the model's slowest branch after learning, fraction. It is in
+    /// addition to the common error of all resistances.
     pub slow_branch: f64,
 }
 
@@ -143,14 +146,14 @@ impl SensorErrors {
 /// Rejection of outliers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GateSettings {
-    /// Largest accepted innovation, standard deviations.
+    /// Maximum accepted innovation, in standard deviations.
     pub sigma: f64,
-    /// Model error of a single reading, V (standard deviation). The gate and the consistency monitor use it, because the
-    /// information-per-second variance would accept every reading at high sample rates.
+    /// Model error of a single reading, V (standard deviation). The gate and the consistency monitor use this value. If
+    /// they used the error per second instead, they would accept every reading at high sample rates.
     pub model_error_v: f64,
     /// Model error of a single reading along the OCV curve, fraction of SOC.
     pub soc_error: f64,
-    /// The filter restarts from the voltage after all readings of this time, s, were beyond the gate.
+    /// If all readings of this time, s, were beyond the gate, the filter restarts from the voltage.
     pub lost_after_s: f64,
 }
 
@@ -159,6 +162,6 @@ pub struct GateSettings {
 pub struct ConsistencySettings {
     /// Window of the consistency monitor, s.
     pub window_s: f64,
-    /// Largest mean normalised innovation squared of a trusted estimate.
+    /// Maximum mean normalised innovation squared of an estimate that is trusted.
     pub limit: f64,
 }

@@ -45,7 +45,7 @@ impl Coverage {
         self.soc.iter().all(|count| *count == 0)
     }
 
-    /// Covered share of the SOC range, in steps of a tenth.
+    /// Covered fraction of the SOC range, as a multiple of one tenth.
     pub fn soc_share(&self) -> f64 {
         self.soc.iter().filter(|count| **count > 0).count() as f64 / PARTS as f64
     }
@@ -64,7 +64,7 @@ impl Coverage {
     }
 }
 
-/// Joins neighbouring classes into ranges: the first class, and one past the last.
+/// Joins neighbouring classes into ranges. A range is [first class, last class + 1].
 fn ranges(classes: impl Iterator<Item = i32>) -> Vec<[i32; 2]> {
     let mut ranges: Vec<[i32; 2]> = Vec::new();
     for class in classes {

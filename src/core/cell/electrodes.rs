@@ -5,12 +5,13 @@
 //! to the new cell's capacity: Q_p y + Q_n x = n. An aged cell is full and empty at the same voltages V as the new cell; its
 //! capacity is Q_n (x_full - x_empty).
 //!
-//! An ageing cell loses lithium (n falls) and active material of either electrode (Q_n, Q_p fall): Birkl et al., J. Power
-//! Sources 341 (2017) 373; Dubarry et al., J. Power Sources 219 (2012) 204. The lithium in lost material need not be known: it
-//! only changes n, and n follows from the capacity.
+//! An ageing cell loses lithium (n falls) and active material of the electrodes (Q_n and Q_p fall): Birkl et al., J.
+//! Power Sources 341 (2017) 373; Dubarry et al., J. Power Sources 219 (2012) 204. How much lithium the lost material
+//! contained need not be known: it only changes n, and n follows from the capacity.
 //!
-//! In: materials and lithium contents of the new cell. Out: V, and capacity as a fraction of the new cell's. Contents stay
-//! within 0 to 1. A loss after which no cell remains has no curve. An ageing cell never gains lithium.
+//! In: materials and lithium contents of the new cell. Out: V, and capacity as a fraction of the new cell's capacity.
+//! Contents are limited to 0 to 1. If no cell remains after a loss, there is no curve. An ageing cell never gains
+//! lithium.
 
 use crate::filter::crossing;
 
@@ -68,7 +69,7 @@ impl PositiveMaterial {
         (Self::Lfp, "lfp"),
     ];
 
-    /// Smallest valid lithium content of the function: below it the published fits rise or have poles.
+    /// Minimum lithium content at which the function is valid. Below it, the published functions rise or have poles.
     pub const fn least_content(self) -> f64 {
         match self {
             Self::Nca => 0.3,
@@ -78,7 +79,8 @@ impl PositiveMaterial {
         }
     }
 
-    /// Potential against lithium, V, at a lithium content; outside the valid contents, the potential at their end.
+    /// Potential against lithium, V, at a lithium content. Outside the valid contents, the potential at the nearest
+    /// valid content.
     pub fn potential_v(self, y: f64) -> f64 {
         use libm::{exp, pow, tanh};
         let y = y.clamp(self.least_content(), 1.0 - EDGE);
@@ -139,7 +141,8 @@ impl NegativeMaterial {
         (Self::McmbRamadass, "mcmb_ramadass"),
     ];
 
-    /// Potential against lithium, V, at a lithium content; beyond [`EDGE`], the potential at the edge.
+    /// Potential against lithium, V, at a lithium content. Outside the range limited by [`EDGE`], the potential at the
+    /// edge.
     pub fn potential_v(self, x: f64) -> f64 {
         use libm::{exp, tanh};
         let x = x.clamp(EDGE, 1.0 - EDGE);
@@ -250,16 +253,17 @@ impl Electrodes {
             - self.negative.potential_v(between(self.negative_content))
     }
 
-    /// Capacities of the new electrodes, negative and positive, and cyclable lithium, relative to the cell's capacity.
+    /// Capacity of the new negative electrode, capacity of the new positive electrode, and cyclable lithium, all
+    /// relative to the cell's capacity.
     fn new_contents(&self) -> [f64; 3] {
         let negative = 1.0 / (self.negative_content[1] - self.negative_content[0]);
         let positive = 1.0 / (self.positive_content[0] - self.positive_content[1]);
         [negative, positive, negative * self.negative_content[1] + positive * self.positive_content[1]]
     }
 
-    /// The cell that has lost this material, and lithium until this part of the capacity remains. `None` if there is no such cell,
-    /// if it cannot reach its end voltages, or if the new cell holds more lithium than it can use, because the capacity then does
-    /// not determine the loss.
+    /// The cell that has lost the material `lost`, and as much lithium that the fraction `capacity` of its capacity
+    /// remains. Returns `None` in three cases: there is no such cell; it cannot reach its end voltages; or the new cell
+    /// contains more lithium than it can use, so the capacity does not determine the loss.
     pub fn aged(&self, lost: LostMaterial, capacity: f64) -> Option<AgedElectrodes> {
         let [negative, positive, new_lithium] = self.new_contents();
         let ends_v = [0.0, 1.0].map(|soc| self.voltage_v(soc));
@@ -275,7 +279,7 @@ impl Electrodes {
             cell
         };
         let new = |lithium: f64| cell(LostMaterial::default(), lithium).capacity();
-        // A cell without excess lithium loses capacity with a little less lithium.
+        // A new cell without excess lithium loses capacity if it loses a little lithium.
         if new(0.995 * new_lithium) >= new(new_lithium) {
             return None;
         }

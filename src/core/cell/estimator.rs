@@ -7,28 +7,31 @@
 //! SOC -= q / (3600 C); U_i by `circuit::BranchAt` with the mean current q/dt; ln rho and C stay.
 //! Update with the voltage: V = OCV(SOC, T) - sum U_i - rho R0(SOC, T) I. Source: the paper, section 3.3.3.
 //!
-//! Deviation 1: ln rho is a state (random walk). Reason: a fixed model attributes grown resistance to lost charge in an
-//! aged cell. Effect: without it the end of life of the measured cells comes 14-23 cycles early.
-//! Deviation 2: C is a state ([`CapacityState::Joint`]). Reason: the SOC error grows with the capacity's error in proportion to the
-//! moved charge, so both are correlated; without the correlation the filter treats its assumed capacity as if it had been measured. `Held`
-//! gives the paper's filter (C known, variance 1e-12 Ah^2).
-//! Deviation 3: process noises are densities per second, and the measurement variance is
-//! sensor^2 + model^2 / dt: model error is slow, so information is counted per second, not per sample.
-//! Effect: the sample rate does not change the result.
+//! Deviation 1: ln rho is a state (random walk). Reason: in an aged cell, a filter with a fixed resistance mistakes the
+//! higher resistance for lost charge. Effect: without this state, the end of life of the measured cells is reported 14
+//! to 23 cycles early.
+//! Deviation 2: C is a state ([`CapacityState::Joint`]). Reason: the SOC error grows with the error of the capacity, in
+//! proportion to the charge moved, so the two errors are correlated. Without the correlation, the filter treats its
+//! assumed capacity as if it had been measured. `Held` gives the paper's filter (C known, variance 1e-12 Ah^2).
+//! Deviation 3: process noises are densities per second, and the measurement variance is sensor^2 + model^2 / dt.
+//! Reason: the model error is slow, so information is counted per second and not per sample. Effect: the sample rate
+//! does not change the result.
 //!
 //! Deviation 4: model^2 = base^2 + (k drop)^2 + (k' load)^2. The base is the cell model's stated error over SOC and temperature, or
 //! a configured constant. The drop is the present voltage drop in the cell, the load the voltage drop of the last minutes' load.
-//! Reason: most model error is error of the resistances and of diffusion slower than the branches. Effect: a record that begins
-//! under load, the constant-voltage part of a charge, and cold cells no longer count as exact. At rest the error repeats instead
-//! of averaging out, so a rest of duration t gives only as much information as t_r ln(1 + t/t_r) under load, t_r = 1000 s.
-//! Deviation 5: the OCV curve changes with the capacity lost by the last half-cycle ([`AgedOcv`](crate::cell::AgedOcv)).
-//! Effect: the top and the bottom of an aged cell's curve give the same capacity.
+//! Reason: most of the model error comes from the resistances and from diffusion that is slower than the branches.
+//! Effect: a record that begins under load, the constant-voltage part of a charge, and cold cells no longer count as
+//! exact. At rest, the error repeats instead of averaging out. A rest of duration t therefore gives only as much
+//! information as the time t_r ln(1 + t/t_r) under load, with t_r = 1000 s.
+//! Deviation 5: the OCV curve changes with the lost capacity ([`AgedOcv`](crate::cell::AgedOcv)), as learned by the end
+//! of the last half-cycle. Effect: readings at the top and at the bottom of an aged cell's curve give the same
+//! capacity.
 //!
-//! Deviation 6: use of the cell while the program does not run, see [`downtime`].
+//! Deviation 6: the cell may be used while the program does not run, see [`downtime`].
 //!
-//! Deviation 7: the filter follows the effect of constant errors of sensors and model; it also considers the errors of
-//! [`SensorErrors`](crate::cell::SensorErrors) in the gain (see below).
-//! Deviation 8: the current's offset is learned ([`crate::health::offset`]).
+//! Deviation 7: the filter tracks the effect of constant errors of sensors and model. For the errors of
+//! [`SensorErrors`](crate::cell::SensorErrors), the gain also takes this effect into account (see below).
+//! Deviation 8: the offset of the current sensor is learned ([`crate::health::offset`]).
 //! Deviation 9: the slowest branch has its own learned resistance ratio ([`slow_branch`]), which multiplies U_n in the voltage.
 //!
 //! The filter is unscented, with additive noise and a scalar measurement. Sigma points are x and x +/- sqrt(N + lambda) L_i with L
@@ -39,8 +42,8 @@
 //! 1966): an update weighs the voltage by the covariance with them, and P is updated in Joseph's form, as the gain is not the best
 //! one for P alone. The others change no mean (Friedland 1969).
 //!
-//! A reading beyond the gate leaves the state unchanged. If all readings of `lost_after_s` were beyond the gate, the filter
-//! restarts: it takes SOC and branches from the voltage, and keeps resistance and capacity.
+//! A reading beyond the gate does not change the state. If all readings of `lost_after_s` were beyond the gate, the
+//! filter restarts: it determines SOC and branch voltages from the voltage, and keeps resistance and capacity.
 
 mod bank;
 mod cell_estimator;

@@ -1,8 +1,9 @@
 //! Loss modes of an aged cell from its capacity: lithium inventory (LLI) and active material of each electrode (LAM).
 //!
-//! In: the learned capacity (Ah) and the table of lithium inventories of [`super::aged_ocv`]. Out: fractions of the model's new
-//! cell, 0 to 1, each with its standard deviation. With d = 1 - C / C_new, the share s of material lost per part of capacity
-//! and the inventory L(C, s_n, s_p) of [`super::electrodes`]:
+//! In: the learned capacity (Ah) and the table of lithium inventories of [`super::aged_ocv`]. Out: losses as fractions
+//! (0 to 1) of the model's new cell, each with its standard deviation. The formulas use d = 1 - C / C_new, the shares
+//! s_n and s_p (material lost per lost capacity in the negative and the positive electrode), and the inventory L(C,
+//! s_n, s_p) of [`super::electrodes`]:
 //!
 //! LAM_NE = s_n d,  LAM_PE = s_p d,  LLI = 1 - L(C, s_n, s_p) / L(C_new, 0, 0)
 //!

@@ -1,8 +1,8 @@
 //! One cell: circuit, thermal model and the filter that estimates its state.
 //!
-//! In: a checked cell model, settings and one [`CellStep`] per voltage reading (V, A with positive = discharge, s, degrees
-//! C). Out: SOC, resistance ratio, capacity (Ah) and branch voltages (V), each with its standard deviation. Readings beyond the
-//! gate do not change an estimate.
+//! In: a checked cell model, settings and one [`CellStep`] per voltage reading (V, A with positive = discharge, s,
+//! degrees C). Out: SOC, resistance ratio, capacity (Ah) and branch voltages (V), each with its standard deviation.
+//! Readings beyond the gate (outliers) do not change an estimate.
 
 pub mod aged_ocv;
 pub mod chemistry;

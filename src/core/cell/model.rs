@@ -1,26 +1,28 @@
 //! Equivalent-circuit model of one cell type: OCV, R0 and 1 to 3 RC branches over SOC x temperature.
 //!
-//! All values are interpolated linearly over SOC. Over temperature, the OCV and the time constants are interpolated linearly,
-//! and resistances by an Arrhenius law of [`ACTIVATION_ENERGY_J_PER_MOL`] through both values: linear interpolation would be up
-//! to 15 % too high in the middle of a 20 K interval. Outside the temperatures of the grid the edge value holds. Outside SOC 0
-//! to 1, resistances hold their edge value and the OCV continues with the slope of its last interval, so that a wrong SOC beyond
-//! 0 or 1 is still corrected.
+//! All values are interpolated linearly over SOC. Over temperature, the OCV and the time constants are interpolated
+//! linearly. Resistances follow an Arrhenius law with [`ACTIVATION_ENERGY_J_PER_MOL`] that passes through the values at
+//! both breakpoints; linear interpolation would be up to 15 % too high in the middle of a 20 K interval. Outside the
+//! temperatures of the grid, the value at the edge is used. Outside SOC 0 to 1, resistances keep the value at the edge,
+//! and the OCV continues with the slope of its last interval, so that a wrong SOC below 0 or above 1 is still
+//! corrected.
 //!
-//! Deviation: the paper interpolates R1 and C1; this model interpolates their product, the time constant. Reason: between nodes
-//! with different resistances, the product of two interpolated values is up to twice the product at either node. Effect: none
-//! where both are constant.
+//! Deviation: the paper interpolates R1 and C1 separately; this model interpolates their product, the time constant.
+//! Reason: between nodes with different resistances, the product of the two interpolated values is up to twice the
+//! product at either node. Effect: none where R1 and C1 are constant.
 
 use super::aged_ocv::{AgedOcv, AgeingLaw, MIXES, OffsetLine};
 use super::loss_modes::LossModes;
 use crate::filter::{ScalarGaussian, crossing, interpolation, locate};
 
-/// Largest number of RC branches.
+/// Maximum number of RC branches.
 pub const MAX_BRANCHES: usize = 3;
 
-/// Activation energy of the resistances between two temperature breakpoints, J/mol (measured on such cells: 15 to 35 kJ/mol).
+/// Activation energy of the resistances between two temperature breakpoints, J/mol. Measured cells of these types have
+/// 15 to 35 kJ/mol.
 pub const ACTIVATION_ENERGY_J_PER_MOL: f64 = 25_000.0;
 
-/// Resistance at a temperature, relative to that at 25 degrees C.
+/// Resistance at a temperature, relative to the resistance at 25 degrees C.
 pub fn arrhenius(temperature_c: f64) -> f64 {
     let per_kelvin = 1.0 / (temperature_c + 273.15) - 1.0 / (25.0 + 273.15);
     // Divided by the gas constant, J/(mol K) (CODATA 2018).
@@ -60,7 +62,7 @@ pub struct CellModel {
     pub name: String,
     /// Label capacity, Ah: the reference of SOH.
     pub rated_capacity_ah: f64,
-    /// Capacity of a new cell between its full and empty open-circuit voltages at the reference temperature, Ah.
+    /// Capacity of a new cell between its full and its empty open-circuit voltage at the reference temperature, Ah.
     pub capacity_ah: f64,
     /// Lowest voltage under load, V.
     pub voltage_min_v: f64,
@@ -82,12 +84,12 @@ pub struct CellModel {
     pub voltage_error_v: Option<Table>,
     /// Thermal parameters; `None` = no estimate of a missing temperature.
     pub thermal: Option<Thermal>,
-    /// Spread of cells around the model; `None` = the usual spread of one cell type.
+    /// Spread of the cells around the model; `None` = the usual spread of cells of one type.
     pub spread: Option<ModelSpread>,
 }
 
-/// Standard deviations of a cell from a model that was not fitted to its type. The modes of the open-circuit curve are stored with
-/// the modes of ageing ([`AgedOcv::add_spread`]).
+/// Standard deviations of a cell's properties from a model that was not fitted to its type. The modes of the
+/// open-circuit curve are stored with the modes of ageing ([`AgedOcv::add_spread`]).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ModelSpread {
     /// Constant error of the open-circuit curve in addition to its modes, V.
@@ -98,7 +100,8 @@ pub struct ModelSpread {
     pub slow_branch: f64,
     /// Capacity, fraction.
     pub capacity: f64,
-    /// Voltage drop, present and by the load of the last minutes: fraction of the drop over one second.
+    /// Present voltage drop and voltage drop caused by the load of the last minutes: fraction of the drop, for an
+    /// average over one second.
     pub drop_sqrt_s: f64,
 }
 
@@ -130,7 +133,7 @@ pub struct GridPosition {
     s: usize,
     /// Weight of the upper SOC column, in [0, 1].
     along_s: f64,
-    /// The same weight without the limits: the OCV continues beyond 0 and 1.
+    /// The weight of the upper SOC column without limits, because the OCV continues below SOC 0 and above SOC 1.
     beyond_s: f64,
     temperature: TemperaturePosition,
 }
@@ -206,8 +209,8 @@ impl CellModel {
             + self.offset(position, capacity_ah).offset_v.0[1]
     }
 
-    /// Takes the cells aged to this capacity, Ah, as new: their curve becomes the new cells' curve. Further ageing follows from the
-    /// same electrodes.
+    /// Makes the cells aged to this capacity, Ah, the new cells of the returned model: their curve becomes the new
+    /// cells' curve. Further ageing follows from the same electrodes.
     pub fn rebased(&self, capacity_ah: f64) -> Self {
         let last = self.soc.len() - 2;
         let offset_v = |s: usize| self.aged_ocv.line(&self.soc, s.min(last), capacity_ah).offset_v.at(self.soc[s]);
@@ -266,7 +269,8 @@ impl CellModel {
         (0..self.branches.len()).fold(self.r0_ohm(position), |sum, i| sum + self.branch_r_ohm(i, position))
     }
 
-    /// SOC of a new cell at an open-circuit voltage, by bisection over -0.5 to 1.5; outside, the nearer end.
+    /// SOC of a new cell at an open-circuit voltage, found by bisection between -0.5 and 1.5. For a voltage outside
+    /// this range, the nearer end.
     pub fn soc_of_ocv(&self, voltage_v: f64, temperature_c: f64) -> f64 {
         self.soc_of_aged_ocv(&self.temperature_position(temperature_c), self.capacity_ah, voltage_v)
     }

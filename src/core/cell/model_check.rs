@@ -4,18 +4,20 @@
 //! [`ModelCheck::mismatch`], above 1 if the model belongs to another cell, after 10 minutes of use. Readings without an update,
 //! after a gap or beyond the gate do not count as evidence.
 //!
-//! A filter hides a wrong model from its innovations, because it corrects first the resistance and then the SOC. Two witnesses
-//! remain:
-//! * r^2, the square of ln(resistance relative to new) over its configured standard deviation,
+//! A filter with a wrong model hides the error from its innovations, because it corrects first the resistance and then
+//! the SOC. Two kinds of evidence (witnesses) remain:
+//! * r^2, the square of ln(resistance relative to new) divided by its configured standard deviation;
 //! * c^2, the part of the innovations v that a constant a and a slope b over SOC explain: with the sums A and g of `h h' / R` and `h v / R`,
 //!   h = (1, SOC - 0.5) and R the variance over the time that a reading stands for, c^2 = g' (A + P^-1)^-1 g (the score test;
 //!   Cox and Hinkley, Theoretical Statistics, 1974, section 9.3), P the variances of a and b in another chemistry.
 //!
-//! Each witness counts at most [`CORROBORATED`] times as much as the other. An aged cell has a higher resistance and fitting
-//! voltages; a local error of a cell's own curve does not change its resistance; another cell differs in both.
+//! In the sum of the witnesses, each counts at most [`CORROBORATED`] times as much as the other. The reason is that
+//! other causes affect only one witness: an aged cell has a higher resistance but its voltages fit, and a local error
+//! of a cell's own curve does not change its resistance. With another cell's model, both witnesses are large.
 //!
-//! The check ends after [`WINDOW_S`] without a mismatch: a cell ages, but does not become another cell. After a mismatch the next
-//! windows are judged one by one until one passes: an aged cell is trusted again after its capacity and resistance were learned.
+//! The check ends after [`WINDOW_S`] without a mismatch, because a cell ages but does not become another cell. After a
+//! mismatch, the following windows are judged one by one until one window has no mismatch. An aged cell is thus trusted
+//! again after its capacity and resistance have been learned.
 
 use serde::{Deserialize, Serialize};
 
@@ -23,16 +25,19 @@ use crate::cell::{CellModel, Update};
 use crate::filter::square;
 use crate::quantity::InvalidState;
 
-/// Time of use in a window, s. Half of it shows another cell on drives from -10 to 40 degrees C; a longer window includes ageing.
+/// Duration of use in a window, s. On drives from -10 to 40 degrees C, half of this time suffices to recognise another
+/// cell; in a longer window, the cell would age.
 const WINDOW_S: f64 = 3600.0;
 
-/// Standard deviations of the voltage that another cell's curve adds: a constant, V, and a slope, V per unit of SOC.
+/// Standard deviations of the voltage difference to another cell's curve: a constant, V, and a slope, V per unit of
+/// SOC.
 const CURVE_STD_V: [f64; 2] = [0.2, 0.4];
 
-/// Largest weight of a witness relative to the other one.
+/// Maximum weight of a witness relative to the other one.
 const CORROBORATED: f64 = 4.0;
 
-/// Smallest sum of the witnesses in a mismatch: three parts (constant, slope, resistance) of 1.4 standard deviations each.
+/// Minimum sum of the witnesses that counts as a mismatch: three parts (constant, slope, resistance) of 1.4 standard
+/// deviations each.
 const LIMIT: f64 = 6.0;
 
 /// Evidence about one cell's model.
@@ -42,20 +47,20 @@ pub struct ModelCheck {
     model: u64,
     /// Time of use judged so far, s.
     use_s: f64,
-    /// Time, s, and charge, A s, since the last evidence.
+    /// Time, s, and charge, A s, since the last evidence was taken.
     since_s: f64,
     since_as: f64,
     /// Duration of the latest step, s.
     step_s: f64,
     voltages: VoltageSums,
-    /// Largest sum of the witnesses over [`LIMIT`] in this window.
+    /// Maximum sum of the witnesses in this window, divided by [`LIMIT`].
     mismatch: f64,
-    /// The same of the previous window, if that was a mismatch.
+    /// `mismatch` of the previous window if it exceeded 1, else 0.
     before: f64,
 }
 
-/// Sums over the readings of a window, about their mean SOC. Sums about a fixed SOC would be differences of large numbers while
-/// the SOC hardly changes, and a checkpoint keeps only six digits of a number.
+/// Sums over the readings of a window, relative to their mean SOC. While the SOC hardly changes, sums relative to a
+/// fixed SOC would be differences of large numbers, and a checkpoint stores only six digits of a number.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(from = "[f64; 5]", into = "[f64; 5]")]
 struct VoltageSums {
@@ -94,8 +99,8 @@ impl VoltageSums {
         self.score[0] += weight * innovation;
     }
 
-    /// c^2, the part of the innovations that a constant and a slope over SOC explain. Omits the products that cancel in the module's
-    /// formula, so no term is negative.
+    /// c^2, the part of the innovations that a constant and a slope over SOC explain. Products that cancel in the
+    /// formula of the module header are left out, so no term is negative.
     fn explained(&self) -> f64 {
         let Self { weight, mean_soc, spread, score: [constant, slope] } = *self;
         let [prior_constant, prior_slope] = CURVE_STD_V.map(|std| 1.0 / square(std));
@@ -141,12 +146,12 @@ impl ModelCheck {
         Self { model, ..Self::default() }
     }
 
-    /// A check that has ended without a mismatch.
+    /// Creates a check that has already ended without a mismatch.
     pub fn ended() -> Self {
         Self { use_s: WINDOW_S, ..Self::default() }
     }
 
-    /// This check if it checks the model, else a new check.
+    /// Returns this check if it belongs to the model, otherwise a new check.
     pub fn or_new(self, model: u64) -> Self {
         if self.model == model || self.model == 0 { self } else { Self::new(model) }
     }
@@ -156,13 +161,14 @@ impl ModelCheck {
         self.model != 0 && self.model != model
     }
 
-    /// Whether evidence still counts.
+    /// Whether the check still takes evidence.
     #[inline]
     pub fn is_open(&self) -> bool {
         self.use_s < WINDOW_S
     }
 
-    /// Adds a step's time, s, and charge, A s; a step with unmeasured time discards them.
+    /// Adds the time, s, and the charge, A s, of a step. If the step has unmeasured time, discards the time and charge
+    /// since the last evidence.
     #[inline]
     pub fn add_step(&mut self, measured_s: f64, charge_as: f64, unmeasured_s: f64) {
         if !self.is_open() {
@@ -184,7 +190,8 @@ impl ModelCheck {
         self.since_s >= 10.0 && self.is_open()
     }
 
-    /// Takes due evidence of a cell of rated capacity `rated_ah`, Ah; `None` when the filter has none.
+    /// Takes the evidence that is due for a cell of rated capacity `rated_ah`, Ah. `evidence` is `None` if the filter
+    /// has none.
     pub fn judge(&mut self, evidence: Option<ModelEvidence>, rated_ah: f64) {
         // One reading stands for at most 90 s. Currents below C/50 do not show the resistance.
         let (elapsed_s, charge_as) = (self.since_s.min(90.0), self.since_as);
@@ -203,7 +210,7 @@ impl ModelCheck {
             // Discard sums that cannot be stored.
             *self = Self::new(self.model);
         }
-        // In the first minutes the filter still settles, and one wrong reading has much weight.
+        // In the first minutes, the filter still settles and a single wrong reading has too much weight.
         if self.use_s < 600.0 {
             return;
         }
@@ -218,7 +225,7 @@ impl ModelCheck {
         }
     }
 
-    /// Largest evidence of this and the previous window for another cell, relative to the limit.
+    /// Maximum evidence for another cell in this window and the previous window, relative to the limit.
     #[inline]
     pub fn mismatch(&self) -> f64 {
         self.mismatch.max(self.before)

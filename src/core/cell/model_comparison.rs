@@ -1,7 +1,7 @@
 //! Differences between two cell models: open-circuit curves in V, resistances as a fraction, and the resulting SOC errors.
 //!
-//! In: two [`CellModel`]s. Out: differences of the second from the first. Resistances are compared per rated capacity under a load
-//! of each cell's C/2, so cells of different size can be compared.
+//! In: two [`CellModel`]s. Out: values of the second model minus values of the first. Resistances are compared per
+//! rated capacity. The load of each cell is C/2 of its own rated capacity, so cells of different size can be compared.
 
 use super::chemistry::USUAL_LOAD_PER_H;
 use super::model::CellModel;
@@ -11,7 +11,8 @@ use super::model_bands::CURVE_C;
 const CURVE_STEPS: u32 = 100;
 /// Steps of SOC for looking up a voltage under load: a multiple of the curve's steps.
 const READ_STEPS: u32 = 400;
-/// SOC range in which SOC errors count: outside, curves are so steep that any model is good.
+/// SOC range in which SOC errors count. Outside this range, curves are so steep that the SOC errors of any model are
+/// small.
 const MIDDLE: (f64, f64) = (0.05, 0.95);
 
 /// A quantity at one SOC.
@@ -19,7 +20,7 @@ const MIDDLE: (f64, f64) = (0.05, 0.95);
 pub struct AtSoc {
     /// SOC, fraction.
     pub soc: f64,
-    /// The second model's less the first's.
+    /// Value of the second model minus value of the first.
     pub value: f64,
 }
 
@@ -95,7 +96,8 @@ fn ocv_v(model: &CellModel, soc: f64) -> f64 {
     model.ocv_v(&model.grid_position(soc, CURVE_C))
 }
 
-/// Whether a temperature is within the tables of a model; a table with one temperature counts as measured at its curve's.
+/// Whether a temperature is within the tables of a model. A table with a single temperature counts as measured at the
+/// temperature of the curve.
 fn has(model: &CellModel, temperature_c: f64) -> bool {
     match model.temperature_c[..] {
         [_] => temperature_c == CURVE_C,
@@ -121,8 +123,8 @@ fn at_temperature(first: &CellModel, second: &CellModel, temperature_c: f64) -> 
     }
 }
 
-/// SOC that the second model reads from a voltage of the first, minus the true SOC, under a settled load relative to the rated
-/// capacity.
+/// SOC that the second model reads from a voltage of the first model, minus the true SOC. The load is settled and
+/// stated relative to the rated capacity.
 fn soc_difference(first: &CellModel, second: &CellModel, temperature_c: f64, load_per_h: f64) -> Difference {
     let drop_v = |model: &CellModel, soc: f64| {
         load_per_h * model.rated_capacity_ah * model.settled_ohm(&model.grid_position(soc, temperature_c))
@@ -139,8 +141,9 @@ fn soc_difference(first: &CellModel, second: &CellModel, temperature_c: f64, loa
     Difference::of(&middle.collect::<Vec<_>>())
 }
 
-/// SOC nearest to `soc` at which a model has a voltage; if it has the voltage nowhere, the SOC of the nearest voltage. Under load
-/// several SOCs may have one voltage, because a resistance that rises with the SOC bends the curve down.
+/// Of all SOCs at which a model has the voltage, the one nearest to `soc`. If the model has the voltage at no SOC, the
+/// SOC with the nearest voltage. Under load, several SOCs may have the same voltage, because a resistance that rises
+/// with the SOC bends the curve down.
 fn nearest(places: &[f64], readings_v: &[f64], voltage_v: f64, soc: f64) -> f64 {
     let crossings = places.windows(2).zip(readings_v.windows(2)).filter_map(|(place, reading)| {
         let (low, high) = (reading[0] - voltage_v, reading[1] - voltage_v);

@@ -1,12 +1,13 @@
-//! Condensed readings of a vehicle's cells between two rests: the rows from which a model is fitted on board.
+//! Readings of a vehicle's cells, condensed into rows. The on-board fit of a cell model uses these rows.
 //!
 //! In: one [`CellStep`] per voltage reading of any cell (A, V, s, degrees C). Out: at most [`MAX_ROWS`] rows of the mean cell.
 //!
-//! A row is the mean over a time in which the SOC hardly moves. In addition to the voltage it holds everything that its
-//! prediction needs in linear form: the charge since the start of the stretch, the current, and the current through first-order
-//! filters with the time constants of the branches. Rows can therefore be dropped without breaking a stretch. A mean hides steps
-//! of the current, so these are summed as a small regression. A full notebook drops the oldest row of the fullest class (SOC,
-//! temperature, direction) and keeps rare rows.
+//! A row is the mean over a time in which the SOC hardly changes. A *stretch* is a period with a continuously measured
+//! current. In addition to the voltage, a row contains all inputs of its prediction in linear form: the charge since
+//! the start of the stretch, the current, and the current after first-order filters with the time constants of the
+//! branches. Single rows can therefore be removed from a stretch. A mean hides current steps, so these are stored as
+//! the sums of a small regression. If the notebook is full, it removes the oldest row of the class with the most rows
+//! (class of SOC, temperature and direction) and thus keeps rare rows.
 
 use serde::{Deserialize, Serialize};
 
@@ -14,15 +15,16 @@ use super::CellStep;
 use super::chemistry::TAU_S;
 use crate::quantity::InvalidState;
 
-/// Largest number of rows: below 8 kB at 64 bytes each.
+/// Maximum number of rows. With 64 bytes per row, the notebook stays below 8 kB.
 pub const MAX_ROWS: usize = 120;
-/// Below this SOC, fraction, rows and classes are narrower, because curves are steep and resistances rise.
+/// Below this SOC, fraction, rows and classes cover a smaller range of SOC, because curves are steep and resistances
+/// rise.
 const LOW_SOC: f64 = 0.15;
-/// Their width there, as a part of the usual one.
+/// Range of SOC of a row or class below `LOW_SOC`, as a fraction of the usual range.
 const LOW_SOC_PART: f64 = 0.25;
-/// Width of a class of rows in SOC, fraction.
+/// Range of SOC of a class of rows, fraction.
 const CLASS_SOC: f64 = 0.1;
-/// Largest current at rest, relative to the rated capacity per hour.
+/// Maximum current that counts as rest, in units of the 1 C current.
 const REST_PER_H: f64 = 0.02;
 
 /// Filters of the current: one per branch of a label's model.
@@ -32,9 +34,9 @@ pub const FILTERS: usize = 3;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Row {
-    /// Number of its stretch.
+    /// Number of the stretch that contains the row.
     pub stretch: u32,
-    /// SOC estimate at that time; only selects the class.
+    /// SOC estimate of the row; it only selects the class.
     soc: f32,
     /// Duration, s.
     pub seconds: f32,
@@ -54,8 +56,8 @@ pub struct Row {
     pub steps: CurrentSteps,
 }
 
-/// Sums over differences between neighbouring readings: of the current (i), A, the fastest filter's current (x), A, and the
-/// voltage (v), V.
+/// Sums of products of differences between consecutive readings. The differences are those of the current (i), A, of
+/// the current after the fastest filter (x), A, and of the voltage (v), V.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CurrentSteps {
@@ -71,7 +73,7 @@ pub struct CurrentSteps {
     pub xv: f32,
 }
 
-/// Readings of the cells that do not yet form a reading of the mean cell.
+/// Readings of the cells that have not yet been combined into a reading of the mean cell.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct Readings {
     count: u32,
@@ -103,12 +105,12 @@ struct RowSums {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 struct Stretch {
     charge_ah: f64,
-    /// Time since it began, s.
+    /// Time since the stretch began, s.
     elapsed_s: f64,
     filtered_a: [f64; FILTERS],
-    /// Current, fastest filter and voltage of the previous reading.
+    /// Current, current after the fastest filter, and voltage of the previous reading.
     last: [f64; 3],
-    /// Time of rest so far, s.
+    /// Duration of the present rest, s.
     rest_s: f64,
     row: RowSums,
 }
@@ -120,7 +122,7 @@ pub struct PresentStretch {
     pub number: u32,
     /// Charge taken out so far, Ah.
     pub charge_ah: f64,
-    /// Time since it began, s.
+    /// Time since the stretch began, s.
     pub elapsed_s: f64,
 }
 
@@ -154,7 +156,7 @@ impl NotebookConfig {
         Self { cells, rated_ah, tau_s: TAU_S }
     }
 
-    /// Currents below this are rest, A.
+    /// Currents below this value, A, count as rest.
     fn rest_a(&self) -> f64 {
         REST_PER_H * self.rated_ah
     }
@@ -209,7 +211,7 @@ impl Notebook {
         self.present.as_ref().map(of)
     }
 
-    /// Present current through the filters, A; `None` outside a stretch.
+    /// Present current after each filter, A; `None` outside a stretch.
     pub fn filtered_a(&self) -> Option<[f64; FILTERS]> {
         self.present.as_ref().map(|stretch| stretch.filtered_a)
     }
@@ -230,9 +232,9 @@ impl Notebook {
             readings.temperatures += 1;
             readings.temperature_c += temperature_c;
         }
-        // The mean cell has at most one reading a second.
+        // The mean cell has at most one reading per second.
         let is_due = readings.count >= config.cells && readings.measured_s >= f64::from(config.cells);
-        // The first reading of a stretch has no time before it.
+        // Before the first reading of a stretch, no time is measured.
         let begins = self.present.is_none() && readings.count >= config.cells;
         (is_due || begins) && self.close_readings(config, step.ambient_c)
     }
@@ -244,7 +246,7 @@ impl Notebook {
         let (cells, count) = (f64::from(config.cells), f64::from(count));
         let temperature_c = if temperatures > 0 { temperature_c / f64::from(temperatures) } else { ambient_c };
         let (dt_s, current_a, voltage_v) = (measured_s / cells, current_a / count, voltage_v / count);
-        // A longer time without a measured current ends a stretch.
+        // A stretch ends if the current was not measured for longer than this.
         if unmeasured_s > 10.0 * cells {
             self.end_stretch(config);
         }
@@ -273,7 +275,8 @@ impl Notebook {
         let charge_before_ah = stretch.charge_ah;
         stretch.charge_ah += charge_as / cells / 3600.0;
         stretch.elapsed_s += dt_s;
-        // A single reading stands for the end of its interval, several for its middle.
+        // A single reading per cell represents the end of its interval; the mean of several readings represents the
+        // middle.
         let late = if count > cells { 0.5 } else { 1.0 };
         let along = |before: f64, after: f64| before + late * (after - before);
         let filtered_a: [f64; FILTERS] = std::array::from_fn(|i| along(before_a[i], stretch.filtered_a[i]));
@@ -282,7 +285,7 @@ impl Notebook {
         let [i, x, v] = [current_a, filtered_a[0], voltage_v];
         let [last_i, last_x, last_v] = std::mem::replace(&mut stretch.last, [i, x, v]);
         let row = &mut stretch.row;
-        // A difference over a longer time does not count as a step.
+        // A difference between readings that are further apart does not count as a step.
         if dt_s <= 3.0 {
             let [di, dx, dv] = [i - last_i, x - last_x, v - last_v];
             let products = [di * di, di * dx, dx * dx, di * dv, dx * dv];
@@ -299,12 +302,12 @@ impl Notebook {
         let soc = last_soc.map_or(1.0, |(soc, last_ah)| soc - (charge_ah - last_ah) / config.rated_ah);
         let part = if soc < LOW_SOC { LOW_SOC_PART } else { 1.0 };
         (charge_ah - first_ah).abs() >= part * 0.02 * config.rated_ah
-            // A row at rest is at least half as long as the rest so far, so a night takes a few rows.
+            // A row at rest takes at least half as long as the rest so far, so a night gives only a few rows.
             || row.seconds >= f64::max(300.0, 0.5 * stretch.rest_s)
             || (temperature_c - first_c).abs() >= 4.0
     }
 
-    /// Ends the present row at an estimated SOC.
+    /// Ends the present row. `soc` is its estimated SOC.
     pub fn close_row(&mut self, config: &NotebookConfig, soc: f64) {
         let Some(stretch) = &mut self.present else { return };
         let sums = std::mem::take(&mut stretch.row);
@@ -341,16 +344,16 @@ impl Notebook {
         }
     }
 
-    /// Ends the present stretch: the following readings do not continue it.
+    /// Ends the present stretch. The next reading starts a new stretch.
     pub fn end_stretch(&mut self, config: &NotebookConfig) {
         self.finish_row(config);
         (self.readings, self.present) = (Readings::default(), None);
     }
 
-    /// Drops rows beyond the bounds.
+    /// Removes rows until the limits on stretches and rows are met.
     fn make_room(&mut self, config: &NotebookConfig) {
         let class_of = |row: &Row| row.class(config.rated_ah);
-        // The fit must find one SOC per stretch.
+        // Each stretch adds a parameter to the fit: its initial SOC.
         if self.rows.chunk_by(|a, b| a.stretch == b.stretch).count() > 16
             && let Some(dropped) = self.least_missed(config)
         {
@@ -371,7 +374,8 @@ impl Notebook {
         }
     }
 
-    /// The oldest of the past stretches with the fewest rows in classes that no other stretch has.
+    /// The past stretch whose removal loses the fewest rows of classes that no other stretch has; the oldest of
+    /// several.
     fn least_missed(&self, config: &NotebookConfig) -> Option<u32> {
         let class_of = |row: &Row| row.class(config.rated_ah);
         let alone = |stretch: &[Row]| {

@@ -1,7 +1,7 @@
-//! Model of this pack's own cells: the label's model, corrected by the readings of the vehicle.
+//! Model of this pack's own cells: the label's model, corrected by the vehicle's readings.
 //!
-//! In: a [`Label`] and a [`Notebook`](super::notebook::Notebook). Out: an [`OwnModel`], which gives the filters' [`CellModel`].
-//! Where the notebook has no readings, the label's model and spread remain.
+//! In: a [`Label`] and a [`Notebook`](super::notebook::Notebook). Out: an [`OwnModel`], from which the [`CellModel`] of
+//! the filters is made. Where the notebook has no readings, the model and the spread of the label remain.
 
 pub mod fit;
 pub mod task;
@@ -26,9 +26,9 @@ pub struct OwnModel {
     pub curve_v: [f64; SOC_NODES],
     /// Modes of the curve's uncertainty, V per standard deviation.
     pub modes_v: [[f64; SOC_NODES]; 2],
-    /// Standard deviation of the rest, V.
+    /// Standard deviation of the curve without the modes, V.
     pub rest_v: [f64; SOC_NODES],
-    /// Resistances relative to the label's.
+    /// Resistances relative to those of the label's model.
     pub factors: ResistanceFactors,
     /// Standard deviation of ln(voltage drop) at the temperatures of the tables.
     pub drop_std: [f64; TEMPERATURE_NODES],
@@ -41,7 +41,7 @@ pub struct OwnModel {
 }
 
 impl OwnModel {
-    /// The model of the filters; `None` when the label has none.
+    /// The cell model for the filters; `None` if the label has no model.
     pub fn cell_model(&self, label: &Label) -> Option<CellModel> {
         let curve = CurveOfCells {
             mean_v: self.curve_v.to_vec(),
@@ -52,11 +52,11 @@ impl OwnModel {
         };
         let spread = ModelSpread {
             curve_v: median(self.rest_v.iter().copied()).unwrap_or_default(),
-            // The cells of a pack are alike.
+            // The cells of one pack are similar.
             log_resistance: 0.1,
             slow_branch: 0.2,
             capacity: self.capacity.std() / self.capacity.mean,
-            // 10 % that repeats over 100 s; no table of resistances removes it.
+            // 10 % of the drop, repeating over 100 s. This error remains with any table of resistances.
             drop_sqrt_s: 1.0,
         };
         let mut model = label.model_of(self.capacity.mean, &curve, &self.factors, &self.drop_std, spread);
@@ -64,10 +64,10 @@ impl OwnModel {
         Some(model)
     }
 
-    /// The estimator's settings for the learned `model`, from the settings for the label's.
+    /// The estimator's settings for the learned `model`, derived from the settings for the label's model.
     pub fn estimator_config(&self, base: &EstimatorConfig, label: &CellModel, model: &CellModel) -> EstimatorConfig {
         let (Some(old), Some(new)) = (label.spread, model.spread) else { return *base };
-        // A key in the configuration replaces the label's value.
+        // If the configuration replaced the label's value, keep the configured value.
         let instead = |value: f64, old: f64, new: f64| if value == old { new } else { value };
         let parts = |value: f64, old: f64, new: f64| (value * value - old * old).max(0.0).sqrt().hypot(new);
         let mut config = *base;
@@ -84,7 +84,7 @@ impl OwnModel {
         config
     }
 
-    /// Whether the remaining uncertainty is small: capacity within 3 %.
+    /// Whether the remaining uncertainty is small: the standard deviation of the capacity is at most 3 %.
     pub fn is_settled(&self) -> bool {
         self.capacity.std() < 0.03 * self.capacity.mean
     }

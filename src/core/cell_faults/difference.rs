@@ -189,8 +189,9 @@ impl Difference {
         self.covariance[pair(LEAK, LEAK)] = std * std;
     }
 
-    /// Handles hours without rows, during which the cell may have lost more charge than usual. If the row contradicts
-    /// the prediction, raises the uncertainty of SOC and channel. The next drive shows which of them changed.
+    /// Handles hours without rows, in which the cell may have lost more charge than usual. If the row after them
+    /// contradicts the prediction, raises the uncertainty of the SOC and of the channel offset. The next drive then
+    /// shows which of the two has changed.
     pub(super) fn open_charge(&mut self, days: f64, observed: &Observation) {
         if days >= 0.04 && self.deviations(observed).abs() > JUMP {
             let lost = FIRST_STD[LEAK] * days;

@@ -22,8 +22,7 @@ pub enum CellFaultKind {
     WeakCell = 3,
     /// The cell's resistance is higher than that of the other cells, as in an aged cell; fraction.
     HighResistance = 4,
-    /// The cell's capacity is higher than that of the other cells, because the cell is newer or of another type;
-    /// fraction.
+    /// The cell's capacity is higher than that of the other cells, because the cell was replaced; fraction.
     ForeignCell = 5,
     /// Neighbouring cells have changed suddenly, because a module was replaced. The size is the mean change of their
     /// capacity, fraction.

@@ -1,10 +1,11 @@
-//! Mean and spread of the open-circuit curves of cells of one chemistry, from half-cell potentials.
+//! Mean and spread of the open-circuit curves of cells of one chemistry, computed from half-cell potentials.
 //!
 //! In: positive and negative materials, cut-off voltages (V). Out: mean (V) and covariance (V^2) over SOC breakpoints.
 //!
-//! A cell is a pair of materials with a lithium content of the full negative and of the empty positive electrode; the other two
-//! contents follow from the cut-off voltages. All pairs and all contents of a grid are equally likely. A smooth deviation of
-//! 10 mV and half of the hysteresis cover cells that no pair of the library describes.
+//! A cell is a pair of materials, together with two lithium contents: of the full negative electrode and of the empty
+//! positive electrode. The contents of the empty negative and the full positive electrode follow from the cut-off
+//! voltages. All pairs and all contents of a grid are equally likely. Two further errors cover cells that no pair of
+//! the library describes: a smooth deviation of 10 mV, and half of the hysteresis.
 
 use nalgebra::{DMatrix, SymmetricEigen};
 
@@ -12,17 +13,17 @@ use crate::cell::aged_ocv::MIXES;
 use crate::cell::electrodes::{Electrodes, NegativeMaterial, PositiveMaterial};
 use crate::filter::{bell, crossing};
 
-/// Points of a blend's table.
+/// Number of intervals in the table of a blend.
 const BLEND_POINTS: u32 = 400;
-/// Voltages of a blend's table, V.
+/// Lowest and highest voltage in the table of a blend, V.
 const BLEND_V: (f64, f64) = (2.5, 4.8);
 
-/// A positive electrode of one material or of two.
+/// A positive electrode made of one material or of two.
 #[derive(Debug, Clone)]
 pub enum PositiveElectrode {
     /// One material.
     One(PositiveMaterial),
-    /// A blend: content over falling potential, V, in steps of equal size from the lowest.
+    /// A blend: lithium content at equally spaced potentials, from the lowest potential to the highest.
     Blend(Vec<f64>),
 }
 
@@ -33,7 +34,8 @@ impl From<PositiveMaterial> for PositiveElectrode {
 }
 
 impl PositiveElectrode {
-    /// Two materials in one electrode, at one potential: the contents add. `share` is the capacity of `a` in it.
+    /// Two materials in one electrode. Both have the same potential, so their contents are added. `share` is the
+    /// fraction of the electrode's capacity that material `a` holds.
     pub fn blend(a: PositiveMaterial, share: f64, b: PositiveMaterial) -> Self {
         let content = |material: PositiveMaterial, potential_v: f64| {
             let ends = (material.least_content(), 1.0);
@@ -122,8 +124,8 @@ impl CurvePrior {
         let mean_v: Vec<f64> =
             (0..soc.len()).map(|s| cells.iter().map(|(_, cell)| cell.curve_v[s]).sum::<f64>() / count).collect();
         let off_v = |cell: &PossibleCell, s: usize| cell.curve_v[s] - mean_v[s];
-        // Smooth deviation of a cell's materials from the library's materials of that name, larger where curves fall steeply (the
-        // deviations that the fit of electrodes allows, `ident::electrodes`).
+        // Smooth deviation of a cell's materials from the library's materials of the same name; larger where the curves
+        // are steep. These are the deviations that the fit of electrodes allows (`ident::electrodes`).
         let material_v = |s: usize| if soc[s] < 0.05 { 0.030 } else { 0.010 };
         let covariance = DMatrix::from_fn(soc.len(), soc.len(), |a, b| {
             let between: f64 = cells.iter().map(|(_, cell)| off_v(cell, a) * off_v(cell, b)).sum::<f64>() / count;
@@ -145,13 +147,13 @@ impl CurvePrior {
         Some(Self { soc: soc.to_vec(), mean_v, covariance, electrodes })
     }
 
-    /// The largest independent modes of the spread, V per standard deviation, and the standard deviation of the rest, V. Modes
-    /// are ordered by their effect on a SOC that is read from the voltage.
+    /// The largest independent modes of the spread, V per standard deviation, and the standard deviation of the rest,
+    /// V. Modes are ordered by their effect on the SOC that is read from a voltage.
     pub fn modes_v(&self) -> ([Vec<f64>; MIXES], Vec<f64>) {
         let n = self.soc.len();
         let slope_v = |s: usize| {
             let (a, b) = (s.saturating_sub(1), (s + 1).min(n - 1));
-            // On a flatter curve a voltage says nothing about the SOC.
+            // On a flatter curve, a voltage gives no information about the SOC.
             ((self.mean_v[b] - self.mean_v[a]) / (self.soc[b] - self.soc[a])).max(0.1)
         };
         let width = |s: usize| 0.5 * (self.soc[(s + 1).min(n - 1)] - self.soc[s.saturating_sub(1)]);
@@ -162,14 +164,14 @@ impl CurvePrior {
         order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));
         let mode = |k: usize| {
             let (column, scale) = (eigen.eigenvectors.column(order[k]), eigen.eigenvalues[order[k]].max(0.0).sqrt());
-            // The sign of an eigenvector is arbitrary: make its largest part positive.
+            // The sign of an eigenvector is arbitrary: make its largest component positive.
             let largest = column.iter().copied().fold(0.0, |m: f64, v| if v.abs() > m.abs() { v } else { m });
             (0..n).map(|s| largest.signum() * scale * column[s] / weight[s]).collect::<Vec<f64>>()
         };
         let modes_v: [Vec<f64>; MIXES] = std::array::from_fn(mode);
         let rest = |s: usize| {
             let explained: f64 = modes_v.iter().map(|mode_v| mode_v[s] * mode_v[s]).sum();
-            // Smallest error of a curve, V.
+            // Minimum error of a curve, V.
             (self.covariance[(s, s)] - explained).max(0.0).sqrt().max(0.004)
         };
         let rest_v = (0..n).map(rest).collect();
@@ -177,7 +179,8 @@ impl CurvePrior {
     }
 }
 
-/// The cell of a pair with these contents (full negative, empty positive) between the cut-off voltages, if any.
+/// The cell made of a pair of materials with these contents (full negative, empty positive) between the cut-off
+/// voltages; `None` if there is no such cell.
 fn possible_cell(
     (positive, negative): (&PositiveElectrode, NegativeMaterial),
     (negative_full, positive_empty): (f64, f64),

@@ -1,26 +1,27 @@
-//! Finds the measurements that reduce the SOC error of a cell model most, from its bands.
+//! Finds the measurements that reduce a cell model's SOC error the most, from the bands of the model.
 //!
-//! In: [`ModelBands`]. Out: up to [`MOST`] measurements, the most useful first, each with the error that remains after it and the
-//! measurements before it.
+//! In: [`ModelBands`]. Out: up to [`MOST`] measurements, the most useful first. Each measurement is returned with the
+//! error that remains after it and all measurements before it.
 //!
-//! The expected error is the mean square error of the SOC over SOC and the temperatures of [`USE_C`]: from one voltage under a
-//! usual load, and from counting charge since the last sure voltage with an uncertain capacity. A measurement is a linear
-//! observation of the curve, of ln(resistance) or of the capacity. Covariances fall with the distance in SOC and temperature, so a
-//! measurement also informs about its neighbours (Gaussian conditioning: p - c^2 / (v + r)).
+//! The expected error is the root mean square error of the SOC, averaged over SOC and over the temperatures of
+//! [`USE_C`]. The SOC is estimated from two sources: one voltage under a usual load, and the charge counted since the
+//! last reliable voltage with an uncertain capacity. A measurement is a linear observation of the curve, of
+//! ln(resistance) or of the capacity. Covariances fall with the distance in SOC and temperature, so a measurement also
+//! gives information about neighbouring points (Gaussian conditioning: p - c^2 / (v + r)).
 
 use std::fmt;
 
 use super::{ModelBands, ResistanceBand, soc_variance};
 use crate::filter::{bell, square};
 
-/// Largest number of measurements.
+/// Maximum number of measurements.
 const MOST: usize = 3;
 
 /// Temperatures of use, degrees C, with their weights: a car outdoors in a temperate climate.
 const USE_C: [(f64, f64); 4] = [(-7.0, 0.15), (3.0, 0.25), (20.0, 0.4), (35.0, 0.2)];
-/// SOC over which errors are averaged.
+/// SOC values over which the errors are averaged.
 const USE_SOC: [f64; 10] = [0.05, 0.15, 0.25, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85, 0.95];
-/// Possible SOC of a rest.
+/// SOC values at which the vehicle can rest.
 const REST_SOC: [f64; 9] = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9];
 
 /// A measurement that the vehicle can make.
@@ -38,7 +39,7 @@ impl fmt::Display for Measurement {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Rest(soc) => write!(f, "one rest of an hour near {:.0} %", 100.0 * soc),
-            // A cold drive may be colder, or up to 2 K warmer.
+            // A cold drive may take place at lower temperatures, or at up to 2 K more.
             Self::Drive(temperature_c) if *temperature_c < 10.0 => {
                 write!(f, "a drive below {:.0} \u{b0}C", temperature_c + 2.0)
             }
@@ -53,12 +54,12 @@ impl fmt::Display for Measurement {
 pub struct Advice {
     /// The measurement.
     pub measurement: Measurement,
-    /// Expected SOC error after this measurement and those before it in the list, points.
+    /// Expected SOC error after this measurement and all measurements before it in the list, percentage points.
     pub left_points: f64,
 }
 
-/// Expected SOC error with the model, points, and the measurements that reduce it; `None` if the model states no error. The list is
-/// empty if no measurement helps much.
+/// Expected SOC error with the model, in percentage points, and the measurements that reduce it. `None` if the model
+/// states no error. The list is empty if no measurement helps much.
 pub fn advise(bands: &ModelBands<'_>) -> Option<(f64, Vec<Advice>)> {
     let mut belief = Belief::of(bands)?;
     let first_points = belief.points();
@@ -71,7 +72,7 @@ pub fn advise(bands: &ModelBands<'_>) -> Option<(f64, Vec<Advice>)> {
         let tried = candidates.iter().map(|measurement| (*measurement, belief.after(measurement)));
         let best = tried.map(|(measurement, after)| (after.points(), measurement, after));
         let Some((left_points, measurement, after)) = best.min_by(|a, b| a.0.total_cmp(&b.0)) else { break };
-        // A measurement must gain at least 0.1 points and 5 % of the first error.
+        // A measurement must reduce the error by at least 0.1 points and by at least 5 % of the initial error.
         if points - left_points < f64::max(0.1, 0.05 * first_points) {
             break;
         }
@@ -81,7 +82,7 @@ pub fn advise(bands: &ModelBands<'_>) -> Option<(f64, Vec<Advice>)> {
     Some((first_points, advice))
 }
 
-/// Belief about a model: covariances over the grid of use and the possible measurements.
+/// Present knowledge about a model: covariances over the grid of use and the possible measurements.
 #[derive(Clone)]
 struct Belief {
     /// Slope of the curve at [`USE_SOC`], V per unit of SOC, and at [`REST_SOC`].
@@ -129,8 +130,8 @@ impl Belief {
 
     /// Expected error of the SOC, points.
     fn points(&self) -> f64 {
-        // Half of the capacity has been moved since the last sure voltage. With the right capacity the counted SOC still errs by 6 %:
-        // its start and the current sensor.
+        // Assumes that half of the capacity has been moved since the last reliable voltage. Even with the right
+        // capacity, the counted SOC has an error of 6 %, because of its initial value and the current sensor.
         let counted = square(0.06) + square(0.5 * self.capacity_std);
         let at = |t: usize, s: usize| {
             let of_drop = self.resistance[s][t][t] * square(self.drop_v[t][s]);
@@ -141,19 +142,20 @@ impl Belief {
         100.0 * variance.sqrt()
     }
 
-    /// The belief after a measurement.
+    /// The knowledge after a measurement.
     fn after(&self, measurement: &Measurement) -> Self {
         let mut after = self.clone();
         match measurement {
             Measurement::Rest(soc) => {
                 let place = REST_SOC.iter().position(|known| known == soc).unwrap_or(0);
-                // Errors of the voltage after an hour of rest, and of the SOC counted from another rest.
+                // Error of the voltage after an hour of rest, and error of the SOC that was counted since another rest.
                 let noise_v = f64::hypot(0.005, 0.02 * self.rest_slope_v[place]);
                 condition(&mut after.curve, USE_SOC.len() + place, square(noise_v));
             }
             Measurement::Drive(temperature_c) => {
                 let place = USE_C.iter().position(|(known, _)| known == temperature_c).unwrap_or(0);
-                // A drive leaves ln(resistance) uncertain by 10 %, a charge from below 20 % to full the capacity by 2 %.
+                // After a drive, ln(resistance) is known to 10 %; after a charge from below 20 % to full, the capacity
+                // is known to 2 %.
                 after.resistance.iter_mut().for_each(|of_soc| condition(of_soc, place, square(0.1)));
             }
             Measurement::Charge => after.capacity_std = self.capacity_std.min(0.02),
@@ -162,7 +164,7 @@ impl Belief {
     }
 }
 
-/// Conditions a covariance on an observation of `at` with this variance.
+/// Updates a covariance for an observation of element `at` with this variance.
 fn condition(covariance: &mut [Vec<f64>], at: usize, variance: f64) {
     let column: Vec<f64> = covariance.iter().map(|row| row[at]).collect();
     let total = column[at] + variance;

@@ -1,7 +1,7 @@
-//! A fit of the on-board model as a task: its inputs and its result.
+//! A fit of the on-board model, as a task with inputs and a result.
 //!
-//! A fit takes hundreds of times longer than a tick may, and depends only on its inputs. A live host runs it on its own thread; a
-//! replay runs it in place, with the same result.
+//! A fit takes hundreds of times longer than a tick may take, and it depends only on its inputs. A live host runs it on
+//! a separate thread. A replay runs it on the calling thread, with the same result.
 
 use super::fit::{self, Fit};
 use super::{OwnModel, rows_cost};
@@ -13,9 +13,9 @@ use crate::cell::notebook::{Notebook, Row};
 pub struct FitTask {
     label: Label,
     rows: Vec<Row>,
-    /// Number of last rows that no model has seen.
+    /// Number of rows at the end that were not used for any model yet.
     new_rows: usize,
-    /// The current and the previous model; `None` = the label's.
+    /// The present and the previous model; `None` = the label's model.
     own: Option<OwnModel>,
     before: Option<OwnModel>,
 }
@@ -23,11 +23,12 @@ pub struct FitTask {
 /// Result of a task.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FitFindings {
-    /// The previous model predicts the new rows better than the current one.
+    /// The previous model predicts the new rows better than the present model.
     pub is_before_better: bool,
     /// The rows sufficed for a fit.
     pub is_enough: bool,
-    /// The fit to all rows; `None` if there are too few rows, or their capacity is far from the label's.
+    /// The fit to all rows. `None` if there are too few rows, or if the fitted capacity is far from the label's
+    /// capacity.
     pub fit: Option<Fit>,
     /// The chemistry that explains the rows clearly better than the label's.
     pub chemistry: Option<Chemistry>,
@@ -55,12 +56,12 @@ impl FitTask {
         let new_rows = &self.rows[self.rows.len() - self.new_rows..];
         let cost = |own: Option<&OwnModel>| rows_cost(prior, own, new_rows);
         let costs = cost(Some(own)).zip(cost(self.before.as_ref()));
-        // 50 times more likely.
+        // A cost difference of 4 means 50 times more likely.
         costs.is_some_and(|(present, before)| before < present - 4.0)
     }
 
-    /// The chemistry that explains the rows clearly better than the label's, if any. Each chemistry is judged at the fit's capacity
-    /// or at the rated capacity, whichever suits it better.
+    /// The chemistry that explains the rows clearly better than the label's chemistry, if any. Each chemistry is judged
+    /// at the fitted capacity or at the rated capacity, whichever fits it better.
     fn better_chemistry(&self, prior: &LabelPrior, fitted: Option<&Fit>) -> Option<Chemistry> {
         let Self { label, rows, .. } = self;
         // 50 times more likely; more if the rows deviate from both by more than drives that a circuit describes (0.45). NCA and NMC
