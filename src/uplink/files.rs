@@ -1,6 +1,6 @@
 //! Reads files named by the settings: settings, passwords, tokens, certificates.
 //!
-//! Reads only regular files of bounded size. A pipe or a device, which could block the program, is an error.
+//! Only regular files of limited size are read. A pipe or a device could block the program, so it gives an error.
 
 use std::fs::File;
 use std::io::Read as _;
@@ -14,7 +14,7 @@ const MAX_BYTES: u64 = 1 << 20;
 /// Reads a file.
 ///
 /// # Errors
-/// Not a regular file, unreadable, or too long; the message names the file.
+/// Fails if the path is not a regular file, or if the file cannot be read or is too long. The message names the file.
 pub(crate) fn read(path: &Path) -> Result<Vec<u8>, String> {
     let at = path.display();
     let fault = |error: std::io::Error| format!("{at}: {error}");
@@ -32,7 +32,7 @@ pub(crate) fn read(path: &Path) -> Result<Vec<u8>, String> {
 /// Reads a secret or a certificate. A relative path is relative to the unit's credentials folder, if it has one.
 ///
 /// # Errors
-/// As [`read`].
+/// Fails like [`read`].
 pub(crate) fn read_credential(path: &Path) -> Result<Vec<u8>, String> {
     let folder = std::env::var_os(CREDENTIALS).map(PathBuf::from).unwrap_or_default();
     read(&folder.join(path))

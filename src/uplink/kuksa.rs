@@ -1,8 +1,8 @@
 //! `kuksa`: provides the daemon's values to a KUKSA databroker (protocol `kuksa.val.v2`) until stopped.
 //!
-//! Input: settings, documents of the daemon. Output: values in the databroker, one batch a second. After a lost connection it
-//! reconnects, with pauses from [`FIRST_PAUSE`] to [`LONGEST_PAUSE`]; documents received without a connection are dropped, never
-//! queued. `SIGTERM` withdraws the values.
+//! Input: settings, and status documents of the daemon. Output: values in the databroker, one batch a second. After a
+//! lost connection, the program reconnects. The pauses between attempts grow from [`FIRST_PAUSE`] to [`LONGEST_PAUSE`].
+//! Documents that arrive without a connection are dropped, never queued. `SIGTERM` withdraws the values.
 //!
 //! | module | what lives there |
 //! | --- | --- |
@@ -45,7 +45,7 @@ pub(crate) const LONGEST_PAUSE: Duration = Duration::from_secs(8);
 /// Runs the command until it is stopped.
 ///
 /// # Errors
-/// The settings are invalid, or the runtime cannot be started.
+/// Fails if the settings are invalid or the runtime cannot be started.
 pub fn run(options: &Options) -> Result<(), Failure> {
     let settings = options.start()?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
@@ -60,7 +60,7 @@ async fn serve(settings: &Settings) -> std::io::Result<()> {
     let (mut pause, mut latest_error) = (FIRST_PAUSE, String::new());
     loop {
         let connections = journal.counts.connections;
-        // Publish the present document, or its absence, with the first batch of a connection.
+        // The first batch of a connection contains the present document, or unknown values if there is no document.
         documents.mark_changed();
         let Err(error) = session::run(&settings.kuksa, &mut documents, &mut stop, &mut journal).await else { break };
         let was_connected = journal.counts.connections > connections;
@@ -91,7 +91,7 @@ fn stop_requests() -> std::io::Result<watch::Receiver<bool>> {
             _ = interrupt.recv() => {}
         }
         sender.send_replace(true);
-        // Keep the sender alive: without it every wait would end.
+        // The sender must stay alive, because all waits for a stop would end without it.
         sender.closed().await;
     });
     Ok(receiver)

@@ -1,7 +1,8 @@
 //! Sends the daemon's status to other software in and outside the vehicle: MQTT brokers (`mqtt`) and KUKSA databrokers (`kuksa`).
 //!
-//! A separate program that reads the daemon's status stream, like the exporter. So a slow, missing or hostile broker does not delay an
-//! estimate, and the vehicle program has no network library. `packwatch mqtt`, `packwatch kuksa` and `packwatch vss` start it.
+//! This crate is a separate program, which reads the daemon's status stream like the exporter. A slow, missing or
+//! hostile broker can therefore not delay the estimates, and the program in the vehicle needs no network library.
+//! `packwatch mqtt`, `packwatch kuksa` and `packwatch vss` start this program.
 //!
 //! | module | what lives there |
 //! | --- | --- |

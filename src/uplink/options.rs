@@ -22,7 +22,7 @@ impl Options {
     /// Starts logging and reads the settings.
     ///
     /// # Errors
-    /// The log filter or the settings are invalid.
+    /// Fails if the log filter or the settings are invalid.
     pub(crate) fn start(&self) -> Result<Settings, Failure> {
         logging::start(self.log.as_deref()).map_err(Failure::new)?;
         Settings::read(&self.config).map_err(Failure::config)

@@ -1,7 +1,8 @@
 //! The uplink's settings: a TOML file separate from the daemon's configuration, so that changing the broker changes neither the daemon
 //! nor the hash of its configuration.
 //!
-//! Input: the file of `-c`. Output: validated settings. An error names file, key and allowed values, and for a single key its line.
+//! Input: the file given with `-c`. Output: validated settings. An error names the file, the key and the allowed
+//! values. An error of a single key also names its line.
 
 use std::path::{Path, PathBuf};
 
@@ -42,7 +43,7 @@ impl Settings {
     /// Reads the file at `path`.
     ///
     /// # Errors
-    /// The file cannot be read, or is invalid; the message names file, line and reason.
+    /// Fails if the file cannot be read or is invalid. The message names file, line and reason.
     pub fn read(path: &Path) -> Result<Self, String> {
         let at = path.display();
         let text = String::from_utf8(files::read(path)?).map_err(|error| format!("{at}: {error}"))?;

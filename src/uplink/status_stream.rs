@@ -1,8 +1,9 @@
 //! The daemon's status, one document a second.
 //!
-//! Input: the daemon's stream socket. Output: [`StatusDocument`]s, and `None` once when the daemon stops sending: nothing for
-//! [`SILENCE`], the end of the stream, or an unreadable document. Reconnects every [`RETRY`] until stopped. A reader slower than the
-//! daemon gets the newest document; older ones are dropped.
+//! Input: the daemon's stream socket. Output: [`StatusDocument`]s. When the daemon stops sending, the output is `None`
+//! once. The daemon counts as stopped if nothing arrives for [`SILENCE`], if the stream ends, or if a document cannot
+//! be parsed. The stream is opened again every [`RETRY`]. A reader that is slower than the daemon gets only the newest
+//! document.
 
 use std::io;
 use std::path::Path;
@@ -16,7 +17,8 @@ use tokio::net::UnixStream;
 use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
 
-/// Longest time without a document before the daemon counts as silent. The daemon itself sends none older than 3 s.
+/// Time without a document after which the daemon counts as silent. The daemon sends no document that is older than 3
+/// s.
 pub const SILENCE: Duration = Duration::from_secs(5);
 /// Pause before reconnecting.
 pub const RETRY: Duration = Duration::from_secs(1);

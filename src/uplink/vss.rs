@@ -1,4 +1,5 @@
-//! `vss`: writes the overlay of the Vehicle Signal Specification (VSS): the signals that VSS does not have.
+//! `vss`: writes an overlay of the Vehicle Signal Specification (VSS), which contains the signals that VSS does not
+//! have.
 //!
 //! Input: the settings' branch. Output: `packwatch.vspec`, which vss-tools merge into VSS (`vspec export json -l`), and
 //! `packwatch.json`, which a databroker reads in addition to VSS's own file (`--vss vss.json,packwatch.json`). `--reference` prints
@@ -36,7 +37,7 @@ pub struct Args {
 /// Runs the command.
 ///
 /// # Errors
-/// The settings are invalid, or a file cannot be written.
+/// Fails if the settings are invalid or a file cannot be written.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let Some(config) = args.config.as_ref().filter(|_| !args.reference) else {
         return std::io::stdout()

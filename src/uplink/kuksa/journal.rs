@@ -4,7 +4,8 @@ use std::collections::HashSet;
 
 use super::routes::{DataPoints, SkippedSignal};
 
-/// Most reasons remembered as logged: all signals with a few reasons each. Further reasons from a broker are not logged.
+/// Maximum number of logged reasons that are remembered: all signals with a few reasons each. Further reasons are not
+/// logged.
 const MAX_LOGGED: usize = 1000;
 
 /// Counts since the start of the program.
@@ -29,7 +30,7 @@ pub(crate) struct Counts {
 pub(crate) struct Journal {
     pub(crate) counts: Counts,
     logged: HashSet<String>,
-    /// Signals outside the broker's limits in the latest batch.
+    /// Signals whose values in the latest batch exceed the broker's limits.
     outside: HashSet<&'static str>,
 }
 

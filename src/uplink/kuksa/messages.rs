@@ -1,7 +1,8 @@
 //! The messages and three calls of the protocol `kuksa.val.v2` that a provider of values needs.
 //!
-//! Written by hand, because the generated client of the KUKSA project compiles protoc, a C++ program, at every build. Fields that
-//! this program does not read are omitted; protobuf skips them. Field numbers are from the published protocol.
+//! The messages are written by hand, because the generated client of the KUKSA project compiles protoc, a C++ program,
+//! at every build. Fields that this program does not read are omitted, because protobuf skips them. The field numbers
+//! are those of the published protocol.
 
 use std::collections::BTreeMap;
 
@@ -31,7 +32,7 @@ pub(crate) struct Datapoint {
     pub(crate) value: Option<Value>,
 }
 
-/// A value; unknown without a type.
+/// A value; without a type, the value is unknown.
 #[derive(Clone, PartialEq, prost::Message)]
 pub(crate) struct Value {
     #[prost(oneof = "TypedValue", tags = "11, 12, 13, 14, 15, 16, 17, 18, 21, 22, 25, 27")]
@@ -108,7 +109,7 @@ pub(crate) struct ListMetadataResponse {
 pub(crate) struct Metadata {
     #[prost(string, tag = "9")]
     pub(crate) path: String,
-    /// Valid until the broker restarts.
+    /// Number of the signal. It is valid until the broker restarts.
     #[prost(int32, tag = "10")]
     pub(crate) id: i32,
     /// Number of the VSS datatype.
@@ -128,7 +129,7 @@ pub(crate) struct SampleInterval {
     pub(crate) interval_ms: u32,
 }
 
-/// Claims signals: no other program may provide them while the stream is open.
+/// Claims signals. While the stream is open, no other program may provide them.
 #[derive(Clone, PartialEq, Eq, prost::Message)]
 pub(crate) struct ProvideSignalRequest {
     #[prost(btree_map = "int32, message", tag = "1")]
@@ -190,7 +191,8 @@ pub(crate) struct Rejection {
     pub(crate) message: String,
 }
 
-/// A reader asked the broker for values. The broker forwards the request and waits a second.
+/// A reader has asked the broker for values. The broker forwards the request to this program, and waits a second for
+/// the answer.
 #[derive(Clone, PartialEq, Eq, prost::Message)]
 pub(crate) struct GetProviderValueRequest {
     #[prost(uint32, tag = "1")]

@@ -1,8 +1,9 @@
-//! The messages of one connection to the broker, created when the connection can send one.
+//! The messages of one connection to the broker. A message is created only when the connection can send it.
 //!
 //! * While the connection cannot send, only the newest batch of values is kept.
-//! * An empty claim follows each batch. The broker accepts it after it has read everything before it, so the acceptance serves as a
-//!   receipt; the protocol has no other. A check is such a claim without a batch.
+//! * An empty claim follows each batch. The broker accepts a claim after it has read every message before it, so the
+//!   acceptance serves as a receipt for the batch. The protocol has no other receipt. A *check* is an empty claim
+//!   without a batch.
 //! * An answer overtakes a waiting batch. See `value_requests` for why the order matters.
 
 use std::collections::VecDeque;
@@ -16,26 +17,26 @@ use tokio_stream::wrappers::WatchStream;
 
 use super::messages::{Action, GetProviderValueResponse, ProvideSignalRequest, PublishValuesRequest, ToBroker};
 
-/// Most waiting answers; the broker sends one request at a time.
+/// Maximum number of waiting answers. The broker sends one request at a time.
 const MAX_ANSWERS: usize = 8;
 
 /// What a receipt confirms.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum ReceiptScope {
-    /// The batch with this number, and everything before it.
+    /// The broker has read the batch with this number, and every message before it.
     Batch(u32),
-    /// Everything before it.
+    /// The broker has read every message before the check.
     Check,
 }
 
-/// Sent messages not yet confirmed as read, in order.
+/// Messages that were sent and are not yet confirmed as read, in the order of sending.
 type UnreadMessages = Arc<Mutex<VecDeque<ReceiptScope>>>;
 
-/// Takes the session's messages. Dropping it ends the stream after the waiting messages.
+/// Takes the session's messages. When it is dropped, the waiting messages are sent and the stream ends.
 #[derive(Debug)]
 pub(crate) struct Outbox {
     batches: watch::Sender<PublishValuesRequest>,
-    /// `None` = a check.
+    /// The answers to send; `None` stands for a check.
     answers: mpsc::Sender<Option<GetProviderValueResponse>>,
     unread: UnreadMessages,
 }
@@ -56,22 +57,22 @@ impl Outbox {
         (Self { batches, answers, unread }, messages)
     }
 
-    /// Sends the batch; replaces a waiting batch.
+    /// Queues a batch. It replaces a batch that is still waiting.
     pub(crate) fn publish(&self, batch: PublishValuesRequest) {
         self.batches.send_replace(batch);
     }
 
-    /// Sends an answer; `false` if too many are waiting.
+    /// Queues an answer. Returns `false` if too many answers are waiting.
     pub(crate) fn answer(&self, answer: GetProviderValueResponse) -> bool {
         self.answers.try_send(Some(answer)).is_ok()
     }
 
-    /// Requests a receipt; `false` if too many answers are waiting.
+    /// Queues a check. Returns `false` if too many answers are waiting.
     pub(crate) fn check(&self) -> bool {
         self.answers.try_send(None).is_ok()
     }
 
-    /// Handles a receipt: returns what the broker has read.
+    /// Handles a receipt. Returns what the broker has read.
     pub(crate) fn acknowledge(&self) -> Option<ReceiptScope> {
         self.unread.lock().unwrap_or_else(PoisonError::into_inner).pop_front()
     }
@@ -80,7 +81,7 @@ impl Outbox {
 /// The message stream of the connection.
 #[derive(Debug)]
 pub(crate) struct Messages {
-    /// Sent before everything else: the initial claim, later the empty claim of a receipt.
+    /// A message that is sent before all others: first the initial claim, later the empty claim after each batch.
     next: Option<Action>,
     answers: mpsc::Receiver<Option<GetProviderValueResponse>>,
     batches: WatchStream<PublishValuesRequest>,
@@ -103,7 +104,7 @@ impl Messages {
                 self.note_unread(ReceiptScope::Check);
                 return Poll::Ready(Some(receipt));
             }
-            // The outbox is closed, so the batches end too.
+            // If the outbox is closed, the batches end too.
             Poll::Ready(None) | Poll::Pending => {}
         }
         let Some(batch) = std::task::ready!(Pin::new(&mut self.batches).poll_next(context)) else {

@@ -1,8 +1,9 @@
 //! Maps the broker's ids to signals, for one connection.
 //!
-//! Input: the broker's metadata; status documents. Output: the claim, and data points by id. A signal has a route only if the broker
-//! lists its path with the same datatype and a unique id. Ids change when the broker restarts, so routes belong to a connection.
-//! A value outside the broker's limits is withheld: its data point has no value.
+//! Input: the broker's metadata and status documents. Output: the claim, and data points by id. A signal has a route
+//! only if the broker lists its path with the same datatype and a unique id. Ids change when the broker restarts, so
+//! the routes belong to one connection. A value outside the broker's limits is withheld: its data point is sent without
+//! a value.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -74,7 +75,7 @@ impl Routes {
         self.by_id.len()
     }
 
-    /// Name of the signal with this id.
+    /// Name of the signal with this id; `None` = this connection does not provide such a signal.
     pub(crate) fn name(&self, id: i32) -> Option<&'static str> {
         self.by_id.get(&id).map(|route| &*route.signal.name)
     }
@@ -86,7 +87,7 @@ impl Routes {
         ProvideSignalRequest { signals: self.by_id.keys().map(|id| (*id, interval)).collect() }
     }
 
-    /// Returns a data point for every signal; without a document, all are unknown.
+    /// Returns a data point for every signal. Without a document, all values are unknown.
     pub(crate) fn points(&self, document: Option<&StatusDocument>) -> DataPoints {
         self.points_of(self.by_id.keys(), document)
     }

@@ -1,8 +1,9 @@
-//! One connection to the broker, from its metadata to its end.
+//! One connection to the broker, from opening to closing.
 //!
-//! Input: settings, documents, the request to stop. Output: values by the ids of this connection. Order: ListMetadata, claim, then a
-//! batch for each document. If the daemon is silent or this program stops, it sends a batch without values, so that no reader takes
-//! an old value for a present one. The connection ends with a reason if the broker ends it or does not answer.
+//! Input: settings, status documents, the request to stop. Output: values, identified by the ids of this connection.
+//! The program lists the metadata, claims the signals, and then sends a batch for each document. If the daemon falls
+//! silent or this program stops, it sends a batch without values, so that no reader takes an old value for a present
+//! one. The connection ends with a reason if the broker closes it or does not answer.
 
 use std::future::Future;
 use std::path::Path;
@@ -31,15 +32,16 @@ const PATIENCE: Duration = Duration::from_secs(5);
 const PING_PERIOD: Duration = Duration::from_secs(10);
 /// Longest wait for the broker to read the last batch.
 const FAREWELL: Duration = Duration::from_millis(500);
-/// Longest time in which the broker may read no batch; beyond it, its readers take old values for present ones.
+/// Longest time during which the broker may read no batch. After this time the connection is closed, because readers
+/// would take old values for present ones.
 const UNREAD_LIMIT: Duration = Duration::from_secs(30);
 /// Longest token, bytes.
 const MAX_TOKEN_BYTES: usize = 16 << 10;
 
-/// Serves one connection. `Ok` means that it ended on request.
+/// Serves one connection. Returns `Ok` if the connection ended on request.
 ///
 /// # Errors
-/// Why the connection could not be opened, or why it ended.
+/// Fails if the connection could not be opened or has ended; the error is the reason.
 pub(crate) async fn run(
     settings: &KuksaSettings,
     documents: &mut Documents,
@@ -80,7 +82,7 @@ struct Session {
     receipts: Receipts,
 }
 
-/// Time since which the broker owes a receipt.
+/// Time since which the broker has owed a receipt.
 #[derive(Debug, Default)]
 struct Receipts {
     owed_since: Option<Instant>,
@@ -91,12 +93,13 @@ impl Receipts {
         self.owed_since.get_or_insert(now);
     }
 
-    /// Handles a receipt: the next batch restarts the time.
+    /// Handles a receipt. The broker owes the next receipt from the next batch on.
     fn note_read(&mut self) {
         self.owed_since = None;
     }
 
-    /// Fails if the broker keeps the connection open but reads nothing or sends no receipts. It owes none if nothing was sent.
+    /// Fails if a receipt is overdue. This happens if the broker keeps the connection open but does not read messages
+    /// or send receipts. If no batch was sent, the broker owes no receipt.
     fn check(&self, now: Instant) -> Result<(), String> {
         match self.owed_since {
             Some(since) if now.duration_since(since) > UNREAD_LIMIT => {
@@ -135,7 +138,7 @@ impl Session {
         })
     }
 
-    /// Sends a value of every signal; without a document, all are unknown.
+    /// Sends a value of every signal. Without a document, all values are unknown.
     fn publish(&mut self, document: Option<&StatusDocument>, journal: &mut Journal) {
         let points = self.routes.points(document);
         journal.note_published(&points);
@@ -169,7 +172,7 @@ impl Session {
         }
     }
 
-    /// Requests the receipt of an answer when it is due.
+    /// Sends a check when the proof of an answer needs one.
     fn handle_time(&mut self) -> Result<(), String> {
         if self.value_requests.handle_time(Instant::now())? && !self.outbox.check() {
             return Err("the broker reads no answers".to_owned());
@@ -177,17 +180,17 @@ impl Session {
         Ok(())
     }
 
-    /// Withdraws every value, and gives the broker time to read it.
+    /// Makes every value unknown, and gives the broker time to read this.
     async fn withdraw(mut self, journal: &mut Journal) {
         self.publish(None, journal);
         drop(self.outbox);
         let until_end = async { while let Ok(Some(_)) = self.incoming.message().await {} };
-        // A broker that keeps its side open has read everything by then.
+        // If the broker keeps the connection open, it has read everything within this time.
         let _ = timeout(FAREWELL, until_end).await;
     }
 }
 
-/// Waits until `time`; forever without one.
+/// Waits until `time`; `None` = waits forever.
 async fn wait_until(time: Option<Instant>) {
     match time {
         Some(time) => sleep_until(time).await,
@@ -206,7 +209,7 @@ async fn accepted(incoming: &mut Streaming<FromBroker>) -> Result<(), Status> {
     }
 }
 
-/// Lists metadata at and below `root`; empty if the broker does not know `root`.
+/// Lists the metadata of `root` and of every signal below it. The list is empty if the broker does not know `root`.
 async fn list(client: &mut Client, root: &str) -> Result<Vec<super::messages::Metadata>, Status> {
     match client.list_metadata(root).await {
         Err(status) if status.code() == Code::NotFound => Ok(Vec::new()),
@@ -287,7 +290,7 @@ mod tests {
         let begin = Instant::now();
         let at = |seconds: u64| begin + Duration::from_secs(seconds);
         let mut receipts = Receipts::default();
-        // No daemon and nothing to send for an hour; then a batch.
+        // There is no daemon and nothing is sent for an hour. Then a batch is sent.
         receipts.note_sent(at(3600));
         assert_eq!(receipts.check(at(3600)), Ok(()));
         receipts.note_read();

@@ -7,7 +7,7 @@ use serde::Deserialize;
 
 use super::signals::STANDARD_BRANCH;
 
-/// Longest branch, bytes; the databroker reads paths of up to 1,000.
+/// Longest branch, bytes. The databroker accepts paths of up to 1,000 bytes.
 const MAX_BRANCH_BYTES: usize = 200;
 
 /// The databroker, and the branch of the overlay's signals.
@@ -42,7 +42,7 @@ impl KuksaSettings {
     /// Checks each key and combinations of keys.
     ///
     /// # Errors
-    /// The key, what was found and what is allowed.
+    /// Returns an error that states the key, the value found and the values allowed.
     pub(crate) fn check(&self) -> Result<(), String> {
         let address = &self.address;
         let (scheme, rest) = address.split_once(':').unwrap_or_default();

@@ -1,8 +1,9 @@
 //! The signals that this program provides, and the derivation of each from the status document.
 //!
-//! Input: a status document (units in its field names, current positive = discharge, SOC and SOH as fractions, cells from 0).
-//! Output: VSS values: current positive = into the battery, percent, cells from 0. `None` = something the value needs is unknown.
-//! An array has a value only if every cell has one, because its positions are cell numbers and VSS has no unknown number.
+//! Input: a status document (units in its field names, positive current = discharge, SOC and SOH as fractions, cells
+//! from 0). Output: VSS values (positive current = charge, percentages, cells from 0). `None` means that the value
+//! depends on something unknown. An array has a value only if every cell has one: positions in the array are cell
+//! numbers, and a VSS array cannot contain an unknown number.
 
 mod derived;
 
@@ -36,16 +37,16 @@ pub(crate) struct Signal {
     pub(crate) name: Cow<'static, str>,
     pub(crate) origin: Origin,
     pub(crate) data_type: DataType,
-    /// Name of the unit in VSS 5 and 6.
+    /// Name of the unit in VSS 5 and 6; `None` = no unit.
     pub(crate) unit: Option<&'static str>,
     /// Description for the overlay and the manual.
     pub(crate) description: Cow<'static, str>,
-    /// Fields of the status document that it is derived from.
+    /// Fields of the status document from which the signal is derived.
     pub(crate) fields: Cow<'static, str>,
     source: Source,
 }
 
-/// Source of a value. A number of the catalogue is multiplied by the factor.
+/// Source of a signal's value. A number from the catalogue of quantities is multiplied by the factor.
 #[derive(Debug, Clone, Copy)]
 enum Source {
     Document(fn(&StatusDocument) -> Option<Value>),
@@ -63,7 +64,7 @@ impl Signal {
         format!("{branch}.{}", self.name)
     }
 
-    /// Its value; `None` if unknown.
+    /// The signal's value; `None` = unknown.
     pub(crate) fn value(&self, document: &StatusDocument) -> Option<Value> {
         // Adding 0 turns -0 into 0.
         let scaled = |value: Option<f64>, factor: f64| single(value.map(|value| factor * value + 0.0));
@@ -78,7 +79,7 @@ impl Signal {
         }
     }
 
-    /// Whether it is a row of the catalogue.
+    /// Whether the signal is a quantity of the catalogue.
     pub(crate) fn is_quantity(&self) -> bool {
         !matches!(self.source, Source::Document(_))
     }
@@ -99,7 +100,7 @@ pub(crate) fn of_overlay() -> impl Iterator<Item = &'static Signal> {
     all().filter(|signal| signal.origin == Origin::Overlay)
 }
 
-/// The signals of a catalogue row: its mean and, if it has one, its standard deviation.
+/// The signals of one quantity: its mean and, if the quantity has one, its standard deviation.
 fn signals_of(row: &'static QuantityRow, it: &'static Presentation, is_pack: bool) -> impl Iterator<Item = Signal> {
     let (unit, factor) = vss_unit(row.unit);
     let (owner, data_type) = if is_pack { ("pack", DataType::Float) } else { ("cells", DataType::Floats) };

@@ -83,7 +83,7 @@ pub(crate) enum Value {
 }
 
 impl Value {
-    /// Returns its datatype.
+    /// The datatype of this value.
     pub(crate) const fn data_type(&self) -> DataType {
         match self {
             Self::Text(_) => DataType::Text,
@@ -96,7 +96,7 @@ impl Value {
         }
     }
 
-    /// Whether all its numbers are within the limits.
+    /// Whether all numbers of this value are within the limits.
     pub(crate) fn is_within(&self, limits: Limits) -> bool {
         match self {
             Self::Uint16(number) => limits.contain(f64::from(*number)),

@@ -1,13 +1,14 @@
-//! Requests of the broker: a reader wants a value now, and the broker asks the provider.
+//! Requests of the broker for values. When a reader asks the broker for a present value, the broker asks this program.
 //!
-//! While the databroker (0.7) waits up to a second for an answer, it reads nothing else from the provider. It mistakes a late answer
-//! for the answer to its next request, which may be about another signal. A batch sent during the wait delays the answer behind it.
-//! Therefore:
+//! While the databroker (0.7) waits for an answer (up to a second), it reads nothing else from this program. It
+//! mistakes a late answer for the answer to its next request, which may be about another signal. If a batch is sent
+//! during the wait, the broker must read it before the answer. Therefore:
 //!
-//! * A request is answered only after the broker has read everything sent before. If this takes longer than [`DEADLINE`], the request
-//!   gets no answer, and the broker gives its reader the last value.
-//! * Every answer needs a proof that the broker read it in time: its next request within that second, else a receipt. Without a proof
-//!   the connection ends, which also discards answers waiting in the broker.
+//! * A request is answered only after the broker has read all earlier messages. If this takes longer than [`DEADLINE`],
+//!   the request gets no answer, and the broker gives its reader the last value.
+//! * Every answer needs a proof that the broker read it in time. The proof is either the broker's next request, if it
+//!   arrives before [`LATEST_PROOF`], or a receipt. Without a proof the connection is closed, which also discards
+//!   answers that wait in the broker.
 
 use std::time::Duration;
 
@@ -18,12 +19,12 @@ use super::outgoing::ReceiptScope;
 
 /// Longest wait before an answer: half of the broker's timeout.
 const DEADLINE: Duration = Duration::from_millis(500);
-/// Time without a further request after which a receipt is requested. A reader that asks for many values in a row proves each answer
-/// by its next request.
+/// If no further request arrives within this time after a request, a receipt is requested. A reader that asks for many
+/// values in a row proves each answer by its next request.
 const CHECK_AFTER: Duration = Duration::from_millis(100);
 /// Latest time of the proof: the broker's timeout minus 200 ms of transport latency.
 const LATEST_PROOF: Duration = Duration::from_millis(800);
-/// Most waiting requests; the broker sends one at a time.
+/// Maximum number of waiting requests. The broker sends one request at a time.
 const MAX_REQUESTS: usize = 8;
 
 /// A request and its time of arrival.
@@ -33,10 +34,10 @@ pub(crate) type ValueRequest = (Instant, GetProviderValueRequest);
 #[derive(Debug, Default)]
 pub(crate) struct ValueRequests {
     waiting: Vec<ValueRequest>,
-    /// Number of the latest batch made, and of the latest batch the broker has read.
+    /// Number of the latest batch that was created. `read` is the number of the latest batch that the broker has read.
     made: u32,
     read: u32,
-    /// Arrival of the request whose answer is not proved yet.
+    /// Arrival of the latest request whose answer is not yet proved.
     unproved: Option<Instant>,
     is_checking: bool,
 }
@@ -56,7 +57,7 @@ impl ValueRequests {
         }
     }
 
-    /// Adds a request; `false` if too many are waiting.
+    /// Adds a request. Returns `false` if too many requests are waiting.
     pub(crate) fn ask(&mut self, request: GetProviderValueRequest, now: Instant) -> bool {
         if self.unproved.is_some_and(|asked| now.duration_since(asked) <= LATEST_PROOF) {
             self.unproved = None;
@@ -68,7 +69,7 @@ impl ValueRequests {
         has_room
     }
 
-    /// Requests to answer now, and the number of requests that expired.
+    /// Returns the requests to answer now, and the number of requests that have expired.
     pub(crate) fn take(&mut self, now: Instant) -> (Vec<ValueRequest>, u64) {
         if self.made != self.read || self.is_checking {
             return (Vec::new(), 0);
@@ -89,7 +90,7 @@ impl ValueRequests {
     /// Whether to request a receipt now.
     ///
     /// # Errors
-    /// The proof of an answer is overdue.
+    /// Fails if the proof of an answer is overdue.
     pub(crate) fn handle_time(&mut self, now: Instant) -> Result<bool, String> {
         if self.unproved.is_some_and(|asked| now.duration_since(asked) >= LATEST_PROOF) {
             return Err("the broker may have read an answer late".to_owned());

@@ -12,26 +12,26 @@ use crate::files::read_credential;
 
 /// Longest wait for the connection and for the broker's answer, s.
 const CONNECT_LIMIT_S: u64 = 15;
-/// Most requests waiting in memory for the connection: a window of messages of the queue.
+/// Maximum number of requests that wait in memory for the connection.
 const REQUESTS: usize = 64;
-/// Most unacknowledged messages, of the queue and of the current values together.
+/// Maximum number of unacknowledged messages, counting queued messages and present values together.
 const IN_FLIGHT: u16 = 64;
-/// Largest packet accepted from the broker, bytes; there are no subscriptions.
+/// Largest packet accepted from the broker, bytes. This program subscribes to nothing, so all packets are small.
 const MAX_INCOMING_BYTES: u32 = 64 << 10;
 
 /// Creates a client. Its event loop connects.
 ///
 /// # Errors
-/// A file named by the settings cannot be read or used.
+/// Fails if a file named by the settings cannot be read or used.
 pub fn client(settings: &MqttSettings) -> Result<(AsyncClient, EventLoop), String> {
     let broker = Broker::tcp(settings.host.clone(), settings.port());
     let mut options = MqttOptions::new(settings.client_id(), broker);
     options.set_keep_alive(u16::try_from(settings.keep_alive_s).unwrap_or(u16::MAX));
-    // Unacknowledged messages are in the queue on disk; a session at the broker would only repeat old values.
+    // The queue on disk keeps the unacknowledged messages. A session stored by the broker would only repeat old values.
     options.set_clean_start(true);
     options.set_last_will(LastWill::new(settings.topic(topic::STATUS), OFFLINE, QoS::AtLeastOnce, true, None));
     options.set_incoming_packet_size_limit(rumqttc::IncomingPacketSizeLimit::Bytes(MAX_INCOMING_BYTES));
-    // Memory for unacknowledged messages; the default is 65,535.
+    // This limits the memory for unacknowledged messages; the default is 65,535 messages.
     options.set_outgoing_inflight_upper_limit(IN_FLIGHT);
     let mut network = options.network_options();
     network.set_connection_timeout(CONNECT_LIMIT_S);
@@ -50,7 +50,7 @@ pub fn client(settings: &MqttSettings) -> Result<(AsyncClient, EventLoop), Strin
 }
 
 fn certificates(tls: &TlsSettings) -> Result<TlsConfiguration, String> {
-    // The settings' check ensures that both or neither are given.
+    // The check of the settings ensures that both files or neither are given.
     let client_auth = match (&tls.certificate_file, &tls.key_file) {
         (Some(certificate), Some(key)) => Some((read_credential(certificate)?, read_credential(key)?)),
         _ => None,

@@ -1,7 +1,8 @@
 //! Home Assistant discovery messages: the entities and the sources of their values.
 //!
-//! Input: the daemon's status (cells, rules, vehicle) and the settings. Output: retained messages, one per entity, all for one device.
-//! Entities of the pack are available while both uplink and daemon are online; entities of the uplink while the uplink is online.
+//! Input: the daemon's status (cells, rules, vehicle) and the settings. Output: retained messages, one per entity, all
+//! for one device. Entities of the pack are available while both the uplink and the daemon are online. Entities of the
+//! uplink are available while the uplink is online.
 
 use packwatch_host::status::document::StatusDocument;
 use serde_json::{Value, json};

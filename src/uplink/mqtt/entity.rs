@@ -1,8 +1,8 @@
-//! The entities of a pack: key in `info`, name, unit and value. Most are rows of the catalogue.
+//! The entities of a pack: key in `info`, name, unit and value. Nearly all are rows of the catalogue of quantities.
 //!
-//! Input: the daemon's status. Output: the values as JSON. Keys and names match Battery-Emulator where it has the quantity. As in
-//! Battery-Emulator, published SOC and similar values are percent, and current and power are positive into the pack (charging), so the
-//! daemon's current is negated. Cells count from 1. Unknown values are `null`, never a number.
+//! Input: the daemon's status. Output: the values as JSON. If Battery-Emulator has a quantity, its key and name are
+//! used. As in Battery-Emulator, SOC and other fractions are published in percent, and positive current and power mean
+//! charging. The daemon's current is therefore negated. Cells count from 1. Unknown values are `null`, never a number.
 
 use std::borrow::Cow;
 use std::sync::LazyLock;
@@ -42,7 +42,7 @@ pub struct Entity {
     pub name: Cow<'static, str>,
     /// Kind of value.
     pub kind: Kind,
-    /// Whether it describes the daemon rather than the pack.
+    /// Whether the entity describes the daemon instead of the pack.
     pub is_diagnostic: bool,
     source: Source,
 }
@@ -63,7 +63,7 @@ impl Entity {
         Self { is_diagnostic: true, ..self }
     }
 
-    /// Its value; `null` if unknown.
+    /// The entity's value; `null` if unknown.
     pub fn value(&self, document: &StatusDocument) -> Value {
         match self.source {
             Source::Document(value) => value(document),
@@ -116,7 +116,7 @@ fn of_catalogue() -> impl Iterator<Item = Entity> {
             let (measure, _) = measure(row.unit);
             let (ending, name, class) = match part {
                 Part::Mean => ("", name.into(), measure.class),
-                // The class is for levels; a deviation is not a level.
+                // The device class is for a level; a standard deviation is not a level.
                 Part::Std if row.unit == Unit::Level => ("_std", format!("{name} Standard Deviation").into(), ""),
                 Part::Std => ("_std", format!("{name} Standard Deviation").into(), measure.class),
             };
@@ -144,7 +144,7 @@ fn derived() -> [Entity; 19] {
     let watts = Kind::Measured { unit: "W", class: "power", decimals: 0 };
     [
         Entity::new("time", "Time of the Values", Kind::Time, |d| stamp(d.wall_time).into()).diagnostic(),
-        // Battery-Emulator also has a scaled SOC. Here the two are equal.
+        // Battery-Emulator also has a scaled SOC. Here, the scaled and the real SOC are equal.
         Entity::new("SOC_real", "SoC (real)", measure(Unit::Level).0.kind(), |d| {
             published(Quantity::Soc, Part::Mean, d.pack.values.mean(Quantity::Soc))
         }),

@@ -1,10 +1,13 @@
-//! The link to the broker: reconnects until stopped, publishes current values, and forwards the queue.
+//! The link to the broker. It reconnects until it is stopped, publishes the present values, and forwards the queue.
 //!
-//! Input: the daemon's documents and the [`Queue`]. Output: messages with QoS 1. Each connection starts without messages in memory, so
-//! no value of an earlier connection is repeated. Current values come from the newest document. A message leaves the queue only after
-//! the broker has acknowledged it. After a lost connection the pause doubles up to `retry_max_s`; after a connection of more than
-//! `retry_max_s` it starts again at 1 s. A message that the broker rejects does not end the connection: a queued message is retried after `retry_max_s`, a current
-//! value with the next document.
+//! Input: the daemon's documents and the [`Queue`]. Output: messages with QoS 1. Each connection starts without
+//! messages in memory, so it repeats no value of an earlier connection. Present values come from the newest document. A
+//! message leaves the queue only after the broker has acknowledged it.
+//!
+//! After a lost connection, the link pauses for 1 s. The pause doubles with each further loss, up to `retry_max_s`.
+//! After a connection of more than `retry_max_s`, it is 1 s again. A message that the broker rejects does not end the
+//! connection. A rejected message of the queue is sent again after `retry_max_s`; a rejected present value is replaced
+//! with the next document.
 
 use std::convert::Infallible;
 use std::fmt;
@@ -29,7 +32,7 @@ use crate::status_stream::Documents;
 const RETRY: Duration = Duration::from_secs(1);
 /// Maximum number of unacknowledged messages of the queue; most brokers accept this number.
 const WINDOW: usize = 20;
-/// Longest wait for an acknowledgement. A connection that acknowledges nothing is closed then.
+/// Longest wait for an acknowledgement. If none arrives within this time, the connection is closed.
 const ACKNOWLEDGEMENT: Duration = Duration::from_secs(120);
 /// Pause before the queue on disk is retried.
 const QUEUE_RETRY: Duration = Duration::from_secs(5);
@@ -39,7 +42,7 @@ const FAREWELL: Duration = Duration::from_secs(2);
 /// Why a message was not published.
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum Fault {
-    /// The broker rejected it.
+    /// The broker rejected the message.
     Refused(String),
     /// The connection failed.
     Lost(String),
@@ -73,7 +76,7 @@ impl Link<'_> {
             if began.elapsed() > most {
                 (pause, latest) = (RETRY, String::new());
             }
-            // Log each reason once, not each attempt.
+            // Each reason is logged once, not at every attempt.
             if error != latest {
                 tracing::warn!(
                     broker = self.broker(),
@@ -99,7 +102,7 @@ impl Link<'_> {
     async fn connection(&self, stopped: &mut watch::Receiver<bool>) -> Result<(), String> {
         let (client, mut events) = connect::client(self.settings)?;
         let mut driven = pin!(drive(&mut events));
-        // Each class is separate: if the broker rejects one, the other continues.
+        // Events and samples are forwarded separately: if the broker rejects one class, the other continues.
         let work = async {
             let (samples, events) = (self.forward(&client, Class::Sample), self.forward(&client, Class::Event));
             tokio::try_join!(self.current(&client), samples, events).map(|_| ())
@@ -113,7 +116,7 @@ impl Link<'_> {
         Ok(())
     }
 
-    /// Publishes the same state as the last will, and disconnects.
+    /// Publishes `offline`, like the last will, and disconnects.
     async fn farewell(&self, client: &AsyncClient, driven: Pin<&mut impl Future<Output = String>>) {
         let farewell = async {
             publish(client, vec![Message::retained(self.settings.topic(topic::STATUS), OFFLINE)]).await;
@@ -130,7 +133,7 @@ impl Link<'_> {
         tracing::info!("disconnected");
     }
 
-    /// Publishes current values every period, and at once when the daemon falls silent or reports again.
+    /// Publishes the present values every period, and at once when the daemon falls silent or reports again.
     async fn current(&self, client: &AsyncClient) -> Result<Infallible, String> {
         let mut documents = self.documents.clone();
         let period = Duration::from_secs(self.settings.period_s);
@@ -225,7 +228,7 @@ async fn persist<T>(action: &str, mut attempt: impl FnMut() -> Result<T, String>
     }
 }
 
-/// What this connection has published, so that only changes are sent.
+/// What this connection has published. It is used to send only changes.
 #[derive(Debug, Default)]
 struct PublishedState {
     has_status: bool,
@@ -236,8 +239,9 @@ struct PublishedState {
 }
 
 impl PublishedState {
-    /// Messages that are due: the values, whether the daemon is online, the queue's fill, whether this program is online, and discovery if
-    /// the entities changed. The order ensures that no reader takes earlier values as current.
+    /// Returns the messages that are due, in this order: the values, whether the daemon is online, the fill of the
+    /// queue, whether this program is online, and the discovery messages if the entities have changed. With this order,
+    /// no reader takes values of an earlier connection as present.
     fn news(&mut self, settings: &MqttSettings, document: Option<&StatusDocument>, fill: Fill) -> Vec<Message> {
         let retained = |name: &str, text: String| Message::retained(settings.topic(name), text);
         let mut news = Vec::new();

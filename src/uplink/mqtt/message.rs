@@ -3,11 +3,11 @@
 /// A message to the broker.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Message {
-    /// Its topic.
+    /// Topic of the message.
     pub topic: String,
-    /// Its text. If empty and retained, the broker removes the retained message.
+    /// Text of the message. An empty retained message makes the broker delete the retained message of this topic.
     pub text: String,
-    /// Whether the broker keeps it for later readers.
+    /// Whether the broker keeps the message for later readers.
     pub is_retained: bool,
 }
 

@@ -9,7 +9,7 @@
 //! | `recorder` | which documents and events are queued |
 //! | `connect`, `link` | one connection; publishing and forwarding |
 //!
-//! Recorder and link share one thread and the queue. The recorder never waits for the link.
+//! The recorder and the link share one thread and the queue. The recorder never waits for the link.
 
 pub mod connect;
 pub mod discovery;
@@ -38,9 +38,9 @@ pub mod topic {
     pub const STATUS: &str = "status";
     /// Whether the daemon is online: retained.
     pub const DAEMON: &str = "daemon";
-    /// Current values of the pack: retained.
+    /// Present values of the pack: retained.
     pub const INFO: &str = "info";
-    /// Current values of the cells: retained.
+    /// Present values of the cells: retained.
     pub const CELLS: &str = "spec_data";
     /// Events, each once, in order.
     pub const EVENTS: &str = "events";
@@ -58,7 +58,7 @@ pub const OFFLINE: &str = "offline";
 /// Runs until SIGTERM or SIGINT.
 ///
 /// # Errors
-/// The settings are invalid or have no broker, or the queue cannot be opened.
+/// Fails if the settings are invalid or have no broker, or if the queue cannot be opened.
 pub fn run(options: &Options) -> Result<(), Failure> {
     let settings = options.start()?;
     let config = options.config.display();

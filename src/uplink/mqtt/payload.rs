@@ -20,7 +20,8 @@ pub fn info(document: &StatusDocument) -> Value {
     info.into()
 }
 
-/// Whether an alarm of the rule is raised; `null` if any of them is unknown and none raised.
+/// Whether an alarm of the rule is raised. The result is `null` if no alarm is known to be raised and at least one is
+/// unknown.
 fn alarm(alarms: &AlarmStatus, rule: Rule) -> Value {
     let is_raised = alarms.list.iter().any(|alarm| alarm.rule == rule && alarm.state.is_raised());
     let is_known = alarms.omitted == 0 && alarms.unknown.iter().all(|unknown| unknown.rule != rule);
@@ -51,7 +52,8 @@ pub fn sample(document: &StatusDocument) -> Value {
     json!({ "time": stamp(document.wall_time), "info": info(document), "spec_data": spec_data(document) })
 }
 
-/// An event of the daemon, with Battery-Emulator's `event_type`, `severity` and `message`. Its time is from the computer's clock.
+/// An event of the daemon, with Battery-Emulator's keys `event_type`, `severity` and `message`. The event's time is
+/// converted to the computer's clock.
 pub fn event(document: &StatusDocument, event: &Value) -> Value {
     let text = |key: &str| event.get(key).and_then(Value::as_str);
     let name = text("event").unwrap_or("unknown");

@@ -1,9 +1,11 @@
 //! The queue on disk: messages that the broker has not acknowledged, oldest first.
 //!
-//! Input: messages of the recorder. Output: the oldest messages of a class in order, until removed. An added message survives a power
-//! cut and a restart (SQLite, write-ahead log, flushed at each commit). The queue is bounded in messages and bytes. If full, it drops
-//! the oldest samples; it drops the oldest events only if no samples are left. Drops are counted permanently. A damaged file is set
-//! aside and a new one created. If the disk fails or a newer version wrote the file, the file is left unchanged.
+//! Input: messages of the recorder. Output: the oldest messages of a class, in order, until they are removed. An added
+//! message survives a power cut and a restart (SQLite with a write-ahead log, flushed at each commit).
+//!
+//! The number and the size of the messages are limited. A full queue drops its oldest samples. It drops its oldest
+//! events only if it has no samples. Drops are counted, and the counts survive restarts. A damaged file is set aside
+//! and replaced by a new one. If the disk fails, or if a newer version wrote the file, the file is left unchanged.
 
 use std::cell::{Cell, RefCell};
 use std::fs::File;
@@ -19,10 +21,10 @@ const FILE: &str = "queue.db";
 const LOCK: &str = "queue.lock";
 /// Layout version of the file.
 const VERSION: i64 = 1;
-/// Pages (4 KiB) of the write-ahead log before a checkpoint: 1 MiB.
+/// Number of pages (4 KiB each) in the write-ahead log that cause a checkpoint: 1 MiB.
 const CHECKPOINT_PAGES: i64 = 256;
 
-/// Class of a message; decides what is dropped first.
+/// Class of a message. The class decides which messages are dropped first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Class {
     /// A periodic sample.
@@ -34,9 +36,9 @@ pub enum Class {
 /// A queued message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct QueuedMessage {
-    /// Sequence number; increases by one with each message, also across restarts.
+    /// Sequence number. It increases by one with each message, also across restarts.
     pub sequence: i64,
-    /// Its text.
+    /// Text of the message.
     pub body: String,
 }
 
@@ -68,7 +70,7 @@ impl Queue {
     /// Opens the queue in its folder; creates what is missing.
     ///
     /// # Errors
-    /// The folder cannot be written, or another uplink uses it.
+    /// Fails if the folder cannot be written, or if another uplink uses it.
     pub fn open(settings: &HistorySettings) -> Result<Self, String> {
         let folder = &settings.folder;
         let at = |error: &dyn std::fmt::Display| format!("{}: {error}", folder.display());
@@ -81,7 +83,8 @@ impl Queue {
             Err(OpenFault::Damaged(error)) => {
                 let aside = put_aside(&path).map_err(|error| at(&error))?;
                 tracing::error!(error, aside = %aside.display(), "the queue is damaged: set aside, starting a new one");
-                // Start above all numbers of the old queue; a reader takes a known number for a repetition.
+                // The numbers start above all numbers of the damaged queue, because a reader takes a known number for a
+                // repetition.
                 let millis = Reading::now().realtime_ns / 1_000_000;
                 prepare(&path, millis).map_err(|fault| at(&fault.text()))?
             }
@@ -93,7 +96,7 @@ impl Queue {
         Ok(Self { database, max_messages, max_bytes, fill: Cell::new(fill), added: Notify::new(), _lock: lock })
     }
 
-    /// Returns its fill.
+    /// The fill of the queue.
     pub fn fill(&self) -> Fill {
         self.fill.get()
     }
@@ -103,10 +106,11 @@ impl Queue {
         self.added.notified()
     }
 
-    /// Adds messages and stores `seen` for [`Self::seen`] in one transaction. On return they are on disk.
+    /// Adds messages, and stores `seen` for [`Self::seen`] in the same transaction. When this function returns, they
+    /// are on disk.
     ///
     /// # Errors
-    /// The disk fails or is full.
+    /// Fails if the disk fails or is full.
     pub fn add(&self, messages: &[(Class, String)], seen: Option<&str>) -> Result<(), String> {
         let mut database = self.database.borrow_mut();
         let fill = self.try_add(&mut database, messages, seen).map_err(|error| error.to_string())?;
@@ -155,7 +159,7 @@ impl Queue {
     /// Returns the oldest messages of a class, at most `count`.
     ///
     /// # Errors
-    /// The disk cannot be read.
+    /// Fails if the disk cannot be read.
     pub fn oldest(&self, class: Class, count: usize) -> Result<Vec<QueuedMessage>, String> {
         let database = self.database.borrow();
         let read = || {
@@ -172,7 +176,7 @@ impl Queue {
     /// Removes acknowledged messages. Messages already dropped are ignored.
     ///
     /// # Errors
-    /// The disk cannot be written; the messages will be sent again.
+    /// Fails if the disk cannot be written. In this case, the messages will be sent again.
     pub fn remove(&self, messages: &[QueuedMessage]) -> Result<(), String> {
         let mut database = self.database.borrow_mut();
         let mut fill = self.fill.get();
@@ -206,7 +210,7 @@ fn length(body: &str) -> u64 {
 enum OpenFault {
     /// The file is not a valid queue.
     Damaged(String),
-    /// The file may be valid: the disk is full or fails, or a newer version wrote it.
+    /// The file may be valid, but the disk is full or fails, or a newer version wrote the file.
     Failed(String),
 }
 
@@ -227,7 +231,8 @@ impl From<rusqlite::Error> for OpenFault {
     }
 }
 
-/// Opens the file and checks it. Creates missing tables; the first message then gets the number after `latest`.
+/// Opens the file and checks it. If the file is new, creates the tables; the first message then gets the number after
+/// `latest`.
 fn prepare(path: &Path, latest: i64) -> Result<Connection, OpenFault> {
     let database = Connection::open(path)?;
     database.pragma_update(None, "journal_mode", "wal")?;
@@ -247,7 +252,7 @@ fn prepare(path: &Path, latest: i64) -> Result<Connection, OpenFault> {
             )));
         }
     }
-    // AUTOINCREMENT: numbers are never reused, even if the queue was empty in between.
+    // With AUTOINCREMENT, a number is never reused, even if the queue was empty.
     database.execute_batch(&format!(
         "BEGIN;
          CREATE TABLE IF NOT EXISTS message (id INTEGER PRIMARY KEY AUTOINCREMENT, class INTEGER NOT NULL, body TEXT NOT NULL);
@@ -261,7 +266,7 @@ fn prepare(path: &Path, latest: i64) -> Result<Connection, OpenFault> {
     Ok(database)
 }
 
-/// Renames the file and its write-ahead log, replacing those set aside earlier.
+/// Renames the file and its write-ahead log. Files that were set aside earlier are replaced.
 fn put_aside(path: &Path) -> std::io::Result<PathBuf> {
     let aside = path.with_extension("damaged");
     for suffix in ["", "-wal", "-shm"] {
@@ -286,13 +291,13 @@ fn read_fill(database: &Connection) -> rusqlite::Result<Fill> {
             database.query_row("SELECT count FROM dropped WHERE class = ?", [class as i64], |row| count(row, 0));
         count.optional().map(Option::unwrap_or_default)
     };
-    // In bytes, as in `length`; SQLite counts characters of a text.
+    // The size is in bytes, as in `length`. Without the cast, SQLite would count characters.
     let size = "SELECT count(*), coalesce(sum(length(CAST(body AS BLOB))), 0) FROM message";
     let (messages, bytes) = database.query_row(size, [], |row| Ok((count(row, 0)?, count(row, 1)?)))?;
     Ok(Fill { messages, bytes, dropped_samples: dropped(Class::Sample)?, dropped_events: dropped(Class::Event)? })
 }
 
-/// Drops the oldest sample, else the oldest event; `false` if the queue is empty.
+/// Drops the oldest sample or, if there are no samples, the oldest event. Returns `false` if the queue is empty.
 fn drop_oldest(transaction: &Transaction<'_>, fill: &mut Fill) -> rusqlite::Result<bool> {
     let oldest = "DELETE FROM message WHERE id = (SELECT id FROM message ORDER BY class, id LIMIT 1)
                   RETURNING class, length(CAST(body AS BLOB))";

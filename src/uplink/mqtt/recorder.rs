@@ -1,8 +1,9 @@
 //! The recorder: selects the documents to queue as samples, and the new events.
 //!
-//! Input: the daemon's documents. Output: messages in the [`Queue`], whether or not the broker can be reached. Samples are due by the
-//! daemon's clock. Each document lists the latest events; the recorder finds the new ones by comparing the lists, also across its own
-//! restart. Events that leave the list between two documents, or while this program is not running, are missed; the former is logged.
+//! Input: the daemon's documents. Output: messages in the [`Queue`], even if the broker cannot be reached. The daemon's
+//! clock decides when a sample is due. Each document lists the latest events. The recorder finds new events by
+//! comparing the lists of two documents, also across its own restart. Events that leave the list between two documents
+//! are missed and logged. Events that leave it while this program does not run are missed.
 
 use std::cell::Cell;
 
@@ -15,7 +16,8 @@ use super::payload;
 use super::queue::{Class, Fill, Queue};
 use crate::status_stream::Documents;
 
-/// A document this much before a sample is due is used, because documents arrive about once a second.
+/// A document is also used as a sample if it is at most this much too early, because documents arrive about once a
+/// second.
 const TOLERANCE_S: f64 = 0.5;
 
 /// State of the recorder.
@@ -78,7 +80,7 @@ impl<'a> Recorder<'a> {
         }
     }
 
-    /// Logs once when messages are dropped, until no more are.
+    /// Logs the first drop. Logs again only after a document whose messages caused no drop.
     fn note_drops(&self, before: Fill, now: Fill) {
         let is_dropping = (before.dropped_samples, before.dropped_events) != (now.dropped_samples, now.dropped_events);
         if is_dropping && !self.drops.get() {
@@ -110,7 +112,8 @@ impl<'a> Recorder<'a> {
     }
 }
 
-/// Events of `now` not listed in `before`. `now` begins with the end of `before`, because the daemon drops the oldest.
+/// Returns the events of `now` that `before` does not list. The list `now` begins with the end of `before`, because the
+/// daemon drops its oldest events.
 fn new_events<'a>(before: &[Value], now: &'a [Value]) -> &'a [Value] {
     let kept = (0..=before.len()).find_map(|dropped| {
         let end = &before[dropped..];

@@ -33,7 +33,7 @@ pub struct MqttSettings {
     /// Time between current values, s.
     #[serde(deserialize_with = "whole::<1, 3600, _>")]
     pub period_s: u64,
-    /// Longest silence on the connection, s. The broker publishes the last will after 1.5 times this.
+    /// Longest silence on the connection, s. The broker publishes the last will after 1.5 times this duration.
     #[serde(deserialize_with = "whole::<5, 3600, _>")]
     pub keep_alive_s: u64,
     /// Longest pause between attempts to connect, s.
@@ -55,7 +55,7 @@ pub struct TlsSettings {
     pub ca_file: Option<PathBuf>,
     /// PEM file with the client's certificate; `None` = no client certificate.
     pub certificate_file: Option<PathBuf>,
-    /// PEM file with the key of that certificate.
+    /// PEM file with the private key of the client's certificate.
     pub key_file: Option<PathBuf>,
 }
 
@@ -83,7 +83,7 @@ pub struct HistorySettings {
     pub period_s: u64,
     /// Folder of the queue.
     pub folder: PathBuf,
-    /// Most messages in the queue.
+    /// Maximum number of messages in the queue.
     #[serde(deserialize_with = "whole::<1, 10_000_000, _>")]
     pub max_messages: u64,
     /// Largest total size of queued messages, bytes.
@@ -152,7 +152,7 @@ impl MqttSettings {
     /// Checks combinations of keys.
     ///
     /// # Errors
-    /// The keys and what is allowed.
+    /// Returns an error that states the keys and what is allowed.
     pub(crate) fn check(&self) -> Result<(), String> {
         let Some(tls) = &self.tls else { return Ok(()) };
         if tls.certificate_file.is_some() != tls.key_file.is_some() {
@@ -167,7 +167,7 @@ impl MqttSettings {
     /// Reads the password; a trailing line end is removed.
     ///
     /// # Errors
-    /// The file cannot be read or is empty.
+    /// Fails if the file cannot be read or is empty.
     pub fn password(&self) -> Result<Option<Vec<u8>>, String> {
         let Some(path) = &self.password_file else { return Ok(None) };
         let mut password = read_credential(path)?;
