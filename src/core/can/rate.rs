@@ -9,9 +9,9 @@
 //! intervals are much shorter than the mean, because each frame of one sender falls between two frames of the other
 //! sender. The second sign is that the reported currents alternate. A single sender that becomes faster, as many do
 //! when the vehicle wakes, shows neither sign. Some messages always have short intervals, for example between the pages
-//! of a multiplexed message. These intervals are learned with the rate and do not count. The expected number is the
-//! highest steady rate so far, or the rate from the DBC's cycle time if it is higher. The learned rate is stored, so
-//! that a second sender is also found after a restart.
+//! of a multiplexed message. These intervals are learned with the rate and do not count. The expected number follows
+//! from the highest steady rate so far, or from the DBC's cycle time if the cycle time gives a higher rate. The learned
+//! rate is stored, so that a second sender is also found after a restart.
 //!
 //! A second sender is not found in these cases:
 //! * the message has fewer than [`LEAST_PER_S`] frames a second, and the second sender is as slow as the first;

@@ -462,7 +462,8 @@ fn check_trailer(message: &Message, authentication: Authentication, fault: &mut 
 }
 
 /// Adapts the steps of Ah signals: multiplies the built-in step by the smallest of 1, 2, 5, 10, ... for which the
-/// largest possible value fits. That value is twice the rated capacity, or half of it for a standard deviation.
+/// largest possible value fits. The largest possible value is twice the rated capacity; for a standard deviation, it is
+/// half of the rated capacity.
 fn fit_steps(message: &mut Message, rated_capacity_ah: f64) {
     let largest_ah = |signal: &Signal| rated_capacity_ah * if signal.name.ends_with("Std") { 0.5 } else { 2.0 };
     for is_std in [false, true] {
@@ -478,7 +479,7 @@ fn fit_steps(message: &mut Message, rated_capacity_ah: f64) {
 
 /// The smallest of 1, 2, 5, 10, ... that is not below `needed`, but at most the largest step.
 fn times(needed: f64) -> f64 {
-    /// The largest factor. It is enough for a million times 40 Ah, which is more than any cell has.
+    /// The largest factor. It allows capacities up to a million times 40 Ah, more than any cell has.
     const LARGEST: f64 = 1e6;
     let ladder = std::iter::successors(Some(1.0), |decade| Some(decade * 10.0)).take_while(|decade| *decade < LARGEST);
     let mut ladder = ladder.flat_map(|decade| [decade, 2.0 * decade, 5.0 * decade]);

@@ -5,7 +5,8 @@
 //! is still sent for at least a second. If the code was inactive only while a change waited, it stays in the message
 //! with a higher count.
 //!
-//! The state "all known" follows the same rule when it becomes true. When it becomes false, it is sent at once.
+//! The state "all values are known" follows the same rule when it becomes true. When it becomes false, the change is
+//! sent at once.
 
 use serde::{Deserialize, Serialize};
 
