@@ -12,9 +12,9 @@ use super::truth::Pack;
 pub struct Balancing {
     /// Current of a balancing resistor, A.
     pub bleed_a: f64,
-    /// Bleeding starts at this voltage above the lowest cell, V.
+    /// Bleeding of a cell starts when its voltage exceeds the lowest cell voltage by this value, V.
     pub start_v: f64,
-    /// Bleeding stops at this voltage above the lowest cell, V.
+    /// Bleeding of a cell stops when its voltage exceeds the lowest cell voltage by less than this value, V.
     pub stop_v: f64,
     /// A charge is near its end if the fullest cell has at least this SOC.
     pub from_soc: f64,

@@ -2,8 +2,9 @@
 //!
 //! At each moment, the current until the next moment is known. The readings and the true state of a moment belong
 //! together: the voltage includes the drop that this current causes. Cells are stepped once per cell sampling period,
-//! with the mean current of the period. The charge is exact. The branch voltages differ slightly from those with a step
-//! at every current sample. The relative difference is less than half a period divided by the branch's time constant.
+//! with the mean current of the period. With this simplification, the charge remains exact, but the branch voltages
+//! differ slightly from a simulation that steps the cells at every current sample. The relative difference is less than
+//! `period / (2 tau)`, where `tau` is the branch's time constant.
 
 use super::balancing::{Balancer, Balancing};
 use super::course::{Course, Demand};

@@ -39,7 +39,8 @@ const CHANNEL_LIMIT: f64 = 2.0;
 pub struct Sensors {
     /// Pack current, A.
     pub current: SensorError,
-    /// Cell voltages, V. The pack voltage has the noise times the square root of the number of cells, and no offset.
+    /// Cell voltages, V. The noise of the pack voltage is this noise times the square root of the number of cells; the
+    /// pack voltage has no offset.
     pub voltage: SensorError,
     /// Temperatures, degrees C.
     pub temperature: SensorError,

@@ -20,7 +20,7 @@ use crate::quantity::CellIndex;
 /// Hysteresis of the open-circuit voltage, which the estimator does not model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hysteresis {
-    /// Distance of the settled charge and discharge curves from the OCV, V; 0 = no hysteresis.
+    /// Distance of the settled charge curve and of the settled discharge curve from the OCV, V; 0 = no hysteresis.
     pub magnitude_v: f64,
     /// How fast the voltage changes from one curve to the other, in e-foldings per full charge moved.
     pub rate: f64,
