@@ -118,7 +118,7 @@ pub struct RuleSpec {
     /// A learned value stays valid: a capacity stays low until the next cycle. A measured value does not, because
     /// without new data, the old value proves nothing.
     pub is_learned: bool,
-    /// The compared quantity, for messages.
+    /// Name of the compared quantity, for messages.
     pub about: &'static str,
 }
 
