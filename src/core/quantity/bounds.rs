@@ -46,17 +46,19 @@ impl Bounds {
 /// Capacity of a cell in the configuration, Ah: from a watch cell to a hundred times the largest cell on the market.
 pub const CONFIGURED_CAPACITY_AH: Bounds = Bounds::new(1e-3, 1e5, "0.001 to 1e5 Ah");
 
-/// Estimated capacity of a cell, Ah: from a thousandth of the smallest cell to ten thousand times the largest.
+/// Estimated capacity of a cell, Ah: from a thousandth of the smallest cell's capacity to ten thousand times the
+/// largest cell's capacity.
 pub const CAPACITY_AH: Bounds = Bounds::new(1e-6, 1e9, "1e-6 to 1e9 Ah");
 
-/// SOC in a running filter. A model's curve is extrapolated this far beyond empty and full. A filter whose SOC is
-/// outside restarts.
+/// SOC in a running filter. A model's curve is extrapolated to these bounds, beyond empty and full. A filter restarts
+/// if its SOC is outside these bounds.
 pub const FILTER_SOC: Bounds = Bounds::new(-0.5, 1.5, "-0.5 to 1.5");
 
 /// SOC of a trusted estimate. The bounds allow for the error at the ends of a curve.
 pub const TRUSTED_SOC: Bounds = Bounds::new(-0.1, 1.1, "-0.1 to 1.1");
 
-/// SOC in a stored state. Wider than [`FILTER_SOC`], because earlier versions allowed a filter to go further.
+/// SOC in a stored state. The range is wider than [`FILTER_SOC`], because earlier versions allowed a wider range in a
+/// filter.
 pub const STORED_SOC: Bounds = Bounds::new(-10.0, 10.0, "-10 to 10");
 
 /// Natural logarithm of a cell's resistance relative to new: a factor of about 1,000 in both directions.
@@ -65,8 +67,8 @@ pub const LOG_RESISTANCE: Bounds = Bounds::new(-7.0, 7.0, "-7 to 7");
 /// Like [`LOG_RESISTANCE`], for a trusted estimate: a factor of 33.
 pub const TRUSTED_LOG_RESISTANCE: Bounds = Bounds::new(-3.5, 3.5, "-3.5 to 3.5");
 
-/// Learned capacity that is trusted, relative to the cell model's or the configured capacity. A worn cell keeps more
-/// than a twentieth of its capacity, and no cell has three times the capacity on its label.
+/// Learned capacity that is trusted, relative to the capacity of the cell model or of the configuration. A worn cell
+/// keeps more than a twentieth of its capacity, and no cell has three times the capacity on its label.
 pub const TRUSTED_CAPACITY: Bounds = Bounds::new(0.05, 3.0, "0.05 to 3 times the cell's capacity");
 
 /// Configured initial capacity, relative to the cell model's capacity.
@@ -99,7 +101,7 @@ pub const STAMP_NS: Bounds = Bounds::new(-4.6e18, 4.6e18, "within 145 years of t
 /// Any number without a more specific bound: its square and its cube do not overflow.
 pub const NUMBER: Bounds = Bounds::new(-1e20, 1e20, "at most 1e20 in size");
 
-/// Variance, in the square of its unit. The caller can divide by its square.
+/// Variance, in the square of its unit. The caller can divide by the square of the variance.
 pub const VARIANCE: Bounds = Bounds::new(1e-150, 1e20, "1e-150 to 1e20");
 
 /// Standard deviation or noise density in the configuration, in its unit.

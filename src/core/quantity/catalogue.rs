@@ -359,7 +359,7 @@ impl<const IS_PACK: bool> Default for Values<IS_PACK> {
 }
 
 impl<const IS_PACK: bool> Values<IS_PACK> {
-    /// The rows that apply to this owner, each with its presentation.
+    /// The rows that apply to this owner (the pack or a cell), each with its presentation for this owner.
     pub fn rows() -> impl Iterator<Item = (&'static QuantityRow, &'static Presentation)> {
         TABLE.iter().filter_map(|row| Some((row, if IS_PACK { row.pack.as_ref() } else { row.cell.as_ref() }?)))
     }
