@@ -55,7 +55,7 @@ pub struct MonitorConfig {
     pub balancing: Option<BalancingConfig>,
     /// Settings of the estimator.
     pub estimator: EstimatorConfig,
-    /// Settings for learning at charge/discharge transitions.
+    /// Settings of the learning stage, which learns at changes between charge and discharge.
     pub health: HealthConfig,
     /// Alarm rules.
     pub rules: Vec<RuleConfig>,
@@ -277,7 +277,7 @@ impl MonitorConfig {
         }
     }
 
-    /// Whether `new` has the same settings as `self` wherever these affect estimates.
+    /// Whether all settings that affect estimates are equal in `self` and `new`.
     pub(crate) fn estimates_as(&self, new: &Self) -> bool {
         self.model == new.model
             && self.modules == new.modules

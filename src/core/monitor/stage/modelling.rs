@@ -10,7 +10,7 @@
 //!
 //! Before the change, the task compares the present model and the previous model on the new rows. Neither model was
 //! fitted to these rows. The worse model is dropped. A settled model is fitted again only if the pack has reached
-//! another range of temperature or state of charge. The half-cycles then continue to learn the capacity.
+//! another range of temperature or state of charge. Until then, only the half-cycles continue to learn the capacity.
 
 use serde::{Deserialize, Serialize};
 
@@ -40,8 +40,8 @@ const MOST_MISFIT: f64 = 0.7;
 /// Misfit above which the present model is dropped, because the rows deviate from it by more than their errors explain.
 const HOPELESS_MISFIT: f64 = 1.0;
 
-/// Largest relative standard deviation of a usable fit's capacity. For the label's capacity, it is 0.1. Rows that
-/// determine the capacity poorly also determine the curve poorly.
+/// Largest relative standard deviation of a usable fit's capacity. The capacity from the label has a relative standard
+/// deviation of 0.1. Rows that determine the capacity poorly also determine the curve poorly.
 const MOST_CAPACITY_STD: f64 = 0.05;
 
 /// Maximum number of stored changes of the model.
