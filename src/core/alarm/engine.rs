@@ -319,8 +319,8 @@ impl AlarmEngine {
         AlarmSnapshot { alarms: self.rules.iter().flat_map(of_rule).collect() }
     }
 
-    /// Restores a stored state whose times the caller has rebased; none is later than `now`. Returns the alarms that no configured threshold
-    /// watches any longer; the caller reports them.
+    /// Restores a stored state. The caller has rebased its times, and no time is later than `now`. Returns the alarms
+    /// that no configured threshold watches any longer; the caller reports them.
     pub fn restore(&mut self, now: Timestamp, state: &AlarmSnapshot) -> Vec<StoredAlarm> {
         let cells = self.cells();
         *self = Self::new(self.rules.drain(..).map(|rule| rule.config).collect(), cells);

@@ -267,7 +267,8 @@ impl Machine {
         self.occurrences > 0 || self.state == AlarmState::Pending
     }
 
-    /// The machine after a restore at `now`: the value is unknown until the next observation, and no time is in the future.
+    /// The machine after a restore at `now`: the value is unknown until the next observation, and no time is later than
+    /// `now`.
     pub(super) fn restored(self, now: Timestamp) -> Self {
         let (first_raised, last_raised) = (self.first_raised.min(now), self.last_raised.min(now));
         let value = Observation::default();
