@@ -1,4 +1,4 @@
-//! Arguments shared by several functions: paths, and the source of a configuration.
+//! Arguments that several functions share: paths, and where a configuration comes from.
 
 use std::path::{Path, PathBuf};
 
@@ -9,7 +9,7 @@ use pyo3::prelude::*;
 
 use crate::error;
 
-/// One value, or several.
+/// An argument that is one value or a list of values.
 pub(crate) struct List<T>(pub(crate) Vec<T>);
 
 impl<'py, T: FromPyObjectOwned<'py>> FromPyObject<'_, 'py> for List<T> {
@@ -25,14 +25,14 @@ pub(crate) fn of_json<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, P
     py.import("json")?.call_method1("loads", (text,))
 }
 
-/// Loads a configuration from text; the files it names are in `folder`.
+/// Loads a configuration from text. The files that it names are relative to `folder`.
 pub(crate) fn of_text(text: &str, folder: &Path) -> PyResult<Config> {
     let main = folder.join("configuration.toml");
     let read = |file: &Path| if file == main { Ok(text.as_bytes().to_vec()) } else { std::fs::read(file) };
     config::load_with(&ConfigFiles::alone(&main), &read).map_err(error::config)
 }
 
-/// Source of the configuration of a single cell.
+/// Checks the arguments that give the configuration of a single cell, and combines them.
 pub(crate) fn cell_source(
     config: Option<PathBuf>,
     cell: Option<PathBuf>,

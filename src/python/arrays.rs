@@ -1,7 +1,9 @@
-//! Arrays from Python: anything that NumPy reads as numbers. Not copied if contiguous, aligned and of the right type.
+//! Converts arrays from Python. Everything that NumPy reads as numbers is accepted. An array is not copied if it is
+//! contiguous, aligned and of the right type.
 //!
-//! Masked and missing reals become NaN. Whole numbers are never rounded and never wrap: one that is unknown, has a fraction or is out of
-//! range is an error with its index. Arrays of other types are an error with the dtype.
+//! Masked and missing reals become NaN. Whole numbers are never rounded and never wrap around. A whole number that is
+//! missing, has a fraction or is out of range gives an error with its index. An array of another type gives an error
+//! with its dtype.
 
 use arrow_array::cast::AsArray;
 use arrow_array::types::{ArrowPrimitiveType, Float64Type, UInt8Type, UInt32Type};
@@ -15,7 +17,7 @@ use crate::error::data;
 /// Numbers in row-major order.
 #[derive(Debug)]
 pub(crate) struct Matrix<T: ArrowPrimitiveType> {
-    /// Values; may be memory owned by Python, which is kept until this is dropped.
+    /// The values. Their memory may belong to Python. It is kept until this buffer is dropped.
     pub(crate) values: ScalarBuffer<T::Native>,
     /// Number of rows.
     pub(crate) rows: usize,
@@ -38,7 +40,7 @@ impl<T: ArrowPrimitiveType> Matrix<T> {
         &self.values[row * self.columns..][..self.columns]
     }
 
-    /// Requires one column.
+    /// Returns an error if there is more than one column.
     fn one_column(self, name: &str) -> PyResult<Self> {
         if self.columns == 1 {
             Ok(self)
@@ -91,14 +93,15 @@ pub(crate) fn float64<'py>(name: &str, values: &Bound<'py, PyAny>) -> PyResult<B
     let array = numpy.call_method1("asanyarray", (values,)).map_err(none)?;
     check_numbers(name, &array)?;
     if !is_masked(&array)? {
-        // Use the values as given: a column of another library knows its missing values.
+        // The values are converted as given, because a column of another library knows which of its values are missing.
         return laid_out(values, "float64").map_err(none);
     }
     let filled = array.call_method1("astype", ("float64",)).and_then(|array| array.call_method1("filled", (f64::NAN,)));
     laid_out(&filled.map_err(none)?, "float64")
 }
 
-/// Whole numbers from 0 to `most`, the largest of `T`. Used unchanged if they have that dtype, else checked one by one.
+/// Converts to whole numbers from 0 to `most`, the largest value of `T`. An array with the dtype `dtype` is used
+/// unchanged; the numbers of any other array are checked one by one.
 fn whole<T>(name: &str, dtype: &str, values: &Bound<'_, PyAny>, most: T::Native) -> PyResult<Matrix<T>>
 where
     T: ArrowPrimitiveType,
@@ -112,7 +115,8 @@ where
     }
     let found = reals(name, values)?;
     let converted = |(at, value): (usize, &f64)| {
-        // Exact: `as` preserves whole numbers that both types have, and the comparison rejects all others, including NaN.
+        // The conversion is exact: the cast preserves every whole number in range, and the comparison rejects all other
+        // numbers, including NaN.
         let whole = Some(*value as u64).filter(|whole| *whole as f64 == *value);
         whole.and_then(|whole| T::Native::try_from(whole).ok()).ok_or_else(|| {
             data(format!("{name}{} = {value}, must be a whole number from 0 to {most}", found.index(at)))
@@ -132,7 +136,7 @@ fn check_numbers(name: &str, array: &Bound<'_, PyAny>) -> PyResult<()> {
     let dtype = array.getattr("dtype")?;
     let kind: String = dtype.getattr("kind")?.extract()?;
     let refused = |what: String| Err(data(format!("{name} is an array of {what}, must be an array of numbers")));
-    // Bool, signed, unsigned, real, and objects; each object must convert to a real.
+    // The accepted kinds are bool, signed, unsigned, real, and objects that can be converted to a real.
     if !["b", "i", "u", "f", "O"].contains(&kind.as_str()) {
         return refused(dtype.str()?.to_string());
     }
@@ -150,13 +154,13 @@ fn check_numbers(name: &str, array: &Bound<'_, PyAny>) -> PyResult<()> {
 }
 
 fn laid_out<'py>(values: &Bound<'py, PyAny>, dtype: &str) -> PyResult<Bound<'py, PyAny>> {
-    // Required layout: C order, aligned, a plain array and not a subclass.
+    // "CAE" requires C order, alignment, and a plain array instead of a subclass.
     let array = values.py().import("numpy")?.call_method1("require", (values, dtype, "CAE"))?;
     // A single number becomes an array of one.
     if array.getattr("ndim")?.eq(0)? { array.call_method1("reshape", (-1,)) } else { Ok(array) }
 }
 
-/// Makes a matrix of an array that has the dtype and the layout.
+/// Makes a matrix of an array that already has the dtype and layout.
 fn matrix<T: ArrowPrimitiveType>(name: &str, array: &Bound<'_, PyAny>) -> PyResult<Matrix<T>> {
     let shape: Vec<usize> = array.getattr("shape")?.extract()?;
     let (rows, columns) = match shape[..] {

@@ -1,7 +1,9 @@
-//! Long work: runs without the interpreter's lock, with a tqdm progress bar if installed, and stops on Ctrl-C.
+//! Runs long work without holding the interpreter's lock. Shows a tqdm progress bar if tqdm is installed, and stops on
+//! Ctrl-C.
 //!
-//! The work runs on its own thread and reports its progress. The calling thread shows it and asks Python for signals. After Ctrl-C, the
-//! next report ends the work by unwinding its stack, so that half-written files are removed.
+//! The work runs on its own thread and reports its progress. The calling thread shows the progress and checks for
+//! Python signals. After Ctrl-C, the next progress report ends the work by unwinding its stack, so that half-written
+//! files are removed.
 
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -11,7 +13,7 @@ use std::time::Duration;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-/// Period of checking signals and progress.
+/// Time between two checks for signals and progress.
 const PERIOD: Duration = Duration::from_millis(100);
 
 /// Payload of the panic after Ctrl-C.
@@ -25,7 +27,7 @@ pub(crate) struct BackgroundTask {
 }
 
 impl BackgroundTask {
-    /// Adds to the progress; after Ctrl-C it does not return.
+    /// Adds to the progress. After Ctrl-C, this function does not return but unwinds the stack.
     pub(crate) fn advance(&self, amount: u64) {
         self.done.fetch_add(amount, Ordering::Relaxed);
         if self.must_end.load(Ordering::Relaxed) {
@@ -39,14 +41,14 @@ impl BackgroundTask {
 pub(crate) struct Progress<'a> {
     /// Whether to show a bar.
     pub(crate) is_shown: bool,
-    /// Amount of all work; `None` if unknown.
+    /// Total amount of work; `None` = unknown.
     pub(crate) total: Option<u64>,
     /// Unit of the amount.
     pub(crate) unit: &'a str,
 }
 
 impl Progress<'_> {
-    /// Progress that is not shown.
+    /// A progress bar that is not shown.
     pub(crate) fn hidden() -> Self {
         Self { is_shown: false, total: None, unit: "" }
     }

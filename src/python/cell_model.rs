@@ -100,7 +100,8 @@ impl CellModel {
         self.model().temperature_c.clone()
     }
 
-    /// Returns the model at these SOC and this temperature: open-circuit voltage, series and branch resistances, time constants.
+    /// Returns a table with one row per SOC, at this temperature: open-circuit voltage, series resistance, and the
+    /// resistance and time constant of each branch.
     #[pyo3(signature = (soc, temperature_c=25.0))]
     fn table(&self, soc: &Bound<'_, PyAny>, temperature_c: f64) -> PyResult<Table> {
         let (soc, model) = (arrays::column("soc", soc)?, self.model());

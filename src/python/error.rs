@@ -1,4 +1,5 @@
-//! Exceptions: errors of configurations, of data and arguments, of files. Each has the same text as on the command line.
+//! Python exceptions for errors of configurations, of data and arguments, and of files. Their texts are those of the
+//! command line.
 
 use std::fmt::Display;
 
@@ -6,7 +7,8 @@ use packwatch_host::config::ConfigFaults;
 use packwatch_lab::error::{LabError, RequestError};
 use pyo3::PyErr;
 
-// Defined in Python, because each has two bases: the common class, and ValueError or OSError.
+// These exceptions are defined in Python because each has two base classes: the common class, and ValueError or
+// OSError.
 pyo3::import_exception!(packwatch._errors, ConfigError);
 pyo3::import_exception!(packwatch._errors, DataError);
 pyo3::import_exception!(packwatch._errors, FileError);

@@ -1,7 +1,8 @@
-//! A monitor's state for one call at a time, from any thread.
+//! Gives one call at a time access to a monitor's state, from any thread.
 //!
-//! A waiting call does not hold the interpreter's lock, and a signal ends the wait. Two kinds of calls fail instead of waiting: a call
-//! from a signal handler that interrupts a call on the same thread, and any call after a panic, which left the state inconsistent.
+//! A call that waits does not hold the interpreter's lock, and a signal ends the wait. Two kinds of calls fail instead
+//! of waiting. The first is a call from a signal handler that has interrupted another call on the same thread. The
+//! second is any call after a panic, which left the state inconsistent.
 
 use std::ops::{Deref, DerefMut};
 use std::sync::{Mutex, MutexGuard, PoisonError, TryLockError};
@@ -12,10 +13,10 @@ use pyo3::prelude::*;
 
 use crate::error::data;
 
-/// A monitor's state for one call at a time.
+/// A monitor's state, which one call at a time may use.
 pub(crate) struct ExclusiveState<S> {
     state: Mutex<S>,
-    /// Thread of the current call.
+    /// Thread of the running call.
     holder: Mutex<Option<ThreadId>>,
 }
 
@@ -33,7 +34,8 @@ impl<S> ExclusiveState<S> {
     /// Waits for exclusive access.
     ///
     /// # Errors
-    /// An earlier call failed inside the library, this thread is already in a call, or a signal handler raises an exception.
+    /// Fails if an earlier call panicked, if this thread is already in a call, or if a signal handler raises an
+    /// exception.
     pub(crate) fn wait(&self, py: Python<'_>) -> PyResult<StateGuard<'_, S>> {
         loop {
             match self.state.try_lock() {
@@ -49,7 +51,7 @@ impl<S> ExclusiveState<S> {
                 }
                 Err(TryLockError::WouldBlock) => {
                     py.check_signals()?;
-                    // Polling period: shorter than the overhead of a Python call, longer than a check.
+                    // This period is shorter than the overhead of a Python call, and longer than one check takes.
                     py.detach(|| thread::sleep(Duration::from_millis(1)));
                 }
             }
@@ -81,7 +83,7 @@ impl<S> DerefMut for StateGuard<'_, S> {
 
 impl<S> Drop for StateGuard<'_, S> {
     fn drop(&mut self) {
-        // Before the state is released, because the next holder sets its own.
+        // The holder is cleared before the state is released, because the next call sets its own thread.
         self.owner.set_holder(None);
     }
 }

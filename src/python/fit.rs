@@ -105,7 +105,7 @@ pub(crate) fn fit(
     let begin = Instant::now();
     let shown = Progress { is_shown: progress, total: None, unit: "step" };
     let outcome = background_task::run(py, shown, |work| {
-        // A progress step is a file read or a pass of the fit.
+        // One step of the progress is a file that was read, or one pass of the fit.
         lab_fit::run(&request, |progress: FitProgress| match progress {
             FitProgress::Read(..) | FitProgress::Pass(..) => work.advance(1),
         })

@@ -1,9 +1,9 @@
 //! The Python module `packwatch._packwatch`: the library behind the command line as classes and functions.
 //!
-//! Input: paths, NumPy or Arrow arrays (seconds, A with positive = discharge, V, degrees C). Output: Arrow tables, strings and
-//! dictionaries, the same as the command line writes. Unknown values are null or NaN, never a default number. Bad input raises a
-//! Python exception (`packwatch._errors`) with the command line's error message. Long work runs without the interpreter's lock, and
-//! Ctrl-C stops it.
+//! Input: paths, and NumPy or Arrow arrays (seconds, A with positive = discharge, V, degrees C). Output: Arrow tables,
+//! strings and dictionaries with the same content that the command line writes. Unknown values are null or NaN, never a
+//! default number. Invalid input raises a Python exception (`packwatch._errors`) with the error message of the command
+//! line. Long work runs without the interpreter's lock, and Ctrl-C stops it.
 //!
 //! | file | contents |
 //! | --- | --- |

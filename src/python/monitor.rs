@@ -1,8 +1,8 @@
-//! `Monitor`: rows or frames in, tables out.
+//! `Monitor`: processes rows or frames, and returns tables.
 //!
-//! Rows become the frames that would have carried them, with the resolution of the configured signals, as in a replay of a CSV file. So
-//! the same rows give the same estimates as `packwatch replay`. After Ctrl-C, inputs already processed stay processed; their outputs come
-//! with the next call.
+//! Rows are converted to the frames that would have carried them, with the resolution of the configured signals, as
+//! when a CSV file is replayed. The same rows therefore give the same estimates as `packwatch replay`. After Ctrl-C,
+//! the inputs that were already processed are kept; their outputs are returned by the next call.
 
 use std::path::{Path, PathBuf};
 
@@ -22,9 +22,9 @@ use crate::error::{config as config_error, data};
 use crate::exclusive_state::ExclusiveState;
 use crate::outputs::{Columns, Outputs, Wanted};
 
-/// Rows between two progress reports.
+/// Number of rows between two progress reports.
 const REPORT_EVERY: usize = 16_384;
-/// Bit 31 of an identifier marks an extended one, as in a DBC and in SocketCAN.
+/// Bit 31 of an identifier marks an extended identifier, as in a DBC and in SocketCAN.
 const EXTENDED: u32 = 0x8000_0000;
 
 /// The monitor of a pack.
@@ -36,7 +36,7 @@ pub(crate) struct Monitor {
     is_pack_total: bool,
 }
 
-/// State after the inputs so far.
+/// State after all inputs already processed.
 struct State {
     driver: MonitorDriver,
     columns: Columns,
@@ -96,7 +96,7 @@ impl Monitor {
         self.interfaces.clone()
     }
 
-    /// Number of values so far that no frame of the configuration can carry.
+    /// Number of values, in all rows already processed, that no frame of the configuration can carry.
     #[getter]
     fn uncarried_values(&self, py: Python<'_>) -> PyResult<usize> {
         Ok(self.state.wait(py)?.driver.uncarried_values)
@@ -149,7 +149,8 @@ impl Monitor {
             let length = length.as_ref().map_or(payloads.columns, |length| length.values[row] as usize);
             frame(row, can_id.values[row], payloads.row(row), length)
         };
-        // Check all frames before the first is processed, so that an error does not leave half of them processed.
+        // All frames are checked before the first frame is processed, so that an error does not leave some of them
+        // processed.
         let frames = (0..time_s.rows).map(frame).collect::<PyResult<Vec<Frame>>>()?;
         self.work(py, progress, time_s.rows, |state, work| {
             for (row, frame) in frames.iter().enumerate() {
@@ -161,7 +162,7 @@ impl Monitor {
         })
     }
 
-    /// Continues the record at `time_s` after a gap of unknown length.
+    /// Continues the record at `time_s`, after a gap of unknown length.
     fn gap(&self, py: Python<'_>, time_s: f64) -> PyResult<Outputs> {
         if !time_s.is_finite() {
             return Err(data(format!("time_s = {time_s}, must be a finite number")));
@@ -171,7 +172,7 @@ impl Monitor {
         state.finish(py, &self.interfaces)
     }
 
-    /// Ends the record; the last samples become estimates.
+    /// Ends the record, so that the last samples become estimates.
     fn finish(&self, py: Python<'_>) -> PyResult<Outputs> {
         let mut state = self.state.wait(py)?;
         state.driver.finish();
@@ -231,7 +232,7 @@ impl State {
         }
     }
 
-    /// Begins an input at `time_s`. Skips estimates that would not become rows, to save time.
+    /// Begins an input at `time_s`. If its estimates would not become rows, they are not computed.
     fn begin(&mut self, time_s: f64) -> Timestamp {
         let time = Timestamp::from_secs(time_s);
         self.driver.out.want_estimates = self.columns.wants_estimates(self.wanted, time, self.cells);

@@ -12,7 +12,7 @@ use pyo3::prelude::*;
 use crate::error::data;
 use crate::table::{Table, reals};
 
-/// Number of real columns of an estimate: all but time, cell and acceptance.
+/// Number of columns of an estimate that contain reals: all columns except time, cell and acceptance.
 const REALS: usize = ESTIMATE_COLUMNS.len() - 3;
 
 /// Tables of the outputs.
@@ -24,7 +24,7 @@ pub(crate) struct Outputs {
     /// Events: time, name, and the document as in `replay --events`.
     #[pyo3(get)]
     events: Py<Table>,
-    /// Frames to be sent.
+    /// The frames that would be sent.
     #[pyo3(get)]
     frames: Py<Table>,
 }
@@ -37,7 +37,7 @@ impl Outputs {
     }
 }
 
-/// Growing columns.
+/// Columns to which outputs are appended.
 #[derive(Default)]
 pub(crate) struct Columns {
     estimates: EstimateColumns,
@@ -45,10 +45,11 @@ pub(crate) struct Columns {
     frames: Vec<Transmit>,
 }
 
-/// Selection of outputs.
+/// The outputs that the caller wants.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Wanted {
-    /// At most one estimate per cell in each period, ns; 0 = all, `None` = none.
+    /// Length of the periods, ns. Each cell has at most one estimate in each period. 0 = all estimates, `None` = no
+    /// estimates.
     pub(crate) period_ns: Option<i64>,
 }
 
@@ -81,7 +82,7 @@ impl Columns {
         self.frames.extend_from_slice(&out.frames);
     }
 
-    /// Whether an estimate at `time` of a pack of `cells` cells may become a row.
+    /// Whether an estimate at `time` may become a row, in a pack of `cells` cells.
     pub(crate) fn wants_estimates(&self, wanted: Wanted, time: Timestamp, cells: usize) -> bool {
         match wanted.period_ns {
             None => false,
@@ -90,7 +91,8 @@ impl Columns {
         }
     }
 
-    /// Returns the tables and clears the columns; `interfaces` are the names by number.
+    /// Returns the tables and clears the columns. `interfaces` are the names of the interfaces in the order of their
+    /// numbers.
     pub(crate) fn finish(&mut self, py: Python<'_>, interfaces: &[String]) -> PyResult<Outputs> {
         Ok(Outputs {
             estimates: self.estimates.finish()?.into_py(py)?,
@@ -109,7 +111,7 @@ struct EstimateColumns {
     /// Time of the record's first estimate.
     first: Option<Timestamp>,
     periods: Vec<Option<i64>>,
-    /// The latest period, and the number of cells with a row in it.
+    /// The latest period, and the number of cells that have a row in this period.
     latest: Option<(i64, usize)>,
 }
 
@@ -143,7 +145,8 @@ impl EstimateColumns {
         self.reals.iter_mut().zip(values).for_each(|(column, value)| column.push(value));
     }
 
-    /// Whether it is the first estimate of its cell in a period since the start of the record. If the clock went back, periods restart.
+    /// Whether this is the first estimate of its cell in its period. Periods are counted from the start of the record.
+    /// They start again if the clock goes back.
     fn begins_period(&mut self, period_ns: i64, estimate: &Estimate) -> bool {
         let first = *self.first.get_or_insert(estimate.time);
         let period = estimate.time.nanos().saturating_sub(first.nanos()).div_euclid(period_ns);

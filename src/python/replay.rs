@@ -16,7 +16,7 @@ use crate::background_task::{self, BackgroundTask, Progress};
 use crate::error::{self, data};
 use crate::outputs::{Columns, Outputs, Wanted};
 
-// The signatures below and of `Monitor` repeat it as a literal, which Python shows.
+// The Python signatures of `replay` and of `Monitor` repeat this number as a literal, because Python shows them.
 const _: () = assert!(SLEEP_GAP_S == 30.0);
 
 /// Results of a replay.

@@ -49,7 +49,8 @@ pub(crate) fn rul<'py>(
     of_json(py, &document)
 }
 
-/// Builds the document: forecasts at the end, or scored forecasts at points of the life.
+/// Builds the document. With `at`, it contains scored forecasts at these points of the life; otherwise, forecasts at
+/// the end of each history.
 fn document(
     files: &[PathBuf],
     thresholds: &[Threshold],

@@ -1,4 +1,5 @@
-//! A table of results: an Arrow table that other libraries read without a copy, and columns as NumPy arrays.
+//! A table of results. It is an Arrow table that other libraries read without a copy. Its columns can also be read as
+//! NumPy arrays.
 
 use std::sync::Arc;
 
@@ -126,7 +127,7 @@ impl Table {
     }
 }
 
-/// Wraps memory in a NumPy array, which keeps it alive.
+/// Wraps memory in a NumPy array. The array keeps the memory alive.
 fn numpy<'py>(py: Python<'py>, memory: Buffer, dtype: &str) -> PyResult<Bound<'py, PyAny>> {
     py.import("numpy")?.call_method1("frombuffer", (PyArrowBuffer::new(memory), dtype))
 }
