@@ -1,6 +1,6 @@
 //! `packwatch cells`: lists the installed cell models, and the chemistries for use without a model.
 //!
-//! A file that is not a cell model is reported on standard error, after the list; exit code 1.
+//! A file that is not a cell model is reported on standard error, after the list. The exit code is then 1.
 
 use std::path::PathBuf;
 
@@ -84,7 +84,7 @@ fn listed(models: &[(PathBuf, SourcedModel)]) -> String {
     page
 }
 
-/// The stated error of the model, else the residuals of its fit.
+/// The voltage error that the model states or, if it states none, the residuals of its fit.
 fn error(sourced: &SourcedModel) -> String {
     match (sourced.error_v(), sourced.source.residual_v()) {
         (Some(error_v), _) => format!("{:.0}", 1e3 * error_v),
@@ -99,9 +99,9 @@ fn label_row(chemistry: Chemistry) -> Vec<String> {
     vec![chemistry.name().to_owned(), format!("{low} to {high}"), points]
 }
 
-/// Expected initial SOC error with a label alone, points.
+/// Expected error of the first SOC estimate of a cell described only by its label, percentage points.
 fn first_points(chemistry: Chemistry) -> Option<f64> {
-    // The error does not depend on the capacity, so 1 Ah will do.
+    // The error does not depend on the capacity, so any capacity can be used.
     let model = Label::usual(chemistry, 1.0).model()?;
     advise(&ModelBands::new(&model)).map(|(points, _)| points)
 }

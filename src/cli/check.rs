@@ -1,7 +1,8 @@
 //! `packwatch check`: checks a configuration and describes it.
 //!
-//! Opens every file that the configuration names. If it is valid: warnings, then its description on standard output; exit
-//! code 0. If not: every fault in a line on standard error; exit code 78.
+//! Opens every file that the configuration names. If the configuration is valid, prints warnings and then its
+//! description on standard output; the exit code is 0. If it is not valid, prints every fault on a line of standard
+//! error; the exit code is 78.
 
 use std::path::PathBuf;
 
@@ -85,7 +86,7 @@ fn show(description: &Description, page: &mut String) {
     }
 }
 
-/// Verdict of the first line.
+/// The first line of the output, which states the result.
 fn verdict(warnings: usize) -> String {
     match warnings {
         0 => "good".to_owned(),

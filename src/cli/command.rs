@@ -1,6 +1,6 @@
 //! `packwatch acknowledge`, `clear`, `pack-replaced` and `poll`: commands to the running daemon.
 //!
-//! They succeed unless the daemon refuses something. The error message then lists refused alarms with their reasons.
+//! A command fails if the daemon refuses any part of it. The error message lists the refused alarms with their reasons.
 
 use std::fmt::Write as _;
 

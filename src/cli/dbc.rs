@@ -1,8 +1,8 @@
 //! `packwatch dbc`: writes the DBC of the configured frames for their receivers.
 //!
-//! The DBC is generated from the layout that the encoder uses: identifiers, frame formats, end-to-end protection, cycle times,
-//! value tables. The output file appears under its name only when it is complete. Exit code 78: the configuration is
-//! invalid or has no frames to send.
+//! The DBC is generated from the layout that the encoder uses, so it contains the same identifiers, frame formats,
+//! end-to-end protection, cycle times and value tables. The output file gets its final name only when it is complete.
+//! The exit code is 78 if the configuration is invalid or has no frames to send.
 
 use std::path::PathBuf;
 

@@ -1,8 +1,9 @@
-//! `packwatch demo`: a short battery life on an in-process bus, ending in alarms. Needs no CAN interface, root or files.
+//! `packwatch demo`: simulates a short battery life on a bus inside this process, until alarms are raised. It needs no
+//! CAN interface, no root privileges and no files.
 //!
-//! A simulated cell loses 0.1 Ah per cycle. Its readings become frames of `config/measured.dbc` and go through the same core as
-//! live frames. A consumer that has only `config/packwatch.dbc` decodes the frames that the core sends. Exit code 0 if both a
-//! capacity and a recharge-period alarm were raised, else 1.
+//! A simulated cell loses 0.1 Ah per cycle. Its readings become frames of `config/measured.dbc`, which the core
+//! processes like live frames. A consumer that has only `config/packwatch.dbc` decodes the frames that the core sends.
+//! The exit code is 0 if a capacity alarm and a recharge-period alarm were raised, else 1.
 
 mod consumer;
 mod table;
@@ -30,17 +31,17 @@ const FILES: [(&str, &str); 3] = [
     ("measured.dbc", include_str!("../../config/measured.dbc")),
     ("cells/example_nmc_2600.toml", include_str!("../../config/cells/example_nmc_2600.toml")),
 ];
-/// Loss of capacity per cycle, Ah; raises both alarms within about ten cycles.
+/// Loss of capacity per cycle, Ah. It raises the capacity and the recharge-period alarm within about ten cycles.
 const LOSS_AH_PER_CYCLE: f64 = 0.1;
-/// SOC range of the cycling; wider than the recharge window, so that every charge covers the window.
+/// SOC range of the cycles. It is wider than the recharge window, so that every charge covers the whole window.
 const SOC_WINDOW: (f64, f64) = (0.2, 0.95);
-/// Cycles until the demo gives up; the cell then has 1.2 Ah, far below both thresholds.
+/// Maximum number of cycles. After this number the cell has 1.2 Ah, far below the thresholds of the two alarms.
 const MAX_CYCLES: u32 = 14;
-/// Samples between two updates of the live row.
+/// Number of samples between two updates of the live row.
 const LIVE_SAMPLES: u64 = 400;
 /// Bus time at the start of the demo (Unix time, as in a log).
 const START: Timestamp = Timestamp::from_nanos(1_700_000_000_000_000_000);
-/// Gaps between frames longer than this count as sleep, s; the demo has none.
+/// A gap between frames that is longer than this counts as sleep, s. The demo has no such gap.
 const SLEEP_GAP_S: f64 = 30.0;
 
 /// Arguments of `demo`.
@@ -186,11 +187,11 @@ impl Demo {
 
     fn is_complete(&self) -> bool {
         let last = self.first(Rule::CapacityLow).zip(self.first(Rule::RechargePeriodLow));
-        // Show one cycle after the last alarm.
+        // The demo ends one cycle after the last alarm.
         last.is_some_and(|(a, b)| self.sim.pack().cycles() + 1 > a.cycle.max(b.cycle) + 1)
     }
 
-    /// A table row with the present estimate and truth.
+    /// A table row with the present estimate and the true value.
     fn row(&self, moment: &Moment, cycles: u32) -> String {
         let soc = match self.monitor.latest().next().flatten() {
             Some(e) => format!("{:6.1} +-{:5.1}", 100.0 * e.soc, 100.0 * e.soc_std),
@@ -226,7 +227,7 @@ impl Demo {
         Ok(())
     }
 
-    /// Prints the result in one line. Fails if an alarm is missing or a frame is not in the DBC.
+    /// Prints the result in one line. Fails if an alarm is missing, or if the DBC does not define a sent frame.
     fn conclude(&self) -> Result<(), Failure> {
         let unknown = self.consumer.unknown_frames();
         match (self.first(Rule::CapacityLow), self.first(Rule::RechargePeriodLow)) {

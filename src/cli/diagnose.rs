@@ -71,7 +71,7 @@ struct FindingRow {
     advice: &'static str,
 }
 
-/// Difference of a cell from the pack's median; unknown values are `null`.
+/// Differences of a cell from the median of the pack. Unknown values are `null`.
 #[derive(Debug, Serialize)]
 struct CellRow {
     cell: u16,
@@ -195,7 +195,7 @@ fn text(diagnosis: &CellFaultDetector, pack: Vec<(String, String)>, page: &Page)
     text + &table(&heads, rows, 0)
 }
 
-/// Formats value and deviation with a sign; zero gets a plus sign.
+/// Formats a value with its sign and its standard deviation. Zero gets a plus sign.
 fn with_deviation(mean: f64, std: f64, digits: usize) -> String {
     let scale = 10f64.powi(i32::try_from(digits).unwrap_or(0));
     format!("{:+.digits$} ± {std:.digits$}", (mean * scale).round() / scale + 0.0)

@@ -1,6 +1,8 @@
-//! `packwatch doctor`: listens to a pack or replays a record, and reports probable faults.
+//! `packwatch doctor`: listens to a pack or replays a record, and reports probable faults of the wiring and of the
+//! configuration.
 //!
-//! Exit codes: 0 no error and no warning, 1 findings, 78 invalid configuration (its readable parts are diagnosed anyway).
+//! Exit codes: 0 = no errors and no warnings, 1 = findings, 78 = invalid configuration (the parts of it that can be
+//! read are still checked).
 
 mod page;
 
@@ -70,7 +72,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
 }
 
-/// Replaces the names of the configured interfaces.
+/// Replaces the names of the configured interfaces by the names on the command line.
 fn rename_interfaces(args: &Args, survey: &mut Survey) -> Result<(), Failure> {
     let configured = survey.plan.interfaces.len();
     if args.interfaces.len() > configured {
@@ -134,7 +136,7 @@ fn listen(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<WiringR
     result.map_err(failure)
 }
 
-/// Combines the faults of the configuration in one finding; `None` if it has none.
+/// Combines all faults of the configuration in one finding; `None` = the configuration is valid.
 fn invalid(faults: &[String]) -> Option<WiringFinding> {
     let (first, others) = faults.split_first()?;
     let title = match others.len() {
@@ -153,7 +155,7 @@ fn invalid(faults: &[String]) -> Option<WiringFinding> {
 fn complete(report: &mut WiringReport, survey: &Survey) {
     if let Some(finding) = invalid(&survey.faults) {
         report.add(finding);
-        // A wrong layout in the DBC causes other faults; list it first.
+        // A wrong layout in the DBC causes other faults, so it is listed first.
         if let Some(layout) =
             report.findings.iter().position(|f| (f.severity, f.topic) == (Severity::Error, Topic::Layout))
         {

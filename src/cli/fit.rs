@@ -1,6 +1,7 @@
 //! `packwatch fit`: fits a cell model to measured data.
 //!
-//! Prints a table of files with residuals, warnings, a verdict, and the result of the fit. Writes the model only when it is complete.
+//! Prints a table of the files with their residuals, then warnings, a verdict, and the result of the fit. Writes the
+//! model file only if it is complete.
 
 mod report;
 
@@ -140,7 +141,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     unless_closed(report::table(&outcome, seconds, &args.out))
 }
 
-/// Fits to logs; takes missing parts of the request from the configuration.
+/// Fits to logs. Parts of the request that are not given come from the configuration.
 fn fit_logs(
     args: &Args,
     request: &mut FitRequest,

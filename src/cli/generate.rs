@@ -1,5 +1,5 @@
-//! `packwatch generate`: writes manual pages and shell completions from the definition of the command line. Hidden: only package
-//! builds use it.
+//! `packwatch generate`: writes manual pages and shell completions from the definition of the command line. The command
+//! is hidden, because only package builds use it.
 
 use std::path::{Path, PathBuf};
 
@@ -90,7 +90,7 @@ fn manual_pages(all: &clap::Command) -> Vec<(String, Vec<u8>)> {
     pages
 }
 
-/// Adds the page of a command, then those of its subcommands.
+/// Adds the page of a command, then the pages of its subcommands.
 fn add_pages(command: &clap::Command, pages: &mut Vec<(String, Vec<u8>)>) {
     pages.push(page(command));
     for own in command.get_subcommands().filter(|own| !own.is_hide_set()) {

@@ -126,7 +126,7 @@ impl ColumnArgs {
     }
 }
 
-/// Reads files; rejects a column given twice, because it would predict itself.
+/// Reads files. Rejects a column that is given twice, because it could predict itself.
 fn read(files: &[PathBuf], wanted: &ColumnSelection<'_>, part: &PartColumn) -> Result<ColumnTable, Failure> {
     let table = ColumnTable::read(files, wanted, part).map_err(failure)?;
     let names = &table.names[..wanted.columns.len()];
@@ -206,7 +206,7 @@ fn predict(args: &PredictArgs) -> Result<(), Failure> {
     let table = ColumnTable::read(&args.files.files, &wanted, &PartColumn::None).map_err(failure)?;
     let predictions = trained.predict(&table).map_err(failure)?;
     match gpr::write_predictions(&args.out, &trained, &table, &predictions) {
-        // The reader has closed the output early; not an error.
+        // If the reader has closed the output early, this is not an error.
         Err(error) if to_stdout && error.to_string().contains("Broken pipe") => return Ok(()),
         written => written.map_err(failure)?,
     }

@@ -14,7 +14,7 @@ use packwatch_host::failure::Failure;
 
 /// Version of the JSON document.
 const VERSION: u32 = 1;
-/// Rows listed by default: a few screens.
+/// Number of rows that are listed by default. They fill a few screens.
 const LISTED: u32 = 100;
 
 /// Arguments of `history`.

@@ -1,7 +1,8 @@
 //! `packwatch import`: converts signal lists of a car, or a BPX cell, to configuration files.
 //!
-//! Standard error shows how many items were left out for each reason; the written file lists them with their place. Exit code
-//! 1: the file cannot be read, has another format, or nothing in it can be converted.
+//! Standard error shows how many items were left out for each reason. The written file lists these items with their
+//! positions. The exit code is 1 if the file cannot be read, has another format, or contains nothing that can be
+//! converted.
 
 use std::path::{Path, PathBuf};
 

@@ -1,4 +1,4 @@
-//! `packwatch model`: shows, plots and writes a cell model, and compares two.
+//! `packwatch model`: shows, plots and writes a cell model, and compares two cell models.
 
 mod compare;
 mod page;

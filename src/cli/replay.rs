@@ -37,7 +37,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         None => replay_all(args, &mut source, config, settings),
     };
     match result {
-        // The reader has closed our output early; not an error.
+        // If the reader has closed the output early, this is not an error.
         Err(ReplayError::Write(error)) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
         result => result.map_err(failure),
     }
@@ -78,7 +78,7 @@ fn play(args: &Args, source: &mut LogSource, settings: &ReplaySettings, interfac
 }
 
 fn settings(args: &Args, config: &Config) -> Result<ReplaySettings, Failure> {
-    // Frames played onto an interface keep their timing; a replay through the core need not.
+    // Frames that are sent on an interface keep their timing. A replay through the core runs as fast as possible.
     let speed = args.speed.or(args.to.is_some().then_some(1.0));
     Ok(ReplaySettings {
         speed: speed.filter(|speed| speed.is_finite()),
@@ -96,7 +96,7 @@ fn settings(args: &Args, config: &Config) -> Result<ReplaySettings, Failure> {
     })
 }
 
-/// Settings for the selected part, at full speed, with nothing stored.
+/// Settings for the selected part of the log, at full speed, without storing anything.
 fn plain_settings(args: &Args, config: &Config) -> ReplaySettings {
     let plain = ReplaySettings::plain(args.input.sleep_gap, config.interface_names());
     ReplaySettings { from: args.from, until: args.until, ..plain }

@@ -142,7 +142,7 @@ fn replay_logs(args: &Args, config: &Config) -> Result<ReportInput, Failure> {
     });
     let sinks = Sinks { watch: Some(watch), ..Sinks::default() };
     let Replayed { summary, snapshot, .. } = replaying::replay(&args.logs, &args.input, config, sinks)?;
-    // The replay has ended, and with it the closure that shared the data.
+    // The closure that shared the data was dropped with the replay.
     let mut data = Rc::try_unwrap(data).map_err(|_| Failure::new("the replay still holds its data"))?.into_inner();
     data.set_current_offset(summary.current_offset_a.zip(summary.current_offset_std_a));
     Ok((data, provenance(args, &summary), config.vehicle.clone(), snapshot))

@@ -41,7 +41,7 @@ pub(crate) struct Args {
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    // At most one for each percent.
+    // At most one point for each percent is useful.
     if args.at.len() > 99 {
         return Err(Failure::new(format!("--at: {} points, must be at most 99", args.at.len())));
     }
@@ -63,7 +63,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     unless_closed(shown)
 }
 
-/// Runs `work` for every file with every threshold, in the order given.
+/// Runs `work` for every file with every threshold, in the order of the arguments.
 fn each<T>(args: &Args, work: impl Fn(&rul::History, &str, Threshold) -> T) -> Result<Vec<T>, Failure> {
     let mut all = Vec::with_capacity(args.files.len() * args.end_of_life.len());
     for (path, name) in args.files.iter().zip(short_names(&args.files)) {

@@ -1,8 +1,8 @@
 //! `packwatch simulate`: simulates a pack with known true state, as frames of the configured DBC.
 //!
-//! Output: a candump log (`-o`, compressed if the name ends in `.gz`) or frames on an interface (`--to`), and the truth as
-//! CSV (`--truth`). The same seed gives the same bytes on every machine. Frames of the same sample are spaced as on a 1 Mbit/s
-//! bus, or closer if the next sample requires it.
+//! Output: a candump log (`-o`, compressed if its name ends in `.gz`) or frames on an interface (`--to`), and the true
+//! state as CSV (`--truth`). The same seed gives the same bytes on every machine. Frames of one sample are spaced as on
+//! a 1 Mbit/s bus, or closer if the next sample would otherwise be late.
 
 mod output;
 mod player;
@@ -144,7 +144,7 @@ impl Sink {
     }
 }
 
-/// Settings of the scenario for the configured cell, with the changes from the command line.
+/// Returns the settings of the scenario for the configured cell, with the changes from the command line.
 fn settings_for(args: &Args, config: &Config) -> Result<Settings, Failure> {
     let capacity_ah = args.changes.pack.capacity_ah.unwrap_or(config.monitor.model.capacity_ah);
     let mut settings = Settings::of(args.scenario, capacity_ah);

@@ -102,7 +102,7 @@ fn mean<const IS_PACK: bool>(values: &Values<IS_PACK>, quantity: Quantity, decim
     shown(values.mean(quantity).map(|mean| factor * mean), decimals, unit)
 }
 
-/// Unit on the screen, and the factor to it.
+/// The unit shown on the screen, and the factor that converts to this unit.
 const fn screen_unit(unit: Unit) -> (&'static str, f64) {
     match unit {
         Unit::Level | Unit::Fraction => (" %", 100.0),

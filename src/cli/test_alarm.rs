@@ -1,6 +1,7 @@
 //! `packwatch test-alarm`: asks the running daemon to send a rule's alarm frame as a test, and reports the frames seen on the bus.
 //!
-//! Succeeds only when every interface saw at least one such frame, intact and in sequence.
+//! The command succeeds only if every interface received at least one such frame and all of these frames were intact
+//! and in sequence.
 
 use std::fmt::Write as _;
 use std::path::PathBuf;
@@ -97,7 +98,7 @@ const ON_THE_WIRE: [AlarmState; 7] = [
     AlarmState::Unknown,
 ];
 
-/// Appends the other frames of the interface.
+/// Appends notes about the other frames of the interface.
 fn push_notes(text: &mut String, report: &ChannelReport) {
     let observed = &report.observed;
     for (&(rule, state), count) in &observed.genuine {

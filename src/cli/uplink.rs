@@ -1,6 +1,7 @@
-//! `packwatch mqtt`, `kuksa` and `vss`: replace this process by the program `packwatch-uplink`, which has its own package.
+//! `packwatch mqtt`, `kuksa` and `vss`: replace this process by the program `packwatch-uplink`, which is in a separate
+//! package.
 //!
-//! The program is searched for next to this one, then in `PATH`.
+//! The program is searched for first in the folder of this program, then in `PATH`.
 
 use std::ffi::OsString;
 use std::io;
@@ -21,7 +22,7 @@ pub(crate) struct Args {
     arguments: Vec<OsString>,
 }
 
-/// Replaces this process by the other program; returns only on failure.
+/// Replaces this process by `packwatch-uplink`. Returns only if this fails.
 pub(crate) fn run(command: &str, args: &Args) -> Result<(), Failure> {
     let error = Command::new(program()).arg(command).args(&args.arguments).exec();
     Err(Failure::new(match error.kind() {
@@ -32,7 +33,8 @@ pub(crate) fn run(command: &str, args: &Args) -> Result<(), Failure> {
     }))
 }
 
-/// Path of the program next to this one, else its name, to be found in `PATH`.
+/// Path of `packwatch-uplink` in the folder of this program. If it is not there, returns its name, which is then
+/// searched for in `PATH`.
 fn program() -> PathBuf {
     let beside = std::env::current_exe().ok().map(|own| own.with_file_name(PROGRAM));
     beside.filter(|path| path.is_file()).unwrap_or_else(|| PROGRAM.into())

@@ -1,4 +1,4 @@
-//! `packwatch whatif`: evaluates the alarms of logs under other settings.
+//! `packwatch whatif`: shows which alarms recorded logs would have raised with other settings.
 
 mod document;
 mod report;
@@ -97,7 +97,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             Some(EndOfLifeArg::Part(part)) => part * rated_ah,
             None => plain.health.end_of_life_ah,
         },
-        // The configured end of life is a capacity; one given here is a usable capacity if `[usable]` is configured.
+        // The configured end of life is a capacity. If `[usable]` is configured, an end of life given on the command
+        // line is a usable capacity.
         judges_usable: args.end_of_life.is_some(),
         horizon: args.horizon,
         jobs: args.logs.threads(),

@@ -3,7 +3,7 @@
 use crate::alarm::{Alarm, Direction, Rule, Unit};
 use crate::quantity::CellIndex;
 
-/// Number of cells from which equal alarms share a row.
+/// Minimum number of cells with equal alarms that share a row.
 const MANY: usize = 4;
 /// Longest list of cells, characters; longer lists are cut.
 const MAX_LIST: usize = 24;
@@ -39,7 +39,7 @@ impl AlarmGroup {
     }
 }
 
-/// Groups alarms of many cells that differ only in their values; keeps the order.
+/// Groups alarms of several cells that differ only in their values. The order of the alarms is kept.
 pub(crate) fn grouped(alarms: &[Alarm]) -> Vec<AlarmGroup> {
     let is_alike = |a: &Alarm, b: &Alarm| {
         let kind = |alarm: &Alarm| (alarm.rule, alarm.severity, alarm.state, alarm.is_acknowledged);
@@ -59,7 +59,7 @@ pub(crate) fn grouped(alarms: &[Alarm]) -> Vec<AlarmGroup> {
     groups
 }
 
-/// The alarm with the worst value; alarms without a value rank last.
+/// The alarm with the worst value. An alarm without a value counts as less bad than any other.
 fn worst(alarms: &[&Alarm]) -> Alarm {
     let badness = |alarm: &Alarm| match (alarm.value, alarm.rule.spec().direction) {
         (None, _) => f64::NEG_INFINITY,
@@ -139,7 +139,7 @@ mod tests {
         let owners: Vec<String> = groups.iter().map(AlarmGroup::owner).collect();
         assert_eq!(owners, ["pack", "96 cells (1-96)", "cell 4", "cell 6"]);
         assert_eq!((groups[1].alarm.value, groups[1].cells()), (Some(95.0), "96: 1-96".to_owned()));
-        // Alarms in another state get their own row. With a lower limit, the smallest value is the worst.
+        // Alarms in another state get their own row. For a rule with a lower limit, the smallest value is the worst.
         let mut low: Vec<Alarm> =
             (0..8).map(|cell| alarm(Rule::CapacityLow, Some(cell), 2.0 - f64::from(cell))).collect();
         low[1].state = AlarmState::Clearing;

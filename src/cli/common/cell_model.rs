@@ -1,4 +1,4 @@
-//! The cell model of a record: the learned one, else the configured one.
+//! The cell model at the end of a record: the model learned on board, else the configured model.
 
 use packwatch_host::failure::Failure;
 
@@ -7,7 +7,7 @@ use crate::config::cell_model::SourcedModel;
 use crate::config::{self, Config};
 use crate::monitor::Snapshot;
 
-/// Returns the cell model at the end of the record: learned, else configured.
+/// Returns the cell model at the end of the record: the learned model or, if none was learned, the configured model.
 pub(crate) fn cell_model(
     snapshot: Option<&Snapshot>,
     config: Option<&Config>,

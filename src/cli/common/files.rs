@@ -29,7 +29,8 @@ fn unreadable(file: &Path, error: &std::io::Error) -> Failure {
     named(file, format!("cannot be read: {error}"))
 }
 
-/// Returns how a configuration names a file: by its file name if both share a folder, else by its full path.
+/// Returns the name of a file as a configuration should write it: the file name if both are in the same folder, else
+/// the full path.
 pub(crate) fn named_from(config: &Path, file: &Path) -> Result<String, Failure> {
     let whole = |path: &Path| std::path::absolute(path).map_err(|error| named(path, error));
     let (config, file) = (whole(config)?, whole(file)?);

@@ -1,4 +1,4 @@
-//! Arguments shared by the commands that read logs.
+//! Arguments that all commands that read logs share.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,4 @@
-//! Arguments shared by the commands over many logs: the logs, reading options, progress.
+//! Arguments of the commands that read many logs: the logs, reading options, progress.
 
 use std::path::{Path, PathBuf};
 
@@ -73,7 +73,7 @@ impl LogArgs {
 /// Opens logs as one record, read with a configuration.
 pub(crate) fn open(input: &InputArgs, config: &Config, logs: &[PathBuf]) -> OpenedLog {
     let mut options = log_options(input, config);
-    // A table of cycles gives the times of a single log.
+    // A table of cycles next to a log gives the times of that log only, so it is not used with several logs.
     let found = logs.first().filter(|_| options.csv.start_times.is_none() && logs.len() == 1);
     let found = found.and_then(|log| truth::cycles_next_to(log));
     let note = found.as_ref().map(|table| format!("dated by {}", table.display()));

@@ -1,7 +1,7 @@
 //! Output shared by the commands: tables, JSON documents, result folders, errors.
 //!
-//! Tables and documents go to the writer given or to standard output.
-//! If the reader closes standard output early (`| head`), the command still succeeds.
+//! Tables and documents are written to the given writer or to standard output. If the reader closes standard output
+//! early (`| head`), the command still succeeds.
 
 use std::fmt::Display;
 use std::io::{self, Write};
@@ -24,7 +24,7 @@ pub(crate) fn named(path: &Path, what: impl Display) -> Failure {
     Failure::new(format!("{}: {what}", path.display()))
 }
 
-/// Ignores the error of a closed output.
+/// Treats an error that means "the reader has closed the output" as success.
 pub(crate) fn unless_closed(written: io::Result<()>) -> Result<(), Failure> {
     match written {
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),

@@ -1,4 +1,4 @@
-//! The receiving ECU: decodes frames with their DBC alone.
+//! The receiving ECU. It decodes frames with the DBC alone.
 
 use crate::alarm::Rule;
 use crate::can::Frame;
@@ -64,7 +64,7 @@ fn explain_signal(signal: &Signal, data: &[u8]) -> String {
     match (named, plan.decode(data)) {
         (Some((_, name)), _) => format!("{} {name}", signal.name),
         (None, Ok(value)) => {
-            let rounded = (value * 1e6).round() / 1e6; // factor times code is not exact in binary
+            let rounded = (value * 1e6).round() / 1e6; // the product of factor and code is not exact in binary
             format!("{} {rounded} {}", signal.name, signal.unit).trim_end().to_owned()
         }
         (None, Err(fault)) => format!("{} {fault:?}", signal.name),

@@ -1,4 +1,5 @@
-//! Loss of pack capacity due to differences between cells, as JSON: fractions of the mean cell capacity, Ah and kWh of one string.
+//! Capacity that the pack loses because its cells differ, as JSON. The values are fractions of the mean cell capacity,
+//! Ah, and kWh of one string.
 
 use serde::Serialize;
 

@@ -1,4 +1,4 @@
-//! The doctor's report as text: findings, most severe first; what is in order; what could not be judged.
+//! The doctor's report as text: findings (most severe first), what is in order, and what could not be checked.
 
 use std::io::IsTerminal as _;
 use std::path::Path;
@@ -50,7 +50,7 @@ fn render(report: &WiringReport, config: &Path, source: &str, width: usize, pain
     page
 }
 
-/// The proposed line; a description if only a person can know the value.
+/// The proposed line or, if only a person can know the value, a description of the value.
 fn proposal(change: &Change) -> String {
     let line = format!("{} = {}", change.key, change.proposed);
     if toml::from_str::<toml::Table>(&line).is_ok() {
@@ -95,7 +95,7 @@ fn show(finding: &WiringFinding, width: usize, paint: Paint, page: &mut String) 
     consequences(&finding.consequences, width, paint, page);
 }
 
-/// Consequences of a finding; a long list is cut.
+/// Lists the consequences of a finding. A long list is cut.
 fn consequences(titles: &[String], width: usize, paint: Paint, page: &mut String) {
     const SHOWN: usize = 4;
     let shown = titles.iter().take(SHOWN).map(String::as_str).collect::<Vec<_>>().join("; ");
@@ -107,7 +107,7 @@ fn consequences(titles: &[String], width: usize, paint: Paint, page: &mut String
     page.push_str(&format!("{}{}\n", paint.dim(&format!("  {:8}", "below")), wrapped(&text, width, INDENT)));
 }
 
-/// Lines to change; a long list is cut.
+/// Lists the lines to change. A long list is cut.
 fn changes(changes: &[Change], paint: Paint, page: &mut String) {
     const SHOWN: usize = 4;
     for change in changes.iter().take(SHOWN) {

@@ -14,7 +14,7 @@ use crate::regress::{FitProgress, Fold, Form, GprSettings, Hyperparameter, Jitte
 
 /// Version of the JSON documents.
 pub(super) const VERSION: u32 = 1;
-/// Parts of a fold in the progress bar.
+/// Number of progress steps per fold.
 const TICKS: usize = 100;
 
 /// Creates a progress bar over a number of fits.
@@ -22,7 +22,7 @@ pub(super) fn fit_bar(fits: usize) -> ProgressBar {
     progress_bar((fits * TICKS) as u64, "{bar:32} {percent} % {msg}, {elapsed}, eta {eta}")
 }
 
-/// Shows a step of a search; `before` fits were done before this cross-validation.
+/// Shows one step of a search. `before` is the number of fits that were finished before this cross-validation.
 pub(super) fn show_step(bar: &ProgressBar, what: &str, before: usize, p: FitProgress) -> ControlFlow<()> {
     let part = (p.search - 1) * p.max_iterations + p.iteration;
     let whole = (p.searches * p.max_iterations).max(1);

@@ -1,4 +1,4 @@
-//! `packwatch model compare`: how far the second model is from the first, as tables or JSON.
+//! `packwatch model compare`: shows how far the second model differs from the first, as tables or JSON.
 
 use serde_json::{Value, json};
 
@@ -22,7 +22,7 @@ pub(super) fn page(comparison: &ModelComparison, [first, second]: [Named<'_>; 2]
     let rows = rows.into_iter().map(|(what, value)| vec![what.to_owned(), value]);
     page.push_str(&output::table::<&str>(&[], rows, 2));
     page.push_str("\nopen-circuit voltage at 25 \u{b0}C\n");
-    // Every tenth of the curve's steps of 1 %.
+    // The table shows every tenth point of the curve, which has steps of 1 %.
     let points = comparison.curve_v.iter().step_by(10);
     let rows = points.map(|at| vec![format!("{:.0}", 100.0 * at.soc), signed(1e3 * at.value)]);
     page.push_str(&output::table(&["SOC, %", "mV"], rows, 0));

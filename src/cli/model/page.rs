@@ -8,7 +8,7 @@ use crate::config::cell_model::{KnownBy, LearnedFrom, MeasuredRange, SourcedMode
 use crate::io::stamp::format_utc;
 use crate::monitor::{ModelChange, ModelState};
 
-/// Rows of the curve: every 5 % of SOC.
+/// Number of steps of the printed curve: one row every 5 % of SOC.
 const CURVE_STEPS: u32 = 20;
 /// SOC of the resistance columns.
 const RESISTANCE_SOC: [f64; 5] = [0.1, 0.3, 0.5, 0.7, 0.9];
@@ -42,7 +42,7 @@ struct LearnedRow {
     fits: u32,
     changes: Vec<ChangeRow>,
     residual_v: Option<f64>,
-    /// The chemistry that fits the voltages better.
+    /// A chemistry that fits the voltages better than the chemistry on the label.
     chemistry: Option<Chemistry>,
     soc_share: f64,
     soc_ranges: Vec<[f64; 2]>,
@@ -99,7 +99,7 @@ struct BranchPart {
     tau_s: f64,
 }
 
-/// An advised measurement.
+/// The measurement that would improve the model most.
 #[derive(Debug, Serialize)]
 struct AdviceRow {
     measurement: String,

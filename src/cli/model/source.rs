@@ -33,7 +33,7 @@ impl SourceArgs {
     /// Returns the model and its display name.
     ///
     /// # Errors
-    /// All faults of the source, if it cannot be read.
+    /// Fails if the source cannot be read, and returns all its faults.
     pub(super) fn load(&self) -> Result<(String, SourcedModel), Failure> {
         let config = self.config.as_deref().map(config::load).transpose()?;
         match (self.state.as_ref().or(self.source.as_ref()), config, self.label.label()) {
@@ -43,7 +43,7 @@ impl SourceArgs {
             (None, None, Some(label)) => {
                 of_label_named(format!("{}:{}", label.chemistry.name(), label.rated_ah), &label)
             }
-            // The command line parser requires one of them.
+            // The command line parser requires at least one of these arguments.
             (None, None, None) => Err(Failure::new("give a cell model: SOURCE, --config, --chemistry or --state")),
         }
     }
@@ -57,12 +57,12 @@ impl SourceArgs {
 /// Returns the model of a SOURCE and its display name.
 ///
 /// # Errors
-/// All faults of the source, if it cannot be read.
+/// Fails if the source cannot be read, and returns all its faults.
 pub(super) fn load(path: &Path) -> Result<(String, SourcedModel), Failure> {
     load_with(path, None)
 }
 
-/// As [`load`]; `config` supplies the model if the state has learned none.
+/// Like [`load`]. If the vehicle's state contains no learned model, the model comes from `config`.
 fn load_with(path: &Path, config: Option<Config>) -> Result<(String, SourcedModel), Failure> {
     if path.is_dir() {
         let reader = HistoryReader::open(path).map_err(Failure::new)?;
@@ -87,7 +87,7 @@ fn load_with(path: &Path, config: Option<Config>) -> Result<(String, SourcedMode
     of_label_text(path)
 }
 
-/// Returns the learned model of a vehicle, or the configured one if it has learned none.
+/// Returns the model that the vehicle has learned or, if it has learned none, the configured model.
 fn of_snapshot(path: &Path, snapshot: &Snapshot, config: Option<Config>) -> Result<(String, SourcedModel), Failure> {
     let label = config.as_ref().and_then(|config| config.monitor.label);
     let view = snapshot.model(label).map_err(|error| Failure::new(format!("{}: {error}", path.display())))?;
@@ -122,7 +122,8 @@ fn of_label_text(path: &Path) -> Result<(String, SourcedModel), Failure> {
     of_label_named(source, &Label::usual(known, rated_ah))
 }
 
-/// Whether a file is a configuration, which has a table [pack]. Its faults are reported when it is read.
+/// Whether a file is a configuration, that is, contains a table `[pack]`. Faults of the file are reported later, when
+/// it is read.
 fn is_configuration(path: &Path) -> bool {
     let text = std::fs::read_to_string(path).unwrap_or_default();
     text.parse::<toml::Table>().is_ok_and(|table| table.contains_key("pack"))

@@ -74,7 +74,7 @@ impl Args {
         [&self.estimates, &self.events, &self.frames, &self.snapshot].into_iter().filter_map(|path| path.as_deref())
     }
 
-    /// Whether a result goes to standard output; the summary then goes elsewhere.
+    /// Whether a result goes to standard output. If so, the summary is printed on standard error.
     pub(crate) fn results_on_stdout(&self) -> bool {
         self.results().any(|path| path == Path::new("-"))
     }
@@ -82,7 +82,7 @@ impl Args {
     /// Checks arguments that depend on each other.
     pub(crate) fn check(&self) -> Result<(), Failure> {
         if self.each {
-            // Results are folders; `each` checks them.
+            // With `--each`, results are folders, which `each` checks.
             return Ok(());
         }
         let on_stdout = self.results().filter(|&path| path == Path::new("-")).count() + usize::from(self.json);

@@ -50,7 +50,7 @@ pub(super) fn run(args: &Args, config: &Config) -> Result<(), Failure> {
     );
     bar.bar.finish_and_clear();
     match written {
-        // The reader has closed our output early; not an error.
+        // If the reader has closed the output early, this is not an error.
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => {}
         written => written.map_err(failure)?,
     }
@@ -118,7 +118,7 @@ fn replay_one(args: &Args, config: &Config, log: &Path, bar: &EachBar) -> Result
     result.map(|(summary, _)| summary)
 }
 
-/// Adds the log's name to an error, if it is missing.
+/// Adds the log's name to an error that does not contain it.
 fn named(log: &Path, error: &ReplayError) -> String {
     let (name, text) = (log.display().to_string(), error.to_string());
     if text.starts_with(&name) { text } else { format!("{name}: {text}") }
@@ -148,7 +148,7 @@ struct EachBar {
     logs: usize,
     finished: AtomicU64,
     frames: AtomicU64,
-    /// Replayed record time, ms.
+    /// Time of the records already replayed, ms.
     awake_ms: AtomicU64,
 }
 
@@ -195,7 +195,7 @@ impl LogProgress<'_> {
     fn show(&mut self, now: ReplayProgress) {
         let awake_s = (now.times_real_time * self.began.elapsed().as_secs_f64()).max(self.awake_s);
         self.bar.frames.fetch_add(now.frames.saturating_sub(self.frames), Ordering::Relaxed);
-        // Saturates, far beyond any record.
+        // The cast saturates only at times that are far longer than any record.
         self.bar.awake_ms.fetch_add(((awake_s - self.awake_s) * 1e3) as u64, Ordering::Relaxed);
         self.bar.bar.inc(now.bytes.saturating_sub(self.bytes));
         (self.bytes, self.frames, self.awake_s) = (now.bytes, now.frames, awake_s);

@@ -8,9 +8,9 @@ use crate::monitor::{Event, EventKind};
 use crate::quantity::catalogue::Quantity;
 use crate::replay::{ProtectedSummary, ReplaySummary};
 
-/// Most alarms in the table; JSON has more.
+/// Maximum number of alarms in the table. The JSON summary has more.
 const MAX_SHOWN_ALARMS: usize = 20;
-/// Most cells in the table; JSON has all.
+/// Maximum number of cells in the table. The JSON summary has all cells.
 const MAX_SHOWN_CELLS: usize = 16;
 
 /// Prints the summary as a line of JSON that begins with the log's name.

@@ -23,7 +23,8 @@ impl Player {
         Ok(Self { sender, speed, started: None })
     }
 
-    /// Waits until the frame is due, then sends it; frames of all configured interfaces go to this interface.
+    /// Waits until the frame is due, then sends it. The frames of all configured interfaces are sent on this one
+    /// interface.
     pub(super) fn play(&mut self, time: Timestamp, frame: &Frame) -> Result<(), Failure> {
         let (start, first) = *self.started.get_or_insert_with(|| (Instant::now(), time));
         if self.speed > 0.0 {

@@ -1,4 +1,4 @@
-//! The table of `packwatch status`. Pure: document in, text out.
+//! The table of `packwatch status`. All functions are pure: they convert a document to text.
 
 use std::fmt::Write as _;
 
@@ -11,13 +11,13 @@ use crate::quantity::catalogue::{PackValues, Quantity};
 use crate::status::counters::LATENCY_BOUNDS_S;
 use crate::status::document::{Intruder, IntruderKind, StatusDocument};
 
-/// Most cells that are listed without `--cells`, so that the table fits a screen.
+/// Maximum number of cells that are listed without `--cells`. With this number, the table fits a screen.
 const MAX_LISTED: usize = 16;
-/// A cell is an outlier if it is this many times the median distance from the median.
+/// A cell is an outlier if its distance from the median is at least this many times the median distance.
 const OUTLYING: f64 = 3.0;
-/// Most outliers listed.
+/// Maximum number of outliers that are listed.
 const MAX_OUTLIERS: usize = 8;
-/// Most findings listed.
+/// Maximum number of findings that are listed.
 const MOST_FOUND: usize = 8;
 
 /// Formats the document as a table; `all` lists every cell.
@@ -114,7 +114,7 @@ fn losses(values: &PackValues) -> String {
     )
 }
 
-/// Remaining life of the cell that ends first.
+/// Remaining life of the cell that reaches its end of life first.
 fn remaining(pack: &PackView) -> String {
     let quantities = [Quantity::RemainingCycles, Quantity::RemainingCyclesLow, Quantity::RemainingCyclesHigh];
     let [Some(cycles), Some(low), Some(high)] = quantities.map(|quantity| pack.values.mean(quantity)) else {
@@ -229,8 +229,9 @@ fn row(cell: &CellView) -> Vec<String> {
     ]
 }
 
-/// A quantity compared between cells: name, decimals, and the distance from the median within which a cell is never an outlier, in
-/// the quantity's unit and relative to the median. The distance covers the differences of sensors and equal cells.
+/// A quantity that is compared between cells: name, quantity, decimals, and two smallest distances from the median at
+/// which a cell can be an outlier. The first distance is in the quantity's unit, the second is relative to the median.
+/// They cover the differences of sensors and of equal cells.
 type Comparison = (&'static str, Quantity, usize, f64, f64);
 
 const COMPARISONS: [Comparison; 5] = [
@@ -262,7 +263,7 @@ fn spread(text: &mut String, cells: &[CellView]) {
     }
 }
 
-/// Cells that are not trusted, unknown, or furthest from the median of a quantity, sorted by number.
+/// Cells whose estimate is not trusted or unknown, and cells far from the median of a quantity, sorted by cell number.
 fn outliers(cells: &[CellView]) -> Vec<&CellView> {
     let mut ranked: Vec<(f64, &CellView)> = cells.iter().map(|cell| (0.0, cell)).collect();
     for (_, quantity, _, floor, relative_floor) in COMPARISONS {
@@ -276,14 +277,14 @@ fn outliers(cells: &[CellView]) -> Vec<&CellView> {
         let floor = floor.max(relative_floor * median.abs());
         let typical = distances[distances.len() / 2].max(floor / OUTLYING);
         for (rank, cell) in &mut ranked {
-            // A cell with an unknown value ranks first.
+            // A cell with an unknown value has the highest rank.
             *rank = rank.max(of(cell).map_or(f64::MAX, |value| (value - median).abs() / typical));
         }
     }
     for (rank, cell) in &mut ranked {
         *rank = if cell.trusted == Some(false) { f64::MAX } else { *rank };
     }
-    // A stable sort: the first cells of equal rank.
+    // The sort is stable, so of several cells with equal rank the first ones are listed.
     ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
     let mut found: Vec<&CellView> =
         ranked.into_iter().filter(|(rank, _)| *rank > OUTLYING).take(MAX_OUTLIERS).map(|(_, cell)| cell).collect();

@@ -1,7 +1,8 @@
 //! The full-screen live view of `packwatch status --watch`: the terminal, and the loop around [`App`].
 //!
-//! Input: documents of the stream socket, keys, the clock. Output: a screen, redrawn on each input. Restores the terminal on
-//! quitting, on SIGTERM, SIGINT and SIGHUP, and on a panic. Waits for a daemon that has stopped.
+//! Input: documents of the stream socket, keys, the clock. Output: a screen, which is redrawn on each input. The
+//! terminal is restored when the user quits, on SIGTERM, SIGINT and SIGHUP, and on a panic. If the daemon stops, the
+//! view waits until the daemon returns.
 
 mod app;
 mod draw;
@@ -31,7 +32,7 @@ const KEYS: usize = 64;
 /// Runs the view until the user quits. `socket` is the status socket; the stream socket is next to it.
 ///
 /// # Errors
-/// No terminal, or the terminal fails.
+/// Fails if there is no terminal, or if the terminal fails.
 pub(super) fn run(socket: &Path) -> Result<(), String> {
     if !io::stdout().is_terminal() || !io::stdin().is_terminal() {
         return Err(
@@ -45,7 +46,7 @@ pub(super) fn run(socket: &Path) -> Result<(), String> {
     let app = App::new(socket.to_owned(), has_colour);
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| format!("cannot start: {error}"))?;
-    // From here on a panic also restores the terminal.
+    // After this call, a panic also restores the terminal.
     let terminal = ratatui::try_init().map_err(|error| format!("terminal: {error}"))?;
     let watched = runtime.block_on(watch(terminal, app));
     ratatui::restore();
@@ -98,7 +99,7 @@ fn read_keys() -> io::Result<mpsc::Receiver<Event>> {
     Ok(keys)
 }
 
-/// Maps a key to an action: Esc for every key that quits, `None` for unknown keys.
+/// Converts a key to an action. Every key that quits gives Esc; an unknown key gives `None`.
 fn meaning(key: KeyEvent) -> Option<KeyCode> {
     let has_control = key.modifiers.contains(KeyModifiers::CONTROL);
     match key.code {

@@ -10,7 +10,7 @@ use crate::lab::fleet::judge::Horizon;
 use crate::lab::fleet::variants::VariantGrid;
 use crate::lab::fleet::whatif::{EndOfLife, LogResult, ThresholdScore, WhatifSettings};
 
-/// Columns of a table after those of the alarm and the values set.
+/// Number of columns after the columns of the alarm and of the settings.
 const OWN_COLUMNS: usize = 9;
 const SUMMARY_HEADS: [&str; OWN_COLUMNS] =
     ["threshold", "raised", "lead, days", "lead, cycles", "missed", "false", "open", "false raises", "flickers"];
@@ -156,7 +156,7 @@ impl WhatifReport<'_> {
         std::iter::once(alarm).chain(self.setting_cells(setting)).chain(own).collect()
     }
 
-    /// Returns the columns of the values set; "unchanged" for the plain configuration.
+    /// Returns the columns of the settings. For the configuration without changes, they contain "unchanged".
     fn setting_cells(&self, setting: usize) -> impl Iterator<Item = String> {
         let values = self.grid.variants.get(setting).map(|variant| variant.values.clone()).unwrap_or_default();
         let plain = values.is_empty();
@@ -207,7 +207,8 @@ fn summary(rows: &[&ThresholdScore]) -> Summary {
     }
 }
 
-/// Median, 5 % and 95 % quantiles, each the nearest existing value (the lower of two middle ones).
+/// Median, 5 % and 95 % quantiles. Each quantile is the nearest existing value; of two middle values, the lower one is
+/// used.
 fn quantiles(mut values: Vec<f64>) -> Option<[f64; 3]> {
     values.sort_by(f64::total_cmp);
     let last = values.len().checked_sub(1)?;

@@ -127,7 +127,7 @@ fn large_pack_lists_outliers_only() {
         .skip(1)
         .filter_map(|line| line.split_whitespace().next())
         .collect();
-    // Cells without a value, not trusted and silent.
+    // The SOC of cell 41 is an outlier, cell 95 is not trusted, and cell 96 is silent.
     assert_eq!(listed, ["41", "95", "96"]);
     assert_eq!(table(&document, true).lines().filter(|line| line.contains(" °C  ")).count(), 95);
 }

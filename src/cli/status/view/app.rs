@@ -10,7 +10,7 @@ use crate::quantity::catalogue::Quantity;
 use crate::status::STALE;
 use crate::status::document::StatusDocument;
 
-/// Documents kept for the plots: four minutes.
+/// Number of documents that are kept for the plots. They cover four minutes.
 pub(super) const HISTORY: usize = 240;
 
 /// An update from the stream.
@@ -62,9 +62,9 @@ pub(super) type CellPoint = [Option<f32>; MAPPED.len()];
 pub(super) struct App {
     path: PathBuf,
     pub(super) has_colour: bool,
-    /// The latest document, unless stale.
+    /// The latest document; `None` if it is stale.
     pub(super) document: Option<StatusDocument>,
-    /// While no fresh document is available: time of the last document, and why it was lost.
+    /// Set while there is no fresh document: the time of the last document, and the reason why there is none.
     pub(super) lost: Option<(Option<Timestamp>, String)>,
     /// Time of the latest document.
     received_at: Option<Timestamp>,
@@ -75,11 +75,11 @@ pub(super) struct App {
     pub(super) mapped: usize,
     /// The selected cell.
     pub(super) selected: usize,
-    /// First visible line of the other pages.
+    /// First visible line of the pages that are not the cell map.
     pub(super) scroll: usize,
-    /// Cells in a row of the map when last drawn.
+    /// Number of cells in a row of the map when it was last drawn.
     pub(super) row_cells: usize,
-    /// Lines of a page when last drawn.
+    /// Number of lines of a page when it was last drawn.
     pub(super) page_lines: usize,
     now: Timestamp,
 }

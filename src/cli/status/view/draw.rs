@@ -25,7 +25,7 @@ pub(super) fn draw(frame: &mut Frame<'_>, app: &mut App) {
         return frame.render_widget(Paragraph::new(text), area);
     }
     let theme = Theme { has_colour: app.has_colour };
-    // Taken out, so that the pages can update the app while they draw.
+    // The document is taken out of `app`, so that the pages can change `app` while they draw.
     let Some(document) = app.document.take() else { return lost(frame, app, area) };
     let [head_area, pack_area, alarm_area, tab_area, page_area, keys_area] = Layout::vertical([
         Constraint::Length(1),

@@ -40,12 +40,12 @@ fn finding(event: &Map<String, Value>) -> Option<CellFault> {
     serde_json::from_value(Value::Object(keys)).ok()
 }
 
-/// Formats a key with its value; `None` if another key shows it.
+/// Formats a key with its value; `None` = the value is shown with another key.
 fn part(event: &Map<String, Value>, key: &str, value: &Value, document: &StatusDocument) -> Option<String> {
     let (stem, unit) = UNITS.iter().find_map(|(end, unit)| Some((key.strip_suffix(end)?, *unit))).unwrap_or((key, ""));
     let end = &key[stem.len()..];
     if let Some(mean) = stem.strip_suffix("_std") {
-        // Shown after the mean.
+        // The standard deviation is shown after the mean.
         return (!event.contains_key(&format!("{mean}{end}")))
             .then(|| format!("{} {}", named(stem), shown(key, value, document) + unit));
     }

@@ -17,7 +17,8 @@ use crate::status::stream_path;
 
 /// Pause before reconnecting.
 const RETRY: Duration = Duration::from_secs(1);
-/// Longest wait for a line before the connection is closed, because a suspended daemon keeps it open.
+/// Longest wait for a line. After this time the connection is closed, because a suspended daemon keeps it open without
+/// sending.
 const SILENCE: Duration = Duration::from_secs(5);
 
 /// The computer's clock.

@@ -22,7 +22,7 @@ use crate::status::document::StatusDocument;
 const LABEL: usize = 5;
 /// Lines reserved below the map for the list of cells and the plot.
 const LIST_LINES: usize = 4;
-/// Smallest range of the SOC bars; hides small differences.
+/// Smallest range of the SOC bars. It avoids magnifying small differences.
 const LEAST_SOC_RANGE: f64 = 0.05;
 /// Height of the selected cell's plot, including its title.
 const PLOT_LINES: usize = 5;
@@ -72,7 +72,7 @@ struct Grid {
 }
 
 impl Grid {
-    /// Chooses the widest bars that fit all cells; if the narrowest do not fit, the map scrolls.
+    /// Chooses the widest bars with which all cells fit. If not even the narrowest bars fit, the map scrolls.
     fn new(cells: usize, width: usize, lines: usize) -> Self {
         let with = |cell_width: usize| {
             let fit = (width.saturating_sub(LABEL) / cell_width).max(1);

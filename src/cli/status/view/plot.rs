@@ -50,7 +50,8 @@ impl ValueRange {
     }
 }
 
-/// Draws a gauge: full up to the lower end of the interval, hatched within it, light beyond; a stroke marks the value.
+/// Draws a gauge. It is full up to the lower end of the interval, hatched within the interval, and light above it. A
+/// stroke marks the value.
 pub(super) fn gauge(value: Option<f64>, low: Option<f64>, high: Option<f64>, width: usize) -> String {
     let (Some(value), Some(low), Some(high)) = (value, low, high) else { return UNKNOWN.to_string().repeat(width) };
     // The cast saturates to 0 to width.
