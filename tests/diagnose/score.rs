@@ -94,7 +94,7 @@ fn poisson_upper(count: f64) -> f64 {
     n * (1.0 - 1.0 / (9.0 * n) + NORMAL_95 / (3.0 * n.sqrt())).powi(3)
 }
 
-/// Cells that a right finding may name, as ranges; empty = the pack.
+/// Ranges of cells (first, last) that a correct finding may name. Empty if it must name the whole pack.
 fn places(fault: &FaultKind) -> Vec<(CellIndex, CellIndex)> {
     let sensor = |i: u16| (CellIndex(i * CELLS_PER_SENSOR), CellIndex((i + 1) * CELLS_PER_SENSOR - 1));
     match *fault {

@@ -97,7 +97,7 @@ fn show_states_valid_bands_and_priors() {
         numbers(&document, &mut found, "");
         let bands: Vec<_> = found.iter().filter(|(path, _)| path.contains("std")).collect();
         assert!(bands.len() > 5 && bands.iter().all(|(_, value)| *value >= 0.0), "{source}: {bands:?}");
-        // JSON has no NaN: it would be written as null, which is allowed only if the model states no error.
+        // JSON has no NaN: it would be written as null. Null is allowed only if the model states no error.
         let is_stated = document["soc_error_points"].is_number();
         assert_eq!(is_stated, !source.contains("nasa"), "{source}");
         let nulls = document["curve"].as_array().unwrap().iter().filter(|row| row["ocv_std_v"].is_null()).count();

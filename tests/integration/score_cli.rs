@@ -92,7 +92,7 @@ fn perfect_cell_converges_from_20_points() {
 #[test]
 fn cell_error_appears_in_score() {
     // The voltages indicate 8 points more than the counter, so an estimator that trusts them is 8 points off and
-    // outside the interval.
+    // outside its interval.
     let bench = Bench::new();
     bench.write_discharge("drive.csv", 1.5, 0.08);
     let score = &bench.json(&["drive.csv", "--start", "middle", "--told", "0", "--soc-std", "30"])["scores"][0];

@@ -6,9 +6,10 @@ One RC branch at a fixed time constant makes the voltage linear in the table val
 
     V(t) = sum_j OCV_j h_j(s) - sum_j R0_j h_j(s) I - sum_j R1_j u_j(t),   tau du_j/dt = h_j(s) I - u_j
 
-with h_j the hat functions of the SOC grid and I > 0 discharge, so one bounded least-squares problem gives all
-tables. SOC comes from ampere-hours between anchors. The anchors are 1 at the end of every full charge (the state this
-charger leaves), and the knee of each discharge (3.0 V under load) at one common SOC. This keeps two errors out of the
+with s the SOC, h_j the hat function of point j of its grid, I the current (positive = discharge) and u_j the current of the branch at
+point j. One bounded least-squares problem therefore gives all tables. Between two anchors, the SOC is counted in ampere-hours. The
+anchors are the end of every full charge (SOC 1, the state in which this charger leaves the cell) and the knee of each discharge (3.0 V
+under load), which has the same SOC in all discharges. This keeps two errors out of the
 curves: the cycle-to-cycle fade, and the charger's current-gain error (its ampere-hours exceed the discharge's by 1 %).
 Needs numpy and scipy. Deterministic.
 """

@@ -46,7 +46,7 @@ MOVING = (1, 3)  # charge, discharge
 # Properties of fast_pack.
 PERIOD_S, MAX_RATE_PER_S = 0.01, 0.32
 MEMORY = 300  # samples
-LOST = 0.75  # lowest part of the estimates within two deviations: fewer mean that a fault made them wrong. tests/integration/restart.rs judges the calibration
+LOST = 0.75  # minimum share of estimates within two standard deviations; a smaller share means that a fault made them wrong (calibration: tests/integration/restart.rs)
 TOO_LATE_S, STEP_S = 0.1, 600.0
 
 

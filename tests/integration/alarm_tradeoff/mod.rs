@@ -26,7 +26,7 @@ const HEALTHY: usize = 100;
 /// Seeds: the n-th ageing life has `AGEING_SEED + n`, the n-th healthy one `HEALTHY_SEED + n`.
 const AGEING_SEED: u64 = 1_000;
 const HEALTHY_SEED: u64 = 5_000;
-/// Ageing and healthy lives that every test run judges.
+/// Numbers of ageing and of healthy lives that every test run judges.
 const QUICK: (usize, usize) = (6, 3);
 
 const WRITE: &str = "PACKWATCH_WRITE_TRADEOFF";

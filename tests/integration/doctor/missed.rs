@@ -48,7 +48,7 @@ fn second_bus(broken: &mut BrokenPack, on: &str) {
     });
 }
 
-/// Adds the pack's own voltage: `by` times the number of cells times the first cell's mean.
+/// Adds a signal of the pack voltage, whose value is `by` times the number of cells times the first cell's mean voltage.
 fn pack_voltage(broken: &mut BrokenPack, by: f64) {
     let cells = if broken.bench == Pack96 { 96.0 } else { 12.0 };
     let (mut sum, mut n) = (0.0, 0.0);
@@ -61,7 +61,7 @@ fn pack_voltage(broken: &mut BrokenPack, by: f64) {
     broken.data("100", |data| data[2..4].copy_from_slice(&code.to_le_bytes()));
 }
 
-/// Adds two states of charge: the pack's own of 80 %, and the dashboard's.
+/// Adds two signals of the state of charge: that of the BMS, which is 80 %, and that of the dashboard, `dash`.
 pub(crate) fn two_socs(broken: &mut BrokenPack, dash: u8) {
     broken.dbc(
         "CM_ \"Example",

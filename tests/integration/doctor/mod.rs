@@ -1,5 +1,5 @@
 //! Tests `packwatch doctor` against injected faults. Healthy packs are simulated with several configurations, scenarios
-//! and seeds; then the configuration, the DBC or the log is broken in one way. The first finding must be the right one.
+//! and seeds. Then one fault is put into the configuration, the DBC or the log. The first finding must be the right one.
 //! On healthy packs the doctor must find nothing.
 //!
 //! `faults` is the table: name, how to break the pack, expected first finding, proposed line.
