@@ -202,7 +202,8 @@ fn wants_openmetrics(headers: &HeaderMap) -> bool {
 }
 
 impl StatusSource {
-    /// Reads the daemon's status; `None` = no status was received in time. A change between the two is logged.
+    /// Reads the daemon's status; `None` = no status was received in time. Logs when the daemon starts or stops
+    /// answering.
     async fn read(&self) -> Option<StatusDocument> {
         let line = timeout(STATUS_LIMIT, self.line()).await.unwrap_or_else(|late| Err(late.into()));
         let document = line.map_err(|error| explain(&self.path, &error)).and_then(|line| parse(&line));

@@ -33,7 +33,7 @@ fn needs_attention(alarm: &Alarm) -> bool {
     }
 }
 
-/// Keeps the alarms that fit into an answer, raised alarms first. Returns the number of omitted alarms.
+/// Keeps as many alarms as fit into an answer, raised alarms first. Returns the number of omitted alarms.
 fn shorten(alarms: &mut Vec<Alarm>) -> usize {
     let omitted = alarms.len().saturating_sub(MAX_LISTED);
     if omitted > 0 {
@@ -70,7 +70,7 @@ fn describe(which: &Selector) -> String {
     if words.is_empty() { "\"all\"".to_owned() } else { words.join(", ") }
 }
 
-/// Computes the outcome of a command from its events and from the alarms after the command. The caller sets
+/// Computes the outcome of a command from the command's events and from the alarms after the command. The caller sets
 /// `is_stored`.
 ///
 /// # Errors

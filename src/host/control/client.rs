@@ -10,9 +10,9 @@ use serde::Deserialize;
 use super::protocol::{Request, contents};
 use super::standard_path;
 
-/// Longest wait for a list. A daemon answers between two ticks, so a daemon that needs longer hangs.
+/// Longest wait for a list of alarms. The daemon answers between two ticks, so a daemon that needs longer is hanging.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// Longest answer, bytes. It is ten times the size of a thousand alarms of 400 bytes.
+/// Longest answer, bytes: ten times the size of an answer with 1,000 alarms of 400 bytes each.
 const MAX_ANSWER_BYTES: u64 = 4 << 20;
 
 /// A daemon's control socket.
@@ -53,7 +53,8 @@ impl ControlClient {
         let mut stream = UnixStream::connect(&self.path)?;
         stream.set_read_timeout(Some(patience(request)))?;
         stream.set_write_timeout(Some(PATIENCE))?;
-        // A daemon without a free slot may already have answered and closed the connection.
+        // Writing may fail because a daemon without a free slot has already answered and closed the connection. Its
+        // answer is then read.
         let written = stream.write_all(request.to_line().as_bytes());
         let mut line = Vec::new();
         BufReader::new(stream.take(MAX_ANSWER_BYTES)).read_until(b'\n', &mut line)?;

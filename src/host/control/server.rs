@@ -16,7 +16,8 @@ use crate::io::event_log::command_words;
 use crate::io::place::PlaceSetting;
 use crate::io::unix_socket::{BoundSocket, SocketFile, bind};
 
-/// Pause after a connection could not be accepted because no descriptor is left. An immediate retry would fail too.
+/// Pause after a connection could not be accepted because the process has no free file descriptor. An immediate retry
+/// would fail too.
 const ACCEPT_PAUSE: Duration = Duration::from_secs(1);
 
 /// A request on its way to the loop.
@@ -28,7 +29,7 @@ pub struct PendingRequest {
     pub answer: oneshot::Sender<Answer>,
 }
 
-/// The running socket. Dropping this closes it and deletes its file.
+/// The running socket. When it is dropped, the socket is closed and its file is deleted.
 #[derive(Debug)]
 pub struct ControlServer {
     _tasks: JoinSet<()>,
@@ -56,7 +57,7 @@ impl ControlServer {
         requests: mpsc::Sender<PendingRequest>,
         max_silence: Duration,
     ) -> std::io::Result<Self> {
-        // This is the daemon's own user, as the kernel reports it for a peer.
+        // The kernel reports the daemon's own user in the same way as the user of a client.
         let own_uid = UnixStream::pair()?.0.peer_cred()?.uid();
         tracing::info!(path = %bound.file.path.display(), "control socket open");
         let mut tasks = JoinSet::new();
@@ -104,7 +105,7 @@ async fn accept(listener: UnixListener, context: ConnectionContext) {
     }
 }
 
-/// Rejects a connection. The reason is sent only if this does not block.
+/// Rejects a connection. The reason is sent only if sending does not block.
 fn refuse(stream: &UnixStream) {
     tracing::warn!(limit = MAX_CONNECTIONS, "connection to the control socket rejected: too many at once");
     let error = format!("{MAX_CONNECTIONS} connections are open, which is the limit; try again later");

@@ -39,7 +39,7 @@ pub struct ChannelReport {
     pub protection: Option<StatusCounts>,
     /// Frames dropped by the kernel.
     pub dropped: u64,
-    /// Why listening ended early; `None` = it did not.
+    /// Why listening ended before the end of the test; `None` = it did not end early.
     pub error: Option<String>,
 }
 
@@ -63,12 +63,13 @@ pub struct ObservedFrames {
 }
 
 impl ChannelReport {
-    /// Whether the test arrived on this interface.
+    /// Whether at least one test frame arrived on this interface, listening did not end early, and no frame was damaged
+    /// or missing.
     pub fn is_good(&self) -> bool {
         self.observed.tests > 0 && self.error.is_none() && self.is_intact()
     }
 
-    /// Whether every frame was intact and no frame was missing. It is true for unprotected frames.
+    /// Whether no frame was damaged or missing. It is also true if the frames are not protected.
     pub fn is_intact(&self) -> bool {
         let good = [Status::Ok, Status::Initial];
         self.protection.is_none_or(|counts| counts.iter().all(|(status, count)| count == 0 || good.contains(&status)))
@@ -149,7 +150,7 @@ impl ObservedFrames {
     }
 }
 
-/// Runs the test. `SIGINT` and `SIGTERM` end it early, also in the daemon.
+/// Runs the test. `SIGINT` and `SIGTERM` end the test early; the daemon then also stops sending it.
 ///
 /// # Errors
 /// Fails if no alarm frame is configured, an interface cannot be opened, or the daemon refuses.

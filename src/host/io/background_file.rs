@@ -63,7 +63,7 @@ impl BackgroundFile {
         Ok(Self { piece: Vec::with_capacity(PIECE_BYTES), pieces: Some(pieces), writer: Some(writer) })
     }
 
-    /// Writes the remaining bytes, synchronises the file to disk and waits for both.
+    /// Writes the remaining bytes, synchronises the file to disk, and waits until this is done.
     ///
     /// # Errors
     /// Returns the first error of any write.
@@ -102,7 +102,7 @@ impl BackgroundFile {
     }
 }
 
-/// Waits up to [`MAX_FINISH`] for a thread to end; returns whether it has ended.
+/// Waits for a thread to end, but at most [`MAX_FINISH`]. Returns whether the thread has ended.
 pub fn ends_in_time<T>(thread: &JoinHandle<T>) -> bool {
     let began = Instant::now();
     while !thread.is_finished() {

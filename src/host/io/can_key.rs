@@ -1,8 +1,8 @@
 //! Reads the key of authenticated frames once at the start, from a systemd credential or a file. The key is never
 //! shown.
 //!
-//! In: the key's location. Out: AES-128-CMAC of any bytes. A key that is missing, or that other users can read, is an
-//! error. So is a key that does not have 16 bytes or 32 hex digits. The error does not contain the key.
+//! In: the location of the key. Out: the AES-128-CMAC of given bytes. It is an error if the key is missing, if other
+//! users can read it, or if it does not have 16 bytes or 32 hex digits. The error never contains the key.
 
 use std::ffi::OsString;
 use std::fmt;

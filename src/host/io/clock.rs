@@ -1,16 +1,18 @@
 //! A clock that never steps: wall time at the program's start plus CLOCK_BOOTTIME since the start (which counts
 //! suspend).
 //!
-//! The kernel stamps received frames with CLOCK_REALTIME, which steps (NTP, a clock set by hand), or with the adapter's
-//! own clock, whose origin is arbitrary. [`StampMapper`] maps both to the program's clock:
+//! The kernel stamps received frames with CLOCK_REALTIME, or with the adapter's own clock. CLOCK_REALTIME may step
+//! (NTP, a clock set by hand). The origin of the adapter's clock is arbitrary. [`StampMapper`] converts both kinds of
+//! stamps to the program's clock:
 //!
-//! * A software stamp becomes `stamp - (realtime - boottime)`, with this difference measured when the frame is read.
-//!   Around a step of the clock, the previous difference is tried too, and the later of the plausible times is used. If
-//!   neither difference gives a plausible time, the time of reading replaces the stamp.
-//! * A time is plausible if it is after the socket was last found empty and before the frame was read. This interval
-//!   therefore bounds the error of any stamp, and the distortion of time differences by a step.
-//! * A hardware stamp becomes `stamp + offset`. The offset is the smallest recent (arrival - stamp), because queueing only
-//!   adds to it. Old values are forgotten, so that the offset follows the drift of the adapter's quartz.
+//! * A software stamp becomes `stamp - (realtime - boottime)`. This difference is measured when the frame is read.
+//!   Around a step of the clock, the difference that was measured before the step is tried too. If both give a
+//!   plausible time, the later one is used. If neither does, the time of reading replaces the stamp.
+//! * A time is plausible if it is not after the reading of the frame, and not before the socket was last found empty
+//!   (with a small tolerance). The length of this interval therefore bounds the error of any stamp.
+//! * A hardware stamp becomes `stamp + offset`. The offset is the smallest recent value of `arrival - stamp`, because
+//!   queueing can only increase this value. Old values are forgotten, so that the offset follows the drift of the
+//!   adapter's quartz.
 //!
 //! Times of one interface never go backwards. All functions except the clock readings are pure: tests pass their own clock.
 
@@ -21,8 +23,8 @@ use nix::time::{ClockId, clock_gettime};
 
 use crate::quantity::Timestamp;
 
-/// Half of the time for which the smallest hardware offset is kept, ns. During this time, a quartz with an error of 100
-/// ppm drifts by 1 ms.
+/// Half of the time for which the smallest offset of a hardware stamp is remembered, ns. In this time, a quartz with an
+/// error of 100 ppm drifts by 1 ms.
 const HARDWARE_WINDOW_NS: i64 = 10_000_000_000;
 
 /// Maximum number of readings of the wall clock for one [`Reading`].
@@ -43,8 +45,9 @@ impl Reading {
         Self::between(nanos_of)
     }
 
-    /// Reads the wall clock between two readings of the boot clock, and keeps the attempt in which they are closest. On a busy
-    /// processor this thread may wait for milliseconds between two calls, which would falsify the clocks' difference.
+    /// Reads the wall clock between two readings of the boot clock. Several attempts are made, and the attempt with the
+    /// smallest distance between these two readings is kept. The reason: on a busy processor this thread may wait for
+    /// milliseconds between two calls, which would falsify the difference of the clocks.
     fn between(clock: impl Fn(ClockId) -> i64) -> Self {
         let read = || {
             let before_ns = clock(ClockId::CLOCK_BOOTTIME);
@@ -120,7 +123,7 @@ pub struct StampMapper {
     clock: MappedClock,
     /// Boot time when the socket was last found empty, ns.
     emptied_ns: i64,
-    /// Wall time minus boot time at that moment, ns.
+    /// Wall time minus boot time when the socket was last found empty, ns.
     emptied_offset_ns: i64,
     hardware: HardwareClock,
     latest: Timestamp,

@@ -36,7 +36,7 @@ pub struct CsvOptions {
 pub struct RowTime {
     /// Time of the row.
     pub time: Timestamp,
-    /// Whether the time between this row and the previous row is unknown.
+    /// Whether an unknown time has passed between this row and the previous row.
     pub after_unknown_gap: bool,
 }
 

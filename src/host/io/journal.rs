@@ -15,11 +15,11 @@
 //! RELOAD (1700000000.600000000)
 //! ```
 //!
-//! `SECURED` is a frame of an authenticated message. Its last field is the freshness value that made the authenticator
-//! valid (`-`: not valid), so a replay needs no key. `RELOAD` means that another configuration applies after this line;
-//! the journal does not contain it. `RESTORE` is the first line of a run that restored a stored state, with the
-//! downtime (`-`: the stamps give it). If the last line has no line feed, a power cut has torn it. It counts as a bad
-//! line, even if it can be parsed.
+//! `SECURED` is a frame of an authenticated message. Its last field is the freshness value with which the authenticator
+//! was valid (`-`: the authenticator was not valid), so a replay needs no key. `RELOAD` means that another
+//! configuration applies after this line. The journal does not contain this configuration. `RESTORE` is the first line
+//! of a run that restored a stored state. It contains the downtime (`-`: the downtime follows from the stamps). If the
+//! last line has no line feed, a power cut has torn it. Such a line counts as a bad line, even if it can be parsed.
 
 use std::io::{self, Write};
 

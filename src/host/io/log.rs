@@ -1,10 +1,10 @@
 //! Reads logs of any format as one stream of core inputs: journals, candump logs and CSV, uncompressed or as gzip or
 //! zstd.
 //!
-//! The first line decides the format (CSV also by file name). Several logs are read one after another on one clock. A
-//! log, or a CSV section without a start time, may begin before the latest record already read. In this case, an
-//! unknown gap follows that record, and the log or section is moved to one second after it. [`LogCounts`] counts
-//! everything that does not become a record.
+//! The first line decides the format; for CSV, the file name decides too. Several logs are read one after another on
+//! one clock. A log, or a CSV section without a start time, may begin before the latest record that was already read.
+//! The log or section is then moved so that it begins one second after this record, and an unknown gap precedes it.
+//! [`LogCounts`] counts everything that does not become a record.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
@@ -230,8 +230,8 @@ impl LogSource {
         }
     }
 
-    /// Reads the next records, at least one: the records that are available without reading more of the file. Returns
-    /// `false` at the end of the last log.
+    /// Reads the next records, at least one. Returns the records that are available without reading more of the file.
+    /// The result is `false` at the end of the last log.
     ///
     /// # Errors
     /// Fails like [`next_record`](Self::next_record), after all records before the error were returned.

@@ -1,5 +1,5 @@
-//! Unix sockets and their files. The socket file of a daemon that has ended is replaced; that of a running daemon is
-//! kept.
+//! Unix sockets and their files. If the daemon of a socket file has ended, the file is replaced. If this daemon is
+//! running, the file is kept.
 
 use std::fs::Permissions;
 use std::io::{self, ErrorKind};

@@ -1,14 +1,14 @@
 //! Processes many items on several threads and returns the results in the order of the items.
 //!
 //! Promise: the memory for waiting results depends on the number of threads, not on the number of items. No thread
-//! starts an item far beyond the first unfinished item.
+//! starts an item far beyond the first item that is not finished.
 
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Mutex, PoisonError};
 use std::thread;
 
-/// Number of items per thread that may be started beyond the first unfinished item. It is above 1, so that a long item
-/// does not stop the other threads soon.
+/// Number of items per thread that may be started beyond the first unfinished item. It is larger than 1, so that the
+/// other threads can continue for some time while one thread processes a long item.
 const AHEAD: usize = 4;
 
 /// Items that are not yet started, and the queue of receivers for their results, in the same order.

@@ -64,9 +64,9 @@ pub struct CounterBaseline {
 }
 
 impl CounterBaseline {
-    /// Returns the counts of a monitor that has just restored a state, or zeros if the monitor has restored none.
-    /// Events of the same tick count as events of the earlier runs, for example an alarm about an input that is missing
-    /// after the downtime.
+    /// Returns the counts of a monitor that has just restored a state, or zeros if it has restored none. Events of the
+    /// tick that restored the state count as events of the earlier runs. An example is an alarm about an input that is
+    /// missing after the downtime.
     pub fn of(monitor: &Monitor) -> Self {
         let mut statistics = monitor.statistics().clone();
         if statistics.restores == 0 {
@@ -127,7 +127,8 @@ impl Sources<'_> {
             alarms: alarms(monitor),
             counters: StatusCounters {
                 core,
-                // Interfaces are counted by index, so a changed order of interfaces would mix up their counts.
+                // The counts are stored per interface number. If the order of the interfaces were changed, counts of
+                // different interfaces would be mixed.
                 lifetime: Statistics { buses: Vec::new(), ..monitor.statistics().clone() },
                 readings: monitor.reading_counts().since(&before.readings),
                 time_backwards: monitor.time_backwards().saturating_sub(before.time_backwards),

@@ -1,4 +1,5 @@
-//! Counters of the loop and of the status clients, and the latency of frames. All are plain numbers that the loop owns.
+//! Counters of the loop and of the status clients, and the latency of frames. The counters are plain numbers that the
+//! loop owns.
 //!
 //! In: the lateness of ticks and the latency of frames, s. Out: structs of the status document. Nothing is allocated or
 //! locked per frame.
@@ -49,8 +50,8 @@ impl Latency {
         self.sum_s += seconds;
     }
 
-    /// The smallest bound that at least this share of the frames does not exceed, s. `None` = there are no frames, or
-    /// the bound would be above the last one.
+    /// Returns the smallest upper bound of a bucket that at least the fraction `share` of all frames does not exceed,
+    /// s. `None` = there are no frames, or the result would be in the last, unbounded bucket.
     pub fn quantile_s(&self, share: f64) -> Option<f64> {
         let wanted = (share * self.frames as f64).ceil().max(1.0);
         let mut so_far = 0;

@@ -164,8 +164,8 @@ pub struct AlarmStatus {
 }
 
 impl AlarmStatus {
-    /// Whether there are thresholds and all of them can be evaluated. If it is true and no alarm is raised, all is
-    /// well.
+    /// Whether there are thresholds and all of them can be evaluated. If so, and if no alarm is raised, the pack has no
+    /// known problem.
     pub fn are_judged(&self) -> bool {
         self.thresholds > 0 && self.unknown.is_empty()
     }
@@ -177,9 +177,9 @@ impl AlarmStatus {
     }
 }
 
-/// Counters. All of them start at 0 with the program (also the counters of interfaces, protected messages, controllers
-/// and floods), except `lifetime`. The reason: a stored count may be a minute old after a power cut, but readers that
-/// sum differences need counters that never decrease.
+/// Counters. All counters start at 0 when the program starts, including those of interfaces, protected messages,
+/// controllers and floods. The only exception is `lifetime`. The reason: after a power cut, a stored count may be a
+/// minute old, but readers that sum differences need counters that never decrease.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StatusCounters {
     /// Counters of the core.

@@ -1,8 +1,8 @@
 //! Rows that wait for the disk, in limited memory.
 //!
 //! In: batches of rows. Out: the same batches, oldest first. If there is no room, the oldest half-cycles are dropped
-//! first, because they are details. Then the oldest other rows are dropped. Dropped rows are counted, and the count is
-//! written with the next rows.
+//! first, because they are details. After the half-cycles, the oldest other rows are dropped. Dropped rows are counted,
+//! and the count is written with the next rows.
 
 use std::collections::VecDeque;
 
@@ -19,7 +19,7 @@ pub(super) struct Backlog {
     batches: VecDeque<RowBatch>,
     rows: usize,
     lost: LossCount,
-    /// The losses that the rows taken last report.
+    /// The losses that are reported with the rows taken last.
     reported: LossCount,
 }
 

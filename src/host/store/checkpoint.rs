@@ -1,14 +1,16 @@
 //! Decides when the next checkpoint of the state is due. A checkpoint writes the whole state, and flash memory wears out.
 //!
-//! In: the bytes and the time of each commit. Alarm changes and learned results are never delayed. They delay the
-//! checkpoints instead. A pack of 96 cells (70 kB) gets a checkpoint every 7 minutes, a pack of 12 cells every minute.
+//! In: the bytes and the time of each commit. Alarm changes and learned results are written at once. The bytes that
+//! they write delay the next checkpoint. A pack of 96 cells (state of 70 kB) gets a checkpoint every 7 minutes, a pack
+//! of 12 cells every minute.
 
 use crate::quantity::Timestamp;
 
-/// Bytes of states written per day. In total 20 MB may be written per day; history and file system take the rest.
+/// Bytes written per day before checkpoints are delayed. In total 20 MB may be written per day; the rest is for the
+/// history and the file system.
 const BYTES_PER_DAY: f64 = 15e6;
-/// Bytes that a commit without a state writes: three pages of SQLite, first in its log and later in its file. Both are
-/// rounded up to whole pages of the system.
+/// Bytes that a commit without a state writes. SQLite writes three of its pages, first to its log and later to its
+/// file. Each write is rounded up to whole pages of the system.
 const COMMIT_BYTES: f64 = 8e3;
 /// Longest time without a checkpoint, s, regardless of what else was written.
 const MAX_PERIOD_S: f64 = 3600.0;
@@ -20,7 +22,7 @@ pub(super) struct CheckpointSchedule {
     period_s: f64,
     /// Time of the last state.
     last: Option<Timestamp>,
-    /// Bytes written beyond the daily rate, and the time for which this number holds.
+    /// Bytes written beyond the daily rate, and the time to which this number refers.
     ahead: (f64, Timestamp),
 }
 

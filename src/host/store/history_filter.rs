@@ -1,7 +1,8 @@
 //! Selects the events that the history keeps, and decides when they are committed.
 //!
 //! In: the events of one input. Out: rows to commit now, if any, and whether to write the state with them. Token
-//! buckets limit rows that change little; their times are those of the events. Only the debounce limits alarm changes.
+//! buckets limit the rows that differ little from earlier rows; these buckets use the times of the events. Rows of
+//! alarm changes are limited only by the debounce of the alarm rules.
 
 use std::collections::BTreeMap;
 
@@ -104,7 +105,7 @@ impl HistoryFilter {
         if may_go { std::mem::take(&mut self.deferred) } else { Vec::new() }
     }
 
-    /// Keeps the first and the last row of each cell's filter.
+    /// Defers a row. Only the first and the last deferred row of each cell's filter are kept.
     fn defer(&mut self, kind: EventKind) {
         let row = HistoryRow::Event(kind);
         let same: Vec<usize> = (0..self.deferred.len()).filter(|&at| self.deferred[at] == row).collect();
@@ -135,7 +136,8 @@ impl HistoryFilter {
             self.written_life.cycles = None;
         }
         if let EventKind::RemainingLife { cycles, cycles_low, .. } = *kind {
-            // Half of the interval's lower part is a little less than a standard deviation.
+            // The distance from the median to the lower end of the interval is a little less than two standard
+            // deviations, so half of it is used.
             return self.is_life_worth_writing(
                 cycles.zip(cycles_low).map(|(median, low)| (median, 0.5 * (median - low))),
                 now,

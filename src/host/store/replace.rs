@@ -44,7 +44,8 @@ pub fn replace_pack(path: &Path) -> Result<i64, String> {
     };
     // If the first attempt finds damage, the second attempt sets the database aside.
     let pack = replace().or_else(|_| replace())?;
-    // A state of a closed pack is not restored. If the database were lost, it would be restored, so it is deleted.
+    // A state of a closed pack is not restored. If the history were lost, the store would not know that the pack is
+    // closed, so the state is deleted.
     state_files::forget(path).map_err(|error| named(error.to_string()))?;
     Ok(pack)
 }

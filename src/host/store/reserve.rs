@@ -1,8 +1,8 @@
 //! Reserves disk space for the time when the disk is full. The reserve is a file, which is shortened step by step so
 //! that learned results and alarms can be stored. It is restored when the disk has room again.
 //!
-//! One step is enough for several commits. States without new rows do not use the reserve, but wait until the disk has
-//! room.
+//! One step provides room for several commits. A state without new rows does not use the reserve; it waits until the
+//! disk has room.
 
 use std::fs::{self, File};
 use std::io::{self, Write};

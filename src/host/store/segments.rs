@@ -1,10 +1,11 @@
 //! Segments of the history. A segment has the rows of a day, but at most about 10,000 rows. Rows are chained by hash.
 //!
-//! Every row has a number, counted across the tables. The hash of a segment is the SHA-256 chain over its rows,
-//! starting from the hash of the segment before. The hash reveals rows that were changed, removed, inserted or moved.
-//! The number of segments, stored separately, reveals segments cut off at the end. The oldest segments are deleted as a
-//! whole but keep their hashes, so the remaining ones can still be verified. A person who can write the file can
-//! recompute the whole chain. A copy of the chain's end that is kept elsewhere reveals this too ([`contradiction`]).
+//! Every row has a number, counted across the tables. The hash of a segment is a SHA-256 chain over its rows, which
+//! starts from the hash of the segment before. The hash reveals rows that were changed, removed, inserted or moved. The
+//! number of segments is stored separately; it reveals that segments at the end are missing. The oldest segments are
+//! deleted as a whole but keep their hashes, so the remaining segments can still be verified. A person who can write
+//! the file can recompute the whole chain. A copy of the chain's end that is kept elsewhere reveals this too
+//! ([`contradiction`]).
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -24,8 +25,8 @@ pub(super) type Hash = [u8; 32];
 
 /// Nanoseconds in a day.
 pub(super) const NS_PER_DAY: i64 = 86_400_000_000_000;
-/// Number of rows after which a segment ends, together with the batch that reaches this number. Deleting so many rows
-/// takes about 0.1 s.
+/// Number of rows after which a segment ends. The batch that reaches this number is still added to the segment.
+/// Deleting this many rows takes about 0.1 s.
 const MAX_ROWS: i64 = 10_000;
 
 /// A segment.

@@ -45,13 +45,13 @@ impl BootId {
     /// Marks the bus time of a replayed record, which has no boot.
     pub const REPLAY: Self = Self(*b"packwatch replay");
 
-    /// The current boot.
+    /// The boot of the running system.
     pub fn current() -> Self {
         // In a sandbox without the kernel's file (`ProcSubset=pid`), the unit passes the identity.
         let text = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").ok();
         let kernel = text.and_then(|text| Self::parse(&text));
         let variable = || std::env::var(BOOT_ID_VARIABLE).ok().and_then(|text| Self::parse(&text));
-        // Two unknown boots never count as equal.
+        // If the boot is unknown, the result never counts as equal to another unknown boot.
         kernel.or_else(variable).unwrap_or(Self::UNKNOWN)
     }
 

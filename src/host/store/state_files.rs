@@ -1,5 +1,5 @@
-//! The stored state: two files next to the database, which are written in turn, so that damage or a power cut costs at
-//! most the newer state.
+//! The stored state: two files next to the database, which are written in turn. Damage or a power cut therefore
+//! destroys at most the newer state.
 //!
 //! | file | contents |
 //! | --- | --- |
@@ -148,8 +148,8 @@ impl Formatter for Rounding {
     }
 }
 
-/// Rounds a number to nine digits, or to six decimals from 1,000 on. Whole numbers (identities) and large ones (times)
-/// stay exact.
+/// Rounds a number below 1,000 to nine digits, and a larger number to six decimals. Whole numbers (identities) and very
+/// large numbers (times) stay exact.
 fn rounded(value: f64) -> f64 {
     let text = match value.abs() {
         size if value.fract() == 0.0 || size >= 1e9 => return value,

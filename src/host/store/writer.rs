@@ -66,7 +66,7 @@ struct QueueState {
     state: Option<StateDocument>,
     /// Whether the state must be written.
     is_state_due: bool,
-    /// Whether the next state must not overwrite the stored one.
+    /// Whether the next state must not overwrite the stored state, which is set aside first.
     sets_aside: bool,
     ticket: u64,
     /// Whether the writer has work.
@@ -198,7 +198,8 @@ impl Writer {
     /// Writes until [`WriteQueue::stop`].
     pub(super) fn run(mut self) {
         self.reserve.make();
-        // If this fails, the database is opened again and the failure is reported then.
+        // If the vehicle cannot be written, the database is closed here. It is opened again later, and a failure is
+        // reported then.
         self.database = self.database.take().filter(|database| database.set_vehicle(&self.vehicle).is_ok());
         loop {
             let work = self.write_queue.take(self.retry.at);
@@ -225,8 +226,8 @@ impl Writer {
         }
     }
 
-    /// Writes rows and state. If this fails, they wait for the next attempt. Without a state nothing is written, but a
-    /// database that could not be opened before is opened if possible.
+    /// Writes rows and state. If this fails, they wait for the next attempt. Without a state, nothing is written. After
+    /// a failure, however, the database is opened if possible.
     fn write(
         &mut self,
         mut batches: Vec<RowBatch>,

@@ -1,7 +1,7 @@
 //! Converts the digits of a candump line several bytes at a time. The functions use lanes of a `u64` (first byte
 //! lowest), or loops that compile to vector instructions.
 
-/// 1 in every byte of a word, and the highest bit of every byte.
+/// A word with 1 in every byte. `HIGHS` has the highest bit of every byte.
 const ONES: u64 = 0x0101_0101_0101_0101;
 const HIGHS: u64 = 0x80 * ONES;
 
@@ -37,7 +37,7 @@ pub(super) fn eight_digits(text: u64) -> Option<i64> {
     lanes(text ^ (u64::from(b'0') * ONES), 0x76 * ONES).map(number::<1>)
 }
 
-/// Returns the lanes. Returns `None` if adding `wrong` brings any lane to 0x80 or more.
+/// Returns `lanes`. Returns `None` if the addition of `wrong` sets the highest bit of any lane (0x80 or more).
 #[inline(always)]
 fn lanes(lanes: u64, wrong: u64) -> Option<u64> {
     ((lanes | lanes.wrapping_add(wrong)) & HIGHS == 0).then_some(lanes)

@@ -1,9 +1,9 @@
 //! Parses candump lines.
 //!
 //! In: text that begins with a line; the parser ignores what follows the line feed. Out: the line, or the first
-//! position at which it violates the grammar. Nothing is allocated and nothing is read twice. Parts that nearly all
-//! lines have in common use fast paths, which convert several bytes at a time. These parts are: the same second as in
-//! the previous line, a known interface, and a payload of eight bytes.
+//! Nothing is allocated and nothing is read twice. Three parts are the same in nearly all lines: the second of the
+//! previous line, a known interface, and a payload of eight bytes. These parts have fast paths, which convert several
+//! bytes at a time.
 
 use super::digits::{HEX, eight_digits, eight_hex_bytes, six_decimals, word};
 use super::{Line, LineError};
@@ -12,13 +12,13 @@ use crate::quantity::{BusIndex, Timestamp};
 
 /// Largest 29-bit identifier, and the mask of an error frame's class bits.
 const MAX_EXTENDED: u32 = 0x1FFF_FFFF;
-/// Two words that match no line: they contradict each other where they overlap.
+/// Two words that match no line. The words overlap, and their overlapping bytes differ.
 const NO_HEAD: [u64; 2] = [0, u64::MAX];
 
 /// An interface with a name of up to seven bytes.
 #[derive(Debug, Clone, Copy)]
 struct Interface {
-    /// The name and the space after it; different names have different words.
+    /// The name and the space after it, as a word. Different names have different words.
     name: u64,
     /// Mask that selects the bytes of the name and the space in a word of text.
     mask: u64,
@@ -134,7 +134,7 @@ impl LineParser {
         Ok(time)
     }
 
-    /// Parses a stamp of any form and the space after it. Also returns the position after both.
+    /// Parses a stamp of any form and the space after it. Also returns the position after the space.
     #[inline(never)]
     fn other_stamp(&mut self, mut cursor: Cursor<'_>) -> Result<(Timestamp, usize), LineError> {
         let time = cursor.stamp()?;
@@ -150,8 +150,9 @@ impl LineParser {
     /// Parses the interface's name and the space after it. Returns the name, and its number if known.
     #[inline(always)]
     fn interface<'a>(&self, cursor: &mut Cursor<'a>) -> Result<(&'a [u8], Option<BusIndex>), LineError> {
-        // The position after the name depends on its length. If the name is compared with known names, the processor
-        // predicts this position; if its bytes were counted, the processor would wait.
+        // The position after the name depends on the name's length. When the name is compared with known names, the
+        // processor can predict this position. If the bytes were counted instead, the processor would have to wait for
+        // the count.
         let ahead = cursor.ahead().unwrap_or(&[0; 8]);
         let name = u64::from_le_bytes(*ahead);
         let is_known = |known: &&Interface| name & known.mask == known.name;
@@ -253,7 +254,8 @@ impl<'a> Cursor<'a> {
         Ok(Timestamp::from_nanos(if negative { -total } else { total }))
     }
 
-    /// Parses decimal digits. Returns the number, which saturates far above any stamp, and the count of digits.
+    /// Parses decimal digits. Returns the number and the count of digits. A number that is too large saturates at a
+    /// value far above any stamp.
     fn decimal(&mut self) -> (i64, usize) {
         let start = self.at;
         let mut value: i64 = 0;

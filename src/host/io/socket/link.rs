@@ -1,10 +1,10 @@
 //! One interface during the daemon's whole life. The link receives and sends, and continues when the interface goes
 //! down, is removed or returns. It reports every change as a [`BusEvent`]; no failure here ends the program.
 //!
-//! If the interface goes down, the socket is kept: it stays bound, so the first frame after the interface comes up is
-//! not lost. If the interface is removed, its socket is dead even if an interface of the same name returns, and a new
-//! one is opened. One task uses the socket for both directions, because the kernel hides the daemon's own frames only
-//! from the socket that sent them.
+//! If the interface goes down, its socket is kept and stays bound, so the first frame after the interface comes up
+//! again is not lost. If the interface is removed, its socket can no longer be used, even if an interface of the same
+//! name returns. A new socket is then opened. One task uses the socket for both directions, because the kernel hides
+//! the daemon's own frames only from the socket that sent them.
 
 use std::io;
 use std::sync::Arc;

@@ -1,8 +1,9 @@
 //! One SocketCAN raw socket. Its filters are set before it is bound, so it receives only wanted identifiers. It reads several
 //! frames with their stamps in one system call, and writes without blocking.
 //!
-//! The kernel's drop counter is read separately. A frame's control message contains the counter only after a later
-//! frame was received. The size of the control message changes with the first drop (see [`Slots`]).
+//! The kernel's drop counter is read separately, for two reasons. The control message of a frame contains the counter
+//! only after a later frame was received. In addition, the size of the control message changes with the first drop (see
+//! [`Slots`]).
 
 use std::cell::RefCell;
 use std::io::{self, IoSliceMut};
@@ -41,9 +42,9 @@ pub(super) struct RawRead {
     pub(super) stamps: KernelStamps,
 }
 
-/// Buffers of one call, which are reused. The kernel writes into each header how much space for control messages it
-/// used, and this becomes the space for the next frame in the same slot. The space is sufficient while every frame has
-/// a stamp. After a frame without a stamp, the headers are built again.
+/// Buffers of one call, which are reused. The kernel writes into each header how much space its control messages used.
+/// This number is also the space that the next frame in the same slot gets. The space is sufficient while every frame
+/// has a stamp. After a frame without a stamp, the headers are built again.
 struct Slots {
     headers: MultiHeaders<()>,
     bytes: [[u8; FD_BYTES]; CALL_BATCH],

@@ -1,7 +1,7 @@
 //! Signals in the DBC files that are not configured but can be compared with configured ones.
 //!
-//! In: the DBC files and the configured signals. Out: signals that, according to name and unit, are the pack's voltage or a state
-//! of charge. They are bound to every interface, because a DBC does not state its bus.
+//! In: the DBC files and the configured signals. Out: signals that measure the pack's voltage or a state of charge,
+//! according to their names and units. Each signal is bound to every interface, because a DBC does not state its bus.
 
 use crate::can::dbc::{Message, Signal};
 use crate::can::decode::Binding;
