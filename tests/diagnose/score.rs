@@ -76,7 +76,7 @@ impl Score {
         delays.get(at).map_or_else(|| "-".to_owned(), |days| format!("{days:.1}"))
     }
 
-    /// False findings per pack-month, and the upper end of the one-sided 95 % interval of their rate.
+    /// False findings per pack-month, and the upper end of the one-sided 95 % interval of this rate.
     fn false_rate(&self) -> String {
         let months = self.healthy_days / MONTH_DAYS;
         if months <= 0.0 {

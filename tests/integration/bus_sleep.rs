@@ -1,5 +1,5 @@
-//! If all buses of a parked vehicle fall silent at once, this is not a fault. Silence under load, or of a single input,
-//! is a fault.
+//! If all buses of a parked vehicle fall silent at once, the silence is not a fault. Silence under load is a fault, and
+//! so is the silence of a single input.
 
 use packwatch::alarm::{Change, Rule};
 use packwatch::can::{CanId, Frame};

@@ -295,7 +295,7 @@ fn found(pack: &FaultyPack) -> Vec<(CellFaultKind, Option<(CellIndex, CellIndex)
     pack.monitor.findings().iter().map(|finding| (finding.kind, finding.cells)).collect()
 }
 
-/// A healthy cell's channel reads too high, so the BMS bleeds it below the others.
+/// The channel of a healthy cell reads too high, so the BMS bleeds this cell below the other cells.
 #[test]
 fn bled_cells_raise_no_leak() {
     use SensorQuality::{Good, Poor};

@@ -97,8 +97,8 @@ fn leaf_log_gives_values_of_its_answers() {
     assert!(controller["lost"].as_array().unwrap().iter().all(|lost| lost == 0), "{controller}");
 }
 
-/// The current rises while the answer with the cells is transmitted: their voltages belong to the current at its first
-/// frame.
+/// The current rises while the answer with the cells is transmitted. The cell voltages belong to the current at the
+/// time of the answer's first frame.
 #[test]
 fn answer_values_are_dated_to_first_frame() {
     let folder = tempfile::tempdir().unwrap();

@@ -1,7 +1,7 @@
 //! Build script: sets `cfg(measured_data)` if measured data are present. Otherwise the tests that need them are ignored
 //! (and counted as skipped).
 //!
-//! The folder is the one that `PACKWATCH_DATA` names, or `../shared/data` next to the project.
+//! `PACKWATCH_DATA` names the folder; the default is `../shared/data` next to the project.
 #![expect(clippy::print_stdout, reason = "Cargo reads the output of a build script")]
 
 use std::path::{Path, PathBuf};

@@ -46,7 +46,8 @@ fn uplink_gets_arguments_and_returns_exit_code() {
     let output = run(&program, &arguments, elsewhere.path());
     assert_eq!(String::from_utf8(output.stdout).unwrap(), "of-path\nmqtt\n-c\na b.toml\n--help\n--log=debug\n");
     assert_eq!(output.status.code(), Some(7));
-    // The uplink next to packwatch takes precedence over the one in PATH: it has the version of this packwatch.
+    // The uplink next to packwatch takes precedence over the uplink in PATH, because it has the same version as this
+    // packwatch.
     put_uplink(folder.path(), "beside");
     let output = run(&program, &["vss"], elsewhere.path());
     assert_eq!(String::from_utf8(output.stdout).unwrap(), "beside\nvss\n");

@@ -298,7 +298,7 @@ def compare_alarm(result, life, time, values, pending):
     threshold = name.replace("Value_", "Threshold_")
     factor = 100 if result.reader.signals["PACKWATCH_Alarm", name].unit == "%" else 1
     key = rule, cell, severity
-    # If there are more changes than the frame budget allows, they are sent one after another, each alarm in its current state.
+    # If there are more changes than the frame budget allows, they are sent one after another, each alarm in its present state.
     waiting = [(at, e) for at in pending if time - WAIT_NS <= at <= time for e in pending[at] if (e["rule"], e["cell"], e["severity"]) == key]
     at_once = waiting[-1][1] if waiting else None
     result.value(time, "Alarm", "Test", values["Test"], 0)

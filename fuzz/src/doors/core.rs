@@ -20,7 +20,7 @@ use super::world;
 const MAX_INPUTS: usize = 3000;
 /// Maximum number of cuts per execution. Each takes as long as some hundred inputs.
 const MAX_CUTS: usize = 100;
-/// Maximum number of outputs per input. The configuration has at most two cells and eleven rules.
+/// Maximum number of outputs per input. The configuration has three cells and 14 alarm rules.
 const MAX_OUTPUTS: usize = 2000;
 /// Inputs and cuts of all executions of this process, printed for tests/fuzz.
 static INPUTS: AtomicU64 = AtomicU64::new(0);

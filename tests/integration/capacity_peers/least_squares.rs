@@ -62,7 +62,7 @@ impl Peer {
 
     pub(crate) fn take(&mut self, swing: &Swing) {
         let Swing { x, x_variance, y_ah: y, y_variance } = *swing;
-        // WLS has errors in y only, so convert the errors in x to y with the current capacity estimate.
+        // WLS has errors in y only, so convert the errors in x to errors in y with the present capacity estimate.
         let y_variance = match self.method {
             Method::Wls => {
                 let q = if self.c[0] > 0.0 { self.c[1] / self.c[0] } else { y / x };

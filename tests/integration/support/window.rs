@@ -25,7 +25,7 @@ impl Uniform {
 }
 
 /// Writes the life to `to`, keeping only a random window of 40 to 70 % of each record. Time stamps are unchanged, so
-/// the rest becomes a gap of known length and unknown current.
+/// the removed rows become a gap of known length and unknown current.
 pub(crate) fn windowed(life: &Path, to: &Path, seed: u64, by: WindowUnit) {
     let file = std::io::BufReader::new(flate2::read::GzDecoder::new(std::fs::File::open(life).unwrap()));
     let mut reader = csv::Reader::from_reader(file);
