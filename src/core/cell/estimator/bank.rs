@@ -1,14 +1,15 @@
-//! The estimators of all cells of one type, stepped together.
+//! The estimators of all cells of one type. They are stepped together.
 //!
 //! In: one [`CellStep`] per cell and batch (V, A, s, degrees C). Out: a [`StepResult`] and estimates per cell.
 //!
-//! Almost every step is ordinary: the current was measured all the time since the last voltage, and the voltage is
-//! within the gate. The [`kernel`] makes these steps, [`WIDTH`] cells at a time, over structures of arrays; it selects
-//! wider instructions at run time (without the feature `wide`, cells are stepped one by one). All other
-//! steps are made from parts of the same kernel with one lane ([`SingleCell`]): a first voltage, a gap, no current, a reading
-//! beyond the gate, a covariance without a factor. The tests compare the kernel with the textbook filter: SOC within 1e-9
-//! over 100,000 steps. Which way a step is made depends on that cell alone, and a lane's bits do not depend on other lanes,
-//! so a cell's estimates do not depend on the other cells of the pack.
+//! Almost every step is ordinary: the current was measured for the whole time since the last voltage, and the voltage
+//! is within the gate. The [`kernel`] computes ordinary steps for [`WIDTH`] cells at a time, on structures of arrays.
+//! It selects wider instructions at run time (without the feature `wide`, cells are stepped one by one). All other
+//! steps use parts of the same kernel with one lane ([`SingleCell`]): a first voltage, a gap, an unknown current, a
+//! reading beyond the gate, a covariance without a Cholesky factor. The tests compare the kernel with the textbook
+//! filter: the SOC agrees within 1e-9 over 100,000 steps. The cell alone determines how its step is computed, and the
+//! bits of a lane do not depend on other lanes. Therefore, a cell's estimates do not depend on the other cells of the
+//! pack.
 
 mod filter_array;
 mod input;
@@ -40,7 +41,7 @@ pub struct EstimatorBank {
     plausible_ah: (f64, f64),
     filters: FilterArrays,
     cells: Vec<CellSlot>,
-    /// The steps of the batch. Inputs of absent cells are stale and not read.
+    /// The inputs of the batch. Inputs of cells that are not in the batch are old and are not read.
     inputs: Vec<BlockInput>,
     results: Vec<StepResult>,
     /// Cells of the batch whose step is not ordinary.
@@ -77,7 +78,7 @@ impl EstimatorBank {
         bank
     }
 
-    /// Replaces settings and tables for the same cells; the model must have as many branches.
+    /// Replaces settings and tables for the same cells. The new model must have the same number of branches.
     pub fn reconfigure(&mut self, model: &CellModel, config: &EstimatorConfig) {
         if (&self.model, &self.config) == (model, config) {
             return;
@@ -132,7 +133,7 @@ impl EstimatorBank {
         input.voltage_v.0[lane] = step.voltage_v;
     }
 
-    /// Makes the steps of the batch; [`Self::result`] returns their outcomes.
+    /// Computes the steps of the batch; [`Self::result`] returns their outcomes.
     pub fn step(&mut self) {
         #[cfg(feature = "wide")]
         let machine = self.machine;
@@ -172,12 +173,12 @@ impl EstimatorBank {
         self.cells[cell].has_filter
     }
 
-    /// State of charge of the filter, not widened by downtime and not bounded.
+    /// State of charge in the filter, without the uncertainty of downtime and without limits.
     pub fn filtered_soc(&self, cell: usize) -> Option<ScalarGaussian> {
         self.is_started(cell).then(|| self.marginal(cell, 0))
     }
 
-    /// State of charge, between empty and full; `None` before the first voltage.
+    /// State of charge, limited to 0 to 1; `None` before the first voltage.
     #[inline]
     pub fn soc(&self, cell: usize) -> Option<ScalarGaussian> {
         let CellSlot { memory, has_filter, .. } = &self.cells[cell];
@@ -189,7 +190,8 @@ impl EstimatorBank {
         })
     }
 
-    /// State of charge of the emptiest and the fullest cell; `None` if a cell has none yet, or none since a downtime.
+    /// State of charge of the emptiest and of the fullest cell. `None` if a cell has no SOC yet, or if a cell has had
+    /// no voltage since a downtime.
     pub fn extremes(&self) -> Option<(ScalarGaussian, ScalarGaussian)> {
         if !self.cells.iter().all(|cell| cell.has_filter && !cell.memory.is_carried_over()) {
             return None;
@@ -205,7 +207,7 @@ impl EstimatorBank {
         if *has_filter { self.marginal(cell, LOG_RESISTANCE) } else { memory.log_resistance }
     }
 
-    /// Branch voltages, V; NaN beyond the model's branches and before the first voltage.
+    /// Branch voltages, V; NaN for branches that the model does not have, and before the first voltage.
     pub fn branch_v(&self, cell: usize) -> [f64; MAX_BRANCHES] {
         self.cell(cell).branch_v()
     }
@@ -217,7 +219,7 @@ impl EstimatorBank {
         each_array!(&self.filters, x => x.blocks[block].memory[MEAN_NIS].0[lane])
     }
 
-    /// Whether a cell of the model can have this cell's SOC, resistance and capacity.
+    /// Whether this cell's SOC, resistance and capacity are plausible for a cell of the model.
     #[inline]
     pub fn is_plausible(&self, cell: usize) -> bool {
         let (block, lane) = (cell / WIDTH, cell % WIDTH);
@@ -238,7 +240,7 @@ impl EstimatorBank {
         (0..self.cells.len()).all(|cell| self.is_plausible(cell))
     }
 
-    /// Largest [`Self::mean_nis`] of all cells, not below 0; NaN counts as infinite.
+    /// Maximum of [`Self::mean_nis`] of all cells, at least 0; NaN counts as infinite.
     pub fn worst_nis(&self) -> f64 {
         let larger = |a: f64, b: f64| match () {
             () if b <= a => a,
@@ -257,7 +259,7 @@ impl EstimatorBank {
         self.cells[cell].memory.temperature_c
     }
 
-    /// Whether the SOC is from before a downtime or sleep, because no voltage has been used since.
+    /// Whether the SOC dates from before a downtime or sleep, because no voltage has been used since.
     pub fn is_carried_over(&self, cell: usize) -> bool {
         self.cells[cell].memory.is_carried_over()
     }
@@ -277,7 +279,7 @@ impl EstimatorBank {
         self.cells[cell].memory = *memory;
     }
 
-    /// Changes a cell's estimator.
+    /// Calls `change` with a cell's estimator and stores the changed estimator.
     pub fn change<R>(&mut self, cell: usize, change: impl FnOnce(&mut CellEstimator) -> R) -> R {
         let mut estimator = self.cell(cell);
         let result = change(&mut estimator);
@@ -285,9 +287,9 @@ impl EstimatorBank {
         result
     }
 
-    /// Evidence about the current sensor's offset since the last correction: sums of d^2 / R and of d x innovation / R, with d the
-    /// effect of one standard deviation of the offset on an innovation of variance R. Means over the cells, because their models
-    /// have common errors.
+    /// Evidence about the current sensor's offset since the last correction: (sum of d^2 / R, sum of d x innovation / R).
+    /// d is the effect of one standard deviation of the offset on an innovation, and R the variance of the innovation.
+    /// The sums are averaged over the cells, because the models of the cells have common errors.
     pub fn offset_evidence(&self) -> (f64, f64) {
         let cells = self.cells.len();
         let mean = |i: usize| {
@@ -298,7 +300,8 @@ impl EstimatorBank {
         (mean(OFFSET_INFORMATION), mean(OFFSET_SCORE))
     }
 
-    /// Corrects all cells by `deviations` standard deviations of the current's offset, which becomes known to `offset_std_a`.
+    /// Corrects all cells by `deviations` standard deviations of the current sensor's offset. Afterwards, the standard
+    /// deviation of the offset is `offset_std_a`.
     pub fn absorb_current_offset(&mut self, deviations: f64, offset_std_a: f64) {
         let before_a = self.config.sensor.current_offset_a;
         let remains = if before_a > 0.0 { offset_std_a / before_a } else { 1.0 };
@@ -306,13 +309,13 @@ impl EstimatorBank {
         self.set_current_offset_std(offset_std_a);
     }
 
-    /// Corrects every cell's slowest branch by the evidence since the last correction.
+    /// Corrects the ratio of every cell's slowest branch by the evidence since the last correction.
     pub fn learn_slow_branches(&mut self) {
         let config = self.config;
         self.change_all(|cell| cell.learn_slow_branch(&config));
     }
 
-    /// Sets the standard deviation of the current's offset, per cell, A.
+    /// Sets the standard deviation of the current sensor's offset per cell, A.
     pub fn set_current_offset_std(&mut self, offset_std_a: f64) {
         self.config.sensor.current_offset_a = offset_std_a;
         self.constants.sensor.current_offset_a = offset_std_a;
@@ -335,7 +338,7 @@ impl EstimatorBank {
     }
 }
 
-/// Smallest and largest plausible capacity, Ah, from the model's and the configured capacity.
+/// Minimum and maximum plausible capacity, Ah, from the model's capacity and the configured capacity.
 fn plausible_ah(model: &CellModel, config: &EstimatorConfig) -> (f64, f64) {
     let (model_ah, initial_ah) = (model.capacity_ah, config.initial.capacity_ah);
     (bounds::TRUSTED_CAPACITY.low * model_ah.min(initial_ah), bounds::TRUSTED_CAPACITY.high * model_ah.max(initial_ah))

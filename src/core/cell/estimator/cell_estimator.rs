@@ -1,4 +1,4 @@
-//! The estimator of one cell apart from its bank: rare steps, restarts, learning and estimates.
+//! The estimator of a single cell outside its bank: rare steps, restarts, learning and estimates.
 //!
 //! In: one [`CellStep`] per voltage reading. Out: a [`StepResult`], and estimates with their variances. A reading beyond
 //! the gate leaves the state unchanged; a step that cannot be computed restarts the filter.
@@ -20,7 +20,7 @@ use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES, SensorErrors};
 use crate::filter::ScalarGaussian;
 use crate::quantity::bounds;
 
-/// State in which a cell continues with another model.
+/// State from which a cell continues with another model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdoptedState {
     /// SOC, fraction; `None` = start from the next voltage.
@@ -48,7 +48,8 @@ impl CellEstimator {
         Self { filter: None, memory: Memory::new(config) }
     }
 
-    /// Makes a step that is not ordinary: predicts over the time since the last reading, then updates with the voltage.
+    /// Computes a step that is not ordinary: predicts over the time since the last reading, then updates with the
+    /// voltage.
     pub(super) fn rare_step(
         &mut self,
         mut kernel: SingleCell,
@@ -65,14 +66,14 @@ impl CellEstimator {
             self.start(model, config, &step);
         }
         if let (None, Some(x)) = (&result, &mut self.filter) {
-            // The correlation may have made the covariance indefinite.
+            // The step failed, possibly because the correlation made the covariance indefinite. Remove the correlation.
             x.correlate(LOG_RESISTANCE, CAPACITY, 0.0);
             x.by_constant.fill(0.0);
         }
         StepResult { update: result.flatten(), reset }
     }
 
-    /// `None` when the step cannot be computed.
+    /// Computes the step; `None` if this is not possible.
     fn try_step(
         &mut self,
         kernel: &mut SingleCell,
@@ -113,7 +114,7 @@ impl CellEstimator {
         Some(Some(update))
     }
 
-    /// Starts SOC and branches from the voltage; keeps the learned resistance and capacity.
+    /// Starts SOC and branches from the voltage. Keeps the learned resistance and capacity.
     fn start(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
         let first = self.filter.is_none();
         (self.memory.capacity, self.memory.log_resistance) = (self.capacity(), self.log_resistance());
@@ -125,7 +126,7 @@ impl CellEstimator {
             let load_v =
                 model.r0_ohm(&guess) * libm::exp(self.memory.log_resistance.mean) * step.current_a.unwrap_or(0.0);
             let temperature = model.temperature_position(temperature_c);
-            // A voltage just beyond the end of a flat curve could give any SOC.
+            // Limits the SOC, because near the end of a flat curve a small voltage error would give any SOC.
             model.soc_of_aged_ocv(&temperature, self.memory.curve.mean, step.voltage_v + load_v).clamp(-0.05, 1.05)
         });
         let soc = ScalarGaussian { mean: soc, variance: square(config.initial.soc_std).max(KNOWN_VARIANCE) };
@@ -137,7 +138,7 @@ impl CellEstimator {
             by_constant: self.learned_by_constant(),
         };
         self.filter = Some(Gaussian::at_start(soc, &branch_variance[..model.branches.len()], &kept));
-        // A restart does not restore trust; the window does.
+        // A restart does not make the estimate trusted again; only the window of the consistency monitor does.
         self.memory.mean_nis = self.memory.mean_nis.min(config.consistency.limit * std::f64::consts::E);
         self.memory.information_s = config.voltage.max_information_s;
         (self.memory.downtime_std, self.memory.used_prior, self.memory.noted_s) = (0.0, 0.0, 0.0);
@@ -145,7 +146,7 @@ impl CellEstimator {
         self.memory.is_soc_unknown = false;
     }
 
-    /// Continues with another `model` from a state found with that model; discards estimates of the old model.
+    /// Continues with another `model`, from a state that was found with it. Discards the estimates of the old model.
     pub fn adopt(&mut self, model: &CellModel, config: &EstimatorConfig, state: &AdoptedState) {
         let temperature_c = self.memory.temperature_c;
         self.memory.capacity = state.capacity;
@@ -174,14 +175,15 @@ impl CellEstimator {
             *variance += square(config.initial.log_resistance_std * branch_v(i));
         }
         let mut x = Gaussian::at_start(soc, &branch_variance[..model.branches.len()], &kept);
-        // Rounding must not make them more than fully correlated.
+        // Limits the correlation to 0.99, because rounding must not make it larger than 1.
         let most = 0.99 * (x.covariance[(0, 0)] * x.covariance[(CAPACITY, CAPACITY)]).sqrt();
         x.correlate(0, CAPACITY, state.soc_by_capacity.clamp(-most, most));
         (0..model.branches.len()).for_each(|i| x.mean[BRANCHES + i] = branch_v(i));
         self.filter = Some(x);
     }
 
-    /// Variance of each branch's voltage at a start, V^2. Under load, a usual load of unknown duration may have charged it.
+    /// Variance of each branch's voltage at a start, V^2. If the start is under load, a usual load of unknown duration
+    /// may have charged the branches.
     fn first_branch_variance(
         &self,
         model: &CellModel,
@@ -202,7 +204,8 @@ impl CellEstimator {
         variance
     }
 
-    /// The sensor's temperature, else the thermal model's prediction from the last known temperature, degrees C.
+    /// The sensor's temperature. If it is unknown, the thermal model's prediction from the last known temperature.
+    /// Degrees C.
     fn temperature(&self, model: &CellModel, step: &CellStep) -> f64 {
         step.temperature_c.unwrap_or_else(|| {
             let soc = self.soc().map_or(0.5, |soc| soc.mean);
@@ -210,7 +213,7 @@ impl CellEstimator {
         })
     }
 
-    /// Handles a gap of unknown length: the SOC becomes unknown, the branches may have relaxed.
+    /// Handles a gap of unknown length: the SOC becomes unknown, and the branches may have relaxed.
     pub fn handle_unknown_gap(&mut self) {
         self.memory.end_downtime();
         (self.memory.rest_s, self.memory.is_unseen, self.memory.is_soc_unknown) = (0.0, true, true);
@@ -219,14 +222,14 @@ impl CellEstimator {
         }
     }
 
-    /// State of charge, between empty and full; `None` before the first voltage.
+    /// State of charge, limited to 0 to 1; `None` before the first voltage.
     pub fn soc(&self) -> Option<ScalarGaussian> {
         let soc = self.marginal(0)?;
         let variance = self.memory.downtime_std_if_any().map_or(soc.variance, |std| widened(soc.variance, square(std)));
         Some(within_bounds(ScalarGaussian { variance, ..soc }))
     }
 
-    /// Branch voltages, V; NaN beyond the model's branches and before the first voltage.
+    /// Branch voltages, V; NaN for branches that the model does not have, and before the first voltage.
     pub fn branch_v(&self) -> [f64; MAX_BRANCHES] {
         let mut branch_v = [f64::NAN; MAX_BRANCHES];
         if let Some(x) = &self.filter {
@@ -242,7 +245,7 @@ impl CellEstimator {
         self.marginal(LOG_RESISTANCE).unwrap_or(self.memory.log_resistance)
     }
 
-    /// Capacity in the filter's present state, Ah.
+    /// Capacity in the present state of the filter, Ah.
     pub fn capacity(&self) -> ScalarGaussian {
         self.marginal(CAPACITY).unwrap_or(self.memory.capacity)
     }
@@ -257,14 +260,15 @@ impl CellEstimator {
         self.filter.as_ref().map_or_else(SMatrix::zeros, rows)
     }
 
-    /// Corrects the state by `deviations` standard deviations of the current's offset. The offset's remaining standard deviation is
-    /// `remains` times the old one.
+    /// Corrects the state by `deviations` standard deviations of the current sensor's offset. The standard deviation of
+    /// the offset is multiplied by `remains`.
     pub fn absorb_current_offset(&mut self, deviations: f64, remains: f64) {
         (self.memory.offset_information, self.memory.offset_score) = (0.0, 0.0);
         self.absorb(CURRENT_OFFSET, deviations, remains);
     }
 
-    /// Corrects the slowest of several branches by the evidence since the last correction.
+    /// Corrects the ratio of the slowest branch by the evidence since the last correction, if the cell has several
+    /// branches.
     pub fn learn_slow_branch(&mut self, config: &EstimatorConfig) {
         if self.filter.as_ref().is_none_or(|x| x.states == BRANCHES + 1) {
             (self.memory.slow_branch.information, self.memory.slow_branch.score) = (0.0, 0.0);
@@ -274,7 +278,7 @@ impl CellEstimator {
         }
     }
 
-    /// Resistance of the slowest branch relative to the model's with the cell's resistance ratio.
+    /// Resistance ratio of the slowest branch, in addition to the resistance ratio of the cell.
     pub fn slow_ratio(&self, config: &EstimatorConfig) -> ScalarGaussian {
         let slow_branch = &self.memory.slow_branch;
         ScalarGaussian::from_std(slow_branch.ratio, slow_branch.std(config.sensor.slow_branch))
@@ -308,17 +312,18 @@ impl CellEstimator {
         self.memory.curve
     }
 
-    /// Change of the capacity estimate with the capacity of the open-circuit curve since the last restatement.
+    /// Derivative of the capacity estimate with respect to the capacity of the open-circuit curve, since the last call
+    /// of [`Self::restate_capacity`].
     pub fn capacity_by_curve(&self) -> f64 {
         let std_ah = self.memory.curve.std();
         let by_curve = |x: f64| if std_ah > 0.0 { -x / std_ah } else { 0.0 };
         self.filter.as_ref().map_or(0.0, |x| by_curve(x.by_constant[(CAPACITY, CURVE_CAPACITY)]))
     }
 
-    /// Replaces the capacity estimate and sets the open-circuit curve to this capacity (only at transitions). The state moves as if
-    /// the curve had been in use since the last call.
+    /// Replaces the capacity estimate and the capacity of the open-circuit curve by `capacity`. Called only at
+    /// transitions. The state is corrected as if the new curve had been used since the last call.
     ///
-    /// The filter's variance does not fall: the evidence since the last call may have had too much weight.
+    /// The variance of the filter does not fall, because the evidence since the last call may have had too much weight.
     pub fn restate_capacity(&mut self, capacity: ScalarGaussian) {
         self.memory.capacity = capacity;
         let before = self.memory.curve;
@@ -337,7 +342,7 @@ impl CellEstimator {
         x.covariance[(CAPACITY, CAPACITY)] += missing.max(0.0);
     }
 
-    /// Sets ln of the resistance relative to new for the filter's start.
+    /// Sets ln of the resistance relative to new, for the next start of the filter.
     pub fn relearn_resistance(&mut self, log_resistance: ScalarGaussian) {
         self.memory.log_resistance = log_resistance;
     }
@@ -351,12 +356,13 @@ impl CellEstimator {
         }
     }
 
-    /// Notes a sleep: the SOC counts as carried over until a voltage has been used.
+    /// Handles a sleep: the SOC counts as carried over until a voltage has been used.
     pub fn note_sleep(&mut self) {
         self.memory.is_unseen = self.filter.is_some();
     }
 
-    /// Adds a downtime of `downtime_s`: widens the SOC by the charge that may have been moved in either direction.
+    /// Adds a downtime of `downtime_s`: raises the uncertainty of the SOC by the charge that may have been moved in
+    /// either direction.
     pub fn note_downtime(&mut self, config: &EstimatorConfig, downtime_s: f64) {
         let downtime_s = downtime_s.max(0.0);
         self.memory.note_downtime(config.gap.away_use_per_s * downtime_s, USED_PRIOR);

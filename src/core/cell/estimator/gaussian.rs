@@ -1,7 +1,7 @@
-//! Mean and covariance of one cell's state, of any number of branches.
+//! Mean and covariance of one cell's state, for any number of branches.
 //!
-//! In and out: numbers in the units of the states. Inputs are not checked; [`Gaussian::is_possible`] says whether a cell can
-//! have the state.
+//! In and out: values in the units of the states. Inputs are not checked; [`Gaussian::is_possible`] says whether a cell
+//! can have the state.
 
 use nalgebra::{SMatrix, SVector};
 
@@ -17,7 +17,7 @@ pub(super) const MAX_STATES: usize = BRANCHES + MAX_BRANCHES;
 
 pub(super) type Covariance = SMatrix<f64, MAX_STATES, MAX_STATES>;
 
-/// Mean and covariance of a cell's state. Numbers beyond `states` are 0.
+/// Mean and covariance of a cell's state. Elements from index `states` on are 0.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Gaussian {
     /// Number of states: 3, and one per branch.
@@ -33,7 +33,7 @@ pub(super) struct Gaussian {
 pub(super) struct LearnedState {
     pub(super) log_resistance: ScalarGaussian,
     pub(super) capacity: ScalarGaussian,
-    /// Covariance of both without the constant errors.
+    /// Covariance of ln rho and the capacity, without the constant errors.
     pub(super) covariance: f64,
     /// Errors of ln rho and of the capacity caused by the constant errors.
     pub(super) by_constant: SMatrix<f64, 2, CONSTANT_ERRORS>,
@@ -79,8 +79,8 @@ impl Gaussian {
             && (0..self.states).all(|i| (1e-40..=bounds::NUMBER.high).contains(&self.covariance[(i, i)]))
     }
 
-    /// Corrects the mean by `deviations` standard deviations of a constant error. The error's remaining standard deviation is
-    /// `remains` times the old one.
+    /// Corrects the mean by `deviations` standard deviations of a constant error. The standard deviation of the error
+    /// is multiplied by `remains`.
     pub(super) fn absorb(&mut self, constant_error: usize, deviations: f64, remains: f64) {
         let column = self.by_constant.column(constant_error).into_owned();
         self.mean += column * deviations;
@@ -93,7 +93,8 @@ impl Gaussian {
         }
     }
 
-    /// Widens the state after a gap of unknown length: unknown SOC, branches anywhere between loaded and relaxed.
+    /// Raises the uncertainty after a gap of unknown length: the SOC is unknown, and the branches are anywhere between
+    /// loaded and relaxed.
     pub(super) fn widen_after_unknown_gap(&mut self) {
         self.covariance[(0, 0)] = widened(self.covariance[(0, 0)], UNKNOWN_SOC_VARIANCE);
         for i in BRANCHES..self.states {
@@ -102,7 +103,7 @@ impl Gaussian {
         }
     }
 
-    /// Drops all correlations of state `i` and its constant errors.
+    /// Removes all correlations of state `i` with other states and with the constant errors.
     pub(super) fn isolate(&mut self, i: usize) {
         let variance = self.covariance[(i, i)];
         self.covariance.row_mut(i).fill(0.0);
@@ -111,8 +112,8 @@ impl Gaussian {
         self.by_constant.row_mut(i).fill(0.0);
     }
 
-    /// Sets mean and covariance to the mixture with another Gaussian that has `weight`. Ignores the difference of their constant
-    /// errors, which is small compared with the difference of their means.
+    /// Replaces this Gaussian by its mixture with `other`, which has the weight `weight`. The difference between their
+    /// constant errors is ignored, because it is small compared with the difference between their means.
     pub(super) fn merge(&mut self, other: &Self, weight: f64) {
         let apart = other.mean - self.mean;
         let between = apart * apart.transpose();

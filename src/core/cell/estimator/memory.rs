@@ -1,4 +1,5 @@
-//! The estimator's memory: rest, load, consistency, rejected readings, and the estimates that survive a restart of the filter.
+//! The estimator's memory: rest, load, consistency, rejected readings, and the estimates that a restart of the filter
+//! keeps.
 //!
 //! In: steps (A, s) and the outcomes of updates. Out: the time that a reading stands for, s, the load, A, and whether the
 //! filter must restart. Stored numbers are checked ([`Memory::check`]).
@@ -19,14 +20,15 @@ const GAP_LOAD_PER_H: f64 = 1.0;
 /// Prior probability that a cell was used while the program did not run.
 pub(super) const USED_PRIOR: f64 = 0.2;
 
-/// The same for a gap with a load before or after it: the load continued or ended with equal probability.
+/// Prior probability of use in a gap with a load before or after it: the load continued or ended, with equal
+/// probability.
 const LOADED_PRIOR: f64 = 0.5;
 
-/// The same for a gap of at least half a day with rest on both sides: a charger may work without the bus, but a bus in use wakes its
-/// listeners.
+/// Prior probability of use in a gap of at least half a day with rest before and after it. A charger may work while the
+/// bus sleeps, but this is rare, because a bus in use wakes its listeners.
 const CHARGER_PRIOR: f64 = 0.05;
 
-/// Largest negligible standard deviation of the SOC by downtime, fraction.
+/// Downtime that adds at most this standard deviation to the SOC, fraction, is negligible.
 const NEGLIGIBLE_STD: f64 = 0.002;
 
 /// State of the estimator in addition to its filter.
@@ -40,23 +42,24 @@ pub(super) struct Memory {
     pub(super) log_resistance: ScalarGaussian,
     pub(super) temperature_c: Option<f64>,
     pub(super) last_current_a: f64,
-    /// |current| low-passed over `load_memory_s`, A: the load that still drives slow diffusion.
+    /// Low-pass of |current| with the time constant `load_memory_s`, A: the load that still drives slow diffusion.
     pub(super) load_a: f64,
     /// Mean normalised innovation squared over the consistency window.
     pub(super) mean_nis: f64,
-    /// Time that the next voltage reading stands for, s: the time since the last used reading.
+    /// Time that the next voltage reading represents, s: the time since the last used reading.
     pub(super) information_s: f64,
     /// Duration of the present rest, s.
     pub(super) rest_s: f64,
-    /// Information about the current sensor's offset since its last correction, in units of its standard deviation: sum of
-    /// d^2 / R, with d the offset's effect on an innovation of variance R without it.
+    /// Information about the current sensor's offset since its last correction, in units of its standard deviation: sum
+    /// of d^2 / R. d is the effect of the offset on an innovation; R is the variance of the innovation without this
+    /// effect.
     pub(super) offset_information: f64,
-    /// Evidence about the offset from the same voltages: sum of d x innovation / R.
+    /// Evidence about the current sensor's offset from the same voltages: sum of d x innovation / R.
     pub(super) offset_score: f64,
     pub(super) slow_branch: SlowBranch,
-    /// Standard deviation of the SOC change during downtime, until a voltage has been used.
+    /// Standard deviation of the SOC change during downtime. It counts until a voltage has been used.
     pub(super) downtime_std: f64,
-    /// Part of the coming unmeasured time that has been noted as downtime, s.
+    /// Part of the next unmeasured time that has already been noted as downtime, s.
     pub(super) noted_s: f64,
     /// Probability that the cell was used during the downtime.
     pub(super) used_prior: f64,
@@ -64,11 +67,11 @@ pub(super) struct Memory {
     pub(super) is_unseen: bool,
     /// The SOC is unknown after a gap of unknown length: the filter restarts from the next voltage.
     pub(super) is_soc_unknown: bool,
-    /// Consecutive readings beyond the gate.
+    /// Number of consecutive readings beyond the gate.
     pub(super) rejected: u32,
     /// Duration of the run of rejected readings, s.
     pub(super) rejected_s: f64,
-    /// The run started after a gap: then the gap is the cause, not the sensor.
+    /// Whether the run of rejected readings started after a gap. If so, the gap is the cause and not the sensor.
     pub(super) rejected_after_gap: bool,
 }
 
@@ -100,14 +103,15 @@ impl Memory {
         }
     }
 
-    /// Adds a downtime in which the cell was used with probability `used`, by up to `most`, fraction of SOC.
+    /// Adds a downtime. `used` is the probability that the cell was used; `most` is the maximum SOC change, fraction.
     pub(super) fn note_downtime(&mut self, most: f64, used: f64) {
         self.downtime_std = (self.downtime_std + most / 3.0_f64.sqrt()).min(1.0);
         self.used_prior = 1.0 - (1.0 - self.used_prior) * (1.0 - used);
     }
 
-    /// Notes the unmeasured time of a step: the load before or after it may have continued, or a charger may have been connected. The
-    /// next voltage decides about downtime. For a short load, returns the standard deviation of the SOC, fraction.
+    /// Notes the unmeasured time of a step. The load before or after this time may have continued through it, or a
+    /// charger may have been connected. The next voltage decides whether this happened. If the possible change is
+    /// small, it is not noted as downtime; its standard deviation (fraction of SOC) is returned instead.
     pub(super) fn note_gap(&mut self, config: &EstimatorConfig, step: &CellStep, capacity_ah: f64) -> f64 {
         let noted_s = std::mem::take(&mut self.noted_s).min(step.unmeasured_s);
         let adjacent_a = self.gap_load_a(config, step);
@@ -118,7 +122,7 @@ impl Memory {
         }
         let load_per_s = if is_loaded { adjacent_a / (3600.0 * capacity_ah) } else { 0.0 };
         let away_per_s = config.gap.away_use_per_s;
-        // Within an hour, slow relaxation would be mistaken for a charger.
+        // In gaps shorter than an hour, slow relaxation would be mistaken for a charger.
         let charger_per_s = if unnoted_s < 3600.0 { 0.0 } else { away_per_s };
         let most = load_per_s.max(charger_per_s) * step.unmeasured_s - away_per_s * noted_s;
         if most <= 0.0 {
@@ -134,7 +138,8 @@ impl Memory {
         0.0
     }
 
-    /// The load before or after a step's gap, A, which may have continued through the gap. 0 if a silent bus means rest.
+    /// The load before or after a step's gap, A, which may have continued through the gap. 0 if the cell counts as
+    /// resting while the bus is silent.
     fn gap_load_a(&self, config: &EstimatorConfig, step: &CellStep) -> f64 {
         if is_silent_rest(config, step) {
             return 0.0;
@@ -142,8 +147,8 @@ impl Memory {
         self.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs())
     }
 
-    /// Updates load and rest for the unmeasured time of a step, which follows its measured time. A gap with a load before or after it
-    /// counts as the heaviest usual load.
+    /// Updates load and rest for the unmeasured time of a step, which follows its measured time. If there was a load
+    /// before or after a gap, the gap counts as a load of at least 1 C.
     pub(super) fn pass_gap(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
         self.rest_s = 0.0;
         self.load_a *= libm::exp(-step.unmeasured_s / config.voltage.load_memory_s);
@@ -153,25 +158,26 @@ impl Memory {
         }
     }
 
-    /// Standard deviation of the SOC change during downtime, until a voltage has been used; `None` if negligible.
+    /// Standard deviation of the SOC change during downtime, if no voltage has been used since; `None` if it is
+    /// negligible.
     #[inline]
     pub(super) fn downtime_std_if_any(&self) -> Option<f64> {
         (self.downtime_std > NEGLIGIBLE_STD).then_some(self.downtime_std)
     }
 
-    /// Ends the downtime hypotheses: a voltage has resolved them.
+    /// Ends the downtime hypotheses, because a voltage has decided between them.
     #[inline]
     pub(super) fn end_downtime(&mut self) {
         (self.downtime_std, self.used_prior, self.noted_s, self.is_unseen) = (0.0, 0.0, 0.0, false);
     }
 
-    /// Whether the SOC is from before a downtime or sleep, because no voltage has been used since.
+    /// Whether the SOC dates from before a downtime or sleep, because no voltage has been used since.
     #[inline]
     pub(super) fn is_carried_over(&self) -> bool {
         self.is_unseen || self.downtime_std_if_any().is_some()
     }
 
-    /// Consistency monitor: exponentially forgotten mean of the normalised innovation squared.
+    /// Consistency monitor: mean of the normalised innovation squared, with exponentially decreasing weights.
     #[inline]
     pub(super) fn record_update(&mut self, config: &EstimatorConfig, step: &CellStep, update: &Update) {
         let elapsed_s = step.measured_s + step.unmeasured_s;
@@ -193,9 +199,9 @@ impl Memory {
     /// Whether the filter must restart, because too many consecutive readings were beyond the gate.
     #[inline]
     pub(super) fn has_lost_cell(&self, config: &EstimatorConfig) -> bool {
-        // One or two readings can be glitches.
+        // One or two readings can be outliers.
         let long_enough = self.rejected >= 3 && self.rejected_s >= config.gate.lost_after_s;
-        // After a gap the record is incomplete: two readings suffice.
+        // After a gap, the record is incomplete, so two readings suffice.
         long_enough || (self.rejected_after_gap && self.rejected >= 2)
     }
 
@@ -213,7 +219,7 @@ impl Memory {
         }
     }
 
-    /// Checks stored numbers; the error is the first impossible one.
+    /// Checks stored numbers. The error names the first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         InvalidState::unless_capacity("the capacity a cell's reset keeps", self.capacity.mean)?;
         check_log_resistance(self.log_resistance.mean)?;
@@ -247,7 +253,7 @@ impl Memory {
     }
 }
 
-/// Whether, by the configuration, the cells rested in the unmeasured time of a step.
+/// Whether, according to the configuration, the cell rested in the unmeasured time of a step.
 fn is_silent_rest(config: &EstimatorConfig, step: &CellStep) -> bool {
     // After 5 s without a current the bus counts as silent.
     config.gap.silence_is_rest && step.unmeasured_s > 5.0

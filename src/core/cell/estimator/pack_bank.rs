@@ -23,7 +23,7 @@ pub struct CellModule {
     pub is_given: bool,
 }
 
-/// Place of a cell's estimator.
+/// Where the estimator of a cell is stored.
 #[derive(Debug, Clone, Copy)]
 struct Place {
     bank: usize,
@@ -69,7 +69,7 @@ impl PackBank {
         }
     }
 
-    /// Replaces settings and tables for the same cells and modules; a model must have as many branches as before.
+    /// Replaces settings and tables for the same cells and modules. Each model must have as many branches as before.
     pub fn reconfigure(&mut self, model: &CellModel, config: &EstimatorConfig, modules: &[CellModule]) {
         self.banks[0].reconfigure(model, config);
         for (bank, module) in self.banks[1..].iter_mut().zip(modules) {
@@ -141,7 +141,7 @@ impl PackBank {
         self.at(cell).0.config()
     }
 
-    /// As [`EstimatorBank::add`].
+    /// Adds a step, see [`EstimatorBank::add`].
     ///
     /// # Panics
     /// If there is no such cell.
@@ -151,7 +151,7 @@ impl PackBank {
         bank.add(cell, step);
     }
 
-    /// As [`EstimatorBank::step`].
+    /// Makes the steps, see [`EstimatorBank::step`].
     pub fn step(&mut self) {
         self.banks.iter_mut().for_each(EstimatorBank::step);
     }
@@ -181,7 +181,7 @@ impl PackBank {
         bank.soc(cell)
     }
 
-    /// As [`EstimatorBank::extremes`], of all cells.
+    /// Like [`EstimatorBank::extremes`], for all cells of the pack.
     pub fn extremes(&self) -> Option<(ScalarGaussian, ScalarGaussian)> {
         let mut of_banks = self.banks.iter().filter(|bank| bank.cells() > 0).map(EstimatorBank::extremes);
         let first = of_banks.next()??;
@@ -258,7 +258,7 @@ impl PackBank {
         bank.change(cell, change)
     }
 
-    /// As [`EstimatorBank::offset_evidence`]: means over all cells.
+    /// Like [`EstimatorBank::offset_evidence`], averaged over all cells of the pack.
     pub fn offset_evidence(&self) -> (f64, f64) {
         let of_bank = |bank: &EstimatorBank| {
             let (share, (information, score)) = (bank.cells() as f64 / self.cells() as f64, bank.offset_evidence());

@@ -1,35 +1,40 @@
-//! Resistance of the slowest branch relative to the cell's other resistances: a ratio to the model, learned per cell.
+//! Learns, for each cell, the resistance ratio of the slowest branch, in addition to the resistance ratio of the whole
+//! cell.
 //!
-//! In: evidence from innovations. Out: the ratio and its standard deviation. Diffusion and the electrolyte vary between cells and
-//! age differently from the contacts and the charge transfer, which
-//! [`LOG_RESISTANCE`](super::state_vector::LOG_RESISTANCE) follows. A wrong slow voltage would be mistaken for charge.
+//! In: evidence from innovations. Out: the ratio and its standard deviation. Diffusion and the electrolyte determine
+//! the slowest branch. They vary between cells and age differently from the contacts and the charge transfer, whose
+//! resistance [`LOG_RESISTANCE`](super::state_vector::LOG_RESISTANCE) follows. A wrong voltage of the slowest branch
+//! would be mistaken for charge.
 //!
-//! Source: Friedland (1969), separate estimation of a bias, as for the current's offset ([`crate::health::offset`]). The ratio is
-//! corrected at changes of mode. The branch of a model with one branch covers all time constants; its ratio stays 1.
+//! Source: Friedland (1969), separate estimation of a bias, as for the offset of the current sensor
+//! ([`crate::health::offset`]). The ratio is corrected when the mode changes. If a model has a single branch, this
+//! branch covers all time constants, and its ratio stays 1.
 
 use serde::{Deserialize, Serialize};
 
 use crate::quantity::InvalidState;
 
-/// Smallest standard deviation, relative to the first one: the ratio changes with temperature and SOC, so evidence does not last.
+/// Minimum standard deviation, relative to the initial one. The ratio changes with temperature and SOC, so evidence
+/// does not last.
 const LEAST_PART: f64 = 0.5;
 
-/// Largest information between two corrections, relative to the information of the ratio's own standard deviation. The model's errors
-/// repeat from voltage to voltage, so many voltages hardly say more than one.
+/// Maximum information between two corrections, relative to the information 1 / variance of the ratio itself. The
+/// errors of the model repeat from voltage to voltage, so many voltages give hardly more information than one.
 const MAX_INFORMATION: f64 = 0.3;
 
-/// Smallest and largest ratio.
+/// Minimum and maximum ratio.
 const RANGE: (f64, f64) = (0.05, 3.0);
 
 /// The learned ratio, and the evidence since its last correction.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct SlowBranch {
-    /// Voltage of the slowest branch relative to the model's with the cell's resistance ratio.
+    /// Ratio of the slowest branch's voltage to the voltage of the model's branch with the cell's resistance ratio.
     pub(super) ratio: f64,
     /// Standard deviation of the ratio, relative to the configured one.
     pub(super) part: f64,
-    /// Sum of d^2 / R, with d the effect of one standard deviation on an innovation of variance R without it.
+    /// Sum of d^2 / R. d is the effect of one standard deviation of the ratio on an innovation; R is the variance of
+    /// the innovation without this effect.
     pub(super) information: f64,
     /// Sum of d x innovation / R.
     pub(super) score: f64,
@@ -39,9 +44,9 @@ pub(super) struct SlowBranch {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Correction {
     pub(super) deviations: f64,
-    /// Standard deviation after the evidence, relative to the one before.
+    /// Standard deviation after the evidence, divided by the standard deviation before it.
     pub(super) remains: f64,
-    /// New standard deviation, relative to the one after the evidence.
+    /// New standard deviation, divided by the standard deviation after the evidence.
     pub(super) widened: f64,
 }
 
@@ -52,13 +57,13 @@ impl Default for SlowBranch {
 }
 
 impl SlowBranch {
-    /// Standard deviation of the ratio; `configured` is the one before any evidence.
+    /// Standard deviation of the ratio. `configured` is its standard deviation before any evidence.
     #[inline]
     pub(super) fn std(&self, configured: f64) -> f64 {
         self.part * configured
     }
 
-    /// Corrects the ratio by the evidence and clears the evidence; `None` without evidence.
+    /// Corrects the ratio by the evidence, then clears the evidence. `None` if there is no evidence.
     pub(super) fn correct(&mut self, configured: f64) -> Option<Correction> {
         let (information, score) = (self.information, self.score);
         (self.information, self.score) = (0.0, 0.0);
@@ -66,7 +71,7 @@ impl SlowBranch {
         if !(information > 0.0 && information.is_finite() && score.is_finite() && std > 0.0) {
             return None;
         }
-        // Beyond two standard deviations of the expectation, something else is wrong.
+        // If the evidence deviates from its expectation by more than two standard deviations, it has another cause.
         let most = 2.0 * (information * (1.0 + information)).sqrt();
         let counted = information.min(MAX_INFORMATION) / information;
         let (information, score) = (counted * information, counted * score.clamp(-most, most));
@@ -80,7 +85,7 @@ impl SlowBranch {
         Some(correction)
     }
 
-    /// Checks stored numbers; the error is the first impossible one.
+    /// Checks stored numbers. The error names the first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         let (low, high) = RANGE;
         InvalidState::unless(

@@ -19,14 +19,14 @@ use crate::quantity::bounds;
 pub struct CellState {
     /// Mean of the filter's state in the order [SOC, U_1 .. U_n, ln rho, C]; empty before the first voltage.
     mean: Vec<f64>,
-    /// Covariance in that order, row by row.
+    /// Covariance in the same order, row by row.
     covariance: Vec<f64>,
     /// Errors of the state caused by the constant errors, state by state.
     by_constant: Vec<f64>,
     memory: Memory,
 }
 
-/// Index in the filter's state of the `i`-th of `n` numbers of the document.
+/// Index in the filter's state of the `i`-th of the `n` numbers in the document.
 const fn place_of(i: usize, n: usize) -> usize {
     match i {
         0 => 0,
@@ -43,7 +43,7 @@ impl CellEstimator {
         CellState { mean, covariance, by_constant, memory: self.memory }
     }
 
-    /// Restores a stored state; `None` if it has another number of branches.
+    /// Restores a stored state. `None` if it has a different number of branches.
     ///
     /// A covariance that rounding has made inconsistent loses its correlations and keeps its variances. A filter with an impossible
     /// SOC is discarded and starts from the next voltage.
@@ -82,7 +82,7 @@ fn document(x: &Gaussian) -> (Vec<f64>, Vec<f64>, Vec<f64>) {
     let n = x.states;
     let place = |i| place_of(i, n);
     let mean = (0..n).map(|i| x.mean[place(i)]).collect();
-    // A variance that has decayed to 0 is stored as the smallest one.
+    // A variance that has decayed to 0 is stored as the smallest allowed variance.
     let least = |i: usize| if i / n == i % n { bounds::VARIANCE.low } else { f64::NEG_INFINITY };
     let covariance = (0..n * n).map(|i| x.covariance[(place(i / n), place(i % n))].max(least(i))).collect();
     let by_constant =

@@ -1,4 +1,4 @@
-//! Layout of the estimator's state vector, and small helpers on its numbers.
+//! Layout of the estimator's state vector, and small helper functions.
 //!
 //! In and out: means and variances in the units of the states. Inputs are not checked.
 
@@ -18,13 +18,13 @@ pub(super) const CAPACITY: usize = 2;
 /// Index of the first branch voltage in the state.
 pub(super) const BRANCHES: usize = 3;
 
-/// A SOC variance grown by `by`, at most to the variance of an unknown SOC.
+/// The SOC variance increased by `by`, but at most the variance of an unknown SOC.
 #[inline]
 pub(super) fn widened(variance: f64, by: f64) -> f64 {
     variance.max((variance + by).min(UNKNOWN_SOC_VARIANCE))
 }
 
-/// Limits a state of charge to empty and full: anything beyond is an error of the model.
+/// Limits a state of charge to 0 to 1. A value outside this range is an error of the model.
 #[inline]
 pub(super) fn within_bounds(soc: ScalarGaussian) -> ScalarGaussian {
     ScalarGaussian { mean: soc.mean.clamp(0.0, 1.0), ..soc }
@@ -32,7 +32,7 @@ pub(super) fn within_bounds(soc: ScalarGaussian) -> ScalarGaussian {
 
 /// Number of constant errors whose effect the filter follows.
 pub(super) const CONSTANT_ERRORS: usize = 7;
-/// Number of constant errors, the first ones, that the gain considers.
+/// Number of constant errors that the gain considers. They are the first ones in the order of the indices.
 pub(super) const CONSIDERED: usize = 4;
 
 /// Index of the voltage sensor's offset among the constant errors: measured minus true.
@@ -43,7 +43,7 @@ pub(super) const CURRENT_OFFSET: usize = 1;
 pub(super) const CURRENT_GAIN: usize = 2;
 /// Index of the error of the slowest branch's ratio ([`super::slow_branch`]): true minus estimated.
 pub(super) const SLOW_BRANCH: usize = 3;
-/// Index of the error of the open-circuit curve's capacity: the curve's minus the true one.
+/// Index of the error of the open-circuit curve's capacity: capacity of the curve minus true capacity.
 pub(super) const CURVE_CAPACITY: usize = 4;
 /// Index of the first uncertain mix of losses.
 pub(super) const CURVE_MIXES: usize = 5;

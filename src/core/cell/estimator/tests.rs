@@ -1,4 +1,4 @@
-//! The estimator against its own model, driven by a small simulation without noise.
+//! Tests of the estimator with its own model as the cell, in a small simulation without noise.
 
 mod robust;
 pub(super) mod textbook;

@@ -1,17 +1,19 @@
 //! Fits a model to the rows of a notebook over a grid of capacities.
 //!
-//! In: a [`Label`] and rows. Out: a [`Fit`]. For each capacity of the grid, Gauss-Newton finds the most likely other parameters
-//! (maximum a posteriori): the open-circuit curve at the SOC breakpoints, the resistances relative to the label's over SOC and by
-//! temperature, and the SOC s_k at which each stretch began: SOC = s_k - q / C. The density of a capacity is the density of its
-//! best fit times the volume of the other parameters around it (Laplace). If the rows allow two capacities, the density has two
+//! In: a [`Label`] and rows. Out: a [`Fit`]. For each capacity C of the grid, Gauss-Newton finds the most likely values
+//! of the other parameters (maximum a posteriori). These parameters are the open-circuit curve at the SOC breakpoints,
+//! the resistances relative to the label's model over SOC and by temperature, and the SOC s_k at which each stretch
+//! began: SOC = s_k - q / C after the charge q. The density of a capacity is the density of its best fit times the
+//! volume of the other parameters around this fit (Laplace). If the rows allow two capacities, the density has two
 //! maxima.
 //!
 //! # Errors of a row
-//! The errors of the circuit repeat: rows at nearly the same SOC share one error of the voltage, of the drop and of the SOC. The errors of
-//! rows are therefore correlated over 12 % of SOC, with parts proportional to a constant, to the slope of the curve and to the
-//! voltage drop. The drop's error grows with the drop, because charge transfer is not linear (Butler-Volmer).
+//! The errors of the circuit model repeat: rows at nearly the same SOC have the same errors of voltage, SOC and drop.
+//! The errors of rows are therefore correlated over 12 % of SOC. Their covariance has three parts: a constant, a part
+//! proportional to the slope of the curve, and a part proportional to the voltage drop. The error of the drop grows
+//! with the drop, because charge transfer is not linear (Butler-Volmer).
 //!
-//! The numbers were chosen on LG HG2, LG M50 (simulated) and the Leaf cell, all at 25 degrees C.
+//! The constants were chosen on LG HG2, LG M50 (simulated) and the Leaf cell, all at 25 degrees C.
 
 mod basis;
 mod noise;
@@ -28,14 +30,15 @@ use crate::filter::levenberg_marquardt::{Damping, minimise};
 use basis::{BEGINNINGS, BY_TEMPERATURE, Basis, COLD_SAG, FACTORS, LOG_CAPACITY, OFFSET};
 use noise::{NormalEquations, RepeatedErrors};
 
-/// Damping of a search.
+/// Damping of the search for the most likely parameters.
 const DAMPING: Damping =
     Damping { first: 1e-3, fall: 0.2, fall_after_growth: 0.2, growth: 8.0, least: 1e-9, most: 8e6 };
-/// Step of the capacity grid, relative to the rated capacity. The grid starts at 0.52, the search at the rated capacity.
+/// Step of the capacity grid, relative to the rated capacity. The grid starts at 0.52; the search starts at the rated
+/// capacity.
 const CAPACITY_STEP: f64 = 0.04;
 const CAPACITIES: usize = 20;
 const FIRST_CAPACITY: usize = 12;
-/// The search ends at a cost this far above the least.
+/// The search ends if the cost exceeds the lowest cost by more than this.
 const HOPELESS: f64 = 25.0;
 /// Points between two capacities of the grid at which the density is evaluated.
 const FINE: usize = 20;
@@ -45,8 +48,8 @@ const FINE: usize = 20;
 pub struct Fit {
     /// The model.
     pub own: OwnModel,
-    /// Root mean square of the rows' residuals in standard deviations: about 1 if the cells have the label's chemistry and the
-    /// circuit model errs as assumed.
+    /// Root mean square of the rows' residuals, in standard deviations. It is about 1 if the cells have the label's
+    /// chemistry and the errors of the circuit model are as assumed.
     pub misfit: f64,
     /// Start of the last stretch; `None` without rows.
     beginning: Option<Beginning>,
@@ -59,7 +62,7 @@ struct Beginning {
     /// SOC at the start and offset of the current sensor, A, with their covariance at the most likely capacity.
     means: [f64; 2],
     covariance: [[f64; 2]; 2],
-    /// Change of both with one standard deviation of the capacity.
+    /// Changes of SOC and offset with one standard deviation of the capacity.
     by_capacity: [f64; 2],
 }
 
@@ -86,7 +89,7 @@ impl Fit {
 #[derive(Debug, Clone)]
 struct Conditional {
     theta: DVector<f64>,
-    /// Information about the other parameters, without the capacity.
+    /// Information matrix of the other parameters, without the capacity.
     normal: DMatrix<f64>,
     /// Minus the logarithm of the capacity's density, up to the prior's constant.
     cost: f64,
@@ -103,12 +106,13 @@ struct Search<'a> {
     rated_ah: f64,
 }
 
-/// Whether the rows suffice for a fit.
+/// Whether the rows contain enough information for a fit.
 pub fn says_enough(label: &Label, rows: &[Row]) -> bool {
     rows.len() >= 12 && span_ah(rows) >= 0.15 * label.rated_ah
 }
 
-/// Fits a model; `None` if the rows say too little, or their capacity is far from the label's.
+/// Fits a model. `None` if the rows contain too little information, or if the fitted capacity is far from the label's
+/// capacity.
 pub fn fit(prior: &LabelPrior, rows: &[Row]) -> Option<Fit> {
     if !says_enough(&prior.label, rows) {
         return None;
@@ -118,15 +122,16 @@ pub fn fit(prior: &LabelPrior, rows: &[Row]) -> Option<Fit> {
     search.finish(capacity, &start)
 }
 
-/// Minus the logarithm of the rows' probability with a label, at the best of some capacities, Ah. Comparable between labels.
+/// Minus the logarithm of the rows' probability with a label, minimised over `capacities_ah`, Ah. The results of
+/// different labels can be compared.
 pub fn label_cost(prior: &LabelPrior, rows: &[Row], capacities_ah: &[f64]) -> Option<f64> {
     let (search, start) = Search::new(prior, rows)?;
     let costs = capacities_ah.iter().filter_map(|&ah| search.conditional(ah, &start).map(|found| found.cost));
     Some(costs.min_by(f64::total_cmp)? - 0.5 * prior::log_determinant(&search.prior)?)
 }
 
-/// Cost of rows with a model (`None` = the label's): minus the logarithm of their density, with the most likely SOC at the start of
-/// each stretch. `None` without rows.
+/// Cost of rows with a model (`None` = the label's model): minus the logarithm of their density. Each stretch starts at
+/// its most likely SOC. Returns `None` if there are no rows.
 pub(super) fn rows_cost(prior: &LabelPrior, own: Option<&OwnModel>, rows: &[Row]) -> Option<f64> {
     let basis = Basis::new(prior, rows);
     let theta = basis.parameters(own);
@@ -148,7 +153,7 @@ fn span_ah(rows: &[Row]) -> f64 {
 }
 
 impl<'a> Search<'a> {
-    /// A fit with its first parameters.
+    /// Creates a search with its initial parameters.
     fn new(prior: &'a LabelPrior, rows: &'a [Row]) -> Option<(Self, DVector<f64>)> {
         let rated_ah = prior.label.rated_ah;
         let basis = Basis::new(prior, rows);
@@ -160,7 +165,7 @@ impl<'a> Search<'a> {
         Some((Self { basis, prior, expected, rated_ah }, start))
     }
 
-    /// Sums of rows and prior at `theta`, without the capacity's prior.
+    /// Sums of rows and prior at `theta`, without the prior of the capacity.
     fn sums(&self, theta: &DVector<f64>, errors: &RepeatedErrors) -> Option<NormalEquations> {
         let off = theta - &self.expected;
         let gradient = &self.prior * &off;
@@ -174,7 +179,8 @@ impl<'a> Search<'a> {
         sums.cost.is_finite().then_some(sums)
     }
 
-    /// The most likely other parameters at a capacity, Ah, starting from `start` (Levenberg-Marquardt).
+    /// The most likely values of the other parameters at a capacity, Ah. The search starts from `start`
+    /// (Levenberg-Marquardt).
     fn conditional(&self, capacity_ah: f64, start: &DVector<f64>) -> Option<Conditional> {
         self.conditional_with(&RepeatedErrors::USUAL, capacity_ah, start)
     }
@@ -198,7 +204,7 @@ impl<'a> Search<'a> {
         Some(Conditional { theta, normal: sums.normal, cost, misfit })
     }
 
-    /// The capacity, Ah.
+    /// The most likely capacity, Ah.
     fn capacity(&self, start: &DVector<f64>) -> Option<ScalarGaussian> {
         let at = |k: usize| self.rated_ah * (0.52 + CAPACITY_STEP * k as f64);
         let mut found: Vec<Option<f64>> = vec![None; CAPACITIES];
@@ -218,7 +224,7 @@ impl<'a> Search<'a> {
                 theta = next.theta;
             }
         }
-        // A maximum beyond the grid does not fit this label.
+        // If the maximum of the density lies outside the grid, the capacity does not fit this label.
         let is_open = |end: Option<f64>| end.is_some_and(|cost| cost < least + 3.0);
         if is_open(found[0]) || is_open(found[CAPACITIES - 1]) {
             return None;
@@ -228,7 +234,7 @@ impl<'a> Search<'a> {
         let (mean, variance) = moments(&costs, least);
         let step_ah = CAPACITY_STEP * self.rated_ah;
         let capacity_ah = at(first) + step_ah * mean;
-        // Adds errors that the fit cannot detect, such as the current sensor's gain and offset.
+        // Adds errors that the fit cannot detect, such as the gain and the offset of the current sensor.
         let std_ah = (1.4 * step_ah * variance.sqrt()).hypot(0.015 * capacity_ah);
         Some(ScalarGaussian::from_std(capacity_ah, std_ah))
     }

@@ -1,6 +1,7 @@
-//! The filters of a pack with one number of branches, in blocks of [`WIDTH`] lanes, and the steps of a batch over them.
+//! The filters of a pack whose model has a given number of branches, in blocks of [`WIDTH`] lanes, and the steps of a
+//! batch.
 //!
-//! In: inputs of the blocks. Out: moved states and results; steps that were not ordinary are added to `others`.
+//! In: inputs of the blocks. Out: changed states, and results. Steps that are not ordinary are added to `others`.
 
 use std::array::from_fn;
 
@@ -15,12 +16,12 @@ use crate::cell::estimator::step::{CellStep, StepResult, Update};
 use crate::cell::model::CellModel;
 use crate::filter::simd::Lanes;
 
-/// Filters of N states, with T numbers of the covariance and tables of W columns.
+/// Filters with N states, T covariance elements and tables of W columns.
 #[derive(Debug, Clone)]
 pub(super) struct FilterArray<const N: usize, const T: usize, const W: usize> {
     tables: Tables<W>,
     pub(super) blocks: Vec<FilterState<WIDTH, N, T>>,
-    /// Per block, for steps of all its cells together, and per cell, for its own.
+    /// Per block: the cache for steps of all its cells together, and the caches for steps of single cells.
     cache: Vec<(LineCache<WIDTH, W>, [LineCache<1, W>; WIDTH])>,
     step_time: StepTime,
 }
@@ -33,7 +34,7 @@ pub(super) enum FilterArrays {
     Three(FilterArray<6, 21, 24>),
 }
 
-/// Runs an expression for the pack's number of branches.
+/// Evaluates an expression for the array with the pack's number of branches.
 macro_rules! each_array {
     ($filters:expr, $x:ident => $body:expr) => {
         match $filters {
@@ -45,7 +46,8 @@ macro_rules! each_array {
 }
 pub(super) use each_array;
 
-/// The last step time, s, with its decay factors, because most readings arrive at one interval.
+/// The last step time, s, with its decay factors. Most readings arrive at the same interval, so the factors can be
+/// reused.
 #[derive(Debug, Clone)]
 struct StepTime {
     time_s: f64,
@@ -64,7 +66,7 @@ impl StepTime {
     }
 }
 
-/// The steps of a batch, for the machine's widest instructions.
+/// The steps of a batch, to be compiled for the widest instructions of the machine.
 pub(super) struct BatchStep<'a, const N: usize, const T: usize, const W: usize> {
     pub(super) lanes: &'a mut FilterArray<N, T, W>,
     pub(super) constants: &'a KernelConstants,
@@ -85,12 +87,14 @@ impl<const N: usize, const T: usize, const W: usize> pulp::WithSimd for BatchSte
 }
 
 impl<const N: usize, const T: usize, const W: usize> BatchStep<'_, N, T, W> {
-    /// Makes the steps. Without wide instructions, the same kernel steps the lanes one by one and gives the same bits.
+    /// Computes the steps. Without wide instructions, the same kernel steps the lanes one by one and gives the same
+    /// bits.
     #[inline(always)]
     pub(super) fn run<const WIDE: bool>(self) {
         self.lanes.step::<WIDE>(self.constants, self.inputs, self.cells, self.results);
         for (block, input) in self.inputs.iter_mut().enumerate().filter(|(_, input)| input.is_present.any()) {
-            // The input was ordinary, but the outcome was not usable.
+            // The input was ordinary, but the outcome was not usable: the step is computed again as a step that is not
+            // ordinary.
             for lane in 0..WIDTH {
                 if input.is_present.lane(lane) {
                     input.is_present.set_lane(lane, false);
@@ -104,7 +108,7 @@ impl<const N: usize, const T: usize, const W: usize> BatchStep<'_, N, T, W> {
 impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
     pub(super) fn new(model: &CellModel, blocks: usize) -> Self {
         let zero = Lanes::splat(0.0);
-        // The kernel can step every lane, including lanes without a cell.
+        // The kernel may step every lane, so lanes without a cell need valid states too.
         let mut covariance = [zero; T];
         (0..N).for_each(|i| covariance[at(i, i)] = Lanes::splat(1.0));
         let mut mean = [zero; N];
@@ -120,7 +124,7 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         }
     }
 
-    /// Steps every block with inputs. Clears `is_present` of each cell that made its step.
+    /// Steps every block that has inputs. Clears `is_present` of each cell whose step was computed.
     #[inline(always)]
     fn step<const WIDE: bool>(
         &mut self,
@@ -163,7 +167,8 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         }
     }
 
-    /// Indices of the cells with the lowest and the highest SOC; the first of several.
+    /// Indices of the cells with the lowest and with the highest SOC. If several cells have the same SOC, the first
+    /// one.
     pub(super) fn extremes(&self, cells: usize) -> Option<(usize, usize)> {
         let all = self.blocks.iter().flat_map(|state| state.mean[0].0).take(cells).enumerate();
         let first = all.clone().next()?;
@@ -182,7 +187,7 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
     /// Replaces state and memory of a lane; returns whether the cell has a filter.
     pub(super) fn set(&mut self, cell: usize, filter: Option<&Gaussian>, hot: HotMemory) -> bool {
         let (block, lane) = (&mut self.blocks[cell / WIDTH], cell % WIDTH);
-        // The filter has as many branches as the model: states are checked when they are restored.
+        // The filter has as many branches as the model, because states are checked when they are restored.
         let Some(filter) = filter.filter(|filter| filter.states == N) else {
             block.memory.iter_mut().zip(hot).for_each(|(all, one)| all.0[lane] = one.0[0]);
             return false;
@@ -191,7 +196,8 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         true
     }
 
-    /// Predicts a cell's state apart from its lane; `None`, with the state unchanged, when it cannot be computed.
+    /// Predicts a cell's state separately from its lane. Returns `None` and leaves the state unchanged if the
+    /// prediction cannot be computed.
     #[inline(never)]
     pub(super) fn predict(
         &mut self,
@@ -207,8 +213,8 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         (has_factor & has_variances(&new, Lanes([0.0]))).all().then(|| *x = new.gaussian())
     }
 
-    /// Updates a cell's state apart from its lane with a voltage, where that is within the gate; returns the memory too. `None`,
-    /// with the state unchanged, when it cannot be computed.
+    /// Updates a cell's state with a voltage, separately from its lane; a voltage beyond the gate does not change it.
+    /// Also returns the memory. Returns `None` and leaves the state unchanged if the update cannot be computed.
     #[inline(never)]
     pub(super) fn update(
         &mut self,

@@ -7,13 +7,15 @@ use crate::cell::estimator::memory::Memory;
 use crate::cell::estimator::step::{CellStep, StepResult, Update};
 use crate::filter::simd::{Lanes, Mask};
 
-/// Cells of a block: one AVX-512 vector, two AVX2 vectors (4 and 16 cells measured slower).
+/// Number of cells in a block: one AVX-512 vector or two AVX2 vectors (blocks of 4 and 16 cells were slower in
+/// measurements).
 pub(super) const WIDTH: usize = 8;
 
-/// State of a cell in addition to its lane.
+/// State of a cell in addition to the state in its lane.
 #[derive(Debug, Clone)]
 pub(super) struct CellSlot {
-    /// The lane holds the present load, consistency, information, rest and evidence; the values here are stale.
+    /// Memory of the cell. The present values of load, consistency, information, rest and evidence are in the lane; the
+    /// values here are out of date.
     pub(super) memory: Memory,
     pub(super) has_filter: bool,
 }
@@ -63,8 +65,8 @@ impl BlockInput {
         },
     };
 
-    /// Copies the step time of another lane into lanes without a step, so that one set of decay factors serves all. Their results
-    /// are discarded.
+    /// Copies the step time of another lane into lanes without a step, so that the same decay factors serve all lanes.
+    /// The results of lanes without a step are discarded.
     #[inline(always)]
     pub(super) fn fill_absent(&mut self) {
         if !self.is_present.all() {

@@ -1,14 +1,15 @@
 //! The ordinary step of L cells at once: predict over a measured time, update with a voltage that passes the gate.
 //!
-//! The filter of [`estimator`](crate::cell::estimator) with the circuit of [`crate::cell::circuit`], to rounding.
-//! It saves work by exact rearrangements:
+//! The filter of [`estimator`](crate::cell::estimator) with the circuit of [`crate::cell::circuit`]; the results agree
+//! up to rounding. The following exact rearrangements save work:
 //! * Points come in pairs x +- s L_k (s = sqrt(N + lambda)). With f's odd and even parts over each pair, o_k = (f+ - f-) / 2s and
 //!   e_k = ((f+ + f-) / 2 - f0) / s, the weighted sums become f0 + m with m = sum e_k / s for the mean, and
 //!   sum (o_k o_k' + e_k e_k') plus beta - alpha^2 times m m' for the covariance. For a pair that a linear map moves, o_k is the
 //!   pair's image and e_k = 0.
 //! * The order of the states lets only the first three columns of the Cholesky factor L move nonlinear states. The columns of the
 //!   branches add up to P minus the first three columns, and are never computed.
-//! * Only one pair has a different SOC, so each phase reads the tables at three points instead of 2 N + 1.
+//! * Only one pair has a different SOC, so prediction and update each read the tables at three points instead of 2 N +
+//!   1.
 //! * The lines of the tables are cached from step to step: [`LineCache`].
 //! * exp(x + d) = exp(x) exp(d), and exp(-2x) = exp(-x)^2 for the branches' noise.
 //!
@@ -94,7 +95,8 @@ fn is_possible<const L: usize, const N: usize, const T: usize>(x: &FilterState<L
     is_possible
 }
 
-/// Rest after which a cell's voltage adds little information, s: what still relaxes then is slower than the branches.
+/// Rest, s, after which further voltages of a cell add little information: what still relaxes then is slower than the
+/// branches.
 const REST_REPEATS_S: f64 = 1000.0;
 
 /// Updates the load's low-pass, the time at rest, and the time that the reading stands for.

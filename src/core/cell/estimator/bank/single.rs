@@ -1,7 +1,7 @@
-//! The kernel with one lane, for the parts of a step that is not ordinary.
+//! The kernel with one lane. It computes the parts of a step that is not ordinary.
 //!
-//! In: a cell's state and memory apart from their lane, and its input. Out: the moved state and memory; `None`, with both
-//! unchanged, when a part cannot be computed.
+//! In: a cell's state and memory, separate from its lane, and its input. Out: the changed state and memory. If a part
+//! cannot be computed, returns `None` and leaves state and memory unchanged.
 
 use super::filter_array::{FilterArrays, each_array};
 use super::kernel::{
@@ -66,15 +66,15 @@ impl<'a> SingleCell<'a> {
         each_array!(&mut *self.filters, array => array.predict(c, (self.cell, x, hot), input, soc_per_s))
     }
 
-    /// Updates load, rest and information for the measured time of a step.
+    /// Updates load, rest and information of the memory for the measured time of a step.
     pub(in crate::cell::estimator) fn pass_measured(&self, memory: &mut Memory, step: &CellStep) {
         let mut hot = hot(memory, self.constants);
         update_memory(self.constants, &mut hot, &self.input(step, step.measured_s));
         *memory = with_hot(memory, &hot);
     }
 
-    /// Updates with the voltage of a step under a known current. A voltage within the gate moves the state, and its evidence
-    /// counts in the memory.
+    /// Updates with the voltage of a step whose current is known. If the voltage is within the gate, the state changes
+    /// and the evidence is added to the memory.
     pub(in crate::cell::estimator) fn update(
         &mut self,
         (x, memory): (&mut Gaussian, &mut Memory),
@@ -84,7 +84,7 @@ impl<'a> SingleCell<'a> {
         let (c, mut hot) = (self.constants, hot(memory, self.constants));
         let (update, after) = each_array!(&mut *self.filters, array => array.update(c, (self.cell, x, hot), &input))?;
         if update.accepted {
-            // Evidence stays storable; what is not a number adds nothing.
+            // Keeps the evidence storable; NaN adds nothing.
             for i in EVIDENCE.into_iter().filter(|&i| !after[i].0[0].is_nan()) {
                 hot[i] = after[i].at_least(bounds::NUMBER.low).at_most(bounds::NUMBER.high);
             }
@@ -94,7 +94,7 @@ impl<'a> SingleCell<'a> {
     }
 }
 
-/// The numbers of a memory that the kernel reads.
+/// The values of a memory that the kernel reads.
 pub(super) fn hot(memory: &Memory, c: &KernelConstants) -> HotMemory {
     let mut hot = [0.0; MEMORY];
     hot[LOAD_A] = memory.load_a;
@@ -110,7 +110,7 @@ pub(super) fn hot(memory: &Memory, c: &KernelConstants) -> HotMemory {
     hot.map(|number| Lanes([number]))
 }
 
-/// A memory with the numbers that the kernel changes.
+/// The memory with the values that the kernel has changed.
 pub(super) fn with_hot(memory: &Memory, hot: &HotMemory) -> Memory {
     let mut memory = *memory;
     let number = |i: usize| hot[i].0[0];

@@ -1,12 +1,14 @@
 //! A cell model's tables in the form the kernel reads.
 //!
-//! Each SOC interval has one row with the line of every quantity (value at SOC 0 and slope), so one position gives all quantities
-//! without a division. Temperatures change slowly and several cells share them: the rows of a temperature are computed once and
-//! stay until their slot is needed ([`MAX_ISOTHERMS`]). A cell stays in its interval for thousands of steps: its lines are cached
-//! lane by lane ([`LineCache`]), and a look-up is one comparison. Cached values depend only on temperature, SOC and capacity, so
-//! results do not depend on the state of the cache.
+//! Each SOC interval has one row. A row contains a line for every quantity (value at SOC 0, and slope), so one look-up
+//! gives all quantities without a division. Temperatures change slowly, and several cells share a temperature. The rows
+//! of a temperature are therefore computed once and are kept until their slot is reused ([`MAX_ISOTHERMS`]). A cell
+//! stays in its SOC interval for thousands of steps, so its lines are cached lane by lane ([`LineCache`]), and a
+//! look-up is a single comparison. Cached values depend only on temperature, SOC and capacity, so the results do not
+//! depend on the state of the cache.
 //!
-//! In: states of charge, degrees C. Out: V, ohm, s. A NaN gives NaN in its own lane only; such a step is not usable.
+//! In: states of charge, degrees C. Out: V, ohm, s. A NaN in one lane gives NaN in this lane only; the step is then not
+//! usable.
 
 use crate::cell::aged_ocv::{MIXES, OffsetLine};
 use crate::cell::model::CellModel;
@@ -23,7 +25,8 @@ pub(super) const ERROR_V: usize = R0_OHM + 2;
 /// Index of the first branch's resistance, ohm; its time constant, s, follows, then the next branch.
 const BRANCHES: usize = ERROR_V + 2;
 
-/// Number of temperatures with cached rows: more than a pack has sensors. Further temperatures are computed again, with equal results.
+/// Number of temperatures with cached rows. It is larger than the number of sensors in a pack. The rows of further
+/// temperatures are computed again, with equal results.
 const MAX_ISOTHERMS: usize = 64;
 
 /// Index of the resistance of branch `i`; its time constant follows.
@@ -37,13 +40,13 @@ pub(super) struct Tables<const W: usize> {
     model: CellModel,
     /// Borders between intervals of SOC; the outer intervals are unbounded.
     borders: Vec<f64>,
-    /// Rows at the model's temperatures, temperature by temperature. The highest temperature is stored twice, so that each has an
-    /// upper neighbour.
+    /// Rows at the model's temperatures, temperature by temperature. The rows of the highest temperature are stored
+    /// twice, so that each temperature has an upper neighbour.
     nodes: Vec<[f64; W]>,
     /// Rows at `temperatures_c`.
     rows: Vec<[f64; W]>,
     temperatures_c: [f64; MAX_ISOTHERMS],
-    /// Slot of the next new temperature.
+    /// Slot for the rows of the next new temperature.
     next: usize,
     has_error: bool,
 }
@@ -52,7 +55,7 @@ pub(super) struct Tables<const W: usize> {
 #[derive(Debug, Clone)]
 pub(super) struct LineCache<const L: usize, const W: usize> {
     temperature_c: [f64; L],
-    /// Last slots of the temperatures' rows.
+    /// Slots in which the rows of each lane's temperature were last found.
     isotherms: [usize; L],
     /// Capacities of the open-circuit curves, Ah.
     capacity_ah: [f64; L],
@@ -68,7 +71,7 @@ struct CachedLines<const L: usize, const W: usize> {
     /// Upper ends of the intervals.
     to: Lanes<L>,
     row: [Lanes<L>; W],
-    /// The part of the open-circuit voltage's line that follows from the capacity; `row` includes it.
+    /// The part of the open-circuit voltage's line that depends on the capacity. It is included in `row`.
     offset_v: [Lanes<L>; 2],
 }
 
@@ -77,7 +80,7 @@ struct CachedLines<const L: usize, const W: usize> {
 pub(super) struct TablePoint<'a, const L: usize, const W: usize> {
     row: &'a [Lanes<L>; W],
     soc: Lanes<L>,
-    /// SOC limited to the ends of the tables.
+    /// SOC limited to the range of the tables.
     inside: Lanes<L>,
 }
 
@@ -104,7 +107,8 @@ impl<const W: usize> Tables<W> {
         self.has_error
     }
 
-    /// Slot of the rows of a temperature, valid until the next call; `hint` is the slot of the last call.
+    /// Slot of the rows of a temperature. It is valid until the next call. `hint` is the slot that the last call
+    /// returned.
     fn isotherm(&mut self, temperature_c: f64, hint: usize) -> usize {
         if self.temperatures_c[hint % MAX_ISOTHERMS] == temperature_c {
             hint % MAX_ISOTHERMS
@@ -146,7 +150,7 @@ impl<const W: usize> Tables<W> {
         self.borders[1..self.intervals()].iter().filter(|&&border| soc >= border).count()
     }
 
-    /// Updates the lines of `cache` to these temperatures.
+    /// Updates the lines in `cache` to these temperatures.
     #[inline(always)]
     pub(super) fn refresh_temperatures<const L: usize>(
         &mut self,
@@ -172,7 +176,8 @@ impl<const W: usize> Tables<W> {
         }
     }
 
-    /// Updates the lines of `cache` to the open-circuit curves of these capacities, Ah, which change at half-cycles.
+    /// Updates the lines in `cache` to the open-circuit curves of these capacities, Ah. The capacities change at
+    /// half-cycles.
     #[inline(always)]
     pub(super) fn refresh_capacities<const L: usize>(&mut self, cache: &mut LineCache<L, W>, capacity_ah: &Lanes<L>) {
         let same = (0..L).fold(true, |same, lane| same & (cache.capacity_ah[lane] == capacity_ah.0[lane]));
@@ -195,8 +200,8 @@ impl<const W: usize> Tables<W> {
         }
     }
 
-    /// Table points of L states of charge, and of those `reach` above and below, at the temperatures of the last
-    /// [`Self::refresh_temperatures`].
+    /// Table points at L states of charge, at `reach` above them and at `reach` below them. The temperatures are those
+    /// of the last [`Self::refresh_temperatures`].
     #[inline(always)]
     pub(super) fn table_points<'a, const L: usize>(
         &mut self,
@@ -234,7 +239,8 @@ impl<const W: usize> Tables<W> {
         }
     }
 
-    /// Updates the lines that follow from a lane's capacity, Ah. [`Self::copy`] adds them to the open-circuit voltage.
+    /// Updates the lines that depend on the capacity of a lane, Ah. [`Self::copy`] adds them to the open-circuit
+    /// voltage.
     fn age<const L: usize>(&self, capacity_ah: f64, lines: &mut CachedLines<L, W>, lane: usize) {
         let OffsetLine { offset_v, per_ah_v, mixes_v } =
             self.model.aged_ocv.line(&self.model.soc, lines.interval[lane], capacity_ah);
@@ -277,7 +283,7 @@ impl<const L: usize, const W: usize> LineCache<L, W> {
 }
 
 impl<const L: usize, const W: usize> CachedLines<L, W> {
-    /// Whether the lines hold at a lane's state of charge.
+    /// Whether the cached lines are valid at a lane's state of charge.
     #[inline(always)]
     fn holds(&self, soc: &Lanes<L>, lane: usize) -> bool {
         (soc.0[lane] >= self.from.0[lane]) & (soc.0[lane] < self.to.0[lane])

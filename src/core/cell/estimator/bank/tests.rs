@@ -1,4 +1,4 @@
-//! The kernel against the textbook filter, and a cell in a pack against the same cell alone.
+//! Compares the kernel with the textbook filter, and a cell in a pack with the same cell alone.
 
 use super::*;
 use crate::cell::circuit::{self, BranchAt};
@@ -9,7 +9,7 @@ use crate::cell::model::tests::small_model;
 use crate::cell::{AgedOcv, CellModule, PackBank, SensorErrors, Table};
 use crate::quantity::CellIndex;
 
-/// Settings with every constant error.
+/// Settings in which every constant error is larger than 0.
 fn config() -> EstimatorConfig {
     let sensor =
         SensorErrors { voltage_offset_v: 0.004, current_offset_a: 0.02, current_gain: 0.005, slow_branch: 0.3 };
@@ -56,7 +56,7 @@ impl Pack {
         Self { model: model.clone(), dice: Dice(0x2545_F491_4F6C_DD1D), cells, current_a: 1.0, temperature_c: 20.0 }
     }
 
-    /// The steps of one time; a few cells are missing from some.
+    /// The steps at one time. Some cells are missing at some times.
     fn steps(&mut self, time: u32) -> Vec<(usize, CellStep)> {
         let dt_s = if time.is_multiple_of(7) { 0.25 } else { 1.0 };
         let low = self.cells.iter().any(|cell| cell.soc < 0.1);
@@ -75,7 +75,7 @@ impl Pack {
 
     fn measure(&mut self, index: usize, time: u32, dt_s: f64) -> Option<(usize, CellStep)> {
         let (current_a, dice) = (self.current_a, &mut self.dice);
-        // Neighbours do not always report at one interval, and sometimes twice at one time.
+        // Cells report at different intervals, and some report twice at the same time.
         let dt_s = match dice.roll() {
             roll if roll < 0.01 => 0.0,
             roll if roll < 0.02 => 0.5 * dt_s,
@@ -130,7 +130,7 @@ fn model(branches: usize) -> CellModel {
     model
 }
 
-/// Largest differences of the SOC, and of everything else, between the bank and the textbook filter.
+/// Maximum difference of the SOC, and maximum difference of all other values, between the bank and the textbook filter.
 fn differences<const N: usize>(model: &CellModel, config: &EstimatorConfig, rounds: u32) -> (f64, f64) {
     const CELLS: usize = 11;
     let mut bank = EstimatorBank::new(model, config, CELLS);

@@ -1,4 +1,5 @@
-//! Wrong starts, a current sensor with an offset, rests that still relax.
+//! Tests of the estimator with wrong initial values, a current sensor with an offset, and rests in which the cell still
+//! relaxes.
 //!
 //! The simulated cell has a slow branch that the estimator's model lacks; there is no noise.
 

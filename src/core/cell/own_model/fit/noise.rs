@@ -24,7 +24,8 @@ pub(super) struct RepeatedErrors {
 impl RepeatedErrors {
     /// Errors of circuits, for fitting the capacity.
     pub(super) const USUAL: Self = Self { voltage_v: 0.012, soc: 0.01, drop: 0.2 };
-    /// A third of them, for fitting the tables, so that common differences of the rows go into the tables and not into the errors.
+    /// Repeating errors for fitting the tables. They are smaller than `USUAL`, so that differences that the rows have
+    /// in common go into the tables and not into the errors.
     pub(super) const IN_TABLES: Self = Self { voltage_v: 0.004, soc: 0.004, drop: 0.05 };
 }
 
@@ -53,7 +54,7 @@ impl NormalEquations {
         let predictions: Vec<Prediction> = (0..basis.rows.len()).map(|at| basis.predict(theta, at)).collect();
         let (count, size) = (predictions.len(), theta.len());
         let lower = covariance(&predictions, errors).cholesky()?.unpack();
-        // Residuals and derivatives side by side, whitened together.
+        // Residuals and derivatives in one matrix, so that they are whitened together.
         let mut all = DMatrix::zeros(count, size + 1);
         for (at, prediction) in predictions.iter().enumerate() {
             all[(at, size)] = prediction.voltage_v - f64::from(basis.rows[at].voltage_v);
@@ -87,13 +88,13 @@ impl NormalEquations {
     }
 
     /// Adds the evidence of a row's current steps about the series resistance and the fastest branch.
-    ///
-    /// The row holds the sums of the least squares problem v = - R0 i - R1 x; the Cholesky factor of the sums of i and x turns them
+    /// The row contains the sums of the least-squares problem v = - R0 i - R1 x. The Cholesky factor of the sums of i
+    /// and x turns them into two rows.
     /// into two rows.
     fn add_steps(&mut self, row: &Row, prediction: &Prediction) {
         let CurrentSteps { ii, ix, xx, iv, xv } = row.steps;
         let [ii, ix, xx, iv, xv] = [ii, ix, xx, iv, xv].map(f64::from);
-        // Ignore smaller steps.
+        // Current steps below this size are ignored.
         if ii <= 1e-12 {
             return;
         }

@@ -8,14 +8,15 @@ use crate::cell::chemistry::{FACTOR_SOC, RESISTANCES, usual_cold_sag_v};
 use crate::cell::own_model::{FACTOR_NODES, SOC_NODES};
 use crate::filter::bell;
 
-/// Standard deviation of ln(resistance) between cells that all parts of a cell share. This one and the next three are those of the
-/// five cells of the chemistry's resistances.
+/// Standard deviation of ln(resistance) between cells that all resistances of a cell have in common. This constant and
+/// the next three were found on the five cells that also give the usual resistances of a chemistry.
 const COMMON_LOG_STD: f64 = 0.35;
-/// Standard deviation of ln(resistance) of each part beyond the shared one.
+/// Standard deviation of ln(resistance) of each single resistance, in addition to the common one.
 const PART_LOG_STD: [f64; RESISTANCES] = [0.3, 0.4, 0.4, 0.5];
 /// Standard deviation of ln(resistance) over the SOC.
 const SHAPE_LOG_STD: f64 = 0.15;
-/// Standard deviation of ln(resistance) of all parts at the first nodes, near empty: where the curve turns steep, diffusion counts as resistance.
+/// Standard deviation of ln(resistance) of all resistances at the first nodes, near empty. The curve is steep there, so
+/// diffusion appears as resistance.
 const LOW_LOG_STD: [f64; 3] = [0.7, 0.6, 0.5];
 
 /// Information matrix about the label's values; `None` if a covariance is not positive definite.
@@ -32,9 +33,9 @@ pub(super) fn information(curve: &CurvePrior, rated_ah: f64, size: usize) -> Opt
     (BY_TEMPERATURE..COLD_SAG).for_each(|i| near(i, 0.25));
     near(COLD_SAG, usual_cold_sag_v().std());
     near(LOG_CAPACITY, 0.1);
-    // The rated capacity in 700 h.
+    // Standard deviation of the offset: the current that moves the rated capacity in 700 h.
     near(OFFSET, rated_ah / 700.0);
-    // The voltages determine the SOC at the start of a stretch.
+    // Wide prior, because the voltages determine the SOC at the start of a stretch.
     (BEGINNINGS..size).for_each(|i| near(i, 0.5));
     Some(prior)
 }

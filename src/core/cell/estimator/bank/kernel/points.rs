@@ -7,7 +7,7 @@ use super::types::{KernelConstants, at};
 use crate::cell::estimator::state_vector::LOG_RESISTANCE;
 use crate::filter::simd::{Lanes, Mask};
 
-/// Columns of the factor that move more than branch voltages.
+/// Number of columns of the factor that change more than branch voltages.
 pub(super) const COLUMNS: usize = 3;
 
 /// The first columns of the lower Cholesky factor, and the remaining covariance of the branches.
@@ -49,8 +49,8 @@ struct CholeskyColumn<const L: usize, const N: usize> {
 }
 
 impl<const L: usize, const N: usize> CholeskyColumn<L, N> {
-    /// Column K from the columns before it, without waiting for their square roots. NaN if there is no factor; the NaN propagates
-    /// into every result.
+    /// Column K, from the columns before it. Does not wait for their square roots. NaN if there is no factor; the NaN
+    /// then appears in every result.
     #[inline(always)]
     fn new<const T: usize, const K: usize>(covariance: &[Lanes<L>; T], done: [&Self; K]) -> Self {
         let mut left = [Lanes::splat(0.0); N];
@@ -92,7 +92,7 @@ fn is_positive<const L: usize, const N: usize>(rest: &[[Lanes<L>; N]; N]) -> Mas
     positive
 }
 
-/// Resistance ratios of the sigma points relative to the centre. Only the first two pairs differ from it.
+/// Resistance ratios of the sigma points relative to the centre. Only the first two pairs differ from the centre.
 pub(super) struct ResistanceRatios<const L: usize> {
     /// Factor of the first pair's plus and minus point.
     pub(super) first: [Lanes<L>; 2],

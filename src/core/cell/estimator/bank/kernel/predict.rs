@@ -1,7 +1,7 @@
 //! The prediction: the circuit's equations over a measured time.
 //!
-//! In: a state, charge (A s) and time (s). Out: mean and covariance after the time, in the units of the states, and a mask of the
-//! lanes whose covariance was positive definite.
+//! In: a state, charge (A s) and time (s). Out: mean and covariance after this time, in the units of the states, and a
+//! mask of the lanes whose covariance was positive definite.
 
 use super::points::{COLUMNS, OddEvenParts, PartialCholesky, ResistanceRatios, sum};
 use super::types::{FilterState, KernelConstants, StepInput, at};
@@ -11,7 +11,7 @@ use crate::cell::estimator::state_vector::{
 };
 use crate::filter::simd::{Lanes, Mask};
 
-/// Longest time of the resistance's random walk between two readings, s: a cell does not age in a gap.
+/// Maximum time between two readings that counts for the random walk of the resistance, s: a cell hardly ages in a gap.
 const MAX_WALK_S: f64 = 600.0;
 
 /// A branch at L table points, over the measured time.
@@ -19,9 +19,9 @@ struct BranchStep<const L: usize> {
     /// Resistance of new cells, ohm.
     r_ohm: Lanes<L>,
     tau_s: Lanes<L>,
-    /// Remaining part of the branch's voltage after the measured time.
+    /// Remaining fraction of the branch's voltage after the measured time.
     decay: Lanes<L>,
-    /// Exact value of `decay` under either rule.
+    /// The exact value of `decay`, even if Euler's rule is used.
     exact: Lanes<L>,
 }
 
@@ -36,15 +36,16 @@ impl<const L: usize> BranchStep<L> {
         Self { r_ohm, tau_s, decay, exact }
     }
 
-    /// Voltage of a branch that starts at `u`, under a current that settles a new cell's branch at `r_ohm` x `drive`.
+    /// Voltage of a branch that starts at `u`. With the present current, a new cell's branch would settle at `r_ohm` x
+    /// `drive`.
     #[inline(always)]
     fn voltage_v(&self, drive: Lanes<L>, u: Lanes<L>) -> Lanes<L> {
         self.r_ohm * drive * (Lanes::splat(1.0) - self.decay) + u * self.decay
     }
 }
 
-/// Effect of a discharge of `charge_ah` on the SOC: the loss at the centre, and the parts over the pairs. Linear except for the
-/// charge over the capacity.
+/// Effect of a discharge of `charge_ah` on the SOC: the decrease at the centre, and its odd and even parts over the
+/// pairs. Only the quotient of charge and capacity is nonlinear.
 #[inline(always)]
 fn soc_parts<const L: usize, const N: usize>(
     c: &KernelConstants,
@@ -66,9 +67,9 @@ fn soc_parts<const L: usize, const N: usize>(
 
 /// Prediction of a branch.
 struct BranchPrediction<const L: usize> {
-    /// Its voltage at the centre.
+    /// The branch's voltage at the centre.
     centre_v: Lanes<L>,
-    /// Remaining part of its voltage, at the centre.
+    /// Remaining fraction of the branch's voltage, at the centre.
     decay: Lanes<L>,
     /// Voltage that a current adds to a new cell's, at the centre, ohm.
     gain_ohm: Lanes<L>,
@@ -76,8 +77,8 @@ struct BranchPrediction<const L: usize> {
     parts: OddEvenParts<L>,
 }
 
-/// Predicts branch `i` under a current that settles a new cell's branch at its resistance times `drive`. The pair of the first column
-/// has other table points, the pair of the second column another resistance.
+/// Predicts branch `i`. With the present current, a new cell's branch would settle at its resistance times `drive`. The
+/// pair of the first column has other table points, and the pair of the second column another resistance.
 #[inline(always)]
 fn predict_branch<const L: usize, const N: usize, const W: usize>(
     c: &KernelConstants,
@@ -113,8 +114,8 @@ fn excess_as<const L: usize>(c: &KernelConstants, input: &StepInput<L>) -> [Lane
     excess_as
 }
 
-/// Predicts the state, whose SOC gains the variance `soc_per_s` per second; the mask is true where the covariance before was
-/// positive definite.
+/// Predicts the state. The SOC gains the variance `soc_per_s` per second. The mask is true where the covariance before
+/// the prediction was positive definite.
 #[inline(always)]
 pub(in crate::cell::estimator::bank) fn predict<const L: usize, const N: usize, const T: usize, const W: usize>(
     tables: &mut Tables<W>,

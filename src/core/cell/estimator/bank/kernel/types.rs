@@ -1,6 +1,6 @@
 //! State, inputs, outcome and constants of the kernel.
 //!
-//! In: the estimator's settings and the cell model. Out: numbers in the units of the states, lane by lane.
+//! In: the estimator's settings and the cell model. Out: values in the units of the states, lane by lane.
 
 use std::array::from_fn;
 
@@ -11,7 +11,7 @@ use crate::cell::estimator::state_vector::{BRANCHES, CONSTANT_ERRORS, square};
 use crate::cell::{CellModel, Discretisation, EstimatorConfig, SensorErrors};
 use crate::filter::simd::{Lanes, Mask};
 
-/// Filter states of L cells: N means each, the T numbers of the covariance's lower triangle, and a memory.
+/// Filter states of L cells: N means, the T elements of the covariance's lower triangle, and a memory.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(in crate::cell::estimator::bank) struct FilterState<const L: usize, const N: usize, const T: usize> {
     /// Means in the order of the estimator's state.
@@ -29,7 +29,7 @@ pub(in crate::cell::estimator::bank) type HotMemory = [Lanes<1>; MEMORY];
 
 /// Number of memory values that steps change or read.
 pub(in crate::cell::estimator::bank) const MEMORY: usize = 12;
-/// |current| low-passed, A.
+/// Low-pass of |current|, A.
 pub(in crate::cell::estimator::bank) const LOAD_A: usize = 0;
 /// Mean normalised innovation squared.
 pub(in crate::cell::estimator::bank) const MEAN_NIS: usize = 1;
@@ -41,18 +41,18 @@ pub(in crate::cell::estimator::bank) const REST_S: usize = 3;
 pub(in crate::cell::estimator::bank) const OFFSET_INFORMATION: usize = 4;
 /// Evidence about the current's offset.
 pub(in crate::cell::estimator::bank) const OFFSET_SCORE: usize = 5;
-/// Capacity of the open-circuit curve, Ah. No step changes it.
+/// Capacity of the open-circuit curve, Ah. Steps do not change it.
 pub(in crate::cell::estimator::bank) const CURVE_AH: usize = 6;
-/// Standard deviation of the curve's capacity, Ah. No step changes it.
+/// Standard deviation of the curve's capacity, Ah. Steps do not change it.
 pub(in crate::cell::estimator::bank) const CURVE_STD_AH: usize = 7;
 
 /// Information about the ratio of the slowest branch.
 pub(in crate::cell::estimator::bank) const SLOW_INFORMATION: usize = 8;
 /// Evidence about the ratio of the slowest branch.
 pub(in crate::cell::estimator::bank) const SLOW_SCORE: usize = 9;
-/// Ratio of the slowest branch's resistance to the model's. No step changes it.
+/// Ratio of the slowest branch's resistance to the model's. Steps do not change it.
 pub(in crate::cell::estimator::bank) const SLOW_RATIO: usize = 10;
-/// Standard deviation of the ratio. No step changes it.
+/// Standard deviation of the ratio of the slowest branch. Steps do not change it.
 pub(in crate::cell::estimator::bank) const SLOW_STD: usize = 11;
 
 /// Index of the covariance of `i` and `j` <= `i`.
@@ -113,7 +113,7 @@ impl<const L: usize> DecayFactors<L> {
 /// Outcome of a step.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::cell::estimator::bank) struct StepOutcome<const L: usize> {
-    /// Whether the covariance was positive definite, and the innovation's variance is positive.
+    /// Whether the covariance was positive definite and the variance of the innovation is positive.
     pub(in crate::cell::estimator::bank) is_usable: Mask<L>,
     /// Whether the innovation is within the gate.
     pub(in crate::cell::estimator::bank) is_accepted: Mask<L>,
@@ -125,7 +125,7 @@ pub(in crate::cell::estimator::bank) struct StepOutcome<const L: usize> {
 /// Settings in the form that the kernel uses.
 #[derive(Debug, Clone, PartialEq)]
 pub(in crate::cell::estimator::bank) struct KernelConstants {
-    /// s: spread of the sigma points.
+    /// Spread s of the sigma points.
     pub(super) scale: f64,
     /// beta - alpha^2.
     pub(super) excess: f64,
@@ -161,7 +161,7 @@ pub(super) struct ReadingVariances {
     pub(super) gate: f64,
     /// Per square of the slope of the open-circuit voltage.
     pub(super) gate_soc: f64,
-    /// Largest test ratio.
+    /// Maximum test ratio of an accepted reading.
     pub(super) gate_limit: f64,
 }
 
@@ -222,7 +222,7 @@ impl<const N: usize, const T: usize> FilterState<1, N, T> {
         }
     }
 
-    /// The state apart from its lane.
+    /// The state without its lane.
     pub(in crate::cell::estimator::bank) fn gaussian(&self) -> Gaussian {
         let (mut mean, mut covariance, mut by_constant) = (SVector::zeros(), SMatrix::zeros(), SMatrix::zeros());
         for i in 0..N {
@@ -266,7 +266,7 @@ impl<const L: usize, const N: usize, const T: usize> FilterState<L, N, T> {
         }
     }
 
-    /// Takes the new state where the mask is true.
+    /// Replaces the state by the new state where the mask is true.
     #[inline(always)]
     pub(in crate::cell::estimator::bank) fn take_where(&mut self, mask: Mask<L>, new: &Self) {
         for i in 0..N {

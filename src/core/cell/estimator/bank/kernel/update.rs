@@ -1,7 +1,8 @@
-//! The measurement update.
+//! The update of the state with a measured voltage.
 //!
-//! In: a state and the reading, V. Out: the updated state, the innovation, V, its variance, V^2, and the test ratio, which is 1 for
-//! an innovation of one standard deviation. Masks mark usable lanes and lanes within the gate.
+//! In: a state and the reading, V. Out: the updated state, the innovation, V, its variance, V^2, and the test ratio.
+//! The test ratio is 1 for an innovation of one standard deviation. One mask marks the usable lanes, another one the
+//! lanes within the gate.
 
 use super::points::{COLUMNS, OddEvenParts, PartialCholesky, ResistanceRatios};
 use super::types::{
@@ -85,7 +86,8 @@ impl<const L: usize> PredictedVoltage<L> {
     }
 }
 
-/// Contribution of a part of branch `i`'s voltage to the cell's voltage; the slowest branch counts with its ratio.
+/// Contribution of a part of branch `i`'s voltage to the cell's voltage. For the slowest branch, it is multiplied by
+/// the ratio of that branch.
 #[inline(always)]
 fn weighed<const L: usize, const N: usize, const T: usize>(
     x: &FilterState<L, N, T>,
@@ -122,7 +124,7 @@ fn by_constant<const L: usize, const N: usize, const T: usize>(
     effect_v
 }
 
-/// The measurement update. Moves `x` in every lane; the outcome marks the usable ones.
+/// Updates the state `x` in every lane. The outcome marks the lanes whose result is usable.
 #[inline(always)]
 pub(in crate::cell::estimator::bank) fn update<const L: usize, const N: usize, const T: usize, const W: usize>(
     tables: &mut Tables<W>,
