@@ -68,11 +68,13 @@ class Outputs:
 
 @final
 class Monitor:
-    """The monitor of a pack: rows or frames in, estimates out.
+    """The monitor of a pack. It processes rows or frames, and returns estimates.
 
-    The configuration is a file (``config``), a text (``text``, whose files are in ``folder``), or a built-in one for a single cell with a
-    cell model (``cell``) or a label (``chemistry``, ``rated_ah``). At most one estimate per cell and ``estimates_period_s`` is kept; 0 keeps
-    all, ``None`` none. Periods restart if the clock goes back.
+    The configuration is a file (``config``), or a text (``text``; files that it names are relative to ``folder``). For a single cell, it may
+    also be built in; the cell is then described by a cell model (``cell``) or by a label (``chemistry``, ``rated_ah``).
+
+    In each period of ``estimates_period_s``, at most one estimate per cell is kept. 0 keeps all estimates, ``None`` keeps no estimates.
+    Periods start again if the clock goes back.
 
     Calls from several threads wait for each other. After Ctrl-C, rows or frames already processed stay processed, and their outputs come
     with the next call. After a failure inside packwatch (``PanicException``), every call raises :class:`DataError`.
@@ -100,7 +102,7 @@ class Monitor:
         """Names of the interfaces."""
     @property
     def uncarried_values(self) -> int:
-        """Number of values so far that no configured frame can carry."""
+        """Number of values, in all rows already processed, that no configured frame can carry."""
     def rows(
         self,
         time_s: _Numbers,
@@ -125,7 +127,7 @@ class Monitor:
     def gap(self, time_s: float) -> Outputs:
         """Continues the record at ``time_s`` after a gap of unknown length."""
     def finish(self) -> Outputs:
-        """Ends the record; the last samples become estimates."""
+        """Ends the record, so that the last samples become estimates."""
 
 @final
 class Replay:
@@ -154,7 +156,7 @@ class Score:
         """The document of ``packwatch score --json``."""
     @property
     def scores(self) -> list[dict[str, Any]]:
-        """The scores of the document, one per file and case."""
+        """The scores in the document, one dictionary per file and case."""
     def json(self) -> str:
         """The output of ``packwatch score --json``."""
     def table(self) -> str:
@@ -208,7 +210,7 @@ class CellModel:
     def temperature_c(self) -> list[float]:
         """Temperature breakpoints, degrees C."""
     def table(self, soc: _Numbers, temperature_c: float = 25.0) -> Table:
-        """Returns ``ocv_v``, ``r0_ohm`` and for each branch ``r1_ohm``, ``tau1_s`` and so on at these SOC."""
+        """Returns a row per SOC: ``ocv_v``, ``r0_ohm``, and ``r1_ohm``, ``tau1_s`` and so on for the branches."""
     def soc_of_ocv(self, voltage_v: float, temperature_c: float = 25.0) -> float:
         """Returns the SOC at an open-circuit voltage, a fraction."""
     def text(self) -> str:
@@ -243,7 +245,7 @@ class GaussianProcess:
     def save(self, path: _Path) -> None:
         """Writes the model atomically."""
     def predict(self, inputs: _Numbers) -> Table:
-        """Returns ``mean`` and ``std`` of a measurement, and its 95 % interval ``low_95``, ``high_95``."""
+        """Returns ``mean`` and ``std`` of a measurement at each row, and the 95 % interval from ``low_95`` to ``high_95``."""
     @property
     def inputs(self) -> list[str]: ...
     @property
@@ -254,7 +256,7 @@ class GaussianProcess:
     def hyperparameters(self) -> list[tuple[str, float]]: ...
 
 def float64(name: str, values: _Numbers) -> npt.NDArray[np.float64]:
-    """Returns a contiguous array; masked values become NaN. A :class:`packwatch.DataError` names the array ``name``."""
+    """Returns a contiguous array; masked values become NaN. Error messages call the array ``name``."""
 
 def read(path: _Path, *, bdf_positive: Literal["charge", "discharge"] = "charge") -> Table:
     """Reads a measured file, in packwatch's CSV or in the Battery Data Format.
@@ -340,4 +342,4 @@ def rul(
     at: Sequence[float] | None = None,
     alpha: float = 0.2,
 ) -> dict[str, Any]:
-    """Returns the document of ``packwatch rul --json``; ``at`` are points of the life, fractions."""
+    """Returns the document of ``packwatch rul --json``. ``at`` contains points of the life, as fractions."""

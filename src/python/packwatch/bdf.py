@@ -11,14 +11,14 @@ from ._packwatch import BDF_COLUMNS, float64
 REQUIRED = ("time_s", "current_a", "voltage_v")
 """Columns that the format requires."""
 SIGNED = ("current_a", "discharged_ah")
-"""Columns whose sign is reversed if positive current is charge."""
+"""Columns whose sign is reversed if a positive current in the table is a charge."""
 
 
 def from_bdf(table: Any, *, positive: Literal["charge", "discharge"] = "charge") -> dict[str, npt.NDArray[np.float64]]:
     """Returns the columns of a Battery Data Format table with packwatch's names and signs.
 
-    ``table`` is anything that gives a column by its name: a pandas or polars DataFrame, a pyarrow table, a dictionary. The format does not
-    state the sign of the current; ``positive`` does.
+    ``table`` may be anything that returns a column by its name: a pandas or polars DataFrame, a pyarrow table, a dictionary. The format does
+    not state the sign of the current, so ``positive`` states what a positive current means.
 
     Raises:
         DataError: a required column is missing, a column has no numbers, or ``positive`` is invalid.
