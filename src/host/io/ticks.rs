@@ -1,11 +1,13 @@
 //! Generates ticks for logs that contain none. A tick is a time at which the core runs although no record arrives.
 //!
-//! Live, the driver ticks every [`TICK_PERIOD_MS`](crate::monitor::TICK_PERIOD_MS) while it is awake. A plain log
-//! states only when frames arrived, so this module generates the same ticks, at multiples of the period. A tick at time
-//! T comes after every record of time T and before the first later record. After a record, the recorder counts as awake
-//! for the sleep gap, like a daemon on a silent bus, so that the core detects a lost input. After the sleep gap, the
-//! recorder counts as asleep. The first record, and the first record after sleep, wake it: one tick has the time of
-//! that record. There are no ticks after the last record.
+//! In the daemon, the driver ticks every [`TICK_PERIOD_MS`](crate::monitor::TICK_PERIOD_MS) while the computer is
+//! awake. A plain log only states when frames arrived. This module generates the same ticks for it, at multiples of the
+//! period. A tick at time T comes after every record of time T and before the first later record.
+//!
+//! If no record follows, the recorder counts as awake for the sleep gap. The ticks in this time let the core detect a
+//! lost input, as the daemon does on a silent bus. After the sleep gap, the recorder counts as asleep, and there are no
+//! ticks. The first record of the log and the first record after sleep wake the recorder, which gives one tick with the
+//! time of that record. There are no ticks after the last record.
 //!
 //! The caller passes the time of the core's next necessary tick ([`Ticks::pop`]'s `due`). Earlier ticks are skipped
 //! because they would change nothing.

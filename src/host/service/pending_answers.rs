@@ -2,8 +2,9 @@
 //! the power.
 //!
 //! In: the ticket of the commit with the command's outcome, the progress of the store, the time. Out: the answer, which
-//! states whether the outcome is stored. If the disk fails, the answer is sent at once; if the disk is slow, after
-//! [`MAX_WAIT`]. In both cases the outcome is in effect, and it is stored when the disk works again.
+//! states whether the outcome is stored. If the disk fails, the answer is sent at once. If the disk is slow, the answer
+//! is sent after [`MAX_WAIT`]. In both cases the command is in effect, and its outcome is stored when the disk works
+//! again.
 
 use tokio::sync::oneshot;
 use tokio::time::{Duration, Instant};

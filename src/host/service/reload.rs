@@ -1,10 +1,11 @@
 //! Reloads the configuration on SIGHUP, outside the loop. If the new configuration is rejected, the old configuration
 //! stays in use.
 //!
-//! Only one reading runs at a time. Signals that arrive during a reading cause one further reading, at least
-//! [`MIN_PERIOD`] after the start of the last reading. Many signals in a short time therefore neither fill the log nor
-//! block the loop. The configuration that applies at the end is read after the last signal. A change of interfaces or
-//! store requires a restart and is rejected with this hint. The core decides about all other changes
+//! Only one reading runs at a time. Signals that arrive during a reading cause one further reading, which starts at
+//! least [`MIN_PERIOD`] after the start of the last reading. Many signals in a short time therefore neither fill the
+//! log nor block the loop. Because the last reading starts after the last signal, the newest file always applies in the
+//! end. A new configuration with other interfaces or another store is rejected, because these changes require a
+//! restart. The core decides whether all other changes can be applied
 //! ([`Monitor::reconfigure`](crate::monitor::Monitor::reconfigure)).
 
 use std::fmt;

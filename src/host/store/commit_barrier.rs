@@ -1,9 +1,9 @@
 //! Holds frames until the results that they announce are on disk.
 //!
-//! During a commit, every announcing frame ([`Transmit::announces`]) waits. Announcing frames are the frames of the
-//! input that led to the result, and the cyclic frames that would repeat it. If the first packet of a transfer waits,
-//! its later packets wait too. The frames are sent in order. The status frame is not held, because its state of charge
-//! and validity must not become old. It contains only the number of raised alarms.
+//! During a commit, every announcing frame ([`Transmit::announces`]) waits. These are the frames of the input that led
+//! to the result, and the cyclic frames that would repeat the result. If the first packet of a transfer waits, its
+//! later packets wait too. The frames are sent in order. The status frame is not held, because its state of charge and
+//! validity must be up to date. Of the alarms, it contains only the number of raised ones.
 //!
 //! No frame waits longer than [`MAX_WAIT`], because an alarm on the bus is more important than an alarm on disk.
 
@@ -16,8 +16,8 @@ use crate::monitor::Transmit;
 
 /// Longest wait of a frame for the disk.
 const MAX_WAIT: Duration = Duration::from_millis(200);
-/// Maximum number of held frames. The largest pack, with an alarm for each cell, sends that many in twice the longest
-/// wait. Beyond this number, held frames are released.
+/// Maximum number of held frames. If more frames are held, they are released. The largest pack, with an alarm for each
+/// cell, sends this many frames in twice the time [`MAX_WAIT`].
 const MAX_HELD: usize = 4096;
 
 /// Holds announcing frames while commits are running.

@@ -1,12 +1,14 @@
 //! The time when a state was stored, on every clock, and its age at a later time.
 //!
-//! The wall clock of a vehicle computer may show 1970 until it is set, and may step. The boot clock never steps but
-//! restarts with every boot. Therefore both times are stored, together with the boot's identity.
+//! The wall clock of a vehicle computer may show 1970 until it is set, and it may step. The boot clock never steps, but
+//! it starts again with every boot. Therefore the times of both clocks are stored, together with the identity of the
+//! boot.
 //!
-//! Across boots, only the wall clock can measure the age, and only if a hardware clock ran while the computer was off.
-//! Without a battery-backed clock, the wall clock continues from its last saved value (systemd saves it at every boot).
-//! A week without power then looks like seconds, and the time itself does not reveal this. The wall clock is therefore
-//! trusted only if a hardware clock agrees with it ([`WallClock`]) or a time server has set it.
+//! The age of a state from an earlier boot can only be measured with the wall clock, and only if a hardware clock ran
+//! while the computer was off. Without a battery-backed clock, the wall clock continues from its last saved value
+//! (systemd saves this value at every boot). A week without power then looks like seconds, and the wall clock itself
+//! does not show that it is wrong. The wall clock is therefore trusted only if a hardware clock agrees with it
+//! ([`WallClock`]) or a time server has set it.
 
 use std::fmt;
 use std::path::Path;

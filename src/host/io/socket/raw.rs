@@ -1,5 +1,5 @@
-//! One SocketCAN raw socket. Its filters are set before it is bound, so it receives only wanted identifiers. It reads several
-//! frames with their stamps in one system call, and writes without blocking.
+//! One SocketCAN raw socket. Its filters are set before it is bound, so it receives only wanted identifiers. It reads
+//! several frames with their stamps in one system call, and writes without blocking.
 //!
 //! The kernel's drop counter is read separately, for two reasons. The control message of a frame contains the counter
 //! only after a later frame was received. In addition, the size of the control message changes with the first drop (see
