@@ -70,7 +70,7 @@ class Outputs:
 class Monitor:
     """The monitor of a pack. It processes rows or frames, and returns estimates.
 
-    The configuration is a file (``config``), or a text (``text``; files that it names are relative to ``folder``). For a single cell, it may
+    The configuration is a file (``config``), or a text (``text``; files that it names are relative to ``folder``). For a single cell it may
     also be built in; the cell is then described by a cell model (``cell``) or by a label (``chemistry``, ``rated_ah``).
 
     In each period of ``estimates_period_s``, at most one estimate per cell is kept. 0 keeps all estimates, ``None`` keeps no estimates.

@@ -17,7 +17,7 @@ SIGNED = ("current_a", "discharged_ah")
 def from_bdf(table: Any, *, positive: Literal["charge", "discharge"] = "charge") -> dict[str, npt.NDArray[np.float64]]:
     """Returns the columns of a Battery Data Format table with packwatch's names and signs.
 
-    ``table`` may be anything that returns a column by its name: a pandas or polars DataFrame, a pyarrow table, a dictionary. The format does
+    ``table`` is anything that returns a column by its name: a pandas or polars DataFrame, a pyarrow table, a dictionary. The format does
     not state the sign of the current, so ``positive`` states what a positive current means.
 
     Raises:
