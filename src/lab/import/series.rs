@@ -1,12 +1,12 @@
-//! Joins signals to one line with `{n}` if their names differ only in a number.
+//! Joins signals whose names differ only in one number to a single line with `{n}`.
 //!
-//! A series is a run of signals at rising positions of one answer. They are equal except for one number in their names, which counts
-//! by one, and their bits, which have a constant distance. Leading zeros of the number are dropped, because `{n}` in a pattern matches
-//! any number of them.
+//! A series is a run of signals at rising positions of one answer. The signals are equal except for one number in their names, which
+//! increases by one, and their bits, which have a constant distance. Leading zeros of the number are dropped, because `{n}` in a
+//! pattern matches a number with any leading zeros.
 
 use crate::import::{DiagnosticSignal, NumberRange};
 
-/// A name, split around one of its numbers.
+/// A name that is split around one of its numbers.
 #[derive(Debug, PartialEq, Eq)]
 struct NumberedName<'a> {
     before: &'a str,
@@ -51,7 +51,7 @@ fn series(name: &NumberedName<'_>, signals: &[DiagnosticSignal]) -> (DiagnosticS
     (joined, length)
 }
 
-/// The name, split around each of its numbers.
+/// Returns the name, split around each of its numbers in turn.
 fn numbered(name: &str) -> Vec<NumberedName<'_>> {
     let mut found = Vec::new();
     let mut at = 0;

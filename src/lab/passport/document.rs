@@ -1,7 +1,9 @@
-//! The passport as JSON: the manufacturer's part merged with the known values, checked against the form of its standard.
+//! The passport as JSON. The known values are merged into the manufacturer's part, and the result is checked against the form of its
+//! standard.
 //!
 //! Input: a [`Condition`] and the manufacturer's part. Output: the passport, and the [details](details) for which the standards have no
-//! members. A value has one source: a static part that states a measured value is rejected. The same inputs give the same bytes.
+//! members. Each value has one source: a manufacturer's part that states a measured value is rejected. The same inputs give the same
+//! bytes.
 
 use serde_json::{Map, Value, json};
 
@@ -16,7 +18,8 @@ use crate::io::stamp::format_utc;
 /// Merges the known values into the manufacturer's part and checks the result.
 ///
 /// # Errors
-/// Every fault of the static part with its path, and every missing required value with the reason; one per line.
+/// The manufacturer's part is faulty, or required values are missing. The error has one line per fault with its path, and one per
+/// missing value with the reason.
 pub fn passport(standard: Standard, condition: &Condition, manufacturer: Value) -> Result<Value, Vec<String>> {
     let Value::Object(mut root) = manufacturer else {
         return Err(vec!["static part: must be an object".to_owned()]);
@@ -39,7 +42,7 @@ pub fn passport(standard: Standard, condition: &Condition, manufacturer: Value) 
     if faults.is_empty() { Ok(document) } else { Err(faults) }
 }
 
-/// Every value with its unit, definition, standard deviation and time, and the reasons for absent values.
+/// Returns every value with its unit, definition, standard deviation and time, and the reason for each absent value.
 pub fn details(standard: Standard, condition: &Condition, vehicle: &VehicleIdentity) -> Value {
     let (mut values, mut absent) = (Vec::new(), Vec::new());
     for field in Field::ALL {
@@ -74,7 +77,7 @@ fn places(standard: Standard) -> impl Iterator<Item = (Field, Place)> {
     Field::ALL.into_iter().filter_map(move |field| Some((field, field.place(standard)?)))
 }
 
-/// Whether a path leads to a group or equals it.
+/// Whether a path is above a group, or equals it.
 fn is_above(path: &str, group: &str) -> bool {
     group.strip_prefix(path).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
 }
@@ -84,7 +87,7 @@ fn insert(root: &mut Map<String, Value>, group: &str, name: &str, value: Value) 
     let mut object = root;
     for step in group.split('.') {
         let next = object.entry(step).or_insert_with(|| Value::Object(Map::new()));
-        // The check of the form reports other values in this place.
+        // If another value is in this place, the check of the form reports it.
         let Some(next) = next.as_object_mut() else { return Ok(()) };
         object = next;
     }
@@ -98,7 +101,7 @@ fn insert(root: &mut Map<String, Value>, group: &str, name: &str, value: Value) 
     Ok(())
 }
 
-/// Faults of a static part that belongs to another battery. Only Catena-X states the rated values.
+/// Returns faults that show that the manufacturer's part belongs to another battery. Only Catena-X states the rated values.
 fn other_battery(rated: Rated, document: &Value) -> impl Iterator<Item = String> {
     let both = [
         ("capacity", rated.capacity_ah, "Ah by the configuration (cell model and strings)"),

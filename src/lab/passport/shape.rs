@@ -1,8 +1,9 @@
-//! The form that a standard asks of a JSON document, and the check of a document against it.
+//! The form that a standard requires of a JSON document, and the check of a document against this form.
 //!
-//! In: rows of path and kind, e.g. `identification.codes[].key|value`. `|` separates members of the same form. A member that may be
-//! missing ends in `?` in the first row that names it; `[]` is a list, `{}` a list without duplicates. Out: every fault with its path, and the required members that are missing. A member that
-//! the standard does not have is a fault too: a misspelt name would go unnoticed.
+//! Input: rows of path and kind, for example `identification.codes[].key|value`. In a path, `|` separates members of the same form,
+//! `[]` is a list, and `{}` is a list without duplicates. A member that may be missing ends in `?` in the first row that names it.
+//! Output: every fault with its path, and the required members that are missing. A member that the standard does not define is also a
+//! fault, because a misspelt name would otherwise stay unnoticed.
 
 use std::collections::HashSet;
 use std::ops::Range;
@@ -28,11 +29,11 @@ pub(super) enum Kind {
     Time,
     /// A UUID, possibly as a URN.
     Uuid,
-    /// A business partner number: these letters and twelve characters.
+    /// A business partner number: the given letters, followed by twelve characters.
     Partner(&'static str),
-    /// One of these texts.
+    /// One of the given texts.
     Choice(&'static [&'static str]),
-    /// One of these texts, or `customKey:` and a word.
+    /// One of the given texts, or `customKey:` followed by a word.
     LocalKey(&'static [&'static str]),
     /// A list of documents: content, contentType, header.
     Documents,
@@ -80,7 +81,7 @@ impl Shape {
         root
     }
 
-    /// Adds a leaf below this object, or several where the path has alternatives.
+    /// Adds a leaf below this object. If the path has alternatives, adds one leaf for each.
     fn add(&mut self, path: &str, kind: Kind) {
         let (steps, rest) = path.split_once('.').unwrap_or((path, ""));
         let Self::Object(members) = self else { return };
@@ -114,8 +115,8 @@ impl Shape {
         }
     }
 
-    /// Checks a document. A missing object counts as one missing member, unless `is_opened` holds for its path: then its own required
-    /// members count.
+    /// Checks a document. A missing object counts as one missing member. If `is_opened` returns true for the path of the object, its
+    /// own required members count instead.
     pub(super) fn check(&self, document: &Value, is_opened: &dyn Fn(&str) -> bool) -> Verdict {
         let mut verdict = Verdict::default();
         self.check_at("", document, is_opened, &mut verdict);
@@ -192,7 +193,7 @@ fn short(value: &Value) -> String {
 }
 
 impl Kind {
-    /// The allowed values; `None` = the value is allowed.
+    /// Returns the allowed values; `None` = the value is allowed.
     fn refuses(self, value: &Value) -> Option<String> {
         let number = |is_good: &dyn Fn(f64) -> bool| value.as_f64().is_some_and(is_good);
         let text = |is_good: &dyn Fn(&str) -> bool| value.as_str().is_some_and(is_good);
@@ -216,14 +217,14 @@ impl Kind {
                 let is_key = |text: &str| all.contains(&text) || text.strip_prefix("customKey:").is_some_and(is_word);
                 (text(&is_key), format!("one of {}, customKey:WORD", all.join(", ")))
             }
-            // Not used for leaves.
+            // Leaves do not have these kinds.
             Self::Documents | Self::Facilities | Self::Reading => (true, String::new()),
         };
         (!is_good).then_some(allowed)
     }
 }
 
-/// Whether the text has this form: `0` stands for a digit, other characters for themselves.
+/// Whether a text has a form. In the form, `0` stands for any digit; other characters stand for themselves.
 fn has_form(text: &str, form: &str) -> bool {
     let fits = |(byte, expected): (u8, u8)| if expected == b'0' { byte.is_ascii_digit() } else { byte == expected };
     text.len() == form.len() && text.bytes().zip(form.bytes()).all(fits)
@@ -245,7 +246,7 @@ fn is_date(text: &str) -> bool {
     (1..=days).contains(&day)
 }
 
-/// Whether the text is date and time; seconds may have decimals, the zone is `Z`, an offset or missing.
+/// Whether a text is date and time. Seconds may have decimals. The zone is `Z`, an offset, or missing.
 fn is_time(text: &str) -> bool {
     let Some((date, clock)) = text.split_once('T') else { return false };
     let zone_at = clock.find(['Z', '+', '-']).unwrap_or(clock.len());
@@ -270,7 +271,7 @@ fn is_zone(zone: &str) -> bool {
     matches!(zone, "" | "Z") || zone.strip_prefix(['+', '-']).is_some_and(is_offset)
 }
 
-/// The number in these digits; 0 for other characters.
+/// Returns the number in these digits; other characters give 0.
 fn number_in(text: &str, digits: Range<usize>) -> u32 {
     text.get(digits).and_then(|digits| digits.parse().ok()).unwrap_or(0)
 }

@@ -1,11 +1,11 @@
-//! Stores a record of any length in a limited number of bins: when they are full, neighbouring bins are joined.
+//! Stores a record of any length in a limited number of bins. When all bins are used, neighbouring bins are joined.
 
-/// Most bins: about two per pixel column of a wide picture.
+/// Maximum number of bins: about two per pixel column of a wide picture.
 const MOST: usize = 2048;
 
 /// Content of a bin.
 pub(super) trait Bin: Clone + Default {
-    /// Joins a later neighbour to this bin.
+    /// Adds the content of the next bin to this bin.
     fn join(&mut self, later: &Self);
 }
 
@@ -22,7 +22,7 @@ impl<B: Bin> Bins<B> {
         Self { begin_s, width_s: 1.0, bins: Vec::new() }
     }
 
-    /// Returns the bin of a time; a time before the first (after a clock was set back) belongs to the first bin.
+    /// Returns the bin of a time. A time before the first one (after a clock was set back) belongs to the first bin.
     pub(super) fn at(&mut self, time_s: f64) -> &mut B {
         let after_s = (time_s - self.begin_s).max(0.0);
         while after_s / self.width_s >= MOST as f64 {
@@ -45,7 +45,7 @@ impl<B: Bin> Bins<B> {
         self.bins = joined.collect();
     }
 
-    /// The bins with the times of their centres.
+    /// Returns the bins with the times of their centres.
     pub(super) fn iter(&self) -> impl Iterator<Item = (f64, &B)> {
         let middle = |index: usize| self.begin_s + (index as f64 + 0.5) * self.width_s;
         self.bins.iter().enumerate().map(move |(index, bin)| (middle(index), bin))

@@ -9,9 +9,9 @@ use crate::quantity::CellIndex;
 /// Content of a page in addition to the data.
 #[derive(Debug, Default)]
 pub struct PageContext<'a> {
-    /// Title of the page.
+    /// Title shown on the page.
     pub title: String,
-    /// Source of thresholds and rated capacity; `None` = unknown.
+    /// Configuration with thresholds and rated capacity; `None` = unknown.
     pub config: Option<&'a Config>,
     /// Text of the configuration file, for the end of the page.
     pub config_text: Option<String>,

@@ -1,6 +1,6 @@
-//! Data of a report, collected from a store's rows or from a replay's events and estimates.
+//! Data of a report, collected from the rows of a store or from the events and estimates of a replay.
 //!
-//! Times are seconds on the wall clock; in a replay, on the clock of the log. Cells count from 0.
+//! Times are in seconds. They are on the wall clock, or in a replay on the clock of the log. Cells count from 0.
 
 use std::collections::BTreeSet;
 
@@ -15,9 +15,9 @@ use crate::store::{HistoryEntry, HistoryQuery, HistoryReader, HistoryTable};
 /// Origin of the data.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Origin {
-    /// A store's history: learned values and alarms, no samples.
+    /// The history of a store, with learned values and alarms but without samples.
     Store,
-    /// A replay: everything.
+    /// A replay, which contains all data.
     Replay,
 }
 
@@ -41,12 +41,12 @@ pub(super) struct CapacityRecord {
     pub(super) measured_ah: Option<f64>,
     /// Standard deviation of that capacity, Ah.
     pub(super) measured_std_ah: Option<f64>,
-    /// Mean and standard deviation, Ah.
+    /// Learned capacity, Ah: mean and standard deviation.
     pub(super) capacity_ah: (f64, f64),
     pub(super) usable_ah: Option<(f64, f64)>,
     /// Losses of lithium and of the material of the negative and positive electrode, fractions.
     pub(super) losses: Option<[(f64, f64); 3]>,
-    /// Relative to new.
+    /// Resistance relative to new: mean and standard deviation.
     pub(super) resistance: (f64, f64),
 }
 
@@ -55,7 +55,7 @@ pub(super) struct CapacityRecord {
 pub(super) struct RechargeRecord {
     pub(super) time_s: f64,
     pub(super) raw_s: Option<f64>,
-    /// Mean and standard deviation.
+    /// Normalised recharge period, s: mean and standard deviation.
     pub(super) normalised_s: Option<(f64, f64)>,
 }
 
@@ -95,7 +95,7 @@ pub struct DataSource {
     pub origin: Origin,
     /// Number of the store's pack, from 1.
     pub pack: Option<i64>,
-    /// Reason for doubt about the data: a sentence without its full stop.
+    /// Reason for doubt about the data, as a sentence without its full stop.
     pub doubt: Option<String>,
 }
 
@@ -108,7 +108,7 @@ pub struct Data {
     pub(super) recharges: Vec<RechargeRecord>,
     pub(super) alarms: Vec<AlarmRecord>,
     pub(super) models: Vec<ModelRecord>,
-    /// Resets, damages and lost trust: time and text.
+    /// Time and text of resets, damages and losses of trust.
     pub(super) incidents: Vec<(f64, String)>,
     pub(super) trace: Trace,
     /// Cells whose estimate is untrusted at the end.
@@ -151,7 +151,7 @@ impl Data {
         Ok(data)
     }
 
-    /// Sets the reason for doubt about the data: a sentence without its full stop.
+    /// Sets the reason for doubt about the data. The text is a sentence without its full stop.
     pub fn doubt(&mut self, why: String) {
         self.source.doubt = Some(why);
     }
@@ -232,7 +232,7 @@ impl Data {
         });
     }
 
-    /// Adds the losses of a cell to its capacity of the same time, which came before.
+    /// Adds the losses of a cell to its capacity of the same time, which was received before.
     fn take_losses(&mut self, time_s: f64, fields: &Fields) {
         let Some(cell) = cell_of(fields) else { return };
         let [lithium, negative, positive] =
@@ -296,7 +296,7 @@ impl Data {
         self.incidents.push((time_s, what));
     }
 
-    /// A replay's report, like a store's, describes the pack that is connected at the end.
+    /// Removes the data of the old pack. The report of a replay, like that of a store, describes the pack that is connected at the end.
     fn forget_pack(&mut self) {
         self.halves.clear();
         self.learned.clear();
@@ -323,7 +323,7 @@ impl Data {
 
     /// Whether times are dates.
     pub(super) fn is_dated(&self) -> bool {
-        // Later stamps are dates, s since 1970; a log with earlier stamps counts from its own start.
+        // From this value on, times are dates, s since 1970. Smaller times count from the start of a log.
         self.first_s >= 3.0e8
     }
 

@@ -1,7 +1,7 @@
-//! Data for the report's tests: a recording of estimates, and a worn pack that gives every card a value.
+//! Data for the tests of the report: a recording of estimates, and a worn pack for which every card has a value.
 //!
-//! Times in s; cells count from 0. Standard deviations differ between quantities and between neighbouring cells, so that a test
-//! detects one printed in place of another.
+//! Times are in s; cells count from 0. Standard deviations differ between quantities and between neighbouring cells. A test can
+//! therefore detect that a standard deviation is printed in place of another.
 
 use std::path::Path;
 
@@ -16,7 +16,7 @@ pub(super) const HALVES: u16 = 60;
 /// End of the first half-cycle, 2023-11-14, and time between the ends.
 const FIRST_END_S: f64 = 1.7e9;
 const HALF_CYCLE_S: f64 = 21_600.0;
-/// Number of estimates of a recording, without the first.
+/// Number of estimates of a recording after the first.
 const STEPS: u16 = 60;
 
 /// The demo's configuration: cells of 2.6 Ah rated, end of life at 2.08 Ah.
@@ -67,9 +67,9 @@ pub(super) fn stds(cell: u16) -> CellStds {
     CellStds { capacity_ah, usable_ah, resistance, losses: [0.02, 0.07, 0.12].map(|std| std + 0.01 * own) }
 }
 
-/// A pack at the end of [`HALVES`] half-cycles. The last cell has the smallest capacity, the first the smallest usable capacity
-/// and the largest resistance; the second has lost most lithium, the third most of the negative and the first most of the positive
-/// electrode.
+/// Creates a pack at the end of [`HALVES`] half-cycles. The last cell has the smallest capacity. The first cell has the smallest usable
+/// capacity and the largest resistance. The losses of lithium, of the negative and of the positive electrode are largest in the second,
+/// third and first cell.
 pub(super) fn worn(cells: u16) -> Data {
     let mut data = Data::new(Origin::Replay);
     for half in 0..HALVES {

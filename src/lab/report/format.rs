@@ -41,7 +41,7 @@ pub(super) fn amount(value: f64, rule: &str) -> String {
     format!("{digits} {}", unit.replace("degrees C", "\u{b0}C")).trim_end().to_owned()
 }
 
-/// Formats an alarm like "a cell's usable capacity was 1.38 Ah, limit 1.4 Ah (cell 3)"; `verb` is "is" or "was".
+/// Formats an alarm, for example "a cell's usable capacity was 1.38 Ah, limit 1.4 Ah (cell 3)". `verb` is "is" or "was".
 pub(super) fn alarm_text(row: &AlarmRecord, verb: &str) -> String {
     let amount = |value: f64| amount(value, &row.rule);
     let value = row.value.map_or_else(|| "unknown".to_owned(), amount);

@@ -8,16 +8,16 @@ use crate::io::table::TableError;
 /// Measured or true values; times in s on the clock of the data.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Reference {
-    /// Time and Ah; if rows name their cell, of the weakest cell.
+    /// Time and capacity, Ah. If the rows name their cells, the capacity is that of the weakest cell.
     pub capacities: Vec<(f64, f64)>,
-    /// Whether capacities were measured under load; otherwise they are between full and empty.
+    /// Whether the capacities were measured under load. Otherwise, they are the charge between full and empty.
     pub is_loaded: bool,
-    /// Time, and SOC of the lowest and the highest cell, fraction.
+    /// Time, and the lowest and highest SOC of all cells, fraction.
     pub socs: Vec<(f64, f64, f64)>,
 }
 
-/// Reads a [`CapacityTable`]. With a column `cell`, rows of the same time are joined to the weakest cell's capacity and the lowest
-/// and highest SOC.
+/// Reads a [`CapacityTable`]. If it has a column `cell`, rows with the same time are joined to the capacity of the weakest cell, and to
+/// the lowest and highest SOC.
 ///
 /// # Errors
 /// The file cannot be read, a column is missing, or a value is not a number or is out of range; the error names file and line.
@@ -48,7 +48,7 @@ pub fn read(path: &Path) -> Result<Reference, TableError> {
     Ok(reference)
 }
 
-/// Keeps the points at which the capacity changed by more than 0.02 %, and the last.
+/// Keeps the points at which the capacity has changed by more than 0.02 %, and the last point.
 fn thin(points: &mut Vec<(f64, f64)>) {
     let last = points.last().copied();
     let mut kept_ah = f64::INFINITY;

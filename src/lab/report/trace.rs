@@ -1,4 +1,4 @@
-//! Summary of a replay's estimates in bins: SOC, temperature, and consistency of the estimator.
+//! Summary of the estimates of a replay in bins: SOC, temperature, and consistency of the estimator.
 
 use std::collections::VecDeque;
 
@@ -13,20 +13,20 @@ pub(super) struct TraceBin {
     pub(super) soc: (f64, f64),
     /// Lowest and highest end of a 95 % interval.
     pub(super) soc_band: (f64, f64),
-    /// Degrees C.
+    /// Lowest and highest temperature, degrees Celsius.
     pub(super) temperature_c: (f64, f64),
-    /// V.
+    /// Lowest and highest innovation, V.
     pub(super) innovation_v: (f64, f64),
     pub(super) health: Consistency,
 }
 
-/// Consistency of the innovations with the filter's own variance.
+/// Consistency of the innovations with the variance that the filter states.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Consistency {
     pub(super) count: u64,
-    /// Number within their own 95 % interval.
+    /// Number of innovations within their own 95 % interval.
     pub(super) inside: u64,
-    /// Number rejected by the gate.
+    /// Number of innovations rejected by the gate.
     pub(super) gated: u64,
     /// Sum of (innovation / standard deviation) squared.
     pub(super) squares: f64,
@@ -81,12 +81,12 @@ impl Consistency {
         self.squares += other.squares;
     }
 
-    /// Share of innovations within their own 95 % interval.
+    /// Returns the share of innovations within their own 95 % interval.
     pub(super) fn coverage(&self) -> Option<f64> {
         (self.count > 0).then(|| self.inside as f64 / self.count as f64)
     }
 
-    /// Mean normalised innovation squared: 1 if the filter's variance is right.
+    /// Returns the mean normalised innovation squared. It is 1 if the variance of the filter is right.
     pub(super) fn mean_nis(&self) -> Option<f64> {
         (self.count > 0).then(|| self.squares / self.count as f64)
     }

@@ -13,7 +13,7 @@ use crate::quantity::Timestamp;
 pub(crate) struct Discharge {
     /// Start of the discharge.
     pub(crate) start: Timestamp,
-    /// Published capacity, Ah; `None` = not stated.
+    /// Published capacity, Ah; `None` = the table does not state it.
     pub(crate) capacity_ah: Option<f64>,
 }
 
@@ -21,7 +21,7 @@ pub(crate) struct Discharge {
 #[derive(Debug, Clone, PartialEq)]
 pub struct CycleTable {
     starts: HashMap<String, Timestamp>,
-    /// In order of time; discharge number n is the n-th, counted from 1.
+    /// Discharges in order of time. Discharge number n is the n-th entry, counted from 1.
     pub(crate) discharges: Vec<Discharge>,
 }
 
@@ -49,7 +49,8 @@ impl CycleTable {
         Ok(table)
     }
 
-    /// Reduces the capacities to the charge down to the load's cut-off, without the charge that the tester took later at a held voltage.
+    /// Reduces each capacity to the charge down to the load's cut-off. Charge that the tester took out later, at a held voltage, is
+    /// subtracted.
     pub(super) fn at_load(&self, parts: &[MeasuredPart]) -> Self {
         let mut table = self.clone();
         for part in parts.iter().filter(|part| part.is_discharge()) {
@@ -62,12 +63,12 @@ impl CycleTable {
         table
     }
 
-    /// Start of the part with this key; `None` = not in the table.
+    /// Returns the start of the part with this key; `None` = the table does not contain it.
     pub(super) fn start(&self, key: &str) -> Option<Timestamp> {
         self.starts.get(key).copied()
     }
 
-    /// Number, from 1, of the latest discharge that started by `time`; 0 = before the first.
+    /// Returns the number, from 1, of the latest discharge that had started at `time`; 0 = `time` is before the first.
     pub(super) fn number_at(&self, time: Timestamp) -> usize {
         self.discharges.partition_point(|discharge| discharge.start <= time)
     }

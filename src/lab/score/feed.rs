@@ -1,4 +1,4 @@
-//! Feeds rows of a measured file to the monitor: as frames on a bus, with the driver's ticks between them.
+//! Feeds the rows of a measured file to the monitor: as frames on a bus, with the ticks of the driver between them.
 
 use crate::can::decode::SensorIndex;
 use crate::filter::ScalarGaussian;
@@ -6,10 +6,10 @@ use crate::monitor::{Downtime, ModelState, MonitorConfig, Outputs, Snapshot};
 use crate::quantity::{CellIndex, Channel, Timestamp};
 use crate::replay::MonitorDriver;
 
-/// Time between the record so far and a part that starts at an unknown time.
+/// Assumed time between the record so far and a part whose start is unknown, ns.
 pub(super) const UNKNOWN_GAP_NS: i64 = 1_000_000_000;
 
-/// State of a monitor after the files it has learned from.
+/// State of a monitor after the files from which it has learned.
 #[derive(Debug, Clone)]
 pub struct Learned {
     /// The state.
@@ -24,7 +24,7 @@ pub struct Learned {
 pub(super) struct Feeder(MonitorDriver);
 
 impl Feeder {
-    /// Creates a monitor before its first row, in the state it has learned.
+    /// Creates a monitor that has received no row. It starts in the learned state, if there is one.
     pub(super) fn new(config: MonitorConfig, sleep_gap_s: f64, learned: Option<&Learned>) -> Self {
         let mut driver = MonitorDriver::new(config, sleep_gap_s);
         if let Some(learned) = learned {
@@ -35,7 +35,7 @@ impl Feeder {
         Self(driver)
     }
 
-    /// Outputs since the caller last cleared them.
+    /// Returns the outputs since the caller last cleared them.
     pub(super) fn out(&mut self) -> &mut Outputs {
         &mut self.0.out
     }
@@ -52,7 +52,7 @@ impl Feeder {
         Learned { snapshot: monitor.snapshot(), model: monitor.model().state, capacity }
     }
 
-    /// Feeds one row: A (positive = discharge), V, degrees C; NaN = no value.
+    /// Feeds one row: current, A (positive = discharge), voltage, V, and temperature, degrees Celsius; NaN = no value.
     pub(super) fn row(&mut self, time: Timestamp, current_a: f64, voltage_v: f64, temperature_c: f64) {
         let values = [
             (Channel::Current, Some(current_a)),

@@ -1,4 +1,4 @@
-//! Learns from measured files before the scored file: runs them through the monitor, one after the other.
+//! Learns from measured files before a file is scored: runs them through the monitor, one after the other.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,4 @@
-//! A cell's life: usable capacity after each discharge against the published one.
+//! Scores the life of a cell: usable capacity after each discharge, compared with the published capacity.
 
 use serde::Serialize;
 
@@ -38,7 +38,7 @@ pub struct LifeScore {
     pub discharges: usize,
     /// Number of discharges in the statistics.
     pub scored: usize,
-    /// Number of discharges, after those skipped, without an estimate or without a published capacity.
+    /// Number of discharges, without those skipped, that have no estimate or no published capacity.
     pub left_out: usize,
     /// Mean |estimate - published|, Ah.
     pub mean_abs_error_ah: f64,
@@ -52,9 +52,9 @@ pub struct LifeScore {
     pub mean_half_width_ah: f64,
     /// Threshold of the two results below, Ah.
     pub threshold_ah: f64,
-    /// First discharge (after those skipped) whose estimate is below the threshold.
+    /// First discharge (without those skipped) whose estimate is below the threshold.
     pub first_below_estimate: Option<usize>,
-    /// First discharge (after those skipped) whose published capacity is below the threshold.
+    /// First discharge (without those skipped) whose published capacity is below the threshold.
     pub first_below_truth: Option<usize>,
     /// Every discharge with an estimate.
     pub each: Vec<DischargeScore>,
@@ -63,7 +63,7 @@ pub struct LifeScore {
 /// Collects the estimates after each discharge from the monitor's events.
 #[derive(Debug, Default)]
 pub(super) struct LifeRecorder {
-    /// Mode of the latest half-cycle; its capacity event follows.
+    /// Mode of the latest half-cycle. The capacity event of this half-cycle follows.
     mode: Option<Mode>,
     each: Vec<DischargeScore>,
 }

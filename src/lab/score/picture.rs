@@ -8,7 +8,7 @@ use super::soc::SocSample;
 use crate::OF_95;
 use crate::chart::{self, Axis, Chart, Ink, Layer, Picture, PlotError};
 
-/// Names for an error of the capacity and of the current.
+/// Words for the errors of capacity and current.
 const WORDS: [&str; 2] = ["capacity", "current"];
 
 /// Draws the run and returns the path of the file.
@@ -33,7 +33,7 @@ pub(super) fn draw(
 }
 
 fn band(points: impl Iterator<Item = (f64, f64, f64)>) -> Layer {
-    // (x, middle, half of the interval)
+    // Converts (x, middle, half of the interval) to (x, lower, upper).
     let points = points.map(|(x, middle, half)| (x, middle - half, middle + half));
     Layer::band("95 % interval", Ink::Orange, points)
 }

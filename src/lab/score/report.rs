@@ -13,7 +13,7 @@ use crate::monitor::ModelState;
 /// Scores with their settings.
 #[derive(Debug)]
 pub struct ScoreReport {
-    /// The configuration's path.
+    /// Path of the configuration.
     pub config: PathBuf,
     /// Settings of all files and cases.
     pub settings: ScoreSettings,
@@ -239,7 +239,7 @@ fn least<T>(all: &[(&str, &T)], value: impl Fn(&T) -> f64) -> f64 {
     all.iter().map(|(_, score)| value(score)).fold(f64::INFINITY, f64::min)
 }
 
-/// The file with the largest value, with that value.
+/// Returns the file with the largest value, and this value.
 fn worst<'a, T>(all: &[(&'a str, &T)], value: impl Fn(&T) -> f64) -> Option<(&'a str, f64)> {
     all.iter().map(|(name, score)| (*name, value(score))).max_by(|a, b| a.1.total_cmp(&b.1))
 }
@@ -287,7 +287,7 @@ fn life_row(score: &CaseScore, life: &LifeScore) -> Vec<String> {
     ]
 }
 
-/// Formats a finite value; others become a dash.
+/// Formats a finite value. Other values become a dash.
 fn known(value: f64, format: impl Fn(f64) -> String) -> String {
     if value.is_finite() { format(value) } else { "-".to_owned() }
 }

@@ -1,4 +1,4 @@
-//! A request for scores, for the command line and the Python module, and the run made from it.
+//! A request for scores, which the command line and the Python module use, and the run that is made from it.
 //!
 //! Input: files, the configuration of the cell, starts of the estimator, settings of the statistics. Output: [`ScoreRun`], with all
 //! inputs read and checked. Errors name the file or the argument.
@@ -21,9 +21,9 @@ pub struct ScoreRequest {
     pub source: CellSource,
     /// Files that the monitor has seen before, in order.
     pub learn: Vec<PathBuf>,
-    /// Where in each file the estimator starts.
+    /// Starts of the estimator in each file.
     pub start: Vec<Start>,
-    /// Share of the full charge that has been taken out where a start in the middle begins.
+    /// For a start in the middle of a file: the share of the full charge that has been taken out before the start.
     pub remove: f64,
     /// Errors of the initial SOC, points; `None` = no initial SOC.
     pub soc_error_points: Vec<Option<f64>>,
@@ -35,7 +35,7 @@ pub struct ScoreRequest {
     pub capacity_std_percent: Option<f64>,
     /// Offsets of the current sensor, A.
     pub current_offset_a: Vec<f64>,
-    /// Time after the start without statistics, s.
+    /// Time after the start that is left out of the statistics, s.
     pub settle_s: f64,
     /// Charge from full to empty that defines the true SOC, Ah; `None` = the model's capacity.
     pub truth_capacity_ah: Option<f64>,
@@ -43,13 +43,13 @@ pub struct ScoreRequest {
     pub sleep_gap_s: f64,
     /// Tables of published capacities, one per file; empty without tables.
     pub cycles: Vec<PathBuf>,
-    /// Load of those capacities: A, degrees C, V; `None` = the configuration's `[usable]`.
+    /// Load at which the capacities were published: A, degrees Celsius, V; `None` = `[usable]` of the configuration.
     pub load: Option<[f64; 3]>,
-    /// Capacity whose first undershoot is reported, Ah.
+    /// Capacity threshold, Ah; the first discharge below it is reported.
     pub threshold_ah: f64,
-    /// Number of discharges before the statistics of the capacity.
+    /// Number of discharges at the start of a life that are left out of the statistics.
     pub skip_cycles: usize,
-    /// Smallest and largest share of each half-cycle's charge that is visible.
+    /// Smallest and largest share of the charge of each half-cycle that the monitor sees; `None` = it sees everything.
     pub window: Option<(f64, f64)>,
     /// Seeds of the windows.
     pub seeds: Vec<u64>,

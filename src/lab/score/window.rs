@@ -11,7 +11,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::measured::MeasuredPart;
 
-/// The visible rows of part number `index`: at least one, unless the part is empty.
+/// Returns the visible rows of part number `index`. There is at least one, unless the part is empty.
 pub(super) fn rows(part: &MeasuredPart, index: usize, seed: u64, (least, most): (f64, f64)) -> Range<usize> {
     let moved = moved_as(part);
     let total = moved.last().copied().unwrap_or(0.0);
@@ -28,7 +28,7 @@ pub(super) fn rows(part: &MeasuredPart, index: usize, seed: u64, (least, most): 
     first..end.max(first + 1)
 }
 
-/// Charge moved up to each row, A s, both directions added.
+/// Returns the charge moved up to each row, A s; both directions are added.
 fn moved_as(part: &MeasuredPart) -> Vec<f64> {
     let mut total = 0.0;
     let mut before_s = part.time_s.first().copied().unwrap_or(0.0);
@@ -42,7 +42,7 @@ fn moved_as(part: &MeasuredPart) -> Vec<f64> {
     part.time_s.iter().zip(&part.current_a).map(&mut step).collect()
 }
 
-/// Uniform in [0, 1).
+/// Returns a random number in [0, 1), uniformly distributed.
 fn uniform(generator: &mut ChaCha8Rng) -> f64 {
     let unit = 1.0 / (1_u64 << 53) as f64;
     (generator.next_u64() >> 11) as f64 * unit

@@ -1,13 +1,14 @@
 //! Expressions of one variable `x` as in BPX files: a subset of Python's grammar, evaluated without Python.
 //!
 //! Input: a text with numbers, `x`, `+ - * / **`, signs, parentheses and the functions of [`FUNCTIONS`]. Output: a program for a stack
-//! machine, evaluated with `libm`, so that the same text gives the same bytes on every machine. As in Python, `**` binds more tightly
-//! than a sign before it (`-x**2` is `-(x**2)`) and is right-associative. A fault states the column, what was found and what is allowed.
+//! machine. It is evaluated with `libm`, so the same text gives the same bytes on every machine. As in Python, `**` is
+//! right-associative and binds more tightly than a sign before it (`-x**2` is `-(x**2)`). A fault states the column, what was found and
+//! what is allowed.
 
-/// Longest text, bytes; the longest known potential has 500 bytes.
+/// Maximum length of a text, bytes; the longest known potential has 500 bytes.
 const MAX_BYTES: usize = 20_000;
 
-/// Deepest nesting of parentheses, functions, signs and powers; deeper nesting would exhaust the parser's stack.
+/// Maximum nesting of parentheses, functions, signs and powers. Deeper nesting would exhaust the stack of the parser.
 const MAX_DEPTH: usize = 64;
 
 type Function = fn(f64) -> f64;
@@ -64,7 +65,7 @@ impl Expression {
         }
     }
 
-    /// Value at `x`; NaN or infinite if the expression is.
+    /// Returns the value at `x`; it is NaN or infinite if the expression is.
     pub(super) fn at(&self, x: f64) -> f64 {
         let mut stack = Vec::with_capacity(16);
         for step in &self.0 {
@@ -112,13 +113,13 @@ impl Parser<'_> {
         &self.text[self.at..]
     }
 
-    /// The next character that is not white space.
+    /// Returns the next character that is not white space.
     fn peek(&mut self) -> Option<char> {
         self.at = self.text.len() - self.rest().trim_start().len();
         self.rest().chars().next()
     }
 
-    /// Consumes `token` if it comes next.
+    /// Consumes `token` if the text continues with it; returns whether it did.
     fn accept(&mut self, token: &str) -> bool {
         let is_next = self.peek().is_some() && self.rest().starts_with(token);
         if is_next {
@@ -132,7 +133,7 @@ impl Parser<'_> {
         format!("column {}: {found}, must be {allowed}", self.text[..self.at].chars().count() + 1)
     }
 
-    /// The next name, or else the next character.
+    /// Returns the next name, or else the next character.
     fn word(&self) -> &str {
         let rest = self.rest();
         let is_name = |c: char| c.is_alphanumeric() || c == '_';
@@ -160,7 +161,7 @@ impl Parser<'_> {
         Ok(())
     }
 
-    /// A power with signs before it.
+    /// Parses a power with the signs before it.
     fn signed(&mut self) -> Result<(), String> {
         self.depth += 1;
         if self.depth > MAX_DEPTH {

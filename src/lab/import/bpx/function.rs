@@ -1,13 +1,13 @@
-//! A parameter of a BPX file that may depend on a variable: a number, an expression of `x`, or a table.
+//! A parameter of a BPX file that may depend on a variable. It is a number, an expression of `x`, or a table.
 
 use serde_json::Value;
 
 use super::expression::Expression;
 
-/// Most points of a table; measured potentials have a few thousand.
+/// Maximum number of points of a table; measured potentials have a few thousand.
 const MAX_POINTS: usize = 100_000;
 
-/// Path below a JSON value (empty, or starting with a dot), and what was found and is allowed.
+/// A fault: the path below the JSON value (empty, or starting with a dot), and a text with what was found and what is allowed.
 type Fault = (String, String);
 
 /// A function of stoichiometry or concentration.
@@ -15,7 +15,7 @@ type Fault = (String, String);
 pub(super) enum Function {
     Constant(f64),
     Expression(Expression),
-    /// Points with rising `x`; linear between and outside them, as in PyBaMM.
+    /// Points with rising `x`. Values between and outside the points are linear, as in PyBaMM.
     Table(Vec<(f64, f64)>),
 }
 
@@ -23,7 +23,7 @@ impl Function {
     /// Reads a JSON value.
     ///
     /// # Errors
-    /// Path below the value (empty, or starting with a dot), what was found and what is allowed; one entry per fault.
+    /// The value is not a valid parameter. Each entry is a fault with its path below the value.
     pub(super) fn read(value: &Value) -> Result<Self, Vec<Fault>> {
         let fault = |text: String| vec![(String::new(), text)];
         match value {
@@ -37,7 +37,7 @@ impl Function {
         }
     }
 
-    /// Value at `x`.
+    /// Returns the value at `x`.
     pub(super) fn at(&self, x: f64) -> f64 {
         match self {
             Self::Constant(value) => *value,
@@ -50,13 +50,13 @@ impl Function {
         }
     }
 
-    /// Slope at `x`, from `h` below to `h` above it.
+    /// Returns the slope at `x`, computed between `x - h` and `x + h`.
     pub(super) fn slope(&self, x: f64, h: f64) -> f64 {
         (self.at(x + h) - self.at(x - h)) / (2.0 * h)
     }
 }
 
-/// Short form of a JSON value for a message.
+/// Formats a JSON value briefly for a message.
 pub(super) fn found(value: &Value) -> String {
     match value {
         Value::Null => "null".to_owned(),

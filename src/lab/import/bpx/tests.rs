@@ -61,7 +61,7 @@ fn model_of(value: &Value) -> CellModel {
     crate::config::cell_model::load(&path).unwrap()
 }
 
-/// Capacity of either electrode of [`straight`], Ah.
+/// Capacity of each electrode of [`straight`], Ah.
 fn electrode_ah() -> f64 {
     FARADAY_C_PER_MOL * 0.5 * 1e-4 * 0.2 * 30_000.0 / 3600.0
 }
@@ -102,7 +102,7 @@ fn entropic_change_shifts_the_curve_with_temperature() {
 #[test]
 fn single_particle_resistances_match_the_closed_forms() {
     let model = model_of(&straight());
-    // SOC 0.5: x = 0.5, y = 0.6; surface of either electrode 3e5 * 1e-4 * 0.2 = 6 m2.
+    // At SOC 0.5: x = 0.5, y = 0.6. The surface of each electrode is 3e5 * 1e-4 * 0.2 = 6 m2.
     let position = model.grid_position(0.5, 25.0);
     let transfer = |content: f64| {
         GAS_J_PER_MOL_K * 298.15
@@ -116,7 +116,7 @@ fn single_particle_resistances_match_the_closed_forms() {
         assert!((model.branch_r_ohm(branch, &position) / diffusion - 1.0).abs() < 1e-3);
         assert!((model.branch_tau_s(branch, &position) / (25e-12 / 35e-14) - 1.0).abs() < 1e-3);
     }
-    // 15 K colder, a row of the table: Arrhenius' law with 40 kJ/mol, and R T / F.
+    // At 15 K colder, which is a row of the table, two factors apply: Arrhenius' law with 40 kJ/mol, and R T / F.
     let colder = model.r0_ohm(&model.grid_position(0.5, 10.0)) / model.r0_ohm(&position);
     let law = (40_000.0 / GAS_J_PER_MOL_K * (1.0 / 283.15 - 1.0 / 298.15)).exp() * 283.15 / 298.15;
     assert!((colder / law - 1.0).abs() < 1e-3, "{colder} {law}");

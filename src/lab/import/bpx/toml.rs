@@ -6,7 +6,7 @@ use super::document::BpxCell;
 use super::{BpxSettings, ERROR_OF_DROP, Model};
 use crate::fit::{quoted, toml_list as list, toml_table as table};
 
-/// Returns the whole file.
+/// Returns the text of the whole file.
 pub(super) fn text(
     settings: &BpxSettings,
     cell: &BpxCell,

@@ -11,15 +11,15 @@
 use super::document::AddressDocument;
 use crate::can::CanId;
 
-/// `TT` of requests to one controller.
+/// Value of `TT` in requests to one controller.
 const PHYSICAL: u32 = 0xDA;
 
-/// Identifiers of one command.
+/// CAN identifiers of one command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Addresses {
     pub(super) request: CanId,
     pub(super) response: CanId,
-    /// First data byte of requests and of answers, if addressing is extended.
+    /// First data byte of requests and of answers; `None` = addressing is not extended.
     pub(super) extension: Option<(u8, u8)>,
 }
 
@@ -41,7 +41,7 @@ fn standard(document: &AddressDocument) -> Result<Addresses, String> {
     let request = hexadecimal("hdr", &document.hdr)?;
     let response = match &document.rax {
         Some(rax) => hexadecimal("rax", rax)?,
-        // As ISO 15765-4 defines it.
+        // ISO 15765-4 defines this distance.
         None if (0x7E0..=0x7E7).contains(&request) => request + 8,
         None => return Err(format!("hdr is {} without rax, must be 7E0 to 7E7 for that", document.hdr)),
     };
@@ -63,7 +63,7 @@ fn extended(document: &AddressDocument) -> Result<Addresses, String> {
     let priority = byte("pri", document.pri.as_ref())?.map_or(0x18, u32::from);
     let tester = byte("tst", document.tst.as_ref())?.map_or(0xF1, u32::from);
     let sender = match &document.rax {
-        // Longer forms contain more of the identifier; the last byte is the address of the controller.
+        // Longer forms contain more of the identifier. The last byte is the address of the controller.
         Some(rax) => hexadecimal("rax", rax)? & 0xFF,
         None if middle >> 8 == PHYSICAL => middle & 0xFF,
         None => return Err(format!("hdr is {} without rax, must be DA and the address for that", document.hdr)),
@@ -76,7 +76,7 @@ fn extended(document: &AddressDocument) -> Result<Addresses, String> {
     Ok(Addresses { request, response, extension: None })
 }
 
-/// A number of at most 24 bits.
+/// Reads a hexadecimal number of at most 24 bits.
 fn hexadecimal(field: &str, text: &str) -> Result<u32, String> {
     let number = u32::from_str_radix(text, 16).ok().filter(|number| *number <= 0xFF_FFFF && !text.starts_with('+'));
     number.ok_or_else(|| format!("{field} is \"{text}\", must be 1 to 6 hexadecimal digits"))

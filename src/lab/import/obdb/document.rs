@@ -1,5 +1,5 @@
-//! The JSON of an OBDb signal set (github.com/OBDb/.schemas, `signals.json`): used fields, and known fields without effect here. Each
-//! command and signal is read separately, so that a faulty one does not hide the others.
+//! The JSON of an OBDb signal set (github.com/OBDb/.schemas, `signals.json`): the fields that the conversion uses, and known fields
+//! that it ignores. Each command and signal is read separately, so a faulty entry does not hide other entries.
 
 use std::collections::BTreeMap;
 
@@ -50,7 +50,7 @@ pub(super) struct AddressDocument {
     pub(super) proto: Option<String>,
 }
 
-/// Model years of a command: the range, or one of the single years. If `from` is after `to`, the years between them are excluded.
+/// Model years of a command: a range, or a list of single years. If `from` is after `to`, the years between them are excluded.
 #[derive(Debug, Deserialize)]
 pub(super) struct YearFilter {
     from: Option<i64>,
@@ -88,9 +88,9 @@ pub(super) struct FormatDocument {
     #[serde(default = "one")]
     pub(super) div: f64,
     pub(super) unit: Option<String>,
-    /// Values up to this one are not available.
+    /// Values up to this value are not available.
     pub(super) nullmin: Option<f64>,
-    /// Values from this one on are not available.
+    /// Values from this value on are not available.
     pub(super) nullmax: Option<f64>,
     pub(super) map: Option<Value>,
     #[serde(flatten)]

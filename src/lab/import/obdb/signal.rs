@@ -1,17 +1,17 @@
 //! Converts an OBDb signal to a signal of a diagnostic input: position, scaling, range, unit.
 //!
-//! * factor = `mul` / `div`, offset = `add`; `min` defaults to 0, as in OBDb's own decoder. That decoder clamps values to `min` and
-//!   `max`; here, a value outside them is a bad reading. Without a `max` above `min`, the range is unlimited.
-//! * `nullmin`, `nullmax`: values at or outside them are not available. Few codes are listed; otherwise the range ends before
-//!   them.
-//! * All units are kept, also degrees Fahrenheit: nothing is converted.
+//! * factor = `mul` / `div`, offset = `add`. As in OBDb's own decoder, `min` defaults to 0. OBDb's decoder clamps values to `min` and
+//!   `max`; here, a value outside this range is a bad reading. If there is no `max` above `min`, the range is unlimited.
+//! * `nullmin`, `nullmax`: values at or outside these limits are not available. If only a few codes are affected, they are listed;
+//!   otherwise the allowed range ends before these limits.
+//! * All units are kept, including degrees Fahrenheit. Nothing is converted.
 
 use super::document::{FormatDocument, SignalDocument};
 use crate::import::{DiagnosticSignal, ExclusionReason};
 
-/// Most codes listed as "not available"; a person does not read a longer list.
+/// Maximum number of codes that are listed as "not available". Nobody reads a longer list.
 const MAX_LISTED_CODES: usize = 8;
-/// Bits of the longest ISO-TP message with a 12-bit length.
+/// Number of bits of the longest ISO-TP message with a 12-bit length.
 const MAX_BITS: i64 = 4095 * 8;
 
 /// Units: the name in OBDb, `=`, the symbol here. Numbers without a unit have an empty symbol.
@@ -26,7 +26,7 @@ const UNITS: &str = "ampereHours=Ah amps=A bars=bar celsius=degC centimeters=cm 
 /// Why a signal is left out.
 type Fault = (ExclusionReason, String);
 
-/// Converts one signal; its name is the whole `id`.
+/// Converts one signal. Its name is the whole `id`.
 pub(super) fn convert(document: &SignalDocument) -> Result<DiagnosticSignal, Fault> {
     let SignalDocument { id, fmt, .. } = document;
     let invalid = |what: String| (ExclusionReason::InvalidField, what);
@@ -106,13 +106,13 @@ fn limit(signal: &mut DiagnosticSignal, fmt: &FormatDocument) -> Result<(), Stri
     }
     signal.not_available = codes.unwrap_or_default();
     let (low, high) = signal.representable();
-    // Tolerance for the rounded decimals of the file.
+    // Tolerance for the rounding of the decimals in the file.
     let room = 1e-6 * signal.factor.abs();
     signal.range = (low < range.0 - room || high > range.1 + room).then_some(range);
     Ok(())
 }
 
-/// Codes (bits of the signal) whose value is not available; `None` if there are too many.
+/// Returns the codes (bits of the signal) whose value is not available; `None` = there are too many.
 fn listed_codes(signal: &DiagnosticSignal, is_null: impl Fn(f64) -> bool) -> Option<Vec<u64>> {
     let (low, high) = signal.codes();
     let value = |code: f64| code * signal.factor + signal.offset;
@@ -122,7 +122,7 @@ fn listed_codes(signal: &DiagnosticSignal, is_null: impl Fn(f64) -> bool) -> Opt
     };
     let mut codes = from_end(low, 1.0);
     codes.extend(from_end(high, -1.0).into_iter().rev().filter(|code| !codes.contains(code)).collect::<Vec<_>>());
-    // The bits of a negative code.
+    // Bits of a negative code in two's complement.
     let bits = |code: f64| if code < 0.0 { (code + 2.0 * -low) as u64 } else { code as u64 };
     (codes.len() <= MAX_LISTED_CODES).then(|| codes.into_iter().map(bits).collect())
 }
