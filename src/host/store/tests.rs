@@ -281,7 +281,7 @@ fn database_damaged_while_running_is_set_aside() {
     let (store, found) =
         Store::open(&PlaceSetting::At(place.path().to_owned()), &config().store, &VehicleIdentity::default()).unwrap();
     let mut store = store.unwrap();
-    // If the damaged pages were still cached, only the next start finds the damage.
+    // If the damaged pages were still in SQLite's cache, only the next start finds the damage.
     assert!(!found.works || place.path().join("packwatch.db.damaged-1").exists());
     assert_eq!(found.states.len(), 1, "the state does not depend on the database");
     let ticket = learn(&mut store, 10.0);
@@ -344,7 +344,7 @@ fn unfit_state_waits_for_matching_start() {
     assert_eq!(reasons(place.path()), ["state_unfit"]);
     let (store, found) = open();
     assert_eq!(states(&found), [(STATE_SOURCE, 2.0), (ASIDE, 1.0)]);
-    // The state that was set aside stays when later states are written.
+    // Writing later states does not replace the state that was set aside.
     finish(store, 3.0);
     let (store, found) = open();
     assert_eq!(states(&found), [(STATE_SOURCE, 3.0), (ASIDE, 1.0)]);

@@ -201,7 +201,8 @@ pub(crate) struct GetProviderValueRequest {
     pub(crate) signal_ids: Vec<i32>,
 }
 
-/// A message from the broker. Filters (tag 5) are ignored: every document is published, because all readers see the same values.
+/// A message from the broker. Filters (tag 5) are ignored: every document is published, because all readers see the
+/// same values.
 #[derive(Clone, PartialEq, prost::Message)]
 pub(crate) struct FromBroker {
     #[prost(oneof = "Event", tags = "2, 4, 6")]

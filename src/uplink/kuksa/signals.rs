@@ -134,7 +134,8 @@ fn signals_of(row: &'static QuantityRow, it: &'static Presentation, is_pack: boo
     })
 }
 
-/// The path of a part. A standard deviation is always in the overlay: next to the VSS signal, or named after the overlay's signal.
+/// The path of a quantity's mean or standard deviation. A standard deviation is always in the overlay. If its mean is a
+/// VSS signal, it has the same position below the overlay's branch; otherwise, it is named after the mean.
 fn path(path: VssPath, part: Part) -> (Origin, Cow<'static, str>) {
     match (path, part) {
         (VssPath::Standard(path), Part::Mean) => (Origin::Standard, path.into()),

@@ -28,7 +28,8 @@ fn alarm(alarms: &AlarmStatus, rule: Rule) -> Value {
     if is_raised || is_known { is_raised.into() } else { Value::Null }
 }
 
-/// Values of the cells: voltages in mV and, for Battery-Emulator, in V; SOC, capacity and resistance with standard deviations.
+/// Values of the cells: voltages in mV and, for Battery-Emulator, in V. Also SOC, capacity and resistance, each with
+/// its standard deviation.
 pub fn spec_data(document: &StatusDocument) -> Value {
     let each = |of: &dyn Fn(&CellView) -> Value| document.cells.iter().map(of).collect::<Value>();
     let millivolts = |cell: &CellView| whole(cell.values.mean(Quantity::Voltage).map(|volts| volts * 1000.0));

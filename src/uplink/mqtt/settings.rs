@@ -1,7 +1,7 @@
 //! Table `[mqtt]` of the uplink's settings: the broker, what is published when, and the queue for a lost link.
 //!
-//! Input: TOML. Output: validated settings. A value outside its range is reported with its line. Files are read at each connection, so
-//! a new certificate or password needs no restart.
+//! Input: TOML. Output: validated settings. A value that is outside its range is reported with its line. The files
+//! named here are read at each connection, so a new certificate or password needs no restart.
 
 use std::path::PathBuf;
 

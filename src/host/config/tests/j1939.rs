@@ -130,7 +130,7 @@ fn alarm_code_without_node_is_rejected() {
 #[test]
 fn two_rules_with_one_code_are_rejected() {
     let shared = with(TABLE).replace("spn = 7000\n", "").replace("info = 1000\n", "info = 1000\nspn = 520196\n");
-    good(&shared); // the two codes have different failure modes
+    good(&shared); // the two alarms share a parameter number but have different failure modes
     let shared = shared.replace("info = 1000", "warning = 1000").replace("spn = 520196", "spn = 520193");
     let what = "must be unique per rule, but alarm[1] in line 19 has the same code with FMI 18 (warning)";
     assert_eq!(faults(&shared), [format!("pack.toml:28: alarm[3].spn = 520193, {what}")]);

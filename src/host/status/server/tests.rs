@@ -100,7 +100,7 @@ fn clients_beyond_limit_are_rejected_and_counted() {
     for mut stream in seated {
         assert_ne!(stream.read(&mut [0; 16]).unwrap(), 0, "the server must serve an admitted client");
     }
-    // The admitted clients have closed, so there is room again.
+    // The clients that were served have closed their connections, so there is room again.
     until("room", || {
         offer(&server, 1, 8);
         server.clients().connected == 0

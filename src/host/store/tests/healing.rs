@@ -144,7 +144,7 @@ fn announced_alarm_survives_power_cut_without_new_state() {
     assert_eq!(stored(&place.path().join("state")).number, 1);
     let mut found = after_cut(place.path());
     assert_eq!(raised(found.states.remove(0).snapshot), [(101, 1.0)], "times are not later than the state's restore");
-    // Without a valid state, the history is enough.
+    // If there is no valid state, the history alone is enough to restore the alarms.
     without_states(place.path());
     let found = after_cut(place.path());
     assert_eq!((found.states.len(), found.alarms.len()), (0, 201));
