@@ -134,8 +134,9 @@ fn signals_of(row: &'static QuantityRow, it: &'static Presentation, is_pack: boo
     })
 }
 
-/// The path of a quantity's mean or standard deviation. A standard deviation is always in the overlay. If its mean is a
-/// VSS signal, it has the same position below the overlay's branch; otherwise, it is named after the mean.
+/// The path of a mean or of a standard deviation. All standard deviations are in the overlay. If the mean is the VSS
+/// signal `BRANCH.NAME`, its standard deviation is `BRANCH.StandardDeviation`. If the mean is in the overlay,
+/// `StandardDeviation` is appended to its path.
 fn path(path: VssPath, part: Part) -> (Origin, Cow<'static, str>) {
     match (path, part) {
         (VssPath::Standard(path), Part::Mean) => (Origin::Standard, path.into()),
