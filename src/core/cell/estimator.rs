@@ -34,13 +34,15 @@
 //! Deviation 8: the offset of the current sensor is learned ([`crate::health::offset`]).
 //! Deviation 9: the slowest branch has its own learned resistance ratio ([`slow_branch`]), which multiplies U_n in the voltage.
 //!
-//! The filter is unscented, with additive noise and a scalar measurement. Sigma points are x and x +/- sqrt(N + lambda) L_i with L
-//! the lower Cholesky factor of P and lambda = alpha^2 (N + kappa) - N; weights as in Wan and van der Merwe (2000), equations
-//! 15. An update **redraws** the points from the predicted mean and covariance. (Reusing the propagated points, as some
-//! packages do, differs by up to 3e-4 of SOC on drive data.) For each constant error the filter keeps a column: how far
-//! one standard deviation of that error has shifted each state. The first [`CONSIDERED`](state_vector::CONSIDERED) are considered in the gain (Schmidt
-//! 1966): an update weighs the voltage by the covariance with them, and P is updated in Joseph's form, as the gain is not the best
-//! one for P alone. The others change no mean (Friedland 1969).
+//! The filter is unscented, with additive noise and a scalar measurement. The sigma points are x and x +/- sqrt(N +
+//! lambda) L_i. L_i is column i of the lower Cholesky factor of P, and lambda = alpha^2 (N + kappa) - N. The weights
+//! are those of Wan and van der Merwe (2000), equations 15. An update **redraws** the points from the predicted mean
+//! and covariance. (Some packages reuse the propagated points; this changes the SOC by up to 3e-4 on drive data.)
+//!
+//! For each constant error, the filter keeps a column: the shift of each state that one standard deviation of this
+//! error has caused. The gain considers the first [`CONSIDERED`](state_vector::CONSIDERED) constant errors (Schmidt
+//! 1966): an update weighs the voltage by its covariance with these errors. The gain is then not optimal for P alone,
+//! so P is updated in Joseph's form. The remaining constant errors do not change the mean (Friedland 1969).
 //!
 //! A reading beyond the gate does not change the state. If all readings of `lost_after_s` were beyond the gate, the
 //! filter restarts: it determines SOC and branch voltages from the voltage, and keeps resistance and capacity.

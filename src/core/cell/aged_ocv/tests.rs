@@ -1,4 +1,5 @@
-//! Offsets of aged curves: against the electrodes they come from, at their edges, and rising everywhere.
+//! Tests of the offsets of aged curves: they agree with the electrodes, continue at the edges, and keep the curves
+//! rising.
 
 use super::*;
 use crate::cell::electrodes::tests::{LFP, M50};
@@ -24,7 +25,7 @@ fn new_cell_has_no_offset() {
     for s in 0..5 {
         assert!(offset_v(&m50(), s, 5.0).abs() < 1e-12, "{s}");
         assert_eq!(m50().line(&SOC, s, 5.0).mixes_v, [SocLine::default(); MIXES]);
-        // Smooth through the new capacity, constant above 105 %.
+        // The curve changes smoothly around the new capacity and is constant above 105 %.
         assert!((offset_v(&m50(), s, 5.25) + offset_v(&m50(), s, 4.75)).abs() < 1e-12, "{s}");
         assert_eq!(offset_v(&m50(), s, 5.3), offset_v(&m50(), s, 9.0));
     }
@@ -45,14 +46,14 @@ fn offsets_match_aged_curves_and_are_continuous() {
         let (least, edge) = (offset_v(&table, s, 0.5), offset_v(&table, s, 2.0));
         assert!((least - edge).abs() < 1e-9, "constant below the lowest capacity: {least} {edge}");
     }
-    // Half the difference of mixes on both sides.
+    // Half of the difference between the offsets with more and with less of the mix.
     let with =
         |negative: f64| M50.aged(LostMaterial { negative: negative * 0.2, positive: 0.3 * 0.2 }, 0.8).expect("a cell");
     let expected_v = 0.5 * (with(0.6).voltage_v(SOC[2]) - with(0.0).voltage_v(SOC[2]));
     let mix_v = |capacity_ah: f64| table.line(&SOC, 2, capacity_ah).mixes_v[0].at(SOC[2]);
     assert!((mix_v(4.0) - expected_v).abs() < 1e-9, "{} {expected_v}", mix_v(4.0));
     assert!(mix_v(4.0).abs() > 0.001 && mix_v(4.5).abs() < mix_v(4.0).abs());
-    // The change with the capacity is the difference over it.
+    // The change with the capacity is the difference of the offsets divided by the difference of the capacities.
     let per_ah_v = (offset_v(&table, 2, 4.2) - offset_v(&table, 2, 4.1)) / 0.1;
     assert!((table.line(&SOC, 2, 4.15).per_ah_v.at(SOC[2]) - per_ah_v).abs() < 1e-9);
 }
@@ -60,7 +61,7 @@ fn offsets_match_aged_curves_and_are_continuous() {
 #[test]
 fn shift_keeps_both_ends() {
     let table = AgedOcv::of_shift(0.8, &SOC, 2.0, &rows(|z| 3.0 + z));
-    // A quarter lost: a = 0.8 x 0.25 = 0.2.
+    // A quarter of the capacity is lost: a = 0.8 x 0.25 = 0.2.
     assert!((offset_v(&table, 2, 1.5) - 0.2 * 0.4 * 0.6).abs() < 1e-12);
     assert_eq!(offset_v(&table, 0, 1.5), 0.0);
     assert!(table.line(&SOC, 4, 1.5).offset_v.at(1.0).abs() < 1e-12);

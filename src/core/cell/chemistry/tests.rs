@@ -1,4 +1,4 @@
-//! Models from labels: every chemistry has one, and its curve is that of cells.
+//! Tests of models from labels: every chemistry has a model, and its curve is plausible for cells of this chemistry.
 
 use super::*;
 use crate::cell::TemperaturePosition;
@@ -39,7 +39,7 @@ fn resistances_scale_with_cell_size() {
         model.settled_ohm(&model.grid_position(0.5, 25.0))
     };
     assert!((settled_ohm(3.0) / settled_ohm(60.0) - 20.0).abs() < 1e-9);
-    // C/2 at half charge drops 50 to 150 mV in usual cells.
+    // A load of C/2 at half charge causes a drop of 50 to 150 mV in usual cells.
     assert!((0.05..0.15).contains(&(30.0 * settled_ohm(60.0))), "{}", settled_ohm(60.0));
 }
 

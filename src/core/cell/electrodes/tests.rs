@@ -20,14 +20,14 @@ pub(crate) const LFP: Electrodes = Electrodes {
 
 #[test]
 fn materials_fall_with_their_lithium_content() {
-    // Functions fitted to measurements rise by a few millivolts somewhere.
+    // Functions that were fitted to measurements rise by a few millivolts at some points.
     let falls = |potential_v: &dyn Fn(f64) -> f64| {
         (1..=98).all(|k| potential_v(0.01 * f64::from(k)) > potential_v(0.01 * f64::from(k + 1)) - 0.004)
     };
     assert!(NegativeMaterial::ALL.iter().all(|(material, _)| falls(&|x| material.potential_v(x))));
     for (material, _) in PositiveMaterial::ALL {
         assert!(falls(&|y| material.potential_v(y)), "{material:?}");
-        // Constant where the function does not hold.
+        // The potential is constant where the function is not valid.
         assert_eq!(material.potential_v(0.0), material.potential_v(material.least_content()));
     }
 }
@@ -66,7 +66,7 @@ fn lithium_loss_slides_electrodes() {
 fn impossible_loss_gives_no_curve() {
     assert!(M50.aged(LostMaterial { negative: 0.5, positive: 0.0 }, 0.9).is_none());
     assert!(M50.aged(LostMaterial::default(), 3.0).is_none());
-    // An excess of lithium: less of it leaves more capacity.
+    // With an excess of lithium, a loss of lithium leaves more capacity.
     let excess = Electrodes {
         negative: NegativeMaterial::Mcmb,
         negative_content: [0.035, 0.956],

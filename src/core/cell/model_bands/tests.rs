@@ -1,4 +1,5 @@
-//! Bands of models from labels and of one without any statement, and the advice that follows from them.
+//! Tests of the bands of models from labels and of a model that states no error, and of the advice that follows from
+//! them.
 
 use super::*;
 use crate::cell::model::tests::small_model;
@@ -37,7 +38,7 @@ fn model_without_error_has_no_band() {
     let bands = ModelBands::new(&model);
     assert_eq!((bands.curve_std_v(0.5), bands.rest_soc_std(0.5), bands.load_soc_std(0.5, 20.0)), (None, None, None));
     assert_eq!(advise(&bands), None);
-    // As cells of one type are.
+    // The spread of cells of one type.
     assert_eq!((bands.resistance(0.5, 20.0).std(), bands.capacity_std()), (0.2, 0.1));
 }
 

@@ -2,14 +2,15 @@
 //!
 //! The filter of [`estimator`](crate::cell::estimator) with the circuit of [`crate::cell::circuit`]; the results agree
 //! up to rounding. The following exact rearrangements save work:
-//! * Points come in pairs x +- s L_k (s = sqrt(N + lambda)). With f's odd and even parts over each pair, o_k = (f+ - f-) / 2s and
-//!   e_k = ((f+ + f-) / 2 - f0) / s, the weighted sums become f0 + m with m = sum e_k / s for the mean, and
-//!   sum (o_k o_k' + e_k e_k') plus beta - alpha^2 times m m' for the covariance. For a pair that a linear map moves, o_k is the
-//!   pair's image and e_k = 0.
-//! * The order of the states lets only the first three columns of the Cholesky factor L move nonlinear states. The columns of the
-//!   branches add up to P minus the first three columns, and are never computed.
-//! * Only one pair has a different SOC, so prediction and update each read the tables at three points instead of 2 N +
-//!   1.
+//! * Sigma points come in pairs x +- s L_k with s = sqrt(N + lambda). A function f has the values f+ and f- at the two
+//!   points of a pair and f0 at the centre. Its odd part is o_k = (f+ - f-) / 2s.
+//!   Its even part is e_k = ((f+ + f-) / 2 - f0) / s. With m = sum e_k / s, the mean is f0 + m.
+//!   The covariance is sum (o_k o_k' + e_k e_k') + (beta - alpha^2) m m'.
+//!   If a linear map moves the pair, o_k is the image of L_k and e_k = 0.
+//! * Because of the order of the states, only the first three columns of the Cholesky factor L change nonlinear states.
+//!   The columns of the branches add up to P minus the contribution of the first three columns, and are never computed.
+//! * Only one pair has a different SOC, so prediction and update each read the tables at three points instead of
+//!   2 N + 1.
 //! * The lines of the tables are cached from step to step: [`LineCache`].
 //! * exp(x + d) = exp(x) exp(d), and exp(-2x) = exp(-x)^2 for the branches' noise.
 //!

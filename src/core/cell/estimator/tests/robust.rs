@@ -8,8 +8,8 @@ use super::*;
 /// Time constant of the slow polarisation that the estimator's model lacks, s.
 const SLOW_TAU_S: f64 = 1500.0;
 
-/// Resistance of the slow polarisation, ohm: a fifth of the model's. From 15 mohm on the default model error of 0.15 V
-/// over a second is too little for an error that lasts for 1500 s, and the interval falls short.
+/// Resistance of the slow polarisation, ohm: a fifth of the model's resistance. From 15 mohm on, the intervals would be
+/// too narrow: the default model error of 0.15 V over one second does not cover an error that lasts for 1500 s.
 const SLOW_OHM: f64 = 0.01;
 
 /// Half of a 95 % interval, standard deviations.
@@ -26,11 +26,11 @@ struct Bench {
     offset_a: f64,
 }
 
-/// Errors over a stretch, percentage points of SOC.
+/// Errors during a part of the test, percentage points of SOC.
 #[derive(Debug, Clone, Copy, Default)]
 struct StretchErrors {
     largest_error: f64,
-    /// Largest |error| over the 95 % interval's half-width.
+    /// Maximum of |error| divided by half of the width of the 95 % interval.
     largest_ratio: f64,
 }
 
@@ -72,7 +72,7 @@ impl Bench {
     }
 }
 
-/// The worst of three days of partial cycles with rests between.
+/// Maximum errors over three days of partial cycles with rests between them.
 fn three_days(slow_ohm: f64, offset_a: f64) -> StretchErrors {
     let mut bench = Bench::new(0.8, None, slow_ohm, offset_a);
     bench.run(1.0, 1800.0);
@@ -89,11 +89,11 @@ fn three_days(slow_ohm: f64, offset_a: f64) -> StretchErrors {
 
 #[test]
 fn current_offset_does_not_drift_soc() {
-    // 0.5 % of 1 C of 2 Ah: 10 mA; in 72 h 0.72 Ah, 36 points.
+    // An offset of 0.5 % of 1 C (2 Ah): 10 mA. In 72 h it adds 0.72 Ah, 36 percentage points.
     for offset_a in [-0.01, 0.01] {
         let worst = three_days(0.0, offset_a);
         assert!(worst.largest_error < 0.75, "{offset_a} A: {worst:?}");
-        // The interval knows of no offset: it is up to a quarter too narrow for one that never ends.
+        // The interval does not include the offset: for a permanent offset, it is up to a quarter too narrow.
         assert!(worst.largest_ratio < 1.25, "{offset_a} A: {worst:?}");
         let worst = three_days(SLOW_OHM, offset_a);
         assert!(worst.largest_error < 1.25, "with a slow branch, {offset_a} A: {worst:?}");
@@ -117,7 +117,7 @@ fn thirty_point_error_recovers_within_minutes() {
 #[test]
 fn interval_covers_error_while_cell_relaxes() {
     for current_a in [1.0, -1.0] {
-        // Starts with the load: the estimate has only the voltages that relax towards rest.
+        // The filter starts together with the load, so its only information is the voltages that relax towards rest.
         let mut bench = Bench::new(0.5 + 0.3 * current_a, None, SLOW_OHM, 0.0);
         bench.run(current_a, 3600.0);
         let mut rested_s = 0.0;
@@ -126,7 +126,8 @@ fn interval_covers_error_while_cell_relaxes() {
             rested_s = until_s;
             assert!(seen.largest_ratio < 1.0, "{current_a} A, {until_s} s: {seen:?}");
         }
-        // The slow branch has relaxed: the voltage is the open-circuit voltage, and the estimate has converged to it.
+        // The slow branch has relaxed, so the voltage is the open-circuit voltage, and the estimate has converged to
+        // it.
         assert!(bench.error_points().abs() < 0.5, "{current_a} A: {}", bench.error_points());
         // Ten hours of rest count as 1000 s x ln 37 under load, not as ten hours.
         let least = 100.0 * STD_OF_95 * bench.config.voltage.model_error_v_sqrt_s / 1.2 / libm::sqrt(3600.0);

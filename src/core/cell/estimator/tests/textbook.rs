@@ -1,7 +1,7 @@
-//! The filter in its textbook form, as the oracle of the kernel: every sigma point through the whole circuit.
+//! The filter in its textbook form, as a reference for the kernel: every sigma point passes through the whole circuit.
 //!
-//! It runs freely through steps with a measured or unmeasured time and a voltage. A start, downtime and learning move its state
-//! to that of the estimator under test.
+//! The textbook filter computes steps with a measured or unmeasured time and a voltage by itself. After a start,
+//! downtime or learning, it copies the state of the estimator under test.
 
 mod circuit;
 mod noise;
@@ -41,7 +41,8 @@ impl<const N: usize> Textbook<N> {
         }
     }
 
-    /// Makes the step that has led an estimator `before` to `after`; `None` where it copies that state.
+    /// Computes the step that has led an estimator from `before` to `after`. Returns `None` if it copies the state
+    /// `after` instead.
     pub(in crate::cell::estimator) fn step(
         &mut self,
         model: &CellModel,
@@ -93,7 +94,7 @@ impl<const N: usize> Textbook<N> {
         Some(Some(update))
     }
 
-    /// Load, rest and information of a step's time.
+    /// Updates load, rest and information for the time of a step.
     fn pass_time(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
         const REST_REPEATS_S: f64 = 1000.0;
         let memory = &mut self.memory;
@@ -117,7 +118,8 @@ impl<const N: usize> Textbook<N> {
         }
     }
 
-    /// Largest differences from an estimator: of the SOC, and of everything else. Evidence counts relative to its size.
+    /// Maximum difference of the SOC, and maximum difference of all other values, from an estimator. Differences of
+    /// evidence are relative to its size.
     pub(in crate::cell::estimator) fn differences(&self, estimator: &CellEstimator) -> (f64, f64) {
         let near = |a: ScalarGaussian, b: ScalarGaussian| (a.mean - b.mean).abs().max((a.std() - b.std()).abs());
         let x = estimator.filter.as_ref().expect("started");

@@ -105,7 +105,7 @@ fn predict_branch<const L: usize, const N: usize, const W: usize>(
     BranchPrediction { centre_v, decay, gain_ohm, noise, parts }
 }
 
-/// Charge that one standard deviation of each constant error adds to the measured one, A s.
+/// Charge that one standard deviation of each constant error adds to the measured charge, A s.
 #[inline(always)]
 fn excess_as<const L: usize>(c: &KernelConstants, input: &StepInput<L>) -> [Lanes<L>; CONSTANT_ERRORS] {
     let mut excess_as = [Lanes::splat(0.0); CONSTANT_ERRORS];

@@ -14,8 +14,8 @@ fn spread<const N: usize>(config: &EstimatorConfig) -> SigmaPointWeights {
     SigmaPointWeights::new(N, config.points.alpha, config.points.beta, config.points.kappa)
 }
 
-/// Predicts over the measured and the unmeasured time of a step; `gap_std` is the deviation of the SOC that use in the
-/// unmeasured time adds, fraction.
+/// Predicts over the measured and the unmeasured time of a step. `gap_std` is the standard deviation that possible use
+/// in the unmeasured time adds to the SOC, fraction.
 #[inline]
 pub(super) fn predict<const N: usize>(
     x: &mut Gaussian<N>,
@@ -71,7 +71,7 @@ fn propagate<const N: usize>(
     let here = position(x.mean[0]);
     let q = noise::process::<N>(model, config, &here, dt_s);
 
-    // The constant errors: the circuit's derivatives at the mean, and the charge that the sensor counts too much.
+    // Constant errors: the derivatives of the circuit at the mean, and the charge that the sensor counts in excess.
     let mut by_constant = x.by_constant;
     let (per_as, ratio) = (1.0 / (3600.0 * x.mean[CAPACITY]), libm::exp(x.mean[LOG_RESISTANCE]));
     let mut excess_as = [0.0; CONSTANT_ERRORS];

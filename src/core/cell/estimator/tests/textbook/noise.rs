@@ -11,7 +11,7 @@ use crate::cell::estimator::state_vector::{
 use crate::cell::{CellModel, ERROR_WINDOW_S, EstimatorConfig, GridPosition, SensorErrors, TemperaturePosition};
 use crate::filter::ScalarGaussian;
 
-/// Longest time of the resistance's random walk between two readings, s: it does not age in a gap.
+/// Maximum time between two readings that counts for the random walk of the resistance, s: a cell hardly ages in a gap.
 const MAX_WALK_S: f64 = 600.0;
 
 /// Covariance that the random walks gain in `dt_s`; the capacity's is added at transitions.
@@ -39,12 +39,12 @@ pub(super) struct VoltageReading {
     pub(super) load_a: f64,
     pub(super) temperature: TemperaturePosition,
     pub(super) information_s: f64,
-    /// Capacity of the open-circuit curve, Ah: that by the last half-cycle. A voltage says nothing about the capacity through
-    /// the shape of the curve: the model's errors would be mistaken for lost capacity.
+    /// Capacity of the open-circuit curve, Ah, as learned by the last half-cycle. A voltage must not change the
+    /// capacity through the shape of the curve, because errors of the model would be mistaken for lost capacity.
     pub(super) curve: ScalarGaussian,
-    /// Resistance of the slowest branch beside the others, relative to the model.
+    /// Resistance of the slowest branch relative to the model, in addition to the resistance ratio of the cell.
     pub(super) slow_ratio: f64,
-    /// Its standard deviation.
+    /// Standard deviation of `slow_ratio`.
     pub(super) slow_std: f64,
 }
 
@@ -84,7 +84,7 @@ impl VoltageReading {
         }
     }
 
-    /// Effect of the constant errors on the voltage less its prediction, V.
+    /// Effect of the constant errors on (measured minus predicted voltage), V.
     fn by_constant<const N: usize>(
         &self,
         x: &Gaussian<N>,

@@ -1,19 +1,20 @@
 //! Unscented Kalman filter with additive noise and a scalar measurement.
 //!
-//! State x of N numbers with covariance P. Sigma points x, x +/- sqrt(N + lambda) L_i with L the lower
-//! Cholesky factor of P and lambda = alpha^2 (N + kappa) - N; weights as in Wan and van der Merwe (2000),
-//! equations 15. Predict: every point through f, mean and covariance of the images plus Q. Update: the
-//! points are **redrawn** from the predicted mean and covariance, then every point through h. (Reusing the
-//! propagated points instead, as some packages do, differs by up to 3e-4 of SOC on drive data.)
+//! State x of N numbers with covariance P. The sigma points are x and x +/- sqrt(N + lambda) L_i. L_i is column i of
+//! the lower Cholesky factor of P, and lambda = alpha^2 (N + kappa) - N. The weights are those of Wan and van der Merwe
+//! (2000), equations 15. A prediction passes every point through f and takes the mean and covariance of the images,
+//! plus Q. An update **redraws** the points from the predicted mean and covariance and passes them through h. (Some
+//! packages reuse the propagated points; this changes the SOC by up to 3e-4 on drive data.)
 //!
-//! Constant errors of measurements and model (offsets, gains) are not estimated here: each has a column, the error of every
-//! state that one standard deviation of it has caused. The total covariance is P plus the columns' outer products. The
-//! first [`CONSIDERED`] are considered in the gain (Schmidt 1966): an update weighs the measurement by the covariance with
-//! them, so that a constant error never averages out; P is then updated in Joseph's form, as the gain is not the best one
-//! for P alone. The others change no mean: their columns show what they have done (Friedland 1969).
+//! Constant errors of measurements and model (offsets, gains) are not estimated here. Each constant error has a column:
+//! the error of every state that one standard deviation of this constant error has caused. The total covariance is P
+//! plus the outer products of the columns. The gain considers the first [`CONSIDERED`] constant errors (Schmidt 1966):
+//! an update weighs the measurement by its covariance with these errors, so they never average out. The gain is then
+//! not optimal for P alone, so P is updated in Joseph's form. The remaining constant errors do not change the mean;
+//! their columns show their effect (Friedland 1969).
 //!
-//! The resulting covariance is symmetric. A failed factorisation or a number that is not finite is an error; nothing is
-//! repaired silently. Sums are plain loops in a fixed order, so that every machine gives the same bits.
+//! The resulting covariance is symmetric. A failed factorisation or a non-finite number is an error; nothing is
+//! repaired silently. Sums are plain loops in a fixed order, so every machine gives the same bits.
 
 use nalgebra::{SMatrix, SVector};
 
@@ -28,7 +29,7 @@ pub(super) struct Gaussian<const N: usize> {
     pub(super) mean: SVector<f64, N>,
     /// Covariance without the constant errors, symmetric and positive definite.
     pub(super) covariance: SMatrix<f64, N, N>,
-    /// Column k: error of the mean (true less mean) by one standard deviation of constant error k.
+    /// Column k: error of the mean (true minus mean) caused by one standard deviation of constant error k.
     pub(super) by_constant: SMatrix<f64, N, CONSTANT_ERRORS>,
 }
 
@@ -62,15 +63,15 @@ impl SigmaPointWeights {
 /// Variances of one scalar measurement.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct MeasurementNoise {
-    /// Variance that weighs the measurement.
+    /// Variance that determines the weight of the measurement.
     pub(super) variance: f64,
-    /// Variance of a single reading's error, for the gate. Differs from `variance` where that one counts information
-    /// per time.
+    /// Variance of the error of a single reading, for the gate. It differs from `variance` if `variance` counts
+    /// information per time.
     pub(super) gate_variance: f64,
     /// Gate width in standard deviations.
     pub(super) gate_sigma: f64,
-    /// Change of the measurement less its prediction by one standard deviation of each constant error: directly, and through
-    /// the errors of the mean that it has caused.
+    /// Change of (measurement minus prediction) per standard deviation of each constant error. It has two parts: the
+    /// direct effect, and the effect through the errors of the mean that the constant error has caused.
     pub(super) by_constant: SVector<f64, CONSTANT_ERRORS>,
 }
 
@@ -99,8 +100,7 @@ impl<const N: usize> Gaussian<N> {
 
     /// Propagates the state through `f` and adds the process noise covariance `q`.
     ///
-    /// # Errors
-    /// When the covariance cannot be factored or the result is not finite; the state is then unchanged.
+    /// If the covariance cannot be factored or the result is not finite. The state is then unchanged.
     pub(super) fn predict(
         &mut self,
         spread: &SigmaPointWeights,
@@ -126,8 +126,7 @@ impl<const N: usize> Gaussian<N> {
     /// Updates the state with the scalar measurement `z` = `h`(x) + `noise`. An innovation beyond the gate is reported
     /// and leaves the state unchanged.
     ///
-    /// # Errors
-    /// When the covariance cannot be factored or the result is not finite; the state is then unchanged.
+    /// If the covariance cannot be factored or the result is not finite. The state is then unchanged.
     pub(super) fn update(
         &mut self,
         spread: &SigmaPointWeights,
