@@ -1,4 +1,4 @@
-//! Arguments that all commands that read logs share.
+//! Arguments shared by the commands that read logs.
 
 use std::path::PathBuf;
 
