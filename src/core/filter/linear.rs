@@ -55,8 +55,8 @@ impl ScalarGaussian {
         self.variance *= 1.0 - gain;
     }
 
-    /// Returns the measurement (value z, variance R) that would change this estimate (x0, P0) to `after` (x1, P1): 1/R
-    /// = 1/P1 - 1/P0, z = R (x1/P1 - x0/P0).
+    /// Returns the measurement (value z, variance R) that would change this estimate (x0, P0) to `after` (x1, P1):
+    /// 1/R = 1/P1 - 1/P0, z = R (x1/P1 - x0/P0).
     ///
     /// The result contains only the information gained since `self`, so the assumptions in `self` do not count as
     /// evidence. `None` if the variance has not fallen (P1 >= P0).

@@ -336,8 +336,8 @@ impl Learner {
         let is_held = self.is_held.get(cell).copied().unwrap_or(false);
         let evidence = self.prior[cell].information_until(&after).filter(|_| !is_in_doubt && !is_held);
         let measurement = evidence.map(|z| {
-            // The open-circuit curve assumes a capacity C_curve, which influences the measurement z: z = C + s (C_curve
-            // - C). Solve for C.
+            // The open-circuit curve assumes a capacity C_curve, which influences the measurement z:
+            // z = C + s (C_curve - C). Solve for C.
             let weight = 1.0 - after.variance / self.prior[cell].variance;
             // Limits s, the influence of the curve's capacity.
             let by_curve = (estimator.capacity_by_curve() / weight).clamp(-0.8, 0.8);
