@@ -283,7 +283,7 @@ impl Store {
     /// Queues rows and the state for the writer. Returns the ticket.
     fn submit(&mut self, HistoryCommit { rows, with_state }: HistoryCommit, monitor: &Monitor, now: Timestamp) -> u64 {
         let state = self.document(monitor, now);
-        self.schedule.note_written(now, with_state.then_some(self.progress.borrow().state_bytes));
+        self.schedule.note_written(now, rows.len(), with_state.then_some(self.progress.borrow().state_bytes));
         let batch = (!rows.is_empty()).then_some(RowBatch { stamp: state.stamp, rows });
         self.write_queue.submit(batch, state, with_state)
     }

@@ -6,12 +6,14 @@
 
 use crate::quantity::Timestamp;
 
-/// Bytes written per day before checkpoints are delayed. In total 20 MB may be written per day; the rest is for the
-/// history and the file system.
+/// Bytes written per day before checkpoints are delayed. In total 20 MB may be written per day; bursts of alarms take the
+/// rest.
 const BYTES_PER_DAY: f64 = 15e6;
 /// Bytes that a commit without a state writes. SQLite writes three of its pages, first to its log and later to its
 /// file. Each write is rounded up to whole pages of the system.
 const COMMIT_BYTES: f64 = 8e3;
+/// Bytes that each row adds to a commit, in the log and later in the file of SQLite.
+const ROW_BYTES: f64 = 180.0;
 /// Longest time without a checkpoint, s, regardless of what else was written.
 const MAX_PERIOD_S: f64 = 3600.0;
 
@@ -40,9 +42,9 @@ impl CheckpointSchedule {
         elapsed_s >= self.period_s.max(period_s) && may_write
     }
 
-    /// Notes a commit and the size of its state; `None` = a commit without a state.
-    pub(super) fn note_written(&mut self, now: Timestamp, state_bytes: Option<u64>) {
-        let bytes = state_bytes.map_or(COMMIT_BYTES, |bytes| bytes as f64);
+    /// Notes a commit with its number of rows and the size of its state; `None` = a commit without a state.
+    pub(super) fn note_written(&mut self, now: Timestamp, rows: usize, state_bytes: Option<u64>) {
+        let bytes = state_bytes.map_or(COMMIT_BYTES, |bytes| bytes as f64) + ROW_BYTES * rows as f64;
         self.ahead = (self.ahead_at(now) + bytes, now);
         self.last = state_bytes.map_or(self.last, |_| Some(now));
     }
@@ -64,12 +66,12 @@ mod tests {
         for second in 0..86_400_u32 {
             let now = Timestamp::from_secs(f64::from(second));
             if schedule.is_due(now, 0.0) {
-                schedule.note_written(now, Some(bytes));
+                schedule.note_written(now, 0, Some(bytes));
                 (checkpoints, written) = (checkpoints + 1, written + bytes as f64);
             }
             if commits(second) {
-                schedule.note_written(now, None);
-                written += COMMIT_BYTES;
+                schedule.note_written(now, 1, None);
+                written += COMMIT_BYTES + ROW_BYTES;
             }
         }
         (checkpoints, written)

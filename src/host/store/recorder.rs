@@ -73,6 +73,7 @@ impl Recorder {
 
     fn write(&mut self, commit: HistoryCommit, monitor: &Monitor, now: Timestamp) -> Result<(), String> {
         let HistoryCommit { rows, with_state } = commit;
+        let row_count = rows.len();
         let stamp = Stamp::replayed(now);
         let written = match rows.is_empty() {
             true => self.database.apply(&self.limits, &stamp),
@@ -89,7 +90,7 @@ impl Recorder {
             snapshot: Box::new(monitor.snapshot().for_restart()),
         });
         let bytes = state.map(|state| self.state_files.write(state)).transpose()?;
-        self.schedule.note_written(now, bytes);
+        self.schedule.note_written(now, row_count, bytes);
         Ok(())
     }
 }
