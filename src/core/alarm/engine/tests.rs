@@ -184,8 +184,11 @@ fn restored_engine_behaves_like_stored_engine() {
     assert_eq!(changes.len(), 1);
 }
 
+/// Whether a threshold is raised, its count, whether it is acknowledged, its times and its value.
+type KeptThreshold = (bool, u32, bool, [Option<Timestamp>; 2], Option<f64>);
+
 /// What a restart keeps of every alarm.
-fn kept(state: &AlarmSnapshot, rules: &[RuleConfig]) -> Vec<(bool, u32, bool, [Option<Timestamp>; 2], Option<f64>)> {
+fn kept(state: &AlarmSnapshot, rules: &[RuleConfig]) -> Vec<KeptThreshold> {
     let mut engine = AlarmEngine::new(rules.to_vec(), 2);
     engine.restore(at(1e6), state);
     let of = |alarm: Alarm| {
