@@ -4,11 +4,10 @@
 //!   ms for the disk ([`commit_barrier`]). Learned results are stored with the whole state. An alarm change is stored
 //!   as a small row of the history. A start restores the newest state, then repeats the alarm changes that are newer
 //!   (`learned`).
-//!
-//! Rows are committed before the state that contains them (`writer`). If the power is cut between these two writes, the
-//! rows were not announced. The next start repeats their alarm changes. Learned results are learned again and get a
-//! second row. A pack change is not undone: the history says that the state's pack is closed, so the state is not
-//! restored.
+//! * Rows are committed before the state that contains them (`writer`). If the power is cut between these two writes, the
+//!   rows were not announced. The next start repeats their alarm changes. Learned results are learned again and get a
+//!   second row. A pack change is not undone: the history says that the state's pack is closed, so the state is not
+//!   restored.
 //! * The state is also written at checkpoints (`checkpoint`), on stop, and every second to the runtime folder, which is
 //!   in memory.
 //! * The state is written to two files in turn (`state_files`) and does not depend on the database. If there is no valid state,

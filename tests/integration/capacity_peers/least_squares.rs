@@ -121,9 +121,9 @@ fn awtls_cost([c1, c2, c3, c4, c5, c6]: &[f64; 6], q: f64) -> f64 {
     ((((c4 * q - 2.0 * c5) * q + (c1 + c6)) * q - 2.0 * c2) * q + c3) / (q * q + 1.0).powi(2)
 }
 
-/// Minimum of [`awtls_cost`] among its stationary points. The cost's derivative is 2 P(Q) / (Q^2 + 1)^3 with P = c5 Q^4
-/// + (2 c4 - c1 - c6) Q^3 + 3 (c2 - c5) Q^2 + (c1 - 2 c3 + c6) Q - c2. At a root of P the second derivative is 2 P' /
-/// (Q^2 + 1)^3.
+/// Minimum of [`awtls_cost`] among its stationary points. The cost's derivative is 2 P(Q) / (Q^2 + 1)^3 with
+/// `P = c5 Q^4 + (2 c4 - c1 - c6) Q^3 + 3 (c2 - c5) Q^2 + (c1 - 2 c3 + c6) Q - c2`. At a root of P the second derivative is
+/// 2 P' / (Q^2 + 1)^3.
 fn awtls(c: &[f64; 6]) -> ScalarGaussian {
     let [c1, c2, c3, c4, c5, c6] = *c;
     let p = [c5, 2.0 * c4 - c1 - c6, 3.0 * (c2 - c5), c1 - 2.0 * c3 + c6, -c2];
