@@ -217,7 +217,7 @@ def test_error_text_omits_origin(tmp_path):
         (lambda: pw.score("a.csv", cell=CELL, settle_s=float("nan")), "settle_s = NaN, must be 0 or more"),
         (lambda: pw.score("a.csv", cell=CELL, capacity_error_percent=-100.0), "capacity_error_percent = -100, must be above -100 and at most 100"),
         (lambda: pw.score("a.csv", cell=CELL, window=(0.7, 0.4)), "window = 0.7, 0.4, must be two parts above 0 and at most 1, the smaller first"),
-        (lambda: pw.rul("a.csv", "soon"), 'end_of_life "soon": must be Ah above 0 like 1.4, or per cent'),
+        (lambda: pw.rul("a.csv", "soon"), 'end_of_life "soon": must be Ah above 0 like 1.4, or percent of the first capacity'),
         (lambda: pw.rul("a.csv", 1.4, at=[1.0]), "at or alpha = 1, must be above 0 and below 1"),
         (lambda: pw.rul("a.csv", 1.4, at=[]), "no at, must be one or more"),
         (lambda: pw.rul("a.csv", []), "no end_of_life, must be one or more"),
