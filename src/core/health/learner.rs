@@ -8,7 +8,6 @@
 //! filter* ([`CellEstimator`]) takes a step at every sample. The *event filter* takes one step per half-cycle and holds
 //! the published capacity (a random walk; paper, section 3.3.4). With `Swing`, the event filter also estimates the fade
 //! ([`super::drift`]). Its measurement is computed by one of two methods:
-//! measurement in one of two ways:
 //! * `Swing`: the information about the capacity in all voltages since the last half-cycle. The sample filter estimates
 //!   the capacity together with its correlation with the SOC. The measurement is computed from the sample filter's
 //!   previous estimate and its present estimate (`ScalarGaussian::information_until`). Dividing the charge by the swing
@@ -348,7 +347,7 @@ impl Learner {
         let before = *drift;
         if let Some(z) = measurement {
             drift.update(z, &effects_ah(model, config, half_cycle, after.mean));
-        } else if is_in_doubt {
+        } else if is_in_doubt && !is_held {
             drift.at_least(half_cycle.charge_ah);
         }
         // Discards a measurement that makes the capacity impossible for this cell.

@@ -1,0 +1,236 @@
+//! Compares the steps of the measured current with the steps of the cells' voltages.
+//!
+//! In: rounds of voltages with the current at their time, and the series resistance that the model gives. Out: whether
+//! the current is doubtful.
+//!
+//! A step of the current moves the voltages of all cells in the opposite direction, by the resistance times the step.
+//! No other cause moves all cells within one round. The check judges each clear step:
+//!
+//! * A step of the voltages is *explained* if the current has stepped at the same time or one round earlier or later,
+//!   in the opposite direction, and if the resistance is at least 1/[`MAX_FACTOR`] and at most [`MAX_FACTOR`] times the
+//!   usual one. The tolerance of one round allows for a gateway that sends current and voltages at different times.
+//! * A step of the current that moves no voltage is unexplained, too.
+//!
+//! Explained and unexplained steps are evidence for and against the sensor. One unexplained step is enough for a doubt,
+//! because the charge is wrong from the first second. The check finds a current that is frozen, limited, without sign,
+//! inverted or delayed, whether or not its last digits change. It finds nothing while the load does not change.
+
+use serde::{Deserialize, Serialize};
+
+use crate::quantity::{InvalidState, Timestamp, bounds};
+use crate::sample::CellSample;
+
+/// Evidence of an explained and of an unexplained step: ln of the ratio of their probabilities with a good sensor (0.97
+/// and 0.03) and with a faulty sensor (0.65 and 0.35). A sensor without sign still explains most steps of a drive.
+const EXPLAINED: f64 = 0.4;
+const UNEXPLAINED: f64 = -2.5;
+/// Highest evidence. A longer good record does not delay a doubt.
+const MAX_EVIDENCE: f64 = 2.0;
+/// Lowest evidence. A sensor that has failed often must explain 20 steps.
+const MIN_EVIDENCE: f64 = -8.0;
+/// Largest ratio of a step's resistance and the usual resistance, in either direction. Temperature, ageing and the time
+/// between two rounds change the resistance by less.
+const MAX_FACTOR: f64 = 4.0;
+/// Smallest clear step of the voltages, V.
+const MIN_STEP_V: f64 = 0.01;
+/// Clear step as a multiple of the usual change between two rounds.
+const STEP_MOVES: f64 = 8.0;
+/// Factor by which a round changes the usual change (an estimate of the median).
+const MOVE_GAIN: f64 = 1.02;
+/// Range of the usual change between two rounds, V.
+const MOVE_V: (f64, f64) = (1e-4, 0.05);
+/// Part of an explained step's ln(resistance ratio) that the usual ratio takes over.
+const RATIO_GAIN: f64 = 0.1;
+/// Longest time between two rounds, s. After a longer pause, the steps are not compared.
+const MAX_PAUSE_S: f64 = 60.0;
+/// Weight of a round in the share of readings that differ from the previous reading.
+const NOISE_GAIN: f64 = 0.02;
+/// Lowest probability that a good sensor repeats a reading exactly.
+const MIN_REPEAT: f64 = 0.01;
+/// Probability that a frozen or limited sensor repeats a reading.
+const FAULTY_REPEAT: f64 = 0.5;
+/// Evidence of repeated readings that makes the sensor doubtful.
+const REPEATED: f64 = -10.0;
+/// Maximum number of cells that are compared.
+pub(crate) const MAX_CELLS: usize = 15;
+const ROUNDS: usize = 4;
+
+/// One round of voltages.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Round {
+    time: Timestamp,
+    /// Current of a cell, A.
+    current_a: f64,
+    /// Change of the voltages since the previous round, V.
+    move_v: f64,
+}
+
+/// State of the check; part of the stored state.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct CurrentCheck {
+    /// Latest voltage of each compared cell, V; `None` = no reading since the last pause.
+    voltages_v: [Option<f64>; MAX_CELLS],
+    /// The latest rounds, the oldest first.
+    rounds: [Round; ROUNDS],
+    /// Number of valid rounds, counted from the latest.
+    count: usize,
+    /// Evidence for the sensor (positive) or against it, as ln of an odds ratio.
+    evidence: f64,
+    /// ln of the usual resistance relative to the model.
+    log_ratio: f64,
+    /// Usual change of the voltages between two rounds that the current does not explain, V.
+    usual_v: f64,
+    /// Share of readings of a flowing current that differ from the previous reading.
+    differing: f64,
+    /// Evidence of the present run of equal readings.
+    repeated: f64,
+}
+
+impl Default for CurrentCheck {
+    fn default() -> Self {
+        Self {
+            voltages_v: [None; MAX_CELLS],
+            rounds: [Round::default(); ROUNDS],
+            count: 0,
+            evidence: MAX_EVIDENCE,
+            log_ratio: 0.0,
+            usual_v: 1e-3,
+            differing: 0.0,
+            repeated: 0.0,
+        }
+    }
+}
+
+impl CurrentCheck {
+    /// Whether the steps of the voltages contradict the current.
+    pub(crate) fn is_doubtful(&self) -> bool {
+        self.evidence < 0.0
+    }
+
+    /// Handles a round. `samples`: the compared cells that have reported, each with its place from 0 to [`MAX_CELLS`] - 1.
+    /// `noise_v`: standard deviation of a reading. `ohm`: the model's series resistance.
+    pub(crate) fn handle<'a>(
+        &mut self,
+        samples: impl Iterator<Item = (usize, &'a CellSample)>,
+        noise_v: f64,
+        ohm: f64,
+    ) {
+        let (mut moves_v, mut moves, mut latest) = ([0.0; MAX_CELLS], 0, None);
+        for (place, sample) in samples {
+            latest = Some(sample);
+            if let Some(before_v) = self.voltages_v[place].replace(sample.voltage_v) {
+                moves_v[moves] = sample.voltage_v - before_v;
+                moves += 1;
+            }
+        }
+        let Some(&CellSample { time, current_a, .. }) = latest else { return };
+        let is_late = self.count > 0 && time.since(self.rounds[ROUNDS - 1].time) > MAX_PAUSE_S;
+        let Some(current_a) = current_a.filter(|_| !is_late && moves > 0) else {
+            self.count = 0;
+            return;
+        };
+        let move_v = common_move(&mut moves_v[..moves]);
+        self.rounds.rotate_left(1);
+        self.rounds[ROUNDS - 1] = Round { time, current_a, move_v };
+        self.count = (self.count + 1).min(ROUNDS);
+        if self.count == ROUNDS {
+            self.judge(noise_v, ohm * libm::exp(self.log_ratio));
+        }
+        if self.count >= 2 {
+            self.judge_repeat();
+        }
+    }
+
+    /// Judges whether the last reading of a flowing current repeats the one before. A sensor whose last digits change
+    /// all the time and then stop is frozen or at its limit.
+    fn judge_repeat(&mut self) {
+        let [.., before, now] = self.rounds;
+        let differs = now.current_a != before.current_a;
+        if now.current_a == 0.0 || differs {
+            self.repeated = 0.0;
+        } else {
+            self.repeated += libm::log((1.0 - self.differing).max(MIN_REPEAT) / FAULTY_REPEAT).min(0.0);
+            if self.repeated <= REPEATED {
+                (self.repeated, self.evidence) = (0.0, self.evidence.min(UNEXPLAINED));
+            }
+        }
+        if now.current_a != 0.0 {
+            self.differing += NOISE_GAIN * (f64::from(u8::from(differs)) - self.differing);
+        }
+    }
+
+    /// Handles a restart of most filters: the voltages contradict the counted charge.
+    pub(crate) fn note_restart(&mut self) {
+        self.weigh(false);
+    }
+
+    /// Judges the step before the last round. `ohm`: the usual resistance.
+    fn judge(&mut self, noise_v: f64, ohm: f64) {
+        let [r0, r1, r2, r3] = self.rounds;
+        let clear_v = MIN_STEP_V.max(2.0 * noise_v).max(STEP_MOVES * self.usual_v);
+        let unexplained_v = (r2.move_v + ohm * (r2.current_a - r1.current_a)).abs();
+        let factor = if unexplained_v.min(r2.move_v.abs()) > self.usual_v { MOVE_GAIN } else { 1.0 / MOVE_GAIN };
+        self.usual_v = (self.usual_v * factor).clamp(MOVE_V.0, MOVE_V.1);
+        // Without the drift that the step before has shown.
+        let drift_v = r1.move_v * (r2.time.since(r1.time) / r1.time.since(r0.time).max(1e-3)).min(2.0);
+        let step_v = if (r2.move_v - drift_v).abs() < r2.move_v.abs() { r2.move_v - drift_v } else { r2.move_v };
+        let factor = |a: Round, b: Round| -step_v / (ohm * (b.current_a - a.current_a));
+        let is_explained = |factor: f64| (1.0 / MAX_FACTOR..=MAX_FACTOR).contains(&factor);
+        if step_v.abs() >= clear_v {
+            let now = factor(r1, r2);
+            if is_explained(now) {
+                self.log_ratio = (self.log_ratio + RATIO_GAIN * libm::log(now)).clamp(-2.0, 2.0);
+            }
+            let shifted = [(r0, r2), (r1, r3), (r0, r3)].map(|(a, b)| factor(a, b));
+            self.weigh(is_explained(now) || shifted.into_iter().any(is_explained));
+        } else {
+            let expected_v = ohm * (r2.current_a - r1.current_a).abs();
+            let moved_v = [r1, r2, r3].iter().fold(0.0_f64, |most, round| most.max(round.move_v.abs()));
+            if expected_v >= MAX_FACTOR * clear_v && moved_v < expected_v / MAX_FACTOR {
+                self.weigh(false);
+            }
+        }
+    }
+
+    fn weigh(&mut self, is_explained: bool) {
+        let evidence = if is_explained { EXPLAINED } else { UNEXPLAINED };
+        self.evidence = (self.evidence + evidence).clamp(MIN_EVIDENCE, MAX_EVIDENCE);
+    }
+
+    /// Forgets the latest rounds, because the next reading comes after a pause. The evidence stays.
+    pub(crate) fn interrupt(&mut self) {
+        (self.voltages_v, self.rounds, self.count) = ([None; MAX_CELLS], [Round::default(); ROUNDS], 0);
+    }
+
+    /// Checks a stored state; the error is the first impossible number.
+    pub(crate) fn check(&self) -> Result<(), InvalidState> {
+        bounds::VOLTAGE_V.check_all("a voltage of the check of the current", self.voltages_v.into_iter().flatten())?;
+        bounds::CURRENT_A.check_all("a current of the check of the current", self.rounds.map(|round| round.current_a))?;
+        let numbers = self.rounds.map(|round| round.move_v);
+        bounds::NUMBER.check_all("a voltage step of the check of the current", numbers)?;
+        let state = [self.evidence, self.log_ratio, self.usual_v];
+        bounds::NUMBER.check_all("the check of the current", state)?;
+        InvalidState::unless(self.count <= ROUNDS, "rounds of the check of the current", self.count as f64, "at most 4")
+    }
+
+    /// Shifts all timestamps by `by_nanos`, to another clock.
+    pub(crate) fn rebase(&mut self, by_nanos: i64) {
+        self.rounds.iter_mut().for_each(|round| round.time = round.time.plus_nanos(by_nanos));
+    }
+}
+
+/// The change that at least three quarters of the cells reach or exceed in the same direction, V; 0 without cells.
+fn common_move(moves_v: &mut [f64]) -> f64 {
+    moves_v.sort_unstable_by(f64::total_cmp);
+    let Some(last) = moves_v.len().checked_sub(1) else { return 0.0 };
+    let (low, high) = (moves_v[last / 4], moves_v[last - last / 4]);
+    if low > 0.0 {
+        low
+    } else if high < 0.0 {
+        high
+    } else {
+        0.0
+    }
+}
