@@ -26,6 +26,10 @@ use crate::filter::{Measurement, ScalarGaussian};
 use crate::quantity::bounds;
 use crate::quantity::{InvalidState, Mode, Timestamp};
 
+/// Difference between a measured capacity and the belief, in standard deviations of both, beyond which one of them is
+/// wrong.
+const CONTRADICTION: f64 = 4.0;
+
 /// Result of the capacity filter's step over a half-cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CapacityUpdate {
@@ -345,7 +349,16 @@ impl Learner {
         });
         let drift = &mut self.drift[cell];
         let before = *drift;
-        if let Some(z) = measurement {
+        let expected = drift.capacity();
+        let is_contradiction = |z: &Measurement| {
+            let difference = z.value - expected.mean;
+            difference * difference > CONTRADICTION * CONTRADICTION * (z.variance + expected.variance)
+        };
+        if let Some(z) = measurement.filter(is_contradiction) {
+            // The measurement or the belief is wrong. Another half-cycle decides.
+            let difference = z.value - expected.mean;
+            drift.doubt(difference * difference / (CONTRADICTION * CONTRADICTION));
+        } else if let Some(z) = measurement {
             drift.update(z, &effects_ah(model, config, half_cycle, after.mean));
         } else if is_in_doubt && !is_held {
             drift.at_least(half_cycle.charge_ah);
@@ -355,7 +368,7 @@ impl Learner {
         if !is_possible {
             *drift = before;
         }
-        let measurement = measurement.filter(|_| is_possible);
+        let measurement = measurement.filter(|z| is_possible && !is_contradiction(z));
         self.capacity[cell] = drift.capacity();
         let cycles = half_cycle.charge_ah / (2.0 * after.mean);
         let rest_days = (self.rest_s / 86_400.0).min(1.0);

@@ -239,7 +239,9 @@ impl Stages {
         let mut publisher = Publisher { now, alarming, sending, out };
         let teaches_capacity = modelling.teaches_capacity();
         let is_doubtful = estimation.take_doubt();
-        learning.complete_mode(change, &mut estimation.bank, (teaches_capacity, is_doubtful), &mut publisher);
+        let is_doubtful = |cell: usize| is_doubtful || !estimation.is_trusted(cell);
+        let doubtful: Vec<bool> = (0..estimation.cells()).map(is_doubtful).collect();
+        learning.complete_mode(change, &mut estimation.bank, (teaches_capacity, &doubtful), &mut publisher);
     }
 
     /// Fits the model of the cells to the rows of the notebook and adopts the result.

@@ -60,7 +60,7 @@ impl EstimatorBank {
             _ => FilterArrays::Three(FilterArray::new(model, blocks)),
         };
         let cell = CellSlot { memory: Memory::new(config), has_filter: false };
-        let idle = StepResult { update: None, reset: false };
+        let idle = StepResult { update: None, reset: false, was_used: false };
         let mut bank = Self {
             constants: KernelConstants::new(model, config),
             plausible_ah: plausible_ah(model, config),

@@ -59,6 +59,8 @@ impl CellEstimator {
     ) -> StepResult {
         let step = CellStep { temperature_c: Some(self.temperature(model, step)), ..*step };
         self.memory.temperature_c = step.temperature_c;
+        let was_silent = !self.memory.is_current_unknown;
+        self.memory.was_used = false;
         let result = self.try_step(&mut kernel, model, config, &step);
         let result = result.filter(|_| self.filter.as_ref().is_none_or(Gaussian::is_possible));
         let reset = result.is_none() || self.memory.has_lost_cell(config);
@@ -70,7 +72,7 @@ impl CellEstimator {
             x.correlate(LOG_RESISTANCE, CAPACITY, 0.0);
             x.by_constant.fill(0.0);
         }
-        StepResult { update: result.flatten(), reset }
+        StepResult { update: result.flatten(), reset, was_used: was_silent && std::mem::take(&mut self.memory.was_used) }
     }
 
     /// Computes the step; `None` if this is not possible.
@@ -106,7 +108,10 @@ impl CellEstimator {
         memory.last_current_a = step.current_a.unwrap_or(memory.last_current_a);
         let (Some(_), Some(x)) = (step.current_a, &mut self.filter) else { return Some(None) };
         let update = match memory.downtime_std_if_any() {
-            None => kernel.update((x, memory), step)?,
+            None => {
+                x.covariance[(0, 0)] = widened(x.covariance[(0, 0)], square(memory.downtime_std));
+                kernel.update((x, memory), step)?
+            }
             Some(_) => update_after_downtime(kernel, (x, memory), (model, config), step)?,
         };
         memory.end_downtime();

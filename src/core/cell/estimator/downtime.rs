@@ -29,17 +29,22 @@ use super::step::{CellStep, Update};
 use crate::cell::{CellModel, EstimatorConfig};
 
 /// Distance, in standard deviations of the voltage, at which the curve shows how far the SOC may be.
-const FAR: f64 = 2.0;
+const FAR: f64 = 4.0;
+
+/// Change of the SOC, in standard deviations before the downtime, that only use explains.
+const CLEARLY: f64 = 4.0;
 
 /// Updates with the first reading after a downtime. This reading does not count as evidence about the sensor's offset
 /// or the slowest branch.
 pub(super) fn update_after_downtime(
     kernel: &mut SingleCell,
-    (x, memory): (&mut Gaussian, &Memory),
+    (x, memory): (&mut Gaussian, &mut Memory),
     (model, config): (&CellModel, &EstimatorConfig),
     step: &CellStep,
 ) -> Option<Update> {
-    let mut update = |x: &mut Gaussian| kernel.update((x, &mut { *memory }), step);
+    let kept = *memory;
+    let mut update = |x: &mut Gaussian| kernel.update((x, &mut { kept }), step);
+    let before = x.marginal(0);
     let (before_soc, ratio) = (x.mean[0], libm::exp(x.mean[LOG_RESISTANCE]));
     let mut used = used_prior(x, config, memory.downtime_std);
     // The present load may have started at any time, so each branch is anywhere between relaxed and settled.
@@ -74,11 +79,15 @@ pub(super) fn update_after_downtime(
     let std = far.map(|far| (far - used.mean[0]).abs() / FAR).into_iter().fold(0.0, f64::max);
     used.covariance[(0, 0)] = used.covariance[(0, 0)].max(square(std));
     let by_left_alone = update(x)?;
+    // A SOC that was known before, and a voltage that leaves it within `std`.
+    let left_alone_variance = 1.0 / (1.0 / before.variance + 1.0 / square(std).max(f64::MIN_POSITIVE));
+    x.covariance[(0, 0)] = x.covariance[(0, 0)].max(left_alone_variance);
     let log_likelihood =
         |u: &Update| -0.5 * (libm::log(u.innovation_variance) + square(u.innovation) / u.innovation_variance);
     let odds = libm::exp(log_likelihood(&by_left_alone) - log_likelihood(&wide)).max(f64::MIN_POSITIVE);
     let weight = memory.used_prior / (memory.used_prior + (1.0 - memory.used_prior) * odds);
     x.merge(&used, weight);
+    memory.was_used = weight > 0.5 && (x.mean[0] - before.mean).abs() > CLEARLY * before.std();
     Some(if weight > 0.5 { by_used } else { by_left_alone })
 }
 

@@ -65,6 +65,9 @@ pub(super) struct Memory {
     pub(super) used_prior: f64,
     /// Whether the current was unknown at the last reading, so that an unmeasured stretch continues.
     pub(super) is_current_unknown: bool,
+    /// Whether the voltage of the last step has shown that the cell was used during a downtime.
+    #[serde(skip)]
+    pub(super) was_used: bool,
     /// No voltage has been used since the last sleep or unknown gap.
     pub(super) is_unseen: bool,
     /// The SOC is unknown after a gap of unknown length: the filter restarts from the next voltage.
@@ -98,6 +101,7 @@ impl Memory {
             noted_s: 0.0,
             used_prior: 0.0,
             is_current_unknown: false,
+            was_used: false,
             is_unseen: false,
             is_soc_unknown: false,
             rejected: 0,
@@ -118,8 +122,9 @@ impl Memory {
     /// (fraction of SOC) is returned instead.
     pub(super) fn note_gap(&mut self, config: &EstimatorConfig, step: &CellStep, capacity_ah: f64) -> f64 {
         let noted_s = std::mem::take(&mut self.noted_s).min(step.unmeasured_s);
-        let continues = self.is_current_unknown || step.current_a.is_none();
-        self.is_current_unknown = step.current_a.is_none();
+        let is_unknown = step.current_a.is_none() && step.unmeasured_s > 0.0;
+        let continues = self.is_current_unknown || is_unknown;
+        self.is_current_unknown = is_unknown;
         let adjacent_a = self.gap_load_a(config, step);
         let is_loaded = adjacent_a > config.gap.rest_current_a;
         let unnoted_s = step.unmeasured_s - noted_s;

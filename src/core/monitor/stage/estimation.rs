@@ -15,7 +15,7 @@ use current_check::{CurrentCheck, MAX_CELLS};
 use super::modelling::{Adoption, Modelling};
 use crate::cell::model_check::model_id;
 use crate::cell::{
-    AdoptedState, CellModel, CellModule, CellStep, EstimatorConfig, ModelCheck, ModelEvidence, PackBank,
+    AdoptedState, CellModel, CellModule, CellStep, EstimatorConfig, ModelCheck, ModelEvidence, PackBank, StepResult,
 };
 use crate::filter::ScalarGaussian;
 use crate::health::{CapacityConfig, Learner};
@@ -85,6 +85,9 @@ pub(crate) struct Consumed {
     pub(crate) charge_as: f64,
     offset_s: f64,
     pub(crate) unmeasured_s: f64,
+    /// The latest voltage, V, and the common path of the cells ([`CurrentCheck::path_v`]) at its last change, V.
+    voltage_v: f64,
+    path_v: f64,
 }
 
 impl Estimation {
@@ -189,9 +192,10 @@ impl Estimation {
             self.bank.add(cell, &step);
         }
         self.bank.step();
-        let restarted = samples.iter().filter(|sample| self.bank.result(sample.cell.index()).reset).count();
-        if 2 * restarted > samples.len() {
-            self.current_check.note_restart();
+        let contradicts = |result: &StepResult| result.reset || result.was_used;
+        let contradicted = samples.iter().filter(|sample| contradicts(self.bank.result(sample.cell.index()))).count();
+        if 2 * contradicted > samples.len() {
+            self.current_check.note_contradiction();
         }
         self.check_models(&samples);
         if modelling.has_row() {
@@ -262,8 +266,18 @@ impl Estimation {
     fn next_step(&mut self, sample: &CellSample, learner: &mut Learner) -> CellStep {
         let index = sample.cell.index();
         let (charge, unmeasured) = (sample.charge_as, sample.unmeasured_s);
-        let now =
-            Consumed { time: sample.time, charge_as: charge, offset_s: sample.offset_s, unmeasured_s: unmeasured };
+        let path_v = match self.progress[index].consumed {
+            Some(before) if before.voltage_v == sample.voltage_v => before.path_v,
+            _ => self.current_check.path_v(),
+        };
+        let now = Consumed {
+            time: sample.time,
+            charge_as: charge,
+            offset_s: sample.offset_s,
+            unmeasured_s: unmeasured,
+            voltage_v: sample.voltage_v,
+            path_v,
+        };
         let (mut measured_s, mut charge_as, mut offset_s, mut unmeasured_s) = (0.0, 0.0, 0.0, 0.0);
         // Before the first reading, and after a gap of unknown length, the unmeasured time is infinite.
         let mut gap_s = f64::INFINITY;
@@ -284,6 +298,8 @@ impl Estimation {
         if self.is_current_doubtful {
             (measured_s, charge_as, offset_s, unmeasured_s) = (0.0, 0.0, 0.0, measured_s + unmeasured_s);
             current_a = None;
+        } else if self.is_voltage_frozen(index) {
+            current_a = None;
         }
         // Corrects the current for the sensor's offset. A reading of exactly zero counts as free of offset.
         let offset_a = learner.current_offset().mean_a();
@@ -298,6 +314,11 @@ impl Estimation {
             ambient_c: self.ambient_c,
             voltage_v: sample.voltage_v,
         }
+    }
+
+    /// Whether a cell's voltage has stayed exactly the same while the other cells' voltages have changed.
+    fn is_voltage_frozen(&self, index: usize) -> bool {
+        self.progress[index].consumed.is_some_and(|consumed| self.current_check.is_frozen_since(consumed.path_v))
     }
 
     /// Records the sample of a cell's latest step. Returns whether that step reset its filter.
@@ -361,7 +382,9 @@ impl Estimation {
         let (mean_nis, check) = (self.bank.mean_nis(index), &self.checks[index]);
         let limit = self.bank.own_config().consistency.limit;
         let mismatch = if check.is_mismatched() { check.mismatch() } else { 0.0 };
-        let doubt = if self.is_current_doubtful || !self.bank.is_plausible(index) { DOUBT } else { 0.0 };
+        let is_doubtful =
+            self.is_current_doubtful || self.is_voltage_frozen(index) || !self.bank.is_plausible(index);
+        let doubt = if is_doubtful { DOUBT } else { 0.0 };
         if mismatch.max(doubt) > 0.0 { mean_nis.max(mismatch.max(doubt) * limit) } else { mean_nis }
     }
 

@@ -27,6 +27,7 @@ impl CellSlot {
         self.has_filter
             && self.memory.rejected == 0
             && !self.memory.is_soc_unknown
+            && !self.memory.is_current_unknown
             && self.memory.downtime_std_if_any().is_none()
     }
 }
@@ -121,6 +122,6 @@ impl StepInput<WIDTH> {
         cell.memory.last_current_a = self.current_a.0[lane];
         cell.memory.temperature_c = Some(self.temperature_c.0[lane]);
         cell.memory.end_downtime();
-        *result = StepResult { update: Some(outcome.lane(from)), reset: false };
+        *result = StepResult { update: Some(outcome.lane(from)), reset: false, was_used: false };
     }
 }

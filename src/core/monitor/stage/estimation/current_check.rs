@@ -51,6 +51,13 @@ const MIN_REPEAT: f64 = 0.01;
 const FAULTY_REPEAT: f64 = 0.5;
 /// Evidence of repeated readings that makes the sensor doubtful.
 const REPEATED: f64 = -10.0;
+/// Smallest common change of the cells that a voltage must follow, V, and the same in steps of the coarsest reading.
+const FROZEN_V: f64 = 0.03;
+const FROZEN_STEPS: f64 = 2.5;
+/// Resolution of the voltages before a change has been seen, V.
+const COARSE_V: f64 = 0.05;
+/// The sum of changes starts again at this value, V, so that it keeps its resolution.
+const PATH_V: f64 = 1e3;
 /// Maximum number of cells that are compared.
 pub(crate) const MAX_CELLS: usize = 15;
 const ROUNDS: usize = 4;
@@ -84,6 +91,9 @@ pub(crate) struct CurrentCheck {
     usual_v: f64,
     /// Share of readings of a flowing current that differ from the previous reading.
     differing: f64,
+    /// Sum of all common changes, V, and the smallest change of a single voltage, V.
+    path_v: f64,
+    resolution_v: f64,
     /// Evidence of the present run of equal readings.
     repeated: f64,
 }
@@ -98,6 +108,8 @@ impl Default for CurrentCheck {
             log_ratio: 0.0,
             usual_v: 1e-3,
             differing: 0.0,
+            path_v: 0.0,
+            resolution_v: COARSE_V,
             repeated: 0.0,
         }
     }
@@ -122,16 +134,20 @@ impl CurrentCheck {
             latest = Some(sample);
             if let Some(before_v) = self.voltages_v[place].replace(sample.voltage_v) {
                 moves_v[moves] = sample.voltage_v - before_v;
+                if moves_v[moves] != 0.0 {
+                    self.resolution_v = self.resolution_v.min(moves_v[moves].abs());
+                }
                 moves += 1;
             }
         }
         let Some(&CellSample { time, current_a, .. }) = latest else { return };
+        let move_v = common_move(&mut moves_v[..moves]);
+        self.path_v = (self.path_v + move_v) % PATH_V;
         let is_late = self.count > 0 && time.since(self.rounds[ROUNDS - 1].time) > MAX_PAUSE_S;
         let Some(current_a) = current_a.filter(|_| !is_late && moves > 0) else {
             self.count = 0;
             return;
         };
-        let move_v = common_move(&mut moves_v[..moves]);
         self.rounds.rotate_left(1);
         self.rounds[ROUNDS - 1] = Round { time, current_a, move_v };
         self.count = (self.count + 1).min(ROUNDS);
@@ -161,9 +177,22 @@ impl CurrentCheck {
         }
     }
 
-    /// Handles a restart of most filters: the voltages contradict the counted charge.
-    pub(crate) fn note_restart(&mut self) {
-        self.weigh(false);
+    /// Handles a contradiction between the voltages and the counted charge in most cells: the filters have restarted, or
+    /// the first voltages after a silence show that the cells were used. Either the sensor or the record is wrong, so
+    /// the current stays doubtful until it explains a step of the voltages.
+    pub(crate) fn note_contradiction(&mut self) {
+        self.evidence = self.evidence.min(-0.5 * EXPLAINED);
+    }
+
+    /// Sum of all changes that the cells have in common, V. Only its differences are meaningful.
+    pub(crate) fn path_v(&self) -> f64 {
+        self.path_v
+    }
+
+    /// Whether the cells have clearly changed in common since the path was `path_v`. If a voltage has not changed since,
+    /// it is frozen.
+    pub(crate) fn is_frozen_since(&self, path_v: f64) -> bool {
+        (self.path_v - path_v).abs() >= FROZEN_V.max(FROZEN_STEPS * self.resolution_v)
     }
 
     /// Judges the step before the last round. `ohm`: the usual resistance.
@@ -210,7 +239,7 @@ impl CurrentCheck {
         bounds::CURRENT_A.check_all("a current of the check of the current", self.rounds.map(|round| round.current_a))?;
         let numbers = self.rounds.map(|round| round.move_v);
         bounds::NUMBER.check_all("a voltage step of the check of the current", numbers)?;
-        let state = [self.evidence, self.log_ratio, self.usual_v];
+        let state = [self.evidence, self.log_ratio, self.usual_v, self.differing, self.path_v, self.resolution_v, self.repeated];
         bounds::NUMBER.check_all("the check of the current", state)?;
         InvalidState::unless(self.count <= ROUNDS, "rounds of the check of the current", self.count as f64, "at most 4")
     }
