@@ -30,6 +30,9 @@ use crate::quantity::{InvalidState, Mode, Timestamp};
 /// wrong.
 const CONTRADICTION: f64 = 4.0;
 
+/// Standard deviation of the capacity of cells of one type, fraction.
+const NEW_SPREAD: f64 = 0.1;
+
 /// Result of the capacity filter's step over a half-cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CapacityUpdate {
@@ -355,9 +358,12 @@ impl Learner {
             difference * difference > CONTRADICTION * CONTRADICTION * (z.variance + expected.variance)
         };
         if let Some(z) = measurement.filter(is_contradiction) {
-            // The measurement or the belief is wrong. Another half-cycle decides.
+            // The measurement or the belief is wrong; other half-cycles decide. Each of them widens the belief by at
+            // most the spread of new cells, so that one wild measurement does not make the capacity unknown.
             let difference = z.value - expected.mean;
-            drift.doubt(difference * difference / (CONTRADICTION * CONTRADICTION));
+            let doubt = difference * difference / (CONTRADICTION * CONTRADICTION);
+            let spread_ah = NEW_SPREAD * model.capacity_ah;
+            drift.doubt(doubt.min(expected.variance + spread_ah * spread_ah));
         } else if let Some(z) = measurement {
             drift.update(z, &effects_ah(model, config, half_cycle, after.mean));
         } else if is_in_doubt && !is_held {

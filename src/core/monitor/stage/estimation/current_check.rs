@@ -43,6 +43,8 @@ const MOVE_V: (f64, f64) = (1e-4, 0.05);
 const RATIO_GAIN: f64 = 0.1;
 /// Longest time between two rounds, s. After a longer pause, the steps are not compared.
 const MAX_PAUSE_S: f64 = 60.0;
+/// Part of the earlier doubts that remains after an explained step.
+const FORGET_DOUBT: f64 = 0.998;
 /// Weight of a round in the share of readings that differ from the previous reading.
 const NOISE_GAIN: f64 = 0.02;
 /// Lowest probability that a good sensor repeats a reading exactly.
@@ -96,6 +98,10 @@ pub(crate) struct CurrentCheck {
     resolution_v: f64,
     /// Evidence of the present run of equal readings.
     repeated: f64,
+    /// Readings of either sign at which the sensor was frozen or limited, A; 0 = none.
+    limits_a: [f64; 2],
+    /// Number of earlier doubts; explained steps reduce it.
+    doubts: f64,
 }
 
 impl Default for CurrentCheck {
@@ -111,6 +117,8 @@ impl Default for CurrentCheck {
             path_v: 0.0,
             resolution_v: COARSE_V,
             repeated: 0.0,
+            limits_a: [0.0; 2],
+            doubts: 0.0,
         }
     }
 }
@@ -164,12 +172,17 @@ impl CurrentCheck {
     fn judge_repeat(&mut self) {
         let [.., before, now] = self.rounds;
         let differs = now.current_a != before.current_a;
+        if self.limits_a.contains(&now.current_a) && now.current_a != 0.0 {
+            self.doubt(UNEXPLAINED);
+        }
         if now.current_a == 0.0 || differs {
             self.repeated = 0.0;
         } else {
             self.repeated += libm::log((1.0 - self.differing).max(MIN_REPEAT) / FAULTY_REPEAT).min(0.0);
             if self.repeated <= REPEATED {
-                (self.repeated, self.evidence) = (0.0, self.evidence.min(UNEXPLAINED));
+                self.repeated = 0.0;
+                self.limits_a[usize::from(now.current_a < 0.0)] = now.current_a;
+                self.doubt(UNEXPLAINED);
             }
         }
         if now.current_a != 0.0 {
@@ -181,7 +194,7 @@ impl CurrentCheck {
     /// the first voltages after a silence show that the cells were used. Either the sensor or the record is wrong, so
     /// the current stays doubtful until it explains a step of the voltages.
     pub(crate) fn note_contradiction(&mut self) {
-        self.evidence = self.evidence.min(-0.5 * EXPLAINED);
+        self.doubt(-0.5 * EXPLAINED);
     }
 
     /// Sum of all changes that the cells have in common, V. Only its differences are meaningful.
@@ -202,9 +215,13 @@ impl CurrentCheck {
         let unexplained_v = (r2.move_v + ohm * (r2.current_a - r1.current_a)).abs();
         let factor = if unexplained_v.min(r2.move_v.abs()) > self.usual_v { MOVE_GAIN } else { 1.0 / MOVE_GAIN };
         self.usual_v = (self.usual_v * factor).clamp(MOVE_V.0, MOVE_V.1);
-        // Without the drift that the step before has shown.
+        // The part beyond the previous change: a drift continues, and a relaxation becomes slower.
         let drift_v = r1.move_v * (r2.time.since(r1.time) / r1.time.since(r0.time).max(1e-3)).min(2.0);
-        let step_v = if (r2.move_v - drift_v).abs() < r2.move_v.abs() { r2.move_v - drift_v } else { r2.move_v };
+        let step_v = if drift_v * r2.move_v <= 0.0 {
+            r2.move_v
+        } else {
+            (r2.move_v.abs() - drift_v.abs()).max(0.0).copysign(r2.move_v)
+        };
         let factor = |a: Round, b: Round| -step_v / (ohm * (b.current_a - a.current_a));
         let is_explained = |factor: f64| (1.0 / MAX_FACTOR..=MAX_FACTOR).contains(&factor);
         if step_v.abs() >= clear_v {
@@ -224,8 +241,23 @@ impl CurrentCheck {
     }
 
     fn weigh(&mut self, is_explained: bool) {
-        let evidence = if is_explained { EXPLAINED } else { UNEXPLAINED };
-        self.evidence = (self.evidence + evidence).clamp(MIN_EVIDENCE, MAX_EVIDENCE);
+        if is_explained {
+            self.evidence = (self.evidence + EXPLAINED).min(MAX_EVIDENCE);
+            self.doubts *= FORGET_DOUBT;
+        } else {
+            self.doubt(self.evidence + UNEXPLAINED);
+        }
+    }
+
+    /// Lowers the evidence to `evidence`, and further if the sensor has been doubtful before.
+    fn doubt(&mut self, evidence: f64) {
+        let was_doubtful = self.is_doubtful();
+        self.evidence = self.evidence.min(evidence);
+        if self.is_doubtful() && !was_doubtful {
+            self.evidence -= self.doubts;
+            self.doubts += 1.0;
+        }
+        self.evidence = self.evidence.max(MIN_EVIDENCE);
     }
 
     /// Forgets the latest rounds, because the next reading comes after a pause. The evidence stays.
@@ -236,10 +268,10 @@ impl CurrentCheck {
     /// Checks a stored state; the error is the first impossible number.
     pub(crate) fn check(&self) -> Result<(), InvalidState> {
         bounds::VOLTAGE_V.check_all("a voltage of the check of the current", self.voltages_v.into_iter().flatten())?;
-        bounds::CURRENT_A.check_all("a current of the check of the current", self.rounds.map(|round| round.current_a))?;
+        bounds::CURRENT_A.check_all("a current of the check of the current", self.rounds.map(|round| round.current_a).into_iter().chain(self.limits_a))?;
         let numbers = self.rounds.map(|round| round.move_v);
         bounds::NUMBER.check_all("a voltage step of the check of the current", numbers)?;
-        let state = [self.evidence, self.log_ratio, self.usual_v, self.differing, self.path_v, self.resolution_v, self.repeated];
+        let state = [self.evidence, self.log_ratio, self.usual_v, self.differing, self.path_v, self.resolution_v, self.repeated, self.doubts];
         bounds::NUMBER.check_all("the check of the current", state)?;
         InvalidState::unless(self.count <= ROUNDS, "rounds of the check of the current", self.count as f64, "at most 4")
     }
