@@ -26,10 +26,8 @@ use super::gaussian::Gaussian;
 use super::memory::Memory;
 use super::state_vector::{BRANCHES, LOG_RESISTANCE, square, widened};
 use super::step::{CellStep, Update};
+use super::voltage_reach::FAR;
 use crate::cell::{CellModel, EstimatorConfig};
-
-/// Distance, in standard deviations of the voltage, at which the curve shows how far the SOC may be.
-const FAR: f64 = 4.0;
 
 /// Change of the SOC, in standard deviations before the downtime, that only use explains.
 const CLEARLY: f64 = 4.0;
