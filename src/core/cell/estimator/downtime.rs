@@ -77,9 +77,6 @@ pub(super) fn update_after_downtime(
     let std = far.map(|far| (far - used.mean[0]).abs() / FAR).into_iter().fold(0.0, f64::max);
     used.covariance[(0, 0)] = used.covariance[(0, 0)].max(square(std));
     let by_left_alone = update(x)?;
-    // A SOC that was known before, and a voltage that leaves it within `std`.
-    let left_alone_variance = 1.0 / (1.0 / before.variance + 1.0 / square(std).max(f64::MIN_POSITIVE));
-    x.covariance[(0, 0)] = x.covariance[(0, 0)].max(left_alone_variance);
     let log_likelihood =
         |u: &Update| -0.5 * (libm::log(u.innovation_variance) + square(u.innovation) / u.innovation_variance);
     let odds = libm::exp(log_likelihood(&by_left_alone) - log_likelihood(&wide)).max(f64::MIN_POSITIVE);

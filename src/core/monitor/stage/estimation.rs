@@ -28,6 +28,9 @@ use crate::sample::CellSample;
 /// enough to trip an alarm whose threshold is the limit.
 const DOUBT: f64 = 2.0;
 
+/// Path of a frozen voltage: far from every path of the cells.
+const FROZEN_PATH_V: f64 = 1e9;
+
 /// The estimation stage.
 #[derive(Debug)]
 pub(crate) struct Estimation {
@@ -267,6 +270,8 @@ impl Estimation {
         let index = sample.cell.index();
         let (charge, unmeasured) = (sample.charge_as, sample.unmeasured_s);
         let path_v = match self.progress[index].consumed {
+            // A frozen voltage counts as frozen until it changes, even if the other cells return.
+            Some(before) if before.voltage_v == sample.voltage_v && self.is_voltage_frozen(index) => FROZEN_PATH_V,
             Some(before) if before.voltage_v == sample.voltage_v => before.path_v,
             _ => self.current_check.path_v(),
         };

@@ -33,6 +33,8 @@ const MIN_EVIDENCE: f64 = -8.0;
 const MAX_FACTOR: f64 = 4.0;
 /// Smallest clear step of the voltages, V.
 const MIN_STEP_V: f64 = 0.01;
+/// Clear step in steps of the coarsest reading.
+const STEP_READINGS: f64 = 1.5;
 /// Clear step as a multiple of the usual change between two rounds.
 const STEP_MOVES: f64 = 8.0;
 /// Factor by which a round changes the usual change (an estimate of the median).
@@ -211,7 +213,7 @@ impl CurrentCheck {
     /// Judges the step before the last round. `ohm`: the usual resistance.
     fn judge(&mut self, noise_v: f64, ohm: f64) {
         let [r0, r1, r2, r3] = self.rounds;
-        let clear_v = MIN_STEP_V.max(2.0 * noise_v).max(STEP_MOVES * self.usual_v);
+        let clear_v = MIN_STEP_V.max(2.0 * noise_v).max(STEP_READINGS * self.resolution_v).max(STEP_MOVES * self.usual_v);
         let unexplained_v = (r2.move_v + ohm * (r2.current_a - r1.current_a)).abs();
         let factor = if unexplained_v.min(r2.move_v.abs()) > self.usual_v { MOVE_GAIN } else { 1.0 / MOVE_GAIN };
         self.usual_v = (self.usual_v * factor).clamp(MOVE_V.0, MOVE_V.1);
@@ -282,11 +284,12 @@ impl CurrentCheck {
     }
 }
 
-/// The change that at least three quarters of the cells reach or exceed in the same direction, V; 0 without cells.
+/// The change that at least two thirds of the cells reach or exceed in the same direction, V; 0 without cells.
 fn common_move(moves_v: &mut [f64]) -> f64 {
     moves_v.sort_unstable_by(f64::total_cmp);
     let Some(last) = moves_v.len().checked_sub(1) else { return 0.0 };
-    let (low, high) = (moves_v[last / 4], moves_v[last - last / 4]);
+    let others = moves_v.len() / 3;
+    let (low, high) = (moves_v[others], moves_v[last - others]);
     if low > 0.0 {
         low
     } else if high < 0.0 {
