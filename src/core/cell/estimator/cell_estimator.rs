@@ -72,7 +72,11 @@ impl CellEstimator {
             x.correlate(LOG_RESISTANCE, CAPACITY, 0.0);
             x.by_constant.fill(0.0);
         }
-        StepResult { update: result.flatten(), reset, was_used: was_silent && std::mem::take(&mut self.memory.was_used) }
+        StepResult {
+            update: result.flatten(),
+            reset,
+            was_used: was_silent && std::mem::take(&mut self.memory.was_used),
+        }
     }
 
     /// Computes the step; `None` if this is not possible.

@@ -387,8 +387,7 @@ impl Estimation {
         let (mean_nis, check) = (self.bank.mean_nis(index), &self.checks[index]);
         let limit = self.bank.own_config().consistency.limit;
         let mismatch = if check.is_mismatched() { check.mismatch() } else { 0.0 };
-        let is_doubtful =
-            self.is_current_doubtful || self.is_voltage_frozen(index) || !self.bank.is_plausible(index);
+        let is_doubtful = self.is_current_doubtful || self.is_voltage_frozen(index) || !self.bank.is_plausible(index);
         let doubt = if is_doubtful { DOUBT } else { 0.0 };
         if mismatch.max(doubt) > 0.0 { mean_nis.max(mismatch.max(doubt) * limit) } else { mean_nis }
     }

@@ -213,7 +213,8 @@ impl CurrentCheck {
     /// Judges the step before the last round. `ohm`: the usual resistance.
     fn judge(&mut self, noise_v: f64, ohm: f64) {
         let [r0, r1, r2, r3] = self.rounds;
-        let clear_v = MIN_STEP_V.max(2.0 * noise_v).max(STEP_READINGS * self.resolution_v).max(STEP_MOVES * self.usual_v);
+        let clear_v =
+            MIN_STEP_V.max(2.0 * noise_v).max(STEP_READINGS * self.resolution_v).max(STEP_MOVES * self.usual_v);
         let unexplained_v = (r2.move_v + ohm * (r2.current_a - r1.current_a)).abs();
         let factor = if unexplained_v.min(r2.move_v.abs()) > self.usual_v { MOVE_GAIN } else { 1.0 / MOVE_GAIN };
         self.usual_v = (self.usual_v * factor).clamp(MOVE_V.0, MOVE_V.1);
@@ -270,10 +271,22 @@ impl CurrentCheck {
     /// Checks a stored state; the error is the first impossible number.
     pub(crate) fn check(&self) -> Result<(), InvalidState> {
         bounds::VOLTAGE_V.check_all("a voltage of the check of the current", self.voltages_v.into_iter().flatten())?;
-        bounds::CURRENT_A.check_all("a current of the check of the current", self.rounds.map(|round| round.current_a).into_iter().chain(self.limits_a))?;
+        bounds::CURRENT_A.check_all(
+            "a current of the check of the current",
+            self.rounds.map(|round| round.current_a).into_iter().chain(self.limits_a),
+        )?;
         let numbers = self.rounds.map(|round| round.move_v);
         bounds::NUMBER.check_all("a voltage step of the check of the current", numbers)?;
-        let state = [self.evidence, self.log_ratio, self.usual_v, self.differing, self.path_v, self.resolution_v, self.repeated, self.doubts];
+        let state = [
+            self.evidence,
+            self.log_ratio,
+            self.usual_v,
+            self.differing,
+            self.path_v,
+            self.resolution_v,
+            self.repeated,
+            self.doubts,
+        ];
         bounds::NUMBER.check_all("the check of the current", state)?;
         InvalidState::unless(self.count <= ROUNDS, "rounds of the check of the current", self.count as f64, "at most 4")
     }
@@ -296,5 +309,128 @@ fn common_move(moves_v: &mut [f64]) -> f64 {
         high
     } else {
         0.0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::quantity::CellIndex;
+
+    const OHM: f64 = 2e-3;
+    const CELLS: usize = 5;
+
+    /// Load of a drive, A: a new level every 10 s.
+    fn load_a(time_s: u32) -> f64 {
+        let level = (time_s / 10).wrapping_mul(2_654_435_761) >> 24;
+        f64::from(level) / 2.0 - 30.0
+    }
+
+    /// Runs a drive of `seconds`, one round every 2 s. `measured` returns the reading for the load and the time. Returns
+    /// the share of rounds in doubt, and the check.
+    fn drive(check: &mut CurrentCheck, seconds: u32, measured: impl Fn(f64, u32) -> Option<f64>) -> f64 {
+        let mut doubtful = 0;
+        for time_s in (0..seconds).step_by(2) {
+            let noise_a = 0.01 * f64::from(time_s % 7);
+            let samples: Vec<CellSample> = (0..CELLS)
+                .map(|cell| CellSample {
+                    time: Timestamp::from_secs(f64::from(time_s)),
+                    cell: CellIndex(cell as u16),
+                    voltage_v: 3.7 - 1.2 * OHM * load_a(time_s) + 1e-4 * ((time_s as usize + cell) % 5) as f64,
+                    current_a: measured(load_a(time_s), time_s).map(|current_a| current_a + noise_a),
+                    charge_as: 0.0,
+                    offset_s: 0.0,
+                    unmeasured_s: 0.0,
+                    temperature_c: None,
+                })
+                .collect();
+            check.handle(samples.iter().enumerate(), 0.001, OHM);
+            doubtful += u32::from(check.is_doubtful());
+        }
+        f64::from(doubtful) / f64::from(seconds / 2)
+    }
+
+    fn share_in_doubt(measured: impl Fn(f64, u32) -> Option<f64>) -> f64 {
+        drive(&mut CurrentCheck::default(), 3600, measured)
+    }
+
+    #[test]
+    fn good_current_is_never_doubted() {
+        assert_eq!(share_in_doubt(|load_a, _| Some(load_a)), 0.0);
+        // A gateway sends the current one round late; the resistance is twice the model's.
+        assert_eq!(share_in_doubt(|_, time_s| Some(load_a(time_s.saturating_sub(2)))), 0.0);
+        assert_eq!(share_in_doubt(|load_a, _| Some(0.5 * load_a)), 0.0);
+        // One reading in four is lost.
+        assert_eq!(share_in_doubt(|load_a, time_s| (time_s % 8 != 0).then_some(load_a)), 0.0);
+    }
+
+    #[test]
+    fn wrong_current_is_doubted_within_seconds() {
+        let faults: [(&str, fn(f64, u32) -> f64); 5] = [
+            ("zero", |_, _| 0.0),
+            ("inverted", |load_a, _| -load_a),
+            ("without sign", |load_a, _| load_a.abs()),
+            ("late by 20 s", |_, time_s| load_a(time_s.saturating_sub(20))),
+            ("overflow", |load_a, _| (load_a + 20.0).rem_euclid(40.0) - 20.0),
+        ];
+        for (name, fault) in faults {
+            let share = share_in_doubt(|load_a, time_s| Some(fault(load_a, time_s)));
+            assert!(share > 0.85, "{name}: {share}");
+        }
+    }
+
+    #[test]
+    fn repeated_reading_of_noisy_sensor_is_its_limit() {
+        let mut check = CurrentCheck::default();
+        drive(&mut check, 1200, |load_a, _| Some(load_a));
+        let noise = |time_s: u32| 0.01 * f64::from(time_s % 7);
+        // The reading without the noise that `drive` adds: exactly 20 A while the load is larger.
+        let limited = |load_a: f64, time_s: u32| Some(if load_a >= 20.0 { 20.0 - noise(time_s) } else { load_a });
+        assert!(drive(&mut check, 3600, limited) > 0.5);
+        assert!((check.limits_a[0] - 20.0).abs() < 1e-9, "{:?}", check.limits_a);
+    }
+
+    #[test]
+    fn doubt_ends_after_explained_steps_and_lasts_longer_each_time() {
+        let mut check = CurrentCheck::default();
+        drive(&mut check, 600, |load_a, _| Some(load_a));
+        let mut shares = Vec::new();
+        for _ in 0..3 {
+            check.note_contradiction();
+            shares.push(drive(&mut check, 1200, |load_a, _| Some(load_a)));
+            assert!(!check.is_doubtful());
+        }
+        assert!(shares.is_sorted() && shares[0] < 0.1 && shares[2] < 0.5, "{shares:?}");
+    }
+
+    #[test]
+    fn frozen_voltage_shows_against_common_path() {
+        let mut check = CurrentCheck::default();
+        drive(&mut check, 600, |load_a, _| Some(load_a));
+        let path_v = check.path_v();
+        assert!(!check.is_frozen_since(path_v));
+        assert!(check.is_frozen_since(path_v - 0.05));
+    }
+
+    #[test]
+    fn relaxation_after_load_is_not_a_step() {
+        let mut check = CurrentCheck::default();
+        for k in 0..20_u32 {
+            let since_load = k.checked_sub(5).map(f64::from);
+            let samples: Vec<CellSample> = (0..CELLS)
+                .map(|cell| CellSample {
+                    time: Timestamp::from_secs(f64::from(600 + 2 * k)),
+                    cell: CellIndex(cell as u16),
+                    voltage_v: 3.7 - since_load.map_or(0.102, |rounds| 0.03 * libm::exp(-rounds / 3.0)),
+                    current_a: Some(if since_load.is_none() { 30.0 } else { 0.0 }),
+                    charge_as: 0.0,
+                    offset_s: 0.0,
+                    unmeasured_s: 0.0,
+                    temperature_c: None,
+                })
+                .collect();
+            check.handle(samples.iter().enumerate(), 0.001, OHM);
+        }
+        assert!(!check.is_doubtful(), "{check:?}");
     }
 }
