@@ -239,7 +239,7 @@ impl Stages {
         let mut publisher = Publisher { now, alarming, sending, out };
         let teaches_capacity = modelling.teaches_capacity();
         let is_doubtful = estimation.take_doubt();
-        let is_doubtful = |cell: usize| is_doubtful || !estimation.is_trusted(cell);
+        let is_doubtful = |cell: usize| is_doubtful || estimation.is_voltage_frozen(cell);
         let doubtful: Vec<bool> = (0..estimation.cells()).map(is_doubtful).collect();
         learning.complete_mode(change, &mut estimation.bank, (teaches_capacity, &doubtful), &mut publisher);
     }

@@ -32,6 +32,9 @@ use crate::cell::{CellModel, EstimatorConfig};
 /// Change of the SOC, in standard deviations before the downtime, that only use explains.
 const CLEARLY: f64 = 4.0;
 
+/// Change of the SOC, fraction, that slow relaxation cannot imitate.
+const MUCH: f64 = 0.1;
+
 /// Updates with the first reading after a downtime. This reading does not count as evidence about the sensor's offset
 /// or the slowest branch.
 pub(super) fn update_after_downtime(
@@ -82,7 +85,7 @@ pub(super) fn update_after_downtime(
     let odds = libm::exp(log_likelihood(&by_left_alone) - log_likelihood(&wide)).max(f64::MIN_POSITIVE);
     let weight = memory.used_prior / (memory.used_prior + (1.0 - memory.used_prior) * odds);
     x.merge(&used, weight);
-    memory.was_used = weight > 0.5 && (x.mean[0] - before.mean).abs() > CLEARLY * before.std();
+    memory.was_used = weight > 0.5 && (x.mean[0] - before.mean).abs() > (CLEARLY * before.std()).max(MUCH);
     Some(if weight > 0.5 { by_used } else { by_left_alone })
 }
 

@@ -322,7 +322,7 @@ impl Estimation {
     }
 
     /// Whether a cell's voltage has stayed exactly the same while the other cells' voltages have changed.
-    fn is_voltage_frozen(&self, index: usize) -> bool {
+    pub(crate) fn is_voltage_frozen(&self, index: usize) -> bool {
         self.progress[index].consumed.is_some_and(|consumed| self.current_check.is_frozen_since(consumed.path_v))
     }
 

@@ -41,6 +41,8 @@ const STEP_MOVES: f64 = 8.0;
 const MOVE_GAIN: f64 = 1.02;
 /// Range of the usual change between two rounds, V.
 const MOVE_V: (f64, f64) = (1e-4, 0.05);
+/// Usual change before the first rounds, V. It exceeds the noise of any sensor.
+const FIRST_MOVE_V: f64 = 0.01;
 /// Part of an explained step's ln(resistance ratio) that the usual ratio takes over.
 const RATIO_GAIN: f64 = 0.1;
 /// Longest time between two rounds, s. After a longer pause, the steps are not compared.
@@ -114,7 +116,7 @@ impl Default for CurrentCheck {
             count: 0,
             evidence: MAX_EVIDENCE,
             log_ratio: 0.0,
-            usual_v: 1e-3,
+            usual_v: FIRST_MOVE_V,
             differing: 0.0,
             path_v: 0.0,
             resolution_v: COARSE_V,
