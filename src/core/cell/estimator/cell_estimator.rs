@@ -59,8 +59,6 @@ impl CellEstimator {
     ) -> StepResult {
         let step = CellStep { temperature_c: Some(self.temperature(model, step)), ..*step };
         self.memory.temperature_c = step.temperature_c;
-        let was_silent = !self.memory.is_current_unknown;
-        self.memory.was_used = false;
         let result = self.try_step(&mut kernel, model, config, &step);
         let result = result.filter(|_| self.filter.as_ref().is_none_or(Gaussian::is_possible));
         let reset = result.is_none() || self.memory.has_lost_cell(config);
@@ -72,11 +70,7 @@ impl CellEstimator {
             x.correlate(LOG_RESISTANCE, CAPACITY, 0.0);
             x.by_constant.fill(0.0);
         }
-        StepResult {
-            update: result.flatten(),
-            reset,
-            was_used: was_silent && std::mem::take(&mut self.memory.was_used),
-        }
+        StepResult { update: result.flatten(), reset }
     }
 
     /// Computes the step; `None` if this is not possible.

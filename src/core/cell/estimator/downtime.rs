@@ -29,23 +29,15 @@ use super::step::{CellStep, Update};
 use super::voltage_reach::FAR;
 use crate::cell::{CellModel, EstimatorConfig};
 
-/// Change of the SOC, in standard deviations before the downtime, that only use explains.
-const CLEARLY: f64 = 4.0;
-
-/// Change of the SOC, fraction, that slow relaxation cannot imitate.
-const MUCH: f64 = 0.1;
-
 /// Updates with the first reading after a downtime. This reading does not count as evidence about the sensor's offset
 /// or the slowest branch.
 pub(super) fn update_after_downtime(
     kernel: &mut SingleCell,
-    (x, memory): (&mut Gaussian, &mut Memory),
+    (x, memory): (&mut Gaussian, &Memory),
     (model, config): (&CellModel, &EstimatorConfig),
     step: &CellStep,
 ) -> Option<Update> {
-    let kept = *memory;
-    let mut update = |x: &mut Gaussian| kernel.update((x, &mut { kept }), step);
-    let before = x.marginal(0);
+    let mut update = |x: &mut Gaussian| kernel.update((x, &mut { *memory }), step);
     let (before_soc, ratio) = (x.mean[0], libm::exp(x.mean[LOG_RESISTANCE]));
     let mut used = used_prior(x, config, memory.downtime_std);
     // The present load may have started at any time, so each branch is anywhere between relaxed and settled.
@@ -85,7 +77,6 @@ pub(super) fn update_after_downtime(
     let odds = libm::exp(log_likelihood(&by_left_alone) - log_likelihood(&wide)).max(f64::MIN_POSITIVE);
     let weight = memory.used_prior / (memory.used_prior + (1.0 - memory.used_prior) * odds);
     x.merge(&used, weight);
-    memory.was_used = weight > 0.5 && (x.mean[0] - before.mean).abs() > (CLEARLY * before.std()).max(MUCH);
     Some(if weight > 0.5 { by_used } else { by_left_alone })
 }
 

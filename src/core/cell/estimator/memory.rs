@@ -65,9 +65,6 @@ pub(super) struct Memory {
     pub(super) used_prior: f64,
     /// Whether the current was unknown at the last reading, so that an unmeasured stretch continues.
     pub(super) is_current_unknown: bool,
-    /// Whether the voltage of the last step has shown that the cell was used during a downtime.
-    #[serde(skip)]
-    pub(super) was_used: bool,
     /// No voltage has been used since the last sleep or unknown gap.
     pub(super) is_unseen: bool,
     /// The SOC is unknown after a gap of unknown length: the filter restarts from the next voltage.
@@ -101,7 +98,6 @@ impl Memory {
             noted_s: 0.0,
             used_prior: 0.0,
             is_current_unknown: false,
-            was_used: false,
             is_unseen: false,
             is_soc_unknown: false,
             rejected: 0,

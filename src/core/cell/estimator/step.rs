@@ -42,6 +42,4 @@ pub struct StepResult {
     pub update: Option<Update>,
     /// Whether the filter was restarted from the voltage.
     pub reset: bool,
-    /// Whether this first reading after a silence shows that the cell was used during the silence.
-    pub was_used: bool,
 }

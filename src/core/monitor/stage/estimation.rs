@@ -15,7 +15,7 @@ use current_check::{CurrentCheck, MAX_CELLS};
 use super::modelling::{Adoption, Modelling};
 use crate::cell::model_check::model_id;
 use crate::cell::{
-    AdoptedState, CellModel, CellModule, CellStep, EstimatorConfig, ModelCheck, ModelEvidence, PackBank, StepResult,
+    AdoptedState, CellModel, CellModule, CellStep, EstimatorConfig, ModelCheck, ModelEvidence, PackBank,
 };
 use crate::filter::ScalarGaussian;
 use crate::health::{CapacityConfig, Learner};
@@ -195,11 +195,6 @@ impl Estimation {
             self.bank.add(cell, &step);
         }
         self.bank.step();
-        let contradicts = |result: &StepResult| result.reset || result.was_used;
-        let contradicted = samples.iter().filter(|sample| contradicts(self.bank.result(sample.cell.index()))).count();
-        if 2 * contradicted > samples.len() {
-            self.current_check.note_contradiction();
-        }
         self.check_models(&samples);
         if modelling.has_row() {
             modelling.close_row(self.mean_soc());

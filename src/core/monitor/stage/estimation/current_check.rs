@@ -10,8 +10,8 @@
 //! rounds. They contain less noise than the difference of two readings, and a current that arrives one round earlier or
 //! later than the voltages still explains its step.
 //!
-//! Explained and unexplained steps are evidence for and against the sensor. One unexplained step is enough for a doubt,
-//! because the charge is wrong from the first second. The check finds a current that is frozen, limited, without sign,
+//! Explained and unexplained steps are evidence for and against the sensor. One or two unexplained steps are enough for a
+//! doubt, because the charge is wrong from the first second. The check finds a current that is frozen, limited, without sign,
 //! inverted or delayed, whether or not its last digits change. It finds nothing while the load does not change.
 
 use serde::{Deserialize, Serialize};
@@ -23,8 +23,11 @@ use crate::sample::CellSample;
 /// and 0.03) and with a faulty sensor (0.65 and 0.35). A sensor without sign still explains most steps of a drive.
 const EXPLAINED: f64 = 0.4;
 const UNEXPLAINED: f64 = -2.5;
-/// Highest evidence. A longer good record does not delay a doubt.
-const MAX_EVIDENCE: f64 = 2.0;
+/// Evidence before the first step: a single unexplained step makes a new sensor doubtful.
+const FIRST_EVIDENCE: f64 = 2.0;
+/// Highest evidence. After ten explained steps, two unexplained steps make the sensor doubtful. A longer good record
+/// does not delay a doubt.
+const MAX_EVIDENCE: f64 = 4.0;
 /// Lowest evidence. A sensor that has failed often must explain 20 steps.
 const MIN_EVIDENCE: f64 = -8.0;
 /// Largest ratio of a step's resistance and the usual resistance, in either direction. Temperature, ageing and the time
@@ -47,7 +50,7 @@ const RATIO_GAIN: f64 = 0.1;
 /// Longest time between two rounds, s. After a longer pause, the steps are not compared.
 const MAX_PAUSE_S: f64 = 60.0;
 /// Part of the earlier doubts that remains after an explained step.
-const FORGET_DOUBT: f64 = 0.998;
+const FORGET_DOUBT: f64 = 0.97;
 /// Weight of a round in the share of readings that differ from the previous reading.
 const NOISE_GAIN: f64 = 0.02;
 /// Lowest probability that a good sensor repeats a reading exactly.
@@ -113,7 +116,7 @@ impl Default for CurrentCheck {
             voltages_v: [None; MAX_CELLS],
             rounds: [Round::default(); ROUNDS],
             count: 0,
-            evidence: MAX_EVIDENCE,
+            evidence: FIRST_EVIDENCE,
             log_ratio: 0.0,
             usual_v: FIRST_MOVE_V,
             differing: 0.0,
@@ -191,13 +194,6 @@ impl CurrentCheck {
         if now.current_a != 0.0 {
             self.differing += NOISE_GAIN * (f64::from(u8::from(differs)) - self.differing);
         }
-    }
-
-    /// Handles a contradiction between the voltages and the counted charge in most cells: the filters have restarted, or
-    /// the first voltages after a silence show that the cells were used. Either the sensor or the record is wrong, so
-    /// the current stays doubtful until it explains a step of the voltages.
-    pub(crate) fn note_contradiction(&mut self) {
-        self.doubt(-0.5 * EXPLAINED);
     }
 
     /// Sum of all changes that the cells have in common, V. Only its differences are meaningful.
@@ -389,7 +385,7 @@ mod tests {
         drive(&mut check, 600, |load_a, _| Some(load_a));
         let mut shares = Vec::new();
         for _ in 0..3 {
-            check.note_contradiction();
+            (0..2).for_each(|_| check.weigh(false));
             shares.push(drive(&mut check, 1200, |load_a, _| Some(load_a)));
             assert!(!check.is_doubtful());
         }
