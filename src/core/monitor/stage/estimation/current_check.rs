@@ -27,7 +27,7 @@ const UNEXPLAINED: f64 = -2.5;
 /// Highest evidence, and the evidence before the first step. Two unexplained steps make a good sensor doubtful. A longer
 /// good record does not delay a doubt.
 const MAX_EVIDENCE: f64 = 4.0;
-/// Lowest evidence. A sensor that has failed often must explain 20 steps.
+/// Lowest evidence. A sensor that has failed often must explain more than 20 steps.
 const MIN_EVIDENCE: f64 = -8.0;
 /// Largest ratio of a step's resistance and the usual resistance, in either direction. Temperature, ageing and the time
 /// between two rounds change the resistance by less.
@@ -65,8 +65,6 @@ const FROZEN_V: f64 = 0.03;
 const FROZEN_STEPS: f64 = 2.5;
 /// Resolution of the voltages before a change has been seen, V.
 const COARSE_V: f64 = 0.05;
-/// The sum of changes starts again at this value, V, so that it keeps its resolution.
-const PATH_V: f64 = 1e3;
 /// Maximum number of cells that are compared.
 pub(crate) const MAX_CELLS: usize = 15;
 const ROUNDS: usize = 4;
@@ -157,7 +155,7 @@ impl CurrentCheck {
         }
         let Some(&CellSample { time, current_a, .. }) = latest else { return };
         let move_v = common_move(&mut moves_v[..moves]);
-        self.path_v = (self.path_v + move_v) % PATH_V;
+        self.path_v += move_v;
         let is_late = self.count > 0 && time.since(self.rounds[ROUNDS - 1].time) > MAX_PAUSE_S;
         let Some(current_a) = current_a.filter(|_| !is_late && moves > 0) else {
             self.count = 0;
