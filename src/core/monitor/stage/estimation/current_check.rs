@@ -10,10 +10,11 @@
 //! rounds. They contain less noise than the difference of two readings, and a current that arrives one round earlier or
 //! later than the voltages still explains its step.
 //!
-//! Explained and unexplained steps are evidence for and against the sensor. Two unexplained steps are enough for a doubt,
-//! because the charge is wrong from the first second. The check finds a current that is frozen, inverted, late
-//! or beyond its range, whether or not its last digits change. It finds nothing while the load does not change, and a
-//! current without sign only if most steps change the direction.
+//! Explained and unexplained steps are evidence for and against the sensor. One unexplained step up and one down are
+//! enough for a doubt, because the charge is wrong from the first second. Steps in one direction only are no evidence: a
+//! charger that disconnects, or a relaxation, moves the voltages and never back. The check finds a current that is
+//! frozen, inverted, late or beyond its range, whether or not its last digits change. It finds nothing while the load
+//! does not change, and a current without sign only if most steps change the direction.
 
 use serde::{Deserialize, Serialize};
 
@@ -21,14 +22,13 @@ use crate::quantity::{InvalidState, Timestamp, bounds};
 use crate::sample::CellSample;
 
 /// Evidence of an explained and of an unexplained step: ln of the ratio of their probabilities with a good sensor (0.97
-/// and 0.03) and with a faulty sensor (0.65 and 0.35). A sensor without sign still explains most steps of a drive.
+/// and 0.03) and with a faulty sensor (0.65 and 0.35).
 const EXPLAINED: f64 = 0.4;
-const UNEXPLAINED: f64 = -2.5;
-/// Highest evidence, and the evidence before the first step. Two unexplained steps make a good sensor doubtful. A longer
-/// good record does not delay a doubt.
-const MAX_EVIDENCE: f64 = 4.0;
-/// Lowest evidence. A sensor that has failed often must explain more than 20 steps.
-const MIN_EVIDENCE: f64 = -8.0;
+const UNEXPLAINED: f64 = 2.5;
+/// Evidence of unexplained steps in each direction that does not make the sensor doubtful: less than one step.
+const TOLERATED: f64 = 2.0;
+/// Highest evidence. A sensor that has failed often must explain 10 steps.
+const MOST_UNEXPLAINED: f64 = 6.0;
 /// Largest ratio of a step's resistance and the usual resistance, in either direction. Temperature, ageing and the time
 /// between two rounds change the resistance by less.
 const MAX_FACTOR: f64 = 4.0;
@@ -90,8 +90,8 @@ pub(crate) struct CurrentCheck {
     rounds: [Round; ROUNDS],
     /// Number of valid rounds, counted from the latest.
     count: usize,
-    /// Evidence for the sensor (positive) or against it, as ln of an odds ratio.
-    evidence: f64,
+    /// Evidence of the unexplained steps down and up, less that of the explained steps, as ln of an odds ratio.
+    unexplained: [f64; 2],
     /// ln of the usual resistance relative to the model.
     log_ratio: f64,
     /// Usual change of the voltages between two rounds that the current does not explain, V.
@@ -115,7 +115,7 @@ impl Default for CurrentCheck {
             voltages_v: [None; MAX_CELLS],
             rounds: [Round::default(); ROUNDS],
             count: 0,
-            evidence: MAX_EVIDENCE,
+            unexplained: [0.0; 2],
             log_ratio: 0.0,
             usual_v: FIRST_MOVE_V,
             differing: 0.0,
@@ -131,7 +131,7 @@ impl Default for CurrentCheck {
 impl CurrentCheck {
     /// Whether the steps of the voltages contradict the current.
     pub(crate) fn is_doubtful(&self) -> bool {
-        self.evidence < 0.0
+        self.unexplained[0].min(self.unexplained[1]) > TOLERATED
     }
 
     /// Handles a round. `samples`: the compared cells that have reported, each with its place from 0 to [`MAX_CELLS`] - 1.
@@ -178,7 +178,7 @@ impl CurrentCheck {
         let [.., before, now] = self.rounds;
         let differs = now.current_a != before.current_a;
         if self.limits_a.contains(&now.current_a) && now.current_a != 0.0 {
-            self.doubt(UNEXPLAINED);
+            self.add_unexplained(&[0, 1]);
         }
         if now.current_a == 0.0 || differs {
             self.repeated = 0.0;
@@ -187,7 +187,7 @@ impl CurrentCheck {
             if self.repeated <= REPEATED {
                 self.repeated = 0.0;
                 self.limits_a[usize::from(now.current_a < 0.0)] = now.current_a;
-                self.doubt(UNEXPLAINED);
+                self.add_unexplained(&[0, 1]);
             }
         }
         if now.current_a != 0.0 {
@@ -227,27 +227,29 @@ impl CurrentCheck {
         if is_explained {
             self.log_ratio = (self.log_ratio + RATIO_GAIN * libm::log(factor)).clamp(-2.0, 2.0);
         }
-        self.weigh(is_explained);
+        self.weigh(is_explained, moved_v > 0.0);
     }
 
-    fn weigh(&mut self, is_explained: bool) {
+    /// Adds a step of the voltages, up or down, to the evidence.
+    fn weigh(&mut self, is_explained: bool, is_up: bool) {
         if is_explained {
-            self.evidence = (self.evidence + EXPLAINED).min(MAX_EVIDENCE);
+            self.unexplained = self.unexplained.map(|sum| (sum - EXPLAINED).max(0.0));
             self.doubts *= FORGET_DOUBT;
         } else {
-            self.doubt(self.evidence + UNEXPLAINED);
+            self.add_unexplained(&[usize::from(is_up)]);
         }
     }
 
-    /// Lowers the evidence to `evidence`, and further if the sensor has been doubtful before.
-    fn doubt(&mut self, evidence: f64) {
+    /// Adds an unexplained step in each of the `directions`, and more if the sensor has been doubtful before.
+    fn add_unexplained(&mut self, directions: &[usize]) {
         let was_doubtful = self.is_doubtful();
-        self.evidence = self.evidence.min(evidence);
+        for &direction in directions {
+            self.unexplained[direction] = (self.unexplained[direction] + UNEXPLAINED).min(MOST_UNEXPLAINED);
+        }
         if self.is_doubtful() && !was_doubtful {
-            self.evidence -= self.doubts;
+            self.unexplained = self.unexplained.map(|sum| (sum + self.doubts).min(MOST_UNEXPLAINED));
             self.doubts += 1.0;
         }
-        self.evidence = self.evidence.max(MIN_EVIDENCE);
     }
 
     /// Forgets the latest rounds, because the next reading comes after a pause. The evidence stays.
@@ -264,8 +266,10 @@ impl CurrentCheck {
         )?;
         let numbers = self.rounds.map(|round| round.move_v);
         bounds::NUMBER.check_all("a voltage step of the check of the current", numbers)?;
+        let [down, up] = self.unexplained;
         let state = [
-            self.evidence,
+            down,
+            up,
             self.log_ratio,
             self.usual_v,
             self.differing,
@@ -382,7 +386,7 @@ mod tests {
         drive(&mut check, 600, |load_a, _| Some(load_a));
         let mut shares = Vec::new();
         for _ in 0..3 {
-            (0..2).for_each(|_| check.weigh(false));
+            check.add_unexplained(&[0, 1]);
             shares.push(drive(&mut check, 1200, |load_a, _| Some(load_a)));
             assert!(!check.is_doubtful());
         }
