@@ -57,6 +57,7 @@ mod slow_branch;
 mod state;
 mod state_vector;
 mod step;
+mod voltage_reach;
 
 pub use bank::EstimatorBank;
 pub use cell_estimator::{AdoptedState, CellEstimator};

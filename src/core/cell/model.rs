@@ -106,10 +106,10 @@ pub struct ModelSpread {
 }
 
 impl ModelSpread {
-    /// Spread of cells of the model's own type.
-    pub fn usual(branches: usize) -> Self {
+    /// Spread of cells of the model's own type. `curve_v`: standard deviation of the open-circuit curve's error, V.
+    pub fn usual(branches: usize, curve_v: f64) -> Self {
         let slow_branch = if branches > 1 { 0.2 } else { 0.1 };
-        Self { curve_v: 0.0, log_resistance: 0.2, slow_branch, capacity: 0.1, drop_sqrt_s: 0.0 }
+        Self { curve_v, log_resistance: 0.2, slow_branch, capacity: 0.1, drop_sqrt_s: 0.0 }
     }
 }
 
@@ -152,7 +152,26 @@ impl Table {
     }
 }
 
+/// Mean slope of the open-circuit curve, V per unit of SOC, below which an electrode is a mixture of two phases.
+const TWO_PHASE_SLOPE_V: f64 = 0.15;
+
+/// Standard deviation of the hysteresis of a two-phase electrode around the middle of both branches, V. For LFP, the
+/// branches are 10 to 25 mV apart.
+const TWO_PHASE_HYSTERESIS_V: f64 = 0.01;
+
 impl CellModel {
+    /// Spread of the cells around the model. If the model states none: the usual spread of cells of one type, and the
+    /// hysteresis of a two-phase electrode if the curve is flat.
+    pub fn spread(&self) -> ModelSpread {
+        self.spread.unwrap_or_else(|| {
+            let middle = self.temperature_position(25.0);
+            let [low_v, high_v] = [0.2, 0.8].map(|soc| self.ocv_v(&self.grid_position_at(&middle, soc)));
+            let is_two_phase = (high_v - low_v) / 0.6 < TWO_PHASE_SLOPE_V;
+            let curve_v = if is_two_phase { TWO_PHASE_HYSTERESIS_V } else { 0.0 };
+            ModelSpread::usual(self.branches.len(), curve_v)
+        })
+    }
+
     /// Grid position of a SOC and a temperature.
     pub fn grid_position(&self, soc: f64, temperature_c: f64) -> GridPosition {
         self.grid_position_at(&self.temperature_position(temperature_c), soc)

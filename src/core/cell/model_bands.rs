@@ -102,7 +102,7 @@ impl<'a> ModelBands<'a> {
     }
 
     fn spread(&self) -> ModelSpread {
-        self.model.spread.unwrap_or(ModelSpread::usual(self.model.branches.len()))
+        self.model.spread()
     }
 
     /// Standard deviation of the SOC from one voltage at rest, fraction.

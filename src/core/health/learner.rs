@@ -26,6 +26,13 @@ use crate::filter::{Measurement, ScalarGaussian};
 use crate::quantity::bounds;
 use crate::quantity::{InvalidState, Mode, Timestamp};
 
+/// Difference between a measured capacity and the belief, in standard deviations of both, beyond which one of them is
+/// wrong.
+const CONTRADICTION: f64 = 4.0;
+
+/// Standard deviation of the capacity of cells of one type, fraction.
+const NEW_SPREAD: f64 = 0.1;
+
 /// Result of the capacity filter's step over a half-cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CapacityUpdate {
@@ -345,9 +352,21 @@ impl Learner {
         });
         let drift = &mut self.drift[cell];
         let before = *drift;
-        if let Some(z) = measurement {
+        let expected = drift.capacity();
+        let is_contradiction = |z: &Measurement| {
+            let difference = z.value - expected.mean;
+            difference * difference > CONTRADICTION * CONTRADICTION * (z.variance + expected.variance)
+        };
+        if let Some(z) = measurement.filter(is_contradiction) {
+            // The measurement or the belief is wrong; other half-cycles decide. Each of them widens the belief by at
+            // most the spread of new cells, so that one wild measurement does not make the capacity unknown.
+            let difference = z.value - expected.mean;
+            let doubt = difference * difference / (CONTRADICTION * CONTRADICTION);
+            let spread_ah = NEW_SPREAD * model.capacity_ah;
+            drift.doubt(doubt.min(expected.variance + spread_ah * spread_ah));
+        } else if let Some(z) = measurement {
             drift.update(z, &effects_ah(model, config, half_cycle, after.mean));
-        } else if is_in_doubt {
+        } else if is_in_doubt && !is_held {
             drift.at_least(half_cycle.charge_ah);
         }
         // Discards a measurement that makes the capacity impossible for this cell.
@@ -355,7 +374,7 @@ impl Learner {
         if !is_possible {
             *drift = before;
         }
-        let measurement = measurement.filter(|_| is_possible);
+        let measurement = measurement.filter(|z| is_possible && !is_contradiction(z));
         self.capacity[cell] = drift.capacity();
         let cycles = half_cycle.charge_ah / (2.0 * after.mean);
         let rest_days = (self.rest_s / 86_400.0).min(1.0);

@@ -115,6 +115,7 @@ impl Snapshot {
         restarted.intake.restart();
         restarted.sampling.restart();
         restarted.estimation.is_current_doubtful = false;
+        restarted.estimation.current_check.interrupt();
         restarted.modelling.iter_mut().for_each(ModellingState::restart);
         restarted.diagnosis.iter_mut().for_each(CellFaultDetector::interrupt);
         restarted.alarming.restart();
@@ -192,6 +193,7 @@ impl Snapshot {
             stored.check().map_err(|invalid| at_cell(cell, invalid))?;
         }
         self.estimation.waiting.iter().try_for_each(CellSample::check)?;
+        self.estimation.current_check.check()?;
         self.modelling.iter().try_for_each(ModellingState::check)?;
         self.diagnosis.iter().try_for_each(|diagnosis| diagnosis.check(self.cells.len()))?;
         self.sampling.sampler.check()?;
@@ -229,6 +231,7 @@ impl Snapshot {
         for consumed in self.cells.iter_mut().filter_map(|cell| cell.consumed.as_mut()) {
             consumed.time = consumed.time.plus_nanos(by_nanos);
         }
+        self.estimation.current_check.rebase(by_nanos);
         self.estimation.waiting.iter_mut().for_each(|sample| sample.time = sample.time.plus_nanos(by_nanos));
         self.sampling.sampler.rebase(by_nanos);
         self.learning.rebase(by_nanos);

@@ -106,7 +106,10 @@ impl CellEstimator {
         memory.last_current_a = step.current_a.unwrap_or(memory.last_current_a);
         let (Some(_), Some(x)) = (step.current_a, &mut self.filter) else { return Some(None) };
         let update = match memory.downtime_std_if_any() {
-            None => kernel.update((x, memory), step)?,
+            None => {
+                x.covariance[(0, 0)] = widened(x.covariance[(0, 0)], square(memory.downtime_std));
+                kernel.update((x, memory), step)?
+            }
             Some(_) => update_after_downtime(kernel, (x, memory), (model, config), step)?,
         };
         memory.end_downtime();

@@ -63,6 +63,8 @@ pub(super) struct Memory {
     pub(super) noted_s: f64,
     /// Probability that the cell was used during the downtime.
     pub(super) used_prior: f64,
+    /// Whether the current was unknown at the last reading, so that an unmeasured stretch continues.
+    pub(super) is_current_unknown: bool,
     /// No voltage has been used since the last sleep or unknown gap.
     pub(super) is_unseen: bool,
     /// The SOC is unknown after a gap of unknown length: the filter restarts from the next voltage.
@@ -95,6 +97,7 @@ impl Memory {
             downtime_std: 0.0,
             noted_s: 0.0,
             used_prior: 0.0,
+            is_current_unknown: false,
             is_unseen: false,
             is_soc_unknown: false,
             rejected: 0,
@@ -110,10 +113,14 @@ impl Memory {
     }
 
     /// Notes the unmeasured time of a step. The load before or after this time may have continued through it, or a
-    /// charger may have been connected. The next voltage decides whether this happened. If the possible change is
-    /// small, it is not noted as downtime; its standard deviation (fraction of SOC) is returned instead.
+    /// charger may have been connected. The next voltage with a known current decides whether this happened. If a short
+    /// gap ends with this step and its possible change is small, it is not noted as downtime; its standard deviation
+    /// (fraction of SOC) is returned instead.
     pub(super) fn note_gap(&mut self, config: &EstimatorConfig, step: &CellStep, capacity_ah: f64) -> f64 {
         let noted_s = std::mem::take(&mut self.noted_s).min(step.unmeasured_s);
+        let is_unknown = step.current_a.is_none() && step.unmeasured_s > 0.0;
+        let continues = self.is_current_unknown || is_unknown;
+        self.is_current_unknown = is_unknown;
         let adjacent_a = self.gap_load_a(config, step);
         let is_loaded = adjacent_a > config.gap.rest_current_a;
         let unnoted_s = step.unmeasured_s - noted_s;
@@ -122,19 +129,27 @@ impl Memory {
         }
         let load_per_s = if is_loaded { adjacent_a / (3600.0 * capacity_ah) } else { 0.0 };
         let away_per_s = config.gap.away_use_per_s;
-        // In gaps shorter than an hour, slow relaxation would be mistaken for a charger.
-        let charger_per_s = if unnoted_s < 3600.0 { 0.0 } else { away_per_s };
-        let most = load_per_s.max(charger_per_s) * step.unmeasured_s - away_per_s * noted_s;
+        // A cell that reports its voltage is awake, so use may start at any time. In silent gaps shorter than an hour,
+        // slow relaxation would be mistaken for a charger.
+        let use_per_s = if continues || unnoted_s >= 3600.0 { away_per_s } else { 0.0 };
+        let most = load_per_s.max(use_per_s) * step.unmeasured_s - away_per_s * noted_s;
         if most <= 0.0 {
             return 0.0;
         }
         let std = most / 3.0_f64.sqrt();
-        if std <= NEGLIGIBLE_STD {
+        if std <= NEGLIGIBLE_STD && !continues {
             return std;
         }
         let used_at_rest = CHARGER_PRIOR * (unnoted_s / 43_200.0).min(1.0);
         let used = if is_loaded { LOADED_PRIOR } else { used_at_rest };
-        self.note_downtime(most, if noted_s > 0.0 { 0.0 } else { used });
+        if continues {
+            // One unknown current flows through the whole stretch: its charge grows linearly, and the stretch counts as
+            // one gap.
+            self.downtime_std = (self.downtime_std + std).min(1.0);
+            self.used_prior = self.used_prior.max(used.max(USED_PRIOR));
+        } else {
+            self.note_downtime(most, if noted_s > 0.0 { 0.0 } else { used });
+        }
         0.0
     }
 

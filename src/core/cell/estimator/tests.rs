@@ -197,6 +197,29 @@ fn unmeasured_load_widens_soc() {
 }
 
 #[test]
+fn lost_current_widens_soc_linearly() {
+    let (config, mut truth, model) = (config(), truth(), small_model());
+    let mut estimator = CellEstimator::new(&config);
+    cycle(&mut estimator, &config, &mut truth, 1.0, 1.0);
+    let (before, capacity_ah) = (soc(&estimator), estimator.capacity().mean);
+    for _ in 0..120 {
+        let lost = CellStep {
+            measured_s: 0.0,
+            charge_as: 0.0,
+            offset_s: 0.0,
+            unmeasured_s: 10.0,
+            current_a: None,
+            ..truth.step(&model, 1.0, 1.0)
+        };
+        estimator.step(&model, &config, &lost);
+    }
+    // Any current between rest and the load before the stretch is equally likely to have flowed all the time.
+    let load_std = 1200.0 / (3600.0 * capacity_ah) / 3.0_f64.sqrt();
+    let added = (soc(&estimator).variance - before.variance).sqrt();
+    assert!((added / load_std - 1.0).abs() < 0.05, "{added} {load_std}");
+}
+
+#[test]
 fn slowest_branch_ratio_is_learned() {
     let mut model = small_model();
     let mut slow = model.branches[0].clone();

@@ -79,7 +79,7 @@ fn advice_reduces_the_error_step_by_step() {
 #[test]
 fn certain_model_needs_no_measurement() {
     let errors = vec![vec![0.001; 3], vec![0.001; 3]];
-    let spread = ModelSpread { log_resistance: 0.05, capacity: 0.01, ..ModelSpread::usual(1) };
+    let spread = ModelSpread { log_resistance: 0.05, capacity: 0.01, ..ModelSpread::usual(1, 0.0) };
     let model = CellModel { voltage_error_v: Some(Table { values: errors }), spread: Some(spread), ..small_model() };
     let (points, advice) = advise(&ModelBands::new(&model)).expect("stated");
     assert!(points < 1.0 && advice.is_empty(), "{points}: {advice:?}");

@@ -198,16 +198,17 @@ impl Learning {
 
     /// Ends a mode. If this completes a half-cycle, every cell learns from the half-cycle. `teaches_capacity`: whether
     /// the model of the pack's own kind of cells is good enough to learn capacities. Cells of a module learn their
-    /// capacity if their model was given.
+    /// capacity if their model was given. `is_doubtful`: per cell, whether the current was doubtful or its
+    /// voltage is frozen; it then learns no capacity.
     pub(crate) fn complete_mode(
         &mut self,
         change: ModeChange,
         bank: &mut PackBank,
-        teaches_capacity: bool,
+        (teaches_capacity, is_doubtful): (bool, &[bool]),
         to: &mut Publisher<'_>,
     ) {
         let teaches = |cell| if bank.is_own(cell) { teaches_capacity } else { bank.has_given_model(cell) };
-        self.state.learner.hold(|cell| !teaches(cell));
+        self.state.learner.hold(|cell| is_doubtful[cell] || !teaches(cell));
         to.event(EventKind::Mode { from: change.from, to: change.to });
         // If readings of the current stop, keep the evidence for the offset and the slow branches until the next change
         // of mode.
