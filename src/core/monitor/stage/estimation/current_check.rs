@@ -4,31 +4,39 @@
 //! the current is doubtful.
 //!
 //! A step of the current moves the voltages of all cells in the opposite direction, by the resistance times the step.
-//! No other cause moves all cells from one round to the next. The check judges each clear step of the voltages. The step
-//! is *explained* if the current has stepped in the opposite direction, and if the resistance is at least
-//! 1/[`MAX_FACTOR`] and at most [`MAX_FACTOR`] times the usual one. Steps are differences between the means of two
-//! rounds. They contain less noise than the difference of two readings, and a current that arrives one round earlier or
-//! later than the voltages still explains its step.
+//! The check judges each clear step between two steady levels of the voltages. The step is *explained* if the current
+//! has stepped in the opposite direction, and if the resistance is at least 1/[`MAX_FACTOR`] and at most [`MAX_FACTOR`]
+//! times the usual one. Steps are differences between the means of two rounds. They contain less noise than the
+//! difference of two readings, and a current that arrives one round earlier or later than the voltages still explains
+//! its step.
 //!
-//! Explained and unexplained steps are evidence for and against the sensor. One unexplained step up and one down are
-//! enough for a doubt, because the charge is wrong from the first second. Steps in one direction only are no evidence: a
-//! charger that disconnects, or a relaxation, moves the voltages and never back. The check finds a current that is
-//! frozen, inverted, late or beyond its range, whether or not its last digits change. It finds nothing while the load
-//! does not change, and a current without sign only if most steps change the direction.
+//! Explained and unexplained steps are evidence for and against the sensor. How much they count depends on how many
+//! steps the sensor has left unexplained so far: one unexplained step of a sensor that has explained all steps is
+//! enough for a doubt, because the charge is wrong from the first second. A logger that reads current and voltages
+//! seconds apart leaves many steps unexplained, and one more says little.
+//!
+//! The check finds a current that is frozen, inverted, late or beyond its range, whether or not its last digits change.
+//! It finds nothing while the load does not change, and a current without sign only if most steps change the direction.
 
 use serde::{Deserialize, Serialize};
 
 use crate::quantity::{InvalidState, Timestamp, bounds};
 use crate::sample::CellSample;
 
-/// Evidence of an explained and of an unexplained step: ln of the ratio of their probabilities with a good sensor (0.97
-/// and 0.03) and with a faulty sensor (0.65 and 0.35).
-const EXPLAINED: f64 = 0.4;
-const UNEXPLAINED: f64 = 2.5;
-/// Evidence of unexplained steps in each direction that does not make the sensor doubtful: less than one step.
-const TOLERATED: f64 = 2.0;
-/// Highest evidence. A sensor that has failed often must explain 10 steps.
-const MOST_UNEXPLAINED: f64 = 6.0;
+/// Share of the steps that a faulty sensor leaves unexplained.
+const FAULTY_SHARE: f64 = 0.7;
+/// Numbers of unexplained and of explained steps that a new sensor counts as having had.
+const FIRST_STEPS: [f64; 2] = [0.2, 20.0];
+/// Part of the counts that remains after another step.
+const FORGET_STEP: f64 = 0.98;
+/// Largest share of unexplained steps that counts as usual for a good sensor.
+const MAX_USUAL_SHARE: f64 = 0.25;
+/// Evidence that makes the sensor doubtful, as ln of the odds against it.
+const DOUBTFUL: f64 = 4.0;
+/// Highest evidence. A sensor that has failed often must explain several steps.
+const MAX_EVIDENCE: f64 = 8.0;
+/// Largest movement of voltages and current just before and just after a step, as a part of the step.
+const STEADY: f64 = 0.3;
 /// Largest ratio of a step's resistance and the usual resistance, in either direction. Temperature, ageing and the time
 /// between two rounds change the resistance by less.
 const MAX_FACTOR: f64 = 4.0;
@@ -90,8 +98,10 @@ pub(crate) struct CurrentCheck {
     rounds: [Round; ROUNDS],
     /// Number of valid rounds, counted from the latest.
     count: usize,
-    /// Evidence of the unexplained steps down and up, less that of the explained steps, as ln of an odds ratio.
-    unexplained: [f64; 2],
+    /// Evidence against the sensor: ln of the odds, at least 0.
+    evidence: f64,
+    /// Numbers of unexplained and of explained steps, the latest with most weight.
+    steps: [f64; 2],
     /// ln of the usual resistance relative to the model.
     log_ratio: f64,
     /// Usual change of the voltages between two rounds that the current does not explain, V.
@@ -115,7 +125,8 @@ impl Default for CurrentCheck {
             voltages_v: [None; MAX_CELLS],
             rounds: [Round::default(); ROUNDS],
             count: 0,
-            unexplained: [0.0; 2],
+            evidence: 0.0,
+            steps: FIRST_STEPS,
             log_ratio: 0.0,
             usual_v: FIRST_MOVE_V,
             differing: 0.0,
@@ -131,7 +142,7 @@ impl Default for CurrentCheck {
 impl CurrentCheck {
     /// Whether the steps of the voltages contradict the current.
     pub(crate) fn is_doubtful(&self) -> bool {
-        self.unexplained[0].min(self.unexplained[1]) > TOLERATED
+        self.evidence > DOUBTFUL
     }
 
     /// Handles a round. `samples`: the compared cells that have reported, each with its place from 0 to [`MAX_CELLS`] - 1.
@@ -178,7 +189,7 @@ impl CurrentCheck {
         let [.., before, now] = self.rounds;
         let differs = now.current_a != before.current_a;
         if self.limits_a.contains(&now.current_a) && now.current_a != 0.0 {
-            self.add_unexplained(&[0, 1]);
+            self.add_evidence(DOUBTFUL);
         }
         if now.current_a == 0.0 || differs {
             self.repeated = 0.0;
@@ -187,7 +198,7 @@ impl CurrentCheck {
             if self.repeated <= REPEATED {
                 self.repeated = 0.0;
                 self.limits_a[usize::from(now.current_a < 0.0)] = now.current_a;
-                self.add_unexplained(&[0, 1]);
+                self.add_evidence(MAX_EVIDENCE);
             }
         }
         if now.current_a != 0.0 {
@@ -216,10 +227,8 @@ impl CurrentCheck {
             MIN_STEP_V.max(STEP_SIGMA * noise_v).max(STEP_READINGS * self.resolution_v).max(STEP_MOVES * self.usual_v);
         let factor = if (moved_v + ohm * moved_a).abs() > self.usual_v { MOVE_GAIN } else { 1.0 / MOVE_GAIN };
         self.usual_v = (self.usual_v * factor).clamp(MOVE_V.0, MOVE_V.1);
-        let is_in_the_middle = r2.move_v.abs() >= r1.move_v.abs().max(r3.move_v.abs());
-        // A drift continues, and a relaxation becomes slower.
-        let drift_v = if r1.move_v * moved_v > 0.0 { 2.0 * r1.move_v.abs() } else { 0.0 };
-        if !is_in_the_middle || moved_v.abs() - drift_v < clear_v {
+        let is_steady = |before: f64, after: f64| before.abs().max(after.abs()) <= STEADY * moved_v.abs();
+        if moved_v.abs() < clear_v || !is_steady(r1.move_v, r3.move_v) {
             return;
         }
         let factor = -moved_v / (ohm * moved_a);
@@ -227,27 +236,32 @@ impl CurrentCheck {
         if is_explained {
             self.log_ratio = (self.log_ratio + RATIO_GAIN * libm::log(factor)).clamp(-2.0, 2.0);
         }
-        self.weigh(is_explained, moved_v > 0.0);
+        // A current that changes all the time may have been read at another moment than the voltages.
+        if is_explained || is_steady(ohm * (r1.current_a - r0.current_a), ohm * (r3.current_a - r2.current_a)) {
+            self.weigh(is_explained);
+        }
     }
 
-    /// Adds a step of the voltages, up or down, to the evidence.
-    fn weigh(&mut self, is_explained: bool, is_up: bool) {
+    /// Adds a step of the voltages to the evidence.
+    fn weigh(&mut self, is_explained: bool) {
+        let [unexplained, explained] = self.steps;
+        let usual_share = (unexplained / (unexplained + explained)).min(MAX_USUAL_SHARE);
         if is_explained {
-            self.unexplained = self.unexplained.map(|sum| (sum - EXPLAINED).max(0.0));
+            self.add_evidence(libm::log((1.0 - FAULTY_SHARE) / (1.0 - usual_share)));
             self.doubts *= FORGET_DOUBT;
         } else {
-            self.add_unexplained(&[usize::from(is_up)]);
+            self.add_evidence(libm::log(FAULTY_SHARE / usual_share));
         }
+        self.steps = self.steps.map(|count| FORGET_STEP * count);
+        self.steps[usize::from(is_explained)] += 1.0;
     }
 
-    /// Adds an unexplained step in each of the `directions`, and more if the sensor has been doubtful before.
-    fn add_unexplained(&mut self, directions: &[usize]) {
+    /// Adds to the evidence, and more at the start of a doubt if the sensor has been doubtful before.
+    fn add_evidence(&mut self, log_odds: f64) {
         let was_doubtful = self.is_doubtful();
-        for &direction in directions {
-            self.unexplained[direction] = (self.unexplained[direction] + UNEXPLAINED).min(MOST_UNEXPLAINED);
-        }
+        self.evidence = (self.evidence + log_odds).clamp(0.0, MAX_EVIDENCE);
         if self.is_doubtful() && !was_doubtful {
-            self.unexplained = self.unexplained.map(|sum| (sum + self.doubts).min(MOST_UNEXPLAINED));
+            self.evidence = (self.evidence + self.doubts).min(MAX_EVIDENCE);
             self.doubts += 1.0;
         }
     }
@@ -266,10 +280,11 @@ impl CurrentCheck {
         )?;
         let numbers = self.rounds.map(|round| round.move_v);
         bounds::NUMBER.check_all("a voltage step of the check of the current", numbers)?;
-        let [down, up] = self.unexplained;
+        let [unexplained, explained] = self.steps;
         let state = [
-            down,
-            up,
+            self.evidence,
+            unexplained,
+            explained,
             self.log_ratio,
             self.usual_v,
             self.differing,
@@ -386,7 +401,7 @@ mod tests {
         drive(&mut check, 600, |load_a, _| Some(load_a));
         let mut shares = Vec::new();
         for _ in 0..3 {
-            check.add_unexplained(&[0, 1]);
+            check.add_evidence(DOUBTFUL + 1.0);
             shares.push(drive(&mut check, 1200, |load_a, _| Some(load_a)));
             assert!(!check.is_doubtful());
         }
