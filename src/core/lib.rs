@@ -24,7 +24,7 @@
 //! | --- | --- |
 //! | a new alarm rule | `alarm/rule.rs` (number, unit, direction), `monitor/stages/watch.rs` (its value) |
 //! | an alarm's state transition or command | `alarm/machine.rs` (table), `alarm/engine.rs` |
-//! | a new event, or a field of one | `monitor/message/event.rs` |
+//! | a new event, or a new field of an event | `monitor/message/event.rs` |
 //! | a new field of the live view | `monitor/message/view.rs` (type), `monitor/view.rs` |
 //! | a new field of a stored state | the stage's state, `monitor/snapshot.rs` |
 //! | what is restored when only the history survived | `monitor/lifecycle/relearn.rs` |

@@ -198,8 +198,8 @@ impl Learning {
 
     /// Ends a mode. If this completes a half-cycle, every cell learns from the half-cycle. `teaches_capacity`: whether
     /// the model of the pack's own kind of cells is good enough to learn capacities. Cells of a module learn their
-    /// capacity if their model was given. `is_doubtful`: per cell, whether the current was doubtful or its
-    /// voltage is frozen; it then learns no capacity.
+    /// capacity if their model was given. `is_doubtful`: per cell, whether the current was doubtful or the cell's
+    /// voltage is frozen. A doubtful cell learns no capacity.
     pub(crate) fn complete_mode(
         &mut self,
         change: ModeChange,

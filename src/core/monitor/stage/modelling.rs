@@ -342,8 +342,8 @@ impl Modelling {
             return self.return_to_label().or_else(|| unless_fitted(self));
         }
         let Some(fitted) = fit else { return unless_fitted(self) };
-        // A fit of LFP cells is not used: hysteresis hides their flat curve, and the error of a row does not include
-        // it.
+        // A fit of LFP cells is not used: hysteresis hides their flat curve, and a row's error does not include the
+        // hysteresis.
         let is_flat = label.chemistry == Chemistry::LfpGraphite;
         let is_rough = fitted.misfit > MOST_MISFIT;
         if is_flat || is_rough || fitted.own.capacity.std() > MOST_CAPACITY_STD * fitted.own.capacity.mean {
