@@ -242,8 +242,8 @@ impl CellFaultDetector {
         }
     }
 
-    /// Adds the mean cell after all samples of the same time. Returns whether the row is complete. If so, the caller
-    /// ends the row with [`Self::close_row`].
+    /// Adds the mean cell's values, after all samples with the same time. Returns whether the row is complete. If so,
+    /// the caller ends the row with [`Self::close_row`].
     pub fn note(&mut self, time: Timestamp, mean: &MeanCell, capacity_ah: f64) -> bool {
         if ![mean.soc, mean.current_a, mean.drop_v, mean.temperature_c, mean.charge_ah].iter().all(|it| it.is_finite())
         {
@@ -274,8 +274,7 @@ impl CellFaultDetector {
             || time.since(begun) >= ROW_S.max(REST_PART * self.rest_s)
     }
 
-    /// Handles the probability and size of a fault of a sensor that all cells share. Returns the finding if it is a new
-    /// one.
+    /// Handles the probability and size of a fault of a sensor that all cells share. Returns the finding if it is new.
     pub fn note_sensor(
         &mut self,
         time: Timestamp,

@@ -88,7 +88,7 @@ pub struct Sampler {
     /// Number of voltage channels.
     voltages: usize,
     flow_a: f64,
-    /// Voltage step that noise does not reach, V.
+    /// Voltage step that is larger than the noise, V.
     step_v: f64,
     state: SamplerState,
     /// No signal becomes stale before this time; `None` = to be computed.
@@ -261,8 +261,8 @@ impl Sampler {
         self.next_stale = Some(next);
     }
 
-    /// Handles a gap of unknown length before `time`. Afterwards, no value is fresh, and ages start at `time`. The gap
-    /// counts no charge.
+    /// Handles a gap of unknown length before `time`. Afterwards, no value is fresh, and ages start at `time`. No
+    /// charge is counted for the gap.
     pub fn handle_gap(&mut self, time: Timestamp) {
         self.state.charge.handle_gap(self.state.latest, time, self.config.current.max_age_s);
         self.state.signals.iter_mut().for_each(Signal::handle_gap);
