@@ -1,6 +1,6 @@
 //! The pure core: frames in; estimates, alarms and frames out. It never reads a clock, a file or a socket and never
 //! logs: the same inputs give the same outputs, byte for byte. No dependency of this crate does I/O. Keys for
-//! authenticated frames stay in the driver. It creates and checks authenticators and passes the results to the core.
+//! authenticated frames stay in the driver, which creates and checks authenticators and passes the results to the core.
 //!
 //! # Data path
 //! [`monitor::Monitor`] handles every record. Data flows in one direction. `monitor/message` defines the records that

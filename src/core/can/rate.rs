@@ -81,7 +81,7 @@ pub struct MessageRate {
     /// Consecutive windows with too many frames, and consecutive normal windows.
     excess: u32,
     calm: u32,
-    /// Start of the window; `None` = no frame since listening started.
+    /// Start of the window; `None` = no frame since listening started or since a pause.
     window_from: Option<Timestamp>,
     frames: u32,
     short: u32,

@@ -3,9 +3,9 @@
 //! All values are interpolated linearly over SOC. Over temperature, the OCV and the time constants are interpolated
 //! linearly. Resistances follow an Arrhenius law with [`ACTIVATION_ENERGY_J_PER_MOL`] that passes through the values at
 //! both breakpoints; linear interpolation would be up to 15 % too high in the middle of a 20 K interval. Outside the
-//! temperatures of the grid, the value at the edge is used. Outside SOC 0 to 1, resistances keep the value at the edge,
-//! and the OCV continues with the slope of its last interval, so that a wrong SOC below 0 or above 1 is still
-//! corrected.
+//! temperatures of the grid, the value at the edge is used. Outside SOC 0 to 1, resistances keep the value at the edge.
+//! The OCV continues with the slope of its last interval, so that the filter still corrects a wrong SOC below 0 or
+//! above 1.
 //!
 //! Deviation: the paper interpolates R1 and C1 separately; this model interpolates their product, the time constant.
 //! Reason: between nodes with different resistances, the product of the two interpolated values is up to twice the

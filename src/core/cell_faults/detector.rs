@@ -128,7 +128,7 @@ impl WatchedCell {
 pub struct CellFaultDetector {
     cells: Vec<WatchedCell>,
     pack: PackSums,
-    /// Middle time, SOC and charge (Ah) of the last row.
+    /// Time of the middle of the last row, and SOC and charge (Ah) of the row.
     last_row: Option<(Timestamp, f64, f64)>,
     /// Duration of the present rest, s.
     rest_s: f64,
@@ -202,7 +202,7 @@ impl CellFaultDetector {
     }
 
     /// A cell's states minus the median of the pack. `None` if the detector is inactive or the pack has no such cell. A
-    /// state that is unknown is `None`: every state of a cell of another kind, and the leak of a cell that the BMS may
+    /// state is `None` if it is unknown: every state of a cell of another kind, and the leak of a cell that the BMS may
     /// bleed.
     pub fn relative(&self, cell: CellIndex) -> Option<[Option<ScalarGaussian>; STATES]> {
         let WatchedCell { is_compared, difference, .. } = self.cells.get(cell.index())?;
