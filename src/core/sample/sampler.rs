@@ -97,8 +97,8 @@ pub struct Sampler {
     shared: SharedInputs,
 }
 
-/// Inputs shared by readings with the same time stamp. A new reading of the current invalidates all fields. A new
-/// temperature invalidates only `sensor`.
+/// Inputs shared by readings with the same time stamp. A new reading of the current or of the contactors invalidates
+/// all fields. A new temperature invalidates only `sensor`.
 #[derive(Debug, Clone, Copy, Default)]
 struct SharedInputs {
     /// Whether the other fields are valid.

@@ -412,7 +412,8 @@ impl Learning {
         capacities.min_by(|a, b| a.1.mean.total_cmp(&b.1.mean)).filter(|_| self.state.learner.has_learned_all())
     }
 
-    /// Fields of the health frame: values of the weakest cell, once every cell's capacity has been learned.
+    /// Fields of the health frame, once every cell's capacity has been learned: the worst value of any cell, and the
+    /// losses of the weakest cell.
     pub(crate) fn health_fields(&self, bank: &PackBank) -> HealthFields {
         let recharge_period_s = self.state.recharge_period_s;
         if !self.state.learner.has_learned_all() {
