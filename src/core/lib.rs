@@ -1,6 +1,6 @@
 //! The pure core: frames in; estimates, alarms and frames out. It never reads a clock, a file or a socket and never
 //! logs: the same inputs give the same outputs, byte for byte. No dependency of this crate does I/O. Keys for
-//! authenticated frames stay in the driver. It creates and checks authenticators and passes the results to the core.
+//! authenticated frames stay in the driver, which creates and checks authenticators and passes the results to the core.
 //!
 //! # Data path
 //! [`monitor::Monitor`] handles every record. Data flows in one direction. `monitor/message` defines the records that
@@ -24,7 +24,7 @@
 //! | --- | --- |
 //! | a new alarm rule | `alarm/rule.rs` (number, unit, direction), `monitor/stages/watch.rs` (its value) |
 //! | an alarm's state transition or command | `alarm/machine.rs` (table), `alarm/engine.rs` |
-//! | a new event, or a field of one | `monitor/message/event.rs` |
+//! | a new event, or a new field of an event | `monitor/message/event.rs` |
 //! | a new field of the live view | `monitor/message/view.rs` (type), `monitor/view.rs` |
 //! | a new field of a stored state | the stage's state, `monitor/snapshot.rs` |
 //! | what is restored when only the history survived | `monitor/lifecycle/relearn.rs` |

@@ -219,8 +219,8 @@ impl AlarmEngine {
         self.each_threshold(rule, cell, changes, |machine, config| machine.observe(now, config, observation));
     }
 
-    /// Whether no value of `rule` up to `worst` can change an alarm of any cell: every alarm of the rule is at rest,
-    /// and `worst` is not beyond a threshold. Returns true if the rule is not configured.
+    /// Whether no value of `rule` that is at most as bad as `worst` can change an alarm of any cell: every alarm of the
+    /// rule is at rest, and `worst` is healthy. Returns true if the rule is not configured.
     pub fn is_quiet(&self, rule: Rule, worst: f64) -> bool {
         self.rules[self.by_rule[usize::from(rule as u8)].clone()].iter().all(|slots| {
             let is_beyond = || LimitCheck::of(&slots.config, &Observation::new(Some(worst))).0 != LimitCheck::Healthy;

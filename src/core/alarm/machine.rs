@@ -158,7 +158,7 @@ impl Machine {
         }
     }
 
-    /// Stores a value that changes nothing, without a standard deviation.
+    /// Stores a value that cannot change the alarm and has no standard deviation.
     #[inline]
     pub(super) fn show(&mut self, value: f64) {
         (self.observation, self.probability) = (Observation { value: Some(value), ..Observation::default() }, None);

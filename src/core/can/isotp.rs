@@ -267,9 +267,9 @@ fn without_extension(extension: Option<u8>, payload: &[u8]) -> Option<&[u8]> {
     }
 }
 
-/// Segments a message into classic payloads: one single frame, or a first and consecutive frames. They are padded with
-/// `padding` (ISO 15765-2 recommends 0xCC; cars also send 0x00, 0x55 and 0xAA). The result is empty for a message of 0
-/// bytes or of more than 4,095.
+/// Segments a message into classic payloads: one single frame, or a first and consecutive frames. The payloads are
+/// padded with `padding` (ISO 15765-2 recommends 0xCC; cars also send 0x00, 0x55 and 0xAA). The result is empty for a
+/// message of 0 bytes or of more than 4,095.
 pub fn segment(extension: Option<u8>, message: &[u8], padding: u8) -> Vec<[u8; CLASSIC]> {
     let room = CLASSIC - usize::from(extension.is_some());
     let Ok(length) = u16::try_from(message.len()) else { return Vec::new() };

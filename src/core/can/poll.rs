@@ -52,7 +52,7 @@ pub struct PollRequest {
 /// Configuration of polling.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PollConfig {
-    /// Requests, in the order in which they are sent if several are due.
+    /// Requests. If several are due at the same time, the first of them in this list is sent first.
     pub requests: Vec<PollRequest>,
     /// Maximum number of requests per second, over all requests.
     pub max_requests_per_s: f64,
@@ -70,7 +70,7 @@ pub enum PollSilence {
     OtherTester,
     /// The supply voltage is low or unknown.
     LowSupply,
-    /// The bus is asleep: no frames from other nodes.
+    /// A polled bus is asleep: no frames from other nodes.
     BusAsleep,
 }
 

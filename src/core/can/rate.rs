@@ -47,7 +47,7 @@ const STEADY: (f64, f64) = (0.2, 1.0);
 const LEAST_PER_S: f64 = 3.0;
 /// An interval shorter than this fraction of the mean is short.
 const SHORT: f64 = 0.5;
-/// Minimum number of short intervals or contradictions per expected frame that indicates a second sender.
+/// Minimum number of short intervals, or of alternating currents, per expected frame that indicates a second sender.
 const SIGNS: f64 = 0.4;
 /// Fraction of the frames that follow a short interval by chance, because other messages delay them.
 const CHANCE_SHORT: f64 = 0.02;
@@ -81,7 +81,7 @@ pub struct MessageRate {
     /// Consecutive windows with too many frames, and consecutive normal windows.
     excess: u32,
     calm: u32,
-    /// Start of the window; `None` = no frame since listening started.
+    /// Start of the window; `None` = no frame since listening started or since a pause.
     window_from: Option<Timestamp>,
     frames: u32,
     short: u32,

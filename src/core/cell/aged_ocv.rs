@@ -56,8 +56,8 @@ pub struct AgedOcv {
     offset_v: Vec<Vec<f64>>,
     /// Change of the offsets by one standard deviation of each mix, V, same shape; empty = unknown.
     mixes_v: [Vec<Vec<f64>>; MIXES],
-    /// Per capacity: lithium lost, relative to the new cell's, and its change by one standard deviation of each mix. Empty without
-    /// electrodes.
+    /// Per capacity: lithium lost, as a fraction of the new cell's lithium, and the change of this loss by one standard
+    /// deviation of each mix. Empty without electrodes.
     lithium: Vec<Vec<f64>>,
     is_shift: bool,
     law: AgeingLaw,
@@ -80,7 +80,7 @@ impl SocLine {
     }
 }
 
-/// Difference of the curve from the new cell's near one capacity, over one interval of SOC.
+/// Difference between the curve near one capacity and the new cell's curve, over one interval of SOC.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct OffsetLine {
     /// Offset, V.
@@ -91,7 +91,7 @@ pub struct OffsetLine {
     pub mixes_v: [SocLine; MIXES],
 }
 
-/// Lithium lost at one capacity, relative to the new cell's.
+/// Lithium lost at one capacity, as a fraction of the new cell's lithium.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LithiumLoss {
     /// Lithium lost.

@@ -5,8 +5,8 @@
 //! be used to test it.
 //!
 //! * Open-circuit voltage: mean and covariance over cells built from published half-cell potentials ([`curve`]).
-//! * Resistances: proportional to 1 / capacity, for every chemistry. Medians and deviations come from five fitted cells of 2.9 to
-//!   280 Ah ([`RESISTANCE`]); [`arrhenius`](super::arrhenius) gives other temperatures.
+//! * Resistances: proportional to 1 / capacity, for every chemistry. Medians and deviations come from five fitted cells
+//!   of 2.9 to 280 Ah ([`RESISTANCE`]); [`arrhenius`](super::arrhenius) gives other temperatures.
 
 pub mod curve;
 
@@ -129,7 +129,7 @@ struct UsualResistance {
     ohm_ah: f64,
     /// Time constant, s; 0 = series resistance.
     tau_s: f64,
-    /// Resistance relative to half charge at the SOC of [`SHAPE_SOC`].
+    /// Resistance at each SOC of [`SHAPE_SOC`], relative to the resistance at half charge.
     shape: [f64; 5],
 }
 
@@ -250,8 +250,8 @@ impl Label {
             slow_branch: 0.5,
             // Tolerance and age of the cell.
             capacity: 0.1,
-            // 40 % of the drop, repeating over 100 s: cells differ in how their resistance depends on time, SOC and
-            // temperature. Chosen on LG HG2 from 0 to -10 degrees C.
+            // An error of 40 % of the drop that persists for 100 s: cells differ in how their resistance depends on
+            // time, SOC and temperature. Chosen on LG HG2 from 0 to -10 degrees C.
             drop_sqrt_s: 4.0,
         };
         let CurvePrior { mean_v, electrodes, .. } = curve.clone();
@@ -261,8 +261,9 @@ impl Label {
         Some(LabelPrior { label: *self, model, curve })
     }
 
-    /// The model of a cell with this present capacity, Ah, this curve and these resistances. `drop_std` is the standard deviation
-    /// of ln(voltage drop) at each temperature of the tables; at a usual load it counts as voltage error of the model.
+    /// The model of a cell with this present capacity, Ah, curve and resistances. `drop_std` is the standard deviation
+    /// of ln(voltage drop) at each temperature of the tables. At the usual load, it counts as voltage error of the
+    /// model.
     pub fn model_of(
         &self,
         capacity_ah: f64,

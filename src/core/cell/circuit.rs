@@ -52,8 +52,8 @@ pub fn terminal_v(
     model.ocv_v(position) - branches_v - model.r0_ohm(position) * resistance_ratio * current_a
 }
 
-/// Terminal voltage, V, of an aged cell under `current_a` at `state` = (SOC, resistance ratio, capacity in Ah); `branches_v` is
-/// the sum of the branch voltages.
+/// Terminal voltage, V, of an aged cell under `current_a`. `state` = (SOC, resistance ratio, capacity in Ah);
+/// `branches_v` is the sum of the branch voltages.
 pub fn aged_terminal_v(
     model: &CellModel,
     state: (f64, f64, f64),

@@ -97,7 +97,8 @@ pub struct GapSettings {
     pub self_discharge_per_s: f64,
     /// Maximum rate at which the SOC changes by use or charging while the program does not run, fraction of SOC per s.
     pub away_use_per_s: f64,
-    /// Largest current of a resting cell, A per cell. A larger current before or after a gap may have flowed through the gap.
+    /// Largest current of a resting cell, A per cell. A larger current before or after a gap may have flowed during the
+    /// gap.
     pub rest_current_a: f64,
     /// Whether the cell counts as resting in every longer gap without readings, regardless of the current before and
     /// after the gap.
@@ -153,7 +154,7 @@ pub struct GateSettings {
     pub model_error_v: f64,
     /// Model error of a single reading along the OCV curve, fraction of SOC.
     pub soc_error: f64,
-    /// If all readings of this time, s, were beyond the gate, the filter restarts from the voltage.
+    /// If all readings during this time, s, were beyond the gate, the filter restarts from the voltage.
     pub lost_after_s: f64,
 }
 

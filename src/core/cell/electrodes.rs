@@ -1,13 +1,13 @@
 //! The two electrodes of a cell: open-circuit voltage as the difference of two half-cell potentials, new and aged.
 //!
 //! V(z) = U_p(y) - U_n(x): x and y are the lithium contents (stoichiometry, 0 to 1) of the negative and the positive
-//! electrode, both linear in the charge. With the electrodes' capacities Q_n, Q_p and the cyclable lithium n, all relative
-//! to the new cell's capacity: Q_p y + Q_n x = n. An aged cell is full and empty at the same voltages V as the new cell; its
-//! capacity is Q_n (x_full - x_empty).
+//! electrode. Both are linear in the charge. The electrodes' capacities Q_n, Q_p and the cyclable lithium n are
+//! relative to the new cell's capacity: Q_p y + Q_n x = n. An aged cell is full and empty at the same voltages V as the
+//! new cell. Its capacity is Q_n (x_full - x_empty).
 //!
 //! An ageing cell loses lithium (n falls) and active material of the electrodes (Q_n and Q_p fall): Birkl et al., J.
-//! Power Sources 341 (2017) 373; Dubarry et al., J. Power Sources 219 (2012) 204. How much lithium the lost material
-//! contained need not be known: it only changes n, and n follows from the capacity.
+//! Power Sources 341 (2017) 373; Dubarry et al., J. Power Sources 219 (2012) 204. The lithium content of the lost
+//! material need not be known, because it only changes n, and n follows from the capacity.
 //!
 //! In: materials and lithium contents of the new cell. Out: V, and capacity as a fraction of the new cell's capacity.
 //! Contents are limited to 0 to 1. If no cell remains after a loss, there is no curve. An ageing cell never gains
@@ -218,7 +218,7 @@ pub struct Electrodes {
     pub negative_content: [f64; 2],
 }
 
-/// Active material lost, as a fraction of the new electrode's.
+/// Active material lost, as a fraction of the new electrode's material.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct LostMaterial {
     /// Loss of the negative electrode.
@@ -261,9 +261,9 @@ impl Electrodes {
         [negative, positive, negative * self.negative_content[1] + positive * self.positive_content[1]]
     }
 
-    /// The cell that has lost the material `lost`, and as much lithium that the fraction `capacity` of its capacity
-    /// remains. Returns `None` in three cases: there is no such cell; it cannot reach its end voltages; or the new cell
-    /// contains more lithium than it can use, so the capacity does not determine the loss.
+    /// The cell after the loss of the material `lost` and of so much lithium that the fraction `capacity` of its
+    /// capacity remains. Returns `None` in three cases: there is no such cell; it cannot reach its end voltages; or the
+    /// new cell contains more lithium than it can use, so the capacity does not determine the loss.
     pub fn aged(&self, lost: LostMaterial, capacity: f64) -> Option<AgedElectrodes> {
         let [negative, positive, new_lithium] = self.new_contents();
         let ends_v = [0.0, 1.0].map(|soc| self.voltage_v(soc));

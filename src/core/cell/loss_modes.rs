@@ -7,8 +7,9 @@
 //!
 //! LAM_NE = s_n d,  LAM_PE = s_p d,  LLI = 1 - L(C, s_n, s_p) / L(C_new, 0, 0)
 //!
-//! The capacity, s_n and s_p are independent; the standard deviations include the products of their errors. The split between
-//! material and lithium is an assumption ([`MATERIAL_SHARE`], standard deviation [`MATERIAL_SHARE_STD`]); the total is learned.
+//! The capacity, s_n and s_p are independent; the standard deviations include the products of their errors. The split
+//! between material and lithium is an assumption ([`MATERIAL_SHARE`], standard deviation [`MATERIAL_SHARE_STD`]); the
+//! total is learned.
 //!
 //! Source: Birkl et al., J. Power Sources 341 (2017) 373 (modes and their names).
 //!
@@ -30,7 +31,8 @@ pub struct LossModes {
 }
 
 impl LossModes {
-    /// Losses of a cell with this capacity, Ah. `None` if the model has no electrodes, or no curve down to this capacity.
+    /// Losses of a cell with this capacity, Ah. `None` if the model has no electrodes or no curve down to this
+    /// capacity.
     pub fn of_capacity(aged_ocv: &AgedOcv, new_capacity_ah: f64, capacity: ScalarGaussian) -> Option<Self> {
         let LithiumLoss { lost, per_ah, mixes, mixes_per_ah } = aged_ocv.lithium_loss(capacity.mean)?;
         let by_mixes =
@@ -44,7 +46,7 @@ impl LossModes {
             mean: MATERIAL_SHARE * part,
             variance: (MATERIAL_SHARE * MATERIAL_SHARE + share_variance) * part_variance + share_variance * part * part,
         };
-        // A loss is between nothing and all.
+        // A loss is a fraction between 0 and 1.
         let lithium = ScalarGaussian { mean: lithium.mean.clamp(0.0, 1.0), ..lithium };
         Some(Self { lithium, negative: material, positive: material })
     }
@@ -87,8 +89,8 @@ mod tests {
         }
     }
 
-    /// Lives of such a cell simulated with PyBaMM 26.10 (OKane2022): remaining capacity, LLI, LAM_NE, LAM_PE. The first five lose
-    /// lithium to the SEI and material by stress; the last one loses only lithium.
+    /// Lives of such a cell simulated with PyBaMM 26.10 (OKane2022): remaining capacity, LLI, LAM_NE, LAM_PE. The first
+    /// five lose lithium to the SEI and material by stress; the last one loses only lithium.
     const SIMULATED: [[f64; 4]; 6] = [
         [0.9365, 0.0496, 0.0214, 0.0100],
         [0.8723, 0.0985, 0.0440, 0.0233],

@@ -1,15 +1,16 @@
 //! Checks in windows of an hour of use whether the configured model fits the cell.
 //!
-//! In: innovations (V) with their variances (V^2), SOC and the learned resistance, every 10 s of use. Out:
-//! [`ModelCheck::mismatch`], above 1 if the model belongs to another cell, after 10 minutes of use. Readings without an update,
-//! after a gap or beyond the gate do not count as evidence.
+//! In: innovations (V) with their variances (V^2), SOC and the learned resistance, every 10 s of use. Out: after 10
+//! minutes of use, [`ModelCheck::mismatch`], which is above 1 if the model belongs to another cell. Readings without an
+//! update, after a gap or beyond the gate do not count as evidence.
 //!
 //! A filter with a wrong model hides the error from its innovations, because it corrects first the resistance and then
 //! the SOC. Two kinds of evidence (witnesses) remain:
 //! * r^2, the square of ln(resistance relative to new) divided by its configured standard deviation;
-//! * c^2, the part of the innovations v that a constant a and a slope b over SOC explain: with the sums A and g of `h h' / R` and `h v / R`,
-//!   h = (1, SOC - 0.5) and R the variance over the time that a reading stands for, c^2 = g' (A + P^-1)^-1 g (the score test;
-//!   Cox and Hinkley, Theoretical Statistics, 1974, section 9.3), P the variances of a and b in another chemistry.
+//! * c^2 = g' (A + P^-1)^-1 g, the part of the innovations v that a constant a and a slope b over SOC explain (the
+//!   score test; Cox and Hinkley, Theoretical Statistics, 1974, section 9.3). A and g are the sums of `h h' / R` and `h
+//!   v / R` with h = (1, SOC - 0.5). R is the variance over the time that a reading represents. P contains the
+//!   variances of a and b in another chemistry.
 //!
 //! In the sum of the witnesses, each counts at most [`CORROBORATED`] times as much as the other. The reason is that
 //! other causes affect only one witness: an aged cell has a higher resistance but its voltages fit, and a local error
@@ -237,7 +238,7 @@ impl ModelCheck {
         self.mismatch() > 1.0
     }
 
-    /// Checks stored numbers; the error is the first impossible one.
+    /// Checks stored numbers.
     ///
     /// # Errors
     /// The first number that is out of range.

@@ -1,4 +1,4 @@
-//! Differences between two cell models: open-circuit curves in V, resistances as a fraction, and the resulting SOC errors.
+//! Differences between two cell models: open-circuit curves in V, resistances as a fraction, and resulting SOC errors.
 //!
 //! In: two [`CellModel`]s. Out: values of the second model minus values of the first. Resistances are compared per
 //! rated capacity. The load of each cell is C/2 of its own rated capacity, so cells of different size can be compared.
@@ -51,7 +51,7 @@ pub struct AtTemperature {
 pub struct ModelComparison {
     /// Open-circuit voltage at 25 degrees C over SOC, V.
     pub curve_v: Vec<AtSoc>,
-    /// Summary of `ocv_v`.
+    /// Summary of `curve_v`.
     pub curve: Difference,
     /// SOC read from a voltage at rest, fraction.
     pub rest_soc: Difference,
@@ -141,9 +141,9 @@ fn soc_difference(first: &CellModel, second: &CellModel, temperature_c: f64, loa
     Difference::of(&middle.collect::<Vec<_>>())
 }
 
-/// Of all SOCs at which a model has the voltage, the one nearest to `soc`. If the model has the voltage at no SOC, the
-/// SOC with the nearest voltage. Under load, several SOCs may have the same voltage, because a resistance that rises
-/// with the SOC bends the curve down.
+/// Of all SOCs at which a model has the voltage, the one nearest to `soc`. If the model has the voltage at no SOC,
+/// returns the SOC with the nearest voltage. Under load, several SOCs may have the same voltage, because a resistance
+/// that rises with the SOC bends the curve down.
 fn nearest(places: &[f64], readings_v: &[f64], voltage_v: f64, soc: f64) -> f64 {
     let crossings = places.windows(2).zip(readings_v.windows(2)).filter_map(|(place, reading)| {
         let (low, high) = (reading[0] - voltage_v, reading[1] - voltage_v);

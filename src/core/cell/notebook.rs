@@ -1,6 +1,7 @@
 //! Readings of a vehicle's cells, condensed into rows. The on-board fit of a cell model uses these rows.
 //!
-//! In: one [`CellStep`] per voltage reading of any cell (A, V, s, degrees C). Out: at most [`MAX_ROWS`] rows of the mean cell.
+//! In: one [`CellStep`] per voltage reading of any cell (A, V, s, degrees C). Out: at most [`MAX_ROWS`] rows of the
+//! mean cell.
 //!
 //! A row is the mean over a time in which the SOC hardly changes. A *stretch* is a period with a continuously measured
 //! current. In addition to the voltage, a row contains all inputs of its prediction in linear form: the charge since
@@ -246,7 +247,7 @@ impl Notebook {
         let (cells, count) = (f64::from(config.cells), f64::from(count));
         let temperature_c = if temperatures > 0 { temperature_c / f64::from(temperatures) } else { ambient_c };
         let (dt_s, current_a, voltage_v) = (measured_s / cells, current_a / count, voltage_v / count);
-        // A stretch ends if the current was not measured for longer than this.
+        // The stretch ends if the current was unmeasured for more than 10 s (the sum is over all cells).
         if unmeasured_s > 10.0 * cells {
             self.end_stretch(config);
         }
@@ -374,8 +375,8 @@ impl Notebook {
         }
     }
 
-    /// The past stretch whose removal loses the fewest rows of classes that no other stretch has; the oldest of
-    /// several.
+    /// The past stretch whose removal loses the fewest rows of classes that no other stretch has. If several stretches
+    /// qualify, the oldest.
     fn least_missed(&self, config: &NotebookConfig) -> Option<u32> {
         let class_of = |row: &Row| row.class(config.rated_ah);
         let alone = |stretch: &[Row]| {
@@ -427,7 +428,7 @@ impl Notebook {
 }
 
 impl Row {
-    /// SOC estimate at that time, fraction.
+    /// SOC estimate of the row, fraction.
     pub fn soc(&self) -> f64 {
         f64::from(self.soc)
     }

@@ -56,7 +56,7 @@ impl OwnModel {
             log_resistance: 0.1,
             slow_branch: 0.2,
             capacity: self.capacity.std() / self.capacity.mean,
-            // 10 % of the drop, repeating over 100 s. This error remains with any table of resistances.
+            // An error of 10 % of the drop that persists for 100 s. It remains with any table of resistances.
             drop_sqrt_s: 1.0,
         };
         let mut model = label.model_of(self.capacity.mean, &curve, &self.factors, &self.drop_std, spread);

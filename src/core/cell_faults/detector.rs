@@ -128,7 +128,7 @@ impl WatchedCell {
 pub struct CellFaultDetector {
     cells: Vec<WatchedCell>,
     pack: PackSums,
-    /// Middle time, SOC and charge (Ah) of the last row.
+    /// Time of the middle of the last row, and SOC and charge (Ah) of the row.
     last_row: Option<(Timestamp, f64, f64)>,
     /// Duration of the present rest, s.
     rest_s: f64,
@@ -202,7 +202,7 @@ impl CellFaultDetector {
     }
 
     /// A cell's states minus the median of the pack. `None` if the detector is inactive or the pack has no such cell. A
-    /// state that is unknown is `None`: every state of a cell of another kind, and the leak of a cell that the BMS may
+    /// state is `None` if it is unknown: every state of a cell of another kind, and the leak of a cell that the BMS may
     /// bleed.
     pub fn relative(&self, cell: CellIndex) -> Option<[Option<ScalarGaussian>; STATES]> {
         let WatchedCell { is_compared, difference, .. } = self.cells.get(cell.index())?;
@@ -242,8 +242,8 @@ impl CellFaultDetector {
         }
     }
 
-    /// Adds the mean cell after all samples of the same time. Returns whether the row is complete. If so, the caller
-    /// ends the row with [`Self::close_row`].
+    /// Adds the mean cell's values, after all samples with the same time. Returns whether the row is complete. If so,
+    /// the caller ends the row with [`Self::close_row`].
     pub fn note(&mut self, time: Timestamp, mean: &MeanCell, capacity_ah: f64) -> bool {
         if ![mean.soc, mean.current_a, mean.drop_v, mean.temperature_c, mean.charge_ah].iter().all(|it| it.is_finite())
         {
@@ -274,8 +274,7 @@ impl CellFaultDetector {
             || time.since(begun) >= ROW_S.max(REST_PART * self.rest_s)
     }
 
-    /// Handles the probability and size of a fault of a sensor that all cells share. Returns the finding if it is a new
-    /// one.
+    /// Handles the probability and size of a fault of a sensor that all cells share. Returns the finding if it is new.
     pub fn note_sensor(
         &mut self,
         time: Timestamp,

@@ -189,7 +189,7 @@ impl Difference {
         self.covariance[pair(LEAK, LEAK)] = std * std;
     }
 
-    /// Handles hours without rows, in which the cell may have lost more charge than usual. If the row after them
+    /// Handles an hour or more without rows, in which the cell may have lost more charge than usual. If the next row
     /// contradicts the prediction, raises the uncertainty of the SOC and of the channel offset. The next drive then
     /// shows which of the two has changed.
     pub(super) fn open_charge(&mut self, days: f64, observed: &Observation) {

@@ -31,7 +31,7 @@ use crate::cell::CellModel;
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Timestamp};
 
-/// A cell's SOC or capacity counts as unknown from this standard deviation on. It is half of the standard deviation
+/// From this standard deviation on, a cell's SOC or capacity counts as unknown. It is half of the standard deviation
 /// before the first row.
 const UNKNOWN_SOC_STD: f64 = 0.025;
 const UNKNOWN_CAPACITY_STD: f64 = 0.05;

@@ -10,8 +10,8 @@ pub fn crossing(ends: (f64, f64), is_below: impl Fn(f64) -> bool) -> f64 {
     0.5 * (low + high)
 }
 
-/// Halves the interval `ends` as often as `halvings` says. Each time, keeps the half in which `is_below` changes from
-/// true to false.
+/// Halves the interval `ends` `halvings` times. Each time, keeps the half in which `is_below` changes from true to
+/// false.
 pub fn bisect(ends: (f64, f64), halvings: u32, is_below: impl Fn(f64) -> bool) -> (f64, f64) {
     (0..halvings).fold(ends, |(low, high), _| {
         let middle = 0.5 * (low + high);

@@ -278,7 +278,7 @@ fn ln(x: f64) -> f64 {
 
 /// At and below this x, e^x counts as 0, because smaller results would be subnormal.
 const LEAST: f64 = -708.0;
-/// Adding this number to a number below 2^51 rounds the latter to an integer.
+/// If this number is added to a number x below 2^51, the sum rounds x to an integer.
 const ROUNDER: f64 = 6_755_399_441_055_744.0; // 1.5 * 2^52
 /// 2^52.
 const LARGE: f64 = 4_503_599_627_370_496.0;

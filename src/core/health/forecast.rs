@@ -69,7 +69,7 @@ const DAY_S: f64 = 86_400.0;
 
 /// Minimum number of readings for a forecast: two readings give a rate, and the third can contradict it.
 pub const MIN_READINGS: u32 = 3;
-/// A forecast requires a loss of at least this many of its own standard deviations.
+/// Minimum loss for a forecast, in standard deviations of the loss.
 pub const MIN_FADE_DEVIATIONS: f64 = 1.0;
 /// Maximum ratio of the interval's upper end to the median. It does not apply if the upper end is below the use since
 /// the first reading.

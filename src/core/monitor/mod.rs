@@ -271,7 +271,7 @@ impl Monitor {
 
     /// How to check the authenticator of a frame; `None` if the frame does not belong to an authenticated message. The
     /// driver has the key: it checks such a frame and passes it as [`RecordKind::SecuredFrame`]. If the driver passes
-    /// it as [`RecordKind::Frame`], it counts as forged.
+    /// the frame as [`RecordKind::Frame`], the frame counts as forged.
     #[inline]
     pub fn mac_check(&self, bus: BusIndex, frame: &Frame) -> Option<MacCheck> {
         let commands = self.config.commands.as_ref()?;

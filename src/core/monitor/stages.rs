@@ -411,7 +411,8 @@ impl Stages {
             // A cell without a fresh voltage may be the weakest.
             self.forget_pack_state();
         }
-        // A frozen reading of the current, or a message with a second sender, makes the estimates doubtful.
+        // A frozen or contradicted reading of the current, or a message with a second sender, makes the estimates
+        // doubtful.
         let is_current_frozen = self.sampling.sampler.is_current_frozen();
         let is_contradicted = self.estimation.current_check.is_doubtful();
         self.estimation.is_current_doubtful = self.sampling.has_second_sender || is_current_frozen || is_contradicted;

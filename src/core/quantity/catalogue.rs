@@ -130,7 +130,7 @@ pub struct QuantityRow {
 }
 
 impl QuantityRow {
-    /// The keys of its mean and, if it has one, its standard deviation.
+    /// The key of the mean and, if the quantity has one, of the standard deviation.
     pub fn parts(&self) -> impl Iterator<Item = (Part, &'static str)> + use<> {
         [(Part::Mean, self.key)].into_iter().chain(self.std_key.map(|key| (Part::Std, key)))
     }

@@ -112,7 +112,8 @@ pub(super) struct FrozenCheck {
     is_frozen: bool,
 }
 
-/// Step that noise does not reach, V: [`STEP_SIGMA`] times the standard deviation `noise_v`, V.
+/// Step that exceeds the noise, V: [`STEP_SIGMA`] times the standard deviation `noise_v`, V, but at least
+/// [`MIN_STEP_V`].
 pub(super) fn step_v(noise_v: f64) -> f64 {
     (STEP_SIGMA * noise_v).max(MIN_STEP_V)
 }

@@ -88,7 +88,7 @@ pub struct Sampler {
     /// Number of voltage channels.
     voltages: usize,
     flow_a: f64,
-    /// Voltage step that noise does not reach, V.
+    /// Voltage step that is larger than the noise, V.
     step_v: f64,
     state: SamplerState,
     /// No signal becomes stale before this time; `None` = to be computed.
@@ -97,8 +97,8 @@ pub struct Sampler {
     shared: SharedInputs,
 }
 
-/// Inputs shared by readings with the same time stamp. A new reading of the current invalidates all fields. A new
-/// temperature invalidates only `sensor`.
+/// Inputs shared by readings with the same time stamp. A new reading of the current or of the contactors invalidates
+/// all fields. A new temperature invalidates only `sensor`.
 #[derive(Debug, Clone, Copy, Default)]
 struct SharedInputs {
     /// Whether the other fields are valid.
@@ -261,8 +261,8 @@ impl Sampler {
         self.next_stale = Some(next);
     }
 
-    /// Handles a gap of unknown length before `time`. Afterwards, no value is fresh, and ages start at `time`. The gap
-    /// counts no charge.
+    /// Handles a gap of unknown length before `time`. Afterwards, no value is fresh, and ages start at `time`. No
+    /// charge is counted for the gap.
     pub fn handle_gap(&mut self, time: Timestamp) {
         self.state.charge.handle_gap(self.state.latest, time, self.config.current.max_age_s);
         self.state.signals.iter_mut().for_each(Signal::handle_gap);

@@ -94,7 +94,7 @@ pub struct Simulation {
     readings: Vec<(Channel, Option<f64>)>,
     time: Timestamp,
     current_a: f64,
-    /// Charge, As, and time, ns, that the cells have not been stepped for yet.
+    /// Charge, As, and time, ns, for which the cells have not been stepped yet.
     pending: (f64, i64),
     cells_due: bool,
     started: bool,

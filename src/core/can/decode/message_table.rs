@@ -291,7 +291,7 @@ impl PageTable {
     }
 }
 
-/// Whether the run may be present with this code of the selector.
+/// Whether the run of bindings may be present if the selector has this code.
 fn may_hold(selector: SignalPlan, tests: &[MuxTest], code: u64) -> bool {
     tests.iter().filter(|test| test.plan == selector).all(|test| test.allows(code))
 }

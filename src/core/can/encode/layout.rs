@@ -24,8 +24,8 @@ use crate::can::secoc::{self, Authentication};
 use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 use crate::can::{CanId, FrameKind};
 
-/// Names of the signals that protection and authentication write. No signal with a value of the daemon has one of these
-/// names.
+/// Names of the signals that protection and authentication write. Signals that carry the daemon's values never have
+/// these names.
 pub(super) const HEADER_SIGNALS: [&str; 5] = ["E2eCrc", "E2eCounter", "E2eDataIdNibble", "SecOCFreshness", "SecOCMac"];
 
 /// Length of a built-in message whose signals were moved for profile 5, bytes: the next FD length above 8.

@@ -1,6 +1,7 @@
 //! The J1939 node: claims its address, sends DM1 once a second and on every change, and answers requests.
 //!
-//! * DM1 is sent once a second, even without codes, and at once on a change. `codes` limits how often one code changes.
+//! * DM1 is sent once a second, even without codes, and at once on a change. The module `codes` limits how often one
+//!   code changes.
 //! * DM2 is sent only on request.
 //! * Messages of more than 8 bytes are transferred one after the other, so a changed DM1 waits for the end of a
 //!   transfer. If a DM1 and a DM2 wait, they are sent alternately, so that neither a flood of requests stops DM1 nor a

@@ -65,7 +65,7 @@ fn shift_keeps_both_ends() {
     assert!((offset_v(&table, 2, 1.5) - 0.2 * 0.4 * 0.6).abs() < 1e-12);
     assert_eq!(offset_v(&table, 0, 1.5), 0.0);
     assert!(table.line(&SOC, 4, 1.5).offset_v.at(1.0).abs() < 1e-12);
-    // Its deviation of 0.3 moves the curve by 0.3 x 0.25 s (1 - s); another deviation scales it, electrodes have none.
+    // The shift's standard deviation of 0.3 moves the curve by 0.3 x 0.25 s (1 - s). Only a shift has this deviation.
     let mix_v = |table: &AgedOcv| table.line(&SOC, 2, 1.5).mixes_v[0].at(SOC[2]);
     assert!((mix_v(&table) - 0.075 * 0.4 * 0.6).abs() < 1e-12);
     let (mut other, mut electrodes) = (table.clone(), m50());

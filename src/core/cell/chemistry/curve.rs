@@ -107,8 +107,8 @@ impl CurvePrior {
         let CellType { positives, negatives, empty_v, full_v, hysteresis_v } = *cell_type;
         let pairs = positives.iter().flat_map(|p| negatives.iter().map(move |&n| (p, n)));
         let with_contents = |(p, n)| {
-            // Full negative electrode: designs between fast charging and high energy. Empty positive electrode: lithium lost in the
-            // first cycles.
+            // Full negative electrode: from fast-charging to high-energy designs. Empty positive electrode: lithium
+            // lost in the first cycles.
             let contents =
                 [0.78, 0.84, 0.90, 0.95].iter().flat_map(|&x| [0.84, 0.88, 0.92, 0.97].iter().map(move |&y| (x, y)));
             let ends = contents.flat_map(|contents| full_v.iter().map(move |&full_v| (contents, full_v)));

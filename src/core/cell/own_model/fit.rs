@@ -244,7 +244,8 @@ impl<'a> Search<'a> {
         let Conditional { theta, normal, misfit, .. } = self.conditional(capacity.mean, start)?;
         let std_ah = capacity.std();
         let [low, high] = [-0.5, 0.5].map(|part| self.conditional(capacity.mean + part * std_ah, &theta));
-        // Change of each parameter per standard deviation of the capacity. The capacity's entry is the change of ln(capacity).
+        // Change of each parameter per standard deviation of the capacity. The capacity's entry is the change of its
+        // logarithm.
         let by_capacity = high?.theta - low?.theta;
         let theta = self.conditional_with(&RepeatedErrors::IN_TABLES, capacity.mean, &theta)?.theta;
         let mut covariance = normal.cholesky()?.inverse();
@@ -294,7 +295,7 @@ impl<'a> Search<'a> {
     }
 }
 
-/// Mean and variance (steps) of the density exp(least - cost) over a grid of steps; a cubic through neighbours joins the costs
+/// Mean and variance, in steps, of the density exp(least - cost) over a grid of steps. Cubics interpolate the costs
 /// (Catmull-Rom).
 fn moments(costs: &[f64], least: f64) -> (f64, f64) {
     let last = costs.len() - 1;

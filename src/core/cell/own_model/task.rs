@@ -23,9 +23,9 @@ pub struct FitTask {
 /// Result of a task.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FitFindings {
-    /// The previous model predicts the new rows better than the present model.
+    /// Whether the previous model predicts the new rows better than the present model.
     pub is_before_better: bool,
-    /// The rows sufficed for a fit.
+    /// Whether the rows suffice for a fit.
     pub is_enough: bool,
     /// The fit to all rows. `None` if there are too few rows, or if the fitted capacity is far from the label's
     /// capacity.
@@ -64,8 +64,9 @@ impl FitTask {
     /// at the fitted capacity or at the rated capacity, whichever fits it better.
     fn better_chemistry(&self, prior: &LabelPrior, fitted: Option<&Fit>) -> Option<Chemistry> {
         let Self { label, rows, .. } = self;
-        // 50 times more likely; more if the rows deviate from both by more than drives that a circuit describes (0.45). NCA and NMC
-        // differ by 4 to 9 on the drives of four cells; LFP differs from all others by hundreds.
+        // The better chemistry must be 50 times more likely. The margin grows with a misfit above 0.45, which is the
+        // misfit on drives that a circuit describes. On the drives of four cells, NCA and NMC differ by 4 to 9; LFP
+        // differs from all others by hundreds.
         let margin = 4.0 * fitted.map_or(1.0, |it| (it.misfit / 0.45).max(1.0));
         let fitted_ah = fitted.map(|it| it.own.capacity.mean);
         let capacities_ah: Vec<f64> = [label.rated_ah].into_iter().chain(fitted_ah).collect();

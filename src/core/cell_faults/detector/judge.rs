@@ -124,8 +124,8 @@ impl CellFaultDetector {
     }
 
     /// The cell whose channel clearly reads lowest at the SOC at which a BMS bleeds cells; `None` if no cell clearly
-    /// reads lowest. A BMS never bleeds this cell, because it follows its own readings, including their errors. The
-    /// cell counts as the lowest until another cell reads lower.
+    /// reads lowest. A BMS never bleeds this cell, because the BMS follows its own readings, including their errors.
+    /// The cell counts as the lowest until another cell reads lower.
     fn clearly_lowest(&self, slope_v: f64) -> Option<usize> {
         let (mut lowest, mut next): (Option<(usize, ScalarGaussian)>, Option<ScalarGaussian>) = (None, None);
         let compared = self.cells.iter().enumerate().filter(|(_, cell)| cell.is_compared);

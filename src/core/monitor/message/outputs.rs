@@ -56,7 +56,7 @@ pub enum Validity {
     Valid = 1,
     /// Current or temperature is stale or implausible: the estimate is extrapolated and its standard deviation grows.
     Degraded = 2,
-    /// The filter's innovations contradict its covariance.
+    /// A cell's innovations contradict its filter's covariance, its model does not fit, or the current is doubtful.
     Untrusted = 3,
 }
 

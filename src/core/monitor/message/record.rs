@@ -10,8 +10,8 @@ use crate::quantity::{BusIndex, Timestamp};
 /// Something that happened, with the time on the driver's clock. Logs and journals hold records; the core handles them.
 ///
 /// Records arrive in the order in which they happened. A time up to [`MERGE_TOLERANCE_NS`] before the latest time is
-/// possible, because records of several buses may be merged out of order; it is counted and treated as the latest time.
-/// A time further back means that the clock was set back, so the elapsed time is unknown.
+/// possible, because records of several buses may be merged out of order. Such a time is counted and treated as the
+/// latest time. A time further back means that the clock was set back, so the elapsed time is unknown.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Record {
     /// Time on the driver's clock.

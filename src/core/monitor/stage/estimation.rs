@@ -28,7 +28,7 @@ use crate::sample::CellSample;
 /// enough to trip an alarm whose threshold is the limit.
 const DOUBT: f64 = 2.0;
 
-/// Path of a frozen voltage: far from every path of the cells.
+/// Path stored for a frozen voltage, V: far outside the range of the cells' common path.
 const FROZEN_PATH_V: f64 = 1e9;
 
 /// The estimation stage.

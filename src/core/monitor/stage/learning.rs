@@ -198,8 +198,8 @@ impl Learning {
 
     /// Ends a mode. If this completes a half-cycle, every cell learns from the half-cycle. `teaches_capacity`: whether
     /// the model of the pack's own kind of cells is good enough to learn capacities. Cells of a module learn their
-    /// capacity if their model was given. `is_doubtful`: per cell, whether the current was doubtful or its
-    /// voltage is frozen; it then learns no capacity.
+    /// capacity if their model was given. `is_doubtful`: per cell, whether the current was doubtful or the cell's
+    /// voltage is frozen. A doubtful cell learns no capacity.
     pub(crate) fn complete_mode(
         &mut self,
         change: ModeChange,
@@ -412,7 +412,8 @@ impl Learning {
         capacities.min_by(|a, b| a.1.mean.total_cmp(&b.1.mean)).filter(|_| self.state.learner.has_learned_all())
     }
 
-    /// Fields of the health frame: values of the weakest cell, once every cell's capacity has been learned.
+    /// Fields of the health frame, once every cell's capacity has been learned: the worst value of any cell, and the
+    /// losses of the weakest cell.
     pub(crate) fn health_fields(&self, bank: &PackBank) -> HealthFields {
         let recharge_period_s = self.state.recharge_period_s;
         if !self.state.learner.has_learned_all() {

@@ -37,7 +37,8 @@ const FIT_S: f64 = 30.0;
 /// Largest misfit of a usable fit. With typical sensors, the misfit is at most 0.65. Heavy load in the cold, a faulty
 /// sensor, or a pack that was exchanged between the rows cause a larger misfit.
 const MOST_MISFIT: f64 = 0.7;
-/// Misfit above which the present model is dropped, because the rows deviate from it by more than their errors explain.
+/// Misfit of a fit above which also the present model is dropped: the rows deviate from every fit by more than their
+/// errors.
 const HOPELESS_MISFIT: f64 = 1.0;
 
 /// Largest relative standard deviation of a usable fit's capacity. The capacity from the label has a relative standard
@@ -342,8 +343,8 @@ impl Modelling {
             return self.return_to_label().or_else(|| unless_fitted(self));
         }
         let Some(fitted) = fit else { return unless_fitted(self) };
-        // A fit of LFP cells is not used: hysteresis hides their flat curve, and the error of a row does not include
-        // it.
+        // A fit of LFP cells is not used: hysteresis hides their flat curve, and a row's error does not include the
+        // hysteresis.
         let is_flat = label.chemistry == Chemistry::LfpGraphite;
         let is_rough = fitted.misfit > MOST_MISFIT;
         if is_flat || is_rough || fitted.own.capacity.std() > MOST_CAPACITY_STD * fitted.own.capacity.mean {

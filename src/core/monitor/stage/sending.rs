@@ -435,7 +435,7 @@ impl Sending {
         self.send(now, LayoutMessage::Alarm, out, |plan, counters| Some(plan.alarm(fields, counters)));
     }
 
-    /// Sends the frame that `encode` returns on every output interface.
+    /// Sends the frame returned by `encode` on every output interface.
     fn send(
         &mut self,
         time: Timestamp,

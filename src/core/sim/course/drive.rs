@@ -118,7 +118,7 @@ impl DayCourse {
         // `power_w` is for a pack of this energy, Wh.
         let capacities_per_hour = power_w(self.speed_m_s, acceleration) / 60_000.0;
         let (lowest_v, highest_v) = pack.extremes_v(0.0);
-        // Nominal cell voltage behind that energy, V.
+        // Nominal voltage of the cells of the 60 kWh car, V.
         let current_c = capacities_per_hour * 3.65 / (0.5 * (lowest_v + highest_v));
         let current_a = self.capacity_ah * current_c.clamp(-CURRENT_LIMIT_C.0, CURRENT_LIMIT_C.1);
         if current_a > 0.0 {

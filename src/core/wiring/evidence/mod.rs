@@ -1,5 +1,5 @@
-//! Evidence about signals from their values, names and bits. The doctor judges the configured signals with it,
-//! `discover` scores candidates.
+//! Evidence about signals from their values, names and bits. The doctor uses it to judge the configured signals,
+//! `discover` to score candidates.
 //!
 //! | file | purpose |
 //! | --- | --- |

@@ -164,7 +164,7 @@ impl Series {
         Some(self.changes.median()? / (0.6745 * std::f64::consts::SQRT_2))
     }
 
-    /// Number of readings without a value: outside the range, too short, or "not available".
+    /// Number of readings without a value: outside the range, not finite, too short, or "not available".
     pub fn bad(&self) -> u64 {
         self.invalid() + self.unusable.not_available
     }

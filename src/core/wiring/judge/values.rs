@@ -33,7 +33,7 @@ pub(super) fn check(judge: &mut Judge<'_>) {
 /// A signal and the layout that makes its values plausible.
 type BetterLayout<'d> = (SignalSeries<'d>, &'d AlternativeReading);
 
-/// The first alternative layout that fits three quarters of the signals, with the first signal that it fits.
+/// The first alternative layout that fits at least three quarters of the signals, with the first signal that it fits.
 fn better_layout<'d>(
     all: &[SignalSeries<'d>],
     fits: impl Fn(SignalSeries<'d>, &AlternativeReading) -> bool,

@@ -1,6 +1,6 @@
 //! Predicted voltages of a notebook's rows from the parameters of a fit, with derivatives.
 //!
-//! In: parameters ([`Layout`](super) of indices below), rows. Out: V. A row's voltage is linear in the curve and in all resistances.
+//! In: parameters (indices below) and rows. Out: V. A row's voltage is linear in the curve and in all resistances.
 
 use nalgebra::{DMatrix, DVector};
 
@@ -11,9 +11,9 @@ use crate::cell::notebook::Row;
 use crate::cell::own_model::{FACTOR_NODES, OwnModel, SOC_NODES};
 use crate::filter::interpolation::{between, locate_clamped};
 
-/// First indices of the parameters: difference of the curve from the label's, V, at the SOC breakpoints; ln of the resistance
-/// factors over SOC; their deviation from the temperature law; difference of the cold sag from the label's, V; ln of the capacity,
-/// Ah; offset of the current sensor, A (measured minus true); SOC at the start of each stretch.
+/// First indices of the parameters: difference from the label's curve, V, at the SOC breakpoints; ln of the resistance
+/// factors over SOC; their deviation from the temperature law; difference from the label's cold sag, V; ln of the
+/// capacity, Ah; offset of the current sensor, A (measured minus true); SOC at the start of each stretch.
 pub(super) const FACTORS: usize = SOC_NODES;
 pub(super) const BY_TEMPERATURE: usize = FACTORS + RESISTANCES * FACTOR_NODES;
 pub(super) const COLD_SAG: usize = BY_TEMPERATURE + RESISTANCES;
@@ -26,7 +26,7 @@ pub(super) const CURVE_AND_SOC: usize = 6;
 /// Limits of the SOC at the start of a stretch.
 pub(super) const BEGINNING: (f64, f64) = (-0.05, 1.05);
 
-/// The label as the fit uses it.
+/// The label's model and curve, and the rows to be fitted.
 pub(super) struct Basis<'a> {
     pub(super) model: &'a CellModel,
     pub(super) curve: &'a CurvePrior,

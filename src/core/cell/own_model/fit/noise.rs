@@ -1,6 +1,7 @@
 //! Errors of a notebook's rows: their covariance, and the cost of residuals.
 //!
-//! In: predictions and rows. Out: whitened residuals with their derivatives, and their cost (minus the logarithm of their density).
+//! In: predictions and rows. Out: whitened residuals with their derivatives, and their cost (minus the logarithm of
+//! their density).
 
 use nalgebra::{DMatrix, DVector};
 
@@ -87,9 +88,8 @@ impl NormalEquations {
         Some(())
     }
 
-    /// Adds the evidence of a row's current steps about the series resistance and the fastest branch.
-    /// The row contains the sums of the least-squares problem v = - R0 i - R1 x. The Cholesky factor of the sums of i
-    /// and x turns them into two rows.
+    /// Adds the evidence of a row's current steps about the series resistance and the fastest branch. The row contains
+    /// the sums of the least-squares problem v = - R0 i - R1 x. The Cholesky factor of the sums of i and x turns them
     /// into two rows.
     fn add_steps(&mut self, row: &Row, prediction: &Prediction) {
         let CurrentSteps { ii, ix, xx, iv, xv } = row.steps;
@@ -102,7 +102,7 @@ impl NormalEquations {
         let of_x = (xx - of_i[1] * of_i[1]).max(0.0).sqrt();
         let v_i = iv / of_i[0];
         let v_x = if of_x > 0.0 { (xv - of_i[1] * v_i) / of_x } else { 0.0 };
-        // The voltage of the steps errs by 10 mV; the steps of one row determine a resistance to 20 % at best.
+        // The voltage of the steps has an error of 10 mV. The steps of one row determine a resistance to 20 % at best.
         let weight = f64::min(1.0 / (0.01 * 0.01), 1.0 / (0.2 * 0.2 * v_i * v_i));
         let Prediction { ohm: [series_ohm, fast_ohm, ..], by_factor, index, .. } = prediction;
         let residuals_v = [v_i + of_i[0] * series_ohm + of_i[1] * fast_ohm, v_x + of_x * fast_ohm];
