@@ -2,7 +2,7 @@
 //!
 //! Input: settings, and status documents of the daemon. Output: values in the databroker, one batch a second. After a
 //! lost connection, the program reconnects. The pauses between attempts grow from [`FIRST_PAUSE`] to [`LONGEST_PAUSE`].
-//! Documents that arrive without a connection are dropped, never queued. `SIGTERM` withdraws the values.
+//! Documents that arrive while there is no connection are dropped, never queued. `SIGTERM` withdraws the values.
 //!
 //! | module | what lives there |
 //! | --- | --- |

@@ -150,7 +150,7 @@ impl ObservedFrames {
     }
 }
 
-/// Runs the test. `SIGINT` and `SIGTERM` end the test early; the daemon then also stops sending it.
+/// Runs the test. `SIGINT` and `SIGTERM` end the test early; the daemon then also stops sending the alarm.
 ///
 /// # Errors
 /// Fails if no alarm frame is configured, an interface cannot be opened, or the daemon refuses.

@@ -167,7 +167,7 @@ impl StampMapper {
         self.never_back(Timestamp::from_nanos(self.clock.origin_ns + arrived_ns))
     }
 
-    /// Time of an interface event noticed at `reading`, in order with its frames.
+    /// Time of an interface event noticed at `reading`; never before an earlier result.
     pub fn event(&mut self, reading: Reading) -> Timestamp {
         self.never_back(self.clock.at(reading))
     }
@@ -188,8 +188,8 @@ impl StampMapper {
 
     /// Whether a frame that was read at `reading` can have arrived at `arrived_ns`.
     fn possible(&self, arrived_ns: i64, reading: Reading) -> bool {
-        // Stamps may be older than the time when the socket was last found empty, by this tolerance, ns. The reason is
-        // the delay between stamping and queueing: a soft interrupt and, with USB adapters, a batch.
+        // Tolerance: a frame is stamped up to 20 ms before it is queued, because of a soft interrupt and, with USB
+        // adapters, batching.
         (self.emptied_ns - 20_000_000..=reading.boottime_ns).contains(&arrived_ns)
     }
 }

@@ -26,7 +26,7 @@ pub struct Ticks {
     limit_ns: i64,
     /// Latest record; `None` before the first and after [`Ticks::sleep`].
     latest_ns: Option<i64>,
-    /// Time of the first tick after a hole in the log, which follows the ticks before the hole.
+    /// Time of the first tick after a hole in the log. It is popped after the ticks before the hole.
     wake_ns: Option<i64>,
 }
 

@@ -33,7 +33,7 @@ use crate::store::{HISTORY_SOURCE, STATE_SOURCE, StateCandidate, Store, StorePro
 pub(super) struct Engine {
     pub(super) monitor: Monitor,
     pub(super) outputs: Outputs,
-    /// Outputs of the interfaces for the core's frames; empty before the start and after the stop.
+    /// Sending ends of the interfaces; empty before the start and after the stop.
     pub(super) links: Vec<LinkOutput>,
     /// Key of authenticated frames.
     key: Option<CanKey>,

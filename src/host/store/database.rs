@@ -85,8 +85,8 @@ impl From<rusqlite::Error> for OpenError {
     }
 }
 
-/// Whether an error means that the file's contents are wrong. This holds for every error that the disk or another
-/// process does not cause. If damage were not recognised, the store would never be written again.
+/// Whether an error means that the file's contents are wrong: every error not caused by the disk or another process. If
+/// damage were not recognised, the store would never be written again.
 pub(super) fn is_damage(error: &rusqlite::Error) -> bool {
     match error {
         rusqlite::Error::SqliteFailure(failure, _) => !matches!(
@@ -122,7 +122,7 @@ pub(super) struct Database {
     pack: i64,
 }
 
-/// Limits of the history, beyond which the oldest segments are deleted.
+/// Limits of the history. If one is exceeded, the oldest segments are deleted.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct RowLimits {
     /// Maximum number of rows kept.

@@ -174,7 +174,7 @@ enum Urgency {
     /// The event is stored with the next commit. Filter resets are deferred, because they may be frequent and are not
     /// announced.
     Deferred,
-    /// The event is stored as a row before it is announced. A start can repeat it from the row.
+    /// The event is stored as a row before it is announced. A start can reapply it from the row.
     AsRow,
     /// The event is stored with the whole state before it is announced. Its row alone is not enough to restore it.
     WithState,

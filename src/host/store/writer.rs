@@ -5,7 +5,7 @@
 //! During a pause, every ticket is answered at once as failed. A failing database does not prevent the state from being
 //! written.
 //!
-//! A start repeats the alarm changes in the rows that are newer than the stored state. This requires that the rows
+//! A start reapplies the alarm changes of rows that are newer than the stored state. This requires that the rows
 //! continue the state in the same database. The first rows after a start, after a failure and in a new database are
 //! therefore written together with a state.
 
@@ -27,7 +27,7 @@ use crate::quantity::Timestamp;
 
 /// First pause after a failure; each further pause doubles.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
-/// Longest pause. When the disk works again, this is detected within this time.
+/// Longest pause. If the disk works again, the writer detects it within this time.
 const LAST_PAUSE: Duration = Duration::from_secs(15);
 
 /// Progress of the writer.

@@ -2,7 +2,7 @@
 //!
 //! Input: settings, status documents, the request to stop. Output: values, identified by the ids of this connection.
 //! The program lists the metadata, claims the signals, and then sends a batch for each document. If the daemon falls
-//! silent or this program stops, it sends a batch without values, so that no reader takes an old value for a present
+//! silent or this program stops, it sends a batch without values, so that no reader mistakes an old value for a current
 //! one. The connection ends with a reason if the broker closes it or does not answer.
 
 use std::future::Future;
@@ -32,8 +32,8 @@ const PATIENCE: Duration = Duration::from_secs(5);
 const PING_PERIOD: Duration = Duration::from_secs(10);
 /// Longest wait for the broker to read the last batch.
 const FAREWELL: Duration = Duration::from_millis(500);
-/// Longest time during which the broker may read no batch. After this time the connection is closed, because readers
-/// would take old values for present ones.
+/// If the broker reads no batch for this time, the connection is closed, because readers would mistake old values for
+/// current ones.
 const UNREAD_LIMIT: Duration = Duration::from_secs(30);
 /// Longest token, bytes.
 const MAX_TOKEN_BYTES: usize = 16 << 10;

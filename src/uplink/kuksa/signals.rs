@@ -149,7 +149,7 @@ fn path(path: VssPath, part: Part) -> (Origin, Cow<'static, str>) {
     }
 }
 
-/// Unit in VSS, and the factor to it.
+/// Unit in VSS, and the conversion factor to it.
 const fn vss_unit(unit: Unit) -> (Option<&'static str>, f64) {
     match unit {
         Unit::Level | Unit::Fraction => (Some("percent"), 100.0),

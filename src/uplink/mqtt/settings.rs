@@ -78,7 +78,7 @@ pub struct DiscoverySettings {
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct HistorySettings {
-    /// Time between samples in the daemon's clock, s; 0 = no samples.
+    /// Time between samples on the daemon's clock, s; 0 = no samples.
     #[serde(deserialize_with = "whole::<0, 86_400, _>")]
     pub period_s: u64,
     /// Folder of the queue.

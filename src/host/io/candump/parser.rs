@@ -1,9 +1,9 @@
 //! Parses candump lines.
 //!
 //! In: text that begins with a line; the parser ignores what follows the line feed. Out: the line, or the first
-//! Nothing is allocated and nothing is read twice. Three parts are the same in nearly all lines: the second of the
-//! previous line, a known interface, and a payload of eight bytes. These parts have fast paths, which convert several
-//! bytes at a time.
+//! violation of the grammar. Nothing is allocated and nothing is read twice. Three parts are the same in nearly all
+//! lines: the second of the previous line, a known interface, and a payload of eight bytes. These parts have fast
+//! paths, which convert several bytes at a time.
 
 use super::digits::{HEX, eight_digits, eight_hex_bytes, six_decimals, word};
 use super::{Line, LineError};
