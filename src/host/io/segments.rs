@@ -17,7 +17,7 @@ use zstd::stream::write::Encoder;
 use super::place::with_suffix;
 
 /// Smallest and largest size of a segment, bytes. Smaller segments would be mostly headers; the deletion of a larger
-/// segment would lose days.
+/// segment would lose days of recording.
 pub const SEGMENT_BYTES: std::ops::RangeInclusive<u64> = 64 << 10..=4 << 30;
 /// Default size of a segment, bytes; a pack of 96 cells fills it in six hours.
 pub const DEFAULT_SEGMENT_BYTES: u64 = 64 << 20;

@@ -79,7 +79,7 @@ impl Folder {
     }
 
     /// Opens the database for the pack that the stored state knows. If the database is damaged, opens an empty one
-    /// instead. Also returns rows about the opening, for the history.
+    /// instead. Also returns the history rows that report this.
     pub(super) fn open(&mut self, now: &Stamp, pack: i64) -> Result<(Database, Vec<HistoryRow>), OpenError> {
         self.lock().map_err(|error| OpenError::Unavailable(format!("{}: {error}", self.path.display())))?;
         let path = self.path.join(DATABASE);

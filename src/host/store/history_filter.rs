@@ -105,7 +105,7 @@ impl HistoryFilter {
         if may_go { std::mem::take(&mut self.deferred) } else { Vec::new() }
     }
 
-    /// Defers a row. Only the first and the last deferred row of each cell's filter are kept.
+    /// Defers a row. Of equal deferred rows, only the first and the last are kept.
     fn defer(&mut self, kind: EventKind) {
         let row = HistoryRow::Event(kind);
         let same: Vec<usize> = (0..self.deferred.len()).filter(|&at| self.deferred[at] == row).collect();
@@ -129,8 +129,8 @@ impl HistoryFilter {
         is_worth_writing
     }
 
-    /// Whether to write an event. A capacity is not written if it has no measurement and the same usable part. If the
-    /// allowance is used up, it is not written if it has hardly changed.
+    /// Whether to write an event. A capacity without a measurement is written only if the usable capacity has changed.
+    /// If the allowance is used up, a capacity is written only if it has changed by [`MIN_CHANGE_STD`].
     fn is_worth_writing(&mut self, kind: &EventKind, now: Timestamp) -> bool {
         if matches!(kind, EventKind::PackReplaced { .. }) {
             self.written_life.cycles = None;

@@ -217,7 +217,7 @@ fn wrong_password_is_retried_and_wrong_authority_fails() {
         "once, not at each attempt: {}",
         uplink.log()
     );
-    // With a line end, as an editor writes it. The file is read again at each attempt.
+    // The password ends with a line break, as an editor writes it. The file is read again at each attempt.
     fs::write(at("password"), "s3cret\r\n").unwrap();
     wait_for("a connection", || uplink.log().contains("connected broker"));
 
