@@ -1,4 +1,5 @@
-//! State and history that survive restarts and power cuts: two state files and a database of the history, in one folder.
+//! State and history that survive restarts and power cuts: two state files and a database of the history, in one
+//! folder.
 //!
 //! * Learned results and alarm changes are written to disk before they are announced. An announcement waits at most 200
 //!   ms for the disk ([`commit_barrier`]). Learned results are stored with the whole state. An alarm change is stored
@@ -9,12 +10,13 @@
 //!   not restored.
 //! * The state is also written at checkpoints (`checkpoint`), on stop, and every second to the runtime folder, which is
 //!   in memory.
-//! * The state is written to two files in turn (`state_files`) and does not depend on the database. If there is no valid state,
-//!   the capacities and alarms in the history are used (`learned`).
+//! * The state is written to two files in turn (`state_files`) and does not depend on the database. If there is no
+//!   valid state, the capacities and alarms in the history are used (`learned`).
 //! * A damaged database is set aside and a new one is created (`folder`). The next start then uses the state alone.
 //! * On a full disk, a reserve provides space for learned results and alarms (`reserve`).
 //! * The loop never accesses the disk; a separate thread does (`writer`).
-//! * After any fault of disk, folder or file, the daemon keeps running and reports the fault to the core (`store_failed`).
+//! * After any fault of disk, folder or file, the daemon keeps running and reports the fault to the core
+//!   (`store_failed`).
 
 mod backlog;
 mod checkpoint;
@@ -80,8 +82,8 @@ pub fn standard_folder() -> PathBuf {
     if !service.exists() && own.exists() { own } else { service }
 }
 
-/// Default folder of a daemon, and whether systemd created it. A daemon started from a shell keeps its state separate from the
-/// service's: in `$XDG_STATE_HOME/packwatch`, by default `~/.local/state/packwatch`.
+/// Default folder of a daemon, and whether systemd created it. A daemon started from a shell keeps its state separate
+/// from the service's: in `$XDG_STATE_HOME/packwatch`, by default `~/.local/state/packwatch`.
 pub fn daemon_folder() -> (PathBuf, bool) {
     if let Some(folder) = first_folder("STATE_DIRECTORY") {
         return (folder, true);

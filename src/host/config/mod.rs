@@ -17,9 +17,9 @@
 //! | `description` | the configuration and its keys in words |
 //!
 //! # How to add a key
-//! 1. In `schema/keys`, add a line to the table's `section!`: doc comment, name, type, unit, range, presence. In a table
-//!    that `gives` the parameters of an algorithm, the key sets the field of the same name. To set another field, or to
-//!    compute the value, write `=> field: value` on the same line.
+//! 1. In `schema/keys`, add a line to the table's `section!`: doc comment, name, type, unit, range, presence. In a
+//!    table that `gives` the parameters of an algorithm, the key sets the field of the same name. To set another field,
+//!    or to compute the value, write `=> field: value` on the same line.
 //! 2. Add the field to the algorithm's parameters.
 //! 3. Run `packwatch check --reference > docs/src/reference/keys.md`; a test compares the two.
 //!

@@ -14,7 +14,8 @@
 //!   queueing can only increase this value. Old values are forgotten, so that the offset follows the drift of the
 //!   adapter's quartz.
 //!
-//! Times of one interface never go backwards. All functions except the clock readings are pure: tests pass their own clock.
+//! Times of one interface never go backwards. All functions except the clock readings are pure: tests pass their own
+//! clock.
 
 use std::time::Duration;
 

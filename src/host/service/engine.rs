@@ -161,8 +161,8 @@ impl Engine {
         Ok(changed)
     }
 
-    /// Sends the core's frames to the interfaces and its events to the log, and writes both to their files. Returns the ticket
-    /// of their commit.
+    /// Sends the core's frames to the interfaces and its events to the log, and writes both to their files. Returns the
+    /// ticket of their commit.
     fn dispatch_outputs(&mut self, time: Timestamp) -> Option<u64> {
         let ticket = self.commit_learned(time);
         for transmit in &self.outputs.frames {

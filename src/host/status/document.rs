@@ -1,11 +1,11 @@
 //! The status document that the status sockets send as JSON. This file is its reference.
 //!
-//! * Version 1. New keys may be added within a version, so readers must ignore unknown keys. Removing a key or changing its
-//!   meaning requires a new version.
+//! * Version 1. New keys may be added within a version, so readers must ignore unknown keys. Removing a key or changing
+//!   its meaning requires a new version.
 //! * An unknown value is `null`, never 0 or 100 %.
-//! * Units are in the names: `_v`, `_a` (positive = discharge), `_c` (degrees C), `_ah`, `_s`. SOC and SOH are fractions.
-//!   `_std` is a standard deviation. Cells count from 0, as in events. Times are ns since 1970 on the daemon's clock, which
-//!   never steps; `wall_time` is the computer's clock.
+//! * Units are in the names: `_v`, `_a` (positive = discharge), `_c` (degrees C), `_ah`, `_s`. SOC and SOH are
+//!   fractions. `_std` is a standard deviation. Cells count from 0, as in events. Times are ns since 1970 on the
+//!   daemon's clock, which never steps; `wall_time` is the computer's clock.
 
 use std::path::Path;
 

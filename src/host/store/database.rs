@@ -301,7 +301,8 @@ fn prepare(connection: &Connection) -> rusqlite::Result<()> {
     connection.pragma_update(None, "cache_size", -256)?;
     connection.pragma_update(None, "temp_store", "MEMORY")?;
     connection.pragma_update(None, "cell_size_check", true)?;
-    // SQLite copies a log of half a megabyte (about fifty commits) into the main file, and truncates a log of more than 1 MiB.
+    // SQLite copies a log of half a megabyte (about fifty commits) into the main file, and truncates a log of more than
+    // 1 MiB.
     connection.query_row("PRAGMA journal_size_limit = 1048576", [], |_| Ok(()))?;
     connection.query_row("PRAGMA wal_autocheckpoint = 512", [], |_| Ok(()))
 }

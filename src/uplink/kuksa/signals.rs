@@ -163,8 +163,8 @@ const fn vss_unit(unit: Unit) -> (Option<&'static str>, f64) {
     }
 }
 
-/// Returns a value per cell if every cell has one and cells are numbered from 0 without a gap, because array positions are cell
-/// numbers.
+/// Returns a value per cell if every cell has one and cells are numbered from 0 without a gap, because array positions
+/// are cell numbers.
 fn of_cells<T>(document: &StatusDocument, value: impl Fn(&CellView) -> Option<T>) -> Option<Vec<T>> {
     let cells = document.cells.iter().enumerate();
     let values = cells.map(|(index, cell)| if cell.cell.index() == index { value(cell) } else { None });

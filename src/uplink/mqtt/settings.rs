@@ -143,7 +143,8 @@ impl MqttSettings {
         format!("{}/{name}", self.topic)
     }
 
-    /// Converts the topic to a word of letters, digits, `-` and `_`, as Home Assistant requires in topics and identifiers.
+    /// Converts the topic to a word of letters, digits, `-` and `_`, as Home Assistant requires in topics and
+    /// identifiers.
     pub fn node(&self) -> String {
         let allowed = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
         self.topic.chars().map(|c| if allowed(c) { c } else { '_' }).collect()

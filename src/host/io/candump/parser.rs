@@ -48,7 +48,8 @@ impl Interface {
 #[derive(Debug, Clone)]
 pub struct LineParser {
     interfaces: Vec<Interface>,
-    /// The first twelve bytes of the previous line (a stamp of ten digits, up to the decimal point) as two overlapping words.
+    /// The first twelve bytes of the previous line (a stamp of ten digits, up to the decimal point) as two overlapping
+    /// words.
     head: [u64; 2],
     /// The second that these bytes encode, ns.
     second_ns: i64,
@@ -448,7 +449,8 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Parses the direction that `candump -x` appends, and blanks. Returns whether the frame was sent by the recording machine.
+    /// Parses the direction that `candump -x` appends, and blanks. Returns whether the frame was sent by the recording
+    /// machine.
     fn suffix(&mut self) -> Result<bool, LineError> {
         let blank = |b: Option<u8>| matches!(b, None | Some(b' ' | b'\r' | b'\t'));
         if !blank(self.peek()) {

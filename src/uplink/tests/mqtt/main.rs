@@ -1,5 +1,5 @@
-//! Runs `packwatch-uplink mqtt` as a user does: the program, a real broker (Debian's mosquitto) on a loopback port, a reader
-//! (mosquitto_sub) with its own session, and a status socket fed by the test.
+//! Runs `packwatch-uplink mqtt` as a user does: the program, a real broker (Debian's mosquitto) on a loopback port, a
+//! reader (mosquitto_sub) with its own session, and a status socket fed by the test.
 
 mod rig;
 
