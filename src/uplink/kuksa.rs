@@ -81,7 +81,7 @@ async fn serve(settings: &Settings) -> std::io::Result<()> {
     Ok(())
 }
 
-/// Watches for `SIGTERM` and `SIGINT`; the value becomes true with the first.
+/// Watches for `SIGTERM` and `SIGINT`; the value becomes true with the first signal.
 fn stop_requests() -> std::io::Result<watch::Receiver<bool>> {
     let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
     let (sender, receiver) = watch::channel(false);

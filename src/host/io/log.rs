@@ -72,7 +72,7 @@ pub struct LogCounts {
     pub foreign: BTreeMap<String, u64>,
     /// Records whose stamp is before the stamp of the preceding record.
     pub time_backwards: u64,
-    /// Number of parts that follow an unknown gap.
+    /// Number of files and CSV sections that follow a gap of unknown length.
     pub unknown_gaps: u64,
     /// CSV values that no input frame can carry (out of the signal's range, or no such signal).
     pub uncarried_values: u64,

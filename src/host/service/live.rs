@@ -86,7 +86,7 @@ impl ServiceLoop {
                 }
                 // At most one request per connection waits.
                 Some(request) = self.requests.recv() => self.answer(request).await,
-                // At most one file a second is read.
+                // At most one configuration a second is read.
                 step = self.reload.next() => self.handle_reload(step).await,
                 received = self.inbox.recv_many(&mut self.batch, BATCH) => {
                     if received > 0 { self.handle_batch() }

@@ -66,7 +66,7 @@ struct QueueState {
     state: Option<StateDocument>,
     /// Whether the state must be written.
     is_state_due: bool,
-    /// Whether the next state must not overwrite the stored state, which is set aside first.
+    /// Whether the stored state must be set aside before the next state is written.
     sets_aside: bool,
     ticket: u64,
     /// Whether the writer has work.
