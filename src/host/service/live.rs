@@ -264,7 +264,7 @@ async fn next_progress(stored: &mut Option<watch::Receiver<StoreProgress>>) -> S
     StoreProgress { works: false, failures: last.failures + 1, ..last }
 }
 
-/// Waits for a fit. Returns `None` if the fit failed; the core then runs it itself.
+/// Waits for a fit. Returns `None` if the fit failed; the core then runs the fit itself.
 async fn next_model_fit(fit: &mut Option<JoinHandle<(FitTask, FitFindings)>>) -> Option<(FitTask, FitFindings)> {
     let Some(running) = fit else { return std::future::pending().await };
     let found = running.await.ok();

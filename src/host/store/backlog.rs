@@ -59,7 +59,8 @@ impl Backlog {
         self.lost.rows -= rows;
     }
 
-    /// Returns rows that could not be written to the front of the backlog. The next rows report the losses again.
+    /// Takes rows back that could not be written; they become the oldest rows again. The next rows report the losses
+    /// again.
     pub(super) fn put_back(&mut self, batches: Vec<RowBatch>) {
         self.reported = LossCount::default();
         let is_loss = |row: &HistoryRow| matches!(row, HistoryRow::Own { reason: "rows_lost", .. });

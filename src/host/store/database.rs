@@ -85,8 +85,8 @@ impl From<rusqlite::Error> for OpenError {
     }
 }
 
-/// Whether an error means that the file's contents are wrong: every error not caused by the disk or another process. If
-/// damage were not recognised, the store would never be written again.
+/// Whether an error means that the file's contents are wrong. True for every error not caused by the disk or another
+/// process. If damage were not recognised, the store would never be written again.
 pub(super) fn is_damage(error: &rusqlite::Error) -> bool {
     match error {
         rusqlite::Error::SqliteFailure(failure, _) => !matches!(
@@ -234,7 +234,7 @@ impl Database {
         learned::read(&self.connection, self.pack)
     }
 
-    /// Closes the history of the pack with the last capacity of its weakest cell, and opens the history of the next
+    /// Closes the history of the pack, noting the last capacity of its weakest cell, and opens the history of the next
     /// pack. Returns the number of the new pack.
     pub(super) fn replace_pack(&mut self, now: &Stamp) -> rusqlite::Result<i64> {
         let learned = self

@@ -76,7 +76,7 @@ impl HistoryFilter {
         let mut rows = self.for_checkpoint(now);
         let mut writes_capacity = false;
         for (_, kind) in stored().filter(|(urgency, _)| *urgency > Urgency::Deferred) {
-            // Loss modes follow from the capacity, whose event precedes them.
+            // Loss modes are derived from the capacity, whose event precedes them, and are written only with it.
             let is_worth_writing = match kind {
                 EventKind::LossModes { .. } => writes_capacity,
                 _ => self.is_worth_writing(&kind, now),

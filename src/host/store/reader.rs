@@ -77,7 +77,7 @@ pub struct HistoryExtent {
     pub half_cycles: i64,
     /// Half-cycles of all packs that the store has deleted because of its limits on rows and age.
     pub deleted_half_cycles: i64,
-    /// Half-cycles of all packs ever written, as counted by the store.
+    /// Half-cycles that the store has ever written, for all packs.
     pub written_half_cycles: i64,
 }
 

@@ -5,9 +5,9 @@
 //! pauses. During a pause, every ticket is answered at once as failed. A failing database does not prevent the state
 //! from being written.
 //!
-//! A start reapplies the alarm changes of rows that are newer than the stored state. This requires that the rows
-//! continue the state in the same database. The first rows after a start, after a failure and in a new database are
-//! therefore written together with a state.
+//! A start reapplies the alarm changes of rows that are newer than the stored state. Therefore the rows in the database
+//! must directly follow the stored state. To ensure this, the first rows after a start, after a failure and in a new
+//! database are written together with a state.
 
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};

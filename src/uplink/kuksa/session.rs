@@ -172,7 +172,7 @@ impl Session {
         }
     }
 
-    /// Sends a check when the proof of an answer needs one.
+    /// Sends a check if the latest answer still needs a proof.
     fn handle_time(&mut self) -> Result<(), String> {
         if self.value_requests.handle_time(Instant::now())? && !self.outbox.check() {
             return Err("the broker reads no answers".to_owned());
