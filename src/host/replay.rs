@@ -378,7 +378,7 @@ impl Replay {
             store.finish(&self.monitor, end).map_err(ReplayError::Store)?;
         }
         if self.settings.snapshot && self.snapshot.is_none() {
-            // A time within the last record's tick period counts as reached.
+            // A snapshot time equal to the time of the last record counts as reached.
             let reached = self.settings.snapshot_at.is_none() || self.snapshot_at == self.span.latest;
             let end_s = self.span.latest.map_or(f64::NAN, Timestamp::secs);
             if !reached {

@@ -229,9 +229,9 @@ fn row(cell: &CellView) -> Vec<String> {
     ]
 }
 
-/// A quantity that is compared between cells: name, quantity, decimals, and two smallest distances from the median at
-/// which a cell can be an outlier. The first distance is in the quantity's unit, the second is relative to the median.
-/// They cover the differences of sensors and of equal cells.
+/// A quantity that is compared between cells: name, quantity, decimals, and two limits for an outlier's distance from
+/// the median. The distance must exceed both: the first in the quantity's unit, the second relative to the median. They
+/// cover sensor errors and the spread of equal cells.
 type Comparison = (&'static str, Quantity, usize, f64, f64);
 
 const COMPARISONS: [Comparison; 5] = [

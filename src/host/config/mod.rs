@@ -23,7 +23,7 @@
 //! 2. Add the field to the algorithm's parameters.
 //! 3. Run `packwatch check --reference > docs/src/reference/keys.md`; a test compares the two.
 //!
-//! From the declaration follow how the key is read, its default, range check and fault texts, and its text in the
+//! The declaration determines how the key is read, its default, range check and fault texts, and its text in the
 //! reference and the manual page. A check that involves several keys belongs in `checks/cross`. A new table also needs
 //! a line in `schema/tables`.
 

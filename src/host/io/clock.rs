@@ -221,7 +221,7 @@ impl HardwareClock {
         stamp_ns.saturating_add(current.min(previous))
     }
 
-    /// Starts again after a jump of the adapter's clock (it was reset, or slept).
+    /// Starts again after a jump of the adapter's clock (the adapter was reset or suspended).
     fn restart(&mut self, stamp_ns: i64, arrived_ns: i64) -> i64 {
         let offset = arrived_ns.saturating_sub(stamp_ns);
         *self = Self { least_ns: Some((offset, offset)), window_start_ns: arrived_ns };

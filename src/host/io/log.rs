@@ -458,7 +458,7 @@ impl ReadState {
             self.shift_ns = 0;
             gap = std::mem::take(&mut self.unknown);
             if let Some(latest) = self.latest.filter(|&latest| raw < latest) {
-                // A part after an unknown gap starts 1 s after the latest record.
+                // A file or section that goes back in time is moved to start 1 s after the latest record.
                 self.shift_ns = latest.plus_nanos(1_000_000_000).nanos().saturating_sub(raw.nanos());
                 (gap, self.has_moved_stamps) = (true, true);
             }

@@ -30,7 +30,7 @@ pub struct ReplaySummary {
     pub estimates: u64,
     /// Frames that would be sent.
     pub frames_out: u64,
-    /// Number of bad readings of signals that became good again.
+    /// Number of bad readings, counted when their signal becomes good again.
     pub bad_readings: u64,
     /// Protected input messages.
     pub protected: Vec<ProtectedSummary>,

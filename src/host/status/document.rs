@@ -91,17 +91,20 @@ pub struct StatusDocument {
     pub latency: Latency,
     /// The store of state and history; `None` = disabled.
     pub store: Option<StoreStatus>,
-    /// The latest events except half-cycles of cells, oldest first, in the format of `--events`.
+    /// The latest events, oldest first, in the format of `--events`; without events that occur once per cell and
+    /// half-cycle.
     pub events: Vec<serde_json::Value>,
 }
 
 impl StatusDocument {
-    /// The first cell with the lowest value, and this value. `None` if the value of any cell is unknown.
+    /// The cell with the lowest value (the first, if there are several), and this value. `None` if the value of any
+    /// cell is unknown.
     pub fn least(&self, quantity: Quantity) -> Option<(CellIndex, f64)> {
         self.extreme(quantity, |candidate, best| candidate < best)
     }
 
-    /// The first cell with the highest value, and this value. `None` if the value of any cell is unknown.
+    /// The cell with the highest value (the first, if there are several), and this value. `None` if the value of any
+    /// cell is unknown.
     pub fn greatest(&self, quantity: Quantity) -> Option<(CellIndex, f64)> {
         self.extreme(quantity, |candidate, best| candidate > best)
     }

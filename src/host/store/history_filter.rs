@@ -176,7 +176,8 @@ enum Urgency {
     Deferred,
     /// The event is stored as a row before it is announced. A start can reapply it from the row.
     AsRow,
-    /// The event is stored with the whole state before it is announced. Its row alone is not enough to restore it.
+    /// The event is stored with the whole state before it is announced. The row alone is not enough to restore the
+    /// result.
     WithState,
 }
 

@@ -51,7 +51,7 @@ pub(super) struct StateDocument {
     pub format: u32,
     /// Number of the state, counting all written states.
     pub number: i64,
-    /// The state folder of the state, because two daemons may share a runtime folder.
+    /// The state folder that the state belongs to. It is stored because two daemons may share a runtime folder.
     pub folder: String,
     /// Number of the pack that was connected; 0 = unknown.
     pub pack: i64,

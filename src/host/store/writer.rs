@@ -114,7 +114,7 @@ impl WriteQueue {
         self.lock().sets_aside = true;
     }
 
-    /// Ends the writer after the work that is already queued.
+    /// Ends the writer after it has done the work that is already queued.
     pub(super) fn stop(&self) {
         let mut queue = self.lock();
         (queue.stop, queue.wanted) = (true, true);
@@ -208,8 +208,8 @@ impl Writer {
             if sets_aside {
                 self.state_files.set_aside();
             }
-            // The last attempt before the end does not wait for the pause. Neither does an attempt that may succeed
-            // with the reserve.
+            // The last attempt before the end, and an attempt that may succeed with the reserve, do not wait for the
+            // pause.
             let is_urgent = stop || (!batches.is_empty() && self.reserve.is_usable());
             let mut progress = *self.progress.borrow();
             progress.works = if self.retry.is_due() || is_urgent {

@@ -2,8 +2,8 @@
 //!
 //! Input: settings, status documents, the request to stop. Output: values, identified by the ids of this connection.
 //! The program lists the metadata, claims the signals, and then sends a batch for each document. If the daemon falls
-//! silent or this program stops, it sends a batch without values, so that no reader mistakes an old value for a current
-//! one. The connection ends with a reason if the broker closes it or does not answer.
+//! silent or this program stops, the program sends a batch without values, so that no reader mistakes an old value for
+//! a current one. The connection ends with a reason if the broker closes it or does not answer.
 
 use std::future::Future;
 use std::path::Path;
@@ -93,7 +93,7 @@ impl Receipts {
         self.owed_since.get_or_insert(now);
     }
 
-    /// Handles a receipt. The broker owes the next receipt from the next batch on.
+    /// Handles a receipt. The broker owes the next receipt once the next batch is sent.
     fn note_read(&mut self) {
         self.owed_since = None;
     }

@@ -386,7 +386,7 @@ impl<'a> Cursor<'a> {
         self.expect(Frame::remote(id, len), "a length of 0 to 8")
     }
 
-    /// Parses `_9` to `_F` after a length of 8, which is the length code on the wire. The payload has 8 bytes for all
+    /// Parses `_9` to `_F` after a length of 8: the length code (DLC) on the wire. The payload has 8 bytes for all
     /// these codes.
     fn raw_length_code(&mut self, len: usize) -> Result<(), LineError> {
         if len != 8 || !self.take(b'_') {

@@ -72,7 +72,7 @@ fn hour_without_broker_and_two_power_cuts_lose_nothing() {
     let mut uplink = Uplink::start(&broker, &daemon, EAGER);
     daemon.send(&document(96, 0));
     reader.wait_for_messages(4);
-    // Messages that the broker has but did not confirm would also wait in the queue.
+    // Messages that the broker has received but not confirmed stay in the queue, so the test waits for the receipts.
     wait_for("the broker's receipts", || fill(&uplink).messages == 0);
     broker.stop();
     for second in 1..=HOUR {
@@ -100,7 +100,7 @@ fn hour_without_broker_and_two_power_cuts_lose_nothing() {
     let mut latest = (0, 0);
     for sample in &samples {
         let now = (sample["sequence"].as_i64().unwrap(), rig::second_of(sample));
-        // Each sample at least once and none skipped: the next one follows, or an earlier one repeats.
+        // Every sample arrives at least once and none is skipped: the next one follows, or an earlier one repeats.
         assert!(now.1 <= latest.1 + 1, "after second {} came {}", latest.1, now.1);
         latest = latest.max(now);
     }
