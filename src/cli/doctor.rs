@@ -151,7 +151,7 @@ fn invalid(faults: &[String]) -> Option<WiringFinding> {
     Some(finding)
 }
 
-/// Adds the configuration's faults and warnings, and the line of every change.
+/// Adds the configuration's faults and warnings, and the position and value of each key to change.
 fn complete(report: &mut WiringReport, survey: &Survey) {
     if let Some(finding) = invalid(&survey.faults) {
         report.add(finding);

@@ -1,4 +1,5 @@
-//! The command line: parsing, dispatch and exit codes. Each command has its own file; `common` holds what commands share.
+//! The command line: parsing, dispatch and exit codes. Each command has its own file; `common` holds what commands
+//! share.
 #![expect(clippy::print_stderr, reason = "this layer writes to the terminal")]
 
 mod alarms;

@@ -1,4 +1,5 @@
-//! `packwatch passport`: writes a battery passport as JSON from a store or a replay, merged with the manufacturer's part.
+//! `packwatch passport`: writes a battery passport as JSON from a store or a replay, merged with the manufacturer's
+//! part.
 
 use std::cell::RefCell;
 use std::fs::File;

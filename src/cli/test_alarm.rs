@@ -1,4 +1,5 @@
-//! `packwatch test-alarm`: asks the running daemon to send a rule's alarm frame as a test, and reports the frames seen on the bus.
+//! `packwatch test-alarm`: asks the running daemon to send a rule's alarm frame as a test, and reports the frames seen
+//! on the bus.
 //!
 //! The command succeeds only if every interface received at least one such frame and all of these frames were intact
 //! and in sequence.

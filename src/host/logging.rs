@@ -27,13 +27,13 @@ use crate::quantity::Timestamp;
 /// Environment variable with the filter, used if `--log` is not given.
 pub const LOG_VARIABLE: &str = "PACKWATCH_LOG";
 
-/// Number of lines that are in no log because they exceeded the limit or journald did not accept them.
+/// Number of lines that were not logged, because they exceeded the limit or journald did not accept them.
 static LEFT_OUT: AtomicU64 = AtomicU64::new(0);
 
 /// Crates of this program that log in addition to `packwatch` itself.
 const MEMBER_CRATES: [&str; 4] = ["packwatch_core", "packwatch_host", "packwatch_lab", "packwatch_uplink"];
 
-/// Counts a line that is in no log.
+/// Counts a line that was not logged.
 fn note_left_out() {
     LEFT_OUT.fetch_add(1, Ordering::Relaxed);
 }

@@ -1,8 +1,8 @@
 //! The replay loop reads records, runs the core, writes results and returns a summary.
 //!
-//! Promise: the same logs and configuration give the same result files, byte for byte. A journal gives the results of
-//! the run that wrote it. Plain logs and CSV get the ticks of [`Ticks`]; journals contain their own. Wall time is used
-//! only for pacing (`speed`) and for reports.
+//! Guarantee: the same logs and configuration give the same result files, byte for byte. The replay of a journal gives
+//! the results of the run that recorded it. Plain logs and CSV get the ticks of [`Ticks`]; journals contain their own.
+//! Wall time is used only for pacing (`speed`) and for reports.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write};
@@ -51,7 +51,7 @@ pub struct ReplaySettings {
     pub from: Option<LogTime>,
     /// Records after this time are skipped.
     pub until: Option<LogTime>,
-    /// Sleep gap, s. If a hole in the log is longer, the recorder was asleep.
+    /// Sleep gap, s. In a longer gap of the log, the recorder counts as asleep.
     pub sleep_gap_s: f64,
     /// Whether to take a snapshot.
     pub snapshot: bool,
@@ -59,7 +59,7 @@ pub struct ReplaySettings {
     pub snapshot_at: Option<LogTime>,
     /// Initial state.
     pub restore: Option<Snapshot>,
-    /// Age of the initial state. `None` = the journal states it, else the stamp of the state.
+    /// Age of the initial state. `None` = from the journal if it states the age, else from the state's stamp.
     pub away: Option<Downtime>,
     /// Store of state and history, in the daemon's format.
     pub store: Option<Recorder>,
@@ -104,7 +104,7 @@ pub enum ReplayError {
     /// A result cannot be written.
     #[error(transparent)]
     Write(#[from] io::Error),
-    /// The snapshot does not fit.
+    /// The snapshot cannot be restored.
     #[error(transparent)]
     Restore(#[from] RestoreError),
     /// State or history cannot be written.
@@ -132,8 +132,8 @@ pub struct ReplayProgress {
 /// Replays `source` through a monitor that has had no input. Returns the summary and, if requested, the snapshot.
 ///
 /// # Errors
-/// Fails if a log cannot be read or a result cannot be written. Also fails if a snapshot does not fit or if the log
-/// ends before the snapshot's time.
+/// Fails if a log cannot be read or a result cannot be written. Also fails if the initial state cannot be restored, or
+/// if the log ends before the snapshot's time.
 pub fn run(
     source: &mut LogSource,
     monitor: Monitor,
@@ -378,7 +378,7 @@ impl Replay {
             store.finish(&self.monitor, end).map_err(ReplayError::Store)?;
         }
         if self.settings.snapshot && self.snapshot.is_none() {
-            // A time within the last record's tick period counts as reached.
+            // A snapshot time equal to the time of the last record counts as reached.
             let reached = self.settings.snapshot_at.is_none() || self.snapshot_at == self.span.latest;
             let end_s = self.span.latest.map_or(f64::NAN, Timestamp::secs);
             if !reached {

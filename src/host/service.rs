@@ -96,7 +96,7 @@ pub enum ServiceError {
         /// The error.
         error: io::Error,
     },
-    /// The snapshot does not fit.
+    /// The snapshot cannot be restored.
     #[error("{0}")]
     Restore(#[from] RestoreError),
     /// Another daemon uses the state folder.

@@ -1,21 +1,22 @@
-//! State and history that survive restarts and power cuts: two state files and a database of the history, in one folder.
+//! State and history that survive restarts and power cuts: two state files and a database of the history, in one
+//! folder.
 //!
 //! * Learned results and alarm changes are written to disk before they are announced. An announcement waits at most 200
 //!   ms for the disk ([`commit_barrier`]). Learned results are stored with the whole state. An alarm change is stored
-//!   as a small row of the history. A start restores the newest state, then repeats the alarm changes that are newer
-//!   (`learned`).
-//! * Rows are committed before the state that contains them (`writer`). If the power is cut between these two writes, the
-//!   rows were not announced. The next start repeats their alarm changes. Learned results are learned again and get a
-//!   second row. A pack change is not undone: the history says that the state's pack is closed, so the state is not
-//!   restored.
+//!   as a small row of the history. A start restores the newest state, then reapplies newer alarm changes (`learned`).
+//! * Rows are committed before the state that contains them (`writer`). If the power is cut between these two writes,
+//!   the rows were not announced. The next start reapplies their alarm changes. Learned results are learned again and
+//!   get a second row. A pack change is not undone: the history says that the state's pack is closed, so the state is
+//!   not restored.
 //! * The state is also written at checkpoints (`checkpoint`), on stop, and every second to the runtime folder, which is
 //!   in memory.
-//! * The state is written to two files in turn (`state_files`) and does not depend on the database. If there is no valid state,
-//!   the capacities and alarms in the history are used (`learned`).
+//! * The state is written to two files in turn (`state_files`) and does not depend on the database. If there is no
+//!   valid state, the capacities and alarms in the history are used (`learned`).
 //! * A damaged database is set aside and a new one is created (`folder`). The next start then uses the state alone.
 //! * On a full disk, a reserve provides space for learned results and alarms (`reserve`).
 //! * The loop never accesses the disk; a separate thread does (`writer`).
-//! * After any fault of disk, folder or file, the daemon keeps running and reports the fault to the core (`store_failed`).
+//! * After any fault of disk, folder or file, the daemon keeps running and reports the fault to the core
+//!   (`store_failed`).
 
 mod backlog;
 mod checkpoint;
@@ -81,8 +82,8 @@ pub fn standard_folder() -> PathBuf {
     if !service.exists() && own.exists() { own } else { service }
 }
 
-/// Default folder of a daemon, and whether systemd created it. A daemon started from a shell keeps its state separate from the
-/// service's: in `$XDG_STATE_HOME/packwatch`, by default `~/.local/state/packwatch`.
+/// Default folder of a daemon, and whether systemd created it. A daemon started from a shell keeps its state separate
+/// from the service's: in `$XDG_STATE_HOME/packwatch`, by default `~/.local/state/packwatch`.
 pub fn daemon_folder() -> (PathBuf, bool) {
     if let Some(folder) = first_folder("STATE_DIRECTORY") {
         return (folder, true);
@@ -222,7 +223,7 @@ impl Store {
         &self.folder
     }
 
-    /// Keeps a stored state that could not be restored until a start that it fits. `why` is recorded in the history.
+    /// Keeps a stored state that could not be restored, until a start can restore it. `why` is recorded in the history.
     pub fn set_state_aside(&self, why: &str, now: Timestamp) {
         tracing::error!(error = why, "stored state {SET_ASIDE}");
         let row = HistoryRow::Own { reason: "state_unfit", detail: format!("{why}; {SET_ASIDE}") };
@@ -309,11 +310,11 @@ struct OpenedFolder {
     state_files: StateFiles,
     /// The open database; `None` = it cannot be used at present.
     database: Option<Database>,
-    /// Rows about the opening, to be added to the history.
+    /// Rows to add to the history about opening the folder.
     rows: Vec<HistoryRow>,
     /// Number of the connected pack; 0 = unknown.
     pack: i64,
-    /// Number of rows of the history that the newest state contains or that the start repeats.
+    /// Number of rows of the history that the newest state contains or that the start reapplies.
     known_rows: i64,
     found: StoredStates,
 }

@@ -1,7 +1,8 @@
 //! Limits how often an action may happen: a burst at once, then once per period.
 //!
 //! The store uses it to limit the rows and commits of a flickering alarm; `logging` uses it to limit log lines. In: the
-//! time of each request. Out: whether it is allowed. If a time is before the previous time, no time counts as passed.
+//! time of each request. Out: whether it is allowed. If a request's time is before the previous one, no tokens are
+//! added.
 
 use crate::quantity::Timestamp;
 

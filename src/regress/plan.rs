@@ -22,7 +22,7 @@ pub(super) enum ParameterRole {
 }
 
 impl ParameterRole {
-    /// The value in standardised units is multiplied by this number to get the value in the caller's units.
+    /// Factor from standardised units to the caller's units.
     pub(super) fn unit(self, scale: &Scale) -> f64 {
         if matches!(self, Self::Signal | Self::Noise) { scale.target_deviation } else { 1.0 }
     }
@@ -169,7 +169,7 @@ impl Covariance {
         &work.values[self.plan.steps.len() - 1][..count]
     }
 
-    /// Adds derivatives to `gradient`: those of `sum of weight * kernel` over a block of pairs, with respect to every
+    /// Adds the derivatives of `sum of weight * kernel` over a block of pairs to `gradient`, with respect to every
     /// parameter except the noise.
     pub(super) fn add_gradient(&self, squares: &[f64], weights: &[f64], work: &mut Work, gradient: &mut [f64]) {
         let count = weights.len();

@@ -30,7 +30,7 @@ const EXP_SERIES: [f64; 14] = [
     1.0,
 ];
 
-/// exp(x) for x <= 0. The result for x < -700 is that for -700.
+/// exp(x) for x <= 0. For x < -700, the result is exp(-700).
 #[inline(always)]
 pub(crate) fn exp(x: f64) -> f64 {
     // The result for -700 is about 1e-304, which is far above the subnormal numbers.
@@ -45,7 +45,7 @@ pub(crate) fn exp(x: f64) -> f64 {
     series * f64::from_bits(rounded.to_bits().wrapping_add(1023) << 52)
 }
 
-/// ln(x) for x >= 1 that is finite.
+/// ln(x) for finite x >= 1.
 #[inline(always)]
 pub(crate) fn ln(x: f64) -> f64 {
     const MANTISSA: u64 = (1 << 52) - 1;

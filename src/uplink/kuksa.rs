@@ -2,7 +2,7 @@
 //!
 //! Input: settings, and status documents of the daemon. Output: values in the databroker, one batch a second. After a
 //! lost connection, the program reconnects. The pauses between attempts grow from [`FIRST_PAUSE`] to [`LONGEST_PAUSE`].
-//! Documents that arrive without a connection are dropped, never queued. `SIGTERM` withdraws the values.
+//! Documents that arrive while there is no connection are dropped, never queued. `SIGTERM` withdraws the values.
 //!
 //! | module | what lives there |
 //! | --- | --- |
@@ -81,7 +81,7 @@ async fn serve(settings: &Settings) -> std::io::Result<()> {
     Ok(())
 }
 
-/// Watches for `SIGTERM` and `SIGINT`; the value becomes true with the first.
+/// Watches for `SIGTERM` and `SIGINT`; the value becomes true with the first signal.
 fn stop_requests() -> std::io::Result<watch::Receiver<bool>> {
     let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
     let (sender, receiver) = watch::channel(false);

@@ -1,4 +1,5 @@
-//! Sends the daemon's status to other software in and outside the vehicle: MQTT brokers (`mqtt`) and KUKSA databrokers (`kuksa`).
+//! Sends the daemon's status to other software in and outside the vehicle: MQTT brokers (`mqtt`) and KUKSA databrokers
+//! (`kuksa`).
 //!
 //! This crate is a separate program, which reads the daemon's status stream like the exporter. A slow, missing or
 //! hostile broker can therefore not delay the estimates, and the program in the vehicle needs no network library.

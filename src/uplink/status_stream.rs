@@ -26,7 +26,8 @@ pub const RETRY: Duration = Duration::from_secs(1);
 /// The newest document, as a watched value; `None` = the daemon is silent.
 pub type Documents = watch::Receiver<Option<Box<StatusDocument>>>;
 
-/// Reads the stream next to the status socket `socket` in a task of the current runtime, until the last receiver is dropped.
+/// Reads the stream next to the status socket `socket` in a task of the current runtime, until the last receiver is
+/// dropped.
 pub fn follow(socket: &Path) -> Documents {
     let (sender, receiver) = watch::channel(None);
     let path = stream_path(socket);

@@ -2,8 +2,8 @@
 //! have.
 //!
 //! Input: the settings' branch. Output: `packwatch.vspec`, which vss-tools merge into VSS (`vspec export json -l`), and
-//! `packwatch.json`, which a databroker reads in addition to VSS's own file (`--vss vss.json,packwatch.json`). `--reference` prints
-//! every signal as Markdown, for the manual.
+//! `packwatch.json`, which a databroker reads in addition to VSS's own file (`--vss vss.json,packwatch.json`).
+//! `--reference` prints every signal as Markdown, for the manual.
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;

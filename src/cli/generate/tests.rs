@@ -39,7 +39,7 @@ fn page_shows_usage_and_names_other_pages() {
     assert!(run.contains("\\fBpackwatch run\\fR") && run.contains("\\-\\-config"), "{run}");
     let whole = text("packwatch.1");
     assert!(whole.contains("packwatch\\-alarms(1)") && !whole.contains("generate"), "{whole}");
-    // In the order of man-pages(7); a page does not refer to itself.
+    // The sections have the order of man-pages(7), and a page does not refer to itself.
     let files = whole.find(".SH FILES").unwrap_or(usize::MAX);
     assert!(whole.find(".SH SEE ALSO").is_some_and(|at| at > files) && !whole.contains(".BR packwatch (1)"), "{whole}");
     assert!(run.contains(".BR packwatch (1)"), "{run}");

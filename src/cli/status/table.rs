@@ -13,7 +13,7 @@ use crate::status::document::{Intruder, IntruderKind, StatusDocument};
 
 /// Maximum number of cells that are listed without `--cells`. With this number, the table fits a screen.
 const MAX_LISTED: usize = 16;
-/// A cell is an outlier if its distance from the median is at least this many times the median distance.
+/// A cell is an outlier if its distance from the median is more than this many times the median distance.
 const OUTLYING: f64 = 3.0;
 /// Maximum number of outliers that are listed.
 const MAX_OUTLIERS: usize = 8;
@@ -229,9 +229,9 @@ fn row(cell: &CellView) -> Vec<String> {
     ]
 }
 
-/// A quantity that is compared between cells: name, quantity, decimals, and two smallest distances from the median at
-/// which a cell can be an outlier. The first distance is in the quantity's unit, the second is relative to the median.
-/// They cover the differences of sensors and of equal cells.
+/// A quantity that is compared between cells: name, quantity, decimals, and two limits for an outlier's distance from
+/// the median. The distance must exceed both: the first in the quantity's unit, the second relative to the median. They
+/// cover sensor errors and the spread of equal cells.
 type Comparison = (&'static str, Quantity, usize, f64, f64);
 
 const COMPARISONS: [Comparison; 5] = [
@@ -273,7 +273,7 @@ fn outliers(cells: &[CellView]) -> Vec<&CellView> {
         let Some(&median) = known.get(known.len() / 2) else { continue };
         let mut distances: Vec<f64> = known.iter().map(|value| (value - median).abs()).collect();
         distances.sort_by(f64::total_cmp);
-        // Relative to the median distance; cells within the floor do not count.
+        // With this divisor, the distance of an outlier exceeds both the floor and `OUTLYING` median distances.
         let floor = floor.max(relative_floor * median.abs());
         let typical = distances[distances.len() / 2].max(floor / OUTLYING);
         for (rank, cell) in &mut ranked {

@@ -377,7 +377,8 @@ fn reference_page_matches_committed_file() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(2000))]
 
-    /// After random deletions and insertions, the result is a configuration or a non-empty list of faults, never a panic.
+    /// After random deletions and insertions, the result is a configuration or a non-empty list of faults, never a
+    /// panic.
     #[test]
     fn any_corrupted_file_gives_faults_or_configuration(
         edits in prop::collection::vec((0..3_usize, any::<prop::sample::Index>(), 0..24_usize, any::<prop::sample::Index>()), 1..6),

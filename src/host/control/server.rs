@@ -57,7 +57,7 @@ impl ControlServer {
         requests: mpsc::Sender<PendingRequest>,
         max_silence: Duration,
     ) -> std::io::Result<Self> {
-        // The kernel reports the daemon's own user in the same way as the user of a client.
+        // The daemon's own user, as the kernel would report it for a client.
         let own_uid = UnixStream::pair()?.0.peer_cred()?.uid();
         tracing::info!(path = %bound.file.path.display(), "control socket open");
         let mut tasks = JoinSet::new();

@@ -1,7 +1,8 @@
 //! Tests the alarm of a rule from outside: asks the daemon to send the alarm, and listens for its frames on the bus.
 //!
-//! In: the daemon's configuration, a rule, a duration. Out: a [`ChannelReport`] per interface. Frames are received on a separate
-//! socket with the kernel's stamps. Alarm frames without the test marker are genuine alarms and are counted separately.
+//! In: the daemon's configuration, a rule, a duration. Out: a [`ChannelReport`] per interface. Frames are received on a
+//! separate socket with the kernel's stamps. Alarm frames without the test marker are genuine alarms and are counted
+//! separately.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -150,7 +151,7 @@ impl ObservedFrames {
     }
 }
 
-/// Runs the test. `SIGINT` and `SIGTERM` end the test early; the daemon then also stops sending it.
+/// Runs the test. `SIGINT` and `SIGTERM` end the test early; the daemon then also stops sending the alarm.
 ///
 /// # Errors
 /// Fails if no alarm frame is configured, an interface cannot be opened, or the daemon refuses.

@@ -14,7 +14,8 @@
 //!   queueing can only increase this value. Old values are forgotten, so that the offset follows the drift of the
 //!   adapter's quartz.
 //!
-//! Times of one interface never go backwards. All functions except the clock readings are pure: tests pass their own clock.
+//! Times of one interface never go backwards. All functions except the clock readings are pure: tests pass their own
+//! clock.
 
 use std::time::Duration;
 
@@ -167,7 +168,7 @@ impl StampMapper {
         self.never_back(Timestamp::from_nanos(self.clock.origin_ns + arrived_ns))
     }
 
-    /// Time of an interface event noticed at `reading`, in order with its frames.
+    /// Time of an interface event noticed at `reading`; never before an earlier result.
     pub fn event(&mut self, reading: Reading) -> Timestamp {
         self.never_back(self.clock.at(reading))
     }
@@ -188,8 +189,8 @@ impl StampMapper {
 
     /// Whether a frame that was read at `reading` can have arrived at `arrived_ns`.
     fn possible(&self, arrived_ns: i64, reading: Reading) -> bool {
-        // Stamps may be older than the time when the socket was last found empty, by this tolerance, ns. The reason is
-        // the delay between stamping and queueing: a soft interrupt and, with USB adapters, a batch.
+        // Tolerance: a frame is stamped up to 20 ms before it is queued, because of a soft interrupt and, with USB
+        // adapters, batching.
         (self.emptied_ns - 20_000_000..=reading.boottime_ns).contains(&arrived_ns)
     }
 }
@@ -220,7 +221,7 @@ impl HardwareClock {
         stamp_ns.saturating_add(current.min(previous))
     }
 
-    /// Starts again after a jump of the adapter's clock (it was reset, or slept).
+    /// Starts again after a jump of the adapter's clock (the adapter was reset or suspended).
     fn restart(&mut self, stamp_ns: i64, arrived_ns: i64) -> i64 {
         let offset = arrived_ns.saturating_sub(stamp_ns);
         *self = Self { least_ns: Some((offset, offset)), window_start_ns: arrived_ns };

@@ -269,7 +269,8 @@ fn numbered(pattern: &str, index: u16) -> String {
     pattern.replace("{n}", &(u32::from(index) + 1).to_string())
 }
 
-/// Reads the start of each section: the column named like the section column, and `start` (ISO 8601 or seconds).
+/// Reads the start of each section from a table with two columns: the section column, and `start` (ISO 8601 or
+/// seconds).
 fn read_starts(path: &Path, section: &str) -> Result<HashMap<Vec<u8>, Timestamp>, TableError> {
     let mut table = Table::open(path)?;
     let [section, start] = [table.header().required(&[section])?, table.header().required(&["start"])?];

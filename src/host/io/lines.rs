@@ -29,7 +29,8 @@ pub enum RawLine<'a> {
     TooLong,
 }
 
-/// Opens a log. `-` is standard input; gzip and zstd are decompressed. `read_bytes` counts the bytes read from the file.
+/// Opens a log. `-` is standard input; gzip and zstd are decompressed. `read_bytes` counts the bytes read from the
+/// file.
 ///
 /// # Errors
 /// Fails if the file cannot be opened or its first bytes cannot be read.

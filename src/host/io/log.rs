@@ -2,9 +2,9 @@
 //! zstd.
 //!
 //! The first line decides the format; for CSV, the file name decides too. Several logs are read one after another on
-//! one clock. A log, or a CSV section without a start time, may begin before the latest record that was already read.
-//! The log or section is then moved so that it begins one second after this record, and an unknown gap precedes it.
-//! [`LogCounts`] counts everything that does not become a record.
+//! one clock. If a log, or a CSV section without a start time, begins before the latest record read so far, it is moved
+//! to one second after this record, and an unknown gap precedes it. [`LogCounts`] counts everything that does not
+//! become a record.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
@@ -72,7 +72,7 @@ pub struct LogCounts {
     pub foreign: BTreeMap<String, u64>,
     /// Records whose stamp is before the stamp of the preceding record.
     pub time_backwards: u64,
-    /// Number of parts that follow an unknown gap.
+    /// Number of files and CSV sections that follow a gap of unknown length.
     pub unknown_gaps: u64,
     /// CSV values that no input frame can carry (out of the signal's range, or no such signal).
     pub uncarried_values: u64,
@@ -281,8 +281,8 @@ fn named_csv(path: &Path) -> bool {
 }
 
 impl ReadState {
-    /// Fills slots with the next frames of a text log, as far as their whole lines are already in the buffer. The first
-    /// record of the file is excluded. Returns the number of frames.
+    /// Fills slots with the next frames of a text log whose complete lines are already in the buffer. The first record
+    /// of the file is excluded. Returns the number of frames.
     fn next_frames(&mut self, lines: &mut Lines, slots: &mut [Record]) -> usize {
         let Some(mut latest) = self.latest.filter(|_| !self.fresh) else { return 0 };
         let all = lines.unread();
@@ -458,7 +458,7 @@ impl ReadState {
             self.shift_ns = 0;
             gap = std::mem::take(&mut self.unknown);
             if let Some(latest) = self.latest.filter(|&latest| raw < latest) {
-                // A part after an unknown gap starts 1 s after the latest record.
+                // A file or section that goes back in time is moved to start 1 s after the latest record.
                 self.shift_ns = latest.plus_nanos(1_000_000_000).nanos().saturating_sub(raw.nanos());
                 (gap, self.has_moved_stamps) = (true, true);
             }

@@ -33,7 +33,6 @@ impl ResultFile {
             let part = with_suffix(path, ".part");
             (File::create(&part).map_err(|e| named(path, e))?, Some(part))
         };
-        // 256 KiB are the size of the buffer.
         Ok(Self { path: path.to_owned(), part, out: BufWriter::with_capacity(256 * 1024, file) })
     }
 

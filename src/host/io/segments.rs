@@ -17,7 +17,7 @@ use zstd::stream::write::Encoder;
 use super::place::with_suffix;
 
 /// Smallest and largest size of a segment, bytes. Smaller segments would be mostly headers; the deletion of a larger
-/// segment would lose days.
+/// segment would lose days of recording.
 pub const SEGMENT_BYTES: std::ops::RangeInclusive<u64> = 64 << 10..=4 << 30;
 /// Default size of a segment, bytes; a pack of 96 cells fills it in six hours.
 pub const DEFAULT_SEGMENT_BYTES: u64 = 64 << 20;
@@ -180,7 +180,8 @@ pub(super) struct SegmentWriter {
 }
 
 impl SegmentWriter {
-    /// Renames the segments of an earlier run and starts the first segment. The text itself contains the first `header`.
+    /// Renames the segments of an earlier run and starts the first segment. The text itself contains the first
+    /// `header`.
     ///
     /// # Errors
     /// Fails if a file cannot be renamed, deleted or created.
@@ -239,7 +240,8 @@ fn begin(path: &Path) -> io::Result<Encoder<'static, CountedFile>> {
     Encoder::new(CountedFile { file: File::create(path)?, bytes: 0 }, 1)
 }
 
-/// Renames the segments of the last run to `base.1` after deleting that name's old segments. Returns them with their sizes.
+/// Renames the segments of the last run to `base.1` after deleting that name's old segments. Returns them with their
+/// sizes.
 fn keep_earlier(base: &Path) -> io::Result<VecDeque<(PathBuf, u64)>> {
     let earlier = with_suffix(base, ".1");
     for segment in find(&earlier)? {

@@ -26,7 +26,7 @@ pub struct Ticks {
     limit_ns: i64,
     /// Latest record; `None` before the first and after [`Ticks::sleep`].
     latest_ns: Option<i64>,
-    /// Time of the first tick after a hole in the log, which follows the ticks before the hole.
+    /// Time of the first tick after a sleep gap. It is popped after the ticks before the gap.
     wake_ns: Option<i64>,
 }
 
@@ -46,7 +46,7 @@ impl Ticks {
 
     /// Announces a record at `time`. The caller then calls [`pop`](Self::pop) until `None`, and processes the record.
     /// Returns whether the recorder was asleep before this record, that is, whether it is the first record or follows a
-    /// hole. A record slightly older than the latest record (interfaces merged out of order) causes no tick.
+    /// sleep gap. A record slightly older than the latest record (interfaces merged out of order) causes no tick.
     #[inline]
     pub fn advance(&mut self, time: Timestamp) -> bool {
         let time_ns = time.nanos();

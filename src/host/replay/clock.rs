@@ -58,7 +58,7 @@ pub(super) struct RecordSpan {
     sleep_gap_ns: i64,
     pub(super) first: Option<Timestamp>,
     pub(super) latest: Option<Timestamp>,
-    /// Covered time without holes. Nanoseconds keep the sum of millions of steps exact.
+    /// Covered time without gaps longer than the sleep gap. Nanoseconds keep the sum of millions of steps exact.
     awake_ns: i64,
     pub(super) started: Instant,
 }
@@ -74,7 +74,7 @@ impl RecordSpan {
         }
     }
 
-    /// Adds a record. Returns whether the record follows a hole.
+    /// Adds a record. Returns whether the record follows a gap longer than the sleep gap.
     pub(super) fn advance(&mut self, time: Timestamp) -> bool {
         self.first.get_or_insert(time);
         let latest = *self.latest.get_or_insert(time);
@@ -108,7 +108,7 @@ impl Pace {
         Self { speed, anchor: None }
     }
 
-    /// Restarts the pace at the next record, so that the replay skips holes and unknown gaps.
+    /// Restarts the pace at the next record, so that the replay does not wait through sleep gaps and unknown gaps.
     pub(super) fn rebase(&mut self) {
         self.anchor = None;
     }

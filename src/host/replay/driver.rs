@@ -2,7 +2,7 @@
 //! them.
 //!
 //! In: rows or frames, with their times. Rows are in A (positive = discharge), V and degrees C. Out: the monitor's
-//! [`Outputs`], which the caller clears. Promise: `packwatch replay` with a log of the same inputs gives the same
+//! [`Outputs`], which the caller clears. Guarantee: `packwatch replay` with a log of the same inputs gives the same
 //! outputs.
 
 use super::reading::RowFrames;

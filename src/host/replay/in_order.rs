@@ -1,6 +1,6 @@
 //! Processes many items on several threads and returns the results in the order of the items.
 //!
-//! Promise: the memory for waiting results depends on the number of threads, not on the number of items. No thread
+//! Guarantee: the memory for waiting results depends on the number of threads, not on the number of items. No thread
 //! starts an item far beyond the first item that is not finished.
 
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};

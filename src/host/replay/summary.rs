@@ -30,7 +30,7 @@ pub struct ReplaySummary {
     pub estimates: u64,
     /// Frames that would be sent.
     pub frames_out: u64,
-    /// Number of bad readings of signals that became good again.
+    /// Number of bad readings, counted when their signal becomes good again.
     pub bad_readings: u64,
     /// Protected input messages.
     pub protected: Vec<ProtectedSummary>,
@@ -52,7 +52,7 @@ pub struct ReplaySummary {
     pub first_s: Option<f64>,
     /// Last stamp, s.
     pub last_s: Option<f64>,
-    /// Covered time without holes longer than the sleep gap, s.
+    /// Covered time without gaps longer than the sleep gap, s.
     pub awake_s: f64,
     /// Wall time, s.
     pub wall_s: f64,

@@ -33,7 +33,7 @@ use crate::store::{HISTORY_SOURCE, STATE_SOURCE, StateCandidate, Store, StorePro
 pub(super) struct Engine {
     pub(super) monitor: Monitor,
     pub(super) outputs: Outputs,
-    /// Outputs of the interfaces for the core's frames; empty before the start and after the stop.
+    /// Sending ends of the interfaces; empty before the start and after the stop.
     pub(super) links: Vec<LinkOutput>,
     /// Key of authenticated frames.
     key: Option<CanKey>,
@@ -161,8 +161,8 @@ impl Engine {
         Ok(changed)
     }
 
-    /// Sends the core's frames to the interfaces and its events to the log, and writes both to their files. Returns the ticket
-    /// of their commit.
+    /// Sends the core's frames to the interfaces and its events to the log, and writes both to their files. Returns the
+    /// ticket of their commit.
     fn dispatch_outputs(&mut self, time: Timestamp) -> Option<u64> {
         let ticket = self.commit_learned(time);
         for transmit in &self.outputs.frames {

@@ -86,7 +86,7 @@ impl ServiceLoop {
                 }
                 // At most one request per connection waits.
                 Some(request) = self.requests.recv() => self.answer(request).await,
-                // At most one file a second is read.
+                // At most one configuration a second is read.
                 step = self.reload.next() => self.handle_reload(step).await,
                 received = self.inbox.recv_many(&mut self.batch, BATCH) => {
                     if received > 0 { self.handle_batch() }
@@ -264,7 +264,7 @@ async fn next_progress(stored: &mut Option<watch::Receiver<StoreProgress>>) -> S
     StoreProgress { works: false, failures: last.failures + 1, ..last }
 }
 
-/// Waits for a fit. Returns `None` if the fit failed; the core then runs it itself.
+/// Waits for a fit. Returns `None` if the fit failed; the core then runs the fit itself.
 async fn next_model_fit(fit: &mut Option<JoinHandle<(FitTask, FitFindings)>>) -> Option<(FitTask, FitFindings)> {
     let Some(running) = fit else { return std::future::pending().await };
     let found = running.await.ok();

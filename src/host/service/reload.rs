@@ -54,7 +54,7 @@ pub(super) struct Reload {
     path: PathBuf,
     fixed: Arc<FixedSettings>,
     reading: Option<LoadTask>,
-    /// Whether a signal has not yet led to a reading.
+    /// Whether a signal still waits for its reading.
     is_requested: bool,
     /// Earliest start of the next reading.
     not_before: Instant,

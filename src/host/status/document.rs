@@ -1,11 +1,11 @@
 //! The status document that the status sockets send as JSON. This file is its reference.
 //!
-//! * Version 1. New keys may be added within a version, so readers must ignore unknown keys. Removing a key or changing its
-//!   meaning requires a new version.
+//! * Version 1. New keys may be added within a version, so readers must ignore unknown keys. Removing a key or changing
+//!   its meaning requires a new version.
 //! * An unknown value is `null`, never 0 or 100 %.
-//! * Units are in the names: `_v`, `_a` (positive = discharge), `_c` (degrees C), `_ah`, `_s`. SOC and SOH are fractions.
-//!   `_std` is a standard deviation. Cells count from 0, as in events. Times are ns since 1970 on the daemon's clock, which
-//!   never steps; `wall_time` is the computer's clock.
+//! * Units are in the names: `_v`, `_a` (positive = discharge), `_c` (degrees C), `_ah`, `_s`. SOC and SOH are
+//!   fractions. `_std` is a standard deviation. Cells count from 0, as in events. Times are ns since 1970 on the
+//!   daemon's clock, which never steps; `wall_time` is the computer's clock.
 
 use std::path::Path;
 
@@ -91,17 +91,20 @@ pub struct StatusDocument {
     pub latency: Latency,
     /// The store of state and history; `None` = disabled.
     pub store: Option<StoreStatus>,
-    /// The latest events except half-cycles of cells, oldest first, in the format of `--events`.
+    /// The latest events, oldest first, in the format of `--events`; without events that occur once per cell and
+    /// half-cycle.
     pub events: Vec<serde_json::Value>,
 }
 
 impl StatusDocument {
-    /// The first cell with the lowest value, and this value. `None` if the value of any cell is unknown.
+    /// The cell with the lowest value (the first, if there are several), and this value. `None` if the value of any
+    /// cell is unknown.
     pub fn least(&self, quantity: Quantity) -> Option<(CellIndex, f64)> {
         self.extreme(quantity, |candidate, best| candidate < best)
     }
 
-    /// The first cell with the highest value, and this value. `None` if the value of any cell is unknown.
+    /// The cell with the highest value (the first, if there are several), and this value. `None` if the value of any
+    /// cell is unknown.
     pub fn greatest(&self, quantity: Quantity) -> Option<(CellIndex, f64)> {
         self.extreme(quantity, |candidate, best| candidate > best)
     }

@@ -9,8 +9,8 @@ use std::collections::VecDeque;
 use super::rows::{HistoryRow, RowBatch};
 use super::stamp::Stamp;
 
-/// Maximum number of rows that wait for the disk. They take half a megabyte of memory. For a pack of 96 cells they are
-/// about 25 transitions, which are days of driving.
+/// Maximum number of rows that wait for the disk. They take half a megabyte of memory. For a pack of 96 cells they
+/// cover about 25 half-cycles of each cell, which are days of driving.
 pub(super) const MAX_ROWS: usize = 5_000;
 
 /// Waiting rows, oldest first.
@@ -59,7 +59,8 @@ impl Backlog {
         self.lost.rows -= rows;
     }
 
-    /// Puts rows that could not be written back at the front. The next rows report the losses again.
+    /// Takes rows back that could not be written; they become the oldest rows again. The next rows report the losses
+    /// again.
     pub(super) fn put_back(&mut self, batches: Vec<RowBatch>) {
         self.reported = LossCount::default();
         let is_loss = |row: &HistoryRow| matches!(row, HistoryRow::Own { reason: "rows_lost", .. });

@@ -1,4 +1,5 @@
-//! Decides when the next checkpoint of the state is due. A checkpoint writes the whole state, and flash memory wears out.
+//! Decides when the next checkpoint of the state is due. A checkpoint writes the whole state, and flash memory wears
+//! out.
 //!
 //! In: the bytes and the time of each commit. Alarm changes and learned results are written at once. The bytes that
 //! they write delay the next checkpoint. A pack of 96 cells (state of 70 kB) gets a checkpoint every 7 minutes, a pack
@@ -6,8 +7,8 @@
 
 use crate::quantity::Timestamp;
 
-/// Bytes written per day before checkpoints are delayed. In total 20 MB may be written per day; bursts of alarms take the
-/// rest.
+/// Bytes written per day before checkpoints are delayed. In total 20 MB may be written per day; bursts of alarms take
+/// the rest.
 const BYTES_PER_DAY: f64 = 15e6;
 /// Bytes that a commit without a state writes. SQLite writes three of its pages, first to its log and later to its
 /// file. Each write is rounded up to whole pages of the system.

@@ -85,8 +85,8 @@ impl From<rusqlite::Error> for OpenError {
     }
 }
 
-/// Whether an error means that the file's contents are wrong. This holds for every error that the disk or another
-/// process does not cause. If damage were not recognised, the store would never be written again.
+/// Whether an error means that the file's contents are wrong. True for every error not caused by the disk or another
+/// process. If damage were not recognised, the store would never be written again.
 pub(super) fn is_damage(error: &rusqlite::Error) -> bool {
     match error {
         rusqlite::Error::SqliteFailure(failure, _) => !matches!(
@@ -122,7 +122,7 @@ pub(super) struct Database {
     pack: i64,
 }
 
-/// Limits of the history, beyond which the oldest segments are deleted.
+/// Limits of the history. If one is exceeded, the oldest segments are deleted.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct RowLimits {
     /// Maximum number of rows kept.
@@ -234,7 +234,7 @@ impl Database {
         learned::read(&self.connection, self.pack)
     }
 
-    /// Closes the history of the pack with the last capacity of its weakest cell, and opens the history of the next
+    /// Closes the history of the pack, noting the last capacity of its weakest cell, and opens the history of the next
     /// pack. Returns the number of the new pack.
     pub(super) fn replace_pack(&mut self, now: &Stamp) -> rusqlite::Result<i64> {
         let learned = self
@@ -301,7 +301,8 @@ fn prepare(connection: &Connection) -> rusqlite::Result<()> {
     connection.pragma_update(None, "cache_size", -256)?;
     connection.pragma_update(None, "temp_store", "MEMORY")?;
     connection.pragma_update(None, "cell_size_check", true)?;
-    // SQLite copies a log of half a megabyte (about fifty commits) into the main file, and truncates a log of more than 1 MiB.
+    // SQLite copies a log of half a megabyte (about fifty commits) into the main file, and truncates a log of more than
+    // 1 MiB.
     connection.query_row("PRAGMA journal_size_limit = 1048576", [], |_| Ok(()))?;
     connection.query_row("PRAGMA wal_autocheckpoint = 512", [], |_| Ok(()))
 }

@@ -17,8 +17,8 @@ use crate::io::place::with_suffix;
 pub(super) const DATABASE: &str = "packwatch.db";
 /// Name of the file that a daemon keeps locked.
 const LOCK: &str = "packwatch.lock";
-/// Suffixes of SQLite's files of a database. The log is moved first, because SQLite would use it with the next
-/// database.
+/// Suffixes of SQLite's files of a database. The write-ahead log is moved first, because SQLite would otherwise apply
+/// it to the next database.
 const FILES: [&str; 3] = ["-wal", "-shm", ""];
 /// Maximum number of damaged databases that are kept, so that a disk that damages every file does not fill up with
 /// them.
@@ -79,7 +79,7 @@ impl Folder {
     }
 
     /// Opens the database for the pack that the stored state knows. If the database is damaged, opens an empty one
-    /// instead. Also returns rows about the opening, for the history.
+    /// instead. Also returns the history rows that report this.
     pub(super) fn open(&mut self, now: &Stamp, pack: i64) -> Result<(Database, Vec<HistoryRow>), OpenError> {
         self.lock().map_err(|error| OpenError::Unavailable(format!("{}: {error}", self.path.display())))?;
         let path = self.path.join(DATABASE);

@@ -76,7 +76,7 @@ impl HistoryFilter {
         let mut rows = self.for_checkpoint(now);
         let mut writes_capacity = false;
         for (_, kind) in stored().filter(|(urgency, _)| *urgency > Urgency::Deferred) {
-            // Loss modes follow from the capacity, whose event precedes them.
+            // Loss modes are derived from the capacity, whose event precedes them, and are written only with it.
             let is_worth_writing = match kind {
                 EventKind::LossModes { .. } => writes_capacity,
                 _ => self.is_worth_writing(&kind, now),
@@ -105,7 +105,7 @@ impl HistoryFilter {
         if may_go { std::mem::take(&mut self.deferred) } else { Vec::new() }
     }
 
-    /// Defers a row. Only the first and the last deferred row of each cell's filter are kept.
+    /// Defers a row. Of equal deferred rows, only the first and the last are kept.
     fn defer(&mut self, kind: EventKind) {
         let row = HistoryRow::Event(kind);
         let same: Vec<usize> = (0..self.deferred.len()).filter(|&at| self.deferred[at] == row).collect();
@@ -129,8 +129,8 @@ impl HistoryFilter {
         is_worth_writing
     }
 
-    /// Whether to write an event. A capacity is not written if it has no measurement and the same usable part. If the
-    /// allowance is used up, it is not written if it has hardly changed.
+    /// Whether to write an event. A capacity without a measurement is written only if the usable capacity has changed.
+    /// If the allowance is used up, a capacity is written only if it has changed by [`MIN_CHANGE_STD`].
     fn is_worth_writing(&mut self, kind: &EventKind, now: Timestamp) -> bool {
         if matches!(kind, EventKind::PackReplaced { .. }) {
             self.written_life.cycles = None;
@@ -174,9 +174,10 @@ enum Urgency {
     /// The event is stored with the next commit. Filter resets are deferred, because they may be frequent and are not
     /// announced.
     Deferred,
-    /// The event is stored as a row before it is announced. A start can repeat it from the row.
+    /// The event is stored as a row before it is announced. A start can reapply it from the row.
     AsRow,
-    /// The event is stored with the whole state before it is announced. Its row alone is not enough to restore it.
+    /// The event is stored with the whole state before it is announced. The row alone is not enough to restore the
+    /// result.
     WithState,
 }
 

@@ -77,7 +77,7 @@ pub struct HistoryExtent {
     pub half_cycles: i64,
     /// Half-cycles of all packs that the store has deleted because of its limits on rows and age.
     pub deleted_half_cycles: i64,
-    /// Half-cycles of all packs ever written, as counted by the store.
+    /// Half-cycles that the store has ever written, for all packs.
     pub written_half_cycles: i64,
 }
 
@@ -243,8 +243,8 @@ fn json(value: Value) -> serde_json::Value {
     }
 }
 
-/// Opens the database for reading, next to a daemon that writes. On a read-only disk, SQLite cannot create its index of
-/// the log, so a copy is opened.
+/// Opens the database for reading while a daemon may write to it. On a read-only disk, SQLite cannot create its index
+/// of the write-ahead log, so a copy is opened.
 fn open_read_only(path: &Path, max_copy_bytes: u64) -> Result<(Connection, Option<TemporaryCopy>), String> {
     let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
     let open = |path: &Path, flags: OpenFlags| -> rusqlite::Result<Connection> {

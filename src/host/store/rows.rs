@@ -46,7 +46,7 @@ pub enum HistoryTable {
     Capacity,
     /// Loss modes of the cells.
     LossModes,
-    /// Remaining lives. Each is that of the cell that reaches its end of life first.
+    /// Remaining lives, each of the cell that reaches its end of life first.
     RemainingLife,
     /// Changes of the cell model learned on board.
     Model,
@@ -134,7 +134,7 @@ impl HistoryRow {
             }
             Self::Event(kind) => kind,
         };
-        // These values differ from the event's field with the name of the column.
+        // Values of the columns that do not contain the event's field of the same name.
         let (table, own) = match kind {
             EventKind::HalfCycle { .. } => (HistoryTable::HalfCycle, vec![]),
             EventKind::Capacity { .. } => (HistoryTable::Capacity, vec![]),

@@ -4,7 +4,7 @@
 //! | file | contents |
 //! | --- | --- |
 //! | `state-a.json.zst`, `state-b.json.zst` | the latest state and the one before it |
-//! | `state-aside.json.zst` | a state that could not be restored, kept until a start that it fits |
+//! | `state-aside.json.zst` | a state that could not be restored, kept until a start can restore it |
 //!
 //! A file is one zstd frame of JSON and a skippable frame with its SHA-256. Therefore `zstdcat` prints the JSON, and
 //! every flipped bit is detected. The file is written to a temporary name, synced and renamed, and the folder is
@@ -51,7 +51,7 @@ pub(super) struct StateDocument {
     pub format: u32,
     /// Number of the state, counting all written states.
     pub number: i64,
-    /// The state folder of the state, because two daemons may share a runtime folder.
+    /// The state folder that the state belongs to. It is stored because two daemons may share a runtime folder.
     pub folder: String,
     /// Number of the pack that was connected; 0 = unknown.
     pub pack: i64,
@@ -159,7 +159,7 @@ fn rounded(value: f64) -> f64 {
     text.parse().unwrap_or(value)
 }
 
-/// The state files of a folder, and where the next write continues.
+/// The state files of a folder, and which of them is written next.
 #[derive(Debug)]
 pub(super) struct StateFiles {
     folder: PathBuf,
@@ -210,7 +210,7 @@ impl StateFiles {
         (files, found)
     }
 
-    /// Makes the next write set the newest state aside. It is kept until a start that it fits.
+    /// Makes the next write set the newest state aside. It is kept until a start can restore it.
     pub(super) fn set_aside(&mut self) {
         self.aside = Some(1 - self.next);
     }

@@ -348,7 +348,8 @@ fn unfit_state_waits_for_matching_start() {
     finish(store, 3.0);
     let (store, found) = open();
     assert_eq!(states(&found), [(STATE_SOURCE, 3.0), (ASIDE, 1.0)]);
-    // The pack matches the state that was set aside first, so that state becomes current and the other one is set aside.
+    // The pack matches the state that was set aside first, so that state becomes current and the other one is set
+    // aside.
     store.set_state_aside("snapshot is of 5 cells", Timestamp::from_secs(4.0));
     finish(store, 4.0);
     let (store, found) = open();

@@ -1,13 +1,13 @@
 //! The thread that writes to the disk, and the queue that it shares with the service loop.
 //!
-//! The loop queues rows and the latest state. The thread takes all queued work, commits the rows, and writes the state if
-//! it is due. Then it reports the last ticket that is completely on disk. It retries a failing disk after increasing pauses.
-//! During a pause, every ticket is answered at once as failed. A failing database does not prevent the state from being
-//! written.
+//! The loop queues rows and the latest state. The thread takes all queued work, commits the rows, and writes the state
+//! if it is due. Then it reports the last ticket that is completely on disk. It retries a failing disk after increasing
+//! pauses. During a pause, every ticket is answered at once as failed. A failing database does not prevent the state
+//! from being written.
 //!
-//! A start repeats the alarm changes in the rows that are newer than the stored state. This requires that the rows
-//! continue the state in the same database. The first rows after a start, after a failure and in a new database are
-//! therefore written together with a state.
+//! A start reapplies the alarm changes of rows that are newer than the stored state. Therefore the rows in the database
+//! must directly follow the stored state. To ensure this, the first rows after a start, after a failure and in a new
+//! database are written together with a state.
 
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -27,7 +27,7 @@ use crate::quantity::Timestamp;
 
 /// First pause after a failure; each further pause doubles.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
-/// Longest pause. When the disk works again, this is detected within this time.
+/// Longest pause. If the disk works again, the writer detects it within this time.
 const LAST_PAUSE: Duration = Duration::from_secs(15);
 
 /// Progress of the writer.
@@ -66,7 +66,7 @@ struct QueueState {
     state: Option<StateDocument>,
     /// Whether the state must be written.
     is_state_due: bool,
-    /// Whether the next state must not overwrite the stored state, which is set aside first.
+    /// Whether the stored state must be set aside before the next state is written.
     sets_aside: bool,
     ticket: u64,
     /// Whether the writer has work.
@@ -114,7 +114,7 @@ impl WriteQueue {
         self.lock().sets_aside = true;
     }
 
-    /// Ends the writer after the work that is already queued.
+    /// Ends the writer after it has done the work that is already queued.
     pub(super) fn stop(&self) {
         let mut queue = self.lock();
         (queue.stop, queue.wanted) = (true, true);
@@ -208,8 +208,8 @@ impl Writer {
             if sets_aside {
                 self.state_files.set_aside();
             }
-            // The last attempt before the end does not wait for the pause. Neither does an attempt that may succeed
-            // with the reserve.
+            // The last attempt before the end, and an attempt that may succeed with the reserve, do not wait for the
+            // pause.
             let is_urgent = stop || (!batches.is_empty() && self.reserve.is_usable());
             let mut progress = *self.progress.borrow();
             progress.works = if self.retry.is_due() || is_urgent {

@@ -2,8 +2,8 @@
 //!
 //! Input: settings, status documents, the request to stop. Output: values, identified by the ids of this connection.
 //! The program lists the metadata, claims the signals, and then sends a batch for each document. If the daemon falls
-//! silent or this program stops, it sends a batch without values, so that no reader takes an old value for a present
-//! one. The connection ends with a reason if the broker closes it or does not answer.
+//! silent or this program stops, the program sends a batch without values, so that no reader mistakes an old value for
+//! a current one. The connection ends with a reason if the broker closes it or does not answer.
 
 use std::future::Future;
 use std::path::Path;
@@ -32,8 +32,8 @@ const PATIENCE: Duration = Duration::from_secs(5);
 const PING_PERIOD: Duration = Duration::from_secs(10);
 /// Longest wait for the broker to read the last batch.
 const FAREWELL: Duration = Duration::from_millis(500);
-/// Longest time during which the broker may read no batch. After this time the connection is closed, because readers
-/// would take old values for present ones.
+/// If the broker reads no batch for this time, the connection is closed, because readers would mistake old values for
+/// current ones.
 const UNREAD_LIMIT: Duration = Duration::from_secs(30);
 /// Longest token, bytes.
 const MAX_TOKEN_BYTES: usize = 16 << 10;
@@ -93,7 +93,7 @@ impl Receipts {
         self.owed_since.get_or_insert(now);
     }
 
-    /// Handles a receipt. The broker owes the next receipt from the next batch on.
+    /// Handles a receipt. The broker owes the next receipt once the next batch is sent.
     fn note_read(&mut self) {
         self.owed_since = None;
     }
@@ -172,7 +172,7 @@ impl Session {
         }
     }
 
-    /// Sends a check when the proof of an answer needs one.
+    /// Sends a check if the latest answer still needs a proof.
     fn handle_time(&mut self) -> Result<(), String> {
         if self.value_requests.handle_time(Instant::now())? && !self.outbox.check() {
             return Err("the broker reads no answers".to_owned());

@@ -16,7 +16,8 @@ const MAX_BRANCH_BYTES: usize = 200;
 pub struct KuksaSettings {
     /// `http://HOST:PORT`, `https://HOST:PORT` or `unix:PATH`.
     pub address: String,
-    /// PEM file of the authorities that signed the databroker's certificate; required with `https`, not allowed otherwise.
+    /// PEM file of the authorities that signed the databroker's certificate; required with `https`, not allowed
+    /// otherwise.
     pub ca_file: Option<PathBuf>,
     /// Name in the databroker's certificate, if it differs from the host of `address`.
     pub server_name: Option<String>,

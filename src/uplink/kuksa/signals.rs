@@ -149,7 +149,7 @@ fn path(path: VssPath, part: Part) -> (Origin, Cow<'static, str>) {
     }
 }
 
-/// Unit in VSS, and the factor to it.
+/// Unit in VSS, and the conversion factor to it.
 const fn vss_unit(unit: Unit) -> (Option<&'static str>, f64) {
     match unit {
         Unit::Level | Unit::Fraction => (Some("percent"), 100.0),
@@ -163,8 +163,8 @@ const fn vss_unit(unit: Unit) -> (Option<&'static str>, f64) {
     }
 }
 
-/// Returns a value per cell if every cell has one and cells are numbered from 0 without a gap, because array positions are cell
-/// numbers.
+/// Returns a value per cell if every cell has one and cells are numbered from 0 without a gap, because array positions
+/// are cell numbers.
 fn of_cells<T>(document: &StatusDocument, value: impl Fn(&CellView) -> Option<T>) -> Option<Vec<T>> {
     let cells = document.cells.iter().enumerate();
     let values = cells.map(|(index, cell)| if cell.cell.index() == index { value(cell) } else { None });

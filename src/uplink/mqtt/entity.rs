@@ -116,7 +116,7 @@ fn of_catalogue() -> impl Iterator<Item = Entity> {
             let (measure, _) = measure(row.unit);
             let (ending, name, class) = match part {
                 Part::Mean => ("", name.into(), measure.class),
-                // The device class is for a level; a standard deviation is not a level.
+                // The device class `battery` is for levels, so it does not fit a standard deviation.
                 Part::Std if row.unit == Unit::Level => ("_std", format!("{name} Standard Deviation").into(), ""),
                 Part::Std => ("_std", format!("{name} Standard Deviation").into(), measure.class),
             };

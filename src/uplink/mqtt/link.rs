@@ -4,10 +4,10 @@
 //! messages in memory, so it repeats no value of an earlier connection. Present values come from the newest document. A
 //! message leaves the queue only after the broker has acknowledged it.
 //!
-//! After a lost connection, the link pauses for 1 s. The pause doubles with each further loss, up to `retry_max_s`.
-//! After a connection of more than `retry_max_s`, it is 1 s again. A message that the broker rejects does not end the
-//! connection. A rejected message of the queue is sent again after `retry_max_s`; a rejected present value is replaced
-//! with the next document.
+//! After a lost connection, the link pauses for 1 s. The pause doubles with each further loss, up to `retry_max_s`. If
+//! the connection has lasted longer than `retry_max_s`, the pause is 1 s again. A message that the broker rejects does
+//! not end the connection. A rejected message of the queue is sent again after `retry_max_s`; a rejected present value
+//! is replaced with the next document.
 
 use std::convert::Infallible;
 use std::fmt;
@@ -241,7 +241,7 @@ struct PublishedState {
 impl PublishedState {
     /// Returns the messages that are due, in this order: the values, whether the daemon is online, the fill of the
     /// queue, whether this program is online, and the discovery messages if the entities have changed. With this order,
-    /// no reader takes values of an earlier connection as present.
+    /// no reader mistakes values of an earlier connection for current values.
     fn news(&mut self, settings: &MqttSettings, document: Option<&StatusDocument>, fill: Fill) -> Vec<Message> {
         let retained = |name: &str, text: String| Message::retained(settings.topic(name), text);
         let mut news = Vec::new();

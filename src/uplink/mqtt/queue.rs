@@ -83,8 +83,8 @@ impl Queue {
             Err(OpenFault::Damaged(error)) => {
                 let aside = put_aside(&path).map_err(|error| at(&error))?;
                 tracing::error!(error, aside = %aside.display(), "the queue is damaged: set aside, starting a new one");
-                // The numbers start above all numbers of the damaged queue, because a reader takes a known number for a
-                // repetition.
+                // The numbers start above all numbers of the damaged queue, because readers take a known number for a
+                // duplicate.
                 let millis = Reading::now().realtime_ns / 1_000_000;
                 prepare(&path, millis).map_err(|fault| at(&fault.text()))?
             }

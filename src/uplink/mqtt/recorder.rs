@@ -3,7 +3,7 @@
 //! Input: the daemon's documents. Output: messages in the [`Queue`], even if the broker cannot be reached. The daemon's
 //! clock decides when a sample is due. Each document lists the latest events. The recorder finds new events by
 //! comparing the lists of two documents, also across its own restart. Events that leave the list between two documents
-//! are missed and logged. Events that leave it while this program does not run are missed.
+//! are missed; a warning is logged. Events that leave it while this program does not run are missed.
 
 use std::cell::Cell;
 

@@ -78,7 +78,7 @@ pub struct DiscoverySettings {
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct HistorySettings {
-    /// Time between samples in the daemon's clock, s; 0 = no samples.
+    /// Time between samples on the daemon's clock, s; 0 = no samples.
     #[serde(deserialize_with = "whole::<0, 86_400, _>")]
     pub period_s: u64,
     /// Folder of the queue.
@@ -143,7 +143,8 @@ impl MqttSettings {
         format!("{}/{name}", self.topic)
     }
 
-    /// Converts the topic to a word of letters, digits, `-` and `_`, as Home Assistant requires in topics and identifiers.
+    /// Converts the topic to a word of letters, digits, `-` and `_`, as Home Assistant requires in topics and
+    /// identifiers.
     pub fn node(&self) -> String {
         let allowed = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
         self.topic.chars().map(|c| if allowed(c) { c } else { '_' }).collect()

@@ -1,4 +1,5 @@
-//! The state of the view: the document, the page, the selected cell. It changes only by updates and keys, and does no I/O.
+//! The state of the view: the document, the page, the selected cell. It changes only by updates and keys, and does no
+//! I/O.
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};

@@ -196,7 +196,7 @@ fn check_shape(place: &TablePlace, key: &str, rows: &[Vec<f64>], tables: &Tables
     }
 }
 
-/// Returns the first two adjacent values of which the second is not larger than the first.
+/// Returns the first pair of adjacent values whose second value is not larger than the first.
 fn first_not_rising(values: &[f64]) -> Option<(f64, f64)> {
     values.windows(2).find(|pair| pair[1] <= pair[0]).map(|pair| (pair[0], pair[1]))
 }

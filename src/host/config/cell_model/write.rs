@@ -1,4 +1,5 @@
-//! Writes a cell model as a file that [`load`](super::load) reads back with identical numbers. The file contains no date.
+//! Writes a cell model as a file that [`load`](super::load) reads back with identical numbers. The file contains no
+//! date.
 
 use toml::{Table as TomlTable, Value};
 

@@ -201,8 +201,8 @@ fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, thresh
     }
 }
 
-/// Notes a threshold of a fraction that is not between 0 and 1, because its percent sign is probably missing. Values
-/// would always or never exceed this threshold.
+/// If the threshold of a fraction is not 0 to 1, notes a fault: a percent sign is probably missing, and values would
+/// always or never exceed the threshold.
 fn check_unit(alarm: &Alarm, key: &str, set: f64) {
     let is_fraction = matches!(alarm.rule.spec().unit, Unit::Fraction | Unit::FractionPerDay);
     if is_fraction && !(0.0..=1.0).contains(&set) {

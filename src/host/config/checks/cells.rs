@@ -115,7 +115,7 @@ pub(crate) fn modules<'a>(path: &Path, raw: &'a RawTables, file: ReadFile<'_>) -
     raw.modules.iter().filter_map(of_keys).collect()
 }
 
-/// Notes, at the key `cells`, cells that do not exist and cells that an earlier module contains.
+/// Notes a fault at the key `cells` for cells that do not exist or that an earlier module contains.
 pub(crate) fn check_cells<'a>(
     place: &TablePlace,
     cells: &[u16],

@@ -9,7 +9,7 @@ use crate::config::schema::keys::{
     CellVoltageInput, DiagnosticInput, MethodKey, Pack, PackVoltageInput, TemperatureInput,
 };
 
-/// Maximum number of interfaces of one daemon. No vehicle computer has more, and the number fits one byte in journals.
+/// Maximum number of interfaces of one daemon. No vehicle computer has more, and the number fits a `BusIndex`.
 const MAX_INTERFACES: usize = 16;
 /// Longest kernel name of an interface (IFNAMSIZ without the closing zero).
 const MAX_INTERFACE_NAME: usize = 15;

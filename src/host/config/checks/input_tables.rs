@@ -11,7 +11,7 @@ use crate::config::schema::keys::{CurrentInput, Interface, SignalSource};
 use crate::config::schema::{RawTables, SECTIONS};
 use crate::config::schema::{Section as _, SectionInfo};
 
-/// Notes unknown interfaces, and missing ones if there are several interfaces.
+/// Notes unknown interface names, and missing names if there are several interfaces.
 pub(crate) fn interfaces(document: &Document<'_>, raw: &RawTables) {
     if raw.broken {
         return;

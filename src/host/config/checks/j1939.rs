@@ -1,6 +1,7 @@
 //! Builds the settings of the J1939 node from `[j1939]` and `[[alarm]]`: its NAME, and the trouble code of each alarm.
 //!
-//! The node's identifiers must differ from the identifiers of inputs and of `[output]`, and no two rules may share a code.
+//! The node's identifiers must differ from the identifiers of inputs and of `[output]`, and no two rules may share a
+//! code.
 
 use super::signals::ResolvedSignal;
 use crate::alarm::{Direction, Rule, Severity};

@@ -1,4 +1,5 @@
-//! The sent frames: layout, identifiers, interfaces, periods, protection. No sent frame may have the identifier of an input.
+//! The sent frames: layout, identifiers, interfaces, periods, protection. No sent frame may have the identifier of an
+//! input.
 
 use std::path::Path;
 

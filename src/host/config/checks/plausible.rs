@@ -34,8 +34,8 @@ pub(crate) fn signals(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Opti
     overlaps(raw, found);
 }
 
-/// Range of values, in the channel's unit. The channel must be able to report at least a part of this range. `None` =
-/// any range is good.
+/// Range of values that can occur, in the channel's unit. A signal must be able to encode at least a part of it. `None`
+/// = not checked.
 fn needed_values(channel: Channel, (model, series): (Option<&CellModel>, u16)) -> Option<(f64, f64)> {
     // Without a model, the range is that of any lithium-ion cell.
     let (low, high) = model.map_or((1.2, 4.6), |model| (model.voltage_min_v, model.voltage_max_v));
@@ -201,8 +201,8 @@ fn is_beside(a: &ResolvedSignal<'_>, b: &ResolvedSignal<'_>) -> bool {
         && !a.signal.conditions.iter().any(is_other_page)
 }
 
-/// Whether two inputs of one message share bits. In an answer, each layout is counted from the signal's own first byte,
-/// so the first bytes are added.
+/// Whether two inputs of one message share bits. The layouts of an answer count from the signal's own first byte, so
+/// the position of that byte is added.
 fn has_bits_of(a: &ResolvedSignal<'_>, b: &ResolvedSignal<'_>) -> bool {
     let bits = |resolved: &ResolvedSignal<'_>| {
         let first = resolved.answer?.bit(&resolved.signal.layout);

@@ -297,7 +297,7 @@ pub(crate) fn channel_words(channel: Channel) -> String {
     }
 }
 
-/// Notes, at the key `id` of a frame's table, an identifier that an input uses on one of these interfaces.
+/// If an input uses the identifier `id` on one of these interfaces, notes a fault at the key `id` of the frame's table.
 pub(crate) fn check_no_input(place: &TablePlace, id: CanId, buses: &[BusIndex], found: &[ResolvedSignal<'_>]) {
     if let Some(input) = found.iter().find(|input| buses.contains(&input.bus) && input.message.id == id) {
         place.fault("id", format!("must not be the identifier of an input, but {} has {id}", input.message.name));

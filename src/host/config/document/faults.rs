@@ -74,7 +74,8 @@ impl Faults {
         self.len() == 0
     }
 
-    /// The faults, one line each. Files are in the order in which they first failed; faults of a file are sorted by line.
+    /// The faults, one line each. Files are in the order in which they first failed; faults of a file are sorted by
+    /// line.
     pub(crate) fn lines(&self) -> ConfigFaults {
         ConfigFaults(lines(&self.0.borrow().faults))
     }

@@ -10,8 +10,8 @@ use crate::config::checks::{Databases, ResolvedSignal, cells, cross, input_table
 use crate::config::document::{ConfigFaults, ConfigFiles, Document, Faults, ReadFile, Sources, read_file};
 use crate::config::schema::RawTables;
 
-/// Reads and checks a configuration, its drop-ins and the files they name (DBC files, cell models; paths are relative to
-/// the configuration file).
+/// Reads and checks a configuration, its drop-ins and the files they name (DBC files, cell models; paths are relative
+/// to the configuration file).
 ///
 /// # Errors
 /// Returns every fault found, not only the first.

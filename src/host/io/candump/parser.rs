@@ -1,9 +1,9 @@
 //! Parses candump lines.
 //!
 //! In: text that begins with a line; the parser ignores what follows the line feed. Out: the line, or the first
-//! Nothing is allocated and nothing is read twice. Three parts are the same in nearly all lines: the second of the
-//! previous line, a known interface, and a payload of eight bytes. These parts have fast paths, which convert several
-//! bytes at a time.
+//! violation of the grammar. Nothing is allocated and nothing is read twice. Three parts are the same in nearly all
+//! lines: the second of the previous line, a known interface, and a payload of eight bytes. These parts have fast
+//! paths, which convert several bytes at a time.
 
 use super::digits::{HEX, eight_digits, eight_hex_bytes, six_decimals, word};
 use super::{Line, LineError};
@@ -48,7 +48,8 @@ impl Interface {
 #[derive(Debug, Clone)]
 pub struct LineParser {
     interfaces: Vec<Interface>,
-    /// The first twelve bytes of the previous line (a stamp of ten digits, up to the decimal point) as two overlapping words.
+    /// The first twelve bytes of the previous line (a stamp of ten digits, up to the decimal point) as two overlapping
+    /// words.
     head: [u64; 2],
     /// The second that these bytes encode, ns.
     second_ns: i64,
@@ -385,7 +386,7 @@ impl<'a> Cursor<'a> {
         self.expect(Frame::remote(id, len), "a length of 0 to 8")
     }
 
-    /// Parses `_9` to `_F` after a length of 8, which is the length code on the wire. The payload has 8 bytes for all
+    /// Parses `_9` to `_F` after a length of 8: the length code (DLC) on the wire. The payload has 8 bytes for all
     /// these codes.
     fn raw_length_code(&mut self, len: usize) -> Result<(), LineError> {
         if len != 8 || !self.take(b'_') {
@@ -448,7 +449,8 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Parses the direction that `candump -x` appends, and blanks. Returns whether the frame was sent by the recording machine.
+    /// Parses the direction that `candump -x` appends, and blanks. Returns whether the frame was sent by the recording
+    /// machine.
     fn suffix(&mut self) -> Result<bool, LineError> {
         let blank = |b: Option<u8>| matches!(b, None | Some(b' ' | b'\r' | b'\t'));
         if !blank(self.peek()) {

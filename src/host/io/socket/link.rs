@@ -121,8 +121,8 @@ struct OpenSocket {
     pending: Option<QueuedFrame>,
 }
 
-/// Registers a socket with the runtime. Errors are included, because a socket is neither readable nor writable after
-/// its interface is removed.
+/// Registers a socket with the runtime, for errors too: after its interface is removed, a socket is neither readable
+/// nor writable.
 #[expect(
     deprecated,
     reason = "its successor needs unsafe, which this crate forbids; RawSocket keeps its one descriptor open while it lives"
@@ -214,8 +214,8 @@ impl Link {
                 ready = open.socket.ready(interest) => match ready {
                     Ok(mut guard) => {
                         let ready = guard.ready();
-                        // The readiness is cleared before the work, so that an edge during the work sets it again. The
-                        // loop reads until the socket is empty.
+                        // Readiness is cleared before the work. If the socket becomes ready during the work, the
+                        // runtime sets it again. The loop reads until the socket is empty.
                         guard.clear_ready_matching(if ready.is_writable() { Ready::WRITABLE } else { Ready::EMPTY });
                         guard.clear_ready_matching(Ready::READABLE | Ready::ERROR);
                         Ok(())

@@ -1,4 +1,4 @@
-//! Tests estimates after a power cut. They are restored from a state file, whose numbers are rounded, and have an age
+//! Tests estimates after a power cut. They are restored from a state file, whose numbers are rounded. Their age comes
 //! from the clocks.
 
 use nalgebra::DMatrix;

@@ -1,13 +1,14 @@
 //! Signals outside the catalogue: derived from several values, from the alarms, or from the state of the daemon.
 //!
-//! VSS signals have the names, datatypes and units of releases 3 to 6. Some are omitted, because the status document has no value for
-//! them: `NetCapacity` and `GrossCapacity` (whole kWh; the daemon learns Ah), `StateOfCharge.CurrentEnergy` and the energies (no energy
-//! is estimated), the throughputs "over lifetime of the battery" (the daemon knows its own time only), `StateOfCharge.Displayed` (what
-//! the customer sees), `Charging.IsCharging` (true only with a charger; braking also charges the battery).
+//! VSS signals have the names, datatypes and units of releases 3 to 6. Some are omitted, because the status document
+//! has no value for them: `NetCapacity` and `GrossCapacity` (whole kWh; the daemon learns Ah),
+//! `StateOfCharge.CurrentEnergy` and the energies (no energy is estimated), the throughputs "over lifetime of the
+//! battery" (the daemon knows its own time only), `StateOfCharge.Displayed` (what the customer sees),
+//! `Charging.IsCharging` (true only with a charger; braking also charges the battery).
 //!
-//! Overlay booleans begin with `Is`, as VSS recommends. No overlay signal has a temperature unit, because its name changed from VSS 5 to
-//! 6. None has a list of allowed values: the databroker (0.7) also checks an unknown value against the list, and the last value would
-//! stay.
+//! Overlay booleans begin with `Is`, as VSS recommends. No overlay signal has a temperature unit, because the unit's
+//! name changed between VSS 5 and VSS 6. No overlay signal has a list of allowed values: the databroker (0.7) checks
+//! even an unknown value against the list, and would keep the last value.
 
 use packwatch_host::quantity::catalogue::Quantity;
 use packwatch_host::quantity::{CellIndex, Mode};
@@ -264,8 +265,8 @@ fn average(status: &StatusDocument, quantity: Quantity) -> Option<f64> {
     Some(numbers.iter().sum::<f64>() / numbers.len() as f64)
 }
 
-/// Codes of the raised alarms: `RULE:SEVERITY`, for a cell `RULE:SEVERITY:cell3`. If none is raised, returns an empty list only if
-/// every threshold was evaluated.
+/// Codes of the raised alarms: `RULE:SEVERITY`, for a cell `RULE:SEVERITY:cell3`. If none is raised, returns an empty
+/// list only if every threshold was evaluated.
 fn alarm_codes(document: &StatusDocument) -> Option<Value> {
     let alarms = &document.alarms;
     let raised = alarms.list.iter().filter(|alarm| alarm.state.is_raised());

@@ -90,7 +90,7 @@ fn second_uplink_fails_and_damaged_file_is_set_aside() {
     let queue = Queue::open(&settings(folder.path(), 3, 1000)).unwrap();
     queue.add(&[sample("a")], None).unwrap();
     assert_eq!(queue.fill().messages, 1);
-    // Readers cannot know its numbers.
+    // The new queue's numbers are above all numbers that readers know.
     assert!(queue.oldest(Class::Sample, 1).unwrap()[0].sequence > 1_700_000_000_000);
     assert!(folder.path().join("queue.damaged").exists());
 }

@@ -52,12 +52,12 @@ fn new_events_are_those_not_listed_before() {
         (&[][..], &[1, 2][..], &[1, 2][..]),
         (&[1, 2], &[1, 2], &[]),
         (&[1, 2], &[1, 2, 3], &[3]),
-        // The daemon dropped the oldest.
+        // The daemon dropped its oldest event.
         (&[1, 2, 3], &[2, 3, 4], &[4]),
         (&[1, 2, 3], &[7, 8, 9], &[7, 8, 9]),
         // Two events of the same time.
         (&[1, 1], &[1, 1, 1], &[1]),
-        // A different daemon.
+        // Another daemon, which has no events.
         (&[1, 2, 3], &[], &[]),
     ] {
         assert_eq!(new_events(&list(before), &list(now)), list(new), "{before:?} {now:?}");

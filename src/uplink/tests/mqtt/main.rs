@@ -1,5 +1,5 @@
-//! Runs `packwatch-uplink mqtt` as a user does: the program, a real broker (Debian's mosquitto) on a loopback port, a reader
-//! (mosquitto_sub) with its own session, and a status socket fed by the test.
+//! Runs `packwatch-uplink mqtt` as a user does: the program, a real broker (Debian's mosquitto) on a loopback port, a
+//! reader (mosquitto_sub) with its own session, and a status socket fed by the test.
 
 mod rig;
 
@@ -72,7 +72,7 @@ fn hour_without_broker_and_two_power_cuts_lose_nothing() {
     let mut uplink = Uplink::start(&broker, &daemon, EAGER);
     daemon.send(&document(96, 0));
     reader.wait_for_messages(4);
-    // Messages that the broker has but did not confirm would also wait in the queue.
+    // Messages that the broker has received but not confirmed stay in the queue, so the test waits for the receipts.
     wait_for("the broker's receipts", || fill(&uplink).messages == 0);
     broker.stop();
     for second in 1..=HOUR {
@@ -100,7 +100,7 @@ fn hour_without_broker_and_two_power_cuts_lose_nothing() {
     let mut latest = (0, 0);
     for sample in &samples {
         let now = (sample["sequence"].as_i64().unwrap(), rig::second_of(sample));
-        // Each sample at least once and none skipped: the next one follows, or an earlier one repeats.
+        // Every sample arrives at least once and none is skipped: the next one follows, or an earlier one repeats.
         assert!(now.1 <= latest.1 + 1, "after second {} came {}", latest.1, now.1);
         latest = latest.max(now);
     }
@@ -217,7 +217,7 @@ fn wrong_password_is_retried_and_wrong_authority_fails() {
         "once, not at each attempt: {}",
         uplink.log()
     );
-    // With a line end, as an editor writes it. The file is read again at each attempt.
+    // The password ends with a line break, as an editor writes it. The file is read again at each attempt.
     fs::write(at("password"), "s3cret\r\n").unwrap();
     wait_for("a connection", || uplink.log().contains("connected broker"));
 

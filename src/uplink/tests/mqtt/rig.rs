@@ -60,12 +60,12 @@ pub(crate) struct Broker {
 }
 
 impl Broker {
-    /// Starts it; `more` adds lines to its configuration.
+    /// Starts the broker; `more` adds lines to its configuration.
     pub(crate) fn start(more: &str) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
         let anonymous = if more.contains("allow_anonymous") { "" } else { "allow_anonymous true\n" };
-        // By default root becomes another user, who cannot read the test's folder.
+        // By default, a broker started by root changes to another user, who cannot read the test's folder.
         let text = format!(
             "user root\nlistener {port} 127.0.0.1\n{anonymous}{more}persistence true\npersistence_location {}/\nmax_queued_messages 100000\n",
             folder.path().display()
@@ -76,7 +76,7 @@ impl Broker {
         broker
     }
 
-    /// Restarts it with its stored state.
+    /// Restarts the broker with its stored state.
     pub(crate) fn restart(&mut self) {
         let log = fs::File::options().create(true).append(true).open(self.folder.path().join("log")).unwrap();
         let mut command = Command::new("mosquitto");
@@ -87,7 +87,7 @@ impl Broker {
         wait_for("the broker", || TcpStream::connect(("127.0.0.1", port)).is_ok());
     }
 
-    /// Stops it; it keeps its state.
+    /// Stops the broker, which stores its state.
     pub(crate) fn stop(&mut self) {
         if let Some(mut process) = self.process.take() {
             signal(&process, "TERM");
@@ -120,13 +120,13 @@ impl Daemon {
         Self { folder, listener, client: RefCell::new(None) }
     }
 
-    /// Sends a document; accepts a new client if the former has disconnected.
+    /// Sends a document; accepts a new client if the previous one has disconnected.
     pub(crate) fn send(&self, document: &Value) {
         let line = format!("{document}\n");
         loop {
             let mut client = self.client.borrow_mut();
             let stream = client.get_or_insert_with(|| self.listener.accept().unwrap().0);
-            // Reading detects a killed client: it sends nothing else.
+            // A client sends nothing, so an end of file means that it was killed.
             stream.set_nonblocking(true).unwrap();
             let has_gone = matches!(std::io::Read::read(stream, &mut [0]), Ok(0));
             stream.set_nonblocking(false).unwrap();
@@ -150,7 +150,7 @@ pub(crate) struct Uplink {
 }
 
 impl Uplink {
-    /// Starts it; `more` adds lines to its table `[mqtt]`.
+    /// Starts the program; `more` adds lines to its table `[mqtt]`.
     pub(crate) fn start(broker: &Broker, daemon: &Daemon, more: &str) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let socket = daemon.folder.path().join("status.sock");
@@ -181,19 +181,19 @@ impl Uplink {
         command.spawn().unwrap()
     }
 
-    /// Kills it, like a power cut.
+    /// Kills the program, like a power cut.
     pub(crate) fn kill(&mut self) {
         self.process.kill().unwrap();
         self.process.wait().unwrap();
     }
 
-    /// Terminates it, like systemd.
+    /// Terminates the program, like systemd.
     pub(crate) fn terminate(&mut self) {
         signal(&self.process, "TERM");
         assert!(self.process.wait().unwrap().success());
     }
 
-    /// Restarts it with the same queue.
+    /// Restarts the program with the same queue.
     pub(crate) fn restart(self) -> Self {
         let folder = Arc::clone(&self.folder);
         drop(self);
@@ -236,7 +236,7 @@ pub(crate) fn fill(uplink: &Uplink) -> Fill {
     read().unwrap_or(Fill { written: 0, messages: 0 })
 }
 
-/// A reader whose missed messages the broker keeps.
+/// A reader with a persistent session: the broker keeps the messages that it misses.
 pub(crate) struct Reader {
     process: Child,
     lines: Arc<Mutex<Vec<String>>>,
@@ -341,7 +341,7 @@ fn run(folder: &Path, program: &str, arguments: &str) {
     assert!(output.status.success(), "{program} {arguments}: {}", String::from_utf8_lossy(&output.stderr));
 }
 
-/// `ca.pem` signs `broker.pem` for 127.0.0.1; `other.pem` is another authority.
+/// Creates `ca.pem`, which signs `broker.pem` for 127.0.0.1, and `other.pem`, another authority.
 pub(crate) fn make_certificates(folder: &Path) {
     fs::write(folder.join("names"), "subjectAltName=IP:127.0.0.1\nbasicConstraints=CA:FALSE\n").unwrap();
     let key = "-newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes";
