@@ -15,13 +15,14 @@ use crate::ident::parameters::ParameterTables;
 use crate::ident::pass::residuals;
 use crate::ident::record::Record;
 
-/// Shortest time between two recorded differences, s. Differences change only with the SOC, so closer ones add no information.
+/// Shortest time between two recorded differences, s. Differences change only with the SOC, so a shorter interval adds
+/// no information.
 const PERIOD_S: f64 = 5.0;
 /// Standard deviations before the fit: ln capacity, ln resistance, sensor offset (V), leakage (share of the capacity per h), SOC.
 const PRIOR: [f64; OWN + 1] = [0.15, 0.4, 0.003, 0.002, 0.15];
 /// Number of unknowns of a cell without the SOC at the start of each stretch.
 const OWN: usize = 4;
-/// Error of a difference, V. The next constant is the correlation time of the error, s.
+/// Standard deviation of the error of a difference, V. Next constant: correlation time of this error, s.
 const DISTANCE_V: f64 = 0.002;
 const REPEATS_S: f64 = 50.0;
 /// Smallest number of cells for a comparison.
@@ -67,7 +68,7 @@ pub struct CellDeviation {
     pub residual_v: f64,
 }
 
-/// Factors with which the unknowns act on the differences at one time.
+/// Coefficients of the unknowns in the equation of the differences, at one time.
 struct Factors {
     stretch: usize,
     weight: f64,
@@ -101,7 +102,7 @@ pub(super) fn fit(
     (0..cells).into_par_iter().map(|cell| fit_cell(cell, distances.len(), &factors, &all_v)).collect()
 }
 
-/// Returns the factors at the times of the differences, each from the latest row before.
+/// Returns the coefficients at the time of each difference, computed from the latest row up to this time.
 fn factors(
     stretch: usize,
     distances: &CellDistances,

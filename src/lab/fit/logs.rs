@@ -43,14 +43,15 @@ const LEAST_ROWS: usize = 20;
 const BEGINNING_STD: f64 = 0.02;
 /// A stretch starts full if its open-circuit voltage is at least the OCV at this SOC.
 const FULL_SOC: f64 = 0.975;
-/// Share of the usual series resistance with which the open-circuit voltage at the start is computed. No cell has a smaller share.
+/// The open-circuit voltage at the start is computed with this share of the model's series resistance. No cell has
+/// less.
 const LEAST_RESISTANCE: f64 = 0.4;
 /// Standard deviation of the initial SOC of a stretch that starts full.
 const FULL_STD: f64 = 0.01;
 /// A cold cell is limited by diffusion below this SOC times (Arrhenius factor - 1). No circuit models the voltage there, so its error
 /// would be mistaken for lost capacity. Chosen on Panasonic 18650PF cells.
 const KNEE_SOC: f64 = 0.13;
-/// Upper limit of this SOC.
+/// Upper limit of [`KNEE_SOC`] times (Arrhenius factor - 1).
 const MOST_KNEE_SOC: f64 = 0.35;
 /// A cold cell does not settle within a drive. Its voltage is therefore wrong by the equivalent of this SOC times (Arrhenius factor -
 /// 1). Rests of 20 min of Panasonic 18650PF cells at 10 to -20 degrees C show 0.013 to 0.024; rests during drives are shorter.
@@ -78,7 +79,7 @@ pub struct LogRequest<'a> {
     pub monitor: &'a MonitorConfig,
     /// Names of the interfaces.
     pub interfaces: Vec<String>,
-    /// A gap in a log that is longer than this means that the recorder was asleep, s.
+    /// If a gap in a log is longer than this, s, the recorder was asleep.
     pub sleep_gap_s: f64,
     /// Creates the options for reading one log.
     pub options: &'a (dyn Fn() -> LogOptions + Sync),
@@ -86,7 +87,7 @@ pub struct LogRequest<'a> {
     pub logs: Vec<PathBuf>,
 }
 
-/// The mean of all cells in a part of a log without a gap.
+/// Mean of all cells over a part of a log that has no gap.
 #[derive(Debug, Clone, Default)]
 struct Stretch {
     log: usize,

@@ -28,7 +28,7 @@ pub(super) fn verdict(outcome: &FitOutcome) -> Vec<String> {
     said
 }
 
-/// Returns the error of a SOC from voltage alone at every node, points.
+/// Returns the error at every node of an SOC determined by voltage alone, points.
 fn soc_points(fit: &FittedTables, voltage_error_v: &[f64]) -> Vec<f64> {
     let (soc, columns) = (&fit.grid.soc, fit.grid.soc.len());
     let of_node = |node: usize| {

@@ -12,7 +12,7 @@ pub struct LagWindows<'a> {
     part: Vec<(usize, usize)>,
 }
 
-/// Steps of the time between consecutive rows.
+/// Time steps between consecutive rows.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RowSpacing {
     /// Median step, in the unit of the time column.
