@@ -132,7 +132,7 @@ fn is_plausible(signal: &LogSignal) -> bool {
     let (SignalOrigin::Raw(_, field), LogSignal { label, series, .. }) = (&signal.origin, signal) else { return false };
     let within = |low: f64, high: f64| series.extent.min >= low && series.extent.max <= high;
     if label.has_unit_of(Quantity::Voltage) {
-        // Larger codes mean "no value", or they are the sign of a longer number.
+        // Larger codes (0xFF00 and above) mean "no value" or are the sign bytes of a longer number.
         within(PACK_V.0, PACK_V.1) && series.extent.max < 65_280.0 * field.factor
     } else if label.has_unit_of(Quantity::Current) {
         within(-1500.0, 1500.0) && !series.is_constant()

@@ -35,7 +35,7 @@ pub enum Horizon {
     Days(f64),
 }
 
-/// Use, truth and end of life of a log. Its alarms are judged by them.
+/// Use, truth and end of life of a log, by which its alarms are judged.
 #[derive(Debug, Clone, Copy)]
 pub struct LogLife<'a> {
     /// Charge moved, and learned capacities.

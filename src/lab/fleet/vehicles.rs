@@ -70,7 +70,8 @@ fn logs_in(folder: &Path) -> Result<Vec<PathBuf>, LabError> {
     Ok(logs)
 }
 
-/// Whether the name of a file, compressed or not, is that of a log. Truth tables and cycle tables are not logs.
+/// Whether a file name, with or without the ending of a compression, belongs to a log. Truth tables and cycle tables
+/// are not logs.
 fn is_log(name: &OsStr) -> bool {
     let name = name.to_string_lossy();
     let name = crate::without_compression(&name);
