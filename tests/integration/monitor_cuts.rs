@@ -323,7 +323,7 @@ fn cut(seed: u64, config: &MonitorConfig, one_in: usize) -> usize {
     let mut before = Timestamp::from_nanos(0);
     let is_secured = !config.authentications().is_empty();
     for (nth, record) in records(seed, 3000, config).iter().enumerate() {
-        // The freshness decides whether a forged command counts as old.
+        // Skip commands: the freshness, which differs after a cut, decides whether a forged command counts as old.
         if is_secured && is_command(record) {
             continue;
         }
