@@ -1,4 +1,4 @@
-//! Finds bit fields that behave like pack voltage, current or cell voltages, in messages that no DBC describes.
+//! Finds bit fields that behave like pack voltage, current or cell voltages. Used if no DBC is given.
 //!
 //! * Voltage: fields of 16 bits at every byte and of 12 bits at every half byte, in both byte orders, with common scales. The value is
 //!   plausible for a pack, changes slightly, and its last digits vary.

@@ -153,7 +153,7 @@ fn temperatures(key: &AnswerKey, answers: &Answers, bytes: usize) -> Vec<LogSign
             let row = temperature_row(key, answers, (first, bytes), distance, offset);
             let values: std::collections::BTreeSet<u64> =
                 row.iter().flat_map(|signal| signal.series.values.kept()).map(|value| value.to_bits()).collect();
-            // Equal constants are more likely to be bytes of other numbers.
+            // Bytes that all have the same constant value are more likely to be parts of other numbers.
             let weight = if values.len() > 1 { 2 * row.len() + usize::from(distance > 1) } else { 0 };
             if row.len() >= 3 && weight > best_weight {
                 (best, best_weight) = (row, weight);
