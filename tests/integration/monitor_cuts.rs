@@ -4,8 +4,8 @@
 //! A pack of three cells with protected inputs, all kinds of alarms, commands from both sides, a J1939 node and
 //! diagnostic requests runs through random drives, faults, gaps, sleep and backward clock steps. One monitor runs
 //! through; the other is replaced by its own snapshot (through JSON) after random inputs. The same is done with a pack
-//! that learns its cell model, and with one whose frames are authenticated. The latter is compared without the
-//! freshness, which restarts by design. `PACKWATCH_CUTS` sets the number of cuts.
+//! that learns its cell model, and with one whose frames are authenticated. Authenticated frames are compared without
+//! the freshness, which restarts by design. `PACKWATCH_CUTS` sets the number of cuts.
 
 use packwatch::alarm::{Rule, Selector};
 use packwatch::can::e2e::{Profile, Protection};

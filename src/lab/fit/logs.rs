@@ -59,8 +59,8 @@ const COLD_SOC: f64 = 0.03;
 /// If the residual is above this value, V, the logs do not come from one kind of cell. In the cold, the limit is multiplied by a power
 /// of the Arrhenius factor. Fits of the cells of `tests/label` leave 5 to 20 mV when warm and 27 mV at 0 degrees C.
 const UNFIT_V: f64 = 0.04;
-/// A charge is complete when two conditions hold: the voltage is at most this far below the highest voltage, V, and the current would
-/// need more than the next constant, h, to charge the rated capacity.
+/// A charge is complete if the voltage is at most [`HELD_V`] below the highest voltage, V, and the remaining current
+/// would need more than [`FADED_H`], h, to charge the rated capacity.
 const HELD_V: f64 = 0.012;
 const FADED_H: f64 = 15.0;
 /// Smallest error of the configured model's curve, V: first the error that is smooth over [`CURVE_SOC`], then the error of each
@@ -202,7 +202,8 @@ fn fit_stretches(
     let known = known(model, &grid, request.monitor);
     let fit = unanchored::fit(&settings, &known, &records, |pass, cost| progress(FitProgress::Pass(pass, cost)))
         .map_err(LabError::Data)?;
-    // The logs may come from two packs or from cells of an unknown kind. Then the fit describes neither.
+    // If the logs come from two packs or from cells of an unknown kind, the fit describes neither, so the prior is
+    // used.
     let unfit_v = Some(fit.fitted.total.rmse_v).filter(|rmse_v| *rmse_v > unfit_v(&grid));
     let fit =
         if unfit_v.is_some() { unanchored::prior(&settings, &known, &records).map_err(LabError::Data)? } else { fit };

@@ -61,7 +61,7 @@ impl PriorDeviations {
         ..Self::FREE_OCV
     };
 
-    /// Prior around the resistances of a chemistry. It is the spread of five fitted cells (`cell::chemistry`), which is common to all
+    /// Prior around the resistances of a chemistry: the spread of five fitted cells (`cell::chemistry`), common to all
     /// nodes of a table.
     pub const CHEMISTRY: Self = Self {
         ocv_by_temperature_v: 0.006,

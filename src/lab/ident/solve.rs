@@ -172,7 +172,7 @@ fn bounded_step(h: &DMatrix<f64>, g: &DVector<f64>, damping: f64, y: &[f64], spa
     Some(d)
 }
 
-/// Solves for the free parameters with the held ones at their bounds.
+/// Solves for the free parameters, with the held parameters at their bounds.
 fn solve_free(
     damped: &DMatrix<f64>,
     g: &DVector<f64>,

@@ -135,7 +135,7 @@ struct Battery<'a> {
     record: &'a Record,
     config: &'a Config,
     model: &'a CellModel,
-    /// The state, restored at the time at which it was taken.
+    /// Monitor restored from the state, at the time of the state.
     monitor: Monitor,
     /// Wall clock minus the clock of the inputs, ns.
     offset_ns: i64,
