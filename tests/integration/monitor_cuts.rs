@@ -250,7 +250,8 @@ impl Vehicle {
                 records.push(Record::frame(time, BusIndex(0), if dice.one_in(4) { &damaged } else { &frame }));
             }
             16 => self.identity = f64::from(u8::try_from(dice.below(3)).expect("small")),
-            // A single-frame answer, a two-frame answer whose second frame may be missing, or a refusal.
+            // A single-frame answer, a two-frame answer whose second frame may be missing, or "response pending"
+            // (0x78).
             17..=30 => {
                 records.push(Record::frame(time, BusIndex(0), &tester(0x7BB, &[4, 0x61, 1, 0x20, 0x10, 0, 0, 0])))
             }
