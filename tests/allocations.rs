@@ -1,5 +1,6 @@
-//! In steady state no code on a frame's path allocates. Covered: reading a log, the core with the example's 96 cells,
-//! its ticks, and the frames that it sends. The first frames (growing buffers), transitions and events may allocate.
+//! In steady state, no code that a frame passes through allocates. Covered: reading a log, the core with the example's
+//! 96 cells, its ticks, and the frames that it sends. The first frames (growing buffers), transitions and events may
+//! allocate.
 //!
 //! All threads of the process are counted. If a test fails, `dhat-heap.json` shows the allocations.
 

@@ -46,6 +46,7 @@ pub(crate) struct CapacityRow<'t> {
 impl CapacityTable {
     /// Opens a table whose rows may have any order.
     ///
+    /// # Errors
     /// The file cannot be read, the column of times is missing, or the file has neither capacities nor SOC.
     pub(crate) fn open(path: &Path) -> Result<Self, TableError> {
         let table = Table::open(path)?;

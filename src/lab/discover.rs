@@ -1,9 +1,10 @@
 //! Finds the signals of the traction battery in a log: pack current and voltage, cell voltages, temperatures, and the battery
 //! controller's own SOC and SOH.
 //!
-//! Input: frames with times; optionally DBC files and definitions of diagnostic answers. Output: for each quantity, ranked candidates
-//! with their reasons in plain words. Answers to diagnostic requests are read, no matter which device sent the requests. In answers
-//! without a definition, the search looks for rows of cell voltages and other fields. Memory is bounded. Any frames are accepted.
+//! Input: frames with times; optionally DBC files and definitions of diagnostic answers. Output: for each quantity,
+//! ranked candidates with their reasons in plain words. Answers to diagnostic requests are read regardless of which
+//! device sent the requests. In answers without a definition, the search looks for rows of cell voltages and other
+//! fields. Memory is bounded. Any frames are accepted.
 //!
 //! The owner must confirm the result, because names can mislead and a parked car shows little. If a field has no definition, its scale
 //! is guessed from plausible values.
@@ -156,8 +157,7 @@ impl Discoverer {
 
     /// Writes a configuration that uses the best candidates of [`finish`](Self::finish).
     ///
-    /// # Errors
-    /// Neither the log nor the settings answer some questions. The error contains these questions, one per line.
+    /// # Errors Some questions are answered neither by the log nor by the settings. The error lists them, one per line.
     pub fn configuration(&self, discovery: &Discovery, settings: &PackSettings) -> Result<PackConfiguration, LabError> {
         let Self { capture, descriptions } = self;
         let writer = Writer { discovery, capture, descriptions, settings };

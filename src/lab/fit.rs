@@ -89,7 +89,7 @@ pub struct FileResidual {
     pub rows: usize,
     /// Seconds of data.
     pub seconds: f64,
-    /// Number of rows left out because no cell of this type can have their voltage.
+    /// Number of rows left out because their voltage is not plausible for this cell.
     pub outliers: usize,
     /// Residual of the model.
     pub residual: Residual,
@@ -117,7 +117,7 @@ pub struct FitOutcome {
     pub capacity_ah: f64,
     /// Lowest and highest voltage, V.
     pub voltage_v: (f64, f64),
-    /// Electrodes; `None` = a shift of the curve is given, or no known electrodes fit.
+    /// Electrodes; `None` = a shift of the curve is given, there is no slow test, or no known electrodes fit.
     pub electrodes: Option<FittedElectrodes>,
     /// Thermal parameters; `None` = the data do not determine them.
     pub thermal: Option<Thermal>,
@@ -174,7 +174,7 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
     let by_kind = request.first_cycles.map(|_| prepared.by_kind(&records, &fitted));
     let all: Vec<&MeasuredFile> = files.iter().chain(&slow).collect();
     let files = by_file(&all, &prepared, &records, &fitted);
-    // Full discharges under load give only a coarse curve.
+    // Without slow tests, the curve comes from discharges under load and is too coarse to identify electrodes.
     let has_curve = !prepared.ocv.is_empty() && request.ageing_shift.is_none();
     let electrodes = if has_curve { ageing_electrodes(&fitted, prepared.capacity_ah) } else { None };
     let mut outcome = FitOutcome {
@@ -207,9 +207,10 @@ fn ageing_electrodes(fitted: &FittedTables, capacity_ah: f64) -> Option<FittedEl
         .filter(|found| AgedOcv::of_electrodes(&found.electrodes, soc, capacity_ah, &rows).is_some())
 }
 
-/// Extends the open-circuit curve of an ageing cell below the cut-off of its discharges, where there are no data. The extension is a
-/// straight line with the slope of the curve in the [`LOW_END_SOC`] above the cut-off. Without it, the last rows under load would make
-/// the curve so steep that the gates reject the first rest of an aged cell.
+/// Extends the open-circuit curve of an ageing cell below the cut-off of its discharges, where there are no data. The
+/// extension is a straight line with the slope of the curve in the [`LOW_END_SOC`] above the cut-off. Without the
+/// extension, the last rows under load would make the curve so steep that the estimator's innovation gates reject the
+/// first rest of an aged cell.
 fn continue_low_end(fitted: &mut FittedTables) {
     let soc = &fitted.grid.soc;
     let cut_off = soc.partition_point(|&node| node < ageing::SOC_LEFT);

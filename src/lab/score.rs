@@ -81,7 +81,7 @@ pub struct ScoreJob {
     pub path: PathBuf,
     /// Its table of published capacities.
     pub cycles: Option<CycleTable>,
-    /// Unique name of the file in tables and of its plots.
+    /// Unique name of the file, used in tables and for its plots.
     pub name: String,
 }
 

@@ -38,6 +38,7 @@ pub struct CellSource {
 impl CellSource {
     /// Loads the configuration.
     ///
+    /// # Errors
     /// The files are faulty, or no cell of this chemistry has the given voltages. The error contains all faults.
     pub fn load(&self) -> Result<Config, ConfigFaults> {
         if let Some(label) = &self.label {

@@ -93,7 +93,7 @@ pub(crate) fn float64<'py>(name: &str, values: &Bound<'py, PyAny>) -> PyResult<B
     let array = numpy.call_method1("asanyarray", (values,)).map_err(none)?;
     check_numbers(name, &array)?;
     if !is_masked(&array)? {
-        // The values are converted as given, because a column of another library knows which of its values are missing.
+        // Convert the original object, because a column of another library knows which of its values are missing.
         return laid_out(values, "float64").map_err(none);
     }
     let filled = array.call_method1("astype", ("float64",)).and_then(|array| array.call_method1("filled", (f64::NAN,)));

@@ -51,7 +51,7 @@ impl<S> ExclusiveState<S> {
                 }
                 Err(TryLockError::WouldBlock) => {
                     py.check_signals()?;
-                    // This period is shorter than the overhead of a Python call, and longer than one check takes.
+                    // Polling interval: too short for a user to notice, and much longer than one check takes.
                     py.detach(|| thread::sleep(Duration::from_millis(1)));
                 }
             }

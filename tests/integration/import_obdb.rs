@@ -120,7 +120,7 @@ pub(crate) struct Case {
     response: String,
 }
 
-/// Reads a file of cases. Lines below `expected_values` have the form `ID: VALUE`. Below `response` follow the frames,
+/// Reads a file of cases. Lines below `expected_values` have the form `ID: VALUE`. The frames follow below `response`,
 /// either as the lines of a block (`|-`) or in a quoted text, where `\n` ends a frame and a line end is a space.
 pub(crate) fn cases(text: &str) -> Vec<Case> {
     let mut cases: Vec<Case> = Vec::new();

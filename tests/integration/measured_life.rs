@@ -2,9 +2,9 @@
 //! capacities.
 //!
 //! The published capacity is the charge delivered at 2 A down to 2.7 V (for both cells, even where the cycler
-//! discharged further), so the test compares it with the usable capacity. Discharges are numbered from 1. The published
-//! capacity of B0005 first falls below 1.4 Ah at discharge 125 and never below 1.2 Ah. That of B0006 first falls below
-//! 1.4 Ah at discharge 109. Each model was fitted to its cell's first five cycles only.
+//! discharged further), so the test compares it with the usable capacity. Discharges are numbered from 1. The
+//! published capacity of B0005 first falls below 1.4 Ah at discharge 125 and never below 1.2 Ah. The capacity of
+//! B0006 first falls below 1.4 Ah at discharge 109. Each model was fitted to its cell's first five cycles only.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;

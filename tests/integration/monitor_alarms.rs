@@ -147,8 +147,8 @@ fn bus_commands_need_protection_and_sequence() {
     assert_eq!((reported(&rig), bad(&rig)), (1, 1));
     let marked = rig.last_wire(Rule::CapacityLow);
     assert!((marked.acknowledged, marked.cell, marked.state) == (true, 0, 1), "{marked:?}");
-    // Repeat the frame, then send a frame with a wrong CRC and a frame with an unknown command. None is applied, and
-    // one per second is reported.
+    // Repeat the frame, then send a frame with a wrong CRC and a frame with an unknown command. None of them is
+    // applied; at most one per second is reported.
     rig.seconds(2);
     let again = command_frame(1, 1, 0, 1);
     rig.give(Record::frame(rig.now(), BusIndex(0), &again));

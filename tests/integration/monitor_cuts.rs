@@ -4,8 +4,8 @@
 //! A pack of three cells with protected inputs, all kinds of alarms, commands from both sides, a J1939 node and
 //! diagnostic requests runs through random drives, faults, gaps, sleep and backward clock steps. One monitor runs
 //! through; the other is replaced by its own snapshot (through JSON) after random inputs. The same is done with a pack
-//! that learns its cell model, and with one whose frames are authenticated. The latter is compared without the
-//! freshness, which restarts by design. `PACKWATCH_CUTS` sets the number of cuts.
+//! that learns its cell model, and with one whose frames are authenticated. Authenticated frames are compared without
+//! the freshness, which restarts by design. `PACKWATCH_CUTS` sets the number of cuts.
 
 use packwatch::alarm::{Rule, Selector};
 use packwatch::can::e2e::{Profile, Protection};
@@ -250,7 +250,8 @@ impl Vehicle {
                 records.push(Record::frame(time, BusIndex(0), if dice.one_in(4) { &damaged } else { &frame }));
             }
             16 => self.identity = f64::from(u8::try_from(dice.below(3)).expect("small")),
-            // A single-frame answer, a two-frame answer whose second frame may be missing, or a refusal.
+            // A single-frame answer, a two-frame answer whose second frame may be missing, or "response pending"
+            // (0x78).
             17..=30 => {
                 records.push(Record::frame(time, BusIndex(0), &tester(0x7BB, &[4, 0x61, 1, 0x20, 0x10, 0, 0, 0])))
             }
@@ -323,7 +324,7 @@ fn cut(seed: u64, config: &MonitorConfig, one_in: usize) -> usize {
     let mut before = Timestamp::from_nanos(0);
     let is_secured = !config.authentications().is_empty();
     for (nth, record) in records(seed, 3000, config).iter().enumerate() {
-        // The freshness decides whether a forged command counts as old.
+        // Skip commands: the freshness, which differs after a cut, decides whether a forged command counts as old.
         if is_secured && is_command(record) {
             continue;
         }

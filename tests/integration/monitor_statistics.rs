@@ -9,12 +9,12 @@ use packwatch::quantity::{CellIndex, Mode};
 fn readings_are_counted_by_outcome() {
     let mut rig = Rig::new("");
     rig.seconds(10);
-    // 100 frames of three kinds. All signals but one are bound to an input.
+    // 200 frames: 100 with four bound signals, 100 with two.
     let before = rig.monitor.reading_counts();
     assert_eq!((before.accepted, before.out_of_range), (600, 0));
     assert_eq!(rig.monitor.statistics().buses[0].frames, 200);
     assert_eq!(rig.monitor.statistics().voltages.used, 200);
-    // Above the pack's limits, long enough to be reported once.
+    // The voltage is above the pack's limits for long enough to be reported once.
     rig.voltages_v[1] = Some(4.9);
     rig.seconds(2);
     let after = rig.monitor.reading_counts();
@@ -54,7 +54,7 @@ fn bad_commands_are_counted_and_reports_limited() {
     let mut rig = Rig::new("");
     rig.seconds(1);
     for _ in 0..5 {
-        // No rule has that number.
+        // No rule has this number, so the command is bad.
         rig.command(0, 30, 0x7FF);
     }
     let reported = rig.events.iter().filter(|event| format!("{event:?}").contains("BadCommand")).count();

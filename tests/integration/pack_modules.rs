@@ -65,7 +65,7 @@ fn each_cell_kind_uses_its_own_model() {
     let [own_alone, taken] = socs(&alone);
     assert!((own_alone.0 - own.0).abs() < 0.005, "without the module {own_alone:?}, with it {own:?}");
     assert!((taken.0 - 0.15).abs() > 0.1, "{taken:?}");
-    // Stored values continue.
+    // After a restart, the stored values apply.
     mixed.restart(Downtime::Seconds(1.0));
     mixed.seconds(5);
     let [own_after, module_after] = socs(&mixed);

@@ -361,7 +361,7 @@ fn missing_static_members_are_named() {
     ];
     let mut pointers = Vec::new();
     members(&manufacturer(), "", &mut pointers);
-    // A single document represents all of them.
+    // Skip members of list items whose names begin with `c` or `header`, mostly those of documents.
     let is_wanted = |pointer: &&String| !pointer.contains("/0/c") && !pointer.contains("/0/header");
     let mut document = manufacturer();
     let mut expected = Vec::new();
@@ -664,7 +664,7 @@ fn measured_life_gives_valid_passports() {
     let faults = [peer(&["submodel", &condition]), schema("ProductConditionBattery-schema.json", &condition)];
     assert!(faults.iter().flatten().all(String::is_empty), "{faults:?}");
     let of_replay: Value = serde_json::from_str(&fs::read_to_string(&condition).unwrap()).unwrap();
-    // 168 discharges from 1.86 to 1.29 Ah, as their publishers measured them, and as many charges.
+    // 168 discharges with published capacities from 1.86 to 1.29 Ah, and as many charges.
     let moved_ah = of_replay["CapacityThroughput"]["CapacityThroughputValue"].as_f64().unwrap();
     assert!((480.0..560.0).contains(&moved_ah), "{moved_ah} Ah");
     assert_eq!(of_replay["NumberOfFullCycles"]["NumberOfFullCyclesValue"], json!((moved_ah / 4.0).floor() as u64));

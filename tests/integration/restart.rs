@@ -219,7 +219,7 @@ fn start_waiting(
     let (up, still): (Vec<_>, Vec<_>) = waiting.drain(..).partition(|(up, ..)| time >= *up);
     *waiting = still;
     for (up, mode, state) in up {
-        // The bus fell asleep before the first estimate; another test covers that.
+        // Skip a restart if the bus fell asleep before its first estimate: another test covers this case.
         if time.since(up) > 1.0 {
             continue;
         }

@@ -7,8 +7,8 @@ use assert_cmd::Command;
 use assert_cmd::assert::Assert;
 use serde_json::Value;
 
-/// A linear open-circuit voltage, 3 V + 1.2 V x SOC, 2 Ah, and a very small resistance, so every estimate can be
-/// calculated by hand.
+/// A cell of 2 Ah with a linear open-circuit voltage, 3 V + 1.2 V x SOC, and a very small resistance, so that every
+/// estimate can be calculated by hand.
 const MODEL: &str = "format = 1
 name = \"straight\"
 rated_capacity_ah = 2.0

@@ -201,8 +201,8 @@ class Comparison:
         self.faults, self.printed = 0, []
         self.counters = {}
         self.unreported = 0  # recharge periods without an event in the log
-        # Resistances that cannot be compared: a mode change, at which the current's offset is learned, changes them before the
-        # next rows report them.
+        # Number of resistances that cannot be compared: at a mode change, the current's offset is learned, which changes a
+        # resistance before the next rows report it.
         self.restated = 0
 
     def fault(self, time, message, what):

@@ -75,7 +75,7 @@ pub(super) struct Capture {
     start: Option<Timestamp>,
     latest_s: f64,
     bytes: usize,
-    /// Of every `mask` + 1 windows, one is kept. Values are 0, 1, 3, 7, ...
+    /// One of every `mask` + 1 windows is kept. Values are 0, 1, 3, 7, ...
     mask: u64,
 }
 

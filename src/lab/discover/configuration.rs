@@ -55,7 +55,7 @@ struct Selection<'a> {
     reported: Vec<(&'static str, &'a Candidate)>,
 }
 
-/// Everything from which the text is written.
+/// Inputs of the text of the configuration.
 pub(super) struct Writer<'a> {
     pub(super) discovery: &'a Discovery,
     pub(super) capture: &'a Capture,
@@ -282,7 +282,7 @@ impl Writer<'_> {
         }
     }
 
-    /// Writes the tables of used signals, reduced from the definitions, and the used fields without a definition.
+    /// Returns the given definitions reduced to the used signals, and the used fields without a definition.
     fn used_tables(
         &self,
         selection: &Selection<'_>,
@@ -368,7 +368,7 @@ impl Writer<'_> {
                 .iter()
                 .map(|index| self.signal(*index).series.period_s().unwrap_or(0.0))
                 .fold(0.0, f64::max);
-            // At least the default of the configuration.
+            // Not below the default of the configuration.
             let age_s = (3.0 * period_s).max(2.0).ceil();
             let _ = write!(text, "\n[limits.{name}]\nmax_age_s = {age_s:.1}\n");
         }

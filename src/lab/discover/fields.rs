@@ -1,9 +1,9 @@
-//! Finds bit fields that behave like pack voltage, current or cell voltages, in messages that no DBC describes.
+//! Finds bit fields that behave like pack voltage, current or cell voltages. Used if no DBC is given.
 //!
 //! * Voltage: fields of 16 bits at every byte and of 12 bits at every half byte, in both byte orders, with common scales. The value is
 //!   plausible for a pack, changes slightly, and its last digits vary.
-//! * Current: the same positions, but signed. The changes of the field match the changes of a voltage across a resistance. Of the
-//!   common scales, the one that gives the most typical resistance is guessed.
+//! * Current: the same positions, but signed. The changes of the field match the changes of a voltage across a
+//!   resistance. The scale is a guess: the common scale that gives the most typical resistance.
 //! * Cells: neighbouring fields of 8, 12 or 16 bits with similar values. Each message or page (selected by the first byte) has at least
 //!   three of them, and all together at least eight.
 //!

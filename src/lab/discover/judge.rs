@@ -54,7 +54,7 @@ impl Evidence {
         self.score.add(points, holds, reason);
     }
 
-    /// Whether all values are in the range of a pack in use.
+    /// Whether the values vary by at most 35 %, as in a pack in use.
     fn is_steady(&self) -> bool {
         self.high - self.low <= 0.35 * self.high
     }

@@ -132,7 +132,7 @@ fn is_plausible(signal: &LogSignal) -> bool {
     let (SignalOrigin::Raw(_, field), LogSignal { label, series, .. }) = (&signal.origin, signal) else { return false };
     let within = |low: f64, high: f64| series.extent.min >= low && series.extent.max <= high;
     if label.has_unit_of(Quantity::Voltage) {
-        // Larger codes mean "no value", or they are the sign of a longer number.
+        // Larger codes (0xFF00 and above) mean "no value" or are the sign bytes of a longer number.
         within(PACK_V.0, PACK_V.1) && series.extent.max < 65_280.0 * field.factor
     } else if label.has_unit_of(Quantity::Current) {
         within(-1500.0, 1500.0) && !series.is_constant()
@@ -153,7 +153,7 @@ fn temperatures(key: &AnswerKey, answers: &Answers, bytes: usize) -> Vec<LogSign
             let row = temperature_row(key, answers, (first, bytes), distance, offset);
             let values: std::collections::BTreeSet<u64> =
                 row.iter().flat_map(|signal| signal.series.values.kept()).map(|value| value.to_bits()).collect();
-            // Equal constants are more likely to be bytes of other numbers.
+            // Bytes that all have the same constant value are more likely to be parts of other numbers.
             let weight = if values.len() > 1 { 2 * row.len() + usize::from(distance > 1) } else { 0 };
             if row.len() >= 3 && weight > best_weight {
                 (best, best_weight) = (row, weight);

@@ -15,20 +15,22 @@ use crate::ident::parameters::ParameterTables;
 use crate::ident::pass::residuals;
 use crate::ident::record::Record;
 
-/// Shortest time between two recorded differences, s. Differences change only with the SOC, so closer ones add no information.
+/// Shortest time between two recorded differences, s. Differences change only with the SOC, so a shorter interval adds
+/// no information.
 const PERIOD_S: f64 = 5.0;
 /// Standard deviations before the fit: ln capacity, ln resistance, sensor offset (V), leakage (share of the capacity per h), SOC.
 const PRIOR: [f64; OWN + 1] = [0.15, 0.4, 0.003, 0.002, 0.15];
 /// Number of unknowns of a cell without the SOC at the start of each stretch.
 const OWN: usize = 4;
-/// Error of a difference, V. The next constant is the correlation time of the error, s.
+/// Standard deviation of the error of a difference, V. Next constant: correlation time of this error, s.
 const DISTANCE_V: f64 = 0.002;
 const REPEATS_S: f64 = 50.0;
 /// Smallest number of cells for a comparison.
 const LEAST_CELLS: usize = 4;
-/// A cell is an outlier if its distance from the median exceeds three limits: this many robust standard deviations, the second constant
-/// times the standard deviation of its own value, and the smallest relevant difference. The smallest relevant differences are those of
-/// capacity, of resistance, of the residual (V) and of the leakage (share of the capacity per h).
+/// A cell is an outlier if its distance from the median exceeds three limits: this many robust standard deviations, the
+/// second constant times the standard deviation of its own value (not for the residual), and the smallest relevant
+/// difference. The smallest relevant differences are those of capacity, of resistance, of the residual (V) and of the
+/// leakage (share of the capacity per h).
 const SPREADS: f64 = 5.0;
 const OWN_DEVIATIONS: f64 = 3.0;
 const FLOOR: [f64; 4] = [0.03, 0.15, 0.004, 0.0005];
@@ -67,7 +69,7 @@ pub struct CellDeviation {
     pub residual_v: f64,
 }
 
-/// Factors with which the unknowns act on the differences at one time.
+/// Coefficients of the unknowns in the equation of the differences, at one time.
 struct Factors {
     stretch: usize,
     weight: f64,
@@ -101,7 +103,7 @@ pub(super) fn fit(
     (0..cells).into_par_iter().map(|cell| fit_cell(cell, distances.len(), &factors, &all_v)).collect()
 }
 
-/// Returns the factors at the times of the differences, each from the latest row before.
+/// Returns the coefficients at the time of each difference, computed from the latest row up to this time.
 fn factors(
     stretch: usize,
     distances: &CellDistances,

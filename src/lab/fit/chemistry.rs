@@ -23,8 +23,8 @@ pub(super) fn label_of(model: &CellModel) -> Option<Label> {
     model.spread.and(labels.into_iter().find(|label| label.model().as_ref() == Some(model)))
 }
 
-/// Returns the rows that the daemon would record of these stretches. Each stretch has its initial SOC. The offset of the sensor is
-/// removed.
+/// Returns the rows that the daemon would record for these stretches. Each stretch is given with its initial SOC. The
+/// offset of the current sensor is subtracted.
 fn rows<'a>(label: &Label, offset_a: f64, stretches: impl Iterator<Item = (&'a MeasuredPart, f64)>) -> Vec<Row> {
     let config = NotebookConfig::new(1, label.rated_ah);
     let mut notebook = Notebook::default();

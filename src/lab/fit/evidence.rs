@@ -1,4 +1,5 @@
-//! Sentences about information that is missing in logs. There, the fit keeps the values of the initial model.
+//! Notes on quantities that the logs do not determine. For these quantities, the fit keeps the values of the initial
+//! model.
 //!
 //! Input: stretches and fitted records of the mean cell, capacities (Ah). Output: notes for the user.
 
@@ -13,7 +14,7 @@ pub(super) struct Capacity {
     pub(super) std_ah: f64,
 }
 
-/// Returns the sentences.
+/// Returns the notes.
 pub(super) fn notes(parts: &[&MeasuredPart], records: &[Record], before: Capacity, after: Capacity) -> Vec<String> {
     let mut notes = Vec::new();
     // The logs do not show the capacity if more than this share of its relative standard deviation remains after the fit.
@@ -75,7 +76,7 @@ fn span(record: &Record) -> f64 {
     (high - low).max(0.0)
 }
 
-/// Returns the smallest difference between two unequal voltages, V.
+/// Returns the resolution of the voltage readings: the smallest difference between consecutive unequal readings, V.
 fn step_v(parts: &[&MeasuredPart]) -> f64 {
     let of_part = |part: &&MeasuredPart| {
         let pairs = part.voltage_v.windows(2).take(2000).map(|pair| (pair[1] - pair[0]).abs());

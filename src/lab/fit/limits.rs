@@ -1,9 +1,9 @@
 //! Finds the voltage limits of a cell in its measured data, with the row that shows each limit.
 //!
-//! Input: measured files. Output: lowest and highest voltage, V, each with a note that states file, row, value and the option to change
-//! it. Pulses do not count as limits: a row counts only if the current has kept its direction, or been at rest, for [`HELD_S`]. If the
-//! data are whole cycles, two voltages count: the first row of a discharge below its cut-off, and the voltage at which charges are
-//! held.
+//! Input: measured files. Output: lowest and highest voltage, V, each with a note that states file, row, value and the
+//! option to change it. Pulses do not count as limits: a row counts only if the current has kept its direction, or been
+//! at rest, for [`HELD_S`]. If the data are whole cycles, the limits are the first voltage of a discharge below its
+//! cut-off, and the voltage at which charges are held.
 
 use super::FitRequest;
 use crate::error::LabError;
@@ -15,7 +15,7 @@ pub(super) const DISCONNECTED_V: f64 = 0.5;
 const HELD_S: f64 = 30.0;
 /// Current below which a cell rests, as a share of the largest current of its part.
 const REST_SHARE: f64 = 0.02;
-/// One row in this number may have a stray value.
+/// One outlier per this number of rows is ignored.
 const STRAY: usize = 10_000;
 /// Error of a reading at a limit, V.
 const READING_V: f64 = 0.005;
@@ -79,7 +79,7 @@ fn strays<'a>(files: impl Iterator<Item = &'a MeasuredFile>) -> usize {
     files.map(MeasuredFile::rows).sum::<usize>() / STRAY
 }
 
-/// Returns the readings at which the current has kept its direction for `held_s`, by rising voltage.
+/// Returns the readings at which the current has kept its direction for `held_s`, sorted by rising voltage.
 fn readings<'a>(files: impl Iterator<Item = &'a MeasuredFile>, held_s: f64) -> Vec<Reading<'a>> {
     let mut all = Vec::new();
     for file in files {
@@ -111,9 +111,9 @@ fn held_rows(part: &MeasuredPart, held_s: f64) -> Vec<usize> {
 
 /// Returns the voltage limits of whole cycles.
 ///
-/// A discharge ends with its first row below the cut-off. Cut-offs are multiples of 0.1 V. The lower limit is therefore the highest of
-/// these rows, rounded up to 0.1 V; aborted discharges do not count. Charges hold their voltage, so the upper limit is the median of
-/// their highest voltages.
+/// A discharge ends with its first row below the cut-off. Cut-offs are multiples of 0.1 V. The lower limit is therefore
+/// the highest voltage of these rows, rounded up to 0.1 V; aborted discharges do not count. Charges hold their voltage,
+/// so the upper limit is the median of their highest voltages.
 fn cycle_limits(files: &[MeasuredFile], first: usize) -> Option<(Limit<'_>, Limit<'_>)> {
     let (mut ends, mut tops) = (Vec::new(), Vec::new());
     for file in files {

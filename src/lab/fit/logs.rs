@@ -43,14 +43,15 @@ const LEAST_ROWS: usize = 20;
 const BEGINNING_STD: f64 = 0.02;
 /// A stretch starts full if its open-circuit voltage is at least the OCV at this SOC.
 const FULL_SOC: f64 = 0.975;
-/// Share of the usual series resistance with which the open-circuit voltage at the start is computed. No cell has a smaller share.
+/// The open-circuit voltage at the start is computed with this share of the model's series resistance. No cell has
+/// less.
 const LEAST_RESISTANCE: f64 = 0.4;
 /// Standard deviation of the initial SOC of a stretch that starts full.
 const FULL_STD: f64 = 0.01;
 /// A cold cell is limited by diffusion below this SOC times (Arrhenius factor - 1). No circuit models the voltage there, so its error
 /// would be mistaken for lost capacity. Chosen on Panasonic 18650PF cells.
 const KNEE_SOC: f64 = 0.13;
-/// Upper limit of this SOC.
+/// Upper limit of [`KNEE_SOC`] times (Arrhenius factor - 1).
 const MOST_KNEE_SOC: f64 = 0.35;
 /// A cold cell does not settle within a drive. Its voltage is therefore wrong by the equivalent of this SOC times (Arrhenius factor -
 /// 1). Rests of 20 min of Panasonic 18650PF cells at 10 to -20 degrees C show 0.013 to 0.024; rests during drives are shorter.
@@ -58,8 +59,8 @@ const COLD_SOC: f64 = 0.03;
 /// If the residual is above this value, V, the logs do not come from one kind of cell. In the cold, the limit is multiplied by a power
 /// of the Arrhenius factor. Fits of the cells of `tests/label` leave 5 to 20 mV when warm and 27 mV at 0 degrees C.
 const UNFIT_V: f64 = 0.04;
-/// A charge is complete when two conditions hold: the voltage is at most this far below the highest voltage, V, and the current would
-/// need more than the next constant, h, to charge the rated capacity.
+/// A charge is complete if the voltage is at most [`HELD_V`] below the highest voltage, V, and the remaining current
+/// would need more than [`FADED_H`], h, to charge the rated capacity.
 const HELD_V: f64 = 0.012;
 const FADED_H: f64 = 15.0;
 /// Smallest error of the configured model's curve, V: first the error that is smooth over [`CURVE_SOC`], then the error of each
@@ -78,7 +79,7 @@ pub struct LogRequest<'a> {
     pub monitor: &'a MonitorConfig,
     /// Names of the interfaces.
     pub interfaces: Vec<String>,
-    /// A gap in a log that is longer than this means that the recorder was asleep, s.
+    /// If a gap in a log is longer than this, s, the recorder was asleep.
     pub sleep_gap_s: f64,
     /// Creates the options for reading one log.
     pub options: &'a (dyn Fn() -> LogOptions + Sync),
@@ -86,7 +87,7 @@ pub struct LogRequest<'a> {
     pub logs: Vec<PathBuf>,
 }
 
-/// The mean of all cells in a part of a log without a gap.
+/// Mean of all cells over a part of a log that has no gap.
 #[derive(Debug, Clone, Default)]
 struct Stretch {
     log: usize,
@@ -201,7 +202,8 @@ fn fit_stretches(
     let known = known(model, &grid, request.monitor);
     let fit = unanchored::fit(&settings, &known, &records, |pass, cost| progress(FitProgress::Pass(pass, cost)))
         .map_err(LabError::Data)?;
-    // The logs may come from two packs or from cells of an unknown kind. Then the fit describes neither.
+    // If the logs come from two packs or from cells of an unknown kind, the fit describes neither, so the prior is
+    // used.
     let unfit_v = Some(fit.fitted.total.rmse_v).filter(|rmse_v| *rmse_v > unfit_v(&grid));
     let fit =
         if unfit_v.is_some() { unanchored::prior(&settings, &known, &records).map_err(LabError::Data)? } else { fit };

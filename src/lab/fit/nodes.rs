@@ -1,7 +1,7 @@
 //! Places SOC breakpoints where the open-circuit curve of the slow tests bends.
 //!
-//! Input: slow tests (SOC, V). Output: breakpoints, fraction. A model is linear between breakpoints, which causes an error of the SOC.
-//! A breakpoint is added where this error is largest, until it is below [`MOST_POINTS`] everywhere.
+//! Input: slow tests (SOC, V). Output: breakpoints, fraction. A model is linear between breakpoints, which causes an
+//! SOC error. A breakpoint is added where this error is largest, until it is below [`MOST_POINTS`] everywhere.
 
 use crate::ident::fit::{MIN_SLOPE_V, OcvCurve};
 use crate::ident::grid::interpolate;

@@ -163,7 +163,7 @@ fn slow_test(file: &MeasuredFile, voltage_max_v: f64) -> Result<SlowDischarge, L
         }
     }
     let whole_ah = out_ah.iter().fold(0.0_f64, |most, ah| most.max(*ah));
-    // A slow test must discharge at least this share of the capacity.
+    // The first discharge must take out at least this share of the largest charge taken out in the file.
     if test.out_ah.len() < 10 || test.out_ah[test.out_ah.len() - 1] < 0.5 * whole_ah {
         return Err(fail(format!("its first discharge has {} rows, expected a whole slow one", test.out_ah.len())));
     }

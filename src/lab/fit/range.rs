@@ -74,8 +74,8 @@ impl ModelTables {
         Self { grid, tables, voltage_error_v: voltage_error_v.to_vec() }
     }
 
-    /// Returns the fitted tables with rows outside the measured temperatures. Arrhenius' law applies from the first and last node on if
-    /// `is_scaled` is set, otherwise from the ends of the measured temperatures on.
+    /// Returns the fitted tables with rows outside the measured temperatures. If `is_scaled` is set, Arrhenius' law
+    /// applies from the first and last node on; otherwise, from the ends of the measured temperatures on.
     pub(super) fn beyond(
         fitted: &FittedTables,
         voltage_error_v: &[f64],
@@ -110,7 +110,7 @@ impl ModelTables {
         all
     }
 
-    /// Adds a row for the temperature `to_c`: a fitted row, which holds at `from_c`, scaled by Arrhenius' law.
+    /// Adds a row for the temperature `to_c`: the fitted row `row`, valid at `from_c`, scaled by Arrhenius' law.
     fn add_row(
         &mut self,
         (fitted, voltage_error_v): (&FittedTables, &[f64]),
@@ -138,7 +138,7 @@ impl ModelTables {
         self.voltage_error_v.extend(nodes.map(|node| {
             let settled_ohm = r_ohm.iter().fold(r0_ohm[node], |sum, r| sum + r[node]);
             let arrhenius_v = log_std * rms_a * settled_ohm * colder;
-            // Upper limit of the errors, V: an estimate hardly follows a voltage with such an error.
+            // Upper limit of the errors, V: with such an error, the voltage hardly affects an estimate.
             libm::hypot(voltage_error_v[node] * libm::pow(colder, COLD_POWER), arrhenius_v).min(0.5)
         }));
     }

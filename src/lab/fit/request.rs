@@ -38,8 +38,8 @@ pub struct FitRequest {
     pub temperature_c: Option<Vec<f64>>,
     /// SOC breakpoints, rising from 0 to 1; `None` = the defaults.
     pub soc: Option<Vec<f64>>,
-    /// Number of half-cycles at the start of an ageing cell's life that are used, without slow tests and capacity; `None` = the cell is
-    /// not ageing.
+    /// Number of half-cycles to use from the start of an ageing cell's life; `ocv` and `capacity_ah` must then be
+    /// empty. `None` = the cell is not ageing.
     pub first_cycles: Option<usize>,
     /// Files to fit; at least one.
     pub files: Vec<PathBuf>,

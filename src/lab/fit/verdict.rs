@@ -28,7 +28,7 @@ pub(super) fn verdict(outcome: &FitOutcome) -> Vec<String> {
     said
 }
 
-/// Returns the error of a SOC from voltage alone at every node, points.
+/// Returns the error at every node of an SOC determined by voltage alone, points.
 fn soc_points(fit: &FittedTables, voltage_error_v: &[f64]) -> Vec<f64> {
     let (soc, columns) = (&fit.grid.soc, fit.grid.soc.len());
     let of_node = |node: usize| {
@@ -68,7 +68,7 @@ fn accuracy(rows: &[(f64, f64)]) -> Vec<String> {
     said
 }
 
-/// States the SOC range in which the curve is too flat for the model's error at every temperature.
+/// Lists the SOC breakpoints at which the curve is too flat for the model's error at every temperature.
 fn flat(soc: &[f64], points: &[f64], columns: usize) -> Option<String> {
     // Above this SOC error, points, the voltage at a breakpoint is useless.
     let is_flat = |s: &usize| points.iter().skip(*s).step_by(columns).all(|points| *points > 5.0);

@@ -1,7 +1,8 @@
 //! Replays one log through one monitor, like `packwatch replay` but without its output files.
 //!
-//! Input: a log, and a monitor that has received nothing. Output: after each input, the outputs of the monitor are passed to a closure.
-//! The monitor receives the same inputs and ticks as from `packwatch replay`, so the results are the same.
+//! Input: a log, and a monitor that has not received any input yet. Output: after each input, the outputs of the
+//! monitor are passed to a closure. The monitor receives the same inputs and ticks as from `packwatch replay`, so the
+//! results are the same.
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
@@ -21,7 +22,7 @@ pub type OpenedLog = (LogSource, Option<String>);
 pub struct LogAccess<'a> {
     /// Opens logs with a configuration. The logs are read one after the other, as one recording.
     pub open: &'a (dyn Fn(&Config, &[PathBuf]) -> OpenedLog + Sync),
-    /// A gap in a log that is longer than this means that the recorder was asleep, s.
+    /// If a gap in a log is longer than this, s, the recorder was asleep.
     pub sleep_gap_s: f64,
 }
 

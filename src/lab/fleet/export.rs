@@ -1,9 +1,10 @@
 //! Exports the results of logs as tables of estimates, half-cycles and alarms, in Parquet or CSV format.
 //!
-//! Input: a configuration and logs. Output: for each log, a folder `NAME/` with `estimates`, `half_cycles` and `alarms` (`.parquet` or
-//! `.csv`; see [`columns`] for columns and units), and with `about.json`. `about.json` is written last: if it exists, the tables are
-//! complete. A file gets its final name only when it is complete. Memory holds one row group per table and log, no matter how long the
-//! log is. If a log fails, its folder contains no file, and the other logs continue.
+//! Input: a configuration and logs. Output: for each log, a folder `NAME/` with `estimates`, `half_cycles` and `alarms`
+//! (`.parquet` or `.csv`; see [`columns`] for columns and units), and with `about.json`. `about.json` is written last:
+//! if it exists, the tables are complete. A file gets its final name only when it is complete. Memory holds one row
+//! group per table and log, no matter how long the log is. If a log cannot be replayed, its folder gets no new file,
+//! and the other logs continue.
 
 mod columns;
 pub mod merge;
@@ -103,8 +104,7 @@ pub fn run(
 
 /// Exports the logs of one recording.
 ///
-/// # Errors
-/// A log cannot be read or a table cannot be written. In this case, no table remains.
+/// # Errors A log cannot be read or a table cannot be written. If a log cannot be read, no new table is written.
 pub(super) fn export(
     config: &Config,
     logs: &[PathBuf],

@@ -35,7 +35,7 @@ pub enum Horizon {
     Days(f64),
 }
 
-/// Use, truth and end of life of a log. Its alarms are judged by them.
+/// Use, truth and end of life of a log, by which its alarms are judged.
 #[derive(Debug, Clone, Copy)]
 pub struct LogLife<'a> {
     /// Charge moved, and learned capacities.
@@ -76,11 +76,12 @@ pub struct AlarmScore {
     pub lead_days: Option<f64>,
     /// Lead time, equivalent full cycles.
     pub lead_cycles: Option<f64>,
-    /// Whether the end of life was reached without a true raise; `None` = it was not reached, or the rule is not about ageing.
+    /// Whether the end of life was reached without a true raise; `None` = it was not reached, the log starts after it,
+    /// or the rule is not about ageing.
     pub missed: Option<bool>,
-    /// Number of false alarms; `None` = the rule is not about ageing.
+    /// Number of false alarms; `None` = the rule is not about ageing, or the log starts after the end of life.
     pub false_alarms: Option<usize>,
-    /// Number of raises that cannot be judged.
+    /// Number of raises that cannot be judged; `None` as for `false_alarms`.
     pub open: Option<usize>,
     /// Number of raises while the true capacity was above the threshold; `None` = the true capacities are unknown.
     pub false_raises: Option<usize>,

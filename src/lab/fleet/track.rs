@@ -51,7 +51,8 @@ impl Track {
         *moved_ah += charge_ah;
         let cycles = *moved_ah / (2.0 * self.rated_ah);
         let most = self.cycles.last().map_or(0.0, |last| last.1);
-        // All cells of a string move the same charge. A cell that had no estimates for a time has counted too little.
+        // All cells of a string move the same charge, so the largest count applies: a cell without estimates for some
+        // time has counted too little.
         if cycles > most {
             self.cycles.pop_if(|last| last.0 == time);
             self.cycles.push((time, cycles));

@@ -62,7 +62,7 @@ pub struct Truth {
 }
 
 impl Truth {
-    /// Reads a truth in either format.
+    /// Reads a truth table in either format.
     /// # Errors
     /// The file cannot be read, has neither format, or a field is wrong. The error states file, line, what was found and what is
     /// allowed.
@@ -139,7 +139,7 @@ fn find(log: &Path, alone: bool) -> Option<PathBuf> {
     existing(log, names.chain(alone.then(|| "truth.csv".to_owned())))
 }
 
-/// Returns the name of a log without its endings, and the ending before that of a compression.
+/// Returns the name of a log without its endings, and its format: `("a", "csv")` for `a.csv.gz`.
 fn stem_of(log: &Path) -> Option<(&str, &str)> {
     let name = log.file_name()?.to_str()?;
     let name = crate::without_compression(name);

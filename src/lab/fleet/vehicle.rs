@@ -54,7 +54,7 @@ pub struct VehicleRecord {
 }
 
 impl VehicleRecord {
-    /// Reads the result from a vehicle's folder; `None` = the vehicle is incomplete.
+    /// Reads the result from a vehicle's folder; `None` = the vehicle is incomplete, or the file has another version.
     pub fn read(folder: &Path) -> Option<Self> {
         let text = std::fs::read(folder.join(RECORD)).ok()?;
         serde_json::from_slice(&text).ok().filter(|record: &Self| record.version == VERSION)

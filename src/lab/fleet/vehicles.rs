@@ -6,9 +6,10 @@
 //! | [`Shard::choose`] | all vehicles | the vehicles of one part; parts have similar sizes and are the same on every machine |
 //! | [`run`] | vehicles | a folder for each vehicle with `vehicle.json` and the tables of [`export`](super::export) |
 //!
-//! `vehicle.json` is written last. If it exists for the same manifest line, settings and program, the vehicle is complete and is not
-//! replayed again. If a vehicle fails, its `vehicle.json` contains the reason, and the other vehicles continue. The folder of a vehicle
-//! is locked during its replay: a second process waits, and then finds that the vehicle is complete.
+//! `vehicle.json` is written last. If it exists for the same manifest line, settings and program and contains no error,
+//! the vehicle is complete and is not replayed again. If a vehicle fails, its `vehicle.json` contains the reason, and
+//! the other vehicles continue. The folder of a vehicle is locked during its replay: a second process waits, and then
+//! finds that the vehicle is complete.
 
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
@@ -70,7 +71,8 @@ fn logs_in(folder: &Path) -> Result<Vec<PathBuf>, LabError> {
     Ok(logs)
 }
 
-/// Whether the name of a file, compressed or not, is that of a log. Truth tables and cycle tables are not logs.
+/// Whether a file name, with or without the ending of a compression, belongs to a log. Truth tables and cycle tables
+/// are not logs.
 fn is_log(name: &OsStr) -> bool {
     let name = name.to_string_lossy();
     let name = crate::without_compression(&name);
@@ -167,7 +169,7 @@ pub enum Outcome {
     Replayed(VehicleRecord),
     /// The vehicle was completed in an earlier run.
     Complete(VehicleRecord),
-    /// The vehicle failed and has no tables. The record contains the reason.
+    /// The vehicle failed. The record contains the reason and lists no tables.
     Failed(VehicleRecord),
 }
 

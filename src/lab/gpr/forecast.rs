@@ -101,8 +101,8 @@ pub struct HorizonForecast {
     pub persistence_rmse: Option<f64>,
 }
 
-/// Returns the horizons that get a process: all horizons up to [`MAX_HORIZONS`]. If there are more, this number of horizons with
-/// constant ratios, including the first and the last.
+/// Returns the horizons that get a process. Up to [`MAX_HORIZONS`] steps, these are all horizons. Otherwise, they are
+/// this number of horizons at constant ratios, including the first and the last.
 pub fn horizons(steps: usize) -> Vec<usize> {
     if steps <= MAX_HORIZONS {
         return (1..=steps).collect();
@@ -196,9 +196,9 @@ impl HorizonTask<'_> {
         Ok((horizon, model))
     }
 
-    /// Returns the smallest number of windows for a process. It is larger than the number of features.
+    /// Returns the minimum number of training windows. It is larger than the number of features.
     fn fewest(&self) -> usize {
-        // Smallest number of training windows.
+        // Minimum if the windows have few features.
         (self.windows.width() + 2).max(20)
     }
 

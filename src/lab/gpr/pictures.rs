@@ -7,7 +7,7 @@ use super::forecast::{HorizonForecast, OutputForecast, TableForecast};
 use super::{ColumnTable, CrossValidation, table};
 use crate::chart::{self, Axis, Chart, Ink, Layer, Picture, PlotError, Point, Shape};
 
-/// Number of rows of the stretch that is drawn with its interval; single rows are visible.
+/// Number of rows of the stretch that is drawn with its interval: few enough that single rows are visible.
 const STRETCH: usize = 150;
 
 /// Draws the cross-validation of every kernel as SVG files.

@@ -14,7 +14,7 @@ const UNITS: [&str; 36] = [
     "a", "ma", "ah", "mah", "v", "mv", "w", "kw", "wh", "kwh", "c", "k", "f", "s", "ms", "us", "ns", "min", "h", "d",
     "days", "cycles", "hz", "ohm", "mohm", "percent", "pct", "ppm", "kg", "m", "mm", "pa", "bar", "n", "nm", "rpm",
 ];
-/// Maximum number of rows of a regression; they need some gigabytes.
+/// Maximum number of rows of a regression; this number needs some gigabytes of memory.
 const MAX_ROWS: usize = 5_000_000;
 
 /// What happens to a row with a missing required value.

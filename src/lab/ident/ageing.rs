@@ -36,7 +36,7 @@ pub struct AnchoredHalfCycle {
 /// Charge of a full charge, as a share of the charge that was missing. Other charges are left out.
 const FULL_CHARGE: std::ops::RangeInclusive<f64> = 0.8..=1.25;
 
-/// Points of one discharge, as charge since its start, Ah.
+/// Charge from the start of a discharge to its knee and to its cut-off, Ah.
 struct Marks {
     knee_ah: f64,
     cut_off_ah: f64,

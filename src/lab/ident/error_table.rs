@@ -19,7 +19,7 @@ use super::record::Record;
 const BLOCK_S: f64 = 100.0;
 /// Upper limit of the error of a block, V; also the error if no temperature has data.
 const MOST_V: f64 = 0.1;
-/// Weight, as SOC moved, with which the mean of a temperature is added to each of its nodes.
+/// Weight of the mean error of a temperature in each of its nodes, as SOC moved.
 const LEAN_SOC: f64 = 1.0;
 /// Growth of the variance on data outside the fit: 1 + this constant / number of files.
 const UNSEEN: f64 = 3.0;

@@ -48,8 +48,8 @@ pub struct FitSettings {
     pub voltage_v: (f64, f64),
     /// Slow tests, by rising temperature; empty = the data alone determine the OCV.
     pub ocv: Vec<OcvCurve>,
-    /// Smallest rise of the OCV, V per unit of SOC, as `(from, slope)`: `slope` applies above the SOC `from`. If several entries apply,
-    /// the last one counts.
+    /// Smallest rise of the OCV, V per unit of SOC, as `(from, slope)`: `slope` applies above the SOC `from`. If
+    /// several entries apply, the largest slope counts.
     pub min_slope_v: Vec<(f64, f64)>,
     /// Standard deviations of the prior.
     pub deviations: PriorDeviations,

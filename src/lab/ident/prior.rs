@@ -61,7 +61,7 @@ impl PriorDeviations {
         ..Self::FREE_OCV
     };
 
-    /// Prior around the resistances of a chemistry. It is the spread of five fitted cells (`cell::chemistry`), which is common to all
+    /// Prior around the resistances of a chemistry: the spread of five fitted cells (`cell::chemistry`), common to all
     /// nodes of a table.
     pub const CHEMISTRY: Self = Self {
         ocv_by_temperature_v: 0.006,
@@ -102,7 +102,7 @@ struct PriorDensity {
 pub struct Prior(Vec<PriorDensity>);
 
 impl Prior {
-    /// Creates the prior around the starting values `start`. If `slow_test` is set, their OCV was measured.
+    /// Creates the prior around the starting values `start`. If `slow_test` is set, the OCV in `start` was measured.
     pub fn new(grid: &Grid, layout: &Layout, start: &[f64], slow_test: bool, deviations: &PriorDeviations) -> Self {
         let mut prior = Self(Vec::new());
         let reference = if slow_test { &start[..layout.nodes] } else { &vec![0.0; layout.nodes] };

@@ -63,7 +63,7 @@ pub struct Record {
     pub rows: Vec<FitRow>,
     /// Number of raw rows.
     pub raw_rows: usize,
-    /// Rows left out because no cell of this type can have their voltage (disconnected sensor).
+    /// Rows left out because their voltage is not plausible for this cell (disconnected sensor).
     pub outliers: usize,
 }
 
@@ -121,8 +121,8 @@ impl Record {
 const WHOLE_S: f64 = 8000.0;
 /// Weight of slow tests and pulse tests relative to drives: the model should follow drives.
 const TEST_SHARE: f64 = 0.3;
-/// In a drive, current flows for more than the first share of the time, and its standard deviation is more than the second share of its
-/// mean.
+/// In a drive, current flows for more than the first share of the time, and the standard deviation of the current is
+/// more than the second share of its mean.
 const DRIVE: (f64, f64) = (0.5, 0.3);
 
 /// Returns 1 for a drive (varying current for a large part of the time), and less for pulse tests with rests and for constant current.

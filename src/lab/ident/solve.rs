@@ -14,8 +14,8 @@ use crate::filter::levenberg_marquardt::{self, Damping};
 const MAX_PASSES: usize = 60;
 /// The fit has converged if the relative fall of the cost is below this value twice in a row.
 const CONVERGED: f64 = 3e-4;
-/// Damping of the steps. If a step needed more damping before it succeeded, the damping is then lowered less, because it is close to
-/// its limit.
+/// Damping of the steps. After a step that needed more damping before it succeeded, the damping falls less, because it
+/// is close to its limit.
 const DAMPING: Damping = Damping { first: 0.3, fall: 0.1, fall_after_growth: 0.6, growth: 8.0, least: 1e-4, most: 1e8 };
 /// With less damping than this, a step is nearly undamped.
 const DAMPING_WEAK: f64 = 0.02;
@@ -56,7 +56,7 @@ impl Space {
         theta
     }
 
-    /// `theta` moved into the bounds.
+    /// Returns `theta` moved into the bounds.
     pub fn inside(&self, theta: &[f64]) -> Vec<f64> {
         let mut y = self.to_steps(theta);
         for (k, y) in y.iter_mut().enumerate() {
@@ -172,7 +172,7 @@ fn bounded_step(h: &DMatrix<f64>, g: &DVector<f64>, damping: f64, y: &[f64], spa
     Some(d)
 }
 
-/// Solves for the free parameters with the held ones at their bounds.
+/// Solves for the free parameters, with the held parameters at their bounds.
 fn solve_free(
     damped: &DMatrix<f64>,
     g: &DVector<f64>,

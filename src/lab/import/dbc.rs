@@ -51,13 +51,14 @@ fn judge(message: &Message, signal: &Signal) -> Vec<(PackQuantity, f64)> {
     let points = |quantity| {
         let points = label.score(quantity)?.points;
         let (fits, points) = match quantity {
-            // A larger value is the sum of several cells.
+            // A signal with a larger range is the sum of several cells.
             PackQuantity::CellVoltage if label.says_extreme() => (largest <= 10.0, points - 1.0),
             PackQuantity::CellVoltage => (largest <= 10.0, points),
             PackQuantity::PackVoltage => (largest > 60.0 && !label.says_cell(), points),
             PackQuantity::Current | PackQuantity::Temperature | PackQuantity::Soc | PackQuantity::Soh => (true, points),
         };
-        // Three points are given for example for a unit, and a name that contains the quantity or the battery.
+        // A signal gets three points, for example, for a matching unit and a name that contains the quantity or the
+        // battery.
         (fits && points >= 3.0 && signal.layout.length_bits >= 4).then_some((quantity, points))
     };
     PackQuantity::ALL.into_iter().filter_map(points).collect()

@@ -1,6 +1,7 @@
 //! Writes `[[input.diagnostic]]` tables as TOML: one answer with its signals, one signal per line.
 //!
-//! Numbers are written with the fewest digits from which the same number is read. Values have the unit that the signal states.
+//! Numbers are written with the fewest digits that read back as the same number. Values have the unit that the signal
+//! states.
 
 use std::fmt;
 

@@ -3,8 +3,9 @@
 //! Input: the text of the JSON, a model year, and a name. Output: TOML with one table per command and one signal per line. The tables
 //! are in the order of the controllers. The licence of the source, CC BY-SA 4.0, also applies to the TOML; the TOML states it.
 //!
-//! Signals are named `NAME.REST`. All ids of a file start with the same word. REST is the `id` without this word; NAME is this word or
-//! the given name. A file that is not an OBDb signal set is an error. A command or signal that cannot be converted becomes an
+//! Signals are named `NAME.REST`. If all ids of a file start with the same word, REST is the `id` without this word,
+//! and NAME is the given name or this word. Otherwise, REST is the whole `id`, and NAME is the given name or `Car`. A
+//! file that is not an OBDb signal set is an error. A command or signal that cannot be converted becomes an
 //! [`Exclusion`], and the rest is converted. An unknown field is a warning.
 
 mod address;

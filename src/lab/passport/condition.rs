@@ -12,8 +12,8 @@ use crate::config::Config;
 use crate::monitor::{Downtime, ModelState, Monitor, Outputs, Snapshot};
 use crate::quantity::{CellIndex, Channel, Timestamp, catalogue};
 
-/// An earlier time stamp (before 2001-01-01, s since 1970) is not a date. A clock that was not set starts in 1970, 1980 or 2000; a log
-/// that counts from its own start is shorter than 30 years.
+/// A time stamp before this one (2001-01-01, s since 1970) is not a date. A clock that was not set starts in 1970, 1980
+/// or 2000; a log that counts from its own start is shorter than 30 years.
 const FIRST_DATE_S: f64 = 978_307_200.0;
 /// Largest accepted difference between two values of the same new battery, fraction; the values may be rounded.
 pub(super) const RATED_TOLERANCE: f64 = 0.01;
@@ -78,7 +78,7 @@ impl Condition {
         Self { values, rated }
     }
 
-    /// The new battery.
+    /// Returns the values of the new battery.
     pub(super) fn rated(&self) -> Rated {
         self.rated
     }
@@ -135,7 +135,7 @@ struct Battery<'a> {
     record: &'a Record,
     config: &'a Config,
     model: &'a CellModel,
-    /// The state, restored at the time at which it was taken.
+    /// Monitor restored from the state, at the time of the state.
     monitor: Monitor,
     /// Wall clock minus the clock of the inputs, ns.
     offset_ns: i64,
@@ -308,8 +308,8 @@ impl<'a> Battery<'a> {
         Ok(Quantity { value: *mean, std: Some(*std), time: Timestamp::from_nanos(*at_ns) })
     }
 
-    /// Returns the mean of the cells' resistance ratios. All errors share the error of the model, so the standard deviation is also a
-    /// mean.
+    /// Returns the mean of the cells' resistance ratios. The cells share the error of the model, so the standard
+    /// deviation of the mean is the mean of their standard deviations.
     fn mean_resistance(&self) -> Known {
         let learned = self.learned()?;
         let count = learned.len() as f64;

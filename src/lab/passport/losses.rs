@@ -115,8 +115,8 @@ impl Losses {
 
 /// Whether the lost share of a time, s, is so large that its sum is unknown.
 pub(super) fn is_too_much(lost_s: f64, used_s: f64) -> bool {
-    // Largest share of the time of charges and discharges without current: far below the deviation of a current
-    // sensor's gain, and enough for single lost frames.
+    // Maximum share of the charging and discharging time without a current reading. It tolerates single lost frames,
+    // and its error is far below the gain error of a current sensor.
     lost_s > 1e-3 * used_s
 }
 

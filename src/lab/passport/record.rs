@@ -151,7 +151,8 @@ impl Record {
 
     /// Receives the outputs of a replay, in order.
     pub fn take(&mut self, out: &Outputs) {
-        // An event may be a gap. Earlier estimates show the current before the gap, and estimates with its time follow the gap.
+        // An event may be a gap. Estimates with an earlier time precede the gap and show the current before it;
+        // estimates with the same time follow it.
         let mut estimates = out.estimates.iter().peekable();
         for event in &out.events {
             while let Some(estimate) = estimates.next_if(|estimate| estimate.time < event.time) {

@@ -138,7 +138,7 @@ impl Data {
         }
     }
 
-    /// Reads the history of the connected pack, the latest of a store.
+    /// Reads the history of the connected pack, which is the latest pack of the store.
     ///
     /// # Errors
     /// The file cannot be read.
@@ -232,7 +232,7 @@ impl Data {
         });
     }
 
-    /// Adds the losses of a cell to its capacity of the same time, which was received before.
+    /// Adds the losses of a cell to its capacity record of the same time, which was received first.
     fn take_losses(&mut self, time_s: f64, fields: &Fields) {
         let Some(cell) = cell_of(fields) else { return };
         let [lithium, negative, positive] =

@@ -13,7 +13,7 @@ use crate::quantity::{CellIndex, Mode, Timestamp};
 
 /// Half-cycles of the worn pack: enough for a remaining life of every cell.
 pub(super) const HALVES: u16 = 60;
-/// End of the first half-cycle, 2023-11-14, and time between the ends.
+/// End of the first half-cycle (2023-11-14), s since 1970. Next constant: time between two ends, s.
 const FIRST_END_S: f64 = 1.7e9;
 const HALF_CYCLE_S: f64 = 21_600.0;
 /// Number of estimates of a recording after the first.

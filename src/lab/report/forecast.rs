@@ -18,7 +18,8 @@ const POINTS: usize = 60;
 /// length.
 const MAX_MEDIANS: f64 = 2.5;
 const MAX_RECORDS: f64 = 2.0;
-/// Length of the fan, as a multiple of the record's length, if the median is near but the end may come late.
+/// The first limit is at least this multiple of the record's length, because the median may be near while the end may
+/// come late.
 const LEAST_RECORDS: f64 = 0.2;
 
 /// Forecast of the capacity at a time.
@@ -105,7 +106,8 @@ pub(super) fn cells(data: &Data, context: &PageContext<'_>) -> Vec<Forecast> {
         for half in halves {
             let rated_ah = rated_ah(half.cell);
             let usage = Usage::in_half_cycle(half.charge_ah, half.duration_s, since_before_s, rated_ah);
-            // Use without a capacity counts too, because a store omits capacities without new information.
+            // A half-cycle without a capacity still counts as use, because a store omits capacities without new
+            // information.
             let row = learned.get(&key(half.time_s, half.cell));
             cells[half.cell].update(usage, row.and_then(|row| reading(row, gain_std)));
         }
@@ -241,7 +243,8 @@ mod tests {
         let outlook = outlook(&data, &PageContext::default()).expect("enough readings");
         assert_eq!((outlook.cell, outlook.end_ah), (1, 1.6));
         let left = outlook.life.cycles.expect("cycles");
-        // 1.7 Ah now, 0.006 Ah a cycle: 17 full cycles along a straight line, fewer with the expected knee.
+        // From 1.7 Ah, fading by 0.006 Ah per cycle: 17 full cycles along a straight line, fewer with the expected
+        // knee.
         assert!(left.low < 17.0 && left.high > 17.0 && (8.5..17.0).contains(&left.median), "{left:?}");
         let (first, last) = (outlook.fan[0], outlook.fan[POINTS - 1]);
         assert_eq!(first.time_s, data.halves.last().map(|half| half.time_s).expect("halves"));

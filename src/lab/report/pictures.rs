@@ -139,8 +139,8 @@ fn range(
 fn filled<'a>(bins: impl Iterator<Item = (f64, &'a TraceBin)>) -> Vec<(f64, &'a TraceBin)> {
     let all: Vec<(f64, &TraceBin)> = bins.collect();
     let width_s = all.windows(2).map(|pair| pair[1].0 - pair[0].0).fold(f64::INFINITY, f64::min).max(1.0);
-    // A gap is visible if it is at least this share of all bins, 100 s and 3 bins long. It is not shorter because some sensors are
-    // slow.
+    // A gap is visible if it is at least a hundredth of all bins, 100 s and 3 bins long. Shorter gaps may come from
+    // slow sensors.
     let hole = (all.len() / 100).max((100.0 / width_s) as usize).max(3);
     let mut empty = 0;
     let wanted = all.into_iter().filter(|(_, bin)| {
@@ -506,7 +506,7 @@ fn coverage(data: &Data) -> Option<Picture> {
     let clock = TimeAxis::of(data);
     let line = life.iter().filter_map(|(time_s, bin)| Some((clock.x(time_s), 100.0 * bin.health.coverage()?)));
     let line: Vec<(f64, f64)> = line.collect();
-    // From 80 % if no value is lower.
+    // The axis starts at 80 % if no value is lower.
     let lowest = if line.iter().all(|point| point.1 > 80.0) { 80.0 } else { 0.0 };
     let layers = vec![
         Layer::line("within their own 95 % interval", Ink::Blue, line),

@@ -31,7 +31,7 @@ pub(super) fn raised(data: &Data) -> Vec<ActiveAlarm<'_>> {
     let mut last: BTreeMap<(&str, &str, Option<usize>), ActiveAlarm<'_>> = BTreeMap::new();
     for row in &data.alarms {
         let key = (row.rule.as_str(), row.severity.as_str(), row.cell);
-        // Only the row that raised the alarm certainly contains the value.
+        // Keep the row that raised the alarm: only this row certainly contains the value.
         if row.is_active {
             last.entry(key).or_insert(ActiveAlarm { row, since_s: row.time_s });
         } else {

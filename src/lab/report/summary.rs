@@ -95,8 +95,8 @@ pub(super) fn of(data: &Data, context: &PageContext<'_>, outlook: &Result<Outloo
     }
 }
 
-/// Returns the worst alarm. Among the cells for which a rule has raised its highest severity, it is that of the cell with the worst
-/// value at the end.
+/// Returns the worst alarm. If a rule has raised the highest severity for several cells, returns the alarm of the cell
+/// with the worst value at the end.
 fn worst<'a>(
     alarms: &[&'a ActiveAlarm<'a>],
     value: impl Fn(&ActiveAlarm<'_>) -> Option<f64>,

@@ -30,7 +30,7 @@ pub enum Start {
     Middle,
 }
 
-/// How an estimator is started.
+/// Initial conditions of an estimator.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Case {
     /// Start of the estimator in the file.

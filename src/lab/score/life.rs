@@ -182,7 +182,7 @@ mod tests {
         }
         let score = score(life.each, &table, 1.4, 1);
         assert_eq!((score.discharges, score.scored, score.left_out, score.each.len()), (5, 3, 1, 5));
-        // Errors of 2, 3 and 4: +0.01, -0.02, -0.03; half-width 0.0196.
+        // Errors of discharges 2, 3 and 4: +0.01, -0.02, -0.03; half-width 0.0196.
         assert!((score.mean_abs_error_ah - 0.02).abs() < 1e-12 && (score.mean_error_ah + 0.04 / 3.0).abs() < 1e-12);
         assert!((score.max_abs_error_ah - 0.03).abs() < 1e-12 && (score.coverage - 1.0 / 3.0).abs() < 1e-12);
         assert!((score.mean_half_width_ah - 0.0196).abs() < 1e-12);

@@ -1,8 +1,8 @@
 //! Simulates one life: an ageing cell, its usage, its sensors, a slightly wrong model, and a Monitor.
 //!
 //! Records the Monitor's capacity estimate and the true capacity after each half-cycle, and the Monitor's own alarms.
-//! The same life (cell, usage, model errors) is simulated with every sensor set. Only the sensor errors differ, and
-//! only in size.
+//! The same life (cell, usage, model errors) is simulated with every sensor set. Only the size of the sensor errors
+//! differs.
 
 use std::path::Path;
 

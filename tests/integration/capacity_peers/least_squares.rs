@@ -92,7 +92,7 @@ impl Peer {
         }
     }
 
-    /// K = sx/sy. If this ratio differs between swings, the ratio that follows from the sums of their information.
+    /// K = sx/sy. If this ratio differs between swings, K follows from the sums of their information.
     fn scale(&self) -> f64 {
         (self.y_information / self.x_information).sqrt()
     }
@@ -243,7 +243,7 @@ mod tests {
     #[test]
     fn awtls_equals_tls_for_constant_ratio() {
         let list = swings(&mut Random(7), 30, true);
-        // A prior with the same ratio of deviations as the swings: 10 Ah.
+        // With 10 Ah, the prior has the same ratio sx/sy as the swings.
         let [a, b] =
             [Method::Awtls, Method::Tls].map(|m| run(m, 0.9, ScalarGaussian::from_std(10.0, 1.0), &list).capacity());
         assert!((a.mean - b.mean).abs() < 1e-9 && (a.variance / b.variance - 1.0).abs() < 1e-9, "{a:?} {b:?}");

@@ -4,8 +4,8 @@
 //!
 //! - `filter`: the filter's own SOC at both ends (event `half_cycle`, with its deviation; in windows the same ends as
 //!   `voltage`)
-//! - `voltage`: the SOC at both ends by inversion of the open-circuit curve (`swings`). The present capacity estimate is
-//!   used only for the change of the curve's shape with ageing
+//! - `voltage`: the SOC at both ends by inversion of the open-circuit curve (`swings`). The present capacity estimate
+//!   is used only to compute how ageing changes the curve's shape
 //! - `filter, capacity held`: the filter's SOC, always counted with the wrong initial capacity
 //!
 //! Measured lives publish the capacity delivered at 2 A, not the capacity between open-circuit voltages. Each peer's

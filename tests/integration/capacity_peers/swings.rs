@@ -1,11 +1,11 @@
 //! Swings from the voltage alone: the SOC at both ends comes from the inverted open-circuit curve.
 //!
 //! The open-circuit voltage is V + I R0 rho + sum U, with V the cell's voltage, I the current (positive = discharge),
-//! R0 the series resistance, rho the filter's resistance ratio and U the voltages of the RC branches. The U are stepped
-//! in open loop from rest (from 180 s on if the record begins under load). All readings of the first and the last 60 s
-//! count, each with the charge that had flowed until that reading. A capacity is assumed only for the change of the
-//! curve's shape with ageing. The standard deviation of the SOC at an end is the one that packwatch uses
-//! (`[capacity]`).
+//! R0 the series resistance, rho the filter's resistance ratio and U the voltages of the RC branches. The voltages U
+//! are simulated in open loop, starting at 0. If the record begins under load, readings count only after 180 s. All
+//! readings of the first and the last 60 s count, each with the charge that had flowed until that reading. A capacity
+//! is assumed only to compute how ageing changes the shape of the curve. The standard deviation of the SOC at an end is
+//! the one that packwatch uses (`[capacity]`).
 
 use packwatch::cell::aged_ocv::SHIFT_STD;
 use packwatch::cell::circuit::BranchAt;
@@ -14,7 +14,7 @@ use packwatch::health::CapacityConfig;
 
 use super::least_squares::Swing;
 
-/// An interval between readings that is longer than this is a gap, in which the charge is unknown, s.
+/// If the interval between two readings is longer than this, s, the charge in between is unknown.
 const GAP_S: f64 = 60.0;
 /// Below this current the cell rests, A.
 const REST_A: f64 = 0.05;
@@ -201,7 +201,7 @@ impl Circuit {
     fn step(&mut self, model: &CellModel, config: &CapacityConfig, reading: &Reading) -> Point {
         let &Reading { time_s, voltage_v, current_a, temperature_c, resistance_ratio, .. } = reading;
         let mut load_v = self.branch_v.iter().sum::<f64>();
-        // The resistances depend on the SOC, which depends on the voltage; two passes converge.
+        // The resistance depends on the SOC, which depends on the open-circuit voltage: three passes converge.
         let mut soc = 0.5;
         for _ in 0..3 {
             let r0_ohm = model.r0_ohm(&model.grid_position(soc, temperature_c)) * resistance_ratio;

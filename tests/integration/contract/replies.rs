@@ -242,7 +242,7 @@ fn counters(rig: &Rig, id: u32, protection: Protection) -> Vec<i64> {
     rig.frames_with(id).iter().map(counter).collect()
 }
 
-/// Tenths of a second from the stored state to the kill, and from the kill to the first tick of the next run.
+/// Time from the stored state to the kill, and from the kill to the first tick of the next run, in tenths of a second.
 const KILLS: [(i64, i64); 5] = [(0, 3), (7, 0), (16, 2), (130, 25), (31, 600)];
 
 /// Kills a daemon with one raised alarm. Returns for each message of [`COUNTED`] the counter steps from the last frame

@@ -102,7 +102,7 @@ impl Bench {
     pub(crate) fn dbc(self) -> String {
         match self {
             Self::Protected => PROTECTED_DBC.to_owned(),
-            // Match the simulated period.
+            // Match the cycle time in the DBC to the simulated period.
             Self::Day => shipped("pack96.dbc").replace("BO_ 256 10;", "BO_ 256 100;"),
             _ => shipped(self.dbc_name()),
         }

@@ -61,7 +61,7 @@ fn pack_voltage(broken: &mut BrokenPack, by: f64) {
     broken.data("100", |data| data[2..4].copy_from_slice(&code.to_le_bytes()));
 }
 
-/// Adds two signals of the state of charge: that of the BMS, which is 80 %, and that of the dashboard, `dash`.
+/// Adds two SOC signals: 80 % from the BMS, and `dash` (%) from the dashboard.
 pub(crate) fn two_socs(broken: &mut BrokenPack, dash: u8) {
     broken.dbc(
         "CM_ \"Example",

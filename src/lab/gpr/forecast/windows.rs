@@ -1,4 +1,4 @@
-//! Lag windows: for a row, the value and the differences of the rows before it; and the rows that have such a window.
+//! Lag windows: for each column of a row, the value and the latest differences. Finds the rows that have such a window.
 
 use super::super::ColumnTable;
 
@@ -12,7 +12,7 @@ pub struct LagWindows<'a> {
     part: Vec<(usize, usize)>,
 }
 
-/// Steps of the time between consecutive rows.
+/// Time steps between consecutive rows.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RowSpacing {
     /// Median step, in the unit of the time column.

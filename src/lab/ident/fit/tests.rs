@@ -150,7 +150,7 @@ fn known_parameters_are_recovered_from_noisy_data() {
     let grid = grid();
     let truth = truth();
     let records: Vec<Record> = [5.0, 25.0].iter().map(|&t| simulate(&truth, t, 0.002, &grid)).collect();
-    // The noise is white here, so a second contains more information than in real data.
+    // The noise is white here, so one second contains more information than in real data.
     let fitted = fit(&settings(grid.clone()), &records, &[10.0, 10.0], |_, _| {}).expect("a fit");
     assert!(fitted.converged && fitted.total.rmse_v < 0.002, "{:?}", fitted.total);
     let expected = truth_theta(&grid);

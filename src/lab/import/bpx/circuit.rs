@@ -18,7 +18,8 @@ use super::{FARADAY_C_PER_MOL, GAS_J_PER_MOL_K};
 use crate::cell::model::ACTIVATION_ENERGY_J_PER_MOL as USUAL_J_PER_MOL;
 use crate::quantity::bounds::{Bounds, CAPACITANCE_F, RESISTANCE_OHM};
 
-/// Distance over which the slope of a potential is taken, lithium content: the noise of a table must not count as slope.
+/// Distance over which the slope of a potential is taken, lithium content: wide enough that the noise of a table does
+/// not count as slope.
 const SLOPE_STEP: f64 = 0.005;
 
 /// Smallest resistance, ohm, and smallest time constant, s: a flat potential gives 0, but a model needs a positive value.
@@ -38,7 +39,7 @@ impl Resistances {
         self.r0_ohm + self.branches.iter().map(|branch| branch.0).sum::<f64>()
     }
 
-    /// Returns a value that no cell has, with what is allowed; `None` = the values are possible.
+    /// Returns the first implausible value with its allowed range; `None` = all values are plausible.
     pub(super) fn fault(&self) -> Option<String> {
         let resistances = std::iter::once(self.r0_ohm).chain(self.branches.iter().map(|branch| branch.0));
         let capacitances = self.branches.iter().map(|(r_ohm, tau_s)| tau_s / r_ohm);

@@ -59,7 +59,7 @@ impl<'a> Curve<'a> {
         let ends = (((lithium_ah - q_p) / q_n).max(0.0) + 1e-9, (lithium_ah / q_n).min(1.0) - 1e-9);
         let mut faults = Vec::new();
         let mut content = |key: &str, cut_off_v: f64| {
-            // Search from the full end, so that a bend of a potential outside the other end is not found.
+            // Search outwards from the stated lithium content, so that a bend of a potential far from it is not found.
             let [full, empty] = [n.stoichiometry[1], n.stoichiometry[0]].map(|x| x.clamp(ends.0, ends.1));
             let near = if key == "Upper" { full } else { empty };
             let (low, high) = bracket(near, ends, |x| voltage_v(x) < cut_off_v);
@@ -107,8 +107,7 @@ impl<'a> Curve<'a> {
 
     /// The curve at suitable breakpoints.
     ///
-    /// # Errors
-    /// A potential is not a finite number somewhere.
+    /// # Errors The open-circuit voltage at a breakpoint is not a finite number above 0.
     pub(super) fn table(&self, temperature_k: &[f64]) -> Result<CurveTable, Vec<String>> {
         let mut table = CurveTable { soc: self.nodes(), ocv_v: Vec::new(), raised_v: 0.0 };
         for &kelvin in temperature_k {
@@ -126,7 +125,8 @@ impl<'a> Curve<'a> {
         Ok(table)
     }
 
-    /// Returns the SOC breakpoints. The interval with the largest interpolation error is halved until no error exceeds the limit.
+    /// Returns the SOC breakpoints. The interval with the largest interpolation error is halved until no error exceeds
+    /// 1 mV (at most 80 breakpoints, at least 1e-4 apart).
     fn nodes(&self) -> Vec<f64> {
         let mut nodes: Vec<f64> = (0..=10).map(|k| f64::from(k) / 10.0).collect();
         let mut errors: Vec<f64> = nodes.windows(2).map(|ends| self.line_error_v(ends[0], ends[1])).collect();

@@ -53,7 +53,7 @@ fn moment_s(half: u16, minute: u16) -> f64 {
     1.7e9 + 10_800.0 * f64::from(half) + 60.0 * f64::from(minute)
 }
 
-/// Noise that does not repeat soon.
+/// Deterministic noise that does not repeat soon.
 fn noise(a: u16, b: u16) -> f64 {
     (f64::from(a) * 12.9898 + f64::from(b) * 78.233).sin()
 }
@@ -304,7 +304,7 @@ fn every_plus_minus_is_one_standard_deviation() {
     let page = page(&data, &context);
     assert!(page.contains(STATEMENT));
     let [first, second, third, last] = [0, 1, 2, 3].map(examples::stds);
-    // The worst cell in each loss.
+    // The worst cell for each loss.
     let [lithium, negative, positive] = [second.losses[0], third.losses[1], first.losses[2]].map(|std| 100.0 * std);
     for card in cards(&page) {
         let expected = match card.name {
@@ -318,7 +318,7 @@ fn every_plus_minus_is_one_standard_deviation() {
     }
     let offset = between(&page, "reading minus true current</td><td>", "</td>").expect("a row");
     assert!(states(offset, &[0.034]), "{offset}");
-    // No others: the statement, six on cards, the offset.
+    // No other plus-minus signs: one in the statement, six on cards, one for the offset.
     assert_eq!(page.matches(PLUS_MINUS).count(), 8);
     assert!(!page.contains("+-"), "another plus-minus sign");
 }

@@ -46,12 +46,12 @@ fn undated_recording_counts_seconds_since_its_start() {
 #[test]
 fn dated_life_has_ticks_of_utc_dates() {
     const DAY_S: f64 = 86_400.0;
-    // From 2023-11-14T22:13:20Z.
+    // The recording starts at 2023-11-14T22:13:20Z.
     for (ticks, caption) in x_axes(&examples::recording(1.7e9, 10.0 * DAY_S)) {
         assert_eq!(ticks, ["11-15", "11-16", "11-17", "11-18", "11-19", "11-20", "11-21", "11-22", "11-23", "11-24"]);
         assert_eq!(caption, "UTC, 2023-11-14 to 2023-11-24");
     }
-    // Also if it is short.
+    // A short recording also has dates.
     for (ticks, caption) in x_axes(&examples::recording(1.7e9, 60.0)) {
         assert_eq!(ticks, ["22:13:30", "22:13:45", "22:14:00", "22:14:15"]);
         assert_eq!(caption, "UTC, 2023-11-14 to 2023-11-14");
