@@ -30,7 +30,7 @@ const FIRST_STEPS: [f64; 2] = [0.2, 20.0];
 /// Part of the counts that remains after another step.
 const FORGET_STEP: f64 = 0.98;
 /// Largest share of unexplained steps that counts as usual for a good sensor.
-const MAX_USUAL_SHARE: f64 = 0.25;
+const MAX_USUAL_SHARE: f64 = 0.2;
 /// Evidence that makes the sensor doubtful, as ln of the odds against it.
 const DOUBTFUL: f64 = 4.0;
 /// Highest evidence. A sensor that has failed often must explain several steps.
@@ -60,12 +60,16 @@ const RATIO_GAIN: f64 = 0.1;
 const MAX_PAUSE_S: f64 = 60.0;
 /// Part of the earlier doubts that remains after an explained step.
 const FORGET_DOUBT: f64 = 0.97;
-/// Weight of a round in the share of readings that differ from the previous reading.
+/// Weight of a steady round in the share of readings that differ by noise.
 const NOISE_GAIN: f64 = 0.02;
 /// Lowest probability that a good sensor repeats a reading exactly.
 const MIN_REPEAT: f64 = 0.01;
 /// Probability that a frozen or limited sensor repeats a reading.
 const FAULTY_REPEAT: f64 = 0.5;
+/// Change of a noisy reading, in steps of the sensor. A sensor with less noise repeats its readings.
+const NOISE_STEPS: f64 = 1.5;
+/// Resolution of the current before a change has been seen, A.
+const MAX_RESOLUTION_A: f64 = 1e3;
 /// Evidence of repeated readings that makes the sensor doubtful.
 const REPEATED: f64 = -10.0;
 /// Smallest common change of the cells that a voltage must follow, V, and the same in steps of the coarsest reading.
@@ -106,8 +110,10 @@ pub(crate) struct CurrentCheck {
     log_ratio: f64,
     /// Usual change of the voltages between two rounds that the current does not explain, V.
     usual_v: f64,
-    /// Share of readings of a flowing current that differ from the previous reading.
-    differing: f64,
+    /// Share of readings of a steady current that differ from the previous reading by noise.
+    noisy: f64,
+    /// Smallest change of the current, A.
+    resolution_a: f64,
     /// Sum of all common changes, V, and the smallest change of a single voltage, V.
     path_v: f64,
     resolution_v: f64,
@@ -129,7 +135,8 @@ impl Default for CurrentCheck {
             steps: FIRST_STEPS,
             log_ratio: 0.0,
             usual_v: FIRST_MOVE_V,
-            differing: 0.0,
+            noisy: 0.0,
+            resolution_a: MAX_RESOLUTION_A,
             path_v: 0.0,
             resolution_v: COARSE_V,
             repeated: 0.0,
@@ -184,25 +191,35 @@ impl CurrentCheck {
     }
 
     /// Judges whether the last reading of a flowing current repeats the one before. A sensor whose last digits change
-    /// all the time and then stop is frozen or at its limit.
+    /// all the time under a steady load and then stop is frozen or at its limit. A coarse sensor repeats itself, or
+    /// changes by one step.
     fn judge_repeat(&mut self) {
         let [.., before, now] = self.rounds;
-        let differs = now.current_a != before.current_a;
+        let change_a = (now.current_a - before.current_a).abs();
         if self.limits_a.contains(&now.current_a) && now.current_a != 0.0 {
             self.add_evidence(DOUBTFUL);
         }
-        if now.current_a == 0.0 || differs {
+        if change_a > 0.0 {
+            self.resolution_a = self.resolution_a.min(change_a);
+        }
+        if now.current_a == 0.0 {
+            self.repeated = 0.0;
+            return;
+        }
+        if change_a > 0.0 {
             self.repeated = 0.0;
         } else {
-            self.repeated += libm::log((1.0 - self.differing).max(MIN_REPEAT) / FAULTY_REPEAT).min(0.0);
+            self.repeated += libm::log((1.0 - self.noisy).max(MIN_REPEAT) / FAULTY_REPEAT).min(0.0);
             if self.repeated <= REPEATED {
                 self.repeated = 0.0;
                 self.limits_a[usize::from(now.current_a < 0.0)] = now.current_a;
                 self.add_evidence(MAX_EVIDENCE);
             }
         }
-        if now.current_a != 0.0 {
-            self.differing += NOISE_GAIN * (f64::from(u8::from(differs)) - self.differing);
+        let is_steady = now.move_v.abs() <= self.usual_v.max(self.resolution_v);
+        if is_steady {
+            let is_noise = change_a > NOISE_STEPS * self.resolution_a;
+            self.noisy += NOISE_GAIN * (f64::from(u8::from(is_noise)) - self.noisy);
         }
     }
 
@@ -287,7 +304,8 @@ impl CurrentCheck {
             explained,
             self.log_ratio,
             self.usual_v,
-            self.differing,
+            self.noisy,
+            self.resolution_a,
             self.path_v,
             self.resolution_v,
             self.repeated,
@@ -332,12 +350,17 @@ mod tests {
         f64::from(level) / 2.0 - 30.0
     }
 
+    /// Noise of a reading, A: 0 to 0.07 A in steps of 0.001 A.
+    fn noise_a(time_s: u32) -> f64 {
+        f64::from(time_s.wrapping_mul(2_654_435_761) >> 16 & 0x3F) / 1000.0
+    }
+
     /// Runs a drive of `seconds`, one round every 2 s. `measured` returns the reading for the load and the time. Returns
     /// the share of rounds in doubt, and the check.
     fn drive(check: &mut CurrentCheck, seconds: u32, measured: impl Fn(f64, u32) -> Option<f64>) -> f64 {
         let mut doubtful = 0;
         for time_s in (0..seconds).step_by(2) {
-            let noise_a = 0.01 * f64::from(time_s % 7);
+            let noise_a = noise_a(time_s);
             let samples: Vec<CellSample> = (0..CELLS)
                 .map(|cell| CellSample {
                     time: Timestamp::from_secs(f64::from(time_s)),
@@ -388,9 +411,8 @@ mod tests {
     fn repeated_reading_of_noisy_sensor_is_its_limit() {
         let mut check = CurrentCheck::default();
         drive(&mut check, 1200, |load_a, _| Some(load_a));
-        let noise = |time_s: u32| 0.01 * f64::from(time_s % 7);
         // The reading without the noise that `drive` adds: exactly 20 A while the load is larger.
-        let limited = |load_a: f64, time_s: u32| Some(if load_a >= 20.0 { 20.0 - noise(time_s) } else { load_a });
+        let limited = |load_a: f64, time_s: u32| Some(if load_a >= 20.0 { 20.0 - noise_a(time_s) } else { load_a });
         assert!(drive(&mut check, 3600, limited) > 0.5);
         assert!((check.limits_a[0] - 20.0).abs() < 1e-9, "{:?}", check.limits_a);
     }
