@@ -64,7 +64,7 @@ const FORGET_DOUBT: f64 = 0.97;
 const NOISE_GAIN: f64 = 0.02;
 /// Lowest probability that a good sensor repeats a reading exactly.
 const MIN_REPEAT: f64 = 0.01;
-/// Probability that a frozen or limited sensor repeats a reading.
+/// Probability that a limited sensor repeats a reading.
 const FAULTY_REPEAT: f64 = 0.5;
 /// Change of a noisy reading, in steps of the sensor. A sensor with less noise repeats its readings.
 const NOISE_STEPS: f64 = 1.5;
@@ -119,7 +119,9 @@ pub(crate) struct CurrentCheck {
     resolution_v: f64,
     /// Evidence of the present run of equal readings.
     repeated: f64,
-    /// Readings of either sign at which the sensor was frozen or limited, A; 0 = none.
+    /// Largest reading of discharge and of charge, A.
+    largest_a: [f64; 2],
+    /// Readings of either sign at which the sensor was limited, A; 0 = none.
     limits_a: [f64; 2],
     /// Number of earlier doubts; explained steps reduce it.
     doubts: f64,
@@ -140,6 +142,7 @@ impl Default for CurrentCheck {
             path_v: 0.0,
             resolution_v: COARSE_V,
             repeated: 0.0,
+            largest_a: [0.0; 2],
             limits_a: [0.0; 2],
             doubts: 0.0,
         }
@@ -191,11 +194,13 @@ impl CurrentCheck {
     }
 
     /// Judges whether the last reading of a flowing current repeats the one before. A sensor whose last digits change
-    /// all the time under a steady load and then stop is frozen or at its limit. A coarse sensor repeats itself, or
-    /// changes by one step.
+    /// all the time under a steady load and then stop is at its limit. A coarse sensor repeats itself, or changes by one
+    /// step.
     fn judge_repeat(&mut self) {
         let [.., before, now] = self.rounds;
         let change_a = (now.current_a - before.current_a).abs();
+        let direction = usize::from(now.current_a < 0.0);
+        self.largest_a[direction] = self.largest_a[direction].max(now.current_a.abs());
         if self.limits_a.contains(&now.current_a) && now.current_a != 0.0 {
             self.add_evidence(DOUBTFUL);
         }
@@ -206,13 +211,14 @@ impl CurrentCheck {
             self.repeated = 0.0;
             return;
         }
-        if change_a > 0.0 {
+        // A limit is the largest reading of its direction.
+        if change_a > 0.0 || now.current_a.abs() < self.largest_a[direction] {
             self.repeated = 0.0;
         } else {
             self.repeated += libm::log((1.0 - self.noisy).max(MIN_REPEAT) / FAULTY_REPEAT).min(0.0);
             if self.repeated <= REPEATED {
                 self.repeated = 0.0;
-                self.limits_a[usize::from(now.current_a < 0.0)] = now.current_a;
+                self.limits_a[direction] = now.current_a;
                 self.add_evidence(MAX_EVIDENCE);
             }
         }
@@ -293,7 +299,7 @@ impl CurrentCheck {
         bounds::VOLTAGE_V.check_all("a voltage of the check of the current", self.voltages_v.into_iter().flatten())?;
         bounds::CURRENT_A.check_all(
             "a current of the check of the current",
-            self.rounds.map(|round| round.current_a).into_iter().chain(self.limits_a),
+            self.rounds.map(|round| round.current_a).into_iter().chain(self.limits_a).chain(self.largest_a),
         )?;
         let numbers = self.rounds.map(|round| round.move_v);
         bounds::NUMBER.check_all("a voltage step of the check of the current", numbers)?;
