@@ -27,6 +27,8 @@ use packwatch_host::failure::Failure;
 
 /// Arguments of `diagnose`.
 #[derive(Debug, clap::Args)]
+#[command(override_usage = "packwatch diagnose [OPTIONS] --config <FILE> <LOG>...\n       \
+    packwatch diagnose [OPTIONS] --state <DIR>")]
 pub(crate) struct Args {
     /// Journals, candump logs or CSV files of one pack, also .gz or .zst; read in this order as one record
     #[arg(required_unless_present = "state", value_name = "LOG")]

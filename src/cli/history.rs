@@ -4,11 +4,11 @@ use std::path::PathBuf;
 
 use serde_json::{Value, json};
 
-use super::common::numbers::{NamedValue, one_of};
+use super::common::numbers::{NamedValue, cell_number, integer, one_of};
 use super::common::output::print;
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
-use crate::quantity::{MAX_CELLS, Timestamp};
+use crate::quantity::Timestamp;
 use crate::store::{self, HistoryEntry, HistoryQuery, HistoryReader, HistoryTable, NotedHead};
 use packwatch_host::failure::Failure;
 
@@ -32,7 +32,7 @@ pub(crate) struct Args {
     #[arg(long)]
     json: bool,
     /// Print at most this many rows, the latest; 0 prints all
-    #[arg(long, value_name = "N", default_value_t = LISTED)]
+    #[arg(long, value_name = "N", default_value_t = LISTED, value_parser = integer::<u32>(0, u32::MAX))]
     limit: u32,
 }
 
@@ -55,8 +55,8 @@ struct ExportArgs {
 
 #[derive(Debug, clap::Args)]
 struct VerifyArgs {
-    /// Head of the chain as logged by the daemon ("end of the history's chain"). If the history was rewritten since, verification
-    /// fails
+    /// Number of rows and hash that the daemon logged earlier ("end of the history's chain"). Verification fails if the
+    /// history was rewritten since then
     #[arg(long, value_name = "ROWS:HASH")]
     noted: Vec<NotedHead>,
     /// Print JSON
@@ -71,7 +71,7 @@ struct RowArgs {
     #[arg(long, value_name = "KIND", value_parser = one_of(&KINDS), value_delimiter = ',')]
     kind: Vec<HistoryTable>,
     /// Select rows of this cell, counted from 1
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=MAX_CELLS as i64))]
+    #[arg(long, value_name = "N", value_parser = cell_number)]
     cell: Option<u16>,
     /// Select rows from this time on: 2026-04-02T13:08:17 (UTC) or seconds since 1970
     #[arg(long, value_name = "WHEN", value_parser = when)]

@@ -40,7 +40,9 @@ const STANDARDS: [NamedValue<Standard>; 2] = [
 #[command(
     after_help = "Unknown values are left out. If the standard requires an unknown value, nothing is written; the error lists \
     each missing value with the reason and a remedy. The static part may state everything that packwatch does not \
-    measure; a value that both parts have is an error."
+    measure; a value that both parts have is an error.",
+    override_usage = "packwatch passport [OPTIONS] --config <FILE> <LOG>...\n       \
+    packwatch passport [OPTIONS] --config <FILE> --state <DIR>"
 )]
 pub(crate) struct Args {
     /// Configuration file of the pack

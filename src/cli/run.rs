@@ -39,17 +39,18 @@ pub(crate) struct Args {
     /// Write events as JSON lines, as `packwatch replay --events` does
     #[arg(long, value_name = "FILE")]
     events: Option<PathBuf>,
-    /// Start from this stored state
+    /// Start from the state in this file, which --snapshot has written
     #[arg(long, value_name = "FILE")]
     restore: Option<PathBuf>,
-    /// Age of the stored state. Needed only if the state came from a log, so that its time stamp does not give the age
+    /// Time since the restored state was written. Needed only if the state came from a log, so that its time stamp does not
+    /// give its age
     #[arg(long, value_name = "SECONDS|unknown", requires = "restore", value_parser = away)]
     away: Option<Downtime>,
     /// Folder for state and history; `none` keeps nothing [default: $STATE_DIRECTORY under systemd, else
     /// $XDG_STATE_HOME/packwatch or ~/.local/state/packwatch]. The state found there is restored, unless --restore is given
     #[arg(long, value_name = "DIR")]
     state: Option<PathBuf>,
-    /// Write the state to this file on stopping
+    /// Write the state to this file on stopping, for --restore
     #[arg(long, value_name = "FILE")]
     snapshot: Option<PathBuf>,
     /// Stop after this time

@@ -20,7 +20,7 @@ use packwatch_host::failure::Failure;
 /// Arguments of `test-alarm`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Rule whose frame is sent; raises no alarm
+    /// Rule whose alarm frame is sent, for example capacity_low; no alarm is raised
     #[arg(value_name = "RULE", value_parser = rule_parser(), hide_possible_values = true)]
     rule: Rule,
     /// Configuration file of the daemon

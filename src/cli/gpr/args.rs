@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::cli::common::numbers::{NamedValue, one_of, whole};
+use crate::cli::common::numbers::{NamedValue, integer, one_of, whole};
 use crate::io::result_file::check_place;
 use crate::lab::gpr::MissingPolicy;
 use crate::regress::{Basis, Form, GprSettings, Kernel, MAX_NEIGHBOURS};
@@ -72,11 +72,11 @@ pub(super) struct ModelArgs {
     /// Additional searches for hyperparameters, from random starts
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = whole::<0, 100>)]
     restarts: usize,
-    /// Most steps of a hyperparameter search
+    /// Maximum number of steps of a hyperparameter search
     #[arg(long, value_name = "N", default_value_t = 60, value_parser = whole::<1, 10_000>)]
     max_iterations: usize,
     /// Seed of folds, starts and orders
-    #[arg(long, value_name = "N", default_value_t = 1)]
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = integer::<u64>(0, u64::MAX))]
     pub(super) seed: u64,
     /// Number of threads [default: one per core]
     #[arg(long, value_name = "N", value_parser = whole::<1, 1024>)]

@@ -15,14 +15,14 @@ use packwatch_host::failure::Failure;
 /// Selects a cell model.
 #[derive(Debug, clap::Args)]
 pub(super) struct SourceArgs {
-    /// Cell model file, configuration, snapshot, state folder of a service, or label as CHEMISTRY:AH, for example nca-graphite:2.9
+    /// Cell model file, configuration file, state file of --snapshot, state folder of `packwatch run`, or label as CHEMISTRY:AH,
+    /// for example nca-graphite:2.9
     #[arg(value_name = "SOURCE", required_unless_present_any = ["config", "chemistry", "state"], conflicts_with_all = ["chemistry", "state"])]
     source: Option<PathBuf>,
-    /// Configuration file whose cell model or label to use. With --state or a snapshot: label to use for cells without a learned
-    /// model
+    /// Configuration file whose cell model or label to show. With a state: its cell model is shown if none has been learned
     #[arg(short, long, value_name = "FILE.toml")]
     config: Option<PathBuf>,
-    /// State folder of a service, whose learned model to use
+    /// State folder of `packwatch run`; its learned model is shown
     #[arg(long, value_name = "DIR", conflicts_with = "chemistry")]
     state: Option<PathBuf>,
     #[command(flatten)]
