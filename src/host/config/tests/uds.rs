@@ -208,8 +208,8 @@ fn only_configured_requests_are_sent_and_listed() {
 #[test]
 fn polling_faults_are_reported() {
     let none = pack() + "[poll]\nenabled = true\n";
-    let fault = "pack.toml:34: poll.enabled = true, must be false: no answer in use has drive_every_s, charge_every_s or \
-                 parked_every_s";
+    let fault = "pack.toml:34: poll.enabled = true, must be false, because nothing would be requested: no [[input.diagnostic]] whose \
+                 signals are used has drive_every_s, charge_every_s or parked_every_s";
     assert_eq!(faults(&none), [fault]);
     let polled = pack().replace("Status.Current", "Car.Unused").replacen(
         "identifier = 0x0102",
