@@ -15,6 +15,7 @@ use super::common::numbers::{NamedValue, above_0, one_of, within};
 use super::common::output::{failure, named, unless_closed};
 use super::common::replaying::{self, Replayed};
 use crate::config::{self, Config, VehicleIdentity};
+use crate::io::json::json_fault;
 use crate::io::result_file::check_place;
 use crate::lab;
 use crate::lab::passport::{self, Condition, ReadingLimits, Record, Standard, Terms};
@@ -131,12 +132,13 @@ impl Args {
 
 fn read_static(path: &Path) -> Result<Value, Failure> {
     let mut bytes = Vec::new();
-    let file = File::open(path).map_err(|error| named(path, error))?;
-    file.take(MAX_STATIC_BYTES + 1).read_to_end(&mut bytes).map_err(|error| named(path, error))?;
+    let unread = |error: std::io::Error| named(path, format!("cannot be read: {error}"));
+    let file = File::open(path).map_err(unread)?;
+    file.take(MAX_STATIC_BYTES + 1).read_to_end(&mut bytes).map_err(unread)?;
     if u64::try_from(bytes.len()).is_ok_and(|length| length > MAX_STATIC_BYTES) {
         return Err(named(path, format!("larger than {MAX_STATIC_BYTES} bytes")));
     }
-    serde_json::from_slice(&bytes).map_err(|error| named(path, error))
+    serde_json::from_slice(&bytes).map_err(|error| named(path, format!("not valid JSON: {}", json_fault(&error))))
 }
 
 fn load_store(folder: &Path, config: &Config) -> Result<(Record, VehicleIdentity), Failure> {

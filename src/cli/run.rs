@@ -1,6 +1,6 @@
 //! `packwatch run`: the service on live CAN interfaces.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use super::common::numbers::{MAX_SECONDS, away, between, bytes, whole};
@@ -82,6 +82,11 @@ const MAX_BUFFER_BYTES: usize = (i32::MAX / 2) as usize;
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     logging::start(args.log.as_deref()).map_err(Failure::new)?;
+    let file = args.state.as_deref().filter(|state| *state != Path::new("none") && state.exists() && !state.is_dir());
+    if let Some(file) = file {
+        let what = format!("--state {}: is a file, must be a folder for state and history, or none", file.display());
+        return Err(Failure::new(what));
+    }
     let record_limits = args.record_limit.map(|total| SegmentLimits::new(total, args.record_segment)).transpose();
     let config = config::load(&args.config)?;
     let key = config.key.as_ref().map(|key| CanKey::load(key, std::env::var_os("CREDENTIALS_DIRECTORY"))).transpose();
@@ -89,7 +94,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         key: key.map_err(Failure::config)?,
         config,
         record: args.record.clone(),
-        record_limits: record_limits.map_err(|why| Failure::new(format!("--record-limit: {why}")))?,
+        record_limits: record_limits
+            .map_err(|why| Failure::new(format!("--record-limit: {why} (--record-segment)")))?,
         frames: args.frames.clone(),
         events: args.events.clone(),
         restore: args.restore.as_deref().map(snapshot_file::read).transpose().map_err(Failure::new)?,
