@@ -93,6 +93,16 @@ const KINDS: [NamedValue<HistoryTable>; 7] = [
 ];
 
 impl RowArgs {
+    /// Checks arguments that depend on each other.
+    fn check(&self) -> Result<(), Failure> {
+        match (self.since, self.until) {
+            (Some(since), Some(until)) if since > until => {
+                Err(Failure::new("--since is later than --until, so no row can be selected; exchange them"))
+            }
+            _ => Ok(()),
+        }
+    }
+
     fn filter(&self, limit: Option<u32>) -> HistoryQuery {
         HistoryQuery {
             kinds: self.kind.clone(),
@@ -111,6 +121,10 @@ fn when(text: &str) -> Result<Timestamp, String> {
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    match &args.what {
+        Some(HistoryCommand::Export(export)) => export.wanted.check()?,
+        _ => args.wanted.check()?,
+    }
     let folder = args.state.clone().unwrap_or_else(store::standard_folder);
     let reader = HistoryReader::open(&folder).map_err(Failure::new)?;
     match &args.what {
@@ -225,7 +239,8 @@ fn document(entry: &HistoryEntry) -> Value {
 const OWN_COLUMNS: [&str; 7] = ["kind", "seq", "wall_ns", "utc", "time_ns", "boot", "pack"];
 
 fn export(reader: &HistoryReader, args: &ExportArgs) -> Result<(), Failure> {
-    let fail = |error: &dyn std::fmt::Display| Failure::new(format!("{}: {error}", args.out.display()));
+    // The errors of a result file name it.
+    let fail = |error: &dyn std::fmt::Display| Failure::new(error.to_string());
     let filter = args.wanted.filter(None);
     let kinds: Vec<HistoryTable> = filter.wanted_kinds().collect();
     let mut columns: Vec<&str> = Vec::new();

@@ -149,6 +149,11 @@ impl Sink {
 /// Returns the settings of the scenario for the configured cell, with the changes from the command line.
 fn settings_for(args: &Args, config: &Config) -> Result<Settings, Failure> {
     let capacity_ah = args.changes.pack.capacity_ah.unwrap_or(config.monitor.model.capacity_ah);
+    if args.changes.walk_steps.is_some() && args.scenario != Scenario::RandomWalk {
+        return Err(Failure::new(
+            "--walk-steps changes only the scenario random-walk; choose this scenario or omit the option",
+        ));
+    }
     let mut settings = Settings::of(args.scenario, capacity_ah);
     let series = cells_in_series(&config.monitor.sample);
     settings.pack.cells = series;

@@ -33,6 +33,12 @@ impl FileArgs {
         check_place(result, self.files.iter()).map_err(Failure::new)
     }
 
+    /// Returns a failure about the rows of the files.
+    pub(super) fn fault(&self, error: impl std::fmt::Display) -> Failure {
+        let names: Vec<String> = self.files.iter().map(|file| file.display().to_string()).collect();
+        Failure::new(format!("{}: {error}", names.join(", ")))
+    }
+
     pub(super) fn missing(&self) -> MissingPolicy {
         if self.skip_missing { MissingPolicy::Skipped } else { MissingPolicy::Rejected }
     }

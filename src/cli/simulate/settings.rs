@@ -47,7 +47,7 @@ pub(super) struct Changes {
     cell_period: Option<u32>,
     /// Only for random-walk: number of loads before each pair of reference cycles [default: 1500]
     #[arg(long, value_name = "N", value_parser = integer::<u32>(1, u32::MAX))]
-    walk_steps: Option<u32>,
+    pub(super) walk_steps: Option<u32>,
 }
 
 /// Options of the pack.
@@ -125,7 +125,9 @@ impl FaultArgs {
         balancing: Option<BalancingConfig>,
     ) -> Result<Simulation, Failure> {
         let check = |fault: &Fault| fault.kind.check(cells, sensors);
-        self.faults.iter().try_for_each(check).map_err(|error| Failure::new(format!("--fault: {error}")))?;
+        self.faults.iter().try_for_each(check).map_err(|error| {
+            Failure::new(format!("--fault: {error} (the pack has {cells} cells and {sensors} temperature sensors)"))
+        })?;
         let sim = sim.with_faults(&self.faults);
         let sim = if balancing.is_some() { sim.with_balancing_bits() } else { sim };
         let usual = Balancing::usual(capacity_ah);

@@ -83,6 +83,9 @@ pub fn import(text: &str, settings: &BpxSettings) -> Result<BpxImport, LabError>
         let (line, column, fault) = (error.line(), error.column(), json_fault(&error));
         LabError::Data(format!("{source}:{line}:{column}: not valid JSON: {fault}"))
     })?;
+    if root.get("Header").is_none() && root.get("Parameterisation").is_none() {
+        return Err(LabError::Data(format!("{source}: not a BPX file: it has neither Header nor Parameterisation")));
+    }
     let failed = |faults: Vec<String>| {
         let lines: Vec<String> = faults.iter().map(|fault| format!("{source}: {fault}")).collect();
         LabError::Data(lines.join("\n"))
