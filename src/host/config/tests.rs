@@ -336,7 +336,7 @@ fn invalid_utf_8_is_reported_with_line() {
     let read = |_: &Path| Ok(b"[pack]\ncells = \xFF".to_vec());
     assert_eq!(
         load_with(&ConfigFiles::alone(Path::new("pack.toml")), &read).unwrap_err().0,
-        ["pack.toml:2: is not UTF-8 text"]
+        ["pack.toml:2: is not UTF-8 text, must be a TOML file"]
     );
 }
 

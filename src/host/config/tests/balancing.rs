@@ -51,11 +51,11 @@ fn balancing_faults_are_reported() {
         ),
         (
             pack("signal = \"Bleeding.Bleed1\"\nbleed_a = 0.1\n"),
-            "pack.toml:16: input.balancing.signal = \"Bleeding.Bleed1\", must contain {n} for the cell's number",
+            "pack.toml:16: input.balancing.signal = \"Bleeding.Bleed1\", must contain {n} for the cell's number, because pack.cells = 4",
         ),
         (
             pack("signal = \"Bleeding.Bleed{n}\"\nfirst = 2\nbleed_a = 0.1\n"),
-            "pack.toml:16: input.balancing.signal = \"Bleeding.Bleed{n}\", must match a signal for every cell, but none has number 5",
+            "pack.toml:16: input.balancing.signal = \"Bleeding.Bleed{n}\", must match a signal for each of 4 cells (pack.cells), but none has number 5",
         ),
         (
             pack("signal = \"Bleeding.Bleed{n}\"\nbleed_a = 0.1\n").replacen(
