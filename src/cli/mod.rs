@@ -51,7 +51,14 @@ use clap::{CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 
 /// Streaming battery health monitoring over SocketCAN.
 #[derive(Debug, Parser)]
-#[command(name = "packwatch", version, about, propagate_version = true)]
+#[command(
+    name = "packwatch",
+    version,
+    about,
+    propagate_version = true,
+    after_help = "To begin: `packwatch demo` simulates a pack, `packwatch check FILE` checks a configuration, and \
+    `packwatch run -c FILE` starts the service. `packwatch COMMAND --help` describes a command."
+)]
 pub struct Cli {
     #[command(subcommand)]
     command: Command,

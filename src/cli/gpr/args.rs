@@ -10,6 +10,8 @@ use packwatch_host::failure::Failure;
 
 /// Text below the options.
 pub(super) const GRAMMAR: &str = "\
+Gaussian process regression predicts a value and its standard deviation from rows with similar inputs. The covariance function \
+(kernel) states how fast this similarity falls with the distance between the inputs.\n\n\
 KERNEL is one of exponential, squared_exponential, matern32, matern52, rational_quadratic (or with dashes), or a sum or product of \
 kernels with brackets: \"exponential + matern52 * (squared_exponential + rational_quadratic)\". For a linear trend in the inputs, use \
 --basis linear.\n\n\
