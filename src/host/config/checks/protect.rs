@@ -25,8 +25,9 @@ pub(crate) fn guards(raw: &RawTables, found: &[ResolvedSignal<'_>], inputs_whole
                 names.sort_unstable();
                 names.dedup();
                 let hint = did_you_mean(&keys.message, names.iter().copied());
-                let what = "must be a message with a configured signal on this interface";
-                keys.place.fault("message", format!("{what} ({}){hint}", names.join(", ")));
+                let names = if names.is_empty() { "there is none".to_owned() } else { names.join(", ") };
+                let what = format!("must be a message with a configured signal on this interface ({names}){hint}");
+                keys.place.fault("message", what);
             }
             continue;
         };

@@ -183,7 +183,7 @@ fn table_needs_interface_if_several_exist() {
     assert_eq!(
         faults(&on_the_other),
         [
-            "pack.toml:22: input.protected[1].message = \"Status\", must be a message with a configured signal on this interface (Cells, Status)"
+            "pack.toml:22: input.protected[1].message = \"Status\", must be a message with a configured signal on this interface (there is none)"
         ]
     );
     assert_eq!(read(&format!("{pack}interface = \"can0\"\n")).unwrap().0.monitor.guards.len(), 1);
