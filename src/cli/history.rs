@@ -121,10 +121,8 @@ fn when(text: &str) -> Result<Timestamp, String> {
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    match &args.what {
-        Some(HistoryCommand::Export(export)) => export.wanted.check()?,
-        _ => args.wanted.check()?,
-    }
+    let wanted = if let Some(HistoryCommand::Export(export)) = &args.what { &export.wanted } else { &args.wanted };
+    wanted.check()?;
     let folder = args.state.clone().unwrap_or_else(store::standard_folder);
     let reader = HistoryReader::open(&folder).map_err(Failure::new)?;
     match &args.what {

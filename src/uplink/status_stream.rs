@@ -42,7 +42,7 @@ pub fn follow(socket: &Path) -> Documents {
 async fn read_for_ever(socket: &Path, sender: &watch::Sender<Option<Box<StatusDocument>>>) {
     let mut was_up = None;
     loop {
-        let error = match read(&stream_path(socket), sender, &mut was_up).await {
+        let error: io::Error = match read(&stream_path(socket), sender, &mut was_up).await {
             Ok(()) => io::ErrorKind::UnexpectedEof.into(),
             Err(error) => error,
         };
