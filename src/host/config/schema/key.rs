@@ -140,6 +140,12 @@ impl Key {
         }
     }
 
+    /// The meaning of the key in one sentence, without its full stop.
+    fn meaning(&self) -> &'static str {
+        let about = self.about.trim();
+        about.split_once(". ").map_or(about, |(first, _)| first).trim_end_matches('.')
+    }
+
     /// The allowed values with their type, as they appear in a fault.
     pub(crate) fn must_be(&self) -> String {
         let range = self.range_in_fault();
@@ -211,7 +217,7 @@ impl TableReader<'_> {
             }
             Presence::Required if self.broken => None,
             Presence::Required => {
-                let text = format!("{} is missing, {}", self.place.key(key.name), key.must_be());
+                let text = format!("{} is missing, {}: {}", self.place.key(key.name), key.must_be(), key.meaning());
                 self.document.faults.add_at(&self.place.at, text);
                 None
             }

@@ -39,7 +39,7 @@ fn balancing_faults_are_reported() {
     let table = [
         (
             pack("signal = \"Bleeding.Bleed{n}\"\n"),
-            "pack.toml:15: input.balancing.bleed_a is missing, must be a number, above 0 and at most 1000000 (A)",
+            "pack.toml:15: input.balancing.bleed_a is missing, must be a number, above 0 and at most 1000000 (A): Current of a balancing resistor while the bit is 1, at the BMS's balancing voltage",
         ),
         (
             pack("signal = \"Bleeding.Bleed{n}\"\nbleed_a = 0\n"),

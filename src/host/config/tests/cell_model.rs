@@ -6,7 +6,11 @@ use super::*;
 fn cell_model_faults_are_reported() {
     let table: &[(&str, &str, &str)] = &[
         ("format = 1", "format = 2", "cell.toml:1: format = 2, must be 1"),
-        ("name = \"test\"\n", "", "cell.toml:1: name is missing, must be a string that is not empty"),
+        (
+            "name = \"test\"\n",
+            "",
+            "cell.toml:1: name is missing, must be a string that is not empty: Name of the cell, for people",
+        ),
         ("capacity_ah = 1.9", "capacity_ah = -1.9", "cell.toml:4: capacity_ah = -1.9, must be 0.001 to 100000"),
         (
             "voltage_max_v = 4.2",

@@ -21,7 +21,11 @@ fn faults_state_file_line_key_found_and_allowed() {
         ),
         ("cells = 4", "cells = 4.0", "pack.toml:2: pack.cells = 4.0, must be a whole number, 1 to 1024"),
         ("cells = 4", "cells = \"four\"", "pack.toml:2: pack.cells = \"four\", must be a whole number, 1 to 1024"),
-        ("cells = 4\n", "", "pack.toml:1: pack.cells is missing, must be a whole number, 1 to 1024"),
+        (
+            "cells = 4\n",
+            "",
+            "pack.toml:1: pack.cells is missing, must be a whole number, 1 to 1024: Number of cells in series",
+        ),
         ("cells = 4", "cells = 4\nstring = 1", "pack.toml:3: pack.string is not a known key, did you mean strings"),
         ("cells = 4", "cells = 4\nambient_c = nan", "pack.toml:3: pack.ambient_c = nan, must be -100 to 200"),
         ("cells = 4", "cells = 4\nambient_c = inf", "pack.toml:3: pack.ambient_c = inf, must be -100 to 200"),
@@ -60,7 +64,11 @@ fn faults_state_file_line_key_found_and_allowed() {
 #[test]
 fn signal_faults_state_contents_of_dbc() {
     let table: &[(&str, &str, &str)] = &[
-        ("positive = \"charge\"\n", "", "pack.toml:8: input.current.positive is missing, must be charge or discharge"),
+        (
+            "positive = \"charge\"\n",
+            "",
+            "pack.toml:8: input.current.positive is missing, must be charge or discharge: Meaning of a positive value on the bus",
+        ),
         ("\"charge\"", "\"in\"", "pack.toml:10: input.current.positive = \"in\", must be charge or discharge"),
         (
             "\"charge\"",

@@ -119,7 +119,7 @@ fn protection_faults_are_reported() {
         ),
         (
             "message = \"Status\"\nprofile = \"1C\"\n",
-            "pack.toml:16: input.protected[1].data_id is missing, must be a whole number, 0 to 65535",
+            "pack.toml:16: input.protected[1].data_id is missing, must be a whole number, 0 to 65535: Data identifier agreed with the sender; at most 0xFFF for \"1C\"",
         ),
         (
             "message = \"Status\"\nprofile = \"1A\"\ndata_id = 1\ninterface = \"can1\"\n",

@@ -122,7 +122,7 @@ fn answer_faults_are_reported() {
         (
             "bit = 32",
             "bti = 32",
-            "pack.toml:23: input.diagnostic[1].signals[1].bit is missing, must be a whole number, 0 to 524280 (bits)",
+            "pack.toml:23: input.diagnostic[1].signals[1].bit is missing, must be a whole number, 0 to 524280 (bits): Position of the first (most significant) bit, counted from the most significant bit of the byte after the echoed service and identifier (like `bix` in OBDb)",
         ),
         (
             "numbers = \"1-3\", ",
