@@ -83,7 +83,7 @@ pub fn import(text: &str, settings: &BpxSettings) -> Result<BpxImport, LabError>
         let (line, column, fault) = (error.line(), error.column(), json_fault(&error));
         LabError::Data(format!("{source}:{line}:{column}: not valid JSON: {fault}"))
     })?;
-    if root.get("Header").is_none() && root.get("Parameterisation").is_none() {
+    if root.is_object() && root.get("Header").is_none() && root.get("Parameterisation").is_none() {
         return Err(LabError::Data(format!("{source}: not a BPX file: it has neither Header nor Parameterisation")));
     }
     let failed = |faults: Vec<String>| {
