@@ -4,11 +4,14 @@
 //! description on standard output; the exit code is 0. If it is not valid, prints every fault on a line of standard
 //! error; the exit code is 78.
 
-use std::path::PathBuf;
+use std::fs::File;
+use std::io;
+use std::path::{Path, PathBuf};
 
 use super::common::output;
 use super::common::output::{print, print_json, unless_closed};
-use crate::config::{Description, OutputUse, SignalUse};
+use crate::config::{Description, KeySource, OutputUse, SignalUse};
+use crate::io::can_key::CanKey;
 use packwatch_host::failure::Failure;
 
 /// Arguments of `check`.
@@ -38,6 +41,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         print(&crate::config::merged(file)?)?;
     }
     let description = crate::config::describe(file)?;
+    check_key(file)?;
     if args.merged {
         return Ok(());
     }
@@ -47,6 +51,15 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         let mut page = String::new();
         show(&description, &mut page);
         print(&page)
+    }
+}
+
+/// Checks the key file of `[authentication]`, unless this user may not read it.
+fn check_key(file: &Path) -> Result<(), Failure> {
+    let Some(KeySource::File(path)) = crate::config::load(file)?.key else { return Ok(()) };
+    match File::open(&path) {
+        Err(error) if error.kind() == io::ErrorKind::PermissionDenied => Ok(()),
+        _ => CanKey::load(&KeySource::File(path), None).map(drop).map_err(Failure::config),
     }
 }
 

@@ -26,7 +26,10 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let config = config::load(&args.config)?;
     let Some(layout) = config.output_layout else {
-        let message = format!("{}: nothing is sent; add a table [output] that is enabled", args.config.display());
+        let message = format!(
+            "{}: nothing is sent, so there is no DBC to write; add a table [output] that is enabled",
+            args.config.display()
+        );
         return Err(Failure { message, code: EXIT_CONFIG });
     };
     unless_closed(write_file(&args.output, &layout.to_dbc_bytes()))

@@ -11,6 +11,7 @@ mod table;
 use std::io::{self, Write};
 use std::path::Path;
 
+use super::common::numbers::integer;
 use super::common::output::word;
 use crate::alarm::{Change, Rule};
 use crate::can::Frame;
@@ -48,7 +49,7 @@ const SLEEP_GAP_S: f64 = 30.0;
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     /// Seed of the sensor noise
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = integer::<u64>(0, u64::MAX))]
     seed: u64,
 }
 

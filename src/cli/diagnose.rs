@@ -27,6 +27,8 @@ use packwatch_host::failure::Failure;
 
 /// Arguments of `diagnose`.
 #[derive(Debug, clap::Args)]
+#[command(override_usage = "packwatch diagnose [OPTIONS] --config <FILE> <LOG>...\n       \
+    packwatch diagnose [OPTIONS] --state <DIR>")]
 pub(crate) struct Args {
     /// Journals, candump logs or CSV files of one pack, also .gz or .zst; read in this order as one record
     #[arg(required_unless_present = "state", value_name = "LOG")]
@@ -105,10 +107,16 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         (None, None) => return Err(Failure::new("give --state DIR, or --config FILE and logs")),
     };
     let Some(diagnosis) = snapshot.diagnosis() else {
-        return Err(Failure::new(
-            "no cell can be compared: the pack has fewer than three cells, or an older version of packwatch stored the \
-            state",
-        ));
+        return Err(Failure::new(match (&args.config, &config) {
+            (Some(file), Some(config)) => format!(
+                "no cell can be compared: {} gives the voltages of {} cells, must be at least 3",
+                file.display(),
+                config.monitor.sample.cells
+            ),
+            _ => "no cell can be compared: the pack has fewer than 3 cells with their own voltage, or an older version of \
+                packwatch wrote the state"
+                .to_owned(),
+        }));
     };
     if let Some(folder) = &args.plots {
         create_folder(folder)?;
@@ -126,7 +134,12 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 fn stored(folder: &std::path::Path) -> Result<Snapshot, Failure> {
     let reader = HistoryReader::open(folder).map_err(Failure::new)?;
     let snapshot = reader.snapshot();
-    snapshot.ok_or_else(|| Failure::new(format!("{}: contains no stored state", folder.display())))
+    snapshot.ok_or_else(|| {
+        Failure::new(format!(
+            "{}: contains no usable state; give the state folder of `packwatch run`",
+            folder.display()
+        ))
+    })
 }
 
 fn replayed(args: &Args, config: &Config) -> Result<Snapshot, Failure> {

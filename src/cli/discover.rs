@@ -10,6 +10,7 @@ use std::sync::atomic::Ordering;
 use serde_json::json;
 
 use super::common::files::{database, named_from, read};
+use super::common::numbers::integer;
 use super::common::output::{failure, print, print_json, table, unless_closed};
 use super::common::progress::Bar;
 use crate::config;
@@ -40,7 +41,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FILE.json")]
     obdb: Option<PathBuf>,
     /// Model year, selects commands of the OBDb signal set
-    #[arg(long, value_name = "YEAR", requires = "obdb", value_parser = clap::value_parser!(i64).range(1980..=2100))]
+    #[arg(long, value_name = "YEAR", requires = "obdb", value_parser = integer::<i64>(1980, 2100))]
     year: Option<i64>,
     /// Print all candidates as JSON
     #[arg(long)]
@@ -52,7 +53,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "CELL.toml")]
     model: Option<PathBuf>,
     /// Cells in series for the written configuration; needed if the log has only the pack voltage
-    #[arg(long, value_name = "N", requires = "write", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    #[arg(long, value_name = "N", requires = "write", value_parser = integer::<u16>(1, 1024))]
     cells: Option<u16>,
     /// Meaning of a positive current for the written configuration; needed if the log does not show it
     #[arg(long, value_enum, requires = "write")]

@@ -45,7 +45,7 @@ pub(crate) struct Args {
     /// Direction of positive current in a CSV
     #[arg(long, value_enum, default_value = "discharge")]
     csv_sign: CsvSign,
-    /// CSV table with the section column and a column `start`, as for `replay`
+    /// CSV table with the start time of each section of a CSV log, as for `replay`
     #[arg(long, value_name = "TABLE.csv")]
     start_times: Option<PathBuf>,
 }

@@ -11,7 +11,7 @@ use packwatch_host::failure::Failure;
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     /// Address to listen on; the default accepts connections from this computer only
-    #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:9558")]
+    #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:9558", value_parser = address)]
     listen: SocketAddr,
     /// Status socket of the daemon [default: where `packwatch run` creates it]
     #[arg(long, value_name = "PATH")]
@@ -19,6 +19,10 @@ pub(crate) struct Args {
     /// Log level or filter: error, warn, info, debug, trace [default: $PACKWATCH_LOG, else info]
     #[arg(long, value_name = "LEVEL")]
     log: Option<String>,
+}
+
+fn address(text: &str) -> Result<SocketAddr, String> {
+    text.parse().map_err(|_| "must be a numeric address and a port, for example 127.0.0.1:9558 or [::]:9558".to_owned())
 }
 
 /// Runs the command.

@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use super::common::label::{LabelArgs, one_of_chemistries};
 use super::common::logs::{InputArgs, log_options};
-use super::common::numbers::finite;
+use super::common::numbers::{finite, integer};
 use super::common::output::{failure, print, unless_closed};
 use super::common::progress::progress_bar;
 use crate::config;
@@ -21,24 +21,23 @@ use packwatch_host::failure::Failure;
 
 /// Arguments of `fit`.
 #[derive(Debug, clap::Args)]
+#[command(override_usage = "packwatch fit [OPTIONS] --name <NAME> --out <MODEL.toml> <FILE>...\n       \
+    packwatch fit --log [OPTIONS] --config <FILE.toml> --out <MODEL.toml> <FILE>...\n       \
+    packwatch fit --log [OPTIONS] --chemistry <CHEMISTRY> --rated <AH> --out <MODEL.toml> <FILE>...")]
 pub(crate) struct Args {
-    /// Measured files: CSV, plain or compressed, with the columns time_s, current_a (positive = discharge), voltage_v, and
+    /// Measured files of a cell: CSV (.gz, .zst) with the columns time_s, current_a (positive = discharge), voltage_v, and
     /// optionally temperature_c, discharged_ah, cycle and type. Each file starts with a full cell. With --log: logs of a pack
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
-    /// Read the files as logs, as `replay` does; drives and charges may start at any SOC. The fit starts from the cell model of
-    /// --config, or from --chemistry and --rated, and changes what the logs contradict. The store of a service does not work: it
-    /// has no voltage and current readings
+    /// Fit to logs of a pack, read as by `replay`; they may start at any SOC. The fit starts from the cell model of --config,
+    /// or from --chemistry and --rated, and changes the model where the logs contradict it. A state folder cannot be used,
+    /// because it contains no voltages and currents
     #[arg(long, requires = "start", conflicts_with_all = ["capacity", "ageing_shift", "ocv", "first_cycles", "GridArgs"])]
     log: bool,
-    #[command(flatten)]
-    start: StartArgs,
-    #[command(flatten)]
-    input: InputArgs,
     /// Cell model file to write
     #[arg(short, long, value_name = "MODEL.toml")]
     out: PathBuf,
-    /// Display name of the cell [default with --log: name of the configured model]
+    /// Name of the cell in the cell model file; required without --log [default with --log: name of the configured model]
     #[arg(long, required_unless_present = "log")]
     name: Option<String>,
     /// Capacity that defines SOC, Ah [default: from the slow test nearest 25 degrees C, else the deepest discharge]
@@ -47,9 +46,9 @@ pub(crate) struct Args {
     /// Capacity on the label, Ah [default: --capacity]
     #[arg(long, value_name = "AH", value_parser = finite)]
     rated: Option<f64>,
-    /// How the open-circuit curve changes with lost capacity: 0 = it shrinks evenly, 1 = it shifts by pure lithium loss. This is
-    /// a prior that a fit of a new cell cannot determine [default: from the electrodes found in the slow test; without them 0.5 for
-    /// an ageing cell, chosen on two whole lives, else 0]
+    /// How the open-circuit curve changes as the cell loses capacity: from 0, it shrinks evenly, to 1, it shifts as if only
+    /// lithium were lost. Data of a new cell do not show this [default: from the electrodes found in the slow test; without
+    /// them 0.5 for an ageing cell, else 0]
     #[arg(long, value_name = "SHARE", value_parser = finite)]
     ageing_shift: Option<f64>,
     /// Lowest voltage under load [default: where discharges end, pulses excluded]
@@ -58,13 +57,14 @@ pub(crate) struct Args {
     /// Highest voltage under charge [default: where charges end, pulses excluded]
     #[arg(long, value_name = "VOLTS", value_parser = finite)]
     voltage_max: Option<f64>,
-    /// Slow discharge from full (about C/20), one per temperature. The OCV is its discharge branch with a smooth correction
+    /// Slow test (about C/20) that starts with a full cell and gives the open-circuit curve; repeat for several temperatures
     #[arg(long, value_name = "FILE")]
     ocv: Vec<PathBuf>,
     #[command(flatten)]
     grid: GridArgs,
-    /// Fit an ageing cell: use parts up to this number only, anchored at full charges and at the knees of discharges
-    #[arg(long, value_name = "N", conflicts_with_all = ["ocv", "capacity"])]
+    /// Fit an ageing cell to its first cycles: parts (column cycle) up to this number. SOC is anchored at full charges and at
+    /// the knees of discharges
+    #[arg(long, value_name = "N", value_parser = integer::<usize>(0, usize::MAX), conflicts_with_all = ["ocv", "capacity"])]
     first_cycles: Option<usize>,
     /// Write a plot of the residuals
     #[arg(long, value_name = "FILE.svg")]
@@ -72,17 +72,23 @@ pub(crate) struct Args {
     /// Print JSON
     #[arg(long)]
     json: bool,
+    // The fields with a heading are last, because a heading applies to every option that follows.
+    #[command(flatten)]
+    start: StartArgs,
+    #[command(flatten)]
+    input: InputArgs,
 }
 
 /// Start of a fit to logs.
 #[derive(Debug, clap::Args)]
 #[group(id = "start")]
-#[command(next_help_heading = "Logs")]
+#[command(next_help_heading = "Logs (with --log)")]
 struct StartArgs {
-    /// Configuration file of the pack
+    /// Configuration file of the pack; the fit starts from its cell model
     #[arg(short, long, value_name = "FILE.toml", requires = "log")]
     config: Option<PathBuf>,
-    /// Chemistry on the label of a single cell; needs --rated. Add --voltage-min and --voltage-max if they are not typical
+    /// Chemistry on the label, for logs of a single cell; needs --rated. Add --voltage-min and --voltage-max if they are not
+    /// typical of the chemistry
     #[arg(long, value_parser = one_of_chemistries(), requires_all = ["log", "rated"], conflicts_with = "config")]
     chemistry: Option<String>,
 }
@@ -90,16 +96,17 @@ struct StartArgs {
 /// Size and breakpoints of the model.
 #[derive(Debug, clap::Args)]
 struct GridArgs {
-    /// RC branches [default: 2, for an ageing cell 1]
-    #[arg(long, value_name = "N")]
+    /// Number of RC branches (a resistor and a capacitor), 1 to 3 [default: 2, for an ageing cell 1]
+    #[arg(long, value_name = "N", value_parser = integer::<usize>(0, usize::MAX))]
     branches: Option<usize>,
-    /// Initial time constants, s, ascending
+    /// Initial time constants of the RC branches, s, ascending, for example 10,100
     #[arg(long, value_name = "SECONDS,..", value_delimiter = ',', value_parser = finite)]
     tau: Option<Vec<f64>>,
-    /// Temperature nodes, degrees C, ascending [default: from the data]
+    /// Temperatures of the model's tables, degrees C, ascending [default: from the data]
     #[arg(long, value_name = "CELSIUS,..", value_delimiter = ',', value_parser = finite, allow_negative_numbers = true)]
     temperatures: Option<Vec<f64>>,
-    /// SOC nodes: a number (evenly spaced) or an ascending list from 0 to 1 [default: 15 to 31 with a slow test, denser where its curve bends; 25 for an ageing cell; else 24, denser at both ends]
+    /// SOC of the model's tables: how many values (evenly spaced), or an ascending list from 0 to 1 [default: 15 to 31 values
+    /// with a slow test, denser where its curve bends; 25 for an ageing cell; else 24, denser at both ends]
     #[arg(long, value_name = "N|SOC,..", value_parser = soc_nodes)]
     soc_nodes: Option<SocNodes>,
 }

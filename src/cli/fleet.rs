@@ -8,7 +8,7 @@ use serde_json::json;
 
 use super::common::logs::InputArgs;
 use super::common::many_logs;
-use super::common::numbers::within;
+use super::common::numbers::{integer, within};
 use super::common::output::{check_distinct, failure, print, print_json, unless_closed};
 use super::common::progress::progress_bar;
 use crate::config::{self, Config};
@@ -78,7 +78,7 @@ struct RunArgs {
     #[arg(long, value_name = "SECONDS", value_parser = period)]
     estimates: Option<f64>,
     /// Number of threads [default: one per core]
-    #[arg(short, long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    #[arg(short, long, value_name = "N", value_parser = integer::<u16>(1, 1024))]
     jobs: Option<u16>,
     /// Print JSON
     #[arg(long)]

@@ -158,7 +158,10 @@ fn cv(args: &CvArgs) -> Result<(), Failure> {
     for (k, kernel) in args.kernel.iter().enumerate() {
         let settings = args.model.settings(kernel, table.len());
         let mut watcher = |progress| report::show_step(&bar, &kernel.to_string(), k * args.folds, progress);
-        all.push(gpr::cross_validate(&table, &settings, args.folds, &mut watcher).map_err(failure)?);
+        all.push(
+            gpr::cross_validate(&table, &settings, args.folds, &mut watcher)
+                .map_err(|error| args.files.fault(error))?,
+        );
     }
     bar.finish_and_clear();
     if let Some(path) = &args.predictions {
@@ -186,7 +189,7 @@ fn train(args: &TrainArgs) -> Result<(), Failure> {
     let settings = args.model.settings(&args.kernel, table.len());
     let bar = report::fit_bar(1);
     let mut watcher = |progress| report::show_step(&bar, &args.kernel.to_string(), 0, progress);
-    let trained = TrainedModel::fit(&table, &settings, &mut watcher).map_err(failure)?;
+    let trained = TrainedModel::fit(&table, &settings, &mut watcher).map_err(|error| args.files.fault(error))?;
     bar.finish_and_clear();
     let seconds = begin.elapsed().as_secs_f64();
     trained.save(&args.out).map_err(failure)?;

@@ -4,11 +4,11 @@ use std::path::PathBuf;
 
 use serde_json::{Value, json};
 
-use super::common::numbers::{NamedValue, one_of};
+use super::common::numbers::{NamedValue, cell_number, integer, one_of};
 use super::common::output::print;
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
-use crate::quantity::{MAX_CELLS, Timestamp};
+use crate::quantity::Timestamp;
 use crate::store::{self, HistoryEntry, HistoryQuery, HistoryReader, HistoryTable, NotedHead};
 use packwatch_host::failure::Failure;
 
@@ -32,7 +32,7 @@ pub(crate) struct Args {
     #[arg(long)]
     json: bool,
     /// Print at most this many rows, the latest; 0 prints all
-    #[arg(long, value_name = "N", default_value_t = LISTED)]
+    #[arg(long, value_name = "N", default_value_t = LISTED, value_parser = integer::<u32>(0, u32::MAX))]
     limit: u32,
 }
 
@@ -55,8 +55,8 @@ struct ExportArgs {
 
 #[derive(Debug, clap::Args)]
 struct VerifyArgs {
-    /// Head of the chain as logged by the daemon ("end of the history's chain"). If the history was rewritten since, verification
-    /// fails
+    /// Number of rows and hash that the daemon logged earlier ("end of the history's chain"). Verification fails if the
+    /// history was rewritten since then
     #[arg(long, value_name = "ROWS:HASH")]
     noted: Vec<NotedHead>,
     /// Print JSON
@@ -71,7 +71,7 @@ struct RowArgs {
     #[arg(long, value_name = "KIND", value_parser = one_of(&KINDS), value_delimiter = ',')]
     kind: Vec<HistoryTable>,
     /// Select rows of this cell, counted from 1
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=MAX_CELLS as i64))]
+    #[arg(long, value_name = "N", value_parser = cell_number)]
     cell: Option<u16>,
     /// Select rows from this time on: 2026-04-02T13:08:17 (UTC) or seconds since 1970
     #[arg(long, value_name = "WHEN", value_parser = when)]
@@ -93,6 +93,16 @@ const KINDS: [NamedValue<HistoryTable>; 7] = [
 ];
 
 impl RowArgs {
+    /// Checks arguments that depend on each other.
+    fn check(&self) -> Result<(), Failure> {
+        match (self.since, self.until) {
+            (Some(since), Some(until)) if since > until => {
+                Err(Failure::new("--since is later than --until, so no row can be selected; exchange them"))
+            }
+            _ => Ok(()),
+        }
+    }
+
     fn filter(&self, limit: Option<u32>) -> HistoryQuery {
         HistoryQuery {
             kinds: self.kind.clone(),
@@ -111,6 +121,8 @@ fn when(text: &str) -> Result<Timestamp, String> {
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let wanted = if let Some(HistoryCommand::Export(export)) = &args.what { &export.wanted } else { &args.wanted };
+    wanted.check()?;
     let folder = args.state.clone().unwrap_or_else(store::standard_folder);
     let reader = HistoryReader::open(&folder).map_err(Failure::new)?;
     match &args.what {
@@ -225,7 +237,8 @@ fn document(entry: &HistoryEntry) -> Value {
 const OWN_COLUMNS: [&str; 7] = ["kind", "seq", "wall_ns", "utc", "time_ns", "boot", "pack"];
 
 fn export(reader: &HistoryReader, args: &ExportArgs) -> Result<(), Failure> {
-    let fail = |error: &dyn std::fmt::Display| Failure::new(format!("{}: {error}", args.out.display()));
+    // The errors of a result file name it.
+    let fail = |error: &dyn std::fmt::Display| Failure::new(error.to_string());
     let filter = args.wanted.filter(None);
     let kinds: Vec<HistoryTable> = filter.wanted_kinds().collect();
     let mut columns: Vec<&str> = Vec::new();

@@ -7,6 +7,7 @@
 use std::path::{Path, PathBuf};
 
 use super::common::files::{database, named_from, read};
+use super::common::numbers::integer;
 use super::common::output::{failure, unless_closed};
 use crate::io::result_file::{check_place, write_file};
 use crate::lab::import::ImportResult;
@@ -70,15 +71,15 @@ struct DbcArgs {
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
 The written tables carry the source's licence, CC BY-SA 4.0. Signals are named NAME.SIGNAL in [input.*]. NAME is --name or the common \
-prefix of all ids in the file. Numbered signals of one answer become one line with {n}. Signals are left out, and listed at the end \
-of the file, if their values are names or texts, a field is invalid, or their bits belong to another signal. Commands are left out if \
-they belong to other model years, or their service is not 0x01, 0x21 or 0x22.")]
+prefix of all ids in the file. Numbered signals of one answer become one line, with the letter n in braces for the number. Signals are \
+left out, and listed at the end of the file, if their values are names or texts, a field is invalid, or their bits belong to another \
+signal. Commands are left out if they belong to other model years, or their service is not 0x01, 0x21 or 0x22.")]
 struct ObdbArgs {
     /// signalset.json of a car model
     #[arg(value_name = "FILE.json")]
     file: PathBuf,
     /// Convert only commands of this model year [default: all years]
-    #[arg(long, value_name = "YEAR", value_parser = clap::value_parser!(i64).range(1980..=2100))]
+    #[arg(long, value_name = "YEAR", value_parser = integer::<i64>(1980, 2100))]
     year: Option<i64>,
     /// Name before the dot of every signal [default: common prefix of all ids]
     #[arg(long)]

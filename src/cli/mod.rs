@@ -48,11 +48,18 @@ mod whatif;
 
 use std::process::ExitCode;
 
-use clap::{CommandFactory as _, Parser, Subcommand};
+use clap::{CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 
 /// Streaming battery health monitoring over SocketCAN.
 #[derive(Debug, Parser)]
-#[command(name = "packwatch", version, about, propagate_version = true)]
+#[command(
+    name = "packwatch",
+    version,
+    about,
+    propagate_version = true,
+    after_help = "To begin: `packwatch demo` simulates a pack, `packwatch check FILE` checks a configuration, and \
+    `packwatch run -c FILE` starts the service. `packwatch COMMAND --help` describes a command."
+)]
 pub struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -150,7 +157,9 @@ enum Command {
 
 /// Parses the command line and runs the command.
 pub fn main() -> ExitCode {
-    let result = match Cli::parse().command {
+    let matches = with_negative_numbers(Cli::command()).get_matches();
+    let cli = Cli::from_arg_matches(&matches).unwrap_or_else(|error| error.exit());
+    let result = match cli.command {
         Command::Run(args) => run::run(&args),
         Command::Status(args) => status::run(&args),
         Command::Exporter(args) => exporter::run(&args),
@@ -208,4 +217,14 @@ pub fn main() -> ExitCode {
             ExitCode::from(failure.code)
         }
     }
+}
+
+/// Lets every option accept a negative number, so that its parser rejects `--sleep-gap -1` and states what is allowed.
+/// Otherwise clap would report `-1` as an unknown option.
+fn with_negative_numbers(command: clap::Command) -> clap::Command {
+    let accept = |arg: clap::Arg| {
+        let takes_value = !arg.is_positional() && arg.get_action().takes_values();
+        if takes_value { arg.allow_negative_numbers(true) } else { arg }
+    };
+    command.mut_args(accept).mut_subcommands(with_negative_numbers)
 }

@@ -39,30 +39,30 @@ enum ModelCommand {
 
 #[derive(Debug, clap::Args)]
 struct ShowArgs {
-    #[command(flatten)]
-    source: SourceArgs,
     /// Print JSON
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    source: SourceArgs,
 }
 
 #[cfg(feature = "lab")]
 #[derive(Debug, clap::Args)]
 struct PlotArgs {
-    #[command(flatten)]
-    source: SourceArgs,
-    /// SVG file to write
+    /// SVG file to write; the name must end in .svg
     #[arg(short, long, value_name = "FILE.svg")]
     out: PathBuf,
+    #[command(flatten)]
+    source: SourceArgs,
 }
 
 #[derive(Debug, clap::Args)]
 struct ExportArgs {
-    #[command(flatten)]
-    source: SourceArgs,
     /// Cell model file to write; - writes standard output
     #[arg(short, long, value_name = "FILE.toml", default_value = "-")]
     out: PathBuf,
+    #[command(flatten)]
+    source: SourceArgs,
 }
 
 #[derive(Debug, clap::Args)]

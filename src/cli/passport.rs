@@ -16,6 +16,7 @@ use super::common::numbers::{NamedValue, above_0, one_of, within};
 use super::common::output::{failure, named, unless_closed};
 use super::common::replaying::{self, Replayed};
 use crate::config::{self, Config, VehicleIdentity};
+use crate::io::json::json_fault;
 use crate::io::result_file::check_place;
 use crate::lab;
 use crate::lab::passport::{self, Condition, ReadingLimits, Record, Standard, Terms};
@@ -41,7 +42,9 @@ const STANDARDS: [NamedValue<Standard>; 2] = [
 #[command(
     after_help = "Unknown values are left out. If the standard requires an unknown value, nothing is written; the error lists \
     each missing value with the reason and a remedy. The static part may state everything that packwatch does not \
-    measure; a value that both parts have is an error."
+    measure; a value that both parts have is an error.",
+    override_usage = "packwatch passport [OPTIONS] --config <FILE> <LOG>...\n       \
+    packwatch passport [OPTIONS] --config <FILE> --state <DIR>"
 )]
 pub(crate) struct Args {
     /// Configuration file of the pack
@@ -130,12 +133,13 @@ impl Args {
 
 fn read_static(path: &Path) -> Result<Value, Failure> {
     let mut bytes = Vec::new();
-    let file = File::open(path).map_err(|error| named(path, error))?;
-    file.take(MAX_STATIC_BYTES + 1).read_to_end(&mut bytes).map_err(|error| named(path, error))?;
+    let unread = |error: std::io::Error| named(path, format!("cannot be read: {error}"));
+    let file = File::open(path).map_err(unread)?;
+    file.take(MAX_STATIC_BYTES + 1).read_to_end(&mut bytes).map_err(unread)?;
     if u64::try_from(bytes.len()).is_ok_and(|length| length > MAX_STATIC_BYTES) {
         return Err(named(path, format!("larger than {MAX_STATIC_BYTES} bytes")));
     }
-    serde_json::from_slice(&bytes).map_err(|error| named(path, error))
+    serde_json::from_slice(&bytes).map_err(|error| named(path, format!("not valid JSON: {}", json_fault(&error))))
 }
 
 fn load_store(folder: &Path, config: &Config) -> Result<(Record, VehicleIdentity), Failure> {

@@ -21,6 +21,8 @@ use crate::store::HistoryReader;
 
 /// Arguments of `report`.
 #[derive(Debug, clap::Args)]
+#[command(override_usage = "packwatch report [OPTIONS] --config <FILE> <LOG>...\n       \
+    packwatch report [OPTIONS] --state <DIR> [--config <FILE>]")]
 pub(crate) struct Args {
     /// Configuration file. Optional with --state; then it adds limits and the rated capacity
     #[arg(short, long, value_name = "FILE", required_unless_present = "state")]

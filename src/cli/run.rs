@@ -1,6 +1,6 @@
 //! `packwatch run`: the service on live CAN interfaces.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use super::common::numbers::{MAX_SECONDS, away, between, bytes, whole};
@@ -39,17 +39,18 @@ pub(crate) struct Args {
     /// Write events as JSON lines, as `packwatch replay --events` does
     #[arg(long, value_name = "FILE")]
     events: Option<PathBuf>,
-    /// Start from this stored state
+    /// Start from the state in this file, which --snapshot has written
     #[arg(long, value_name = "FILE")]
     restore: Option<PathBuf>,
-    /// Age of the stored state. Needed only if the state came from a log, so that its time stamp does not give the age
+    /// Time since the restored state was written. Needed only if the state came from a log, so that its time stamp does not
+    /// give its age
     #[arg(long, value_name = "SECONDS|unknown", requires = "restore", value_parser = away)]
     away: Option<Downtime>,
     /// Folder for state and history; `none` keeps nothing [default: $STATE_DIRECTORY under systemd, else
     /// $XDG_STATE_HOME/packwatch or ~/.local/state/packwatch]. The state found there is restored, unless --restore is given
     #[arg(long, value_name = "DIR")]
     state: Option<PathBuf>,
-    /// Write the state to this file on stopping
+    /// Write the state to this file on stopping, for --restore
     #[arg(long, value_name = "FILE")]
     snapshot: Option<PathBuf>,
     /// Stop after this time
@@ -81,6 +82,11 @@ const MAX_BUFFER_BYTES: usize = (i32::MAX / 2) as usize;
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     logging::start(args.log.as_deref()).map_err(Failure::new)?;
+    let file = args.state.as_deref().filter(|state| *state != Path::new("none") && state.exists() && !state.is_dir());
+    if let Some(file) = file {
+        let what = format!("--state {}: is a file, must be a folder for state and history, or none", file.display());
+        return Err(Failure::new(what));
+    }
     let record_limits = args.record_limit.map(|total| SegmentLimits::new(total, args.record_segment)).transpose();
     let config = config::load(&args.config)?;
     let key = config.key.as_ref().map(|key| CanKey::load(key, std::env::var_os("CREDENTIALS_DIRECTORY"))).transpose();
@@ -88,7 +94,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         key: key.map_err(Failure::config)?,
         config,
         record: args.record.clone(),
-        record_limits: record_limits.map_err(|why| Failure::new(format!("--record-limit: {why}")))?,
+        record_limits: record_limits
+            .map_err(|why| Failure::new(format!("--record-limit: {why} (--record-segment)")))?,
         frames: args.frames.clone(),
         events: args.events.clone(),
         restore: args.restore.as_deref().map(snapshot_file::read).transpose().map_err(Failure::new)?,

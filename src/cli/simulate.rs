@@ -10,7 +10,7 @@ mod settings;
 
 use std::path::PathBuf;
 
-use super::common::numbers::one_of;
+use super::common::numbers::{integer, one_of};
 use crate::can::encode::{InputEncoder, InputProtector};
 use crate::can::{CanId, Frame};
 use crate::config::{self, Config};
@@ -27,6 +27,8 @@ const FRAME_SPACING_NS: i64 = 130_000;
 
 /// Arguments of `simulate`.
 #[derive(Debug, clap::Args)]
+#[command(override_usage = "packwatch simulate [OPTIONS] --config <FILE> --out <LOG> <SCENARIO>\n       \
+    packwatch simulate [OPTIONS] --config <FILE> --to <INTERFACE> <SCENARIO>")]
 pub(crate) struct Args {
     /// Load scenario
     #[arg(value_parser = one_of(&settings::SCENARIOS))]
@@ -37,7 +39,7 @@ pub(crate) struct Args {
     /// Candump log to write, compressed if the name ends in .gz; - writes standard output
     #[arg(short, long, value_name = "LOG", required_unless_present = "to", conflicts_with = "to")]
     out: Option<PathBuf>,
-    /// Send the frames on this CAN interface instead
+    /// Send the frames on this CAN interface instead of writing a log
     #[arg(long, value_name = "INTERFACE")]
     to: Option<String>,
     /// Play frames this many times faster than real time; 0 = as fast as the bus accepts them
@@ -50,7 +52,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "SECONDS", default_value_t = 1.0, value_parser = settings::positive)]
     truth_period: f64,
     /// Unix time of the first frame, s
-    #[arg(long, value_name = "SECONDS", default_value_t = 1_700_000_000)]
+    #[arg(long, value_name = "SECONDS", default_value_t = 1_700_000_000, value_parser = integer::<u32>(0, u32::MAX))]
     start: u32,
     #[command(flatten)]
     changes: settings::Changes,
@@ -147,6 +149,11 @@ impl Sink {
 /// Returns the settings of the scenario for the configured cell, with the changes from the command line.
 fn settings_for(args: &Args, config: &Config) -> Result<Settings, Failure> {
     let capacity_ah = args.changes.pack.capacity_ah.unwrap_or(config.monitor.model.capacity_ah);
+    if args.changes.walk_steps.is_some() && args.scenario != Scenario::RandomWalk {
+        return Err(Failure::new(
+            "--walk-steps changes only the scenario random-walk; choose this scenario or omit the option",
+        ));
+    }
     let mut settings = Settings::of(args.scenario, capacity_ah);
     let series = cells_in_series(&config.monitor.sample);
     settings.pack.cells = series;

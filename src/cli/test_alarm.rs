@@ -21,13 +21,13 @@ use packwatch_host::failure::Failure;
 /// Arguments of `test-alarm`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Rule whose frame is sent; raises no alarm
+    /// Rule whose alarm frame is sent, for example capacity_low; no alarm is raised
     #[arg(value_name = "RULE", value_parser = rule_parser(), hide_possible_values = true)]
     rule: Rule,
     /// Configuration file of the daemon
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// Duration of the test
+    /// Duration of the test, s
     #[arg(long = "for", value_name = "SECONDS", default_value_t = 5.0, value_parser = above_0_to(MAX_TEST_S, "seconds, "))]
     duration: f64,
     #[command(flatten)]

@@ -32,10 +32,14 @@ enum EndOfLifeArg {
 #[command(
     after_help = "Each log is replayed once for all alarm settings, and once more for each combination of other settings (and of \
     input_missing). The first rows show the configuration without changes.\n\n\
-    lead: time from the first true raise to the end of life. missed: the end of life came without a true raise. false alarm: \
-    the end of life did not follow a raise within --horizon; without --horizon, a raise in a log without end of life. open: the \
-    log ends before the horizon of a raise. false raise: capacity_low was raised while the true capacity of the cell was above \
-    the threshold. flickers: clears before the end of life. Leads are medians over the logs (5 to 95 %).\n\n\
+    Columns:\n\
+    lead: time from the first true raise to the end of life.\n\
+    missed: the end of life came without a true raise.\n\
+    false alarm: the end of life did not follow a raise within --horizon; without --horizon, a raise in a log without end of life.\n\
+    open: the log ends before the horizon of a raise.\n\
+    false raise: capacity_low was raised while the true capacity of the cell was above the threshold.\n\
+    flickers: clears before the end of life.\n\
+    Leads are medians over the logs (5 to 95 %).\n\n\
     The end of life comes from a truth file next to the log (NAME.truth.csv of simulate --truth, NAME_cycles.csv of score \
     --cycles, or --truth), else from the learned capacity; the table shows which. Sections of a CSV get their times from \
     --start-times, else from NAME_cycles.csv next to the CSV."

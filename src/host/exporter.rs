@@ -85,7 +85,11 @@ pub fn run(listen: SocketAddr, socket: PathBuf) -> Result<(), String> {
     let source = Rc::new(StatusSource { path: socket, is_up: Cell::new(None) });
     let served = async { serve(TcpListener::bind(listen).await?, source).await };
     let served = LocalSet::new().block_on(&runtime, served);
-    served.map_err(|error| format!("{listen}: {error}"))
+    served.map_err(|error| {
+        format!(
+            "{listen}: cannot listen there: {error}; give an address of this computer and a free port with --listen"
+        )
+    })
 }
 
 async fn serve(listener: TcpListener, source: Rc<StatusSource>) -> io::Result<()> {
@@ -206,7 +210,7 @@ impl StatusSource {
     /// answering.
     async fn read(&self) -> Option<StatusDocument> {
         let line = timeout(STATUS_LIMIT, self.line()).await.unwrap_or_else(|late| Err(late.into()));
-        let document = line.map_err(|error| explain(&self.path, &error)).and_then(|line| parse(&line));
+        let document = line.map_err(|error| explain(&self.path, "--socket", &error)).and_then(|line| parse(&line));
         let was_up = self.is_up.replace(Some(document.is_ok()));
         match &document {
             Ok(_) if was_up != Some(true) => tracing::info!("the daemon reports its status"),

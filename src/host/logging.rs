@@ -10,7 +10,7 @@ use std::io::IsTerminal;
 use std::os::linux::fs::MetadataExt;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use tracing_subscriber::filter::Targets;
+use tracing_subscriber::filter::{LevelFilter, Targets};
 use tracing_subscriber::fmt;
 use tracing_subscriber::fmt::format::Writer;
 use tracing_subscriber::fmt::time::FormatTime;
@@ -76,7 +76,14 @@ impl FormatTime for WallClock {
 
 /// Parses a filter. `packwatch::MODULE` selects the module of that name in every member crate.
 fn targets(text: &str) -> Result<Targets, String> {
-    let filter: Targets = text.parse().map_err(|error| format!("log filter '{text}': {error}"))?;
+    let allowed = "must be error, warn, info, debug, trace or off, or a filter such as packwatch::io=debug,info";
+    let filter: Targets = text.parse().map_err(|error| format!("log filter '{text}': {error}, {allowed}"))?;
+    // A single word that is not a level would select a module of that name, and nothing would be logged.
+    let is_level = |word: &str| word.parse::<LevelFilter>().is_ok() || word.starts_with("packwatch");
+    let mut words = text.split(',').map(str::trim).filter(|word| !word.is_empty() && !word.contains('='));
+    if let Some(word) = words.find(|word| !is_level(word)) {
+        return Err(format!("log filter '{text}': {word:?} is not a level, {allowed}"));
+    }
     let modules = filter.iter().filter_map(|(target, level)| Some((target.strip_prefix("packwatch::")?, level)));
     let members =
         modules.flat_map(|(module, level)| MEMBER_CRATES.map(|member| (format!("{member}::{module}"), level)));
@@ -111,6 +118,7 @@ mod tests {
         assert!(
             all.would_enable("packwatch_host::service", &Level::DEBUG) && !all.would_enable("hyper", &Level::ERROR)
         );
+        assert!(targets("loud").unwrap_err().contains("\"loud\" is not a level, must be error, warn"));
         assert!(targets("packwatch::io=loud").unwrap_err().starts_with("log filter 'packwatch::io=loud': "));
     }
 }

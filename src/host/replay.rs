@@ -420,8 +420,25 @@ impl Replay {
                 names.join(", ")
             ));
         }
+        if let Some(note) = unused(counts, &summary, steps) {
+            summary.notes.push(note);
+        }
         Ok((summary, self.snapshot))
     }
+}
+
+/// Explains why a replay gave no estimates; `None` = it gave some, or the reason is already noted.
+fn unused(counts: &LogCounts, summary: &ReplaySummary, steps: u64) -> Option<String> {
+    let found = match (counts.frames, counts.lines) {
+        (0, _) if !counts.foreign.is_empty() => return None,
+        (0, 0) => "no frames: the log is empty",
+        (0, _) if summary.ticks > 0 => "no frames: the log contains only other records",
+        (0, _) => "no frames: no line of the log is one of a candump log, a journal or a CSV log",
+        _ if steps > 0 => return None,
+        _ if summary.ticks == 0 && summary.skipped_records > 0 => "no frames used: --from and --until exclude all",
+        _ => "no estimates: no frame has a usable voltage; `packwatch doctor` with this log finds the reason",
+    };
+    Some(found.to_owned())
 }
 
 /// Voltage readings that reached an estimator since the monitor's first start.

@@ -17,7 +17,7 @@ const MAX_BYTES: u64 = 1 << 20;
 /// Fails if the path is not a regular file, or if the file cannot be read or is too long. The message names the file.
 pub(crate) fn read(path: &Path) -> Result<Vec<u8>, String> {
     let at = path.display();
-    let fault = |error: std::io::Error| format!("{at}: {error}");
+    let fault = |error: std::io::Error| format!("{at}: cannot be read: {error}");
     if !std::fs::metadata(path).map_err(fault)?.is_file() {
         return Err(format!("{at}: must be a regular file"));
     }

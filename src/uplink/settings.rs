@@ -60,8 +60,9 @@ impl Settings {
             let line = 1 + text.as_bytes().iter().take(start).filter(|byte| **byte == b'\n').count();
             let found = text.lines().nth(line - 1).unwrap_or_default().trim();
             let message = error.message().replace('\n', ", ");
-            // A value outside its range: the line shows the key and the value found.
-            if message.starts_with("must ") {
+            let message = message.replace("expected u16", "must be a whole number from 0 to 65535");
+            // A wrong value: the line shows the key and the value found.
+            if message.starts_with("must ") || message.starts_with("invalid ") {
                 format!("{line}: {found}, {message}")
             } else {
                 format!("{line}: {message}")

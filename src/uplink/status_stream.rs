@@ -30,23 +30,24 @@ pub type Documents = watch::Receiver<Option<Box<StatusDocument>>>;
 /// dropped.
 pub fn follow(socket: &Path) -> Documents {
     let (sender, receiver) = watch::channel(None);
-    let path = stream_path(socket);
+    let socket = socket.to_owned();
     tokio::spawn(async move {
         tokio::select! {
-            () = read_for_ever(&path, &sender) => {}
+            () = read_for_ever(&socket, &sender) => {}
             () = sender.closed() => {}
         }
     });
     receiver
 }
 
-async fn read_for_ever(path: &Path, sender: &watch::Sender<Option<Box<StatusDocument>>>) {
+async fn read_for_ever(socket: &Path, sender: &watch::Sender<Option<Box<StatusDocument>>>) {
     let mut was_up = None;
     loop {
-        let error = match read(path, sender, &mut was_up).await {
-            Ok(()) => explain(path, &io::ErrorKind::UnexpectedEof.into()),
-            Err(error) => explain(path, &error),
+        let error: io::Error = match read(&stream_path(socket), sender, &mut was_up).await {
+            Ok(()) => io::ErrorKind::UnexpectedEof.into(),
+            Err(error) => error,
         };
+        let error = explain(socket, "the key status.socket of the settings file", &error);
         if was_up != Some(false) {
             tracing::warn!(error, "no status from the daemon");
         }

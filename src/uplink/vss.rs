@@ -47,7 +47,8 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let branch = Settings::read(config).map_err(Failure::config)?.kuksa.branch;
     for (ending, text) in [("vspec", vspec(&branch)), ("json", json_text(&branch))] {
         let path = args.output.join(format!("{FILE_NAME}.{ending}"));
-        std::fs::write(&path, text).map_err(|error| Failure::new(format!("{}: {error}", path.display())))?;
+        std::fs::write(&path, text)
+            .map_err(|error| Failure::new(format!("{}: cannot be written: {error}", path.display())))?;
     }
     Ok(())
 }

@@ -205,7 +205,10 @@ fn bad_input_error_names_place_and_range() {
     assert!(few.contains("folds = 5, must be"), "{few}");
     let kernel = refused(place, 2, &[&["cv", "cell.csv", "--kernel", "gaussian"], &COLUMNS[..]].concat());
     assert!(kernel.contains("found gaussian, allowed: exponential, squared_exponential"), "{kernel}");
-    assert!(refused(place, 1, &["predict", "cell.csv", "cell.csv"]).contains("line 1: not a model of gpr"));
+    assert!(
+        refused(place, 1, &["predict", "cell.csv", "cell.csv"])
+            .contains("line 1: not a model file of `packwatch gpr train`")
+    );
     printed(place, &[&["train", "cell.csv", "-o", "model.json"], &COLUMNS[..]].concat());
     let model = std::fs::read_to_string(place.join("model.json")).unwrap();
     std::fs::write(place.join("model.json"), model.replacen("targets\":[", "targets\":[1", 1)).unwrap();

@@ -7,11 +7,12 @@ use clap::builder::{PossibleValuesParser, TypedValueParser};
 use crate::alarm::{Rule, Selector, Severity};
 use packwatch_host::failure::Failure;
 
+use super::numbers::cell_number;
 use super::output::print;
 use crate::control::client::ControlClient;
 use crate::control::protocol::{CommandOutcome, Request};
 use crate::monitor::Command;
-use crate::quantity::{CellIndex, MAX_CELLS};
+use crate::quantity::CellIndex;
 
 /// The socket of the daemon.
 #[derive(Debug, clap::Args)]
@@ -32,7 +33,7 @@ impl ControlArgs {
 #[derive(Debug, clap::Args)]
 #[group(id = "which", required = true, multiple = true)]
 pub(crate) struct SelectorArgs {
-    /// Select the alarms of this rule
+    /// Select the alarms of this rule, for example capacity_low
     #[arg(value_name = "RULE", value_parser = rule_parser(), hide_possible_values = true, group = "which")]
     rule: Option<Rule>,
     /// Select the alarms of this severity
@@ -90,6 +91,5 @@ fn severity_parser() -> impl TypedValueParser<Value = Severity> {
 }
 
 fn cell(text: &str) -> Result<CellIndex, String> {
-    let number = text.parse::<u16>().ok().filter(|number| (1..=MAX_CELLS).contains(&usize::from(*number)));
-    number.map(|number| CellIndex(number - 1)).ok_or_else(|| format!("must be a cell number, 1 to {MAX_CELLS}"))
+    cell_number(text).map(|number| CellIndex(number - 1))
 }

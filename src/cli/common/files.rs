@@ -13,7 +13,8 @@ const MAX_BYTES: u64 = 64 << 20;
 /// Reads a DBC file.
 pub(crate) fn database(file: &Path) -> Result<Database, Failure> {
     let bytes = std::fs::read(file).map_err(|error| unreadable(file, &error))?;
-    Database::parse_bytes(&bytes).map_err(|error| named(file, error))
+    Database::parse_bytes(&bytes)
+        .map_err(|error| Failure::new(format!("{}:{}: {}", file.display(), error.line, error.what)))
 }
 
 /// Reads a text file of at most [`MAX_BYTES`].

@@ -19,20 +19,22 @@ pub(crate) enum CsvSign {
 /// Options for reading logs.
 #[derive(Debug, clap::Args)]
 pub(crate) struct InputArgs {
-    /// Stop with an error at the first malformed line
+    /// Stop with an error at the first line that cannot be read
     #[arg(long)]
     pub(crate) strict: bool,
-    /// Treat a gap longer than this as sleep of the recorder: no ticks, no frames
+    /// Count a gap longer than this as sleep of the recorder: during the gap, nothing is computed and no frame is made
     #[arg(long, value_name = "SECONDS", default_value_t = SLEEP_GAP_S, value_parser = positive)]
     pub(crate) sleep_gap: f64,
-    /// Name a CSV column, for example current=Current(A). ROLE is time, current, voltage, temperature or section; an empty NAME
-    /// means that the column does not exist. {n} in both stands for the number of the cell or sensor, from 1
+    /// Name a CSV column, for example current=Current(A). ROLE is time, current, voltage, temperature or section. If each cell
+    /// or sensor has its own column, write the letter n in braces for its number, from 1, in both ROLE and NAME. An empty NAME
+    /// means that the column does not exist
     #[arg(long = "column", value_name = "ROLE=NAME", value_parser = column)]
     pub(crate) columns: Vec<(String, String)>,
     /// Direction of positive current in a CSV
     #[arg(long, value_enum, default_value = "discharge")]
     pub(crate) csv_sign: CsvSign,
-    /// CSV table with the section column and a column `start`, which makes the times absolute
+    /// CSV table with the start time of each section of a CSV log: the section column of the log, for example cycle, and a
+    /// column `start`
     #[arg(long, value_name = "TABLE.csv")]
     pub(crate) start_times: Option<PathBuf>,
 }
@@ -52,7 +54,7 @@ pub(crate) fn column(text: &str) -> Result<(String, String), String> {
     const ROLES: [&str; 7] = ["time", "current", "voltage", "voltage{n}", "temperature", "temperature{n}", "section"];
     let (role, name) = text.split_once('=').ok_or("must be ROLE=NAME, for example current=Current(A)")?;
     if !ROLES.contains(&role) {
-        return Err(format!("role {role:?}, must be one of {}", ROLES.join(", ")));
+        return Err(format!("unknown role {role:?}, must be one of {}", ROLES.join(", ")));
     }
     if role.ends_with("{n}") != name.contains("{n}") {
         return Err("{n} must be in both ROLE and NAME, or in neither".to_owned());

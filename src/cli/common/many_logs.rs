@@ -6,6 +6,7 @@ use indicatif::ProgressBar;
 use packwatch_host::failure::Failure;
 
 use super::logs::{InputArgs, log_options};
+use super::numbers::integer;
 use super::output::check_distinct;
 use super::progress::progress_bar;
 use crate::config::Config;
@@ -22,7 +23,7 @@ pub(crate) struct LogArgs {
     #[command(flatten)]
     input: InputArgs,
     /// Number of threads [default: one per core]
-    #[arg(short, long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    #[arg(short, long, value_name = "N", value_parser = integer::<u16>(1, 1024))]
     jobs: Option<u16>,
 }
 

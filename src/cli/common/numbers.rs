@@ -1,8 +1,12 @@
 //! Argument parsers for numbers and named values. Each error says what is allowed.
 
+use std::fmt::Display;
+use std::str::FromStr;
+
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 
 use crate::monitor::Downtime;
+use crate::quantity::MAX_CELLS;
 
 /// A name, its value, and its line in the help.
 pub(crate) type NamedValue<T> = (&'static str, T, &'static str);
@@ -43,6 +47,23 @@ pub(crate) fn whole<const LOW: usize, const HIGH: usize>(text: &str) -> Result<u
     number.ok_or_else(|| format!("must be a whole number from {LOW} to {HIGH}"))
 }
 
+/// A whole number from `low` to `high`, of any integer type.
+pub(crate) fn integer<T>(low: T, high: T) -> impl Fn(&str) -> Result<T, String> + Clone
+where
+    T: FromStr + PartialOrd + Display + Copy,
+{
+    move |text| {
+        let number = text.trim().parse::<T>().ok().filter(|number| (low..=high).contains(number));
+        number.ok_or_else(|| format!("must be a whole number from {low} to {high}"))
+    }
+}
+
+/// The number of a cell, counted from 1.
+pub(crate) fn cell_number(text: &str) -> Result<u16, String> {
+    let number = text.parse::<u16>().ok().filter(|number| (1..=MAX_CELLS).contains(&usize::from(*number)));
+    number.ok_or_else(|| format!("must be a cell number, 1 to {MAX_CELLS}"))
+}
+
 /// Longest duration of an option, s: ten years.
 pub(crate) const MAX_SECONDS: f64 = 315_576_000.0;
 
@@ -67,8 +88,8 @@ pub(crate) fn bytes(text: &str) -> Result<u64, String> {
 
 /// A number above 0; infinity is allowed.
 pub(crate) fn positive(text: &str) -> Result<f64, String> {
-    let value: f64 = text.parse().map_err(|e| format!("{e}"))?;
-    if value > 0.0 { Ok(value) } else { Err("must be above 0".to_owned()) }
+    let value = text.trim().parse::<f64>().ok().filter(|value| *value > 0.0);
+    value.ok_or_else(|| "must be a number above 0".to_owned())
 }
 
 /// A finite number above 0.

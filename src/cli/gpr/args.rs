@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::cli::common::numbers::{NamedValue, one_of, whole};
+use crate::cli::common::numbers::{NamedValue, integer, one_of, whole};
 use crate::io::result_file::check_place;
 use crate::lab::gpr::MissingPolicy;
 use crate::regress::{Basis, Form, GprSettings, Kernel, MAX_NEIGHBOURS};
@@ -10,6 +10,8 @@ use packwatch_host::failure::Failure;
 
 /// Text below the options.
 pub(super) const GRAMMAR: &str = "\
+Gaussian process regression predicts a value and its standard deviation from rows with similar inputs. The covariance function \
+(kernel) states how fast this similarity falls with the distance between the inputs.\n\n\
 KERNEL is one of exponential, squared_exponential, matern32, matern52, rational_quadratic (or with dashes), or a sum or product of \
 kernels with brackets: \"exponential + matern52 * (squared_exponential + rational_quadratic)\". For a linear trend in the inputs, use \
 --basis linear.\n\n\
@@ -31,6 +33,12 @@ impl FileArgs {
     /// Checks that the result can be written and is not an input file.
     pub(super) fn check_result(&self, result: &Path) -> Result<(), Failure> {
         check_place(result, self.files.iter()).map_err(Failure::new)
+    }
+
+    /// Returns a failure about the rows of the files.
+    pub(super) fn fault(&self, error: impl std::fmt::Display) -> Failure {
+        let names: Vec<String> = self.files.iter().map(|file| file.display().to_string()).collect();
+        Failure::new(format!("{}: {error}", names.join(", ")))
     }
 
     pub(super) fn missing(&self) -> MissingPolicy {
@@ -72,11 +80,11 @@ pub(super) struct ModelArgs {
     /// Additional searches for hyperparameters, from random starts
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = whole::<0, 100>)]
     restarts: usize,
-    /// Most steps of a hyperparameter search
+    /// Maximum number of steps of a hyperparameter search
     #[arg(long, value_name = "N", default_value_t = 60, value_parser = whole::<1, 10_000>)]
     max_iterations: usize,
     /// Seed of folds, starts and orders
-    #[arg(long, value_name = "N", default_value_t = 1)]
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = integer::<u64>(0, u64::MAX))]
     pub(super) seed: u64,
     /// Number of threads [default: one per core]
     #[arg(long, value_name = "N", value_parser = whole::<1, 1024>)]

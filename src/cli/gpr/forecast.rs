@@ -31,7 +31,7 @@ pub(super) struct ForecastArgs {
     /// Additional columns whose past is used; their future is not needed
     #[arg(long, value_name = "COLUMN,..", value_delimiter = ',')]
     inputs: Vec<String>,
-    /// Values of each column that a forecast uses, counted back from the origin
+    /// Number of values of each column that a forecast uses: the last ones before the origin
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = whole::<1, MAX_LAGS>)]
     lags: usize,
     /// Rows to forecast ahead. Up to 10: every horizon from 1 to N; more: 10 horizons, spaced geometrically
@@ -50,7 +50,7 @@ pub(super) struct ForecastArgs {
     /// Covariance function
     #[arg(long, value_name = "KERNEL", default_value = "exponential")]
     kernel: Kernel,
-    /// Most past moments that each forecast learns from, evenly selected
+    /// Maximum number of past rows that each forecast learns from, evenly selected
     #[arg(long, value_name = "N", default_value_t = 1000, value_parser = whole::<20, 20_000>)]
     rows: usize,
     #[command(flatten)]

@@ -1,5 +1,7 @@
 //! Selects a cell model: from a file, a configuration, a label, or the learned state of a vehicle.
 
+use std::fs::File;
+use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
 use crate::cell::{Chemistry, Label};
@@ -15,14 +17,14 @@ use packwatch_host::failure::Failure;
 /// Selects a cell model.
 #[derive(Debug, clap::Args)]
 pub(super) struct SourceArgs {
-    /// Cell model file, configuration, snapshot, state folder of a service, or label as CHEMISTRY:AH, for example nca-graphite:2.9
+    /// Cell model file, configuration file, state file of --snapshot, state folder of `packwatch run`, or label as CHEMISTRY:AH,
+    /// for example nca-graphite:2.9
     #[arg(value_name = "SOURCE", required_unless_present_any = ["config", "chemistry", "state"], conflicts_with_all = ["chemistry", "state"])]
     source: Option<PathBuf>,
-    /// Configuration file whose cell model or label to use. With --state or a snapshot: label to use for cells without a learned
-    /// model
+    /// Configuration file whose cell model or label to show. With a state: its cell model is shown if none has been learned
     #[arg(short, long, value_name = "FILE.toml")]
     config: Option<PathBuf>,
-    /// State folder of a service, whose learned model to use
+    /// State folder of `packwatch run`; its learned model is shown
     #[arg(long, value_name = "DIR", conflicts_with = "chemistry")]
     state: Option<PathBuf>,
     #[command(flatten)]
@@ -69,12 +71,12 @@ fn load_with(path: &Path, config: Option<Config>) -> Result<(String, SourcedMode
         let no_state = || Failure::new(format!("{}: contains no state, or a damaged one", path.display()));
         return of_snapshot(path, &reader.snapshot().ok_or_else(no_state)?, config);
     }
-    if path.extension().is_some_and(|extension| extension == "json") {
+    if is_snapshot(path) {
         return of_snapshot(path, &snapshot_file::read(path).map_err(Failure::new)?, config);
     }
     if config.is_some() {
         return Err(Failure::new(format!(
-            "{}: neither a state folder nor a snapshot, so -c cannot be given with it",
+            "{}: neither a state folder nor a state file, so -c cannot be given with it",
             path.display()
         )));
     }
@@ -120,6 +122,13 @@ fn of_label_text(path: &Path) -> Result<(String, SourcedModel), Failure> {
     let rated_ah =
         above_0(rated).map_err(|what| Failure::new(format!("{source}: rated capacity {rated:?}, {what} (Ah)")))?;
     of_label_named(source, &Label::usual(known, rated_ah))
+}
+
+/// Whether a file is a state in JSON, by its name or its first byte.
+fn is_snapshot(path: &Path) -> bool {
+    let mut first = [0];
+    let read = File::open(path).and_then(|mut file| file.read_exact(&mut first));
+    path.extension().is_some_and(|extension| extension == "json") || (read.is_ok() && first == *b"{")
 }
 
 /// Whether a file is a configuration, that is, contains a table `[pack]`. Faults of the file are reported later, when

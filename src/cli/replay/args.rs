@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use crate::cli::common::logs::InputArgs;
-use crate::cli::common::numbers::{away, positive};
+use crate::cli::common::numbers::{away, integer, positive};
 use crate::io::stamp;
 use crate::monitor::Downtime;
 use crate::replay::LogTime;
@@ -25,12 +25,12 @@ pub(crate) struct Args {
     #[arg(long, conflicts_with_all = ["to", "speed", "snapshot", "snapshot_at", "restore", "away", "state"])]
     pub(crate) each: bool,
     /// Logs to replay at a time [default: one per core]
-    #[arg(short, long, value_name = "N", requires = "each", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    #[arg(short, long, value_name = "N", requires = "each", value_parser = integer::<u16>(1, 1024))]
     pub(crate) jobs: Option<u16>,
     /// Replay this many times faster than real time [default: as fast as possible; with --to, 1]
     #[arg(long, value_name = "FACTOR", value_parser = positive)]
     pub(crate) speed: Option<f64>,
-    /// Send the frames on this CAN interface instead of replaying them through the core
+    /// Send the frames on this CAN interface instead of computing estimates and alarms from them
     #[arg(long, value_name = "IFACE", conflicts_with_all = ["estimates", "events", "frames", "snapshot", "restore", "state"])]
     pub(crate) to: Option<String>,
     /// Write every estimate as CSV. With --each, give a folder for a NAME.csv per log
@@ -45,7 +45,7 @@ pub(crate) struct Args {
     /// Print the summary as JSON
     #[arg(long)]
     pub(crate) json: bool,
-    /// Write the core's state to this file, for --restore
+    /// Write what has been learned, and the state of the alarms, to this file, for --restore
     #[arg(long, value_name = "FILE")]
     pub(crate) snapshot: Option<PathBuf>,
     /// Time at which to write the state: time of the log in seconds, +SECONDS after its start, or a time such as
@@ -55,10 +55,10 @@ pub(crate) struct Args {
     /// Keep state and history in this new folder as `packwatch run` does, with the clock of the log
     #[arg(long, value_name = "DIR")]
     pub(crate) state: Option<PathBuf>,
-    /// Start from this stored state
+    /// Start from the state in this file, which --snapshot has written
     #[arg(long, value_name = "FILE")]
     pub(crate) restore: Option<PathBuf>,
-    /// Age of the stored state [default: from the journal, else from the time stamp of the state]
+    /// Time since the restored state was written [default: from the journal, else from the time stamp of the state]
     #[arg(long, value_name = "SECONDS|unknown", requires = "restore", value_parser = away)]
     pub(crate) away: Option<Downtime>,
     /// Skip everything before this time; formats as for --snapshot-at

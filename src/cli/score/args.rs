@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use crate::cli::common::label::LabelArgs;
-use crate::cli::common::numbers::{NamedValue, above_0, above_0_to, finite, fraction, one_of, within};
+use crate::cli::common::numbers::{NamedValue, above_0, above_0_to, finite, fraction, integer, one_of, within};
 use crate::lab::score::{ScoreRequest, Start};
 use crate::lab::single_cell::CellSource;
 
@@ -21,8 +21,11 @@ pub(crate) struct InitialSocError(pub(crate) Option<f64>);
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "The true SOC is 1 - discharged_ah / C, from the cycler's own counter, with one C for all files \
-    (--truth-capacity). Every list adds cases: each file runs in every combination. Statistics count every \
-    sample after --settle once."
+    (--truth-capacity). Each value of an option with several values adds cases: each file runs in every combination. \
+    Statistics count every sample after --settle once.",
+    override_usage = "packwatch score [OPTIONS] --cell <MODEL.toml> <FILE>...\n       \
+    packwatch score [OPTIONS] --chemistry <CHEMISTRY> --rated <AH> <FILE>...\n       \
+    packwatch score [OPTIONS] --config <FILE.toml> <FILE>..."
 )]
 pub(crate) struct Args {
     /// Measured files: CSV (.gz, .zst) with time_s, current_a (positive = discharge), voltage_v, temperature_c, discharged_ah
@@ -34,11 +37,11 @@ pub(crate) struct Args {
     /// Cell model to use instead of the configured one
     #[arg(long, value_name = "MODEL.toml")]
     pub(crate) cell: Option<PathBuf>,
-    #[command(flatten)]
-    pub(crate) label: LabelArgs,
-    /// Measured files that the monitor replays first, in this order; each scored file starts from the state learned there
+    /// Measured files to replay first, in this order, without a score; each scored file starts from the state learned there
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with = "cycles")]
     pub(crate) learn: Vec<PathBuf>,
+    #[command(flatten)]
+    pub(crate) label: LabelArgs,
     #[command(flatten)]
     pub(crate) starts: StartArgs,
     #[command(flatten)]
@@ -56,7 +59,7 @@ pub(crate) struct StartArgs {
     /// Start of the estimator within each file
     #[arg(long, value_parser = one_of(&STARTS), value_delimiter = ',', default_value = "full")]
     pub(crate) start: Vec<Start>,
-    /// Fraction of the full charge that is discharged before a start in the middle
+    /// With --start middle: fraction of the full charge that is discharged before the start
     #[arg(long, value_name = "FRACTION", default_value_t = 0.3, value_parser = fraction)]
     pub(crate) remove: f64,
     /// Error of the initial SOC given to the estimator, points; -20 is 20 points below the truth. With none, no SOC is given and
@@ -90,7 +93,7 @@ pub(crate) struct StatisticsArgs {
     /// Charge from full to empty that defines the true SOC, Ah [default: capacity_ah of the cell model]
     #[arg(long, value_name = "AH", value_parser = above_0)]
     pub(crate) truth_capacity: Option<f64>,
-    /// Treat a gap longer than this as sleep of the recorder, s
+    /// Count a gap longer than this as sleep of the recorder, s
     #[arg(long, value_name = "SECONDS", default_value_t = 90.0, value_parser = above_0)]
     pub(crate) sleep_gap: f64,
 }
@@ -110,13 +113,13 @@ pub(crate) struct LifeArgs {
     #[arg(long, value_name = "AH", default_value_t = 1.4, value_parser = above_0)]
     pub(crate) threshold: f64,
     /// Discharges to leave out before the capacity statistics start
-    #[arg(long, value_name = "N", default_value_t = 10)]
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = integer::<usize>(0, usize::MAX))]
     pub(crate) skip_cycles: usize,
-    /// Use only a random window of each half-cycle, with this fraction of its charge: 0.4,0.7
+    /// Use only a random window of each half-cycle, which contains from MIN to MAX of its charge: 0.4,0.7
     #[arg(long, value_name = "MIN,MAX", value_parser = window)]
     pub(crate) window: Option<(f64, f64)>,
-    /// Seeds of the windows
-    #[arg(long, value_name = "N", value_delimiter = ',', default_value = "1")]
+    /// Seeds of the random windows
+    #[arg(long, value_name = "N", value_delimiter = ',', default_value = "1", value_parser = integer::<u64>(0, u64::MAX))]
     pub(crate) seed: Vec<u64>,
 }
 

@@ -1,7 +1,7 @@
 //! Command line options that change a scenario's settings.
 
 use crate::cell_faults::BalancingConfig;
-use crate::cli::common::numbers::{NamedValue, between, finite, one_of, share, within};
+use crate::cli::common::numbers::{NamedValue, between, finite, integer, one_of, share, within};
 use crate::sim::{Balancing, Fault, Hysteresis, PackSettings, Scenario, SensorQuality, Sensors, Settings, Simulation};
 use packwatch_host::failure::Failure;
 
@@ -25,10 +25,10 @@ const QUALITIES: [NamedValue<SensorQuality>; 3] = [
 #[derive(Debug, clap::Args)]
 pub(super) struct Changes {
     /// Seed of all random numbers
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = integer::<u64>(0, u64::MAX))]
     seed: u64,
-    /// End after this many cycles; of random-walk: blocks, of ev-day: days [default: reference 10, random-walk 1, ev-day 1]
-    #[arg(long, value_parser = clap::value_parser!(u32).range(1..))]
+    /// End after this many cycles (random-walk: blocks; ev-day: days) [default: reference 10, random-walk 1, ev-day 1]
+    #[arg(long, value_parser = integer::<u32>(1, u32::MAX))]
     cycles: Option<u32>,
     /// End after this time, s [default: ev-day 86400]
     #[arg(long, value_name = "SECONDS", value_parser = positive)]
@@ -40,21 +40,21 @@ pub(super) struct Changes {
     #[command(flatten)]
     pub(super) faults: FaultArgs,
     /// Time between current samples, ms [default: ev-day 10, others 1000]
-    #[arg(long, value_name = "MILLISECONDS", value_parser = clap::value_parser!(u32).range(1..=3_600_000))]
+    #[arg(long, value_name = "MILLISECONDS", value_parser = integer::<u32>(1, 3_600_000))]
     period: Option<u32>,
     /// Time between samples of the cells, ms, a multiple of --period [default: ev-day 100, others --period]
-    #[arg(long, value_name = "MILLISECONDS", value_parser = clap::value_parser!(u32).range(1..=3_600_000))]
+    #[arg(long, value_name = "MILLISECONDS", value_parser = integer::<u32>(1, 3_600_000))]
     cell_period: Option<u32>,
-    /// Loads before each pair of reference cycles of random-walk [default: 1500]
-    #[arg(long, value_parser = clap::value_parser!(u32).range(1..))]
-    walk_steps: Option<u32>,
+    /// Only for random-walk: number of loads before each pair of reference cycles [default: 1500]
+    #[arg(long, value_name = "N", value_parser = integer::<u32>(1, u32::MAX))]
+    pub(super) walk_steps: Option<u32>,
 }
 
 /// Options of the pack.
 #[derive(Debug, clap::Args)]
 pub(super) struct PackChanges {
     /// Cells in series [default: from the configuration]
-    #[arg(long, value_parser = clap::value_parser!(u16).range(1..=1024))]
+    #[arg(long, value_parser = integer::<u16>(1, 1024))]
     cells: Option<u16>,
     /// Capacity of a new cell, Ah [default: from the cell model]
     #[arg(long, value_name = "AH", value_parser = positive)]
@@ -125,7 +125,9 @@ impl FaultArgs {
         balancing: Option<BalancingConfig>,
     ) -> Result<Simulation, Failure> {
         let check = |fault: &Fault| fault.kind.check(cells, sensors);
-        self.faults.iter().try_for_each(check).map_err(|error| Failure::new(format!("--fault: {error}")))?;
+        self.faults.iter().try_for_each(check).map_err(|error| {
+            Failure::new(format!("--fault: {error} (the pack has {cells} cells and {sensors} temperature sensors)"))
+        })?;
         let sim = sim.with_faults(&self.faults);
         let sim = if balancing.is_some() { sim.with_balancing_bits() } else { sim };
         let usual = Balancing::usual(capacity_ah);

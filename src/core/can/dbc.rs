@@ -250,9 +250,13 @@ fn grammar_fault(error: &can_dbc::DbcError) -> DbcError {
         can_dbc::DbcError::Pest(error) => {
             // The report's last line states what was expected; the lines before it show the position.
             let report = error.to_string();
-            let expected = report.lines().rev().find_map(|line| line.trim().strip_prefix("= ")).unwrap_or("not a DBC");
+            let expected = report.lines().rev().find_map(|line| line.trim().strip_prefix("= "));
+            let expected = match expected {
+                None | Some("expected file") => "must be a statement of a DBC file, such as VERSION or BO_".to_owned(),
+                Some(expected) => expected.replace('_', " "),
+            };
             let line = error_line(&report);
-            DbcError { line, what: format!("found \"{}\": {expected}", error.line().trim()) }
+            DbcError { line, what: format!("found \"{}\", {expected}", error.line().trim()) }
         }
         other => DbcError { line: 1, what: other.to_string() },
     }

@@ -272,8 +272,8 @@ fn hex_and_underscores_are_accepted_in_numbers() {
 fn syntax_error_does_not_affect_other_faults() {
     let pack = pack_with("cells = 4", "cells = = 4").replace("\"charge\"", "\"in\"").replace("[input]", "[inp");
     let expected = [
-        "pack.toml:2: extra `=`, expected nothing",
-        "pack.toml:6: unclosed table, expected `]`",
+        "pack.toml:2: invalid TOML: extra `=`, expected nothing",
+        "pack.toml:6: invalid TOML: unclosed table, expected `]`",
         "pack.toml:10: input.current.positive = \"in\", must be charge or discharge",
     ];
     let all = faults(&pack);
@@ -282,7 +282,10 @@ fn syntax_error_does_not_affect_other_faults() {
     }
     assert!(!all.iter().any(|fault| fault.contains("missing")), "{all:#?}");
     let all = read_texts(PACK, DBC, DBC).unwrap_err();
-    assert_eq!((all.len(), all[10].as_str()), (11, "cell.toml:11: and 7 more syntax faults from here on"));
+    assert_eq!(
+        (all.len(), all[10].as_str()),
+        (11, "cell.toml:11: and 7 more syntax faults from here on; is this file really TOML?")
+    );
 }
 
 #[test]
@@ -316,7 +319,8 @@ fn faults_of_all_files_are_sorted_by_line() {
     let all = read_texts(&pack, &cell, &dbc).unwrap_err();
     let expected = [
         "pack.toml:2: pack.cells = 0, must be 1 to 1024",
-        "pack.toml:3: pack.x is not a known key",
+        "pack.toml:3: pack.x is not a known key, must be one of cells, strings, cell_model, chemistry, learn_model, balancing, \
+         voltage_min_v, voltage_max_v, rated_capacity_ah, initial_capacity_ah, initial_capacity_std_ah, ambient_c, module",
         "pack.toml:11: input.current.positive = \"in\", must be charge or discharge",
         "pack.toml:17: recharge.to_soc = 0.1, must be above recharge.from_soc = 0.3",
         "cell.toml:4: capacity_ah = 0, must be 0.001 to 100000",
@@ -332,7 +336,7 @@ fn invalid_utf_8_is_reported_with_line() {
     let read = |_: &Path| Ok(b"[pack]\ncells = \xFF".to_vec());
     assert_eq!(
         load_with(&ConfigFiles::alone(Path::new("pack.toml")), &read).unwrap_err().0,
-        ["pack.toml:2: is not UTF-8 text"]
+        ["pack.toml:2: is not UTF-8 text, must be a TOML file"]
     );
 }
 

@@ -11,6 +11,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use super::place::with_suffix;
+use super::result_file::name_folder;
 use super::segments::{SegmentLimits, SegmentWriter};
 
 /// Number of bytes that are collected before they are sent to the thread. A flush sends fewer bytes.
@@ -38,7 +39,7 @@ impl BackgroundFile {
     /// Fails if the file cannot be created.
     pub fn create(path: &Path) -> io::Result<Self> {
         keep_earlier(path)?;
-        let file = File::create(path)?;
+        let file = File::create(path).map_err(|error| name_folder(path, error))?;
         Self::start(move |queue| write_all(file, queue))
     }
 
@@ -48,7 +49,8 @@ impl BackgroundFile {
     /// # Errors
     /// Fails if the first segment cannot be created.
     pub fn create_segments(path: &Path, header: &'static str, limits: SegmentLimits) -> io::Result<Self> {
-        let mut segments = SegmentWriter::create(path, header, limits)?;
+        let segments = SegmentWriter::create(path, header, limits);
+        let mut segments = segments.map_err(|error| name_folder(path, error))?;
         Self::start(move |queue| {
             for piece in queue {
                 segments.write(&piece)?;

@@ -49,7 +49,10 @@ impl CanKey {
 
     fn read(path: &Path, is_private: bool) -> Result<Self, String> {
         let error = |why: String| format!("key of [authentication]: {}: {why}", path.display());
-        let file = File::open(path).map_err(|why| error(why.to_string()))?;
+        let unreadable = |why: std::io::Error| {
+            error(format!("cannot be read: {why}, must be a file of {KEY_BYTES} bytes or {} hex digits", 2 * KEY_BYTES))
+        };
+        let file = File::open(path).map_err(unreadable)?;
         let mode = file.metadata().map_err(|why| error(why.to_string()))?.mode() & 0o7777;
         // The mask 0o077 selects the permissions of other users.
         if is_private && mode & 0o077 != 0 {

@@ -218,7 +218,11 @@ impl Columns<'_> {
         let starts = match (&self.options.start_times, column) {
             (Some(path), Some(column)) => Some(read_starts(path, &header.names()[column])?),
             (Some(path), None) => {
-                return Err(header.fault(format_args!("no section column for the start times of {}", path.display())));
+                return Err(header.fault(format_args!(
+                    "no section column (cycle, segment or ref), which --start-times {} needs; name it with --column \
+                     section=NAME",
+                    path.display()
+                )));
             }
             (None, _) => None,
         };

@@ -13,7 +13,7 @@ use std::sync::atomic::AtomicU64;
 
 use serde::Serialize;
 
-use super::candump::{Body, Line, LineHead, LineParser, ParsedLine};
+use super::candump::{Body, Line, LineError, LineHead, LineParser, ParsedLine};
 use super::csv_log::{CsvLog, CsvOptions, RowTime};
 use super::journal;
 use super::lines::{self, Lines, RawLine};
@@ -280,6 +280,11 @@ fn named_csv(path: &Path) -> bool {
     name.trim_end_matches(".gz").trim_end_matches(".zst").ends_with(".csv")
 }
 
+/// Whether a line is blank or a comment.
+fn is_remark(line: &[u8]) -> bool {
+    matches!(line.trim_ascii(), [] | [b'#' | b';' | b'%', ..])
+}
+
 impl ReadState {
     /// Fills slots with the next frames of a text log whose complete lines are already in the buffer. The first record
     /// of the file is excluded. Returns the number of frames.
@@ -366,6 +371,9 @@ impl ReadState {
             let record = match self.parser.parse(bytes) {
                 Ok(ParsedLine { line: Line::Other, .. }) if journal && journal::is_mark(bytes) => {
                     journal::parse_mark(bytes, |interface| self.bus(interface))
+                }
+                Ok(ParsedLine { line: Line::Other, .. }) if self.strict && !journal && !is_remark(bytes) => {
+                    Err(LineError { column: 1, expected: "a candump line, a comment (#) or a blank line" })
                 }
                 Ok(parsed) => Ok(self.line_record(&parsed.line)),
                 Err(error) => Err(error),

@@ -8,6 +8,7 @@ pub(crate) mod connection_slots;
 pub mod csv_log;
 pub mod event_log;
 pub mod journal;
+pub mod json;
 pub mod lines;
 pub mod log;
 pub mod paths;

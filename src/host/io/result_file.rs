@@ -31,7 +31,7 @@ impl ResultFile {
             (File::options().write(true).open(path).map_err(|e| named(path, e))?, None)
         } else {
             let part = with_suffix(path, ".part");
-            (File::create(&part).map_err(|e| named(path, e))?, Some(part))
+            (File::create(&part).map_err(|e| named(path, name_folder(path, e)))?, Some(part))
         };
         Ok(Self { path: path.to_owned(), part, out: BufWriter::with_capacity(256 * 1024, file) })
     }
@@ -100,6 +100,16 @@ pub fn check_place<'a>(result: &Path, mut inputs: impl Iterator<Item = &'a PathB
         return Err(format!("{}: is an input, must not be the output too", result.display()));
     }
     Ok(())
+}
+
+/// Replaces the error about a file that cannot be created by one that names the missing folder, if that is the reason.
+pub(super) fn name_folder(path: &Path, error: io::Error) -> io::Error {
+    match path.parent().filter(|folder| !folder.as_os_str().is_empty()) {
+        Some(folder) if error.kind() == io::ErrorKind::NotFound && !folder.is_dir() => {
+            io::Error::new(error.kind(), format!("folder {} does not exist", folder.display()))
+        }
+        _ => error,
+    }
 }
 
 /// Adds the file's name to an error and keeps its kind, so that a closed pipe is still recognised.

@@ -11,6 +11,7 @@ use tokio::net::{UnixListener, UnixStream};
 use tokio::time::timeout;
 
 use super::place::first_folder;
+use super::result_file::name_folder;
 
 /// The folder of the service, and of a daemon that root starts from a shell.
 const STANDARD_FOLDER: &str = "/run/packwatch";
@@ -84,7 +85,9 @@ impl BindError {
             Self::Taken(owner) => Err(format!(
                 "{shown}: already in use by {owner}; stop that process, or choose another path with --{option}"
             )),
-            Self::Io(error) if is_needed => Err(format!("{shown}: {error}")),
+            Self::Io(error) if is_needed => {
+                Err(format!("{shown}: the {option} socket cannot be created: {}", name_folder(path, error)))
+            }
             Self::Io(error) => {
                 tracing::info!(path = %shown, %error, "no {option} socket; choose its path with --{option}");
                 Ok(None)

@@ -33,7 +33,7 @@ impl StatusClient {
     /// # Errors
     /// Fails if no daemon sends the document. The message names the socket and the next step.
     pub fn line(&self) -> Result<Vec<u8>, String> {
-        self.read(PATIENCE).map_err(|error| explain(&self.path, &error))
+        self.read(PATIENCE).map_err(|error| explain(&self.path, "--socket", &error))
     }
 
     fn read(&self, patience: Duration) -> io::Result<Vec<u8>> {
@@ -67,14 +67,15 @@ pub fn check_length(bytes: usize) -> io::Result<()> {
     ))
 }
 
-/// Explains why no document was received, and names the next step.
-pub fn explain(path: &Path, error: &io::Error) -> String {
+/// Explains why no document was received, and names the next step. `setting` is the option or the key with which the user
+/// chooses the status socket `path`.
+pub fn explain(path: &Path, setting: &str, error: &io::Error) -> String {
     let option = if path == standard_path() { String::new() } else { format!(" --status {}", path.display()) };
     let path = path.display();
     match error.kind() {
         ErrorKind::NotFound | ErrorKind::ConnectionRefused => format!(
-            "{path}: no daemon listens there; start one with \"packwatch run -c FILE{option}\", or give the path of its socket \
-             with --socket"
+            "{path}: no daemon listens there; start one with \"packwatch run -c FILE{option}\", or give the path of its status \
+             socket with {setting}"
         ),
         ErrorKind::PermissionDenied => format!("{path}: only root may read the service's folder; try sudo"),
         ErrorKind::WouldBlock | ErrorKind::TimedOut => format!("{path}: the daemon sent no status in time"),

@@ -37,6 +37,9 @@ impl Recorder {
         if folder::is_used(path) {
             return Err(format!("{}: already contains a state; a replay needs a new state folder", path.display()));
         }
+        if path.exists() && !path.is_dir() {
+            return Err(format!("{}: is a file, must be a folder for state and history", path.display()));
+        }
         let mut folder = Folder::new(path.to_owned());
         folder.lock().map_err(|error| format!("{}: {error}", path.display()))?;
         let now = Stamp::replayed(Timestamp::ZERO);

@@ -33,7 +33,7 @@ impl std::str::FromStr for Choice {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let expected = "must be KEY=VALUE[,VALUE...]";
+        let expected = "must be KEY=VALUE[,VALUE...], for example capacity_low.warning=1.5,1.6";
         let (key, values) = text.split_once('=').ok_or(expected)?;
         let key = key.trim().to_owned();
         let parts = split(values);

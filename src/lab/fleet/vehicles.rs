@@ -23,6 +23,7 @@ use super::export::{self, ExportSettings};
 use super::vehicle::{RECORD, VERSION, Vehicle, VehicleRecord};
 use crate::config::Config;
 use crate::error::LabError;
+use crate::io::json::json_fault;
 
 /// File that is locked while a vehicle is replayed.
 const LOCK: &str = ".lock";
@@ -40,7 +41,8 @@ pub fn plan(paths: &[PathBuf]) -> Result<Vec<Vehicle>, LabError> {
         let path = &std::path::absolute(path).map_err(|error| named(path, &error))?;
         let logs = if path.is_dir() { logs_in(path)? } else { vec![path.clone()] };
         let size = |log: &PathBuf| {
-            let meta = std::fs::metadata(log).map_err(|error| LabError::File(format!("{}: {error}", log.display())))?;
+            let meta = std::fs::metadata(log)
+                .map_err(|error| LabError::File(format!("{}: cannot be read: {error}", log.display())))?;
             Ok::<u64, LabError>(meta.len())
         };
         let bytes = logs.iter().map(size).sum::<Result<u64, LabError>>()?;
@@ -103,8 +105,12 @@ pub fn read_manifest(path: &Path) -> Result<Vec<Vehicle>, LabError> {
     let mut lines = BTreeMap::new();
     let mut vehicles = Vec::new();
     for (number, line) in (1..).zip(text.lines()).filter(|(_, line)| !line.trim().is_empty()) {
-        let vehicle: Vehicle = serde_json::from_str(line)
-            .map_err(|error| LabError::Data(format!("{shown}:{number}: not a vehicle: {error}")))?;
+        let vehicle: Vehicle = serde_json::from_str(line).map_err(|error| {
+            let fault = json_fault(&error);
+            LabError::Data(format!(
+                "{shown}:{number}: not a vehicle of a manifest (see `packwatch fleet plan`): {fault}"
+            ))
+        })?;
         let Vehicle { vehicle: name, logs, .. } = &vehicle;
         if name.is_empty() || export::clean(name) != *name {
             let allowed = "must be letters, digits, '.', '_' and '-', not '.' first";
@@ -119,7 +125,7 @@ pub fn read_manifest(path: &Path) -> Result<Vec<Vehicle>, LabError> {
         vehicles.push(vehicle);
     }
     if vehicles.is_empty() {
-        return Err(LabError::Data(format!("{shown}: contains no vehicle")));
+        return Err(LabError::Data(format!("{shown}: contains no vehicle; `packwatch fleet plan` writes a manifest")));
     }
     Ok(vehicles)
 }

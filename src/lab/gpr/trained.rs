@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::{ColumnTable, interval, split, table, write_csv};
 
 use crate::error::LabError;
+use crate::io::json::json_fault;
 use crate::regress::{GprSettings, Model, Prediction, ProgressCallback, TrainingRows, fit};
 
 /// Format name in the first line.
@@ -77,16 +78,19 @@ impl TrainedModel {
     /// The file cannot be read, is not a model of this kind, is damaged, or has another version.
     pub fn load(path: &Path, threads: usize) -> Result<Self, LabError> {
         let fail = |what: String| LabError::Data(format!("{}: {what}", path.display()));
-        let unread = |error: std::io::Error| LabError::of_io(format!("{}: {error}", path.display()), &error);
+        let unread =
+            |error: std::io::Error| LabError::of_io(format!("{}: cannot be read: {error}", path.display()), &error);
         let size = std::fs::metadata(path).map_err(unread)?.len();
         if size > MAX_BYTES {
             return Err(fail(format!("{size} bytes, must be at most {MAX_BYTES}")));
         }
         let text = std::fs::read_to_string(path).map_err(unread)?;
-        let (first, rest) =
-            text.split_once('\n').ok_or_else(|| fail("has one line, must have three: not a model".into()))?;
-        let names: ModelHeader =
-            serde_json::from_str(first).map_err(|error| fail(format!("line 1: not a model of gpr: {error}")))?;
+        let (first, rest) = text
+            .split_once('\n')
+            .ok_or_else(|| fail("has one line, must have three: not a model file of `packwatch gpr train`".into()))?;
+        let names: ModelHeader = serde_json::from_str(first).map_err(|error| {
+            fail(format!("line 1: not a model file of `packwatch gpr train`: {}", json_fault(&error)))
+        })?;
         if names.format != FORMAT || names.version != VERSION {
             let found = (&names.format, names.version);
             return Err(fail(format!("line 1: found {found:?}, must be {:?}", (FORMAT, VERSION))));

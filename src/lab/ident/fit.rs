@@ -88,7 +88,7 @@ pub struct FittedTables {
 /// Error: the cost is not finite at the starting values.
 const NOT_FINITE: &str = "the data or the starting values are not finite: two slow tests at one temperature, or a value that is not a number";
 /// Error: the current never changes enough to determine a resistance.
-const NO_EXCITATION: &str = "the current does not change: no resistance can be separated from the open-circuit voltage";
+const NO_EXCITATION: &str = "the current does not change, so no resistance can be separated from the open-circuit voltage; add a file with pulses or a drive";
 
 /// Fits tables to `records`; `scale` is the weight of each record. `progress` receives the pass number and the cost.
 ///

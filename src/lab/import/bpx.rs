@@ -22,6 +22,7 @@ use document::BpxCell;
 
 use crate::cell::MAX_BRANCHES;
 use crate::error::LabError;
+use crate::io::json::json_fault;
 
 /// Faraday constant, C/mol (CODATA 2018).
 const FARADAY_C_PER_MOL: f64 = 96_485.332_12;
@@ -79,8 +80,12 @@ pub fn import(text: &str, settings: &BpxSettings) -> Result<BpxImport, LabError>
     let source = &settings.source;
     let text = text.strip_prefix('\u{feff}').unwrap_or(text);
     let root: serde_json::Value = serde_json::from_str(text).map_err(|error| {
-        LabError::Data(format!("{source}:{}:{}: not valid JSON: {error}", error.line(), error.column()))
+        let (line, column, fault) = (error.line(), error.column(), json_fault(&error));
+        LabError::Data(format!("{source}:{line}:{column}: not valid JSON: {fault}"))
     })?;
+    if root.is_object() && root.get("Header").is_none() && root.get("Parameterisation").is_none() {
+        return Err(LabError::Data(format!("{source}: not a BPX file: it has neither Header nor Parameterisation")));
+    }
     let failed = |faults: Vec<String>| {
         let lines: Vec<String> = faults.iter().map(|fault| format!("{source}: {fault}")).collect();
         LabError::Data(lines.join("\n"))

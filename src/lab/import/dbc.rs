@@ -38,7 +38,11 @@ pub fn import(database: &Database, file: &str) -> Result<String, LabError> {
     }
     let is_empty = |kind| candidates.get(&kind).is_none_or(Vec::is_empty);
     if is_empty(PackQuantity::Current) && is_empty(PackQuantity::PackVoltage) && is_empty(PackQuantity::CellVoltage) {
-        let what = format!("{file}: no signal of {} messages looks like a battery's", database.messages.len());
+        let what = format!(
+            "{file}: no signal of {} messages looks like the current or a voltage of a battery, by name, unit and range; \
+             choose the signals yourself and write the tables [input.*]",
+            database.messages.len()
+        );
         return Err(LabError::Data(what));
     }
     Ok(text(file, &candidates))

@@ -21,6 +21,7 @@ use serde_json::Value;
 
 use super::{DiagnosticSignal, DiagnosticTable, Exclusion, ExclusionReason, ImportResult, series};
 use crate::error::LabError;
+use crate::io::json::json_fault;
 use address::Addresses;
 use document::{CommandDocument, SignalDocument, SignalSetDocument};
 
@@ -65,7 +66,8 @@ fn convert(text: &str, settings: &ObdbSettings) -> Result<(SignalSetDocument, Co
     }
     let text = text.strip_prefix('\u{feff}').unwrap_or(text);
     let document: SignalSetDocument = serde_json::from_str(text).map_err(|error| {
-        LabError::Data(format!("{source}:{}:{}: not an OBDb signal set: {error}", error.line(), error.column()))
+        let (line, column, fault) = (error.line(), error.column(), json_fault(&error));
+        LabError::Data(format!("{source}:{line}:{column}: not an OBDb signal set (JSON): {fault}"))
     })?;
     let mut converter = Converter { year: settings.year, ..Converter::default() };
     converter.convert(&document);

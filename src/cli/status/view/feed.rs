@@ -45,7 +45,7 @@ pub(super) fn start(path: PathBuf) -> mpsc::Receiver<FeedUpdate> {
 
 /// Reads until the connection fails (`Err`) or the view ends.
 async fn listen(path: &Path, updates: &mpsc::Sender<FeedUpdate>) -> Result<(), String> {
-    let failed = |error: io::Error| explain(path, &error);
+    let failed = |error: io::Error| explain(path, "--socket", &error);
     let mut stream = UnixStream::connect(stream_path(path)).await.map_err(failed)?;
     let mut unread = Vec::new();
     loop {

@@ -166,13 +166,14 @@ fn check_thresholds(alarm: &Alarm, rated: &RatedCell) {
         match threshold.clear.map(|clear| rated.value(alarm.rule, clear)) {
             Some(None) => place.fault(key, "must clear at a number: percentages are not defined for this rule"),
             Some(Some(clear)) if sign * (clear - set) > 0.0 => {
+                let [set, clear] = [set, clear].map(rounded);
                 place.fault(key, format!("must clear at {set} or {side}, not at {clear}"));
             }
             Some(Some(_)) | None => {}
         }
         check_reachable(alarm, key, rated, set, &threshold);
         if let Some((other, value)) = milder.filter(|(_, value)| sign * (set - value) <= 0.0) {
-            let beyond = if sign > 0.0 { "above" } else { "below" };
+            let (beyond, value) = (if sign > 0.0 { "above" } else { "below" }, rounded(value));
             place.fault(key, format!("must be {beyond} {other} = {value}: it is the more severe threshold"));
         }
         milder = Some((key, set));
@@ -197,12 +198,17 @@ fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, thresh
     let is_within = (0.0..=high).contains(&set); // otherwise it is a fault noted elsewhere, or unreachable
     if is_within && !(low..=high).contains(&clear) {
         let range = if high.is_finite() { format!("{low} to {high}") } else { format!("{low} or more") };
-        alarm.place.fault(written, format!("must clear {key} at {range}, not at {clear}"));
+        alarm.place.fault(written, format!("must clear {key} at {range}, not at {}", rounded(clear)));
     }
 }
 
-/// If the threshold of a fraction is not 0 to 1, notes a fault: a percent sign is probably missing, and values would
-/// always or never exceed the threshold.
+/// A value for a message, without the rounding errors of its computation.
+fn rounded(value: f64) -> f64 {
+    format!("{value:.9e}").parse().unwrap_or(value)
+}
+
+/// Notes a threshold of a fraction that is not between 0 and 1, because its percent sign is probably missing. Values
+/// would always or never exceed this threshold.
 fn check_unit(alarm: &Alarm, key: &str, set: f64) {
     let is_fraction = matches!(alarm.rule.spec().unit, Unit::Fraction | Unit::FractionPerDay);
     if is_fraction && !(0.0..=1.0).contains(&set) {

@@ -63,7 +63,10 @@ fn check_label(place: &TablePlace, chemistry: Option<Chemistry>, rated_ah: Optio
             place.fault("chemistry", "requires rated_capacity_ah, the capacity on the label of one cell");
         }
         (None, _) => {
-            place.fault("cell_model", "must be a cell model file if chemistry and rated_capacity_ah are not given");
+            place.fault(
+                "cell_model",
+                "must be a cell model file, unless chemistry and rated_capacity_ah describe the cell",
+            );
         }
     }
     None

@@ -119,7 +119,7 @@ pub(crate) fn message_settings(keys: &FrameKeys<'_>) -> Option<MessageSettings> 
 fn configured_id(keys: &FrameKeys<'_>, id: u32) -> Option<CanId> {
     let can_id = if keys.extended { CanId::extended(id) } else { CanId::standard(id) };
     if can_id.is_none() {
-        keys.place.fault("id", "must be 0 to 0x7FF, or extended = true");
+        keys.place.fault("id", "must be 0 to 0x7FF; a longer identifier requires extended = true");
     }
     can_id
 }

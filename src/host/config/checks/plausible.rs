@@ -404,7 +404,8 @@ impl AllowedRange<'_> {
 fn voltages_of_model(range: &AllowedRange<'_>, model: &CellModel) {
     let Limits { min, max, .. } = range.limits;
     let (low, high) = (model.voltage_min_v, model.voltage_max_v);
-    if min < high && max > low {
+    // An empty range of the model is noted in its file.
+    if low >= high || min < high && max > low {
         return;
     }
     let what =

@@ -42,7 +42,8 @@ pub(crate) fn poll(raw: &RawTables, found: &[ResolvedSignal<'_>]) -> Option<Poll
         }
     }
     if requests.is_empty() && !raw.broken {
-        let what = "must be false: no answer in use has drive_every_s, charge_every_s or parked_every_s";
+        let what = "must be false, because nothing would be requested: no [[input.diagnostic]] whose signals are used has \
+                    drive_every_s, charge_every_s or parked_every_s";
         keys.place.fault("enabled", what);
     }
     let current = found.iter().find(|resolved| resolved.channel == Channel::Current).and_then(|it| it.answer);

@@ -21,9 +21,13 @@ pub(crate) fn guards(raw: &RawTables, found: &[ResolvedSignal<'_>], inputs_whole
         let Some(first) = inputs.first() else {
             if inputs_whole {
                 let there = found.iter().filter(|input| input.bus == bus).map(|input| input.message.name.as_str());
-                let hint = did_you_mean(&keys.message, there);
-                let what = "must be the message of a configured input on its interface";
-                keys.place.fault("message", format!("{what}{hint}"));
+                let mut names: Vec<&str> = there.collect();
+                names.sort_unstable();
+                names.dedup();
+                let hint = did_you_mean(&keys.message, names.iter().copied());
+                let names = if names.is_empty() { "there is none".to_owned() } else { names.join(", ") };
+                let what = format!("must be a message with a configured signal on this interface ({names}){hint}");
+                keys.place.fault("message", what);
             }
             continue;
         };

@@ -93,6 +93,9 @@ pub(crate) struct DbcRanges {
     pub voltage_step_v: f64,
 }
 
+/// Length of the longest CAN FD frame, bytes.
+const MAX_FRAME_BYTES: u16 = 64;
+
 /// A range that contains every value.
 pub(crate) const UNLIMITED: (f64, f64) = (f64::NEG_INFINITY, f64::INFINITY);
 
@@ -124,6 +127,13 @@ impl Databases {
         of_files.chain(of_answers)
     }
 
+    /// The other message of the same file that has the identifier of `message`, if there is one.
+    fn twin(&self, file: &str, message: &Message) -> Option<&Message> {
+        let databases = self.files.iter().filter(|(name, _)| name == file).map(|(_, database)| database);
+        let mut messages = databases.flat_map(|database| &database.messages);
+        messages.find(|other| other.id == message.id && other.name != message.name)
+    }
+
     fn file_names(&self) -> String {
         let mut names: Vec<&str> = self.files.iter().map(|(file, _)| file.as_str()).collect();
         names.extend((!self.answers.is_empty()).then_some("[[input.diagnostic]]"));
@@ -135,7 +145,12 @@ impl Databases {
 pub(crate) fn read_dbc(path: &Path, read: ReadFile<'_>, faults: &Faults) -> Option<Database> {
     let file = path.display().to_string();
     let bytes = read(path).map_err(|error| faults.add(&file, 0, format!("cannot be read: {error}"))).ok()?;
-    Database::parse_bytes(&bytes).map_err(|error| faults.add(&file, error.line, error.what)).ok()
+    let database = Database::parse_bytes(&bytes).map_err(|error| faults.add(&file, error.line, error.what)).ok()?;
+    if database.messages.is_empty() {
+        faults.add(&file, 0, "contains no message, must be a DBC file with at least one message (BO_)");
+        return None;
+    }
+    Some(database)
 }
 
 /// Finds every configured signal.
@@ -209,7 +224,8 @@ impl<'d> Search<'_, 'd> {
             Err(what) => return source.place.fault("signal", &what),
         };
         if !pattern.has_cell() && cells > 1 {
-            return source.place.fault("signal", "must contain {n} for the cell's number");
+            let what = format!("must contain {{n}} for the cell's number, because pack.cells = {cells}");
+            return source.place.fault("signal", &what);
         }
         let mut hits: BTreeMap<u32, Vec<NamedSignal<'d>>> = BTreeMap::new();
         for hit in self.databases.signals() {
@@ -236,9 +252,11 @@ impl<'d> Search<'_, 'd> {
             }
         }
         if !missing.is_empty() {
-            source
-                .place
-                .fault("signal", format!("must match a signal for every cell, but none has number {}", list(&missing)));
+            let what = format!(
+                "must match a signal for each of {cells} cells (pack.cells), but none has number {}",
+                list(&missing)
+            );
+            source.place.fault("signal", &what);
         }
     }
 
@@ -249,10 +267,23 @@ impl<'d> Search<'_, 'd> {
         };
         let full_name = named.full_name();
         let fd = self.raw.interfaces.get(bus.index()).is_some_and(|interface| interface.fd);
-        if message.len_bytes > 8 && !fd && answer.is_none() {
+        if message.len_bytes > MAX_FRAME_BYTES && answer.is_none() {
+            let what = format!(
+                "message {} has {} bytes in {file}, must have at most {MAX_FRAME_BYTES}",
+                message.name, message.len_bytes
+            );
+            source.place.fault("signal", &what);
+        } else if message.len_bytes > 8 && !fd && answer.is_none() {
             let what = format!(
                 "message {} has {} bytes, requires fd = true on its interface",
                 message.name, message.len_bytes
+            );
+            source.place.fault("signal", &what);
+        }
+        if let Some(twin) = self.databases.twin(file, message).filter(|_| answer.is_none()) {
+            let what = format!(
+                "message {} has identifier {}, which {file} also gives to {}, must be unique",
+                message.name, message.id, twin.name
             );
             source.place.fault("signal", &what);
         }

@@ -85,7 +85,11 @@ impl<'t> Document<'t> {
     /// The text that a fault at `span` quotes as the value found. `span` is the position of `value` or of a part of it.
     pub(crate) fn found(&self, value: &Spanned<DeValue<'_>>, span: &Range<usize>) -> String {
         let is_inline = self.written(&value.span()).starts_with('{');
-        if value.get_ref().is_table() && !is_inline { "a table".to_owned() } else { self.quote(span) }
+        if value.get_ref().is_table() && !is_inline {
+            return "a table".to_owned();
+        }
+        let quote = self.quote(span);
+        if quote.is_empty() { "(no value)".to_owned() } else { quote }
     }
 
     /// The position of a table: its path as shown to users, its line, and the positions of its keys.
@@ -103,12 +107,17 @@ impl<'t> Document<'t> {
 
 fn note_syntax(source: &SourceFile, errors: &[toml::de::Error], faults: &Faults) {
     let line = |error: &toml::de::Error| error.span().map_or(0, |span| source.line(&span));
-    for error in errors.iter().take(MAX_SYNTAX_FAULTS) {
-        faults.add(source.name(), line(error), error.message().trim().replace('\n', ", "));
+    // The first fault is often the cause of the others.
+    let mut errors: Vec<&toml::de::Error> = errors.iter().collect();
+    errors.sort_by_key(|&error| line(error));
+    for &error in errors.iter().take(MAX_SYNTAX_FAULTS) {
+        let what = error.message().trim().replace('\n', ", ");
+        faults.add(source.name(), line(error), format!("invalid TOML: {what}"));
     }
-    if let Some(error) = errors.get(MAX_SYNTAX_FAULTS) {
+    if let Some(&error) = errors.get(MAX_SYNTAX_FAULTS) {
         let more = errors.len() - MAX_SYNTAX_FAULTS;
-        faults.add(source.name(), line(error), format!("and {more} more syntax faults from here on"));
+        let what = format!("and {more} more syntax faults from here on; is this file really TOML?");
+        faults.add(source.name(), line(error), what);
     }
 }
 

@@ -176,7 +176,7 @@ pub(crate) fn read_text(path: &Path, read: ReadFile<'_>, faults: &Faults) -> Opt
         Err(error) => {
             let good = error.utf8_error().valid_up_to();
             let line = 1 + error.as_bytes()[..good].iter().filter(|&&b| b == b'\n').count();
-            faults.add(&file, line, "is not UTF-8 text");
+            faults.add(&file, line, "is not UTF-8 text, must be a TOML file");
             None
         }
     }

@@ -39,7 +39,10 @@ pub(crate) fn key_source(raw: &RawTables, config: &Path, has_authenticated: bool
         (None, Some(file)) => has_authenticated.then(|| KeySource::File(beside(config, file))),
         (None, None) => {
             if has_authenticated {
-                keys.place.fault("credential", "must be given if key_file is not: secoc requires a key");
+                keys.place.fault(
+                    "credential",
+                    "must be the name of a systemd credential, unless key_file names a file: secoc requires a key",
+                );
             }
             None
         }

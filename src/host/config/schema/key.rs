@@ -6,6 +6,7 @@ use std::ops::Range;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
+use super::reader::did_you_mean;
 use crate::config::document::{Document, TablePlace};
 use crate::quantity::bounds::Bounds;
 
@@ -21,6 +22,9 @@ pub(crate) enum ValueRange {
     /// A string or list that is not empty.
     NotEmpty,
 }
+
+/// The range of a threshold in the unit of its rule: no sensible value exceeds it.
+const WIDEST: ValueRange = ValueRange::Between(-1e9, 1e9);
 
 /// The range of a key with physical bounds.
 pub(crate) const fn within(bounds: Bounds) -> ValueRange {
@@ -127,9 +131,24 @@ impl Key {
         if self.choices.is_empty() { self.allowed.to_string() } else { self.choices.join(" or ") }
     }
 
+    /// The range as it appears in a fault. Bounds so wide that no sensible value exceeds them are left out.
+    fn range_in_fault(&self) -> String {
+        match self.choices {
+            [_, _, _, ..] => format!("one of {}", self.choices.join(", ")),
+            _ if self.allowed == WIDEST => String::new(),
+            _ => self.range(),
+        }
+    }
+
+    /// The meaning of the key in one sentence, without its full stop.
+    fn meaning(&self) -> &'static str {
+        let about = self.about.trim();
+        about.split_once(". ").map_or(about, |(first, _)| first).trim_end_matches('.')
+    }
+
     /// The allowed values with their type, as they appear in a fault.
     pub(crate) fn must_be(&self) -> String {
-        let range = self.range();
+        let range = self.range_in_fault();
         if self.allowed == ValueRange::NotEmpty {
             return format!("must be {} that is not empty", self.kind);
         }
@@ -143,7 +162,7 @@ impl Key {
 
     /// The allowed values, without the type, for a fault of a value that has the right type.
     fn must_be_in_range(&self) -> String {
-        match self.range() {
+        match self.range_in_fault() {
             range if range.is_empty() || self.allowed == ValueRange::NotEmpty => self.must_be(),
             range => format!("must be {range}"),
         }
@@ -175,7 +194,10 @@ impl TableReader<'_> {
             Err(wrong) => {
                 let what = match &wrong {
                     ValueFault::Type(_) => key.must_be(),
-                    ValueFault::Range(_) => key.must_be_in_range(),
+                    ValueFault::Range(_) => {
+                        let found = value.get_ref().as_str().unwrap_or_default();
+                        key.must_be_in_range() + &did_you_mean(found, key.choices.iter().copied())
+                    }
                 };
                 let (ValueFault::Type(span) | ValueFault::Range(span)) = wrong;
                 let found = self.document.found(value, &span);
@@ -195,7 +217,7 @@ impl TableReader<'_> {
             }
             Presence::Required if self.broken => None,
             Presence::Required => {
-                let text = format!("{} is missing, {}", self.place.key(key.name), key.must_be());
+                let text = format!("{} is missing, {}: {}", self.place.key(key.name), key.must_be(), key.meaning());
                 self.document.faults.add_at(&self.place.at, text);
                 None
             }

@@ -98,7 +98,11 @@ impl<'a> SchemaReader<'a> {
             if tables.contains(key) {
                 self.table_below(&join(schema, key), &shown_key, value, known);
             } else if !keys.iter().any(|k| k.name == key) {
-                let hint = did_you_mean(key, keys.iter().map(|k| k.name).chain(tables.iter().copied()));
+                let names: Vec<&str> = keys.iter().map(|k| k.name).chain(tables.iter().copied()).collect();
+                let hint = match did_you_mean(key, names.iter().copied()) {
+                    nothing if nothing.is_empty() => format!(", must be one of {}", names.join(", ")),
+                    meant => meant,
+                };
                 self.document.faults.add_at(&line, format!("{shown_key} is not a known key{hint}"));
             }
         }

@@ -99,7 +99,7 @@ impl RawTables {
     /// Returns the interface of a table that uses exactly one interface. Returns `None` and notes a fault if the name
     /// is unknown, or if no name is given although there are several interfaces.
     pub(crate) fn one_bus(&self, interface: Option<&str>, place: &TablePlace) -> Option<BusIndex> {
-        let is_clear = interface.is_some() || self.interfaces.len() <= 1;
+        let is_clear = interface.is_some() || self.distinct_interfaces().len() <= 1;
         let bus = self.bus_of(interface).filter(|_| is_clear);
         if bus.is_none() && self.has_all_interfaces() && !self.interfaces.is_empty() {
             place.fault("interface", format!("must be {}", self.interface_names()));
@@ -109,8 +109,18 @@ impl RawTables {
 
     /// Names of the interfaces, joined by "or" for fault messages.
     pub(crate) fn interface_names(&self) -> String {
-        let names: Vec<&str> = self.interfaces.iter().map(|interface| interface.name.as_str()).collect();
-        names.join(" or ")
+        self.distinct_interfaces().join(" or ")
+    }
+
+    /// Names of the interfaces, each once. A name that is given twice is noted elsewhere.
+    fn distinct_interfaces(&self) -> Vec<&str> {
+        let mut names: Vec<&str> = Vec::new();
+        for interface in &self.interfaces {
+            if !names.contains(&interface.name.as_str()) {
+                names.push(&interface.name);
+            }
+        }
+        names
     }
 
     /// Notes, at the key `fd` of a frame's table, each interface of the frame that has no FD.

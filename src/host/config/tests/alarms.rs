@@ -49,7 +49,7 @@ fn alarm_and_command_faults_are_reported() {
         (
             "[[alarm]]\nrule = \"soc_low\"\nwarning = { set = 0.1, clera = 0.2 }\n",
             "pack.toml:17: alarm[1].warning = { set = 0.1, clera = 0.2 }, must be a number, a string like \"80 %\", or { set \
-             = ..., clear = ... } of these, -1000000000 to 1000000000 (the rule's)",
+             = ..., clear = ... } of these (the rule's unit)",
         ),
         (
             "[[alarm]]\nrule = \"input_missing\"\nwarning = 1\nwhen = { probability = 0.9 }\n",
@@ -87,7 +87,7 @@ fn alarm_and_command_faults_are_reported() {
         ),
         (
             "[output]\n[commands]\nenabled = true\nsecoc = \"1\"\ndata_id = 1\n[output.freshness]\ndata_id = 2\n",
-            "pack.toml:1: authentication.credential is not set, must be given if key_file is not: secoc requires a key",
+            "pack.toml:1: authentication.credential is not set, must be the name of a systemd credential, unless key_file names a file: secoc requires a key",
         ),
         (
             "[output]\n[commands]\nenabled = true\nsecoc = \"1\"\ndata_id = 1\n[authentication]\ncredential = \"k\"\n",

@@ -39,7 +39,7 @@ fn balancing_faults_are_reported() {
     let table = [
         (
             pack("signal = \"Bleeding.Bleed{n}\"\n"),
-            "pack.toml:15: input.balancing.bleed_a is missing, must be a number, above 0 and at most 1000000 (A)",
+            "pack.toml:15: input.balancing.bleed_a is missing, must be a number, above 0 and at most 1000000 (A): Current of a balancing resistor while the bit is 1, at the BMS's balancing voltage",
         ),
         (
             pack("signal = \"Bleeding.Bleed{n}\"\nbleed_a = 0\n"),
@@ -51,11 +51,11 @@ fn balancing_faults_are_reported() {
         ),
         (
             pack("signal = \"Bleeding.Bleed1\"\nbleed_a = 0.1\n"),
-            "pack.toml:16: input.balancing.signal = \"Bleeding.Bleed1\", must contain {n} for the cell's number",
+            "pack.toml:16: input.balancing.signal = \"Bleeding.Bleed1\", must contain {n} for the cell's number, because pack.cells = 4",
         ),
         (
             pack("signal = \"Bleeding.Bleed{n}\"\nfirst = 2\nbleed_a = 0.1\n"),
-            "pack.toml:16: input.balancing.signal = \"Bleeding.Bleed{n}\", must match a signal for every cell, but none has number 5",
+            "pack.toml:16: input.balancing.signal = \"Bleeding.Bleed{n}\", must match a signal for each of 4 cells (pack.cells), but none has number 5",
         ),
         (
             pack("signal = \"Bleeding.Bleed{n}\"\nbleed_a = 0.1\n").replacen(

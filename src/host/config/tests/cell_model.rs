@@ -6,7 +6,11 @@ use super::*;
 fn cell_model_faults_are_reported() {
     let table: &[(&str, &str, &str)] = &[
         ("format = 1", "format = 2", "cell.toml:1: format = 2, must be 1"),
-        ("name = \"test\"\n", "", "cell.toml:1: name is missing, must be a string that is not empty"),
+        (
+            "name = \"test\"\n",
+            "",
+            "cell.toml:1: name is missing, must be a string that is not empty: Name of the cell, for people",
+        ),
         ("capacity_ah = 1.9", "capacity_ah = -1.9", "cell.toml:4: capacity_ah = -1.9, must be 0.001 to 100000"),
         (
             "voltage_max_v = 4.2",
@@ -42,13 +46,17 @@ fn cell_model_faults_are_reported() {
             "[thermal]\nheat_capacity_j_per_k = 1\nresistance_k_per_w = 0\n[provenance]",
             "cell.toml:9: thermal.resistance_k_per_w = 0, must be above 0 and at most 1000000000",
         ),
-        ("[tables]", "[tables]\nx = 1", "cell.toml:10: tables.x is not a known key"),
+        (
+            "[tables]",
+            "[tables]\nx = 1",
+            "cell.toml:10: tables.x is not a known key, must be one of soc, temperature_c, ocv_v, r0_ohm, voltage_error_v, branches",
+        ),
         (
             "[provenance]",
             "[electrodes]\npositive = \"nmc\"\nnegative = \"graphite\"\npositive_content = [0.9, 0.3]\n\
              negative_content = [0.0, 0.9]\n[provenance]",
-            "cell.toml:8: electrodes.positive = \"nmc\", must be nmc811 or nmc532 or nca or nco or lco or \
-             lco_ramadass or lmo or lfp",
+            "cell.toml:8: electrodes.positive = \"nmc\", must be one of nmc811, nmc532, nca, nco, lco, \
+             lco_ramadass, lmo, lfp, did you mean nmc532",
         ),
         (
             "[provenance]",

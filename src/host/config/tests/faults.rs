@@ -21,7 +21,11 @@ fn faults_state_file_line_key_found_and_allowed() {
         ),
         ("cells = 4", "cells = 4.0", "pack.toml:2: pack.cells = 4.0, must be a whole number, 1 to 1024"),
         ("cells = 4", "cells = \"four\"", "pack.toml:2: pack.cells = \"four\", must be a whole number, 1 to 1024"),
-        ("cells = 4\n", "", "pack.toml:1: pack.cells is missing, must be a whole number, 1 to 1024"),
+        (
+            "cells = 4\n",
+            "",
+            "pack.toml:1: pack.cells is missing, must be a whole number, 1 to 1024: Number of cells in series",
+        ),
         ("cells = 4", "cells = 4\nstring = 1", "pack.toml:3: pack.string is not a known key, did you mean strings"),
         ("cells = 4", "cells = 4\nambient_c = nan", "pack.toml:3: pack.ambient_c = nan, must be -100 to 200"),
         ("cells = 4", "cells = 4\nambient_c = inf", "pack.toml:3: pack.ambient_c = inf, must be -100 to 200"),
@@ -31,7 +35,7 @@ fn faults_state_file_line_key_found_and_allowed() {
             "[estimator]\nmax_information_s = 0.0005\n[input]",
             "pack.toml:7: estimator.max_information_s = 0.0005, must be 0.001 to 1000000",
         ),
-        ("cells = 4", "cells = 4\ncells = 5", "pack.toml:3: duplicate key"),
+        ("cells = 4", "cells = 4\ncells = 5", "pack.toml:3: invalid TOML: duplicate key"),
         (
             "cells = 4",
             "cells = 4\nrated_capacity_ah = 0",
@@ -60,7 +64,11 @@ fn faults_state_file_line_key_found_and_allowed() {
 #[test]
 fn signal_faults_state_contents_of_dbc() {
     let table: &[(&str, &str, &str)] = &[
-        ("positive = \"charge\"\n", "", "pack.toml:8: input.current.positive is missing, must be charge or discharge"),
+        (
+            "positive = \"charge\"\n",
+            "",
+            "pack.toml:8: input.current.positive is missing, must be charge or discharge: Meaning of a positive value on the bus",
+        ),
         ("\"charge\"", "\"in\"", "pack.toml:10: input.current.positive = \"in\", must be charge or discharge"),
         (
             "\"charge\"",
@@ -95,7 +103,7 @@ fn signal_faults_state_contents_of_dbc() {
         (
             "CellVoltage{n}",
             "CellVoltage1",
-            "pack.toml:12: input.cell_voltage.signal = \"Cells.CellVoltage1\", must contain {n} for the cell's number",
+            "pack.toml:12: input.cell_voltage.signal = \"Cells.CellVoltage1\", must contain {n} for the cell's number, because pack.cells = 4",
         ),
         (
             "CellVoltage{n}",
@@ -105,7 +113,7 @@ fn signal_faults_state_contents_of_dbc() {
         (
             "CellVoltage{n}",
             "CellVoltage{n}\"\nfirst = 3\ninterface = \"can0",
-            "pack.toml:12: input.cell_voltage.signal = \"Cells.CellVoltage{n}\", must match a signal for every cell, but none has number 5, 6",
+            "pack.toml:12: input.cell_voltage.signal = \"Cells.CellVoltage{n}\", must match a signal for each of 4 cells (pack.cells), but none has number 5, 6",
         ),
         (
             "[input.cell_voltage]\nsignal = \"Cells.CellVoltage{n}\"\n",
@@ -139,14 +147,17 @@ fn faults_of_repeatable_tables_are_reported() {
             "[limits.voltage]\nmin_v = 4\nmax_v = 3\n",
             "pack.toml:17: limits.voltage.max_v = 3, must be above 4, the lower limit",
         ),
-        ("[limits.amps]\n", "pack.toml:15: limits.amps is not a known key"),
+        (
+            "[limits.amps]\n",
+            "pack.toml:15: limits.amps is not a known key, must be one of current, temperature, voltage",
+        ),
         (
             "[usable]\ncurrent_a = 2\ntemperature_c = 24\ncutoff_v = 4.2\n",
             "pack.toml:18: usable.cutoff_v = 4.2, must be below the cell model's voltage_max_v = 4.2",
         ),
         (
             "[output.status]\nid = 0x800\n",
-            "pack.toml:16: output.status.id = 0x800, must be 0 to 0x7FF, or extended = true",
+            "pack.toml:16: output.status.id = 0x800, must be 0 to 0x7FF; a longer identifier requires extended = true",
         ),
         (
             "[output.status]\nid = 1\n[output.alarm]\nid = 1\n",
@@ -158,7 +169,7 @@ fn faults_of_repeatable_tables_are_reported() {
         ),
         ("[output.alarm]\nextended = true\n", "pack.toml:16: output.alarm.extended = true, requires the key id"),
         ("[output.alarm]\nperiod_ms = 9\n", "pack.toml:16: output.alarm.period_ms = 9, must be 10 to 3600000"),
-        ("[output.alarm]\ne2e = \"2\"\n", "pack.toml:16: output.alarm.e2e = \"2\", must be off or 1A or 1C or 5"),
+        ("[output.alarm]\ne2e = \"2\"\n", "pack.toml:16: output.alarm.e2e = \"2\", must be one of off, 1A, 1C, 5"),
         (
             "[output.alarm]\ne2e = \"1A\"\n",
             "pack.toml:15: output.alarm.data_id is not set, must be 0 to 0xFFFF with e2e = \"1A\"",

@@ -84,7 +84,7 @@ fn out_of_range_numbers_are_rejected() {
         (
             "manufacturer_code = 2047\n",
             "",
-            "pack.toml:15: j1939.manufacturer_code is missing, must be a whole number, 0 to 2047",
+            "pack.toml:15: j1939.manufacturer_code is missing, must be a whole number, 0 to 2047: Manufacturer code in the NAME, assigned by SAE",
         ),
         ("[j1939]\n", "[j1939]\necu_instance = 8\n", "pack.toml:16: j1939.ecu_instance = 8, must be 0 to 7"),
         (

@@ -41,7 +41,7 @@ fn label_faults_are_reported() {
     assert_eq!(
         of("strings = 1"),
         [
-            "pack.toml:1: pack.cell_model is not set, must be a cell model file if chemistry and rated_capacity_ah are not given"
+            "pack.toml:1: pack.cell_model is not set, must be a cell model file, unless chemistry and rated_capacity_ah describe the cell"
         ]
     );
     assert_eq!(
@@ -66,7 +66,7 @@ fn label_faults_are_reported() {
     assert_eq!(
         of("chemistry = \"nmc\"\nrated_capacity_ah = 100"),
         [
-            "pack.toml:3: pack.chemistry = \"nmc\", must be nmc811-graphite or nmc-graphite or nca-graphite or lco-graphite or lmo-graphite or lfp-graphite"
+            "pack.toml:3: pack.chemistry = \"nmc\", must be one of nmc811-graphite, nmc-graphite, nca-graphite, lco-graphite, lmo-graphite, lfp-graphite, did you mean nmc-graphite"
         ]
     );
 }

@@ -60,7 +60,7 @@ fn module_faults_are_reported() {
         (
             "cells = \"2\"",
             0,
-            "pack.module[1].cell_model is not set, must be a cell model file if chemistry and rated_capacity_ah are not given",
+            "pack.module[1].cell_model is not set, must be a cell model file, unless chemistry and rated_capacity_ah describe the cell",
         ),
         (
             "cells = \"2\"\nchemistry = \"lfp-graphite\"",

@@ -95,15 +95,15 @@ fn protection_faults_are_reported() {
     let table: &[(&str, &str)] = &[
         (
             "message = \"Stats\"\nprofile = \"1A\"\ndata_id = 1\n",
-            "pack.toml:17: input.protected[1].message = \"Stats\", must be the message of a configured input on its interface, did you mean Status",
+            "pack.toml:17: input.protected[1].message = \"Stats\", must be a message with a configured signal on this interface (Cells, Status), did you mean Status",
         ),
         (
             "message = \"Short\"\nprofile = \"1A\"\ndata_id = 1\n",
-            "pack.toml:17: input.protected[1].message = \"Short\", must be the message of a configured input on its interface",
+            "pack.toml:17: input.protected[1].message = \"Short\", must be a message with a configured signal on this interface (Cells, Status)",
         ),
         (
             "message = \"Status\"\nprofile = \"2\"\ndata_id = 1\n",
-            "pack.toml:18: input.protected[1].profile = \"2\", must be 1A or 1C or 5",
+            "pack.toml:18: input.protected[1].profile = \"2\", must be one of 1A, 1C, 5",
         ),
         (
             "message = \"Status\"\nprofile = \"1A\"\ndata_id = 65536\n",
@@ -119,7 +119,7 @@ fn protection_faults_are_reported() {
         ),
         (
             "message = \"Status\"\nprofile = \"1C\"\n",
-            "pack.toml:16: input.protected[1].data_id is missing, must be a whole number, 0 to 65535",
+            "pack.toml:16: input.protected[1].data_id is missing, must be a whole number, 0 to 65535: Data identifier agreed with the sender; at most 0xFFF for \"1C\"",
         ),
         (
             "message = \"Status\"\nprofile = \"1A\"\ndata_id = 1\ninterface = \"can1\"\n",
@@ -183,7 +183,7 @@ fn table_needs_interface_if_several_exist() {
     assert_eq!(
         faults(&on_the_other),
         [
-            "pack.toml:22: input.protected[1].message = \"Status\", must be the message of a configured input on its interface"
+            "pack.toml:22: input.protected[1].message = \"Status\", must be a message with a configured signal on this interface (there is none)"
         ]
     );
     assert_eq!(read(&format!("{pack}interface = \"can0\"\n")).unwrap().0.monitor.guards.len(), 1);

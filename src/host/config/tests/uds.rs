@@ -122,7 +122,7 @@ fn answer_faults_are_reported() {
         (
             "bit = 32",
             "bti = 32",
-            "pack.toml:23: input.diagnostic[1].signals[1].bit is missing, must be a whole number, 0 to 524280 (bits)",
+            "pack.toml:23: input.diagnostic[1].signals[1].bit is missing, must be a whole number, 0 to 524280 (bits): Position of the first (most significant) bit, counted from the most significant bit of the byte after the echoed service and identifier (like `bix` in OBDb)",
         ),
         (
             "numbers = \"1-3\", ",
@@ -208,8 +208,8 @@ fn only_configured_requests_are_sent_and_listed() {
 #[test]
 fn polling_faults_are_reported() {
     let none = pack() + "[poll]\nenabled = true\n";
-    let fault = "pack.toml:34: poll.enabled = true, must be false: no answer in use has drive_every_s, charge_every_s or \
-                 parked_every_s";
+    let fault = "pack.toml:34: poll.enabled = true, must be false, because nothing would be requested: no [[input.diagnostic]] whose \
+                 signals are used has drive_every_s, charge_every_s or parked_every_s";
     assert_eq!(faults(&none), [fault]);
     let polled = pack().replace("Status.Current", "Car.Unused").replacen(
         "identifier = 0x0102",

@@ -18,7 +18,7 @@ use tokio::sync::mpsc;
 use tokio::time::{Instant, Interval, MissedTickBehavior, interval, sleep_until};
 
 use super::counters::{LinkHealth, LinkState, SharedHealth};
-use super::raw::{CALL_BATCH, RawRead, RawSocket, every_frame, filters, index_of};
+use super::raw::{CALL_BATCH, RawRead, RawSocket, every_frame, explained, filters, index_of};
 use super::wire::Wire;
 use crate::can::{CanId, Frame};
 use crate::io::clock::{MappedClock, Reading, StampMapper};
@@ -445,7 +445,7 @@ impl Link {
 
     /// Logs a problem unless it is the same as the last logged problem.
     fn problem(&mut self, error: &io::Error) {
-        let text = error.to_string();
+        let text = explained(error);
         if self.last_problem.as_ref() != Some(&text) {
             tracing::warn!(interface = self.config.interface, error = text, "interface cannot be used");
             self.last_problem = Some(text);

@@ -95,6 +95,17 @@ pub(super) struct RawSocket {
     pub(super) index: u32,
 }
 
+/// An error of a CAN socket with its cause and the next step, if they are known.
+pub(super) fn explained(error: &io::Error) -> String {
+    let cause = match error.raw_os_error().map(Errno::from_raw) {
+        Some(Errno::EAFNOSUPPORT) => ": this kernel has no SocketCAN; load the module can_raw",
+        Some(Errno::ENODEV) => ": there is no interface of this name; \"ip link\" lists the interfaces",
+        Some(Errno::ENETDOWN) => ": the interface is down; start it with \"ip link set NAME up\"",
+        _ => "",
+    };
+    format!("{error}{cause}")
+}
+
 impl RawSocket {
     /// Opens and binds the socket. If `fd`, it also receives FD frames. Filters are set before the bind, so that no
     /// unwanted frame is queued.
@@ -128,7 +139,7 @@ impl RawSocket {
     pub(super) fn open_up(interface: &str, fd: bool, filters: &[CanFilter], buffer_bytes: usize) -> io::Result<Self> {
         let opened = Self::open(interface, fd, filters, buffer_bytes);
         let opened = opened.and_then(|socket| socket.take_error()?.map_or(Ok(socket), Err));
-        opened.map_err(|error| io::Error::new(error.kind(), format!("{interface}: {error}")))
+        opened.map_err(|error| io::Error::new(error.kind(), format!("{interface}: {}", explained(&error))))
     }
 
     /// The pending error of the socket: `ENETDOWN` right after opening on an interface that is down.

@@ -92,13 +92,13 @@ section! {
         /// What the alarm compares.
         rule: Rule, "", Any, Required;
         /// Threshold of severity "info". The alarm is raised when the value is below it (rules `*_low`) or above it (all others). A number is in the rule's unit. A string like "80 %" is relative to the value of a new cell: its rated capacity, its recharge period with the reference charger, or its resistance. For fractions, 100 % is 1. With `{ set = ..., clear = ... }` the alarm clears at `clear`. At least one of `info`, `warning` and `severe` is required, and each severity may be set once per rule.
-        info: Option<Threshold>, "the rule's", Between(-1e9, 1e9), Optional("no such alarm");
+        info: Option<Threshold>, "the rule's unit", Between(-1e9, 1e9), Optional("no such alarm");
         /// Threshold of severity "warning", written like `info`.
-        warning: Option<Threshold>, "the rule's", Between(-1e9, 1e9), Optional("no such alarm");
+        warning: Option<Threshold>, "the rule's unit", Between(-1e9, 1e9), Optional("no such alarm");
         /// Threshold of severity "severe", written like `info`.
-        severe: Option<Threshold>, "the rule's", Between(-1e9, 1e9), Optional("no such alarm");
+        severe: Option<Threshold>, "the rule's unit", Between(-1e9, 1e9), Optional("no such alarm");
         /// If the threshold has no `clear`, the alarm clears when the value is back on the healthy side by this much. An alarm on a learned value also waits until the true value is on the healthy side with a probability of 95 %.
-        hysteresis: Option<f64>, "the rule's", Between(0.0, 1e9), Optional("2 % of the threshold");
+        hysteresis: Option<f64>, "the rule's unit", Between(0.0, 1e9), Optional("2 % of the threshold");
         /// What is compared with the threshold. "mean": the value itself. `{ probability = 0.95 }`: the alarm is raised when the true value is beyond the threshold with more than this probability. It clears when the probability of being beyond the clear threshold is at most the smaller of this and 0.5. With a probability above 0.5, the alarm is raised later and false alarms are rarer. With one below 0.5, it is raised earlier.
         when: Comparison, "", Any, Default("\"mean\"");
         /// The value must be beyond the threshold for this long before the alarm is raised, and healthy for this long before it clears.
