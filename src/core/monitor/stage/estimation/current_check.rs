@@ -96,7 +96,7 @@ struct Round {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct CurrentCheck {
-    /// Latest voltage of each compared cell, V; `None` = no reading since the last pause.
+    /// Voltage of each compared cell in the latest round, V; `None` = no reading.
     voltages_v: [Option<f64>; MAX_CELLS],
     /// The latest rounds, the oldest first.
     rounds: [Round; ROUNDS],
@@ -164,9 +164,12 @@ impl CurrentCheck {
         ohm: f64,
     ) {
         let (mut moves_v, mut moves, mut latest) = ([0.0; MAX_CELLS], 0, None);
+        // Cells that did not report in the previous round have moved for longer than the current.
+        let before_v = std::mem::replace(&mut self.voltages_v, [None; MAX_CELLS]);
         for (place, sample) in samples {
             latest = Some(sample);
-            if let Some(before_v) = self.voltages_v[place].replace(sample.voltage_v) {
+            self.voltages_v[place] = Some(sample.voltage_v);
+            if let Some(before_v) = before_v[place] {
                 moves_v[moves] = sample.voltage_v - before_v;
                 if moves_v[moves] != 0.0 {
                     self.resolution_v = self.resolution_v.min(moves_v[moves].abs());
