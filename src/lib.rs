@@ -33,7 +33,7 @@
 //! # The path of a frame
 //! `host/io/socket` receives it and `host/service/live.rs` passes it to the [`monitor`]. The stages are `intake` (protection, rate
 //! limit) → `can/decode` (for a diagnostic answer: `can/isotp`, `can/uds`) → `sampling` → `estimation` ([`cell`]) → `learning`
-//! ([`health`]) → `alarming` ([`alarm`]) → `sender` (`can/encode`). A replay starts at `host/replay.rs`; from the monitor on, the path
+//! ([`health`]) → `alarming` ([`alarm`]) → `sending` (`can/encode`). A replay starts at `host/replay.rs`; from the monitor on, the path
 //! is the same.
 //!
 //! # Where to change what
@@ -53,7 +53,7 @@
 //! | ISO-TP; decoding of diagnostic answers; which requests are sent, and when | `core/can/isotp.rs`; `core/can/uds.rs`; `core/can/poll.rs` |
 //! | detection of bus sleep | `core/monitor/stage/sleep.rs` |
 //! | plausibility of a reading | `core/sample/signal.rs` |
-//! | the filter's process or measurement noise | `core/cell/estimator/noise.rs` |
+//! | the filter's process or measurement noise | `core/cell/estimator/bank/kernel/predict.rs`, `core/cell/estimator/bank/kernel/update.rs` |
 //! | the open-circuit curve of an aged cell, half-cell potentials | `core/cell/aged_ocv.rs`, `core/cell/electrodes.rs`; their fit: `lab/ident/electrodes.rs` |
 //! | the model learned on board | `core/cell/own_model/fit.rs` (fit), `core/monitor/stage/modelling.rs` (when); on another thread: `host/service/live.rs` |
 //! | the signature of a cell fault; when it is reported | `core/cell_faults/difference.rs`, `core/cell_faults/channels.rs`; `core/cell_faults/fault.rs` |
