@@ -126,7 +126,7 @@ fn load_store(folder: &Path) -> Result<ReportInput, Failure> {
     let chain = match &verdict.broken {
         None => format!("{} rows, all as they were written; the last has the hash {}", verdict.rows, verdict.head),
         Some(broken) => format!(
-            "{broken}: expected {}, found {}; {} rows before them are good",
+            "{broken}: expected hash {}, found {}; the {} rows before them are intact",
             broken.expected, broken.found, verdict.good_rows
         ),
     };

@@ -87,7 +87,8 @@ pub struct CommandOutcome {
     pub time: Timestamp,
     /// Number of alarms that were changed.
     pub changed: u32,
-    /// Number of refused changes: alarms that are not healthy, or a test although no output is configured.
+    /// Number of refused changes. A change is refused if the alarm's value is not healthy; a test is refused if no
+    /// output is configured.
     pub refused: u32,
     /// The refused alarms.
     pub refused_alarms: Vec<Alarm>,

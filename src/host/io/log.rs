@@ -109,7 +109,7 @@ struct ReadState {
     interfaces: Vec<String>,
     /// Parser that knows the interfaces.
     parser: LineParser,
-    /// Whether unconfigured interfaces get a number too.
+    /// Whether unconfigured interfaces also get a number, so that their records are returned.
     adopt: bool,
     shift_ns: i64,
     latest: Option<Timestamp>,

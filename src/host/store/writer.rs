@@ -226,8 +226,8 @@ impl Writer {
         }
     }
 
-    /// Writes rows and state. If this fails, they wait for the next attempt. Without a state, nothing is written. After
-    /// a failure, however, the database is opened if possible.
+    /// Writes rows and state. If this fails, they wait for the next attempt. Without a state, nothing is written, but a
+    /// database that was closed after a failure is opened again if possible.
     fn write(
         &mut self,
         mut batches: Vec<RowBatch>,

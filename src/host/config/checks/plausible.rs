@@ -87,7 +87,7 @@ fn by_table<'r, 'd>(
     tables
 }
 
-/// `Message.Signal` of a signal in the resolved signal's message.
+/// Returns the name `Message.Signal` of a signal that is in the same message as the resolved signal.
 fn name(resolved: &ResolvedSignal<'_>, signal: &Signal) -> String {
     format!("{}.{}", resolved.message.name, signal.name)
 }
@@ -329,7 +329,7 @@ struct AllowedRange<'a> {
     place: &'a TablePlace,
     keys: [&'static str; 2],
     limits: Limits,
-    /// Limits stated by the DBC, after `scale`.
+    /// Limits stated by the DBC, converted with `scale`.
     dbc: (f64, f64),
     unit: &'static str,
     /// Input whose DBC states the range.

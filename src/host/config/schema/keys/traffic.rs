@@ -126,7 +126,7 @@ frame_section! {
 }
 
 frame_section! {
-    /// The digest frame: number, worst severity and checksum of all raised alarms, the state of every rule, and one threshold. All pages are sent in each period. Not sent if `output.dbc` lacks `PACKWATCH_Digest`.
+    /// The digest frame: number, worst severity and checksum of all raised alarms, the state of every rule, and, in turn, one of the configured thresholds. All pages are sent in each period. Not sent if `output.dbc` lacks `PACKWATCH_Digest`.
     OutputDigest at "output.digest"
 }
 
