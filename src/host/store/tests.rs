@@ -240,7 +240,7 @@ fn failing_disk_is_retried_after_pauses() {
     }
     // The first retry comes after 1 s; the next pause is 2 s.
     assert_eq!((changes, progress.borrow().failures), (1, 1));
-    // Tickets that are answered during the pause cause no attempt.
+    // Work that is queued during the pause is reported as failed, without an attempt to write it.
     let write_queue = Arc::clone(&store.write_queue);
     for _ in 0..3 {
         let ticket = write_queue.submit(None, document(1, 1, 1), true);
@@ -293,7 +293,7 @@ fn database_damaged_while_running_is_set_aside() {
     assert!(place.path().join("packwatch.db.damaged-1").exists());
 }
 
-/// A monitor whose state was taken at that time.
+/// Returns a monitor whose time is `seconds`.
 fn at(seconds: f64) -> Monitor {
     let mut monitor = Monitor::new(config().monitor);
     monitor.handle(&Record::tick(Timestamp::from_secs(seconds)), &mut Outputs::default());

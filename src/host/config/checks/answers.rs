@@ -26,7 +26,7 @@ pub(crate) struct AnswerDefinition {
     identifier: u16,
     /// Time between requests in each [`CarState`](crate::can::poll::CarState), s.
     pub every_s: [Option<f64>; 3],
-    /// The signals of the answer; each layout begins at the first byte of its signal.
+    /// The signals of the answer. Bit positions in the layout of a signal count from the first byte of that signal.
     pub message: Message,
     /// The first byte of each signal, counted after the echoed service and identifier.
     first_bytes: Vec<usize>,
@@ -188,7 +188,7 @@ fn check_numbers(keys: &AnswerSignalKeys) {
     }
 }
 
-/// The signal as a DBC would declare it, with a layout that begins at its first byte.
+/// Returns the signal as a DBC would declare it. Bit positions in its layout count from its own first byte.
 fn as_in_a_dbc(keys: &AnswerSignalKeys, name: String, bit: usize) -> Signal {
     let in_byte = u16::try_from(bit % 8).unwrap_or_default();
     let (byte_order, start_bit) = match keys.byte_order {

@@ -88,8 +88,8 @@ section! {
 }
 
 impl Estimator {
-    /// Standard deviation of the voltage's quantisation, V (uniform: step / sqrt 12). Steps smaller than the sensor's noise
-    /// are already part of it.
+    /// Standard deviation of the voltage's quantisation, V (uniform: step / sqrt 12). It is 0 for steps smaller than
+    /// the sensor's noise, because that noise already contains them.
     pub(crate) fn rounding_v(&self, step_v: f64) -> f64 {
         if step_v > self.voltage_noise_v { step_v / 12.0_f64.sqrt() } else { 0.0 }
     }
