@@ -29,7 +29,7 @@ pub(super) struct WhatifReport<'a> {
     pub(super) failed: Vec<String>,
 }
 
-/// One threshold under one setting, over all logs.
+/// Results of one threshold with one setting, over all logs.
 #[derive(Debug, Clone, Serialize)]
 pub(super) struct Summary {
     setting: usize,
@@ -172,7 +172,7 @@ impl WhatifReport<'_> {
         log.alarms.iter().filter(|row| self.rules.contains(&row.rule))
     }
 
-    /// Every threshold under every setting, over all logs.
+    /// Summarises the results of each threshold with each setting, over all logs.
     pub(super) fn summaries(&self) -> Vec<Summary> {
         let Some(first) = self.logs.first() else { return Vec::new() };
         // Every log has the same rows in the same order.

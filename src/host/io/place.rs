@@ -24,7 +24,7 @@ impl PlaceSetting {
         }
     }
 
-    /// The path, and whether it is required; `None` = switched off.
+    /// Returns the path, and whether it is required; `None` = the socket or the stored state is switched off.
     pub fn resolve(&self, standard: impl FnOnce() -> (PathBuf, bool)) -> Option<(PathBuf, bool)> {
         match self {
             Self::Off => None,
