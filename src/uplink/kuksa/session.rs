@@ -82,7 +82,7 @@ struct Session {
     receipts: Receipts,
 }
 
-/// Time since which the broker has owed a receipt.
+/// Remembers since when the broker owes a receipt; `None` = it owes none.
 #[derive(Debug, Default)]
 struct Receipts {
     owed_since: Option<Instant>,

@@ -42,9 +42,9 @@ pub(super) struct RawRead {
     pub(super) stamps: KernelStamps,
 }
 
-/// Buffers of one call, which are reused. The kernel writes into each header how much space its control messages used.
-/// This number is also the space that the next frame in the same slot gets. The space is sufficient while every frame
-/// has a stamp. After a frame without a stamp, the headers are built again.
+/// Buffers of one call, which are reused. Each call replaces the size of the control buffer in a header by the size
+/// that the kernel used, and the next call offers only this size. The size is sufficient while every frame has a stamp.
+/// After a frame without a stamp, the headers are built again.
 struct Slots {
     headers: MultiHeaders<()>,
     bytes: [[u8; FD_BYTES]; CALL_BATCH],

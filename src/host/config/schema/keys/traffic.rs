@@ -121,7 +121,7 @@ frame_section! {
 }
 
 frame_section! {
-    /// The alarm frame. It is sent at once on a change, then three times 100 ms apart. In addition, each raised alarm is sent once per period. At most 100 frames per second (20 at once after a pause).
+    /// The alarm frame. It is sent at once on a change, then three times 100 ms apart. In addition, each raised alarm is sent once per period. At most 100 frames are sent per second, and at most 20 at once after a pause.
     OutputAlarm at "output.alarm"
 }
 
