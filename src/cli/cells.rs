@@ -84,7 +84,7 @@ fn listed(models: &[(PathBuf, SourcedModel)]) -> String {
     page
 }
 
-/// The voltage error that the model states or, if it states none, the residuals of its fit.
+/// Returns the voltage error that the model states or, if the model states none, the residuals of its fit.
 fn error(sourced: &SourcedModel) -> String {
     match (sourced.error_v(), sourced.source.residual_v()) {
         (Some(error_v), _) => format!("{:.0}", 1e3 * error_v),

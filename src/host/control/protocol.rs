@@ -2,7 +2,7 @@
 //!
 //! | request | keys | answer |
 //! | --- | --- | --- |
-//! | `alarms` | `all` (default false): includes quiet alarms | [`AlarmList`] |
+//! | `alarms` | `all` (default false): also lists alarms that need no attention | [`AlarmList`] |
 //! | `acknowledge`, `clear` | `rule`, `severity`, `cell` (from 0); a missing key selects all | [`CommandOutcome`] |
 //! | `pack_replaced` | | [`CommandOutcome`] |
 //! | `poll` | `standby`: stops sending diagnostic requests | [`CommandOutcome`] |
@@ -36,7 +36,7 @@ const REQUESTS: [(&str, &[&str]); 6] = [
 pub enum Request {
     /// Lists the current alarms.
     Alarms {
-        /// Whether to include quiet alarms.
+        /// Whether to include alarms that need no attention.
         all: bool,
     },
     /// A command, which changes something.

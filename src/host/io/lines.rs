@@ -137,7 +137,7 @@ impl Lines {
         }
     }
 
-    /// The first line without consuming it (without its line feed).
+    /// Returns the first line, without its line feed, and does not consume it.
     ///
     /// # Errors
     /// Returns the errors of the source.

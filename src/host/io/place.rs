@@ -41,7 +41,7 @@ pub fn first_folder(variable: &str) -> Option<PathBuf> {
     std::env::split_paths(&folders).next()
 }
 
-/// A path with a suffix appended to its name.
+/// Returns a path with a suffix appended to its file name.
 pub fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
     name.push(suffix);

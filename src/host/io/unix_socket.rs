@@ -126,7 +126,7 @@ async fn remove_stale(path: &Path) -> Result<(), BindError> {
     }
 }
 
-/// The process that listens, as reported by the kernel.
+/// Describes the process that listens, as reported by the kernel.
 fn owner(stream: &UnixStream) -> String {
     match stream.peer_cred() {
         Ok(who) => {

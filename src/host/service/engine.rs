@@ -225,7 +225,7 @@ impl Engine {
         })
     }
 
-    /// Sends all held frames when the daemon stops.
+    /// Sends all frames that still wait for the disk, when the daemon stops.
     pub(super) fn release_all(&mut self) {
         self.barrier.release(u64::MAX, |transmit| send(&self.links, self.key.as_ref(), transmit));
     }

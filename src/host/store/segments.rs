@@ -183,7 +183,7 @@ pub(super) fn hex(hash: &[u8]) -> String {
     hash.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// All segments, oldest first, each with the segment before it.
+/// Returns all segments, oldest first, each together with the segment before it.
 fn pairs(connection: &Connection) -> rusqlite::Result<Vec<(Segment, Segment)>> {
     let (mut before, mut pairs) = (Segment::START, Vec::new());
     let mut statement = connection.prepare(&format!("SELECT {COLUMNS} FROM segment ORDER BY id"))?;

@@ -252,7 +252,7 @@ async fn connect(endpoint: &Endpoint) -> Result<Channel, String> {
     }
 }
 
-/// An error and its causes; omits repeated texts.
+/// Describes an error and its causes; omits repeated texts.
 fn causes(error: &dyn std::error::Error) -> String {
     let mut texts = vec![error.to_string()];
     let mut next = error.source();

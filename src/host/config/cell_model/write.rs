@@ -93,7 +93,7 @@ fn spread(out: &mut String, spread: &ModelSpread, modes_v: &[Vec<f64>; 2]) {
     out.push_str("]\n");
 }
 
-/// The shortest decimal notation that parses to the same number.
+/// Formats a number in the shortest decimal notation that parses to the same number.
 fn number(value: f64) -> String {
     format!("{value:?}")
 }

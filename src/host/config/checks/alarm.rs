@@ -24,7 +24,7 @@ impl RatedCell {
         Self { capacity_ah, recharge_period_s: 3600.0 * window * capacity_ah / recharge.reference_current_a }
     }
 
-    /// The value that corresponds to 100 % for a rule; `None` if percentages are not defined for this rule.
+    /// Returns the value that counts as 100 % for a rule; `None` if percentages are not defined for this rule.
     fn whole(&self, rule: Rule) -> Option<f64> {
         match (rule, rule.spec().unit) {
             (_, Unit::AmpereHours) => Some(self.capacity_ah),
@@ -53,7 +53,7 @@ impl Alarm {
         all.into_iter().filter_map(|(key, severity, threshold)| Some((key, severity, threshold?)))
     }
 
-    /// The value at which the alarm of a threshold `set` clears.
+    /// Returns the value at which an alarm clears that was raised at the threshold `set`.
     fn clear(&self, rated: &RatedCell, set: f64, threshold: &Threshold) -> Option<f64> {
         match threshold.clear {
             Some(clear) => rated.value(self.rule, clear),

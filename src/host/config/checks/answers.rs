@@ -42,7 +42,7 @@ pub(crate) struct AnswerPlace<'d> {
 }
 
 impl AnswerDefinition {
-    /// The question on interface `bus` that this answer belongs to.
+    /// Returns the diagnostic request on interface `bus` that asks for this answer.
     pub(crate) fn question(&self, bus: BusIndex) -> Question {
         let (request, request_extension) = self.request;
         let (response, response_extension) = self.response;
@@ -148,7 +148,7 @@ fn can_id(raw: u32) -> CanId {
     }
 }
 
-/// Name and first bit of each signal that a table declares.
+/// Returns the name and the first bit of each signal that a table declares.
 fn numbered(keys: &AnswerSignalKeys) -> Vec<(String, u64)> {
     let first = u64::from(keys.bit);
     let has_number = keys.name.contains("{n}");

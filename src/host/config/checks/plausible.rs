@@ -159,7 +159,7 @@ fn other_order(layout: &SignalLayout) -> Option<(&'static str, SignalLayout)> {
     (layout.length_bits > 1).then_some((order, SignalLayout { byte_order, ..*layout }))
 }
 
-/// The multiplexors a signal depends on, with its condition on each.
+/// Returns the multiplexors that a signal depends on, each with the condition that its value must meet.
 fn selectors<'r>(resolved: &'r ResolvedSignal<'_>) -> impl Iterator<Item = (&'r MuxCondition, &'r Signal)> {
     let conditions = resolved.signal.conditions.iter();
     conditions.filter_map(|condition| Some((condition, resolved.message.signals.get(condition.selector)?)))

@@ -95,7 +95,7 @@ pub(super) struct RawSocket {
     pub(super) index: u32,
 }
 
-/// An error of a CAN socket with its cause and the next step, if they are known.
+/// Describes an error of a CAN socket, with its cause and the next step if these are known.
 pub(super) fn explained(error: &io::Error) -> String {
     let cause = match error.raw_os_error().map(Errno::from_raw) {
         Some(Errno::EAFNOSUPPORT) => ": this kernel has no SocketCAN; load the module can_raw",

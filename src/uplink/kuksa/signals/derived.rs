@@ -255,7 +255,7 @@ fn count(count: usize) -> Option<Value> {
     count.try_into().ok().map(Value::Uint16)
 }
 
-/// A word of the status document, as in its JSON.
+/// Returns a word of the status document, spelled as in its JSON.
 fn word(value: Option<impl Serialize>) -> Option<Value> {
     match serde_json::to_value(value?) {
         Ok(serde_json::Value::String(word)) => Some(Value::Text(word)),
