@@ -84,7 +84,7 @@ fn listed(models: &[(PathBuf, SourcedModel)]) -> String {
     page
 }
 
-/// The voltage error that the model states or, if it states none, the residuals of its fit.
+/// Returns the voltage error that the model states or, if the model states none, the residuals of its fit.
 fn error(sourced: &SourcedModel) -> String {
     match (sourced.error_v(), sourced.source.residual_v()) {
         (Some(error_v), _) => format!("{:.0}", 1e3 * error_v),
@@ -99,7 +99,8 @@ fn label_row(chemistry: Chemistry) -> Vec<String> {
     vec![chemistry.name().to_owned(), format!("{low} to {high}"), points]
 }
 
-/// Expected error of the first SOC estimate of a cell described only by its label, percentage points.
+/// Returns the expected error, in percentage points, of the first SOC estimate of a cell that is described only by its
+/// label.
 fn first_points(chemistry: Chemistry) -> Option<f64> {
     // The error does not depend on the capacity, so any capacity can be used.
     let model = Label::usual(chemistry, 1.0).model()?;

@@ -42,7 +42,7 @@ const MAX_CYCLES: u32 = 14;
 const LIVE_SAMPLES: u64 = 400;
 /// Bus time at the start of the demo (Unix time, as in a log).
 const START: Timestamp = Timestamp::from_nanos(1_700_000_000_000_000_000);
-/// A gap between frames that is longer than this counts as sleep, s. The demo has no such gap.
+/// Longest gap between frames, s, that does not count as sleep. The demo has no longer gap.
 const SLEEP_GAP_S: f64 = 30.0;
 
 /// Arguments of `demo`.

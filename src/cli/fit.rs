@@ -46,9 +46,9 @@ pub(crate) struct Args {
     /// Capacity on the label, Ah [default: --capacity]
     #[arg(long, value_name = "AH", value_parser = finite)]
     rated: Option<f64>,
-    /// How the open-circuit curve changes as the cell loses capacity: from 0, it shrinks evenly, to 1, it shifts as if only
-    /// lithium were lost. Data of a new cell do not show this [default: from the electrodes found in the slow test; without
-    /// them 0.5 for an ageing cell, else 0]
+    /// How the open-circuit curve changes as the cell loses capacity: with 0, it shrinks evenly; with 1, it shifts as
+    /// if only lithium were lost. Data of a new cell do not show this [default: from the electrodes found in the slow
+    /// test; without them 0.5 for an ageing cell, else 0]
     #[arg(long, value_name = "SHARE", value_parser = finite)]
     ageing_shift: Option<f64>,
     /// Lowest voltage under load [default: where discharges end, pulses excluded]
@@ -62,8 +62,8 @@ pub(crate) struct Args {
     ocv: Vec<PathBuf>,
     #[command(flatten)]
     grid: GridArgs,
-    /// Fit an ageing cell to its first cycles: parts (column cycle) up to this number. SOC is anchored at full charges and at
-    /// the knees of discharges
+    /// Fit only the first cycles of an ageing cell: the parts whose number in the column cycle is at most this number.
+    /// SOC is anchored at full charges and at the knees of discharges
     #[arg(long, value_name = "N", value_parser = integer::<usize>(0, usize::MAX), conflicts_with_all = ["ocv", "capacity"])]
     first_cycles: Option<usize>,
     /// Write a plot of the residuals

@@ -57,7 +57,7 @@ struct CvArgs {
     /// Write the prediction of every row to this file
     #[arg(long, value_name = "FILE.csv")]
     predictions: Option<PathBuf>,
-    /// Write SVG plots into this folder: predicted against measured, a stretch with its interval, and errors
+    /// Write SVG plots into this folder: predicted against measured, consecutive rows with their intervals, and errors
     #[arg(long, value_name = "DIR")]
     plots: Option<PathBuf>,
     /// Print JSON

@@ -86,7 +86,7 @@ const KINDS: [NamedValue<HistoryTable>; 7] = [
     ("half-cycle", HistoryTable::HalfCycle, "Charges and discharges"),
     ("capacity", HistoryTable::Capacity, "Learned capacities"),
     ("loss-modes", HistoryTable::LossModes, "Lost lithium and active material of cells"),
-    ("remaining-life", HistoryTable::RemainingLife, "Remaining life of the cell that ends first"),
+    ("remaining-life", HistoryTable::RemainingLife, "Remaining life of the cell that reaches its end of life first"),
     ("model", HistoryTable::Model, "Changes of the cell model learned on board"),
     ("alarm", HistoryTable::Alarm, "Alarms"),
     ("reset", HistoryTable::Reset, "Resets, pack replacements, damaged files"),
@@ -180,7 +180,7 @@ fn describe(entry: &HistoryEntry) -> String {
             "{cycles:0} cycles ({cycles_low:0} to {cycles_high:0}), {days:0} days ({days_low:0} to {days_high:0})"
         }
         HistoryTable::Model => {
-            let back = if value("taken_back").as_i64() == Some(1) { ", the one before holds again" } else { "" };
+            let back = if value("taken_back").as_i64() == Some(1) { ", the previous model applies again" } else { "" };
             let better = value("chemistry").as_str().map(|name| format!(", {name} fits better")).unwrap_or_default();
             let words = match value("capacity_ah").is_null() {
                 true => "{state}",
@@ -306,12 +306,12 @@ fn verify(reader: &HistoryReader, args: &VerifyArgs) -> Result<(), Failure> {
         None => {
             let deleted = match verdict.deleted_rows {
                 0 => String::new(),
-                rows => format!(" {rows} of them deleted because of their number or age,"),
+                rows => format!(" ({rows} deleted because of the limits on rows and age)"),
             };
-            print(&format!("{} rows,{deleted} none changed; the hash of the last is {}\n", verdict.rows, verdict.head))
+            print(&format!("{} rows{deleted}, none changed; hash of the last row: {}\n", verdict.rows, verdict.head))
         }
         Some(broken) => Err(Failure::new(format!(
-            "{}: expected {}, found {}; {} rows before them are good",
+            "{}: expected hash {}, found {}; the {} rows before them are intact",
             broken, broken.expected, broken.found, verdict.good_rows
         ))),
     }

@@ -39,9 +39,10 @@ pub(crate) struct Args {
     /// Also write every plot as SVG into this folder
     #[arg(long, value_name = "DIR")]
     plots: Option<PathBuf>,
-    /// True values to show next to the estimates: CSV (.gz, .zst) with capacity_ah or capacity_ah_source (Ah), soc (fraction), or
-    /// both, and the time in the clock of the data: time_s (s), or start or date (such as 2008-04-02T13:08:17, UTC). If it has a column
-    /// cell (as the truth of simulate), the capacity is from full to empty; otherwise it was measured under load
+    /// True values to show next to the estimates: CSV (.gz, .zst) with capacity_ah or capacity_ah_source (Ah), soc
+    /// (fraction), or both, and the time in the clock of the data: time_s (s), or start or date (such as
+    /// 2008-04-02T13:08:17, UTC). If the file has a column cell (such as the truth of `simulate`), its capacities are
+    /// charges from full to empty; otherwise they were measured under load
     #[arg(long, value_name = "TABLE.csv")]
     reference: Option<PathBuf>,
     /// Title of the page [default: vehicle, else name of the log or folder]
@@ -126,7 +127,7 @@ fn load_store(folder: &Path) -> Result<ReportInput, Failure> {
     let chain = match &verdict.broken {
         None => format!("{} rows, all as they were written; the last has the hash {}", verdict.rows, verdict.head),
         Some(broken) => format!(
-            "{broken}: expected {}, found {}; {} rows before them are good",
+            "{broken}: expected hash {}, found {}; the {} rows before them are intact",
             broken.expected, broken.found, verdict.good_rows
         ),
     };

@@ -16,8 +16,8 @@ use packwatch_host::failure::Failure;
 #[command(
     after_help = "If a file has a type column, life is counted in full cycles, one per discharge; otherwise in days, which \
     include rest. The end of life is where a non-increasing least-squares line through all capacities crosses \
-    the threshold, so a temporary recovery after a rest does not change it. Forecasts within the life use no \
-    later readings."
+    the threshold, so a temporary recovery after a rest does not change it. With --at, a forecast uses only \
+    the readings up to its point of the life."
 )]
 pub(crate) struct Args {
     /// Capacity histories: CSV (.gz, .zst) with date or start (ISO 8601 or seconds, ascending), capacity_ah or capacity_ah_source

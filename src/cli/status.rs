@@ -80,12 +80,12 @@ fn in_brackets(cell: Option<CellIndex>) -> String {
     cell.map_or_else(String::new, |cell| format!(" (cell {})", number(cell)))
 }
 
-/// Formats a number with its unit, or a dash.
+/// Formats a number with its unit; an unknown number becomes a dash.
 fn shown(value: Option<f64>, decimals: usize, unit: &str) -> String {
     value.map_or_else(|| "-".to_owned(), |value| format!("{value:.decimals$}{unit}"))
 }
 
-/// Formats a value with its standard deviation, if known, or a dash.
+/// Formats a value with its standard deviation, if that is known; an unknown value becomes a dash.
 fn with_std<const IS_PACK: bool>(values: &Values<IS_PACK>, quantity: Quantity, decimals: usize) -> String {
     let (unit, factor) = screen_unit(quantity.row().unit);
     match values.get(quantity) {
@@ -96,7 +96,7 @@ fn with_std<const IS_PACK: bool>(values: &Values<IS_PACK>, quantity: Quantity, d
     }
 }
 
-/// Formats a value without its standard deviation, or a dash.
+/// Formats a value without its standard deviation; an unknown value becomes a dash.
 fn mean<const IS_PACK: bool>(values: &Values<IS_PACK>, quantity: Quantity, decimals: usize) -> String {
     let (unit, factor) = screen_unit(quantity.row().unit);
     shown(values.mean(quantity).map(|mean| factor * mean), decimals, unit)

@@ -48,8 +48,9 @@ pub(crate) struct Args {
     /// Configuration file
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// Values to try, for example capacity_low.warning=1.5,1.6. KEY is a rule with info, warning or severe (also .set, .clear),
-    /// threshold (of the highest configured severity), probability, debounce_s and so on; or any configuration key, such as
+    /// Values to try, for example capacity_low.warning=1.5,1.6. KEY is RULE.NAME for the alarms of a rule, where NAME
+    /// is info, warning, severe (also with .set or .clear), threshold (that of the highest configured severity),
+    /// probability, debounce_s and so on. KEY may also be any other configuration key, such as
     /// estimator.voltage_noise_v. Several options form a grid
     #[arg(long = "set", value_name = "KEY=V1,V2")]
     set: Vec<Choice>,

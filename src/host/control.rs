@@ -35,8 +35,8 @@ pub const MAX_CONNECTIONS: usize = 8;
 pub const MAX_PER_PROCESS: usize = 4;
 /// Longest request, bytes, including the end of the line. The longest valid request has less than 200 bytes.
 pub const MAX_REQUEST_BYTES: usize = 4096;
-/// Longest time for a request and for reading its answer. A script needs milliseconds, and a client must not keep one
-/// of the few slots for ever.
+/// Longest time in which a client must send its request, and longest time in which it must read the answer. A script
+/// needs milliseconds, and a client must not keep one of the few slots for ever.
 pub const MAX_SILENCE: Duration = Duration::from_secs(10);
 /// Maximum number of alarms in an answer. They make a line of a few hundred kilobytes, which is serialised in a few
 /// milliseconds. Further alarms are counted.

@@ -41,7 +41,7 @@ use live::ServiceLoop;
 use reload::Reload;
 use status_publisher::StatusPublisher;
 
-/// Maximum number of frames and events that wait for the core, half a second of a full 1 Mbit/s bus.
+/// Maximum number of frames and events that wait for the core. A full 1 Mbit/s bus sends this many in half a second.
 const INBOX: usize = 4096;
 
 /// Number of threads for work that would block the loop: reading a configuration, serialising long answers, and fitting

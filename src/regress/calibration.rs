@@ -25,7 +25,7 @@ pub const GAUSSIAN: f64 = 1.959_963_984_540_054;
 /// Maximum number of rows that are left out, one at a time. With this number, the standard error of the factor is below
 /// 1 %.
 pub(super) const CALIBRATION_ROWS: usize = 8000;
-/// Weight of the overall mean in the spread at a row, as a number of rows.
+/// Weight of the overall mean when the spread at a row is computed. The overall mean counts like this number of rows.
 const SHRINKAGE: f64 = 20.0;
 
 /// The factor, and the data from which the spread is computed.

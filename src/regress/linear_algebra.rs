@@ -7,7 +7,7 @@ use faer::linalg::cholesky::llt;
 use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
 use faer::{MatMut, MatRef, Par};
 
-/// The number of threads of the present thread pool, as faer needs it.
+/// Returns the number of threads of the present thread pool, in the form that faer needs.
 pub(super) fn parallelism() -> Par {
     match rayon::current_num_threads() {
         0 | 1 => Par::Seq,

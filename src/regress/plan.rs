@@ -169,8 +169,8 @@ impl Covariance {
         &work.values[self.plan.steps.len() - 1][..count]
     }
 
-    /// Adds the derivatives of `sum of weight * kernel` over a block of pairs to `gradient`, with respect to every
-    /// parameter except the noise.
+    /// Adds to `gradient` the derivatives of the weighted sum of the kernel values of a block of pairs, with respect to
+    /// every parameter except the noise.
     pub(super) fn add_gradient(&self, squares: &[f64], weights: &[f64], work: &mut Work, gradient: &mut [f64]) {
         let count = weights.len();
         self.forward(squares, count, work, true);
@@ -256,7 +256,7 @@ fn combine(below: &[Vec<f64>], children: &[usize], out: &mut [f64], join: impl F
     }
 }
 
-/// Sets the adjoint of each factor to the adjoint of the product times the values of all other factors.
+/// Sets the adjoint of each factor. It is the adjoint of the product, multiplied by the values of all other factors.
 fn product_adjoints(at: usize, children: &[usize], work: &mut Work) {
     let (below, here) = work.adjoints.split_at_mut(at);
     for child in children {

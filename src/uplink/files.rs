@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 /// Folder of the unit's credentials (`LoadCredential=`).
 const CREDENTIALS: &str = "CREDENTIALS_DIRECTORY";
-/// Largest file, bytes: ten times the certificates of all public authorities.
+/// Largest file, bytes: ten times the size of a file with the certificates of all public authorities.
 const MAX_BYTES: u64 = 1 << 20;
 
 /// Reads a file.

@@ -1,4 +1,4 @@
-//! The binary: parse, dispatch, exit code.
+//! The program `packwatch-uplink`: parses the command line, runs the command and returns its exit code.
 #![expect(clippy::print_stderr, reason = "this program writes to the terminal")]
 
 use std::process::ExitCode;

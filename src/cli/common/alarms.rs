@@ -11,7 +11,7 @@ const MAX_LIST: usize = 24;
 /// One row of the alarm table.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct AlarmGroup {
-    /// The alarm; in a row of several cells, the worst of them.
+    /// The alarm. In a row for several cells, the alarm with the worst value.
     pub(crate) alarm: Alarm,
     /// Cells of the row, ascending; empty for a single alarm.
     cells: Vec<CellIndex>,
@@ -95,7 +95,7 @@ pub(crate) fn cell(cell: Option<CellIndex>) -> String {
     cell.map_or_else(|| "pack".to_owned(), |cell| (u32::from(cell.0) + 1).to_string())
 }
 
-/// A rule's value with its unit; fractions as percent.
+/// Formats a value of a rule with its unit. Fractions are shown as percentages.
 pub(crate) fn with_unit(rule: Rule, value: f64) -> String {
     let unit = rule.spec().unit;
     match unit {

@@ -20,34 +20,34 @@ pub(crate) fn one_of<T: Copy + Send + Sync + 'static>(
     PossibleValuesParser::new(names).try_map(find)
 }
 
-/// A finite number.
+/// Parses a finite number.
 pub(crate) fn finite(text: &str) -> Result<f64, String> {
     within(text, |_| true, "a finite number")
 }
 
-/// A finite number accepted by `is_allowed`; the error says `allowed`.
+/// Parses a finite number that `is_allowed` accepts. The error says that the number must be `allowed`.
 pub(crate) fn within(text: &str, is_allowed: impl Fn(f64) -> bool, allowed: &str) -> Result<f64, String> {
     let value = text.trim().parse::<f64>().ok().filter(|value| value.is_finite() && is_allowed(*value));
     value.ok_or_else(|| format!("must be {allowed}"))
 }
 
-/// A number from `low` to `high`; `what` precedes the range in the error.
+/// Parses a number from `low` to `high`. The error states `what` and then this range.
 pub(crate) fn between(low: f64, high: f64, what: &'static str) -> impl Fn(&str) -> Result<f64, String> + Clone {
     move |text| within(text, |value| (low..=high).contains(&value), &format!("{what}{low} to {high}"))
 }
 
-/// A number above 0 and at most `high`; `what` precedes the range in the error.
+/// Parses a number above 0 and at most `high`. The error states `what` and then this range.
 pub(crate) fn above_0_to(high: f64, what: &'static str) -> impl Fn(&str) -> Result<f64, String> + Clone {
     move |text| within(text, |value| value > 0.0 && value <= high, &format!("{what}above 0, at most {high}"))
 }
 
-/// A whole number.
+/// Parses a whole number from `LOW` to `HIGH`.
 pub(crate) fn whole<const LOW: usize, const HIGH: usize>(text: &str) -> Result<usize, String> {
     let number = text.trim().parse::<usize>().ok().filter(|number| (LOW..=HIGH).contains(number));
     number.ok_or_else(|| format!("must be a whole number from {LOW} to {HIGH}"))
 }
 
-/// A whole number from `low` to `high`, of any integer type.
+/// Parses a whole number of any integer type, from `low` to `high`.
 pub(crate) fn integer<T>(low: T, high: T) -> impl Fn(&str) -> Result<T, String> + Clone
 where
     T: FromStr + PartialOrd + Display + Copy,
@@ -58,7 +58,7 @@ where
     }
 }
 
-/// The number of a cell, counted from 1.
+/// Parses the number of a cell, counted from 1.
 pub(crate) fn cell_number(text: &str) -> Result<u16, String> {
     let number = text.parse::<u16>().ok().filter(|number| (1..=MAX_CELLS).contains(&usize::from(*number)));
     number.ok_or_else(|| format!("must be a cell number, 1 to {MAX_CELLS}"))
@@ -77,7 +77,7 @@ pub(crate) fn away(text: &str) -> Result<Downtime, String> {
     }
 }
 
-/// A size in bytes: a whole number, optionally followed by B, KiB, MiB or GiB.
+/// Parses a size in bytes: a whole number, optionally followed by B, KiB, MiB or GiB.
 pub(crate) fn bytes(text: &str) -> Result<u64, String> {
     let units = [("KiB", 10), ("MiB", 20), ("GiB", 30), ("B", 0)];
     let unit = units.into_iter().find_map(|(unit, shift)| Some((text.strip_suffix(unit)?, shift)));
@@ -86,28 +86,28 @@ pub(crate) fn bytes(text: &str) -> Result<u64, String> {
     size.ok_or_else(|| "must be a whole number of bytes, or one with KiB, MiB or GiB, for example 64MiB".to_owned())
 }
 
-/// A number above 0; infinity is allowed.
+/// Parses a number above 0, which may be infinite.
 pub(crate) fn positive(text: &str) -> Result<f64, String> {
     let value = text.trim().parse::<f64>().ok().filter(|value| *value > 0.0);
     value.ok_or_else(|| "must be a number above 0".to_owned())
 }
 
-/// A finite number above 0.
+/// Parses a finite number above 0.
 pub(crate) fn above_0(text: &str) -> Result<f64, String> {
     within(text, |value| value > 0.0, "a finite number above 0")
 }
 
-/// A number strictly between 0 and 1.
+/// Parses a number between 0 and 1, excluding both.
 pub(crate) fn fraction(text: &str) -> Result<f64, String> {
     within(text, |value| value > 0.0 && value < 1.0, "above 0 and below 1")
 }
 
-/// A number from 0 to 1.
+/// Parses a number from 0 to 1.
 pub(crate) fn share(text: &str) -> Result<f64, String> {
     within(text, |value| (0.0..=1.0).contains(&value), "0 to 1")
 }
 
-/// A percentage above 0 and at most 100; a percent sign may follow.
+/// Parses a percentage above 0 and at most 100. A percent sign may follow.
 pub(crate) fn percent(text: &str) -> Result<f64, String> {
     let digits = text.trim().trim_end_matches('%');
     within(digits, |value| value > 0.0 && value <= 100.0, "a percentage above 0, at most 100")

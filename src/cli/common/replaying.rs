@@ -1,4 +1,4 @@
-//! Replays logs for a page about them. Returns statistics, and the state at the end.
+//! Replays logs for the commands that print a page about them. Returns statistics, and the state at the end.
 
 use std::path::PathBuf;
 

@@ -1,5 +1,5 @@
-//! Capacity that the pack loses because its cells differ, as JSON. The values are fractions of the mean cell capacity,
-//! Ah, and kWh of one string.
+//! Describes, as JSON, the capacity that the pack loses because its cells differ. Each amount of charge is stated as a
+//! fraction of the mean cell capacity, in Ah, and in kWh of one string.
 
 use serde::Serialize;
 

@@ -60,7 +60,7 @@ fn proposal(change: &Change) -> String {
     }
 }
 
-/// The report in one sentence.
+/// Summarises the report in one sentence.
 fn summary(report: &WiringReport) -> String {
     let count = |severity| report.findings.iter().filter(|finding| finding.severity == severity).count();
     let many = |n: usize, one: &str| if n == 1 { format!("1 {one}") } else { format!("{n} {one}s") };

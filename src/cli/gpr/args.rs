@@ -49,9 +49,9 @@ impl FileArgs {
 /// Form of the model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub(super) enum FormName {
-    /// All rows with all rows; up to a few thousand rows
+    /// Use the covariance of all pairs of rows; for up to a few thousand rows
     Exact,
-    /// Every row with its nearest rows (Vecchia); any number of rows
+    /// Use the covariance of each row with its nearest rows (Vecchia); for any number of rows
     Nearest,
 }
 

@@ -148,7 +148,7 @@ struct EachBar {
     logs: usize,
     finished: AtomicU64,
     frames: AtomicU64,
-    /// Time of the records already replayed, ms.
+    /// Recorded time already replayed, without sleep gaps, ms.
     awake_ms: AtomicU64,
 }
 

@@ -115,7 +115,8 @@ pub(crate) struct LifeArgs {
     /// Discharges to leave out before the capacity statistics start
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = integer::<usize>(0, usize::MAX))]
     pub(crate) skip_cycles: usize,
-    /// Use only a random window of each half-cycle, which contains from MIN to MAX of its charge: 0.4,0.7
+    /// Use only a random window of each half-cycle. The window contains a fraction of MIN to MAX of the half-cycle's
+    /// charge, for example 0.4,0.7
     #[arg(long, value_name = "MIN,MAX", value_parser = window)]
     pub(crate) window: Option<(f64, f64)>,
     /// Seeds of the random windows

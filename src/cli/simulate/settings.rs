@@ -68,7 +68,7 @@ pub(super) struct PackChanges {
     /// Capacity lost per cycle, Ah
     #[arg(long, value_name = "AH", value_parser = non_negative)]
     loss_per_cycle: Option<f64>,
-    /// Resistance gained per cycle, fraction of the new cell's
+    /// Resistance gained per cycle, as a fraction of a new cell's resistance
     #[arg(long, value_name = "FRACTION", value_parser = non_negative)]
     resistance_per_cycle: Option<f64>,
     /// Spread of capacity between cells, relative standard deviation [default: ev-day 0.01, others 0]
@@ -115,7 +115,8 @@ impl FaultArgs {
         self.balancing || !self.faults.is_empty()
     }
 
-    /// Adds faults and balancing to `sim`. `balancing`: `[input.balancing]`, whose `bleed_a` replaces the default.
+    /// Adds faults and balancing to `sim`. `balancing` is the configured `[input.balancing]`; its `bleed_a` replaces
+    /// the default.
     pub(super) fn apply(
         &self,
         sim: Simulation,

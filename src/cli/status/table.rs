@@ -101,7 +101,7 @@ fn pack(text: &mut String, document: &StatusDocument) {
     let _ = writeln!(text, "life       {}", remaining(pack));
 }
 
-/// Losses of the weakest cell.
+/// Describes the lost lithium and active material of the weakest cell.
 fn losses(values: &PackValues) -> String {
     if values.get(Quantity::LithiumLoss).is_none() {
         return "unknown".to_owned();
@@ -114,7 +114,7 @@ fn losses(values: &PackValues) -> String {
     )
 }
 
-/// Remaining life of the cell that reaches its end of life first.
+/// Describes the remaining life of the cell that reaches its end of life first.
 fn remaining(pack: &PackView) -> String {
     let quantities = [Quantity::RemainingCycles, Quantity::RemainingCyclesLow, Quantity::RemainingCyclesHigh];
     let [Some(cycles), Some(low), Some(high)] = quantities.map(|quantity| pack.values.mean(quantity)) else {

@@ -10,7 +10,7 @@ use crate::lab::fleet::judge::Horizon;
 use crate::lab::fleet::variants::VariantGrid;
 use crate::lab::fleet::whatif::{EndOfLife, LogResult, ThresholdScore, WhatifSettings};
 
-/// Number of columns after the columns of the alarm and of the settings.
+/// Number of columns that follow the alarm's columns and the columns of the settings.
 const OWN_COLUMNS: usize = 9;
 const SUMMARY_HEADS: [&str; OWN_COLUMNS] =
     ["threshold", "raised", "lead, days", "lead, cycles", "missed", "false", "open", "false raises", "flickers"];
@@ -29,16 +29,16 @@ pub(super) struct WhatifReport<'a> {
     pub(super) failed: Vec<String>,
 }
 
-/// One threshold under one setting, over all logs.
+/// Results of one threshold with one setting, over all logs.
 #[derive(Debug, Clone, Serialize)]
 pub(super) struct Summary {
     setting: usize,
     rule: Rule,
     severity: Severity,
     threshold: f64,
-    /// Number of logs in which it was raised.
+    /// Number of logs in which the alarm was raised.
     raised_logs: usize,
-    /// Median, 5 % and 95 % quantiles over the logs.
+    /// Lead time of the alarm: median, 5 % and 95 % quantiles over the logs, days.
     lead_days: Option<[f64; 3]>,
     lead_cycles: Option<[f64; 3]>,
     missed: Option<usize>,
@@ -172,7 +172,7 @@ impl WhatifReport<'_> {
         log.alarms.iter().filter(|row| self.rules.contains(&row.rule))
     }
 
-    /// Every threshold under every setting, over all logs.
+    /// Summarises the results of each threshold with each setting, over all logs.
     pub(super) fn summaries(&self) -> Vec<Summary> {
         let Some(first) = self.logs.first() else { return Vec::new() };
         // Every log has the same rows in the same order.

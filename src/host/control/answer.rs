@@ -43,7 +43,8 @@ fn shorten(alarms: &mut Vec<Alarm>) -> usize {
     omitted
 }
 
-/// The error for a command that selects no configured alarm.
+/// Returns the error for a command that selects no configured alarm; `None` = the command selects at least one
+/// alarm, or does not concern alarms.
 pub fn meaningless(engine: &AlarmEngine, command: &Command) -> Option<Answer> {
     let (Command::Acknowledge(which) | Command::Clear(which)) = command else { return None };
     if engine.all().any(|alarm| which.matches(alarm.rule, alarm.severity, alarm.cell)) {

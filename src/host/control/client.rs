@@ -27,7 +27,7 @@ impl ControlClient {
         Self { path: path.map_or_else(standard_path, Path::to_owned) }
     }
 
-    /// Whether a daemon may be listening. It is false only if the socket is missing or abandoned.
+    /// Whether a daemon may be listening. `false` = the socket is missing, or its daemon has ended.
     pub fn is_served(&self) -> bool {
         let absent = [ErrorKind::NotFound, ErrorKind::ConnectionRefused];
         UnixStream::connect(&self.path).map_or_else(|error| !absent.contains(&error.kind()), |_| true)

@@ -2,7 +2,7 @@
 //!
 //! | request | keys | answer |
 //! | --- | --- | --- |
-//! | `alarms` | `all` (default false): includes quiet alarms | [`AlarmList`] |
+//! | `alarms` | `all` (default false): also lists alarms that need no attention | [`AlarmList`] |
 //! | `acknowledge`, `clear` | `rule`, `severity`, `cell` (from 0); a missing key selects all | [`CommandOutcome`] |
 //! | `pack_replaced` | | [`CommandOutcome`] |
 //! | `poll` | `standby`: stops sending diagnostic requests | [`CommandOutcome`] |
@@ -36,7 +36,7 @@ const REQUESTS: [(&str, &[&str]); 6] = [
 pub enum Request {
     /// Lists the current alarms.
     Alarms {
-        /// Whether to include quiet alarms.
+        /// Whether to include alarms that need no attention.
         all: bool,
     },
     /// A command, which changes something.
@@ -87,7 +87,8 @@ pub struct CommandOutcome {
     pub time: Timestamp,
     /// Number of alarms that were changed.
     pub changed: u32,
-    /// Number of refused changes: alarms that are not healthy, or a test although no output is configured.
+    /// Number of refused changes. A change is refused if the alarm's value is not healthy; a test is refused if no
+    /// output is configured.
     pub refused: u32,
     /// The refused alarms.
     pub refused_alarms: Vec<Alarm>,

@@ -25,7 +25,7 @@ const ACCEPT_PAUSE: Duration = Duration::from_secs(1);
 pub struct PendingRequest {
     /// The request.
     pub request: Request,
-    /// The channel for its answer.
+    /// The channel to which the loop sends the answer.
     pub answer: oneshot::Sender<Answer>,
 }
 

@@ -57,7 +57,7 @@ pub struct ObservedFrames {
     pub ended: bool,
     /// Frames of other rules with the test marker. They show that another test is running.
     pub foreign: u64,
-    /// Frames without the marker, by the codes of rule and state.
+    /// Number of frames without the test marker, for each pair of rule code and state code.
     pub genuine: BTreeMap<(u8, u8), u64>,
     /// Frames that could not be decoded.
     pub unreadable: u64,

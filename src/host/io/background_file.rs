@@ -27,7 +27,7 @@ pub const MAX_FINISH: Duration = Duration::from_secs(5);
 #[derive(Debug)]
 pub struct BackgroundFile {
     piece: Vec<u8>,
-    /// Queue of the thread; `None` after the file was finished or has failed.
+    /// Sends pieces to the thread; `None` after the file was finished or has failed.
     pieces: Option<SyncSender<Vec<u8>>>,
     writer: Option<JoinHandle<io::Result<()>>>,
 }
@@ -43,8 +43,8 @@ impl BackgroundFile {
         Self::start(move |queue| write_all(file, queue))
     }
 
-    /// Like [`create`](Self::create), but writes segments that begin with `header`. The text itself contains the first
-    /// header.
+    /// Like [`create`](Self::create), but writes the bytes as segments. Every later segment starts with `header`; the
+    /// first segment starts with the caller's bytes, which must begin with `header`.
     ///
     /// # Errors
     /// Fails if the first segment cannot be created.

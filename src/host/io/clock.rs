@@ -195,7 +195,7 @@ impl StampMapper {
     }
 }
 
-/// The smallest (arrival - stamp), remembered for one to two windows.
+/// Keeps the smallest value of arrival minus stamp for one to two windows of [`HARDWARE_WINDOW_NS`].
 #[derive(Debug, Clone, Default)]
 struct HardwareClock {
     /// Smallest difference of this window and of the previous window, ns; `None` before the first stamp.

@@ -37,7 +37,7 @@ struct Slot<K> {
     task: AbortHandle,
 }
 
-/// Time since which a connection is idle; `None` = its request is being processed.
+/// Time at which the connection became idle; `None` = its request is being processed.
 #[derive(Debug, Clone)]
 pub(crate) struct Activity(Arc<Mutex<Option<Instant>>>);
 

@@ -103,7 +103,7 @@ impl CsvLog {
 }
 
 impl Sections {
-    /// The time of a row, which may start a new section.
+    /// Returns the time of a row. The row may be the first of a section.
     fn place(&mut self, row: &Row<'_>, time: Timestamp) -> Result<RowTime, TableError> {
         let section = row.bytes(self.column).ok_or_else(|| row.fault(self.column, "a section"))?;
         let is_new = self.current.as_deref() != Some(section);

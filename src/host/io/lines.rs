@@ -23,7 +23,7 @@ const BLOCK: usize = 256 * 1024;
 pub enum RawLine<'a> {
     /// A whole line.
     Whole(&'a [u8]),
-    /// The file's last line if it has no line feed. It may be torn.
+    /// The file's last line if it has no line feed. Such a line may be incomplete.
     Last(&'a [u8]),
     /// A line longer than 256 KiB; it was skipped.
     TooLong,
@@ -137,7 +137,7 @@ impl Lines {
         }
     }
 
-    /// The first line without consuming it (without its line feed).
+    /// Returns the first line, without its line feed, and does not consume it.
     ///
     /// # Errors
     /// Returns the errors of the source.

@@ -2,8 +2,8 @@
 //! zstd.
 //!
 //! The first line decides the format; for CSV, the file name decides too. Several logs are read one after another on
-//! one clock. If a log, or a CSV section without a start time, begins before the latest record read so far, it is moved
-//! to one second after this record, and an unknown gap precedes it. [`LogCounts`] counts everything that does not
+//! one clock. A log, or a CSV section without a start time, may begin before the latest record read so far. It is then
+//! moved to one second after this record, and an unknown gap precedes it. [`LogCounts`] counts everything that does not
 //! become a record.
 
 use std::collections::{BTreeMap, VecDeque};
@@ -109,7 +109,7 @@ struct ReadState {
     interfaces: Vec<String>,
     /// Parser that knows the interfaces.
     parser: LineParser,
-    /// Whether unconfigured interfaces get a number too.
+    /// Whether unconfigured interfaces also get a number, so that their records are returned.
     adopt: bool,
     shift_ns: i64,
     latest: Option<Timestamp>,

@@ -24,7 +24,7 @@ impl PlaceSetting {
         }
     }
 
-    /// The path, and whether it is required; `None` = switched off.
+    /// Returns the path, and whether it is required; `None` = the socket or the stored state is switched off.
     pub fn resolve(&self, standard: impl FnOnce() -> (PathBuf, bool)) -> Option<(PathBuf, bool)> {
         match self {
             Self::Off => None,
@@ -41,7 +41,7 @@ pub fn first_folder(variable: &str) -> Option<PathBuf> {
     std::env::split_paths(&folders).next()
 }
 
-/// A path with a suffix appended to its name.
+/// Returns a path with a suffix appended to its file name.
 pub fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
     name.push(suffix);

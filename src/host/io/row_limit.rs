@@ -1,6 +1,6 @@
 //! Limits the bytes of one row, because a compressed file of a few kilobytes may expand to one line of gigabytes.
 //!
-//! In: the source of the table. Out: the same bytes, or an error if more than [`MAX_ROW_BYTES`] contain no complete
+//! In: the source of the table. Out: the same bytes, or an error after more than [`MAX_ROW_BYTES`] without the end of a
 //! row.
 
 use std::cell::Cell;

@@ -180,8 +180,8 @@ pub(super) struct SegmentWriter {
 }
 
 impl SegmentWriter {
-    /// Renames the segments of an earlier run and starts the first segment. The text itself contains the first
-    /// `header`.
+    /// Renames the segments of an earlier run and starts the first segment. The text that the caller writes must begin
+    /// with `header`; every later segment gets its own `header`.
     ///
     /// # Errors
     /// Fails if a file cannot be renamed, deleted or created.

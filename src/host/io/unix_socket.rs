@@ -1,5 +1,5 @@
-//! Unix sockets and their files. If the daemon of a socket file has ended, the file is replaced. If this daemon is
-//! running, the file is kept.
+//! Opens and deletes Unix sockets and their files. When a daemon opens a socket whose file already exists, it replaces
+//! the file if the daemon that created it has ended. If that daemon still runs, the file is kept and opening fails.
 
 use std::fs::Permissions;
 use std::io::{self, ErrorKind};
@@ -126,7 +126,7 @@ async fn remove_stale(path: &Path) -> Result<(), BindError> {
     }
 }
 
-/// The process that listens, as reported by the kernel.
+/// Describes the process that listens, as reported by the kernel.
 fn owner(stream: &UnixStream) -> String {
     match stream.peer_cred() {
         Ok(who) => {

@@ -37,7 +37,7 @@ pub fn in_order<T: Sync, R: Send>(
     mut take: impl FnMut(&T, R) -> bool,
 ) {
     let jobs = jobs.clamp(1, items.len().max(1));
-    // One receiver is outside the queue while its result is awaited.
+    // The queue has one place less, because the receiver whose result is awaited is not in the queue.
     let (results, queue) = sync_channel(AHEAD * jobs - 1);
     let schedule = Mutex::new(Schedule { items: items.iter(), results });
     let begin = || schedule.lock().unwrap_or_else(PoisonError::into_inner).begin();

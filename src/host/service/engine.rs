@@ -42,7 +42,7 @@ pub(super) struct Engine {
     events: Option<BackgroundFile>,
     names: Vec<String>,
     log: EventLog,
-    /// Whether a file failed and was closed.
+    /// Whether a file could not be written and was therefore closed.
     has_lost_file: bool,
     /// State and history.
     store: Option<Store>,
@@ -127,8 +127,8 @@ impl Engine {
         })
     }
 
-    /// Handles one record. The authenticator of an authenticated frame is checked first. Returns the ticket of the
-    /// commit with the record's changes; `None` = nothing to store, or no store.
+    /// Handles one record. The authenticator of an authenticated frame is checked first. Returns the ticket (number) of
+    /// the commit that stores the record's changes; `None` = nothing to store, or no store.
     pub(super) fn handle(&mut self, record: &Record) -> Option<u64> {
         if let RecordKind::Frame { bus, frame } = &record.kind
             && let Some(check) = self.monitor.mac_check(*bus, frame)
@@ -225,7 +225,7 @@ impl Engine {
         })
     }
 
-    /// Sends all held frames when the daemon stops.
+    /// Sends all frames that still wait for the disk, when the daemon stops.
     pub(super) fn release_all(&mut self) {
         self.barrier.release(u64::MAX, |transmit| send(&self.links, self.key.as_ref(), transmit));
     }

@@ -2,7 +2,7 @@
 //! produces the same frames. The log line also states whether the kernel's stack is loaded, for users who look for the
 //! node there.
 
-/// Logs one line. If the kernel loads its stack on first use, it lists the stack only after that use.
+/// Logs one line. A kernel that loads its J1939 stack on first use lists the stack only after that use.
 pub(super) fn log_kernel_stack() {
     let kernel_stack = stack_state(std::fs::read_to_string("/proc/net/protocols").ok().as_deref());
     tracing::info!(kernel_stack, "J1939 runs in packwatch over raw CAN, not in the kernel");

@@ -107,7 +107,7 @@ impl ServiceLoop {
         }
     }
 
-    /// Notifies the service manager of readiness and of changes of the status line.
+    /// Notifies the service manager when the service is ready and when the status line changes.
     fn notify_manager(&mut self, now: Instant) {
         if now.duration_since(self.left_out_reported) >= Duration::from_secs(60) {
             self.left_out_reported = now;

@@ -1,10 +1,10 @@
 //! Holds the answers to commands until their changes are on disk, because a client that has received the answer may cut
 //! the power.
 //!
-//! In: the ticket of the commit with the command's outcome, the progress of the store, the time. Out: the answer, which
-//! states whether the outcome is stored. If the disk fails, the answer is sent at once. If the disk is slow, the answer
-//! is sent after [`MAX_WAIT`]. In both cases the command is in effect, and its outcome is stored when the disk works
-//! again.
+//! In: the outcome of a command and the ticket (number) of its commit; the progress of the store; the time. Out: the
+//! answer, which states whether the outcome is stored. If the disk fails, the answer is sent at once. If the disk is
+//! slow, the answer is sent after [`MAX_WAIT`]. In both cases the command is in effect, and its outcome is stored when
+//! the disk works again.
 
 use tokio::sync::oneshot;
 use tokio::time::{Duration, Instant};

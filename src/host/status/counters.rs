@@ -50,8 +50,8 @@ impl Latency {
         self.sum_s += seconds;
     }
 
-    /// Returns the smallest upper bound of a bucket that at least the fraction `share` of all frames does not exceed,
-    /// s. `None` = there are no frames, or the result would be in the last, unbounded bucket.
+    /// Returns the upper bound, s, of the first bucket at which the frames counted so far are at least the fraction
+    /// `share` of all frames. `None` = there are no frames, or this is the last, unbounded bucket.
     pub fn quantile_s(&self, share: f64) -> Option<f64> {
         let wanted = (share * self.frames as f64).ceil().max(1.0);
         let mut so_far = 0;

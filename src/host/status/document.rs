@@ -225,7 +225,7 @@ pub struct StatusCount {
 pub struct CommandStatus {
     /// Interface of the commands.
     pub interface: String,
-    /// Identifier of the commands, formatted as in [`MessageProtection`].
+    /// Identifier of the command message, formatted as in [`MessageProtection`].
     pub id: String,
     /// SecOC profile; `None` = the commands are unauthenticated.
     pub secoc: Option<String>,

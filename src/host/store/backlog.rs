@@ -19,7 +19,8 @@ pub(super) struct Backlog {
     batches: VecDeque<RowBatch>,
     rows: usize,
     lost: LossCount,
-    /// The losses that are reported with the rows taken last.
+    /// The numbers of dropped rows that the rows taken last report. They are subtracted from `lost` when that report is
+    /// on disk.
     reported: LossCount,
 }
 

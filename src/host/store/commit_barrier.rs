@@ -24,7 +24,7 @@ const MAX_HELD: usize = 4096;
 #[derive(Debug, Default)]
 pub struct CommitBarrier {
     held: VecDeque<(u64, Transmit)>,
-    /// Open tickets with their deadlines.
+    /// Tickets (numbers of commits) that are not on disk yet, with their deadlines.
     tickets: VecDeque<(u64, Instant)>,
 }
 

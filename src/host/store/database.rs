@@ -4,11 +4,18 @@
 //! | --- | --- | --- |
 //! | `pack` | a pack that was or is connected | always |
 //! | `moment` | the time of a commit: wall clock, inputs' clock, boot, pack | as long as its segment |
-//! | `half_cycle`, `capacity`, `loss_modes`, `remaining_life`, `model`, `alarm`, `reset` | one table per kind of event: a charge or discharge of a cell, a learned capacity, loss modes of a cell, a forecast, a model change, an alarm change, a reset. Rows are numbered across these tables | until the segment is deleted, oldest first |
-//! | `segment` | the rows of a day, with the end of their hash chain (`segments`) | always |
-//! | `meta` | one row: the number of segments, the vehicle | |
+//! | `half_cycle` | a charge or discharge of a cell | as long as its segment |
+//! | `capacity` | a learned capacity | as long as its segment |
+//! | `loss_modes` | the loss modes of a cell | as long as its segment |
+//! | `remaining_life` | a forecast of the remaining life | as long as its segment |
+//! | `model` | a change of the cell model | as long as its segment |
+//! | `alarm` | a change of an alarm | as long as its segment |
+//! | `reset` | a reset, a pack change, or a damaged file | as long as its segment |
+//! | `segment` | a day of rows, with the end of their hash chain (`segments`) | always |
+//! | `meta` | the number of segments, and the vehicle; the only row | always |
 //!
-//! Cells count from 0, times are nanoseconds. `PRAGMA user_version` is the format.
+//! The rows from `half_cycle` to `reset` are numbered across their tables. The oldest segments are deleted first; their
+//! rows in `segment` remain. Cells count from 0, times are nanoseconds. `PRAGMA user_version` is the format.
 //!
 //! * The database is one file in write-ahead mode with `synchronous=FULL`. A commit that has returned survives a power
 //!   cut, and a commit that has not returned leaves no trace.

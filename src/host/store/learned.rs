@@ -1,5 +1,5 @@
-//! Reads the history for a start. Alarm changes are read if they are newer than the stored state. If there is no valid
-//! state, learned values and all alarms are read. Only intact segments are read.
+//! Reads from the history what a starting daemon restores. Alarm changes are read if they are newer than the stored
+//! state. If there is no valid state, learned values and all alarms are read. Only intact segments are read.
 
 use rusqlite::{Connection, Row};
 

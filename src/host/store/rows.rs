@@ -46,7 +46,7 @@ pub enum HistoryTable {
     Capacity,
     /// Loss modes of the cells.
     LossModes,
-    /// Remaining lives, each of the cell that reaches its end of life first.
+    /// Forecasts of the remaining life. Each forecast is for the cell that reaches its end of life first.
     RemainingLife,
     /// Changes of the cell model learned on board.
     Model,

@@ -183,7 +183,7 @@ pub(super) fn hex(hash: &[u8]) -> String {
     hash.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// All segments, oldest first, each with the segment before it.
+/// Returns all segments, oldest first, each together with the segment before it.
 fn pairs(connection: &Connection) -> rusqlite::Result<Vec<(Segment, Segment)>> {
     let (mut before, mut pairs) = (Segment::START, Vec::new());
     let mut statement = connection.prepare(&format!("SELECT {COLUMNS} FROM segment ORDER BY id"))?;
@@ -195,7 +195,7 @@ fn pairs(connection: &Connection) -> rusqlite::Result<Vec<(Segment, Segment)>> {
     Ok(pairs)
 }
 
-/// Deletes the rows of the oldest segment that has rows, if there are more than `max_rows` rows in total or if the
+/// Deletes the rows of the oldest segment that still has rows, if the history has more than `max_rows` rows or if this
 /// segment ended before `horizon_ns`. A segment written while the wall clock was unset is at least as old as the
 /// segments after it.
 pub(super) fn delete_oldest(

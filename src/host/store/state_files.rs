@@ -6,10 +6,10 @@
 //! | `state-a.json.zst`, `state-b.json.zst` | the latest state and the one before it |
 //! | `state-aside.json.zst` | a state that could not be restored, kept until a start can restore it |
 //!
-//! A file is one zstd frame of JSON and a skippable frame with its SHA-256. Therefore `zstdcat` prints the JSON, and
-//! every flipped bit is detected. The file is written to a temporary name, synced and renamed, and the folder is
-//! synced. A state therefore survives a power cut once its write has returned. The newest state is the valid file with
-//! the highest number.
+//! A file contains a zstd frame of JSON, and a skippable frame with the SHA-256 of the first frame. Therefore `zstdcat`
+//! prints the JSON, and every flipped bit is detected. The file is written to a temporary name, synced and renamed, and
+//! the folder is synced. A state therefore survives a power cut once its write has returned. The newest state is the
+//! valid file with the highest number.
 //!
 //! Numbers are stored with nine digits or six decimals (see [`rounded`]), which halves the size to about 70 kB for a
 //! pack of 96 cells.
@@ -44,7 +44,7 @@ const MAX_JSON_BYTES: u64 = 64 << 20;
 /// Head of the frame that contains the hash: the magic number of a skippable zstd frame, and the length of the hash.
 const HASH_HEAD: [u8; 8] = [0x50, 0x2A, 0x4D, 0x18, 32, 0, 0, 0];
 
-/// A state, its time, and its folder and pack.
+/// A stored state, with its time, its state folder and the number of its pack.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(super) struct StateDocument {
     /// [`FORMAT`].

@@ -23,7 +23,7 @@ fn config() -> Config {
     config::load(&PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../config/measured.toml")).unwrap()
 }
 
-/// The log of a cell that is discharged and charged alternately, a quarter of an hour each.
+/// Returns the log of a cell that is alternately discharged and charged, for a quarter of an hour each.
 fn log(config: &Config, folder: &Path) -> LogSource {
     let mut text = String::from("time_s,current_a,voltage_v,temperature_c\n");
     let mut soc: f64 = 0.9;
@@ -49,7 +49,7 @@ fn log(config: &Config, folder: &Path) -> LogSource {
     LogSource::new(vec![path], options)
 }
 
-/// The state after `seconds` of the log, or at its end if `None`.
+/// Returns the state after `seconds` of the log, or at the end of the log if `seconds` is `None`.
 fn snapshot(seconds: Option<i64>, store: Option<Recorder>) -> Snapshot {
     let folder = tempfile::tempdir().unwrap();
     let config = config();
@@ -65,7 +65,7 @@ fn snapshot(seconds: Option<i64>, store: Option<Recorder>) -> Snapshot {
     replay::run(&mut source, monitor, Sinks::default(), settings, &mut |_| {}).unwrap().1.unwrap()
 }
 
-/// A monitor that has restored the state.
+/// Returns a monitor that has restored the state.
 fn restored(snapshot: Snapshot) -> Monitor {
     let mut monitor = Monitor::new(config().monitor);
     let time = snapshot.time;
@@ -240,7 +240,7 @@ fn failing_disk_is_retried_after_pauses() {
     }
     // The first retry comes after 1 s; the next pause is 2 s.
     assert_eq!((changes, progress.borrow().failures), (1, 1));
-    // Tickets that are answered during the pause cause no attempt.
+    // Work that is queued during the pause is reported as failed, without an attempt to write it.
     let write_queue = Arc::clone(&store.write_queue);
     for _ in 0..3 {
         let ticket = write_queue.submit(None, document(1, 1, 1), true);
@@ -293,7 +293,7 @@ fn database_damaged_while_running_is_set_aside() {
     assert!(place.path().join("packwatch.db.damaged-1").exists());
 }
 
-/// A monitor whose state was taken at that time.
+/// Returns a monitor whose time is `seconds`.
 fn at(seconds: f64) -> Monitor {
     let mut monitor = Monitor::new(config().monitor);
     monitor.handle(&Record::tick(Timestamp::from_secs(seconds)), &mut Outputs::default());

@@ -1,9 +1,9 @@
 //! The thread that writes to the disk, and the queue that it shares with the service loop.
 //!
-//! The loop queues rows and the latest state. The thread takes all queued work, commits the rows, and writes the state
-//! if it is due. Then it reports the last ticket that is completely on disk. It retries a failing disk after increasing
-//! pauses. During a pause, every ticket is answered at once as failed. A failing database does not prevent the state
-//! from being written.
+//! The loop queues rows and the latest state, and gets a number for them: the ticket. The thread takes all queued work,
+//! commits the rows, and writes the state if it is due. Then it reports the last ticket, and whether the attempt
+//! succeeded. It retries a failing disk after increasing pauses. During a pause, every ticket is reported at once as
+//! failed. A failing database does not prevent the state from being written.
 //!
 //! A start reapplies the alarm changes of rows that are newer than the stored state. Therefore the rows in the database
 //! must directly follow the stored state. To ensure this, the first rows after a start, after a failure and in a new
@@ -226,8 +226,8 @@ impl Writer {
         }
     }
 
-    /// Writes rows and state. If this fails, they wait for the next attempt. Without a state, nothing is written. After
-    /// a failure, however, the database is opened if possible.
+    /// Writes rows and state. If this fails, they wait for the next attempt. Without a state, nothing is written, but a
+    /// database that was closed after a failure is opened again if possible.
     fn write(
         &mut self,
         mut batches: Vec<RowBatch>,

@@ -82,7 +82,7 @@ struct Session {
     receipts: Receipts,
 }
 
-/// Time since which the broker has owed a receipt.
+/// Remembers since when the broker owes a receipt; `None` = it owes none.
 #[derive(Debug, Default)]
 struct Receipts {
     owed_since: Option<Instant>,
@@ -172,7 +172,7 @@ impl Session {
         }
     }
 
-    /// Sends a check if the latest answer still needs a proof.
+    /// Sends a check if a receipt is needed as the proof that the broker read the latest answer in time.
     fn handle_time(&mut self) -> Result<(), String> {
         if self.value_requests.handle_time(Instant::now())? && !self.outbox.check() {
             return Err("the broker reads no answers".to_owned());
@@ -180,12 +180,13 @@ impl Session {
         Ok(())
     }
 
-    /// Makes every value unknown, and gives the broker time to read this.
+    /// Makes every value unknown, and gives the broker time to read the message that does so.
     async fn withdraw(mut self, journal: &mut Journal) {
         self.publish(None, journal);
         drop(self.outbox);
         let until_end = async { while let Ok(Some(_)) = self.incoming.message().await {} };
-        // If the broker keeps the connection open, it has read everything within this time.
+        // Waits at most [`FAREWELL`], because the broker may keep the connection open. It has then had enough time to
+        // read all messages.
         let _ = timeout(FAREWELL, until_end).await;
     }
 }
@@ -251,7 +252,7 @@ async fn connect(endpoint: &Endpoint) -> Result<Channel, String> {
     }
 }
 
-/// An error and its causes; omits repeated texts.
+/// Describes an error and its causes; omits repeated texts.
 fn causes(error: &dyn std::error::Error) -> String {
     let mut texts = vec![error.to_string()];
     let mut next = error.source();

@@ -116,7 +116,7 @@ impl<'a> Device<'a> {
         self.message("binary_sensor", &key, &config)
     }
 
-    /// Name, topic and identifier match Battery-Emulator.
+    /// Returns the entity of a cell's voltage. Its name, topic and identifier are the same as in Battery-Emulator.
     fn cell(&self, index: usize) -> Message {
         let number = index + 1;
         let name = format!("Battery Cell Voltage {number}");

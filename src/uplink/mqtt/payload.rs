@@ -95,7 +95,7 @@ fn short(number: Option<f64>) -> String {
     rounded(number, 4).to_string()
 }
 
-/// A whole number; `null` if unknown or not finite.
+/// Rounds to a whole number; `null` if the value is unknown or not finite.
 fn whole(value: Option<f64>) -> Value {
     #[expect(clippy::cast_possible_truncation, reason = "voltages in mV are far within the range; `as` saturates")]
     value.filter(|value| value.is_finite()).map_or(Value::Null, |value| Value::from(value.round() as i64))

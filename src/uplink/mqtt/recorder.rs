@@ -2,8 +2,9 @@
 //!
 //! Input: the daemon's documents. Output: messages in the [`Queue`], even if the broker cannot be reached. The daemon's
 //! clock decides when a sample is due. Each document lists the latest events. The recorder finds new events by
-//! comparing the lists of two documents, also across its own restart. Events that leave the list between two documents
-//! are missed; a warning is logged. Events that leave it while this program does not run are missed.
+//! comparing the lists of two documents, also across its own restart. If so many events occur between two documents
+//! that some have left the list, these are missed, and a warning is logged. Events that leave the list while this
+//! program does not run are also missed.
 
 use std::cell::Cell;
 

@@ -166,7 +166,7 @@ fn plot(frame: &mut Frame<'_>, app: &App, theme: Theme, area: Rect) {
     let digits = if quantity == Quantity::Soc { 2 } else { 3 };
     let seconds = values.len();
     let title = format!(" {name} of cell {cell}, {least:.digits$} to {greatest:.digits$}{unit} in {seconds} s ");
-    // At least one dot for a known value: 1 to 1,001.
+    // The height of a known value is at least one dot: heights are 1 to 1,001.
     let dots = values.into_iter().map(|value| value.and_then(|value| Some((1000.0 * scale.share(value)?) as u64 + 1)));
     let dots: Vec<Option<u64>> = dots.collect();
     let sparkline = Sparkline::default().data(dots).max(1001).style(theme.colour(Color::Cyan));
@@ -262,7 +262,7 @@ fn counts(document: &StatusDocument) -> Vec<Line<'static>> {
     let most = latency.buckets.iter().map(|bucket| bucket.frames).max().unwrap_or(0).max(1);
     for bucket in latency.buckets.iter().filter(|bucket| bucket.frames > 0) {
         let name = bucket.le_s.map_or_else(|| "more".to_owned(), |seconds| format!("up to {} ms", 1e3 * seconds));
-        // 1 to 20 characters.
+        // A bar has 1 to 20 characters.
         let bar = "█".repeat(((20.0 * bucket.frames as f64 / most as f64).ceil() as usize).clamp(1, 20));
         text.push(Line::from(format!("  {name:<28}{:>12} {bar}", bucket.frames)));
     }

@@ -18,7 +18,7 @@ fn app() -> App {
     App::new(PathBuf::from("/run/packwatch/status.sock"), true)
 }
 
-/// A pack watched for `seconds`.
+/// Returns a view that has received documents of a pack for `seconds`.
 fn watched(cells: u16, seconds: usize) -> App {
     let mut app = app();
     for second in 0..seconds {

@@ -20,7 +20,7 @@ section! {
         chemistry: Option<String>, "", NotEmpty, Optional("none");
         /// Rated capacity, as on the label. SOH is relative to it.
         rated_capacity_ah: f64, "Ah", within(bounds::CONFIGURED_CAPACITY_AH), Required;
-        /// Charge of a new cell between full and empty open-circuit voltage.
+        /// Charge that a new cell delivers from full to empty, both defined by the open-circuit voltage.
         capacity_ah: f64, "Ah", within(bounds::CONFIGURED_CAPACITY_AH), Required;
         /// How the open-circuit curve changes as the cell loses capacity, if there is no table `[electrodes]`. 0: the curve shrinks evenly over SOC. 1: the top keeps its ampere-hours and the empty end is reached sooner.
         ocv_ageing_shift: Option<f64>, "", Between(0.0, 1.0), Optional("0");
@@ -88,15 +88,15 @@ section! {
     SpreadKeys at "spread" gives ModelSpread, |keys| {
         /// Constant error of the open-circuit curve, in addition to `curve_modes_v`.
         curve_v: f64, "V", Between(0.0, 1.0), Required;
-        /// Natural logarithm of the resistance relative to the model.
+        /// Resistance: spread of its natural logarithm relative to the model.
         log_resistance: f64, "", Between(0.0, 5.0), Required;
         /// Resistance of the slowest branch relative to the other resistances.
         slow_branch: f64, "fraction", Between(0.0, 5.0), Required;
-        /// Capacity.
+        /// Capacity relative to the model.
         capacity: f64, "fraction", Between(0.0, 1.0), Required;
         /// Relative error of the voltage drop, averaged over one second.
         drop_sqrt_s: f64, "", Between(0.0, 100.0), Required;
-        /// Two modes of the open-circuit curve's error, one value per `tables.soc`.
+        /// Two shapes (modes) of the error of the open-circuit curve. Each is a list with one voltage per entry of `tables.soc`.
         curve_modes_v: Vec<Vec<f64>>, "V", Between(-1.0, 1.0), Required =>;
     }
 }

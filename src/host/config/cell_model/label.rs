@@ -5,7 +5,7 @@ use super::source::{LearnedFrom, MeasuredRange, ModelSource, SourcedModel};
 use crate::cell::{Coverage, Label};
 use crate::monitor::{ModelState, ModelView};
 
-/// The model of a cell from its label; `None` = the voltages are not plausible for the chemistry.
+/// Returns the model made from a cell's label; `None` = the voltages are not plausible for the chemistry.
 pub fn of_label(label: &Label) -> Option<SourcedModel> {
     let source = ModelSource {
         state: ModelState::Prior,
@@ -17,7 +17,7 @@ pub fn of_label(label: &Label) -> Option<SourcedModel> {
     label.model().map(|model| SourcedModel { model, source })
 }
 
-/// The present model of a pack that learns its model on board; `None` = the pack's model comes from a file.
+/// Returns the present model of a pack that learns its model on board; `None` = the pack's model comes from a file.
 pub fn of_view(view: &ModelView<'_>) -> Option<SourcedModel> {
     let label = view.label?;
     let SourcedModel { model: prior, source } = of_label(&label)?;

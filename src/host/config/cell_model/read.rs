@@ -27,7 +27,7 @@ pub fn load_sourced(path: &Path) -> Result<SourcedModel, ConfigFaults> {
     model.filter(|_| faults.is_empty()).ok_or_else(|| faults.lines())
 }
 
-/// Like [`load_sourced`], but reads with `read` and adds to a shared list of faults.
+/// Like [`load_sourced`], but reads files with `read` and adds faults to the list `faults`.
 pub(crate) fn load_with(path: &Path, read: ReadFile<'_>, faults: &Faults) -> Option<SourcedModel> {
     let sources = Sources::read(&ConfigFiles::alone(path), read, faults)?;
     let document = Document::parse(&sources, faults);

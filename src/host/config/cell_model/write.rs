@@ -6,7 +6,7 @@ use toml::{Table as TomlTable, Value};
 use super::source::SourcedModel;
 use crate::cell::{AgeingLaw, CellModel, Electrodes, ModelSpread, Table};
 
-/// Returns the whole file. `head` is its first comment and must not contain line breaks.
+/// Returns the contents of the file. `head` becomes the comment in its first line and must not contain line breaks.
 pub fn text(sourced: &SourcedModel, head: &str) -> String {
     let SourcedModel { model, source } = sourced;
     let mut out = format!("# {head}\nformat = 1\nname = {}\n", quoted(&model.name));
@@ -93,7 +93,7 @@ fn spread(out: &mut String, spread: &ModelSpread, modes_v: &[Vec<f64>; 2]) {
     out.push_str("]\n");
 }
 
-/// The shortest decimal notation that parses to the same number.
+/// Formats a number in the shortest decimal notation that parses to the same number.
 fn number(value: f64) -> String {
     format!("{value:?}")
 }

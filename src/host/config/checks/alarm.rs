@@ -24,7 +24,7 @@ impl RatedCell {
         Self { capacity_ah, recharge_period_s: 3600.0 * window * capacity_ah / recharge.reference_current_a }
     }
 
-    /// The value that corresponds to 100 % for a rule; `None` if percentages are not defined for this rule.
+    /// Returns the value that counts as 100 % for a rule; `None` if percentages are not defined for this rule.
     fn whole(&self, rule: Rule) -> Option<f64> {
         match (rule, rule.spec().unit) {
             (_, Unit::AmpereHours) => Some(self.capacity_ah),
@@ -53,7 +53,7 @@ impl Alarm {
         all.into_iter().filter_map(|(key, severity, threshold)| Some((key, severity, threshold?)))
     }
 
-    /// The value at which the alarm of a threshold `set` clears.
+    /// Returns the value at which an alarm clears that was raised at the threshold `set`.
     fn clear(&self, rated: &RatedCell, set: f64, threshold: &Threshold) -> Option<f64> {
         match threshold.clear {
             Some(clear) => rated.value(self.rule, clear),
@@ -202,13 +202,13 @@ fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, thresh
     }
 }
 
-/// A value for a message, without the rounding errors of its computation.
+/// Rounds a value for a message, so that the message shows no rounding errors of the computation.
 fn rounded(value: f64) -> f64 {
     format!("{value:.9e}").parse().unwrap_or(value)
 }
 
-/// Notes a threshold of a fraction that is not between 0 and 1, because its percent sign is probably missing. Values
-/// would always or never exceed this threshold.
+/// Notes a threshold outside 0 to 1 for a value that is a fraction. Its percent sign is probably missing: every value,
+/// or no value, would exceed this threshold.
 fn check_unit(alarm: &Alarm, key: &str, set: f64) {
     let is_fraction = matches!(alarm.rule.spec().unit, Unit::Fraction | Unit::FractionPerDay);
     if is_fraction && !(0.0..=1.0).contains(&set) {

@@ -26,7 +26,7 @@ pub(crate) struct AnswerDefinition {
     identifier: u16,
     /// Time between requests in each [`CarState`](crate::can::poll::CarState), s.
     pub every_s: [Option<f64>; 3],
-    /// The signals of the answer; each layout begins at the first byte of its signal.
+    /// The signals of the answer. Bit positions in the layout of a signal count from the first byte of that signal.
     pub message: Message,
     /// The first byte of each signal, counted after the echoed service and identifier.
     first_bytes: Vec<usize>,
@@ -42,7 +42,7 @@ pub(crate) struct AnswerPlace<'d> {
 }
 
 impl AnswerDefinition {
-    /// The question on interface `bus` that this answer belongs to.
+    /// Returns the diagnostic request on interface `bus` that asks for this answer.
     pub(crate) fn question(&self, bus: BusIndex) -> Question {
         let (request, request_extension) = self.request;
         let (response, response_extension) = self.response;
@@ -148,7 +148,7 @@ fn can_id(raw: u32) -> CanId {
     }
 }
 
-/// Name and first bit of each signal that a table declares.
+/// Returns the name and the first bit of each signal that a table declares.
 fn numbered(keys: &AnswerSignalKeys) -> Vec<(String, u64)> {
     let first = u64::from(keys.bit);
     let has_number = keys.name.contains("{n}");
@@ -188,7 +188,7 @@ fn check_numbers(keys: &AnswerSignalKeys) {
     }
 }
 
-/// The signal as a DBC would declare it, with a layout that begins at its first byte.
+/// Returns the signal as a DBC would declare it. Bit positions in its layout count from its own first byte.
 fn as_in_a_dbc(keys: &AnswerSignalKeys, name: String, bit: usize) -> Signal {
     let in_byte = u16::try_from(bit % 8).unwrap_or_default();
     let (byte_order, start_bit) = match keys.byte_order {

@@ -13,7 +13,7 @@ use crate::config::schema::keys::{
 const MAX_INTERFACES: usize = 16;
 /// Longest kernel name of an interface (IFNAMSIZ without the closing zero).
 const MAX_INTERFACE_NAME: usize = 15;
-/// Longest name of a vehicle or pack, characters. One status line shows name, id and pack.
+/// Maximum number of characters in the name of a vehicle or pack, because one status line shows name, id and pack.
 const MAX_VEHICLE_TEXT: usize = 64;
 
 /// Notes keys that contradict each other.

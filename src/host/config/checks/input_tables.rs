@@ -1,4 +1,4 @@
-//! Checks of the input tables that work even on a faulty table: interface names and signal names.
+//! Checks interface names and signal names in the input tables, even in a table that has another fault.
 //!
 //! In: the document, because a faulty table is not in [`RawTables`] but must still be checked, so that every fault is
 //! reported at once.

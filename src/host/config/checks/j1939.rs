@@ -59,7 +59,7 @@ fn name(keys: &J1939) -> Option<Name> {
     Name::new(&fields).map_err(|error| keys.place.fault(error.field, error)).ok()
 }
 
-/// Returns the code of every threshold; `None` = a code is faulty (noted).
+/// Returns the trouble code of every threshold; `None` = a code is faulty (noted).
 fn codes(alarms: &[Alarm]) -> Option<Vec<AlarmCode>> {
     let mut codes: Vec<(&Alarm, AlarmCode)> = Vec::new();
     let mut is_good = true;

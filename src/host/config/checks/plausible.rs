@@ -87,7 +87,7 @@ fn by_table<'r, 'd>(
     tables
 }
 
-/// `Message.Signal` of a signal in the resolved signal's message.
+/// Returns the name `Message.Signal` of a signal that is in the same message as the resolved signal.
 fn name(resolved: &ResolvedSignal<'_>, signal: &Signal) -> String {
     format!("{}.{}", resolved.message.name, signal.name)
 }
@@ -159,7 +159,7 @@ fn other_order(layout: &SignalLayout) -> Option<(&'static str, SignalLayout)> {
     (layout.length_bits > 1).then_some((order, SignalLayout { byte_order, ..*layout }))
 }
 
-/// The multiplexors a signal depends on, with its condition on each.
+/// Returns the multiplexors that a signal depends on, each with the condition that its value must meet.
 fn selectors<'r>(resolved: &'r ResolvedSignal<'_>) -> impl Iterator<Item = (&'r MuxCondition, &'r Signal)> {
     let conditions = resolved.signal.conditions.iter();
     conditions.filter_map(|condition| Some((condition, resolved.message.signals.get(condition.selector)?)))
@@ -329,7 +329,7 @@ struct AllowedRange<'a> {
     place: &'a TablePlace,
     keys: [&'static str; 2],
     limits: Limits,
-    /// Limits stated by the DBC, after `scale`.
+    /// Limits stated by the DBC, converted with `scale`.
     dbc: (f64, f64),
     unit: &'static str,
     /// Input whose DBC states the range.

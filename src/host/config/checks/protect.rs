@@ -126,7 +126,7 @@ fn check_layout(keys: &ProtectedInput, inputs: &[&ResolvedSignal<'_>]) {
     }
 }
 
-/// A signal and the multiplexors it depends on.
+/// Returns the multiplexors that decide whether a frame contains the signal, then the signal itself.
 fn read_with<'m>(message: &'m Message, signal: &'m Signal) -> impl Iterator<Item = &'m Signal> {
     let selectors = signal.conditions.iter().filter_map(|condition| message.signals.get(condition.selector));
     selectors.chain([signal])

@@ -127,7 +127,8 @@ impl Databases {
         of_files.chain(of_answers)
     }
 
-    /// The other message of the same file that has the identifier of `message`, if there is one.
+    /// Returns another message of the same file with the same identifier as `message`; `None` = there is no such
+    /// message.
     fn twin(&self, file: &str, message: &Message) -> Option<&Message> {
         let databases = self.files.iter().filter(|(name, _)| name == file).map(|(_, database)| database);
         let mut messages = databases.flat_map(|database| &database.messages);

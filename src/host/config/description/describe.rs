@@ -19,7 +19,7 @@ use crate::monitor::MonitorConfig;
 use crate::quantity::{BusIndex, Channel};
 use crate::sample::VoltageSource;
 
-/// Meaning of a valid configuration.
+/// What a valid configuration means, in words and numbers.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Description {
     /// The configuration file.

@@ -22,8 +22,8 @@ pub(crate) struct SourceLine {
 }
 
 impl SourceLine {
-    /// Words that refer to this line in a fault at `other`. The file name is left out if both lines are in the same
-    /// file.
+    /// Describes this line for the text of a fault at the line `other`. The file name is left out if both lines are in
+    /// the same file.
     pub(crate) fn beside(&self, other: &Self) -> String {
         if self.file == other.file { format!("line {}", self.line) } else { self.to_string() }
     }

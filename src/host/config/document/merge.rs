@@ -8,7 +8,7 @@ use toml::de::{DeTable, DeValue};
 use super::faults::{Faults, KeyPlace, SourceLine, TablePlace};
 use super::source::{SourceFile, Sources};
 
-/// Longest quotation in a fault, characters: enough to recognise the text, short enough for one line.
+/// Maximum number of characters that a fault quotes: enough to recognise the text, and few enough for one line.
 const MAX_QUOTE: usize = 48;
 /// Largest number of syntax faults that are listed one by one. A file with more faults is probably not TOML.
 const MAX_SYNTAX_FAULTS: usize = 10;
@@ -82,7 +82,7 @@ impl<'t> Document<'t> {
         shorten(&words.join(" "))
     }
 
-    /// The text that a fault at `span` quotes as the value found. `span` is the position of `value` or of a part of it.
+    /// Returns the text that a fault quotes as the value found. `span` is the position of `value` or of a part of it.
     pub(crate) fn found(&self, value: &Spanned<DeValue<'_>>, span: &Range<usize>) -> String {
         let is_inline = self.written(&value.span()).starts_with('{');
         if value.get_ref().is_table() && !is_inline {

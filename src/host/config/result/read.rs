@@ -27,7 +27,8 @@ pub fn load_with(files: &ConfigFiles, read: ReadFile<'_>) -> Result<Config, Conf
     read_and(files, read, |_, _, _| ()).map(|(config, ())| config)
 }
 
-/// Like [`load_with`], and also returns the result of `then` for the tables, the configuration and the signals found.
+/// Like [`load_with`], but also calls `then` with the tables, the configuration and the signals found, and returns its
+/// result.
 ///
 /// # Errors
 /// Returns every fault found, not only the first.

@@ -23,7 +23,7 @@ pub(crate) enum ValueRange {
     NotEmpty,
 }
 
-/// The range of a threshold in the unit of its rule: no sensible value exceeds it.
+/// The range of every threshold, in the unit of its rule. No sensible threshold is outside this range.
 const WIDEST: ValueRange = ValueRange::Between(-1e9, 1e9);
 
 /// The range of a key with physical bounds.
@@ -89,7 +89,7 @@ pub(crate) trait Setting: Sized {
     fn read_tables(_: &TableReader<'_>, _: &Key, _: &Spanned<DeValue<'_>>) -> Option<Option<Self>> {
         None
     }
-    /// Value of an optional key that is absent; `None` = this type has no value for an absent key.
+    /// The value for an optional key that the file does not contain; `None` = this type has no such value.
     fn absent() -> Option<Self> {
         None
     }

@@ -137,7 +137,7 @@ impl<'a> SchemaReader<'a> {
     }
 }
 
-/// The names of the next path element below `path` that lead to a known table.
+/// Returns the names of the tables directly below `path` that are known tables or contain known tables.
 fn tables_below<'k>(path: &str, known: &'k [SectionInfo]) -> BTreeSet<&'k str> {
     let below = |info: &'k SectionInfo| match path {
         "" => Some(info.path),

@@ -1,5 +1,5 @@
-//! Declares tables and keys. One line of [`section!`] defines a key's type, how the key is read, its fault messages,
-//! and its text in the reference.
+//! Declares tables and keys. One line of [`section!`] determines the type of a key, how the key is read, its fault
+//! messages, and its text in the reference.
 //!
 //! [`section!`] declares a table of a file and, if the table `gives` a parameter struct, builds that struct from the keys.
 //! [`tables!`] lists the tables of a file. [`SchemaReader`] reads the declared tables from a document. It notes missing

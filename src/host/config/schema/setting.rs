@@ -44,7 +44,7 @@ impl Setting for f64 {
     }
 }
 
-/// The value of an integer in any of TOML's bases; `None` if it does not fit.
+/// Returns the value of an integer that is written in any of TOML's bases; `None` if it does not fit.
 fn whole(integer: &DeInteger<'_>) -> Option<i128> {
     i128::from_str_radix(integer.as_str(), integer.radix()).ok()
 }

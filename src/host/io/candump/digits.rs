@@ -37,7 +37,7 @@ pub(super) fn eight_digits(text: u64) -> Option<i64> {
     lanes(text ^ (u64::from(b'0') * ONES), 0x76 * ONES).map(number::<1>)
 }
 
-/// Returns `lanes`. Returns `None` if a lane is 0x80 or more, before or after the addition of `wrong`.
+/// Returns `lanes`, or `None` if a lane is 0x80 or more before or after `wrong` is added to it.
 #[inline(always)]
 fn lanes(lanes: u64, wrong: u64) -> Option<u64> {
     ((lanes | lanes.wrapping_add(wrong)) & HIGHS == 0).then_some(lanes)

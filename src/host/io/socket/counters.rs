@@ -26,7 +26,7 @@ pub struct LinkCounts {
     pub kernel_dropped: u64,
     /// Frames dropped by the daemon because its queue was full.
     pub queue_dropped: u64,
-    /// Reads that are not a valid frame.
+    /// Reads from the socket that did not return a valid frame.
     pub malformed: u64,
     /// Frames sent.
     pub sent: u64,

@@ -121,8 +121,8 @@ struct OpenSocket {
     pending: Option<QueuedFrame>,
 }
 
-/// Registers a socket with the runtime, for errors too: after its interface is removed, a socket is neither readable
-/// nor writable.
+/// Registers a socket with the runtime. Socket errors also wake the task, because a socket is neither readable nor
+/// writable after its interface is removed.
 #[expect(
     deprecated,
     reason = "its successor needs unsafe, which this crate forbids; RawSocket keeps its one descriptor open while it lives"

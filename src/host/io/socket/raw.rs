@@ -42,9 +42,9 @@ pub(super) struct RawRead {
     pub(super) stamps: KernelStamps,
 }
 
-/// Buffers of one call, which are reused. The kernel writes into each header how much space its control messages used.
-/// This number is also the space that the next frame in the same slot gets. The space is sufficient while every frame
-/// has a stamp. After a frame without a stamp, the headers are built again.
+/// Buffers of one call, which are reused. Each call replaces the size of the control buffer in a header by the size
+/// that the kernel used, and the next call offers only this size. The size is sufficient while every frame has a stamp.
+/// After a frame without a stamp, the headers are built again.
 struct Slots {
     headers: MultiHeaders<()>,
     bytes: [[u8; FD_BYTES]; CALL_BATCH],
@@ -95,7 +95,7 @@ pub(super) struct RawSocket {
     pub(super) index: u32,
 }
 
-/// An error of a CAN socket with its cause and the next step, if they are known.
+/// Describes an error of a CAN socket, with its cause and the next step if these are known.
 pub(super) fn explained(error: &io::Error) -> String {
     let cause = match error.raw_os_error().map(Errno::from_raw) {
         Some(Errno::EAFNOSUPPORT) => ": this kernel has no SocketCAN; load the module can_raw",

@@ -36,7 +36,7 @@ fn compare(before: (&Value, &Value), after: (&Value, &Value), what: &str) {
         }
     }
     assert_eq!(kept, kept.transpose(), "{what}");
-    // The smallest eigenvalue is the relative margin to a covariance that cannot be factorised. Quantities that are
+    // The smallest eigenvalue shows how far the covariance is from one that cannot be factorised. Quantities that are
     // configured not to be learned have no variance and are left out.
     let varied: Vec<usize> = (0..mean.len()).filter(|&i| covariance[(i, i)] > 0.0).collect();
     let scaled = DMatrix::from_fn(varied.len(), varied.len(), |a, b| {

@@ -1,10 +1,13 @@
 //! Signals outside the catalogue: derived from several values, from the alarms, or from the state of the daemon.
 //!
-//! VSS signals have the names, datatypes and units of releases 3 to 6. Some are omitted, because the status document
-//! has no value for them: `NetCapacity` and `GrossCapacity` (whole kWh; the daemon learns Ah),
-//! `StateOfCharge.CurrentEnergy` and the energies (no energy is estimated), the throughputs "over lifetime of the
-//! battery" (the daemon knows its own time only), `StateOfCharge.Displayed` (what the customer sees),
-//! `Charging.IsCharging` (true only with a charger; braking also charges the battery).
+//! VSS signals have the names, datatypes and units of releases 3 to 6. These VSS signals are omitted, because the
+//! status document has no value for them:
+//!
+//! * `NetCapacity` and `GrossCapacity`: whole kWh, but the daemon learns Ah.
+//! * `StateOfCharge.CurrentEnergy` and the energies: the daemon estimates no energy.
+//! * The throughputs "over lifetime of the battery": the daemon knows only the time in which it ran.
+//! * `StateOfCharge.Displayed`: the value that the vehicle shows to the customer.
+//! * `Charging.IsCharging`: true only with a charger, but braking also charges the battery.
 //!
 //! Overlay booleans begin with `Is`, as VSS recommends. No overlay signal has a temperature unit, because the unit's
 //! name changed between VSS 5 and VSS 6. No overlay signal has a list of allowed values: the databroker (0.7) checks
@@ -18,7 +21,7 @@ use serde::Serialize;
 use super::super::value::{DataType, Value, single};
 use super::{Origin, Signal, Source, of_cells};
 
-/// Path, datatype, unit, status fields, value, description.
+/// A signal: path, datatype, unit, status fields, value, description.
 type Row =
     (&'static str, DataType, Option<&'static str>, &'static str, fn(&StatusDocument) -> Option<Value>, &'static str);
 
@@ -252,7 +255,7 @@ fn count(count: usize) -> Option<Value> {
     count.try_into().ok().map(Value::Uint16)
 }
 
-/// A word of the status document, as in its JSON.
+/// Returns a word of the status document, spelled as in its JSON.
 fn word(value: Option<impl Serialize>) -> Option<Value> {
     match serde_json::to_value(value?) {
         Ok(serde_json::Value::String(word)) => Some(Value::Text(word)),

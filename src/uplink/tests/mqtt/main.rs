@@ -100,12 +100,13 @@ fn hour_without_broker_and_two_power_cuts_lose_nothing() {
     let mut latest = (0, 0);
     for sample in &samples {
         let now = (sample["sequence"].as_i64().unwrap(), rig::second_of(sample));
-        // Every sample arrives at least once and none is skipped: the next one follows, or an earlier one repeats.
+        // Every sample arrives at least once and none is skipped: each message carries the next sample, or repeats an
+        // earlier one.
         assert!(now.1 <= latest.1 + 1, "after second {} came {}", latest.1, now.1);
         latest = latest.max(now);
     }
     assert_eq!((latest.1, samples.len() >= HOUR as usize), (HOUR + 1, true));
-    // Each power cut repeats at most a window of messages.
+    // Each power cut repeats at most 20 messages, the largest number of unacknowledged messages.
     assert!(samples.len() <= HOUR as usize + 2 + 2 * 20, "{} samples", samples.len());
     let current: Vec<i64> = messages
         .iter()
@@ -113,7 +114,8 @@ fn hour_without_broker_and_two_power_cuts_lose_nothing() {
         .map(|(_, value)| rig::second_of(value))
         .collect();
     assert!(current.is_sorted(), "a current value is older than one before it: {current:?}");
-    // The broker also repeats what a stopped reader had not confirmed. Sequence numbers identify repetitions.
+    // If a reader stops before it confirms a message, the broker sends the message again. Such repetitions have the
+    // same sequence number, so the set removes them.
     let events: BTreeSet<i64> = messages
         .iter()
         .filter(|(topic, _)| topic == "packwatch/events")

@@ -40,11 +40,11 @@ section! {
         initial_log_resistance_std: Option<f64>, "", Between(0.0, 5.0), Optional("the cell model's `spread.log_resistance`, else 0.2");
         /// Process noise of the SOC.
         soc_noise_per_sqrt_s: f64, "fraction/sqrt(s)", DEVIATION, Default("3e-5");
-        /// Process noise of the SOC per charge moved. It covers errors of the current reading.
+        /// Process noise of the SOC while charge flows, per square root of the SOC change. It covers errors of the current reading.
         charge_noise_per_sqrt_soc: f64, "fraction/sqrt(SOC)", DEVIATION, Default("3e-3");
         /// Process noise of the branch voltages.
         branch_noise_v_per_sqrt_s: f64, "V/sqrt(s)", DEVIATION, Default("1e-3");
-        /// Process noise of ln(resistance). It covers ageing. It also covers differences between the true resistance and the tables, in the cold or within minutes of driving.
+        /// Process noise of ln(resistance). It covers ageing, and errors of the cell model's resistance tables: in the cold, and during a few minutes of driving.
         log_resistance_noise_per_sqrt_s: f64, "1/sqrt(s)", DEVIATION, Default("1e-3");
         /// Process noise of the SOC while no current is measured (vehicle asleep).
         gap_noise_per_sqrt_s: f64, "fraction/sqrt(s)", DEVIATION, Default("1.5e-5");
@@ -54,7 +54,7 @@ section! {
         away_use_per_h: f64, "fraction", Between(0.0, 100.0), Default("0.5");
         /// Largest current, per cell, that counts as rest. A larger current next to a gap in the readings may have flowed during the whole gap.
         rest_current_a: Option<f64>, "A", Between(0.0, 1e6), Optional("C/50: the rated capacity over 50 h");
-        /// `true`: a silent bus means zero current. If no current reading arrives for more than 5 s between two voltages of a cell, the cell rested between them. The current before and after does not matter, so voltages must arrive more often than every 5 s. `false`: the load before the gap may have continued, or a charger may have been connected.
+        /// `true`: a silent bus means zero current. If the current is unmeasured for more than 5 s between two voltages of a cell, the cell counts as resting in that time, whatever the current before and after. Use this only if each cell's voltage arrives more often than every 5 s; otherwise a failed current sensor is mistaken for a silent bus. `false`: the load before the gap may have continued, or a charger may have been connected.
         silence_is_rest: bool, "", Any, Default("false");
         /// Standard deviation of the voltage sensor's noise. If the signal's resolution is coarser, its rounding noise is added (5.8 mV for steps of 20 mV).
         voltage_noise_v: f64, "V", within(bounds::VOLTAGE_NOISE_V), Default("0.005");
@@ -76,7 +76,7 @@ section! {
         gate_sigma: f64, "", Above(0.0, 1e6), Default("5.0");
         /// Standard deviation of the cell model's error in a single reading, used by the gate and the consistency monitor.
         gate_model_error_v: f64, "V", Between(0.0, 10.0), Default("0.06");
-        /// Standard deviation of the same error, expressed as an error of SOC on the open-circuit curve.
+        /// Standard deviation of a further error of the cell model, stated as an error of the SOC on the open-circuit curve. It is added to `gate_model_error_v`.
         gate_soc_error: f64, "fraction", Between(0.0, 1.0), Default("0.02");
         /// If every reading has been outside the gate for this long, the filter restarts from the voltage.
         lost_after_s: f64, "s", Above(0.0, 1e9), Default("30.0");
@@ -88,8 +88,8 @@ section! {
 }
 
 impl Estimator {
-    /// Standard deviation of the voltage's quantisation, V (uniform: step / sqrt 12). Steps smaller than the sensor's noise
-    /// are already part of it.
+    /// Standard deviation of the voltage's quantisation, V (uniform: step / sqrt 12). It is 0 for steps smaller than
+    /// the sensor's noise, because that noise already contains them.
     pub(crate) fn rounding_v(&self, step_v: f64) -> f64 {
         if step_v > self.voltage_noise_v { step_v / 12.0_f64.sqrt() } else { 0.0 }
     }

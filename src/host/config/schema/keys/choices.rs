@@ -26,9 +26,9 @@ pub(crate) enum PositiveCurrent {
 /// Which byte of a number comes first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum WireOrder {
-    /// The most significant one.
+    /// The most significant byte.
     Big,
-    /// The least significant one.
+    /// The least significant byte.
     Little,
 }
 

@@ -162,7 +162,7 @@ signal_section! {
     /// One voltage per cell. In `signal`, `{n}` stands for the cell's number and `{m}` for any number, in message and signal name:
     /// `CellVoltages.Cell{n}`, `Module{m}.CellVoltage{n}`. Every cell must have exactly one signal. Multiplexed signals are supported.
     CellVoltageInput at "input.cell_voltage", "V per unit of the DBC" {
-        /// Number that `{n}` has for the first cell.
+        /// Number that replaces `{n}` in the signal name of the first cell.
         first: u16, "", Between(0.0, 60000.0), Default("1") =>;
     }
 }
@@ -170,9 +170,9 @@ signal_section! {
 signal_section! {
     /// One signal per cell that shows whether the BMS bleeds the cell. With this input, the leaks of all cells can be learned. `signal` is a pattern as in `[input.cell_voltage]`. A value other than 0 (after the DBC's factor, `scale` and `offset`) means that the cell is bled; for an inverted bit set `offset = -1.0`. A value is valid until the next value arrives, but for at most `max_age_s`. Frames that carry only these signals do not wake sleeping buses. Requires `pack.balancing = true`.
     BalancingInput at "input.balancing", "any unit" {
-        /// Number that `{n}` has for the first cell.
+        /// Number that replaces `{n}` in the signal name of the first cell.
         first: u16, "", Between(0.0, 60000.0), Default("1") =>;
-        /// Current of a balancing resistor while the bit is 1, at the BMS's balancing voltage. Parallel strings share it. At most a fifth of the pack's rated capacity per hour (C/5).
+        /// Current of a balancing resistor while the bit is 1, at the BMS's balancing voltage. Parallel strings share this current. Must be at most C/5 of the pack.
         bleed_a: f64, "A", Above(0.0, 1e6), Required =>;
         /// Longest time for which a value is valid. Must be longer than the BMS's send period, including its send period while the vehicle is parked. If it is shorter, the balancing state is unknown for the rest of each period.
         max_age_s: f64, "s", Above(0.0, 1e6), Default("10.0") =>;

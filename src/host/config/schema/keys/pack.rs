@@ -99,7 +99,7 @@ section! {
         severe: Option<Threshold>, "the rule's unit", Between(-1e9, 1e9), Optional("no such alarm");
         /// If the threshold has no `clear`, the alarm clears when the value is back on the healthy side by this much. An alarm on a learned value also waits until the true value is on the healthy side with a probability of 95 %.
         hysteresis: Option<f64>, "the rule's unit", Between(0.0, 1e9), Optional("2 % of the threshold");
-        /// What is compared with the threshold. "mean": the value itself. `{ probability = 0.95 }`: the alarm is raised when the true value is beyond the threshold with more than this probability. It clears when the probability of being beyond the clear threshold is at most the smaller of this and 0.5. With a probability above 0.5, the alarm is raised later and false alarms are rarer. With one below 0.5, it is raised earlier.
+        /// What is compared with the threshold. "mean": the value itself. `{ probability = 0.95 }`: the alarm is raised when the true value is beyond the threshold with more than this probability. The alarm clears when the probability that the true value is beyond the clear threshold is at most this probability or 0.5, whichever is smaller. With a probability above 0.5, the alarm is raised later and false alarms are rarer. With a probability below 0.5, the alarm is raised earlier.
         when: Comparison, "", Any, Default("\"mean\"");
         /// The value must be beyond the threshold for this long before the alarm is raised, and healthy for this long before it clears.
         debounce_s: f64, "s", Between(0.0, 1e9), Default("0.0");

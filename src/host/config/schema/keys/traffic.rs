@@ -121,12 +121,12 @@ frame_section! {
 }
 
 frame_section! {
-    /// The alarm frame. It is sent at once on a change, then three times 100 ms apart. In addition, each raised alarm is sent once per period. At most 100 frames per second (20 at once after a pause).
+    /// The alarm frame. It is sent at once on a change, then three times 100 ms apart. In addition, each raised alarm is sent once per period. At most 100 frames are sent per second, and at most 20 at once after a pause.
     OutputAlarm at "output.alarm"
 }
 
 frame_section! {
-    /// The digest frame: number, worst severity and checksum of all raised alarms, the state of every rule, and one threshold. All pages are sent in each period. Not sent if `output.dbc` lacks `PACKWATCH_Digest`.
+    /// The digest frame: number, worst severity and checksum of all raised alarms, the state of every rule, and, in turn, one of the configured thresholds. All pages are sent in each period. Not sent if `output.dbc` lacks `PACKWATCH_Digest`.
     OutputDigest at "output.digest"
 }
 
