@@ -54,7 +54,7 @@ pub struct AgedOcv {
     capacity_ah: Vec<f64>,
     /// `offset_v[c][s]`, V: row per capacity, column per SOC breakpoint.
     offset_v: Vec<Vec<f64>>,
-    /// Change of the offsets by one standard deviation of each mix, V, same shape; empty = unknown.
+    /// Change of `offset_v` by one standard deviation of each mix, V; empty = unknown.
     mixes_v: [Vec<Vec<f64>>; MIXES],
     /// Per capacity: lithium lost, as a fraction of the new cell's lithium, and the change of this loss by one standard
     /// deviation of each mix. Empty without electrodes.

@@ -60,7 +60,7 @@ pub struct Thermal {
 pub struct CellModel {
     /// Display name.
     pub name: String,
-    /// Label capacity, Ah: the reference of SOH.
+    /// Capacity on the label, Ah. The SOH is relative to this capacity.
     pub rated_capacity_ah: f64,
     /// Capacity of a new cell between its full and its empty open-circuit voltage at the reference temperature, Ah.
     pub capacity_ah: f64,

@@ -259,7 +259,8 @@ mod tests {
     use super::*;
     use crate::cell::model::tests::small_model;
 
-    /// The check after `use_s` of steps of 1 s at 1 C from SOC 0.9 down; `voltage` gives the innovation by SOC, V.
+    /// Returns the check after a discharge at 1 C from SOC 0.9 for `use_s` seconds, in steps of 1 s. `voltage` returns
+    /// the innovation at a SOC, V.
     fn after(use_s: u32, ratio: f64, voltage: impl Fn(f64) -> f64) -> ModelCheck {
         let mut check = ModelCheck::default();
         for second in 0..use_s {
@@ -347,7 +348,7 @@ mod tests {
         assert!((sums.explained() / expected - 1.0).abs() < 1e-9, "{} {expected}", sums.explained());
     }
 
-    /// A delta of the store keeps 20 bits of a number.
+    /// The store keeps only 20 bits of a number in a delta.
     #[test]
     fn rounded_sums_keep_their_evidence() {
         let mut sums = VoltageSums::default();

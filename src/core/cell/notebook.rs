@@ -179,7 +179,7 @@ impl Notebook {
         self.unread = 0;
     }
 
-    /// The same rows, all unused.
+    /// Returns the notebook with all rows marked as unused.
     pub fn all_unread(self) -> Self {
         Self { unread: u32::try_from(self.rows.len()).unwrap_or(u32::MAX), ..self }
     }
@@ -376,7 +376,7 @@ impl Notebook {
     }
 
     /// The past stretch whose removal loses the fewest rows of classes that no other stretch has. If several stretches
-    /// qualify, the oldest.
+    /// qualify, returns the oldest of them.
     fn least_missed(&self, config: &NotebookConfig) -> Option<u32> {
         let class_of = |row: &Row| row.class(config.rated_ah);
         let alone = |stretch: &[Row]| {

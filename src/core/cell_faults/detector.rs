@@ -128,7 +128,7 @@ impl WatchedCell {
 pub struct CellFaultDetector {
     cells: Vec<WatchedCell>,
     pack: PackSums,
-    /// Time of the middle of the last row, and SOC and charge (Ah) of the row.
+    /// The last row: the time of its middle, its SOC and its charge, Ah.
     last_row: Option<(Timestamp, f64, f64)>,
     /// Duration of the present rest, s.
     rest_s: f64,

@@ -102,7 +102,7 @@ pub struct Learner {
     in_doubt: Vec<usize>,
     /// Offset of the current sensor.
     offset: CurrentOffset,
-    /// Per cell: whether its capacity stays unchanged by half-cycles.
+    /// Per cell: whether half-cycles leave its capacity unchanged.
     #[serde(skip)]
     is_held: Vec<bool>,
 }

@@ -47,7 +47,7 @@ impl Balancer {
         // Largest current that counts as rest: 0.002 C.
         let is_rest = current_a.abs() <= 0.002 * pack.lowest_capacity_ah();
         self.charging_s = if current_a < 0.0 && !is_rest { self.charging_s + dt_s } else { 0.0 };
-        // Shortest charge, s: regenerative braking does not count.
+        // A charge must last at least this long, s, so that regenerative braking does not count as a charge.
         let ends_charge = self.charging_s >= 60.0 && pack.highest_soc() >= self.settings.from_soc;
         if ends_charge {
             (self.is_armed, self.has_rested) = (true, false);

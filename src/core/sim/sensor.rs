@@ -111,7 +111,7 @@ impl Sensor {
         self.error.offset
     }
 
-    /// Measures `truth`; `None` = dropped out. Both outcomes draw the same number of random numbers.
+    /// Measures `truth`; `None` = the sample is missing. Both outcomes draw the same number of random numbers.
     pub(crate) fn read(&mut self, truth: f64) -> Option<f64> {
         let e = self.error;
         let value = truth * (1.0 + e.gain) + e.offset + e.noise_std * self.noise.normal();

@@ -37,7 +37,7 @@ const NEGLIGIBLE_STD: f64 = 0.002;
 pub(super) struct Memory {
     /// Capacity, Ah, before the first voltage and across a restart.
     pub(super) capacity: ScalarGaussian,
-    /// Capacity of the open-circuit curve, Ah.
+    /// Capacity that selects the open-circuit curve of the aged cell, Ah.
     pub(super) curve: ScalarGaussian,
     pub(super) log_resistance: ScalarGaussian,
     pub(super) temperature_c: Option<f64>,

@@ -19,7 +19,7 @@ pub struct CellModule {
     pub model: CellModel,
     /// The pack's estimator settings with the initial capacity of this model.
     pub estimator: EstimatorConfig,
-    /// The model is from a file, not from the label.
+    /// Whether the model is from a file; otherwise, it is from the label.
     pub is_given: bool,
 }
 
@@ -35,11 +35,11 @@ struct Place {
 pub struct PackBank {
     /// The bank of the pack's own cells, then one bank per module.
     banks: Vec<EstimatorBank>,
-    /// One per cell of the pack.
+    /// Place of each cell of the pack.
     places: Vec<Place>,
     /// The pack's own cells, ascending.
     own: Vec<usize>,
-    /// Per module: its model is from a file.
+    /// Whether the model of each module is from a file.
     is_given: Vec<bool>,
 }
 

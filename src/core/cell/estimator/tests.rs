@@ -95,7 +95,7 @@ impl Truth {
     }
 }
 
-/// Discharges and charges between 0.9 and 0.1 with `dt_s`, for `hours`.
+/// Discharges and charges the cell between SOC 0.9 and 0.1 for `hours`, in steps of `dt_s`.
 fn cycle(estimator: &mut CellEstimator, config: &EstimatorConfig, truth: &mut Truth, dt_s: f64, hours: f64) {
     let model = small_model();
     let mut current_a = 1.0;
@@ -274,7 +274,8 @@ fn unknown_soc_variance_is_limited() {
 fn unseen_charge_moves_soc_not_capacity() {
     let (mut config, model) = (config(), small_model());
     config.gap.away_use_per_s = 0.5 / 3600.0;
-    // Discharges of a tenth on record, the charges between them not, and a load of C/20 next to the gaps.
+    // Discharges of a tenth of the capacity are measured, the charges between them are not. A load of C/20 flows before
+    // and after each gap.
     let mut truth = Truth { soc: 0.8, branch_v: 0.0, capacity_ah: 2.0, ratio: 1.0 };
     let mut estimator = CellEstimator::new(&config);
     for _ in 0..40 {

@@ -239,7 +239,8 @@ impl<'a> Search<'a> {
         Some(ScalarGaussian::from_std(capacity_ah, std_ah))
     }
 
-    /// Model, start of the last stretch and their standard deviations at the capacity found.
+    /// Computes the model and the start of the last stretch, both with their standard deviations, at the capacity
+    /// found.
     fn finish(&self, capacity: ScalarGaussian, start: &DVector<f64>) -> Option<Fit> {
         let Conditional { theta, normal, misfit, .. } = self.conditional(capacity.mean, start)?;
         let std_ah = capacity.std();

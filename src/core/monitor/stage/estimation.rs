@@ -28,7 +28,7 @@ use crate::sample::CellSample;
 /// enough to trip an alarm whose threshold is the limit.
 const DOUBT: f64 = 2.0;
 
-/// Path stored for a frozen voltage, V: far outside the range of the cells' common path.
+/// Value, V, that is stored as the path of a frozen voltage. It is far outside the range of the cells' common path.
 const FROZEN_PATH_V: f64 = 1e9;
 
 /// The estimation stage.
@@ -88,7 +88,8 @@ pub(crate) struct Consumed {
     pub(crate) charge_as: f64,
     offset_s: f64,
     pub(crate) unmeasured_s: f64,
-    /// The latest voltage, V, and the common path of the cells ([`CurrentCheck::path_v`]) at its last change, V.
+    /// The latest voltage, V, and the common path of the cells ([`CurrentCheck::path_v`]) at the last change of this
+    /// voltage, V.
     voltage_v: f64,
     path_v: f64,
 }

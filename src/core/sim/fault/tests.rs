@@ -9,7 +9,8 @@ fn fault(text: &str) -> Fault {
     text.parse().unwrap_or_else(|error| panic!("{text}: {error}"))
 }
 
-/// Four equal cells with ideal sensors at 1.325 A in both directions, sensor 1 on cell 1.
+/// Four equal cells with ideal sensors. The current is 1.325 A in both directions, and temperature sensor 1 is on cell
+/// 1.
 fn settings() -> Settings {
     let mut settings = Settings::of(Scenario::Paper, 2.6);
     settings.pack = crate::sim::PackSettings { cells: 4, ..plain_settings() };

@@ -96,8 +96,8 @@ fn is_possible<const L: usize, const N: usize, const T: usize>(x: &FilterState<L
     is_possible
 }
 
-/// Rest, s, after which further voltages of a cell add little information: what still relaxes then is slower than the
-/// branches.
+/// If a cell has rested for longer than this, s, further voltages add little information, because they only show
+/// relaxation that is slower than the branches.
 const REST_REPEATS_S: f64 = 1000.0;
 
 /// Updates the load's low-pass, the time at rest, and the time that the reading stands for.

@@ -20,7 +20,7 @@ pub(super) const COLD_SAG: usize = BY_TEMPERATURE + RESISTANCES;
 pub(super) const LOG_CAPACITY: usize = COLD_SAG + 1;
 pub(super) const OFFSET: usize = LOG_CAPACITY + 1;
 pub(super) const BEGINNINGS: usize = OFFSET + 1;
-/// Parameters of curve and SOC among those of a row.
+/// Number of parameters of the curve and the SOC that change the voltage of a row.
 pub(super) const CURVE_AND_SOC: usize = 6;
 
 /// Limits of the SOC at the start of a stretch.

@@ -11,7 +11,8 @@ use crate::cell::estimator::state_vector::{
 };
 use crate::filter::simd::{Lanes, Mask};
 
-/// Maximum time between two readings that counts for the random walk of the resistance, s: a cell hardly ages in a gap.
+/// Maximum time between two readings, s, that counts for the random walk of the resistance. A cell hardly ages in a
+/// gap.
 const MAX_WALK_S: f64 = 600.0;
 
 /// A branch at L table points, over the measured time.
@@ -71,7 +72,7 @@ struct BranchPrediction<const L: usize> {
     centre_v: Lanes<L>,
     /// Remaining fraction of the branch's voltage, at the centre.
     decay: Lanes<L>,
-    /// Voltage that a current adds to a new cell's, at the centre, ohm.
+    /// Voltage that a current adds to the branch of a new cell, per ampere, at the centre, ohm.
     gain_ohm: Lanes<L>,
     noise: Lanes<L>,
     parts: OddEvenParts<L>,

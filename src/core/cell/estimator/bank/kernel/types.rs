@@ -154,12 +154,12 @@ pub(super) struct ReadingVariances {
     pub(super) sensor: f64,
     /// One-second variance of the model's error, if the tables state none.
     pub(super) model: f64,
-    /// Per square of the voltage drop, over one second.
+    /// Variance of the model's error per square of the voltage drop, over one second.
     pub(super) drop: f64,
-    /// Per square of the load's voltage, over one second.
+    /// Variance of the model's error per square of the load's voltage, over one second.
     pub(super) load: f64,
     pub(super) gate: f64,
-    /// Per square of the slope of the open-circuit voltage.
+    /// Variance, for the gate, per square of the slope of the open-circuit voltage.
     pub(super) gate_soc: f64,
     /// Maximum test ratio of an accepted reading.
     pub(super) gate_limit: f64,
