@@ -1,4 +1,4 @@
-//! Units as written in a DBC.
+//! Parses units as written in a DBC.
 //!
 //! In: the text between the quotation marks. Out: the quantity and the conversion to the program's unit (A, V, degrees
 //! C). The DBC format does not define a list of units, so an unknown unit gives no information.

@@ -1,4 +1,4 @@
-//! Change of a cell type's open-circuit curve with lost capacity: voltage offsets over SOC and capacity.
+//! Computes how a cell type's open-circuit curve changes with lost capacity: voltage offsets over SOC and capacity.
 //!
 //! In: the electrodes of the new cell, or a shift of the SOC axis, and the SOC breakpoints of the model. Out: offsets,
 //! V, to be added to the new cell's open-circuit voltage. Offsets are interpolated linearly over SOC and capacity.

@@ -1,4 +1,5 @@
-//! Cell model of a cell that was never measured, from its label and the spread between cells of its chemistry.
+//! Creates the model of a cell that was never measured, from its label and from the spread between cells of its
+//! chemistry.
 //!
 //! In: chemistry, rated capacity (Ah), cut-off voltages (V). Out: a [`CellModel`]. Its [`ModelSpread`] and the modes of
 //! its curve state how much a cell may differ from it. No measured cell was used for the curve, so measured cells can
@@ -151,7 +152,7 @@ pub const FACTOR_SOC: [f64; 9] = [0.0, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0
 pub struct ResistanceFactors {
     /// ln of each resistance's ratio at 25 degrees C, at [`FACTOR_SOC`].
     pub ln: [[f64; FACTOR_SOC.len()]; RESISTANCES],
-    /// Deviation of each resistance's activation energy from the usual one, fraction.
+    /// Deviation of each resistance's activation energy from the usual activation energy, fraction.
     pub by_temperature: [f64; RESISTANCES],
 }
 

@@ -1,4 +1,5 @@
-//! Loss modes of an aged cell from its capacity: lithium inventory (LLI) and active material of each electrode (LAM).
+//! Computes the loss modes of an aged cell from its capacity: loss of lithium inventory (LLI) and loss of active
+//! material of each electrode (LAM).
 //!
 //! In: the learned capacity (Ah) and the table of lithium inventories of [`super::aged_ocv`]. Out: losses as fractions
 //! (0 to 1) of the model's new cell, each with its standard deviation. The formulas use d = 1 - C / C_new, the shares

@@ -34,7 +34,7 @@ const WINDOW_S: f64 = 3600.0;
 /// SOC.
 const CURVE_STD_V: [f64; 2] = [0.2, 0.4];
 
-/// Maximum weight of a witness relative to the other one.
+/// Maximum weight of a witness, relative to the other witness.
 const CORROBORATED: f64 = 4.0;
 
 /// Minimum sum of the witnesses that counts as a mismatch: three parts (constant, slope, resistance) of 1.4 standard

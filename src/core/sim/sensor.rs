@@ -1,4 +1,4 @@
-//! Sensors: readings of true values with errors.
+//! Simulates sensors: turns true values into readings with errors.
 //!
 //! `reading = round_to_resolution(truth (1 + gain) + offset + noise_std n)`. n is normally distributed and independent
 //! from sample to sample. A reading is missing with the probability `dropout`. Resolution 0 leaves quantisation to the

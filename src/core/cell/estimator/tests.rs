@@ -213,7 +213,8 @@ fn lost_current_widens_soc_linearly() {
         };
         estimator.step(&model, &config, &lost);
     }
-    // Any current between rest and the load before the stretch is equally likely to have flowed all the time.
+    // A constant current has flowed while no current was measured. Every current between 0 and the load before that
+    // time is equally likely.
     let load_std = 1200.0 / (3600.0 * capacity_ah) / 3.0_f64.sqrt();
     let added = (soc(&estimator).variance - before.variance).sqrt();
     assert!((added / load_std - 1.0).abs() < 0.05, "{added} {load_std}");
@@ -300,7 +301,7 @@ fn silent_gap_is_rest_if_configured() {
         config.gap.silence_is_rest = silence_is_rest;
         let mut estimator = CellEstimator::new(&config);
         cycle(&mut estimator, &config, &mut truth, 1.0, 0.1);
-        // A voltage without a current: nothing is learned from it.
+        // The voltage comes without a current, so the filter learns nothing from it.
         let step = CellStep { unmeasured_s, current_a: None, ..truth.step(&model, 1.0, 1.0) };
         estimator.step(&model, &config, &step);
         soc(&estimator).std()
@@ -387,7 +388,7 @@ fn aged_cell_starts_on_aged_curve() {
     let mut config = config();
     config.initial.capacity_ah = 1.5;
     config.initial.curve = ScalarGaussian::from_std(1.5, 0.0);
-    // So sure of its start that the first voltage does not move it.
+    // The initial SOC is so certain that the first voltage does not change it.
     config.initial.soc_std = 1e-3;
     let mut truth = Truth { soc: 0.4, branch_v: 0.0, capacity_ah: 1.5, ratio: 1.0 };
     let mut estimator = CellEstimator::new(&config);

@@ -1,4 +1,4 @@
-//! How far a constant error of the voltage may have moved the SOC.
+//! Determines how far a constant error of the voltage may have moved the SOC.
 //!
 //! In: a cell model and the standard deviation of a constant voltage error, V. Out: the standard deviation of the SOC
 //! that this error causes, fraction.

@@ -47,7 +47,7 @@ pub(crate) struct Estimation {
     checks: Vec<ModelCheck>,
     any_check_open: bool,
     pub(crate) any_mismatched: bool,
-    /// Compares the steps of the current with those of the voltages.
+    /// Compares the steps of the current with the steps of the voltages.
     pub(crate) current_check: CurrentCheck,
     /// Whether the current's reading is frozen or contradicts the voltages, or an input message has a second sender.
     pub(crate) is_current_doubtful: bool,
@@ -365,7 +365,8 @@ impl Estimation {
         self.any_mismatched = self.checks.iter().any(ModelCheck::is_mismatched);
     }
 
-    /// Whether a cell belongs to a module and its stored `check` was made with another cell model than the present one.
+    /// Whether a cell belongs to a module and its stored `check` was made with another cell model than the present
+    /// model.
     pub(crate) fn is_other_cell(&self, index: usize, check: &ModelCheck) -> bool {
         let id = || model_id(self.bank.model(index), self.bank.config(index).initial.log_resistance_std);
         !self.bank.is_own(index) && check.is_of_other(id())

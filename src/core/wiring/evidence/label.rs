@@ -1,4 +1,4 @@
-//! Evidence about a signal from its name and unit.
+//! Derives evidence about a signal from the signal's name and unit.
 //!
 //! In: message name, signal name and unit as written in the DBC. Out: points for each quantity of a pack, with their
 //! reasons in words, or `None` if the unit belongs to another quantity. The points are weights that were chosen on the

@@ -1,4 +1,4 @@
-//! A cell model's tables in the form the kernel reads.
+//! Holds a cell model's tables in the form that the kernel reads.
 //!
 //! Each SOC interval has one row. A row contains a line for every quantity (value at SOC 0, and slope), so one look-up
 //! gives all quantities without a division. Temperatures change slowly, and several cells share a temperature. The rows

@@ -1,4 +1,4 @@
-//! Predicted voltages of a notebook's rows from the parameters of a fit, with derivatives.
+//! Predicts the voltages of a notebook's rows from the parameters of a fit, with derivatives.
 //!
 //! In: parameters (indices below) and rows. Out: V. A row's voltage is linear in the curve and in all resistances.
 

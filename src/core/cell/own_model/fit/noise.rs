@@ -1,4 +1,4 @@
-//! Errors of a notebook's rows: their covariance, and the cost of residuals.
+//! Computes the covariance of the errors of a notebook's rows, and the cost of residuals.
 //!
 //! In: predictions and rows. Out: whitened residuals with their derivatives, and their cost (minus the logarithm of
 //! their density).

@@ -1,4 +1,4 @@
-//! State of the interfaces, for the alarm rule about interfaces.
+//! Tracks the state of the interfaces for the alarm rule about interfaces.
 //!
 //! An interface counts as faulty in three cases:
 //! * while it is down or missing;

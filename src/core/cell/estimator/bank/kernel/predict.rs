@@ -1,4 +1,4 @@
-//! The prediction: the circuit's equations over a measured time.
+//! Predicts the state over a measured time with the circuit's equations.
 //!
 //! In: a state, charge (A s) and time (s). Out: mean and covariance after this time, in the units of the states, and a
 //! mask of the lanes whose covariance was positive definite.

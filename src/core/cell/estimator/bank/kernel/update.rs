@@ -1,4 +1,4 @@
-//! The update of the state with a measured voltage.
+//! Updates the state with a measured voltage.
 //!
 //! In: a state and the reading, V. Out: the updated state, the innovation, V, its variance, V^2, and the test ratio.
 //! The test ratio is 1 for an innovation of one standard deviation. One mask marks the usable lanes, another one the

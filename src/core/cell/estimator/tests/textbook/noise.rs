@@ -1,4 +1,4 @@
-//! Process noise of a step, and measurement noise of a voltage reading, with the textbook filter.
+//! Computes the process noise of a step and the measurement noise of a voltage reading for the textbook filter.
 
 use nalgebra::{SMatrix, SVector};
 
