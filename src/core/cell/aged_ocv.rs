@@ -17,9 +17,9 @@ use crate::filter::locate;
 /// How the curve's change with ageing is computed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum AgeingLaw {
-    /// From a shift of the SOC axis; 0 = the curve shrinks evenly.
+    /// The change is computed from a shift of the SOC axis; 0 = the curve shrinks evenly.
     Shift(f64),
-    /// From the electrodes of the new cell.
+    /// The change is computed from the electrodes of the new cell.
     Electrodes(Electrodes),
 }
 
@@ -61,7 +61,7 @@ pub struct AgedOcv {
     lithium: Vec<Vec<f64>>,
     is_shift: bool,
     law: AgeingLaw,
-    /// Modes added by [`Self::add_spread`]; empty = none.
+    /// Modes of the curve's spread between cells, added by [`Self::add_spread`]; empty = no spread.
     spread_v: [Vec<f64>; MIXES],
 }
 
@@ -128,7 +128,8 @@ impl AgedOcv {
             let positive = half_width(curve(MATERIAL_SHARE, low, part)?, curve(MATERIAL_SHARE, high, part)?);
             Some([offset_v, negative, positive])
         };
-        // From the new cell down to the lowest capacity for which the electrodes still form a cell.
+        // The capacities of the table go from the new cell down to the lowest capacity at which the electrodes still
+        // form a cell.
         let aged: Vec<_> = LOST_CAPACITIES.iter().rev().map_while(|&part| Some((part, row(part)?))).collect();
         if aged.last().is_none_or(|(part, _)| *part > LEAST_KNOWN) {
             return None;

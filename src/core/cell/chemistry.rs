@@ -170,7 +170,7 @@ pub struct CurveOfCells {
     pub mean_v: Vec<f64>,
     /// Largest modes of the spread, V per standard deviation.
     pub modes_v: [Vec<f64>; MIXES],
-    /// Standard deviation of the rest, V.
+    /// Standard deviation of the spread that the modes do not explain, V.
     pub rest_v: Vec<f64>,
     /// Fall of the curve from 25 to 0 degrees C, V ([`cold_share`]).
     pub cold_sag_v: ScalarGaussian,

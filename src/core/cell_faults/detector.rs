@@ -1,5 +1,5 @@
-//! Detector for all cells of a pack. It adds samples to rows, compares the cells once per row and derives findings from
-//! the comparison (`judge`).
+//! Detector for all cells of a pack. It adds samples to rows (sums over a few minutes), compares the cells once per row
+//! and derives findings from the comparison (`judge`).
 //!
 //! The assumed errors of a row are rounded values for a circuit model and a typical cell monitor. They were checked
 //! with a simulated pack of ten cells and with the simulator's other packs. No measured pack was used to choose them.

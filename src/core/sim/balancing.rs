@@ -21,7 +21,8 @@ pub struct Balancing {
 }
 
 impl Balancing {
-    /// A typical BMS for a pack of `capacity_ah`: 1 mA per Ah (60 mA at 60 Ah), 10 mV, hysteresis 5 mV.
+    /// Settings of a typical BMS for cells of `capacity_ah`: bleeding takes 1 mA per Ah (60 mA at 60 Ah), starts at 10
+    /// mV and stops at 5 mV.
     pub fn usual(capacity_ah: f64) -> Self {
         Self { bleed_a: 1e-3 * capacity_ah, start_v: 0.010, stop_v: 0.005, from_soc: 0.7 }
     }

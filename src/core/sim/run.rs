@@ -104,7 +104,7 @@ pub struct Simulation {
     balancer: Option<Balancer>,
     has_bits: bool,
     asleep: Option<Asleep>,
-    /// Voltages at the taps, then at the channels, V.
+    /// Voltages, V: first at the taps; after the sensor faults were applied, at the channels.
     sensed_v: Vec<f64>,
 }
 

@@ -1,11 +1,11 @@
 //! Fits a model to the rows of a notebook over a grid of capacities.
 //!
-//! In: a [`Label`] and rows. Out: a [`Fit`]. For each capacity C of the grid, Gauss-Newton finds the most likely values
-//! of the other parameters (maximum a posteriori). These parameters are the open-circuit curve at the SOC breakpoints,
-//! the resistances relative to the label's model over SOC and by temperature, and the SOC s_k at which each stretch
-//! began: SOC = s_k - q / C after the charge q. The density of a capacity is the density of its best fit times the
-//! volume of the other parameters around this fit (Laplace). If the rows allow two capacities, the density has two
-//! maxima.
+//! In: a [`Label`] and rows (readings of the mean cell, averaged over a short time). Out: a [`Fit`]. For each capacity
+//! C of the grid, Gauss-Newton finds the most likely values of the other parameters (maximum a posteriori). These
+//! parameters are the open-circuit curve at the SOC breakpoints, the resistances relative to the label's model over SOC
+//! and by temperature, and the SOC s_k at which each stretch began: SOC = s_k - q / C after the charge q. The density
+//! of a capacity is the density of its best fit times the volume of the other parameters around this fit (Laplace). If
+//! the rows allow two capacities, the density has two maxima.
 //!
 //! # Errors of a row
 //! The errors of the circuit model repeat: rows at nearly the same SOC have the same errors of voltage, SOC and drop.

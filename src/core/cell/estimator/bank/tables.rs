@@ -34,7 +34,7 @@ pub(super) const fn branch(i: usize) -> usize {
     BRANCHES + 4 * i
 }
 
-/// The tables, `W` = 12 + 4 per branch.
+/// The tables. A row has `W` numbers: 12, and 4 more per branch.
 #[derive(Debug, Clone)]
 pub(super) struct Tables<const W: usize> {
     model: CellModel,

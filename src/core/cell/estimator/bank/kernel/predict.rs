@@ -15,7 +15,7 @@ use crate::filter::simd::{Lanes, Mask};
 /// gap.
 const MAX_WALK_S: f64 = 600.0;
 
-/// A branch at L table points, over the measured time.
+/// Values of a branch at L table points, for the measured time.
 struct BranchStep<const L: usize> {
     /// Resistance of new cells, ohm.
     r_ohm: Lanes<L>,
@@ -166,7 +166,7 @@ pub(in crate::cell::estimator::bank) fn predict<const L: usize, const N: usize, 
         p[at(i, CAPACITY)] = sum(capacity_column, odd);
         for j in BRANCHES..=i {
             let (other, other_decay) = &done[j];
-            // One factor moves all columns beyond the second.
+            // All columns beyond the second are multiplied by the same factor.
             let others = x.covariance[at(i, j)] - l[0][i] * l[0][j] - l[1][i] * l[1][j];
             p[at(i, j)] = odd[0] * other.odd[0]
                 + odd[1] * other.odd[1]

@@ -139,7 +139,7 @@ pub(in crate::cell::estimator::bank) struct KernelConstants {
     pub(super) consistency_window_s: f64,
 }
 
-/// Variances that the states gain.
+/// Variances that the states gain through process noise.
 #[derive(Debug, Clone, PartialEq)]
 pub(in crate::cell::estimator::bank) struct ProcessVariances {
     pub(in crate::cell::estimator::bank) soc_per_s: f64,
@@ -152,7 +152,7 @@ pub(in crate::cell::estimator::bank) struct ProcessVariances {
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct ReadingVariances {
     pub(super) sensor: f64,
-    /// One-second variance of the model's error, if the tables state none.
+    /// Variance of the model's error over one second; used if the tables state no error.
     pub(super) model: f64,
     /// Variance of the model's error per square of the voltage drop, over one second.
     pub(super) drop: f64,
@@ -222,7 +222,7 @@ impl<const N: usize, const T: usize> FilterState<1, N, T> {
         }
     }
 
-    /// The state without its lane.
+    /// Returns the state as a [`Gaussian`].
     pub(in crate::cell::estimator::bank) fn gaussian(&self) -> Gaussian {
         let (mut mean, mut covariance, mut by_constant) = (SVector::zeros(), SMatrix::zeros(), SMatrix::zeros());
         for i in 0..N {

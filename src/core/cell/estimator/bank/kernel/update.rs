@@ -20,9 +20,9 @@ use crate::filter::simd::Lanes;
 
 /// Predicted voltage.
 struct PredictedVoltage<const L: usize> {
-    /// At the centre, V.
+    /// Voltage at the centre sigma point, V.
     centre_v: Lanes<L>,
-    /// Over the pairs of the first columns.
+    /// Odd and even parts of the voltage over the pairs of the first columns.
     parts: OddEvenParts<L>,
     /// Slope of the open-circuit voltage, V per unit of SOC.
     slope_v: Lanes<L>,
