@@ -194,7 +194,7 @@ impl ModelCheck {
     /// Takes the evidence that is due for a cell of rated capacity `rated_ah`, Ah. `evidence` is `None` if the filter
     /// has none.
     pub fn judge(&mut self, evidence: Option<ModelEvidence>, rated_ah: f64) {
-        // One reading stands for at most 90 s. Currents below C/50 do not show the resistance.
+        // One reading represents at most 90 s. Currents below C/50 do not show the resistance.
         let (elapsed_s, charge_as) = (self.since_s.min(90.0), self.since_as);
         let is_used = charge_as.abs() >= 0.02 * rated_ah * self.since_s;
         (self.since_s, self.since_as) = (0.0, 0.0);

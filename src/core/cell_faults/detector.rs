@@ -220,7 +220,7 @@ impl CellFaultDetector {
         self.middle
     }
 
-    /// Time of the last row and SOC of the mean cell in it; `None` before the first row.
+    /// Time of the last row, and SOC of the mean cell in this row; `None` before the first row.
     pub(super) fn middle_soc(&self) -> Option<(Timestamp, f64)> {
         self.last_row.map(|(time, soc, _)| (time, soc))
     }

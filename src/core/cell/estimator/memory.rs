@@ -1,8 +1,8 @@
 //! The estimator's memory: rest, load, consistency, rejected readings, and the estimates that a restart of the filter
 //! keeps.
 //!
-//! In: steps (A, s) and the outcomes of updates. Out: the time that a reading stands for, s, the load, A, and whether the
-//! filter must restart. Stored numbers are checked ([`Memory::check`]).
+//! In: steps (A, s) and the outcomes of updates. Out: the time that a reading represents, s, the load, A, and whether
+//! the filter must restart. Stored numbers are checked ([`Memory::check`]).
 
 use serde::{Deserialize, Serialize};
 

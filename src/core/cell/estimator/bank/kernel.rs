@@ -100,7 +100,7 @@ fn is_possible<const L: usize, const N: usize, const T: usize>(x: &FilterState<L
 /// relaxation that is slower than the branches.
 const REST_REPEATS_S: f64 = 1000.0;
 
-/// Updates the load's low-pass, the time at rest, and the time that the reading stands for.
+/// Updates the load's low-pass, the time at rest, and the time that the reading represents.
 #[inline(always)]
 pub(super) fn update_memory<const L: usize>(
     c: &KernelConstants,

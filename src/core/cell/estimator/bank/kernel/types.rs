@@ -33,7 +33,7 @@ pub(in crate::cell::estimator::bank) const MEMORY: usize = 12;
 pub(in crate::cell::estimator::bank) const LOAD_A: usize = 0;
 /// Mean normalised innovation squared.
 pub(in crate::cell::estimator::bank) const MEAN_NIS: usize = 1;
-/// Time that the next reading stands for, s.
+/// Time that the next reading represents, s.
 pub(in crate::cell::estimator::bank) const INFORMATION_S: usize = 2;
 /// Time at rest, s.
 pub(in crate::cell::estimator::bank) const REST_S: usize = 3;
@@ -166,7 +166,7 @@ pub(super) struct ReadingVariances {
 }
 
 impl KernelConstants {
-    /// Time that a reading stands for, s.
+    /// Time that a reading represents, s.
     #[inline(always)]
     pub(in crate::cell::estimator::bank) fn information_s<const L: usize>(
         &self,
