@@ -190,23 +190,23 @@ pub enum FrameOutcome<'a> {
     Nothing,
     /// The frame starts a response. The values of the response count as measured now.
     Begun {
-        /// Index in [`Listener::counts`].
+        /// Index of the controller in [`Listener::counts`].
         controller: usize,
     },
     /// The frame continues a response.
     Continued {
-        /// Index in [`Listener::counts`].
+        /// Index of the controller in [`Listener::counts`].
         controller: usize,
     },
     /// A negative response.
     Refused {
-        /// Index in [`Listener::counts`].
+        /// Index of the controller in [`Listener::counts`].
         controller: usize,
         refusal: Refusal,
     },
     /// A complete response.
     Whole {
-        /// Index in [`Listener::counts`].
+        /// Index of the controller in [`Listener::counts`].
         controller: usize,
         /// Configuration of the response.
         answer: &'a Answer,

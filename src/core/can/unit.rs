@@ -28,7 +28,7 @@ pub struct SignalUnit {
     /// Converts to the program's unit: value x factor + offset. The factor is 1 for quantities that packwatch does not
     /// read.
     pub factor: f64,
-    /// See `factor`.
+    /// Offset of the conversion, see `factor`.
     pub offset: f64,
 }
 

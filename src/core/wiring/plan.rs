@@ -62,7 +62,7 @@ pub struct PackPlan {
 /// One interface.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct InterfacePlan {
-    /// Kernel name.
+    /// Name of the interface in the kernel.
     pub name: String,
     /// Whether FD frames are accepted.
     pub fd: bool,

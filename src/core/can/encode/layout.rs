@@ -134,9 +134,9 @@ pub enum E2eSetting {
     /// The protection of the base; the built-in base has no protection.
     #[default]
     AsBase,
-    /// No protection.
+    /// The message has no protection.
     Off,
-    /// This protection.
+    /// The message has this protection.
     On(Protection),
 }
 

@@ -81,7 +81,7 @@ pub struct ModelView<'a> {
     pub chemistry: Option<Chemistry>,
     /// Number of fits.
     pub fits: u32,
-    /// Number of models that were dropped in favour of the previous model or the label's model.
+    /// Number of times a model was dropped and the previous model or the label's model was used again.
     pub taken_back: u32,
     /// The latest changes, oldest first.
     pub changes: &'a [ModelChange],

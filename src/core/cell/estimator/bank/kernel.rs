@@ -36,7 +36,7 @@ use crate::cell::estimator::state_vector::{CAPACITY, LOG_RESISTANCE};
 use crate::filter::simd::{Lanes, Mask};
 use crate::quantity::bounds::{self, Bounds};
 
-/// One ordinary step.
+/// Computes one ordinary step of L cells.
 #[inline(always)]
 pub(super) fn step<const L: usize, const N: usize, const T: usize, const W: usize>(
     tables: &mut Tables<W>,

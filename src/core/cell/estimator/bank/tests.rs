@@ -1,4 +1,4 @@
-//! Compares the kernel with the textbook filter, and a cell in a pack with the same cell alone.
+//! Compares the kernel with the textbook filter. Also compares a cell in a pack with the same cell alone.
 
 use super::*;
 use crate::cell::circuit::{self, BranchAt};

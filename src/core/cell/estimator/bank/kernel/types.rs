@@ -127,7 +127,7 @@ pub(in crate::cell::estimator::bank) struct StepOutcome<const L: usize> {
 pub(in crate::cell::estimator::bank) struct KernelConstants {
     /// Spread s of the sigma points.
     pub(super) scale: f64,
-    /// beta - alpha^2.
+    /// Factor of m m' in the covariance: beta - alpha^2.
     pub(super) excess: f64,
     pub(super) euler: bool,
     pub(in crate::cell::estimator::bank) process: ProcessVariances,
