@@ -328,7 +328,7 @@ impl Label {
     }
 }
 
-/// Load at which an error of the resistances counts as voltage error of the model, per rated capacity: C/2.
+/// At this load, C/2, an error of the resistances counts as voltage error of the model. Stated per rated capacity.
 pub const USUAL_LOAD_PER_H: f64 = 0.5;
 
 #[cfg(test)]

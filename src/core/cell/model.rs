@@ -153,7 +153,8 @@ impl Table {
     }
 }
 
-/// Mean slope of the open-circuit curve, V per unit of SOC, below which an electrode is a mixture of two phases.
+/// If the mean slope of the open-circuit curve is below this value, V per unit of SOC, an electrode is a mixture of two
+/// phases.
 const TWO_PHASE_SLOPE_V: f64 = 0.15;
 
 /// Standard deviation of the hysteresis of a two-phase electrode around the middle of both branches, V. For LFP, the

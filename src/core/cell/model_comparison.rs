@@ -7,9 +7,9 @@ use super::chemistry::USUAL_LOAD_PER_H;
 use super::model::CellModel;
 use super::model_bands::CURVE_C;
 
-/// Steps of SOC over the curve.
+/// Number of SOC steps over the curve.
 const CURVE_STEPS: u32 = 100;
-/// Steps of SOC for looking up a voltage under load: a multiple of the curve's steps.
+/// Number of SOC steps for looking up a voltage under load. It is a multiple of the curve's number of steps.
 const READ_STEPS: u32 = 400;
 /// SOC range in which SOC errors count. Outside this range, curves are so steep that the SOC errors of any model are
 /// small.

@@ -23,7 +23,7 @@ pub struct Plan {
     pub unconfigured: Vec<SignalPlan>,
     /// The pack.
     pub pack: PackPlan,
-    /// Ages from which a current, a voltage and a temperature are stale, s; `None` = never.
+    /// Ages, s: an older reading of a current, a voltage or a temperature is stale; `None` = never stale.
     pub max_ages_s: [Option<f64>; 3],
     /// Smallest and largest plausible value of current, cell voltage and temperature; infinite = unlimited.
     pub limits: [(f64, f64); 3],

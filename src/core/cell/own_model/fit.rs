@@ -40,7 +40,7 @@ const CAPACITIES: usize = 20;
 const FIRST_CAPACITY: usize = 12;
 /// The search ends if the cost exceeds the lowest cost by more than this.
 const HOPELESS: f64 = 25.0;
-/// Points between two capacities of the grid at which the density is evaluated.
+/// Number of points per step of the capacity grid. The density is evaluated at these points.
 const FINE: usize = 20;
 
 /// A fit.

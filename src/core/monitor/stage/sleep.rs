@@ -15,7 +15,7 @@ pub(crate) const QUIET_S: f64 = 0.25;
 /// State of the bus sleep.
 #[derive(Debug)]
 pub(crate) struct BusSleep {
-    /// Silence after which the buses count as asleep, s; `None` = never.
+    /// If the buses are silent for longer than this, s, they count as asleep; `None` = never.
     pub(crate) after_s: Option<f64>,
     /// Start of the present sleep.
     pub(crate) since: Option<Timestamp>,

@@ -1,5 +1,5 @@
-//! Tests of the estimator with wrong initial values, a current sensor with an offset, and rests in which the cell still
-//! relaxes.
+//! Tests the estimator with wrong initial values, with an offset of the current sensor, and at rests during which the
+//! cell still relaxes.
 //!
 //! The simulated cell has a slow branch that the estimator's model lacks; there is no noise.
 
