@@ -15,7 +15,7 @@ use crate::quantity::{CellIndex, Timestamp};
 /// One input of an engine.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum AlarmInput {
-    /// [`AlarmEngine::observe`].
+    /// A value: input of [`AlarmEngine::observe`].
     Observe {
         rule: Rule,
         /// The cell; `None` = the pack.
@@ -30,16 +30,16 @@ pub enum AlarmInput {
         cell: Option<CellIndex>,
         valid: bool,
     },
-    /// [`AlarmEngine::poll`].
+    /// Time has passed: input of [`AlarmEngine::poll`].
     Poll,
-    /// [`AlarmEngine::handle_gap`].
+    /// A period without values: input of [`AlarmEngine::handle_gap`].
     Gap,
     Acknowledge(Selector),
     /// Clears alarms. A latched alarm ends, and the history of a past alarm is forgotten. A raised alarm that is not
     /// latched stays and counts as refused. A latched alarm whose value is beyond its threshold again also stays and
     /// counts as refused. Learned values do not change.
     Clear(Selector),
-    /// [`AlarmEngine::forget_learned`].
+    /// Another pack is connected: input of [`AlarmEngine::forget_learned`].
     ForgetLearned,
 }
 

@@ -26,7 +26,7 @@ use crate::filter::probability_below;
 /// How a value is compared with a threshold.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Comparison {
-    /// The value itself.
+    /// The value itself is compared with the threshold.
     Mean,
     /// The probability that the true value is beyond the threshold must exceed this level, between 0 and 1 (exclusive).
     Probability(f64),

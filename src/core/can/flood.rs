@@ -64,7 +64,7 @@ pub struct FloodProgress {
 struct LeakyBucket {
     bus: BusIndex,
     id: CanId,
-    /// Size of the burst that is admitted at once: its duration at the allowed rate, ns.
+    /// Time, ns, that the frames of the largest admitted burst take at the allowed rate.
     burst_ns: i64,
     /// Time up to which the allowed rate is spent.
     spent_until: Option<Timestamp>,
@@ -93,7 +93,7 @@ impl FloodGate {
         let frame_ns = (1_000_000_000 / i64::from(config.max_frames_per_s.get())).max(1);
         let bucket = |(bus, id, pages): (BusIndex, CanId, usize)| {
             let pages_ns = i64::try_from(2 * pages).unwrap_or(i64::MAX).saturating_mul(frame_ns);
-            // Burst that is admitted at once, ns: the frames of a tenth of a second.
+            // At the allowed rate, the frames of an admitted burst take at least a tenth of a second, ns.
             let burst_ns = 100_000_000.max(pages_ns).max(frame_ns);
             LeakyBucket { bus, id, burst_ns, spent_until: None, dropped: 0, flood: None }
         };

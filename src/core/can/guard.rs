@@ -21,7 +21,8 @@ use crate::can::e2e::{CheckConfig, Receiver, Status, StatusCounts};
 use crate::can::{CanId, Frame, FrameKind};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// Number of periods after the last frame at which a frame counts as missed. Each further period counts one more frame.
+/// If no frame arrives within this number of periods after the last frame, a frame counts as missed. Each further
+/// period counts one more frame.
 const MISSED_AFTER_PERIODS: f64 = 1.5;
 
 /// Configuration of one protected message.

@@ -34,12 +34,12 @@ const WINDOW_NS: i64 = 1_000_000_000;
 const EXCESS: f64 = 1.5;
 /// Number of additional frames that are allowed, because arbitration may have delayed them into the window.
 const DELAYED: f64 = 1.5;
-/// Number of consecutive windows with too many frames after which a second sender is found. A burst after a pause of
-/// the bus affects only one window.
+/// A second sender is found after this number of consecutive windows with too many frames. A burst after a pause of the
+/// bus affects only one window.
 const WINDOWS: u32 = 3;
-/// Number of consecutive normal windows after which the second sender is gone.
+/// The second sender counts as gone after this number of consecutive normal windows.
 const GONE_WINDOWS: u32 = 10;
-/// Number of consecutive windows with a similar number of frames after which a rate is steady.
+/// A rate counts as steady after this number of consecutive windows with a similar number of frames.
 const STEADY_WINDOWS: u32 = 20;
 /// Largest difference between similar numbers of frames: relative part, and number of frames added to it.
 const STEADY: (f64, f64) = (0.2, 1.0);

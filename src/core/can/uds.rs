@@ -190,23 +190,23 @@ pub enum FrameOutcome<'a> {
     Nothing,
     /// The frame starts a response. The values of the response count as measured now.
     Begun {
-        /// Index in [`Listener::counts`].
+        /// Index of the controller in [`Listener::counts`].
         controller: usize,
     },
     /// The frame continues a response.
     Continued {
-        /// Index in [`Listener::counts`].
+        /// Index of the controller in [`Listener::counts`].
         controller: usize,
     },
     /// A negative response.
     Refused {
-        /// Index in [`Listener::counts`].
+        /// Index of the controller in [`Listener::counts`].
         controller: usize,
         refusal: Refusal,
     },
     /// A complete response.
     Whole {
-        /// Index in [`Listener::counts`].
+        /// Index of the controller in [`Listener::counts`].
         controller: usize,
         /// Configuration of the response.
         answer: &'a Answer,
@@ -406,7 +406,7 @@ impl Listener {
         let head = answer.question.answer_head();
         link.counts.read = link.counts.read.saturating_add(1);
         let is_asked = link.asked.is_some_and(|(asked, at)| {
-            // Longest time from request to response, ns: the longest P2* of ISO 14229-2.
+            // Longest time, ns, from request to response. It is the longest P2* of ISO 14229-2.
             asked.starts_with(&head) && now.nanos().saturating_sub(at.nanos()) <= 5_000_000_000
         });
         link.counts.unasked = link.counts.unasked.saturating_add(u64::from(!is_asked));

@@ -1,4 +1,4 @@
-//! Units as written in a DBC.
+//! Parses units as written in a DBC.
 //!
 //! In: the text between the quotation marks. Out: the quantity and the conversion to the program's unit (A, V, degrees
 //! C). The DBC format does not define a list of units, so an unknown unit gives no information.
@@ -28,7 +28,7 @@ pub struct SignalUnit {
     /// Converts to the program's unit: value x factor + offset. The factor is 1 for quantities that packwatch does not
     /// read.
     pub factor: f64,
-    /// See `factor`.
+    /// Offset of the conversion, see `factor`.
     pub offset: f64,
 }
 

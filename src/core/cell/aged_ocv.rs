@@ -1,4 +1,4 @@
-//! Change of a cell type's open-circuit curve with lost capacity: voltage offsets over SOC and capacity.
+//! Computes how a cell type's open-circuit curve changes with lost capacity: voltage offsets over SOC and capacity.
 //!
 //! In: the electrodes of the new cell, or a shift of the SOC axis, and the SOC breakpoints of the model. Out: offsets,
 //! V, to be added to the new cell's open-circuit voltage. Offsets are interpolated linearly over SOC and capacity.
@@ -17,9 +17,9 @@ use crate::filter::locate;
 /// How the curve's change with ageing is computed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum AgeingLaw {
-    /// From a shift of the SOC axis; 0 = the curve shrinks evenly.
+    /// The change is computed from a shift of the SOC axis; 0 = the curve shrinks evenly.
     Shift(f64),
-    /// From the electrodes of the new cell.
+    /// The change is computed from the electrodes of the new cell.
     Electrodes(Electrodes),
 }
 
@@ -54,14 +54,14 @@ pub struct AgedOcv {
     capacity_ah: Vec<f64>,
     /// `offset_v[c][s]`, V: row per capacity, column per SOC breakpoint.
     offset_v: Vec<Vec<f64>>,
-    /// Change of the offsets by one standard deviation of each mix, V, same shape; empty = unknown.
+    /// Change of `offset_v` by one standard deviation of each mix, V; empty = unknown.
     mixes_v: [Vec<Vec<f64>>; MIXES],
     /// Per capacity: lithium lost, as a fraction of the new cell's lithium, and the change of this loss by one standard
     /// deviation of each mix. Empty without electrodes.
     lithium: Vec<Vec<f64>>,
     is_shift: bool,
     law: AgeingLaw,
-    /// Modes added by [`Self::add_spread`]; empty = none.
+    /// Modes of the curve's spread between cells, added by [`Self::add_spread`]; empty = no spread.
     spread_v: [Vec<f64>; MIXES],
 }
 
@@ -128,7 +128,8 @@ impl AgedOcv {
             let positive = half_width(curve(MATERIAL_SHARE, low, part)?, curve(MATERIAL_SHARE, high, part)?);
             Some([offset_v, negative, positive])
         };
-        // From the new cell down to the lowest capacity for which the electrodes still form a cell.
+        // The capacities of the table go from the new cell down to the lowest capacity at which the electrodes still
+        // form a cell.
         let aged: Vec<_> = LOST_CAPACITIES.iter().rev().map_while(|&part| Some((part, row(part)?))).collect();
         if aged.last().is_none_or(|(part, _)| *part > LEAST_KNOWN) {
             return None;

@@ -1,4 +1,5 @@
-//! Cell model of a cell that was never measured, from its label and the spread between cells of its chemistry.
+//! Creates the model of a cell that was never measured, from its label and from the spread between cells of its
+//! chemistry.
 //!
 //! In: chemistry, rated capacity (Ah), cut-off voltages (V). Out: a [`CellModel`]. Its [`ModelSpread`] and the modes of
 //! its curve state how much a cell may differ from it. No measured cell was used for the curve, so measured cells can
@@ -151,7 +152,7 @@ pub const FACTOR_SOC: [f64; 9] = [0.0, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0
 pub struct ResistanceFactors {
     /// ln of each resistance's ratio at 25 degrees C, at [`FACTOR_SOC`].
     pub ln: [[f64; FACTOR_SOC.len()]; RESISTANCES],
-    /// Deviation of each resistance's activation energy from the usual one, fraction.
+    /// Deviation of each resistance's activation energy from the usual activation energy, fraction.
     pub by_temperature: [f64; RESISTANCES],
 }
 
@@ -169,7 +170,7 @@ pub struct CurveOfCells {
     pub mean_v: Vec<f64>,
     /// Largest modes of the spread, V per standard deviation.
     pub modes_v: [Vec<f64>; MIXES],
-    /// Standard deviation of the rest, V.
+    /// Standard deviation of the spread that the modes do not explain, V.
     pub rest_v: Vec<f64>,
     /// Fall of the curve from 25 to 0 degrees C, V ([`cold_share`]).
     pub cold_sag_v: ScalarGaussian,
@@ -327,7 +328,7 @@ impl Label {
     }
 }
 
-/// Load at which an error of the resistances counts as voltage error of the model, per rated capacity: C/2.
+/// At this load, C/2, an error of the resistances counts as voltage error of the model. Stated per rated capacity.
 pub const USUAL_LOAD_PER_H: f64 = 0.5;
 
 #[cfg(test)]

@@ -23,7 +23,7 @@ pub struct BranchAt {
 }
 
 impl BranchAt {
-    /// Branch `i` of a cell whose resistances are `resistance_ratio` times those of `model`.
+    /// Branch `i` of a cell. The cell's resistances are `resistance_ratio` times the resistances of `model`.
     pub fn new(model: &CellModel, i: usize, position: &GridPosition, resistance_ratio: f64) -> Self {
         Self { r_ohm: model.branch_r_ohm(i, position) * resistance_ratio, tau_s: model.branch_tau_s(i, position) }
     }

@@ -50,9 +50,9 @@ pub struct EstimatorConfig {
 pub struct SigmaPointSettings {
     /// Sigma point spread alpha, (0, 1].
     pub alpha: f64,
-    /// Prior knowledge of the distribution, 2 for Gaussian.
+    /// Sigma point weight beta: prior knowledge of the distribution, 2 for a Gaussian distribution.
     pub beta: f64,
-    /// Secondary scaling.
+    /// Secondary scaling kappa of the sigma points.
     pub kappa: f64,
 }
 
@@ -69,7 +69,7 @@ pub struct InitialState {
     pub capacity_ah: f64,
     /// Standard deviation of the initial capacity, Ah.
     pub capacity_std_ah: f64,
-    /// Capacity of the open-circuit curve before the first half-cycle, Ah.
+    /// Capacity, Ah, that selects the open-circuit curve of the aged cell until the first half-cycle has ended.
     pub curve: ScalarGaussian,
     /// Standard deviation of the initial ln(resistance relative to new).
     pub log_resistance_std: f64,
@@ -80,7 +80,7 @@ pub struct InitialState {
 pub struct ProcessNoise {
     /// SOC process noise, fraction per sqrt(s).
     pub soc_per_sqrt_s: f64,
-    /// SOC process noise per charge moved, fraction per sqrt(SOC): random errors of the current.
+    /// SOC process noise caused by random errors of the current: fraction per square root of the SOC moved.
     pub charge_per_sqrt_soc: f64,
     /// Branch voltage process noise, V per sqrt(s).
     pub branch_v_per_sqrt_s: f64,
@@ -110,8 +110,8 @@ pub struct GapSettings {
 pub struct VoltageError {
     /// White sensor noise of a voltage reading, V, per sample.
     pub noise_v: f64,
-    /// Slow model error, stated as the standard deviation of a 1 s average, V: information is counted per second. Used
-    /// if the cell model states no error.
+    /// Slow model error: standard deviation of its average over one second, V. It is used if the cell model states no
+    /// error.
     pub model_error_v_sqrt_s: f64,
     /// Model error proportional to the present voltage drop in the cell: fraction of the drop, for an average over one
     /// second.

@@ -1,4 +1,4 @@
-//! The ranges of SOC and temperature that the data cover.
+//! Determines the ranges of SOC and temperature that the data cover.
 //!
 //! In: SOC (fraction) and temperature (degrees C) of readings or notebook rows; NaN and infinities are ignored. Out:
 //! shares and ranges.

@@ -1,4 +1,5 @@
-//! Loss modes of an aged cell from its capacity: lithium inventory (LLI) and active material of each electrode (LAM).
+//! Computes the loss modes of an aged cell from its capacity: loss of lithium inventory (LLI) and loss of active
+//! material of each electrode (LAM).
 //!
 //! In: the learned capacity (Ah) and the table of lithium inventories of [`super::aged_ocv`]. Out: losses as fractions
 //! (0 to 1) of the model's new cell, each with its standard deviation. The formulas use d = 1 - C / C_new, the shares
@@ -70,7 +71,8 @@ mod tests {
         LossModes::of_capacity(&table(&M50), NEW_AH, capacity)
     }
 
-    /// Losses of electrodes that have lost these shares of material, computed without the table.
+    /// Lithium lost by an LG M50 cell with the fraction `part` of its capacity, computed without the table. `negative`,
+    /// `positive`: material lost per lost capacity.
     fn lithium(part: f64, negative: f64, positive: f64) -> f64 {
         let lost = LostMaterial { negative: negative * (1.0 - part), positive: positive * (1.0 - part) };
         M50.aged(lost, part).expect("such a cell").lithium_lost()
@@ -89,8 +91,9 @@ mod tests {
         }
     }
 
-    /// Lives of such a cell simulated with PyBaMM 26.10 (OKane2022): remaining capacity, LLI, LAM_NE, LAM_PE. The first
-    /// five lose lithium to the SEI and material by stress; the last one loses only lithium.
+    /// Simulated lives of an LG M50 cell (PyBaMM 26.10, OKane2022): remaining capacity, LLI, LAM_NE, LAM_PE. In the
+    /// first five lives, the cell loses lithium to the SEI and material by stress; in the last life, it loses only
+    /// lithium.
     const SIMULATED: [[f64; 4]; 6] = [
         [0.9365, 0.0496, 0.0214, 0.0100],
         [0.8723, 0.0985, 0.0440, 0.0233],

@@ -60,7 +60,7 @@ pub struct Thermal {
 pub struct CellModel {
     /// Display name.
     pub name: String,
-    /// Label capacity, Ah: the reference of SOH.
+    /// Capacity on the label, Ah. The SOH is relative to this capacity.
     pub rated_capacity_ah: f64,
     /// Capacity of a new cell between its full and its empty open-circuit voltage at the reference temperature, Ah.
     pub capacity_ah: f64,
@@ -153,7 +153,8 @@ impl Table {
     }
 }
 
-/// Mean slope of the open-circuit curve, V per unit of SOC, below which an electrode is a mixture of two phases.
+/// If the mean slope of the open-circuit curve is below this value, V per unit of SOC, an electrode is a mixture of two
+/// phases.
 const TWO_PHASE_SLOPE_V: f64 = 0.15;
 
 /// Standard deviation of the hysteresis of a two-phase electrode around the middle of both branches, V. For LFP, the

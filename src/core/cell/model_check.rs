@@ -34,7 +34,7 @@ const WINDOW_S: f64 = 3600.0;
 /// SOC.
 const CURVE_STD_V: [f64; 2] = [0.2, 0.4];
 
-/// Maximum weight of a witness relative to the other one.
+/// Maximum weight of a witness, relative to the other witness.
 const CORROBORATED: f64 = 4.0;
 
 /// Minimum sum of the witnesses that counts as a mismatch: three parts (constant, slope, resistance) of 1.4 standard
@@ -194,7 +194,7 @@ impl ModelCheck {
     /// Takes the evidence that is due for a cell of rated capacity `rated_ah`, Ah. `evidence` is `None` if the filter
     /// has none.
     pub fn judge(&mut self, evidence: Option<ModelEvidence>, rated_ah: f64) {
-        // One reading stands for at most 90 s. Currents below C/50 do not show the resistance.
+        // One reading represents at most 90 s. Currents below C/50 do not show the resistance.
         let (elapsed_s, charge_as) = (self.since_s.min(90.0), self.since_as);
         let is_used = charge_as.abs() >= 0.02 * rated_ah * self.since_s;
         (self.since_s, self.since_as) = (0.0, 0.0);
@@ -259,7 +259,8 @@ mod tests {
     use super::*;
     use crate::cell::model::tests::small_model;
 
-    /// The check after `use_s` of steps of 1 s at 1 C from SOC 0.9 down; `voltage` gives the innovation by SOC, V.
+    /// Returns the check after a discharge at 1 C from SOC 0.9 for `use_s` seconds, in steps of 1 s. `voltage` returns
+    /// the innovation at a SOC, V.
     fn after(use_s: u32, ratio: f64, voltage: impl Fn(f64) -> f64) -> ModelCheck {
         let mut check = ModelCheck::default();
         for second in 0..use_s {
@@ -347,7 +348,7 @@ mod tests {
         assert!((sums.explained() / expected - 1.0).abs() < 1e-9, "{} {expected}", sums.explained());
     }
 
-    /// A delta of the store keeps 20 bits of a number.
+    /// The store keeps only 20 bits of a number in a delta.
     #[test]
     fn rounded_sums_keep_their_evidence() {
         let mut sums = VoltageSums::default();

@@ -7,9 +7,9 @@ use super::chemistry::USUAL_LOAD_PER_H;
 use super::model::CellModel;
 use super::model_bands::CURVE_C;
 
-/// Steps of SOC over the curve.
+/// Number of SOC steps over the curve.
 const CURVE_STEPS: u32 = 100;
-/// Steps of SOC for looking up a voltage under load: a multiple of the curve's steps.
+/// Number of SOC steps for looking up a voltage under load. It is a multiple of the curve's number of steps.
 const READ_STEPS: u32 = 400;
 /// SOC range in which SOC errors count. Outside this range, curves are so steep that the SOC errors of any model are
 /// small.
@@ -141,9 +141,9 @@ fn soc_difference(first: &CellModel, second: &CellModel, temperature_c: f64, loa
     Difference::of(&middle.collect::<Vec<_>>())
 }
 
-/// Of all SOCs at which a model has the voltage, the one nearest to `soc`. If the model has the voltage at no SOC,
-/// returns the SOC with the nearest voltage. Under load, several SOCs may have the same voltage, because a resistance
-/// that rises with the SOC bends the curve down.
+/// Returns the SOC nearest to `soc` at which a model has the voltage. If the model has the voltage at no SOC, returns
+/// the SOC with the nearest voltage. Under load, several SOCs may have the same voltage, because a resistance that
+/// rises with the SOC bends the curve down.
 fn nearest(places: &[f64], readings_v: &[f64], voltage_v: f64, soc: f64) -> f64 {
     let crossings = places.windows(2).zip(readings_v.windows(2)).filter_map(|(place, reading)| {
         let (low, high) = (reading[0] - voltage_v, reading[1] - voltage_v);

@@ -1,4 +1,4 @@
-//! Readings of a vehicle's cells, condensed into rows. The on-board fit of a cell model uses these rows.
+//! Condenses readings of a vehicle's cells into rows. The on-board fit of a cell model uses these rows.
 //!
 //! In: one [`CellStep`] per voltage reading of any cell (A, V, s, degrees C). Out: at most [`MAX_ROWS`] rows of the
 //! mean cell.
@@ -23,7 +23,7 @@ pub const MAX_ROWS: usize = 120;
 const LOW_SOC: f64 = 0.15;
 /// Range of SOC of a row or class below `LOW_SOC`, as a fraction of the usual range.
 const LOW_SOC_PART: f64 = 0.25;
-/// Range of SOC of a class of rows, fraction.
+/// Width of the SOC range that a class of rows covers, fraction.
 const CLASS_SOC: f64 = 0.1;
 /// Maximum current that counts as rest, in units of the 1 C current.
 const REST_PER_H: f64 = 0.02;
@@ -57,8 +57,8 @@ pub struct Row {
     pub steps: CurrentSteps,
 }
 
-/// Sums of products of differences between consecutive readings. The differences are those of the current (i), A, of
-/// the current after the fastest filter (x), A, and of the voltage (v), V.
+/// Sums of products of three quantities: i is the change of the current between two consecutive readings, A; x is the
+/// change of the current after the fastest filter, A; v is the change of the voltage, V.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CurrentSteps {
@@ -179,7 +179,7 @@ impl Notebook {
         self.unread = 0;
     }
 
-    /// The same rows, all unused.
+    /// Returns the notebook with all rows marked as unused.
     pub fn all_unread(self) -> Self {
         Self { unread: u32::try_from(self.rows.len()).unwrap_or(u32::MAX), ..self }
     }
@@ -376,7 +376,7 @@ impl Notebook {
     }
 
     /// The past stretch whose removal loses the fewest rows of classes that no other stretch has. If several stretches
-    /// qualify, the oldest.
+    /// qualify, returns the oldest of them.
     fn least_missed(&self, config: &NotebookConfig) -> Option<u32> {
         let class_of = |row: &Row| row.class(config.rated_ah);
         let alone = |stretch: &[Row]| {

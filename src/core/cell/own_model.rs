@@ -28,7 +28,7 @@ pub struct OwnModel {
     pub modes_v: [[f64; SOC_NODES]; 2],
     /// Standard deviation of the curve without the modes, V.
     pub rest_v: [f64; SOC_NODES],
-    /// Resistances relative to those of the label's model.
+    /// Resistances relative to the resistances of the label's model.
     pub factors: ResistanceFactors,
     /// Standard deviation of ln(voltage drop) at the temperatures of the tables.
     pub drop_std: [f64; TEMPERATURE_NODES],

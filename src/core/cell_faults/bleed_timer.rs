@@ -1,9 +1,10 @@
 //! Measures from the BMS's balancing bits how long the BMS bled one cell.
 //!
-//! In: balancing bits with their time and validity; starts and ends of rows. Out: for the time between the middles of
-//! two rows, how long the cell was bled, how long the state was unknown, and how long no bits were received. The charge
-//! that a row shows is the charge at its middle, so half of the row's bleed time counts in the next row. If the cell is
-//! bled between two rows, while the buses sleep, this time counts in the later row.
+//! In: balancing bits with their time and validity; starts and ends of rows (a few minutes of samples each). Out: for
+//! the time between the middles of two rows, how long the cell was bled, how long the state was unknown, and how long
+//! no bits were received. The charge that a row shows is the charge at its middle, so half of the row's bleed time
+//! counts in the next row. If the cell is bled between two rows, while the buses sleep, this time counts in the later
+//! row.
 
 use serde::{Deserialize, Serialize};
 

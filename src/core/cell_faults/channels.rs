@@ -8,8 +8,9 @@ use crate::quantity::InvalidState;
 
 /// A channel is frozen if its value stays the same while the middle voltage of the pack changes by more than this, V.
 const FROZEN_V: f64 = 0.03;
-/// Minimum number of voltage changes within a row; with fewer changes, channels are not compared. `doubled` also
-/// requires ten consecutive rows that agree: with a resolution of 2.5 mV, two of 96 healthy cells agreed in three rows.
+/// Minimum number of voltage changes within a row (a few minutes of samples); with fewer changes, channels are not
+/// compared. `doubled` also requires ten consecutive rows that agree: with a resolution of 2.5 mV, two of 96 healthy
+/// cells agreed in three rows.
 const LEAST_CHANGES: u32 = 10;
 
 /// State of one voltage channel.

@@ -1,5 +1,5 @@
-//! Detector for all cells of a pack. It adds samples to rows, compares the cells once per row and derives findings from
-//! the comparison (`judge`).
+//! Detector for all cells of a pack. It adds samples to rows (sums over a few minutes), compares the cells once per row
+//! and derives findings from the comparison (`judge`).
 //!
 //! The assumed errors of a row are rounded values for a circuit model and a typical cell monitor. They were checked
 //! with a simulated pack of ten cells and with the simulator's other packs. No measured pack was used to choose them.
@@ -128,7 +128,7 @@ impl WatchedCell {
 pub struct CellFaultDetector {
     cells: Vec<WatchedCell>,
     pack: PackSums,
-    /// Time of the middle of the last row, and SOC and charge (Ah) of the row.
+    /// The last row: the time of its middle, its SOC and its charge, Ah.
     last_row: Option<(Timestamp, f64, f64)>,
     /// Duration of the present rest, s.
     rest_s: f64,
@@ -220,7 +220,7 @@ impl CellFaultDetector {
         self.middle
     }
 
-    /// Time of the last row and SOC of the mean cell in it; `None` before the first row.
+    /// Time of the last row, and SOC of the mean cell in this row; `None` before the first row.
     pub(super) fn middle_soc(&self) -> Option<(Timestamp, f64)> {
         self.last_row.map(|(time, soc, _)| (time, soc))
     }

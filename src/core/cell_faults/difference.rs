@@ -1,8 +1,8 @@
 //! Filter of the difference between one cell and the middle of its pack.
 //!
-//! In: per row, the cell's voltage minus the middle voltage of the pack. Out: the states that explain this voltage
-//! difference. The filter is a linear Kalman filter, linearised at the cell's own SOC. It can distinguish the states
-//! because they have different effects:
+//! In: per row (a few minutes of samples), the cell's voltage minus the middle voltage of the pack. Out: the states
+//! that explain this voltage difference. The filter is a linear Kalman filter, linearised at the cell's own SOC. It can
+//! distinguish the states because they have different effects:
 //!
 //! | state | effect on the voltage difference |
 //! | --- | --- |

@@ -238,7 +238,8 @@ pub const OFFSET_PER_H: f64 = 0.01;
 /// Limit of the rise of the current sensor's gain, fraction.
 pub const GAIN: f64 = 0.02;
 
-/// Probability from which on a finding is reported, and probability below which it is withdrawn.
+/// A finding is reported if its probability is at least `REPORTED`, and withdrawn if its probability falls below
+/// `WITHDRAWN`. For a leak, [`CellFaultKind::withdrawn_below`] is lower.
 pub(super) const REPORTED: f64 = 0.999;
 pub(super) const WITHDRAWN: f64 = 0.5;
 

@@ -1,4 +1,4 @@
-//! Sums of a row: the samples of a few minutes, per cell and for the pack.
+//! Sums the samples of a few minutes (a row), per cell and for the pack.
 
 use serde::{Deserialize, Serialize};
 

@@ -33,7 +33,7 @@ pub enum CapacityMethod {
 pub struct CapacityConfig {
     /// Source of the measurement.
     pub method: CapacityMethod,
-    /// Process noise: standard deviation gained per equivalent full cycle (Swing) or per event (Nominal), Ah.
+    /// Process noise: standard deviation gained per equivalent full cycle (`Swing`) or per half-cycle (`Nominal`), Ah.
     pub noise_ah_per_cycle: f64,
     /// Process noise of rest: standard deviation gained per day without current, Ah. Rest adds noise because capacity
     /// recovers during rest. At most one day per half-cycle counts. Not used by `Nominal`.

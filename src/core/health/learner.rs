@@ -26,8 +26,8 @@ use crate::filter::{Measurement, ScalarGaussian};
 use crate::quantity::bounds;
 use crate::quantity::{InvalidState, Mode, Timestamp};
 
-/// Difference between a measured capacity and the belief, in standard deviations of both, beyond which one of them is
-/// wrong.
+/// If a measured capacity and the expected capacity differ by more than this many standard deviations of their
+/// difference, one of them is wrong.
 const CONTRADICTION: f64 = 4.0;
 
 /// Standard deviation of the capacity of cells of one type, fraction.
@@ -102,7 +102,7 @@ pub struct Learner {
     in_doubt: Vec<usize>,
     /// Offset of the current sensor.
     offset: CurrentOffset,
-    /// Per cell: whether its capacity stays unchanged by half-cycles.
+    /// Per cell: whether half-cycles leave its capacity unchanged.
     #[serde(skip)]
     is_held: Vec<bool>,
 }
@@ -358,8 +358,8 @@ impl Learner {
             difference * difference > CONTRADICTION * CONTRADICTION * (z.variance + expected.variance)
         };
         if let Some(z) = measurement.filter(is_contradiction) {
-            // The measurement or the belief is wrong; other half-cycles decide. Each of them widens the belief by at
-            // most the spread of new cells, so that one wild measurement does not make the capacity unknown.
+            // The measured or the expected capacity is wrong; further half-cycles decide. Each contradiction adds at
+            // most the variance of new cells, so that one wild measurement does not make the capacity unknown.
             let difference = z.value - expected.mean;
             let doubt = difference * difference / (CONTRADICTION * CONTRADICTION);
             let spread_ah = NEW_SPREAD * model.capacity_ah;

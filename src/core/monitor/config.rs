@@ -39,7 +39,8 @@ pub struct MonitorConfig {
     pub identity_readings: u32,
     /// Limits on the number of frames of one identifier.
     pub flood: FloodConfig,
-    /// Silence of all inputs at rest after which the buses count as asleep, s; `None` = never.
+    /// Time, s. If no current flows and all inputs have been silent for longer than this, the buses count as asleep;
+    /// `None` = never.
     pub asleep_after_s: Option<f64>,
     /// Settings of the sampling stage.
     pub sample: SampleConfig,

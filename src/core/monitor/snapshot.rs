@@ -25,8 +25,10 @@ use crate::sample::{CellSample, SampleConfig};
 
 /// Name of the charge that [`Snapshot::check_charges`] checks, for error messages.
 const CHARGE: &str = "the charge since a cell's latest voltage or half-cycle";
-/// Tolerances for two cases: the limits of the current were wider when the charge was counted, or the clock was set.
+/// Factor by which a charge may exceed the largest plausible charge, because the limits of the current may have been
+/// wider when the charge was counted.
 const CHARGE_TOLERANCE: f64 = 2.0;
+/// Time, s, that is added to the time in which the charge has moved, because the clock may have been set.
 const CHARGE_TOLERANCE_S: f64 = 1000.0;
 
 /// Layout version of [`Snapshot`].

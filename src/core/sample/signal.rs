@@ -26,7 +26,7 @@ pub const ACCEPT_AFTER: u32 = 3;
 /// in an interval of zero would be infinite.
 pub const MIN_RATE_INTERVAL_S: f64 = 1e-3;
 
-/// Number of readings after which a reading has lost most of its weight in the share of bad readings.
+/// After this number of further readings, a reading has lost most of its weight in the share of bad readings.
 pub const BAD_SHARE_READINGS: u32 = 100;
 
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

@@ -21,7 +21,8 @@ pub struct Balancing {
 }
 
 impl Balancing {
-    /// A typical BMS for a pack of `capacity_ah`: 1 mA per Ah (60 mA at 60 Ah), 10 mV, hysteresis 5 mV.
+    /// Settings of a typical BMS for cells of `capacity_ah`: bleeding takes 1 mA per Ah (60 mA at 60 Ah), starts at 10
+    /// mV and stops at 5 mV.
     pub fn usual(capacity_ah: f64) -> Self {
         Self { bleed_a: 1e-3 * capacity_ah, start_v: 0.010, stop_v: 0.005, from_soc: 0.7 }
     }
@@ -47,7 +48,7 @@ impl Balancer {
         // Largest current that counts as rest: 0.002 C.
         let is_rest = current_a.abs() <= 0.002 * pack.lowest_capacity_ah();
         self.charging_s = if current_a < 0.0 && !is_rest { self.charging_s + dt_s } else { 0.0 };
-        // Shortest charge, s: regenerative braking does not count.
+        // A charge must last at least this long, s, so that regenerative braking does not count as a charge.
         let ends_charge = self.charging_s >= 60.0 && pack.highest_soc() >= self.settings.from_soc;
         if ends_charge {
             (self.is_armed, self.has_rested) = (true, false);

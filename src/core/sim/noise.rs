@@ -1,4 +1,4 @@
-//! Seeded random numbers that are bit-identical on every machine.
+//! Generates seeded random numbers that are bit-identical on every machine.
 //!
 //! The generator is ChaCha with 8 rounds, keyed by the seed. Each use has its own stream, so that more cells or another
 //! scenario do not change the numbers of other streams. A uniform number is the upper 53 bits of a 64-bit word divided

@@ -104,7 +104,7 @@ pub struct Simulation {
     balancer: Option<Balancer>,
     has_bits: bool,
     asleep: Option<Asleep>,
-    /// Voltages at the taps, then at the channels, V.
+    /// Voltages, V: first at the taps; after the sensor faults were applied, at the channels.
     sensed_v: Vec<f64>,
 }
 
@@ -186,7 +186,7 @@ impl Simulation {
         Some(Moment { time: self.time, current_a: self.current_a, cells_sampled })
     }
 
-    /// Readings of the latest moment; the value `None` = dropped out.
+    /// Readings of the latest moment; a value of `None` means that the sample is missing.
     pub fn readings(&self) -> &[(Channel, Option<f64>)] {
         &self.readings
     }

@@ -1,4 +1,4 @@
-//! Sensors: readings of true values with errors.
+//! Simulates sensors: turns true values into readings with errors.
 //!
 //! `reading = round_to_resolution(truth (1 + gain) + offset + noise_std n)`. n is normally distributed and independent
 //! from sample to sample. A reading is missing with the probability `dropout`. Resolution 0 leaves quantisation to the
@@ -111,7 +111,7 @@ impl Sensor {
         self.error.offset
     }
 
-    /// Measures `truth`; `None` = dropped out. Both outcomes draw the same number of random numbers.
+    /// Measures `truth`; `None` = the sample is missing. Both outcomes draw the same number of random numbers.
     pub(crate) fn read(&mut self, truth: f64) -> Option<f64> {
         let e = self.error;
         let value = truth * (1.0 + e.gain) + e.offset + e.noise_std * self.noise.normal();

@@ -23,7 +23,7 @@ pub struct Plan {
     pub unconfigured: Vec<SignalPlan>,
     /// The pack.
     pub pack: PackPlan,
-    /// Ages from which a current, a voltage and a temperature are stale, s; `None` = never.
+    /// Ages, s: an older reading of a current, a voltage or a temperature is stale; `None` = never stale.
     pub max_ages_s: [Option<f64>; 3],
     /// Smallest and largest plausible value of current, cell voltage and temperature; infinite = unlimited.
     pub limits: [(f64, f64); 3],
@@ -49,7 +49,7 @@ pub struct PackPlan {
     pub strings: u16,
     /// The cell model; `None` if it cannot be read.
     pub model: Option<CellModel>,
-    /// Capacity of a cell, Ah: the configured capacity, or the model's if none is configured.
+    /// Capacity of a cell, Ah. If no capacity is configured, it is the capacity of the model.
     pub capacity_ah: f64,
     /// Ambient temperature, degrees C.
     pub ambient_c: f64,
@@ -62,7 +62,7 @@ pub struct PackPlan {
 /// One interface.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct InterfacePlan {
-    /// Kernel name.
+    /// Name of the interface in the kernel.
     pub name: String,
     /// Whether FD frames are accepted.
     pub fd: bool,

@@ -95,7 +95,7 @@ pub struct WiringFinding {
     pub why: String,
     /// Lines to change.
     pub changes: Vec<Change>,
-    /// What else to do, or what to do if no line of the configuration helps.
+    /// Further advice, or the only advice if no change of the configuration helps.
     pub advice: Option<String>,
     /// Titles of findings that are probably consequences of this one and are not listed separately.
     pub consequences: Vec<String>,

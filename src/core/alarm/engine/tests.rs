@@ -187,7 +187,7 @@ fn restored_engine_behaves_like_stored_engine() {
 /// Whether a threshold is raised, its count, whether it is acknowledged, its times and its value.
 type KeptThreshold = (bool, u32, bool, [Option<Timestamp>; 2], Option<f64>);
 
-/// What a restart keeps of every alarm.
+/// The part of every alarm's state that a restart keeps.
 fn kept(state: &AlarmSnapshot, rules: &[RuleConfig]) -> Vec<KeptThreshold> {
     let mut engine = AlarmEngine::new(rules.to_vec(), 2);
     engine.restore(at(1e6), state);

@@ -82,7 +82,7 @@ impl Database {
             FrameFormat::Fd { brs } => Some(u8::from(brs).to_string()),
             FrameFormat::Classic => None,
         };
-        // Longest cycle time that the attribute allows, ms: an hour.
+        // Longest cycle time that the attribute allows: an hour, in ms.
         let cycle_time = "INT 0 3600000";
         // Largest number of repetitions that the attribute allows.
         let repetitions = "INT 0 999999";

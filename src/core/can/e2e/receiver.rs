@@ -26,7 +26,8 @@ pub struct CheckConfig {
     pub protection: Protection,
     /// Number of frames that may be lost between two calls. Each call without a valid frame allows one more lost frame.
     pub max_delta_counter_init: u8,
-    /// Number of consecutive calls without a new frame after which the sequence is broken; 14 = any number.
+    /// Maximum number of consecutive calls without a new frame; with more such calls, the sequence is broken. 14 = any
+    /// number.
     pub max_no_new_or_repeated_data: u8,
     /// Number of valid frames required after a broken sequence; each has the status [`Status::Sync`].
     pub sync_counter_init: u8,

@@ -1,4 +1,5 @@
-//! Claims the address, defends it, and falls silent after losing it (J1939-81): a state machine with four states.
+//! State machine of the node's J1939 address: the node claims the address, defends it, and falls silent if it loses it
+//! (J1939-81).
 //!
 //! | state | started | lower or equal NAME claims it | higher NAME claims it | request for claims | 300 ms passed |
 //! | --- | --- | --- | --- | --- | --- |
@@ -19,8 +20,9 @@ use super::name::Name;
 use crate::can::Frame;
 use crate::quantity::Timestamp;
 
-/// Time without objection after which the node has the address, ns: the 250 ms of J1939-81, plus 50 ms. A frame reaches
-/// the wire later than its time stamp here (interface start, queues). A delay of 12 ms was measured.
+/// If no other node objects within this time, ns, the node has the address. The time is the 250 ms of J1939-81 plus 50
+/// ms, because a frame reaches the wire later than its time stamp here (interface start, queues). A delay of 12 ms was
+/// measured.
 const CONTENTION_NS: i64 = 300_000_000;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

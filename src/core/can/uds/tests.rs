@@ -1,4 +1,4 @@
-//! Diagnostic responses: reassembly, negative responses, counts, and losses.
+//! Tests diagnostic responses: reassembly, negative responses, counts, and losses.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "tests may panic")]
 

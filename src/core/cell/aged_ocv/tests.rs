@@ -46,7 +46,8 @@ fn offsets_match_aged_curves_and_are_continuous() {
         let (least, edge) = (offset_v(&table, s, 0.5), offset_v(&table, s, 2.0));
         assert!((least - edge).abs() < 1e-9, "constant below the lowest capacity: {least} {edge}");
     }
-    // Half of the difference between the offsets with more and with less of the mix.
+    // One standard deviation of the mix changes the offset by half of the difference between the shares 0.6 and 0 of
+    // lost negative material.
     let with =
         |negative: f64| M50.aged(LostMaterial { negative: negative * 0.2, positive: 0.3 * 0.2 }, 0.8).expect("a cell");
     let expected_v = 0.5 * (with(0.6).voltage_v(SOC[2]) - with(0.0).voltage_v(SOC[2]));
@@ -77,7 +78,7 @@ fn shift_keeps_both_ends() {
 
 #[test]
 fn aged_curve_rises_on_flat_parts() {
-    // Flat in the middle, at one of two temperatures.
+    // The curve is flat in the middle at one of the two temperatures.
     let flat: Vec<f64> = vec![2.5, 3.28, 3.281, 3.2815, 3.33, 3.6];
     let both = [rows(|z| LFP.voltage_v(z)).remove(0), flat.clone()];
     let tables =

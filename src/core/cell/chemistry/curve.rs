@@ -1,4 +1,4 @@
-//! Mean and spread of the open-circuit curves of cells of one chemistry, computed from half-cell potentials.
+//! Computes the mean and the spread of open-circuit curves from half-cell potentials, for the cells of one chemistry.
 //!
 //! In: positive and negative materials, cut-off voltages (V). Out: mean (V) and covariance (V^2) over SOC breakpoints.
 //!

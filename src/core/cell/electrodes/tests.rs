@@ -1,4 +1,4 @@
-//! Half-cell potentials, and cells that age by their electrodes.
+//! Tests the half-cell potentials, and cells whose ageing is computed from their electrodes.
 
 use super::*;
 

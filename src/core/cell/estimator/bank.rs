@@ -38,8 +38,8 @@ pub struct EstimatorBank {
     model: CellModel,
     config: EstimatorConfig,
     constants: KernelConstants,
-    /// Smallest and largest plausible capacity, Ah.
     voltage_reach: VoltageReach,
+    /// Smallest and largest plausible capacity, Ah.
     plausible_ah: (f64, f64),
     filters: FilterArrays,
     cells: Vec<CellSlot>,

@@ -207,8 +207,8 @@ impl CellEstimator {
         variance
     }
 
-    /// The sensor's temperature. If it is unknown, the thermal model's prediction from the last known temperature.
-    /// Degrees C.
+    /// Temperature of the cell, degrees C. If the sensor has no value, the thermal model predicts the temperature from
+    /// the last known temperature.
     fn temperature(&self, model: &CellModel, step: &CellStep) -> f64 {
         step.temperature_c.unwrap_or_else(|| {
             let soc = self.soc().map_or(0.5, |soc| soc.mean);
@@ -310,7 +310,7 @@ impl CellEstimator {
         self.filter.as_ref().map_or(0.0, |x| x.covariance[(LOG_RESISTANCE, CAPACITY)])
     }
 
-    /// Capacity of the open-circuit curve, Ah.
+    /// Capacity that selects the open-circuit curve of the aged cell, Ah.
     pub fn curve(&self) -> ScalarGaussian {
         self.memory.curve
     }

@@ -1,4 +1,5 @@
-//! Use of a cell while nothing is measured: the program is stopped, the bus sleeps, or the log has a gap.
+//! Handles the possible use of a cell while nothing is measured: the program is stopped, the bus sleeps, or the log has
+//! a gap.
 //!
 //! In: the possible change of the SOC in the downtime, fraction, and the first voltage after it, V. Out: the updated filter;
 //! `None` if the update cannot be computed.

@@ -1,8 +1,8 @@
 //! The estimator's memory: rest, load, consistency, rejected readings, and the estimates that a restart of the filter
 //! keeps.
 //!
-//! In: steps (A, s) and the outcomes of updates. Out: the time that a reading stands for, s, the load, A, and whether the
-//! filter must restart. Stored numbers are checked ([`Memory::check`]).
+//! In: steps (A, s) and the outcomes of updates. Out: the time that a reading represents, s, the load, A, and whether
+//! the filter must restart. Stored numbers are checked ([`Memory::check`]).
 
 use serde::{Deserialize, Serialize};
 
@@ -14,7 +14,7 @@ use crate::filter::ScalarGaussian;
 use crate::quantity::InvalidState;
 use crate::quantity::bounds::{self, Bounds};
 
-/// Assumed load in a gap with a load before or after it, per rated capacity: 1 C.
+/// If there is a load before or after a gap, this load is assumed in the gap, per rated capacity: 1 C.
 const GAP_LOAD_PER_H: f64 = 1.0;
 
 /// Prior probability that a cell was used while the program did not run.
@@ -28,7 +28,7 @@ const LOADED_PRIOR: f64 = 0.5;
 /// bus sleeps, but this is rare, because a bus in use wakes its listeners.
 const CHARGER_PRIOR: f64 = 0.05;
 
-/// Downtime that adds at most this standard deviation to the SOC, fraction, is negligible.
+/// If a downtime adds at most this standard deviation to the SOC, fraction, the downtime is negligible.
 const NEGLIGIBLE_STD: f64 = 0.002;
 
 /// State of the estimator in addition to its filter.
@@ -37,7 +37,7 @@ const NEGLIGIBLE_STD: f64 = 0.002;
 pub(super) struct Memory {
     /// Capacity, Ah, before the first voltage and across a restart.
     pub(super) capacity: ScalarGaussian,
-    /// Capacity of the open-circuit curve, Ah.
+    /// Capacity that selects the open-circuit curve of the aged cell, Ah.
     pub(super) curve: ScalarGaussian,
     pub(super) log_resistance: ScalarGaussian,
     pub(super) temperature_c: Option<f64>,
@@ -65,9 +65,9 @@ pub(super) struct Memory {
     pub(super) used_prior: f64,
     /// Whether the current was unknown at the last reading, so that an unmeasured stretch continues.
     pub(super) is_current_unknown: bool,
-    /// No voltage has been used since the last sleep or unknown gap.
+    /// Whether no voltage has been used since the last sleep or unknown gap.
     pub(super) is_unseen: bool,
-    /// The SOC is unknown after a gap of unknown length: the filter restarts from the next voltage.
+    /// Whether the SOC is unknown after a gap of unknown length. If so, the filter restarts from the next voltage.
     pub(super) is_soc_unknown: bool,
     /// Number of consecutive readings beyond the gate.
     pub(super) rejected: u32,

@@ -19,7 +19,7 @@ pub struct CellModule {
     pub model: CellModel,
     /// The pack's estimator settings with the initial capacity of this model.
     pub estimator: EstimatorConfig,
-    /// The model is from a file, not from the label.
+    /// Whether the model is from a file; otherwise, it is from the label.
     pub is_given: bool,
 }
 
@@ -35,11 +35,11 @@ struct Place {
 pub struct PackBank {
     /// The bank of the pack's own cells, then one bank per module.
     banks: Vec<EstimatorBank>,
-    /// One per cell of the pack.
+    /// Place of each cell of the pack.
     places: Vec<Place>,
     /// The pack's own cells, ascending.
     own: Vec<usize>,
-    /// Per module: its model is from a file.
+    /// Whether the model of each module is from a file.
     is_given: Vec<bool>,
 }
 
@@ -156,26 +156,26 @@ impl PackBank {
         self.banks.iter_mut().for_each(EstimatorBank::step);
     }
 
-    /// As [`EstimatorBank::result`].
+    /// See [`EstimatorBank::result`].
     #[inline]
     pub fn result(&self, cell: usize) -> &StepResult {
         let (bank, cell) = self.at(cell);
         bank.result(cell)
     }
 
-    /// As [`EstimatorBank::is_started`].
+    /// See [`EstimatorBank::is_started`].
     pub fn is_started(&self, cell: usize) -> bool {
         let (bank, cell) = self.at(cell);
         bank.is_started(cell)
     }
 
-    /// As [`EstimatorBank::filtered_soc`].
+    /// See [`EstimatorBank::filtered_soc`].
     pub fn filtered_soc(&self, cell: usize) -> Option<ScalarGaussian> {
         let (bank, cell) = self.at(cell);
         bank.filtered_soc(cell)
     }
 
-    /// As [`EstimatorBank::soc`].
+    /// See [`EstimatorBank::soc`].
     pub fn soc(&self, cell: usize) -> Option<ScalarGaussian> {
         let (bank, cell) = self.at(cell);
         bank.soc(cell)
@@ -194,47 +194,47 @@ impl PackBank {
         })
     }
 
-    /// As [`EstimatorBank::log_resistance`].
+    /// See [`EstimatorBank::log_resistance`].
     pub fn log_resistance(&self, cell: usize) -> ScalarGaussian {
         let (bank, cell) = self.at(cell);
         bank.log_resistance(cell)
     }
 
-    /// As [`EstimatorBank::branch_v`].
+    /// See [`EstimatorBank::branch_v`].
     pub fn branch_v(&self, cell: usize) -> [f64; MAX_BRANCHES] {
         let (bank, cell) = self.at(cell);
         bank.branch_v(cell)
     }
 
-    /// As [`EstimatorBank::mean_nis`].
+    /// See [`EstimatorBank::mean_nis`].
     pub fn mean_nis(&self, cell: usize) -> f64 {
         let (bank, cell) = self.at(cell);
         bank.mean_nis(cell)
     }
 
-    /// As [`EstimatorBank::is_plausible`].
+    /// See [`EstimatorBank::is_plausible`].
     pub fn is_plausible(&self, cell: usize) -> bool {
         let (bank, cell) = self.at(cell);
         bank.is_plausible(cell)
     }
 
-    /// As [`EstimatorBank::are_all_plausible`].
+    /// See [`EstimatorBank::are_all_plausible`].
     pub fn are_all_plausible(&self) -> bool {
         self.banks.iter().all(EstimatorBank::are_all_plausible)
     }
 
-    /// As [`EstimatorBank::worst_nis`].
+    /// See [`EstimatorBank::worst_nis`].
     pub fn worst_nis(&self) -> f64 {
         self.banks.iter().map(EstimatorBank::worst_nis).fold(0.0, f64::max)
     }
 
-    /// As [`EstimatorBank::temperature_c`].
+    /// See [`EstimatorBank::temperature_c`].
     pub fn temperature_c(&self, cell: usize) -> Option<f64> {
         let (bank, cell) = self.at(cell);
         bank.temperature_c(cell)
     }
 
-    /// As [`EstimatorBank::is_carried_over`].
+    /// See [`EstimatorBank::is_carried_over`].
     pub fn is_carried_over(&self, cell: usize) -> bool {
         let (bank, cell) = self.at(cell);
         bank.is_carried_over(cell)
@@ -267,17 +267,17 @@ impl PackBank {
         self.banks.iter().map(of_bank).fold((0.0, 0.0), |sum, of_bank| (sum.0 + of_bank.0, sum.1 + of_bank.1))
     }
 
-    /// As [`EstimatorBank::absorb_current_offset`].
+    /// See [`EstimatorBank::absorb_current_offset`].
     pub fn absorb_current_offset(&mut self, deviations: f64, offset_std_a: f64) {
         self.banks.iter_mut().for_each(|bank| bank.absorb_current_offset(deviations, offset_std_a));
     }
 
-    /// As [`EstimatorBank::learn_slow_branches`].
+    /// See [`EstimatorBank::learn_slow_branches`].
     pub fn learn_slow_branches(&mut self) {
         self.banks.iter_mut().for_each(EstimatorBank::learn_slow_branches);
     }
 
-    /// As [`EstimatorBank::set_current_offset_std`].
+    /// See [`EstimatorBank::set_current_offset_std`].
     pub fn set_current_offset_std(&mut self, offset_std_a: f64) {
         self.banks.iter_mut().for_each(|bank| bank.set_current_offset_std(offset_std_a));
     }

@@ -14,8 +14,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::quantity::InvalidState;
 
-/// Minimum standard deviation, relative to the initial one. The ratio changes with temperature and SOC, so evidence
-/// does not last.
+/// Minimum standard deviation of the ratio, relative to the configured standard deviation. The ratio changes with
+/// temperature and SOC, so evidence does not last.
 const LEAST_PART: f64 = 0.5;
 
 /// Maximum information between two corrections, relative to the information 1 / variance of the ratio itself. The
@@ -29,9 +29,10 @@ const RANGE: (f64, f64) = (0.05, 3.0);
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct SlowBranch {
-    /// Ratio of the slowest branch's voltage to the voltage of the model's branch with the cell's resistance ratio.
+    /// Voltage of the cell's slowest branch, divided by the voltage that the model and the cell's common resistance
+    /// ratio give for this branch.
     pub(super) ratio: f64,
-    /// Standard deviation of the ratio, relative to the configured one.
+    /// Standard deviation of the ratio, relative to the configured standard deviation.
     pub(super) part: f64,
     /// Sum of d^2 / R. d is the effect of one standard deviation of the ratio on an innovation; R is the variance of
     /// the innovation without this effect.
@@ -40,13 +41,13 @@ pub(super) struct SlowBranch {
     pub(super) score: f64,
 }
 
-/// A correction of the ratio, in standard deviations before the correction.
+/// A correction of the ratio. `deviations` is the change of the ratio, in standard deviations before the correction.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Correction {
     pub(super) deviations: f64,
-    /// Standard deviation after the evidence, divided by the standard deviation before it.
+    /// Factor by which the evidence reduces the standard deviation of the ratio.
     pub(super) remains: f64,
-    /// New standard deviation, divided by the standard deviation after the evidence.
+    /// Factor that then raises the standard deviation to its minimum, [`LEAST_PART`]; 1 if it is not below the minimum.
     pub(super) widened: f64,
 }
 

@@ -29,7 +29,8 @@ pub struct Update {
     pub innovation: f64,
     /// Predicted variance of the innovation, V^2.
     pub innovation_variance: f64,
-    /// innovation^2 divided by its variance for the gate. Above the square of the gate, the reading is an outlier.
+    /// Square of the innovation, divided by the variance that the gate uses. If this ratio exceeds the square of the
+    /// gate's width (in standard deviations), the reading is an outlier.
     pub test_ratio: f64,
     /// Whether the innovation passed the gate and moved the state.
     pub accepted: bool,

@@ -1,4 +1,4 @@
-//! How far a constant error of the voltage may have moved the SOC.
+//! Determines how far a constant error of the voltage may have moved the SOC.
 //!
 //! In: a cell model and the standard deviation of a constant voltage error, V. Out: the standard deviation of the SOC
 //! that this error causes, fraction.
@@ -21,8 +21,8 @@ const TEMPERATURE_C: f64 = 25.0;
 /// Reach on a grid of SOC.
 #[derive(Debug, Clone)]
 pub(super) struct VoltageReach {
-    /// Per SOC: standard deviation of the SOC (fraction), and the part of it that is explained by a linear effect of one
-    /// (the slope divided by the voltage error, 1/fraction).
+    /// Per SOC: the reach (standard deviation of the SOC, fraction), and the slope of the curve divided by the voltage
+    /// error (1/fraction). The filter's linear effect times the second value is the share of the reach that counts.
     nodes: Vec<(f64, f64)>,
 }
 
@@ -47,8 +47,8 @@ impl VoltageReach {
     }
 
     /// Standard deviation of the SOC caused by the voltage error, fraction. `linear`: change of the SOC per standard
-    /// deviation of the error, as the filter has linearised it. The reach counts as far as the SOC was found from the
-    /// voltage at this place of the curve, and not from charge counted since another place.
+    /// deviation of the error, as the filter has linearised it. The reach counts only to the extent that the filter
+    /// found the SOC from the voltage at this SOC, and not from the charge counted since another SOC.
     #[inline]
     pub(super) fn std(&self, soc: f64, linear: f64) -> f64 {
         let at = soc.clamp(0.0, 1.0) * INTERVALS as f64;

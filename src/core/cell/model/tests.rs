@@ -1,4 +1,4 @@
-//! Tables, curves and the grid, and a small model for the tests of other files.
+//! Tests tables, curves and the grid. Defines a small model that the tests of other files use.
 
 use super::*;
 

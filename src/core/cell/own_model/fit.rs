@@ -1,11 +1,11 @@
 //! Fits a model to the rows of a notebook over a grid of capacities.
 //!
-//! In: a [`Label`] and rows. Out: a [`Fit`]. For each capacity C of the grid, Gauss-Newton finds the most likely values
-//! of the other parameters (maximum a posteriori). These parameters are the open-circuit curve at the SOC breakpoints,
-//! the resistances relative to the label's model over SOC and by temperature, and the SOC s_k at which each stretch
-//! began: SOC = s_k - q / C after the charge q. The density of a capacity is the density of its best fit times the
-//! volume of the other parameters around this fit (Laplace). If the rows allow two capacities, the density has two
-//! maxima.
+//! In: a [`Label`] and rows (readings of the mean cell, averaged over a short time). Out: a [`Fit`]. For each capacity
+//! C of the grid, Gauss-Newton finds the most likely values of the other parameters (maximum a posteriori). These
+//! parameters are the open-circuit curve at the SOC breakpoints, the resistances relative to the label's model over SOC
+//! and by temperature, and the SOC s_k at which each stretch began: SOC = s_k - q / C after the charge q. The density
+//! of a capacity is the density of its best fit times the volume of the other parameters around this fit (Laplace). If
+//! the rows allow two capacities, the density has two maxima.
 //!
 //! # Errors of a row
 //! The errors of the circuit model repeat: rows at nearly the same SOC have the same errors of voltage, SOC and drop.
@@ -40,7 +40,7 @@ const CAPACITIES: usize = 20;
 const FIRST_CAPACITY: usize = 12;
 /// The search ends if the cost exceeds the lowest cost by more than this.
 const HOPELESS: f64 = 25.0;
-/// Points between two capacities of the grid at which the density is evaluated.
+/// Number of points per step of the capacity grid. The density is evaluated at these points.
 const FINE: usize = 20;
 
 /// A fit.
@@ -239,7 +239,8 @@ impl<'a> Search<'a> {
         Some(ScalarGaussian::from_std(capacity_ah, std_ah))
     }
 
-    /// Model, start of the last stretch and their standard deviations at the capacity found.
+    /// Computes the model and the start of the last stretch, both with their standard deviations, at the capacity
+    /// found.
     fn finish(&self, capacity: ScalarGaussian, start: &DVector<f64>) -> Option<Fit> {
         let Conditional { theta, normal, misfit, .. } = self.conditional(capacity.mean, start)?;
         let std_ah = capacity.std();

@@ -1,4 +1,4 @@
-//! A fit of the on-board model, as a task with inputs and a result.
+//! Describes a fit of the on-board model as a task with inputs and a result.
 //!
 //! A fit takes hundreds of times longer than a tick may take, and it depends only on its inputs. A live host runs it on
 //! a separate thread. A replay runs it on the calling thread, with the same result.

@@ -85,8 +85,8 @@ impl CellFaultDetector {
         self.cells.iter_mut().for_each(|cell| cell.bleed.timer.note_missed_bits(from, to));
     }
 
-    /// Subtracts the charge bled since the last row, relative to the middle cells, from each cell's difference. If
-    /// `balancing` is `None`, discards everything learned from balancing bits.
+    /// For each cell, subtracts the charge that was bled since the last row, relative to the middle cells, from the
+    /// cell's difference. If `balancing` is `None`, discards everything learned from balancing bits.
     pub(super) fn remove_bled_charge(&mut self, time: Timestamp, capacity_ah: f64, balancing: Option<BalancingConfig>) {
         let Some(balancing) = balancing else {
             return self.cells.iter_mut().for_each(|cell| cell.bleed = Bleed::default());

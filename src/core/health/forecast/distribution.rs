@@ -1,4 +1,5 @@
-//! Distribution of the use until a cell's level has fallen by a given loss.
+//! Computes the distribution of the use until a cell's level (its capacity without recovery) has fallen by a given
+//! loss.
 //!
 //! In: mean and covariance of the remaining loss (fraction of the reference capacity) and the rate (the same fraction
 //! per unit of use). Out: probabilities and quantiles of the use. Extreme inputs are limited to [`LOG_RANGE`].

@@ -11,7 +11,7 @@ use crate::quantity::BusIndex;
 pub enum Command {
     /// Acknowledge alarms.
     Acknowledge(Selector),
-    /// End latched alarms and forget past ones; learned values are kept.
+    /// End latched alarms and forget past alarms; learned values are kept.
     Clear(Selector),
     /// Another pack is connected: forget the learned values of the old pack.
     PackReplaced,

@@ -27,9 +27,9 @@ use crate::quantity::{BusIndex, CellIndex, Fault, Mode, Timestamp};
 pub enum EventKind {
     /// The pack's mode changed; the new mode has held for its minimum duration.
     Mode {
-        /// Mode left.
+        /// The mode that ended.
         from: Mode,
-        /// Mode entered.
+        /// The mode that began.
         to: Mode,
     },
     /// One half-cycle of one cell is complete.

@@ -28,7 +28,7 @@ use crate::sample::CellSample;
 /// enough to trip an alarm whose threshold is the limit.
 const DOUBT: f64 = 2.0;
 
-/// Path stored for a frozen voltage, V: far outside the range of the cells' common path.
+/// Value, V, that is stored as the path of a frozen voltage. It is far outside the range of the cells' common path.
 const FROZEN_PATH_V: f64 = 1e9;
 
 /// The estimation stage.
@@ -47,7 +47,7 @@ pub(crate) struct Estimation {
     checks: Vec<ModelCheck>,
     any_check_open: bool,
     pub(crate) any_mismatched: bool,
-    /// Compares the steps of the current with those of the voltages.
+    /// Compares the steps of the current with the steps of the voltages.
     pub(crate) current_check: CurrentCheck,
     /// Whether the current's reading is frozen or contradicts the voltages, or an input message has a second sender.
     pub(crate) is_current_doubtful: bool,
@@ -88,7 +88,8 @@ pub(crate) struct Consumed {
     pub(crate) charge_as: f64,
     offset_s: f64,
     pub(crate) unmeasured_s: f64,
-    /// The latest voltage, V, and the common path of the cells ([`CurrentCheck::path_v`]) at its last change, V.
+    /// The latest voltage, V, and the common path of the cells ([`CurrentCheck::path_v`]) at the last change of this
+    /// voltage, V.
     voltage_v: f64,
     path_v: f64,
 }
@@ -364,7 +365,8 @@ impl Estimation {
         self.any_mismatched = self.checks.iter().any(ModelCheck::is_mismatched);
     }
 
-    /// Whether a cell belongs to a module and its stored `check` was made with another cell model than the present one.
+    /// Whether a cell belongs to a module and its stored `check` was made with another cell model than the present
+    /// model.
     pub(crate) fn is_other_cell(&self, index: usize, check: &ModelCheck) -> bool {
         let id = || model_id(self.bank.model(index), self.bank.config(index).initial.log_resistance_std);
         !self.bank.is_own(index) && check.is_of_other(id())

@@ -32,7 +32,8 @@ use crate::quantity::catalogue::{Quantity, RecordedValues};
 use crate::quantity::{CellIndex, InvalidState, Mode, Timestamp, bounds};
 use crate::sample::CellSample;
 
-/// Largest distance from the model's highest voltage at which a charge is in its constant-voltage phase, V.
+/// If the voltage during a charge is at most this far from the model's highest voltage, V, the charge is in its
+/// constant-voltage phase.
 const TAPER_BAND_V: f64 = 0.03;
 
 /// The learning stage.

@@ -28,17 +28,17 @@ use crate::quantity::{InvalidState, Mode, Timestamp};
 const LEAST_NEW_ROWS: usize = 6;
 const LEAST_NEW_CHARGE: f64 = 0.12;
 
-/// Shortest rest before a fit starts, s: longer than a stop at a red light.
+/// Shortest rest, s, after which a fit starts. It is longer than a stop at a red light.
 const REST_S: f64 = 120.0;
 
-/// Time from the start of a fit to the change of the model, s: enough for a thread of a slow computer.
+/// Time, s, from the start of a fit to the change of the model. It is long enough for a thread of a slow computer.
 const FIT_S: f64 = 30.0;
 
 /// Largest misfit of a usable fit. With typical sensors, the misfit is at most 0.65. Heavy load in the cold, a faulty
 /// sensor, or a pack that was exchanged between the rows cause a larger misfit.
 const MOST_MISFIT: f64 = 0.7;
-/// Misfit of a fit above which also the present model is dropped: the rows deviate from every fit by more than their
-/// errors.
+/// If the misfit of a fit exceeds this value, the present model is dropped, too: the rows deviate from every fit by
+/// more than their errors.
 const HOPELESS_MISFIT: f64 = 1.0;
 
 /// Largest relative standard deviation of a usable fit's capacity. The capacity from the label has a relative standard
@@ -81,7 +81,7 @@ pub struct ModelView<'a> {
     pub chemistry: Option<Chemistry>,
     /// Number of fits.
     pub fits: u32,
-    /// Number of models that were dropped in favour of the previous model or the label's model.
+    /// Number of times a model was dropped and the previous model or the label's model was used again.
     pub taken_back: u32,
     /// The latest changes, oldest first.
     pub changes: &'a [ModelChange],

@@ -25,7 +25,7 @@ use crate::monitor::config::{MonitorConfig, OutputConfig, SupplyConfig};
 use crate::monitor::message::{Event, EventKind, Outputs, Secured, Transmit};
 use crate::quantity::{BusIndex, Fault, Timestamp};
 
-/// Period of a test's frames, s: a receiver that reads once a second still gets several frames.
+/// Period, s, of the frames of a test. A receiver that reads once a second still gets several frames.
 const TEST_PERIOD_S: f64 = 0.1;
 /// Longest duration of a test, s. It ensures that a forgotten test ends.
 pub const MAX_TEST_S: f64 = 600.0;

@@ -7,14 +7,15 @@
 use crate::monitor::config::MonitorConfig;
 use crate::quantity::Timestamp;
 
-/// Silence of all inputs at rest after which inputs are not judged, s, because all buses may be falling asleep. It is
-/// longer than the pauses between frames of an awake bus, and shorter than the age at which a reading is stale.
+/// Time, s. If no current flows and all inputs have been silent for longer than this, the inputs are not judged,
+/// because the buses may be falling asleep. The time is longer than the pauses between frames of an awake bus, and
+/// shorter than the age at which a reading is stale.
 pub(crate) const QUIET_S: f64 = 0.25;
 
 /// State of the bus sleep.
 #[derive(Debug)]
 pub(crate) struct BusSleep {
-    /// Silence after which the buses count as asleep, s; `None` = never.
+    /// If the buses are silent for longer than this, s, they count as asleep; `None` = never.
     pub(crate) after_s: Option<f64>,
     /// Start of the present sleep.
     pub(crate) since: Option<Timestamp>,

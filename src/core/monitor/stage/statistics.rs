@@ -34,16 +34,16 @@ pub struct Statistics {
     pub trust_lost: u64,
     /// Number of periods without measurements: computer asleep, program not running, or gap in the log.
     pub gaps: u64,
-    /// Changes of mode.
+    /// Number of mode changes.
     pub mode_changes: u64,
     /// Half-cycles and their results.
     #[serde(flatten)]
     pub learning: LearningCounts,
-    /// Alarms raised.
+    /// Number of times an alarm was raised, by severity.
     pub alarms_raised: AlarmCounts,
     /// Executed commands, from the bus and from this computer.
     pub commands: u64,
-    /// Rejected command frames.
+    /// Number of rejected command frames.
     pub bad_commands: u64,
     /// Number of times the pack was replaced.
     pub packs_replaced: u64,

@@ -34,7 +34,7 @@ impl InputObservation {
     }
 }
 
-/// The larger of two values; a bound if one of them is unknown.
+/// The larger of two values. If one of them is unknown, the result is a bound.
 fn worst(a: Observation, b: Observation) -> Observation {
     let is_known = |observation: &Observation| observation.value.is_some() && !observation.is_bound;
     Observation {

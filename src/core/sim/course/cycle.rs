@@ -5,7 +5,8 @@ use crate::sim::noise::Noise;
 use crate::sim::scenario::Settings;
 use crate::sim::truth::Pack;
 
-/// Discharge pulses of the example, A for 30 Ah: uniformly distributed in this range, mean 15 A.
+/// Range of the example's discharge pulses, A for a cell of 30 Ah. The pulses are uniformly distributed, with a mean of
+/// 15 A.
 const PULSE_A: (f64, f64) = (0.0, 30.0);
 const PULSE_S: f64 = 60.0;
 
@@ -54,15 +55,16 @@ pub(crate) struct CycleCourse {
 
 impl CycleCourse {
     pub(super) fn paper(settings: &Settings, scale: f64) -> Self {
-        // Current of the paper's scenario in both directions, A for 2.6 Ah. At this current, 48 cycles take the paper's
-        // 2.23e5 s.
+        // Current of the paper's scenario in both directions, A for a cell of 2.6 Ah. At this current, 48 cycles take
+        // the paper's 2.23e5 s.
         let current_a = 1.325 * scale;
         Self::new(settings, Load::Constant { current_a }, current_a)
     }
 
     pub(super) fn reference(settings: &Settings, scale: f64, noise: Noise) -> Self {
         let load = Pulses { noise, scale, current_a: 0.0, left_s: 0.0 };
-        // Charging current of the example, A for 30 Ah: 0.5 C. The source gives a constant current without its value.
+        // Charging current of the example, 0.5 C: A for a cell of 30 Ah. The source gives a constant current without
+        // its value.
         Self::new(settings, Load::Pulses(Box::new(load)), 15.0 * scale)
     }
 

@@ -1,4 +1,5 @@
-//! The next demand of a course: a current that flows until the next sample, a time asleep, or the end of the course.
+//! Defines the next demand of a course: a current that flows until the next sample, a time asleep, or the end of the
+//! course.
 
 /// Next demand of a scenario.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -10,7 +10,7 @@ use crate::sim::truth::Pack;
 const AUXILIARY_W: f64 = 600.0;
 /// Largest acceleration and deceleration, m/s^2.
 const ACCELERATION_M_S2: (f64, f64) = (1.2, 1.5);
-/// Limits of the power electronics, C: regeneration and traction.
+/// Largest currents that the power electronics allow during regeneration and during traction, C.
 const CURRENT_LIMIT_C: (f64, f64) = (0.8, 2.5);
 /// SOC at which fast charging ends.
 const CHARGE_TO_SOC: f64 = 0.80;

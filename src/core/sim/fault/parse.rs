@@ -1,4 +1,4 @@
-//! The text form of a fault: `KIND:...@WHEN`.
+//! Parses the text form of a fault: `KIND:...@WHEN`.
 //!
 //! WHEN is `day3` or `3d` (three days after the start), `12h` or `900s`. Without `@WHEN`, the fault starts with the
 //! simulation.

@@ -9,7 +9,8 @@ fn fault(text: &str) -> Fault {
     text.parse().unwrap_or_else(|error| panic!("{text}: {error}"))
 }
 
-/// Four equal cells with ideal sensors at 1.325 A in both directions, sensor 1 on cell 1.
+/// Four equal cells with ideal sensors. The current is 1.325 A in both directions, and temperature sensor 1 is on cell
+/// 1.
 fn settings() -> Settings {
     let mut settings = Settings::of(Scenario::Paper, 2.6);
     settings.pack = crate::sim::PackSettings { cells: 4, ..plain_settings() };
@@ -178,7 +179,8 @@ fn replaced_module_has_new_cells_of_equal_soc() {
         assert_eq!((cell.resistance_ratio, cell.leak, cell.soc), (1.0, None, cells[1].soc));
     }
     assert_eq!(cells[3], healthy.pack().cells()[3]);
-    // Half of the leaked charge, and the smaller SOC swing because of 15 % more capacity.
+    // The new module starts with the mean SOC of the old one, so it lacks half of the leaked charge. With 15 % more
+    // capacity, its SOC then falls less.
     let missing = healthy.pack().cells()[3].soc - cells[1].soc;
     let moved = 1.325 * 1000.0 / 3600.0 / 2.6;
     let expected = 0.5 * 0.5 * 2000.0 / 3600.0 / 2.6 - moved * (1.0 - 1.0 / 1.15);

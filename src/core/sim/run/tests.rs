@@ -54,7 +54,7 @@ fn run(sim: &mut Simulation) -> Course {
 fn paper_scenario_matches_time_and_final_capacity() {
     let mut sim = simulation(Settings::of(Scenario::Paper, 2.6));
     let course = run(&mut sim);
-    assert_eq!(sim.pack().cycles(), 47); // the 48th, at 0.25 Ah, is the last and loses no capacity
+    assert_eq!(sim.pack().cycles(), 47); // the 48th cycle, at 0.25 Ah, is the last one and loses no capacity
     assert!((sim.pack().lowest_capacity_ah() - 0.25).abs() < 1e-9);
     assert!((course.end_s / 2.23e5 - 1.0).abs() < 0.01, "{} s", course.end_s);
     let one_sample = 1.325 / (3600.0 * 0.25);

@@ -1,8 +1,9 @@
-//! Evidence about a signal from its name and unit.
+//! Derives evidence about a signal from the signal's name and unit.
 //!
 //! In: message name, signal name and unit as written in the DBC. Out: points for each quantity of a pack, with their
 //! reasons in words, or `None` if the unit belongs to another quantity. The points are weights that were chosen on the
-//! DBCs of three cars: a matching unit or name adds 1 to 3, a word of another device or of a limit subtracts 3.
+//! DBCs of three cars: a matching unit or name adds 1 to 3, a word that indicates another device or a limit subtracts
+//! 3.
 
 use serde::Serialize;
 

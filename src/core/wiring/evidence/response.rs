@@ -1,4 +1,4 @@
-//! How the cells' voltages follow the pack's current.
+//! Determines how the cells' voltages follow the pack's current.
 //!
 //! In: voltage readings (V per cell) and the pack current (A, positive = discharge). Both are averaged over blocks of
 //! [`BLOCKS_S`], so that a sensor delay of a tenth of a second does not matter. Out:

@@ -1,4 +1,4 @@
-//! Extent of a stream of values, and a thinned sample of the stream in bounded memory.
+//! Keeps the extent and the roughness of a stream of values, and a thinned sample of the stream, in bounded memory.
 
 /// A sample of a stream. It keeps every value until it is full, then every second value, every fourth, and so on. Two
 /// samples of equal size that receive the same number of values keep the values at the same positions.

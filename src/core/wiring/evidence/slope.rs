@@ -13,7 +13,7 @@ use crate::filter::median;
 pub struct Slope {
     /// Number of steps.
     pub points: usize,
-    /// -dV/dI, ohm.
+    /// Resistance: -dV/dI, ohm.
     pub ohm: f64,
     /// Standard deviation of `ohm`.
     pub(crate) std_ohm: f64,

@@ -132,7 +132,7 @@ fn resistance(judge: &mut Judge<'_>, slope: &Slope) {
 /// A different number of parallel strings that would explain the resistance.
 fn likely_strings(configured: u16, ohm: f64, (fast, slow): (f64, f64)) -> Option<u16> {
     let by_string = ohm / f64::from(configured);
-    // At most `ODD_RATIO` x 1024.
+    // The number of strings is at most `ODD_RATIO` x 1024.
     let strings = (((fast * slow).sqrt() / by_string).round() as u16).max(1);
     // A cell's resistance usually differs from its model's resistance by a factor of less than 1.3.
     let is_like = (fast / 1.3..=slow * 1.3).contains(&(by_string * f64::from(strings)));

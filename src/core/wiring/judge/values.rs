@@ -49,7 +49,7 @@ fn better_layout<'d>(
     })
 }
 
-/// Whether the alternative reading is smooth while the configured one jumps.
+/// Whether the values of the alternative layout are smooth, while those of the configured layout jump.
 fn is_smoother((signal, series): SignalSeries<'_>, other: &AlternativeReading) -> bool {
     let layout = &signal.layout;
     if layout.length_bits < 12 || series.extent.changes < 10 {
@@ -117,7 +117,7 @@ fn voltages(judge: &mut Judge<'_>) {
     }
 }
 
-/// The layout that makes the voltages plausible, if the configured one does not.
+/// The layout that makes the voltages plausible, if the configured layout does not.
 fn better_voltages<'d>(judge: &Judge<'d>, all: &[SignalSeries<'d>]) -> Option<BetterLayout<'d>> {
     let (low, high) = judge.voltage_band();
     let cells = judge.cells_per_reading();
@@ -131,7 +131,7 @@ fn better_voltages<'d>(judge: &Judge<'d>, all: &[SignalSeries<'d>]) -> Option<Be
     })
 }
 
-/// The layout that makes the temperatures plausible, if the configured one does not.
+/// The layout that makes the temperatures plausible, if the configured layout does not.
 fn better_temperatures<'d>(judge: &Judge<'d>, all: &[SignalSeries<'d>]) -> Option<BetterLayout<'d>> {
     let ambient_c = judge.plan.pack.ambient_c;
     let median_c = judge.median_of(Kind::Temperature, |series| series.values.median());

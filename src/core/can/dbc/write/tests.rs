@@ -15,7 +15,7 @@ const SHIPPED: &str = include_str!("../../../../../config/packwatch.dbc");
 fn shipped_dbc_matches_default_layout() {
     let settings = LayoutSettings { command: Some(MessageSettings::default()), ..Default::default() };
     let mut made = layout(LayoutBase::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap();
-    // Sent only with authenticated commands.
+    // The default layout lacks this message, because it is sent only if commands are authenticated.
     made.messages.push(default_database().unwrap().message("PACKWATCH_Freshness").unwrap().clone());
     let written = made.to_dbc();
     for (number, (shipped, written)) in (1..).zip(SHIPPED.lines().zip(written.lines())) {

@@ -102,7 +102,7 @@ fn status_decodes_within_half_a_bit() {
     }
 }
 
-/// Fields of the health frame with the page of each, a value in internal units, and the value that it decodes to.
+/// For each field of the health frame: its page, its name, a value in internal units, and the decoded value.
 const HEALTH_VALUES: [(usize, &str, f64, f64); 18] = [
     (0, "Capacity", 2.6, 2.6),
     (0, "CapacityStd", 0.0213, 0.0213),
@@ -241,7 +241,8 @@ fn extremes_saturate_and_never_become_not_available() {
 
 #[test]
 fn every_rule_has_its_own_value_and_threshold() {
-    // In internal units and as decoded: the share of bad readings is a fraction internally and % on the wire.
+    // Each value in internal units and as decoded. For example, the share of bad readings is a fraction internally and
+    // % on the wire.
     let values: [(f64, f64); RULES.len()] = [
         (1.4, 1.4),
         (1.38, 1.38),
@@ -322,7 +323,7 @@ fn every_filled_signal_is_required() {
         let (message, signal) = name.split_once('.').unwrap();
         let message = dbc.messages.iter_mut().find(|m| m.name.ends_with(message)).unwrap();
         let position = message.signals.iter().position(|s| s.name == signal).unwrap();
-        // Renamed, not removed, because conditions refer to signals by index.
+        // The signal is renamed and not removed, because conditions refer to signals by index.
         message.signals[position].name = "Other".to_owned();
         let found = OutputPlan::new(&dbc).unwrap_err();
         assert_eq!(found.0, [format!("signal PACKWATCH_{name} is missing")]);

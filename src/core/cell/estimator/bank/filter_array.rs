@@ -167,8 +167,8 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         }
     }
 
-    /// Indices of the cells with the lowest and with the highest SOC. If several cells have the same SOC, the first
-    /// one.
+    /// Indices of the cells with the lowest and with the highest SOC. If several cells have the same SOC, the first of
+    /// them is returned.
     pub(super) fn extremes(&self, cells: usize) -> Option<(usize, usize)> {
         let all = self.blocks.iter().flat_map(|state| state.mean[0].0).take(cells).enumerate();
         let first = all.clone().next()?;

@@ -36,7 +36,7 @@ use crate::cell::estimator::state_vector::{CAPACITY, LOG_RESISTANCE};
 use crate::filter::simd::{Lanes, Mask};
 use crate::quantity::bounds::{self, Bounds};
 
-/// One ordinary step.
+/// Computes one ordinary step of L cells.
 #[inline(always)]
 pub(super) fn step<const L: usize, const N: usize, const T: usize, const W: usize>(
     tables: &mut Tables<W>,
@@ -96,11 +96,11 @@ fn is_possible<const L: usize, const N: usize, const T: usize>(x: &FilterState<L
     is_possible
 }
 
-/// Rest, s, after which further voltages of a cell add little information: what still relaxes then is slower than the
-/// branches.
+/// If a cell has rested for longer than this, s, further voltages add little information, because they only show
+/// relaxation that is slower than the branches.
 const REST_REPEATS_S: f64 = 1000.0;
 
-/// Updates the load's low-pass, the time at rest, and the time that the reading stands for.
+/// Updates the load's low-pass, the time at rest, and the time that the reading represents.
 #[inline(always)]
 pub(super) fn update_memory<const L: usize>(
     c: &KernelConstants,

@@ -1,4 +1,4 @@
-//! A cell model's tables in the form the kernel reads.
+//! Holds a cell model's tables in the form that the kernel reads.
 //!
 //! Each SOC interval has one row. A row contains a line for every quantity (value at SOC 0, and slope), so one look-up
 //! gives all quantities without a division. Temperatures change slowly, and several cells share a temperature. The rows
@@ -34,7 +34,7 @@ pub(super) const fn branch(i: usize) -> usize {
     BRANCHES + 4 * i
 }
 
-/// The tables, `W` = 12 + 4 per branch.
+/// The tables. A row has `W` numbers: 12, and 4 more per branch.
 #[derive(Debug, Clone)]
 pub(super) struct Tables<const W: usize> {
     model: CellModel,

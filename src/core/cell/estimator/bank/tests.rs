@@ -1,4 +1,4 @@
-//! Compares the kernel with the textbook filter, and a cell in a pack with the same cell alone.
+//! Compares the kernel with the textbook filter. Also compares a cell in a pack with the same cell alone.
 
 use super::*;
 use crate::cell::circuit::{self, BranchAt};
@@ -112,7 +112,7 @@ impl Pack {
     }
 }
 
-/// One batch.
+/// Makes the steps of one batch.
 fn step(bank: &mut EstimatorBank, steps: &[(usize, CellStep)]) {
     steps.iter().for_each(|(cell, step)| bank.add(*cell, step));
     bank.step();
@@ -162,7 +162,8 @@ fn differences<const N: usize>(model: &CellModel, config: &EstimatorConfig, roun
             (soc, others) = (soc.max(of_soc), others.max(of_others));
         }
         if time % 2500 == 1249 {
-            // Half-cycles restate the curve's capacity: the curve of an aged cell holds at each temperature and interval after it.
+            // Half-cycles change the capacity of the curve. Afterwards, both filters must use the curve of the aged
+            // cell at every temperature and in every SOC interval.
             for (cell, textbook) in textbooks.iter_mut().enumerate() {
                 let mean = model.capacity_ah * (0.95 - 0.02 * cell as f64);
                 let curve = ScalarGaussian { mean, ..bank.cell(cell).curve() };
@@ -236,7 +237,7 @@ fn estimate_is_independent_of_other_cells() {
     let mut pack = Pack::new(&model, 11);
     for time in 0..3000 {
         let steps = pack.steps(time);
-        // In two parts, the second backwards.
+        // The steps are made in two batches, the second in reverse order.
         let (first, second) = steps.split_at(steps.len() / 3);
         step(&mut together, first);
         step(&mut together, &second.iter().rev().copied().collect::<Vec<_>>());

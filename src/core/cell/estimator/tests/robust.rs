@@ -1,5 +1,5 @@
-//! Tests of the estimator with wrong initial values, a current sensor with an offset, and rests in which the cell still
-//! relaxes.
+//! Tests the estimator with wrong initial values, with an offset of the current sensor, and at rests during which the
+//! cell still relaxes.
 //!
 //! The simulated cell has a slow branch that the estimator's model lacks; there is no noise.
 
@@ -8,8 +8,9 @@ use super::*;
 /// Time constant of the slow polarisation that the estimator's model lacks, s.
 const SLOW_TAU_S: f64 = 1500.0;
 
-/// Resistance of the slow polarisation, ohm: a fifth of the model's resistance. From 15 mohm on, the intervals would be
-/// too narrow: the default model error of 0.15 V over one second does not cover an error that lasts for 1500 s.
+/// Resistance of the slow polarisation, ohm. It is a fifth of the model's resistance. From 15 mohm on, the intervals
+/// would be too narrow: the default model error of 0.15 V over one second does not cover an error that lasts for 1500
+/// s.
 const SLOW_OHM: f64 = 0.01;
 
 /// Half of a 95 % interval, standard deviations.

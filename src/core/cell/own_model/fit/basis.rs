@@ -1,4 +1,4 @@
-//! Predicted voltages of a notebook's rows from the parameters of a fit, with derivatives.
+//! Predicts the voltages of a notebook's rows from the parameters of a fit, with derivatives.
 //!
 //! In: parameters (indices below) and rows. Out: V. A row's voltage is linear in the curve and in all resistances.
 
@@ -11,16 +11,17 @@ use crate::cell::notebook::Row;
 use crate::cell::own_model::{FACTOR_NODES, OwnModel, SOC_NODES};
 use crate::filter::interpolation::{between, locate_clamped};
 
-/// First indices of the parameters: difference from the label's curve, V, at the SOC breakpoints; ln of the resistance
-/// factors over SOC; their deviation from the temperature law; difference from the label's cold sag, V; ln of the
-/// capacity, Ah; offset of the current sensor, A (measured minus true); SOC at the start of each stretch.
+/// Index of the first parameter of each group. From index 0: difference from the label's curve, V, at the SOC
+/// breakpoints. [`FACTORS`]: ln of the resistance factors over SOC. [`BY_TEMPERATURE`]: their deviation from the
+/// temperature law. [`COLD_SAG`]: difference from the label's cold sag, V. [`LOG_CAPACITY`]: ln of the capacity, Ah.
+/// [`OFFSET`]: offset of the current sensor, A (measured minus true). [`BEGINNINGS`]: SOC at the start of each stretch.
 pub(super) const FACTORS: usize = SOC_NODES;
 pub(super) const BY_TEMPERATURE: usize = FACTORS + RESISTANCES * FACTOR_NODES;
 pub(super) const COLD_SAG: usize = BY_TEMPERATURE + RESISTANCES;
 pub(super) const LOG_CAPACITY: usize = COLD_SAG + 1;
 pub(super) const OFFSET: usize = LOG_CAPACITY + 1;
 pub(super) const BEGINNINGS: usize = OFFSET + 1;
-/// Parameters of curve and SOC among those of a row.
+/// Number of parameters of the curve and the SOC that change the voltage of a row.
 pub(super) const CURVE_AND_SOC: usize = 6;
 
 /// Limits of the SOC at the start of a stretch.

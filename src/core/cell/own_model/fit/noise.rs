@@ -1,4 +1,4 @@
-//! Errors of a notebook's rows: their covariance, and the cost of residuals.
+//! Computes the covariance of the errors of a notebook's rows, and the cost of residuals.
 //!
 //! In: predictions and rows. Out: whitened residuals with their derivatives, and their cost (minus the logarithm of
 //! their density).
@@ -23,7 +23,7 @@ pub(super) struct RepeatedErrors {
 }
 
 impl RepeatedErrors {
-    /// Errors of circuits, for fitting the capacity.
+    /// Repeating errors of usual circuit models, for fitting the capacity.
     pub(super) const USUAL: Self = Self { voltage_v: 0.012, soc: 0.01, drop: 0.2 };
     /// Repeating errors for fitting the tables. They are smaller than `USUAL`, so that differences that the rows have
     /// in common go into the tables and not into the errors.

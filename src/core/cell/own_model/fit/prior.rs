@@ -1,4 +1,4 @@
-//! Prior of a cell's parameters from its label: covariance and information matrix.
+//! Computes the prior of a cell's parameters from the cell's label: covariance and information matrix.
 
 use nalgebra::DMatrix;
 
@@ -11,7 +11,7 @@ use crate::filter::bell;
 /// Standard deviation of ln(resistance) between cells that all resistances of a cell have in common. This constant and
 /// the next three were found on the five cells that also give the usual resistances of a chemistry.
 const COMMON_LOG_STD: f64 = 0.35;
-/// Standard deviation of ln(resistance) of each single resistance, in addition to the common one.
+/// Standard deviation of ln(resistance) of each single resistance, in addition to the common standard deviation.
 const PART_LOG_STD: [f64; RESISTANCES] = [0.3, 0.4, 0.4, 0.5];
 /// Standard deviation of ln(resistance) over the SOC.
 const SHAPE_LOG_STD: f64 = 0.15;

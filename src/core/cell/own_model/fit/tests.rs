@@ -1,4 +1,4 @@
-//! Fits of rows made from a known cell.
+//! Tests fits to rows that were made from a known cell.
 
 use super::*;
 

@@ -1,12 +1,12 @@
-//! State of the interfaces, for the alarm rule about interfaces.
+//! Tracks the state of the interfaces for the alarm rule about interfaces.
 //!
 //! An interface counts as faulty in three cases:
 //! * while it is down or missing;
 //! * from bus-off until the interface is up again or receives a frame;
 //! * while the daemon's frames cannot be sent.
 //!
-//! Its state is unknown before its first report. After a restart, a fault continues until the interface reports that it
-//! works.
+//! The state of an interface is unknown before its first report. After a restart, a fault continues until the interface
+//! reports that it works.
 
 use serde::{Deserialize, Serialize};
 
@@ -17,8 +17,8 @@ use crate::quantity::{BusIndex, Timestamp};
 pub(crate) const CAN_ERR_BUSOFF: u32 = 0x40;
 const CAN_ERR_RESTARTED: u32 = 0x100;
 
-/// Time after the last report of a failure from which sending counts as working again, s: four report periods of the
-/// driver.
+/// If the driver has not reported a failure to send for this time, s, sending counts as working again. The time is four
+/// report periods of the driver.
 const SEND_RECOVERED_S: f64 = 1.0;
 
 #[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]

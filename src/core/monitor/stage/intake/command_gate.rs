@@ -24,7 +24,7 @@ const FORGED_PERIOD_NS: i64 = 10_000_000_000;
 /// limit), the probability of guessing an authenticator of 24 bits and its repetition within a day is 1 in 800.
 const REPEAT_NS: i64 = 1_000_000_000;
 
-/// Age at which an announced freshness is outdated, ns: two announcement periods.
+/// Age, ns, at which an announced freshness is outdated. It is two announcement periods.
 const STALE_NS: i64 = 2 * FRESHNESS_PERIOD_MS as i64 * 1_000_000;
 
 /// The gate with its counts. The whole structure is stored.

@@ -1,5 +1,5 @@
-//! Contents of the digest frame: a summary of all raised alarms, the state of every rule, and one threshold. Successive
-//! digests show the thresholds one after another.
+//! Computes the contents of the digest frame: a summary of all raised alarms, the state of every rule, and one
+//! threshold. Successive digests show the thresholds one after another.
 //!
 //! In: the alarm engine. Out: [`DigestFields`]. A rule that cannot be judged is shown as unknown, never as "no alarm".
 

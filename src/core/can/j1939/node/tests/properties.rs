@@ -1,4 +1,4 @@
-//! Properties of the node for any sequence of inputs.
+//! Tests properties of the node for any sequence of inputs.
 
 use std::collections::BTreeMap;
 

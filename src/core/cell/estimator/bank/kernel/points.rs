@@ -13,7 +13,7 @@ pub(super) const COLUMNS: usize = 3;
 /// The first columns of the lower Cholesky factor, and the remaining covariance of the branches.
 pub(super) struct PartialCholesky<const L: usize, const N: usize> {
     pub(super) columns: [[Lanes<L>; N]; COLUMNS],
-    /// `rest[i][j]`, both of the branches, j <= i; zero elsewhere.
+    /// Element `rest[i][j]` is the remaining covariance of the branch states i and j <= i. All other elements are zero.
     pub(super) rest: [[Lanes<L>; N]; N],
     pub(super) is_positive: Mask<L>,
 }
@@ -49,8 +49,8 @@ struct CholeskyColumn<const L: usize, const N: usize> {
 }
 
 impl<const L: usize, const N: usize> CholeskyColumn<L, N> {
-    /// Column K, from the columns before it. Does not wait for their square roots. NaN if there is no factor; the NaN
-    /// then appears in every result.
+    /// Computes column K from the columns before it, without waiting for their square roots. If the covariance has no
+    /// factor, the column is NaN, and so is every result.
     #[inline(always)]
     fn new<const T: usize, const K: usize>(covariance: &[Lanes<L>; T], done: [&Self; K]) -> Self {
         let mut left = [Lanes::splat(0.0); N];

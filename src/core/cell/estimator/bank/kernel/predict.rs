@@ -1,4 +1,4 @@
-//! The prediction: the circuit's equations over a measured time.
+//! Predicts the state over a measured time with the circuit's equations.
 //!
 //! In: a state, charge (A s) and time (s). Out: mean and covariance after this time, in the units of the states, and a
 //! mask of the lanes whose covariance was positive definite.
@@ -11,10 +11,11 @@ use crate::cell::estimator::state_vector::{
 };
 use crate::filter::simd::{Lanes, Mask};
 
-/// Maximum time between two readings that counts for the random walk of the resistance, s: a cell hardly ages in a gap.
+/// Maximum time between two readings, s, that counts for the random walk of the resistance. A cell hardly ages in a
+/// gap.
 const MAX_WALK_S: f64 = 600.0;
 
-/// A branch at L table points, over the measured time.
+/// Values of a branch at L table points, for the measured time.
 struct BranchStep<const L: usize> {
     /// Resistance of new cells, ohm.
     r_ohm: Lanes<L>,
@@ -71,7 +72,7 @@ struct BranchPrediction<const L: usize> {
     centre_v: Lanes<L>,
     /// Remaining fraction of the branch's voltage, at the centre.
     decay: Lanes<L>,
-    /// Voltage that a current adds to a new cell's, at the centre, ohm.
+    /// Voltage that a current adds to the branch of a new cell, per ampere, at the centre, ohm.
     gain_ohm: Lanes<L>,
     noise: Lanes<L>,
     parts: OddEvenParts<L>,
@@ -165,7 +166,7 @@ pub(in crate::cell::estimator::bank) fn predict<const L: usize, const N: usize, 
         p[at(i, CAPACITY)] = sum(capacity_column, odd);
         for j in BRANCHES..=i {
             let (other, other_decay) = &done[j];
-            // One factor moves all columns beyond the second.
+            // All columns beyond the second are multiplied by the same factor.
             let others = x.covariance[at(i, j)] - l[0][i] * l[0][j] - l[1][i] * l[1][j];
             p[at(i, j)] = odd[0] * other.odd[0]
                 + odd[1] * other.odd[1]

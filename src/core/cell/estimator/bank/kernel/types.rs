@@ -33,7 +33,7 @@ pub(in crate::cell::estimator::bank) const MEMORY: usize = 12;
 pub(in crate::cell::estimator::bank) const LOAD_A: usize = 0;
 /// Mean normalised innovation squared.
 pub(in crate::cell::estimator::bank) const MEAN_NIS: usize = 1;
-/// Time that the next reading stands for, s.
+/// Time that the next reading represents, s.
 pub(in crate::cell::estimator::bank) const INFORMATION_S: usize = 2;
 /// Time at rest, s.
 pub(in crate::cell::estimator::bank) const REST_S: usize = 3;
@@ -127,7 +127,7 @@ pub(in crate::cell::estimator::bank) struct StepOutcome<const L: usize> {
 pub(in crate::cell::estimator::bank) struct KernelConstants {
     /// Spread s of the sigma points.
     pub(super) scale: f64,
-    /// beta - alpha^2.
+    /// Factor of m m' in the covariance: beta - alpha^2.
     pub(super) excess: f64,
     pub(super) euler: bool,
     pub(in crate::cell::estimator::bank) process: ProcessVariances,
@@ -139,7 +139,7 @@ pub(in crate::cell::estimator::bank) struct KernelConstants {
     pub(super) consistency_window_s: f64,
 }
 
-/// Variances that the states gain.
+/// Variances that the states gain through process noise.
 #[derive(Debug, Clone, PartialEq)]
 pub(in crate::cell::estimator::bank) struct ProcessVariances {
     pub(in crate::cell::estimator::bank) soc_per_s: f64,
@@ -152,21 +152,21 @@ pub(in crate::cell::estimator::bank) struct ProcessVariances {
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct ReadingVariances {
     pub(super) sensor: f64,
-    /// One-second variance of the model's error, if the tables state none.
+    /// Variance of the model's error over one second; used if the tables state no error.
     pub(super) model: f64,
-    /// Per square of the voltage drop, over one second.
+    /// Variance of the model's error per square of the voltage drop, over one second.
     pub(super) drop: f64,
-    /// Per square of the load's voltage, over one second.
+    /// Variance of the model's error per square of the load's voltage, over one second.
     pub(super) load: f64,
     pub(super) gate: f64,
-    /// Per square of the slope of the open-circuit voltage.
+    /// Variance, for the gate, per square of the slope of the open-circuit voltage.
     pub(super) gate_soc: f64,
     /// Maximum test ratio of an accepted reading.
     pub(super) gate_limit: f64,
 }
 
 impl KernelConstants {
-    /// Time that a reading stands for, s.
+    /// Time that a reading represents, s.
     #[inline(always)]
     pub(in crate::cell::estimator::bank) fn information_s<const L: usize>(
         &self,
@@ -222,7 +222,7 @@ impl<const N: usize, const T: usize> FilterState<1, N, T> {
         }
     }
 
-    /// The state without its lane.
+    /// Returns the state as a [`Gaussian`].
     pub(in crate::cell::estimator::bank) fn gaussian(&self) -> Gaussian {
         let (mut mean, mut covariance, mut by_constant) = (SVector::zeros(), SMatrix::zeros(), SMatrix::zeros());
         for i in 0..N {

@@ -1,4 +1,4 @@
-//! The update of the state with a measured voltage.
+//! Updates the state with a measured voltage.
 //!
 //! In: a state and the reading, V. Out: the updated state, the innovation, V, its variance, V^2, and the test ratio.
 //! The test ratio is 1 for an innovation of one standard deviation. One mask marks the usable lanes, another one the
@@ -20,9 +20,9 @@ use crate::filter::simd::Lanes;
 
 /// Predicted voltage.
 struct PredictedVoltage<const L: usize> {
-    /// At the centre, V.
+    /// Voltage at the centre sigma point, V.
     centre_v: Lanes<L>,
-    /// Over the pairs of the first columns.
+    /// Odd and even parts of the voltage over the pairs of the first columns.
     parts: OddEvenParts<L>,
     /// Slope of the open-circuit voltage, V per unit of SOC.
     slope_v: Lanes<L>,

@@ -42,8 +42,9 @@ pub(super) fn predict<const N: usize>(
     Ok(())
 }
 
-/// The circuit's equations over a time (s), the charge (A s) and the time with the current sensor's offset (s) in it, with
-/// the noise of branches and resistance; the caller adds the SOC's.
+/// Predicts the state after `dt_s`, s, with the circuit's equations. `charge_as` is the charge moved, A s; `offset_s`
+/// is the time in which this charge contains the current sensor's offset, s. Adds the noise of the branches and of the
+/// resistance; the caller adds the noise of the SOC.
 fn propagate<const N: usize>(
     x: &mut Gaussian<N>,
     model: &CellModel,
@@ -53,8 +54,8 @@ fn propagate<const N: usize>(
 ) -> Result<(), FilterError> {
     let mean_current_a = if dt_s > 0.0 { charge_as / dt_s } else { 0.0 };
     let temperature = model.temperature_position(temperature_c);
-    // The branch parameters are those at the middle of the step's SOC, by the mean capacity: the capacity of each sigma
-    // point would move it by the charge of a step times the capacity's relative deviation, 1e-6 of SOC at most.
+    // The branch parameters are read at the SOC in the middle of the step. This SOC is computed with the mean capacity.
+    // With the capacity of each sigma point, it would differ by at most 1e-6.
     let half_soc = 0.5 * charge_as / (3600.0 * x.mean[CAPACITY]);
     let position = |soc: f64| model.grid_position_at(&temperature, soc - half_soc);
     let f = |x: &SVector<f64, N>| {
@@ -71,7 +72,8 @@ fn propagate<const N: usize>(
     let here = position(x.mean[0]);
     let q = noise::process::<N>(model, config, &here, dt_s);
 
-    // Constant errors: the derivatives of the circuit at the mean, and the charge that the sensor counts in excess.
+    // The effects of the constant errors follow from the derivatives of the circuit at the mean and from the charge
+    // that the sensor counts in excess.
     let mut by_constant = x.by_constant;
     let (per_as, ratio) = (1.0 / (3600.0 * x.mean[CAPACITY]), libm::exp(x.mean[LOG_RESISTANCE]));
     let mut excess_as = [0.0; CONSTANT_ERRORS];

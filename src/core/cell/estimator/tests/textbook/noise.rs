@@ -1,4 +1,4 @@
-//! Process noise of a step, and measurement noise of a voltage reading, with the textbook filter.
+//! Computes the process noise of a step and the measurement noise of a voltage reading for the textbook filter.
 
 use nalgebra::{SMatrix, SVector};
 
@@ -11,10 +11,11 @@ use crate::cell::estimator::state_vector::{
 use crate::cell::{CellModel, ERROR_WINDOW_S, EstimatorConfig, GridPosition, SensorErrors, TemperaturePosition};
 use crate::filter::ScalarGaussian;
 
-/// Maximum time between two readings that counts for the random walk of the resistance, s: a cell hardly ages in a gap.
+/// Maximum time between two readings, s, that counts for the random walk of the resistance. A cell hardly ages in a
+/// gap.
 const MAX_WALK_S: f64 = 600.0;
 
-/// Covariance that the random walks gain in `dt_s`; the capacity's is added at transitions.
+/// Covariance that the random walks gain in `dt_s`, s. The noise of the capacity is added at transitions.
 pub(super) fn process<const N: usize>(
     model: &CellModel,
     config: &EstimatorConfig,
@@ -23,7 +24,7 @@ pub(super) fn process<const N: usize>(
 ) -> SMatrix<f64, N, N> {
     let mut q = SMatrix::zeros();
     for i in BRANCHES..N {
-        // Noise fed into a decaying branch: bounded by tau/2 however long the step.
+        // A branch decays, so it loses old noise: a step of any length counts as at most tau/2.
         let half_tau_s = 0.5 * model.branch_tau_s(i - BRANCHES, position);
         let effective_s = half_tau_s * -libm::expm1(-dt_s / half_tau_s);
         q[(i, i)] = square(config.process.branch_v_per_sqrt_s) * effective_s;
@@ -39,8 +40,9 @@ pub(super) struct VoltageReading {
     pub(super) load_a: f64,
     pub(super) temperature: TemperaturePosition,
     pub(super) information_s: f64,
-    /// Capacity of the open-circuit curve, Ah, as learned by the last half-cycle. A voltage must not change the
-    /// capacity through the shape of the curve, because errors of the model would be mistaken for lost capacity.
+    /// Capacity that selects the open-circuit curve of the aged cell, Ah, as learned by the last half-cycle. A voltage
+    /// must not change the capacity through the shape of the curve, because errors of the model would be mistaken for
+    /// lost capacity.
     pub(super) curve: ScalarGaussian,
     /// Resistance of the slowest branch relative to the model, in addition to the resistance ratio of the cell.
     pub(super) slow_ratio: f64,

@@ -52,7 +52,8 @@ pub(super) struct SigmaPointWeights {
 }
 
 impl SigmaPointWeights {
-    /// From alpha (0 to 1], beta and kappa, for `n` states; `n` + `kappa` must be positive.
+    /// Computes the weights for `n` states from alpha (above 0, at most 1), beta and kappa; `n` + `kappa` must be
+    /// positive.
     pub(super) fn new(n: usize, alpha: f64, beta: f64, kappa: f64) -> Self {
         let total = alpha * alpha * (n as f64 + kappa); // n + lambda
         let mean_0 = (total - n as f64) / total;
@@ -100,7 +101,7 @@ impl<const N: usize> Gaussian<N> {
 
     /// Propagates the state through `f` and adds the process noise covariance `q`.
     ///
-    /// If the covariance cannot be factored or the result is not finite. The state is then unchanged.
+    /// Returns an error if the covariance cannot be factored or the result is not finite. The state is then unchanged.
     pub(super) fn predict(
         &mut self,
         spread: &SigmaPointWeights,
@@ -126,7 +127,7 @@ impl<const N: usize> Gaussian<N> {
     /// Updates the state with the scalar measurement `z` = `h`(x) + `noise`. An innovation beyond the gate is reported
     /// and leaves the state unchanged.
     ///
-    /// If the covariance cannot be factored or the result is not finite. The state is then unchanged.
+    /// Returns an error if the covariance cannot be factored or the result is not finite. The state is then unchanged.
     pub(super) fn update(
         &mut self,
         spread: &SigmaPointWeights,
@@ -250,7 +251,8 @@ mod tests {
 
     #[test]
     fn considered_errors_match_augmented_filter() {
-        // States [x0, x1, b] with b constant and never corrected, against two states and a column.
+        // Compares two filters. One has the states [x0, x1, b], where b is constant and never corrected; the other has
+        // two states and a column for b.
         let spread = SigmaPointWeights::new(2, 1.0, 2.0, 0.0);
         let (f, h, hb, r) = (matrix![1.0, 0.1; 0.0, 0.9], matrix![1.0, 0.4], 0.3, 0.02);
         let into = vector![0.05, 0.0];
@@ -321,7 +323,8 @@ mod tests {
 
     #[test]
     fn matched_noise_gives_consistent_innovations() {
-        // Random walk observed in noise, both drawn by a small fixed generator: mean NIS must be 1 within 3 sigma.
+        // A small generator with a fixed seed draws a random walk and the noise of its measurements. The mean NIS must
+        // be 1 within 3 sigma.
         let spread = SigmaPointWeights::new(1, 1.0, 2.0, 0.0);
         let mut seed = 0x2545_F491_4F6C_DD1D_u64;
         let mut normal = || {

@@ -1,4 +1,4 @@
-//! Noise against its closed forms.
+//! Compares the noise with closed formulas.
 
 use super::*;
 use crate::cell::Table;
