@@ -20,7 +20,7 @@ const WINDOW_S: f64 = 2.0;
 /// Maximum number of messages (identifiers on an interface) that are kept. A car has a few hundred messages; a flood of random
 /// identifiers has more.
 const MAX_MESSAGES: usize = 4096;
-/// First data byte of the answers of BMW controllers. Their extended addressing is recognised without a definition.
+/// First data byte in answers from BMW controllers, by which their extended addressing is recognised without a definition.
 const TESTER: u8 = 0xF1;
 
 /// An identifier on an interface.
