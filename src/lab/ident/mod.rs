@@ -24,7 +24,7 @@ pub mod unanchored;
 /// Consecutive rows whose time does not restart.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct MeasuredPart {
-    /// Value of the part column; empty without this column.
+    /// Value of the part column (`cycle`, `segment` or `ref`); empty if the file has no such column.
     pub key: String,
     /// Value of the `type` column in the first row, `charge` or `discharge`; empty without that column.
     pub kind: String,
@@ -80,7 +80,7 @@ impl MeasuredPart {
         charge_ah[last] - charge_ah[first]
     }
 
-    /// Whether it has no rows.
+    /// Whether the part has no rows.
     pub fn is_empty(&self) -> bool {
         self.time_s.is_empty()
     }

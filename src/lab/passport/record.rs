@@ -68,7 +68,7 @@ pub struct Record {
     pub(super) cells: Vec<CellRecord>,
     /// End of the last half-cycle. If the clock was set back, this is not the latest time.
     pub(super) moved_until_ns: Option<i64>,
-    /// Why the half-cycles lack charge.
+    /// Why the half-cycles do not contain all charge; `None` = they do.
     pub(super) gap: Option<String>,
     /// `None` = unknown: the record comes from a store.
     pub(super) energy: Option<Energy>,
@@ -250,7 +250,7 @@ impl Record {
         (strings * most.charge_ah, (most.discharging_s - most.charging_s).abs() / 3600.0)
     }
 
-    /// Sums of the cell that moved most.
+    /// Returns the sums of the cell that moved the largest charge.
     fn fullest(&self) -> Throughput {
         let sums = self.cells.iter().map(|cell| cell.moved);
         sums.max_by(|a, b| a.charge_ah.total_cmp(&b.charge_ah)).unwrap_or_default()

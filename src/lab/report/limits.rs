@@ -1,4 +1,4 @@
-//! Limits of the alarms: from the configuration, or without one from the alarms in the record.
+//! Finds the limits of the alarms. They come from the configuration; if there is none, from the alarms in the record.
 
 use super::context::PageContext;
 use super::data::Data;

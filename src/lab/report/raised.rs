@@ -89,7 +89,7 @@ pub(super) fn cells(cells: impl Iterator<Item = usize>) -> String {
     }
 }
 
-/// Value at the end of the record of the quantity that an alarm judges; `None` = the record does not contain it.
+/// Returns the value that an alarm compares with its threshold, at the end of the record; `None` = the record does not contain it.
 pub(super) fn value(
     row: &AlarmRecord,
     data: &Data,

@@ -39,7 +39,7 @@ pub struct ScoreRequest {
     pub settle_s: f64,
     /// Charge from full to empty that defines the true SOC, Ah; `None` = the model's capacity.
     pub truth_capacity_ah: Option<f64>,
-    /// A longer gap means that the recorder was asleep, s.
+    /// If a gap in a file is longer than this, s, the recorder was asleep.
     pub sleep_gap_s: f64,
     /// Tables of published capacities, one per file; empty without tables.
     pub cycles: Vec<PathBuf>,

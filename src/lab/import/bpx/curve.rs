@@ -107,7 +107,8 @@ impl<'a> Curve<'a> {
 
     /// The curve at suitable breakpoints.
     ///
-    /// # Errors The open-circuit voltage at a breakpoint is not a finite number above 0.
+    /// # Errors
+    /// The open-circuit voltage at a breakpoint is not a finite number above 0.
     pub(super) fn table(&self, temperature_k: &[f64]) -> Result<CurveTable, Vec<String>> {
         let mut table = CurveTable { soc: self.nodes(), ocv_v: Vec::new(), raised_v: 0.0 };
         for &kelvin in temperature_k {
