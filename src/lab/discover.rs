@@ -101,7 +101,7 @@ pub struct Discoverer {
 }
 
 impl PositiveDirection {
-    /// Name in a configuration.
+    /// Returns the name of this direction in a configuration.
     pub fn name(self) -> &'static str {
         match self {
             Self::Charge => "charge",

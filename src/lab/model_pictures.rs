@@ -14,7 +14,7 @@ use crate::config::cell_model::{KnownBy, SourcedModel};
 const POINTS: u32 = 200;
 /// Range of the picture over temperature, degrees Celsius; the picture ends earlier if the tables do.
 const SHOWN_C: (f64, f64) = (-20.0, 50.0);
-/// Second, cold temperature that is drawn with the temperature of the curve, degrees Celsius.
+/// Cold temperature that is drawn in addition to the temperature of the curve, degrees Celsius.
 const COLD_C: f64 = 0.0;
 /// Below this SOC, percent, a curve or resistance may leave the picture, because both rise steeply there.
 const STEEP_PERCENT: f64 = 12.0;

@@ -1,4 +1,4 @@
-//! Configurations and cell models: an accepted configuration must run and accept its own stored state.
+//! Configurations and cell models. A monitor with an accepted configuration must run, and accept the state that it has stored.
 
 use packwatch::config::Config;
 use packwatch::monitor::{Downtime, Monitor, Outputs, Snapshot};

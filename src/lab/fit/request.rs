@@ -12,7 +12,7 @@ use crate::quantity::bounds;
 /// Maximum number of SOC breakpoints: one per percent. The duration of a fit grows with the cube of their number.
 pub const MAX_SOC_NODES: usize = 101;
 
-/// What is fitted.
+/// Arguments of a fit.
 #[derive(Debug, Clone, Default)]
 pub struct FitRequest {
     /// Name of the cell.

@@ -53,7 +53,7 @@ impl TableFormat {
     }
 }
 
-/// Settings of all logs.
+/// Settings that apply to all logs.
 #[derive(Clone)]
 pub struct ExportSettings<'a> {
     /// How to read the logs.

@@ -73,7 +73,7 @@ impl MeasuredPart {
         let lowest_v = self.voltage_v[..=last].iter().copied().fold(f64::INFINITY, f64::min);
         let is_held = |row: usize| {
             let current_a = self.current_a[row];
-            // The voltage is held if the current is below 97 % of the load and the voltage within 50 mV of its lowest value.
+            // The voltage is held if it is within 50 mV of its lowest value while the current is below 97 % of the load.
             current_a > 0.0 && current_a < 0.97 * load_a && self.voltage_v[row] <= lowest_v + 0.05
         };
         let first = (0..=last).rev().take_while(|&row| is_held(row)).last().unwrap_or(last);

@@ -15,11 +15,11 @@ use crate::store::{HistoryEntry, HistoryExtent, HistoryQuery, HistoryReader, His
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Learned {
     pub(super) at_ns: i64,
-    /// Ah.
+    /// Capacity, Ah.
     pub(super) capacity: (f64, f64),
     /// Usable capacity, Ah, with the time of the latest half-cycle that gave it; `None` = no load is configured.
     pub(super) usable: Option<(i64, (f64, f64))>,
-    /// Relative to new.
+    /// Resistance relative to a new cell.
     pub(super) resistance: (f64, f64),
 }
 
@@ -70,7 +70,7 @@ pub struct Record {
     pub(super) moved_until_ns: Option<i64>,
     /// Why the half-cycles do not contain all charge; `None` = they do.
     pub(super) gap: Option<String>,
-    /// `None` = unknown: the record comes from a store.
+    /// Energy of charges and discharges; `None` = unknown, because the record comes from a store.
     pub(super) energy: Option<Energy>,
     limits: ReadingLimits,
     /// Losses of a replay.

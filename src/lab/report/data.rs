@@ -44,7 +44,7 @@ pub(super) struct CapacityRecord {
     /// Learned capacity, Ah: mean and standard deviation.
     pub(super) capacity_ah: (f64, f64),
     pub(super) usable_ah: Option<(f64, f64)>,
-    /// Losses of lithium and of the material of the negative and positive electrode, fractions.
+    /// Losses of lithium, of the negative and of the positive electrode, fractions: mean and standard deviation each.
     pub(super) losses: Option<[(f64, f64); 3]>,
     /// Resistance relative to new: mean and standard deviation.
     pub(super) resistance: (f64, f64),

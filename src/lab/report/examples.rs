@@ -54,9 +54,9 @@ pub(super) fn recording(first_s: f64, length_s: f64) -> Data {
 pub(super) struct CellStds {
     pub(super) capacity_ah: f64,
     pub(super) usable_ah: f64,
-    /// Relative to new.
+    /// Resistance relative to a new cell.
     pub(super) resistance: f64,
-    /// Lithium, negative and positive electrode, fractions.
+    /// Losses of lithium and of the two electrodes (negative, positive), fractions.
     pub(super) losses: [f64; 3],
 }
 

@@ -31,7 +31,7 @@ pub(super) fn rank(severity: &str) -> usize {
     Severity::ALL.iter().position(|known| known.name() == severity).unwrap_or(0)
 }
 
-/// The rule of this name.
+/// Returns the rule with this name.
 pub(super) fn rule(name: &str) -> Option<Rule> {
     Rule::ALL.into_iter().find(|rule| rule.name() == name)
 }
