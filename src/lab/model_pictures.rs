@@ -1,4 +1,4 @@
-//! Pictures of a cell model: open-circuit curve, slope of the curve, resistances over SOC and over temperature, and the SOC error that
+//! Draws a cell model: open-circuit curve, slope of the curve, resistances over SOC and over temperature, and the SOC error that
 //! follows from them.
 //!
 //! Bands are 95 % intervals ([`ModelBands`]). If a model does not state the error of its curve, the curve has no band, and the

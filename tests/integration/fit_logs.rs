@@ -1,4 +1,5 @@
-//! Models from labels and from ordinary drives (`score --chemistry`, `fit --log`), on simulated and measured cells.
+//! Tests models from labels and from ordinary drives (`score --chemistry`, `fit --log`), on simulated and measured
+//! cells.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};

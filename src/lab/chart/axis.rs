@@ -1,4 +1,4 @@
-//! Axes: their range, ticks and labels.
+//! Determines the range, ticks and labels of an axis.
 
 use crate::filter::ends;
 use crate::io::stamp::format_utc;

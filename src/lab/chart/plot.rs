@@ -1,4 +1,4 @@
-//! Lines, bands, points and thresholds over one pair of axes.
+//! Draws lines, bands, points and thresholds over one pair of axes.
 
 use super::axis::Axis;
 use super::style::Ink;

@@ -1,4 +1,4 @@
-//! Bands of states over time; they show when each alarm was raised.
+//! Draws states over time as bands, which show when each alarm was raised.
 
 use super::Size;
 use super::axis::Axis;

@@ -1,4 +1,4 @@
-//! Frames and diagnostic answers of a log, within a memory limit.
+//! Stores the frames and diagnostic answers of a log within a memory limit.
 //!
 //! All frames are kept until they exceed [`MAX_BYTES`]. Then whole windows of [`WINDOW_S`] are dropped: first every second window, then
 //! three of four, and so on. All identifiers keep the same windows, so the pages of multiplexed messages stay complete. Answers are

@@ -1,4 +1,4 @@
-//! Deviations of the cells of a pack from their mean: capacity, resistance and charge of each cell, and notes on outliers.
+//! Determines how the cells of a pack differ from their mean: capacity, resistance and charge of each cell, and notes on outliers.
 //!
 //! Input: for some rows, the difference between the voltage of every cell and the mean voltage (V); and the fitted records of the mean
 //! cell. Output: a [`CellDeviation`] per cell. All cells share one curve and one current sensor, so errors of the model and of the

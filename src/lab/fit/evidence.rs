@@ -1,4 +1,4 @@
-//! Notes on quantities that the logs do not determine. For these quantities, the fit keeps the values of the initial
+//! Writes notes on quantities that the logs do not determine. For these quantities, the fit keeps the values of the initial
 //! model.
 //!
 //! Input: stretches and fitted records of the mean cell, capacities (Ah). Output: notes for the user.

@@ -1,4 +1,4 @@
-//! A request for a fit; the command line and the Python module use it.
+//! Defines and checks the request for a fit, which the command line and the Python module make.
 //!
 //! Input: files, and known data of the cell. Output: a checked request. Only [`FitRequest::check`] defines the allowed ranges. Errors
 //! name the argument of the command.

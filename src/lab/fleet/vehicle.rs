@@ -1,4 +1,4 @@
-//! A vehicle of a fleet: its line in the manifest, and the file `vehicle.json` in its folder.
+//! Describes a vehicle of a fleet: its line in the manifest, and the file `vehicle.json` in its folder.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

@@ -1,4 +1,5 @@
-//! Error of the fitted model over SOC and temperature: the standard deviation of its voltage error, averaged over [`BLOCK_S`].
+//! Estimates the error of the fitted model over SOC and temperature: the standard deviation of its voltage error, averaged over
+//! [`BLOCK_S`].
 //!
 //! Errors of a model are correlated over minutes, so they are averaged over blocks of 100 s. A block is weighted by the charge that was
 //! moved in it, and is shared among the nodes around it. A node with little charge follows the mean of its temperature.

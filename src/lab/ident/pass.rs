@@ -1,4 +1,4 @@
-//! One pass over the data: residuals, their exact Jacobian, and the normal equations.
+//! Makes one pass over the data: computes the residuals, their exact Jacobian, and the normal equations.
 //!
 //! The residual of a row is e = V - (OCV(s,T) - sum U_i - R0(s,T) I). Over the step of a row, the voltage U of a branch is solved
 //! exactly:

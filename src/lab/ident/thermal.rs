@@ -1,4 +1,4 @@
-//! Heat capacity C and thermal resistance R of a cell: C dT/dt = I (OCV - V) - (T - Ta)/R, integrated and solved by linear least
+//! Fits heat capacity C and thermal resistance R of a cell: C dT/dt = I (OCV - V) - (T - Ta)/R, integrated and solved by linear least
 //! squares.
 //!
 //! The surroundings are assumed to have the temperature at which a record starts. Some records start while the cell is still warm or

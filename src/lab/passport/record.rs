@@ -1,4 +1,4 @@
-//! Record of the connected pack, from a store or a replay: sums of half-cycles, energy, latest learned values, last state.
+//! Collects the record of the connected pack from a store or a replay: sums of half-cycles, energy, latest learned values, last state.
 //!
 //! Times are nanoseconds since 1970, on the wall clock of a store or the log's clock of a replay. Rows of a store and events of a replay
 //! use the same names, so both give the same sums. Energy needs every voltage, which a store does not contain. If a part of a

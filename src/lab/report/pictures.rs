@@ -1,4 +1,4 @@
-//! The report's pictures, each with the name of its file.
+//! Draws the report's pictures, each with the name of its file.
 
 use std::path::Path;
 

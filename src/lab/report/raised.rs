@@ -1,4 +1,4 @@
-//! The state at the end of the record: raised alarms with their values at this time, and cells whose estimate is untrusted.
+//! Determines the state at the end of the record: raised alarms with their values, and cells whose estimate is untrusted.
 
 use std::collections::BTreeMap;
 

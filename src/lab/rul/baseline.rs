@@ -1,4 +1,4 @@
-//! Baselines for comparison with forecasts: a straight line through the last points, and a least-squares double
+//! Computes baselines for comparison with forecasts: a straight line through the last points, and a least-squares double
 //! exponential.
 //!
 //! Input: points of [use, capacity]. Output: the use at which the curve first falls below the threshold.

@@ -1,4 +1,4 @@
-//! Capacity histories: a [`CapacityTable`] in order of time.
+//! Reads capacity histories: a [`CapacityTable`] in order of time.
 //!
 //! With a column `type`, only discharges are readings, and each discharge counts as a full cycle. Without this column, the file does
 //! not contain the use, so days are counted. `duration_s` is the time in use that starts at a row; the time from its end to the next

@@ -1,4 +1,4 @@
-//! Tables of published capacities: a [`CapacityTable`] with `cycle` and `type`, one line per cycle.
+//! Reads tables of published capacities: a [`CapacityTable`] with `cycle` and `type`, one line per cycle.
 
 use std::collections::HashMap;
 use std::path::Path;

@@ -1,4 +1,4 @@
-//! A request for scores, which the command line and the Python module use, and the run that is made from it.
+//! Defines and checks the request for scores, which the command line and the Python module make, and runs it.
 //!
 //! Input: files, the configuration of the cell, starts of the estimator, settings of the statistics. Output: [`ScoreRun`], with all
 //! inputs read and checked. Errors name the file or the argument.

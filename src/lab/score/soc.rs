@@ -1,4 +1,4 @@
-//! Errors of the SOC, and the coverage of its interval.
+//! Computes the errors of the SOC, and the coverage of its interval.
 
 use serde::Serialize;
 
