@@ -24,7 +24,8 @@ const SLEEP_GAP_S: f64 = 30.0;
 const LOG_S: f64 = 160.0;
 /// Length of the warm-up, s: the health frames go through all 96 cells once.
 const WARM_S: f64 = 110.0;
-/// Minimum number of frames after the warm-up. The remaining 50 s contain more: 10 currents and 32 other frames every 100 ms.
+/// Minimum number of frames after the warm-up. The remaining 50 s contain more: 10 currents and 32 other frames every
+/// 100 ms.
 const MIN_FRAMES: u64 = 20_000;
 
 /// Maximum number of blocks that may be allocated when a row ends, for 96 cells. A row holds the sums of each cell's

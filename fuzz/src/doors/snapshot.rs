@@ -1,5 +1,5 @@
-//! A stored state with changed numbers and words is either rejected, or the monitor starts from this state, runs, and accepts the
-//! state that it then writes.
+//! Fuzz entry point for a stored state with changed numbers and words. The state is either rejected, or the monitor
+//! starts from this state, runs, and accepts the state that it then writes.
 
 use std::sync::OnceLock;
 
