@@ -1,4 +1,4 @@
-//! Time to decode one frame with [`InputMap::decode`], and to encode the frames of one set of values with
+//! Measures the time to decode one frame with [`InputMap::decode`], and to encode the frames of one set of values with
 //! [`InputEncoder`].
 
 use divan::{Bencher, black_box};

@@ -1,4 +1,5 @@
-//! Time of one estimator step, and of one round of a 96-cell pack through the whole core (frames in, frames out).
+//! Measures the time of one estimator step, and of one round of a 96-cell pack through the whole core (frames in,
+//! frames out).
 
 use common::{example, reading};
 use packwatch_host::can::encode::InputEncoder;

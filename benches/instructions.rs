@@ -1,4 +1,4 @@
-//! Workloads for `tests/instructions`, which counts their instructions: parser, decoder, estimator.
+//! Runs the workloads (parser, decoder, estimator) whose instructions `tests/instructions` counts.
 //!
 //! `instructions WORK PASSES` runs one of [`WORKS`] PASSES times over the same inputs. It prints the number of units
 //! per pass and the processor's SIMD extensions (such as AVX2), which select the estimator's code. `tests/instructions`

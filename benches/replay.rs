@@ -1,4 +1,4 @@
-//! Time of a whole replay of a log with the command: read, parse, decode, estimate, encode.
+//! Measures the time of a whole replay of a log with the command: read, parse, decode, estimate, encode.
 #![expect(clippy::unwrap_used, reason = "a bench panics if its setup fails")]
 
 use std::process::Command;

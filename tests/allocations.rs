@@ -18,13 +18,14 @@ use packwatch::monitor::{Monitor, Outputs, Record, RecordKind, TICK_PERIOD_MS};
 #[global_allocator]
 static ALLOCATOR: dhat::Alloc = dhat::Alloc;
 
-/// A gap in the record that is longer than this means that the recorder was asleep, s. Here there is no gap.
+/// If a gap in the record is longer than this, s, the recorder was asleep. This record has no gap.
 const SLEEP_GAP_S: f64 = 30.0;
 /// Length of the log, s.
 const LOG_S: f64 = 160.0;
 /// Length of the warm-up, s: the health frames go through all 96 cells once.
 const WARM_S: f64 = 110.0;
-/// Minimum number of frames after the warm-up: 50 s of 10 currents and 32 other frames each 100 ms give more.
+/// Minimum number of frames after the warm-up. The remaining 50 s contain more: 10 currents and 32 other frames every
+/// 100 ms.
 const MIN_FRAMES: u64 = 20_000;
 
 /// Maximum number of blocks that may be allocated when a row ends, for 96 cells. A row holds the sums of each cell's

@@ -1,4 +1,4 @@
-//! Estimator inputs shared by several benches: the example pack's cells and their readings.
+//! Provides estimator inputs for several benches: the example pack's cells and their readings.
 
 use packwatch_host::cell::CellStep;
 use packwatch_host::config::{self, Config};

@@ -38,7 +38,7 @@ pub(crate) struct CapacityRow<'t> {
     pub(crate) soc: Option<f64>,
     pub(crate) cell: Option<CellIndex>,
     pub(crate) cycle: Cow<'t, str>,
-    /// Whether the row belongs to a discharge; true for every row of a table without types.
+    /// Whether the row belongs to a discharge; true for every row if the table has no column `type`.
     pub(crate) is_discharge: bool,
     pub(crate) duration_s: Option<f64>,
 }

@@ -1,4 +1,5 @@
-//! Pictures of a cell fault detector. For each estimated state, one picture shows how far each cell is from the median of its pack.
+//! Draws the results of a cell fault detector. For each estimated state, one picture shows how far each cell is from the median of its
+//! pack.
 //!
 //! A bar is a 95 % interval. A cell is red if the detector has reported one of the findings that the picture shows.
 

@@ -101,7 +101,7 @@ pub struct Discoverer {
 }
 
 impl PositiveDirection {
-    /// Name in a configuration.
+    /// Returns the name of this direction in a configuration.
     pub fn name(self) -> &'static str {
         match self {
             Self::Charge => "charge",
@@ -157,7 +157,8 @@ impl Discoverer {
 
     /// Writes a configuration that uses the best candidates of [`finish`](Self::finish).
     ///
-    /// # Errors Some questions are answered neither by the log nor by the settings. The error lists them, one per line.
+    /// # Errors
+    /// Some questions are answered neither by the log nor by the settings. The error lists them, one per line.
     pub fn configuration(&self, discovery: &Discovery, settings: &PackSettings) -> Result<PackConfiguration, LabError> {
         let Self { capture, descriptions } = self;
         let writer = Writer { discovery, capture, descriptions, settings };

@@ -1,4 +1,4 @@
-//! Errors of offline commands: a text that states the place, what was found and what is allowed.
+//! Defines the errors of offline commands. Their text states the place, what was found and what is allowed.
 
 use std::path::Path;
 

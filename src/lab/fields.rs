@@ -1,4 +1,4 @@
-//! Values of an event or of a history row, found by name.
+//! Finds the values of an event or of a history row by name.
 //!
 //! Events and the rows of a store use the same names for the same values. An unknown value is null or a number that is not finite; it
 //! is returned as `None`. Finite numbers are returned unchanged.

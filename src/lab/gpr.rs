@@ -1,4 +1,4 @@
-//! Gaussian process regression on files: tables, cross-validation, trained models, predictions, forecasts, pictures.
+//! Applies Gaussian process regression to files: tables, cross-validation, trained models, predictions, forecasts, pictures.
 //!
 //! [`ColumnTable`] reads columns of CSV files. [`cross_validate`] runs the experiment of the paper. [`TrainedModel`] is a model that
 //! can be saved and loaded, with the names of its columns. [`forecast`] predicts future rows from past rows, without future inputs. The

@@ -1,4 +1,4 @@
-//! Pictures of a cell model: open-circuit curve, slope of the curve, resistances over SOC and over temperature, and the SOC error that
+//! Draws a cell model: open-circuit curve, slope of the curve, resistances over SOC and over temperature, and the SOC error that
 //! follows from them.
 //!
 //! Bands are 95 % intervals ([`ModelBands`]). If a model does not state the error of its curve, the curve has no band, and the
@@ -14,7 +14,7 @@ use crate::config::cell_model::{KnownBy, SourcedModel};
 const POINTS: u32 = 200;
 /// Range of the picture over temperature, degrees Celsius; the picture ends earlier if the tables do.
 const SHOWN_C: (f64, f64) = (-20.0, 50.0);
-/// Second, cold temperature that is drawn with the temperature of the curve, degrees Celsius.
+/// Cold temperature that is drawn in addition to the temperature of the curve, degrees Celsius.
 const COLD_C: f64 = 0.0;
 /// Below this SOC, percent, a curve or resistance may leave the picture, because both rise steeply there.
 const STEEP_PERCENT: f64 = 12.0;

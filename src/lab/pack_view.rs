@@ -1,4 +1,4 @@
-//! Formats the cost of the differences between cells for their pack: lines with a name and a value.
+//! Formats what the differences between cells cost the pack, as lines with a name and a value.
 //!
 //! Cells count from 1. Every "±" is one standard deviation. Ah and kWh refer to one string.
 

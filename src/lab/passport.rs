@@ -1,4 +1,4 @@
-//! Battery passports: the values that a vehicle can determine, in the formats of two standards.
+//! Writes battery passports: the values that a vehicle can determine, in the formats of two standards.
 //!
 //! A [`Record`] is collected from a store or a replay, and a [`Condition`] is determined from the record. [`passport`] merges the
 //! values of the condition into the part that the manufacturer wrote, and checks the result. [`details`] contains standard deviations

@@ -1,4 +1,4 @@
-//! The report: one self-contained HTML file from the history of a store or from a replay.
+//! Writes the report: one self-contained HTML file from the history of a store or from a replay.
 //!
 //! [`Data`] is collected from the store or the replay. [`page`] renders the page, and [`write_plots`] writes the pictures as separate
 //! files. Nothing here reads a clock, so the same data give the same bytes. An unknown value is shown as unknown, with the reason.

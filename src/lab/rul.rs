@@ -1,5 +1,5 @@
-//! Remaining useful life from measured capacity histories: a forecast at the end of a history, and forecasts at earlier points of the
-//! life, which are scored against the truth.
+//! Forecasts the remaining useful life from measured capacity histories: a forecast at the end of a history, and forecasts at earlier
+//! points of the life, which are scored against the truth.
 //!
 //! The forecast is the one of the monitor ([`crate::health::forecast`]). It receives one reading after the other, and uses no reading
 //! that is later than the time of the forecast.

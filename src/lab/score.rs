@@ -52,7 +52,7 @@ pub struct ScoreSettings {
     pub soc_std: Option<f64>,
     /// Standard deviation of the initial capacity, as a fraction of the model's; `None` = as configured.
     pub capacity_std: Option<f64>,
-    /// A longer gap means that the recorder was asleep, s.
+    /// If a gap in a file is longer than this, s, the recorder was asleep.
     pub sleep_gap_s: f64,
     /// Capacity threshold, Ah; the first discharge below it is reported.
     pub threshold_ah: f64,

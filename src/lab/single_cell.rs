@@ -1,4 +1,4 @@
-//! The configuration of one measured cell: a given configuration, or the built-in one with another cell model or label.
+//! Creates the configuration of one measured cell: a given configuration, or the built-in one with another cell model or label.
 //!
 //! Input: paths, or the data of a label. Output: a checked configuration with the input signals of `measured.dbc`. Estimator keys have
 //! their defaults unless the given configuration states them. A fault names its file.

@@ -1,4 +1,4 @@
-//! Arguments that several functions share: paths, and where a configuration comes from.
+//! Handles arguments that several functions share: paths, and the source of a configuration.
 
 use std::path::{Path, PathBuf};
 

@@ -27,11 +27,11 @@ pub(crate) struct Matrix<T: ArrowPrimitiveType> {
     has_columns: bool,
 }
 
-/// Numbers.
+/// A matrix of real numbers.
 pub(crate) type Reals = Matrix<Float64Type>;
-/// Whole numbers.
+/// A matrix of whole numbers.
 pub(crate) type Words = Matrix<UInt32Type>;
-/// Bytes.
+/// A matrix of bytes.
 pub(crate) type Bytes = Matrix<UInt8Type>;
 
 impl<T: ArrowPrimitiveType> Matrix<T> {

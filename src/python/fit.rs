@@ -53,7 +53,7 @@ impl Fit {
         self.outcome.notes.clone()
     }
 
-    /// What the model can be used for.
+    /// Statements on the accuracy of the model, as `fit` prints them at the end.
     #[getter]
     fn verdict(&self) -> Vec<String> {
         self.outcome.verdict.clone()

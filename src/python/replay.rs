@@ -22,7 +22,7 @@ const _: () = assert!(SLEEP_GAP_S == 30.0);
 /// Results of a replay.
 #[pyclass(frozen, module = "packwatch")]
 pub(crate) struct Replay {
-    /// Estimates, events, frames.
+    /// Tables of the estimates, events and frames.
     #[pyo3(get)]
     outputs: Py<Outputs>,
     /// The summary of `replay --json`.

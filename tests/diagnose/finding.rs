@@ -1,4 +1,4 @@
-//! The finding that packwatch should report for an injected fault.
+//! States the finding that packwatch should report for an injected fault.
 
 use packwatch_core::cell_faults::CellFaultKind;
 use packwatch_core::sim::FaultKind;

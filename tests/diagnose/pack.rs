@@ -15,7 +15,7 @@ use packwatch_host::io::ticks::Ticks;
 
 use crate::finding::kind_of;
 
-/// A gap in the record that is longer than this means that the vehicle slept, s.
+/// If a gap in the record is longer than this, s, the vehicle slept.
 const SLEEP_GAP_S: f64 = 30.0;
 /// Interval between two checks of the findings while the buses are awake, s.
 const LOOK_S: f64 = 300.0;

@@ -68,7 +68,8 @@ impl Score {
         )
     }
 
-    /// Delay within which this share of all packs was found. A pack whose fault was not found counts as infinite delay.
+    /// Delay within which the fault was found in this share of all packs. If it was not found in a pack, the pack's
+    /// delay is infinite.
     fn delay(&self, quantile: f64) -> String {
         let mut delays = self.delays_days.clone();
         delays.sort_by(f64::total_cmp);

@@ -1,6 +1,6 @@
-//! The contract with other ECUs. A listener loses frames, starts late and sees the daemon killed. After two cycles it
-//! must have the daemon's alarm table. The listener is built only from the written DBC and the manual's page
-//! `ecu/contract.md`.
+//! Tests the contract with other ECUs. A listener loses frames, starts late and sees the daemon killed. After two
+//! cycles it must have the daemon's alarm table. The listener is built only from the written DBC and the manual's
+//! page `ecu/contract.md`.
 //!
 //! `PACKWATCH_CONTRACT_RUNS` sets the number of runs (default 200); the full test has 10,000.
 

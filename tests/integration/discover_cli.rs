@@ -1,5 +1,5 @@
-//! `packwatch discover` on logs of real cars, and on simulated traffic among messages of random content. Pack voltage,
-//! current, cells and temperature must be among the first three candidates, and `--write` must write a valid
+//! Tests `packwatch discover` on logs of real cars, and on simulated traffic among messages of random content. Pack
+//! voltage, current, cells and temperature must be among the first three candidates, and `--write` must write a valid
 //! configuration.
 
 use std::fmt::Write as _;

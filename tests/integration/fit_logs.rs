@@ -1,4 +1,5 @@
-//! Models from labels and from ordinary drives (`score --chemistry`, `fit --log`), on simulated and measured cells.
+//! Tests models from labels and from ordinary drives (`score --chemistry`, `fit --log`), on simulated and measured
+//! cells.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -71,7 +72,7 @@ fn drive(folder: &Path, name: &str, mut soc: f64, seed: u32) -> PathBuf {
     path
 }
 
-/// Root mean square error in points and fraction within the interval, of the only score.
+/// Returns the root mean square error in points and the fraction within the interval. The run must have one score.
 fn soc_score(args: &[&str]) -> (f64, f64) {
     let found = json(args);
     let soc = &found["scores"][0]["soc"];

@@ -1,5 +1,5 @@
-//! Bad logs for `fit --log`: the fitted model must be at least as good as the label's, and the output must name what is
-//! missing.
+//! Tests `fit --log` with bad logs: the fitted model must be at least as good as the label's, and the output must
+//! name what is missing.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};

@@ -1,5 +1,6 @@
-//! The paper's regression on the paper's data: voltage of RW9 from time, temperature and current. Exponential kernel,
-//! constant basis, standardised inputs. One of five folds is held out. (The paper: RMSE 0.1058 V over five folds.)
+//! Repeats the paper's regression on the paper's data: voltage of RW9 from time, temperature and current. Exponential
+//! kernel, constant basis, standardised inputs. One of five folds is held out. (The paper: RMSE 0.1058 V over five
+//! folds.)
 
 use std::ops::ControlFlow;
 use std::path::Path;

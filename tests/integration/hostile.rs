@@ -1,4 +1,5 @@
-//! A hostile or broken bus: what packwatch detects, and how fast. It must never show an unphysical number as valid.
+//! Tests a hostile or broken bus: what packwatch detects, and how fast. It must never show an unphysical number as
+//! valid.
 //!
 //! The runs use random absurd readings, random configurations (every number of the reference page, within and at the
 //! ends of its range), a second sender, frames with our own identifiers, and a frozen current. `PACKWATCH_CONFIGS` sets

@@ -1,5 +1,5 @@
-//! `packwatch import obdb` on the signal sets of three cars. The core reads every expected value of their test cases
-//! from raw frames through the imported file: ISO-TP, configuration, decoder.
+//! Tests `packwatch import obdb` on the signal sets of three cars. The core reads every expected value of their test
+//! cases from raw frames through the imported file: ISO-TP, configuration, decoder.
 //!
 //! The reference decoder clamps a value to its range; packwatch reports such a value as out of range. No other
 //! difference is allowed. Some cases were recorded with missing characters, so their lines are not CAN frames;

@@ -1,4 +1,4 @@
-//! The log grammars: every form of candump line, the journal, CSV, and arbitrary bytes.
+//! Tests the log grammars: every form of candump line, the journal, CSV, and arbitrary bytes.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};

@@ -1,4 +1,4 @@
-//! Alarm rules through the whole core: from input frames to events and alarm frames, and commands back.
+//! Tests alarm rules through the whole core: from input frames to events and alarm frames, and commands back.
 
 use crate::support::rig::{NO_VALUE, Rig, WHOLE_PACK, Wire, command_frame, learned};
 use packwatch::alarm::{AlarmState, Change, Rule, Selector};

@@ -1,7 +1,7 @@
-//! Properties of the whole core: a restored monitor behaves as if it had never stopped, and ticks before `next_due` may
-//! be omitted. The inputs come from the simulator: the paper's cell (with a recharge window, transitions and alarms)
-//! and a pack of 96 cells whose voltages come in many frames. Outputs are compared bit for bit (floats by their
-//! shortest text that reads back unchanged).
+//! Tests properties of the whole core: a restored monitor behaves as if it had never stopped, and ticks before
+//! `next_due` may be omitted. The inputs come from the simulator: the paper's cell (with a recharge window,
+//! transitions and alarms) and a pack of 96 cells whose voltages come in many frames. Outputs are compared bit for
+//! bit (floats by their shortest text that reads back unchanged).
 
 use std::path::Path;
 

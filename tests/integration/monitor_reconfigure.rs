@@ -1,4 +1,4 @@
-//! Reload of the configuration while the core runs: what is applied, what continues unchanged, and what needs a
+//! Tests a reload of the configuration while the core runs: what is applied, what continues unchanged, and what needs a
 //! restart.
 
 use crate::support::rig::{Rig, learned, load};

@@ -1,4 +1,4 @@
-//! Effects of a restart and of sleep on estimates and alarms, with hand-made frames of a two-cell pack.
+//! Tests the effects of a restart and of sleep on estimates and alarms, with hand-made frames of a two-cell pack.
 
 use crate::support::rig::{Rig, learned};
 use packwatch::alarm::{AlarmState, Change, Rule, Selector};

@@ -1,4 +1,4 @@
-//! Regression scenarios with hand-made frames of one measured cell. In each, an earlier version published a false
+//! Tests regression scenarios with hand-made frames of one measured cell. In each, an earlier version published a false
 //! value, lost a value, or flickered.
 
 use std::path::Path;

@@ -1,4 +1,4 @@
-//! The core's counters and the values it shows, with hand-made frames of a two-cell pack.
+//! Tests the core's counters and the values that it shows, with hand-made frames of a two-cell pack.
 
 use crate::support::rig::{Rig, learned};
 use packwatch::monitor::{BusStatistics, CellView, Downtime, Statistics, Validity};

@@ -1,4 +1,4 @@
-//! A pack of two cells of different kinds: `[[pack.module]]`.
+//! Tests a pack whose two cells are of different kinds, as configured by `[[pack.module]]`.
 
 use packwatch::cell::CellModel;
 use packwatch::monitor::Downtime;

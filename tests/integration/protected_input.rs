@@ -1,5 +1,5 @@
-//! Bad frames of protected messages, and floods, as inputs of the core. Each bad frame is counted and reported. No bad
-//! frame changes an estimate, and other messages are still processed.
+//! Tests bad frames of protected messages, and floods, as inputs of the core. Each bad frame is counted and reported.
+//! No bad frame changes an estimate, and other messages are still processed.
 
 use crate::support::config_texts;
 use packwatch::can::e2e::{Profile, Protection, Status};

@@ -1,4 +1,4 @@
-//! Normalised recharge periods through the whole core: simulated cells -> sensors -> frames -> Monitor.
+//! Tests normalised recharge periods through the whole core: simulated cells -> sensors -> frames -> Monitor.
 //!
 //! Simulates a fleet of cells of 1.4 to 2.6 Ah. Each cell has its own charger (0.3 to 1.2 C, constant current, then
 //! constant voltage), temperature (5 to 40 degrees C) and depth of discharge. Its current sensor has 20 mA noise, and

@@ -1,6 +1,6 @@
-//! The published 30 Ah example (scenario `reference`) through the whole core: ten cycles between 30 and 90 % SOC, with
-//! discharge by random pulses, charge at 15 A, and 1 Ah lost per cycle. The example claims a final SOC error below
-//! 0.5 %.
+//! Runs the published 30 Ah example (scenario `reference`) through the whole core: ten cycles between 30 and 90 %
+//! SOC, with discharge by random pulses, charge at 15 A, and 1 Ah lost per cycle. The example claims a final SOC
+//! error below 0.5 %.
 //!
 //! The example's tables are not published. This test uses the tables of `config/cells/example_nmc_2600.toml`, scaled to
 //! 30 Ah, that is eleven and a half such cells in parallel: resistances are divided by 30 / 2.6, capacitances

@@ -1,4 +1,4 @@
-//! Cost of a restart: compares a run that is killed, or loses power, with an uninterrupted run.
+//! Measures the cost of a restart: compares a run that is killed, or loses power, with an uninterrupted run.
 //!
 //! Input: days of the simulated electric car. After each drive the car rests with the bus awake, then the bus falls
 //! asleep. The state is stored every second, as the daemon does. At random times a second monitor starts from an older

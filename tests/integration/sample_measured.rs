@@ -1,4 +1,4 @@
-//! The sample stage on a measured life (NASA B0005, uneven time steps, real glitches). It must reject exactly the
+//! Tests the sample stage on a measured life (NASA B0005, uneven time steps, real glitches). It must reject exactly the
 //! glitches, and each cycle's charge must match the data set's own table.
 
 use std::collections::BTreeMap;

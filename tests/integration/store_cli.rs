@@ -1,4 +1,4 @@
-//! State and history from a user's view: `replay --state`, `history`, `reset`.
+//! Tests state and history from a user's view: `replay --state`, `history`, `reset`.
 
 use std::fs;
 use std::path::{Path, PathBuf};

@@ -1,5 +1,5 @@
-"""Measured files: packwatch's CSV, and the Battery Data Format as its own package writes it, in which a positive current is
-charge."""
+"""Tests that `read` reads packwatch's CSV, and files that the package of the Battery Data Format writes. In these files, a positive
+current is a charge."""
 
 import bdf
 import numpy as np

@@ -1,4 +1,4 @@
-"""Decoding by cantools, and bit positions read directly from a DBC.
+"""Decodes frames with cantools, and reads bit positions directly from a DBC.
 
 usage: dbc_oracle.py FILE.dbc decode [strict]   reads `message hex` lines, answers with one line each of
                                                 `signal=repr(value)` pairs, or `!reason` if cantools rejects the payload;

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Cell model of a NASA PCoE 18650 from its first cycles: derive_nasa_cell.py CELL.csv.gz OUT.toml [--name NAME]
+"""Makes a cell model of a NASA PCoE 18650 from its first cycles: derive_nasa_cell.py CELL.csv.gz OUT.toml [--name NAME]
 
 Reads cycles 0..LAST only (five discharges, five charges); the model does not use the rest of the life.
 One RC branch at a fixed time constant makes the voltage linear in the table values:

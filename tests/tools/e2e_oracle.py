@@ -1,4 +1,4 @@
-"""End-to-end protection by autosar-e2e and, for profile 5, by cantools.
+"""Protects and checks payloads end to end with autosar-e2e and, for profile 5, with cantools.
 
 usage: e2e_oracle.py   reads lines `profile data_id raw ours flipped` with payloads in hex:
                          raw       before protection, with the previous counter

@@ -1,4 +1,4 @@
-"""scikit-learn's Gaussian process regression, exponential kernel, fixed hyperparameters: the reference for
+"""Runs scikit-learn's Gaussian process regression with an exponential kernel and fixed hyperparameters, as the reference for
 tests/integration/gp_peer.rs.
 
 Reads one command per line from standard input; each answer is one line on standard output:

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""ISO-TP by PyPI `can-isotp`, for tests/integration/isotp_peer.rs.
+"""Sends and receives ISO-TP messages with PyPI `can-isotp`, for tests/integration/isotp_peer.rs.
 
         isotp_oracle.py send       reads one message per line (hex); prints its frames on one line (hex, separated by blanks)
         isotp_oracle.py receive    the reverse: reads frames, prints the message

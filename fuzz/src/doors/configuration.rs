@@ -1,4 +1,5 @@
-//! Configurations and cell models: an accepted configuration must run and accept its own stored state.
+//! Fuzz entry points for configurations and cell models. A monitor with an accepted configuration must run, and
+//! accept the state that it has stored.
 
 use packwatch::config::Config;
 use packwatch::monitor::{Downtime, Monitor, Outputs, Snapshot};

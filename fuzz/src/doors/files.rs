@@ -1,4 +1,5 @@
-//! Files that are read in blocks: logs, journals, tables. The test files are written to a folder in memory if possible.
+//! Fuzz entry points for files that are read in blocks: logs, journals, tables. The test files are written to a
+//! folder in memory if possible.
 
 use std::path::Path;
 

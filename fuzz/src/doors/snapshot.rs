@@ -1,4 +1,5 @@
-//! A stored state with changed numbers and words is rejected, or the monitor runs from it and accepts its own state.
+//! Fuzz entry point for a stored state with changed numbers and words. The state is either rejected, or the monitor
+//! starts from this state, runs, and accepts the state that it then writes.
 
 use std::sync::OnceLock;
 

@@ -1,4 +1,5 @@
-//! Texts that are parsed as a whole: DBC, requests of the control socket, signal sets and BPX files.
+//! Fuzz entry points for texts that are parsed as a whole: DBC, requests of the control socket, signal sets and BPX
+//! files.
 
 use packwatch::can::dbc::Database;
 use packwatch::control::protocol::{AlarmList, CommandOutcome, Request, contents};

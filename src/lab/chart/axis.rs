@@ -1,4 +1,4 @@
-//! Axes: their range, ticks and labels.
+//! Determines the range, ticks and labels of an axis.
 
 use crate::filter::ends;
 use crate::io::stamp::format_utc;
@@ -142,7 +142,7 @@ fn month_ticks((low, high): (f64, f64), raw: f64) -> Vec<(f64, String)> {
         .collect()
 }
 
-/// Formats a time with the precision of the step; midnight is shown as the new day.
+/// Formats a time with the precision of the step; at midnight, the date is shown instead of the time.
 fn moment(time_s: f64, step: f64) -> String {
     let text = format_utc(Timestamp::from_secs(time_s));
     let part = if step >= DAY || (step >= MINUTE && time_s.rem_euclid(DAY) == 0.0) {

@@ -1,4 +1,4 @@
-//! Heat maps: values over rows and columns of time, each drawn in one of nine colours, with a legend.
+//! Draws heat maps: values over rows and columns of time, each drawn in one of nine colours, with a legend.
 
 use super::Size;
 use super::axis::Axis;

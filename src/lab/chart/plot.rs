@@ -1,4 +1,4 @@
-//! Lines, bands, points and thresholds over one pair of axes.
+//! Draws lines, bands, points and thresholds over one pair of axes.
 
 use super::axis::Axis;
 use super::style::Ink;
@@ -260,7 +260,7 @@ impl Layer {
         // Maximum number of points with tool tips. In larger layers, the points have none.
         if finite().count() <= 400 {
             return finite().for_each(|point| {
-                // A point at the edge is moved inwards, because half of it would be cut off.
+                // A point at the edge of the area is moved inwards; otherwise half of the dot would be cut off.
                 let x = area.px(point.x);
                 let x = if (-0.5..=area.width + 0.5).contains(&x) { x.clamp(DOT, area.width - DOT) } else { x };
                 svg.circle((x, area.py(point.y)), DOT, &self.ink.fill(), &point.tip);

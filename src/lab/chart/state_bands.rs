@@ -1,4 +1,4 @@
-//! Bands of states over time; they show when each alarm was raised.
+//! Draws states over time as bands, which show when each alarm was raised.
 
 use super::Size;
 use super::axis::Axis;
@@ -6,7 +6,7 @@ use super::plot::{Area, title};
 use super::style::Ink;
 use super::svg::{Svg, text_width};
 
-/// Height of the name of a band, and of its spans, pixels.
+/// Height of a band's name, pixels. The next constant is the height of its spans, pixels.
 const NAME: f64 = 16.0;
 const BAR: f64 = 12.0;
 /// Minimum width of a span, pixels, so that even the shortest alarm is visible.

@@ -1,4 +1,4 @@
-//! Colours: classes for strokes, fills and text, and their values in light and dark.
+//! Defines the colours: CSS classes for strokes, fills and text, and their values on a light and a dark page.
 //!
 //! The inks are those of Okabe and Ito, which people with any colour vision can distinguish; they are lighter on a dark page. The steps
 //! of heat maps are from cividis (Nuñez, Anderton, Renslow 2018), which has the same property.

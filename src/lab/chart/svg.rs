@@ -1,4 +1,4 @@
-//! SVG text: elements whose coordinates have few digits.
+//! Writes SVG elements as text. Their coordinates have few digits.
 
 use std::fmt::Write as _;
 

@@ -1,4 +1,4 @@
-//! Frames and diagnostic answers of a log, within a memory limit.
+//! Stores the frames and diagnostic answers of a log within a memory limit.
 //!
 //! All frames are kept until they exceed [`MAX_BYTES`]. Then whole windows of [`WINDOW_S`] are dropped: first every second window, then
 //! three of four, and so on. All identifiers keep the same windows, so the pages of multiplexed messages stay complete. Answers are
@@ -20,7 +20,7 @@ const WINDOW_S: f64 = 2.0;
 /// Maximum number of messages (identifiers on an interface) that are kept. A car has a few hundred messages; a flood of random
 /// identifiers has more.
 const MAX_MESSAGES: usize = 4096;
-/// First data byte of the answers of BMW controllers. Their extended addressing is recognised without a definition.
+/// First data byte in answers from BMW controllers, by which their extended addressing is recognised without a definition.
 const TESTER: u8 = 0xF1;
 
 /// An identifier on an interface.

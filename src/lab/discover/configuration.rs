@@ -41,7 +41,7 @@ pub struct PackConfiguration {
     pub text: String,
     /// DBC of the fields that no given DBC describes. It must be saved as the file that [`PackSettings::own_database`] names.
     pub database: Option<String>,
-    /// Questions that the log does not answer; the user must decide them.
+    /// Questions that the log does not answer and the user must decide.
     pub open: Vec<String>,
 }
 

@@ -1,4 +1,4 @@
-//! A signal of the log, and the origin of its description.
+//! A signal of the log. Its description (name, position, scaling) comes from a file, or the search has found it.
 
 use super::capture::AnswerKey;
 use crate::can::CanId;

@@ -32,7 +32,7 @@ const CURRENT_FORMS: [(u32, &[f64]); 3] =
 /// Smallest number of answers in which a field is searched.
 const MIN_ANSWERS: usize = 3;
 
-/// Number of cells found so far in rows of each form. A row of the same form in the next answer continues the cell numbers.
+/// For each form of a row, the number of cells found so far. A row of the same form in the next answer continues the cell numbers.
 #[derive(Debug, Default)]
 pub(super) struct CellRows(BTreeMap<RowForm, u32>);
 

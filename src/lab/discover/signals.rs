@@ -1,5 +1,5 @@
-//! Signals of a log with their values: from DBC files, from definitions of diagnostic answers, and fields of answers without a
-//! definition.
+//! Collects the signals of a log with their values: from DBC files, from definitions of diagnostic answers, and fields of answers
+//! without a definition.
 
 use super::capture::{AnswerKey, Answers, Capture, MessageKey, Payloads};
 use super::log_signal::{LogSignal, SignalOrigin};

@@ -1,4 +1,4 @@
-//! Synthetic logs, with signals that must be found and signals that must not be found.
+//! Tests the search on synthetic logs, with signals that must be found and signals that must not be found.
 
 #![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
 

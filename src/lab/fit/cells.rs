@@ -1,4 +1,4 @@
-//! Deviations of the cells of a pack from their mean: capacity, resistance and charge of each cell, and notes on outliers.
+//! Determines how the cells of a pack differ from their mean: capacity, resistance and charge of each cell, and notes on outliers.
 //!
 //! Input: for some rows, the difference between the voltage of every cell and the mean voltage (V); and the fitted records of the mean
 //! cell. Output: a [`CellDeviation`] per cell. All cells share one curve and one current sensor, so errors of the model and of the
@@ -27,10 +27,10 @@ const DISTANCE_V: f64 = 0.002;
 const REPEATS_S: f64 = 50.0;
 /// Smallest number of cells for a comparison.
 const LEAST_CELLS: usize = 4;
-/// A cell is an outlier if its distance from the median exceeds three limits: this many robust standard deviations, the
-/// second constant times the standard deviation of its own value (not for the residual), and the smallest relevant
-/// difference. The smallest relevant differences are those of capacity, of resistance, of the residual (V) and of the
-/// leakage (share of the capacity per h).
+/// A cell is an outlier if its distance from the median exceeds three limits. The first is this number of robust
+/// standard deviations of all cells. The second is [`OWN_DEVIATIONS`] standard deviations of the cell's value; it does
+/// not apply to the residual. The third is [`FLOOR`]: the smallest relevant difference of capacity, of resistance, of
+/// the residual (V) and of the leakage (share of the capacity per h).
 const SPREADS: f64 = 5.0;
 const OWN_DEVIATIONS: f64 = 3.0;
 const FLOOR: [f64; 4] = [0.03, 0.15, 0.004, 0.0005];

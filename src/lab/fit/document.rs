@@ -1,4 +1,4 @@
-//! Result of a fit as a JSON document; the model itself is a separate file.
+//! Writes the result of a fit as a JSON document; the model itself is a separate file.
 
 use super::{FileResidual, FitOutcome};
 

@@ -1,4 +1,4 @@
-//! Notes on quantities that the logs do not determine. For these quantities, the fit keeps the values of the initial
+//! Writes notes on quantities that the logs do not determine. For these quantities, the fit keeps the values of the initial
 //! model.
 //!
 //! Input: stretches and fitted records of the mean cell, capacities (Ah). Output: notes for the user.
@@ -7,7 +7,7 @@ use crate::filter::{ends, median};
 use crate::ident::MeasuredPart;
 use crate::ident::record::Record;
 
-/// Capacity with its standard deviation, Ah, before or after a fit.
+/// A capacity and its standard deviation, Ah, either before or after a fit.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Capacity {
     pub(super) mean_ah: f64,

@@ -13,9 +13,9 @@ use crate::measured::{MeasuredFile, MeasuredPart};
 pub(super) const DISCONNECTED_V: f64 = 0.5;
 /// A current that keeps its direction for less than this time is a pulse, s. Pulse tests use 10 to 18 s.
 const HELD_S: f64 = 30.0;
-/// Current below which a cell rests, as a share of the largest current of its part.
+/// Current below which a cell rests, as a share of the largest current in this part of the file.
 const REST_SHARE: f64 = 0.02;
-/// One outlier per this number of rows is ignored.
+/// For each group of this many rows, one outlier is ignored.
 const STRAY: usize = 10_000;
 /// Error of a reading at a limit, V.
 const READING_V: f64 = 0.005;

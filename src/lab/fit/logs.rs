@@ -53,8 +53,8 @@ const FULL_STD: f64 = 0.01;
 const KNEE_SOC: f64 = 0.13;
 /// Upper limit of [`KNEE_SOC`] times (Arrhenius factor - 1).
 const MOST_KNEE_SOC: f64 = 0.35;
-/// A cold cell does not settle within a drive. Its voltage is therefore wrong by the equivalent of this SOC times (Arrhenius factor -
-/// 1). Rests of 20 min of Panasonic 18650PF cells at 10 to -20 degrees C show 0.013 to 0.024; rests during drives are shorter.
+/// A cold cell does not settle within a drive. The error of its voltage corresponds to an SOC error of this value times (Arrhenius
+/// factor - 1). Rests of 20 min of Panasonic 18650PF cells at 10 to -20 degrees C show 0.013 to 0.024; rests during drives are shorter.
 const COLD_SOC: f64 = 0.03;
 /// If the residual is above this value, V, the logs do not come from one kind of cell. In the cold, the limit is multiplied by a power
 /// of the Arrhenius factor. Fits of the cells of `tests/label` leave 5 to 20 mV when warm and 27 mV at 0 degrees C.

@@ -1,4 +1,4 @@
-//! The plot of residuals: one panel per file with the measured voltage minus the model's voltage over time.
+//! Plots the residuals: one panel per file with the measured voltage minus the model's voltage over time.
 
 use std::path::Path;
 

@@ -21,7 +21,7 @@ pub(super) struct AnchoredPart {
     pub(super) file: usize,
     part: MeasuredPart,
     judged: Vec<bool>,
-    /// Weight of each second; `None` = computed from the covered SOC and the kind of test.
+    /// Weight of each second of the part; `None` = computed from the covered SOC and the kind of test.
     scale: Option<f64>,
 }
 

@@ -1,4 +1,4 @@
-//! The measured range of a model, and the extension of its tables beyond the measured temperatures.
+//! Determines the measured range of a model, and extends the model's tables beyond the measured temperatures.
 //!
 //! Input: the records of a fit, and the fitted tables. Output: the measured ranges of temperature (degrees Celsius), current (A) and
 //! SOC, and extended tables. The extended tables have an additional row [`REACH_K`] below the lowest measured temperature, and another

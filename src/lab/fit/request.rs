@@ -1,4 +1,4 @@
-//! A request for a fit; the command line and the Python module use it.
+//! Defines and checks the request for a fit, which the command line and the Python module make.
 //!
 //! Input: files, and known data of the cell. Output: a checked request. Only [`FitRequest::check`] defines the allowed ranges. Errors
 //! name the argument of the command.
@@ -12,7 +12,7 @@ use crate::quantity::bounds;
 /// Maximum number of SOC breakpoints: one per percent. The duration of a fit grows with the cube of their number.
 pub const MAX_SOC_NODES: usize = 101;
 
-/// What is fitted.
+/// Arguments of a fit.
 #[derive(Debug, Clone, Default)]
 pub struct FitRequest {
     /// Name of the cell.

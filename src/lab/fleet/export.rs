@@ -53,7 +53,7 @@ impl TableFormat {
     }
 }
 
-/// Settings of all logs.
+/// Settings that apply to all logs.
 #[derive(Clone)]
 pub struct ExportSettings<'a> {
     /// How to read the logs.
@@ -104,7 +104,8 @@ pub fn run(
 
 /// Exports the logs of one recording.
 ///
-/// # Errors A log cannot be read or a table cannot be written. If a log cannot be read, no new table is written.
+/// # Errors
+/// A log cannot be read or a table cannot be written. If a log cannot be read, no new table is written.
 pub(super) fn export(
     config: &Config,
     logs: &[PathBuf],

@@ -1,4 +1,4 @@
-//! The true capacities of a log, from a CSV file in the same folder.
+//! Reads the true capacities of a log from a CSV file in the same folder.
 //!
 //! There are two formats, which are recognised by their columns. A table with a column `cell` was written by `simulate --truth`; it
 //! contains the capacity of every cell between the open-circuit voltages of a full and an empty cell. A table with `cycle` and `type`

@@ -1,4 +1,4 @@
-//! `--set KEY=V1,V2`: replaces values of a configuration, and builds all combinations of the replaced values.
+//! Implements `--set KEY=V1,V2`: replaces values of a configuration, and builds all combinations of the replaced values.
 //!
 //! Input: the text of a configuration, and choices. Output: one checked configuration per combination, with the original first, and the
 //! information which of them can share a replay. Configurations can share a replay if they differ only in `[[alarm]]` tables. Tables of

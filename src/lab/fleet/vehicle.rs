@@ -1,4 +1,4 @@
-//! A vehicle of a fleet: its line in the manifest, and the file `vehicle.json` in its folder.
+//! Describes a vehicle of a fleet: its line in the manifest, and the file `vehicle.json` in its folder.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -14,7 +14,7 @@ pub(super) const RECORD: &str = "vehicle.json";
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Vehicle {
-    /// Name of the vehicle and of its folder; the first column of its tables contains it.
+    /// Name of the vehicle, of its folder, and in the first column of its tables.
     pub vehicle: String,
     /// Size of the vehicle's logs, bytes.
     pub bytes: u64,

@@ -29,7 +29,7 @@ pub struct WhatifJob {
     pub truth: Option<PathBuf>,
 }
 
-/// Settings of all logs.
+/// Settings that apply to all logs.
 #[derive(Clone, Copy)]
 pub struct WhatifSettings<'a> {
     /// How to read the logs.

@@ -37,7 +37,7 @@ pub const MAX_HORIZONS: usize = 10;
 /// Ends of the blocks for the calibration of the interval, as shares of the training rows.
 const BLOCKS: [f64; 5] = [0.4, 0.55, 0.7, 0.85, 1.0];
 
-/// What is forecast.
+/// Arguments of a forecast.
 #[derive(Debug, Clone)]
 pub struct ForecastPlan {
     /// Number of output columns; they are the first columns of the table.

@@ -1,4 +1,4 @@
-//! Pictures of regressions (predicted over measured values, a stretch of rows with its interval, the error of every row) and of
+//! Draws pictures of regressions (predicted over measured values, a stretch of rows with its interval, the error of every row) and of
 //! forecasts (the fan at the origin, error and coverage over the horizon).
 
 use std::path::Path;

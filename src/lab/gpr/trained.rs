@@ -1,4 +1,4 @@
-//! A model with the names of its columns. It is trained on a table, saved, loaded, and applied to other files.
+//! A regression model that remembers the names of its columns. It is trained on a table, saved, loaded, and applied to other files.
 //!
 //! The file has one line of JSON with the names of the columns, followed by the two lines of the model itself. These two lines have a
 //! checksum (see [`Model`]).

@@ -1,4 +1,5 @@
-//! Error of the fitted model over SOC and temperature: the standard deviation of its voltage error, averaged over [`BLOCK_S`].
+//! Estimates the error of the fitted model over SOC and temperature: the standard deviation of its voltage error, averaged over
+//! [`BLOCK_S`].
 //!
 //! Errors of a model are correlated over minutes, so they are averaged over blocks of 100 s. A block is weighted by the charge that was
 //! moved in it, and is shared among the nodes around it. A node with little charge follows the mean of its temperature.
@@ -19,11 +20,11 @@ use super::record::Record;
 const BLOCK_S: f64 = 100.0;
 /// Upper limit of the error of a block, V; also the error if no temperature has data.
 const MOST_V: f64 = 0.1;
-/// Weight of the mean error of a temperature in each of its nodes, as SOC moved.
+/// Each node gets the mean error of its temperature, weighted like data with this much charge moved, as SOC.
 const LEAN_SOC: f64 = 1.0;
 /// Growth of the variance on data outside the fit: 1 + this constant / number of files.
 const UNSEEN: f64 = 3.0;
-/// A file visits a node if it has moved more than this charge near the node, as SOC.
+/// A file visits a node if more than this charge, as SOC, was moved near the node.
 const VISIT_SOC: f64 = 0.005;
 
 /// Sums per node.

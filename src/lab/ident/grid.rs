@@ -1,4 +1,4 @@
-//! The grid of the tables, and the position of a point (SOC, temperature) in it.
+//! Defines the grid of the tables, and finds the position of a point (SOC, temperature) in this grid.
 //!
 //! The rules are those of [`CellModel::grid_position`](crate::cell::CellModel::grid_position). Along SOC, all values are linear. Below
 //! 0 and above 1, the OCV is extrapolated and the other values stay constant. Along temperature, the OCV and the time constants are

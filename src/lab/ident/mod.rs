@@ -24,7 +24,7 @@ pub mod unanchored;
 /// Consecutive rows whose time does not restart.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct MeasuredPart {
-    /// Value of the part column; empty without this column.
+    /// Value of the part column (`cycle`, `segment` or `ref`); empty if the file has no such column.
     pub key: String,
     /// Value of the `type` column in the first row, `charge` or `discharge`; empty without that column.
     pub kind: String,
@@ -73,14 +73,14 @@ impl MeasuredPart {
         let lowest_v = self.voltage_v[..=last].iter().copied().fold(f64::INFINITY, f64::min);
         let is_held = |row: usize| {
             let current_a = self.current_a[row];
-            // The voltage is held if the current is below 97 % of the load and the voltage within 50 mV of its lowest value.
+            // The voltage is held if it is within 50 mV of its lowest value while the current is below 97 % of the load.
             current_a > 0.0 && current_a < 0.97 * load_a && self.voltage_v[row] <= lowest_v + 0.05
         };
         let first = (0..=last).rev().take_while(|&row| is_held(row)).last().unwrap_or(last);
         charge_ah[last] - charge_ah[first]
     }
 
-    /// Whether it has no rows.
+    /// Whether the part has no rows.
     pub fn is_empty(&self) -> bool {
         self.time_s.is_empty()
     }

@@ -1,4 +1,4 @@
-//! One pass over the data: residuals, their exact Jacobian, and the normal equations.
+//! Makes one pass over the data: computes the residuals, their exact Jacobian, and the normal equations.
 //!
 //! The residual of a row is e = V - (OCV(s,T) - sum U_i - R0(s,T) I). Over the step of a row, the voltage U of a branch is solved
 //! exactly:
@@ -39,8 +39,8 @@ const HUBER_ERRORS: f64 = 3.0;
 #[derive(Debug, Clone)]
 pub struct NormalEquations {
     n: usize,
-    /// Matrix, row-major. The product of a pair of parameters is in one of its two symmetric places until
-    /// [`NormalEquations::symmetric`] adds them.
+    /// Matrix, row-major. The product of two parameters is stored in only one of the two symmetric places;
+    /// [`NormalEquations::symmetric`] adds both places.
     h: Vec<f64>,
     /// Gradient of the cost.
     pub g: Vec<f64>,

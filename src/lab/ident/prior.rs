@@ -1,4 +1,4 @@
-//! The prior of a fit: smooth tables, Arrhenius' law between temperatures, and an OCV near the slow test.
+//! Defines the prior of a fit: smooth tables, Arrhenius' law between temperatures, and an OCV near the slow test.
 //!
 //! Each term is a linear combination of node parameters with a target and a standard deviation. The curvature at a node is the change
 //! of the slope, multiplied by the mean of the distances to both neighbours.

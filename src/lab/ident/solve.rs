@@ -1,4 +1,4 @@
-//! Projected Levenberg-Marquardt on normal equations, with bounds.
+//! Minimises the cost within bounds: projected Levenberg-Marquardt on normal equations.
 //!
 //! Some parameters form a *rising* block (the OCV over SOC). For such a block, the solver uses its first value and the rises from node
 //! to node instead of the node values. A bound on each rise keeps the curve monotone. The damped quadratic model is minimised within

@@ -1,4 +1,4 @@
-//! Heat capacity C and thermal resistance R of a cell: C dT/dt = I (OCV - V) - (T - Ta)/R, integrated and solved by linear least
+//! Fits heat capacity C and thermal resistance R of a cell: C dT/dt = I (OCV - V) - (T - Ta)/R, integrated and solved by linear least
 //! squares.
 //!
 //! The surroundings are assumed to have the temperature at which a record starts. Some records start while the cell is still warm or
@@ -20,7 +20,8 @@ const CELL_J_PER_K_WH: (f64, f64) = (2.5, 12.5);
 
 /// Fits heat capacity and thermal resistance. `energy_wh` is the energy that the cell stores.
 ///
-/// # Errors No discharge warms the cell enough, or the result is not plausible for a cell.
+/// # Errors
+/// No discharge warms the cell enough, or the result is not plausible for a cell.
 pub fn fit(records: &[Record], tables: &ParameterTables, energy_wh: f64) -> Result<Thermal, String> {
     let thermal = medians(records, tables).ok_or("no thermal parameters: no file warms enough to determine them")?;
     let found_j_per_k = thermal.heat_capacity_j_per_k;

@@ -24,7 +24,7 @@ const BEGINNING: (f64, f64) = (-0.05, 1.05);
 /// Largest factor between the fitted capacity and the capacity on the label, in either direction.
 const CAPACITY_FACTOR: f64 = 1.6;
 
-/// Largest offset of the current, in standard deviations of its prior.
+/// Largest offset of the current sensor, in standard deviations of the offset's prior.
 const MOST_OFFSETS: f64 = 4.0;
 
 /// Standard deviation of the SOC at the end of a full charge.
@@ -47,7 +47,7 @@ pub struct Known {
     pub offset_std_a: f64,
 }
 
-/// A record, and the charge of its rows.
+/// A record whose rows have a charge instead of a SOC.
 #[derive(Debug, Clone)]
 pub struct UnanchoredRecord {
     /// Rows. Their `soc` is minus the charge taken out since the first row, Ah.

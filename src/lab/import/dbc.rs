@@ -55,7 +55,7 @@ fn judge(message: &Message, signal: &Signal) -> Vec<(PackQuantity, f64)> {
     let points = |quantity| {
         let points = label.score(quantity)?.points;
         let (fits, points) = match quantity {
-            // A signal with a larger range is the sum of several cells.
+            // A range that is too large for one cell belongs to the sum of several cells.
             PackQuantity::CellVoltage if label.says_extreme() => (largest <= 10.0, points - 1.0),
             PackQuantity::CellVoltage => (largest <= 10.0, points),
             PackQuantity::PackVoltage => (largest > 60.0 && !label.says_cell(), points),

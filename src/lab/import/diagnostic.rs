@@ -51,7 +51,7 @@ pub(crate) struct DiagnosticSignal {
     pub(crate) range: Option<(f64, f64)>,
     /// Codes that mean "not available".
     pub(crate) not_available: Vec<u64>,
-    /// Numbers of a series.
+    /// Numbers in the names of a series; `None` = a single signal.
     pub(crate) numbers: Option<NumberRange>,
 }
 

@@ -1,4 +1,5 @@
-//! The condition of a battery for a passport: every value with its time and standard deviation, or the reason why it is unknown.
+//! Determines the condition of a battery for a passport: every value with its time and standard deviation, or the reason why it is
+//! unknown.
 //!
 //! Input: a [`Record`], the configuration, the current cell model, and data that only people know ([`Terms`]). Measured and learned
 //! values are known; a configured start value, an untrusted estimate and an incomplete sum are not.

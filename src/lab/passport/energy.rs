@@ -1,4 +1,4 @@
-//! Energy of a discharge at the configured load.
+//! Computes the energy of a discharge at the configured load.
 //!
 //! Input: model, load, capacity (Ah) and resistance ratio of a cell. Output: the energy (Wh) until a given charge (Ah) has been
 //! delivered. The voltage under load follows from the usable capacity ([`usable_ah`]): a table contains the charge q(v) that a

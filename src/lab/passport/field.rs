@@ -1,4 +1,4 @@
-//! The values of a battery passport that packwatch can determine: name, unit, definition and place in each standard.
+//! Lists the values of a battery passport that packwatch can determine: name, unit, definition and place in each standard.
 //!
 //! This table decides which value is written to which member; `docs/src/lab/passport.md` explains it.
 

@@ -1,4 +1,4 @@
-//! Charge that a replay did not see because the current was unknown.
+//! Detects charge that a replay did not see because the current was unknown.
 //!
 //! Input: events and estimates of a replay, in order. Output: lost seconds, or the first gap with unlimited charge. A replay reports
 //! a missing current in these ways:

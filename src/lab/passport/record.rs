@@ -1,4 +1,4 @@
-//! Record of the connected pack, from a store or a replay: sums of half-cycles, energy, latest learned values, last state.
+//! Collects the record of the connected pack from a store or a replay: sums of half-cycles, energy, latest learned values, last state.
 //!
 //! Times are nanoseconds since 1970, on the wall clock of a store or the log's clock of a replay. Rows of a store and events of a replay
 //! use the same names, so both give the same sums. Energy needs every voltage, which a store does not contain. If a part of a
@@ -15,11 +15,11 @@ use crate::store::{HistoryEntry, HistoryExtent, HistoryQuery, HistoryReader, His
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Learned {
     pub(super) at_ns: i64,
-    /// Ah.
+    /// Capacity, Ah.
     pub(super) capacity: (f64, f64),
     /// Usable capacity, Ah, with the time of the latest half-cycle that gave it; `None` = no load is configured.
     pub(super) usable: Option<(i64, (f64, f64))>,
-    /// Relative to new.
+    /// Resistance relative to a new cell.
     pub(super) resistance: (f64, f64),
 }
 
@@ -68,9 +68,9 @@ pub struct Record {
     pub(super) cells: Vec<CellRecord>,
     /// End of the last half-cycle. If the clock was set back, this is not the latest time.
     pub(super) moved_until_ns: Option<i64>,
-    /// Why the half-cycles lack charge.
+    /// Why the half-cycles do not contain all charge; `None` = they do.
     pub(super) gap: Option<String>,
-    /// `None` = unknown: the record comes from a store.
+    /// Energy of charges and discharges; `None` = unknown, because the record comes from a store.
     pub(super) energy: Option<Energy>,
     limits: ReadingLimits,
     /// Losses of a replay.
@@ -250,7 +250,7 @@ impl Record {
         (strings * most.charge_ah, (most.discharging_s - most.charging_s).abs() / 3600.0)
     }
 
-    /// Sums of the cell that moved most.
+    /// Returns the sums of the cell that moved the largest charge.
     fn fullest(&self) -> Throughput {
         let sums = self.cells.iter().map(|cell| cell.moved);
         sums.max_by(|a, b| a.charge_ah.total_cmp(&b.charge_ah)).unwrap_or_default()

@@ -1,4 +1,4 @@
-//! The form that a standard requires of a JSON document, and the check of a document against this form.
+//! Defines the form that a standard requires of a JSON document, and checks documents against this form.
 //!
 //! Input: rows of path and kind, for example `identification.codes[].key|value`. In a path, `|` separates members of the same form,
 //! `[]` is a list, and `{}` is a list without duplicates. A member that may be missing ends in `?` in the first row that names it.

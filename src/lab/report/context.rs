@@ -1,4 +1,4 @@
-//! Title, configuration, reference and provenance of a page.
+//! Holds what a page shows in addition to the data: title, configuration, reference and provenance.
 
 use super::reference::Reference;
 use crate::cell_faults::{CellFaultDetector, Imbalance, UnknownImbalance};

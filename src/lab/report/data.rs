@@ -1,4 +1,4 @@
-//! Data of a report, collected from the rows of a store or from the events and estimates of a replay.
+//! Collects the data of a report from the rows of a store or from the events and estimates of a replay.
 //!
 //! Times are in seconds. They are on the wall clock, or in a replay on the clock of the log. Cells count from 0.
 
@@ -44,7 +44,7 @@ pub(super) struct CapacityRecord {
     /// Learned capacity, Ah: mean and standard deviation.
     pub(super) capacity_ah: (f64, f64),
     pub(super) usable_ah: Option<(f64, f64)>,
-    /// Losses of lithium and of the material of the negative and positive electrode, fractions.
+    /// Losses of lithium, of the negative and of the positive electrode, fractions: mean and standard deviation each.
     pub(super) losses: Option<[(f64, f64); 3]>,
     /// Resistance relative to new: mean and standard deviation.
     pub(super) resistance: (f64, f64),

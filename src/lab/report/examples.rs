@@ -1,4 +1,4 @@
-//! Data for the tests of the report: a recording of estimates, and a worn pack for which every card has a value.
+//! Creates data for the tests of the report: a recording of estimates, and a worn pack for which every card has a value.
 //!
 //! Times are in s; cells count from 0. Standard deviations differ between quantities and between neighbouring cells. A test can
 //! therefore detect that a standard deviation is printed in place of another.
@@ -54,9 +54,9 @@ pub(super) fn recording(first_s: f64, length_s: f64) -> Data {
 pub(super) struct CellStds {
     pub(super) capacity_ah: f64,
     pub(super) usable_ah: f64,
-    /// Relative to new.
+    /// Resistance relative to a new cell.
     pub(super) resistance: f64,
-    /// Lithium, negative and positive electrode, fractions.
+    /// Losses of lithium and of the two electrodes (negative, positive), fractions.
     pub(super) losses: [f64; 3],
 }
 

@@ -1,4 +1,5 @@
-//! The remaining life, computed from the record by the monitor's own filter (`health::Forecast`), and its fan.
+//! Forecasts the remaining life from the record, with the monitor's own filter (`health::Forecast`), and computes the fan that shows
+//! the forecast in the capacity chart.
 //!
 //! A store's rows and a replay's events both contain the filter's inputs, so both give the same result as the monitor. A
 //! record that lacks its beginning gives a wider interval.

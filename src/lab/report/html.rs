@@ -21,11 +21,11 @@ const ALARMS_AFTER: &str = "temperature";
 struct Section {
     id: &'static str,
     title: &'static str,
-    /// Names of its pictures.
+    /// Names of the section's pictures.
     pictures: &'static [&'static str],
     /// How to read the pictures.
     note: &'static str,
-    /// Text when it has no picture.
+    /// Text for a section without pictures.
     none: fn(&Data) -> &'static str,
 }
 

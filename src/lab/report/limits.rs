@@ -1,4 +1,4 @@
-//! Limits of the alarms: from the configuration, or without one from the alarms in the record.
+//! Finds the limits of the alarms. They come from the configuration; if there is none, from the alarms in the record.
 
 use super::context::PageContext;
 use super::data::Data;
@@ -31,7 +31,7 @@ pub(super) fn rank(severity: &str) -> usize {
     Severity::ALL.iter().position(|known| known.name() == severity).unwrap_or(0)
 }
 
-/// The rule of this name.
+/// Returns the rule with this name.
 pub(super) fn rule(name: &str) -> Option<Rule> {
     Rule::ALL.into_iter().find(|rule| rule.name() == name)
 }

@@ -1,4 +1,4 @@
-//! How well the cells' model is known: the rows and the advice of the section "How well the battery is known".
+//! Creates the section "How well the battery is known": rows that describe the cell model, and advice on useful measurements.
 
 use super::context::PageContext;
 use super::data::{Data, ModelRecord};

@@ -1,4 +1,4 @@
-//! The report's pictures, each with the name of its file.
+//! Draws the report's pictures, each with the name of its file.
 
 use std::path::Path;
 
@@ -108,7 +108,7 @@ fn ink_of(severity: &str) -> Ink {
     }
 }
 
-/// The times at which alarms of a rule were raised.
+/// Returns vertical lines at the times at which alarms of a rule were raised.
 fn raised(data: &Data, clock: &TimeAxis, rule: Rule) -> Option<Layer> {
     let rows = data.alarms.iter().filter(|row| row.rule == rule.name() && row.change == "raised");
     let points: Vec<Point> = rows

@@ -1,4 +1,4 @@
-//! The state at the end of the record: raised alarms with their values at this time, and cells whose estimate is untrusted.
+//! Determines the state at the end of the record: raised alarms with their values, and cells whose estimate is untrusted.
 
 use std::collections::BTreeMap;
 
@@ -89,7 +89,7 @@ pub(super) fn cells(cells: impl Iterator<Item = usize>) -> String {
     }
 }
 
-/// Value at the end of the record of the quantity that an alarm judges; `None` = the record does not contain it.
+/// Returns the value that an alarm compares with its threshold, at the end of the record; `None` = the record does not contain it.
 pub(super) fn value(
     row: &AlarmRecord,
     data: &Data,

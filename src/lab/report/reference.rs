@@ -1,4 +1,4 @@
-//! Measured or true capacities and SOC from a CSV file, drawn with the estimates.
+//! Reads measured or true capacities and SOC from a CSV file. They are drawn together with the estimates.
 
 use std::path::Path;
 

@@ -1,4 +1,5 @@
-//! Series over the life of a pack: its worst cell, the range over its cells, and every cell in columns of time.
+//! Computes series over the life of a pack: the worst cell and the range over all cells after every half-cycle, and the value of every
+//! cell in each time column of a heat map.
 
 use super::data::{CapacityRecord, Data};
 use crate::filter::ends;

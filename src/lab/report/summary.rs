@@ -1,4 +1,5 @@
-//! The summary at the top: condition of the battery, since when, what to do; "unknown" where data are missing.
+//! Creates the summary at the top of the page: the condition of the battery, since when it has lasted, and what to do. If data are
+//! missing, the summary says "unknown".
 
 use std::collections::BTreeSet;
 
@@ -95,8 +96,8 @@ pub(super) fn of(data: &Data, context: &PageContext<'_>, outlook: &Result<Outloo
     }
 }
 
-/// Returns the worst alarm. If a rule has raised the highest severity for several cells, returns the alarm of the cell
-/// with the worst value at the end.
+/// Returns the most severe alarm. If its rule has raised alarms of the same severity for several cells, returns the alarm whose value
+/// is the worst at the end of the record.
 fn worst<'a>(
     alarms: &[&'a ActiveAlarm<'a>],
     value: impl Fn(&ActiveAlarm<'_>) -> Option<f64>,
@@ -298,7 +299,8 @@ fn tiles(
     estimates
 }
 
-/// Marks a capacity that no half-cycle of the cell has measured: it is the configured value, aged since then.
+/// Returns a remark for the capacity of a cell. If no half-cycle has measured the capacity, it is the configured value minus the
+/// assumed fade, and the remark says so. Otherwise, the remark is empty.
 fn assumed(data: &Data, cell: usize) -> &'static str {
     let is_measured = data.learned.iter().any(|row| row.cell == cell && row.measured_ah.is_some());
     if is_measured { "" } else { "; assumed, not measured yet" }

@@ -1,4 +1,4 @@
-//! Summary of the estimates of a replay in bins: SOC, temperature, and consistency of the estimator.
+//! Summarises the estimates of a replay in bins: SOC, temperature, and consistency of the estimator.
 
 use std::collections::VecDeque;
 

@@ -1,4 +1,4 @@
-//! Baselines for comparison with forecasts: a straight line through the last points, and a least-squares double
+//! Computes baselines for comparison with forecasts: a straight line through the last points, and a least-squares double
 //! exponential.
 //!
 //! Input: points of [use, capacity]. Output: the use at which the curve first falls below the threshold.
@@ -43,7 +43,7 @@ pub(super) fn double_exponential(points: &[[f64; 2]], threshold: f64) -> Option<
     (0..=STEPS).map(|index| scale + step * f64::from(index)).find(|&used| capacity(used) < threshold)
 }
 
-/// Sum of squares, factors, exponents.
+/// A fit: sum of squared errors, factors `[a, c]`, exponents `[b, d]`.
 type ExponentialFit = (f64, [f64; 2], [f64; 2]);
 
 /// Pattern search: moves to a better neighbour and doubles the step, or else halves the step.

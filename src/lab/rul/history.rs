@@ -1,4 +1,4 @@
-//! Capacity histories: a [`CapacityTable`] in order of time.
+//! Reads capacity histories: a [`CapacityTable`] in order of time.
 //!
 //! With a column `type`, only discharges are readings, and each discharge counts as a full cycle. Without this column, the file does
 //! not contain the use, so days are counted. `duration_s` is the time in use that starts at a row; the time from its end to the next
@@ -24,7 +24,7 @@ pub struct MeasuredCapacity {
     pub days: f64,
     /// Days without current since the first reading.
     pub rest_days: f64,
-    /// Ah.
+    /// Measured capacity, Ah.
     pub capacity_ah: f64,
 }
 
@@ -33,7 +33,7 @@ pub struct MeasuredCapacity {
 pub struct History {
     /// Unit of use.
     pub axis: Axis,
-    /// In order of time, at least one.
+    /// Readings in order of time; there is at least one.
     pub rows: Vec<MeasuredCapacity>,
 }
 
@@ -97,7 +97,7 @@ impl UseCounter {
         reading
     }
 
-    /// Counts the time since the previous line. The part of it that the previous line did not use was rest.
+    /// Counts the time since the previous line. After the time in use that the previous line states, the cell rested.
     fn pass(&mut self, time: Timestamp) {
         if let Some(last) = self.last {
             self.rest_days += (time.since(last) / 86_400.0 - self.used_days).max(0.0);

@@ -1,4 +1,4 @@
-//! End of a life: where the isotonic (non-increasing least-squares) fit of its capacities falls below the threshold.
+//! Finds the end of a life: the use at which the isotonic (non-increasing least-squares) fit of the capacities falls below the threshold.
 
 use super::History;
 

@@ -67,7 +67,7 @@ impl Case {
 pub struct CaseScore {
     /// The file.
     pub path: PathBuf,
-    /// Its short name.
+    /// Short name of the file.
     pub name: String,
     /// The case.
     #[serde(flatten)]

@@ -1,4 +1,4 @@
-//! Tables of published capacities: a [`CapacityTable`] with `cycle` and `type`, one line per cycle.
+//! Reads tables of published capacities: a [`CapacityTable`] with `cycle` and `type`, one line per cycle.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -49,8 +49,8 @@ impl CycleTable {
         Ok(table)
     }
 
-    /// Reduces each capacity to the charge down to the load's cut-off. Charge that the tester took out later, at a held voltage, is
-    /// subtracted.
+    /// Reduces each capacity to the charge that the load takes out down to its cut-off. Charge that the tester took out later, at
+    /// a held voltage, is subtracted.
     pub(super) fn at_load(&self, parts: &[MeasuredPart]) -> Self {
         let mut table = self.clone();
         for part in parts.iter().filter(|part| part.is_discharge()) {

@@ -1,4 +1,4 @@
-//! Plots of a run: SOC and its error with 95 % band over time, and a life over its discharges.
+//! Plots a run: the SOC and its error over time with 95 % bands, or the usable capacity of a life over its discharges.
 
 use std::path::{Path, PathBuf};
 

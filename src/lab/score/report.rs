@@ -1,4 +1,4 @@
-//! The scores as text tables and as one JSON document.
+//! Writes the scores as text tables and as one JSON document.
 
 use std::fmt::Write as _;
 use std::path::PathBuf;

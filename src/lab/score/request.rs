@@ -1,4 +1,4 @@
-//! A request for scores, which the command line and the Python module use, and the run that is made from it.
+//! Defines and checks the request for scores, which the command line and the Python module make, and runs it.
 //!
 //! Input: files, the configuration of the cell, starts of the estimator, settings of the statistics. Output: [`ScoreRun`], with all
 //! inputs read and checked. Errors name the file or the argument.
@@ -39,7 +39,7 @@ pub struct ScoreRequest {
     pub settle_s: f64,
     /// Charge from full to empty that defines the true SOC, Ah; `None` = the model's capacity.
     pub truth_capacity_ah: Option<f64>,
-    /// A longer gap means that the recorder was asleep, s.
+    /// If a gap in a file is longer than this, s, the recorder was asleep.
     pub sleep_gap_s: f64,
     /// Tables of published capacities, one per file; empty without tables.
     pub cycles: Vec<PathBuf>,

@@ -1,4 +1,4 @@
-//! Errors of the SOC, and the coverage of its interval.
+//! Computes the errors of the SOC, and the coverage of its interval.
 
 use serde::Serialize;
 
@@ -14,11 +14,11 @@ pub const CONVERGED_HOLD_S: f64 = 600.0;
 pub(super) struct SocSample {
     /// Time since the start, s.
     pub(super) time_s: f64,
-    /// Fraction.
+    /// True SOC, fraction.
     pub(super) truth: f64,
-    /// Fraction.
+    /// Estimated SOC, fraction.
     pub(super) soc: f64,
-    /// Fraction.
+    /// Standard deviation of the estimated SOC, fraction.
     pub(super) soc_std: f64,
     /// (Innovation / standard deviation) squared; NaN without an innovation.
     pub(super) nis: f64,

@@ -1,4 +1,4 @@
-//! Random windows: the monitor sees only a part of each half-cycle, as in a vehicle that starts and stops at any time.
+//! Selects random windows: the monitor sees only a part of each half-cycle, as in a vehicle that starts and stops at any time.
 //!
 //! The window covers a share of the charge that the part moves (|current| times time). A share of the time would be dominated by the
 //! long taper of a charger. Share and position are uniformly distributed. Rows outside the window are dropped, so the monitor sees a

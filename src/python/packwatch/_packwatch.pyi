@@ -177,7 +177,7 @@ class Fit:
     def notes(self) -> list[str]: ...
     @property
     def verdict(self) -> list[str]:
-        """What the model can be used for."""
+        """Statements on the accuracy of the model, as ``packwatch fit`` prints them at the end."""
     def text(self) -> str:
         """Returns the text of the cell model file."""
     def write(self, path: _Path) -> None:

@@ -1,4 +1,4 @@
-//! Lead time against false alarms on simulated lives, for `when = "mean"` and `when = { probability = p }`.
+//! Compares lead time and false alarms on simulated lives, for `when = "mean"` and `when = { probability = p }`.
 //!
 //! Each simulated life runs through the whole core: a cell with its own fade, sensors with their own errors, frames,
 //! Monitor. Every rule then judges the Monitor's capacity estimates. The Monitor itself runs three of the rules and

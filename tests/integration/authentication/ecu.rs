@@ -1,4 +1,5 @@
-//! A sender of authenticated commands built from the manual's description, and a bus that connects it to the core.
+//! Simulates a sender of authenticated commands built from the manual's description, and a bus that connects it to
+//! the core.
 
 use std::cell::RefCell;
 

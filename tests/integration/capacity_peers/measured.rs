@@ -1,4 +1,5 @@
-//! Whole measured lives (NASA PCoE B0005, B0006), complete and in windows, against their published capacities.
+//! Compares estimates on whole measured lives (NASA PCoE B0005, B0006), complete and in windows, against their
+//! published capacities.
 //!
 //! Discharges are numbered from 1; scores start at number 11. The published capacity first falls below 1.4 Ah at
 //! discharge 125 (B0005) and 109 (B0006).

@@ -1,4 +1,4 @@
-//! Swings from the voltage alone: the SOC at both ends comes from the inverted open-circuit curve.
+//! Computes swings from the voltage alone: the SOC at both ends comes from the inverted open-circuit curve.
 //!
 //! The open-circuit voltage is V + I R0 rho + sum U, with V the cell's voltage, I the current (positive = discharge),
 //! R0 the series resistance, rho the filter's resistance ratio and U the voltages of the RC branches. The voltages U

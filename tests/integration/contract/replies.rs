@@ -1,4 +1,4 @@
-//! Replies to commands, the digest's pages, and counters across a kill of the daemon, tested with hand-made frames.
+//! Tests replies to commands, the digest's pages, and counters across a kill of the daemon, with hand-made frames.
 
 use packwatch::alarm::Rule;
 use packwatch::can::e2e::{Profile, Protection};

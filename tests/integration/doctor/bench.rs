@@ -1,4 +1,5 @@
-//! Healthy packs for the doctor's tests: configurations, DBC files and simulated logs. The tests put faults into them.
+//! Creates healthy packs for the doctor's tests: configurations, DBC files and simulated logs. The tests put faults
+//! into them.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

@@ -1,4 +1,4 @@
-//! The table of faults, one per row.
+//! Lists the faults that the doctor must find, one per row.
 
 use packwatch::wiring::Topic;
 

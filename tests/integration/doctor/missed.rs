@@ -1,4 +1,4 @@
-//! Faults that the doctor once missed, in the same table form.
+//! Lists faults that the doctor once missed, in the same table form.
 
 use packwatch::wiring::Topic;
 

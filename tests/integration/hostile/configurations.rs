@@ -1,4 +1,4 @@
-//! Random configurations: each one that `check` accepts must run without a panic and accept its own stored state.
+//! Tests random configurations: each one that `check` accepts must run without a panic and accept its own stored state.
 
 use super::*;
 

@@ -1,4 +1,4 @@
-//! A configuration from texts: `pack.toml` and `pack.dbc` as given, other files (cell models) as shipped.
+//! Loads a configuration from texts: `pack.toml` and `pack.dbc` as given, other files (cell models) as shipped.
 
 use std::path::Path;
 

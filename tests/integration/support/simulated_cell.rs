@@ -7,7 +7,7 @@ use packwatch::monitor::{Event, Monitor, MonitorConfig, Outputs, Record, TICK_PE
 use packwatch::quantity::Timestamp;
 use packwatch::sim::{Simulation, Wiring};
 
-/// A gap in the record that is longer than this means that the recorder was asleep, s. Here there is no gap.
+/// If a gap in the record is longer than this, s, the recorder was asleep. This record has no gap.
 const SLEEP_GAP_S: f64 = 30.0;
 
 /// Runs `settings` to the end. After each step calls `each` with the time, the truth, the core and the core's events.

@@ -1,4 +1,4 @@
-//! Measured lives with gaps: keeps only a window of each record. A seed always gives the same windows.
+//! Makes gaps in measured lives: keeps only a window of each record. A seed always gives the same windows.
 
 use std::path::Path;
 

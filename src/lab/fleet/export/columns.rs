@@ -1,4 +1,4 @@
-//! The columns of the exported tables: name, type, unit, meaning and value.
+//! Defines the columns of the exported tables: name, type, unit, meaning and value.
 //!
 //! These lines define the writers, the schema of the Parquet files and the page `docs/src/reference/export.md`. An unknown value is
 //! null (an empty field in CSV), never NaN. Cells count from 0; a positive current discharges.

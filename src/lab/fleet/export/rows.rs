@@ -1,4 +1,4 @@
-//! Rows of the exported tables.
+//! Defines the rows of the exported tables.
 
 use std::sync::Arc;
 

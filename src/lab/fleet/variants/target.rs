@@ -11,7 +11,7 @@ const SEVERITIES: [&str; 3] = ["info", "warning", "severe"];
 const ALARM_KEYS: [&str; 8] =
     ["when", "probability", "hysteresis", "debounce_s", "debounce_events", "latched", "spn", "fmi"];
 
-/// What a key refers to.
+/// The part of a configuration that a key refers to.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Target {
     /// A threshold of a rule: its severity, and whether the `set` or the `clear` value is meant.

@@ -1,4 +1,5 @@
-//! Lag windows: for each column of a row, the value and the latest differences. Finds the rows that have such a window.
+//! Finds the rows of a table that have a lag window. The lag window of a row has, for each column, the value and the latest
+//! differences.
 
 use super::super::ColumnTable;
 

@@ -1,4 +1,4 @@
-//! Resistances and branches of a BPX cell by closed forms of its equations for small currents.
+//! Computes the resistances and branches of a BPX cell. The cell's equations have these closed solutions for small currents:
 //!
 //! | part | resistance | time constant | source |
 //! | --- | --- | --- | --- |

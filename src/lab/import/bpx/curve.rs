@@ -1,4 +1,4 @@
-//! The open-circuit voltage of a BPX cell over SOC, and the charge between its cut-offs.
+//! Computes the open-circuit voltage of a BPX cell over SOC, and the charge between its cut-offs.
 //!
 //! `u(soc, T) = u_p(y) - u_n(x) + (T - T_ref) (du_p/dT(y) - du_n/dT(x))` with the lithium contents `x` (negative) and `y` (positive).
 //! The cyclable lithium follows from the full cell in the file: the negative electrode is at its maximum, the positive at its minimum.
@@ -107,7 +107,8 @@ impl<'a> Curve<'a> {
 
     /// The curve at suitable breakpoints.
     ///
-    /// # Errors The open-circuit voltage at a breakpoint is not a finite number above 0.
+    /// # Errors
+    /// The open-circuit voltage at a breakpoint is not a finite number above 0.
     pub(super) fn table(&self, temperature_k: &[f64]) -> Result<CurveTable, Vec<String>> {
         let mut table = CurveTable { soc: self.nodes(), ocv_v: Vec::new(), raised_v: 0.0 };
         for &kelvin in temperature_k {

@@ -45,34 +45,34 @@ pub(super) struct Electrode {
     pub(super) thickness_m: f64,
     pub(super) surface_per_m: f64,
     pub(super) radius_m: f64,
-    /// Mol/m3.
+    /// Largest concentration of lithium in the active material, mol/m3.
     pub(super) concentration_max: f64,
     /// Lowest and highest lithium content.
     pub(super) stoichiometry: [f64; 2],
     pub(super) ocp_v: Function,
-    /// V/K; 0 if not stated.
+    /// Change of the potential with temperature, V/K; 0 if not stated.
     pub(super) entropic: Function,
-    /// m2/s.
+    /// Diffusivity of lithium in the particles, m2/s.
     pub(super) diffusivity: Function,
     pub(super) diffusivity_j_per_mol: Option<f64>,
-    /// Mol/(m2 s).
+    /// Rate constant of the charge transfer, mol/(m2 s).
     pub(super) reaction_rate: f64,
     pub(super) reaction_j_per_mol: Option<f64>,
 }
 
-/// Electrolyte and conduction of negative electrode, separator, positive electrode.
+/// Transport through the cell: layers (negative electrode, separator, positive electrode), solid and electrolyte.
 #[derive(Debug, Clone)]
 pub(super) struct Transport {
     pub(super) layers: [Layer; 3],
     /// Conductivity of the solid of the negative and positive electrode, S/m.
     pub(super) solid_s_per_m: [f64; 2],
-    /// Mol/m3.
+    /// Concentration of the electrolyte, mol/m3.
     pub(super) concentration: f64,
     pub(super) transference: f64,
-    /// S/m at the concentration above.
+    /// Conductivity of the electrolyte at this concentration, S/m.
     pub(super) conductivity: f64,
     pub(super) conductivity_j_per_mol: Option<f64>,
-    /// m2/s at the concentration above.
+    /// Diffusivity of the electrolyte at this concentration, m2/s.
     pub(super) diffusivity: f64,
     pub(super) diffusivity_j_per_mol: Option<f64>,
 }

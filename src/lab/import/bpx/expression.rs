@@ -1,4 +1,4 @@
-//! Expressions of one variable `x` as in BPX files: a subset of Python's grammar, evaluated without Python.
+//! Parses and evaluates expressions of one variable `x` as in BPX files: a subset of Python's grammar, evaluated without Python.
 //!
 //! Input: a text with numbers, `x`, `+ - * / **`, signs, parentheses and the functions of [`FUNCTIONS`]. Output: a program for a stack
 //! machine. It is evaluated with `libm`, so the same text gives the same bytes on every machine. As in Python, `**` is

@@ -1,4 +1,4 @@
-//! Conversion of small BPX texts whose curve and resistances are known in closed form.
+//! Tests the conversion of small BPX texts whose curve and resistances are known in closed form.
 
 #![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
 

@@ -1,5 +1,5 @@
-//! The JSON of an OBDb signal set (github.com/OBDb/.schemas, `signals.json`): the fields that the conversion uses, and known fields
-//! that it ignores. Each command and signal is read separately, so a faulty entry does not hide other entries.
+//! Defines the JSON of an OBDb signal set (github.com/OBDb/.schemas, `signals.json`): the fields that the conversion uses, and known
+//! fields that it ignores. Each command and signal is read separately, so a faulty entry does not hide other entries.
 
 use std::collections::BTreeMap;
 

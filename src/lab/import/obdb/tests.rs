@@ -1,4 +1,4 @@
-//! Conversion of small signal sets.
+//! Tests the conversion of small signal sets.
 
 #![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
 

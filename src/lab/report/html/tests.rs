@@ -1,4 +1,4 @@
-//! The size of the page of a long life, the text of a page without data, and the cards and alarms of a worn pack.
+//! Tests the size of the page for a long life, the text of a page without data, and the cards and alarms of a worn pack.
 
 use super::*;
 use crate::alarm::{AlarmState, Change, Rule, Severity};

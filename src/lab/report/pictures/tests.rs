@@ -1,4 +1,4 @@
-//! The time axis: dates if the record has them, or else the time since its start in a unit that suits its length.
+//! Tests the time axis. It shows dates if the record has them, otherwise the time since the start in a unit that suits the record's length.
 
 use super::*;
 use crate::chart::Size;
