@@ -433,7 +433,7 @@ fn unused(counts: &LogCounts, summary: &ReplaySummary, steps: u64) -> Option<Str
         (0, _) if !counts.foreign.is_empty() => return None,
         (0, 0) => "no frames: the log is empty",
         (0, _) if summary.ticks > 0 => "no frames: the log contains only other records",
-        (0, _) => "no frames: no line of the log is one of a candump log, a journal or a CSV log",
+        (0, _) => "no frames: no line of the log has the format of a candump log, a journal or a CSV log",
         _ if steps > 0 => return None,
         _ if summary.ticks == 0 && summary.skipped_records > 0 => "no frames used: --from and --until exclude all",
         _ => "no estimates: no frame has a usable voltage; `packwatch doctor` with this log finds the reason",

@@ -181,7 +181,7 @@ def reported_by(files: list[Path]) -> tuple[int, int, int]:
 
 
 def learned(args) -> None:
-    """Reads the reports first, because values reported while the store is read may already be stored."""
+    """Reads the reports before the store: a value that is stored and reported in between is then only an extra row."""
     reported, stored = reported_by(args.events), Store(args.state).counts()
     print(" ".join(map(str, stored)))
     if any(of_store < of_events for of_store, of_events in zip(stored, reported)):

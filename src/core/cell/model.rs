@@ -166,11 +166,21 @@ impl CellModel {
     /// hysteresis of a two-phase electrode if the curve is flat.
     pub fn spread(&self) -> ModelSpread {
         self.spread.unwrap_or_else(|| {
-            let middle = self.temperature_position(25.0);
-            let [low_v, high_v] = [0.2, 0.8].map(|soc| self.ocv_v(&self.grid_position_at(&middle, soc)));
-            let is_two_phase = (high_v - low_v) / 0.6 < TWO_PHASE_SLOPE_V;
-            let curve_v = if is_two_phase { TWO_PHASE_HYSTERESIS_V } else { 0.0 };
+            let curve_v = if self.is_two_phase() { TWO_PHASE_HYSTERESIS_V } else { 0.0 };
             ModelSpread::usual(self.branches.len(), curve_v)
+        })
+    }
+
+    /// Whether the curve between 20 and 80 % is flat. A model that has not been checked may have incomplete tables; it
+    /// counts as steep.
+    fn is_two_phase(&self) -> bool {
+        let curve = self.ocv_v.values.first();
+        let node = |at: f64| {
+            let index = self.soc.iter().position(|&soc| soc >= at)?;
+            Some((self.soc[index], *curve?.get(index)?))
+        };
+        node(0.2).zip(node(0.8)).is_some_and(|((low, low_v), (high, high_v))| {
+            high > low && high_v - low_v < TWO_PHASE_SLOPE_V * (high - low)
         })
     }
 

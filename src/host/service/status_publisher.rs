@@ -52,7 +52,8 @@ impl StatusPublisher {
         }
     }
 
-    /// Publishes a document if a period has passed at the tick due at `tick`.
+    /// Publishes a document, unless the last one was published less than one [`PERIOD`] ago. `tick`: the time at which
+    /// the current tick was due.
     pub(super) fn publish(&mut self, engine: &Engine, tick: Instant, now: Timestamp) {
         let Some(server) = &self.server else { return };
         if self.published.is_some_and(|published| tick.duration_since(published) < PERIOD) {

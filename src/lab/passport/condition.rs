@@ -259,7 +259,7 @@ impl<'a> Battery<'a> {
         self.check_trust()?;
         let is_voltage = |channel: Channel| matches!(channel, Channel::CellVoltage(_) | Channel::PackVoltage);
         let voltages = self.monitor.latest_readings().filter(|(channel, ..)| is_voltage(*channel));
-        // The pack is known at the time of its oldest voltage.
+        // The SOC is dated with the oldest of the latest voltage readings.
         let oldest = voltages.map(|(_, time, _)| time).min();
         match (self.monitor.pack(), oldest) {
             (Some(pack), Some(time)) => {

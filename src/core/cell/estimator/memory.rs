@@ -270,7 +270,7 @@ impl Memory {
 
 /// Whether, according to the configuration, the cell rested in the unmeasured time of a step.
 fn is_silent_rest(config: &EstimatorConfig, step: &CellStep) -> bool {
-    // After 5 s without a current the bus counts as silent.
+    // If the current has not been measured for more than 5 s, the bus counts as silent.
     config.gap.silence_is_rest && step.unmeasured_s > 5.0
 }
 

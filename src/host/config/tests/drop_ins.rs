@@ -34,9 +34,9 @@ fn fault_names_drop_in_and_line() {
         "2.toml:7: store.checkpoint_s = 0, must be 1 to 3600",
         "1.toml:3: pack.cells = 0, must be 1 to 1024",
         "1.toml:5: interface[2].name = \"can0\", must be unique, but is also the name in pack.toml:5",
-        "pack.toml:8: input.current.interface is not set, must be can0 or can0",
-        "pack.toml:11: input.cell_voltage.interface is not set, must be can0 or can0",
-        "pack.toml:13: input.temperature[1].interface is not set, must be can0 or can0",
+        "pack.toml:8: input.current.interface is not set, must be can0",
+        "pack.toml:11: input.cell_voltage.interface is not set, must be can0",
+        "pack.toml:13: input.temperature[1].interface is not set, must be can0",
     ];
     assert_eq!(all, expected);
 }

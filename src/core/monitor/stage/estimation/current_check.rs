@@ -6,9 +6,9 @@
 //! A step of the current moves the voltages of all cells in the opposite direction, by the resistance times the step.
 //! The check judges each clear step between two steady levels of the voltages. The step is *explained* if the current
 //! has stepped in the opposite direction, and if the resistance is at least 1/[`MAX_FACTOR`] and at most [`MAX_FACTOR`]
-//! times the usual one. Steps are differences between the means of two rounds. They contain less noise than the
-//! difference of two readings, and a current that arrives one round earlier or later than the voltages still explains
-//! its step.
+//! times the usual one. A step is the mean of two consecutive rounds minus the mean of the two rounds before them. It
+//! contains less noise than the difference of two readings, and a current that arrives one round earlier or later than
+//! the voltages still explains its step.
 //!
 //! Explained and unexplained steps are evidence for and against the sensor. How much they count depends on how many
 //! steps the sensor has left unexplained so far: one unexplained step of a sensor that has explained all steps is
@@ -16,7 +16,8 @@
 //! seconds apart leaves many steps unexplained, and one more says little.
 //!
 //! The check finds a current that is frozen, inverted, late or beyond its range, whether or not its last digits change.
-//! It finds nothing while the load does not change, and a current without sign only if most steps change the direction.
+//! It finds nothing while the load is constant. It finds a current without sign only if the true current often changes
+//! its direction.
 
 use serde::{Deserialize, Serialize};
 
@@ -25,7 +26,7 @@ use crate::sample::CellSample;
 
 /// Share of the steps that a faulty sensor leaves unexplained.
 const FAULTY_SHARE: f64 = 0.7;
-/// Numbers of unexplained and of explained steps that a new sensor counts as having had.
+/// Initial counts of unexplained and of explained steps, for a sensor without history.
 const FIRST_STEPS: [f64; 2] = [0.2, 20.0];
 /// Part of the counts that remains after another step.
 const FORGET_STEP: f64 = 0.98;
@@ -42,9 +43,9 @@ const STEADY: f64 = 0.3;
 const MAX_FACTOR: f64 = 4.0;
 /// Smallest clear step of the voltages, V.
 const MIN_STEP_V: f64 = 0.01;
-/// Clear step in standard deviations of a reading's noise.
+/// Clear step in standard deviations of a reading's noise, and in scatters of the cells.
 const STEP_SIGMA: f64 = 5.0;
-/// Clear step in steps of the coarsest reading.
+/// Smallest clear step, as a multiple of the resolution of the voltages.
 const STEP_READINGS: f64 = 1.5;
 /// Clear step as a multiple of the usual change between two rounds.
 const STEP_MOVES: f64 = 9.0;
@@ -60,7 +61,7 @@ const RATIO_GAIN: f64 = 0.1;
 const MAX_PAUSE_S: f64 = 60.0;
 /// Part of the earlier doubts that remains after an explained step.
 const FORGET_DOUBT: f64 = 0.97;
-/// Weight of a steady round in the share of readings that differ by noise.
+/// Weight of a round in the scatter of the cells, and of a steady round in the share of readings that differ by noise.
 const NOISE_GAIN: f64 = 0.02;
 /// Lowest probability that a good sensor repeats a reading exactly.
 const MIN_REPEAT: f64 = 0.01;
@@ -72,7 +73,8 @@ const NOISE_STEPS: f64 = 1.5;
 const MAX_RESOLUTION_A: f64 = 1e3;
 /// Evidence of repeated readings that makes the sensor doubtful.
 const REPEATED: f64 = -10.0;
-/// Smallest common change of the cells that a voltage must follow, V, and the same in steps of the coarsest reading.
+/// Smallest common change of the cells that must also show in each voltage, V, and as a multiple of the resolution of
+/// the voltages. The larger limit applies.
 const FROZEN_V: f64 = 0.03;
 const FROZEN_STEPS: f64 = 2.5;
 /// Resolution of the voltages before a change has been seen, V.
@@ -110,6 +112,8 @@ pub(crate) struct CurrentCheck {
     log_ratio: f64,
     /// Usual change of the voltages between two rounds that the current does not explain, V.
     usual_v: f64,
+    /// Usual difference of a cell's move between two rounds from the common move, V.
+    scatter_v: f64,
     /// Share of readings of a steady current that differ from the previous reading by noise.
     noisy: f64,
     /// Smallest change of the current, A.
@@ -137,6 +141,7 @@ impl Default for CurrentCheck {
             steps: FIRST_STEPS,
             log_ratio: 0.0,
             usual_v: FIRST_MOVE_V,
+            scatter_v: FIRST_MOVE_V,
             noisy: 0.0,
             resolution_a: MAX_RESOLUTION_A,
             path_v: 0.0,
@@ -164,7 +169,7 @@ impl CurrentCheck {
         ohm: f64,
     ) {
         let (mut moves_v, mut moves, mut latest) = ([0.0; MAX_CELLS], 0, None);
-        // Cells that did not report in the previous round have moved for longer than the current.
+        // Skips cells without a reading in the previous round: their change spans more than one round.
         let before_v = std::mem::replace(&mut self.voltages_v, [None; MAX_CELLS]);
         for (place, sample) in samples {
             latest = Some(sample);
@@ -180,6 +185,9 @@ impl CurrentCheck {
         let Some(&CellSample { time, current_a, .. }) = latest else { return };
         let move_v = common_move(&mut moves_v[..moves]);
         self.path_v += move_v;
+        if moves > 1 {
+            self.scatter_v += NOISE_GAIN * (scatter(&mut moves_v[..moves], move_v) - self.scatter_v);
+        }
         let is_late = self.count > 0 && time.since(self.rounds[ROUNDS - 1].time) > MAX_PAUSE_S;
         let Some(current_a) = current_a.filter(|_| !is_late && moves > 0) else {
             self.count = 0;
@@ -249,8 +257,11 @@ impl CurrentCheck {
         let [r0, r1, r2, r3] = self.rounds;
         let moved_v = 0.5 * r1.move_v + r2.move_v + 0.5 * r3.move_v;
         let moved_a = 0.5 * (r2.current_a + r3.current_a - r0.current_a - r1.current_a);
-        let clear_v =
-            MIN_STEP_V.max(STEP_SIGMA * noise_v).max(STEP_READINGS * self.resolution_v).max(STEP_MOVES * self.usual_v);
+        let clear_v = MIN_STEP_V
+            .max(STEP_SIGMA * noise_v)
+            .max(STEP_SIGMA * self.scatter_v)
+            .max(STEP_READINGS * self.resolution_v)
+            .max(STEP_MOVES * self.usual_v);
         let factor = if (moved_v + ohm * moved_a).abs() > self.usual_v { MOVE_GAIN } else { 1.0 / MOVE_GAIN };
         self.usual_v = (self.usual_v * factor).clamp(MOVE_V.0, MOVE_V.1);
         let is_steady = |before: f64, after: f64| before.abs().max(after.abs()) <= STEADY * moved_v.abs();
@@ -313,6 +324,7 @@ impl CurrentCheck {
             explained,
             self.log_ratio,
             self.usual_v,
+            self.scatter_v,
             self.noisy,
             self.resolution_a,
             self.path_v,
@@ -343,6 +355,13 @@ fn common_move(moves_v: &mut [f64]) -> f64 {
     } else {
         0.0
     }
+}
+
+/// Median difference of the cells' moves from the common move, V.
+fn scatter(moves_v: &mut [f64], common_v: f64) -> f64 {
+    moves_v.iter_mut().for_each(|move_v| *move_v = (*move_v - common_v).abs());
+    moves_v.sort_unstable_by(f64::total_cmp);
+    moves_v[moves_v.len() / 2]
 }
 
 #[cfg(test)]
@@ -419,11 +438,11 @@ mod tests {
     #[test]
     fn repeated_reading_of_noisy_sensor_is_its_limit() {
         let mut check = CurrentCheck::default();
-        drive(&mut check, 1200, |load_a, _| Some(load_a));
-        // The reading without the noise that `drive` adds: exactly 20 A while the load is larger.
-        let limited = |load_a: f64, time_s: u32| Some(if load_a >= 20.0 { 20.0 - noise_a(time_s) } else { load_a });
+        // The reading without the noise that `drive` adds: exactly 60 A while the load is larger.
+        let limited = |load_a: f64, time_s: u32| Some(if load_a >= 60.0 { 60.0 - noise_a(time_s) } else { load_a });
+        drive(&mut check, 1200, |load_a, _| (load_a < 60.0).then_some(load_a));
         assert!(drive(&mut check, 3600, limited) > 0.5);
-        assert!((check.limits_a[0] - 20.0).abs() < 1e-9, "{:?}", check.limits_a);
+        assert!((check.limits_a[0] - 60.0).abs() < 1e-9, "{:?}", check.limits_a);
     }
 
     #[test]
