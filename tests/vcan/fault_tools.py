@@ -86,8 +86,8 @@ class Truth:
                 self.samples[-1].append(float(words[column]))
 
     def errors(self, lines, after: int = -1) -> list[tuple[float, float]]:
-        """Error and stated deviation of the estimates on the bus, from sample `after` on. Excludes the charge that
-        moved while a busy machine delayed the player itself."""
+        """Error and stated deviation of the estimates on the bus, from sample `after` on. Each error is reduced by
+        the largest SOC change that is possible in the time by which a busy machine delayed the player."""
         sample, found = -1, []
         self.latest_s = 0.0
         late_s = collections.deque(maxlen=MEMORY)  # delay of each sample in the last seconds

@@ -32,7 +32,8 @@
 //! Deviation 7: the filter tracks the effect of constant errors of sensors and model. For the errors of
 //! [`SensorErrors`](crate::cell::SensorErrors), the gain also takes this effect into account (see below).
 //! Deviation 8: the offset of the current sensor is learned ([`crate::health::offset`]).
-//! Deviation 9: the slowest branch has its own learned resistance ratio ([`slow_branch`]). In the equation of the terminal voltage V, it multiplies U_n.
+//! Deviation 9: the slowest branch has its own learned resistance ratio ([`slow_branch`]). In the equation of the
+//! terminal voltage V, it multiplies U_n.
 //!
 //! The filter is unscented, with additive noise and a scalar measurement. The sigma points are x and x +/- sqrt(N +
 //! lambda) L_i. L_i is column i of the lower Cholesky factor of P, and lambda = alpha^2 (N + kappa) - N. The weights

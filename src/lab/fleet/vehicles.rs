@@ -318,7 +318,10 @@ mod tests {
             (line("a/../b"), ":1: vehicle name \"a/../b\", must be letters"),
             (line(".."), ":1: vehicle name \"..\", must be letters"),
             (line("a").replace("\"a.log\"", ""), ":1: vehicle a has no logs"),
-            (line("a").replace("bytes", "size"), ":1: not a vehicle of a manifest (see `packwatch fleet plan`): unknown field `size`"),
+            (
+                line("a").replace("bytes", "size"),
+                ":1: not a vehicle of a manifest (see `packwatch fleet plan`): unknown field `size`",
+            ),
             (String::new(), ": contains no vehicle"),
         ] {
             std::fs::write(&path, &text).unwrap();

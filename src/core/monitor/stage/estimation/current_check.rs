@@ -223,7 +223,8 @@ impl CurrentCheck {
             return;
         }
         // A limit is the largest reading of its direction.
-        if change_a > 0.0 || now.current_a.abs() < self.largest_a[direction] {
+        let is_largest = now.current_a.abs() >= self.largest_a[direction];
+        if change_a > 0.0 || !is_largest {
             self.repeated = 0.0;
         } else {
             self.repeated += libm::log((1.0 - self.noisy).max(MIN_REPEAT) / FAULTY_REPEAT).min(0.0);
@@ -234,7 +235,7 @@ impl CurrentCheck {
             }
         }
         let is_steady = now.move_v.abs() <= self.usual_v.max(self.resolution_v);
-        if is_steady {
+        if is_steady && !is_largest {
             let is_noise = change_a > NOISE_STEPS * self.resolution_a;
             self.noisy += NOISE_GAIN * (f64::from(u8::from(is_noise)) - self.noisy);
         }
@@ -378,9 +379,9 @@ mod tests {
         f64::from(level) / 2.0 - 30.0
     }
 
-    /// Noise of a reading, A: 0 to 0.07 A in steps of 0.001 A.
+    /// Noise of a reading, A: 0 to 0.06 A in steps of 0.001 A.
     fn noise_a(time_s: u32) -> f64 {
-        f64::from(time_s.wrapping_mul(2_654_435_761) >> 16 & 0x3F) / 1000.0
+        f64::from(time_s.wrapping_mul(time_s) % 61) / 1000.0
     }
 
     /// Runs a drive of `seconds`, one round every 2 s. `measured` returns the reading for the load and the time. Returns
@@ -441,7 +442,8 @@ mod tests {
         // The reading without the noise that `drive` adds: exactly 60 A while the load is larger.
         let limited = |load_a: f64, time_s: u32| Some(if load_a >= 60.0 { 60.0 - noise_a(time_s) } else { load_a });
         drive(&mut check, 1200, |load_a, _| (load_a < 60.0).then_some(load_a));
-        assert!(drive(&mut check, 3600, limited) > 0.5);
+        let share = drive(&mut check, 3600, limited);
+        assert!(share > 0.5, "{share} {check:?}");
         assert!((check.limits_a[0] - 60.0).abs() < 1e-9, "{:?}", check.limits_a);
     }
 
