@@ -370,6 +370,9 @@ mod tests {
     use super::*;
     use crate::quantity::CellIndex;
 
+    /// Name of a fault, and the reading for a load and a time.
+    type Fault = (&'static str, fn(f64, u32) -> f64);
+
     const OHM: f64 = 2e-3;
     const CELLS: usize = 5;
 
@@ -424,7 +427,7 @@ mod tests {
 
     #[test]
     fn wrong_current_is_doubted_within_seconds() {
-        let faults: [(&str, fn(f64, u32) -> f64); 4] = [
+        let faults: [Fault; 4] = [
             ("zero", |_, _| 0.0),
             ("inverted", |load_a, _| -load_a),
             ("late by 20 s", |_, time_s| load_a(time_s.saturating_sub(20))),
