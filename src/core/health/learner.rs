@@ -30,7 +30,7 @@ use crate::quantity::{InvalidState, Mode, Timestamp};
 /// difference, one of them is wrong.
 const CONTRADICTION: f64 = 4.0;
 
-/// Standard deviation of the capacity of cells of one type, fraction.
+/// Standard deviation of the capacity of cells of one type, fraction. A smaller difference is never a contradiction.
 const NEW_SPREAD: f64 = 0.1;
 
 /// Result of the capacity filter's step over a half-cycle.
@@ -355,7 +355,9 @@ impl Learner {
         let expected = drift.capacity();
         let is_contradiction = |z: &Measurement| {
             let difference = z.value - expected.mean;
-            difference * difference > CONTRADICTION * CONTRADICTION * (z.variance + expected.variance)
+            // A cell that has rested may gain a few percent of capacity.
+            difference.abs() > NEW_SPREAD * model.capacity_ah
+                && difference * difference > CONTRADICTION * CONTRADICTION * (z.variance + expected.variance)
         };
         if let Some(z) = measurement.filter(is_contradiction) {
             // The measured or the expected capacity is wrong; further half-cycles decide. Each contradiction adds at
