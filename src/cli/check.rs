@@ -57,10 +57,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 /// Checks the key file of `[authentication]`, unless this user may not read it.
 fn check_key(file: &Path) -> Result<(), Failure> {
     let Some(KeySource::File(path)) = crate::config::load(file)?.key else { return Ok(()) };
-    match File::open(&path) {
-        Err(error) if error.kind() == io::ErrorKind::PermissionDenied => Ok(()),
-        _ => CanKey::load(&KeySource::File(path), None).map(drop).map_err(Failure::config),
+    let is_file = path.metadata().is_ok_and(|found| found.is_file());
+    if is_file && File::open(&path).is_err_and(|error| error.kind() == io::ErrorKind::PermissionDenied) {
+        return Ok(());
     }
+    CanKey::load(&KeySource::File(path), None).map(drop).map_err(Failure::config)
 }
 
 fn show(description: &Description, page: &mut String) {

@@ -52,6 +52,10 @@ impl CanKey {
         let unreadable = |why: std::io::Error| {
             error(format!("cannot be read: {why}, must be a file of {KEY_BYTES} bytes or {} hex digits", 2 * KEY_BYTES))
         };
+        // Opening a named pipe would wait for a writer.
+        if path.metadata().is_ok_and(|found| !found.is_file()) {
+            return Err(error("is not a regular file".to_owned()));
+        }
         let file = File::open(path).map_err(unreadable)?;
         let mode = file.metadata().map_err(|why| error(why.to_string()))?.mode() & 0o7777;
         // The mask 0o077 selects the permissions of other users.
@@ -157,6 +161,9 @@ mod tests {
             CanKey::load(source, credentials.map(|folder| folder.as_os_str().to_owned())).unwrap_err()
         };
         assert!(error(&source, None).contains("can.key: cannot be read: No such file or directory"));
+        std::fs::create_dir(&path).unwrap();
+        assert!(error(&source, None).ends_with("can.key: is not a regular file"));
+        std::fs::remove_dir(&path).unwrap();
         std::fs::write(&path, KEY).unwrap();
         for (mode, is_good) in [(0o600, true), (0o400, true), (0o640, false), (0o604, false), (0o620, false)] {
             std::fs::set_permissions(&path, std::fs::Permissions::from_mode(mode)).unwrap();
