@@ -1,6 +1,6 @@
 //! `packwatch run`: the service on live CAN interfaces.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Duration;
 
 use super::common::numbers::{MAX_SECONDS, away, between, bytes, whole};
@@ -82,11 +82,6 @@ const MAX_BUFFER_BYTES: usize = (i32::MAX / 2) as usize;
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     logging::start(args.log.as_deref()).map_err(Failure::new)?;
-    let file = args.state.as_deref().filter(|state| *state != Path::new("none") && state.exists() && !state.is_dir());
-    if let Some(file) = file {
-        let what = format!("--state {}: is a file, must be a folder for state and history, or none", file.display());
-        return Err(Failure::new(what));
-    }
     let record_limits = args.record_limit.map(|total| SegmentLimits::new(total, args.record_segment)).transpose();
     let config = config::load(&args.config)?;
     let key = config.key.as_ref().map(|key| CanKey::load(key, std::env::var_os("CREDENTIALS_DIRECTORY"))).transpose();

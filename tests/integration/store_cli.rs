@@ -161,6 +161,8 @@ fn replay_rejects_existing_history() {
     let printed = bad(&["replay", "-c", &config, &log, "--state", &place.state()]);
     assert!(printed.contains("already contains a state; a replay needs a new state folder"), "{printed}");
     assert_eq!(fs::read(place.database()).expect("read"), before);
+    let printed = bad(&["replay", "-c", &config, &log, "--state", &log]);
+    assert!(printed.contains("is a file, must be a folder for state and history"), "{printed}");
 }
 
 #[test]
