@@ -1,4 +1,4 @@
-//! Regression scenarios with hand-made frames of one measured cell. In each, an earlier version published a false
+//! Tests regression scenarios with hand-made frames of one measured cell. In each, an earlier version published a false
 //! value, lost a value, or flickered.
 
 use std::path::Path;
@@ -276,7 +276,7 @@ fn waking_alone_does_not_clear_input_missing() {
 }
 
 #[test]
-fn repeatedly_lost_filter_is_not_trusted() {
+fn jumping_voltage_is_not_trusted() {
     let mut c = load("paper.toml");
     c.rules = vec![rule(Rule::EstimateUntrusted, 4.0, 60.0)];
     let mut b = Bench::new(c, 0.6);
@@ -289,9 +289,7 @@ fn repeatedly_lost_filter_is_not_trusted() {
             valid += u32::from(b.status().validity == 1);
         }
     }
-    assert!(b.count(|k| matches!(k, EventKind::FilterReset { .. })) > 0);
     assert!(valid < 600, "SOC valid for {valid} of 3600 s");
-
     assert!(b.count(|k| alarm(k, Rule::EstimateUntrusted, true)) > 0);
 }
 
@@ -533,7 +531,7 @@ fn state_restored_on_earlier_clock_keeps_sending() {
         let time = Timestamp::from_secs(-1e6).plus_nanos(tick * 10_000_000);
         monitor.handle(&Record::tick(time), &mut out);
     }
-    // Three seconds give a status frame, five health pages and three digest pages each. The state may have been taken
+    // Three seconds give a status frame, five health pages and four digest pages each. The state may have been taken
     // anywhere in the period.
     assert!((21..=36).contains(&out.frames.len()), "{} frames", out.frames.len());
 }

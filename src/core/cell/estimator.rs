@@ -1,8 +1,8 @@
 //! Estimates one cell's state, sample by sample, with an unscented Kalman filter.
 //!
 //! State x = [SOC, ln rho, C, U_1 .. U_n]: state of charge (fraction), logarithm of the resistance relative to a new
-//! cell, capacity (Ah), branch voltages (V); n = 1 to 3 branches. The nonlinear states come first, so that a linear map moves the
-//! sigma points of the branches.
+//! cell, capacity (Ah), branch voltages (V); n = 1 to 3 branches. The nonlinear states come first, so that a linear map
+//! moves the sigma points of the branches.
 //! Predict over the charge q (A s) and time dt since the last sample:
 //! SOC -= q / (3600 C); U_i by `circuit::BranchAt` with the mean current q/dt; ln rho and C stay.
 //! Update with the voltage: V = OCV(SOC, T) - sum U_i - rho R0(SOC, T) I. Source: the paper, section 3.3.3.
@@ -17,12 +17,12 @@
 //! Reason: the model error is slow, so information is counted per second and not per sample. Effect: the sample rate
 //! does not change the result.
 //!
-//! Deviation 4: model^2 = base^2 + (k drop)^2 + (k' load)^2. The base is the cell model's stated error over SOC and temperature, or
-//! a configured constant. The drop is the present voltage drop in the cell, the load the voltage drop of the last minutes' load.
-//! Reason: most of the model error comes from the resistances and from diffusion that is slower than the branches.
-//! Effect: a record that begins under load, the constant-voltage part of a charge, and cold cells no longer count as
-//! exact. At rest, the error repeats instead of averaging out. A rest of duration t therefore gives only as much
-//! information as the time t_r ln(1 + t/t_r) under load, with t_r = 1000 s.
+//! Deviation 4: model^2 = base^2 + (k drop)^2 + (k' load)^2. The base is the cell model's stated error over SOC and
+//! temperature, or a configured constant. The drop is the present voltage drop in the cell. The load is the voltage
+//! drop caused by the load of the last minutes. Reason: most of the model error comes from the resistances and from
+//! diffusion that is slower than the branches. Effect: a record that begins under load, the constant-voltage part of a
+//! charge, and cold cells no longer count as exact. At rest, the error repeats instead of averaging out. A rest of
+//! duration t therefore gives only as much information as the time t_r ln(1 + t/t_r) under load, with t_r = 1000 s.
 //! Deviation 5: the OCV curve changes with the lost capacity ([`AgedOcv`](crate::cell::AgedOcv)), as learned by the end
 //! of the last half-cycle. Effect: readings at the top and at the bottom of an aged cell's curve give the same
 //! capacity.
@@ -32,7 +32,8 @@
 //! Deviation 7: the filter tracks the effect of constant errors of sensors and model. For the errors of
 //! [`SensorErrors`](crate::cell::SensorErrors), the gain also takes this effect into account (see below).
 //! Deviation 8: the offset of the current sensor is learned ([`crate::health::offset`]).
-//! Deviation 9: the slowest branch has its own learned resistance ratio ([`slow_branch`]), which multiplies U_n in the voltage.
+//! Deviation 9: the slowest branch has its own learned resistance ratio ([`slow_branch`]). In the equation of the
+//! terminal voltage V, it multiplies U_n.
 //!
 //! The filter is unscented, with additive noise and a scalar measurement. The sigma points are x and x +/- sqrt(N +
 //! lambda) L_i. L_i is column i of the lower Cholesky factor of P, and lambda = alpha^2 (N + kappa) - N. The weights
@@ -57,6 +58,7 @@ mod slow_branch;
 mod state;
 mod state_vector;
 mod step;
+mod voltage_reach;
 
 pub use bank::EstimatorBank;
 pub use cell_estimator::{AdoptedState, CellEstimator};

@@ -3,9 +3,9 @@
 //! All values are interpolated linearly over SOC. Over temperature, the OCV and the time constants are interpolated
 //! linearly. Resistances follow an Arrhenius law with [`ACTIVATION_ENERGY_J_PER_MOL`] that passes through the values at
 //! both breakpoints; linear interpolation would be up to 15 % too high in the middle of a 20 K interval. Outside the
-//! temperatures of the grid, the value at the edge is used. Outside SOC 0 to 1, resistances keep the value at the edge,
-//! and the OCV continues with the slope of its last interval, so that a wrong SOC below 0 or above 1 is still
-//! corrected.
+//! temperatures of the grid, the value at the edge is used. Outside SOC 0 to 1, resistances keep the value at the edge.
+//! The OCV continues with the slope of its last interval, so that the filter still corrects a wrong SOC below 0 or
+//! above 1.
 //!
 //! Deviation: the paper interpolates R1 and C1 separately; this model interpolates their product, the time constant.
 //! Reason: between nodes with different resistances, the product of the two interpolated values is up to twice the
@@ -18,8 +18,8 @@ use crate::filter::{ScalarGaussian, crossing, interpolation, locate};
 /// Maximum number of RC branches.
 pub const MAX_BRANCHES: usize = 3;
 
-/// Activation energy of the resistances between two temperature breakpoints, J/mol. Measured cells of these types have
-/// 15 to 35 kJ/mol.
+/// Activation energy of the resistances between two temperature breakpoints, J/mol. Measured cells have 15 to 35
+/// kJ/mol.
 pub const ACTIVATION_ENERGY_J_PER_MOL: f64 = 25_000.0;
 
 /// Resistance at a temperature, relative to the resistance at 25 degrees C.
@@ -54,13 +54,13 @@ pub struct Thermal {
     pub resistance_k_per_w: f64,
 }
 
-/// A checked cell model: breakpoints and OCV rise strictly, all resistances and capacitances are positive and finite, and the
-/// tables are complete. Created by `config::cell_model`.
+/// A checked cell model: breakpoints and OCV rise strictly, all resistances and capacitances are positive and finite,
+/// and the tables are complete. Created by `config::cell_model`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CellModel {
     /// Display name.
     pub name: String,
-    /// Label capacity, Ah: the reference of SOH.
+    /// Capacity on the label, Ah. The SOH is relative to this capacity.
     pub rated_capacity_ah: f64,
     /// Capacity of a new cell between its full and its empty open-circuit voltage at the reference temperature, Ah.
     pub capacity_ah: f64,
@@ -100,16 +100,16 @@ pub struct ModelSpread {
     pub slow_branch: f64,
     /// Capacity, fraction.
     pub capacity: f64,
-    /// Present voltage drop and voltage drop caused by the load of the last minutes: fraction of the drop, for an
-    /// average over one second.
+    /// Error of the present voltage drop and of the voltage drop caused by the load of the last minutes: fraction of
+    /// the drop, for an average over one second.
     pub drop_sqrt_s: f64,
 }
 
 impl ModelSpread {
-    /// Spread of cells of the model's own type.
-    pub fn usual(branches: usize) -> Self {
+    /// Spread of cells of the model's own type. `curve_v`: standard deviation of the open-circuit curve's error, V.
+    pub fn usual(branches: usize, curve_v: f64) -> Self {
         let slow_branch = if branches > 1 { 0.2 } else { 0.1 };
-        Self { curve_v: 0.0, log_resistance: 0.2, slow_branch, capacity: 0.1, drop_sqrt_s: 0.0 }
+        Self { curve_v, log_resistance: 0.2, slow_branch, capacity: 0.1, drop_sqrt_s: 0.0 }
     }
 }
 
@@ -139,7 +139,8 @@ pub struct GridPosition {
 }
 
 impl TemperaturePosition {
-    /// Interpolates `value` between the lower and the upper row with weight `along`. Does not read the upper row at weight 0.
+    /// Interpolates `value` between the lower and the upper row with weight `along`. At weight 0, does not read the
+    /// upper row.
     fn between(&self, along: f64, value: impl Fn(usize) -> f64) -> f64 {
         let low = value(self.t);
         if along == 0.0 { low } else { low + along * (value(self.t + 1) - low) }
@@ -152,7 +153,37 @@ impl Table {
     }
 }
 
+/// If the mean slope of the open-circuit curve is below this value, V per unit of SOC, an electrode is a mixture of two
+/// phases.
+const TWO_PHASE_SLOPE_V: f64 = 0.15;
+
+/// Standard deviation of the hysteresis of a two-phase electrode around the middle of both branches, V. For LFP, the
+/// branches are 10 to 25 mV apart.
+const TWO_PHASE_HYSTERESIS_V: f64 = 0.01;
+
 impl CellModel {
+    /// Spread of the cells around the model. If the model states none: the usual spread of cells of one type, and the
+    /// hysteresis of a two-phase electrode if the curve is flat.
+    pub fn spread(&self) -> ModelSpread {
+        self.spread.unwrap_or_else(|| {
+            let curve_v = if self.is_two_phase() { TWO_PHASE_HYSTERESIS_V } else { 0.0 };
+            ModelSpread::usual(self.branches.len(), curve_v)
+        })
+    }
+
+    /// Whether the curve between 20 and 80 % is flat. A model that has not been checked may have incomplete tables; it
+    /// counts as steep.
+    fn is_two_phase(&self) -> bool {
+        let curve = self.ocv_v.values.first();
+        let node = |at: f64| {
+            let index = self.soc.iter().position(|&soc| soc >= at)?;
+            Some((self.soc[index], *curve?.get(index)?))
+        };
+        node(0.2).zip(node(0.8)).is_some_and(|((low, low_v), (high, high_v))| {
+            high > low && high_v - low_v < TWO_PHASE_SLOPE_V * (high - low)
+        })
+    }
+
     /// Grid position of a SOC and a temperature.
     pub fn grid_position(&self, soc: f64, temperature_c: f64) -> GridPosition {
         self.grid_position_at(&self.temperature_position(temperature_c), soc)
@@ -190,7 +221,8 @@ impl CellModel {
         self.ocv_v(position) + self.offset(position, capacity_ah).offset_v.at(self.soc_at(position))
     }
 
-    /// Change of the aged open-circuit voltage per Ah of capacity, V, and by one standard deviation of each mix of losses, V.
+    /// Change of the aged open-circuit voltage per Ah of capacity, V, and per standard deviation of each mix of losses,
+    /// V.
     pub fn aged_ocv_changes_v(&self, position: &GridPosition, capacity_ah: f64) -> (f64, [f64; MIXES]) {
         let (line, soc) = (self.offset(position, capacity_ah), self.soc_at(position));
         (line.per_ah_v.at(soc), line.mixes_v.map(|mix_v| mix_v.at(soc)))
@@ -209,8 +241,8 @@ impl CellModel {
             + self.offset(position, capacity_ah).offset_v.0[1]
     }
 
-    /// Makes the cells aged to this capacity, Ah, the new cells of the returned model: their curve becomes the new
-    /// cells' curve. Further ageing follows from the same electrodes.
+    /// Returns a model whose new cells are the cells aged to this capacity, Ah: the aged curve becomes the new cells'
+    /// curve. Further ageing follows from the same electrodes.
     pub fn rebased(&self, capacity_ah: f64) -> Self {
         let last = self.soc.len() - 2;
         let offset_v = |s: usize| self.aged_ocv.line(&self.soc, s.min(last), capacity_ah).offset_v.at(self.soc[s]);
@@ -269,8 +301,8 @@ impl CellModel {
         (0..self.branches.len()).fold(self.r0_ohm(position), |sum, i| sum + self.branch_r_ohm(i, position))
     }
 
-    /// SOC of a new cell at an open-circuit voltage, found by bisection between -0.5 and 1.5. For a voltage outside
-    /// this range, the nearer end.
+    /// SOC of a new cell at an open-circuit voltage, found by bisection between -0.5 and 1.5. If the SOC is outside
+    /// this range, returns the nearer end.
     pub fn soc_of_ocv(&self, voltage_v: f64, temperature_c: f64) -> f64 {
         self.soc_of_aged_ocv(&self.temperature_position(temperature_c), self.capacity_ah, voltage_v)
     }

@@ -6,9 +6,10 @@
 //! * Curve: the modes of the spread between cells, and the smallest `voltage_error_v` of all temperatures at this SOC.
 //!   At the temperature with the smallest error, the resistances matter least, so this error is mostly an error of the
 //!   curve. If the model has no such table, the constant error of the spread is used.
-//! * Resistances: a common error (`log_resistance` of the spread, else the spread of cells of one type), and an error that differs
-//!   between SOC and temperatures: the voltage drop's standard deviation over [`ERROR_WINDOW_S`], and the part of `voltage_error_v`
-//!   beyond the curve's error, relative to the drop at a usual load.
+//! * Resistances: a common error (`log_resistance` of the spread, else the spread of cells of one type), and an error
+//!   that differs between SOC and temperatures. The second error consists of the voltage drop's standard deviation over
+//!   [`ERROR_WINDOW_S`] and of the part of `voltage_error_v` beyond the curve's error, relative to the drop at a usual
+//!   load.
 
 mod advice;
 
@@ -18,7 +19,7 @@ use super::chemistry::USUAL_LOAD_PER_H;
 use super::model::{CellModel, ERROR_WINDOW_S, GridPosition, ModelSpread};
 use crate::filter::square;
 
-/// Temperature of a displayed curve, degrees C. If the table does not include this temperature, the nearest breakpoint.
+/// Temperature of a displayed curve, degrees C. If the table does not include it, the nearest breakpoint is used.
 pub const CURVE_C: f64 = 25.0;
 
 /// Variance of an unknown SOC: uniform over 0 to 1.
@@ -57,7 +58,8 @@ impl<'a> ModelBands<'a> {
         self.model.ocv_v(&self.at(soc))
     }
 
-    /// Slope of the open-circuit voltage at [`CURVE_C`], V per unit of SOC, over 5 % of SOC, the resolution of a filter.
+    /// Slope of the open-circuit voltage at [`CURVE_C`], V per unit of SOC, over 5 % of SOC (the resolution of a
+    /// filter).
     pub fn slope_v(&self, soc: f64) -> f64 {
         let (low, high) = ((soc - 0.025).max(0.0), (soc + 0.025).min(1.0));
         (self.ocv_v(high) - self.ocv_v(low)) / (high - low)
@@ -102,7 +104,7 @@ impl<'a> ModelBands<'a> {
     }
 
     fn spread(&self) -> ModelSpread {
-        self.model.spread.unwrap_or(ModelSpread::usual(self.model.branches.len()))
+        self.model.spread()
     }
 
     /// Standard deviation of the SOC from one voltage at rest, fraction.

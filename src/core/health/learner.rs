@@ -26,6 +26,13 @@ use crate::filter::{Measurement, ScalarGaussian};
 use crate::quantity::bounds;
 use crate::quantity::{InvalidState, Mode, Timestamp};
 
+/// If a measured capacity and the expected capacity differ by more than this many standard deviations of their
+/// difference, one of them is wrong.
+const CONTRADICTION: f64 = 4.0;
+
+/// Standard deviation of the capacity of cells of one type, fraction. A smaller difference is never a contradiction.
+const NEW_SPREAD: f64 = 0.1;
+
 /// Result of the capacity filter's step over a half-cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CapacityUpdate {
@@ -95,7 +102,7 @@ pub struct Learner {
     in_doubt: Vec<usize>,
     /// Offset of the current sensor.
     offset: CurrentOffset,
-    /// Per cell: whether its capacity stays unchanged by half-cycles.
+    /// Per cell: whether half-cycles leave its capacity unchanged.
     #[serde(skip)]
     is_held: Vec<bool>,
 }
@@ -345,9 +352,23 @@ impl Learner {
         });
         let drift = &mut self.drift[cell];
         let before = *drift;
-        if let Some(z) = measurement {
+        let expected = drift.capacity();
+        let is_contradiction = |z: &Measurement| {
+            let difference = z.value - expected.mean;
+            // A cell that has rested may gain a few percent of capacity.
+            difference.abs() > NEW_SPREAD * model.capacity_ah
+                && difference * difference > CONTRADICTION * CONTRADICTION * (z.variance + expected.variance)
+        };
+        if let Some(z) = measurement.filter(is_contradiction) {
+            // The measured or the expected capacity is wrong; further half-cycles decide. Each contradiction adds at
+            // most the variance of new cells, so that one wild measurement does not make the capacity unknown.
+            let difference = z.value - expected.mean;
+            let doubt = difference * difference / (CONTRADICTION * CONTRADICTION);
+            let spread_ah = NEW_SPREAD * model.capacity_ah;
+            drift.doubt(doubt.min(expected.variance + spread_ah * spread_ah));
+        } else if let Some(z) = measurement {
             drift.update(z, &effects_ah(model, config, half_cycle, after.mean));
-        } else if is_in_doubt {
+        } else if is_in_doubt && !is_held {
             drift.at_least(half_cycle.charge_ah);
         }
         // Discards a measurement that makes the capacity impossible for this cell.
@@ -355,7 +376,7 @@ impl Learner {
         if !is_possible {
             *drift = before;
         }
-        let measurement = measurement.filter(|_| is_possible);
+        let measurement = measurement.filter(|z| is_possible && !is_contradiction(z));
         self.capacity[cell] = drift.capacity();
         let cycles = half_cycle.charge_ah / (2.0 * after.mean);
         let rest_days = (self.rest_s / 86_400.0).min(1.0);

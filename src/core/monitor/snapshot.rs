@@ -25,8 +25,10 @@ use crate::sample::{CellSample, SampleConfig};
 
 /// Name of the charge that [`Snapshot::check_charges`] checks, for error messages.
 const CHARGE: &str = "the charge since a cell's latest voltage or half-cycle";
-/// Tolerances for two cases: the limits of the current were wider when the charge was counted, or the clock was set.
+/// Factor by which a charge may exceed the largest plausible charge, because the limits of the current may have been
+/// wider when the charge was counted.
 const CHARGE_TOLERANCE: f64 = 2.0;
+/// Time, s, that is added to the time in which the charge has moved, because the clock may have been set.
 const CHARGE_TOLERANCE_S: f64 = 1000.0;
 
 /// Layout version of [`Snapshot`].
@@ -115,6 +117,7 @@ impl Snapshot {
         restarted.intake.restart();
         restarted.sampling.restart();
         restarted.estimation.is_current_doubtful = false;
+        restarted.estimation.current_check.interrupt();
         restarted.modelling.iter_mut().for_each(ModellingState::restart);
         restarted.diagnosis.iter_mut().for_each(CellFaultDetector::interrupt);
         restarted.alarming.restart();
@@ -192,6 +195,7 @@ impl Snapshot {
             stored.check().map_err(|invalid| at_cell(cell, invalid))?;
         }
         self.estimation.waiting.iter().try_for_each(CellSample::check)?;
+        self.estimation.current_check.check()?;
         self.modelling.iter().try_for_each(ModellingState::check)?;
         self.diagnosis.iter().try_for_each(|diagnosis| diagnosis.check(self.cells.len()))?;
         self.sampling.sampler.check()?;
@@ -229,6 +233,7 @@ impl Snapshot {
         for consumed in self.cells.iter_mut().filter_map(|cell| cell.consumed.as_mut()) {
             consumed.time = consumed.time.plus_nanos(by_nanos);
         }
+        self.estimation.current_check.rebase(by_nanos);
         self.estimation.waiting.iter_mut().for_each(|sample| sample.time = sample.time.plus_nanos(by_nanos));
         self.sampling.sampler.rebase(by_nanos);
         self.learning.rebase(by_nanos);

@@ -237,7 +237,11 @@ impl Stages {
     fn complete_mode(&mut self, now: Timestamp, change: ModeChange, out: &mut Outputs) {
         let Self { estimation, modelling, learning, alarming, sending, .. } = self;
         let mut publisher = Publisher { now, alarming, sending, out };
-        learning.complete_mode(change, &mut estimation.bank, modelling.teaches_capacity(), &mut publisher);
+        let teaches_capacity = modelling.teaches_capacity();
+        let is_doubtful = estimation.take_doubt();
+        let is_doubtful = |cell: usize| is_doubtful || estimation.is_voltage_frozen(cell);
+        let doubtful: Vec<bool> = (0..estimation.cells()).map(is_doubtful).collect();
+        learning.complete_mode(change, &mut estimation.bank, (teaches_capacity, &doubtful), &mut publisher);
     }
 
     /// Fits the model of the cells to the rows of the notebook and adopts the result.
@@ -407,9 +411,11 @@ impl Stages {
             // A cell without a fresh voltage may be the weakest.
             self.forget_pack_state();
         }
-        // A frozen reading of the current, or a message with a second sender, makes the estimates doubtful.
+        // A frozen or contradicted reading of the current, or a message with a second sender, makes the estimates
+        // doubtful.
         let is_current_frozen = self.sampling.sampler.is_current_frozen();
-        self.estimation.is_current_doubtful = self.sampling.has_second_sender || is_current_frozen;
+        let is_contradicted = self.estimation.current_check.is_doubtful();
+        self.estimation.is_current_doubtful = self.sampling.has_second_sender || is_current_frozen || is_contradicted;
         self.findings.watch_current(now, is_current_frozen, out);
         if is_judged {
             self.watch(now, out);

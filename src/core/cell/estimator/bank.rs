@@ -25,8 +25,9 @@ use single::{hot, with_hot};
 
 use super::cell_estimator::{CellEstimator, thermal_c};
 use super::memory::Memory;
-use super::state_vector::{CAPACITY, LOG_RESISTANCE, widened, within_bounds};
+use super::state_vector::{CAPACITY, LOG_RESISTANCE, VOLTAGE_OFFSET, widened, within_bounds};
 use super::step::{CellStep, StepResult};
+use super::voltage_reach::VoltageReach;
 use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES};
 use crate::filter::ScalarGaussian;
 use crate::quantity::bounds;
@@ -37,6 +38,7 @@ pub struct EstimatorBank {
     model: CellModel,
     config: EstimatorConfig,
     constants: KernelConstants,
+    voltage_reach: VoltageReach,
     /// Smallest and largest plausible capacity, Ah.
     plausible_ah: (f64, f64),
     filters: FilterArrays,
@@ -63,6 +65,7 @@ impl EstimatorBank {
         let idle = StepResult { update: None, reset: false };
         let mut bank = Self {
             constants: KernelConstants::new(model, config),
+            voltage_reach: VoltageReach::new(model, config.sensor.voltage_offset_v),
             plausible_ah: plausible_ah(model, config),
             model: model.clone(),
             config: *config,
@@ -184,8 +187,11 @@ impl EstimatorBank {
         let CellSlot { memory, has_filter, .. } = &self.cells[cell];
         has_filter.then(|| {
             let soc = self.marginal(cell, 0);
+            let linear = self.soc_by_voltage(cell);
+            let reach = self.voltage_reach.std(soc.mean, linear);
+            let variance = soc.variance + reach * reach - linear * linear;
             let downtime_std = memory.downtime_std_if_any();
-            let variance = downtime_std.map_or(soc.variance, |std| widened(soc.variance, std * std));
+            let variance = downtime_std.map_or(variance, |std| widened(variance, std * std));
             within_bounds(ScalarGaussian { variance, ..soc })
         })
     }
@@ -197,7 +203,7 @@ impl EstimatorBank {
             return None;
         }
         let (lowest, highest) = each_array!(&self.filters, x => x.extremes(self.cells.len()))?;
-        Some((within_bounds(self.marginal(lowest, 0)), within_bounds(self.marginal(highest, 0))))
+        Some((self.soc(lowest)?, self.soc(highest)?))
     }
 
     /// ln of the resistance relative to new.
@@ -324,6 +330,13 @@ impl EstimatorBank {
     /// Changes every cell's estimator.
     pub fn change_all(&mut self, mut change: impl FnMut(&mut CellEstimator)) {
         (0..self.cells.len()).for_each(|cell| self.change(cell, &mut change));
+    }
+
+    /// Change of a cell's SOC per standard deviation of the voltage's constant error, fraction.
+    #[inline]
+    fn soc_by_voltage(&self, cell: usize) -> f64 {
+        let (block, lane) = (cell / WIDTH, cell % WIDTH);
+        each_array!(&self.filters, x => x.blocks[block].by_constant[VOLTAGE_OFFSET][0].0[lane])
     }
 
     #[inline]

@@ -106,7 +106,10 @@ impl CellEstimator {
         memory.last_current_a = step.current_a.unwrap_or(memory.last_current_a);
         let (Some(_), Some(x)) = (step.current_a, &mut self.filter) else { return Some(None) };
         let update = match memory.downtime_std_if_any() {
-            None => kernel.update((x, memory), step)?,
+            None => {
+                x.covariance[(0, 0)] = widened(x.covariance[(0, 0)], square(memory.downtime_std));
+                kernel.update((x, memory), step)?
+            }
             Some(_) => update_after_downtime(kernel, (x, memory), (model, config), step)?,
         };
         memory.end_downtime();
@@ -204,8 +207,8 @@ impl CellEstimator {
         variance
     }
 
-    /// The sensor's temperature. If it is unknown, the thermal model's prediction from the last known temperature.
-    /// Degrees C.
+    /// Temperature of the cell, degrees C. If the sensor has no value, the thermal model predicts the temperature from
+    /// the last known temperature.
     fn temperature(&self, model: &CellModel, step: &CellStep) -> f64 {
         step.temperature_c.unwrap_or_else(|| {
             let soc = self.soc().map_or(0.5, |soc| soc.mean);
@@ -307,7 +310,7 @@ impl CellEstimator {
         self.filter.as_ref().map_or(0.0, |x| x.covariance[(LOG_RESISTANCE, CAPACITY)])
     }
 
-    /// Capacity of the open-circuit curve, Ah.
+    /// Capacity that selects the open-circuit curve of the aged cell, Ah.
     pub fn curve(&self) -> ScalarGaussian {
         self.memory.curve
     }

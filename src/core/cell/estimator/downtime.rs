@@ -1,4 +1,5 @@
-//! Use of a cell while nothing is measured: the program is stopped, the bus sleeps, or the log has a gap.
+//! Handles the possible use of a cell while nothing is measured: the program is stopped, the bus sleeps, or the log has
+//! a gap.
 //!
 //! In: the possible change of the SOC in the downtime, fraction, and the first voltage after it, V. Out: the updated filter;
 //! `None` if the update cannot be computed.
@@ -26,6 +27,7 @@ use super::gaussian::Gaussian;
 use super::memory::Memory;
 use super::state_vector::{BRANCHES, LOG_RESISTANCE, square, widened};
 use super::step::{CellStep, Update};
+use super::voltage_reach::FAR;
 use crate::cell::{CellModel, EstimatorConfig};
 
 /// Updates with the first reading after a downtime. This reading does not count as evidence about the sensor's offset
@@ -43,11 +45,12 @@ pub(super) fn update_after_downtime(
     let current_a = step.current_a.unwrap_or(0.0);
     let temperature = model.temperature_position(step.temperature_c.unwrap_or(step.ambient_c));
     let position = model.grid_position_at(&temperature, before_soc);
-    let mut drop_v = current_a * model.r0_ohm(&position) * ratio;
+    let (mut drop_v, mut branch_variance) = (current_a * model.r0_ohm(&position) * ratio, 0.0);
     for i in BRANCHES..used.states {
         let most_v = current_a * ratio * model.branch_r_ohm(i - BRANCHES, &position);
         used.mean[i] = 0.5 * most_v;
         used.covariance[(i, i)] += square(most_v) / 12.0;
+        branch_variance += used.covariance[(i, i)];
         drop_v += if i + 1 < used.states { used.mean[i] } else { memory.slow_branch.ratio * used.mean[i] };
     }
     // This wide prior is used only for the weights of the hypotheses; its updated copy is discarded.
@@ -56,8 +59,19 @@ pub(super) fn update_after_downtime(
     let soc = model.soc_of_aged_ocv(&temperature, memory.curve.mean, step.voltage_v + drop_v);
     // All SOCs within reach are equally likely. The prior is centred at the SOC that the voltage gives, where the curve
     // is then linearised.
-    used.mean[0] = soc.clamp(before_soc - reach, before_soc + reach);
+    let within_reach = |soc: f64| soc.clamp(before_soc - reach, before_soc + reach);
+    used.mean[0] = within_reach(soc);
     let by_used = update(&mut used)?;
+    // On a flat part of the curve, the slope at one SOC says little: a small error of the voltage leads to a far SOC.
+    let voltage_variance = square(config.sensor.voltage_offset_v)
+        + square(config.gate.model_error_v)
+        + branch_variance
+        + square(drop_v) * x.marginal(LOG_RESISTANCE).variance;
+    let error_v = FAR * voltage_variance.sqrt();
+    let soc_at = |voltage_v: f64| within_reach(model.soc_of_aged_ocv(&temperature, memory.curve.mean, voltage_v));
+    let far = [soc_at(step.voltage_v + drop_v - error_v), soc_at(step.voltage_v + drop_v + error_v)];
+    let std = far.map(|far| (far - used.mean[0]).abs() / FAR).into_iter().fold(0.0, f64::max);
+    used.covariance[(0, 0)] = used.covariance[(0, 0)].max(square(std));
     let by_left_alone = update(x)?;
     let log_likelihood =
         |u: &Update| -0.5 * (libm::log(u.innovation_variance) + square(u.innovation) / u.innovation_variance);

@@ -1,8 +1,8 @@
 //! The estimator's memory: rest, load, consistency, rejected readings, and the estimates that a restart of the filter
 //! keeps.
 //!
-//! In: steps (A, s) and the outcomes of updates. Out: the time that a reading stands for, s, the load, A, and whether the
-//! filter must restart. Stored numbers are checked ([`Memory::check`]).
+//! In: steps (A, s) and the outcomes of updates. Out: the time that a reading represents, s, the load, A, and whether
+//! the filter must restart. Stored numbers are checked ([`Memory::check`]).
 
 use serde::{Deserialize, Serialize};
 
@@ -14,7 +14,7 @@ use crate::filter::ScalarGaussian;
 use crate::quantity::InvalidState;
 use crate::quantity::bounds::{self, Bounds};
 
-/// Assumed load in a gap with a load before or after it, per rated capacity: 1 C.
+/// If there is a load before or after a gap, this load is assumed in the gap, per rated capacity: 1 C.
 const GAP_LOAD_PER_H: f64 = 1.0;
 
 /// Prior probability that a cell was used while the program did not run.
@@ -28,7 +28,7 @@ const LOADED_PRIOR: f64 = 0.5;
 /// bus sleeps, but this is rare, because a bus in use wakes its listeners.
 const CHARGER_PRIOR: f64 = 0.05;
 
-/// Downtime that adds at most this standard deviation to the SOC, fraction, is negligible.
+/// If a downtime adds at most this standard deviation to the SOC, fraction, the downtime is negligible.
 const NEGLIGIBLE_STD: f64 = 0.002;
 
 /// State of the estimator in addition to its filter.
@@ -37,7 +37,7 @@ const NEGLIGIBLE_STD: f64 = 0.002;
 pub(super) struct Memory {
     /// Capacity, Ah, before the first voltage and across a restart.
     pub(super) capacity: ScalarGaussian,
-    /// Capacity of the open-circuit curve, Ah.
+    /// Capacity that selects the open-circuit curve of the aged cell, Ah.
     pub(super) curve: ScalarGaussian,
     pub(super) log_resistance: ScalarGaussian,
     pub(super) temperature_c: Option<f64>,
@@ -63,9 +63,11 @@ pub(super) struct Memory {
     pub(super) noted_s: f64,
     /// Probability that the cell was used during the downtime.
     pub(super) used_prior: f64,
-    /// No voltage has been used since the last sleep or unknown gap.
+    /// Whether the current was unknown at the last reading, so that an unmeasured stretch continues.
+    pub(super) is_current_unknown: bool,
+    /// Whether no voltage has been used since the last sleep or unknown gap.
     pub(super) is_unseen: bool,
-    /// The SOC is unknown after a gap of unknown length: the filter restarts from the next voltage.
+    /// Whether the SOC is unknown after a gap of unknown length. If so, the filter restarts from the next voltage.
     pub(super) is_soc_unknown: bool,
     /// Number of consecutive readings beyond the gate.
     pub(super) rejected: u32,
@@ -95,6 +97,7 @@ impl Memory {
             downtime_std: 0.0,
             noted_s: 0.0,
             used_prior: 0.0,
+            is_current_unknown: false,
             is_unseen: false,
             is_soc_unknown: false,
             rejected: 0,
@@ -110,10 +113,14 @@ impl Memory {
     }
 
     /// Notes the unmeasured time of a step. The load before or after this time may have continued through it, or a
-    /// charger may have been connected. The next voltage decides whether this happened. If the possible change is
-    /// small, it is not noted as downtime; its standard deviation (fraction of SOC) is returned instead.
+    /// charger may have been connected. The next voltage with a known current decides whether this happened. If a short
+    /// gap ends with this step and its possible change is small, it is not noted as downtime; its standard deviation
+    /// (fraction of SOC) is returned instead.
     pub(super) fn note_gap(&mut self, config: &EstimatorConfig, step: &CellStep, capacity_ah: f64) -> f64 {
         let noted_s = std::mem::take(&mut self.noted_s).min(step.unmeasured_s);
+        let is_unknown = step.current_a.is_none() && step.unmeasured_s > 0.0;
+        let continues = self.is_current_unknown || is_unknown;
+        self.is_current_unknown = is_unknown;
         let adjacent_a = self.gap_load_a(config, step);
         let is_loaded = adjacent_a > config.gap.rest_current_a;
         let unnoted_s = step.unmeasured_s - noted_s;
@@ -122,19 +129,27 @@ impl Memory {
         }
         let load_per_s = if is_loaded { adjacent_a / (3600.0 * capacity_ah) } else { 0.0 };
         let away_per_s = config.gap.away_use_per_s;
-        // In gaps shorter than an hour, slow relaxation would be mistaken for a charger.
-        let charger_per_s = if unnoted_s < 3600.0 { 0.0 } else { away_per_s };
-        let most = load_per_s.max(charger_per_s) * step.unmeasured_s - away_per_s * noted_s;
+        // A cell that reports its voltage is awake, so use may start at any time. In silent gaps shorter than an hour,
+        // slow relaxation would be mistaken for a charger.
+        let use_per_s = if continues || unnoted_s >= 3600.0 { away_per_s } else { 0.0 };
+        let most = load_per_s.max(use_per_s) * step.unmeasured_s - away_per_s * noted_s;
         if most <= 0.0 {
             return 0.0;
         }
         let std = most / 3.0_f64.sqrt();
-        if std <= NEGLIGIBLE_STD {
+        if std <= NEGLIGIBLE_STD && !continues {
             return std;
         }
         let used_at_rest = CHARGER_PRIOR * (unnoted_s / 43_200.0).min(1.0);
         let used = if is_loaded { LOADED_PRIOR } else { used_at_rest };
-        self.note_downtime(most, if noted_s > 0.0 { 0.0 } else { used });
+        if continues {
+            // One unknown current flows through the whole stretch: its charge grows linearly, and the stretch counts as
+            // one gap.
+            self.downtime_std = (self.downtime_std + std).min(1.0);
+            self.used_prior = self.used_prior.max(used.max(USED_PRIOR));
+        } else {
+            self.note_downtime(most, if noted_s > 0.0 { 0.0 } else { used });
+        }
         0.0
     }
 
@@ -255,7 +270,7 @@ impl Memory {
 
 /// Whether, according to the configuration, the cell rested in the unmeasured time of a step.
 fn is_silent_rest(config: &EstimatorConfig, step: &CellStep) -> bool {
-    // After 5 s without a current the bus counts as silent.
+    // If the current has not been measured for more than 5 s, the bus counts as silent.
     config.gap.silence_is_rest && step.unmeasured_s > 5.0
 }
 

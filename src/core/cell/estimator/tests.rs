@@ -95,7 +95,7 @@ impl Truth {
     }
 }
 
-/// Discharges and charges between 0.9 and 0.1 with `dt_s`, for `hours`.
+/// Discharges and charges the cell between SOC 0.9 and 0.1 for `hours`, in steps of `dt_s`.
 fn cycle(estimator: &mut CellEstimator, config: &EstimatorConfig, truth: &mut Truth, dt_s: f64, hours: f64) {
     let model = small_model();
     let mut current_a = 1.0;
@@ -197,6 +197,30 @@ fn unmeasured_load_widens_soc() {
 }
 
 #[test]
+fn lost_current_widens_soc_linearly() {
+    let (config, mut truth, model) = (config(), truth(), small_model());
+    let mut estimator = CellEstimator::new(&config);
+    cycle(&mut estimator, &config, &mut truth, 1.0, 1.0);
+    let (before, capacity_ah) = (soc(&estimator), estimator.capacity().mean);
+    for _ in 0..120 {
+        let lost = CellStep {
+            measured_s: 0.0,
+            charge_as: 0.0,
+            offset_s: 0.0,
+            unmeasured_s: 10.0,
+            current_a: None,
+            ..truth.step(&model, 1.0, 1.0)
+        };
+        estimator.step(&model, &config, &lost);
+    }
+    // A constant current has flowed while no current was measured. Every current between 0 and the load before that
+    // time is equally likely.
+    let load_std = 1200.0 / (3600.0 * capacity_ah) / 3.0_f64.sqrt();
+    let added = (soc(&estimator).variance - before.variance).sqrt();
+    assert!((added / load_std - 1.0).abs() < 0.05, "{added} {load_std}");
+}
+
+#[test]
 fn slowest_branch_ratio_is_learned() {
     let mut model = small_model();
     let mut slow = model.branches[0].clone();
@@ -251,7 +275,8 @@ fn unknown_soc_variance_is_limited() {
 fn unseen_charge_moves_soc_not_capacity() {
     let (mut config, model) = (config(), small_model());
     config.gap.away_use_per_s = 0.5 / 3600.0;
-    // Discharges of a tenth on record, the charges between them not, and a load of C/20 next to the gaps.
+    // Discharges of a tenth of the capacity are measured, the charges between them are not. A load of C/20 flows before
+    // and after each gap.
     let mut truth = Truth { soc: 0.8, branch_v: 0.0, capacity_ah: 2.0, ratio: 1.0 };
     let mut estimator = CellEstimator::new(&config);
     for _ in 0..40 {
@@ -276,7 +301,7 @@ fn silent_gap_is_rest_if_configured() {
         config.gap.silence_is_rest = silence_is_rest;
         let mut estimator = CellEstimator::new(&config);
         cycle(&mut estimator, &config, &mut truth, 1.0, 0.1);
-        // A voltage without a current: nothing is learned from it.
+        // The voltage comes without a current, so the filter learns nothing from it.
         let step = CellStep { unmeasured_s, current_a: None, ..truth.step(&model, 1.0, 1.0) };
         estimator.step(&model, &config, &step);
         soc(&estimator).std()
@@ -363,7 +388,7 @@ fn aged_cell_starts_on_aged_curve() {
     let mut config = config();
     config.initial.capacity_ah = 1.5;
     config.initial.curve = ScalarGaussian::from_std(1.5, 0.0);
-    // So sure of its start that the first voltage does not move it.
+    // The initial SOC is so certain that the first voltage does not change it.
     config.initial.soc_std = 1e-3;
     let mut truth = Truth { soc: 0.4, branch_v: 0.0, capacity_ah: 1.5, ratio: 1.0 };
     let mut estimator = CellEstimator::new(&config);

@@ -1,5 +1,5 @@
-//! Tests of the bands of models from labels and of a model that states no error, and of the advice that follows from
-//! them.
+//! Tests the bands of two kinds of models: models from labels, and a model that states no error. Also tests the advice
+//! that is derived from the bands.
 
 use super::*;
 use crate::cell::model::tests::small_model;
@@ -9,7 +9,7 @@ fn of_label(chemistry: Chemistry) -> CellModel {
     Label::usual(chemistry, 5.0).model().expect("a model")
 }
 
-/// SOC and temperatures, also beyond the tables.
+/// Pairs of SOC and temperature, some of them beyond the tables.
 fn places() -> impl Iterator<Item = (f64, f64)> {
     let of_soc = |k: u32| [-40.0, -10.0, 5.0, 25.0, 70.0].map(|t| (f64::from(k) / 40.0, t));
     (0..=40).flat_map(of_soc)
@@ -38,7 +38,7 @@ fn model_without_error_has_no_band() {
     let bands = ModelBands::new(&model);
     assert_eq!((bands.curve_std_v(0.5), bands.rest_soc_std(0.5), bands.load_soc_std(0.5, 20.0)), (None, None, None));
     assert_eq!(advise(&bands), None);
-    // The spread of cells of one type.
+    // Without a stated error, the model has the spread of cells of one type.
     assert_eq!((bands.resistance(0.5, 20.0).std(), bands.capacity_std()), (0.2, 0.1));
 }
 
@@ -79,7 +79,7 @@ fn advice_reduces_the_error_step_by_step() {
 #[test]
 fn certain_model_needs_no_measurement() {
     let errors = vec![vec![0.001; 3], vec![0.001; 3]];
-    let spread = ModelSpread { log_resistance: 0.05, capacity: 0.01, ..ModelSpread::usual(1) };
+    let spread = ModelSpread { log_resistance: 0.05, capacity: 0.01, ..ModelSpread::usual(1, 0.0) };
     let model = CellModel { voltage_error_v: Some(Table { values: errors }), spread: Some(spread), ..small_model() };
     let (points, advice) = advise(&ModelBands::new(&model)).expect("stated");
     assert!(points < 1.0 && advice.is_empty(), "{points}: {advice:?}");

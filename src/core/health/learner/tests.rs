@@ -152,3 +152,21 @@ fn lasting_errors_of_equal_half_cycles_stay_in_interval() {
         deviations_after_thousand_half_cycles(&CapacityConfig { end_error_v: Some(0.0), ..config }, SensorErrors::NONE);
     assert!(without.abs() > 3.0, "{without}");
 }
+
+#[test]
+fn contradicting_half_cycle_widens_belief_and_changes_no_capacity() {
+    let config = config();
+    let mut estimator = CellEstimator::new(&estimator_config());
+    let mut learner = Learner::new(&config, vec![estimator.capacity()]);
+    let belief = ScalarGaussian::from_std(4.0, 0.02);
+    (learner.drift[0], learner.capacity[0]) = (DriftFilter::new(&config, belief), belief);
+    let at = |soc| CellMark { soc: Some(ScalarGaussian::from_std(soc, 0.01)), ..CellMark::default() };
+    let moved = half_cycle(1.0, 3600.0, &at(0.9), &at(0.4));
+    discharge(&mut estimator);
+    let model = small_model();
+    let update = learner.learn(&model, &config, 0, &mut estimator, &moved);
+    assert_eq!((update.measurement, learner.has_learned(0)), (None, false));
+    assert!((update.capacity.mean - 4.0).abs() < 1e-12, "{update:?}");
+    let widest = f64::hypot(0.02, NEW_SPREAD * model.capacity_ah);
+    assert!((update.capacity.std() - widest).abs() < 1e-9, "{update:?} {widest}");
+}

@@ -133,8 +133,10 @@ impl Stages {
         let is_continued = snapshot.may_continue;
         let has_reported = snapshot.cells.iter().map(|cell| cell.updated_in_round).collect();
         let batch = CellBatch::restore(has_reported, snapshot.estimation.waiting);
-        let is_current_doubtful = snapshot.estimation.is_current_doubtful;
-        self.restore_learned(&snapshot.cells, snapshot.modelling, snapshot.learning, batch, is_current_doubtful);
+        self.estimation.is_current_doubtful = snapshot.estimation.is_current_doubtful;
+        self.estimation.was_current_doubtful = snapshot.estimation.was_current_doubtful;
+        self.estimation.current_check = snapshot.estimation.current_check;
+        self.restore_learned(&snapshot.cells, snapshot.modelling, snapshot.learning, batch);
         self.findings.restore(snapshot.diagnosis, (!is_continued).then_some((snapshot.time, now)));
         self.note_faulty_channels();
         self.sampling.restore(snapshot.sampling);
@@ -162,7 +164,6 @@ impl Stages {
         model: Option<ModellingState>,
         state: LearningState,
         batch: CellBatch,
-        is_current_doubtful: bool,
     ) {
         let Self { estimation, modelling, learning, .. } = self;
         if let Some(stored) = model {
@@ -185,7 +186,7 @@ impl Stages {
             }
         }
         let stored = cells.iter().map(|cell| (cell.consumed, cell.trusted, cell.model_check));
-        estimation.restore(stored, batch, is_current_doubtful);
+        estimation.restore(stored, batch);
         let configured_a = learning.config.capacity.current_offset_std_a;
         estimation.bank.set_current_offset_std(learning.state.learner.current_offset().std_a(configured_a));
     }
@@ -208,8 +209,7 @@ impl Stages {
     /// Restores a previously connected pack after a time of unknown length.
     pub(crate) fn restore_pack(&mut self, now: Timestamp, pack: StoredPack, out: &mut Outputs) {
         let batch = CellBatch::new(pack.cells.len());
-        let is_current_doubtful = self.estimation.is_current_doubtful;
-        self.restore_learned(&pack.cells, pack.modelling, pack.learning, batch, is_current_doubtful);
+        self.restore_learned(&pack.cells, pack.modelling, pack.learning, batch);
         self.modelling.end_stretch();
         self.estimation.handle_unknown_gap();
         // Balancing while the pack was absent was not counted, so the charge of the cells is unknown.

@@ -7,8 +7,10 @@
 use serde::{Deserialize, Serialize};
 
 pub(crate) mod batch;
+pub(crate) mod current_check;
 
 use batch::CellBatch;
+use current_check::{CurrentCheck, MAX_CELLS};
 
 use super::modelling::{Adoption, Modelling};
 use crate::cell::model_check::model_id;
@@ -26,6 +28,9 @@ use crate::sample::CellSample;
 /// enough to trip an alarm whose threshold is the limit.
 const DOUBT: f64 = 2.0;
 
+/// Value, V, that is stored as the path of a frozen voltage. It is far outside the range of the cells' common path.
+const FROZEN_PATH_V: f64 = 1e9;
+
 /// The estimation stage.
 #[derive(Debug)]
 pub(crate) struct Estimation {
@@ -42,8 +47,12 @@ pub(crate) struct Estimation {
     checks: Vec<ModelCheck>,
     any_check_open: bool,
     pub(crate) any_mismatched: bool,
-    /// Whether the current's reading is frozen, or an input message has a second sender.
+    /// Compares the steps of the current with the steps of the voltages.
+    pub(crate) current_check: CurrentCheck,
+    /// Whether the current's reading is frozen or contradicts the voltages, or an input message has a second sender.
     pub(crate) is_current_doubtful: bool,
+    /// Whether the current was doubtful at any time since the last change of mode.
+    pub(crate) was_current_doubtful: bool,
     ambient_c: f64,
     /// Cells whose next half-cycle may have started in the gap before their latest sample.
     after_gap: Vec<usize>,
@@ -55,8 +64,11 @@ pub(crate) struct Estimation {
 pub(crate) struct EstimationState {
     /// Samples that wait for their filter step.
     pub(crate) waiting: Vec<CellSample>,
-    /// Whether the current's reading is frozen, or an input message has a second sender.
+    /// Whether the current's reading is frozen or contradicts the voltages, or an input message has a second sender.
     pub(crate) is_current_doubtful: bool,
+    /// Whether the current was doubtful at any time since the last change of mode.
+    pub(crate) was_current_doubtful: bool,
+    pub(crate) current_check: CurrentCheck,
 }
 
 /// How far a cell's samples have been used. It is stored apart from the filters for cache locality, because every
@@ -76,6 +88,10 @@ pub(crate) struct Consumed {
     pub(crate) charge_as: f64,
     offset_s: f64,
     pub(crate) unmeasured_s: f64,
+    /// The latest voltage, V, and the common path of the cells ([`CurrentCheck::path_v`]) at the last change of this
+    /// voltage, V.
+    voltage_v: f64,
+    path_v: f64,
 }
 
 impl Estimation {
@@ -92,7 +108,9 @@ impl Estimation {
             all_trusted: true,
             any_check_open: true,
             any_mismatched: false,
+            current_check: CurrentCheck::default(),
             is_current_doubtful: false,
+            was_current_doubtful: false,
             ambient_c: config.sample.ambient_c,
             after_gap: Vec::new(),
         }
@@ -143,6 +161,11 @@ impl Estimation {
         self.note_checks();
     }
 
+    /// Whether the current was doubtful at any time since the last call.
+    pub(crate) fn take_doubt(&mut self) -> bool {
+        std::mem::replace(&mut self.was_current_doubtful, self.is_current_doubtful)
+    }
+
     /// Temperature that replaces a missing measurement, degrees C.
     pub(crate) fn ambient_c(&self) -> f64 {
         self.ambient_c
@@ -162,6 +185,9 @@ impl Estimation {
     /// [`finish`](Self::finish).
     pub(crate) fn step(&mut self, learner: &mut Learner, modelling: &mut Modelling) -> Vec<CellSample> {
         let samples = std::mem::take(&mut self.batch.waiting);
+        self.check_current(&samples);
+        self.is_current_doubtful |= self.current_check.is_doubtful();
+        self.was_current_doubtful |= self.is_current_doubtful;
         for sample in &samples {
             let (cell, step) = (sample.cell.index(), self.next_step(sample, learner));
             if self.bank.is_own(cell) {
@@ -175,6 +201,18 @@ impl Estimation {
             modelling.close_row(self.mean_soc());
         }
         samples
+    }
+
+    /// Compares the steps of the current and of the voltages.
+    fn check_current(&mut self, samples: &[CellSample]) {
+        let Self { bank, current_check, .. } = self;
+        let own = bank.own_cells();
+        let place = |sample: &CellSample| own.iter().take(MAX_CELLS).position(|&cell| cell == sample.cell.index());
+        let compared = samples.iter().take(MAX_CELLS).filter_map(|sample| Some((place(sample)?, sample)));
+        let soc = bank.filtered_soc(own[0]).map_or(0.5, |soc| soc.mean.clamp(0.0, 1.0));
+        let temperature_c = bank.temperature_c(own[0]).unwrap_or(self.ambient_c);
+        let ohm = bank.own_model().r0_ohm(&bank.own_model().grid_position(soc, temperature_c));
+        current_check.handle(compared, bank.own_config().voltage.noise_v, ohm);
     }
 
     /// Mean SOC of the pack's own kind of cells, fraction; 0.5 if no such cell has an estimate.
@@ -227,8 +265,20 @@ impl Estimation {
     fn next_step(&mut self, sample: &CellSample, learner: &mut Learner) -> CellStep {
         let index = sample.cell.index();
         let (charge, unmeasured) = (sample.charge_as, sample.unmeasured_s);
-        let now =
-            Consumed { time: sample.time, charge_as: charge, offset_s: sample.offset_s, unmeasured_s: unmeasured };
+        let path_v = match self.progress[index].consumed {
+            // A frozen voltage counts as frozen until it changes, even if the other cells return.
+            Some(before) if before.voltage_v == sample.voltage_v && self.is_voltage_frozen(index) => FROZEN_PATH_V,
+            Some(before) if before.voltage_v == sample.voltage_v => before.path_v,
+            _ => self.current_check.path_v(),
+        };
+        let now = Consumed {
+            time: sample.time,
+            charge_as: charge,
+            offset_s: sample.offset_s,
+            unmeasured_s: unmeasured,
+            voltage_v: sample.voltage_v,
+            path_v,
+        };
         let (mut measured_s, mut charge_as, mut offset_s, mut unmeasured_s) = (0.0, 0.0, 0.0, 0.0);
         // Before the first reading, and after a gap of unknown length, the unmeasured time is infinite.
         let mut gap_s = f64::INFINITY;
@@ -245,6 +295,13 @@ impl Estimation {
         if learner.observe(index, sample.time, sample.temperature_c, measured_s, gap_s) {
             self.after_gap.push(index);
         }
+        let mut current_a = sample.current_a;
+        if self.is_current_doubtful {
+            (measured_s, charge_as, offset_s, unmeasured_s) = (0.0, 0.0, 0.0, measured_s + unmeasured_s);
+            current_a = None;
+        } else if self.is_voltage_frozen(index) {
+            current_a = None;
+        }
         // Corrects the current for the sensor's offset. A reading of exactly zero counts as free of offset.
         let offset_a = learner.current_offset().mean_a();
         let corrected = |current_a: f64| if current_a == 0.0 { 0.0 } else { current_a - offset_a };
@@ -253,11 +310,16 @@ impl Estimation {
             charge_as: charge_as - offset_a * offset_s,
             offset_s,
             unmeasured_s,
-            current_a: sample.current_a.map(corrected),
+            current_a: current_a.map(corrected),
             temperature_c: sample.temperature_c,
             ambient_c: self.ambient_c,
             voltage_v: sample.voltage_v,
         }
+    }
+
+    /// Whether a cell's voltage has stayed exactly the same while the other cells' voltages have changed.
+    pub(crate) fn is_voltage_frozen(&self, index: usize) -> bool {
+        self.progress[index].consumed.is_some_and(|consumed| self.current_check.is_frozen_since(consumed.path_v))
     }
 
     /// Records the sample of a cell's latest step. Returns whether that step reset its filter.
@@ -303,7 +365,8 @@ impl Estimation {
         self.any_mismatched = self.checks.iter().any(ModelCheck::is_mismatched);
     }
 
-    /// Whether a cell belongs to a module and its stored `check` was made with another cell model than the present one.
+    /// Whether a cell belongs to a module and its stored `check` was made with another cell model than the present
+    /// model.
     pub(crate) fn is_other_cell(&self, index: usize, check: &ModelCheck) -> bool {
         let id = || model_id(self.bank.model(index), self.bank.config(index).initial.log_resistance_std);
         !self.bank.is_own(index) && check.is_of_other(id())
@@ -321,7 +384,8 @@ impl Estimation {
         let (mean_nis, check) = (self.bank.mean_nis(index), &self.checks[index]);
         let limit = self.bank.own_config().consistency.limit;
         let mismatch = if check.is_mismatched() { check.mismatch() } else { 0.0 };
-        let doubt = if self.is_current_doubtful || !self.bank.is_plausible(index) { DOUBT } else { 0.0 };
+        let is_doubtful = self.is_current_doubtful || self.is_voltage_frozen(index) || !self.bank.is_plausible(index);
+        let doubt = if is_doubtful { DOUBT } else { 0.0 };
         if mismatch.max(doubt) > 0.0 { mean_nis.max(mismatch.max(doubt) * limit) } else { mean_nis }
     }
 
@@ -381,7 +445,12 @@ impl Estimation {
 
     /// The state to be stored, without the cells.
     pub(crate) fn snapshot(&self) -> EstimationState {
-        EstimationState { waiting: self.batch.waiting.clone(), is_current_doubtful: self.is_current_doubtful }
+        EstimationState {
+            waiting: self.batch.waiting.clone(),
+            is_current_doubtful: self.is_current_doubtful,
+            was_current_doubtful: self.was_current_doubtful,
+            current_check: self.current_check.clone(),
+        }
     }
 
     /// Restores stored cells (used totals, trust, model checks) and the batch.
@@ -389,7 +458,6 @@ impl Estimation {
         &mut self,
         cells: impl Iterator<Item = (Option<Consumed>, bool, ModelCheck)>,
         batch: CellBatch,
-        is_current_doubtful: bool,
     ) {
         let ids = ids_of_models(&self.bank);
         for (index, (consumed, trusted, check)) in cells.enumerate() {
@@ -400,7 +468,6 @@ impl Estimation {
         self.note_checks();
         self.all_trusted = self.trusted.iter().all(|&trusted| trusted);
         self.batch = batch;
-        self.is_current_doubtful = is_current_doubtful;
     }
 }
 

@@ -32,7 +32,8 @@ use crate::quantity::catalogue::{Quantity, RecordedValues};
 use crate::quantity::{CellIndex, InvalidState, Mode, Timestamp, bounds};
 use crate::sample::CellSample;
 
-/// Largest distance from the model's highest voltage at which a charge is in its constant-voltage phase, V.
+/// If the voltage during a charge is at most this far from the model's highest voltage, V, the charge is in its
+/// constant-voltage phase.
 const TAPER_BAND_V: f64 = 0.03;
 
 /// The learning stage.
@@ -198,16 +199,17 @@ impl Learning {
 
     /// Ends a mode. If this completes a half-cycle, every cell learns from the half-cycle. `teaches_capacity`: whether
     /// the model of the pack's own kind of cells is good enough to learn capacities. Cells of a module learn their
-    /// capacity if their model was given.
+    /// capacity if their model was given. `is_doubtful`: per cell, whether the current was doubtful or the cell's
+    /// voltage is frozen. A doubtful cell learns no capacity.
     pub(crate) fn complete_mode(
         &mut self,
         change: ModeChange,
         bank: &mut PackBank,
-        teaches_capacity: bool,
+        (teaches_capacity, is_doubtful): (bool, &[bool]),
         to: &mut Publisher<'_>,
     ) {
         let teaches = |cell| if bank.is_own(cell) { teaches_capacity } else { bank.has_given_model(cell) };
-        self.state.learner.hold(|cell| !teaches(cell));
+        self.state.learner.hold(|cell| is_doubtful[cell] || !teaches(cell));
         to.event(EventKind::Mode { from: change.from, to: change.to });
         // If readings of the current stop, keep the evidence for the offset and the slow branches until the next change
         // of mode.
@@ -411,7 +413,8 @@ impl Learning {
         capacities.min_by(|a, b| a.1.mean.total_cmp(&b.1.mean)).filter(|_| self.state.learner.has_learned_all())
     }
 
-    /// Fields of the health frame: values of the weakest cell, once every cell's capacity has been learned.
+    /// Fields of the health frame, once every cell's capacity has been learned: the worst value of any cell, and the
+    /// losses of the weakest cell.
     pub(crate) fn health_fields(&self, bank: &PackBank) -> HealthFields {
         let recharge_period_s = self.state.recharge_period_s;
         if !self.state.learner.has_learned_all() {

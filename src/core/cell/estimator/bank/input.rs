@@ -27,6 +27,7 @@ impl CellSlot {
         self.has_filter
             && self.memory.rejected == 0
             && !self.memory.is_soc_unknown
+            && !self.memory.is_current_unknown
             && self.memory.downtime_std_if_any().is_none()
     }
 }

@@ -4,7 +4,7 @@
 use super::choices::{DEVIATION, MethodKey, TEMPERATURE_C};
 use crate::cell::{
     CapacityState, CellModel, ConsistencySettings, Discretisation, EstimatorConfig, GapSettings, GateSettings,
-    InitialState, ModelSpread, ProcessNoise, SensorErrors, SigmaPointSettings, VoltageError,
+    InitialState, ProcessNoise, SensorErrors, SigmaPointSettings, VoltageError,
 };
 use crate::config::schema::key::Presence::{Default, Optional, Required};
 use crate::config::schema::key::ValueRange::{Above, Any, Between};
@@ -105,7 +105,7 @@ impl Estimator {
     ) -> EstimatorConfig {
         let rounding_v = self.rounding_v(voltage_step_v);
         let initial_ah = initial_ah.unwrap_or(model.capacity_ah);
-        let spread = model.spread.unwrap_or(ModelSpread::usual(model.branches.len()));
+        let spread = model.spread();
         EstimatorConfig {
             points: SigmaPointSettings { alpha: self.alpha, beta: self.beta, kappa: self.kappa },
             discretisation: self.discretisation,
