@@ -30,6 +30,9 @@ use super::step::{CellStep, Update};
 use super::voltage_reach::FAR;
 use crate::cell::{CellModel, EstimatorConfig};
 
+/// If a voltage error moves the SOC this many times as far as the slope of the curve says, the curve is flat.
+const FLAT: f64 = 2.0;
+
 /// Updates with the first reading after a downtime. This reading does not count as evidence about the sensor's offset
 /// or the slowest branch.
 pub(super) fn update_after_downtime(
@@ -71,7 +74,10 @@ pub(super) fn update_after_downtime(
     let soc_at = |voltage_v: f64| within_reach(model.soc_of_aged_ocv(&temperature, memory.curve.mean, voltage_v));
     let far = [soc_at(step.voltage_v + drop_v - error_v), soc_at(step.voltage_v + drop_v + error_v)];
     let std = far.map(|far| (far - used.mean[0]).abs() / FAR).into_iter().fold(0.0, f64::max);
-    used.covariance[(0, 0)] = used.covariance[(0, 0)].max(square(std));
+    let slope_v = model.ocv_slope_v(&model.grid_position_at(&temperature, used.mean[0]), memory.curve.mean);
+    if std * slope_v > FLAT * voltage_variance.sqrt() {
+        used.covariance[(0, 0)] = used.covariance[(0, 0)].max(square(std));
+    }
     let by_left_alone = update(x)?;
     let log_likelihood =
         |u: &Update| -0.5 * (libm::log(u.innovation_variance) + square(u.innovation) / u.innovation_variance);
