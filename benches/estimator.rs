@@ -1,5 +1,5 @@
-//! Measures the time of one estimator step, and of one round of a 96-cell pack through the whole core (frames in,
-//! frames out).
+//! Measures the time of one estimator step. Also measures the time in which the whole core, from input frames to output
+//! frames, handles one reading of each cell of a 96-cell pack.
 
 use common::{example, reading};
 use packwatch_host::can::encode::InputEncoder;
@@ -17,7 +17,7 @@ fn main() {
     divan::main();
 }
 
-/// The example's cell with 1 to 3 RC branches.
+/// The cell model of `config/example.toml`, with 1 to 3 equal RC branches.
 fn model(branches: usize) -> CellModel {
     let mut model = example().monitor.model;
     model.branches = vec![model.branches[0].clone(); branches];

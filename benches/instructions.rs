@@ -3,7 +3,8 @@
 //! `instructions WORK PASSES` runs one of [`WORKS`] PASSES times over the same inputs. It prints the number of units
 //! per pass and the processor's SIMD extensions (such as AVX2), which select the estimator's code. `tests/instructions`
 //! counts the instructions of two such runs, the second with twice the passes. The difference of the two counts
-//! excludes start-up. Without arguments, as under `cargo bench`, the program prints the time of each work.
+//! excludes start-up. Without arguments, as under `cargo bench`, the program prints the time of each
+//! workload.
 #![expect(clippy::print_stdout, reason = "a program whose output is read by tests/instructions")]
 
 use std::hint::black_box;
@@ -24,7 +25,7 @@ use tempfile::NamedTempFile;
 
 mod common;
 
-/// Name, unit, and constructor of each work.
+/// Name, unit and constructor of each workload.
 const WORKS: [Named; 7] = [
     ("parse", "candump line of 8 bytes, read and placed in time", parse),
     ("parse_and_decode", "candump line and its 3 signals", parse_and_decode),
@@ -42,7 +43,7 @@ const TIMED_PASSES: u32 = 200;
 
 type Named = (&'static str, &'static str, fn() -> Work);
 
-/// Runs one pass over the inputs. Returns a result so that the optimiser cannot remove the work.
+/// Runs one pass over the inputs. Returns a result so that the optimiser cannot remove the pass.
 type Work = Box<dyn FnMut() -> f64>;
 
 fn main() {
@@ -86,7 +87,7 @@ fn time((name, unit, work): &Named) {
     println!("{name:20} {:8.1} ns median per {unit}", took_ns[took_ns.len() / 2]);
 }
 
-/// A candump log as a running pack produces it, with one message of three signals.
+/// A candump log with one message of three signals, one frame per millisecond.
 fn log() -> NamedTempFile {
     let line = |n: u64| {
         let data = n.wrapping_mul(0x9E37_79B9_7F4A_7C15);
@@ -159,7 +160,7 @@ fn decode_page() -> Work {
     })
 }
 
-/// The example's cell with 1 to 3 RC branches.
+/// The cell model of `config/example.toml`, with 1 to 3 equal RC branches, and the estimator's settings.
 fn cell(branches: usize) -> (CellModel, EstimatorConfig) {
     let monitor = example().monitor;
     let mut model = monitor.model;

@@ -1,5 +1,5 @@
-//! Measures the time to turn candump logs into frames and readings as `replay` does, compared with a plain newline
-//! scan, which any reader needs.
+//! Measures the time to convert candump logs to frames and readings, as `replay` does. For comparison, also measures a
+//! plain newline scan, which any reader needs.
 #![expect(clippy::unwrap_used, reason = "a bench panics if its setup fails")]
 
 use divan::Bencher;

@@ -1,4 +1,4 @@
-//! Measures the time of a whole replay of a log with the command: read, parse, decode, estimate, encode.
+//! Measures the time of the command `replay` for a whole log: read, parse, decode, estimate, encode.
 #![expect(clippy::unwrap_used, reason = "a bench panics if its setup fails")]
 
 use std::process::Command;
@@ -7,7 +7,7 @@ fn main() {
     divan::main();
 }
 
-/// Ten minutes of the EV day with 96 cells, simulated once.
+/// Simulates ten minutes of the scenario `ev-day` with 96 cells. Returns the folder of the log.
 fn log() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     let log = folder.path().join("day.log");
