@@ -1,10 +1,11 @@
-//! The core as a library: records in, events and frames out. The core needs no CAN interface and reads no clock.
+//! Uses the core as a library: passes records to the core, and receives events and frames. The core needs no CAN
+//! interface and reads no clock.
 //!
 //! ```sh
 //! cargo run --example core_as_library -- examples/pack/pack.toml examples/pack/drive.log
 //! ```
 //!
-//! Prints each event as a line of JSON, then the state of the pack at the end of the log.
+//! The program prints each event as a line of JSON, then the state of the pack at the end of the log.
 
 use std::error::Error;
 use std::io::{self, Write};
@@ -17,7 +18,7 @@ use packwatch::io::log::{LogOptions, LogSource};
 use packwatch::io::ticks::Ticks;
 use packwatch::monitor::{Monitor, Outputs, Record, TICK_PERIOD_MS};
 
-/// A gap in the log that is longer than this means that the recorder was asleep, s.
+/// If a gap in the log is longer than this time in seconds, the recorder was asleep.
 const SLEEP_GAP_S: f64 = 5.0;
 
 fn main() -> Result<(), Box<dyn Error>> {

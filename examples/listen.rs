@@ -5,9 +5,9 @@
 //! cargo run --example listen -- config/packwatch.dbc <frames.log
 //! ```
 //!
-//! Reads candump lines from standard input and prints a line for every change. It follows rules 1 to 4 of the contract
-//! (`docs/src/ecu/contract.md`). It leaves out rule 5, which confirms the table by its checksum. Time-outs are checked
-//! when a frame arrives; a real ECU also checks them by its own clock.
+//! Reads candump lines from standard input and prints a line for every change. The program follows rules 1 to 4 of the
+//! contract (`docs/src/ecu/contract.md`). It leaves out rule 5, which confirms the table by its checksum. Time-outs are
+//! checked when a frame arrives; a real ECU also checks them by its own clock.
 
 use std::collections::BTreeMap;
 use std::error::Error;
@@ -16,7 +16,7 @@ use std::io::{self, BufRead, Write};
 use packwatch::can::dbc::{Database, Message, Signal};
 use packwatch::can::{CanId, Frame};
 
-/// If no status frame arrives for this time, all values are unknown, s.
+/// If no status frame arrives for this time in seconds, all values are unknown.
 const STATUS_TIMEOUT_S: f64 = 0.3;
 /// If no frame of an alarm arrives for this number of passes, the alarm is no longer raised. In one pass packwatch
 /// sends a frame of each raised alarm.
@@ -56,8 +56,7 @@ struct Listener {
     database: Database,
     /// Time of the latest frame of each raised alarm.
     alarms: BTreeMap<Key, f64>,
-    /// Duration of a pass according to the latest digest, s. Before the first digest: the cycle time of the alarm
-    /// frames.
+    /// Duration of a pass, s, as in the latest digest. Before the first digest: the cycle time of the alarm frames.
     pass_time_s: f64,
     status_at_s: Option<f64>,
     validity: String,
@@ -113,7 +112,7 @@ impl Listener {
         Ok(())
     }
 
-    /// Removes the alarms whose rule the digest reports as not raised. (The frame that announced their end was lost.)
+    /// Removes the alarms whose rule the digest reports as not raised: the frame that announced the end was lost.
     fn handle_digest(&mut self, now_s: f64, signals: &Signals, out: &mut impl Write) -> io::Result<()> {
         if let Some(Ok(pass_time_s)) = signals.get("PassTime").map(|text| text.parse()) {
             self.pass_time_s = pass_time_s;

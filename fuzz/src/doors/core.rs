@@ -1,6 +1,6 @@
-//! Fuzz entry points of the core. The bytes determine what happens in a small simulated vehicle: its driver, faults,
-//! diagnostic testers and attackers, in up to some thousand inputs. At a cut, the monitor is replaced by a new one that
-//! is restored from its snapshot.
+//! Fuzz entry points of the core. The bytes encode up to 3000 inputs of a small simulated vehicle, with its driver,
+//! faults, diagnostic testers and attackers. At a cut, a monitor is replaced by a new one that is restored from the
+//! snapshot of the old one.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -18,25 +18,25 @@ use super::world;
 
 /// Maximum number of inputs per execution: about 50 ms of work.
 const MAX_INPUTS: usize = 3000;
-/// Maximum number of cuts per execution. Each takes as long as some hundred inputs.
+/// Maximum number of cuts per execution. Each cut takes as long as some hundred inputs.
 const MAX_CUTS: usize = 100;
 /// Maximum number of outputs per input. The configuration has three cells and 14 alarm rules.
 const MAX_OUTPUTS: usize = 2000;
-/// Inputs and cuts of all executions of this process, printed for tests/fuzz.
+/// Numbers of inputs and cuts in all executions of this process, printed for tests/fuzz.
 static INPUTS: AtomicU64 = AtomicU64::new(0);
 static CUTS: AtomicU64 = AtomicU64::new(0);
-/// Number of inputs between two printed counts.
+/// Number of inputs after which the counts are printed again.
 const REPORT_EVERY: u64 = 100_000;
 const BUS: BusIndex = BusIndex(0);
 /// CAN identifiers that the monitor uses with this configuration: output messages and diagnostic requests.
 const OWN: [u16; 8] = [0x6B0, 0x6B1, 0x6B2, 0x6B4, 0x6B5, 0x6B6, 0x79B, 0x7DF];
-/// Address of the J1939 node, and the address it uses until it has claimed one.
+/// Address of the J1939 node, and the source address that the node uses until it has claimed an address.
 const OWN_ADDRESSES: [u32; 2] = [249, 254];
 const MS: i64 = 1_000_000;
-/// If there is no input for longer than this, a restored monitor assumes that the program was off, s.
+/// If no input arrives for longer than this time in seconds, a restored monitor assumes that the program was off.
 const BREAK_S: f64 = 30.0;
 
-/// Feeds frames, gaps and commands to a monitor. A second run with the same inputs must give the same outputs.
+/// Feeds the inputs to a monitor and checks its outputs. A second run with the same inputs must give the same outputs.
 pub fn core(data: &[u8]) {
     let mut source = Source::new(data);
     let is_repeated = source.byte().is_multiple_of(8);
@@ -47,8 +47,7 @@ pub fn core(data: &[u8]) {
     }
 }
 
-/// Feeds the same inputs to two monitors. One of them is regularly replaced by a monitor restored from its stored
-/// state. Both must give the same outputs.
+/// Feeds the same inputs to two monitors. One of the monitors is cut regularly. Both must give the same outputs.
 pub fn cuts(data: &[u8]) {
     let mut source = Source::new(data);
     let steps = [1 + usize::from(source.byte()), 1 + usize::from(source.byte())];
@@ -76,7 +75,7 @@ pub fn cuts(data: &[u8]) {
     count(records.len(), cuts);
 }
 
-/// Feeds the inputs to a monitor, checks its outputs and returns their digest.
+/// Feeds the inputs to a monitor, checks the outputs if `is_checked`, and returns a hash of the outputs.
 fn run(records: &[Record], is_checked: bool) -> u64 {
     let (mut monitor, mut out, mut digest) = (monitor(), outputs(), 0xCBF2_9CE4_8422_2325);
     let mut digested = |number: u64| digest = (digest ^ number).wrapping_mul(0x0100_0000_01B3);
@@ -203,7 +202,7 @@ struct Vehicle {
     records: Vec<Record>,
 }
 
-/// The inputs that the bytes encode.
+/// Returns the inputs that the bytes encode.
 pub(super) fn records(source: &mut Source<'_>) -> Vec<Record> {
     let mut vehicle = Vehicle {
         encoder: InputEncoder::new(&world::config().monitor.input),
@@ -315,14 +314,14 @@ impl Vehicle {
                     u32::from(pgn) << 8 | u32::from(source_address) | u32::from(source.byte() % 2) << 26 | 0x1800_0000;
                 self.frame(CanId::Extended(id & 0x1FFF_FFFF), &data[..usize::from(source.byte() % 9)]);
             }
-            // A flood of one identifier.
+            // A flood of frames with one identifier.
             22 => (0..u16::from(source.byte()) * 2).for_each(|_| self.frame(CanId::Standard(0x110), &[1; 8])),
             // A valid answer of a controller.
             _ => self.frame(CanId::Standard(0x7BB), &[4, 0x61, 1, 0x20, source.byte(), 0, 0, 0]),
         }
     }
 
-    /// Frames of a healthy pack in one period, and the following tick.
+    /// Adds the frames of a healthy pack in one period, and the tick at the end of the period.
     fn drive(&mut self, period_ns: i64) {
         self.soc = (self.soc - self.current_a * period_ns as f64 / 1e9 / 3600.0 / 2.6 * 10.0).clamp(0.02, 0.98);
         let voltage_v = 3.3 + 0.8 * self.soc - 0.03 * self.current_a + self.offset_v;
@@ -358,7 +357,7 @@ impl Vehicle {
         self.frame(CanId::Standard(0x100), &payload);
     }
 
-    /// A command frame with arbitrary content and a correct, repeated or wrong counter.
+    /// Adds a command frame with arbitrary content and a correct or repeated counter.
     fn command(&mut self, source: &mut Source<'_>) {
         let (profile, mut payload) = (Profile::P01A, source.array::<8>());
         if !source.byte().is_multiple_of(4) {
