@@ -8,7 +8,7 @@ use packwatch_host::can::encode::InputEncoder;
 use packwatch_host::can::{CanId, Frame};
 use packwatch_host::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
 
-/// Cells of the shipped example pack. Each of its 32 multiplexer pages has the voltages of three cells.
+/// Number of cells of the shipped example pack. Each of the 32 multiplexer pages has the voltages of three cells.
 const CELLS: u16 = 96;
 
 fn main() {

@@ -3,8 +3,7 @@
 //! `instructions WORK PASSES` runs one of [`WORKS`] PASSES times over the same inputs. It prints the number of units
 //! per pass and the processor's SIMD extensions (such as AVX2), which select the estimator's code. `tests/instructions`
 //! counts the instructions of two such runs, the second with twice the passes. The difference of the two counts
-//! excludes start-up. Without arguments, as under `cargo bench`, the program prints the time of each
-//! workload.
+//! excludes start-up. Without arguments, as under `cargo bench`, the program prints the time of each workload.
 #![expect(clippy::print_stdout, reason = "a program whose output is read by tests/instructions")]
 
 use std::hint::black_box;

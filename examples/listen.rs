@@ -56,7 +56,8 @@ struct Listener {
     database: Database,
     /// Time of the latest frame of each raised alarm.
     alarms: BTreeMap<Key, f64>,
-    /// Duration of a pass, s, as in the latest digest. Before the first digest: the cycle time of the alarm frames.
+    /// Duration of a pass in seconds, as the latest digest states it. Before the first digest, the cycle time of the
+    /// alarm frames.
     pass_time_s: f64,
     status_at_s: Option<f64>,
     validity: String,
