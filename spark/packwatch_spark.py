@@ -57,7 +57,7 @@ def replay(spark, lines: list[str], config: str, out: str, binary: str = "packwa
 
     # The executors' Python needs this module.
     spark.sparkContext.addPyFile(os.path.abspath(__file__))
-    # The largest first, one task each, so that the last tasks are short.
+    # One task per vehicle, the largest vehicles first, so that the last tasks are short.
     largest = sorted(lines, key=lambda line: -json.loads(line)["bytes"])
     numbered = spark.sparkContext.parallelize([(line,) for line in largest], max(1, len(largest)))
     return spark.createDataFrame(numbered, "line string").mapInArrow(tasks, SCHEMA)

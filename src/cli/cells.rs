@@ -99,8 +99,7 @@ fn label_row(chemistry: Chemistry) -> Vec<String> {
     vec![chemistry.name().to_owned(), format!("{low} to {high}"), points]
 }
 
-/// Returns the expected error, in percentage points, of the first SOC estimate of a cell that is described only by its
-/// label.
+/// Returns the expected error of the first SOC estimate, in percentage points, if only the label of a cell is known.
 fn first_points(chemistry: Chemistry) -> Option<f64> {
     // The error does not depend on the capacity, so any capacity can be used.
     let model = Label::usual(chemistry, 1.0).model()?;

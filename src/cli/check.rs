@@ -54,7 +54,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
 }
 
-/// Checks the key file of `[authentication]`, unless this user may not read it.
+/// Checks the key file of `[authentication]`. Skips the check if this user has no permission to read the file.
 fn check_key(file: &Path) -> Result<(), Failure> {
     let Some(KeySource::File(path)) = crate::config::load(file)?.key else { return Ok(()) };
     let is_file = path.metadata().is_ok_and(|found| found.is_file());
@@ -109,7 +109,7 @@ fn verdict(warnings: usize) -> String {
     }
 }
 
-/// A heading and indented lines; `none` stands for an empty list.
+/// Appends a heading and indented lines. If `lines` is empty, appends `none` instead.
 fn list(heading: &str, lines: &[String], none: &str, page: &mut String) {
     page.push_str(&format!("\n{heading}\n"));
     for line in lines.iter().map(String::as_str).chain(Some(none).filter(|none| lines.is_empty() && !none.is_empty())) {

@@ -1,4 +1,4 @@
-//! `packwatch dbc`: writes the DBC of the configured frames for their receivers.
+//! `packwatch dbc`: writes a DBC that describes the configured output frames, for the ECUs that receive them.
 //!
 //! The DBC is generated from the layout that the encoder uses, so it contains the same identifiers, frame formats,
 //! end-to-end protection, cycle times and value tables. The output file gets its final name only when it is complete.

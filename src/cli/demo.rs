@@ -32,13 +32,14 @@ const FILES: [(&str, &str); 3] = [
     ("measured.dbc", include_str!("../../config/measured.dbc")),
     ("cells/example_nmc_2600.toml", include_str!("../../config/cells/example_nmc_2600.toml")),
 ];
-/// Loss of capacity per cycle, Ah. It raises the capacity and the recharge-period alarm within about ten cycles.
+/// Loss of capacity per cycle, Ah. With this loss, the capacity alarm and the recharge-period alarm are raised within
+/// about ten cycles.
 const LOSS_AH_PER_CYCLE: f64 = 0.1;
 /// SOC range of the cycles. It is wider than the recharge window, so that every charge covers the whole window.
 const SOC_WINDOW: (f64, f64) = (0.2, 0.95);
 /// Maximum number of cycles. After this number the cell has 1.2 Ah, far below the thresholds of the two alarms.
 const MAX_CYCLES: u32 = 14;
-/// Number of samples between two updates of the live row.
+/// Number of samples between two updates of the live row, which shows the current state on a terminal.
 const LIVE_SAMPLES: u64 = 400;
 /// Bus time at the start of the demo (Unix time, as in a log).
 const START: Timestamp = Timestamp::from_nanos(1_700_000_000_000_000_000);
@@ -119,7 +120,7 @@ impl Demo {
         })
     }
 
-    /// Runs the demo on standard output, except for its last line.
+    /// Runs the demo and prints everything except the last line, which [`Self::conclude`] prints.
     fn run(&mut self) -> io::Result<()> {
         let chain = "cell -> frames -> monitor -> frames -> consumer";
         writeln!(io::stdout(), "one 2.6 Ah cell loses {LOSS_AH_PER_CYCLE} Ah per cycle; {chain}")?;

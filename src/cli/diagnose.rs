@@ -1,4 +1,5 @@
-//! `packwatch diagnose`: finds failing cells. Reports findings with advice, and each cell's difference from its pack.
+//! `packwatch diagnose`: finds failing cells. Reports findings with advice, and each cell's difference from the median
+//! of the pack.
 //!
 //! Input: logs, which are replayed, or the stored state of a vehicle. Every "±" is one standard deviation.
 

@@ -1,7 +1,7 @@
 //! `packwatch discover`: finds the signals of the traction battery in a log.
 //!
-//! The exit code is 1 if a file cannot be read or the log has no frames. If no signals are found, the page says so and
-//! the exit code is 0.
+//! The exit code is 1 if a file cannot be read or the log has no frames. If no signals are found, the output says so
+//! and the exit code is 0.
 
 use std::io::Write as _;
 use std::path::{Path, PathBuf};

@@ -155,7 +155,7 @@ fn invalid(faults: &[String]) -> Option<WiringFinding> {
 fn complete(report: &mut WiringReport, survey: &Survey) {
     if let Some(finding) = invalid(&survey.faults) {
         report.add(finding);
-        // A wrong layout in the DBC causes other faults, so it is listed first.
+        // A wrong layout in the DBC causes other faults, so the finding on the layout is listed first.
         if let Some(layout) =
             report.findings.iter().position(|f| (f.severity, f.topic) == (Severity::Error, Topic::Layout))
         {

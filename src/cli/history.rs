@@ -201,7 +201,8 @@ fn describe(entry: &HistoryEntry) -> String {
     filled(words, &value)
 }
 
-/// Fills in fields: `{name:2}` is a number with two decimals, `{name%1}` a percentage with one decimal, `{name}` a string.
+/// Fills in the fields of a template: `{name:2}` is a number with two decimals, `{name%1}` a percentage with one
+/// decimal, `{name}` a string.
 fn filled<'v>(words: &str, value: &impl Fn(&str) -> &'v Value) -> String {
     let mut parts = words.split('{');
     let mut text = parts.next().unwrap_or_default().to_owned();
@@ -237,7 +238,7 @@ fn document(entry: &HistoryEntry) -> Value {
 const OWN_COLUMNS: [&str; 7] = ["kind", "seq", "wall_ns", "utc", "time_ns", "boot", "pack"];
 
 fn export(reader: &HistoryReader, args: &ExportArgs) -> Result<(), Failure> {
-    // The errors of a result file name it.
+    // The errors of a result file already contain its name.
     let fail = |error: &dyn std::fmt::Display| Failure::new(error.to_string());
     let filter = args.wanted.filter(None);
     let kinds: Vec<HistoryTable> = filter.wanted_kinds().collect();

@@ -1,4 +1,4 @@
-//! `packwatch score`: compares estimates with the truth of measured files.
+//! `packwatch score`: replays measured files and compares the estimates with the true values.
 
 mod args;
 mod bar;

@@ -183,8 +183,8 @@ fn wiring(sample: &SampleConfig) -> Wiring {
     Wiring { strings: sample.strings.max(1), temperature_at: (0..sensors).map(cell_of).collect() }
 }
 
-/// Encodes the frames of a moment. Frames with the current come first, because the voltages contain the drop that it
-/// causes.
+/// Encodes the frames of a moment. Frames with the current come first, because the voltages contain the voltage drop
+/// that this current causes.
 struct FrameMaker {
     encoder: InputEncoder,
     protector: InputProtector,

@@ -88,7 +88,7 @@ fn protection(report: &ChannelReport) -> String {
     format!("BROKEN: {}", found.collect::<Vec<_>>().join(", "))
 }
 
-/// States that have a wire code.
+/// One state for each wire code.
 const ON_THE_WIRE: [AlarmState; 7] = [
     AlarmState::Inactive,
     AlarmState::Active,

@@ -51,7 +51,8 @@ fn options(strict: bool) -> LogOptions {
     }
 }
 
-/// Reading records one by one and in batches must give the same records. A strict reader must give a prefix of them.
+/// Reading records one by one and in batches must give the same records. In strict mode, reading must give a prefix of
+/// these records.
 fn compare(path: &Path) {
     let one_by_one = |strict: bool| -> (Vec<Record>, bool) {
         let mut log = LogSource::new([path.to_owned()], options(strict));

@@ -4,16 +4,16 @@
 //! | entry point | input of the program | invariants, in addition to "no panic" |
 //! | --- | --- | --- |
 //! | `core` | frames, ticks, gaps, commands, J1939, diagnostics into the monitor | only own identifiers are sent; estimates are finite; an unknown value clears no alarm; a second run gives the same outputs |
-//! | `cuts` | as for `core`, with snapshots taken and restored in between | own state is accepted; frames, events and estimates equal those without a cut, bit for bit |
+//! | `cuts` | as for `core`, with snapshots taken and restored in between | the monitor accepts its own state; frames, events and estimates are bit-identical to a run without snapshots |
 //! | `snapshot` | a stored state with damaged numbers | either rejected, or the monitor runs on with finite outputs and accepts the state that it then writes |
-//! | `configuration` | TOML; numbers of any size in any key | if accepted, it runs and accepts its own state |
+//! | `configuration` | TOML with numbers of any size in any key | with an accepted configuration, a monitor runs and accepts its own state |
 //! | `cell_model` | a cell model file | as for `configuration` |
 //! | `dbc` | a DBC file | a written DBC reads back unchanged |
-//! | `log`, `journal` | candump logs, CSV, journals | reading one by one and in batches gives the same records |
+//! | `log`, `journal` | candump logs, CSV, journals | reading records one by one and in batches gives the same records |
 //! | `table` | measured CSV of `fit`, `rul`, `gpr` | rows are finite |
 //! | `obdb`, `bpx` | files of `import` | a written cell model is accepted |
 //! | `control` | a line on the control socket | a written line reads back unchanged |
-//! | `store` | a database with changed bytes | opens, or reports why; works again afterwards |
+//! | `store` | a database or state file with changed bytes | opening succeeds or reports a reason; a daemon can run on a store that opens |
 
 mod configuration;
 mod core;

@@ -1,5 +1,5 @@
-//! Fuzz entry point for a stored state with changed numbers and words. The state is either rejected, or the monitor
-//! starts from this state, runs, and accepts the state that it then writes.
+//! Fuzz entry point for a stored state with some numbers replaced, or for arbitrary bytes. The state is either
+//! rejected, or the monitor starts from this state, runs, and accepts the state that it then writes.
 
 use std::sync::OnceLock;
 
@@ -14,7 +14,7 @@ const DRIVE: &[u8] = &[
     7, 0xE8, 3, 6, 31, 6, 31, 15, 0, 7, 0x18, 0xFC, 6, 31, 6, 31, 8, 120, 0, 31, 23, 5, 14, 1, 0, 0, 0, 0, 0, 3, 0, 31,
 ];
 
-/// The stored state after that drive.
+/// The stored state after [`DRIVE`].
 fn stored() -> &'static str {
     static STORED: OnceLock<String> = OnceLock::new();
     STORED.get_or_init(|| {
@@ -25,7 +25,7 @@ fn stored() -> &'static str {
     })
 }
 
-/// Positions of the numbers in a JSON text.
+/// Start and end of each number in a JSON text.
 fn numbers(text: &str) -> Vec<(usize, usize)> {
     let (mut found, mut begin, mut is_text) = (Vec::new(), None, false);
     for (at, byte) in text.bytes().enumerate() {

@@ -3,7 +3,7 @@
 use crate::alarm::{Alarm, Direction, Rule, Unit};
 use crate::quantity::CellIndex;
 
-/// Minimum number of cells with equal alarms that share a row.
+/// Alarms of different cells share a row if at least this many cells have the same alarm.
 const MANY: usize = 4;
 /// Longest list of cells, characters; longer lists are cut.
 const MAX_LIST: usize = 24;
@@ -18,7 +18,7 @@ pub(crate) struct AlarmGroup {
 }
 
 impl AlarmGroup {
-    /// `pack`, `7`, `96: 1-96`.
+    /// Formats the cells of the row, for example `pack`, `7` or `96: 1-96`.
     pub(crate) fn cells(&self) -> String {
         match (self.alarm.cell, self.cells.len()) {
             (None, _) => "pack".to_owned(),
@@ -27,7 +27,7 @@ impl AlarmGroup {
         }
     }
 
-    /// `pack`, `cell 7`, `96 cells (1-96)`.
+    /// Formats the owner of the alarm, for example `pack`, `cell 7` or `96 cells (1-96)`.
     pub(crate) fn owner(&self) -> String {
         match (self.alarm.cell, self.cells.len()) {
             (None, _) => "pack".to_owned(),
@@ -59,7 +59,7 @@ pub(crate) fn grouped(alarms: &[Alarm]) -> Vec<AlarmGroup> {
     groups
 }
 
-/// The alarm with the worst value. An alarm without a value counts as less bad than any other.
+/// The alarm with the worst value. An alarm without a value counts as the least bad.
 fn worst(alarms: &[&Alarm]) -> Alarm {
     let badness = |alarm: &Alarm| match (alarm.value, alarm.rule.spec().direction) {
         (None, _) => f64::NEG_INFINITY,

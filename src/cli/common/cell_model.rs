@@ -1,4 +1,4 @@
-//! The cell model at the end of a record: the model learned on board, else the configured model.
+//! Selects the cell model of a replayed or stored state: the model learned on board, else the configured model.
 
 use packwatch_host::failure::Failure;
 
@@ -7,7 +7,7 @@ use crate::config::cell_model::SourcedModel;
 use crate::config::{self, Config};
 use crate::monitor::Snapshot;
 
-/// Returns the cell model at the end of the record: the learned model or, if none was learned, the configured model.
+/// Returns the learned model of `snapshot` or, if none was learned, the configured model.
 pub(crate) fn cell_model(
     snapshot: Option<&Snapshot>,
     config: Option<&Config>,

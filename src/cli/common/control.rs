@@ -1,4 +1,5 @@
-//! Shared by the commands to a running daemon: its socket, the selection of alarms, the replacement of the pack.
+//! Arguments and functions shared by the commands to a running daemon: control socket, selection of alarms, replacement
+//! of the pack.
 
 use std::path::PathBuf;
 

@@ -30,8 +30,8 @@ fn unreadable(file: &Path, error: &std::io::Error) -> Failure {
     named(file, format!("cannot be read: {error}"))
 }
 
-/// Returns the name of a file as a configuration should write it: the file name if both are in the same folder, else
-/// the full path.
+/// Returns the name of a file as a configuration should write it. If the file is in the folder of the configuration or
+/// below, the name is relative to this folder. Otherwise, it is the full path.
 pub(crate) fn named_from(config: &Path, file: &Path) -> Result<String, Failure> {
     let whole = |path: &Path| std::path::absolute(path).map_err(|error| named(path, error));
     let (config, file) = (whole(config)?, whole(file)?);

@@ -1,4 +1,4 @@
-//! The demo's table: one row per cycle and, on a terminal, a live row redrawn below them.
+//! The demo's table: one row per cycle and, on a terminal, a live row that is redrawn below the other rows.
 
 use std::io::{self, IsTerminal, Write};
 use std::time::Duration;

@@ -11,7 +11,7 @@ use crate::filter::ScalarGaussian;
 use crate::io::stamp::format_utc;
 use crate::lab::pack_view::energy_kwh;
 
-/// The pack; unknown values are `null`, with the reason.
+/// Imbalance of the pack. If the imbalance is unknown, `unknown` states the reason and all other keys are missing.
 #[derive(Debug, Serialize)]
 pub(super) struct PackPage {
     unknown: Option<String>,

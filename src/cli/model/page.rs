@@ -351,7 +351,7 @@ fn resistance_row(sourced: &SourcedModel, bands: &ModelBands<'_>, temperature_c:
         ohm: model.settled_ohm(&model.grid_position(soc, temperature_c)),
         std: bands.resistance(soc, temperature_c).std(),
     });
-    // The parts at half charge.
+    // Series resistance and branches are shown at half charge.
     let position = model.grid_position(0.5, temperature_c);
     let part =
         |i: usize| BranchPart { r_ohm: model.branch_r_ohm(i, &position), tau_s: model.branch_tau_s(i, &position) };

@@ -13,7 +13,7 @@ const STARTS: [NamedValue<Start>; 2] = [
     ("middle", Start::Middle, "Where --remove has been discharged; earlier rows are skipped"),
 ];
 
-/// Error of the initial SOC, points; `None` if no initial SOC is given.
+/// Error of the initial SOC, percentage points; `None` if no initial SOC is given.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct InitialSocError(pub(crate) Option<f64>);
 

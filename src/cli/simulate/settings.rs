@@ -174,7 +174,7 @@ impl Changes {
     pub(super) fn apply(&self, settings: &mut Settings) -> Result<(), Failure> {
         settings.seed = self.seed;
         settings.cycles = self.cycles.or(settings.cycles);
-        // Only ev-day has a duration of its own, and its cycles are days.
+        // Only ev-day has a default duration, and a cycle of ev-day is a day.
         let days = f64::from(self.cycles.unwrap_or(1));
         settings.duration_s = self.duration.or(settings.duration_s.map(|day_s| days * day_s));
         settings.walk_steps = self.walk_steps.unwrap_or(settings.walk_steps);

@@ -230,8 +230,8 @@ fn row(cell: &CellView) -> Vec<String> {
 }
 
 /// A quantity that is compared between cells: name, quantity, decimals, and two limits for an outlier's distance from
-/// the median. The distance must exceed both: the first in the quantity's unit, the second relative to the median. They
-/// cover sensor errors and the spread of equal cells.
+/// the median. The distance must exceed both: the first in the quantity's unit, the second relative to the median. The
+/// limits cover sensor errors and the spread of equal cells.
 type Comparison = (&'static str, Quantity, usize, f64, f64);
 
 const COMPARISONS: [Comparison; 5] = [

@@ -129,7 +129,8 @@ impl AlarmSnapshot {
     }
 }
 
-/// The slots of one threshold: first the pack's slot, if the rule has one, then the cells' slots in order.
+/// The slots of one threshold. A slot is the index of an alarm in `machines`. The pack's slot, if the rule has one,
+/// comes first; the cells' slots follow in order.
 #[derive(Debug, Clone)]
 struct RuleSlots {
     config: RuleConfig,
@@ -219,8 +220,8 @@ impl AlarmEngine {
         self.each_threshold(rule, cell, changes, |machine, config| machine.observe(now, config, observation));
     }
 
-    /// Whether no value of `rule` that is at most as bad as `worst` can change an alarm of any cell: every alarm of the
-    /// rule is at rest, and `worst` is healthy. Returns true if the rule is not configured.
+    /// Whether `worst` and all better values of `rule` leave every alarm of the rule unchanged, because all these
+    /// alarms are at rest and `worst` is healthy. Returns true if the rule is not configured.
     pub fn is_quiet(&self, rule: Rule, worst: f64) -> bool {
         self.rules[self.by_rule[usize::from(rule as u8)].clone()].iter().all(|slots| {
             let is_beyond = || LimitCheck::of(&slots.config, &Observation::new(Some(worst))).0 != LimitCheck::Healthy;
@@ -245,7 +246,7 @@ impl AlarmEngine {
         while let Some(&slot) = self.counting.get(next) {
             let index = self.rule_of(slot);
             let is_learned = self.rules[index].config.rule.spec().is_learned;
-            // A slot whose alarm changes leaves the list.
+            // A slot whose alarm changes is removed from `counting`.
             let has_changed =
                 is_learned && self.change(index, slot, changes, |machine, config| machine.poll(now, config));
             next += usize::from(!has_changed);
@@ -319,8 +320,8 @@ impl AlarmEngine {
         AlarmSnapshot { alarms: self.rules.iter().flat_map(of_rule).collect() }
     }
 
-    /// Restores a stored state. The caller has rebased its times, and no time is later than `now`. Returns the alarms
-    /// that no configured threshold watches any longer; the caller reports them.
+    /// Restores a stored state whose times the caller has rebased. Times of raises after `now` are set to `now`.
+    /// Returns the alarms that no configured threshold watches any longer; the caller reports them.
     pub fn restore(&mut self, now: Timestamp, state: &AlarmSnapshot) -> Vec<StoredAlarm> {
         let cells = self.cells();
         *self = Self::new(self.rules.drain(..).map(|rule| rule.config).collect(), cells);

@@ -11,8 +11,9 @@
 //! | latched | count towards active | stay | stay | hold | mark | rest |
 //! | cleared | count towards active | stay | stay | unknown | inactive | inactive, forget |
 //!
-//! * Rest: `cleared` if the alarm was raised and not acknowledged, else `inactive`.
-//! * End: `latched` for a latching rule, else rest.
+//! * A name of a state: enter this state.
+//! * Rest: enter `cleared` if the alarm was raised and not acknowledged, else `inactive`.
+//! * End: enter `latched` for a latching rule, else rest.
 //! * Count: both the time and the number of new values of the debounce must be reached.
 //! * Hold: stay, and keep the time and the number of values counted.
 //! * Mark: acknowledge the latest occurrence. Forget: reset the number of occurrences. Refuse: change nothing.
@@ -267,8 +268,8 @@ impl Machine {
         self.occurrences > 0 || self.state == AlarmState::Pending
     }
 
-    /// The machine after a restore at `now`: the value is unknown until the next observation, and no time is later than
-    /// `now`.
+    /// The machine after a restore at `now`. The value is unknown until the next observation. Times of raises after
+    /// `now` are set to `now`.
     pub(super) fn restored(self, now: Timestamp) -> Self {
         let (first_raised, last_raised) = (self.first_raised.min(now), self.last_raised.min(now));
         let value = Observation::default();

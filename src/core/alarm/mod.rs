@@ -1,9 +1,9 @@
 //! Compares named values with thresholds and raises alarms, with debounce, hysteresis, severity and acknowledgement.
 //! The module does not depend on the estimators.
 //!
-//! In: commands, and a rule's values per cell or per pack, in the rule's unit, or `None` if unknown. Out: changes of
-//! alarms. An unknown value neither raises nor clears an alarm, and it is visible. The memory is limited to rules x
-//! cells. States and transitions follow ISA-18.2 (unacknowledged, latched, suppressed).
+//! In: commands, and the values of each rule per cell or per pack, in the rule's unit (`None` = unknown). Out: changes
+//! of alarms. An unknown value neither raises nor clears an alarm, but the alarm's state shows it. The memory is
+//! limited to rules x cells. States and transitions follow ISA-18.2 (unacknowledged, latched, suppressed).
 //! * [`rule`] specifies what each rule compares;
 //! * [`limit`] compares a value with a threshold;
 //! * [`machine`] is the state machine of one alarm;

@@ -10,15 +10,15 @@ use serde::{Deserialize, Serialize};
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
 pub enum Rule {
-    /// The capacity between the full and the empty open-circuit voltage is below the threshold, Ah.
+    /// The capacity (Ah) between the full and the empty open-circuit voltage is below the threshold.
     CapacityLow = 1,
-    /// The usable capacity, with the configured load and cut-off, is below the threshold, Ah.
+    /// The usable capacity (Ah), with the configured load and cut-off, is below the threshold.
     UsableCapacityLow = 2,
-    /// The recharge period is below the threshold, s.
+    /// The recharge period (s) is below the threshold.
     RechargePeriodLow = 3,
-    /// A configured input is missing for too long; the value is the input's age, s.
+    /// A configured input is missing for too long. The value is the input's age (s).
     InputMissing = 4,
-    /// A configured input keeps being implausible; the value is the share of bad readings, fraction.
+    /// A configured input is implausible too often. The value is the fraction of bad readings.
     InputImplausible = 5,
     /// The estimator's innovations contradict its own covariance, or the model belongs to another cell. The value is
     /// the mean normalised innovation squared, or the mismatch ([`ModelCheck`](crate::cell::ModelCheck)) on the same
@@ -27,28 +27,29 @@ pub enum Rule {
     /// The resistance relative to new is above the threshold. The value is the resistance that was learned in the last
     /// half-cycle.
     ResistanceHigh = 7,
-    /// The SOC of the cell that limits discharge is below the threshold, fraction.
+    /// The SOC (fraction) of the cell that limits discharge is below the threshold.
     SocLow = 8,
-    /// The highest temperature is above the threshold, degrees C.
+    /// The highest temperature (degrees C) is above the threshold.
     TemperatureHigh = 9,
-    /// The SOC difference between the fullest and the emptiest cell is above the threshold, fraction.
+    /// The SOC difference (fraction) between the fullest and the emptiest cell is above the threshold.
     CellImbalance = 10,
-    /// The remaining useful life is below the threshold, equivalent full cycles.
+    /// The remaining useful life (equivalent full cycles) is below the threshold.
     RemainingLifeLow = 11,
-    /// SOC or SOH reported by the pack differs from the estimate; the value is the larger of the two differences,
-    /// fraction.
+    /// SOC or SOH reported by the pack differs from the estimate. The value is the larger of the two differences
+    /// (fraction).
     BmsDisagrees = 12,
-    /// A file of the stored state or of the records cannot be written; the value is the duration, s.
+    /// A file of the stored state or of the records cannot be written. The value is the duration of this fault (s).
     StoreFailed = 13,
-    /// An interface is down, missing, bus-off or accepts no frames; the value is the duration, s.
+    /// An interface is down, missing, bus-off or accepts no frames. The value is the duration of this fault (s).
     BusFault = 14,
-    /// A cell's self-discharge in excess of the other cells is above the threshold, fraction of the capacity per day.
+    /// A cell's self-discharge in excess of the other cells is above the threshold. The unit is a fraction of the
+    /// capacity per day.
     CellLeak = 15,
     /// A cell's contact resistance in excess of the other cells is above the threshold. The unit is a fraction of the
     /// cell's series resistance at medium SOC and 25 degrees C.
     ConnectionResistance = 16,
-    /// A voltage channel does not show its own cell. The value is 1 in this case, else 0. While it is 1, the rules that
-    /// depend on the cell's voltage are unknown.
+    /// A voltage channel does not show its own cell. The value is 1 in this case, else 0. While the value is 1, the
+    /// rules that depend on the cell's voltage are unknown.
     ChannelFaulty = 17,
 }
 

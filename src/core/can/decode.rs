@@ -1,9 +1,9 @@
 //! Decodes input frames to readings.
 //!
 //! The decoding plan is built once from the configured signals. Each frame needs one look-up by interface and
-//! identifier, one by the selector's code, and a shift and a multiply-add per signal. A signal that is absent because
-//! of its multiplexor gives no reading. A signal that is present but unusable gives a reading with its fault. A message
-//! is identified by its interface, its identifier, and whether the identifier is standard or extended.
+//! identifier, and one by the code of its multiplexor. Each signal needs a shift and a multiply-add. A signal that is
+//! absent because of its multiplexor gives no reading. A signal that is present but unusable gives a reading with its
+//! fault. A message is identified by its interface, its identifier, and whether the identifier is standard or extended.
 
 mod message_table;
 

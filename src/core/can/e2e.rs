@@ -5,17 +5,18 @@
 //! receiver detect payloads that are damaged, repeated, lost or from another message. It does not stop an attacker,
 //! because anybody can compute a CRC.
 //!
-//! | profile | bytes of the header | CRC | counter |
-//! | --- | --- | --- | --- |
-//! | 1A | 0: CRC; 1, low nibble: counter | CRC-8 0x1D, from 0, of id low, id high, payload from byte 1 | 0 to 14 |
-//! | 1C | as 1A; 1, high nibble: low nibble of the id's high byte | CRC-8 0x1D, from 0, of id low, 0, payload from byte 1 | 0 to 14 |
-//! | 5 | 0, 1: CRC, low byte first; 2: counter | CRC-16 0x1021, from 0xFFFF, of payload from byte 2, id low, id high | 0 to 255 |
+//! | profile | header | CRC and its start value | bytes that the CRC covers, in this order | counter |
+//! | --- | --- | --- | --- | --- |
+//! | 1A | byte 0: CRC; byte 1, low nibble: counter | CRC-8 0x1D, 0 | id low, id high, payload from byte 1 | 0 to 14 |
+//! | 1C | as 1A; byte 1, high nibble: bits 8 to 11 of the id | CRC-8 0x1D, 0 | id low, 0, payload from byte 1 | 0 to 14 |
+//! | 5 | bytes 0 and 1: CRC, low byte first; byte 2: counter | CRC-16 0x1021, 0xFFFF | payload from byte 2, id low, id high | 0 to 255 |
 //!
 //! In 1A the high nibble of byte 1 is free for a signal of the message; `protect` does not change it.
 //! The CRC of profile 1 equals the AUTOSAR library's CRC-8 with its start value and final XOR (0xFF) cancelled.
 //!
-//! A payload shorter than the header is an error when sending and a wrong CRC when receiving. Source: AUTOSAR "SWS E2E
-//! Library", as implemented by two test peers and four open-source receivers; vectors in the tests.
+//! A sender rejects a payload that is shorter than the header; a receiver reports such a payload as a wrong CRC.
+//! Source: AUTOSAR "SWS E2E Library", as implemented by two test peers and four open-source receivers; vectors in the
+//! tests.
 //!
 //! * Deviation 1: in AUTOSAR, the check of profile 5 has no statuses SYNC and INITIAL; the state machine above it
 //!   provides them. Here, profile 5 uses the receiver of profile 1 with the counter modulo 256, so that both profiles

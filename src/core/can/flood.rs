@@ -3,9 +3,10 @@
 //!
 //! In: time and identifier of each received frame. Out: whether the frame is admitted. Dropped frames are counted, and
 //! a [`FloodChange`] reports when dropping starts and ends. Each message has a leaky bucket, stored as one number: the
-//! time up to which the allowed rate is spent. The bucket admits a burst of a tenth of a second's frames. In the long
-//! run, it admits the allowed rate. The result depends only on the time stamps, and nothing is allocated after the
-//! start. Messages that are not configured always pass, because they are not decoded and cost almost no time.
+//! time up to which the allowed rate is spent. At once, a bucket admits the frames of a tenth of a second at the
+//! allowed rate, or two frames per multiplexer page if this is more. In the long run, it admits the allowed rate. The
+//! result depends only on the time stamps, and nothing is allocated after the start. Messages that are not configured
+//! always pass, because they are not decoded and cost almost no time.
 
 use std::num::NonZeroU32;
 

@@ -4,10 +4,10 @@
 //! [`Status`] of each frame and counts per message. A [`GuardChange`] reports that a message starts to fail its check
 //! or becomes usable again.
 //!
-//! If a message's cycle time is known, each period without a frame counts as one NONEWDATA. The first NONEWDATA is
-//! counted one and a half periods after the last frame, where half a period allows for jitter. Each further period
-//! counts one more. While the check allows this number of lost frames, no change is reported, because the next frame
-//! will be usable. Otherwise, a sender with jitter would fill the log.
+//! If a message's cycle time is known, each period without a frame counts as one [`Status::NoNewData`]. The first is
+//! counted one and a half periods after the last frame; the half period allows for jitter. Each further period counts
+//! one more. While the check allows this number of lost frames, no change is reported, because the next frame will be
+//! usable. Otherwise, a sender with jitter would fill the log.
 //!
 //! A time without listening is not the sender's fault. After sleep, a restart of the program or a clock step, the
 //! receivers wait for a first frame again ([`Guards::restart`]). For the same reason, a restarted program restores the
@@ -208,7 +208,7 @@ impl Guards {
 }
 
 impl Guard {
-    /// Counts one NONEWDATA for each period without a frame.
+    /// Counts one [`Status::NoNewData`] for each period without a frame.
     fn count_missed(&mut self, now: Timestamp, changes: &mut Vec<GuardChange>) {
         let Some(period_s) = self.config.cycle_time_s else { return };
         // At the start of listening, the first period begins now.

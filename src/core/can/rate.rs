@@ -4,14 +4,14 @@
 //! ([`SecondSenders::poll`]). Out: a [`SenderChange`] when a second sender is found, and when the second sender is
 //! gone.
 //!
-//! Frames are counted in windows of [`WINDOW_NS`]. A second sender is found if [`WINDOWS`] consecutive windows have
-//! more than [`EXCESS`] times the expected number of frames and one of two further signs. The first sign is that many
-//! intervals are much shorter than the mean, because each frame of one sender falls between two frames of the other
-//! sender. The second sign is that the reported currents alternate. A single sender that becomes faster, as many do
-//! when the vehicle wakes, shows neither sign. Some messages always have short intervals, for example between the pages
-//! of a multiplexed message. These intervals are learned with the rate and do not count. The expected number follows
-//! from the highest steady rate so far, or from the DBC's cycle time if the cycle time gives a higher rate. The learned
-//! rate is stored, so that a second sender is also found after a restart.
+//! Frames are counted in windows of [`WINDOW_NS`]. A second sender is found if, in [`WINDOWS`] consecutive windows, the
+//! number of frames is above [`EXCESS`] times the expected number and one of two further signs appears. The first sign
+//! is that many intervals are much shorter than the mean, because each frame of one sender falls between two frames of
+//! the other sender. The second sign is that the reported currents alternate. A single sender that becomes faster, as
+//! many do when the vehicle wakes, shows neither sign. Some messages always have short intervals, for example between
+//! the pages of a multiplexed message. These intervals are learned with the rate and do not count. The expected number
+//! follows from the highest steady rate so far, or from the DBC's cycle time if the cycle time gives a higher rate. The
+//! learned rate is stored, so that a second sender is also found after a restart.
 //!
 //! A second sender is not found in these cases:
 //! * the message has fewer than [`LEAST_PER_S`] frames a second, and the second sender is as slow as the first;
@@ -41,13 +41,15 @@ const WINDOWS: u32 = 3;
 const GONE_WINDOWS: u32 = 10;
 /// A rate counts as steady after this number of consecutive windows with a similar number of frames.
 const STEADY_WINDOWS: u32 = 20;
-/// Largest difference between similar numbers of frames: relative part, and number of frames added to it.
+/// Largest difference between two similar numbers of frames: a fraction of the number, plus a constant number of
+/// frames.
 const STEADY: (f64, f64) = (0.2, 1.0);
 /// Lowest rate that is learned, frames a second. Fewer frames in a window are not significant.
 const LEAST_PER_S: f64 = 3.0;
 /// An interval shorter than this fraction of the mean is short.
 const SHORT: f64 = 0.5;
-/// Minimum number of short intervals, or of alternating currents, per expected frame that indicates a second sender.
+/// A second sender is indicated if the number of short intervals, or of alternating currents, is at least this multiple
+/// of the expected number of frames.
 const SIGNS: f64 = 0.4;
 /// Fraction of the frames that follow a short interval by chance, because other messages delay them.
 const CHANCE_SHORT: f64 = 0.02;

@@ -9,10 +9,10 @@
 //! whole freshness (64 bit), big-endian. The caller has the key and the cipher and passes the 16 bytes of a CMAC. This
 //! module contains no secret, so its results can be reproduced without the key.
 //!
-//! | profile | freshness | authenticator | bytes | a guess succeeds once in |
+//! | profile | freshness sent | authenticator sent | both, bytes | guesses until one succeeds, on average |
 //! | --- | --- | --- | --- | --- |
 //! | 1 | 8 bit | 24 bit | 4 | 1.7 x 10^7 |
-//! | 3 | 4 bit | 28 bit | 4 | 2.7 x 10^8, tried with each possible freshness |
+//! | 3 | 4 bit | 28 bit | 4 | 2.7 x 10^8 for each freshness value that the receiver tries |
 //! | fd | 32 bit | 64 bit | 12 | 1.8 x 10^19 |
 //! | announcement | 36 bit | 28 bit | 8 | 2.7 x 10^8 |
 //!

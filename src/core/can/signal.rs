@@ -5,9 +5,9 @@
 //! then needs one load, two shifts and one multiply-add. Signals have 1 to 64 bits at any position of a payload of up
 //! to 64 bytes.
 //!
-//! Bad input is data. A payload that is too short gives [`Fault::ShortFrame`]. NaN or infinity gives
-//! [`Fault::NotFinite`]. A value outside the DBC's range gives [`Fault::OutOfRange`]. Encoding rounds to the nearest
-//! code and saturates.
+//! Bad input gives a fault instead of a value. A payload that is too short gives [`Fault::ShortFrame`]. NaN or infinity
+//! gives [`Fault::NotFinite`]. A value outside the DBC's range gives [`Fault::OutOfRange`]. Encoding rounds to the
+//! nearest code and saturates.
 
 use crate::can::MAX_DATA;
 use crate::quantity::Fault;

@@ -1,8 +1,8 @@
 //! Receives diagnostic responses over ISO-TP (UDS ISO 14229-1, KWP 2000, OBD ISO 15031-5) and decodes their signals.
 //!
-//! In: frames of the configured identifiers, from any tester. Out: complete responses and their readings
-//! ([`Answer::readings`]), and counts per controller ([`ControllerCounts`]). This module sends nothing. It stores one
-//! message per configured controller.
+//! In: frames with the configured identifiers; the requests may come from any tester. Out: complete responses and their
+//! readings ([`Answer::readings`]), and counts per controller ([`ControllerCounts`]). This module sends nothing. It
+//! stores one message per configured controller.
 
 use serde::{Deserialize, Serialize};
 
@@ -262,7 +262,7 @@ impl Listener {
         }
         sorted.sort_by_key(|answer| answer.question);
         for answer in &mut sorted {
-            // Decode the current before the voltages, because their samples use it.
+            // Decode the current before the voltages, because the voltage samples use the current.
             answer.signals.sort_by_key(|signal| signal.binding.channel);
         }
         let mut controllers: Vec<Controller> = sorted.iter().map(|answer| answer.question.controller).collect();

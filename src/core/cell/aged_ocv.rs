@@ -5,11 +5,11 @@
 //! Outside the range of capacities in the table, they are constant; below SOC 0 and above SOC 1, they continue
 //! linearly.
 //!
-//! # One curve per capacity
-//! The capacity alone does not show how much lithium and how much active material was lost. Assumption: if the cell has
-//! lost a fraction x of its capacity, each electrode has lost the fraction [`MATERIAL_SHARE`] x of its active material.
-//! The rest of the lost capacity is explained by lost lithium. [`OffsetLine::mixes_v`] is the change of the offset if
-//! the share of one electrode is higher by [`MATERIAL_SHARE_STD`].
+//! # One curve per capacity The capacity alone does not show how much lithium and how much active material was lost.
+//! Assumption: if the cell has lost a fraction x of its capacity, each electrode has lost the fraction
+//! [`MATERIAL_SHARE`] x of its active material. The rest of the lost capacity is explained by lost lithium. The
+//! uncertain share of each electrode is called a mix. [`OffsetLine::mixes_v`] is the change of the offset if the share
+//! of one electrode is higher by [`MATERIAL_SHARE_STD`].
 
 use super::electrodes::{Electrodes, LostMaterial};
 use crate::filter::locate;

@@ -1,9 +1,9 @@
 //! Creates the model of a cell that was never measured, from its label and from the spread between cells of its
 //! chemistry.
 //!
-//! In: chemistry, rated capacity (Ah), cut-off voltages (V). Out: a [`CellModel`]. Its [`ModelSpread`] and the modes of
-//! its curve state how much a cell may differ from it. No measured cell was used for the curve, so measured cells can
-//! be used to test it.
+//! In: chemistry, rated capacity (Ah), cut-off voltages (V). Out: a [`CellModel`]. The model's [`ModelSpread`] and the
+//! modes of its curve state how much a cell may differ from the model. No measured cell was used for the curve, so
+//! measured cells can be used to test it.
 //!
 //! * Open-circuit voltage: mean and covariance over cells built from published half-cell potentials ([`curve`]).
 //! * Resistances: proportional to 1 / capacity, for every chemistry. Medians and deviations come from five fitted cells
@@ -262,9 +262,9 @@ impl Label {
         Some(LabelPrior { label: *self, model, curve })
     }
 
-    /// The model of a cell with this present capacity, Ah, curve and resistances. `drop_std` is the standard deviation
-    /// of ln(voltage drop) at each temperature of the tables. At the usual load, it counts as voltage error of the
-    /// model.
+    /// The model of a cell with this present capacity (Ah), curve and resistances. `drop_std` is the standard deviation
+    /// of ln(voltage drop) at each temperature of the tables. At [`USUAL_LOAD_PER_H`], this deviation counts as voltage
+    /// error of the model.
     pub fn model_of(
         &self,
         capacity_ah: f64,
@@ -328,7 +328,8 @@ impl Label {
     }
 }
 
-/// At this load, C/2, an error of the resistances counts as voltage error of the model. Stated per rated capacity.
+/// Load at which an error of the resistances counts as voltage error of the model: C/2, stated as current divided by
+/// rated capacity, 1/h.
 pub const USUAL_LOAD_PER_H: f64 = 0.5;
 
 #[cfg(test)]

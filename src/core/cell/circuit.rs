@@ -41,7 +41,8 @@ impl BranchAt {
     }
 }
 
-/// Terminal voltage, V, of a new cell under `current_a`; `branches_v` is the sum of the branch voltages.
+/// Terminal voltage under `current_a`, V, with the open-circuit curve of a new cell. `branches_v` is the sum of the
+/// branch voltages.
 pub fn terminal_v(
     model: &CellModel,
     position: &GridPosition,
@@ -52,7 +53,7 @@ pub fn terminal_v(
     model.ocv_v(position) - branches_v - model.r0_ohm(position) * resistance_ratio * current_a
 }
 
-/// Terminal voltage, V, of an aged cell under `current_a`. `state` = (SOC, resistance ratio, capacity in Ah);
+/// Terminal voltage of an aged cell under `current_a`, V. `state` = (SOC, resistance ratio, capacity in Ah);
 /// `branches_v` is the sum of the branch voltages.
 pub fn aged_terminal_v(
     model: &CellModel,

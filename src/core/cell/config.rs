@@ -154,7 +154,7 @@ pub struct GateSettings {
     pub model_error_v: f64,
     /// Model error of a single reading along the OCV curve, fraction of SOC.
     pub soc_error: f64,
-    /// If all readings during this time, s, were beyond the gate, the filter restarts from the voltage.
+    /// If all readings during this time (s) were beyond the gate, the filter restarts from the voltage.
     pub lost_after_s: f64,
 }
 

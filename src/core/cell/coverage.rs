@@ -1,7 +1,7 @@
 //! Determines the ranges of SOC and temperature that the data cover.
 //!
-//! In: SOC (fraction) and temperature (degrees C) of readings or notebook rows; NaN and infinities are ignored. Out:
-//! shares and ranges.
+//! In: SOC (fraction) and temperature (degrees C) of readings, or of notebook rows (means over several readings); NaN
+//! and infinities are ignored. Out: shares and ranges.
 
 use std::collections::BTreeMap;
 

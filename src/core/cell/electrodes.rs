@@ -79,8 +79,8 @@ impl PositiveMaterial {
         }
     }
 
-    /// Potential against lithium, V, at a lithium content. Outside the valid contents, the potential at the nearest
-    /// valid content.
+    /// Potential against lithium, V, at a lithium content. Outside the valid contents, returns the potential at the
+    /// nearest valid content.
     pub fn potential_v(self, y: f64) -> f64 {
         use libm::{exp, pow, tanh};
         let y = y.clamp(self.least_content(), 1.0 - EDGE);
@@ -141,8 +141,8 @@ impl NegativeMaterial {
         (Self::McmbRamadass, "mcmb_ramadass"),
     ];
 
-    /// Potential against lithium, V, at a lithium content. Outside the range limited by [`EDGE`], the potential at the
-    /// edge.
+    /// Potential against lithium, V, at a lithium content. Outside the range limited by [`EDGE`], returns the potential
+    /// at the edge.
     pub fn potential_v(self, x: f64) -> f64 {
         use libm::{exp, tanh};
         let x = x.clamp(EDGE, 1.0 - EDGE);

@@ -20,11 +20,12 @@
 //! Deviation 4: model^2 = base^2 + (k drop)^2 + (k' load)^2. The base is the cell model's stated error over SOC and
 //! temperature, or a configured constant. The drop is the present voltage drop in the cell. The load is the voltage
 //! drop caused by the load of the last minutes. Reason: most of the model error comes from the resistances and from
-//! diffusion that is slower than the branches. Effect: a record that begins under load, the constant-voltage part of a
-//! charge, and cold cells no longer count as exact. At rest, the error repeats instead of averaging out. A rest of
-//! duration t therefore gives only as much information as the time t_r ln(1 + t/t_r) under load, with t_r = 1000 s.
-//! Deviation 5: the OCV curve changes with the lost capacity ([`AgedOcv`](crate::cell::AgedOcv)), as learned by the end
-//! of the last half-cycle. Effect: readings at the top and at the bottom of an aged cell's curve give the same
+//! diffusion that is slower than the branches. Effect: the filter no longer treats voltages as exact at the start of a
+//! record under load, in the constant-voltage part of a charge, and in cold cells. At rest, the error repeats instead
+//! of averaging out. A rest of duration t therefore gives only as much information as the time t_r ln(1 + t/t_r) under
+//! load, with t_r = 1000 s.
+//! Deviation 5: the OCV curve changes with the lost capacity ([`AgedOcv`](crate::cell::AgedOcv)), as learned up to the
+//! end of the last half-cycle. Effect: readings at the top and at the bottom of an aged cell's curve give the same
 //! capacity.
 //!
 //! Deviation 6: the cell may be used while the program does not run, see [`downtime`].
@@ -32,13 +33,13 @@
 //! Deviation 7: the filter tracks the effect of constant errors of sensors and model. For the errors of
 //! [`SensorErrors`](crate::cell::SensorErrors), the gain also takes this effect into account (see below).
 //! Deviation 8: the offset of the current sensor is learned ([`crate::health::offset`]).
-//! Deviation 9: the slowest branch has its own learned resistance ratio ([`slow_branch`]). In the equation of the
-//! terminal voltage V, it multiplies U_n.
+//! Deviation 9: the slowest branch has its own learned resistance ratio ([`slow_branch`]). This ratio multiplies U_n in
+//! the equation of the terminal voltage V.
 //!
 //! The filter is unscented, with additive noise and a scalar measurement. The sigma points are x and x +/- sqrt(N +
 //! lambda) L_i. L_i is column i of the lower Cholesky factor of P, and lambda = alpha^2 (N + kappa) - N. The weights
-//! are those of Wan and van der Merwe (2000), equations 15. An update **redraws** the points from the predicted mean
-//! and covariance. (Some packages reuse the propagated points; this changes the SOC by up to 3e-4 on drive data.)
+//! follow Wan and van der Merwe (2000), equations 15. An update **redraws** the points from the predicted mean and
+//! covariance. (Some packages reuse the propagated points; this changes the SOC by up to 3e-4 on drive data.)
 //!
 //! For each constant error, the filter keeps a column: the shift of each state that one standard deviation of this
 //! error has caused. The gain considers the first [`CONSIDERED`](state_vector::CONSIDERED) constant errors (Schmidt

@@ -65,14 +65,14 @@ pub(super) struct App {
     pub(super) has_colour: bool,
     /// The latest document; `None` if it is stale.
     pub(super) document: Option<StatusDocument>,
-    /// Set while there is no fresh document: the time of the last document, and the reason why there is none.
+    /// Time of the last document, and the reason why no newer document arrives; set while no fresh document is known.
     pub(super) lost: Option<(Option<Timestamp>, String)>,
     /// Time of the latest document.
     received_at: Option<Timestamp>,
     /// History of each cell, oldest first.
     pub(super) history: Vec<VecDeque<CellPoint>>,
     pub(super) page: Page,
-    /// Index of the mapped quantity.
+    /// Index in [`MAPPED`] of the quantity that the cell map shows.
     pub(super) mapped: usize,
     /// The selected cell.
     pub(super) selected: usize,

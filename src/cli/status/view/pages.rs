@@ -62,10 +62,10 @@ fn cells(frame: &mut Frame<'_>, app: &mut App, document: &StatusDocument, theme:
     }
 }
 
-/// Layout of the map.
+/// Layout of the cell map.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Grid {
-    /// Characters of a cell, including its space.
+    /// Width of a cell in characters, including the space between cells.
     cell_width: usize,
     per_row: usize,
     rows: usize,
@@ -269,7 +269,7 @@ fn counts(document: &StatusDocument) -> Vec<Line<'static>> {
     text
 }
 
-/// Newest first.
+/// Lists the events, newest first.
 fn events(document: &StatusDocument) -> Vec<Line<'static>> {
     let mut text: Vec<Line<'_>> =
         document.events.iter().rev().map(|event| Line::from(event_line(event, document))).collect();

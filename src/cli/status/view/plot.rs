@@ -1,18 +1,18 @@
-//! Bars and small plots made of characters. Pure.
+//! Draws bars and small plots with characters. All functions are pure.
 
 /// Bars of one to eight eighths of a character's height.
 const EIGHTHS: [char; 8] = ['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
 /// Mark of an unknown value.
 const UNKNOWN: char = '·';
 
-/// Returns a bar one character high; `share` is 0 to 1 of its height.
+/// Returns a bar of one character. `share` is the filled part of the character's height, 0 to 1.
 pub(super) fn bar(share: Option<f64>) -> char {
     let Some(share) = share else { return UNKNOWN };
-    // The cast saturates to 0 to 7.
+    // The product is 0 to 8; the cast turns NaN into 0.
     EIGHTHS[((share.clamp(0.0, 1.0) * 8.0) as usize).min(7)]
 }
 
-/// Draws the last `width` values as bars between their smallest and largest value; pads on the left.
+/// Draws the last `width` values as bars, scaled to the range of these values; pads on the left.
 pub(super) fn sparkline(values: impl ExactSizeIterator<Item = Option<f64>>, width: usize) -> String {
     let skipped = values.len().saturating_sub(width);
     let values: Vec<Option<f64>> = values.skip(skipped).collect();
@@ -29,7 +29,7 @@ pub(super) struct ValueRange {
 }
 
 impl ValueRange {
-    /// Returns the range of the values; `None` if there are none.
+    /// Returns the range of the values; `None` without values.
     pub(super) fn of(values: impl Iterator<Item = f64>) -> Option<Self> {
         values.fold(None, |so_far, value| match so_far {
             None => Some(Self { least: value, greatest: value }),
@@ -54,7 +54,7 @@ impl ValueRange {
 /// stroke marks the value.
 pub(super) fn gauge(value: Option<f64>, low: Option<f64>, high: Option<f64>, width: usize) -> String {
     let (Some(value), Some(low), Some(high)) = (value, low, high) else { return UNKNOWN.to_string().repeat(width) };
-    // The cast saturates to 0 to width.
+    // The product is 0 to `width`; the cast turns NaN into 0.
     let column = |share: f64| (share.clamp(0.0, 1.0) * width as f64).round() as usize;
     let (low, high, at) = (column(low), column(high), column(value).min(width.saturating_sub(1)));
     let dot = |index: usize| match index {

@@ -1,4 +1,4 @@
-//! Colours and words shared by the frame of the view and its pages.
+//! Colours and words shared by all parts of the live view.
 
 use ratatui::style::{Color, Modifier, Style};
 

@@ -309,7 +309,8 @@ fn commands_change_selected_alarms_and_refuse_unhealthy_ones() {
 fn show_equals_observe_for_quiet_values() {
     let rules = [Rule::InputMissing, Rule::EstimateUntrusted, Rule::CellImbalance];
     let mut configs = rules.map(|r| rule(r, 3.0, 0.5, 5.0, 3)).to_vec();
-    // One rule has two thresholds. Another threshold needs a standard deviation, which shown values lack.
+    // One rule has two thresholds. Another threshold compares a probability and needs a standard deviation, which
+    // values passed to `show` do not have.
     configs.push(RuleConfig { severity: Severity::Severe, ..rule(Rule::InputMissing, 3.1, 0.2, 1.0, 1) });
     configs[2].when = Comparison::Probability(0.9);
     let mut observation = AlarmEngine::new(configs, 2);

@@ -247,8 +247,9 @@ impl MessageGroups {
 }
 
 impl PageTable {
-    /// Creates the table for the selector on which more runs depend than on any other selector; `None` = no selector,
-    /// or the table would be too large.
+    /// Creates the table for the selector on which most groups depend. `runs` are the ranges of the groups' bindings,
+    /// `all` are the groups. `None` = no selector, a selector that is not a simple integer, or a table that would be
+    /// too large.
     fn new(bindings: &[Binding], runs: &[Range<usize>], all: &[SignalGroup]) -> Option<Self> {
         let tests = |run: &Range<usize>| bindings[run.start].mux.as_slice();
         let dependents = |plan: SignalPlan| runs.iter().flat_map(tests).filter(|test| test.plan == plan).count();
@@ -291,7 +292,7 @@ impl PageTable {
     }
 }
 
-/// Whether the run of bindings may be present if the selector has this code.
+/// Whether a group with these conditions may be present if the selector has this code.
 fn may_hold(selector: SignalPlan, tests: &[MuxTest], code: u64) -> bool {
     tests.iter().filter(|test| test.plan == selector).all(|test| test.allows(code))
 }

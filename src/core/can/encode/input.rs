@@ -138,7 +138,8 @@ impl InputEncoder {
     pub fn new(map: &InputMap) -> Self {
         let same_message = |a: &Binding, b: &Binding| (a.bus, a.id) == (b.bus, b.id);
         let pages = map.bindings().chunk_by(same_message).flat_map(|message| {
-            // Signals that are always present are on the pages of the multiplexed signals, if there are any.
+            // If the message has multiplexed signals, the signals that are always present are on the pages of the
+            // multiplexed signals.
             let paged = message.iter().any(|binding| !binding.mux.is_empty());
             let of_a_page = message.iter().filter(|binding| !paged || !binding.mux.is_empty());
             let mut templates: Vec<_> = of_a_page.map(template).collect();
@@ -244,7 +245,7 @@ impl AnswerPage {
         Some(message)
     }
 
-    /// Appends the request, the response, and the flow control after its first frame.
+    /// Appends the request and the response, with the flow control after the first frame of the response.
     fn exchange(&self, message: &[u8], out: &mut Vec<(BusIndex, Frame)>) {
         let Controller { bus, request, request_extension, response, response_extension } = self.question.controller;
         let of_tester = |payload: &[u8]| Frame::classic(request, payload).map(|frame| (bus, frame));

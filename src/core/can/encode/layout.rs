@@ -1,9 +1,10 @@
 //! Creates the layout of the sent frames and of the command frame: one [`Database`] for the encoder and for consumers.
 //!
 //! In: a base (the built-in `config/packwatch.dbc`, or the user's own DBC) and settings per message. Out: the base's
-//! messages with the configured identifiers, frame formats, cycle times, end-to-end protection and authentication. They
-//! include the signals of header and trailer. The encoder is built from this database, and `packwatch dbc` writes this
-//! database, so the encoder and the written DBC always agree.
+//! messages with the configured identifiers, frame formats, cycle times, end-to-end protection and authentication. A
+//! protected message includes the signals of its header, an authenticated message the signals of its trailer. The
+//! encoder is built from this database, and `packwatch dbc` writes this database, so the encoder and the written DBC
+//! always agree.
 //!
 //! The built-in base is adapted:
 //!
@@ -208,7 +209,8 @@ pub struct SettingFault {
     pub what: String,
 }
 
-/// Creates the layout. Omits messages that the base does not have; the plans report what is missing.
+/// Creates the layout. Omits messages that the base does not have; `OutputPlan` and `CommandPlan` report missing
+/// messages.
 ///
 /// # Errors
 /// All settings that do not fit.
@@ -461,9 +463,9 @@ fn check_trailer(message: &Message, authentication: Authentication, fault: &mut 
     }
 }
 
-/// Adapts the steps of Ah signals: multiplies the built-in step by the smallest of 1, 2, 5, 10, ... for which the
-/// largest possible value fits. The largest possible value is twice the rated capacity; for a standard deviation, it is
-/// half of the rated capacity.
+/// Adapts the steps of Ah signals: multiplies the built-in step by the smallest factor of 1, 2, 5, 10, ... with which
+/// the largest possible value fits. The largest possible value is twice the rated capacity; for a standard deviation,
+/// it is half of the rated capacity.
 fn fit_steps(message: &mut Message, rated_capacity_ah: f64) {
     let largest_ah = |signal: &Signal| rated_capacity_ah * if signal.name.ends_with("Std") { 0.5 } else { 2.0 };
     for is_std in [false, true] {

@@ -1,12 +1,15 @@
-//! State machine of the node's J1939 address: the node claims the address, defends it, and falls silent if it loses it
-//! (J1939-81).
+//! State machine of the node's J1939 address (J1939-81): the node claims the address, defends it, and falls silent if
+//! another node takes the address. If two nodes claim the same address, the node with the lower NAME (a 64-bit
+//! identity) wins.
 //!
-//! | state | started | lower or equal NAME claims it | higher NAME claims it | request for claims | 300 ms passed |
+//! | state | started | lower or equal NAME claims | higher NAME claims | request for claims | 300 ms passed |
 //! | --- | --- | --- | --- | --- | --- |
-//! | idle | claim | - | - | - | - |
-//! | claiming | claim | lost | claim | claim | claimed |
-//! | claimed | claim | lost | claim | claim | - |
-//! | lost | claim | - | - | cannot claim | - |
+//! | idle | claiming; claim | - | - | - | - |
+//! | claiming | claiming; claim | lost; cannot claim | claiming; claim | claiming; claim | claimed |
+//! | claimed | claiming; claim | lost; cannot claim | claimed; claim | claimed; claim | - |
+//! | lost | claiming; claim | - | - | lost; cannot claim | - |
+//!
+//! Each cell contains the next state and, after the semicolon, the frame that the node sends; "-" = no effect.
 //!
 //! An equal NAME belongs to a second node with the same configuration. Arbitration cannot separate the two nodes, and
 //! their broadcasts from one address would corrupt each other. Therefore a node that receives its own NAME falls
@@ -20,9 +23,9 @@ use super::name::Name;
 use crate::can::Frame;
 use crate::quantity::Timestamp;
 
-/// If no other node objects within this time, ns, the node has the address. The time is the 250 ms of J1939-81 plus 50
-/// ms, because a frame reaches the wire later than its time stamp here (interface start, queues). A delay of 12 ms was
-/// measured.
+/// If no other node objects within this time (ns), the node has the address. J1939-81 specifies 250 ms. The additional
+/// 50 ms are needed because a frame reaches the bus later than its time stamp (interface start, queues). A delay of 12
+/// ms was measured.
 const CONTENTION_NS: i64 = 300_000_000;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

@@ -302,7 +302,7 @@ impl Node {
         }
     }
 
-    /// Time at which [`poll`](Self::poll) must be called next; a time in the past means now. `None` = not before a
+    /// Time at which [`poll`](Self::poll) must be called next; a time in the past means now. `None` = only after a
     /// frame or [`start`](Self::start). A poll before this time does nothing.
     pub fn next_due(&self) -> Option<Timestamp> {
         let claim = self.claim.next_due();

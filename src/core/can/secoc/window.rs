@@ -4,12 +4,12 @@
 //! The receiver announces a value once a second, each time [`ANNOUNCEMENT_STEP`] higher. A command carries the
 //! announced value, or a higher value that is below the next announcement. The sender uses each value once and in
 //! rising order. The receiver accepts a value if it is higher than all values accepted before, not older than the
-//! previous announcement, and already announced. If an attacker delays a command, it expires after two seconds. A
-//! command with an invented value is useless until the receiver announces that value.
+//! previous announcement, and already announced. If an attacker delays a command, the command expires after two
+//! seconds. A command with an invented value is useless until the receiver announces that value.
 //!
 //! The sender stores nothing: after a restart, it waits for an announcement. The receiver stores its state. After a
-//! restart it begins [`RESTART_STEPS`] announcements beyond the stored state, and at least at the value that
-//! corresponds to its clock. Therefore it never reuses a value of the previous run, even if that value was not stored.
+//! restart it begins [`RESTART_STEPS`] announcements beyond the stored state, and not below the value that corresponds
+//! to its clock. Therefore it never reuses a value of the previous run, even if that value was not stored.
 
 use serde::{Deserialize, Serialize};
 

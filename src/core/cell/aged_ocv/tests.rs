@@ -1,5 +1,4 @@
-//! Tests of the offsets of aged curves: they agree with the electrodes, continue at the edges, and keep the curves
-//! rising.
+//! Tests that the offsets of aged curves agree with the electrodes, continue at the edges, and keep the curves rising.
 
 use super::*;
 use crate::cell::electrodes::tests::{LFP, M50};

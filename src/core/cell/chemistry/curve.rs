@@ -2,10 +2,10 @@
 //!
 //! In: positive and negative materials, cut-off voltages (V). Out: mean (V) and covariance (V^2) over SOC breakpoints.
 //!
-//! A cell is a pair of materials, together with two lithium contents: of the full negative electrode and of the empty
-//! positive electrode. The contents of the empty negative and the full positive electrode follow from the cut-off
-//! voltages. All pairs and all contents of a grid are equally likely. Two further errors cover cells that no pair of
-//! the library describes: a smooth deviation of 10 mV, and half of the hysteresis.
+//! A pair of materials and two lithium contents (full negative electrode, empty positive electrode) describe a cell.
+//! The contents of the empty negative and the full positive electrode follow from the cut-off voltages. All pairs and
+//! all contents of a grid are equally likely. Two further errors cover cells that no pair of the library describes: a
+//! smooth deviation of 10 mV, and half of the hysteresis.
 
 use nalgebra::{DMatrix, SymmetricEigen};
 

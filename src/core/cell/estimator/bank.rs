@@ -3,13 +3,13 @@
 //! In: one [`CellStep`] per cell and batch (V, A, s, degrees C). Out: a [`StepResult`] and estimates per cell.
 //!
 //! Almost every step is ordinary: the current was measured for the whole time since the last voltage, and the voltage
-//! is within the gate. The [`kernel`] computes ordinary steps for [`WIDTH`] cells at a time, on structures of arrays.
-//! It selects wider instructions at run time (without the feature `wide`, cells are stepped one by one). All other
-//! steps use parts of the same kernel with one lane ([`SingleCell`]): a first voltage, a gap, an unknown current, a
-//! reading beyond the gate, a covariance without a Cholesky factor. The tests compare the kernel with the textbook
-//! filter: the SOC agrees within 1e-9 over 100,000 steps. The cell alone determines how its step is computed, and the
-//! bits of a lane do not depend on other lanes. Therefore, a cell's estimates do not depend on the other cells of the
-//! pack.
+//! is within the gate. The [`kernel`] computes ordinary steps for [`WIDTH`] cells at a time, on structures of arrays
+//! with one cell per lane. It selects wider instructions at run time (without the feature `wide`, cells are stepped one
+//! by one). All other steps (a first voltage, a gap, an unknown current, a reading beyond the gate, a covariance
+//! without a Cholesky factor) use parts of the same kernel with one lane ([`SingleCell`]). The tests compare the kernel
+//! with the textbook filter: the SOC agrees within 1e-9 over 100,000 steps. The cell alone determines how its step is
+//! computed, and the bits of a lane do not depend on other lanes. Therefore, a cell's estimates do not depend on the
+//! other cells of the pack.
 
 mod filter_array;
 mod input;

@@ -1,4 +1,5 @@
-//! The estimator of a single cell outside its bank: rare steps, restarts, learning and estimates.
+//! The estimator of a single cell outside its bank: steps that are not ordinary ([`super::bank`]), restarts, learning
+//! and estimates.
 //!
 //! In: one [`CellStep`] per voltage reading. Out: a [`StepResult`], and estimates with their variances. A reading beyond
 //! the gate leaves the state unchanged; a step that cannot be computed restarts the filter.
@@ -149,7 +150,8 @@ impl CellEstimator {
         self.memory.is_soc_unknown = false;
     }
 
-    /// Continues with another `model`, from a state that was found with it. Discards the estimates of the old model.
+    /// Continues with another `model`, from a state that was determined with this model. Discards the estimates of the
+    /// old model.
     pub fn adopt(&mut self, model: &CellModel, config: &EstimatorConfig, state: &AdoptedState) {
         let temperature_c = self.memory.temperature_c;
         self.memory.capacity = state.capacity;
@@ -324,7 +326,8 @@ impl CellEstimator {
     }
 
     /// Replaces the capacity estimate and the capacity of the open-circuit curve by `capacity`. Called only at
-    /// transitions. The state is corrected as if the new curve had been used since the last call.
+    /// transitions between charge and discharge. The state is corrected as if the new curve had been used since the
+    /// last call.
     ///
     /// The variance of the filter does not fall, because the evidence since the last call may have had too much weight.
     pub fn restate_capacity(&mut self, capacity: ScalarGaussian) {

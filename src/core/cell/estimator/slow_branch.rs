@@ -3,8 +3,8 @@
 //!
 //! In: evidence from innovations. Out: the ratio and its standard deviation. Diffusion and the electrolyte determine
 //! the slowest branch. They vary between cells and age differently from the contacts and the charge transfer, whose
-//! resistance [`LOG_RESISTANCE`](super::state_vector::LOG_RESISTANCE) follows. A wrong voltage of the slowest branch
-//! would be mistaken for charge.
+//! resistance is the state [`LOG_RESISTANCE`](super::state_vector::LOG_RESISTANCE). A wrong voltage of the slowest
+//! branch would be mistaken for charge.
 //!
 //! Source: Friedland (1969), separate estimation of a bias, as for the offset of the current sensor
 //! ([`crate::health::offset`]). The ratio is corrected when the mode changes. If a model has a single branch, this

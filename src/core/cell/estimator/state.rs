@@ -26,7 +26,7 @@ pub struct CellState {
     memory: Memory,
 }
 
-/// Index in the filter's state of the `i`-th of the `n` numbers in the document.
+/// Converts an index in the document's state, which has `n` numbers, to the index in the filter's state.
 const fn place_of(i: usize, n: usize) -> usize {
     match i {
         0 => 0,
@@ -43,7 +43,7 @@ impl CellEstimator {
         CellState { mean, covariance, by_constant, memory: self.memory }
     }
 
-    /// Restores a stored state. `None` if it has a different number of branches.
+    /// Restores a stored state. `None` if the stored state has a different number of branches.
     ///
     /// A covariance that rounding has made inconsistent loses its correlations and keeps its variances. A filter with an impossible
     /// SOC is discarded and starts from the next voltage.

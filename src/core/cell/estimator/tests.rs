@@ -1,4 +1,4 @@
-//! Tests of the estimator with its own model as the cell, in a small simulation without noise.
+//! Tests the estimator on a simulated cell that follows the estimator's own model, without noise.
 
 mod robust;
 pub(super) mod textbook;

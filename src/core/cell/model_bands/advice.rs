@@ -1,4 +1,4 @@
-//! Finds the measurements that reduce a cell model's SOC error the most, from the bands of the model.
+//! Finds the measurements that reduce a cell model's SOC error the most, from the standard deviations of the model.
 //!
 //! In: [`ModelBands`]. Out: up to [`MOST`] measurements, the most useful first. Each measurement is returned with the
 //! error that remains after it and all measurements before it.

@@ -1,5 +1,5 @@
-//! The filters of a pack whose model has a given number of branches, in blocks of [`WIDTH`] lanes, and the steps of a
-//! batch.
+//! Stores the filters of a pack in blocks of [`WIDTH`] lanes, one cell per lane, and computes the steps of a batch. The
+//! number of the model's branches is a parameter of the types.
 //!
 //! In: inputs of the blocks. Out: changed states, and results. Steps that are not ordinary are added to `others`.
 
@@ -213,8 +213,8 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         (has_factor & has_variances(&new, Lanes([0.0]))).all().then(|| *x = new.gaussian())
     }
 
-    /// Updates a cell's state with a voltage, separately from its lane; a voltage beyond the gate does not change it.
-    /// Also returns the memory. Returns `None` and leaves the state unchanged if the update cannot be computed.
+    /// Updates a cell's state with a voltage, separately from its lane; a voltage beyond the gate does not change the
+    /// state. Also returns the memory. Returns `None` and leaves the state unchanged if the update cannot be computed.
     #[inline(never)]
     pub(super) fn update(
         &mut self,
@@ -240,7 +240,8 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         Some((outcome.lane(0), state.memory))
     }
 
-    /// The tables, and a cell's own cache at its temperature and its curve's capacity.
+    /// Returns the tables and the cell's own cache, after updating both to the cell's temperature and to the capacity
+    /// of its open-circuit curve.
     fn own_tables(
         &mut self,
         cell: usize,

@@ -1,7 +1,7 @@
 //! The ordinary step of L cells at once: predict over a measured time, update with a voltage that passes the gate.
 //!
-//! The filter of [`estimator`](crate::cell::estimator) with the circuit of [`crate::cell::circuit`]; the results agree
-//! up to rounding. The following exact rearrangements save work:
+//! Computes the filter of [`estimator`](crate::cell::estimator) with the circuit of [`crate::cell::circuit`]. The
+//! results agree with the textbook form up to rounding. The following exact rearrangements save work:
 //! * Sigma points come in pairs x +- s L_k with s = sqrt(N + lambda). A function f has the values f+ and f- at the two
 //!   points of a pair and f0 at the centre. Its odd part is o_k = (f+ - f-) / 2s.
 //!   Its even part is e_k = ((f+ + f-) / 2 - f0) / s. With m = sum e_k / s, the mean is f0 + m.
@@ -76,7 +76,7 @@ pub(super) fn has_variances<const L: usize, const N: usize, const T: usize>(
     sum.is_finite() & least.above_number(0.0)
 }
 
-/// Whether a cell can have the state, and its evidence can be stored; see `Gaussian::is_possible`.
+/// Whether a cell can have the state (see `Gaussian::is_possible`), and whether the evidence can be stored.
 #[inline(always)]
 fn is_possible<const L: usize, const N: usize, const T: usize>(x: &FilterState<L, N, T>) -> Mask<L> {
     let within = |value: Lanes<L>, bounds: Bounds| {
@@ -96,8 +96,8 @@ fn is_possible<const L: usize, const N: usize, const T: usize>(x: &FilterState<L
     is_possible
 }
 
-/// If a cell has rested for longer than this, s, further voltages add little information, because they only show
-/// relaxation that is slower than the branches.
+/// Time at rest, s, after which further voltages add little information, because they only show relaxation that is
+/// slower than the branches.
 const REST_REPEATS_S: f64 = 1000.0;
 
 /// Updates the load's low-pass, the time at rest, and the time that the reading represents.

@@ -1,4 +1,4 @@
-//! The kernel with one lane. It computes the parts of a step that is not ordinary.
+//! The kernel with one lane. It computes the parts of a step that is not ordinary (see [`super`]).
 //!
 //! In: a cell's state and memory, separate from its lane, and its input. Out: the changed state and memory. If a part
 //! cannot be computed, returns `None` and leaves state and memory unchanged.
@@ -84,7 +84,7 @@ impl<'a> SingleCell<'a> {
         let (c, mut hot) = (self.constants, hot(memory, self.constants));
         let (update, after) = each_array!(&mut *self.filters, array => array.update(c, (self.cell, x, hot), &input))?;
         if update.accepted {
-            // Keeps the evidence storable; NaN adds nothing.
+            // Limit the evidence to numbers that can be stored; ignore NaN.
             for i in EVIDENCE.into_iter().filter(|&i| !after[i].0[0].is_nan()) {
                 hot[i] = after[i].at_least(bounds::NUMBER.low).at_most(bounds::NUMBER.high);
             }

@@ -20,7 +20,7 @@ pub(super) const OCV_V: usize = 0;
 pub(super) const OCV_PER_AH: usize = 2;
 /// Index of the series resistance, ohm.
 pub(super) const R0_OHM: usize = OCV_PER_AH + 2 + 2 * MIXES;
-/// Index of the voltage error, V; 0 if the model states none.
+/// Index of the voltage error, V; 0 if the model states no error.
 pub(super) const ERROR_V: usize = R0_OHM + 2;
 /// Index of the first branch's resistance, ohm; its time constant, s, follows, then the next branch.
 const BRANCHES: usize = ERROR_V + 2;
@@ -200,8 +200,8 @@ impl<const W: usize> Tables<W> {
         }
     }
 
-    /// Table points at L states of charge, at `reach` above them and at `reach` below them. The temperatures are those
-    /// of the last [`Self::refresh_temperatures`].
+    /// Table points at L states of charge, and at the states of charge `reach` above and `reach` below each of them.
+    /// The temperatures come from the last call of [`Self::refresh_temperatures`].
     #[inline(always)]
     pub(super) fn table_points<'a, const L: usize>(
         &mut self,

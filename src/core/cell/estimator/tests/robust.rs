@@ -128,7 +128,7 @@ fn interval_covers_error_while_cell_relaxes() {
             assert!(seen.largest_ratio < 1.0, "{current_a} A, {until_s} s: {seen:?}");
         }
         // The slow branch has relaxed, so the voltage is the open-circuit voltage, and the estimate has converged to
-        // it.
+        // the true SOC.
         assert!(bench.error_points().abs() < 0.5, "{current_a} A: {}", bench.error_points());
         // Ten hours of rest count as 1000 s x ln 37 under load, not as ten hours.
         let least = 100.0 * STD_OF_95 * bench.config.voltage.model_error_v_sqrt_s / 1.2 / libm::sqrt(3600.0);

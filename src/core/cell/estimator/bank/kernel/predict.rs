@@ -11,7 +11,7 @@ use crate::cell::estimator::state_vector::{
 };
 use crate::filter::simd::{Lanes, Mask};
 
-/// Maximum time between two readings, s, that counts for the random walk of the resistance. A cell hardly ages in a
+/// Maximum time (s) between two readings that counts for the random walk of the resistance. A cell hardly ages in a
 /// gap.
 const MAX_WALK_S: f64 = 600.0;
 
@@ -37,8 +37,8 @@ impl<const L: usize> BranchStep<L> {
         Self { r_ohm, tau_s, decay, exact }
     }
 
-    /// Voltage of a branch that starts at `u`. With the present current, a new cell's branch would settle at `r_ohm` x
-    /// `drive`.
+    /// Voltage, after the measured time, of a branch that starts at the voltage `u`. With the present current, a new
+    /// cell's branch would settle at `r_ohm` x `drive`.
     #[inline(always)]
     fn voltage_v(&self, drive: Lanes<L>, u: Lanes<L>) -> Lanes<L> {
         self.r_ohm * drive * (Lanes::splat(1.0) - self.decay) + u * self.decay

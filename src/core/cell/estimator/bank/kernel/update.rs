@@ -1,8 +1,8 @@
 //! Updates the state with a measured voltage.
 //!
-//! In: a state and the reading, V. Out: the updated state, the innovation, V, its variance, V^2, and the test ratio.
-//! The test ratio is 1 for an innovation of one standard deviation. One mask marks the usable lanes, another one the
-//! lanes within the gate.
+//! In: a state and the reading (V). Out: the updated state, the innovation (V), the variance of the innovation (V^2),
+//! and the test ratio. The test ratio is 1 for an innovation of one standard deviation. One mask marks the usable
+//! lanes, another one the lanes within the gate.
 
 use super::points::{COLUMNS, OddEvenParts, PartialCholesky, ResistanceRatios};
 use super::types::{
@@ -159,7 +159,7 @@ pub(in crate::cell::estimator::bank) fn update<const L: usize, const N: usize, c
         variance = variance + weighed(x, i, others);
     }
 
-    // Measurement noise, deviation 4.
+    // Measurement noise: deviation 4 in the documentation of `estimator`.
     let load_v = predicted.settled_ohm * ratio * x.memory[LOAD_A];
     let model = predicted.base_variance + predicted.lost_v.square() * c.reading.drop + load_v.square() * c.reading.load;
     let own_variance = variance + (model / information_s + c.reading.sensor);

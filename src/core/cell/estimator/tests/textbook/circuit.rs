@@ -42,8 +42,8 @@ pub(super) fn predict<const N: usize>(
     Ok(())
 }
 
-/// Predicts the state after `dt_s`, s, with the circuit's equations. `charge_as` is the charge moved, A s; `offset_s`
-/// is the time in which this charge contains the current sensor's offset, s. Adds the noise of the branches and of the
+/// Predicts the state after `dt_s` with the circuit's equations. `charge_as` is the charge moved, A s; `offset_s` is
+/// the time in which this charge contains the current sensor's offset, s. Adds the noise of the branches and of the
 /// resistance; the caller adds the noise of the SOC.
 fn propagate<const N: usize>(
     x: &mut Gaussian<N>,

@@ -11,11 +11,11 @@ use crate::cell::estimator::state_vector::{
 use crate::cell::{CellModel, ERROR_WINDOW_S, EstimatorConfig, GridPosition, SensorErrors, TemperaturePosition};
 use crate::filter::ScalarGaussian;
 
-/// Maximum time between two readings, s, that counts for the random walk of the resistance. A cell hardly ages in a
+/// Maximum time (s) between two readings that counts for the random walk of the resistance. A cell hardly ages in a
 /// gap.
 const MAX_WALK_S: f64 = 600.0;
 
-/// Covariance that the random walks gain in `dt_s`, s. The noise of the capacity is added at transitions.
+/// Covariance that the random walks gain in `dt_s`. The noise of the capacity is added at transitions.
 pub(super) fn process<const N: usize>(
     model: &CellModel,
     config: &EstimatorConfig,

@@ -1,7 +1,7 @@
 //! Unscented Kalman filter with additive noise and a scalar measurement.
 //!
-//! State x of N numbers with covariance P. The sigma points are x and x +/- sqrt(N + lambda) L_i. L_i is column i of
-//! the lower Cholesky factor of P, and lambda = alpha^2 (N + kappa) - N. The weights are those of Wan and van der Merwe
+//! The state x has N numbers and the covariance P. The sigma points are x and x +/- sqrt(N + lambda) L_i. L_i is column
+//! i of the lower Cholesky factor of P, and lambda = alpha^2 (N + kappa) - N. The weights follow Wan and van der Merwe
 //! (2000), equations 15. A prediction passes every point through f and takes the mean and covariance of the images,
 //! plus Q. An update **redraws** the points from the predicted mean and covariance and passes them through h. (Some
 //! packages reuse the propagated points; this changes the SOC by up to 3e-4 on drive data.)
