@@ -31,7 +31,7 @@ pub enum IsoTpFault {
     /// The requester refused the message by flow control (buffer overflow, reserved state).
     Refused,
     /// The frame states an impossible length: 0, beyond the end of a single frame, or so small that the message needs
-    /// no first frame.
+    /// no first frame. A first frame that is not full also has this fault.
     WrongLength,
     /// The message is longer than [`MAX_MESSAGE`].
     TooLong,

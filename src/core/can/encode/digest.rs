@@ -96,7 +96,7 @@ impl DigestPlan {
         database.message(name)?;
         let rules = RULES.map(|rule| format!("Rule_{rule}"));
         let rules: Vec<&str> = rules.iter().map(String::as_str).collect();
-        // Signals on page 0. The rules and the threshold are on separate pages.
+        // The signals of page 0 and of the rules are required. The signals of the threshold are optional.
         let required = [&["Page", "Raised", "Worst", "TableChecksum", "PassTime"][..], &rules].concat();
         let message = OutputMessage::new(database, name, &required, faults)?.with_places(&rules);
         let factors = RULES.map(|rule| alarm.per_inside_unit(&format!("Threshold_{rule}")));

@@ -203,7 +203,7 @@ impl LayoutSettings {
 #[error("{}: {what}", .message.message())]
 pub struct SettingFault {
     pub message: LayoutMessage,
-    /// Key of the setting: `id`, `fd`, `brs`, `e2e`, `data_id`, `secoc`.
+    /// Key of the setting: `fd`, `brs`, `e2e`, `data_id`, `secoc`.
     pub key: &'static str,
     /// The fault: what was found and what is allowed.
     pub what: String,

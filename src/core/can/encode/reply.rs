@@ -36,7 +36,7 @@ pub enum CommandRefusal {
     /// The freshness was used before, is older than the previous announcement, or was not announced yet.
     OldFreshness = 9,
     /// The frame is authentic, but many forged frames were received. If the sender repeats the command with another
-    /// freshness, it is executed.
+    /// freshness, the command is executed.
     RepeatNeeded = 10,
 }
 
@@ -52,7 +52,7 @@ impl CommandRefusal {
         }
     }
 
-    /// Whether the frame's checksum or authenticator was correct.
+    /// Whether the frame's checksum, or its authenticator and freshness, were correct.
     pub const fn is_intact(self) -> bool {
         !matches!(self, Self::WrongChecksum | Self::NotAuthentic | Self::OldFreshness)
     }

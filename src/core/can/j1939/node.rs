@@ -28,7 +28,7 @@ use crate::quantity::Timestamp;
 
 /// Period of DM1, ns (J1939-73).
 const DM1_PERIOD_NS: i64 = 1_000_000_000;
-/// Maximum number of pending responses. A fifth response would be sent more than 200 ms after its request, when the
+/// Maximum number of pending responses. A fifth response could be sent more than 200 ms after its request, when the
 /// requester has given up (J1939-21).
 const MAX_WAITING_ANSWERS: usize = 4;
 

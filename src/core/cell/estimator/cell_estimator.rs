@@ -325,9 +325,9 @@ impl CellEstimator {
         self.filter.as_ref().map_or(0.0, |x| by_curve(x.by_constant[(CAPACITY, CURVE_CAPACITY)]))
     }
 
-    /// Replaces the capacity estimate and the capacity of the open-circuit curve by `capacity`. Called only at
-    /// transitions between charge and discharge. The state is corrected as if the new curve had been used since the
-    /// last call.
+    /// Replaces the capacity estimate and the capacity of the open-circuit curve by `capacity`. Called at the end of a
+    /// half-cycle and when the learned capacity is replaced or doubted. The state is corrected as if the new curve had
+    /// been used since the last call.
     ///
     /// The variance of the filter does not fall, because the evidence since the last call may have had too much weight.
     pub fn restate_capacity(&mut self, capacity: ScalarGaussian) {

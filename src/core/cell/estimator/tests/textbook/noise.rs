@@ -15,7 +15,7 @@ use crate::filter::ScalarGaussian;
 /// gap.
 const MAX_WALK_S: f64 = 600.0;
 
-/// Covariance that the random walks gain in `dt_s`. The noise of the capacity is added at transitions.
+/// Covariance that the random walks gain in `dt_s`. The noise of the capacity is added at the end of half-cycles.
 pub(super) fn process<const N: usize>(
     model: &CellModel,
     config: &EstimatorConfig,
