@@ -1,8 +1,9 @@
 //! Sends diagnostic requests to controllers, and stops when they could disturb the vehicle or another tester.
 //!
 //! In: frames, responses, the state of the car, the supply voltage and the time. Out: request and flow control frames,
-//! and a [`PollChange`] each time polling stops or starts. At most one request is outstanding at a time. Polling stops
-//! while another tester is active, while the bus sleeps, while the supply voltage is low or unknown, and on standby.
+//! and a [`PollChange`] each time polling stops or starts, or a controller permanently rejects a request. At most one
+//! request is outstanding at a time. Polling stops while another tester is active, while the bus sleeps, while the
+//! supply voltage is low or unknown, and on standby.
 //!
 //! Only requests of a [`Service`](super::uds::Service) can be sent: the types cannot express a write, a session or a
 //! routine. The module is pure: it uses no clock and no socket.
@@ -392,7 +393,7 @@ impl Poller {
     }
 
     /// Index of the request to send now. If request `index` asks for voltages, the request for the current is sent
-    /// first.
+    /// first, unless it was sent last, fails or was refused.
     fn with_current_before(&self, index: usize) -> usize {
         let wanted = &self.config.requests[index];
         if !wanted.has_voltages || wanted.has_current {

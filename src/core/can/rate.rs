@@ -1,4 +1,4 @@
-//! Detects a second sender of an unprotected input message by comparing the frame rate with the message's cycle time.
+//! Detects a second sender of an unprotected input message by comparing the frame rate with the expected rate.
 //!
 //! In: the time and identifier of each frame, and the battery current that the frame reports; between frames, the time
 //! ([`SecondSenders::poll`]). Out: a [`SenderChange`] when a second sender is found, and when the second sender is

@@ -12,7 +12,7 @@
 //! | profile | freshness sent | authenticator sent | both, bytes | guesses until one succeeds, on average |
 //! | --- | --- | --- | --- | --- |
 //! | 1 | 8 bit | 24 bit | 4 | 1.7 x 10^7 |
-//! | 3 | 4 bit | 28 bit | 4 | 2.7 x 10^8 for each freshness value that the receiver tries |
+//! | 3 | 4 bit | 28 bit | 4 | 2.7 x 10^8 for one freshness value; the receiver may try two |
 //! | fd | 32 bit | 64 bit | 12 | 1.8 x 10^19 |
 //! | announcement | 36 bit | 28 bit | 8 | 2.7 x 10^8 |
 //!

@@ -5,11 +5,12 @@
 //! Outside the range of capacities in the table, they are constant; below SOC 0 and above SOC 1, they continue
 //! linearly.
 //!
-//! # One curve per capacity The capacity alone does not show how much lithium and how much active material was lost.
-//! Assumption: if the cell has lost a fraction x of its capacity, each electrode has lost the fraction
-//! [`MATERIAL_SHARE`] x of its active material. The rest of the lost capacity is explained by lost lithium. The
-//! uncertain share of each electrode is called a mix. [`OffsetLine::mixes_v`] is the change of the offset if the share
-//! of one electrode is higher by [`MATERIAL_SHARE_STD`].
+//! # One curve per capacity
+//! The capacity alone does not show how much lithium and how much active material was lost. Assumption: if the cell has
+//! lost a fraction x of its capacity, each electrode has lost the fraction [`MATERIAL_SHARE`] x of its active material.
+//! The rest of the lost capacity is explained by lost lithium. The uncertain share of each electrode is called a mix.
+//! [`OffsetLine::mixes_v`] is the change of the offset if the share of one electrode is higher by
+//! [`MATERIAL_SHARE_STD`].
 
 use super::electrodes::{Electrodes, LostMaterial};
 use crate::filter::locate;
@@ -196,7 +197,7 @@ impl AgedOcv {
     }
 
     /// Sets the standard deviation of the shift, initially [`SHIFT_STD`]. Does nothing if the ageing follows from
-    /// electrodes.
+    /// electrodes, or after [`Self::add_spread`].
     pub fn set_shift_std(&mut self, std: f64) {
         if self.is_shift {
             self.mixes_v[0].iter_mut().flatten().for_each(|mix_v| *mix_v *= std / SHIFT_STD);

@@ -6,8 +6,8 @@
 //! measured cells can be used to test it.
 //!
 //! * Open-circuit voltage: mean and covariance over cells built from published half-cell potentials ([`curve`]).
-//! * Resistances: proportional to 1 / capacity, for every chemistry. Medians and deviations come from five fitted cells
-//!   of 2.9 to 280 Ah ([`RESISTANCE`]); [`arrhenius`](super::arrhenius) gives other temperatures.
+//! * Resistances: proportional to 1 / capacity, for every chemistry. Geometric means and deviations come from five
+//!   fitted cells of 2.9 to 280 Ah ([`RESISTANCE`]); [`arrhenius`](super::arrhenius) gives other temperatures.
 
 pub mod curve;
 
@@ -278,7 +278,7 @@ impl Label {
         let mut aged_ocv = curve
             .electrodes
             .and_then(|electrodes| AgedOcv::of_electrodes(&electrodes, &SOC, capacity_ah, &rows))
-            // The electrodes of this cell are not in the library.
+            // Used if the positive electrode is a blend, or if the electrodes give no curve for an aged cell.
             .unwrap_or_else(|| AgedOcv::of_shift(0.5, &SOC, capacity_ah, &rows));
         aged_ocv.add_spread(&curve.modes_v);
         let table = |j: usize| {

@@ -225,7 +225,8 @@ impl EstimatorBank {
         each_array!(&self.filters, x => x.blocks[block].memory[MEAN_NIS].0[lane])
     }
 
-    /// Whether this cell's SOC, resistance and capacity are plausible for a cell of the model.
+    /// Whether this cell's SOC, resistance and capacity are plausible for a cell of the model. True before the first
+    /// voltage.
     #[inline]
     pub fn is_plausible(&self, cell: usize) -> bool {
         let (block, lane) = (cell / WIDTH, cell % WIDTH);

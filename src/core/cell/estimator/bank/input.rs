@@ -1,6 +1,7 @@
 //! Inputs of the cells of a block, and the results of their steps.
 //!
-//! In: steps, lane by lane (V, A, s, degrees C). Out: the kernel's inputs, or the original step if the outcome is not usable.
+//! In: steps, lane by lane (V, A, s, degrees C). Out: the kernel's inputs, and the original step for outcomes that are
+//! not usable.
 
 use super::kernel::{DecayFactors, StepInput, StepOutcome};
 use crate::cell::estimator::memory::Memory;

@@ -61,7 +61,7 @@ pub(super) fn step<const L: usize, const N: usize, const T: usize, const W: usiz
     (x, outcome)
 }
 
-/// Evidence about the current's offset and the slowest branch.
+/// Indices of the evidence about the current's offset and the slowest branch.
 pub(super) const EVIDENCE: [usize; 4] = [OFFSET_INFORMATION, OFFSET_SCORE, SLOW_INFORMATION, SLOW_SCORE];
 
 /// Whether a state and the sum of `others` are finite, and all variances positive.
