@@ -8,7 +8,7 @@
 //! | active | stay | stay | count towards the end | suppressed | mark | refuse |
 //! | clearing | active | active | count towards the end | suppressed | mark | refuse |
 //! | suppressed | active | active | count towards the end | hold | mark | refuse |
-//! | latched | count towards active | stay | stay | hold | mark | rest |
+//! | latched | count towards active | stay | stay | hold | mark | inactive; unknown if the value is; refuse while counting |
 //! | cleared | count towards active | stay | stay | unknown | inactive | inactive, forget |
 //!
 //! * A name of a state: enter this state.

@@ -29,6 +29,7 @@ impl Selector {
 pub struct CommandOutcome {
     /// Number of changed alarms.
     pub changed: u32,
-    /// Number of alarms that could not be cleared, because they are raised and their value is unhealthy or unknown.
+    /// Number of alarms that could not be cleared, because they are raised and their value is unhealthy, unknown, or
+    /// not healthy for long enough.
     pub refused: u32,
 }

@@ -4,10 +4,10 @@
 //! tables, units, cycle times, frame formats and end-to-end protection. Multiplexing is resolved to conditions on raw
 //! selector codes. [`Database::to_dbc`] writes a database as text, and parsing this text gives an equal database.
 //!
-//! The parser returns a [`DbcError`] with the line in four cases: the file is not a DBC, an identifier is out of range,
-//! a name is defined twice, or multiplexing cannot be resolved. It accepts a signal that extends beyond its message;
-//! decoding this signal gives [`Fault::ShortFrame`](crate::quantity::Fault::ShortFrame). It also accepts an invalid
-//! layout, which [`SignalLayout::plan`] rejects.
+//! The parser returns a [`DbcError`] with the line in four cases: the file is not a DBC, a number is out of range or
+//! not finite, a name is defined twice, or multiplexing cannot be resolved. It accepts a signal that extends beyond its
+//! message; decoding this signal gives [`Fault::ShortFrame`](crate::quantity::Fault::ShortFrame). It also accepts an
+//! invalid layout, which [`SignalLayout::plan`] rejects.
 
 use std::collections::{HashMap, HashSet};
 

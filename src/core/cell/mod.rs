@@ -1,7 +1,7 @@
 //! One cell: circuit, thermal model and the filter that estimates its state.
 //!
 //! In: a checked cell model, settings and one [`CellStep`] per voltage reading (V, A with positive = discharge, s,
-//! degrees C). Out: SOC, resistance ratio, capacity (Ah) and branch voltages (V), each with its standard deviation.
+//! degrees C). Out: SOC, resistance ratio and capacity (Ah), each with its standard deviation, and branch voltages (V).
 //! Readings beyond the gate (outliers) do not change an estimate.
 
 pub mod aged_ocv;

@@ -26,8 +26,8 @@ pub(super) fn now() -> Timestamp {
     Timestamp::from_nanos(Reading::now().realtime_ns)
 }
 
-/// Starts reading the stream next to the status socket at `path`. Errors name the status socket, as the options `--status` and
-/// `--socket` do.
+/// Starts reading the stream socket next to the status socket at `path`. Errors name the status socket, as the options
+/// `--status` and `--socket` do.
 pub(super) fn start(path: PathBuf) -> mpsc::Receiver<FeedUpdate> {
     // One update is drawn while the next is read.
     let (updates, received) = mpsc::channel(1);

@@ -294,9 +294,9 @@ impl EstimatorBank {
         result
     }
 
-    /// Evidence about the current sensor's offset since the last correction: (sum of d^2 / R, sum of d x innovation / R).
-    /// d is the effect of one standard deviation of the offset on an innovation, and R the variance of the innovation.
-    /// The sums are averaged over the cells, because the models of the cells have common errors.
+    /// Evidence about the current sensor's offset since the last correction: sum of d^2 / R, and sum of d x innovation
+    /// / R. d is the effect of one standard deviation of the offset on an innovation, and R the variance of the
+    /// innovation. The sums are averaged over the cells, because the models of the cells have common errors.
     pub fn offset_evidence(&self) -> (f64, f64) {
         let cells = self.cells.len();
         let mean = |i: usize| {

@@ -32,7 +32,8 @@ pub struct AdoptedState {
     pub capacity: ScalarGaussian,
     /// ln of the resistance relative to the model.
     pub log_resistance: f64,
-    /// Current through first-order filters with the time constants of the branches, A; `None` = the branches have relaxed.
+    /// Current after first-order filters with the time constants of the branches, A; `None` = the branches have
+    /// relaxed.
     pub filtered_a: Option<[f64; MAX_BRANCHES]>,
 }
 

@@ -1,7 +1,7 @@
 //! The estimators of a pack whose modules may have different cells: one [`EstimatorBank`] per kind of cell.
 //!
-//! In: one [`CellStep`] per cell and batch, by the cell's index in the pack. Out: results and estimates per cell, as from a bank.
-//! All kinds share the current sensor, so its offset is learned for the whole pack.
+//! In: one [`CellStep`] per cell and batch, by the cell's index in the pack. Out: results and estimates per cell, like
+//! an [`EstimatorBank`]. All kinds share the current sensor, so its offset is learned for the whole pack.
 
 use super::bank::EstimatorBank;
 use super::cell_estimator::CellEstimator;

@@ -114,7 +114,8 @@ mod tests {
     fn evidence_corrects_ratio_once() {
         let mut slow = SlowBranch { information: 0.25, score: -0.25, ..SlowBranch::default() };
         let correction = slow.correct(0.4).expect("evidence");
-        // Evidence for one deviation with a quarter of the prior's information moves the ratio by a fifth of a deviation.
+        // If the evidence for a change by one standard deviation has a quarter of the prior's information, the ratio
+        // moves by a fifth of a standard deviation.
         assert!((correction.deviations + 0.2).abs() < 1e-12, "{correction:?}");
         assert!((correction.remains - 0.8_f64.sqrt()).abs() < 1e-12 && correction.widened == 1.0, "{correction:?}");
         assert!((slow.ratio - 0.92).abs() < 1e-12, "{slow:?}");

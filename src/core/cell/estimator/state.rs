@@ -43,10 +43,10 @@ impl CellEstimator {
         CellState { mean, covariance, by_constant, memory: self.memory }
     }
 
-    /// Restores a stored state. `None` if the stored state has a different number of branches.
+    /// Restores a stored state. `None` if the stored state has a different number of branches or inconsistent lengths.
     ///
-    /// A covariance that rounding has made inconsistent loses its correlations and keeps its variances. A filter with an impossible
-    /// SOC is discarded and starts from the next voltage.
+    /// If rounding has made a covariance inconsistent, the covariance loses its correlations and keeps its variances. A
+    /// filter with an impossible SOC is discarded and starts from the next voltage.
     pub fn restore(state: &CellState, branches: usize) -> Option<Self> {
         let filter = match (state.mean.len(), branches) {
             (0, _) => None,
@@ -59,7 +59,7 @@ impl CellEstimator {
 }
 
 impl CellState {
-    /// Checks that a filter can continue from its numbers.
+    /// Checks that a filter can continue from the stored numbers.
     ///
     /// # Errors
     /// The first number that is out of range.

@@ -39,7 +39,7 @@ pub struct Update {
 /// Outcome of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StepResult {
-    /// The measurement update; `None` without a known current.
+    /// The measurement update; `None` without a known current, or if the step could not be computed.
     pub update: Option<Update>,
     /// Whether the filter was restarted from the voltage.
     pub reset: bool,

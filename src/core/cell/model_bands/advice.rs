@@ -85,7 +85,7 @@ pub fn advise(bands: &ModelBands<'_>) -> Option<(f64, Vec<Advice>)> {
 /// Present knowledge about a model: covariances over the grid of use and the possible measurements.
 #[derive(Clone)]
 struct Belief {
-    /// Slope of the curve at [`USE_SOC`], V per unit of SOC, and at [`REST_SOC`].
+    /// Slope of the curve, V per unit of SOC: `slope_v` at [`USE_SOC`], `rest_slope_v` at [`REST_SOC`].
     slope_v: Vec<f64>,
     rest_slope_v: Vec<f64>,
     /// Covariance of the curve, V^2, over [`USE_SOC`] and then [`REST_SOC`].

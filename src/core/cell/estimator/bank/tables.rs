@@ -16,7 +16,8 @@ use crate::filter::simd::Lanes;
 
 /// Index of the open-circuit voltage, V, in a row. The slope of every quantity (per unit of SOC) follows its value.
 pub(super) const OCV_V: usize = 0;
-/// Index of the voltage's change with the capacity, V per Ah; 0 if the curve does not age. The changes by the mixes of losses follow.
+/// Index of the change of the open-circuit voltage with the capacity, V per Ah; the change is 0 if the curve does not
+/// age. The changes by the mixes of losses follow.
 pub(super) const OCV_PER_AH: usize = 2;
 /// Index of the series resistance, ohm.
 pub(super) const R0_OHM: usize = OCV_PER_AH + 2 + 2 * MIXES;

@@ -1,7 +1,7 @@
 //! Sigma points in pairs: columns of the Cholesky factor, and odd and even parts of a function over each pair.
 //!
-//! In: covariances. Out: columns, resistance ratios, odd and even parts (see [`super`]), in the units of the states. NaN if the
-//! covariance has no factor.
+//! In: covariances. Out: columns, resistance ratios, odd and even parts (see [`super`]), in the units of the states.
+//! All results are NaN if the covariance has no factor.
 
 use super::types::{KernelConstants, at};
 use crate::cell::estimator::state_vector::LOG_RESISTANCE;

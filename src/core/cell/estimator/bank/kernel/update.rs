@@ -1,8 +1,8 @@
 //! Updates the state with a measured voltage.
 //!
 //! In: a state and the reading (V). Out: the updated state, the innovation (V), the variance of the innovation (V^2),
-//! and the test ratio. The test ratio is 1 for an innovation of one standard deviation. One mask marks the usable
-//! lanes, another one the lanes within the gate.
+//! and the test ratio. The test ratio is 1 for an innovation of one standard deviation of the gate. One mask marks the
+//! usable lanes, another one the lanes within the gate.
 
 use super::points::{COLUMNS, OddEvenParts, PartialCholesky, ResistanceRatios};
 use super::types::{
