@@ -43,7 +43,7 @@ const MAX_CYCLES: u32 = 14;
 const LIVE_SAMPLES: u64 = 400;
 /// Bus time at the start of the demo (Unix time, as in a log).
 const START: Timestamp = Timestamp::from_nanos(1_700_000_000_000_000_000);
-/// Longest gap between frames, s, that does not count as sleep. The demo has no longer gap.
+/// Longest gap between frames (s) that does not count as sleep. All gaps of the demo are shorter.
 const SLEEP_GAP_S: f64 = 30.0;
 
 /// Arguments of `demo`.

@@ -1,4 +1,5 @@
-//! Alarms as table rows. An alarm shared by many cells is one row with a count, the list of cells and the worst value.
+//! Converts alarms to table rows. If many cells have the same alarm, they share one row with their number, the list of
+//! cells and the worst value.
 
 use crate::alarm::{Alarm, Direction, Rule, Unit};
 use crate::quantity::CellIndex;

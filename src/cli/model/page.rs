@@ -80,7 +80,7 @@ struct ResistanceRow {
     settled: Vec<SettledResistance>,
     /// Series resistance at half charge, ohm.
     r0_ohm: f64,
-    /// Resistance, ohm, and time constant, s, of each branch at half charge.
+    /// Resistance (ohm) and time constant (s) of each branch at half charge.
     branches: Vec<BranchPart>,
     known_by: KnownBy,
 }

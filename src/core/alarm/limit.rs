@@ -46,8 +46,8 @@ pub struct RuleConfig {
     pub clear: f64,
     /// What is compared with the threshold.
     pub when: Comparison,
-    /// Time, s, for which the value must be beyond the threshold before the alarm is raised, and healthy before the
-    /// alarm clears.
+    /// Time (s) that the value must be beyond the threshold before the alarm is raised, and healthy before the alarm
+    /// clears.
     pub debounce_s: f64,
     /// Number of new values needed before the alarm is raised or cleared, at least 1.
     pub debounce_events: u32,
@@ -62,8 +62,8 @@ pub struct Observation {
     pub value: Option<f64>,
     /// Standard deviation of the value, in the same unit; `None` = unknown.
     pub std: Option<f64>,
-    /// Whether the value is the worst of several sources, some of which are unknown. The true value may then be worse,
-    /// but not better. Such a value can be beyond a threshold, but not healthy.
+    /// Whether the value is the worst of several sources, and at least one source is unknown. The true value may then
+    /// be worse, but not better. Such a value can be beyond a threshold, but not healthy.
     pub is_bound: bool,
     /// Whether the value is a new measurement. Only new measurements count towards `debounce_events`.
     pub is_new: bool,

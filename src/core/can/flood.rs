@@ -65,7 +65,7 @@ pub struct FloodProgress {
 struct LeakyBucket {
     bus: BusIndex,
     id: CanId,
-    /// Time, ns, that the frames of the largest admitted burst take at the allowed rate.
+    /// Time (ns) that the frames of the largest admitted burst take at the allowed rate.
     burst_ns: i64,
     /// Time up to which the allowed rate is spent.
     spent_until: Option<Timestamp>,

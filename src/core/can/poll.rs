@@ -429,7 +429,7 @@ impl Poller {
     /// Extends the wait for the response, up to a limit.
     fn extend_wait(&mut self, now: Timestamp, by_ns: i64) {
         if let Some(outstanding) = &mut self.progress.outstanding {
-            // Maximum total wait, ns, because a gateway may respond "pending" forever.
+            // Maximum total wait (ns), because a gateway may respond "pending" forever.
             outstanding.deadline = now.plus_nanos(by_ns).min(outstanding.sent.plus_nanos(30_000_000_000));
         }
     }

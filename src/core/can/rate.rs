@@ -77,7 +77,7 @@ pub struct MessageRate {
     learned_per_s: Option<f64>,
     /// Fraction of the frames that usually follow a short interval.
     usual_short: f64,
-    /// Smoothed rate, 1/s, and the number of consecutive windows in which it was steady.
+    /// Smoothed rate (1/s), and the number of consecutive windows with this rate.
     candidate: f64,
     steady: u32,
     /// Consecutive windows with too many frames, and consecutive normal windows.
@@ -109,7 +109,7 @@ pub struct SecondSenders {
 }
 
 impl SecondSenders {
-    /// Creates the detector for messages, each with its cycle time, s, if known.
+    /// Creates the detector for messages, each with its cycle time (s) if known.
     pub fn new(messages: impl IntoIterator<Item = (BusIndex, CanId, Option<f64>)>) -> Self {
         let mut messages: Vec<_> = messages.into_iter().collect();
         messages.sort_by_key(|(bus, id, _)| (*bus, *id));

@@ -406,7 +406,7 @@ impl Listener {
         let head = answer.question.answer_head();
         link.counts.read = link.counts.read.saturating_add(1);
         let is_asked = link.asked.is_some_and(|(asked, at)| {
-            // Longest time, ns, from request to response. It is the longest P2* of ISO 14229-2.
+            // Longest time (ns) from request to response: the longest P2* of ISO 14229-2.
             asked.starts_with(&head) && now.nanos().saturating_sub(at.nanos()) <= 5_000_000_000
         });
         link.counts.unasked = link.counts.unasked.saturating_add(u64::from(!is_asked));

@@ -107,7 +107,7 @@ pub struct LithiumLoss {
 
 impl AgedOcv {
     /// Ageing that follows from the electrodes of the new cell. `None` if they give no curve down to [`LEAST_KNOWN`].
-    /// `rows` contains the new cell's open-circuit voltages, V; one row per temperature.
+    /// `rows` contains the new cell's open-circuit voltages (V), one row per temperature.
     pub fn of_electrodes(
         electrodes: &Electrodes,
         soc: &[f64],
@@ -148,9 +148,9 @@ impl AgedOcv {
         Some(table)
     }
 
-    /// Ageing that follows from a shift: OCV(s + a s (1 - s)) with a = shift (1 - C / C_new). The offsets are computed
-    /// for the middle row of `rows`, the new cell's open-circuit voltages, V, with one row per temperature. With shift
-    /// 1, the top of the curve keeps its ampere-hours; with shift 0, the curve shrinks evenly.
+    /// Ageing that follows from a shift: OCV(s + a s (1 - s)) with a = shift (1 - C / C_new). `rows` contains the new
+    /// cell's open-circuit voltages (V), one row per temperature. The offsets are computed for the middle row. With
+    /// shift 1, the top of the curve keeps its ampere-hours; with shift 0, the curve shrinks evenly.
     pub fn of_shift(shift: f64, soc: &[f64], new_capacity_ah: f64, rows: &[Vec<f64>]) -> Self {
         let mut table = Self { law: AgeingLaw::Shift(shift), ..Self::default() };
         let middle_v = &rows[rows.len() / 2];

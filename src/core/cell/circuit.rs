@@ -41,7 +41,7 @@ impl BranchAt {
     }
 }
 
-/// Terminal voltage under `current_a`, V, with the open-circuit curve of a new cell. `branches_v` is the sum of the
+/// Terminal voltage (V) under `current_a`, with the open-circuit curve of a new cell. `branches_v` is the sum of the
 /// branch voltages.
 pub fn terminal_v(
     model: &CellModel,
@@ -53,7 +53,7 @@ pub fn terminal_v(
     model.ocv_v(position) - branches_v - model.r0_ohm(position) * resistance_ratio * current_a
 }
 
-/// Terminal voltage of an aged cell under `current_a`, V. `state` = (SOC, resistance ratio, capacity in Ah);
+/// Terminal voltage (V) of an aged cell under `current_a`. `state` = (SOC, resistance ratio, capacity in Ah);
 /// `branches_v` is the sum of the branch voltages.
 pub fn aged_terminal_v(
     model: &CellModel,

@@ -69,7 +69,7 @@ pub struct InitialState {
     pub capacity_ah: f64,
     /// Standard deviation of the initial capacity, Ah.
     pub capacity_std_ah: f64,
-    /// Capacity, Ah, that selects the open-circuit curve of the aged cell until the first half-cycle has ended.
+    /// Capacity (Ah) that selects the open-circuit curve of the aged cell until the first half-cycle has ended.
     pub curve: ScalarGaussian,
     /// Standard deviation of the initial ln(resistance relative to new).
     pub log_resistance_std: f64,
@@ -108,7 +108,7 @@ pub struct GapSettings {
 /// Error of a voltage reading against the cell model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct VoltageError {
-    /// White sensor noise of a voltage reading, V, per sample.
+    /// White sensor noise of one voltage reading, V.
     pub noise_v: f64,
     /// Slow model error: standard deviation of its average over one second, V. It is used if the cell model states no
     /// error.
@@ -130,12 +130,12 @@ pub struct VoltageError {
 pub struct SensorErrors {
     /// Offset of a cell's voltage, V. It includes a constant error of the model's open-circuit curve.
     pub voltage_offset_v: f64,
-    /// Remaining uncertainty of the current sensor's offset per cell, A, after learning.
+    /// Uncertainty (A) of the current sensor's offset per cell that remains after learning.
     pub current_offset_a: f64,
     /// Gain error of the current, fraction.
     pub current_gain: f64,
-    /// Remaining uncertainty of the resistance of the model's slowest branch after learning, fraction. It is in
-    /// addition to the common error of all resistances.
+    /// Uncertainty (fraction) of the resistance of the model's slowest branch that remains after learning, in addition
+    /// to the common error of all resistances.
     pub slow_branch: f64,
 }
 

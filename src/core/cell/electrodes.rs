@@ -79,7 +79,7 @@ impl PositiveMaterial {
         }
     }
 
-    /// Potential against lithium, V, at a lithium content. Outside the valid contents, returns the potential at the
+    /// Potential against lithium (V) at a lithium content. Outside the valid contents, returns the potential at the
     /// nearest valid content.
     pub fn potential_v(self, y: f64) -> f64 {
         use libm::{exp, pow, tanh};
@@ -141,7 +141,7 @@ impl NegativeMaterial {
         (Self::McmbRamadass, "mcmb_ramadass"),
     ];
 
-    /// Potential against lithium, V, at a lithium content. Outside the range limited by [`EDGE`], returns the potential
+    /// Potential against lithium (V) at a lithium content. Outside the range limited by [`EDGE`], returns the potential
     /// at the edge.
     pub fn potential_v(self, x: f64) -> f64 {
         use libm::{exp, tanh};
@@ -292,7 +292,7 @@ impl Electrodes {
 }
 
 impl AgedElectrodes {
-    /// Voltage at a lithium content of the negative electrode, V, rising with the content.
+    /// Voltage (V) at a lithium content of the negative electrode. It rises with the content.
     fn voltage_at(&self, x: f64) -> f64 {
         let y = (self.lithium - self.negative_capacity * x) / self.positive_capacity;
         self.electrodes.positive.potential_v(y) - self.electrodes.negative.potential_v(x)

@@ -242,7 +242,7 @@ fn identifiers_and_channels_are_unique_and_sorted() {
     assert_eq!(map().channels(), all);
 }
 
-/// Signals of every type and position. A message has several signals, some of which are multiplexed.
+/// Signals of every type and position. Each message has several signals, and some signals are multiplexed.
 fn any_bindings() -> impl Strategy<Value = Vec<Binding>> {
     let order = prop::sample::select(vec![ByteOrder::LittleEndian, ByteOrder::BigEndian]);
     let kind = prop_oneof![

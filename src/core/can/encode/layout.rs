@@ -29,7 +29,7 @@ use crate::can::{CanId, FrameKind};
 /// these names.
 pub(super) const HEADER_SIGNALS: [&str; 5] = ["E2eCrc", "E2eCounter", "E2eDataIdNibble", "SecOCFreshness", "SecOCMac"];
 
-/// Length, bytes, of a built-in message whose signals were moved for profile 5. It is the next FD length above 8.
+/// Length (bytes) of a built-in message whose signals were moved for profile 5. It is the next FD length above 8.
 const MOVED_LEN_BYTES: u16 = 12;
 
 /// Number of repetitions of a changed alarm after its first frame. If one in ten frames is lost, all four frames of a

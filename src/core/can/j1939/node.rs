@@ -239,7 +239,7 @@ impl Node {
             PendingAnswer::Refusal { .. } => true,
         });
         let Some(answer) = ready.and_then(|index| self.answers.remove(index)) else { return };
-        // Shortest time, ns, between two responses to requests. A flood of requests therefore causes at most 20 frames
+        // Shortest time (ns) between two responses to requests. A flood of requests therefore causes at most 20 frames
         // a second.
         self.next_answer_at = now.plus_nanos(50_000_000);
         match answer {

@@ -352,7 +352,7 @@ impl EstimatorBank {
     }
 }
 
-/// Minimum and maximum plausible capacity, Ah, from the model's capacity and the configured capacity.
+/// Minimum and maximum plausible capacity (Ah), from the model's capacity and the configured capacity.
 fn plausible_ah(model: &CellModel, config: &EstimatorConfig) -> (f64, f64) {
     let (model_ah, initial_ah) = (model.capacity_ah, config.initial.capacity_ah);
     (bounds::TRUSTED_CAPACITY.low * model_ah.min(initial_ah), bounds::TRUSTED_CAPACITY.high * model_ah.max(initial_ah))

@@ -377,7 +377,7 @@ impl CellEstimator {
     }
 }
 
-/// Predicts the temperature of a cell without a sensor value, degrees C, from the last known temperature.
+/// Predicts the temperature (degrees C) of a cell without a sensor value from the last known temperature.
 pub(super) fn thermal_c(model: &CellModel, last_c: Option<f64>, soc: f64, log_resistance: f64, step: &CellStep) -> f64 {
     let (Some(last_c), Some(thermal)) = (last_c, &model.thermal) else { return last_c.unwrap_or(step.ambient_c) };
     let mean_current_a = if step.measured_s > 0.0 { step.charge_as / step.measured_s } else { 0.0 };

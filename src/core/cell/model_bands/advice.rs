@@ -88,9 +88,9 @@ struct Belief {
     /// Slope of the curve, V per unit of SOC: `slope_v` at [`USE_SOC`], `rest_slope_v` at [`REST_SOC`].
     slope_v: Vec<f64>,
     rest_slope_v: Vec<f64>,
-    /// Covariance of the curve, V^2, over [`USE_SOC`] and then [`REST_SOC`].
+    /// Covariance (V^2) of the curve over [`USE_SOC`] and then [`REST_SOC`].
     curve: Vec<Vec<f64>>,
-    /// Voltage drop of a usual load, V, by temperature of [`USE_C`] and SOC of [`USE_SOC`].
+    /// Voltage drop (V) of a usual load, by temperature of [`USE_C`] and SOC of [`USE_SOC`].
     drop_v: Vec<Vec<f64>>,
     /// Covariance of ln(resistance) between temperatures of [`USE_C`], at each SOC of [`USE_SOC`].
     resistance: Vec<Vec<Vec<f64>>>,

@@ -147,7 +147,7 @@ impl Bench {
         self.messages.push(Message { ms: self.now_ms, pgn, data });
     }
 
-    /// Time at which each message of a group was complete, ms, and its codes.
+    /// For each message of a group: the time at which the message was complete (ms), and its codes.
     fn received(&self, pgn: u32) -> Vec<(i64, Vec<u32>)> {
         self.messages.iter().filter(|m| m.pgn == pgn).map(|m| (m.ms, m.codes())).collect()
     }

@@ -46,7 +46,7 @@ macro_rules! each_array {
 }
 pub(super) use each_array;
 
-/// The last step time, s, with its decay factors. Most readings arrive at the same interval, so the factors can be
+/// The last step time (s) with its decay factors. Most readings arrive at the same interval, so the factors can be
 /// reused.
 #[derive(Debug, Clone)]
 struct StepTime {

@@ -96,7 +96,7 @@ fn is_possible<const L: usize, const N: usize, const T: usize>(x: &FilterState<L
     is_possible
 }
 
-/// Time at rest, s, after which further voltages add little information, because they only show relaxation that is
+/// Time at rest (s) after which further voltages add little information, because they only show relaxation that is
 /// slower than the branches.
 const REST_REPEATS_S: f64 = 1000.0;
 

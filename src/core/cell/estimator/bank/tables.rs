@@ -14,7 +14,7 @@ use crate::cell::aged_ocv::{MIXES, OffsetLine};
 use crate::cell::model::CellModel;
 use crate::filter::simd::Lanes;
 
-/// Index of the open-circuit voltage, V, in a row. The slope of every quantity (per unit of SOC) follows its value.
+/// Index of the open-circuit voltage (V) in a row. The slope of every quantity (per unit of SOC) follows its value.
 pub(super) const OCV_V: usize = 0;
 /// Index of the change of the open-circuit voltage with the capacity, V per Ah; the change is 0 if the curve does not
 /// age. The changes by the mixes of losses follow.
@@ -23,7 +23,7 @@ pub(super) const OCV_PER_AH: usize = 2;
 pub(super) const R0_OHM: usize = OCV_PER_AH + 2 + 2 * MIXES;
 /// Index of the voltage error, V; 0 if the model states no error.
 pub(super) const ERROR_V: usize = R0_OHM + 2;
-/// Index of the first branch's resistance, ohm; its time constant, s, follows, then the next branch.
+/// Index of the first branch's resistance (ohm). Its time constant (s) follows, then the next branch.
 const BRANCHES: usize = ERROR_V + 2;
 
 /// Number of temperatures with cached rows. It is larger than the number of sensors in a pack. The rows of further
@@ -297,7 +297,7 @@ impl<'a, const L: usize, const W: usize> TablePoint<'a, L, W> {
         Self { row: &lines.row, soc, inside: soc.at_least(0.0).at_most(1.0) }
     }
 
-    /// Open-circuit voltage, V, its slope, V per unit of SOC, and series resistance, ohm.
+    /// Open-circuit voltage (V), its slope (V per unit of SOC), and series resistance (ohm).
     #[inline(always)]
     pub(super) fn ocv_and_r0(&self) -> (Lanes<L>, Lanes<L>, Lanes<L>) {
         let slope_v = self.row[OCV_V + 1];
@@ -310,7 +310,7 @@ impl<'a, const L: usize, const W: usize> TablePoint<'a, L, W> {
         std::array::from_fn(|i| self.row[OCV_PER_AH + 2 * i] + self.row[OCV_PER_AH + 2 * i + 1] * self.soc)
     }
 
-    /// Resistance, ohm, and time constant, s, of a branch.
+    /// Resistance (ohm) and time constant (s) of a branch.
     #[inline(always)]
     pub(super) fn branch(&self, i: usize) -> (Lanes<L>, Lanes<L>) {
         (self.one(branch(i)), self.one(branch(i) + 2))

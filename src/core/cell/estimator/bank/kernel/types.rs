@@ -148,7 +148,7 @@ pub(in crate::cell::estimator::bank) struct ProcessVariances {
     pub(super) log_resistance_per_s: f64,
 }
 
-/// Variances of a voltage reading, V^2, and its gate.
+/// Variances (V^2) of a voltage reading, and the settings of its gate.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct ReadingVariances {
     pub(super) sensor: f64,

@@ -40,9 +40,9 @@ pub(super) struct VoltageReading {
     pub(super) load_a: f64,
     pub(super) temperature: TemperaturePosition,
     pub(super) information_s: f64,
-    /// Capacity that selects the open-circuit curve of the aged cell, Ah, as learned by the last half-cycle. A voltage
-    /// must not change the capacity through the shape of the curve, because errors of the model would be mistaken for
-    /// lost capacity.
+    /// Capacity (Ah) that selects the open-circuit curve of the aged cell, as learned up to the end of the last
+    /// half-cycle. A voltage must not change the capacity through the shape of the curve, because errors of the model
+    /// would be mistaken for lost capacity.
     pub(super) curve: ScalarGaussian,
     /// Resistance of the slowest branch relative to the model, in addition to the resistance ratio of the cell.
     pub(super) slow_ratio: f64,
