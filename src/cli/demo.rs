@@ -3,7 +3,8 @@
 //!
 //! A simulated cell loses 0.1 Ah per cycle. Its readings become frames of `config/measured.dbc`, which the core
 //! processes like live frames. A consumer that has only `config/packwatch.dbc` decodes the frames that the core sends.
-//! The exit code is 0 if a capacity alarm and a recharge-period alarm were raised, else 1.
+//! The exit code is 0 if a capacity alarm and a recharge-period alarm were raised and the DBC defines every sent frame,
+//! else 1.
 
 mod consumer;
 mod table;

@@ -1,4 +1,4 @@
-//! The receiving ECU. It decodes frames with the DBC alone.
+//! The ECU that receives the demo's frames. It decodes the frames with the DBC alone.
 
 use crate::alarm::Rule;
 use crate::can::Frame;

@@ -1,5 +1,5 @@
-//! The state of the view: the document, the page, the selected cell. It changes only by updates and keys, and does no
-//! I/O.
+//! The state of the live view (`packwatch status --watch`): the status document, the page, the selected cell. Updates,
+//! keys and the time change the state. This module does no I/O.
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};

@@ -1,4 +1,4 @@
-//! Draws the view: head, pack, selected page, keys.
+//! Draws the live view (`packwatch status --watch`): head, pack, selected page, keys.
 
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout, Rect};

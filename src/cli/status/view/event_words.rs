@@ -1,5 +1,5 @@
-//! Describes an event of the status document: names without underscores, values with unit and deviation, cells from 1,
-//! interfaces by name.
+//! Describes an event of the status document for the live view: names without underscores, values with unit and
+//! standard deviation, cells counted from 1, interfaces by name.
 
 use serde_json::{Map, Value};
 

@@ -1,4 +1,5 @@
-//! Reads the stream socket and reconnects after a failure. Output: updates for the view.
+//! Reads the daemon's stream socket and reconnects after a failure. Output: updates for the live view (`packwatch
+//! status --watch`).
 
 use std::io;
 use std::path::{Path, PathBuf};

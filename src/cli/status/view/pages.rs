@@ -1,4 +1,4 @@
-//! Draws the pages of the view.
+//! Draws the pages of the live view (`packwatch status --watch`).
 
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout, Rect};

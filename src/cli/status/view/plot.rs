@@ -1,4 +1,4 @@
-//! Draws bars and small plots with characters. All functions are pure.
+//! Draws bars and small plots with characters, for the live view. All functions are pure.
 
 /// Bars of one to eight eighths of a character's height.
 const EIGHTHS: [char; 8] = ['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];

@@ -1,4 +1,4 @@
-//! Events of the node, for the log.
+//! Events of the J1939 node, for the log.
 
 use serde::{Deserialize, Serialize};
 
