@@ -1,7 +1,7 @@
 //! Represents every input of an alarm engine as a value, so that another engine can replay the same inputs.
 //!
 //! In: values that the [`Monitor`](crate::monitor::Monitor) passes to its rules. Out: the changes that the
-//! corresponding methods of the engine give. The values do not depend on thresholds. Therefore an engine with other
+//! corresponding methods of the engine give. These values do not depend on thresholds. Therefore an engine with other
 //! thresholds gives the same changes as a monitor with those thresholds. Exception: for `input_missing`, the strictest
 //! threshold decides whether the monitor reports a silence to the engine at all.
 
@@ -22,8 +22,8 @@ pub enum AlarmInput {
         cell: Option<CellIndex>,
         observation: Observation,
     },
-    /// Whether the inputs of a learned value are valid now. While they are invalid, the value cannot be renewed and
-    /// changes no alarm. Ignored for rules whose value is not learned.
+    /// Whether the inputs of a learned value are valid now. While the inputs are invalid, the value cannot be renewed
+    /// and changes no alarm. Ignored for rules whose value is not learned.
     InputsValid {
         rule: Rule,
         /// The cell; `None` = the pack.

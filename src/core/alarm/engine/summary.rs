@@ -1,4 +1,5 @@
-//! Summarises thresholds and rules: counts, severities, and alarms by rotating index.
+//! Summarises thresholds and rules: counts and severities. Also selects thresholds and alarms by a counter (`turn`), so
+//! that all of them are sent one after the other.
 
 use super::{Alarm, AlarmEngine, Rule, Severity, ThresholdState};
 use crate::quantity::CellIndex;

@@ -1,4 +1,4 @@
-//! Tests with published vectors and with arbitrary payloads.
+//! Tests end-to-end protection with published vectors and with arbitrary payloads.
 
 #![allow(clippy::unwrap_used, reason = "tests may panic")]
 

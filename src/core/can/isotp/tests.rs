@@ -141,9 +141,9 @@ proptest! {
         prop_assert_eq!(receive(extension, &frames), (vec![message(length)], vec![]));
     }
 
-    /// One frame is lost, duplicated or out of order in its message. Every accepted message was sent, and every message
-    /// that arrived intact is accepted. (If the end of one message replaces the start of the next, the protocol itself
-    /// cannot detect a fault.)
+    /// One frame of a message is lost, duplicated or out of order. Every accepted message must have been sent, and
+    /// every message that arrives intact must be accepted. (If the end of one message replaces the start of the next,
+    /// the protocol itself cannot detect a fault.)
     #[test]
     fn damaged_messages_are_never_accepted(
         lengths in proptest::collection::vec(1_usize..80, 1..20), place in any::<proptest::sample::Index>(), kind in 0..3_u8

@@ -5,10 +5,10 @@
 //! byte 1      flashing of the same lamps: 11 = does not flash
 //! then, each  SPN 7..0 | SPN 15..8 | SPN 18..16 and FMI | occurrence count
 //! ```
-//! A message without codes has four zero bytes instead. A message with at most one code is padded with 0xFF to 8 bytes.
-//! SPN is the suspect parameter number, and FMI the failure mode identifier. The highest bit of an occurrence count is
-//! the conversion method. If it is set, the SPN has one of three older layouts, which cannot be distinguished.
-//! packwatch never sets it.
+//! A message without codes has four zero bytes instead of the codes. A message with at most one code is padded with
+//! 0xFF to 8 bytes. SPN is the suspect parameter number, and FMI the failure mode identifier. The highest bit of an
+//! occurrence count is the conversion method. If this bit is set, the SPN has one of three older layouts, which cannot
+//! be distinguished. packwatch never sets this bit.
 
 use serde::{Deserialize, Serialize};
 

@@ -27,7 +27,7 @@ fn request(identifier: u16, every_s: f64) -> PollRequest {
     PollRequest { question: question(identifier), every_s, has_current: false, has_voltages: false }
 }
 
-/// A poller in a moving car, whose bus carries a frame from another node every 100 ms while it is awake.
+/// A poller in a moving car. While the bus is awake, another node sends a frame every 100 ms.
 struct Bench {
     poller: Poller,
     out: PollOutputs,

@@ -1,4 +1,4 @@
-//! Tests with simulated senders: steady, jittering, faster, slower, doubled.
+//! Tests the detection of a second sender with simulated senders: steady, jittering, faster, slower, doubled.
 
 use super::*;
 

@@ -24,7 +24,7 @@ fn question(identifier: u16) -> Question {
     Question { controller: controller(None), service: Service::ByLocalIdentifier, identifier }
 }
 
-/// Consecutive cell voltages of 16 bits, in mV.
+/// A response with consecutive cell voltages of 16 bits, in mV.
 fn cells(identifier: u16, first: u16, count: u16) -> Answer {
     let layout = SignalLayout {
         start_bit: 7,

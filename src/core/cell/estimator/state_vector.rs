@@ -18,7 +18,7 @@ pub(super) const CAPACITY: usize = 2;
 /// Index of the first branch voltage in the state.
 pub(super) const BRANCHES: usize = 3;
 
-/// The SOC variance increased by `by`, but at most the variance of an unknown SOC.
+/// The SOC variance increased by `by`, but not above the variance of an unknown SOC.
 #[inline]
 pub(super) fn widened(variance: f64, by: f64) -> f64 {
     variance.max((variance + by).min(UNKNOWN_SOC_VARIANCE))
@@ -35,15 +35,15 @@ pub(super) const CONSTANT_ERRORS: usize = 7;
 /// Number of constant errors that the gain considers. They are the first ones in the order of the indices.
 pub(super) const CONSIDERED: usize = 4;
 
-/// Index of the voltage sensor's offset among the constant errors: measured minus true.
+/// Index of the voltage sensor's offset (measured minus true) among the constant errors.
 pub(super) const VOLTAGE_OFFSET: usize = 0;
-/// Index of the current sensor's offset: measured minus true.
+/// Index of the current sensor's offset (measured minus true).
 pub(super) const CURRENT_OFFSET: usize = 1;
-/// Index of the current sensor's gain error: measured over true, minus 1.
+/// Index of the current sensor's gain error (measured over true, minus 1).
 pub(super) const CURRENT_GAIN: usize = 2;
-/// Index of the error of the slowest branch's ratio ([`super::slow_branch`]): true minus estimated.
+/// Index of the error (true minus estimated) of the slowest branch's ratio ([`super::slow_branch`]).
 pub(super) const SLOW_BRANCH: usize = 3;
-/// Index of the error of the open-circuit curve's capacity: capacity of the curve minus true capacity.
+/// Index of the error of the open-circuit curve's capacity (capacity of the curve minus true capacity).
 pub(super) const CURVE_CAPACITY: usize = 4;
 /// Index of the first uncertain mix of losses.
 pub(super) const CURVE_MIXES: usize = 5;

@@ -105,7 +105,7 @@ fn mux_links() -> impl Strategy<Value = MuxLink> {
     (condition, any::<bool>())
 }
 
-/// Signals with their names and conditions. Nesting stays below the limit for a loop.
+/// Signals with their names and conditions. Nesting stays below the limit at which it counts as a loop.
 fn assemble(parts: Vec<(Signal, MuxLink)>) -> Vec<Signal> {
     let mut made: Vec<Signal> = Vec::new();
     for (number, (mut signal, (condition, is_multiplexor))) in parts.into_iter().enumerate() {

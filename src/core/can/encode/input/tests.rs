@@ -8,7 +8,7 @@ use proptest::prelude::*;
 
 type Values = Vec<(Channel, Option<f64>)>;
 
-/// The frames, and the number of values that they do not carry.
+/// Returns the frames that carry `values`, and the number of values that no frame carries.
 fn encode(map: &InputMap, values: &[(Channel, Option<f64>)]) -> (Vec<Frame>, usize) {
     let mut frames = Vec::new();
     let lost = InputEncoder::new(map).encode(values, &mut frames);

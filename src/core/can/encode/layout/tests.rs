@@ -278,7 +278,7 @@ fn authenticated_message_has_trailer_signals() {
         assert_eq!(lens, [24, 20, len_bytes, 8], "{profile:?}");
         let plan = CommandPlan::new(&made).unwrap();
         assert_eq!((plan.authentication(), plan.protection()), (command.secoc, None));
-        // The trailer signals are where the trailer is written.
+        // The trailer signals must be at the position at which the trailer is written.
         let command = made.message("PACKWATCH_Command").unwrap();
         let mut payload = vec![0; usize::from(len_bytes)];
         let authentication = Authentication { profile, data_id: 4 };

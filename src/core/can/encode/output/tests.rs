@@ -36,7 +36,7 @@ fn read(name: &str, frame: &Frame) -> (u64, Result<f64, Fault>) {
     (plan.raw(frame.data()).unwrap(), plan.decode(frame.data()))
 }
 
-/// Asserts that a signal decodes to a value within half a bit, in the DBC's unit.
+/// Asserts that a signal decodes to `wanted` (in the DBC's unit) within half of its resolution.
 fn assert_decodes(name: &str, frame: &Frame, wanted: f64) {
     let dbc = default_database().unwrap();
     let half = dbc.signal(&format!("PACKWATCH_{name}")).unwrap().1.layout.factor / 2.0 + 1e-9;

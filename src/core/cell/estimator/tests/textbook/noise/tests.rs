@@ -40,7 +40,7 @@ fn reading_variance_sums_its_parts() {
         .noise(&x, model, &config)
     };
     let at = |load_a: f64, current_a: f64, information_s: f64| of(&model, load_a, current_a, information_s);
-    // At 0 C and a SOC of 0.5: 60 + 20 mohm.
+    // At 0 degrees C and a SOC of 0.5, the series resistance is 60 mohm and the branch has 20 mohm.
     let (base, drop, load) = (0.15 * 0.15, square(0.3 * (0.06 * 2.0 + 0.05)), square(0.5 * 0.08 * 5.0));
     assert!(near(at(5.0, 2.0, 10.0).variance, (base + drop + load) / 10.0));
     assert!(near(at(0.0, 2.0, 1.0).variance, base + drop));
