@@ -2,11 +2,10 @@
 //! logs: the same inputs give the same outputs, byte for byte. No dependency of this crate does I/O. Keys for
 //! authenticated frames stay in the driver, which creates and checks authenticators and passes the results to the core.
 //!
-//! # Data path
-//! [`monitor::Monitor`] handles every record. Data flows in one direction. `monitor/message` defines the records that
-//! come in and the events, estimates and frames that go out; it does not depend on any stage. Each file in
-//! `monitor/stage` is one stage and does not depend on later stages. Only `monitor/stages.rs` knows their order.
-//! `monitor/lifecycle` restores, reconfigures and restarts them.
+//! # Data path [`monitor::Monitor`] handles every record. Data flows in one direction. `monitor/message` defines the
+//! records that come in and the events, estimates and frames that go out; it does not depend on any stage. Each file in
+//! `monitor/stage` is one stage and does not depend on later stages. Only `monitor/stages.rs` knows the order of the
+//! stages. `monitor/lifecycle` restores and reconfigures the stages.
 //!
 //! | stage | in → out | file | algorithms |
 //! | --- | --- | --- | --- |
@@ -29,16 +28,23 @@
 //! | a new field of a stored state | the stage's state, `monitor/snapshot.rs` |
 //! | what is restored when only the history survived | `monitor/lifecycle/relearn.rs` |
 //! | a setting that may change while running | `monitor/config.rs`, `monitor/lifecycle/reconfigure.rs` |
-//! | a field of a sent frame | `can/encode/output.rs`, `monitor/stages.rs` (its value); of the digest `can/encode/digest.rs`, `monitor/stage/sending/digest.rs`; of the reply `can/encode/reply.rs` |
+//! | a field of a sent frame | `can/encode/output.rs`, `monitor/stages.rs` (its value) |
+//! | a field of the digest | `can/encode/digest.rs`, `monitor/stage/sending/digest.rs` |
+//! | a field of the reply to a command | `can/encode/reply.rs` |
 //! | which alarm is sent when, and how often | `monitor/stage/sending/alarm_queue.rs` |
 //! | another end-to-end profile | `can/e2e.rs` |
-//! | authentication of frames; which commands are executed | `can/secoc.rs`; `monitor/stage/intake/command_gate.rs` |
+//! | authentication of frames | `can/secoc.rs` |
+//! | which commands are executed | `monitor/stage/intake/command_gate.rs` |
 //! | what is kept about packs that were exchanged | `monitor/stages/pack_memory.rs` |
-//! | a plausibility check of a signal; of the current against the voltages | `sample/signal.rs`; `sample/frozen.rs` |
+//! | a plausibility check of a signal | `sample/signal.rs` |
+//! | a plausibility check of the current against the voltages | `sample/frozen.rs` |
 //! | how a second sender of the same frame is detected | `can/rate.rs`, `can/own_frames.rs` |
 //! | a physical bound | `quantity/bounds.rs` |
-//! | how a cell ages, a half-cell potential | `cell/aged_ocv.rs`, `cell/electrodes.rs` |
-//! | which data the own model is fitted to; how it is fitted; when it is used | `cell/notebook.rs`; `cell/own_model/fit.rs`; `monitor/stage/modelling.rs` |
+//! | how a cell ages | `cell/aged_ocv.rs` |
+//! | a half-cell potential | `cell/electrodes.rs` |
+//! | which data the cells' own model is fitted to | `cell/notebook.rs` |
+//! | how the own model is fitted | `cell/own_model/fit.rs` |
+//! | when the own model is used | `monitor/stage/modelling.rs` |
 //! | a chemistry on the label | `cell/chemistry.rs` |
 //! | a kind of finding | `cell_faults/fault.rs` (kind, limit), `cell_faults/detector.rs` (detection) |
 //! | a cell's loss of lithium or active material | `cell/loss_modes.rs` |
@@ -46,7 +52,8 @@
 //! | the distance between two cell models | `cell/model_comparison.rs` |
 //! | detection of a model that belongs to another cell | `cell/model_check.rs` |
 //! | the cell's equations | `cell/circuit.rs`, `cell/estimator.rs`, `cell/estimator/bank/kernel.rs` |
-//! | a finding of the doctor; what values, names and bits say about a signal (also used by `discover`) | `wiring/judge/`; `wiring/evidence/` |
+//! | a finding of `doctor` | `wiring/judge/` |
+//! | what values, names and bits say about a signal (used by `doctor` and `discover`) | `wiring/evidence/` |
 //! | a scenario of the simulator | `sim/scenario.rs` |
 //!
 //! # Invariants

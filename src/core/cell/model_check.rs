@@ -2,7 +2,7 @@
 //!
 //! In: innovations (V) with their variances (V^2), SOC and the learned resistance, every 10 s of use. Out: after 10
 //! minutes of use, [`ModelCheck::mismatch`], which is above 1 if the model belongs to another cell. Readings without an
-//! update, after a gap or beyond the gate do not count as evidence.
+//! update, after a gap or outside the innovation gate do not count as evidence.
 //!
 //! A filter with a wrong model hides the error from its innovations, because it corrects first the resistance and then
 //! the SOC. Two kinds of evidence (witnesses) remain:
@@ -10,7 +10,7 @@
 //! * c^2 = g' (A + P^-1)^-1 g, the part of the innovations v that a constant a and a slope b over SOC explain (the
 //!   score test; Cox and Hinkley, Theoretical Statistics, 1974, section 9.3). A and g are the sums of `h h' / R` and `h
 //!   v / R` with h = (1, SOC - 0.5). R is the variance over the time that a reading represents. P contains the
-//!   variances of a and b in another chemistry.
+//!   variances that a and b have between chemistries.
 //!
 //! In the sum of the witnesses, each counts at most [`CORROBORATED`] times as much as the other. The reason is that
 //! other causes affect only one witness: an aged cell has a higher resistance but its voltages fit, and a local error
@@ -60,8 +60,9 @@ pub struct ModelCheck {
     before: f64,
 }
 
-/// Sums over the readings of a window, relative to their mean SOC. While the SOC hardly changes, sums relative to a
-/// fixed SOC would be differences of large numbers, and a checkpoint stores only six digits of a number.
+/// Sums over the readings of a window, relative to the mean SOC of the readings. While the SOC hardly changes, sums
+/// relative to a fixed SOC would give small differences of large numbers, and a checkpoint stores only six digits of a
+/// number.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(from = "[f64; 5]", into = "[f64; 5]")]
 struct VoltageSums {
@@ -88,7 +89,7 @@ impl From<VoltageSums> for [f64; 5] {
 }
 
 impl VoltageSums {
-    /// Adds an innovation, V, of this variance, V^2.
+    /// Adds an innovation (V) with its variance (V^2).
     fn add(&mut self, soc: f64, innovation: f64, variance: f64) {
         let weight = 1.0 / variance;
         let before = self.mean_soc;
@@ -192,14 +193,14 @@ impl ModelCheck {
     }
 
     /// Takes the evidence that is due for a cell of rated capacity `rated_ah`, Ah. `evidence` is `None` if the filter
-    /// has none.
+    /// cannot provide evidence.
     pub fn judge(&mut self, evidence: Option<ModelEvidence>, rated_ah: f64) {
         // One reading represents at most 90 s. Currents below C/50 do not show the resistance.
         let (elapsed_s, charge_as) = (self.since_s.min(90.0), self.since_as);
         let is_used = charge_as.abs() >= 0.02 * rated_ah * self.since_s;
         (self.since_s, self.since_as) = (0.0, 0.0);
         let Some(ModelEvidence { update, soc, log_resistance, log_resistance_std }) = evidence else { return };
-        // The variance of a reading belongs to the step before it.
+        // The filter's variance applies to one step. Scale it to the time that the reading represents.
         let variance = update.innovation_variance * (self.step_s / elapsed_s).min(1.0);
         let is_number = (update.innovation / variance).is_finite() && soc.is_finite() && log_resistance.is_finite();
         if !is_used || !update.accepted || !is_number {

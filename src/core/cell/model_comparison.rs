@@ -1,7 +1,8 @@
 //! Differences between two cell models: open-circuit curves in V, resistances as a fraction, and resulting SOC errors.
 //!
-//! In: two [`CellModel`]s. Out: values of the second model minus values of the first. Resistances are compared per
-//! rated capacity. The load of each cell is C/2 of its own rated capacity, so cells of different size can be compared.
+//! In: two [`CellModel`]s. Out: values of the second model minus values of the first. Resistances are multiplied by the
+//! rated capacity before they are compared. The load of each cell is C/2 of its own rated capacity, so cells of
+//! different size can be compared.
 
 use super::chemistry::USUAL_LOAD_PER_H;
 use super::model::CellModel;
@@ -9,7 +10,7 @@ use super::model_bands::CURVE_C;
 
 /// Number of SOC steps over the curve.
 const CURVE_STEPS: u32 = 100;
-/// Number of SOC steps for looking up a voltage under load. It is a multiple of the curve's number of steps.
+/// Number of SOC steps for looking up a voltage, at rest or under load. Must be a multiple of `CURVE_STEPS`.
 const READ_STEPS: u32 = 400;
 /// SOC range in which SOC errors count. Outside this range, curves are so steep that the SOC errors of any model are
 /// small.
@@ -38,9 +39,9 @@ pub struct Difference {
 pub struct AtTemperature {
     /// Temperature, degrees C.
     pub temperature_c: f64,
-    /// Series resistance per rated capacity, fraction.
+    /// Series resistance times rated capacity, fraction.
     pub series: Difference,
-    /// Resistance with all branches settled, per rated capacity, fraction.
+    /// Resistance with all branches settled, times rated capacity, fraction.
     pub settled: Difference,
     /// SOC read from a voltage under C/2, fraction.
     pub load_soc: Difference,
@@ -123,8 +124,8 @@ fn at_temperature(first: &CellModel, second: &CellModel, temperature_c: f64) -> 
     }
 }
 
-/// SOC that the second model reads from a voltage of the first model, minus the true SOC. The load is settled and
-/// stated relative to the rated capacity.
+/// SOC that the second model reads from a voltage of the first model, minus the true SOC. All branches are settled.
+/// `load_per_h` is the load current divided by the rated capacity.
 fn soc_difference(first: &CellModel, second: &CellModel, temperature_c: f64, load_per_h: f64) -> Difference {
     let drop_v = |model: &CellModel, soc: f64| {
         load_per_h * model.rated_capacity_ah * model.settled_ohm(&model.grid_position(soc, temperature_c))

@@ -7,8 +7,8 @@
 //! current. In addition to the voltage, a row contains all inputs of its prediction in linear form: the charge since
 //! the start of the stretch, the current, and the current after first-order filters with the time constants of the
 //! branches. Single rows can therefore be removed from a stretch. A mean hides current steps, so these are stored as
-//! the sums of a small regression. If the notebook is full, it removes the oldest row of the class with the most rows
-//! (class of SOC, temperature and direction) and thus keeps rare rows.
+//! the sums of a small regression. Rows are classified by SOC, temperature and direction of the current. If the
+//! notebook is full, it removes the oldest row of the class with the most rows and thus keeps rare rows.
 
 use serde::{Deserialize, Serialize};
 
@@ -28,7 +28,7 @@ const CLASS_SOC: f64 = 0.1;
 /// Maximum current that counts as rest, in units of the 1 C current.
 const REST_PER_H: f64 = 0.02;
 
-/// Filters of the current: one per branch of a label's model.
+/// Number of current filters: one per branch of a label's model.
 pub const FILTERS: usize = 3;
 
 /// The mean cell over a short time.
@@ -87,7 +87,7 @@ struct Readings {
     temperature_c: f64,
 }
 
-/// Sums over time of a row that is not complete.
+/// Sums over time for the row that is not yet complete.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct RowSums {
     seconds: f64,
@@ -140,7 +140,7 @@ pub struct Notebook {
     present: Option<Stretch>,
 }
 
-/// How readings become rows.
+/// Settings for turning readings into rows.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct NotebookConfig {
     /// Cells that report.
@@ -164,7 +164,7 @@ impl NotebookConfig {
 }
 
 impl Notebook {
-    /// The rows, grouped by stretch in their order.
+    /// The rows in chronological order.
     pub fn rows(&self) -> &[Row] {
         &self.rows
     }

@@ -15,7 +15,7 @@ use super::notebook::Row;
 use crate::filter::{ScalarGaussian, median};
 use crate::quantity::InvalidState;
 
-/// SOC breakpoints of a fitted model.
+/// Number of SOC breakpoints of a fitted model.
 pub const SOC_NODES: usize = 21;
 
 /// A fitted model.
@@ -56,7 +56,8 @@ impl OwnModel {
             log_resistance: 0.1,
             slow_branch: 0.2,
             capacity: self.capacity.std() / self.capacity.mean,
-            // An error of 10 % of the drop that persists for 100 s. It remains with any table of resistances.
+            // An error of 10 % of the voltage drop that persists for 100 s. This error remains even with fitted
+            // resistances.
             drop_sqrt_s: 1.0,
         };
         let mut model = label.model_of(self.capacity.mean, &curve, &self.factors, &self.drop_std, spread);
@@ -121,5 +122,5 @@ pub fn rows_cost(prior: &LabelPrior, own: Option<&OwnModel>, rows: &[Row]) -> Op
     fit::rows_cost(prior, own, rows)
 }
 
-/// SOC nodes of the resistance factors.
+/// Number of SOC nodes of the resistance factors.
 pub const FACTOR_NODES: usize = FACTOR_SOC.len();

@@ -1,5 +1,5 @@
-//! Detector for all cells of a pack. It adds samples to rows (sums over a few minutes), compares the cells once per row
-//! and derives findings from the comparison (`judge`).
+//! Detects faults of single cells in a pack. The detector adds samples to rows (sums over a few minutes), compares the
+//! cells once per row and derives findings from the comparison (`judge`).
 //!
 //! The assumed errors of a row are rounded values for a circuit model and a typical cell monitor. They were checked
 //! with a simulated pack of ten cells and with the simulator's other packs. No measured pack was used to choose them.
@@ -24,7 +24,7 @@ use balancing::Bleed;
 use judge::Population;
 
 /// Length of a row. A row ends when `ROW_SOC` of the capacity has moved, or after `ROW_S` seconds. During a long rest,
-/// it ends after `REST_PART` of the time at rest, because more samples add no information. With shorter rows, the
+/// the row ends after `REST_PART` of the time at rest, because more samples add no information. With shorter rows, the
 /// detector would find a bad contact sooner, but it would mistake an aged cell for a bad contact and miss exchanged
 /// channels.
 const ROW_SOC: f64 = 0.02;
@@ -32,18 +32,19 @@ const ROW_S: f64 = 300.0;
 const REST_PART: f64 = 0.5;
 /// Minimum number of cells for a comparison.
 pub(super) const LEAST_CELLS: usize = 3;
-/// Standard deviations of the errors of a row: of the voltage, V; of the voltage drop, fraction of the drop; of the SOC
-/// on the open-circuit curve, fraction.
+/// Standard deviations of the errors of a row: `ROW_V` of the voltage, V; `ROW_DROP` of the voltage drop, as a fraction
+/// of the drop; `ROW_CURVE` of the SOC on the open-circuit curve, fraction.
 const ROW_V: f64 = 0.002;
 const ROW_DROP: f64 = 0.03;
 const ROW_CURVE: f64 = 0.001;
-/// Additional errors of a cell per unit of SOC difference from the mean cell: of the open-circuit curve, V, and of the
-/// voltage drop, fraction. `MOST_ELSEWHERE` limits the ratio between the model's resistances at the two SOC values.
+/// Additional errors of a cell per unit of SOC difference from the mean cell: `FAR_V` of the open-circuit curve, V;
+/// `FAR_DROP` of the voltage drop, fraction. `MOST_ELSEWHERE` limits the ratio between the model's resistances at the
+/// two SOC values.
 const FAR_V: f64 = 0.05;
 const FAR_DROP: f64 = 1.0;
 const MOST_ELSEWHERE: f64 = 3.0;
-/// Standard deviations for a resistance measured from current steps: of the resistance, fraction, and of the voltage of
-/// one step, V.
+/// Standard deviations for a resistance measured from current steps: `STEP_PART` of the resistance, fraction; `STEP_V`
+/// of the voltage of one step, V.
 const STEP_PART: f64 = 0.05;
 const STEP_V: f64 = 0.003;
 /// Minimum sum of squared current steps; with a smaller sum, no resistance is measured. Unit: square of the 1 C
@@ -53,7 +54,7 @@ const LEAST_STEPS: f64 = 0.02;
 /// fraction, the counted charge is used.
 const SOC_JUMP: f64 = 0.02;
 const DAY_S: f64 = 86_400.0;
-/// Number of fault kinds up to `TemperatureSensor`. They include all kinds that apply to single cells.
+/// Number of fault kinds up to and including `TemperatureSensor`. All kinds that apply to single cells are among them.
 const CELL_KINDS: usize = CellFaultKind::TemperatureSensor as usize;
 
 /// Estimates of the mean cell at one time.
@@ -128,7 +129,7 @@ impl WatchedCell {
 pub struct CellFaultDetector {
     cells: Vec<WatchedCell>,
     pack: PackSums,
-    /// The last row: the time of its middle, its SOC and its charge, Ah.
+    /// The last row: time of the row's middle, SOC and charge, Ah.
     last_row: Option<(Timestamp, f64, f64)>,
     /// Duration of the present rest, s.
     rest_s: f64,
@@ -353,8 +354,8 @@ impl CellFaultDetector {
         let Some((last, last_soc, last_ah)) = self.last_row.replace((time, row.soc, row.charge_ah)) else { return };
         let counted = (last_ah - row.charge_ah) / row.capacity_ah;
         let estimated = row.soc - last_soc;
-        // If the estimated SOC jumped, the filter has converged without any charge being moved: use the counted charge
-        // instead.
+        // If the estimated SOC jumped, the filter has corrected its estimate although no charge has moved. Use the
+        // counted charge instead.
         let change = if (estimated - counted).abs() < SOC_JUMP { estimated } else { counted };
         let days = (time.since(last) / DAY_S).max(0.0);
         self.cells.iter_mut().for_each(|cell| cell.difference.pass(days, change));

@@ -40,8 +40,8 @@ const PAIRS: usize = STATES * (STATES + 1) / 2;
 
 /// Standard deviations before the first row. The value for the voltage channel is typical of cell monitors.
 const FIRST_STD: [f64; STATES] = [0.05, 0.1, 0.2, 0.5, 0.005, 0.05];
-/// Growth of the standard deviations per day. `MOVED_STD` is the growth of the SOC's standard deviation per unit of SOC
-/// moved.
+/// Random walk of the states: standard deviations gained within one day. `MOVED_STD` is the standard deviation of the
+/// SOC gained in a row, per unit of SOC moved.
 const DAILY_STD: [f64; STATES] = [1e-4, 3e-4, 5e-3, 5e-3, 3e-4, 1e-4];
 const MOVED_STD: f64 = 5e-4;
 /// Standard deviations added after a sudden change of a single cell: its contact or its channel has changed, or the
@@ -52,7 +52,7 @@ const REPLACED_STD: [f64; STATES] = [0.05, 0.1, 0.3, 0.1, 0.005, 0.01];
 /// Standard deviations added if only the resistance has changed suddenly. Resistance grows by ageing over weeks, so the
 /// cause must be the contact.
 const RESISTANCE_STD: [f64; STATES] = [0.0, 0.0, 0.01, 0.5, 0.0, 0.0];
-/// Standard deviation of the charge that a cell loses because a BMS may bleed it, fraction of the capacity per day.
+/// If a BMS may bleed a cell: standard deviation of the charge that the cell loses, fraction of the capacity per day.
 /// After a time without rows, the loss may be larger; `open_charge` handles this case. With 0.01 per day, the detector
 /// would miss exchanged channels and modules.
 const BLED_PER_DAY: f64 = 0.002;

@@ -13,21 +13,21 @@ use crate::quantity::{CellIndex, Timestamp};
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
 pub enum CellFaultKind {
-    /// The cell loses more charge than the other cells; fraction of its capacity per day.
+    /// The cell loses more charge than the other cells. Size: fraction of its capacity per day.
     Leak = 1,
-    /// The contact resistance of the cell is higher than that of the other cells; fraction of the cell's series
+    /// The contact resistance of the cell is higher than in the other cells. Size: fraction of the cell's series
     /// resistance.
     Contact = 2,
-    /// The cell's capacity is lower than that of the other cells; fraction.
+    /// The cell's capacity is lower than the other cells' capacity. Size: fraction.
     WeakCell = 3,
-    /// The cell's resistance is higher than that of the other cells, as in an aged cell; fraction.
+    /// The cell's resistance is higher than the other cells' resistance, as in an aged cell. Size: fraction.
     HighResistance = 4,
-    /// The cell's capacity is higher than that of the other cells, because the cell was replaced; fraction.
+    /// The cell's capacity is higher than the other cells' capacity, because the cell was replaced. Size: fraction.
     ForeignCell = 5,
-    /// Neighbouring cells have changed suddenly, because a module was replaced. The size is the mean change of their
+    /// Neighbouring cells have changed suddenly, because a module was replaced. Size: mean change of these cells'
     /// capacity, fraction.
     Module = 6,
-    /// The cell's voltage channel has a constant offset, V.
+    /// The cell's voltage channel has a constant offset. Size: V.
     VoltageChannel = 7,
     /// The cell's voltage channel stays at one value. The size is 1.
     VoltageFrozen = 8,
@@ -35,13 +35,13 @@ pub enum CellFaultKind {
     DoubledChannels = 9,
     /// Two voltage channels have been exchanged. The size is 1.
     SwappedChannels = 10,
-    /// The current sensor has a constant offset; fraction of the rated capacity per hour.
+    /// The current sensor has a constant offset. Size: fraction of the rated capacity per hour.
     CurrentOffset = 11,
     /// The current reading stays at one value. The size is 1.
     CurrentFrozen = 12,
     /// The temperature sensor of these cells does not follow the load. The size is 1.
     TemperatureSensor = 13,
-    /// The gain of the current sensor has risen; fraction.
+    /// The gain of the current sensor has risen. Size: fraction.
     CurrentGain = 14,
 }
 
@@ -243,6 +243,6 @@ pub const GAIN: f64 = 0.02;
 pub(super) const REPORTED: f64 = 0.999;
 pub(super) const WITHDRAWN: f64 = 0.5;
 
-/// Minimum distance of a finding from the median of the pack, in robust standard deviations of the pack's cells. It
-/// accounts for the normal spread of healthy cells.
+/// Minimum distance of a finding from the median of the pack, in robust standard deviations of the pack's cells. This
+/// distance allows for the normal spread of healthy cells.
 pub(super) const OUTLIER: f64 = 3.5;

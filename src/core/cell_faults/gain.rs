@@ -18,7 +18,7 @@ const DAY_S: f64 = 86_400.0;
 /// Maximum time within which the resistances must fall, s. The estimated resistances follow within hours, so two
 /// consecutive daily checks may each see a part of the fall.
 const APART_S: f64 = 2.5 * DAY_S;
-/// Standard deviation of a change that is not caused by the gain, within these days, fraction.
+/// Standard deviation of changes with other causes than the gain, within `DAYS` days, fraction.
 const ERROR: f64 = 0.005;
 /// Maximum relative standard deviation of the capacities (median of the cells) on a day that is compared. Capacities
 /// that are still being learned change too much.
@@ -111,8 +111,8 @@ impl Gain {
     }
 }
 
-/// Rise of the gain between two days, fraction, if it still exists at `now`. It is the smaller of two values: the fall
-/// of the resistance and the rise of the capacity. `None` if the days cannot be compared.
+/// Rise of the gain between two days, fraction, if the rise still exists at `now`. The rise is the smaller of two
+/// values: the fall of the resistance and the rise of the capacity. `None` if the days cannot be compared.
 fn rise(before: &Day, after: &Day, now: &Day) -> Option<f64> {
     let is_near = |day: &Day| (day.temperature_c - before.temperature_c).abs() <= 5.0;
     let is_next = after.time.since(before.time) <= APART_S;

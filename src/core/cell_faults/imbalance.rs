@@ -31,7 +31,7 @@ use crate::cell::CellModel;
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Timestamp};
 
-/// From this standard deviation on, a cell's SOC or capacity counts as unknown. It is half of the standard deviation
+/// From this standard deviation on, a cell's SOC or capacity counts as unknown. This is half of the standard deviation
 /// before the first row.
 const UNKNOWN_SOC_STD: f64 = 0.025;
 const UNKNOWN_CAPACITY_STD: f64 = 0.05;
@@ -50,8 +50,8 @@ pub struct Imbalance {
     pub usable: ScalarGaussian,
     /// Charge that balancing would recover, fraction.
     pub lost_by_imbalance: ScalarGaussian,
-    /// Additional charge, fraction, that a balanced pack of mean cells would deliver compared with this pack after
-    /// balancing.
+    /// Charge that a balanced pack of mean cells would deliver, minus the charge that this pack would deliver after
+    /// balancing; fraction.
     pub lost_by_weakest: ScalarGaussian,
     /// The cell with the smallest capacity.
     pub weakest: CellIndex,
@@ -154,7 +154,7 @@ pub enum UnknownImbalance {
 }
 
 impl Imbalance {
-    /// Converts a fraction of the mean cell's capacity to Ah.
+    /// Converts a fraction of the cells' mean capacity to Ah.
     pub fn ah(&self, part: ScalarGaussian) -> ScalarGaussian {
         let mean = part.mean * self.mean_ah.mean;
         let variance = part.variance * self.mean_ah.mean * self.mean_ah.mean

@@ -6,8 +6,8 @@
 //! the detector is inactive.
 //!
 //! Terms: a *row* contains the sums of each cell's samples over a few minutes. The *mean cell* is an imaginary cell
-//! with the typical values of the pack. The *middle cell* is the real cell closest to the pack's median; its estimates
-//! are used as those of the mean cell. A cell is *bled* while a balancing resistor discharges it.
+//! with the typical values of the pack. The *middle cell* is the real cell closest to the pack's median; the mean cell
+//! gets its estimates from this cell. A cell is *bled* while a balancing resistor discharges it.
 //!
 //! | file | purpose |
 //! | --- | --- |

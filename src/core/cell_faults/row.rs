@@ -13,7 +13,7 @@ pub(super) struct CellSums {
     voltage_v: f64,
     /// Sum of the squared current steps between samples.
     steps_a2: f64,
-    /// Sum of current step times voltage step between samples.
+    /// Sum of the products of current step and voltage step between samples.
     steps_va: f64,
     /// Time, voltage and current of the previous sample.
     last: Option<(Timestamp, f64, f64)>,

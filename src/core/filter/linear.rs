@@ -2,7 +2,7 @@
 //!
 //! State x (any unit), variance P. Predict: P += Q. Update with the measurement z and its variance R: K = P / (P + R),
 //! x += K (z - x), P = (1 - K) P. Source: the paper's capacity filter (section 3.3.4), in which x is the capacity in Ah
-//! and each charge/discharge transition is a step. Inputs are not checked: a NaN gives a NaN.
+//! and each charge/discharge transition is a step. Inputs are not checked: a NaN as input gives a NaN as result.
 
 use serde::{Deserialize, Serialize};
 

@@ -1,9 +1,9 @@
 //! Arithmetic on L numbers at once, for filters that step several cells together.
 //!
 //! Every operation treats each lane separately, with a fixed order of IEEE 754 operations (no fused multiply-add, no
-//! library function). A lane therefore gives the same bits for every L, every content of the other lanes and every
-//! instruction width. The compiler vectorises the loops. NaN and infinities follow IEEE 754 unless a method states
-//! otherwise.
+//! library function). The result of a lane therefore has the same bits for every L, for any values in the other lanes
+//! and for every instruction width. The compiler vectorises the loops. NaN and infinities follow IEEE 754 unless a
+//! method states otherwise.
 
 use std::ops::{Add, BitAnd, Div, Mul, Neg, Not, Sub};
 
@@ -15,8 +15,8 @@ pub struct Lanes<const L: usize>(pub [f64; L]);
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Mask<const L: usize>([u64; L]);
 
-/// Array of the results of `lane` for each index. It is a plain loop, because the standard library's `from_fn` is not
-/// inlined into long callers; with `from_fn`, a replay of one cell takes 9 % longer.
+/// Calls `lane` for each index and returns the results. This is a plain loop, because the standard library's `from_fn`
+/// is not inlined into long callers; with `from_fn`, a replay of one cell takes 9 % longer.
 #[inline(always)]
 fn from_fn<T: Copy + Default, const L: usize>(mut lane: impl FnMut(usize) -> T) -> [T; L] {
     let mut lanes = [T::default(); L];
@@ -218,8 +218,8 @@ impl<const L: usize> Lanes<L> {
         )
     }
 
-    /// ln x for a normal, positive x. The error is at most two units in the last place of the result, or of 1e-3 if |ln
-    /// x| is smaller than 1e-3.
+    /// ln x for a normal, positive x. The error is at most two units in the last place of the result. If |ln x| is
+    /// below 1e-3, the error is at most two units in the last place of 1e-3.
     #[inline(always)]
     pub fn ln(self) -> Self {
         Self(from_fn(|i| ln(self.0[i])))

@@ -1,6 +1,6 @@
 //! Settings for learning at charge/discharge transitions. The `config` module checks their ranges.
 
-/// Classification of the current as charge, rest or discharge.
+/// Settings for classifying the current as charge, rest or discharge.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TransitionConfig {
     /// The pack rests while |pack current| is at most this, A.
@@ -87,8 +87,8 @@ pub struct UsableConfig {
     /// Voltage under load at which discharge ends, V.
     pub cutoff_v: f64,
     /// Charging current at the end of a full charge, per cell, A. A charge counts as full if the current falls to this
-    /// value at the model's highest voltage. The next usable capacity is then computed from the final SOC of that
-    /// charge. Before the first full charge, it is computed from SOC 1.
+    /// value at the model's highest voltage. The usable capacity is then computed from the final SOC of that charge.
+    /// Before the first full charge, the usable capacity is computed from SOC 1.
     pub taper_current_a: f64,
 }
 

@@ -5,9 +5,9 @@
 //! follows a random walk; the caller passes its variance.
 //!
 //! The cell model has errors that do not change with time (lasting errors, [`super::end_errors`]). The filter considers
-//! these errors but does not estimate them (Schmidt; Woodbury and Junkins 2010). In addition to the covariance P, it
-//! stores how much x changes per standard deviation of each lasting error. The lasting errors increase the published
-//! variance and reduce the gain, so they never average out.
+//! these errors but does not estimate them (Schmidt-Kalman filter; Woodbury and Junkins 2010). In addition to the
+//! covariance P, the filter stores how much the error of x changes per standard deviation of each lasting error. The
+//! lasting errors increase the published variance and reduce the gain, so they never average out.
 //!
 //! Assumed: all fade happens at the end of a charge. `check` checks the numbers of a stored filter; other inputs are
 //! not checked.

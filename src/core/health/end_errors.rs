@@ -1,8 +1,8 @@
 //! Errors of the cell model at the start and end of half-cycles. Two half-cycles between the same SOC values have the
 //! same errors, so averaging over many half-cycles does not remove these errors.
 //!
-//! In: SOC at the start and end of a half-cycle. Out: change of the capacity, Ah, that the half-cycle gives, per
-//! standard deviation of each error.
+//! In: SOC at the start and end of a half-cycle. Out: change of the half-cycle's capacity, Ah, per standard deviation
+//! of each error.
 //!
 //! A half-cycle's capacity is charge / (s_high - s_low). An error e (V) of the open-circuit curve at one end changes
 //! the SOC at this end by e / slope, and the capacity by (C / swing) (e / slope). The errors are defined at SOC nodes.

@@ -14,7 +14,7 @@
 //!   deviation w1 = `RATE_WALK` per square root of capacity lost (`KNEE_WALK` in the knee, see [`knee`]), the second
 //!   part w2 = `RATE_WALK_USE` per square root of an e-fold of use. Both parts are relative, so the same constants suit
 //!   cells that live for 50 cycles and for 5,000. In the linear filter, Q = (w1^2 rate dt + w2^2 ln(t1 / t0)) (rate^2 +
-//!   P_rate);
+//!   P_rate), with the use t0 before the step and t1 after the step;
 //! * recovery: capacity that returns during rest and is used up again (an Ornstein-Uhlenbeck process; measured cells
 //!   show 1 to 5 % after days of rest). Because successive readings share the recovery, ten readings within one cycle
 //!   do not count as ten independent readings;
@@ -22,18 +22,18 @@
 //!   is first - level.
 //!
 //! A reading is level + recovery + noise; outliers get less weight. The forecast integrates over the loss instead of
-//! over time: the use until the level has fallen by L is the integral of 1 / rate over the loss. This integral is a sum
-//! of lognormals. It is approximated by one lognormal with the same mean and variance (see [`distribution`]). The level
+//! over time: the use until the level has fallen by L is the integral of 1 / rate over the loss. This integral, a sum
+//! of lognormals, is approximated by one lognormal with the same mean and variance (see [`distribution`]). The level
 //! only falls, so it passes a threshold once; no first-passage times have to be sampled.
 //!
 //! Assumed: outside the knee, fade may slow down or speed up, so the median keeps the present rate. The knee is the
 //! range from 10 to 20 % of loss. There, fade accelerates in many cells: resistance and current per active area grow
 //! with the loss, and lithium plates. The forecast expects this acceleration before a reading shows it.
 //!
-//! Deviation: the expected acceleration increases the variance of the rate in the filter, but not its mean. Reason:
-//! otherwise, for cells without a knee (the NASA cells), the filter would overestimate the rate after each recovery.
-//! Effect: the filter's mean shows that a knee has begun only after readings show it. `tests/rul.md` lists the
-//! alternatives and figures.
+//! Deviation: the expected acceleration increases the variance of the rate in the filter, but not the rate's mean.
+//! Reason: otherwise, for cells without a knee (the NASA cells), the filter would overestimate the rate after each
+//! recovery. Effect: the filter's mean shows that a knee has begun only after readings show it. `tests/rul.md` lists
+//! the alternatives and figures.
 
 mod distribution;
 #[cfg(test)]
@@ -71,8 +71,8 @@ const DAY_S: f64 = 86_400.0;
 pub const MIN_READINGS: u32 = 3;
 /// Minimum loss for a forecast, in standard deviations of the loss.
 pub const MIN_FADE_DEVIATIONS: f64 = 1.0;
-/// Maximum ratio of the interval's upper end to the median. It does not apply if the upper end is below the use since
-/// the first reading.
+/// Maximum ratio of the interval's upper end to the median. This limit does not apply if the upper end is below the use
+/// since the first reading.
 pub const MAX_SPREAD: f64 = 10.0;
 /// Time constant of the average that gives the recent rate of use, days.
 const RECENT_DAYS: f64 = 30.0;
@@ -450,8 +450,8 @@ impl Forecast {
         1.0 - self.x[LEVEL]
     }
 
-    /// Quantile of the capacity after `ahead` units of use. It is the threshold that the level passes within this use
-    /// with the probability `quantile`.
+    /// Quantile of the capacity after `ahead` units of use: the threshold that the level passes within this use with
+    /// the probability `quantile`.
     fn capacity_ah(&self, ahead: f64, quantile: f64) -> f64 {
         let (level, std) = (self.x[LEVEL], self.level_variance().sqrt());
         let is_below = |threshold_ah: f64| self.crossing(threshold_ah).probability(ahead) < quantile;

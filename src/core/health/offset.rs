@@ -6,8 +6,8 @@
 //! sensor that sends them suppresses small currents.
 //!
 //! Source: Friedland (1969), separate estimation of a bias: the innovations of a filter that ignores the bias are used
-//! to estimate it. Deviation: here the filter considers the bias in its gain, and the correction is applied only when
-//! the mode changes.
+//! to estimate the bias. Deviation: here the filter considers the bias in its gain, and the correction is applied only
+//! when the mode changes.
 //!
 //! [`EstimatorBank::offset_evidence`]: crate::cell::EstimatorBank::offset_evidence
 

@@ -1,13 +1,13 @@
 //! Usable capacity: charge that a full cell delivers at a given current and temperature until its voltage under load
-//! falls to a cut-off voltage. It depends on the cell's capacity and resistance.
+//! falls to a cut-off voltage. The usable capacity depends on the cell's capacity and resistance.
 //!
 //! In: model, load, SOC when full, capacity (Ah) and resistance ratios. Out: Ah, with variance. If the voltage is below
 //! the cut-off from the start, the usable capacity is 0.
 //!
 //! The discharge is simulated with the circuit's equations at constant current until the voltage falls to the cut-off.
-//! It starts from the SOC after a full charge, with relaxed branches. The variance is propagated to first order from
-//! three quantities: the slow ratio (additional resistance ratio of the slowest branch), the capacity and ln rho (rho
-//! is the resistance ratio). Capacity and ln rho are correlated.
+//! The simulation starts from the SOC after a full charge, with relaxed branches. The variance is propagated to first
+//! order from three quantities: the slow ratio (additional resistance ratio of the slowest branch), the capacity and ln
+//! rho (rho is the resistance ratio). Capacity and ln rho are correlated.
 
 use super::UsableConfig;
 use crate::cell::circuit::{BranchAt, aged_terminal_v, soc_after};
@@ -65,8 +65,8 @@ pub fn usable_ah(
     step_ah * f64::from(MAX_STEPS)
 }
 
-/// Usable capacity, Ah, with its variance. `capacity` is the published estimate; its variance may be larger than that
-/// in the cell's filter.
+/// Usable capacity, Ah, with its variance. `capacity` is the published estimate; its variance may be larger than the
+/// capacity variance in the cell's filter.
 pub fn usable_capacity(
     model: &CellModel,
     config: &UsableConfig,

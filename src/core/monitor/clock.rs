@@ -1,5 +1,5 @@
-//! The monitor's clock, which follows the times of the inputs. It never runs backwards. It detects that the computer
-//! was asleep, and that the driver's clock was set back.
+//! The monitor's clock, which follows the times of the inputs and never runs backwards. The clock detects that the
+//! computer was asleep, or that the driver's clock was set back.
 //!
 //! In: the time of each input. Out: the time that the stages use, and a [`TimeJump`] if an input does not closely
 //! follow the previous input. An input that is late by at most [`MERGE_TOLERANCE_NS`] is counted and treated as if it
@@ -8,7 +8,7 @@
 use super::message::MERGE_TOLERANCE_NS;
 use crate::quantity::Timestamp;
 
-/// Longest time between inputs (including ticks) while the computer is awake, s: 500 ticks.
+/// Longest time between inputs (including ticks) while the computer is awake, s. This time contains 500 ticks.
 pub(crate) const ASLEEP_S: f64 = 5.0;
 const ASLEEP_NS: i64 = (ASLEEP_S * 1e9) as i64;
 

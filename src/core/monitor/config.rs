@@ -39,8 +39,7 @@ pub struct MonitorConfig {
     pub identity_readings: u32,
     /// Limits on the number of frames of one identifier.
     pub flood: FloodConfig,
-    /// Time, s. If no current flows and all inputs have been silent for longer than this, the buses count as asleep;
-    /// `None` = never.
+    /// Duration of silence on all inputs, s, after which the buses count as asleep if no current flows; `None` = never.
     pub asleep_after_s: Option<f64>,
     /// Settings of the sampling stage.
     pub sample: SampleConfig,
@@ -163,7 +162,7 @@ impl MonitorConfig {
         module.map_or(&self.model, |module| &module.model)
     }
 
-    /// Whether a cell is one of the pack's own kind, that is, not in a module of another kind.
+    /// Whether a cell is of the pack's own kind, that is, not in a module of another kind.
     pub fn is_own(&self, cell: CellIndex) -> bool {
         !self.modules.iter().any(|module| module.cells.contains(&cell))
     }
@@ -194,7 +193,7 @@ impl MonitorConfig {
     }
 
     /// Unprotected input messages with the cycle time of their frames, s, if known. For a multiplexed message, the
-    /// cycle time counts as unknown, because the stated cycle time may be the cycle time of each page.
+    /// cycle time counts as unknown, because the stated cycle time may apply to each page.
     pub(crate) fn unprotected(&self) -> impl Iterator<Item = (BusIndex, CanId, Option<f64>)> + '_ {
         let is_protected = |bus, id| self.guards.iter().any(|guard| (guard.bus, guard.id) == (bus, id));
         let cycle_s = |bus, id| self.cycle_times_s.iter().find(|of| (of.0, of.1) == (bus, id)).map(|of| of.2);

@@ -181,7 +181,7 @@ impl Snapshot {
         Ok(stored.stored_view(label))
     }
 
-    /// Whether the waiting samples belong to different cells of the snapshot, all of which have reported in the
+    /// Whether the waiting samples belong to different cells of the snapshot, and all these cells have reported in the
     /// unfinished batch.
     pub(crate) fn waiting_fits(&self) -> bool {
         let mut has_come: Vec<bool> = self.cells.iter().map(|cell| cell.updated_in_round).collect();

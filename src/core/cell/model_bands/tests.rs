@@ -1,5 +1,5 @@
-//! Tests the bands of two kinds of models: models from labels, and a model that states no error. Also tests the advice
-//! that is derived from the bands.
+//! Tests the uncertainty bands of models from labels and of a model that states no error. Also tests the advice on
+//! measurements that is derived from the bands.
 
 use super::*;
 use crate::cell::model::tests::small_model;
@@ -9,7 +9,7 @@ fn of_label(chemistry: Chemistry) -> CellModel {
     Label::usual(chemistry, 5.0).model().expect("a model")
 }
 
-/// Pairs of SOC and temperature, some of them beyond the tables.
+/// Pairs of SOC and temperature (degrees C), some outside the model's tables.
 fn places() -> impl Iterator<Item = (f64, f64)> {
     let of_soc = |k: u32| [-40.0, -10.0, 5.0, 25.0, 70.0].map(|t| (f64::from(k) / 40.0, t));
     (0..=40).flat_map(of_soc)
@@ -48,7 +48,7 @@ fn cold_error_counts_as_resistance_error() {
     let model = CellModel { voltage_error_v: Some(Table { values: errors }), ..small_model() };
     let bands = ModelBands::new(&model);
     assert!(bands.curve_std_v(0.5).is_some_and(|v| (v - 0.005).abs() < 1e-12));
-    // C/2 of 2 Ah through 0.08 ohm at 0 degrees C: 80 mV.
+    // At 0 degrees C, a load of C/2 (1 A) through 0.08 ohm drops 80 mV.
     let cold = bands.resistance(0.5, 0.0);
     assert!((cold.local - (0.03_f64.powi(2) - 0.005_f64.powi(2)).sqrt() / 0.08).abs() < 1e-12, "{cold:?}");
     let warm = bands.resistance(0.5, 40.0);

@@ -3,9 +3,9 @@
 //! In: a [`Label`] and rows (readings of the mean cell, averaged over a short time). Out: a [`Fit`]. For each capacity
 //! C of the grid, Gauss-Newton finds the most likely values of the other parameters (maximum a posteriori). These
 //! parameters are the open-circuit curve at the SOC breakpoints, the resistances relative to the label's model over SOC
-//! and by temperature, and the SOC s_k at which each stretch began: SOC = s_k - q / C after the charge q. The density
-//! of a capacity is the density of its best fit times the volume of the other parameters around this fit (Laplace). If
-//! the rows allow two capacities, the density has two maxima.
+//! and by temperature, and the SOC s_k at the start of each stretch (a period with a continuously measured current).
+//! After the charge q, SOC = s_k - q / C. The density of a capacity is the density of its best fit times the volume of
+//! the other parameters around this fit (Laplace). If the rows allow two capacities, the density has two maxima.
 //!
 //! # Errors of a row
 //! The errors of the circuit model repeat: rows at nearly the same SOC have the same errors of voltage, SOC and drop.
@@ -38,7 +38,7 @@ const DAMPING: Damping =
 const CAPACITY_STEP: f64 = 0.04;
 const CAPACITIES: usize = 20;
 const FIRST_CAPACITY: usize = 12;
-/// The search ends if the cost exceeds the lowest cost by more than this.
+/// In each direction, the search over the capacities ends if the cost exceeds the lowest cost by more than this.
 const HOPELESS: f64 = 25.0;
 /// Number of points per step of the capacity grid. The density is evaluated at these points.
 const FINE: usize = 20;
@@ -59,7 +59,7 @@ pub struct Fit {
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Beginning {
     stretch: u32,
-    /// SOC at the start and offset of the current sensor, A, with their covariance at the most likely capacity.
+    /// SOC at the start and offset of the current sensor, A, with their covariance at the fitted capacity.
     means: [f64; 2],
     covariance: [[f64; 2]; 2],
     /// Changes of SOC and offset with one standard deviation of the capacity.
@@ -97,7 +97,7 @@ struct Conditional {
     misfit: f64,
 }
 
-/// The fit of one label to rows.
+/// Search for the parameters that fit the model of one label to rows.
 struct Search<'a> {
     basis: Basis<'a>,
     prior: DMatrix<f64>,
@@ -204,7 +204,7 @@ impl<'a> Search<'a> {
         Some(Conditional { theta, normal: sums.normal, cost, misfit })
     }
 
-    /// The most likely capacity, Ah.
+    /// Mean and variance of the capacity's density, Ah. `None` if the capacity does not fit this label.
     fn capacity(&self, start: &DVector<f64>) -> Option<ScalarGaussian> {
         let at = |k: usize| self.rated_ah * (0.52 + CAPACITY_STEP * k as f64);
         let mut found: Vec<Option<f64>> = vec![None; CAPACITIES];
@@ -234,7 +234,7 @@ impl<'a> Search<'a> {
         let (mean, variance) = moments(&costs, least);
         let step_ah = CAPACITY_STEP * self.rated_ah;
         let capacity_ah = at(first) + step_ah * mean;
-        // Adds errors that the fit cannot detect, such as the gain and the offset of the current sensor.
+        // Add errors that the fit cannot detect, such as the gain and the offset of the current sensor.
         let std_ah = (1.4 * step_ah * variance.sqrt()).hypot(0.015 * capacity_ah);
         Some(ScalarGaussian::from_std(capacity_ah, std_ah))
     }

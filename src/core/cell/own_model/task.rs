@@ -30,7 +30,7 @@ pub struct FitFindings {
     /// The fit to all rows. `None` if there are too few rows, or if the fitted capacity is far from the label's
     /// capacity.
     pub fit: Option<Fit>,
-    /// The chemistry that explains the rows clearly better than the label's.
+    /// The chemistry that explains the rows clearly better than the label's chemistry, if any.
     pub chemistry: Option<Chemistry>,
 }
 
@@ -65,8 +65,8 @@ impl FitTask {
     fn better_chemistry(&self, prior: &LabelPrior, fitted: Option<&Fit>) -> Option<Chemistry> {
         let Self { label, rows, .. } = self;
         // The better chemistry must be 50 times more likely. The margin grows with a misfit above 0.45, which is the
-        // misfit on drives that a circuit describes. On the drives of four cells, NCA and NMC differ by 4 to 9; LFP
-        // differs from all others by hundreds.
+        // misfit on drives that a circuit describes. On the drives of four cells, the costs of NCA and NMC differ by 4
+        // to 9; the cost of LFP differs from all others by hundreds.
         let margin = 4.0 * fitted.map_or(1.0, |it| (it.misfit / 0.45).max(1.0));
         let fitted_ah = fitted.map(|it| it.own.capacity.mean);
         let capacities_ah: Vec<f64> = [label.rated_ah].into_iter().chain(fitted_ah).collect();

@@ -13,8 +13,7 @@ const BLEED_PART: f64 = 0.2;
 /// a cell only down to the level of the lowest cell.
 const MOST_BESIDE: f64 = 0.1;
 
-/// Correlated errors. While their cause lasts, they have the same sign, so the errors are added linearly, not as
-/// squares.
+/// Sum of errors that have the same sign while their cause lasts. Such errors are added linearly, not as squares.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct CorrelatedError {
@@ -40,7 +39,7 @@ impl CorrelatedError {
 #[serde(deny_unknown_fields)]
 pub(super) struct Bleed {
     pub(super) timer: BleedTimer,
-    /// SOC bled from this cell minus the SOC bled from the middle cells, while the BMS bleeds any of them.
+    /// SOC bled from this cell minus the SOC bled from the middle cells, while the BMS bleeds any of these cells.
     bled: CorrelatedError,
     /// Maximum SOC that may have been bled while it was unknown whether the cell was bled.
     unseen: CorrelatedError,
@@ -133,7 +132,7 @@ mod tests {
         Timestamp::from_secs(seconds)
     }
 
-    /// Three cells of 60 Ah. Each cell received a bit with the value 0 at time 0.
+    /// Three cells of 60 Ah. At time 0, a bit with the value 0 was received for each cell.
     fn diagnosis() -> CellFaultDetector {
         let mut diagnosis = CellFaultDetector::new(3);
         (0..3).for_each(|cell| diagnosis.handle_balancing(cell, at(0.0), Some(false), at(10.0)));

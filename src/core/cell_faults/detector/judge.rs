@@ -11,8 +11,7 @@ const SAME_MODULE_S: f64 = 3.0 * DAY_S;
 /// A size counts as known if its standard deviation is at most this many times the limit of its kind.
 const KNOWN_LIMITS: f64 = 2.0;
 
-/// If a cell's SOC differs from that of the other cells by this much or more, its resistance and channel cannot be
-/// judged.
+/// If a cell's SOC differs from the other cells' SOC by this much or more, its resistance and channel cannot be judged.
 const TOO_FAR: f64 = 0.1;
 const DAY_S: f64 = 86_400.0;
 
@@ -22,7 +21,7 @@ struct Judgement {
     kind: CellFaultKind,
     size: ScalarGaussian,
     probability: f64,
-    /// Whether the cell's SOC is close enough to that of the other cells to judge this kind of fault.
+    /// Whether the cell's SOC is close enough to the other cells' SOC to judge this kind of fault.
     is_comparable: bool,
 }
 
@@ -93,8 +92,8 @@ impl CellFaultDetector {
     }
 
     /// Size of each fault, per cell and kind, relative to the median of the pack and in the unit of the kind. `None` if
-    /// the size cannot be judged: the cell's SOC is too far from that of the other cells, its channel is faulty, or the
-    /// size is still too uncertain.
+    /// the size cannot be judged: the cell's SOC is too far from the other cells' SOC, the cell's channel is faulty, or
+    /// the size is still too uncertain.
     pub fn sizes<const N: usize>(&self, kinds: [CellFaultKind; N]) -> Vec<[Option<ScalarGaussian>; N]> {
         let populations = self.populations();
         (0..self.cells.len()).map(|cell| kinds.map(|kind| self.size(cell, kind, &populations))).collect()
@@ -180,7 +179,7 @@ impl CellFaultDetector {
             // A leak soon makes this cell the lowest cell, which can be judged. Until then, the leak does no harm.
             leak = (ScalarGaussian { mean: 0.0, variance: 0.0 }, 0.0);
         } else if !cell.bleed.timer.has_bits && cell.difference.mean()[SOC] >= populations[SOC].middle {
-            // The BMS bleeds a cell with more charge than the others until it matches them.
+            // If a cell has more charge than the others, the BMS bleeds this cell until the charges are equal.
             leak = (ScalarGaussian { mean: leak.0.mean.min(0.0), ..leak.0 }, 0.0);
         }
         // A leak explains a deviating voltage by a deviating charge. While a leak is likely, do not report an offset of
@@ -274,7 +273,8 @@ impl CellFaultDetector {
     }
 
     /// Joins neighbouring cells into a replaced module, if they have had more capacity than the other cells since about
-    /// the same time. `foreign`: per cell, its module finding or its certain finding of more capacity.
+    /// the same time. `foreign`: for each cell, the module finding that includes the cell, or a certain finding of more
+    /// capacity.
     fn find_modules(&mut self, time: Timestamp, foreign: &[Option<CellFault>]) {
         let is_same_event = |a: &Option<CellFault>, b: &Option<CellFault>| {
             a.zip(*b).is_some_and(|(a, b)| a.since.since(b.since).abs() <= SAME_MODULE_S)

@@ -1,4 +1,4 @@
-//! Tests of the detector with some cells that are not compared.
+//! Tests the cell fault detector with cells that are not compared.
 
 use super::*;
 

@@ -51,9 +51,9 @@ impl Monitor {
     /// snapshot was taken `downtime` before that time. The snapshot's timestamps are shifted to the clock of the
     /// present run, and the downtime counts as a gap.
     ///
-    /// [`Downtime::AsStamped`] means that the same clock continues. Frames, events and estimates are then, byte for
-    /// byte, those of a monitor that had not stopped. This does not apply if the downtime exceeds half a minute, or if
-    /// the state was stored [for a restart](Snapshot::for_restart).
+    /// [`Downtime::AsStamped`] means that the same clock continues. Frames, events and estimates are then equal, byte
+    /// for byte, to the outputs of a monitor that had not stopped. This does not apply if the downtime exceeds half a
+    /// minute, or if the state was stored [for a restart](Snapshot::for_restart).
     ///
     /// # Errors
     /// If the snapshot's version or shape does not fit, or a number in it is impossible. The monitor then uses nothing
@@ -191,7 +191,7 @@ impl Stages {
         estimation.bank.set_current_offset_std(learning.state.learner.current_offset().std_a(configured_a));
     }
 
-    /// Learned values of the connected pack, with its number.
+    /// Learned values of the connected pack, with the pack's number.
     pub(crate) fn stored_pack(&self) -> StoredPack {
         let cells = 0..self.estimation.cells();
         let cells = cells.map(|cell| StoredCell { consumed: None, updated_in_round: false, ..self.stored_cell(cell) });

@@ -81,8 +81,8 @@ pub enum EventKind {
         /// Standard deviation of the positive electrode's loss.
         lam_pe_std: f64,
     },
-    /// Remaining life, after a half-cycle, of the cell with the shortest remaining life. Sent while it is known, and
-    /// once without values when it becomes unknown.
+    /// Shortest remaining life of all cells, after a half-cycle. Sent while this remaining life is known, and once
+    /// without values when it becomes unknown.
     RemainingLife {
         /// Index of the cell.
         cell: Option<CellIndex>,
@@ -164,7 +164,7 @@ pub enum EventKind {
         /// Whether the test started.
         running: bool,
     },
-    /// Another pack is connected. Holds the last learned capacity of the old pack, for the records.
+    /// Another pack is connected. The event records the last learned capacity of the old pack.
     PackReplaced {
         /// Capacity of the old pack's weakest cell, Ah; `None` if nothing was learned.
         capacity_ah: Option<f64>,
@@ -275,7 +275,7 @@ pub enum EventKind {
         capacity_std_ah: Option<f64>,
         /// Root mean square of the residuals, V.
         residual_v: Option<f64>,
-        /// The chemistry that explains the voltages better than the label's.
+        /// The chemistry that explains the voltages better than the label's chemistry.
         chemistry: Option<Chemistry>,
         /// Whether the previous model was better and is used again.
         is_taken_back: bool,

@@ -45,7 +45,7 @@ impl Secured {
     }
 }
 
-/// Validity of the published estimates. CAN frames contain the same values.
+/// Validity of the published estimates. CAN frames contain the number of the variant.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
@@ -85,7 +85,7 @@ pub struct Estimate {
     pub innovation_v: f64,
     /// Predicted standard deviation of the innovation, V.
     pub innovation_std_v: f64,
-    /// Whether the reading passed the gate and changed the estimate.
+    /// Whether the reading passed the innovation gate and changed the estimate.
     pub accepted: bool,
     /// The readings used.
     pub measured: MeasuredValues,

@@ -198,7 +198,7 @@ impl std::str::FromStr for Downtime {
     }
 }
 
-/// Period of the driver's ticks, ms. It is a tenth of the shortest sensible period of a cyclic frame.
+/// Period of the driver's ticks, ms: a tenth of the shortest sensible period of a cyclic frame.
 pub const TICK_PERIOD_MS: u32 = 10;
 
 /// Largest step back in time, ns, that can result from merging the frames of several interfaces out of order. A larger

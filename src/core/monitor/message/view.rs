@@ -42,7 +42,7 @@ pub struct PackView {
     /// State of the cells' model; `None` in documents of earlier versions.
     #[serde(default)]
     pub model_state: Option<ModelState>,
-    /// The chemistry that explains the voltages better than the label's.
+    /// The chemistry that explains the voltages better than the label's chemistry.
     #[serde(default)]
     pub model_fits_better: Option<Chemistry>,
     /// Values of the pack.

@@ -123,7 +123,7 @@ impl StoreHealth {
         is_change
     }
 
-    /// Value for the rule about files: time for which the files could not be written, s; 0 while they can be written.
+    /// Value for the rule about files: how long the files could not be written, s; 0 while they can be written.
     pub(crate) fn failing(&self, now: Timestamp) -> Observation {
         let failing_s = self.failing_since.map_or(0.0, |since| now.since(since).max(0.0));
         Observation::new(self.is_known.then_some(failing_s))

@@ -2,7 +2,7 @@
 //!
 //! In: the samples of all cells with their estimates. Out: an event for each new finding ([`EventKind::Finding`]). The
 //! stage only observes: no estimate and no capacity depends on it. When a row of the detector (a few minutes of
-//! samples) ends, its results are passed to the alarm rules about single cells.
+//! samples) ends, the results of the row go to the alarm rules about single cells.
 
 use super::estimation::Estimation;
 use super::learning::Learning;
@@ -52,8 +52,8 @@ impl Findings {
         self.diagnosis.is_active().then(|| self.diagnosis.clone())
     }
 
-    /// Restores a checked state. `away`: start and end of the time in which the daemon did not run; `None` if it ran
-    /// without a break.
+    /// Restores a checked state. `away`: start and end of the time in which the daemon did not run; `None` if the
+    /// daemon ran without a break.
     pub(crate) fn restore(&mut self, stored: Option<CellFaultDetector>, away: Option<(Timestamp, Timestamp)>) {
         let Some(stored) = stored.filter(|_| self.diagnosis.is_active()) else { return };
         self.diagnosis = stored;

@@ -209,7 +209,8 @@ impl Intake {
         out.events.push(Event { time: now, kind: EventKind::Bus { bus, what: event } });
     }
 
-    /// Value for the rule about interfaces: time for which the interface with the longest fault has been faulty, s.
+    /// Value for the rule about interfaces, s: how long the longest present fault of an interface has lasted. Another
+    /// node that uses identifiers of the daemon's frames also counts as a fault.
     pub(crate) fn bus_fault(&self, now: Timestamp, interfaces: usize) -> Observation {
         let (fault_s, is_whole) = self.buses.worst_s(now, interfaces);
         let foreign_s = Some(self.own.longest_s(now)).filter(|seconds| *seconds > 0.0);
@@ -338,7 +339,7 @@ impl Intake {
     }
 }
 
-/// The command of a frame; `None` if it names a rule or severity that does not exist.
+/// The command of a frame; `None` if the frame names a rule or severity that does not exist.
 fn command_of(fields: &CommandFields) -> Option<Command> {
     let severity = |code: u8| Severity::ALL.into_iter().find(|severity| *severity as u8 == code);
     let which = Selector {

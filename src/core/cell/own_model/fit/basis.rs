@@ -95,7 +95,7 @@ impl<'a> Basis<'a> {
         }
     }
 
-    /// Voltage of a row by parameters.
+    /// Predicts the voltage of the row with index `at`.
     pub(super) fn predict(&self, theta: &DVector<f64>, at: usize) -> Prediction {
         let row = &self.rows[at];
         let beginning = BEGINNINGS + self.stretch[at];

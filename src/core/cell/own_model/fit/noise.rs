@@ -1,7 +1,7 @@
 //! Computes the covariance of the errors of a notebook's rows, and the cost of residuals.
 //!
-//! In: predictions and rows. Out: whitened residuals with their derivatives, and their cost (minus the logarithm of
-//! their density).
+//! In: predictions and rows (means of readings over a short time). Out: whitened residuals with their derivatives, and
+//! their cost (minus the logarithm of their density).
 
 use nalgebra::{DMatrix, DVector};
 
@@ -14,7 +14,8 @@ const ROW_V: f64 = 0.006;
 /// Residuals beyond this many standard deviations count linearly (Huber).
 const HUBER: f64 = 3.0;
 
-/// Standard deviations of the repeating errors: voltage, V; SOC; drop, fraction.
+/// Standard deviations of the errors that repeat at nearly the same SOC: of the voltage (V), of the SOC, and of the
+/// voltage drop (fraction).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct RepeatedErrors {
     voltage_v: f64,
@@ -30,7 +31,7 @@ impl RepeatedErrors {
     pub(super) const IN_TABLES: Self = Self { voltage_v: 0.004, soc: 0.004, drop: 0.05 };
 }
 
-/// Gauss-Newton's sums: normal matrix, gradient and cost.
+/// Sums for one Gauss-Newton step: normal matrix, gradient and cost.
 pub(super) struct NormalEquations {
     pub(super) normal: DMatrix<f64>,
     pub(super) gradient: DVector<f64>,
@@ -89,8 +90,8 @@ impl NormalEquations {
     }
 
     /// Adds the evidence of a row's current steps about the series resistance and the fastest branch. The row contains
-    /// the sums of the least-squares problem v = - R0 i - R1 x. The Cholesky factor of the sums of i and x turns them
-    /// into two rows.
+    /// the sums of the least-squares problem v = - R0 i - R1 x. The Cholesky factor of the sums of i and x turns this
+    /// problem into two equations.
     fn add_steps(&mut self, row: &Row, prediction: &Prediction) {
         let CurrentSteps { ii, ix, xx, iv, xv } = row.steps;
         let [ii, ix, xx, iv, xv] = [ii, ix, xx, iv, xv].map(f64::from);

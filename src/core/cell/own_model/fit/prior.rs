@@ -8,8 +8,8 @@ use crate::cell::chemistry::{FACTOR_SOC, RESISTANCES, usual_cold_sag_v};
 use crate::cell::own_model::{FACTOR_NODES, SOC_NODES};
 use crate::filter::bell;
 
-/// Standard deviation of ln(resistance) between cells that all resistances of a cell have in common. This constant and
-/// the next three were found on the five cells that also give the usual resistances of a chemistry.
+/// Standard deviation, between cells, of the part of ln(resistance) that all resistances of a cell share. This constant
+/// and the next three were found on the five cells that also give the usual resistances of a chemistry.
 const COMMON_LOG_STD: f64 = 0.35;
 /// Standard deviation of ln(resistance) of each single resistance, in addition to the common standard deviation.
 const PART_LOG_STD: [f64; RESISTANCES] = [0.3, 0.4, 0.4, 0.5];

@@ -1,4 +1,4 @@
-//! Tests fits to rows that were made from a known cell.
+//! Tests the mean and variance of a capacity that a fit derives from the costs on its grid.
 
 use super::*;
 

@@ -63,8 +63,8 @@ impl Buses {
         (state.is_known, state.off_since) = (true, None);
     }
 
-    /// Time for which the interface with the longest fault has been faulty, s, and whether all `interfaces` have
-    /// reported. The time is 0 if no interface that has reported is faulty, and `None` if no interface has reported.
+    /// Duration of the longest present fault of an interface, s, and whether all `interfaces` have reported. The
+    /// duration is 0 if no interface that has reported is faulty, and `None` if no interface has reported.
     pub(crate) fn worst_s(&self, now: Timestamp, interfaces: usize) -> (Option<f64>, bool) {
         let known = self.states.iter().filter(|state| state.is_known);
         let worst_s = known.clone().map(|state| state.fault_s(now)).max_by(f64::total_cmp);
