@@ -12,7 +12,7 @@ pub mod catalogue;
 
 use serde::{Deserialize, Serialize};
 
-/// A point on a clock that never steps, in integer nanoseconds.
+/// A point in time on the driver's clock, in integer nanoseconds.
 ///
 /// The driver chooses the origin: the daemon uses the wall time of its start, a replay the time stamps of its log. The
 /// core uses only differences.
@@ -85,7 +85,8 @@ impl InvalidState {
         if is_sound { Ok(()) } else { Err(Self { what, found, allowed }) }
     }
 
-    /// Rejects numbers that are not finite or whose square or cube overflows.
+    /// Rejects numbers that are not finite or larger than 1e20 in size. Squares and cubes of the other numbers do not
+    /// overflow.
     pub fn unless_number(what: &'static str, found: f64) -> Result<(), Self> {
         bounds::NUMBER.check(what, found)
     }
@@ -105,7 +106,7 @@ impl InvalidState {
         all.into_iter().try_for_each(|found| Self::unless_natural(what, found))
     }
 
-    /// Rejects numbers at or near 0, so that the caller can divide by the number's square.
+    /// Rejects numbers below 1e-150 or above 1e20, so that the caller can divide by the number's square.
     pub fn unless_positive(what: &'static str, found: f64) -> Result<(), Self> {
         bounds::VARIANCE.check(what, found)
     }
@@ -158,14 +159,14 @@ impl SensorIndex {
 
 /// The input that a configured signal provides.
 ///
-/// Readings of one frame are processed in this order. A voltage triggers the estimator, so current and temperature of
-/// the same frame come first.
+/// Readings of one frame are processed in the order of the variants. A voltage triggers the estimator, so current and
+/// temperature of the same frame come first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Channel {
     /// State of the pack's contactors. When they are open, no current flows.
     Contactor,
-    /// Pack current, A, positive = discharge after the configured sign.
+    /// Pack current, A; positive = discharge, after the configured sign was applied.
     Current,
     /// A temperature sensor, degrees C.
     Temperature(SensorIndex),
@@ -181,9 +182,10 @@ pub enum Channel {
     /// Voltage of the vehicle's 12 V (or 24 V) supply, V. If it is too low, no diagnostic requests are sent. Never used
     /// by an estimate.
     SupplyVoltage,
-    /// Whether the BMS bleeds a cell; 0 = the BMS does not bleed it. Only the diagnosis uses this value.
+    /// Whether the BMS bleeds a cell; 0 = the BMS does not bleed the cell. Only the cell-fault detector uses this
+    /// value.
     Balancing(CellIndex),
-    /// Serial number of the pack, or another number that identifies it.
+    /// Serial number of the pack, or another number that identifies the pack.
     PackIdentity,
 }
 
@@ -203,7 +205,7 @@ pub enum Fault {
     OutOfRange,
     /// The value changed faster than the configured rate allows.
     RateTooHigh,
-    /// The value was unchanged for longer than the configured time while current flowed.
+    /// The value did not change for a long time although it should have changed.
     Stuck,
     /// There was no value for longer than the configured age.
     Stale,

@@ -261,7 +261,7 @@ impl Stages {
         }
     }
 
-    /// Passes the capacities of the cells whose model has changed to the rules on capacity.
+    /// After a change of the model, passes the capacities of the pack's own cells to the rules on capacity.
     fn restate_capacities(&mut self, now: Timestamp, out: &mut Outputs) {
         for index in self.estimation.bank.own_cells().to_vec() {
             let capacity = self.learning.learned_capacity(index);
@@ -289,7 +289,7 @@ impl Stages {
     ) -> CommandOutcome {
         self.step_waiting(now, true, out);
         if command == Command::PackReplaced {
-            // The stored copy belongs to the old pack, regardless of its number.
+            // The values put aside belong to the old pack, so drop them regardless of the pack number.
             self.packs.drop_aside();
         }
         let CommandOutcome { changed, refused } = match command {
@@ -521,8 +521,9 @@ impl Stages {
         self.sampling.sampler.wake(now);
     }
 
-    /// Whether a reading of this channel ends a bus sleep. The supply voltage does not, because the computer may
-    /// measure it itself. Balancing bits do not, because a BMS may balance while the vehicle is parked.
+    /// Whether a reading of this channel ends a bus sleep. A reading of the supply voltage does not, because the
+    /// computer itself may measure this voltage. A balancing bit does not, because a BMS may balance while the vehicle
+    /// is parked.
     pub(crate) fn wakes(channel: Channel) -> bool {
         !matches!(channel, Channel::SupplyVoltage | Channel::Balancing(_))
     }

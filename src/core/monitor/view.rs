@@ -1,4 +1,5 @@
-//! Present values of cells and pack for status, tables and reports. `None` = not known yet, or no longer known.
+//! Methods of the monitor that return present values of cells and pack, for status, tables and reports. `None` = not
+//! known yet, or no longer known.
 
 use super::Monitor;
 use super::config::CommandConfig;
@@ -57,7 +58,7 @@ impl Monitor {
         self.intake.dropped()
     }
 
-    /// Interfaces and input messages with a second sender.
+    /// Input messages with a second sender, each with its interface.
     pub fn second_senders(&self) -> impl Iterator<Item = (BusIndex, CanId)> + '_ {
         self.intake.second_senders()
     }
@@ -82,7 +83,7 @@ impl Monitor {
         self.stages.modelling.view()
     }
 
-    /// Faults found in single cells.
+    /// Findings of the cell-fault detector.
     pub fn findings(&self) -> &[CellFault] {
         self.stages.findings.diagnosis.findings()
     }

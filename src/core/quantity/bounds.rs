@@ -110,7 +110,7 @@ pub const DEVIATION: Bounds = Bounds::new(0.0, 1e3, "0 to 1000");
 /// Standard deviation of a voltage sensor's noise, V. No converter is better than the lower bound.
 pub const VOLTAGE_NOISE_V: Bounds = Bounds::new(1e-6, 10.0, "1e-6 to 10 V");
 
-/// Spread of the sigma points. Below the lower bound, their differences are lost in rounding.
+/// Spread of the sigma points. Below the lower bound, the differences between the points are lost in rounding.
 pub const SIGMA_POINT_SPREAD: Bounds = Bounds::new(1e-3, 1.0, "0.001 to 1");
 
 #[cfg(test)]

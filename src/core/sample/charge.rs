@@ -8,9 +8,9 @@
 //!   cause (bad readings, lost frames, sleep, a restart).
 //!
 //! After the latest reading, the current is held in the same way. The next reading replaces the held value by the
-//! trapezoid. While the contactors' reading is valid and says that they are open, the current is zero, measured or not.
-//! Unmeasured time never decreases and never grows faster than time. Before the first current reading, all time is
-//! unmeasured.
+//! trapezoid. While a valid reading says that the contactors are open, the current counts as zero, regardless of the
+//! current sensor. Unmeasured time never decreases and never grows faster than time. Before the first current reading,
+//! all time is unmeasured.
 
 use serde::{Deserialize, Serialize};
 
@@ -143,7 +143,7 @@ impl ChargeCounter {
     }
 }
 
-/// 1 if the reading includes the sensor's offset, else 0. A reading of exactly zero does not include it.
+/// 1 if the reading includes the sensor's offset, else 0. A reading of exactly zero does not include the offset.
 fn offset_part(current_a: f64) -> f64 {
     if current_a == 0.0 { 0.0 } else { 1.0 }
 }

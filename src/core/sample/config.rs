@@ -1,5 +1,5 @@
-//! Settings of the sample stage: plausible values, maximum ages, and the sensor of each cell. The
-//! configuration module of the host crate checks the ranges.
+//! Settings of the sample stage: plausible values, maximum ages, and the sensor of each cell. The configuration module
+//! of the host crate checks the settings.
 
 use crate::quantity::SensorIndex;
 

@@ -1,7 +1,7 @@
 //! Detects a frozen current sensor: its reading stays bit-identical while the voltages show a changing load.
 //!
 //! In: good readings of the current, A, and of the cells' voltages, V. Out: whether the reading of the current is
-//! frozen. It counts as frozen until it changes.
+//! frozen. The reading counts as frozen until it changes.
 //!
 //! A constant reading alone proves nothing. A parked pack, a charger and a laboratory hold a current for hours, and a
 //! coarse sensor then shows one value. In these cases, the voltages rest or drift in one direction. A changing load
@@ -19,17 +19,17 @@ use crate::quantity::{InvalidState, Timestamp, bounds};
 
 /// Minimum number of equal current readings.
 const MIN_READINGS: u32 = 20;
-/// Time for which the reading must remain unchanged after the voltages turned back, s. No current reading arrives later
-/// than this after the voltages.
+/// How long the reading must remain unchanged after the voltages turned back, s. A current reading follows the voltages
+/// within this time.
 const MIN_FROZEN_S: f64 = 5.0;
 /// Longest time between an extreme voltage and the return from this extreme, s. The voltages of cells that rest, cool
 /// or balance turn more slowly.
 const MAX_TURN_S: f64 = 60.0;
 /// Step that exceeds a voltage's noise, in configured standard deviations.
 const STEP_SIGMA: f64 = 5.0;
-/// Step that exceeds a voltage's noise, as a multiple of the median change of the voltage per round. It applies if the
-/// real noise exceeds the configured noise. The multiple corresponds to 8 standard deviations, so that two consecutive
-/// readings do not exceed the step by chance within a day.
+/// Step that exceeds a voltage's noise, as a multiple of the median change of the voltage per round. This step applies
+/// if the real noise exceeds the configured noise. The multiple corresponds to 8 standard deviations, so that two
+/// consecutive readings do not exceed the step by chance within a day.
 const STEP_MOVES: f64 = 8.4;
 /// Maximum and minimum number of voltage changes from which the median change is calculated.
 const MAX_MOVES: usize = 32;
@@ -279,8 +279,8 @@ mod tests {
     fn measured_load_and_glitches_are_not_frozen() {
         let voltage = |time_s: f64| 3.7 - 1.5e-3 * load_a(time_s);
         assert_eq!(found_s(600, load_a, voltage), None);
-        // A coarse sensor may have five times the configured noise. Here, it is pseudorandom, uniform and derived from
-        // the time.
+        // A coarse sensor may have five times the configured noise. Here, the noise is pseudorandom, uniform and
+        // derived from the time.
         let noise = |time_s: f64| {
             let bits = ((10.0 * time_s) as u64).wrapping_add(1).wrapping_mul(0x9E37_79B9_7F4A_7C15);
             let bits = (bits ^ (bits >> 29)).wrapping_mul(0xBF58_476D_1CE4_E5B9);

@@ -304,7 +304,7 @@ impl Sampler {
         self.sensor_c(self.sensor_of(cell)?, now)
     }
 
-    /// Time since the channel's latest reading, good or bad, s. It is the value of the rule `input_missing`.
+    /// Time since the channel's latest reading, good or bad, s: the value of the rule `input_missing`.
     pub fn silence_s(&self, channel: Channel, now: Timestamp) -> Option<f64> {
         // Use the later of the two times; `None` is less than `Some`. Time before the start or the last waking does not
         // count.

@@ -4,9 +4,9 @@
 //! between good and bad.
 //!
 //! * **Range**: a value outside the limits is bad.
-//! * **Rate**: a value is bad if its distance from the last good value exceeds the fastest plausible change. Once
-//!   [`ACCEPT_AFTER`] consecutive readings agree with each other, they are accepted: the step was real or the last good
-//!   value was wrong. Further rejection would lock out a healthy sensor.
+//! * **Rate**: a value is bad if its distance from the last good value exceeds the fastest plausible change. If
+//!   [`ACCEPT_AFTER`] consecutive readings agree with each other, the last of them is accepted: the step was real or
+//!   the last good value was wrong. Further rejection would lock out a healthy sensor.
 //! * **Stuck**: a value that stays exactly the same for too long while it should change is bad until it changes. The
 //!   caller passes a clock that runs only while the value should change.
 //! * **Stale**: the last good value is older than the maximum age.
@@ -99,7 +99,7 @@ impl Signal {
         Fault::Stale
     }
 
-    /// Time from which the signal is stale if no good reading arrives. Its age does not start before `began`.
+    /// Time from which the signal is stale if no good reading arrives. The signal's age does not start before `began`.
     pub(super) fn stale_from(&self, began: Timestamp, limits: &Limits) -> Timestamp {
         self.good.map_or(began, |good| good.time.max(began)).plus_secs(limits.max_age_s)
     }

@@ -1,4 +1,4 @@
-//! Faults that a simulation injects: cells, contacts, a replaced module, sensors.
+//! Faults that a simulation injects into cells, contacts, modules and sensors.
 //!
 //! A fault starts at a given time of the simulation and lasts until the end. Faults of cells change the true state
 //! ([`Pack`](super::Pack)); faults of sensors change only the readings. The text form is `KIND:...@WHEN` ([`Fault`]'s
@@ -37,7 +37,7 @@ pub enum ContactResistance {
     OfCell(f64),
 }
 
-/// Kind, location and size of a fault. Changes are relative: 0.1 = 10 % more.
+/// Kind, location and size of a fault. Changes without a unit are relative: 0.1 = 10 % more.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum FaultKind {
     /// The cell loses charge continuously, even at rest.

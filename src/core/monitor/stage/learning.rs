@@ -53,7 +53,7 @@ pub(crate) struct Learning {
 pub(crate) struct LearningState {
     pub(crate) detector: TransitionDetector,
     pub(crate) learner: Learner,
-    /// Time of the last half-cycle; `None` if there was none, or if its time is unknown.
+    /// Time of the last half-cycle; `None` before the first half-cycle, or if the time is unknown.
     pub(crate) learned_at: Option<Timestamp>,
     /// Time of the last correction of the current offset.
     offset_at: Option<Timestamp>,
@@ -241,8 +241,8 @@ impl Learning {
         }
     }
 
-    /// Learns the offset of the current sensor from the voltages since the last change of mode, and corrects the
-    /// cells.
+    /// Learns the offset of the current sensor from the voltages since the last change of mode, and corrects the cells'
+    /// estimates.
     fn learn_offset(&mut self, bank: &mut PackBank, now: Timestamp) {
         let configured_a = self.config.capacity.current_offset_std_a;
         let offset = self.state.learner.current_offset_mut();
@@ -413,8 +413,8 @@ impl Learning {
         capacities.min_by(|a, b| a.1.mean.total_cmp(&b.1.mean)).filter(|_| self.state.learner.has_learned_all())
     }
 
-    /// Fields of the health frame, once every cell's capacity has been learned: the worst value of any cell, and the
-    /// losses of the weakest cell.
+    /// Fields of the health frame: the worst value of any cell, and the losses of the weakest cell. Until every cell's
+    /// capacity has been learned, only the recharge period is given.
     pub(crate) fn health_fields(&self, bank: &PackBank) -> HealthFields {
         let recharge_period_s = self.state.recharge_period_s;
         if !self.state.learner.has_learned_all() {

@@ -28,10 +28,10 @@ use crate::quantity::{InvalidState, Mode, Timestamp};
 const LEAST_NEW_ROWS: usize = 6;
 const LEAST_NEW_CHARGE: f64 = 0.12;
 
-/// Shortest rest, s, after which a fit starts. It is longer than a stop at a red light.
+/// Shortest rest, s, after which a fit starts. This rest is longer than a stop at a red light.
 const REST_S: f64 = 120.0;
 
-/// Time, s, from the start of a fit to the change of the model. It is long enough for a thread of a slow computer.
+/// Time, s, from the start of a fit to the change of the model. A slow computer needs less time for the fit.
 const FIT_S: f64 = 30.0;
 
 /// Largest misfit of a usable fit. With typical sensors, the misfit is at most 0.65. Heavy load in the cold, a faulty
@@ -60,13 +60,13 @@ pub struct ModelChange {
     pub capacity: Option<ScalarGaussian>,
     /// Root mean square of the residuals of the rows, V.
     pub residual_v: Option<f64>,
-    /// The chemistry that explains the voltages better than the label's.
+    /// The chemistry that explains the voltages better than the label's chemistry.
     pub chemistry: Option<Chemistry>,
     /// Whether the previous model is used again.
     pub is_taken_back: bool,
 }
 
-/// View of the cells' model and of how it was learned.
+/// View of the cells' model and of how the model was learned.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ModelView<'a> {
     /// How well the model is known.
@@ -77,7 +77,7 @@ pub struct ModelView<'a> {
     pub own: Option<&'a OwnModel>,
     /// Rows from which the model is learned.
     pub notebook: Option<&'a Notebook>,
-    /// The chemistry that explains the voltages better than the label's.
+    /// The chemistry that explains the voltages better than the label's chemistry.
     pub chemistry: Option<Chemistry>,
     /// Number of fits.
     pub fits: u32,
@@ -124,7 +124,7 @@ pub(crate) struct ModellingState {
     notebook: Notebook,
     /// The present learned model.
     own: Option<OwnModel>,
-    /// The previous model; `None` = the label's.
+    /// The previous model; `None` = the label's model.
     before: Option<OwnModel>,
     chemistry: Option<Chemistry>,
     fits: u32,
@@ -147,7 +147,7 @@ pub(crate) struct Adoption {
     pub(crate) mean: AdoptedState,
     /// Whether the cells' capacities restart from the capacity of the mean cell.
     pub(crate) with_capacity: bool,
-    /// Whether the model was learned. If not, it is the label's model, and the capacity is unknown.
+    /// Whether the model was learned. If not, this is the label's model, and the capacity is unknown.
     pub(crate) is_learned: bool,
 }
 
@@ -224,7 +224,7 @@ impl Modelling {
         self.state = ModellingState::default();
     }
 
-    /// Restores a stored state. If it was learned with another label, only its rows are kept.
+    /// Restores a stored state. If the state was learned with another label, only the rows are kept.
     pub(crate) fn restore(&mut self, state: ModellingState) {
         let Some(label) = &self.label else { return };
         self.state = if state.fits_label(label) {
@@ -289,7 +289,8 @@ impl Modelling {
         is_new.then(|| self.task()).flatten()
     }
 
-    /// Receives the findings of a task that the host has run. They only save the computation; the result is the same.
+    /// Receives the findings of a task that the host has run. The findings only save the computation; the result is the
+    /// same.
     pub(crate) fn give(&mut self, task: FitTask, findings: FitFindings) {
         self.given = Some((task, findings));
     }
@@ -299,8 +300,8 @@ impl Modelling {
         Some(FitTask::new(self.label?, notebook, own.as_ref(), before.as_ref()))
     }
 
-    /// Whether half-cycles may learn the capacity. They may not while the label's model is used, because its errors
-    /// would look like lost capacity.
+    /// Whether half-cycles may learn the capacity. While the label's model is used, half-cycles learn no capacity,
+    /// because the model's errors would look like lost capacity.
     pub(crate) fn teaches_capacity(&self) -> bool {
         self.label.is_none() || self.state.own.is_some()
     }

@@ -1,8 +1,7 @@
 //! Sending stage: cyclic frames, alarm frames, replies to commands, tests, diagnostic requests, and the J1939 node.
 //!
-//! In: the other stages' values for the frames, alarms, ticks. Out: frames in [`Outputs`]. If the stage misses a
-//! period, it does not send the frame later. Without `[output]`, only the J1939 node and the poller (diagnostic
-//! requests) send.
+//! In: values from the other stages, alarms, ticks. Out: frames in [`Outputs`]. If the stage misses a period, it does
+//! not send the frame later. Without `[output]`, only the J1939 node and the poller (diagnostic requests) send.
 
 use serde::{Deserialize, Serialize};
 
@@ -27,7 +26,7 @@ use crate::quantity::{BusIndex, Fault, Timestamp};
 
 /// Period, s, of the frames of a test. A receiver that reads once a second still gets several frames.
 const TEST_PERIOD_S: f64 = 0.1;
-/// Longest duration of a test, s. It ensures that a forgotten test ends.
+/// Longest duration of a test, s, so that a forgotten test ends.
 pub const MAX_TEST_S: f64 = 600.0;
 
 /// Number of immediate replies after a pause; further replies are at least [`REPLY_DELAY_MS`] apart. A small number
@@ -35,10 +34,10 @@ pub const MAX_TEST_S: f64 = 600.0;
 const REPLY_BURST: i64 = 5;
 const REPLY_DELAY_NS: i64 = REPLY_DELAY_MS as i64 * 1_000_000;
 
-/// Number of freshness values skipped at a start. It exceeds the number of frames in three hours at the highest rate,
-/// because an earlier process may have sent so many frames after the state was stored.
+/// Number of freshness values skipped at a start. An earlier process may have sent frames after its state was stored.
+/// The skipped values suffice for more than an hour of such frames at the highest rate.
 const RESTART_FRESHNESS: u64 = 1 << 20;
-/// Minimum freshness per second of the clock. It exceeds the number of frames in a second.
+/// Minimum freshness per second of the clock. This value exceeds the number of frames in a second.
 const FRESHNESS_PER_S: u64 = 256;
 
 /// The sending stage.
@@ -514,7 +513,7 @@ impl Sending {
         self.poll_j1939(now, out);
     }
 
-    /// Sends a test frame. It has neither value nor threshold, so that receivers cannot mistake it for a measurement.
+    /// Sends a test frame without value and threshold, so that receivers cannot mistake the frame for a measurement.
     fn send_test(&mut self, now: Timestamp, rule: Rule, state: AlarmState, out: &mut Outputs) {
         let (rule, state) = (rule as u8, Some(state.wire_code()));
         self.send_alarm_fields(now, &AlarmFields { rule, state, test: true, ..AlarmFields::default() }, out);

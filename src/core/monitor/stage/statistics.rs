@@ -59,7 +59,7 @@ pub struct VoltageCounts {
     /// Readings that changed an estimate.
     #[serde(rename = "voltages_used")]
     pub used: u64,
-    /// Readings beyond the filter's gate, which were ignored.
+    /// Readings outside the filter's innovation gate, which were ignored.
     #[serde(rename = "voltages_gated")]
     pub gated: u64,
     /// Readings that could not be compared with a prediction, because there was no current.

@@ -4,9 +4,9 @@
 //! In: the learned values of the connected pack, put aside when readings start to show another number; the new number
 //! once it is confirmed. Out: the stored values of the pack with that number, if there are any.
 //!
-//! Stored are capacities, resistances, remaining lives, recharge periods and the current offset (a pack often has its
-//! own sensor). The unfinished half-cycle and the state of charge are not stored; the first voltage determines the
-//! state of charge. A pack without learned values is not stored, so that bogus numbers do not displace real packs.
+//! The memory stores capacities, resistances, remaining lives, recharge periods and the current offset (a pack often
+//! has its own sensor). The unfinished half-cycle and the state of charge are not stored; the first voltage determines
+//! the state of charge. A pack without learned values is not stored, so that bogus numbers do not displace real packs.
 
 use serde::{Deserialize, Serialize};
 
@@ -71,7 +71,8 @@ impl PackMemory {
         self.aside = Some(Box::new(pack));
     }
 
-    /// Drops the pack that was put aside: its number was read again, or its learned values no longer apply.
+    /// Drops the pack that was put aside. Called if the pack's number was read again, or if its learned values no
+    /// longer apply.
     pub(crate) fn drop_aside(&mut self) {
         self.aside = None;
     }
@@ -100,7 +101,7 @@ impl PackMemory {
         }
     }
 
-    /// Keeps only the packs for which `fits` is true.
+    /// Keeps only the packs that fulfil `fits`.
     pub(crate) fn retain(&mut self, fits: impl Fn(&StoredPack) -> bool) {
         self.packs.retain(&fits);
         self.aside.take_if(|pack| !fits(pack));

@@ -1,4 +1,4 @@
-//! Cycling between two SOC limits: the paper's scenario and the published example.
+//! Cycling between two SOC limits: the scenarios `paper` (from the paper) and `reference` (from a published example).
 
 use super::demand::Demand;
 use crate::sim::noise::Noise;

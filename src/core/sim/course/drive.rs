@@ -115,7 +115,7 @@ impl DayCourse {
         let wanted = (self.target_m_s - self.speed_m_s) / dt_s.max(1.0); // a small difference is closed over 1 s
         let acceleration = wanted.clamp(-ACCELERATION_M_S2.1, ACCELERATION_M_S2.0);
         self.speed_m_s = (self.speed_m_s + acceleration * dt_s).max(0.0);
-        // `power_w` is for a pack of this energy, Wh.
+        // `power_w` returns the power of a car whose pack has 60,000 Wh.
         let capacities_per_hour = power_w(self.speed_m_s, acceleration) / 60_000.0;
         let (lowest_v, highest_v) = pack.extremes_v(0.0);
         // Nominal voltage of the cells of the 60 kWh car, V.

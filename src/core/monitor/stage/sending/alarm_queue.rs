@@ -16,9 +16,10 @@ use crate::alarm::{Alarm, AlarmEngine, AlarmState, Rule, Severity};
 use crate::can::encode::{ALARM_DELAY_MS, CHANGE_REPETITION_MS, CHANGE_REPETITIONS};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Number of immediate frames after a pause: one event changes the alarms of a few cells, or one alarm per module.
+/// Number of immediate frames after a pause. One event usually changes fewer alarms: the alarms of a few cells, or one
+/// alarm per module.
 const BURST: i64 = 20;
-/// Shortest time between frames in turn, in units of [`ALARM_DELAY_MS`]: half of the budget remains for changes.
+/// Shortest time between frames in turn, in units of [`ALARM_DELAY_MS`]. Half of the budget thus remains for changes.
 const TURN_DELAYS: u32 = 2;
 /// Maximum number of alarms that are announced as unknown (17 rules with three severities are 51). Further unknown
 /// alarms are not announced, but the digest shows their rules.

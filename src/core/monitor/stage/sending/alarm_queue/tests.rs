@@ -40,7 +40,7 @@ fn cell_key(cell: u16) -> AlarmKey {
 
 const PACK_KEY: fn() -> AlarmKey = || AlarmKey::new(Rule::TemperatureHigh, Severity::Severe, None);
 
-/// Frames that ticks from `from_ms` send during `for_ms`, each with its time, ms.
+/// Frames sent by the ticks from `from_ms` to `from_ms + for_ms`, each with its time, ms.
 fn sent(queue: &mut AlarmQueue, engine: &AlarmEngine, from_ms: i64, for_ms: i64) -> Vec<(i64, AlarmKey)> {
     let mut sent = Vec::new();
     for ms in (from_ms..from_ms + for_ms).step_by(10) {
