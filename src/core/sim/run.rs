@@ -94,7 +94,7 @@ pub struct Simulation {
     readings: Vec<(Channel, Option<f64>)>,
     time: Timestamp,
     current_a: f64,
-    /// Charge, As, and time, ns, for which the cells have not been stepped yet.
+    /// Charge, As, and time, ns, since the cells were last stepped.
     pending: (f64, i64),
     cells_due: bool,
     started: bool,
@@ -133,7 +133,8 @@ impl Simulation {
         }
     }
 
-    /// Injects faults. The pack must have their cells and sensors ([`FaultKind::check`](super::FaultKind::check)).
+    /// Injects faults. The pack must have the cells and sensors that the faults name
+    /// ([`FaultKind::check`](super::FaultKind::check)).
     #[must_use]
     pub fn with_faults(mut self, faults: &[Fault]) -> Self {
         self.coming.extend(faults.iter().rev());
@@ -148,9 +149,9 @@ impl Simulation {
         self
     }
 
-    /// Makes the BMS report for each cell whether it is bled (1) or not (0). It reports these bits together with the
-    /// voltages. During sleep, it reports them every minute while it bleeds a cell, and once more when it no longer
-    /// bleeds any cell.
+    /// Makes the BMS send a balancing bit for each cell: 1 = the cell is bled, 0 = the cell is not bled. The BMS sends
+    /// the bits together with the voltages. During sleep, the BMS sends the bits every minute while it bleeds a cell,
+    /// and once more when it has stopped bleeding.
     #[must_use]
     pub fn with_balancing_bits(mut self) -> Self {
         self.has_bits = true;
@@ -229,12 +230,13 @@ impl Simulation {
     fn fall_asleep(&mut self, duration_s: f64) {
         self.step_pending();
         self.current_a = 0.0;
-        // Longest step during sleep, s. It limits the error from changing resistances and temperatures.
+        // A step during sleep takes at most 60 s, so that changing resistances and temperatures cause only a small
+        // error.
         let steps = (duration_s / 60.0).ceil().max(1.0) as u32;
         self.asleep = Some(Asleep { from: self.time, duration_s, step: 0, steps });
     }
 
-    /// Continues the sleep, if there is one. Returns whether it reported balancing bits before the end of the sleep.
+    /// Continues the sleep, if there is one. Returns whether balancing bits were reported before the end of the sleep.
     fn sleep(&mut self) -> bool {
         while let Some(asleep) = &mut self.asleep {
             let (now, step_s) = (asleep.time(), asleep.duration_s / f64::from(asleep.steps));

@@ -3,12 +3,12 @@
 //! Amounts are given for a cell with the nominal capacity of the source. They scale with the capacity of the configured
 //! cell model, so that any configuration can be simulated.
 //!
-//! | scenario | nominal | source | course |
+//! | scenario | nominal capacity | source | course |
 //! | --- | --- | --- | --- |
-//! | `paper` | 2.6 Ah | the paper's own run | 1.325 A in both directions between SOC 0.3 and 0.9, 0.05 Ah lost per cycle, until 0.25 Ah: 48 cycles, 2.23e5 s |
-//! | `reference` | 30 Ah | the published example | discharge by random pulses (15 A mean), charge by 15 A, 0.3 to 0.9, 1 Ah lost per cycle |
-//! | `random-walk` | 2.1 Ah | the protocol of NASA's randomized set | 5 min loads of -4.5 to 4.5 A within 3.2 to 4.2 V; two reference cycles after every 1,500 loads |
-//! | `ev-day` | 50 Ah | packwatch | drive, park (bus asleep), drive, fast charge, drive, park; 96 cells |
+//! | `paper` | 2.6 Ah | the paper's own run | 1.325 A in both directions between SOC 0.3 and 0.9; each cycle loses 0.05 Ah; ends at a capacity of 0.25 Ah, after 48 cycles (2.23e5 s) |
+//! | `reference` | 30 Ah | a published example | discharge by random pulses (mean 15 A) to SOC 0.3, charge by 15 A to SOC 0.9; each cycle loses 1 Ah |
+//! | `random-walk` | 2.1 Ah | the protocol of NASA's randomized set | loads of 5 min with currents of -4.5 to 4.5 A, within 3.2 to 4.2 V; two reference cycles after every 1,500 loads |
+//! | `ev-day` | 50 Ah | packwatch | drive, park (buses asleep), drive, fast charge, drive, park; 96 cells |
 
 use super::sensor::{SensorError, Sensors};
 use super::truth::{Ageing, Hysteresis, PackSettings, Spread};
@@ -18,7 +18,7 @@ use super::truth::{Ageing, Hysteresis, PackSettings, Spread};
 pub enum Scenario {
     /// The paper's run: 2.6 Ah, -0.05 Ah per cycle, SOC 30-90 %, until 0.25 Ah.
     Paper,
-    /// The published 30 Ah example: random discharge pulses, -1 Ah per cycle.
+    /// A published example with a cell of 30 Ah: random discharge pulses, -1 Ah per cycle.
     Reference,
     /// Random 5-minute loads, with reference cycles between blocks of loads.
     RandomWalk,
@@ -47,7 +47,7 @@ pub struct Settings {
     pub duration_s: Option<f64>,
     /// The simulation ends when the weakest cell would fall below this capacity, Ah; 0 = no limit.
     pub end_capacity_ah: f64,
-    /// SOC at which charging and discharging start, in the cycling scenarios.
+    /// Lower and upper SOC of the cycling scenarios: charging starts at the lower SOC, discharging at the upper SOC.
     pub soc_window: (f64, f64),
     /// Number of loads between two reference measurements, in the random walk.
     pub walk_steps: u32,
@@ -123,8 +123,8 @@ impl Settings {
         s
     }
 
-    /// Sets a current sample every 10 ms and cell samples every 100 ms. Sets the errors of a typical pack: 0.5 % gain,
-    /// 1 mV noise, 1 % capacity spread.
+    /// Sets sampling periods of 10 ms for the current and 100 ms for the cells. Sets the errors of a typical pack: 0.5
+    /// % gain, 1 mV noise, 1 % capacity spread.
     fn set_ev_day(&mut self) {
         let capacity_ah = self.pack.capacity_ah;
         self.pack.cells = 96;

@@ -6,7 +6,7 @@
 
 use super::noise::{Noise, Stream};
 
-/// Errors of one kind of sensor, in its own unit.
+/// Errors of one kind of sensor, in the unit of the sensor.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct SensorError {
     /// Standard deviation of the white noise per sample.
@@ -48,7 +48,7 @@ pub struct Sensors {
 
 /// Quality of all sensors of a pack.
 ///
-/// | quality | voltage | steps | current | steps | temperature |
+/// | quality | voltage offset | voltage step | current gain + offset | current step | temperature offset |
 /// | --- | --- | --- | --- | --- | --- |
 /// | `Good` | 1 mV | 0.1 mV | 0.1 % + 5 mA | 1 mA | 0.3 K |
 /// | `Usual` | 5 mV | 1 mV | 0.5 % + 50 mA | 10 mA | 1 K |

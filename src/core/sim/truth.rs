@@ -109,7 +109,7 @@ pub struct TruthCell {
 impl TruthCell {
     fn new(settings: &PackSettings, noise: &mut Noise) -> Self {
         let mut spread = |std: f64| std * noise.normal().clamp(-SPREAD_LIMIT, SPREAD_LIMIT);
-        // Lower limit of the capacity, because SOC divides by it: 1 % of the new capacity.
+        // Lower limit of the capacity, because the SOC is a charge divided by the capacity: 1 % of the new capacity.
         let floor_ah = settings.capacity_ah * 0.01;
         Self {
             capacity_ah: (settings.capacity_ah * (1.0 + spread(settings.spread.capacity))).max(floor_ah),
@@ -138,7 +138,8 @@ impl TruthCell {
         (self.unloaded_v(model, hysteresis) - voltage_v) / (model.r0_ohm(&place) * self.resistance_ratio)
     }
 
-    /// Current of the injected leak, A. It stops when the cell is empty. The voltage drop that it causes is negligible.
+    /// Current of the injected leak, A. The leak stops when the cell is empty. The voltage drop that the leak causes is
+    /// neglected.
     pub fn leak_a(&self, model: &CellModel, hysteresis: &Hysteresis) -> f64 {
         match self.leak {
             None => 0.0,

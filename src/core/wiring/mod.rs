@@ -4,7 +4,7 @@
 //! events, and the estimates of a [`Monitor`](crate::monitor::Monitor) if the configuration allows one. Out: a
 //! [`WiringReport`] with findings (each with evidence, reason and the line to change), checks that passed, and checks
 //! that were not possible. The observer has its own decoder, which applies no limits to readings. It therefore also
-//! works with a configuration that the estimator cannot use. Its memory use is bounded for any duration.
+//! works with a configuration that the estimator cannot use. The observer's memory use is bounded for any duration.
 //!
 //! | file | purpose |
 //! | --- | --- |

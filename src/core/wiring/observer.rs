@@ -329,12 +329,12 @@ impl WiringObserver {
         }
     }
 
-    /// Time for which the observer has listened, without sleep, s.
+    /// How long the observer has listened, s, without sleep.
     pub fn seconds(&self) -> f64 {
         self.listened_s.unwrap_or(self.awake_s)
     }
 
-    /// Sets the time for which the observer has listened on live interfaces, s, with or without frames.
+    /// Sets how long the observer has listened on live interfaces, s, with or without frames.
     pub fn handle_listened(&mut self, seconds: f64) {
         self.listened_s = Some(seconds);
     }

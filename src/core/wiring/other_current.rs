@@ -1,4 +1,5 @@
-//! Statistics of a message on another interface that has the identifier of the configured current.
+//! Statistics of a message that has the identifier of the configured current's message but arrives on another
+//! interface.
 //!
 //! Buses of one vehicle may use the same identifier for different messages, or carry the messages of several packs.
 //! If the voltages follow the message on the other interface, the configured interface is wrong.

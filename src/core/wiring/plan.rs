@@ -144,7 +144,7 @@ pub struct OutputPlan {
     pub buses: Vec<BusIndex>,
     /// Identifier.
     pub id: CanId,
-    /// Name of the frame: `status`, `health` or `alarm`.
+    /// Name of the frame, for example `status`.
     pub name: &'static str,
     /// Table of the frame in the configuration.
     pub table: String,

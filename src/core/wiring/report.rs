@@ -97,7 +97,7 @@ pub struct WiringFinding {
     pub changes: Vec<Change>,
     /// Further advice, or the only advice if no change of the configuration helps.
     pub advice: Option<String>,
-    /// Titles of findings that are probably consequences of this one and are not listed separately.
+    /// Titles of findings that are probably consequences of this finding and are not listed separately.
     pub consequences: Vec<String>,
 }
 
@@ -159,9 +159,8 @@ impl WiringReport {
         &mut self.findings[at]
     }
 
-    /// Merges findings into the first finding on `cause`: all later findings on `cause`, and all findings for which
-    /// `is_consequence` is true. Keeps the title of every merged finding. Keeps the advice only of merged findings on
-    /// `cause`.
+    /// Merges findings into the first finding on `cause`: all later findings on `cause`, and all findings that fulfil
+    /// `is_consequence`. Keeps the title of every merged finding. Keeps the advice only of merged findings on `cause`.
     pub(super) fn fold(&mut self, cause: Topic, is_consequence: impl Fn(&WiringFinding) -> bool) {
         let Some(first) = self.findings.iter().position(|finding| finding.topic == cause) else { return };
         let is_moved = |finding: &mut WiringFinding| finding.topic == cause || is_consequence(finding);

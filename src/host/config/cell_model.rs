@@ -9,7 +9,7 @@
 //! | `keys` | every key of the file |
 //! | `read` | reads and checks the file |
 //! | `source` | the origin of a model |
-//! | `label` | the model made from a label, and the model learned from it |
+//! | `label` | the model made from a label, and the model learned on board |
 //! | `write` | writes a model as a file |
 //! | `library` | the model files in the usual folders |
 

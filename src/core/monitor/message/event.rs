@@ -40,7 +40,7 @@ pub enum EventKind {
         mode: Mode,
         /// Charge moved, Ah, positive.
         charge_ah: f64,
-        /// SOC swing, fraction, positive; `None` if the SOC at the start was not estimated.
+        /// SOC swing, fraction, positive; `None` if the SOC at the start or the end was not estimated.
         swing: Option<f64>,
         /// Standard deviation of the swing.
         swing_std: Option<f64>,

@@ -165,7 +165,7 @@ fn weak_and_resistive_cells_keep_their_soc() {
     let cells = faulty.pack().cells();
     assert!((cells[1].capacity_ah - 2.34).abs() < 1e-12 && cells[0].capacity_ah == 2.6);
     assert!((cells[2].resistance_ratio - 1.2).abs() < 1e-12 && cells[1].resistance_ratio == 1.0);
-    // The two packs differ by one step of a second.
+    // The two states are one step of a second apart.
     assert!((before[1] - at[1] - (before[0] - at[0])).abs() < 1e-12);
 }
 
@@ -179,8 +179,8 @@ fn replaced_module_has_new_cells_of_equal_soc() {
         assert_eq!((cell.resistance_ratio, cell.leak, cell.soc), (1.0, None, cells[1].soc));
     }
     assert_eq!(cells[3], healthy.pack().cells()[3]);
-    // The new module starts with the mean SOC of the old one, so it lacks half of the leaked charge. With 15 % more
-    // capacity, its SOC then falls less.
+    // The new module starts with the mean SOC of the old module, so the new module lacks half of the leaked charge.
+    // With 15 % more capacity, the SOC of the new module then falls less.
     let missing = healthy.pack().cells()[3].soc - cells[1].soc;
     let moved = 1.325 * 1000.0 / 3600.0 / 2.6;
     let expected = 0.5 * 0.5 * 2000.0 / 3600.0 / 2.6 - moved * (1.0 - 1.0 / 1.15);

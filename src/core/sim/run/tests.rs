@@ -94,7 +94,7 @@ fn ev_day_drives_regenerates_sleeps_and_charges() {
     settings.pack.cells = 3;
     let mut sim = simulation(settings);
     let course = run(&mut sim);
-    assert_eq!(course.longest_gap_s.round(), 9.5 * 3600.0 - 3300.0); // the night ends with the run
+    assert_eq!(course.longest_gap_s.round(), 9.5 * 3600.0 - 3300.0); // no moment follows the night
     assert_eq!(sim.pack().cycles(), 1);
     assert!(course.soc.0 > 0.3 && course.soc.1 < 0.88, "{:?}", course.soc);
     assert!(course.current_a.1 > 50.0 && course.current_a.0 < -20.0, "{:?}", course.current_a);

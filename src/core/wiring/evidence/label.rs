@@ -57,7 +57,7 @@ enum LabelUnit {
     Other,
 }
 
-// Words in names. A word with `=` must be a whole word of the name; any other word may be a part of it.
+// Words in names. A word with `=` must be a whole word of the name; any other word may be a part of the name.
 
 /// Words that indicate the traction battery.
 const PACK: &str = "batt akku pack bms traction hvb =hv accumulator";

@@ -1,5 +1,5 @@
-//! Evidence about signals from their values, names and bits. The doctor uses it to judge the configured signals,
-//! `discover` to score candidates.
+//! Evidence about signals from their values, names and bits. `doctor` judges the configured signals by this evidence,
+//! and `discover` scores candidates.
 //!
 //! | file | purpose |
 //! | --- | --- |

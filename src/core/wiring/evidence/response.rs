@@ -62,8 +62,8 @@ struct BlockMean {
     cells_v: Vec<f64>,
 }
 
-/// A run that is still growing. Its sums count time and voltage from the first evaluated block, so that rounding
-/// errors stay small.
+/// A run that is still growing. The sums count time and voltage from the first evaluated block, so that rounding errors
+/// stay small.
 #[derive(Debug, Clone, Copy, Default)]
 struct OpenRun {
     from: Timestamp,
@@ -269,8 +269,8 @@ impl VoltageResponse {
             return Slope::of(points(0.2 * largest));
         }
         let all: Vec<(f64, f64)> = points(0.0).collect();
-        // Even the largest step is small for this pack: it is noise, or the unit is wrong. Use only the larger steps,
-        // without outliers.
+        // If even the largest step is small for this pack, it is noise, or the unit is wrong: use only the larger
+        // steps, without outliers.
         if largest < 5.0 * self.tolerance_a { Slope::of(points(0.2 * largest)) } else { Slope::fit(&all) }
     }
 

@@ -1,7 +1,7 @@
 //! Keeps the extent and the roughness of a stream of values, and a thinned sample of the stream, in bounded memory.
 
-/// A sample of a stream. It keeps every value until it is full, then every second value, every fourth, and so on. Two
-/// samples of equal size that receive the same number of values keep the values at the same positions.
+/// A sample of a stream. The sample keeps every value until it is full, then every second value, every fourth, and so
+/// on. Two samples of equal size that receive the same number of values keep the values at the same positions.
 #[derive(Debug, Clone)]
 pub struct ThinnedSample {
     values: Vec<f64>,
@@ -56,7 +56,7 @@ impl ThinnedSample {
         self.quantile(0.5)
     }
 
-    /// Share of the values for which `has` is true; 0 without values.
+    /// Share of the values that fulfil `has`; 0 without values.
     pub(crate) fn share(&self, has: impl Fn(f64) -> bool) -> f64 {
         self.values.iter().filter(|value| has(**value)).count() as f64 / self.values.len().max(1) as f64
     }

@@ -62,7 +62,7 @@ impl Slope {
         Some(Self { points: moved, ..slope })
     }
 
-    /// Slope through the points without outliers, so that a single wrong reading does not change it.
+    /// Slope through the points without outliers, so that a single wrong reading does not change the slope.
     pub(super) fn of(points: impl Iterator<Item = (f64, f64)>) -> Option<Self> {
         let all: Vec<(f64, f64)> = points.filter(|(x, y)| y.is_finite() && *x != 0.0).collect();
         let ratio = median(all.iter().map(|(x, y)| y / x))?;

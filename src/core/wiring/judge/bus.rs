@@ -34,7 +34,7 @@ fn messages_of<'d>(judge: &Judge<'d>, bus: BusIndex) -> Vec<&'d MessagePlan> {
     judge.plan.messages.iter().filter(|message| message.bus == bus).collect()
 }
 
-/// The other interface that has received more of the wanted identifiers than any other, and the number of these
+/// Of the other interfaces, the interface that has received the most wanted identifiers, and the number of these
 /// identifiers.
 fn best_other<'d>(judge: &Judge<'d>, index: usize, wanted: &[&MessagePlan]) -> Option<(&'d BusStats, usize)> {
     let others = judge.observed.buses.iter().enumerate().filter(|(other, _)| *other != index);

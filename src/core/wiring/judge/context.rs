@@ -39,22 +39,22 @@ pub(super) struct Judge<'d> {
     pub(super) wrong_layouts: Vec<Kind>,
 }
 
-/// Adds an error; the caller adds its texts.
+/// Adds an error; the caller adds the texts.
 pub(super) fn error<'j>(judge: &'j mut Judge<'_>, topic: Topic, title: impl Into<String>) -> &'j mut WiringFinding {
     find(judge, Severity::Error, topic, title)
 }
 
-/// Adds a warning; the caller adds its texts.
+/// Adds a warning; the caller adds the texts.
 pub(super) fn warning<'j>(judge: &'j mut Judge<'_>, topic: Topic, title: impl Into<String>) -> &'j mut WiringFinding {
     find(judge, Severity::Warning, topic, title)
 }
 
-/// Adds a note; the caller adds its texts.
+/// Adds a note; the caller adds the texts.
 pub(super) fn note<'j>(judge: &'j mut Judge<'_>, topic: Topic, title: impl Into<String>) -> &'j mut WiringFinding {
     find(judge, Severity::Note, topic, title)
 }
 
-/// Adds a finding; the caller adds its texts.
+/// Adds a finding; the caller adds the texts.
 pub(super) fn find<'j>(
     judge: &'j mut Judge<'_>,
     severity: Severity,
@@ -118,12 +118,12 @@ impl<'d> Judge<'d> {
         if self.plan.pack.is_total { f64::from(self.plan.pack.cells.max(1)) } else { 1.0 }
     }
 
-    /// Median over the cells of their median voltages, read as configured, V per cell; `None` without readings.
+    /// Median over the cells of each cell's median voltage, read as configured, V per cell; `None` without readings.
     pub(super) fn cell_voltage(&self) -> Option<f64> {
         self.median_of(Kind::Voltage, |series| series.values.median()).map(|v| v / self.cells_per_reading())
     }
 
-    /// Median over the signals of a kind.
+    /// Median of `value` over the signals of a kind.
     pub(super) fn median_of(&self, kind: Kind, value: impl Fn(&Series) -> Option<f64>) -> Option<f64> {
         median(self.signals(kind).into_iter().filter_map(|(_, series)| value(series)))
     }

@@ -159,8 +159,9 @@ fn current_unit(judge: &mut Judge<'_>, seen: String, factor: f64, ratio: f64) {
     wrong_unit_or_cell(judge, signal, factor, severity).seen(seen).why(why);
 }
 
-/// Reports a current that `factor` corrects: its unit or the configured cell model is wrong. If the DBC states ampere
-/// and the configuration scales nothing, the reading is probably right, so the finding names the cell model first.
+/// Reports a current that `factor` corrects: the current's unit or the configured cell model is wrong. If the DBC
+/// states ampere and the configuration scales nothing, the reading is probably right, so the finding names the cell
+/// model first.
 pub(super) fn wrong_unit_or_cell<'j>(
     judge: &'j mut Judge<'_>,
     signal: &SignalPlan,

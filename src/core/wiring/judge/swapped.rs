@@ -83,7 +83,7 @@ fn pack_voltage_as_current(judge: &mut Judge<'_>) -> bool {
     is_sum
 }
 
-/// Quantities for which a signal's values are plausible.
+/// Whether a signal's values are plausible as a voltage, a temperature or a current.
 struct Fit {
     voltage: bool,
     temperature: bool,

@@ -1,4 +1,4 @@
-//! Formats numbers and channels with no more digits than are significant.
+//! Formats channel names, and numbers with no more digits than are significant.
 
 use crate::quantity::Channel;
 

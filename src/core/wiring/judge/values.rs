@@ -49,7 +49,7 @@ fn better_layout<'d>(
     })
 }
 
-/// Whether the values of the alternative layout are smooth, while those of the configured layout jump.
+/// Whether the values of the alternative layout are smooth, while the values of the configured layout jump.
 fn is_smoother((signal, series): SignalSeries<'_>, other: &AlternativeReading) -> bool {
     let layout = &signal.layout;
     if layout.length_bits < 12 || series.extent.changes < 10 {
