@@ -1,9 +1,11 @@
-//! The pure core: frames in; estimates, alarms and frames out. It never reads a clock, a file or a socket and never
-//! logs: the same inputs give the same outputs, byte for byte. No dependency of this crate does I/O. Keys for
-//! authenticated frames stay in the driver, which creates and checks authenticators and passes the results to the core.
+//! The pure core: frames in; estimates, alarms and frames out. The core never reads a clock, a file or a socket and
+//! never logs. The same inputs therefore give the same outputs, byte for byte. No dependency of this crate does I/O.
+//! Keys for authenticated frames stay in the driver, which creates and checks authenticators and passes the results to
+//! the core.
 //!
-//! # Data path [`monitor::Monitor`] handles every record. Data flows in one direction. `monitor/message` defines the
-//! records that come in and the events, estimates and frames that go out; it does not depend on any stage. Each file in
+//! # Data path
+//! [`monitor::Monitor`] handles every record. Data flows in one direction. `monitor/message` defines the records that
+//! come in and the events, estimates and frames that go out; these types do not depend on any stage. Each file in
 //! `monitor/stage` is one stage and does not depend on later stages. Only `monitor/stages.rs` knows the order of the
 //! stages. `monitor/lifecycle` restores and reconfigures the stages.
 //!

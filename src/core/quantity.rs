@@ -179,8 +179,8 @@ pub enum Channel {
     /// SOH (capacity over rated capacity) reported by the pack, fraction. The value is only compared with the estimate;
     /// the estimate never uses it.
     ReportedSoh,
-    /// Voltage of the vehicle's 12 V (or 24 V) supply, V. If it is too low, no diagnostic requests are sent. Never used
-    /// by an estimate.
+    /// Voltage of the vehicle's 12 V (or 24 V) supply, V. If this voltage is too low, no diagnostic requests are sent.
+    /// Never used by an estimate.
     SupplyVoltage,
     /// Whether the BMS bleeds a cell; 0 = the BMS does not bleed the cell. Only the cell-fault detector uses this
     /// value.

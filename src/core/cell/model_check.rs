@@ -13,8 +13,8 @@
 //!   variances that a and b have between chemistries.
 //!
 //! In the sum of the witnesses, each counts at most [`CORROBORATED`] times as much as the other. The reason is that
-//! other causes affect only one witness: an aged cell has a higher resistance but its voltages fit, and a local error
-//! of a cell's own curve does not change its resistance. With another cell's model, both witnesses are large.
+//! other causes affect only one witness: an aged cell has a higher resistance, but the voltages fit; a local error of a
+//! cell's own curve does not change the resistance. With another cell's model, both witnesses are large.
 //!
 //! The check ends after [`WINDOW_S`] without a mismatch, because a cell ages but does not become another cell. After a
 //! mismatch, the following windows are judged one by one until one window has no mismatch. An aged cell is thus trusted
@@ -30,8 +30,8 @@ use crate::quantity::InvalidState;
 /// cell; in a longer window, the cell would age.
 const WINDOW_S: f64 = 3600.0;
 
-/// Standard deviations of the voltage difference to another cell's curve: a constant, V, and a slope, V per unit of
-/// SOC.
+/// Standard deviations of the voltage difference to another cell's curve: of the constant (V), and of the slope (V per
+/// unit of SOC).
 const CURVE_STD_V: [f64; 2] = [0.2, 0.4];
 
 /// Maximum weight of a witness, relative to the other witness.
@@ -48,7 +48,7 @@ pub struct ModelCheck {
     model: u64,
     /// Time of use judged so far, s.
     use_s: f64,
-    /// Time, s, and charge, A s, since the last evidence was taken.
+    /// Time (s) and charge (A s) since the last evidence was taken.
     since_s: f64,
     since_as: f64,
     /// Duration of the latest step, s.
@@ -169,7 +169,7 @@ impl ModelCheck {
         self.use_s < WINDOW_S
     }
 
-    /// Adds the time, s, and the charge, A s, of a step. If the step has unmeasured time, discards the time and charge
+    /// Adds the time (s) and the charge (A s) of a step. If the step has unmeasured time, discards the time and charge
     /// since the last evidence.
     #[inline]
     pub fn add_step(&mut self, measured_s: f64, charge_as: f64, unmeasured_s: f64) {

@@ -7,8 +7,8 @@
 //! current. In addition to the voltage, a row contains all inputs of its prediction in linear form: the charge since
 //! the start of the stretch, the current, and the current after first-order filters with the time constants of the
 //! branches. Single rows can therefore be removed from a stretch. A mean hides current steps, so these are stored as
-//! the sums of a small regression. Rows are classified by SOC, temperature and direction of the current. If the
-//! notebook is full, it removes the oldest row of the class with the most rows and thus keeps rare rows.
+//! the sums of a small regression. Rows are classified by SOC, temperature and direction of the current. A full
+//! notebook removes the oldest row of the class with the most rows, and thus keeps rare rows.
 
 use serde::{Deserialize, Serialize};
 
@@ -18,10 +18,10 @@ use crate::quantity::InvalidState;
 
 /// Maximum number of rows. With 64 bytes per row, the notebook stays below 8 kB.
 pub const MAX_ROWS: usize = 120;
-/// Below this SOC, fraction, rows and classes cover a smaller range of SOC, because curves are steep and resistances
+/// SOC, fraction. Below this SOC, rows and classes cover a smaller SOC range, because curves are steep and resistances
 /// rise.
 const LOW_SOC: f64 = 0.15;
-/// Range of SOC of a row or class below `LOW_SOC`, as a fraction of the usual range.
+/// SOC range that a row or class covers below `LOW_SOC`, as a fraction of the usual range.
 const LOW_SOC_PART: f64 = 0.25;
 /// Width of the SOC range that a class of rows covers, fraction.
 const CLASS_SOC: f64 = 0.1;
@@ -57,8 +57,8 @@ pub struct Row {
     pub steps: CurrentSteps,
 }
 
-/// Sums of products of three quantities: i is the change of the current between two consecutive readings, A; x is the
-/// change of the current after the fastest filter, A; v is the change of the voltage, V.
+/// Sums of products of changes between two consecutive readings. i is the change of the current (A), x the change of
+/// the current after the fastest filter (A), v the change of the voltage (V).
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CurrentSteps {
@@ -152,7 +152,7 @@ pub struct NotebookConfig {
 }
 
 impl NotebookConfig {
-    /// Settings for a pack of cells known by their label.
+    /// Settings for a pack whose cells are known by a label.
     pub fn new(cells: u32, rated_ah: f64) -> Self {
         Self { cells, rated_ah, tau_s: TAU_S }
     }

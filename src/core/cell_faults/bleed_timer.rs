@@ -1,10 +1,10 @@
 //! Measures from the BMS's balancing bits how long the BMS bled one cell.
 //!
-//! In: balancing bits with their time and validity; starts and ends of rows (a few minutes of samples each). Out: for
-//! the time between the middles of two rows, how long the cell was bled, how long the state was unknown, and how long
-//! no bits were received. The charge that a row shows is the charge at its middle, so half of the row's bleed time
-//! counts in the next row. If the cell is bled between two rows, while the buses sleep, this time counts in the later
-//! row.
+//! In: balancing bits with their time and validity; starts and ends of rows (a few minutes of samples each). Out: three
+//! durations within the time from the middle of one row to the middle of the next: the cell was bled, the state was
+//! unknown, no bits were received. The charge that a row shows is the charge at its middle, so half of the row's bleed
+//! time counts in the next row. If the cell is bled between two rows, while the buses sleep, this time counts in the
+//! later row.
 
 use serde::{Deserialize, Serialize};
 
@@ -17,7 +17,7 @@ pub struct BalancingConfig {
     pub bleed_a: f64,
     /// Maximum validity of a bit, s.
     pub max_age_s: f64,
-    /// Whether the BMS bleeds no cell while it sends no bits. If false, it is unknown whether cells are bled while no
+    /// Whether the BMS bleeds cells only while it sends bits. If false, it is unknown whether cells are bled while no
     /// bits are sent.
     pub is_only_while_sent: bool,
 }

@@ -1,5 +1,5 @@
-//! Finds voltage channels that do not show the voltage of their own cell: they are frozen at one value or show another
-//! cell.
+//! Finds voltage channels that do not show the voltage of their own cell, because they are frozen at one value or show
+//! another cell.
 
 use serde::{Deserialize, Serialize};
 

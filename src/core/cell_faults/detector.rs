@@ -24,9 +24,9 @@ use balancing::Bleed;
 use judge::Population;
 
 /// Length of a row. A row ends when `ROW_SOC` of the capacity has moved, or after `ROW_S` seconds. During a long rest,
-/// the row ends after `REST_PART` of the time at rest, because more samples add no information. With shorter rows, the
-/// detector would find a bad contact sooner, but it would mistake an aged cell for a bad contact and miss exchanged
-/// channels.
+/// the row ends after `REST_PART` of the time at rest, because more samples add no information. Shorter rows would show
+/// a bad contact sooner. With shorter rows, however, the detector would mistake an aged cell for a bad contact, and
+/// would miss exchanged channels.
 const ROW_SOC: f64 = 0.02;
 const ROW_S: f64 = 300.0;
 const REST_PART: f64 = 0.5;
@@ -50,8 +50,8 @@ const STEP_V: f64 = 0.003;
 /// Minimum sum of squared current steps; with a smaller sum, no resistance is measured. Unit: square of the 1 C
 /// current.
 const LEAST_STEPS: f64 = 0.02;
-/// If the change of the mean cell's SOC between two rows differs from the counted charge by this much or more,
-/// fraction, the counted charge is used.
+/// SOC, fraction. If the change of the mean cell's SOC between two rows differs from the counted charge by this much or
+/// more, the counted charge is used.
 const SOC_JUMP: f64 = 0.02;
 const DAY_S: f64 = 86_400.0;
 /// Number of fault kinds up to and including `TemperatureSensor`. All kinds that apply to single cells are among them.
@@ -407,8 +407,8 @@ impl CellFaultDetector {
             let mean = cell.difference.mean();
             ohm - middle_ohm - slope[RESISTANCE] * mean[RESISTANCE] - slope[CONTACT] * mean[CONTACT]
         };
-        // The scatter between the cells includes the noise of their channels, which is large if the channels have a
-        // coarse resolution.
+        // The scatter between the cells includes the noise of the voltage channels. Channels with a coarse resolution
+        // are noisy.
         let innovations =
             self.cells.iter().zip(&ohms).filter_map(|(cell, ohm)| Some(innovation_ohm(cell, ohm.as_ref()?.0)));
         let scatter_ohm = Population::of(innovations).std;

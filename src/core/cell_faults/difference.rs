@@ -1,8 +1,8 @@
 //! Filter of the difference between one cell and the middle of its pack.
 //!
 //! In: per row (a few minutes of samples), the cell's voltage minus the middle voltage of the pack. Out: the states
-//! that explain this voltage difference. The filter is a linear Kalman filter, linearised at the cell's own SOC. It can
-//! distinguish the states because they have different effects:
+//! that explain this voltage difference. The filter is a linear Kalman filter, linearised at the cell's own SOC. The
+//! filter can distinguish the states because the states have different effects:
 //!
 //! | state | effect on the voltage difference |
 //! | --- | --- |
@@ -13,9 +13,9 @@
 //! | channel | constant |
 //! | leak | grows with time |
 //!
-//! Sources: the filter estimates a mean cell and the differences of the other cells from it, as in Plett's bar-delta
-//! filtering (Battery Management Systems II, section 4.11). For the contact resistance of one cell in a vehicle: Zheng
-//! et al., J. Power Sources 241 (2013) 181.
+//! Sources: one filter estimates the mean cell, and this filter estimates the difference of one cell from the mean
+//! cell, as in Plett's bar-delta filtering (Battery Management Systems II, section 4.11). For the contact resistance of
+//! one cell in a vehicle: Zheng et al., J. Power Sources 241 (2013) 181.
 
 use serde::{Deserialize, Serialize};
 
@@ -85,7 +85,7 @@ pub(super) enum Jump {
     Replaced,
 }
 
-/// Counts consecutive deviations with the same sign that reach `limit`. If there are enough of them for a jump, resets
+/// Counts consecutive deviations with the same sign that reach `limit`. If three such deviations make a jump, resets
 /// the count and returns true.
 fn count_odd(odd: &mut i8, deviations: f64, limit: f64) -> bool {
     let side = if deviations.abs() < limit { 0 } else { deviations.signum() as i8 };

@@ -243,6 +243,6 @@ pub const GAIN: f64 = 0.02;
 pub(super) const REPORTED: f64 = 0.999;
 pub(super) const WITHDRAWN: f64 = 0.5;
 
-/// Minimum distance of a finding from the median of the pack, in robust standard deviations of the pack's cells. This
-/// distance allows for the normal spread of healthy cells.
+/// Minimum distance of a faulty cell from the median of the pack, in robust standard deviations of the pack's cells.
+/// This distance allows for the normal spread of healthy cells.
 pub(super) const OUTLIER: f64 = 3.5;

@@ -197,7 +197,7 @@ impl CellFaultDetector {
     }
 }
 
-/// Mean open-circuit voltage between empty and full, V, of a cell that has aged to `capacity_ah`.
+/// Mean open-circuit voltage, between empty and full, of a cell that has aged to `capacity_ah`, V.
 pub fn mean_ocv_v(model: &CellModel, capacity_ah: f64) -> f64 {
     let soc = |part: u32| (f64::from(part) + 0.5) / f64::from(OCV_PARTS);
     let ocv_v = |part| model.aged_ocv_v(&model.grid_position(soc(part), 25.0), capacity_ah);

@@ -68,7 +68,7 @@ impl CellSums {
         (self.temperatures > 0).then(|| self.temperature_c / f64::from(self.temperatures))
     }
 
-    /// Series resistance computed from current steps, ohm, and the sum of squared current steps, A^2. `None` if this
+    /// Series resistance computed from current steps (ohm), and the sum of squared current steps (A^2). `None` if this
     /// sum is below `least_a2`.
     pub(super) fn ohm(&self, least_a2: f64) -> Option<(f64, f64)> {
         (self.steps_a2 >= least_a2).then(|| (-self.steps_va / self.steps_a2, self.steps_a2))

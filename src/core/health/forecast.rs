@@ -11,10 +11,10 @@
 //! * level: the capacity without recovery, which only falls; level -= rate dt. The use t counts equivalent full
 //!   cycles, or days if the cycles are unknown;
 //! * rate: loss per unit of use. Its logarithm follows a random walk with two parts. The first part has the standard
-//!   deviation w1 = `RATE_WALK` per square root of capacity lost (`KNEE_WALK` in the knee, see [`knee`]), the second
-//!   part w2 = `RATE_WALK_USE` per square root of an e-fold of use. Both parts are relative, so the same constants suit
-//!   cells that live for 50 cycles and for 5,000. In the linear filter, Q = (w1^2 rate dt + w2^2 ln(t1 / t0)) (rate^2 +
-//!   P_rate), with the use t0 before the step and t1 after the step;
+//!   deviation w1 = `RATE_WALK` per square root of capacity lost; in the knee (see [`knee`]), w1 = `KNEE_WALK`. The
+//!   second part has the standard deviation w2 = `RATE_WALK_USE` per square root of an e-fold of use. Both parts are
+//!   relative, so the same constants suit cells that live for 50 cycles and for 5,000. In the linear filter, Q = (w1^2
+//!   rate dt + w2^2 ln(t1 / t0)) (rate^2 + P_rate), with the use t0 before the step and t1 after the step;
 //! * recovery: capacity that returns during rest and is used up again (an Ornstein-Uhlenbeck process; measured cells
 //!   show 1 to 5 % after days of rest). Because successive readings share the recovery, ten readings within one cycle
 //!   do not count as ten independent readings;
@@ -62,8 +62,8 @@ const KNEE_WALK: f64 = 1.5;
 const RECOVERY_IN_USE: f64 = 0.01;
 /// Standard deviation of the recovery gained by rest, fraction of the reference.
 const RECOVERY_IN_REST: f64 = 0.02;
-/// Time constant of the recovery during rest, days. On the axis of days, it is also the time constant with which the
-/// recovery decays.
+/// Time constant of the recovery during rest, days. If use is counted in days, the recovery also decays with this time
+/// constant.
 const RECOVERY_DAYS: f64 = 1.0;
 const DAY_S: f64 = 86_400.0;
 

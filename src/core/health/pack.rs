@@ -33,8 +33,8 @@ pub struct PackState {
     pub soc: f64,
     /// Standard deviation of the limiting cell's SOC.
     pub soc_std: f64,
-    /// Charge, Ah, that the pack delivers if its discharge starts when the fullest cell is full and ends when the
-    /// weakest cell is empty.
+    /// Charge that the pack delivers if the discharge starts when the fullest cell is full and ends when the weakest
+    /// cell is empty, Ah.
     pub capacity_ah: f64,
     /// Standard deviation of the limiting cell's capacity, Ah.
     pub capacity_std_ah: f64,

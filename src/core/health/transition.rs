@@ -1,7 +1,7 @@
 //! Detects charge, rest or discharge from the pack current, with dead band, hysteresis and minimum duration.
 //!
 //! In: pack current in A (positive = discharge), `None` if stale. Out: changes of mode. A change is reported after the
-//! new mode has lasted for the minimum duration; it is dated at the time at which the new mode began.
+//! new mode has lasted for the minimum duration. The change has the time at which the new mode began.
 
 use serde::{Deserialize, Serialize};
 
@@ -84,8 +84,8 @@ impl TransitionDetector {
         Some(ModeChange { from, to: candidate.mode, since: candidate.since })
     }
 
-    /// Mode of a current. Charge or discharge begins only if the current exceeds the dead band plus the hysteresis. It
-    /// continues while the current exceeds the dead band.
+    /// Mode of a current. Charge or discharge begins only if the current exceeds the dead band plus the hysteresis. The
+    /// charge or discharge continues while the current exceeds the dead band.
     fn classify(&self, config: &TransitionConfig, current_a: Option<f64>) -> Mode {
         let Some(current_a) = current_a else { return Mode::Unknown };
         let enter = config.dead_band_a + config.hysteresis_a;

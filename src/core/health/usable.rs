@@ -53,7 +53,7 @@ pub fn usable_ah(
         }
         let after_v = voltage(next, &branch_v);
         if next <= 0.0 {
-            // The cell is empty before its voltage reaches the cut-off: it delivers all its charge.
+            // The cell is empty before the voltage reaches the cut-off, so the cell delivers all its charge.
             return capacity_ah * full_soc;
         }
         if after_v <= config.cutoff_v {

@@ -47,7 +47,7 @@ pub struct MonitorConfig {
     pub model: CellModel,
     /// Cells of another kind, with their own models.
     pub modules: Vec<CellModule>,
-    /// Label of the cells, from which their model is learned; `None` = the model comes from a model file.
+    /// Label of the cells, the starting point for learning their model; `None` = the model comes from a model file.
     pub label: Option<Label>,
     /// Whether the BMS discharges fuller cells after a charge (passive balancing).
     pub is_balanced: bool,
@@ -150,8 +150,8 @@ pub struct ReconfigureError {
 }
 
 impl MonitorConfig {
-    /// Whether the daemon must receive every frame of an interface. This is necessary if the daemon sends requests on
-    /// the interface, because it sends requests only while the bus is awake.
+    /// Whether the daemon must receive every frame of an interface. This is necessary on an interface for requests,
+    /// because the daemon sends requests only while the bus is awake.
     pub fn wants_all(&self, bus: BusIndex) -> bool {
         self.poll.as_ref().is_some_and(|poll| poll.requests.iter().any(|it| it.question.controller.bus == bus))
     }
@@ -173,7 +173,7 @@ impl MonitorConfig {
         u32::from(self.sample.cells).saturating_sub(u32::try_from(in_modules).unwrap_or(u32::MAX))
     }
 
-    /// Identifiers to receive on an interface, ascending. They include the identifiers of the daemon's own frames,
+    /// Identifiers to receive on an interface, ascending. The identifiers of the daemon's own frames are included,
     /// because another node may also use these identifiers.
     pub fn wanted_ids(&self, bus: BusIndex) -> Vec<CanId> {
         let mut ids = self.listened_ids(bus);
@@ -192,8 +192,8 @@ impl MonitorConfig {
         self.output.iter().flat_map(of)
     }
 
-    /// Unprotected input messages with the cycle time of their frames, s, if known. For a multiplexed message, the
-    /// cycle time counts as unknown, because the stated cycle time may apply to each page.
+    /// Unprotected input messages, each with the cycle time (s) of the frames if this time is known. For a multiplexed
+    /// message, the cycle time counts as unknown, because the stated cycle time may apply to each page.
     pub(crate) fn unprotected(&self) -> impl Iterator<Item = (BusIndex, CanId, Option<f64>)> + '_ {
         let is_protected = |bus, id| self.guards.iter().any(|guard| (guard.bus, guard.id) == (bus, id));
         let cycle_s = |bus, id| self.cycle_times_s.iter().find(|of| (of.0, of.1) == (bus, id)).map(|of| of.2);

@@ -1,4 +1,4 @@
-//! The core: handles records and produces outputs. It never reads a clock, a file or a socket, and never logs.
+//! The core: handles records and produces outputs. The core never reads a clock, a file or a socket, and never logs.
 //!
 //! Records arrive in the order in which they happened. The same records give the same outputs, byte for byte. A bad
 //! record is counted and causes an event, never a panic. The data path has one file per stage:
@@ -56,7 +56,7 @@ pub use stage::modelling::{ModelChange, ModelView};
 pub use stage::sending::MAX_TEST_S;
 pub use stage::statistics::{AlarmCounts, BusStatistics, LearningCounts, Statistics, VoltageCounts};
 
-/// The pure core of packwatch: records in, outputs out.
+/// The pure core of packwatch: takes records and returns outputs.
 #[derive(Debug)]
 pub struct Monitor {
     pub(crate) config: MonitorConfig,
@@ -188,9 +188,9 @@ impl Monitor {
         }
     }
 
-    /// Handles a frame of diagnostic requests and answers. The values of an answer count as measured at its first
-    /// frame: by then, the controller has assembled the answer. The times of the remaining frames only depend on the
-    /// tester's flow control.
+    /// Handles a frame of diagnostic requests and answers. The values of an answer count as measured at the time of the
+    /// answer's first frame: by then, the controller has assembled the answer. The times of the remaining frames only
+    /// depend on the tester's flow control.
     fn handle_diagnostic(&mut self, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
         let Self { clock, intake, stages, .. } = self;
         let (now, Intake { listener, moments, controllers, .. }) = (clock.now, &mut *intake);
@@ -270,8 +270,8 @@ impl Monitor {
     }
 
     /// How to check the authenticator of a frame; `None` if the frame does not belong to an authenticated message. The
-    /// driver has the key: it checks such a frame and passes it as [`RecordKind::SecuredFrame`]. If the driver passes
-    /// the frame as [`RecordKind::Frame`], the frame counts as forged.
+    /// driver has the key, so the driver checks such a frame and passes it as [`RecordKind::SecuredFrame`]. If the
+    /// driver passes the frame as [`RecordKind::Frame`], the frame counts as forged.
     #[inline]
     pub fn mac_check(&self, bus: BusIndex, frame: &Frame) -> Option<MacCheck> {
         let commands = self.config.commands.as_ref()?;
@@ -292,8 +292,8 @@ impl Monitor {
         self.stages.modelling.give(task, findings);
     }
 
-    /// Steps the cells that have a waiting sample, without waiting for the other cells. The core does this itself
-    /// before it uses estimates; a driver calls this function after its last input.
+    /// Steps the cells that have a waiting sample, without waiting for the other cells. The core itself does this
+    /// before it uses estimates. A driver calls this function after the last input.
     pub fn settle(&mut self, out: &mut Outputs) {
         let first_event = out.events.len();
         self.stages.step_waiting(self.clock.now, true, out);

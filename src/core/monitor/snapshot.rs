@@ -28,7 +28,7 @@ const CHARGE: &str = "the charge since a cell's latest voltage or half-cycle";
 /// Factor by which a charge may exceed the largest plausible charge, because the limits of the current may have been
 /// wider when the charge was counted.
 const CHARGE_TOLERANCE: f64 = 2.0;
-/// Time, s, that is added to the time in which the charge has moved, because the clock may have been set.
+/// Time that is added to the time in which the charge has moved, because the clock may have been set, s.
 const CHARGE_TOLERANCE_S: f64 = 1000.0;
 
 /// Layout version of [`Snapshot`].

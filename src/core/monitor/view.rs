@@ -137,7 +137,7 @@ impl Monitor {
         self.stages.sampling.sampler.channels().len()
     }
 
-    /// Identity of the connected pack; `None` if no such signal is configured or it has not been read yet.
+    /// Identity of the connected pack; `None` if no identity signal is configured or the signal has not been read yet.
     pub fn pack_identity(&self) -> Option<f64> {
         self.stages.sampling.identity.known
     }
@@ -254,7 +254,7 @@ impl Monitor {
         }
     }
 
-    /// Sum of the cells' voltages, V; `None` unless all of them are fresh.
+    /// Sum of the cells' voltages, V; `None` unless all cell voltages are fresh.
     fn pack_voltage_v(&self) -> Option<f64> {
         let sum_v: Option<f64> = self.cell_views().map(|view| view.values.mean(Quantity::Voltage)).sum();
         match self.stages.sampling.sampler.config().voltage_source {

@@ -54,7 +54,7 @@ pub enum Part {
     Std,
 }
 
-/// Unit of a quantity inside the program. Each output converts it with a `match`.
+/// Unit of a quantity inside the program. Each output converts the unit with a `match`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Unit {
     /// Fraction of a full or of a new battery, 0 to 1.
@@ -91,7 +91,7 @@ impl Unit {
     }
 }
 
-/// Path of a VSS signal. The path of the standard deviation is derived from it.
+/// Path of a VSS signal. The path of the standard deviation is derived from this path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum VssPath {
     /// A signal of standard VSS, below its battery branch.

@@ -3,9 +3,9 @@
 //! In: good current readings, A, positive = discharge. Out: cumulative charge, As, and cumulative unmeasured time, s;
 //! only their differences are meaningful. An interval between two current readings counts as follows:
 //! * at most the current's `max_age_s`: the charge is the mean of the two readings times the elapsed time (trapezoid);
-//! * longer than `max_age_s`, the longest time for which a value may be used: the first reading is held for
-//!   `max_age_s`. The rest of the interval is unmeasured. Unmeasured time is never interpolated, regardless of its
-//!   cause (bad readings, lost frames, sleep, a restart).
+//! * longer than `max_age_s`, the maximum age of a usable value: the first reading is held for `max_age_s`. The rest of
+//!   the interval is unmeasured. Unmeasured time is never interpolated, regardless of its cause (bad readings, lost
+//!   frames, sleep, a restart).
 //!
 //! After the latest reading, the current is held in the same way. The next reading replaces the held value by the
 //! trapezoid. While a valid reading says that the contactors are open, the current counts as zero, regardless of the

@@ -10,8 +10,9 @@
 //! reading is still the same [`MIN_FROZEN_S`] after the turn and at least [`MIN_READINGS`] readings were equal. The
 //! delay allows for a reading that arrives later than the voltages.
 //!
-//! Limits: the check does not detect a load that does not turn back or moves the voltages by less than the step. Nor
-//! does it detect a sensor whose last digits still change. In that case, the voltages contradict the estimate.
+//! Limits: the check does not detect a frozen sensor if the load does not turn back or moves the voltages by less than
+//! the step. The check does not detect a faulty sensor whose last digits still change. In that case, the voltages
+//! contradict the estimate.
 
 use serde::{Deserialize, Serialize};
 
@@ -36,8 +37,8 @@ const MAX_MOVES: usize = 32;
 const MIN_MOVES: usize = 8;
 /// Smallest step, V. A smaller step may be a charger's ripple, or a load within one step of a coarse current sensor.
 const MIN_STEP_V: f64 = 0.02;
-/// Maximum number of cells whose median is calculated. The first cells are used; they are enough to distinguish a
-/// glitch from a load.
+/// Maximum number of cells whose median is calculated. The first cells are used; these cells are enough to distinguish
+/// a glitch from a load.
 const MAX_MEDIAN: usize = 15;
 /// Longest time between two current readings, s. After a longer pause the check restarts.
 const MAX_PAUSE_S: f64 = 5.0;
@@ -106,8 +107,8 @@ pub(super) struct FrozenCheck {
     is_mixed: bool,
     /// Median of the previous round, V.
     median_v: f64,
-    /// Latest absolute changes of the median, V, at most [`MAX_MOVES`]. They are kept when the reading of the current
-    /// changes.
+    /// Latest absolute changes of the median, V, at most [`MAX_MOVES`]. These changes are kept when the reading of the
+    /// current changes.
     moves_v: Vec<f64>,
     is_frozen: bool,
 }

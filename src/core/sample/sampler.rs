@@ -19,7 +19,7 @@ use super::signal::Signal;
 use crate::quantity::{CellIndex, Channel, Fault, InvalidState, Reading, SensorIndex, Timestamp};
 
 /// Smallest current that counts as flowing, as a fraction of the largest plausible current. A sensor's noise and offset
-/// at rest are below this current. Any load under which a voltage or temperature must change is above it.
+/// at rest are below this current. Any load under which a voltage or temperature must change is above this current.
 pub const FLOW_SHARE: f64 = 0.01;
 
 /// Reports that a signal turned bad (`Err` with the fault) or good again (`Ok` with the number of preceding bad
@@ -149,7 +149,8 @@ impl Sampler {
         self.restore(state);
     }
 
-    /// Handles a reading; returns a sample if it is a good voltage. Appends a change of the signal to `changes`.
+    /// Handles a reading; returns a sample if the reading is a good voltage. Appends a change of the signal to
+    /// `changes`.
     pub fn handle_reading(
         &mut self,
         time: Timestamp,
@@ -218,7 +219,7 @@ impl Sampler {
         self.state.frozen.is_frozen()
     }
 
-    /// Change of the pack current that exceeds its sensor's noise, A.
+    /// Change of the pack current that exceeds the noise of the current sensor, A.
     pub fn flow_a(&self) -> f64 {
         self.flow_a
     }
@@ -312,7 +313,7 @@ impl Sampler {
         Some(since.map_or(0.0, |from| now.since(from).max(0.0)))
     }
 
-    /// Share of bad readings on a channel, fraction, averaged over about
+    /// Share of bad readings on a channel (fraction), averaged over about
     /// [`BAD_SHARE_READINGS`](super::signal::BAD_SHARE_READINGS) readings; `None` = no reading yet.
     pub fn bad_share(&self, channel: Channel) -> Option<f64> {
         self.slot(channel).and_then(|slot| self.state.signals[slot].bad_share())
@@ -451,8 +452,8 @@ impl Sampler {
         SamplerState { strings, series, ..self.state.clone() }
     }
 
-    /// Restores a stored state. The caller has rebased its times and checked that it [`fits`](Self::fits). The downtime
-    /// counts as unmeasured, like any other time without readings of the current.
+    /// Restores a stored state. The caller has rebased the times and checked that the state [`fits`](Self::fits). The
+    /// downtime counts as unmeasured, like any other time without readings of the current.
     pub fn restore(&mut self, state: SamplerState) {
         assert!(self.fits(&state), "the stored state must have the same signals");
         let signals = self.state.signals.len();

@@ -12,17 +12,17 @@ use super::truth::Pack;
 pub struct Balancing {
     /// Current of a balancing resistor, A.
     pub bleed_a: f64,
-    /// Bleeding of a cell starts when its voltage exceeds the lowest cell voltage by this value, V.
+    /// Bleeding of a cell starts when the cell's voltage exceeds the lowest cell voltage by this value, V.
     pub start_v: f64,
-    /// Bleeding of a cell stops when its voltage exceeds the lowest cell voltage by less than this value, V.
+    /// Bleeding of a cell stops when the cell's voltage exceeds the lowest cell voltage by less than this value, V.
     pub stop_v: f64,
     /// A charge is near its end if the fullest cell has at least this SOC.
     pub from_soc: f64,
 }
 
 impl Balancing {
-    /// Settings of a typical BMS for cells of `capacity_ah`: bleeding takes 1 mA per Ah (60 mA at 60 Ah), starts at 10
-    /// mV and stops at 5 mV.
+    /// Settings of a typical BMS for cells of `capacity_ah`: a bleed current of 1 mA per Ah (60 mA at 60 Ah), a start
+    /// at 10 mV and a stop at 5 mV.
     pub fn usual(capacity_ah: f64) -> Self {
         Self { bleed_a: 1e-3 * capacity_ah, start_v: 0.010, stop_v: 0.005, from_soc: 0.7 }
     }
@@ -48,7 +48,7 @@ impl Balancer {
         // Largest current that counts as rest: 0.002 C.
         let is_rest = current_a.abs() <= 0.002 * pack.lowest_capacity_ah();
         self.charging_s = if current_a < 0.0 && !is_rest { self.charging_s + dt_s } else { 0.0 };
-        // A charge must last at least this long, s, so that regenerative braking does not count as a charge.
+        // A charge must last at least 60 s, so that regenerative braking does not count as a charge.
         let ends_charge = self.charging_s >= 60.0 && pack.highest_soc() >= self.settings.from_soc;
         if ends_charge {
             (self.is_armed, self.has_rested) = (true, false);

@@ -47,8 +47,8 @@ pub enum FaultKind {
         /// Size of the leak.
         leak: Leak,
     },
-    /// A resistance in series with the cell, between its two voltage taps. It does not depend on temperature, and its
-    /// heat warms no cell.
+    /// A resistance in series with the cell, between its two voltage taps. The resistance does not depend on
+    /// temperature, and its heat warms no cell.
     Contact {
         /// The cell.
         cell: CellIndex,

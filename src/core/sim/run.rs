@@ -94,7 +94,7 @@ pub struct Simulation {
     readings: Vec<(Channel, Option<f64>)>,
     time: Timestamp,
     current_a: f64,
-    /// Charge, As, and time, ns, since the cells were last stepped.
+    /// Charge (As) and time (ns) since the cells were last stepped.
     pending: (f64, i64),
     cells_due: bool,
     started: bool,
@@ -192,7 +192,7 @@ impl Simulation {
         &self.readings
     }
 
-    /// Constant errors of the current sensor, A, and of each cell's voltage sensor, V. Injected faults are not
+    /// Constant errors of the current sensor (A) and of each cell's voltage sensor (V). Injected faults are not
     /// included.
     pub fn sensor_offsets(&self) -> (f64, Vec<f64>) {
         (self.sensors.current.offset(), self.sensors.voltages.iter().map(Sensor::offset).collect())

@@ -3,8 +3,9 @@
 //! In: a [`Plan`] (the readable parts of the configuration), every frame of every interface with its time, interface
 //! events, and the estimates of a [`Monitor`](crate::monitor::Monitor) if the configuration allows one. Out: a
 //! [`WiringReport`] with findings (each with evidence, reason and the line to change), checks that passed, and checks
-//! that were not possible. The observer has its own decoder, which applies no limits to readings. It therefore also
-//! works with a configuration that the estimator cannot use. The observer's memory use is bounded for any duration.
+//! that were not possible. The observer has its own decoder, which applies no limits to readings. The observer
+//! therefore also works with a configuration that the estimator cannot use. The observer's memory use is bounded for
+//! any duration.
 //!
 //! | file | purpose |
 //! | --- | --- |

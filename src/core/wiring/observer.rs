@@ -90,7 +90,7 @@ pub struct WiringObserver {
     pub(crate) estimator: EstimatorStats,
     /// Time of the latest frame.
     latest: Option<Timestamp>,
-    /// Sum of the times between frames, s. Gaps above 30 s are left out, because the buses sleep during them.
+    /// Sum of the times between frames, s. Gaps above 30 s are left out, because the buses sleep during these gaps.
     pub(crate) awake_s: f64,
     /// Time listened on live interfaces, s; `None` for a recording, which uses `awake_s` instead.
     listened_s: Option<f64>,

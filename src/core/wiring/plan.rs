@@ -49,7 +49,7 @@ pub struct PackPlan {
     pub strings: u16,
     /// The cell model; `None` if it cannot be read.
     pub model: Option<CellModel>,
-    /// Capacity of a cell, Ah. If no capacity is configured, it is the capacity of the model.
+    /// Capacity of a cell, Ah. If no capacity is configured, the capacity of the model applies.
     pub capacity_ah: f64,
     /// Ambient temperature, degrees C.
     pub ambient_c: f64,

@@ -8,10 +8,10 @@
 //! the other parameters around this fit (Laplace). If the rows allow two capacities, the density has two maxima.
 //!
 //! # Errors of a row
-//! The errors of the circuit model repeat: rows at nearly the same SOC have the same errors of voltage, SOC and drop.
-//! The errors of rows are therefore correlated over 12 % of SOC. Their covariance has three parts: a constant, a part
-//! proportional to the slope of the curve, and a part proportional to the voltage drop. The error of the drop grows
-//! with the drop, because charge transfer is not linear (Butler-Volmer).
+//! The errors of the circuit model repeat: rows at nearly the same SOC have the same errors of voltage, SOC and voltage
+//! drop. The errors of rows are therefore correlated over 12 % of SOC. Their covariance has three parts: a constant, a
+//! part proportional to the slope of the curve, and a part proportional to the voltage drop. The error of the drop
+//! grows with the drop, because charge transfer is not linear (Butler-Volmer).
 //!
 //! The constants were chosen on LG HG2, LG M50 (simulated) and the Leaf cell, all at 25 degrees C.
 
@@ -59,7 +59,7 @@ pub struct Fit {
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Beginning {
     stretch: u32,
-    /// SOC at the start and offset of the current sensor, A, with their covariance at the fitted capacity.
+    /// SOC at the start, and offset of the current sensor (A). `covariance` is their covariance at the fitted capacity.
     means: [f64; 2],
     covariance: [[f64; 2]; 2],
     /// Changes of SOC and offset with one standard deviation of the capacity.
@@ -67,7 +67,8 @@ struct Beginning {
 }
 
 impl Fit {
-    /// Present SOC, fraction, and its covariance with the capacity, Ah; `None` if the present stretch has no rows.
+    /// Present SOC (fraction), and covariance of the SOC with the capacity (Ah); `None` if the present stretch has no
+    /// rows.
     pub fn soc(&self, present: Option<PresentStretch>) -> Option<(ScalarGaussian, f64)> {
         let (present, beginning) = present.zip(self.beginning)?;
         let Beginning { stretch, means, covariance, by_capacity } = beginning;

@@ -1,7 +1,7 @@
 //! Describes a fit of the on-board model as a task with inputs and a result.
 //!
-//! A fit takes hundreds of times longer than a tick may take, and it depends only on its inputs. A live host runs it on
-//! a separate thread. A replay runs it on the calling thread, with the same result.
+//! A fit takes hundreds of times longer than a tick may take, and the result depends only on the inputs. A live host
+//! therefore runs the task on a separate thread. A replay runs the task on the calling thread, with the same result.
 
 use super::fit::{self, Fit};
 use super::{OwnModel, rows_cost};

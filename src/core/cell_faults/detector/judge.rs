@@ -260,7 +260,7 @@ impl CellFaultDetector {
         }
     }
 
-    /// Inserts a new finding at its position in the order of the cells.
+    /// Inserts a finding; the list stays ordered by cell.
     pub(super) fn insert(&mut self, finding: CellFault) {
         let at = self.findings.partition_point(|found| (found.cells, found.kind) < (finding.cells, finding.kind));
         self.findings.insert(at, finding);
@@ -307,8 +307,8 @@ impl CellFaultDetector {
         self.findings.retain(|it| !is_within(it));
         self.insert(CellFault { kind, cells: Some(cells), since, reported, probability: 1.0, size });
         if earlier.is_none() {
-            // The cells next to the module may belong to it too, even though they changed less. Raise their
-            // uncertainty.
+            // The cells next to the found module may also belong to the module, even though they changed less. Raise
+            // the uncertainty of these cells.
             let edges = [cells.0.index().checked_sub(1), Some(cells.1.index() + 1)];
             for edge in edges.into_iter().flatten() {
                 self.cells.get_mut(edge).into_iter().for_each(|cell| cell.difference.widen_as(Jump::Replaced));

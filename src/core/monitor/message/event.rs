@@ -222,9 +222,9 @@ pub enum EventKind {
         /// Number of bad readings since the signal turned bad.
         bad_readings: u64,
     },
-    /// A protected message started to fail its check, or became usable again. Further results are only counted. The
-    /// result of the first frame is not reported as a change. Lost frames are reported only if more frames are lost
-    /// than the check allows.
+    /// A protected message started to fail the end-to-end check, or became usable again. Further results are only
+    /// counted. The result of the first frame is not reported as a change. Lost frames are reported only if more frames
+    /// are lost than the check allows.
     Protection(GuardChange),
     /// A message started or stopped exceeding its frame limit.
     Flood(FloodChange),
@@ -265,7 +265,8 @@ pub enum EventKind {
         /// Size of the step back, s.
         seconds: f64,
     },
-    /// The model of the cells was learned from the vehicle's data, or it turned out that it cannot be learned.
+    /// The cells' model was learned from the vehicle's data, the previous model is used again, or no model fits the
+    /// data.
     Model {
         /// State of the model after the change.
         state: ModelState,

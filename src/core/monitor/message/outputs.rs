@@ -56,7 +56,8 @@ pub enum Validity {
     Valid = 1,
     /// Current or temperature is stale or implausible: the estimate is extrapolated and its standard deviation grows.
     Degraded = 2,
-    /// A cell's innovations contradict its filter's covariance, its model does not fit, or the current is doubtful.
+    /// A cell's innovations contradict the covariance of the cell's filter, a cell's model does not fit, or the current
+    /// is doubtful.
     Untrusted = 3,
 }
 

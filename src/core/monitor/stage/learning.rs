@@ -32,8 +32,7 @@ use crate::quantity::catalogue::{Quantity, RecordedValues};
 use crate::quantity::{CellIndex, InvalidState, Mode, Timestamp, bounds};
 use crate::sample::CellSample;
 
-/// If the voltage during a charge is at most this far from the model's highest voltage, V, the charge is in its
-/// constant-voltage phase.
+/// Largest distance from the model's highest voltage during the constant-voltage phase of a charge, V.
 const TAPER_BAND_V: f64 = 0.03;
 
 /// The learning stage.
@@ -76,7 +75,7 @@ pub(crate) struct CellHealth {
     pub(crate) throughput: Throughput,
 }
 
-/// Sums over all half-cycles of a cell. In a stored state, it is an array in the order of the fields.
+/// Sums over all half-cycles of a cell. A stored state contains the sums as an array in the order of the fields.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[serde(from = "[f64; 3]", into = "[f64; 3]")]
 pub struct Throughput {
@@ -121,7 +120,7 @@ impl Default for CellHealth {
     }
 }
 
-/// Whether the recharge period is plausible. It may be implausible while the capacity is unknown.
+/// Whether the recharge period is plausible. While the capacity is unknown, the period may be implausible.
 fn is_period(period: &ScalarGaussian) -> bool {
     bounds::TIME_S.has(period.mean) && bounds::TIME_S.has(period.std())
 }

@@ -38,7 +38,7 @@ const FIT_S: f64 = 30.0;
 /// sensor, or a pack that was exchanged between the rows cause a larger misfit.
 const MOST_MISFIT: f64 = 0.7;
 /// If the misfit of a fit exceeds this value, the present model is dropped, too: the rows deviate from every fit by
-/// more than their errors.
+/// more than the assumed errors.
 const HOPELESS_MISFIT: f64 = 1.0;
 
 /// Largest relative standard deviation of a usable fit's capacity. The capacity from the label has a relative standard
@@ -344,8 +344,8 @@ impl Modelling {
             return self.return_to_label().or_else(|| unless_fitted(self));
         }
         let Some(fitted) = fit else { return unless_fitted(self) };
-        // A fit of LFP cells is not used: hysteresis hides their flat curve, and a row's error does not include the
-        // hysteresis.
+        // A fit of LFP cells is not used: hysteresis hides the flat curve of LFP, and the error assumed for a row does
+        // not include hysteresis.
         let is_flat = label.chemistry == Chemistry::LfpGraphite;
         let is_rough = fitted.misfit > MOST_MISFIT;
         if is_flat || is_rough || fitted.own.capacity.std() > MOST_CAPACITY_STD * fitted.own.capacity.mean {

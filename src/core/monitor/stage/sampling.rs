@@ -116,7 +116,7 @@ impl Sampling {
         self.identity_readings = config.identity_readings;
     }
 
-    /// Handles a reading of a signal. If it is a good voltage, returns the resulting sample.
+    /// Handles a reading of a signal. If the reading is a good voltage, returns the resulting sample.
     pub(crate) fn handle_reading(&mut self, now: Timestamp, reading: Reading, out: &mut Outputs) -> Option<CellSample> {
         let sample = self.sampler.handle_reading(now, reading, &mut self.changes);
         self.has_usable_reading =
@@ -125,8 +125,8 @@ impl Sampling {
         sample
     }
 
-    /// Handles a reading of the identity signal. If the identity is new, returns it and whether it replaces a known
-    /// identity.
+    /// Handles a reading of the identity signal. If the identity is new, returns the identity and whether it replaces a
+    /// known identity.
     pub(crate) fn handle_identity(&mut self, reading: Result<f64, Fault>) -> Option<(f64, bool)> {
         let value = reading.ok().filter(|value| value.is_finite())?;
         self.identity.observe(value, self.identity_readings)

@@ -24,7 +24,7 @@ use crate::monitor::config::{MonitorConfig, OutputConfig, SupplyConfig};
 use crate::monitor::message::{Event, EventKind, Outputs, Secured, Transmit};
 use crate::quantity::{BusIndex, Fault, Timestamp};
 
-/// Period, s, of the frames of a test. A receiver that reads once a second still gets several frames.
+/// Period of the frames of a test, s. A receiver that reads once a second still gets several frames.
 const TEST_PERIOD_S: f64 = 0.1;
 /// Longest duration of a test, s, so that a forgotten test ends.
 pub const MAX_TEST_S: f64 = 600.0;
@@ -139,7 +139,7 @@ fn buses_of(output: &OutputConfig, bus: Option<BusIndex>) -> impl Iterator<Item 
     output.buses.iter().copied().filter(move |other| only.is_none_or(|bus| bus == *other))
 }
 
-/// Whether work is due. If so, sets the time at which it is next due; missed periods are skipped.
+/// Whether work is due. If so, sets the next due time; missed periods are skipped.
 fn take_due(due: &mut Timestamp, now: Timestamp, period_s: f64) -> bool {
     if now < *due {
         return false;
@@ -270,7 +270,8 @@ impl Sending {
                 periods(*digest, config.digest_period_s).saturating_mul(pages(config.plan.digest_pages())),
             ),
             (LayoutMessage::Alarm, alarms.frames_until(now, engine, config.alarm_period_s).saturating_add(unknown)),
-            // The state is not stored after a refused command, so it may lack the counter of the reply to that command.
+            // The state is not stored after a refused command, so the stored state may lack the counter of the reply to
+            // that command.
             (LayoutMessage::Reply, 1),
         ] {
             config.plan.skip(message, frames, counters);

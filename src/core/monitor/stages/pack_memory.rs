@@ -1,8 +1,8 @@
-//! Remembers the learned values of previously connected packs by pack number, so that they are available when a pack
-//! returns.
+//! Remembers the learned values of previously connected packs by pack number. When a pack returns, its values are
+//! restored.
 //!
 //! In: the learned values of the connected pack, put aside when readings start to show another number; the new number
-//! once it is confirmed. Out: the stored values of the pack with that number, if there are any.
+//! once it is confirmed. Out: the stored values of the pack with the new number, if there are any.
 //!
 //! The memory stores capacities, resistances, remaining lives, recharge periods and the current offset (a pack often
 //! has its own sensor). The unfinished half-cycle and the state of charge are not stored; the first voltage determines

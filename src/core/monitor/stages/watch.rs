@@ -76,8 +76,8 @@ impl Stages {
         publisher.update_trouble_codes();
     }
 
-    /// Passes silence and share of bad readings of every input to their rules. A cell voltage counts for its cell,
-    /// every other input for the pack.
+    /// Passes the silence and the share of bad readings of every input to the two rules about inputs. A cell voltage
+    /// counts for its cell, every other input for the pack.
     fn watch_inputs(&mut self, now: Timestamp, worst: Option<(f64, f64)>, out: &mut Outputs) {
         let engine = &self.alarming.engine;
         let quiet = |(silence_s, share): (f64, f64)| {
@@ -261,8 +261,8 @@ impl Stages {
         Observation { is_new: true, ..worst }
     }
 
-    /// Whether the innovations of all cells change neither an alarm nor the trust in a cell. If so, they only need to
-    /// be displayed.
+    /// Whether the innovations of all cells change neither an alarm nor the trust in a cell. If so, the innovations
+    /// only need to be displayed.
     pub(crate) fn are_innovations_quiet(&self, out: &Outputs) -> bool {
         let Estimation { all_trusted, any_mismatched, is_current_doubtful, .. } = self.estimation;
         let is_known_good = all_trusted && !any_mismatched && !is_current_doubtful;

@@ -82,7 +82,7 @@ impl DayCourse {
                 Demand::Current(self.charge_a(pack))
             }
             DayPhase::Park { until_s } => {
-                // Shortest sleep, s, if drives and charges took longer than planned.
+                // If drives and charges took longer than planned, the car still sleeps for 60 s.
                 let duration_s = (until_s - self.day_s).max(60.0);
                 self.day_s += duration_s;
                 self.advance_plan(pack);

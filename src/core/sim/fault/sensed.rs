@@ -1,4 +1,4 @@
-//! Applies sensor faults to true values before they are measured, and to readings.
+//! Applies sensor faults to true values before the measurement, and to readings after the measurement.
 
 use super::FaultKind;
 use crate::quantity::{Channel, SensorIndex};
@@ -37,7 +37,7 @@ impl SensorFaults {
         if self.begun.contains(&FaultKind::TemperatureOff(sensor)) { ambient_c } else { truth_c }
     }
 
-    /// Converts voltages at the taps to voltages at the channels, V, in place.
+    /// Converts voltages at the taps to voltages at the channels in place, V.
     pub(crate) fn distort_voltages(&self, voltages_v: &mut [f64]) {
         for fault in &self.begun {
             match *fault {

@@ -1,8 +1,8 @@
 //! Finds cells whose voltages are always the same: one signal is configured for two cells, or a cell's value is copied.
 //!
-//! In: the cells' mean voltages, block by block, V. Out: groups of cells that never differed, with the number of
-//! blocks in which they moved. Equality is exact: a copy has the same digits, while two cells in series differ at least
-//! in the last digit.
+//! In: the cells' mean voltages, block by block, V. Out: groups of cells that never differed, each with the number of
+//! blocks in which the cells' voltages changed. Equality is exact: a copy has the same digits, while two cells in
+//! series differ at least in the last digit.
 
 /// Groups of cells that have never differed.
 #[derive(Debug, Clone, Default)]
@@ -10,7 +10,7 @@ pub(crate) struct EqualCells {
     /// Group number by cell.
     groups: Vec<usize>,
     last_v: Vec<f64>,
-    /// Blocks in which a cell moved.
+    /// Number of blocks in which a cell's voltage changed.
     changes: Vec<u32>,
 }
 
@@ -44,8 +44,8 @@ impl EqualCells {
         self.groups = groups;
     }
 
-    /// Groups of at least two equal cells, each with the number of blocks in which its cells moved. Leaves out cells
-    /// that moved in fewer than `fewest` blocks. Groups and cells are in ascending order.
+    /// Groups of at least two equal cells, each with the number of blocks in which the cells' voltages changed. Leaves
+    /// out cells whose voltage changed in fewer than `fewest` blocks. Groups and cells are in ascending order.
     pub(crate) fn groups(&self, fewest: u32) -> Vec<(Vec<usize>, u32)> {
         let moved = (0..self.groups.len()).filter(|cell| self.changes[*cell] >= fewest);
         let mut found: Vec<(usize, Vec<usize>, u32)> = Vec::new();
@@ -68,7 +68,7 @@ mod tests {
         let mut cells = EqualCells::default();
         for block in 0..40 {
             let v = 3.7 + 0.001 * f64::from(block % 7);
-            // The third cell differs once, the fourth never moves, and a block with a missing voltage is ignored.
+            // The third cell differs once, the fourth never changes, and a block with a missing voltage is ignored.
             cells.push(&[v, v, if block == 20 { v + 0.001 } else { v }, 3.7, v]);
             cells.push(&[v, f64::NAN, v, 3.7, v]);
         }

@@ -2,8 +2,8 @@
 //!
 //! In: message name, signal name and unit as written in the DBC. Out: points for each quantity of a pack, with their
 //! reasons in words, or `None` if the unit belongs to another quantity. The points are weights that were chosen on the
-//! DBCs of three cars: a matching unit or name adds 1 to 3, a word that indicates another device or a limit subtracts
-//! 3.
+//! DBCs of three cars. A matching unit or name adds 1 to 3 points. A word that indicates another device or a limit
+//! subtracts 3 points.
 
 use serde::Serialize;
 

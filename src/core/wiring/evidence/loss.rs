@@ -2,7 +2,7 @@
 //!
 //! In: times between two readings (gaps), s. Out: the share of missing readings. The cycle is the median of the first
 //! gaps. After these, a gap of n cycles counts as n - 1 missing readings. The total is limited to the elapsed cycles
-//! minus the received readings, so that readings that a sender delays and then sends in a burst do not count as
+//! minus the received readings. Readings that a sender delays and then sends in a burst therefore do not count as
 //! missing. If the gaps are not multiples of one value, the sender has no cycle and the share is unknown.
 
 use crate::filter::median;

@@ -6,8 +6,8 @@
 //! * runs of steady current with the drift of the voltage: dV = -(dOCV/dSOC) I t / C;
 //! * rests: runs with a current near zero.
 //!
-//! Only the largest current steps and the longest runs are kept. This selection does not bias the slope, because it
-//! does not look at the voltages.
+//! Only the largest current steps and the longest runs are kept. This selection does not bias the slope, because the
+//! selection does not depend on the voltages.
 
 use super::equal_cells::EqualCells;
 use super::slope::Slope;

@@ -142,7 +142,7 @@ impl Series {
         gap_s
     }
 
-    /// Ignores the next gap, because the observer does not listen during it.
+    /// Ignores the next gap, because the observer does not listen during this gap.
     pub(crate) fn pause(&mut self) {
         self.last_time = None;
     }
@@ -157,8 +157,8 @@ impl Series {
         self.gaps.median()
     }
 
-    /// Standard deviation of the white noise, from the changes between readings. Real steps do not affect it if fewer
-    /// than half of the changes are steps.
+    /// Standard deviation of the white noise, from the changes between readings. Real steps do not affect the result if
+    /// fewer than half of the changes are steps.
     pub(crate) fn noise(&self) -> Option<f64> {
         // The absolute difference of two normal variables with standard deviation s has the median 0.6745 sqrt(2) s.
         Some(self.changes.median()? / (0.6745 * std::f64::consts::SQRT_2))

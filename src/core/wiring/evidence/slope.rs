@@ -96,8 +96,8 @@ impl Slope {
     }
 }
 
-/// Pairs (time in s, voltage, current): each reading of the slower series with the nearest reading of the faster
-/// series, if the two are at most 0.3 s apart.
+/// Returns tuples of time (s), voltage and current. Each reading of the slower series is paired with the nearest
+/// reading of the faster series, if the two are at most 0.3 s apart.
 fn pairs(voltage: &Series, current: &Series) -> Vec<(f64, f64, f64)> {
     let period_s = |series: &Series| series.period_s().unwrap_or(0.0);
     if period_s(voltage) < period_s(current) {

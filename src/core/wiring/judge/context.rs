@@ -15,7 +15,7 @@ use crate::wiring::report::{Severity, Topic, WiringFinding, WiringReport};
 pub(super) const MAX_C_RATE: f64 = 30.0;
 
 /// Smallest share of the voltage's changes that the current must explain before the size of a slope is judged. If the
-/// current explains less, its noise makes the slope too small.
+/// current explains less, the noise of the current makes the slope too small.
 pub(super) const EXPLAINED: f64 = 0.8;
 
 /// A configured signal with the statistics of its values.
@@ -135,8 +135,8 @@ impl<'d> Judge<'d> {
         median.filter(|c| (-40.0..80.0).contains(c)).unwrap_or(self.plan.pack.ambient_c)
     }
 
-    /// Range of the model's resistance over the SOC and temperatures of the recording, ohm: the lowest immediate
-    /// value, and the highest value at the end of a block of `block_s` after a step.
+    /// Range of the model's resistance over the SOC and temperatures of the recording, ohm. The lower end is the lowest
+    /// immediate resistance. The upper end is the highest resistance at the time `block_s` after a current step.
     pub(super) fn model_ohm(&self, model: &CellModel, block_s: f64) -> (f64, f64) {
         let spread = |kind, per: f64, middle: f64| {
             let at = |q| self.median_of(kind, |series| series.values.quantile(q)).map_or(middle, |value| value * per);

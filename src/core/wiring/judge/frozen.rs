@@ -73,7 +73,7 @@ pub(super) fn check_equal(judge: &mut Judge<'_>) {
     if voltages.iter().any(|voltage| step_v(voltage) > 0.005) {
         return;
     }
-    // Only blocks in which the cells moved count, because similar cells may agree for a while.
+    // Only blocks in which the voltages changed count, because similar cells may agree for a while.
     let [fast, slow] = judge.observed.responses().each_ref().map(|response| response.equal_cells.groups(25));
     for (cells, blocks) in if fast.is_empty() { slow } else { fast } {
         let is_member = |(signal, _): &&SignalSeries<'_>| matches!(signal.binding.channel, Channel::CellVoltage(cell) if cells.contains(&cell.index()));

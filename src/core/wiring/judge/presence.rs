@@ -66,8 +66,8 @@ fn cell_number(signal: &SignalPlan) -> Option<u16> {
 }
 
 /// If exactly the last cells are absent, reports that too many cells are configured. Returns the signals that are still
-/// to be reported. If a message or its values are missing, the last module may also be dead, so the signals of these
-/// cells stay in the list.
+/// to be reported. If a message or the message's values are missing, the last module may also be dead, so the signals
+/// of these cells stay in the list.
 fn fewer_cells<'d>(judge: &mut Judge<'d>, absent: Vec<Absent<'d>>) -> Vec<Absent<'d>> {
     let mut cells: Vec<u16> = absent.iter().filter_map(|(signal, _)| cell_number(signal)).collect();
     cells.sort_unstable();

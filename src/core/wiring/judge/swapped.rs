@@ -92,7 +92,7 @@ struct Fit {
 
 fn fit(judge: &Judge<'_>, series: &Series) -> Option<Fit> {
     let (low, high) = series.values.bulk()?;
-    // If a voltage is configured as the current, it gets the current's sign.
+    // A voltage that is configured as the current gets the current's sign.
     let (low, high) = if high <= 0.0 { (-high, -low) } else { (low, high) };
     let (band, cells) = (judge.voltage_band(), judge.cells_per_reading());
     let is_slow = series.changes.median().unwrap_or(0.0) < 1.0 && high - low < 40.0;

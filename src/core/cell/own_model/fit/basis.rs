@@ -21,7 +21,7 @@ pub(super) const COLD_SAG: usize = BY_TEMPERATURE + RESISTANCES;
 pub(super) const LOG_CAPACITY: usize = COLD_SAG + 1;
 pub(super) const OFFSET: usize = LOG_CAPACITY + 1;
 pub(super) const BEGINNINGS: usize = OFFSET + 1;
-/// Number of parameters of the curve and the SOC that change the voltage of a row.
+/// Number of parameters, other than resistance parameters, that change the voltage of a row.
 pub(super) const CURVE_AND_SOC: usize = 6;
 
 /// Limits of the SOC at the start of a stretch.
@@ -45,9 +45,10 @@ pub(super) struct Prediction {
     /// Slope of the open-circuit voltage, V per unit of SOC.
     pub(super) slope_v: f64,
     pub(super) ohm: [f64; RESISTANCES],
-    /// Change of ln of a resistance with each of its three parameters.
+    /// Derivatives of ln(resistance) with respect to the three parameters of a resistance.
     pub(super) by_factor: [f64; 3],
-    /// Indices of the parameters that change the voltage: six of curve and SOC, then three of each resistance.
+    /// Indices of the parameters that change the voltage: [`CURVE_AND_SOC`] parameters first, then three parameters per
+    /// resistance.
     pub(super) index: Vec<usize>,
     pub(super) slope: Vec<f64>,
 }

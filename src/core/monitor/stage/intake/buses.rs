@@ -17,8 +17,8 @@ use crate::quantity::{BusIndex, Timestamp};
 pub(crate) const CAN_ERR_BUSOFF: u32 = 0x40;
 const CAN_ERR_RESTARTED: u32 = 0x100;
 
-/// If the driver has not reported a failure to send for this time, s, sending counts as working again. The time is four
-/// report periods of the driver.
+/// Time without a report that frames could not be sent, s. After this time, sending counts as working again. The time
+/// is four report periods of the driver.
 const SEND_RECOVERED_S: f64 = 1.0;
 
 #[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]

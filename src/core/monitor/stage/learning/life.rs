@@ -105,8 +105,9 @@ impl PackLife {
         Some((cell, self.cells[cell.index()].remaining.ok()?))
     }
 
-    /// Publishes the remaining life after a half-cycle, if it is known or has just become unknown. `was_known`: whether
-    /// it was known before the half-cycle. `is_new`: whether the half-cycle measured a cell's capacity.
+    /// Publishes the pack's remaining life after a half-cycle, if this life is known or has just become unknown.
+    /// `was_known`: whether this life was known before the half-cycle. `is_new`: whether the half-cycle measured a
+    /// cell's capacity.
     pub(crate) fn publish(&self, was_known: bool, is_new: bool, to: &mut Publisher<'_>) {
         let life = self.of_pack();
         if was_known || life.is_some() {

@@ -99,8 +99,8 @@ impl AlarmQueue {
         Timestamp::from_nanos(Self::turn_ns(engine, period_s).saturating_mul(count)).secs()
     }
 
-    /// Time between two frames in turn, ns. It is short enough to send all raised alarms in each period, unless the
-    /// budget requires more time.
+    /// Time between two frames in turn, ns. This time is short enough to send all raised alarms in each period, unless
+    /// the budget requires more time.
     fn turn_ns(engine: &AlarmEngine, period_s: f64) -> i64 {
         let period_ns = Timestamp::ZERO.plus_secs(period_s).nanos().max(1);
         let count = i64::try_from(engine.count()).unwrap_or(i64::MAX).max(1);

@@ -81,7 +81,7 @@ impl J1939 {
                 self.previously_active.push(code);
             }
         }
-        // A list that is too long is cut off at its end, so the most severe codes come first.
+        // If the list is too long, its end is cut off. Put the most severe codes first.
         self.previously_active.reverse();
         if is_test_running {
             self.active.push(ActiveCode { code: self.config.test_code, lamp: Lamp::None });
