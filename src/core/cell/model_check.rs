@@ -12,9 +12,10 @@
 //!   v / R` with h = (1, SOC - 0.5). R is the variance over the time that a reading represents. P contains the
 //!   variances that a and b have between chemistries.
 //!
-//! In the sum of the witnesses, each counts at most [`CORROBORATED`] times as much as the other. The reason is that
-//! other causes affect only one witness: an aged cell has a higher resistance, but the voltages fit; a local error of a
-//! cell's own curve does not change the resistance. With another cell's model, both witnesses are large.
+//! In the sum of the witnesses, each witness counts at most [`CORROBORATED`] times as much as the other witness. The
+//! reason is that other causes affect only one witness: an aged cell has a higher resistance, but the voltages fit; a
+//! local error of a cell's own curve does not change the resistance. With another cell's model, both witnesses are
+//! large.
 //!
 //! The check ends after [`WINDOW_S`] without a mismatch, because a cell ages but does not become another cell. After a
 //! mismatch, the following windows are judged one by one until one window has no mismatch. An aged cell is thus trusted

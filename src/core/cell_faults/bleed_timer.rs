@@ -2,9 +2,9 @@
 //!
 //! In: balancing bits with their time and validity; starts and ends of rows (a few minutes of samples each). Out: three
 //! durations within the time from the middle of one row to the middle of the next: the cell was bled, the state was
-//! unknown, no bits were received. The charge that a row shows is the charge at its middle, so half of the row's bleed
-//! time counts in the next row. If the cell is bled between two rows, while the buses sleep, this time counts in the
-//! later row.
+//! unknown, no bits were received. The charge that a row shows is the charge at the middle of the row, so half of the
+//! row's bleed time counts in the next row. If the cell is bled between two rows, while the buses sleep, this time
+//! counts in the later row.
 
 use serde::{Deserialize, Serialize};
 

@@ -16,7 +16,7 @@ const LEAST_CHANGES: u32 = 10;
 /// State of one voltage channel.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct Channel {
-    /// Middle voltage of the pack, V, in the row in which the channel's value last changed. If it has not changed yet,
+    /// Middle voltage of the pack, V, in the row in which the channel's value last changed. Before the first change,
     /// the middle voltage in the first row.
     middle_v: Option<f64>,
     pub(super) is_frozen: bool,

@@ -156,7 +156,7 @@ impl Difference {
     }
 
     /// Subtracts charge that left the cell without passing the current sensor. `soc`: this charge as a fraction of the
-    /// capacity; `variance`: its variance.
+    /// capacity; `variance`: variance of this fraction.
     pub(super) fn remove_charge(&mut self, soc: f64, variance: f64) {
         self.mean[SOC] -= soc;
         self.covariance[pair(SOC, SOC)] += variance;

@@ -8,8 +8,8 @@ use serde::{Deserialize, Serialize};
 
 /// A sensor is judged only if the sum of the pack's squared warmings is at least this, K^2.
 const LEAST_K2: f64 = 30.0;
-/// A sensor counts as detached if it shows less than the fraction `DETACHED` of the pack's warming. It counts as
-/// attached again if it shows more than the fraction `ATTACHED`.
+/// A sensor counts as detached if it shows less than the fraction `DETACHED` of the pack's warming. A detached sensor
+/// counts as attached again if it shows more than the fraction `ATTACHED`.
 const DETACHED: f64 = 0.35;
 const ATTACHED: f64 = 0.6;
 

@@ -1,8 +1,8 @@
 //! Linear interpolation between breakpoints in rising order. At least two breakpoints are required.
 
-/// Returns the index of the interval that contains `x`, and the position of `x` in it: 0 at the lower breakpoint, 1 at
-/// the upper. If `x` lies outside the breakpoints, the interval is the nearest one and the position is below 0 or above
-/// 1.
+/// Returns the index of the interval that contains `x`, and the position of `x` in this interval: 0 at the lower
+/// breakpoint, 1 at the upper. If `x` lies outside the breakpoints, the interval is the nearest one and the position is
+/// below 0 or above 1.
 pub fn locate(breakpoints: &[f64], x: f64) -> (usize, f64) {
     let last = breakpoints.len() - 2;
     let i = breakpoints[1..=last].iter().take_while(|&&b| x >= b).count();

@@ -33,7 +33,7 @@ pub struct Minimum<T> {
 
 /// Tries at most `steps` damped steps from `start`.
 ///
-/// `step(point, damping)` returns the point after one step from `point`, or `None` if its cost is not lower.
+/// `step(point, damping)` returns the point after one step from `point`, or `None` if that point's cost is not lower.
 /// `has_converged(from, to, damping)` is called after every step that lowers the cost.
 pub fn minimise<T>(
     damping: &Damping,

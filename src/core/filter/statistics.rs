@@ -1,6 +1,6 @@
 //! Statistics of numbers without a unit.
 
-/// Median of the finite values (the upper of the two middle ones); `None` if there is no finite value.
+/// Median of the finite values (of two middle values, the upper value); `None` if there is no finite value.
 pub fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
     // Allocates once. Collecting a filtered iterator would start with a small buffer and grow it.
     let mut finite = Vec::with_capacity(values.size_hint().1.unwrap_or_default());

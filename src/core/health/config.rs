@@ -41,8 +41,8 @@ pub struct CapacityConfig {
     /// Constant error of the open-circuit curve at the ends of a half-cycle, V. `None` = half of the error that the
     /// cell model states for these points. Not used by `Nominal`.
     pub end_error_v: Option<f64>,
-    /// Standard deviation of the current sensor's gain, fraction. It is a lower bound of the capacity's relative
-    /// standard deviation.
+    /// Standard deviation of the current sensor's gain, fraction. The relative standard deviation of a capacity never
+    /// falls below this value.
     pub current_gain_std: f64,
     /// Initial standard deviation of the current sensor's offset per cell, A; 0 = the offset is not learned. Not used
     /// by `Nominal`.

@@ -6,9 +6,9 @@
 //!
 //! A half-cycle's capacity is charge / (s_high - s_low). An error e (V) of the open-circuit curve at one end changes
 //! the SOC at this end by e / slope, and the capacity by (C / swing) (e / slope). The errors are defined at SOC nodes.
-//! They are independent of each other and are interpolated linearly between the nodes. Their size follows from the
-//! voltage error that the cell model states. If the model states no error, the errors are 0 here; the filter's constant
-//! voltage offset then also covers errors of the curve.
+//! The errors are independent of each other and are interpolated linearly between the nodes. The size of the errors
+//! follows from the voltage error that the cell model states. If the model states no error, the errors are 0 here; the
+//! filter's constant voltage offset then also covers errors of the curve.
 
 use super::CapacityConfig;
 use super::half_cycle::HalfCycle;

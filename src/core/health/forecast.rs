@@ -188,7 +188,7 @@ pub struct FanPoint {
     pub high_ah: f64,
 }
 
-/// The forecast filter of one cell. Its size does not depend on the number of readings.
+/// The forecast filter of one cell. The size of the filter does not depend on the number of readings.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Forecast {
@@ -223,7 +223,7 @@ impl Usage {
 
 impl Forecast {
     /// Creates a filter for a cell that had the capacity `reference_ah`, Ah, when new. An approximate value suffices,
-    /// because it only sets the range of the knee: 10 to 20 % below `reference_ah`.
+    /// because the value only sets the range of the knee: 10 to 20 % below `reference_ah`.
     pub fn new(axis: Axis, reference_ah: f64) -> Self {
         let mut p = [[0.0; N]; N];
         // Wide priors: the level is practically unknown, and the rate has a standard deviation of 2 % per cycle.

@@ -10,8 +10,8 @@
 //!
 //! * `message`: inputs and outputs, independent of the stages;
 //! * `stage`: the stages, each of which knows only the stages before it;
-//! * `stages`: connects the stages after the intake, passes their values to the alarm rules, and remembers exchanged
-//!   packs;
+//! * `stages`: connects the stages after the intake, passes the values of these stages to the alarm rules, and
+//!   remembers exchanged packs;
 //! * `snapshot`: the stored state;
 //! * `lifecycle`: restores a stored state, relearns from a history, and applies a new configuration;
 //! * `clock`, `config`, `view`: time, configuration and present values of the whole monitor.
@@ -330,7 +330,7 @@ impl Monitor {
         let was_brief = beginning != Beginning::RestoredAgeless && away_s <= ASLEEP_S;
         if beginning == Beginning::Restored {
             if away_s > HOUSEKEEPING_S {
-                // Samples that were waiting before the downtime belong to the time before it.
+                // Samples that were waiting when the downtime started belong to the time before the downtime.
                 stages.step_waiting(taken, was_brief, out);
             }
             stages.estimation.bank.change_all(|config, estimator| estimator.note_downtime(config, away_s));

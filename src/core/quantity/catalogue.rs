@@ -157,7 +157,7 @@ impl QuantityRow {
     }
 }
 
-/// A published number. Its unit and meaning are in its row of [`TABLE`].
+/// A published number. The unit and the meaning are in the quantity's row of [`TABLE`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[expect(missing_docs, reason = "the row describes it")]
 pub enum Quantity {

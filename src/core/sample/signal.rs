@@ -48,7 +48,7 @@ pub(super) struct Signal {
     refused: Option<TimedValue>,
     /// Number of consecutive readings that agree with `refused`.
     refused_count: u32,
-    /// The latest value. It has not changed since the stuck clock showed `rests_since_s`.
+    /// The latest value, unchanged since the stuck clock showed `rests_since_s`.
     rests_at: Option<f64>,
     /// Time of the stuck clock at the last change of the value, s.
     rests_since_s: f64,

@@ -48,8 +48,8 @@ const FINE: usize = 20;
 pub struct Fit {
     /// The model.
     pub own: OwnModel,
-    /// Root mean square of the rows' residuals, in standard deviations. It is about 1 if the cells have the label's
-    /// chemistry and the errors of the circuit model are as assumed.
+    /// Root mean square of the rows' residuals, in standard deviations. This value is about 1 if the cells have the
+    /// label's chemistry and the errors of the circuit model are as assumed.
     pub misfit: f64,
     /// Start of the last stretch; `None` without rows.
     beginning: Option<Beginning>,

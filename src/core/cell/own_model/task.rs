@@ -61,7 +61,7 @@ impl FitTask {
     }
 
     /// The chemistry that explains the rows clearly better than the label's chemistry, if any. Each chemistry is judged
-    /// at the fitted capacity or at the rated capacity, whichever fits it better.
+    /// at the fitted capacity or at the rated capacity, whichever gives the lower cost.
     fn better_chemistry(&self, prior: &LabelPrior, fitted: Option<&Fit>) -> Option<Chemistry> {
         let Self { label, rows, .. } = self;
         // The better chemistry must be 50 times more likely. The margin grows with a misfit above 0.45, which is the

@@ -204,7 +204,8 @@ impl CellFaultDetector {
         ]
     }
 
-    /// Updates the list of findings with a judgement. Returns the judgement as a finding, even if it is not listed.
+    /// Updates the list of findings with a judgement. Returns the judgement as a finding, even if the finding is not
+    /// listed.
     fn take(&mut self, time: Timestamp, index: usize, judged: &Judgement) -> CellFault {
         let Judgement { kind, size, probability, .. } = *judged;
         let cell = &mut self.cells[index];
@@ -241,8 +242,8 @@ impl CellFaultDetector {
         now.since(since) >= settling_s
     }
 
-    /// Lists a finding. It replaces the finding of the same kind and first cell. If the finding is no longer likely,
-    /// removes it.
+    /// Lists a finding. The finding replaces the listed finding of the same kind and first cell. If the finding is no
+    /// longer likely, removes the listed finding.
     pub(super) fn put(&mut self, finding: CellFault) {
         let first = |found: &CellFault| found.cells.map(|cells| cells.0);
         let is_same = |found: &CellFault| found.kind == finding.kind && first(found) == first(&finding);

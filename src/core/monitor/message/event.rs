@@ -265,8 +265,8 @@ pub enum EventKind {
         /// Size of the step back, s.
         seconds: f64,
     },
-    /// The cells' model was learned from the vehicle's data, the previous model is used again, or no model fits the
-    /// data.
+    /// The cells' model was learned from the vehicle's data, the previous model is used again, or the data fit another
+    /// chemistry better.
     Model {
         /// State of the model after the change.
         state: ModelState,

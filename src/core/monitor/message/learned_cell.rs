@@ -1,4 +1,4 @@
-//! Learned values of one cell from a history. They replace the stored state if it is lost.
+//! Learned values of one cell from a history. These values replace a lost stored state.
 
 use crate::filter::ScalarGaussian;
 use crate::quantity::CellIndex;

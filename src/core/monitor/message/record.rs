@@ -62,9 +62,9 @@ pub enum RecordKind {
         /// Whether the files can be written.
         works: bool,
     },
-    /// The recorded run changed its configuration here. For the driver; the core ignores it.
+    /// The recorded run changed its configuration here. Only the driver uses this record.
     Reload,
-    /// The recorded run restored a stored state here. For the driver; the core ignores it.
+    /// The recorded run restored a stored state here. Only the driver uses this record.
     Restore {
         /// Age of the state.
         away: Downtime,

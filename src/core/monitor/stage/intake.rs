@@ -148,7 +148,7 @@ impl Intake {
         // Diagnostic definitions cannot change here, so the listener keeps partially received messages.
     }
 
-    /// Judges a frame. Returns `None` if it is dropped, otherwise the result of its end-to-end check.
+    /// Judges a frame. Returns `None` if the frame is dropped, otherwise the result of the frame's end-to-end check.
     #[inline]
     pub(crate) fn admit(
         &mut self,

@@ -1,6 +1,6 @@
 //! A day of an electric car: drive, park asleep, fast charge.
 //!
-//! The car is a point mass that follows random target speeds with bounded acceleration. Its electric power is scaled
+//! The car is a point mass that follows random target speeds with bounded acceleration. The electric power is scaled
 //! from a 60 kWh car to the simulated pack, so that every cell has the same C-rate.
 
 use super::demand::Demand;

@@ -1,4 +1,5 @@
-//! Finds signals that never change while others do, cells that respond differently, and cells with the same voltage.
+//! Finds signals that never change while other signals change, cells that respond differently, and cells with the same
+//! voltage.
 
 use super::context::{EXPLAINED, Judge, SignalSeries, error, warning};
 use super::text::{channels, count, milli, number, ranges};
