@@ -56,8 +56,7 @@ impl OwnModel {
             log_resistance: 0.1,
             slow_branch: 0.2,
             capacity: self.capacity.std() / self.capacity.mean,
-            // An error of 10 % of the voltage drop that persists for 100 s. This error remains even with fitted
-            // resistances.
+            // The voltage drop has an error of 10 % that persists for 100 s, even with fitted resistances.
             drop_sqrt_s: 1.0,
         };
         let mut model = label.model_of(self.capacity.mean, &curve, &self.factors, &self.drop_std, spread);
@@ -85,7 +84,7 @@ impl OwnModel {
         config
     }
 
-    /// Whether the remaining uncertainty is small: the standard deviation of the capacity is at most 3 %.
+    /// Whether the remaining uncertainty is small: the standard deviation of the capacity is below 3 %.
     pub fn is_settled(&self) -> bool {
         self.capacity.std() < 0.03 * self.capacity.mean
     }

@@ -1,8 +1,8 @@
-//! Detects faults of single cells in a pack. The detector adds samples to rows (sums over a few minutes), compares the
-//! cells once per row and derives findings from the comparison (`judge`).
+//! Detects faults of the cells of a pack and of their sensors. The detector adds samples to rows (sums over a few
+//! minutes), compares the cells once per row and derives findings from the comparison (`judge`).
 //!
-//! The assumed errors of a row are rounded values for a circuit model and a typical cell monitor. They were checked
-//! with a simulated pack of ten cells and with the simulator's other packs. No measured pack was used to choose them.
+//! The assumed errors of a row are rounded values for a circuit model and a typical cell monitor. These values were
+//! checked with a simulated pack of ten cells and with the simulator's other packs. No measured pack was used.
 
 mod balancing;
 mod judge;

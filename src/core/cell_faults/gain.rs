@@ -61,8 +61,8 @@ impl Gain {
         self.last.is_none_or(|last| !(0.0..DAY_S).contains(&now.since(last)))
     }
 
-    /// Adds the values of a day. Returns the probability that the gain has risen by more than [`GAIN`], and the rise,
-    /// fraction. While a rise is reported, the days before the rise are kept for comparison.
+    /// Adds the values of a day. Returns the probability that the gain has risen by more than [`GAIN`], and the rise
+    /// (fraction). While a rise is reported, the days before the rise are kept for comparison.
     pub(super) fn take(&mut self, time: Timestamp, temperature_c: f64, cells: &[CellAgeing]) -> (f64, ScalarGaussian) {
         let none = (0.0, ScalarGaussian { mean: 0.0, variance: ERROR * ERROR });
         let part = |cell: &CellAgeing| cell.capacity_ah.std() / cell.capacity_ah.mean;

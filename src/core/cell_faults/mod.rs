@@ -1,4 +1,4 @@
-//! Finds failing cells by comparing each cell with the others of its pack.
+//! Finds failing cells and sensors by comparing each cell with the others of its pack.
 //!
 //! In: samples of the cells of one series pack, and the estimators' values for the mean cell. Out: [`CellFault`]s. All
 //! cells carry the same current. Errors that all cells share (model, SOC, current sensor) therefore cancel in the

@@ -48,9 +48,9 @@ impl CurrentOffset {
         self.part.unwrap_or(1.0)
     }
 
-    /// Updates with the evidence (information, score): the sums of d^2 / R and of d x innovation / R over the
-    /// innovations. d is the effect of one standard deviation of the offset on an innovation, R the variance of the
-    /// innovation. Returns the correction in units of the previous standard deviation.
+    /// Updates with the evidence. Over the innovations, `information` is the sum of d^2 / R, and `score` is the sum of
+    /// d x innovation / R. The effect of one standard deviation of the offset on an innovation is d. The variance of
+    /// the innovation is R. Returns the correction in units of the previous standard deviation.
     pub fn update(&mut self, configured_a: f64, (information, score): (f64, f64)) -> f64 {
         let std_a = self.std_a(configured_a);
         if !(information > 0.0 && score.is_finite() && std_a > 0.0) {

@@ -8,7 +8,7 @@
 use super::message::MERGE_TOLERANCE_NS;
 use crate::quantity::Timestamp;
 
-/// Longest time between inputs (including ticks) while the computer is awake, s. This time contains 500 ticks.
+/// Longest time between inputs (including ticks) while the computer is awake, s. This time equals 500 tick periods.
 pub(crate) const ASLEEP_S: f64 = 5.0;
 const ASLEEP_NS: i64 = (ASLEEP_S * 1e9) as i64;
 

@@ -1,7 +1,7 @@
 //! Defines the named scenarios and their settings.
 //!
-//! Amounts are given for a cell with the nominal capacity of the source. They scale with the capacity of the configured
-//! cell model, so that any configuration can be simulated.
+//! Amounts are given for a cell with the nominal capacity of the source. These amounts scale with the capacity of the
+//! configured cell model, so that any configuration can be simulated.
 //!
 //! | scenario | nominal capacity | source | course |
 //! | --- | --- | --- | --- |

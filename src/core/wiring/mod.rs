@@ -10,7 +10,7 @@
 //! | file | purpose |
 //! | --- | --- |
 //! | `plan` | expected interfaces, messages and signals |
-//! | [`evidence`] | evidence about signals from values, names and bits; `discover` also scores its candidates with it |
+//! | [`evidence`] | evidence about signals from values, names and bits; `discover` also scores its candidates with this evidence |
 //! | `other_current` | statistics of the message with the configured current, if another interface also receives this message |
 //! | `observer` | [`WiringObserver`]: collects frames, events and estimates |
 //! | `judge` | turns everything received into a [`WiringReport`] |

@@ -64,9 +64,9 @@ impl FitTask {
     /// at the fitted capacity or at the rated capacity, whichever gives the lower cost.
     fn better_chemistry(&self, prior: &LabelPrior, fitted: Option<&Fit>) -> Option<Chemistry> {
         let Self { label, rows, .. } = self;
-        // The better chemistry must be 50 times more likely. The margin grows with a misfit above 0.45, which is the
-        // misfit on drives that a circuit describes. On the drives of four cells, the costs of NCA and NMC differ by 4
-        // to 9; the cost of LFP differs from all others by hundreds.
+        // The better chemistry must be 50 times more likely. The margin grows if the misfit exceeds 0.45. A misfit of
+        // 0.45 is typical of drives that a circuit model describes. On the drives of four cells, the costs of NCA and
+        // NMC differ by 4 to 9; the cost of LFP differs from all others by hundreds.
         let margin = 4.0 * fitted.map_or(1.0, |it| (it.misfit / 0.45).max(1.0));
         let fitted_ah = fitted.map(|it| it.own.capacity.mean);
         let capacities_ah: Vec<f64> = [label.rated_ah].into_iter().chain(fitted_ah).collect();

@@ -56,8 +56,8 @@ impl Monitor {
     /// minute, or if the state was stored [for a restart](Snapshot::for_restart).
     ///
     /// # Errors
-    /// If the snapshot's version or shape does not fit, or a number in it is impossible. The monitor then uses nothing
-    /// of the snapshot, because one damaged number casts doubt on the others.
+    /// The snapshot's version or shape does not fit, or a number in the snapshot is impossible. The monitor then uses
+    /// nothing of the snapshot, because one damaged number casts doubt on the others.
     pub fn restore(&mut self, snapshot: Snapshot, downtime: Downtime) -> Result<(), RestoreError> {
         if snapshot.version != SNAPSHOT_VERSION {
             let found = snapshot.version;

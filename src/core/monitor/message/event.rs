@@ -281,7 +281,7 @@ pub enum EventKind {
         /// Whether the previous model was better and is used again.
         is_taken_back: bool,
     },
-    /// A cell differs from its pack in a way that indicates a fault.
+    /// The cell-fault detector has found a fault of a cell, a module or a sensor.
     Finding(CellFault),
     /// A cell's filter failed and was restarted from its voltage.
     FilterReset {

@@ -1,4 +1,4 @@
-//! Findings stage: detects faults of single cells from cell samples.
+//! Findings stage: detects faults of cells and sensors from cell samples.
 //!
 //! In: the samples of all cells with their estimates. Out: an event for each new finding ([`EventKind::Finding`]). The
 //! stage only observes: no estimate and no capacity depends on it. When a row of the detector (a few minutes of

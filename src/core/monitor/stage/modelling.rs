@@ -35,7 +35,7 @@ const REST_S: f64 = 120.0;
 const FIT_S: f64 = 30.0;
 
 /// Largest misfit of a usable fit. With typical sensors, the misfit is at most 0.65. Heavy load in the cold, a faulty
-/// sensor, or a pack that was exchanged between the rows cause a larger misfit.
+/// sensor, or an exchange of the pack between the rows causes a larger misfit.
 const MOST_MISFIT: f64 = 0.7;
 /// If the misfit of a fit exceeds this value, the present model is dropped, too: the rows deviate from every fit by
 /// more than the assumed errors.

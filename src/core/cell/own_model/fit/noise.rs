@@ -26,8 +26,8 @@ pub(super) struct RepeatedErrors {
 impl RepeatedErrors {
     /// Repeating errors of usual circuit models, for fitting the capacity.
     pub(super) const USUAL: Self = Self { voltage_v: 0.012, soc: 0.01, drop: 0.2 };
-    /// Repeating errors for fitting the tables. They are smaller than `USUAL`, so that differences that the rows have
-    /// in common go into the tables and not into the errors.
+    /// Repeating errors for fitting the tables. These errors are smaller than `USUAL`, so that differences that the
+    /// rows have in common go into the tables and not into the errors.
     pub(super) const IN_TABLES: Self = Self { voltage_v: 0.004, soc: 0.004, drop: 0.05 };
 }
 
