@@ -6,8 +6,8 @@
 //! # Data path
 //! [`monitor::Monitor`] handles every record. Data flows in one direction. `monitor/message` defines the records that
 //! come in and the events, estimates and frames that go out; these types do not depend on any stage. Each file in
-//! `monitor/stage` is one stage and does not depend on later stages. Only `monitor/stages.rs` knows the order of the
-//! stages. `monitor/lifecycle` restores and reconfigures the stages.
+//! `monitor/stage` contains one stage and does not depend on later stages. Only `monitor/stages.rs` knows the order of
+//! the stages. `monitor/lifecycle` restores and reconfigures the stages.
 //!
 //! | stage | in → out | file | algorithms |
 //! | --- | --- | --- | --- |

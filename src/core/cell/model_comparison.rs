@@ -1,8 +1,7 @@
-//! Differences between two cell models: open-circuit curves in V, resistances as a fraction, and resulting SOC errors.
+//! Compares two cell models: open-circuit curves (V), resistances (fraction), and resulting SOC errors.
 //!
 //! In: two [`CellModel`]s. Out: values of the second model minus values of the first. Resistances are multiplied by the
-//! rated capacity before they are compared. The load of each cell is C/2 of its own rated capacity, so cells of
-//! different size can be compared.
+//! rated capacity before they are compared. The load of each cell is C/2, so cells of different size can be compared.
 
 use super::chemistry::USUAL_LOAD_PER_H;
 use super::model::CellModel;

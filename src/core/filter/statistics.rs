@@ -1,6 +1,6 @@
-//! Statistics of numbers without a unit.
+//! Median, range and normal distribution, for numbers in any unit.
 
-/// Median of the finite values (of two middle values, the upper value); `None` if there is no finite value.
+/// Median of the finite values (of two middle values, the upper value); `None` without a finite value.
 pub fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
     // Allocates once. Collecting a filtered iterator would start with a small buffer and grow it.
     let mut finite = Vec::with_capacity(values.size_hint().1.unwrap_or_default());
@@ -12,7 +12,7 @@ pub fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
     Some(*finite.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
-/// Minimum and maximum of the values; infinity and minus infinity if there are no values.
+/// Minimum and maximum of the values; infinity and minus infinity without values.
 pub fn ends(values: impl Iterator<Item = f64>) -> (f64, f64) {
     values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| (low.min(value), high.max(value)))
 }

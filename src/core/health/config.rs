@@ -1,4 +1,4 @@
-//! Settings for learning at charge/discharge transitions. The `config` module checks their ranges.
+//! Settings for learning at charge/discharge transitions. The host's `config` module checks the ranges.
 
 /// Settings for classifying the current as charge, rest or discharge.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -1,5 +1,6 @@
-//! Errors of the cell model at the start and end of half-cycles. Two half-cycles between the same SOC values have the
-//! same errors, so averaging over many half-cycles does not remove these errors.
+//! Computes how errors of the cell model at the start and end of a half-cycle change the learned capacity. Two
+//! half-cycles between the same SOC values have the same errors, so averaging over many half-cycles does not remove
+//! these errors.
 //!
 //! In: SOC at the start and end of a half-cycle. Out: change of the half-cycle's capacity, Ah, per standard deviation
 //! of each error.

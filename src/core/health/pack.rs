@@ -42,8 +42,8 @@ pub struct PackState {
     pub limiting_cell: CellIndex,
 }
 
-/// Combines the cells. Returns `None` if there are no cells, or if the pack has no capacity because one cell is full
-/// while another is empty.
+/// Combines the cells. Returns `None` without cells, or if the pack has no capacity because one cell is full while
+/// another is empty.
 pub fn combine(cells: impl Iterator<Item = CellShare>) -> Option<PackState> {
     let mut weakest: Option<(f64, CellShare)> = None;
     let mut chargeable_ah = f64::INFINITY;

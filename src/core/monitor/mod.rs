@@ -9,7 +9,7 @@
 //! ```
 //!
 //! * `message`: inputs and outputs, independent of the stages;
-//! * `stage`: the stages, each of which knows only the stages before it;
+//! * `stage`: the stages; each stage knows only the stages before it;
 //! * `stages`: connects the stages after the intake, passes the values of these stages to the alarm rules, and
 //!   remembers exchanged packs;
 //! * `snapshot`: the stored state;
@@ -311,7 +311,7 @@ impl Monitor {
         self.clock.due = self.clock.has_started.then(|| self.stages.sending.next_due());
     }
 
-    /// Starts at the time of the first input, from the pending stored state if there is one.
+    /// Starts at the time of the first input, from the pending stored state, if any.
     fn start(&mut self, time: Timestamp, out: &mut Outputs) {
         (self.clock.has_started, self.clock.now) = (true, time);
         self.stages.sending.restart(time);

@@ -119,7 +119,7 @@ impl ChargeCounter {
         }
     }
 
-    /// Forgets the state of contactors that are no longer configured.
+    /// Forgets the state of contactors that were removed from the configuration.
     pub(super) fn forget_contactors(&mut self) {
         self.open_until = None;
     }

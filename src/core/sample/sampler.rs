@@ -4,8 +4,8 @@
 //! current and temperature that are fresh at that time, and the charge and unmeasured time up to that time. A bad
 //! voltage gives no sample. Readings of channels that are not used are counted ([`Sampler::reading_counts`]).
 //!
-//! The memory is one record per channel, allocated at the start. Handling a reading allocates nothing. The records are
-//! an array of structs, because a reading touches one whole record.
+//! The sampler holds one record per channel, allocated at the start. Handling a reading allocates nothing. The records
+//! are an array of structs, because a reading touches one whole record.
 
 use serde::{Deserialize, Serialize};
 

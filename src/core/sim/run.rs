@@ -236,7 +236,7 @@ impl Simulation {
         self.asleep = Some(Asleep { from: self.time, duration_s, step: 0, steps });
     }
 
-    /// Continues the sleep, if there is one. Returns whether balancing bits were reported before the end of the sleep.
+    /// Continues a sleep in progress. Returns whether balancing bits were reported before the end of the sleep.
     fn sleep(&mut self) -> bool {
         while let Some(asleep) = &mut self.asleep {
             let (now, step_s) = (asleep.time(), asleep.duration_s / f64::from(asleep.steps));

@@ -55,7 +55,7 @@ pub struct Sensors {
 /// | `Poor` | 15 mV | 5 mV | 2 % + 300 mA | 60 mA | 3 K |
 ///
 /// The errors are standard deviations across channels, clipped at two standard deviations, and constant in time. The
-/// noise per sample is one step. Temperatures have steps of 0.1 K and noise of 0.02 K.
+/// standard deviation of the noise per sample equals one step. Temperatures have steps of 0.1 K and noise of 0.02 K.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SensorQuality {
     /// Laboratory equipment, or the best vehicles.

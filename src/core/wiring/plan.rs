@@ -1,4 +1,4 @@
-//! Plan: what the doctor expects on the buses, from the readable parts of the configuration.
+//! Plan: what `doctor` expects on the buses, from the readable parts of the configuration.
 
 use crate::can::CanId;
 use crate::can::decode::Binding;

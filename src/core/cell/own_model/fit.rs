@@ -132,7 +132,7 @@ pub fn label_cost(prior: &LabelPrior, rows: &[Row], capacities_ah: &[f64]) -> Op
 }
 
 /// Cost of rows with a model (`None` = the label's model): minus the logarithm of their density. Each stretch starts at
-/// its most likely SOC. Returns `None` if there are no rows.
+/// its most likely SOC. Returns `None` without rows.
 pub(super) fn rows_cost(prior: &LabelPrior, own: Option<&OwnModel>, rows: &[Row]) -> Option<f64> {
     let basis = Basis::new(prior, rows);
     let theta = basis.parameters(own);

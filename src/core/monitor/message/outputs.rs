@@ -50,7 +50,7 @@ impl Secured {
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
 pub enum Validity {
-    /// There is no estimate: not every cell has an estimate yet, or a cell's voltage is overdue.
+    /// The estimate is missing: not every cell has an estimate yet, or a cell's voltage is overdue.
     Unavailable = 0,
     /// Inputs are fresh and the filter is consistent.
     Valid = 1,

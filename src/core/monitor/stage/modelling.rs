@@ -317,7 +317,7 @@ impl Modelling {
     }
 
     /// Compares the present and the previous model on the new rows, then fits a model to all rows. Returns the model
-    /// that the estimators must adopt; `None` if there is no such model.
+    /// that the estimators must adopt, if any.
     pub(crate) fn refit(&mut self) -> Option<Adoption> {
         let label = self.label?;
         if self.state.fit_since.take().is_none() {

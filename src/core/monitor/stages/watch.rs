@@ -201,8 +201,8 @@ impl Stages {
         publisher.observe(Rule::BmsDisagrees, None, disagreement);
     }
 
-    /// SOC of the emptiest and the fullest cell, among the cells with a fresh estimate and a sound channel; `None` if
-    /// there is no such cell.
+    /// SOC of the emptiest and the fullest cell, among the cells with a fresh estimate and a sound channel; `None`
+    /// without such a cell.
     fn soc_spread(&self, now: Timestamp, all_fresh: bool) -> Option<SocSpread> {
         let bank = &self.estimation.bank;
         if all_fresh

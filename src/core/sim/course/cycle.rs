@@ -1,4 +1,5 @@
-//! Cycling between two SOC limits: the scenarios `paper` (from the paper) and `reference` (from a published example).
+//! Computes the current of the scenarios that cycle between two SOC limits: `paper` (from the paper) and `reference`
+//! (from a published example).
 
 use super::demand::Demand;
 use crate::sim::noise::Noise;

@@ -1,4 +1,5 @@
-//! A day of an electric car: drive, park asleep, fast charge.
+//! Computes the current of the scenario `ev-day`: a day of an electric car with drives, sleep while parked, and a fast
+//! charge.
 //!
 //! The car is a point mass that follows random target speeds with bounded acceleration. The electric power is scaled
 //! from a 60 kWh car to the simulated pack, so that every cell has the same C-rate.

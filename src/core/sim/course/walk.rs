@@ -1,4 +1,5 @@
-//! Random walk: 5-minute loads of random current within voltage limits, with reference cycles in between.
+//! Computes the current of the scenario `random-walk`: 5-minute loads of random current within voltage limits, with
+//! reference cycles in between.
 
 use super::demand::Demand;
 use crate::sim::noise::Noise;

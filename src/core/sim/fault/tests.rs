@@ -130,7 +130,7 @@ fn leak_discharges_cell_while_buses_sleep() {
         end_s = moment.time.secs();
     }
     let cells = sim.pack().cells();
-    // The simulation ends with a night, in which there are no sampling moments.
+    // The simulation ends with a night, which has no sampling moments.
     assert!(end_s < 80_000.0);
     assert!(
         ((cells[0].soc - cells[1].soc) * 2.6 - 0.01 * 22.0).abs() < 1e-3,

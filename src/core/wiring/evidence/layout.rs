@@ -3,7 +3,7 @@
 use super::sample::Extent;
 use crate::can::signal::{ByteOrder, SignalLayout, SignalPlan, ValueType};
 
-/// Layout faults that the doctor looks for, in the order of the alternative readings.
+/// Layout faults that `doctor` looks for, in the order of the alternative readings.
 pub(crate) const LAYOUT_FAULTS: [&str; 5] = [
     "wrong byte order",
     "signed and unsigned exchanged",

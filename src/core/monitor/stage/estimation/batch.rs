@@ -1,7 +1,7 @@
 //! Collects the samples of cells that report one after another. When every cell has reported, the filters of all cells
 //! are stepped together.
 //!
-//! The waiting time of a sample does not affect its estimate, because a step uses only the time and charge of its own
+//! The waiting time of a sample does not affect the estimate, because a step uses only the time and charge of this
 //! sample and no data of other cells.
 
 use crate::quantity::CellIndex;

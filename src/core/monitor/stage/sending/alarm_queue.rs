@@ -165,7 +165,7 @@ impl AlarmQueue {
         Some(next)
     }
 
-    /// The next alarm to announce as unknown; `None` if there is no such alarm or the budget is used up.
+    /// The next alarm to announce as unknown, if any. Returns `None` if the budget is used up.
     pub(crate) fn take_unknown(&mut self, now: Timestamp, engine: &AlarmEngine, turn: usize) -> Option<Alarm> {
         let alarm = engine.unknown_alarm(turn).filter(|_| self.free <= now)?;
         let key = AlarmKey::of(&alarm);
