@@ -194,8 +194,9 @@ impl CellFault {
     }
 }
 
-/// Writes the finding; cells are counted from 1. Example: `cell 7: loses charge by itself, 18.24 ± 0.43 % of its
-/// capacity a day`. The number after ± is the standard deviation.
+/// Writes the finding; cells are counted from 1. Example:
+/// `cell 7: loses charge by itself, 18.24 ± 0.43 % of its capacity a day`.
+/// The number after ± is the standard deviation.
 impl fmt::Display for CellFault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let number = |cell: CellIndex| cell.0 + 1;
