@@ -6,14 +6,14 @@
 //! {"version":1,"request":"clear","rule":"soc_low"}    {"version":1,"ok":true,"changed":1,"refused":0,...}
 //! {"version":1,"request":"nonsense"}                  {"version":1,"ok":false,"error":"..."}
 //! ```
-//! [`protocol`] defines every request and answer; cells count from 0 there, as in events.
+//! [`protocol`] defines every request and answer; in requests and answers, cells count from 0, as in events.
 //!
 //! * The socket's owner and group may read (mode 0660). Commands are executed only for the daemon's own user and for
 //!   root. The kernel identifies the user (`SO_PEERCRED`). Other users get an error.
-//! * Each connection is a task. It sends the loop one request at a time over a bounded queue. A connection that never
-//!   reads or writes does not block other connections and is closed. If all slots are taken, a new connection replaces
-//!   the one that has been idle longest.
-//! * A command reaches the core as an input, so it is in the journal and is replayed.
+//! * Each connection is a task. It sends the daemon's loop one request at a time over a bounded queue. A connection
+//!   that never reads or writes does not block other connections and is closed. If all slots are taken, a new
+//!   connection replaces the one that has been idle longest.
+//! * A command reaches the core as an input, so the journal records the command and a replay repeats it.
 
 pub mod answer;
 pub mod client;
@@ -35,11 +35,11 @@ pub const MAX_CONNECTIONS: usize = 8;
 pub const MAX_PER_PROCESS: usize = 4;
 /// Longest request, bytes, including the end of the line. The longest valid request has less than 200 bytes.
 pub const MAX_REQUEST_BYTES: usize = 4096;
-/// Longest time in which a client must send its request, and longest time in which it must read the answer. A script
-/// needs milliseconds, and a client must not keep one of the few slots for ever.
+/// Time within which a client must send its request, and time within which it must read the answer. A script needs
+/// milliseconds, and a client must not keep one of the few slots for ever.
 pub const MAX_SILENCE: Duration = Duration::from_secs(10);
-/// Maximum number of alarms in an answer. They make a line of a few hundred kilobytes, which is serialised in a few
-/// milliseconds. Further alarms are counted.
+/// Maximum number of alarms in an answer. So many alarms make a line of a few hundred kilobytes, which is serialised in
+/// a few milliseconds. Further alarms are counted.
 pub const MAX_LISTED: usize = 1024;
 
 /// The socket's name in the folder of the daemon.

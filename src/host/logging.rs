@@ -1,5 +1,5 @@
-//! The log. If systemd has connected standard error to journald, lines are sent to journald with fields, else they are
-//! written to standard error.
+//! Sets up the program's log. If systemd has connected standard error to journald, lines are sent to journald with
+//! fields. Otherwise, lines are written to standard error.
 //!
 //! In both cases the number of lines is limited (`limit`). In: a filter from `--log`. Out: log lines.
 

@@ -2,7 +2,7 @@
 //! value and allowed values.
 //!
 //! In: the configuration file, its drop-ins and the files they name (DBC files, cell models). Out: [`Config`],
-//! consistent settings for the other modules, or [`ConfigFaults`], one line per fault. In this module, to "note" a
+//! consistent settings for the other modules, or [`ConfigFaults`], one line per fault. In this module, to "report" a
 //! fault means to add it to the list of faults and to continue.
 //!
 //! The module has six layers. Each layer uses only the layers listed above it. No layer uses this file.

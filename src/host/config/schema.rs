@@ -2,10 +2,10 @@
 //!
 //! | file | content |
 //! | --- | --- |
-//! | `key` | the properties of a key, how its value is read |
+//! | `key` | the properties of a key, and how the value of a key is read |
 //! | `setting`, `threshold` | the types of keys |
-//! | `section` | declaration of tables |
-//! | `reader` | reads the tables of a document; unknown keys |
+//! | `section` | declares tables |
+//! | `reader` | reads the tables of a document and reports unknown keys |
 //! | `keys` | every key |
 //! | `tables` | every table of the file |
 

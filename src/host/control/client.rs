@@ -53,8 +53,8 @@ impl ControlClient {
         let mut stream = UnixStream::connect(&self.path)?;
         stream.set_read_timeout(Some(patience(request)))?;
         stream.set_write_timeout(Some(PATIENCE))?;
-        // Writing may fail because a daemon without a free slot has already answered and closed the connection. Its
-        // answer is then read.
+        // Writing fails if a daemon without a free slot has already answered and closed the connection. The answer is
+        // read even then.
         let written = stream.write_all(request.to_line().as_bytes());
         let mut line = Vec::new();
         BufReader::new(stream.take(MAX_ANSWER_BYTES)).read_until(b'\n', &mut line)?;

@@ -74,7 +74,7 @@ pub struct AlarmList {
 pub struct UnknownAlarms {
     /// The rule.
     pub rule: Rule,
-    /// The threshold.
+    /// Severity of the threshold.
     pub severity: Severity,
     /// Number of alarms.
     pub alarms: usize,

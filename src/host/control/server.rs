@@ -1,4 +1,4 @@
-//! Server of the control socket: accepts connections, passes requests to the loop and returns the loop's answers.
+//! Server of the control socket: accepts connections, passes requests to the daemon's loop and returns the answers.
 
 use std::time::{Duration, Instant};
 
@@ -37,7 +37,8 @@ pub struct ControlServer {
 }
 
 impl ControlServer {
-    /// Opens the socket. Its requests go to `requests`. Returns `None` if the socket cannot be opened (logged).
+    /// Opens the socket and sends the received requests to `requests`. Returns `None` if the socket cannot be opened
+    /// (logged).
     ///
     /// # Errors
     /// Fails if another daemon uses the socket, or if a socket that the user requested cannot be created.

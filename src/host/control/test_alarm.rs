@@ -22,7 +22,7 @@ use crate::io::stop::Stop;
 use crate::monitor::{BusEvent, Command, RecordKind};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// Period of reading the sockets. Results do not depend on it, because the kernel stamps the frames.
+/// Period at which the sockets are read. Results do not depend on this period, because the kernel stamps the frames.
 const READ_PERIOD: Duration = Duration::from_millis(10);
 /// Longest delay of the last frame after the end of the test, equal to fifty ticks of the daemon.
 const GRACE: Duration = Duration::from_millis(500);
@@ -40,7 +40,7 @@ pub struct ChannelReport {
     pub protection: Option<StatusCounts>,
     /// Frames dropped by the kernel.
     pub dropped: u64,
-    /// Why listening ended before the end of the test; `None` = it did not end early.
+    /// Why listening ended before the end of the test; `None` = listening did not end early.
     pub error: Option<String>,
 }
 

@@ -1,4 +1,4 @@
-//! A file written by its own thread, so that a slow disk never delays the loop.
+//! Writes a file on a separate thread, so that a slow disk never delays the daemon's loop.
 //!
 //! Bytes are collected and sent to the thread in pieces. After a failed write, or if too many pieces wait for a slow
 //! disk, every further write is an error. The caller then gives up the file and continues.

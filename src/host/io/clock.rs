@@ -198,7 +198,8 @@ impl StampMapper {
 /// Keeps the smallest value of arrival minus stamp for one to two windows of [`HARDWARE_WINDOW_NS`].
 #[derive(Debug, Clone, Default)]
 struct HardwareClock {
-    /// Smallest difference of this window and of the previous window, ns; `None` before the first stamp.
+    /// Smallest value of arrival minus stamp in this window and in the previous window, ns; `None` before the first
+    /// stamp.
     least_ns: Option<(i64, i64)>,
     window_start_ns: i64,
 }

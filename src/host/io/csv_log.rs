@@ -1,10 +1,10 @@
 //! Reads CSV logs: one row per sample, columns found by name, values in packwatch's units.
 //!
-//! Files in the Battery Data Format are recognised by its columns ([`BDF_COLUMNS`]). A positive current is a discharge,
-//! except with [`CsvOptions::charge_positive`] and in the Battery Data Format. An empty field means "no reading". A row
-//! is bad if a field is missing or is not a finite number. If there is a section column (`cycle`, `segment` or `ref`
-//! unless the user names one), time restarts at each new value. With a table of start times, the stamps are absolute.
-//! Without it, the gap between sections is unknown.
+//! Files in the Battery Data Format are recognised by the columns of that format ([`BDF_COLUMNS`]). A positive current
+//! is a discharge, except with [`CsvOptions::charge_positive`] and in the Battery Data Format. An empty field means "no
+//! reading". A row is bad if a field is missing or is not a finite number. A section column (`cycle`, `segment`, `ref`,
+//! or the column that the user names) divides a file into sections; time restarts in each section. If a table states
+//! the start times of the sections, the stamps are absolute. Otherwise, the gaps between the sections are unknown.
 
 use std::collections::HashMap;
 use std::io::Read;
@@ -31,7 +31,7 @@ pub struct CsvOptions {
     pub pack_total: bool,
 }
 
-/// Time of a row, and whether a section begins there.
+/// Time of a row, and whether an unknown gap precedes the row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RowTime {
     /// Time of the row.
@@ -126,7 +126,7 @@ pub const BDF_COLUMNS: [(&str, &str, &str); 6] = [
     ("voltage_v", "Voltage / V", "voltage_volt"),
     ("temperature_c", "Surface Temperature T1 / degC", "temperature_t1_celsius"),
     ("temperature_c", "Ambient Temperature / degC", "ambient_temperature_celsius"),
-    // This column has the opposite sign, like the current.
+    // The sign of this column is opposite to packwatch's, like the sign of the current.
     ("discharged_ah", "Net Capacity / Ah", "net_capacity_ah"),
 ];
 
@@ -168,7 +168,8 @@ impl<'a> SampleColumns<'a> {
         self.header.find_any(names).ok_or_else(missing)
     }
 
-    /// Index of the column of a role. If the user maps no column, its name is `ours`.
+    /// Index of the column of a role. If the user maps no column, the column has packwatch's name `ours` or, in the
+    /// Battery Data Format, the format's name.
     ///
     /// # Errors
     /// Fails if the file does not have this column.
@@ -176,8 +177,8 @@ impl<'a> SampleColumns<'a> {
         self.find(role, &self.mapped(role).map_or_else(|| self.usual(ours), |column| vec![column]))
     }
 
-    /// Index of the column of a role. If the user maps no column, its name is `ours`. `None` = the file does not have
-    /// this column.
+    /// Index of the column of a role. If the user maps no column, the column has packwatch's name `ours` or, in the
+    /// Battery Data Format, the format's name. `None` = the file does not have this column.
     ///
     /// # Errors
     /// Fails if the file does not have the column that the user maps.

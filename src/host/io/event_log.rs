@@ -54,8 +54,8 @@ impl EventSum {
         if since_s < self.period_s {
             return None;
         }
-        // After a pause the next frames are logged at once. While frames continue, a count is logged after 10 s, and
-        // then after twice the previous time, but at least once an hour.
+        // After a pause, the next frames are logged at once. While frames continue, counts are logged at intervals that
+        // start at 10 s and double up to one hour.
         let continues = since_s < 2.0 * self.period_s;
         self.period_s = if continues { (2.0 * self.period_s).min(3600.0) } else { 10.0 };
         self.reported = Some(time);

@@ -1,4 +1,4 @@
-//! Words for the faults of JSON documents.
+//! Describes faults of JSON documents for users.
 
 /// Returns what is wrong with a JSON document, and where. A document that ends early is described in plain words.
 pub fn json_fault(error: &serde_json::Error) -> String {

@@ -2,9 +2,9 @@
 //! zstd.
 //!
 //! The first line decides the format; for CSV, the file name decides too. Several logs are read one after another on
-//! one clock. A log, or a CSV section without a start time, may begin before the latest record read so far. It is then
-//! moved to one second after this record, and an unknown gap precedes it. [`LogCounts`] counts everything that does not
-//! become a record.
+//! one clock. A log, or a CSV section without a start time, may begin before the latest record read so far. In that
+//! case, the log or section is moved to one second after this record, and an unknown gap is inserted before the log or
+//! section. [`LogCounts`] counts everything that does not become a record.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
@@ -153,7 +153,7 @@ impl LogSource {
         self.state.adopt = true;
     }
 
-    /// Names of the interfaces by number; adopted ones come last.
+    /// Names of the interfaces by number. Adopted interfaces come last.
     pub fn interfaces(&self) -> &[String] {
         &self.state.interfaces
     }

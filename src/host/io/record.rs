@@ -17,8 +17,8 @@ pub struct Batch {
 }
 
 impl Batch {
-    /// Maximum number of records in a batch. They take 12 KiB, so they fit into the first-level cache together with the
-    /// estimators.
+    /// Maximum number of records in a batch. These records take 12 KiB, so they fit into the first-level cache together
+    /// with the estimators.
     pub const MAX: usize = 128;
 
     /// Creates a batch for up to `max` (1 to [`MAX`](Self::MAX)) records. If `max` is above 1, the source may have read

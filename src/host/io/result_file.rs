@@ -1,4 +1,4 @@
-//! Files that a command writes. A file is written completely or not at all, and every failure is reported.
+//! Writes the result files of a command. A file is written completely or not at all, and every failure is reported.
 //!
 //! A regular file is written as `NAME.part` in the same folder and renamed when it is complete. If the command does not
 //! complete it, the part is deleted. `-` is standard output. A device or pipe is written directly.
@@ -81,7 +81,8 @@ pub fn write_file(path: &Path, bytes: &[u8]) -> io::Result<()> {
     file.finish()
 }
 
-/// Checks that the result's path can be written and is not one of the inputs. Commands call it before hours of work.
+/// Checks that the result's path can be written and is not one of the inputs. Commands call this function first, before
+/// hours of work.
 ///
 /// # Errors
 /// Returns an error that states the result's path and the fault.
@@ -102,7 +103,8 @@ pub fn check_place<'a>(result: &Path, mut inputs: impl Iterator<Item = &'a PathB
     Ok(())
 }
 
-/// Replaces the error about a file that cannot be created by one that names the missing folder, if that is the reason.
+/// If a file cannot be created because its folder is missing, returns an error that names the folder. Returns other
+/// errors unchanged.
 pub(super) fn name_folder(path: &Path, error: io::Error) -> io::Error {
     match path.parent().filter(|folder| !folder.as_os_str().is_empty()) {
         Some(folder) if error.kind() == io::ErrorKind::NotFound && !folder.is_dir() => {
@@ -112,7 +114,7 @@ pub(super) fn name_folder(path: &Path, error: io::Error) -> io::Error {
     }
 }
 
-/// Adds the file's name to an error and keeps its kind, so that a closed pipe is still recognised.
+/// Adds the file's name to an error. The kind of the error is kept, so that a closed pipe is still recognised.
 fn named(path: &Path, error: io::Error) -> io::Error {
     if error.kind() == io::ErrorKind::Interrupted {
         return error;

@@ -240,8 +240,8 @@ fn begin(path: &Path) -> io::Result<Encoder<'static, CountedFile>> {
     Encoder::new(CountedFile { file: File::create(path)?, bytes: 0 }, 1)
 }
 
-/// Renames the segments of the last run to `base.1` after deleting that name's old segments. Returns them with their
-/// sizes.
+/// Renames the segments of the last run to `base.1` after deleting that name's old segments. Returns the renamed
+/// segments with their sizes.
 fn keep_earlier(base: &Path) -> io::Result<VecDeque<(PathBuf, u64)>> {
     let earlier = with_suffix(base, ".1");
     for segment in find(&earlier)? {

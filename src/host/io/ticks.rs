@@ -1,13 +1,13 @@
 //! Generates ticks for logs that contain none. A tick is a time at which the core runs although no record arrives.
 //!
 //! In the daemon, the driver ticks every [`TICK_PERIOD_MS`](crate::monitor::TICK_PERIOD_MS) while the computer is
-//! awake. A plain log only states when frames arrived. This module generates the same ticks for it, at multiples of the
-//! period. A tick at time T comes after every record of time T and before the first later record.
+//! awake. A plain log only states when frames arrived. This module generates the same ticks for a plain log, at
+//! multiples of the period. A tick at time T comes after every record of time T and before the first later record.
 //!
-//! If no record follows, the recorder counts as awake for the sleep gap. The ticks in this time let the core detect a
-//! lost input, as the daemon does on a silent bus. After the sleep gap, the recorder counts as asleep, and there are no
-//! ticks. The first record of the log and the first record after sleep wake the recorder, which gives one tick with the
-//! time of that record. There are no ticks after the last record.
+//! After each record, the recorder counts as awake for the sleep gap, even if no further record follows. The ticks in
+//! this time let the core detect a lost input, as the daemon does on a silent bus. After the sleep gap, the recorder
+//! counts as asleep, and there are no ticks. The first record of the log and the first record after sleep wake the
+//! recorder, which gives one tick with the time of that record. There are no ticks after the last record.
 //!
 //! The caller passes the time of the core's next necessary tick ([`Ticks::pop`]'s `due`). Earlier ticks are skipped
 //! because they would change nothing.
@@ -24,7 +24,7 @@ pub struct Ticks {
     next_ns: i64,
     /// Ticks before this time may be popped.
     limit_ns: i64,
-    /// Latest record; `None` before the first and after [`Ticks::sleep`].
+    /// Time of the latest record; `None` before the first record and after [`Ticks::sleep`].
     latest_ns: Option<i64>,
     /// Time of the first tick after a sleep gap. It is popped after the ticks before the gap.
     wake_ns: Option<i64>,
@@ -57,7 +57,7 @@ impl Ticks {
             return true;
         };
         if time_ns < latest_ns.saturating_sub(MERGE_TOLERANCE_NS) {
-            // The recorder's clock was set back, so the ticks continue from there.
+            // The recorder's clock was set back, so the ticks continue from the new time.
             (self.limit_ns, self.latest_ns, self.wake_ns) = (i64::MIN, Some(time_ns), Some(time_ns));
             return true;
         }
@@ -80,7 +80,8 @@ impl Ticks {
         }
     }
 
-    /// Whether [`pop`](Self::pop) may return a tick, regardless of what the core needs. It is false for most records.
+    /// Whether [`pop`](Self::pop) may return a tick, regardless of what the core needs. Returns `false` for most
+    /// records.
     #[inline]
     pub fn is_pending(&self) -> bool {
         self.next_ns < self.limit_ns || self.wake_ns.is_some()

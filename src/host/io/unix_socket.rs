@@ -1,5 +1,5 @@
-//! Opens and deletes Unix sockets and their files. When a daemon opens a socket whose file already exists, it replaces
-//! the file if the daemon that created it has ended. If that daemon still runs, the file is kept and opening fails.
+//! Opens and deletes Unix sockets and their files. If the file of a socket already exists, it is replaced only if the
+//! daemon that created the file has ended. Otherwise, the file is kept and opening fails.
 
 use std::fs::Permissions;
 use std::io::{self, ErrorKind};
@@ -74,8 +74,8 @@ impl From<io::Error> for BindError {
 }
 
 impl BindError {
-    /// Decides whether the server with option `--OPTION` continues without its socket. If it does, the reason is logged
-    /// and the result is `None`.
+    /// Decides whether the server with option `--OPTION` continues without its socket. If so, the reason is logged and
+    /// the result is `None`.
     ///
     /// # Errors
     /// Fails if another daemon uses the socket, or the socket is required.

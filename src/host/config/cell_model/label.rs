@@ -1,5 +1,5 @@
-//! Makes the model of a cell that has no model file. The model is made from the cell's label; on board it is then
-//! improved by learning.
+//! Makes a cell model from the label of a cell (chemistry, rated capacity, voltages), for cells without a model file.
+//! On board, learning then improves this model.
 
 use super::source::{LearnedFrom, MeasuredRange, ModelSource, SourcedModel};
 use crate::cell::{Coverage, Label};
@@ -40,7 +40,7 @@ pub fn of_view(view: &ModelView<'_>) -> Option<SourcedModel> {
     Some(SourcedModel { model: own.unwrap_or(prior), source })
 }
 
-/// Returns the lowest and highest temperature, current and SOC that the data covered.
+/// Returns the lowest and highest temperature and SOC that the data covered; the range of the current is unknown.
 fn seen_range(seen: &Coverage) -> MeasuredRange {
     let whole = |ranges: Vec<[f64; 2]>| Some([ranges.first()?[0], ranges.last()?[1]]);
     MeasuredRange {

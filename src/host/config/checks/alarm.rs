@@ -12,7 +12,7 @@ use crate::health::RechargeAlarm;
 pub(crate) struct RatedCell {
     /// Rated capacity, Ah.
     pub capacity_ah: f64,
-    /// Time that the reference charger needs for the recharge window of a cell with the rated capacity, s.
+    /// Time in which the reference charger charges a cell of the rated capacity through the recharge window, s.
     pub recharge_period_s: f64,
 }
 
@@ -57,7 +57,7 @@ impl Alarm {
     fn clear(&self, rated: &RatedCell, set: f64, threshold: &Threshold) -> Option<f64> {
         match threshold.clear {
             Some(clear) => rated.value(self.rule, clear),
-            // The value of such a rule is the duration of a fault. It is 0 only after the fault has ended.
+            // The value is the duration of a fault, which is 0 only after the fault has ended.
             None if value_is_fault_duration(self.rule) => Some(0.0),
             None => {
                 let hysteresis = self.hysteresis.unwrap_or(0.02 * set.abs());
@@ -66,7 +66,8 @@ impl Alarm {
         }
     }
 
-    /// The configured rules. Relative thresholds of rules without a 100 % value were noted by [`check`].
+    /// The configured rules. Relative thresholds of rules without a 100 % value are left out; [`check`] has reported
+    /// them.
     pub(crate) fn rules(&self, rated: &RatedCell) -> Vec<RuleConfig> {
         let rule = |(_, severity, threshold): (_, _, Threshold)| {
             let set = rated.value(self.rule, threshold.set)?;
@@ -98,7 +99,7 @@ fn beyond_sign(rule: Rule) -> f64 {
     }
 }
 
-/// Notes alarms whose keys contradict each other.
+/// Reports alarms whose keys contradict each other.
 pub(crate) fn check(raw: &RawTables, rated: Option<&RatedCell>) {
     for (index, alarm) in raw.alarms.iter().enumerate() {
         let place = &alarm.place;
@@ -122,7 +123,7 @@ pub(crate) fn check(raw: &RawTables, rated: Option<&RatedCell>) {
     }
 }
 
-/// Notes inputs and tables that the alarm's rule requires but the file does not contain.
+/// Reports inputs and tables that the alarm's rule requires but the file does not contain.
 fn check_needs(alarm: &Alarm, raw: &RawTables) {
     let cells = raw.pack.as_ref().map_or(2, |pack| if raw.is_pack_total() { 1 } else { pack.cells });
     let is_reported = raw.is_written::<ReportedSocInput>() || raw.is_written::<ReportedSohInput>();
@@ -180,7 +181,7 @@ fn check_thresholds(alarm: &Alarm, rated: &RatedCell) {
     }
 }
 
-/// Notes a threshold whose alarm would stay raised for ever, because no value can clear it.
+/// Reports a threshold whose alarm would stay raised for ever, because no value can clear it.
 fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, threshold: &Threshold) {
     let written = if threshold.clear.is_some() { key } else { "hysteresis" };
     if value_is_fault_duration(alarm.rule) {
@@ -195,7 +196,7 @@ fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, thresh
         Unit::AmpereHours | Unit::Seconds | Unit::Ratio | Unit::Cycles => (0.0, f64::INFINITY),
         Unit::Celsius => return,
     };
-    let is_within = (0.0..=high).contains(&set); // otherwise it is a fault noted elsewhere, or unreachable
+    let is_within = (0.0..=high).contains(&set); // otherwise `set` is reported elsewhere
     if is_within && !(low..=high).contains(&clear) {
         let range = if high.is_finite() { format!("{low} to {high}") } else { format!("{low} or more") };
         alarm.place.fault(written, format!("must clear {key} at {range}, not at {}", rounded(clear)));
@@ -207,8 +208,8 @@ fn rounded(value: f64) -> f64 {
     format!("{value:.9e}").parse().unwrap_or(value)
 }
 
-/// Notes a threshold outside 0 to 1 for a value that is a fraction. Its percent sign is probably missing: every value,
-/// or no value, would exceed this threshold.
+/// Reports a threshold outside 0 to 1 for a value that is a fraction. Its percent sign is probably missing: every
+/// value, or no value, would exceed this threshold.
 fn check_unit(alarm: &Alarm, key: &str, set: f64) {
     let is_fraction = matches!(alarm.rule.spec().unit, Unit::Fraction | Unit::FractionPerDay);
     if is_fraction && !(0.0..=1.0).contains(&set) {

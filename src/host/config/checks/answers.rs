@@ -1,7 +1,7 @@
 //! `[[input.diagnostic]]`: the diagnostic requests and answers, and the signals in the answers.
 //!
-//! In: the tables of the file. Out: one [`AnswerDefinition`] per table. The signals of a definition look like signals
-//! of a DBC, so that `[input.*]` can name them in the same way. Also out: the [`Answer`]s that the core decodes.
+//! Each table of the file becomes one [`AnswerDefinition`]. The signals of a definition look like signals of a DBC, so
+//! that `[input.*]` can name them in the same way. `polling` makes the answers that the core decodes.
 
 use crate::can::CanId;
 use crate::can::dbc::{FrameFormat, Message, Signal};
@@ -80,7 +80,7 @@ impl AnswerPlace<'_> {
     }
 }
 
-/// The answers of all tables; faulty ones are noted and left out.
+/// The answers of all tables. Faulty answers are reported and left out.
 pub(crate) fn definitions(raw: &RawTables) -> Vec<AnswerDefinition> {
     raw.diagnostics.iter().filter_map(definition).collect()
 }

@@ -1,8 +1,8 @@
 //! The cells of the pack: the pack's own cells, described by a model file or a label, and modules of other cells
 //! (`[[pack.module]]`).
 //!
-//! In: the tables and the cell model files they name. Out: the models. Notes missing keys and keys that contradict each
-//! other. Notes cells of a module that do not exist, belong to two modules, or have no known type.
+//! In: the tables and the cell model files they name. Out: the models. Reports missing keys and keys that contradict
+//! each other. Reports cells of a module that do not exist, belong to two modules, or have no known type.
 
 use std::path::Path;
 
@@ -55,7 +55,7 @@ pub(crate) fn own_model(path: &Path, named: Option<&str>, raw: &RawTables, read:
     model
 }
 
-/// Chemistry and rated capacity of a cell without a model file; missing keys are noted.
+/// Chemistry and rated capacity of a cell without a model file; missing keys are reported.
 fn check_label(place: &TablePlace, chemistry: Option<Chemistry>, rated_ah: Option<f64>) -> Option<(Chemistry, f64)> {
     match (chemistry, rated_ah) {
         (Some(chemistry), Some(rated_ah)) => return Some((chemistry, rated_ah)),
@@ -72,8 +72,8 @@ fn check_label(place: &TablePlace, chemistry: Option<Chemistry>, rated_ah: Optio
     None
 }
 
-/// Notes label keys that are given together with a model file, because the file states the same values. Returns whether
-/// any such key is given.
+/// Reports label keys that are given together with a model file, because the file states the same values. Returns
+/// whether any such key is given.
 fn check_file(place: &TablePlace, cell_model: Option<&String>) -> bool {
     let of_label = ["chemistry", "voltage_min_v", "voltage_max_v"].into_iter();
     let given: Vec<&str> = of_label.filter(|key| cell_model.is_some() && place.has(key)).collect();
@@ -83,12 +83,12 @@ fn check_file(place: &TablePlace, cell_model: Option<&String>) -> bool {
     !given.is_empty()
 }
 
-/// Notes label keys of the pack given together with a model file.
+/// Reports label keys of the pack given together with a model file.
 pub(crate) fn check(pack: &Pack) {
     check_file(&pack.place, pack.cell_model.as_ref());
 }
 
-/// Reads all modules; faulty ones are left out.
+/// Reads all modules and leaves out faulty modules.
 pub(crate) fn modules<'a>(path: &Path, raw: &'a RawTables, file: ReadFile<'_>) -> Vec<Module<'a>> {
     let Some(pack) = &raw.pack else { return Vec::new() };
     if raw.is_pack_total() {
@@ -118,7 +118,7 @@ pub(crate) fn modules<'a>(path: &Path, raw: &'a RawTables, file: ReadFile<'_>) -
     raw.modules.iter().filter_map(of_keys).collect()
 }
 
-/// Notes a fault at the key `cells` for cells that do not exist or that an earlier module contains.
+/// Reports a fault at the key `cells` for cells that do not exist or that an earlier module contains.
 pub(crate) fn check_cells<'a>(
     place: &TablePlace,
     cells: &[u16],

@@ -10,7 +10,7 @@ use crate::config::schema::keys::Output;
 use crate::monitor::{CommandConfig, OutputConfig};
 
 /// Returns the plan that decodes commands, and the guard that checks commands without authentication. `None` = commands
-/// are disabled, or a fault was noted.
+/// are disabled, or a fault was reported.
 pub(crate) fn commands(
     raw: &RawTables,
     found: &[ResolvedSignal<'_>],

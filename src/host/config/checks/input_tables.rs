@@ -11,7 +11,7 @@ use crate::config::schema::keys::{CurrentInput, Interface, SignalSource};
 use crate::config::schema::{RawTables, SECTIONS};
 use crate::config::schema::{Section as _, SectionInfo};
 
-/// Notes unknown interface names, and missing names if there are several interfaces.
+/// Reports unknown interface names, and missing names if there are several interfaces.
 pub(crate) fn interfaces(document: &Document<'_>, raw: &RawTables) {
     if raw.broken {
         return;
@@ -30,7 +30,7 @@ pub(crate) fn interfaces(document: &Document<'_>, raw: &RawTables) {
             Some(Some(name)) => {
                 raw.has_all_interfaces() && count > 0 && !raw.interfaces.iter().any(|interface| interface.name == name)
             }
-            Some(None) => false, // not a string: noted when it was read
+            Some(None) => false, // not a string: reported when it was read
             None => count > 1,
         };
         if is_fault {
@@ -39,7 +39,7 @@ pub(crate) fn interfaces(document: &Document<'_>, raw: &RawTables) {
     }
 }
 
-/// Notes unknown signals in tables that have another fault.
+/// Reports unknown signals in tables that have another fault.
 pub(crate) fn signals(document: &Document<'_>, raw: &RawTables, databases: &Databases) {
     let read: Vec<&str> = raw.places().map(|place| place.path.as_str()).collect();
     for (place, table) in with_key("signal").flat_map(|info| tables(document, info)) {

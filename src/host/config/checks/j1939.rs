@@ -11,7 +11,7 @@ use crate::config::schema::keys::{Alarm, J1939};
 use crate::monitor::{AlarmCode, J1939Config, OutputConfig};
 use crate::quantity::BusIndex;
 
-/// The node; `None` = not configured, disabled, or faults noted.
+/// The node; `None` = not configured, disabled, or faults reported.
 pub(crate) fn node(
     raw: &RawTables,
     found: &[ResolvedSignal<'_>],
@@ -59,7 +59,7 @@ fn name(keys: &J1939) -> Option<Name> {
     Name::new(&fields).map_err(|error| keys.place.fault(error.field, error)).ok()
 }
 
-/// Returns the trouble code of every threshold; `None` = a code is faulty (noted).
+/// Returns the trouble code of every threshold; `None` = a code is faulty (reported).
 fn codes(alarms: &[Alarm]) -> Option<Vec<AlarmCode>> {
     let mut codes: Vec<(&Alarm, AlarmCode)> = Vec::new();
     let mut is_good = true;
@@ -138,7 +138,7 @@ fn lamp(severity: Severity) -> Lamp {
     }
 }
 
-/// Notes node identifiers that an input or a frame of `[output]` uses on the node's interface.
+/// Reports node identifiers that an input or a frame of `[output]` uses on the node's interface.
 fn check_ids(
     keys: &J1939,
     node: &NodeConfig,

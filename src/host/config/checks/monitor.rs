@@ -20,7 +20,7 @@ use crate::monitor::{MonitorConfig, SupplyConfig};
 use crate::quantity::{BusIndex, SensorIndex};
 use crate::sample::{ContactorConfig, Limits, SampleConfig, VoltageSource};
 
-/// The settings of the core and the layout of the sent frames; `None` if a table is missing or faulty (noted).
+/// The settings of the core and the layout of the sent frames; `None` if a table is missing or faulty (reported).
 /// `inputs_whole` states whether every configured signal was found.
 pub(crate) fn monitor(
     raw: &RawTables,
@@ -31,7 +31,7 @@ pub(crate) fn monitor(
     path: &Path,
     read: ReadFile<'_>,
 ) -> Option<(MonitorConfig, Option<Database>)> {
-    // Builds every part before returning, so that each fault is noted.
+    // Builds every part before returning, so that each fault is reported.
     let mut guards = protect::guards(raw, signals, inputs_whole);
     let laid_out = output::output(raw, signals, path, model.as_ref(), read);
     let (commands, guard) = commands::commands(raw, signals, laid_out.as_ref()).unzip();

@@ -30,7 +30,7 @@ const SENT: [LayoutMessage; 6] = [
     LayoutMessage::Freshness,
 ];
 
-/// The sent frames and their layout. `None` = no frames are configured, or faults are noted.
+/// The sent frames and their layout. `None` = no frames are configured, or faults are reported.
 pub(crate) fn output(
     raw: &RawTables,
     found: &[ResolvedSignal<'_>],
@@ -67,7 +67,7 @@ pub(crate) fn output(
         Some(name) => Some(read_dbc(&beside(config, name), read, &raw.faults)?),
         None => None,
     };
-    // If the cell model is missing, this fault is already noted. Any capacity is then good enough to find further
+    // If the cell model is missing, this fault is already reported. Any capacity is then good enough to find further
     // faults of the layout.
     let rated_capacity_ah = raw.rated_ah(model).unwrap_or(1.0);
     let base = own.as_ref().map_or(LayoutBase::BuiltIn { rated_capacity_ah }, LayoutBase::Own);
@@ -101,7 +101,7 @@ pub(crate) fn output(
     Some((output, database))
 }
 
-/// The settings of a frame's message; `None` = faults noted.
+/// The settings of a frame's message; `None` = faults reported.
 pub(crate) fn message_settings(keys: &FrameKeys<'_>) -> Option<MessageSettings> {
     let id = match keys.id {
         Some(id) => Some(configured_id(keys, id)?),
@@ -142,7 +142,7 @@ fn protection(keys: &FrameKeys<'_>) -> Option<E2eSetting> {
     Some(E2eSetting::On(Protection { profile, data_id }))
 }
 
-/// The authentication of a frame; `None` = faults noted.
+/// The authentication of a frame; `None` = faults reported.
 fn authentication(keys: &FrameKeys<'_>) -> Option<Option<Authentication>> {
     let Some(profile) = keys.secoc else { return Some(None) };
     if keys.data_id.is_none() {
@@ -151,15 +151,15 @@ fn authentication(keys: &FrameKeys<'_>) -> Option<Option<Authentication>> {
     keys.data_id.map(|data_id| Some(Authentication { profile, data_id }))
 }
 
-/// Notes SecOC profiles that only commands may use. A sent frame needs more bits of freshness, because this program may
-/// restart.
+/// Reports SecOC profiles that only commands may use. A sent frame needs more bits of freshness, because this program
+/// may restart.
 fn check_sent_secoc(keys: &FrameKeys<'_>) {
     if keys.secoc.is_some_and(|profile| profile != secoc::Profile::Fd) {
         keys.place.fault("secoc", "must be \"fd\" for a frame that is sent");
     }
 }
 
-/// The settings of the freshness announcement; `None` = faults noted.
+/// The settings of the freshness announcement; `None` = faults reported.
 fn freshness_settings(keys: &FrameKeys<'_>, command: Option<&MessageSettings>) -> Option<MessageSettings> {
     let is_sent = command.is_some_and(|command| command.secoc.is_some());
     let unused = [
@@ -195,8 +195,8 @@ fn keys_of<'k, 'a>(frames: &'k [(LayoutMessage, FrameKeys<'a>)], message: Layout
     frames.iter().find(|(which, _)| *which == message).map(|(_, keys)| keys)
 }
 
-/// Notes identifiers and data ids that two frames share, because receivers could mistake one frame for the other. Also
-/// notes identifiers that an input uses on the same interface.
+/// Reports identifiers and data ids that two frames share, because receivers could mistake one frame for the other.
+/// Also reports identifiers that an input uses on the same interface.
 fn check_ids(
     frames: &[(LayoutMessage, FrameKeys<'_>)],
     plan: &OutputPlan,

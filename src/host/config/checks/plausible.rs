@@ -19,7 +19,7 @@ use crate::sample::Limits;
 /// The estimator learns resistances up to the same multiple of the model's resistances.
 const OTHER_CELL: f64 = 3.0;
 
-/// Notes implausible signals.
+/// Reports implausible signals.
 pub(crate) fn signals(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Option<&CellModel>) {
     let series = raw.pack.as_ref().map_or(1, |pack| pack.cells);
     for (place, signals) in by_table(raw, found) {
@@ -34,8 +34,8 @@ pub(crate) fn signals(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Opti
     overlaps(raw, found);
 }
 
-/// Range of values that can occur, in the channel's unit. A signal must be able to encode at least a part of it. `None`
-/// = not checked.
+/// Range of values that can occur, in the channel's unit. A signal must be able to encode at least a part of this
+/// range. `None` = not checked.
 fn needed_values(channel: Channel, (model, series): (Option<&CellModel>, u16)) -> Option<(f64, f64)> {
     // Without a model, the range is that of any lithium-ion cell.
     let (low, high) = model.map_or((1.2, 4.6), |model| (model.voltage_min_v, model.voltage_max_v));
@@ -53,7 +53,7 @@ fn held(resolved: &ResolvedSignal<'_>, scale: f64, offset: f64) -> (f64, f64) {
     (low * scale + offset, high * scale + offset)
 }
 
-/// Notes the first signal of a table whose bits cannot encode any value that occurs in the pack.
+/// Reports the first signal of a table whose bits cannot encode any value that occurs in the pack.
 fn reach(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&CellModel>, u16)) {
     let beyond = signals.iter().filter(|resolved| resolved.binding().is_ok()).find_map(|resolved| {
         let needed = needed_values(resolved.channel, pack)?;
@@ -92,7 +92,7 @@ fn name(resolved: &ResolvedSignal<'_>, signal: &Signal) -> String {
     format!("{}.{}", resolved.message.name, signal.name)
 }
 
-/// Notes signals with an invalid layout or range: one fault per table and reason.
+/// Reports signals with an invalid layout or range: one fault per table and reason.
 fn unreadable(place: &TablePlace, signals: &[&ResolvedSignal<'_>]) {
     let mut reasons: Vec<(String, &ResolvedSignal<'_>, usize)> = Vec::new();
     for resolved in signals {
@@ -114,7 +114,7 @@ fn unreadable(place: &TablePlace, signals: &[&ResolvedSignal<'_>]) {
     }
 }
 
-/// Notes signals, and multiplexors they depend on, that extend beyond their message: one fault per table.
+/// Reports signals, and multiplexors they depend on, that extend beyond their message: one fault per table.
 fn ends(place: &TablePlace, signals: &[&ResolvedSignal<'_>]) {
     // The length of an answer is unknown until it arrives.
     let in_frames = signals.iter().filter(|resolved| resolved.answer.is_none());
@@ -165,7 +165,7 @@ fn selectors<'r>(resolved: &'r ResolvedSignal<'_>) -> impl Iterator<Item = (&'r 
     conditions.filter_map(|condition| Some((condition, resolved.message.signals.get(condition.selector)?)))
 }
 
-/// Notes inputs that share bits of one message with each other or with a multiplexor: one fault per table.
+/// Reports inputs that share bits of one message with each other or with a multiplexor: one fault per table.
 fn overlaps(raw: &RawTables, found: &[ResolvedSignal<'_>]) {
     for (place, signals) in by_table(raw, found) {
         let mut pairs: Vec<(String, String)> = Vec::new();
@@ -219,7 +219,7 @@ fn ranges_overlap(a: (u64, u64), b: (u64, u64)) -> bool {
     a.0 <= b.1 && b.0 <= a.1
 }
 
-/// Returns the quantity that a channel needs, and its unit; `None` = any.
+/// Returns the quantity that a channel needs, and the unit of this quantity; `None` = any quantity.
 fn needed(channel: Channel) -> Option<(Quantity, &'static str)> {
     match channel {
         Channel::Current => Some((Quantity::Current, "A")),
@@ -230,7 +230,7 @@ fn needed(channel: Channel) -> Option<(Quantity, &'static str)> {
     }
 }
 
-/// Notes DBC units that differ from the input's unit; each unit is noted once.
+/// Reports DBC units that differ from the input's unit; each unit is reported once.
 fn units(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&CellModel>, u16)) {
     let mut seen: Vec<&str> = Vec::new();
     for resolved in signals {
@@ -288,7 +288,7 @@ fn conversion(
     (name, wanted): (&str, &str),
 ) {
     let (scale, offset) = (resolved.scale.abs(), resolved.offset);
-    // A smaller difference is a calibration of the sensor.
+    // A scale within 10 % and an offset within 20 degrees C count as a calibration of the sensor.
     let is_scale = (scale / unit.factor - 1.0).abs() <= 0.1;
     let is_offset = unit.quantity != Quantity::Temperature || (offset - unit.offset).abs() <= 20.0;
     if is_scale && is_offset {
@@ -336,7 +336,7 @@ struct AllowedRange<'a> {
     input: Option<&'a TablePlace>,
 }
 
-/// Notes ranges of plausible readings that are empty.
+/// Reports ranges of plausible readings that are empty.
 pub(crate) fn ranges(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Option<&CellModel>) {
     let Some(pack) = &raw.pack else { return };
     let readable: Vec<ResolvedSignal<'_>> = found.iter().filter(|input| input.binding().is_ok()).cloned().collect();
@@ -367,7 +367,7 @@ pub(crate) fn ranges(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Optio
 }
 
 impl AllowedRange<'_> {
-    /// Returns whether the range allows any value, and notes a fault if it does not.
+    /// Returns whether the range allows any value, and reports a fault if it does not.
     fn check(&self) -> bool {
         let AllowedRange { place, keys: [low_key, high_key], limits, dbc, unit, input } = self;
         let origin = if *unit == "V" { "of the DBC or the cell model" } else { "of the DBC" };
@@ -376,7 +376,7 @@ impl AllowedRange<'_> {
             return true;
         }
         match (place.has(low_key), place.has(high_key)) {
-            (true, true) => {} // noted where the keys are compared
+            (true, true) => {} // reported where the keys are compared
             (false, true) => {
                 let what = format!("must be above {low} {unit}, the smallest plausible value {origin}");
                 place.fault(high_key, &what);
@@ -400,11 +400,11 @@ impl AllowedRange<'_> {
     }
 }
 
-/// Notes limits that exclude the whole voltage range of the cell model.
+/// Reports limits that exclude the whole voltage range of the cell model.
 fn voltages_of_model(range: &AllowedRange<'_>, model: &CellModel) {
     let Limits { min, max, .. } = range.limits;
     let (low, high) = (model.voltage_min_v, model.voltage_max_v);
-    // An empty range of the model is noted in its file.
+    // The check of the model file reports an empty range.
     if low >= high || min < high && max > low {
         return;
     }
@@ -417,14 +417,14 @@ fn voltages_of_model(range: &AllowedRange<'_>, model: &CellModel) {
     }
 }
 
-/// Notes an initial capacity that is impossible for the cell model.
+/// Reports an initial capacity that is impossible for the cell model.
 pub(crate) fn initial_capacity(raw: &RawTables, model: Option<&CellModel>) {
     let (Some(pack), Some(model)) = (&raw.pack, model) else { return };
     initial_of(&pack.place, pack.initial_capacity_ah, model);
 }
 
-/// Notes an implausible initial or rated capacity of a module. Also notes a module whose rated capacity differs much
-/// from `own_ah`, the rated capacity of the pack's own cells.
+/// Reports an implausible initial or rated capacity of a module. Also reports a module whose rated capacity differs
+/// much from `own_ah`, the rated capacity of the pack's own cells.
 pub(crate) fn module(Module { keys, model, .. }: &Module<'_>, own_ah: Option<f64>) {
     let beside = own_ah.map_or(1.0, |own_ah| model.rated_capacity_ah / own_ah);
     if let Some(own_ah) = own_ah.filter(|_| beside.max(1.0 / beside) >= OTHER_CELL) {
@@ -456,7 +456,7 @@ fn initial_of(place: &TablePlace, initial_ah: Option<f64>, model: &CellModel) {
     }
 }
 
-/// Notes a rated capacity that does not fit the cell model.
+/// Reports a rated capacity that does not fit the cell model.
 pub(crate) fn rated_capacity(raw: &RawTables, model: Option<&CellModel>) {
     let (Some(pack), Some(model)) = (&raw.pack, model) else { return };
     let Some(rated_ah) = pack.rated_capacity_ah else { return };

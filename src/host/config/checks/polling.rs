@@ -21,7 +21,7 @@ pub(crate) fn answers(found: &[ResolvedSignal<'_>]) -> Result<Vec<Answer>, Layou
     Ok(answers)
 }
 
-/// The requests to send; `None` = polling is off. Notes missing requirements.
+/// The requests to send; `None` = polling is off. Reports missing requirements.
 pub(crate) fn poll(raw: &RawTables, found: &[ResolvedSignal<'_>]) -> Option<PollConfig> {
     let keys = raw.poll.as_ref().filter(|keys| keys.enabled)?;
     let mut requests: Vec<PollRequest> = Vec::new();

@@ -9,7 +9,7 @@ use crate::config::schema::did_you_mean;
 use crate::config::schema::keys::ProtectedInput;
 use crate::quantity::{BusIndex, Channel};
 
-/// Returns the guards of the protected messages; faults are noted. `inputs_whole` states whether every configured
+/// Returns the guards of the protected messages; faults are reported. `inputs_whole` states whether every configured
 /// signal was found. Only then does a missing message mean that its name is wrong.
 pub(crate) fn guards(raw: &RawTables, found: &[ResolvedSignal<'_>], inputs_whole: bool) -> Vec<GuardConfig> {
     let mut guards: Vec<(GuardConfig, &ProtectedInput)> = Vec::new();
@@ -81,7 +81,7 @@ fn guard(keys: &ProtectedInput, input: &ResolvedSignal<'_>, bus: BusIndex) -> Gu
     }
 }
 
-/// Notes keys that do not fit the profile.
+/// Reports keys that do not fit the profile.
 fn check_profile(keys: &ProtectedInput) {
     let profile = keys.profile;
     if keys.data_id > profile.max_data_id() {

@@ -46,7 +46,7 @@ pub(crate) struct NamedSignal<'d> {
 }
 
 impl NamedSignal<'_> {
-    /// `Message.Signal`.
+    /// The name of the signal in the form `Message.Signal`.
     pub(crate) fn full_name(&self) -> String {
         format!("{}.{}", self.message.name, self.signal.name)
     }
@@ -100,8 +100,8 @@ const MAX_FRAME_BYTES: u16 = 64;
 pub(crate) const UNLIMITED: (f64, f64) = (f64::NEG_INFINITY, f64::INFINITY);
 
 impl Databases {
-    /// Reads the DBC files and the answers. Returns `None` if there are none, or if one is unusable (noted), because
-    /// signals cannot be looked up in that case.
+    /// Reads the DBC files and the answers. Returns `None` if there are no files and no answers, or if a file is
+    /// unusable (reported), because signals cannot be looked up in that case.
     pub(crate) fn load(config: &Path, raw: &RawTables, read: ReadFile<'_>) -> Option<Self> {
         let mut files = Vec::new();
         for name in raw.input.as_ref().map_or(&[][..], |input| &input.dbc) {
@@ -142,7 +142,7 @@ impl Databases {
     }
 }
 
-/// Reads one DBC file; `None` = it cannot be read (noted).
+/// Reads one DBC file; `None` = it cannot be read (reported).
 pub(crate) fn read_dbc(path: &Path, read: ReadFile<'_>, faults: &Faults) -> Option<Database> {
     let file = path.display().to_string();
     let bytes = read(path).map_err(|error| faults.add(&file, 0, format!("cannot be read: {error}"))).ok()?;
@@ -174,7 +174,7 @@ pub(crate) fn resolve<'d>(raw: &RawTables, databases: &'d Databases) -> Vec<Reso
     search.found
 }
 
-/// Notes a signal name that is in none of the files.
+/// Reports a signal name that is in none of the files.
 pub(crate) fn check_name(raw: &RawTables, databases: &Databases, source: &SignalSource<'_>) {
     if !databases.signals().any(|signal| signal.is_named(source.signal)) {
         Search { raw, databases, found: Vec::new() }.not_found(source);
@@ -264,7 +264,7 @@ impl<'d> Search<'_, 'd> {
     fn add(&mut self, channel: Channel, source: &SignalSource<'_>, sign: f64, named: NamedSignal<'d>) {
         let NamedSignal { file, message, signal, answer } = named;
         let Some(bus) = self.raw.bus_of(source.interface) else {
-            return; // the cross checks note unknown interfaces
+            return; // the cross checks report unknown interfaces
         };
         let full_name = named.full_name();
         let fd = self.raw.interfaces.get(bus.index()).is_some_and(|interface| interface.fd);
@@ -329,7 +329,8 @@ pub(crate) fn channel_words(channel: Channel) -> String {
     }
 }
 
-/// If an input uses the identifier `id` on one of these interfaces, notes a fault at the key `id` of the frame's table.
+/// If an input uses the identifier `id` on one of these interfaces, reports a fault at the key `id` of the frame's
+/// table.
 pub(crate) fn check_no_input(place: &TablePlace, id: CanId, buses: &[BusIndex], found: &[ResolvedSignal<'_>]) {
     if let Some(input) = found.iter().find(|input| buses.contains(&input.bus) && input.message.id == id) {
         place.fault("id", format!("must not be the identifier of an input, but {} has {id}", input.message.name));
@@ -373,7 +374,8 @@ impl ResolvedSignal<'_> {
     }
 }
 
-/// The decoder's map, without the diagnostic answers; `None` if a layout cannot be decoded (noted when it was found).
+/// The map from frames to inputs for the decoder, without the diagnostic answers. `None` if a layout cannot be decoded,
+/// which was reported when the signal was found.
 pub(crate) fn input_map(found: &[ResolvedSignal<'_>]) -> Option<InputMap> {
     let in_frames = found.iter().filter(|resolved| resolved.answer.is_none());
     let bindings: Result<Vec<_>, _> = in_frames.map(ResolvedSignal::binding).collect();

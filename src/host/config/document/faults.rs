@@ -49,17 +49,17 @@ struct Notes {
 }
 
 impl Faults {
-    /// Notes `text` about line `line` of `file`; line 0 = the file as a whole.
+    /// Adds the fault `text` at line `line` of `file`; line 0 = the file as a whole.
     pub(crate) fn add(&self, file: &str, line: usize, text: impl fmt::Display) {
         self.add_at(&SourceLine { file: file.to_owned(), line }, text);
     }
 
-    /// Notes `text` about a line.
+    /// Adds the fault `text` at a line.
     pub(crate) fn add_at(&self, at: &SourceLine, text: impl fmt::Display) {
         note(&mut self.0.borrow_mut().faults, at, text);
     }
 
-    /// Notes a value that is allowed but unlikely. The configuration remains valid.
+    /// Adds a warning about a value that is allowed but unlikely. The configuration remains valid.
     fn warn(&self, at: &SourceLine, text: impl fmt::Display) {
         note(&mut self.0.borrow_mut().warnings, at, text);
     }
@@ -115,7 +115,7 @@ pub(crate) struct TablePlace {
     /// `input.current`, `alarm[2]`; empty for the top of the file.
     pub path: String,
     pub spots: BTreeMap<String, KeyPlace>,
-    /// Where faults are noted.
+    /// The list to which faults are added.
     pub faults: Faults,
 }
 
@@ -140,12 +140,12 @@ impl TablePlace {
         self.spots.get(key).map_or(&self.at, |spot| &spot.at)
     }
 
-    /// Notes `KEY = FOUND, WHAT`.
+    /// Adds the fault `KEY = FOUND, WHAT`.
     pub(crate) fn fault(&self, key: &str, what: impl fmt::Display) {
         self.faults.add_at(self.line_of(key), self.sentence(key, what));
     }
 
-    /// Notes `KEY = FOUND, WHAT` as a warning.
+    /// Adds the warning `KEY = FOUND, WHAT`.
     pub(crate) fn warn(&self, key: &str, what: impl fmt::Display) {
         self.faults.warn(self.line_of(key), self.sentence(key, what));
     }
@@ -158,12 +158,12 @@ impl TablePlace {
         }
     }
 
-    /// Notes `KEY: WHAT`, for values that are too long to quote.
+    /// Adds the fault `KEY: WHAT`, for values that are too long to quote.
     pub(crate) fn note(&self, key: &str, what: impl fmt::Display) {
         self.faults.add_at(self.line_of(key), format!("{}: {what}", self.key(key)));
     }
 
-    /// Notes `TABLE WHAT`, a fault of the whole table.
+    /// Adds the fault `TABLE WHAT` about the whole table.
     pub(crate) fn table_fault(&self, what: impl fmt::Display) {
         self.faults.add_at(&self.at, format!("{} {what}", self.path));
     }

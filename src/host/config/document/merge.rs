@@ -20,15 +20,15 @@ pub(crate) struct Document<'t> {
     pub file: String,
     /// Whether a file has a syntax fault. If so, a key that was not found may be in the part that could not be parsed.
     pub broken: bool,
-    /// Where faults are noted.
+    /// The list to which faults are added.
     pub faults: Faults,
     sources: &'t Sources,
     root: DeTable<'t>,
 }
 
 impl<'t> Document<'t> {
-    /// Parses every file of `sources` and merges them in order. Syntax faults are noted; the readable rest is kept and
-    /// checked.
+    /// Parses every file of `sources` and merges them in order. Syntax faults are reported; the readable rest is kept
+    /// and checked.
     pub(crate) fn parse(sources: &'t Sources, faults: &Faults) -> Self {
         let (mut root, mut broken) = (DeTable::new(), false);
         for source in sources.files() {

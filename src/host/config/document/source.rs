@@ -109,10 +109,10 @@ pub(crate) struct Sources {
 }
 
 impl Sources {
-    /// Reads all files; `None` = one of them cannot be read (noted).
+    /// Reads all files; `None` = one of them cannot be read (reported).
     pub(crate) fn read(files: &ConfigFiles, read: ReadFile<'_>, faults: &Faults) -> Option<Self> {
         let text = |path: &Path| Some((path.display().to_string(), read_text(path, read, faults)?));
-        // Reads every file before returning, so that each fault is noted.
+        // Reads every file before returning, so that each fault is reported.
         let texts: Vec<_> = files.all().map(text).collect();
         Some(Self::new(texts.into_iter().collect::<Option<Vec<_>>>()?))
     }
@@ -167,7 +167,7 @@ pub(crate) fn read_file(path: &Path) -> std::io::Result<Vec<u8>> {
     std::fs::read(path)
 }
 
-/// The file as UTF-8 text; `None` = it cannot be read (noted).
+/// The file as UTF-8 text; `None` = it cannot be read (reported).
 pub(crate) fn read_text(path: &Path, read: ReadFile<'_>, faults: &Faults) -> Option<String> {
     let file = path.display().to_string();
     let bytes = read(path).map_err(|error| faults.add(&file, 0, format!("cannot be read: {error}"))).ok()?;

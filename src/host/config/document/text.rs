@@ -1,4 +1,5 @@
-//! The merged tables of a configuration as one TOML text for readers, each part with its file and line.
+//! Writes the merged tables of a configuration as one TOML text for people. Comments in this text state the file and
+//! line of each key and table.
 
 use std::fmt::Write as _;
 use std::path::Path;

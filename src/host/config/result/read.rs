@@ -40,7 +40,8 @@ pub(crate) fn read_and<T>(
     let faults = Faults::default();
     match read_config(files, read, &faults, then) {
         Some(good) if faults.is_empty() => Ok(good),
-        // If a part is missing although no fault was noted, packwatch itself has a bug. Report it instead of hiding it.
+        // If a part is missing although no fault was reported, packwatch itself has a bug. Report it instead of hiding
+        // it.
         None if faults.is_empty() => Err(ConfigFaults(vec![format!(
             "{}: cannot be used, but no fault was found: this is a bug in packwatch",
             files.main.display()

@@ -181,7 +181,7 @@ pub(crate) struct TableReader<'a> {
 }
 
 impl TableReader<'_> {
-    /// Returns the value of `key` or its default. Returns `None` and notes a fault if the value is faulty.
+    /// Returns the value of `key` or its default. Returns `None` and reports a fault if the value is faulty.
     pub(crate) fn setting<T: Setting>(&self, key: &Key) -> Option<T> {
         let Some(value) = self.table.and_then(|table| table.get(key.name)) else {
             return self.absent(key);

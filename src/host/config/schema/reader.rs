@@ -19,15 +19,15 @@ pub(crate) struct SchemaReader<'a> {
 }
 
 impl<'a> SchemaReader<'a> {
-    /// Creates a reader and notes the unknown keys of the document.
+    /// Creates a reader and reports the unknown keys of the document.
     pub(crate) fn new(document: &'a Document<'a>, known: &[SectionInfo]) -> Self {
         let mut walk = Self { document, broken: document.broken };
         walk.refuse_unknown("", "", document.root(), known);
         walk
     }
 
-    /// Reads a table that occurs once. If the file does not contain it, its defaults apply and its required keys are
-    /// noted as missing.
+    /// Reads a table that occurs once. If the file does not contain the table, the table's defaults apply and its
+    /// required keys are reported as missing.
     pub(crate) fn one<S: Section>(&self) -> Option<S> {
         if S::PATH.is_empty() {
             let root = self.document.root();
@@ -37,7 +37,7 @@ impl<'a> SchemaReader<'a> {
             None => self.read(S::PATH, self.line_above(S::PATH), None),
             Some(value) => match value.get_ref() {
                 DeValue::Table(table) => self.read(S::PATH, self.document.line(&value.span()), Some(table)),
-                _ => None, // noted by the check for unknown keys
+                _ => None, // reported by the check for unknown keys
             },
         }
     }
@@ -47,7 +47,7 @@ impl<'a> SchemaReader<'a> {
         self.document.find(S::PATH).and_then(|_| self.one())
     }
 
-    /// Reads every table of a repeatable section. Faulty tables are noted and left out.
+    /// Reads every table of a repeatable section. Faulty tables are reported and left out.
     pub(crate) fn many<S: Section>(&self) -> Vec<S> {
         let Some(DeValue::Array(items)) = self.document.find(S::PATH).map(Spanned::get_ref) else {
             return Vec::new();
@@ -83,7 +83,7 @@ impl<'a> SchemaReader<'a> {
         S::read(&TableReader { document: self.document, broken: self.broken, table, place })
     }
 
-    /// Notes every key of `table` that `known` does not contain. `schema` is the table's path in the schema, `shown`
+    /// Reports every key of `table` that `known` does not contain. `schema` is the table's path in the schema, `shown`
     /// the path in faults (with the number of a repeated table).
     fn refuse_unknown(&mut self, schema: &str, shown: &str, table: &'a DeTable<'a>, known: &[SectionInfo]) {
         let here = known.iter().find(|info| info.path == schema);

@@ -1,9 +1,9 @@
 //! Declares tables and keys. One line of [`section!`] determines the type of a key, how the key is read, its fault
 //! messages, and its text in the reference.
 //!
-//! [`section!`] declares a table of a file and, if the table `gives` a parameter struct, builds that struct from the keys.
-//! [`tables!`] lists the tables of a file. [`SchemaReader`] reads the declared tables from a document. It notes missing
-//! and unknown keys, and values of the wrong type or out of range.
+//! [`section!`] declares a table of a file and, if the table `gives` a parameter struct, builds that struct from the
+//! keys. [`tables!`] lists the tables of a file. [`SchemaReader`] reads the declared tables from a document. It reports
+//! missing and unknown keys, and values of the wrong type or out of range.
 
 use toml::Spanned;
 use toml::de::DeValue;
@@ -18,7 +18,7 @@ pub(crate) trait Section: Sized {
     const ABOUT: &'static str;
     /// The keys of the table.
     const KEYS: &'static [Key];
-    /// Reads the table. Returns `None` and notes a fault if a key is bad.
+    /// Reads the table. Returns `None` and reports a fault if a key is bad.
     fn read(table: &TableReader<'_>) -> Option<Self>;
 }
 
@@ -57,7 +57,8 @@ impl SectionInfo {
     }
 }
 
-/// Declares a table of a file: the struct, its keys, how it is read and, after `gives`, the parameters it provides.
+/// Declares a table of a file: its struct and keys, the function that reads the table and, after `gives`, the
+/// parameters that the table provides.
 ///
 /// ```text
 /// section! {
@@ -161,7 +162,7 @@ pub(crate) use table_field;
 /// the function that reads it.
 ///
 /// A table is `one`, `optional` or `many`. A table `one` is always read: if the file does not contain it, its keys have
-/// their defaults, and missing required keys are noted. A table `optional` is read only if the file contains it. A
+/// their defaults, and missing required keys are reported. A table `optional` is read only if the file contains it. A
 /// table `many` is repeatable (`[[path]]`). `with` names further tables that a key of the table contains.
 macro_rules! tables {
     ($(#[$about:meta])* $name:ident, $sections:ident { $($field:ident: $kind:ident $section:ident $(with $below:ident)?),+ $(,)? }) => {
@@ -170,7 +171,7 @@ macro_rules! tables {
         pub(crate) struct $name {
             /// The file, as the user named it.
             pub file: String,
-            /// Where faults are noted.
+            /// The list to which faults are added.
             pub faults: $crate::config::document::Faults,
             /// Whether the file's syntax or a table is broken. If so, a table that was not found may still exist.
             pub broken: bool,
@@ -180,7 +181,7 @@ macro_rules! tables {
         }
 
         impl $name {
-            /// Reads every table. Faulty and unknown keys are noted.
+            /// Reads every table. Faulty and unknown keys are reported.
             pub(crate) fn read(document: &$crate::config::document::Document<'_>) -> Self {
                 use $crate::config::schema::Section as _;
                 let reader = $crate::config::schema::SchemaReader::new(document, $sections);
@@ -228,7 +229,7 @@ impl<S: Section> Setting for SubTables<S> {
     }
 
     fn read_tables(reader: &TableReader<'_>, key: &Key, value: &Spanned<DeValue<'_>>) -> Option<Option<Self>> {
-        let DeValue::Array(items) = value.get_ref() else { return Some(None) }; // noted by the check for unknown keys
+        let DeValue::Array(items) = value.get_ref() else { return Some(None) }; // the unknown-key check reports this
         if items.is_empty() {
             reader.place.fault(key.name, key.must_be());
             return Some(None);
@@ -239,7 +240,7 @@ impl<S: Section> Setting for SubTables<S> {
             let place = reader.document.place(&path, reader.document.line(&item.span()), table);
             S::read(&TableReader { table: Some(table), place, ..*reader })
         };
-        // Reads every table before returning, so that each fault is noted.
+        // Reads every table before returning, so that each fault is reported.
         let tables: Vec<Option<S>> = items.iter().zip(1..).map(read).collect();
         Some(tables.into_iter().collect::<Option<Vec<S>>>().map(Self))
     }

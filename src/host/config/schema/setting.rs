@@ -44,7 +44,8 @@ impl Setting for f64 {
     }
 }
 
-/// Returns the value of an integer that is written in any of TOML's bases; `None` if it does not fit.
+/// Returns the value of an integer that is written in any of TOML's bases; `None` if the value does not fit into an
+/// `i128`.
 fn whole(integer: &DeInteger<'_>) -> Option<i128> {
     i128::from_str_radix(integer.as_str(), integer.radix()).ok()
 }

@@ -13,7 +13,7 @@ use crate::config::document::TablePlace;
 use crate::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
 
 tables! {
-    /// The tables of a file; `None` = the table is absent or faulty (the fault is noted).
+    /// The tables of a file; `None` = the table is absent or faulty (the fault is reported).
     RawTables, SECTIONS {
         vehicle: one Vehicle,
         pack: one Pack,
@@ -62,7 +62,7 @@ impl RawTables {
         !self.broken && self.interfaces.len() == self.count::<Interface>()
     }
 
-    /// Notes `text` about the table at `place`, or about the whole file if the table could not be read.
+    /// Reports `text` about the table at `place`, or about the whole file if the table could not be read.
     pub(crate) fn note(&self, place: Option<&TablePlace>, text: &str) {
         match place {
             Some(place) => self.faults.add_at(&place.at, text),
@@ -87,7 +87,7 @@ impl RawTables {
     }
 
     /// The interface with this name, or the first interface if no name is given. `None` = there is no such interface
-    /// (the cross checks note it).
+    /// (the cross checks report this fault).
     pub(crate) fn bus_of(&self, interface: Option<&str>) -> Option<BusIndex> {
         let index = match interface {
             Some(name) => self.interfaces.iter().position(|interface| interface.name == name)?,
@@ -96,7 +96,7 @@ impl RawTables {
         u8::try_from(index).ok().map(BusIndex)
     }
 
-    /// Returns the interface of a table that uses exactly one interface. Returns `None` and notes a fault if the name
+    /// Returns the interface of a table that uses exactly one interface. Returns `None` and reports a fault if the name
     /// is unknown, or if no name is given although there are several interfaces.
     pub(crate) fn one_bus(&self, interface: Option<&str>, place: &TablePlace) -> Option<BusIndex> {
         let is_clear = interface.is_some() || self.distinct_interfaces().len() <= 1;
@@ -112,7 +112,7 @@ impl RawTables {
         self.distinct_interfaces().join(" or ")
     }
 
-    /// Names of the interfaces, each once. A name that is given twice is noted elsewhere.
+    /// Names of the interfaces, each once. Another check reports a name that is given twice.
     fn distinct_interfaces(&self) -> Vec<&str> {
         let mut names: Vec<&str> = Vec::new();
         for interface in &self.interfaces {
@@ -123,7 +123,7 @@ impl RawTables {
         names
     }
 
-    /// Notes, at the key `fd` of a frame's table, each interface of the frame that has no FD.
+    /// Reports, at the key `fd` of a frame's table, each interface of the frame that has no FD.
     pub(crate) fn check_fd(&self, place: &TablePlace, buses: &[BusIndex]) {
         let interfaces = buses.iter().filter_map(|bus| self.interfaces.get(bus.index()));
         for interface in interfaces.filter(|interface| !interface.fd) {

@@ -18,7 +18,7 @@ pub(super) static HEX: [u32; 256] = {
     table
 };
 
-/// Eight bytes of the text. Bytes beyond its end are zeros, which callers never use.
+/// Returns eight bytes of the text from `at` as a word; 0 if the text ends earlier.
 #[inline(always)]
 pub(super) fn word(text: &[u8], at: usize) -> u64 {
     text.get(at..).and_then(|rest| rest.first_chunk()).map_or(0, |bytes| u64::from_le_bytes(*bytes))
@@ -37,7 +37,7 @@ pub(super) fn eight_digits(text: u64) -> Option<i64> {
     lanes(text ^ (u64::from(b'0') * ONES), 0x76 * ONES).map(number::<1>)
 }
 
-/// Returns `lanes`, or `None` if a lane is 0x80 or more before or after `wrong` is added to it.
+/// Returns `lanes` unchanged; `None` = a lane is 0x80 or more, either before or after `wrong` is added.
 #[inline(always)]
 fn lanes(lanes: u64, wrong: u64) -> Option<u64> {
     ((lanes | lanes.wrapping_add(wrong)) & HIGHS == 0).then_some(lanes)

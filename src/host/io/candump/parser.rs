@@ -1,9 +1,9 @@
 //! Parses candump lines.
 //!
 //! In: text that begins with a line; the parser ignores what follows the line feed. Out: the line, or the first
-//! violation of the grammar. Nothing is allocated and nothing is read twice. Three parts are the same in nearly all
-//! lines: the second of the previous line, a known interface, and a payload of eight bytes. These parts have fast
-//! paths, which convert several bytes at a time.
+//! violation of the grammar. Nothing is allocated and nothing is read twice. Nearly all lines have the same whole
+//! seconds as the previous line, a known interface, and a payload of eight bytes. These three parts have fast paths,
+//! which convert several bytes at a time.
 
 use super::digits::{HEX, eight_digits, eight_hex_bytes, six_decimals, word};
 use super::{Line, LineError};
@@ -12,7 +12,7 @@ use crate::quantity::{BusIndex, Timestamp};
 
 /// Largest 29-bit identifier, and the mask of an error frame's class bits.
 const MAX_EXTENDED: u32 = 0x1FFF_FFFF;
-/// Two words that match no line. The words overlap, and their overlapping bytes differ.
+/// Two words that match no line: the words of a line overlap, but the overlapping bytes of these words differ.
 const NO_HEAD: [u64; 2] = [0, u64::MAX];
 
 /// An interface with a name of up to seven bytes.
@@ -43,15 +43,15 @@ impl Interface {
     }
 }
 
-/// Parses lines one after another. The parser remembers the second of the previous line, because thousands of lines
-/// share it.
+/// Parses lines one after another. The parser remembers the whole seconds of the previous stamp, because thousands of
+/// lines share them.
 #[derive(Debug, Clone)]
 pub struct LineParser {
     interfaces: Vec<Interface>,
     /// The first twelve bytes of the previous line (a stamp of ten digits, up to the decimal point) as two overlapping
     /// words.
     head: [u64; 2],
-    /// The second that these bytes encode, ns.
+    /// The whole seconds that `head` encodes, ns.
     second_ns: i64,
 }
 

@@ -47,7 +47,7 @@ pub struct LinkHealth {
     pub counts: LinkCounts,
 }
 
-/// The health of one interface, shared between its task and the loop.
+/// The health of one interface, shared between the interface's task and the daemon's loop.
 #[derive(Debug, Default)]
 pub(super) struct SharedHealth(Mutex<LinkHealth>);
 

@@ -1,5 +1,6 @@
-//! One interface during the daemon's whole life. The link receives and sends, and continues when the interface goes
-//! down, is removed or returns. It reports every change as a [`BusEvent`]; no failure here ends the program.
+//! Serves one CAN interface during the daemon's whole life. A [`Link`] receives and sends, and continues when the
+//! interface goes down, is removed or returns. It reports every change as a [`BusEvent`]. No failure of an interface
+//! ends the program.
 //!
 //! If the interface goes down, its socket is kept and stays bound, so the first frame after the interface comes up
 //! again is not lost. If the interface is removed, its socket can no longer be used, even if an interface of the same
@@ -27,9 +28,11 @@ use crate::quantity::{BusIndex, Timestamp};
 
 /// First pause before an interface that is down or missing is checked again.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
-/// Longest pause before such a check. A check costs a few system calls, but each frame that is missed is lost.
+/// Longest pause before such a check. A check costs a few system calls, but frames that arrive before the check are
+/// lost.
 const LONGEST_PAUSE: Duration = Duration::from_secs(1);
-/// Number of frames read before other tasks run. A full 1 Mbit/s bus sends them in 8 ms, which is less than one tick.
+/// Number of frames read before other tasks run. A full 1 Mbit/s bus sends this many frames in 8 ms, which is less than
+/// one tick of the daemon (10 ms).
 const READ_BATCH: usize = 64;
 /// Maximum number of frames that wait to be sent, many times the number of status, health and alarm frames per second.
 const SEND_QUEUE: usize = 256;
@@ -101,7 +104,7 @@ pub struct Link {
     unsent: Arc<AtomicU64>,
     health: Arc<SharedHealth>,
     state: LinkState,
-    /// Time when the state was noted.
+    /// Time of the latest change of the state.
     state_since: Timestamp,
     /// Number of frames lost since the last report, in the kernel or because the daemon's inbox was full.
     lost: u64,
@@ -136,7 +139,7 @@ impl Link {
     pub fn new(config: LinkConfig, clock: MappedClock, inbox: mpsc::Sender<Record>) -> (Self, LinkOutput) {
         let (queue, outgoing) = mpsc::channel(SEND_QUEUE);
         let unsent = Arc::new(AtomicU64::new(0));
-        // Period of loss reports, limited so that a stalled bus does not fill the journal.
+        // Losses are reported at most every 250 ms, so that a stalled bus does not fill the journal.
         let mut report = interval(Duration::from_millis(250));
         report.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let health = Arc::<SharedHealth>::default();
@@ -215,7 +218,7 @@ impl Link {
                     Ok(mut guard) => {
                         let ready = guard.ready();
                         // Readiness is cleared before the work. If the socket becomes ready during the work, the
-                        // runtime sets it again. The loop reads until the socket is empty.
+                        // runtime sets readiness again. The loop reads until the socket is empty.
                         guard.clear_ready_matching(if ready.is_writable() { Ready::WRITABLE } else { Ready::EMPTY });
                         guard.clear_ready_matching(Ready::READABLE | Ready::ERROR);
                         Ok(())
@@ -340,7 +343,7 @@ impl Link {
         true
     }
 
-    /// Handles a socket error and notes the interface's state. Returns `false` if the socket is dead.
+    /// Handles a socket error and records the interface's state. Returns `false` if the socket is dead.
     async fn survives(&mut self, error: Errno) -> bool {
         let (state, is_known, is_alive) = match error {
             Errno::ENETDOWN => (Some(LinkState::Down), true, true),
@@ -396,7 +399,7 @@ impl Link {
         pause
     }
 
-    /// Notes the interface's state. Reports an event if the state is new.
+    /// Records the interface's state. Reports an event if the state is new.
     async fn enter(&mut self, state: LinkState) {
         self.enter_at(state, self.clock.now()).await;
     }

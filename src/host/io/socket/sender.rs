@@ -14,8 +14,8 @@ use crate::can::Frame;
 /// time.
 const RETRY_PAUSE: Duration = Duration::from_millis(1);
 
-/// Maximum number of attempts before a full queue is an error. They take 2 s, in which a working bus sends hundreds of
-/// frames.
+/// Maximum number of attempts before a full queue is an error. These attempts take 2 s, in which a working bus sends
+/// hundreds of frames.
 const MAX_TRIES: u32 = 2_000;
 
 /// Sends frames one after the other on one interface. It receives nothing.

@@ -14,7 +14,8 @@ use crate::filter::ScalarGaussian;
 use crate::health::{CapacityConfig, CapacityMethod, RechargeAlarm, RechargeConfig, TransitionConfig, UsableConfig};
 use crate::quantity::bounds;
 
-/// Standard deviation of the capacity that a cell may have lost before its first half-cycle, as a fraction of a new cell's capacity. Until the first half-cycle, the cell is assumed to have a new cell's open-circuit curve.
+/// Standard deviation of the capacity lost before a cell's first half-cycle, as a fraction of a new cell's capacity.
+/// Until that half-cycle, the cell is assumed to have a new cell's open-circuit curve.
 const FIRST_LOSS_STD: f64 = 0.03;
 
 section! {

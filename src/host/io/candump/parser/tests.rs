@@ -8,7 +8,7 @@ use super::*;
 const MORE: &str = "\n(1700000000.123456) can0 123#1122334455667788\n(1700000000.123457) can0 123#\n";
 
 /// Reads the line with a parser that has read it before, knows its interface and sees more text after it. The result
-/// must equal that of a new parser, which reads only this line and takes no fast path.
+/// must equal the result of a new parser, which reads only this line and takes no fast path.
 fn read(line: &[u8]) -> Result<Line<'_>, LineError> {
     let plain = crate::io::candump::parse_line(line);
     let name = match plain {
