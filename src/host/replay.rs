@@ -1,8 +1,8 @@
 //! The replay loop reads records, runs the core, writes results and returns a summary.
 //!
 //! Guarantee: the same logs and configuration give the same result files, byte for byte. The replay of a journal gives
-//! the results of the run that recorded it. Plain logs and CSV get the ticks of [`Ticks`]; journals contain their own.
-//! Wall time is used only for pacing (`speed`) and for reports.
+//! the results of the run that recorded it. Plain logs and CSV get the ticks of [`Ticks`]; journals contain ticks. Wall
+//! time is used only for pacing (`speed`) and for reports.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write};
@@ -218,7 +218,8 @@ struct Replay {
     /// Whether the summary already notes a reload of the recorded run.
     reloaded: bool,
     learned: BTreeMap<CellIndex, RecordedValues>,
-    /// Cell steps counted in the restored state; `None` until the first input.
+    /// Number of voltage readings that had reached an estimator when the restored state was stored; `None` until the
+    /// first input.
     steps_before: Option<u64>,
 }
 
@@ -427,7 +428,7 @@ impl Replay {
     }
 }
 
-/// Explains why a replay gave no estimates; `None` = it gave some, or the reason is already noted.
+/// Explains why a replay gave no estimates; `None` = the replay gave estimates, or the reason is already noted.
 fn unused(counts: &LogCounts, summary: &ReplaySummary, steps: u64) -> Option<String> {
     let found = match (counts.frames, counts.lines) {
         (0, _) if !counts.foreign.is_empty() => return None,

@@ -2,7 +2,7 @@
 //!
 //! In: frames and states of the interfaces, ticks, commands. Out: frames, events, status. One task owns the core. Every
 //! input is written to the journal before the core handles it, so that a replay of the journal produces the same
-//! frames. No fault of a bus, a disk or the service manager ends the loop. SIGTERM and SIGINT end it cleanly.
+//! frames. No fault of a bus, a disk or the service manager ends the loop. SIGTERM and SIGINT end the loop cleanly.
 
 mod engine;
 mod j1939_carrier;
@@ -102,7 +102,7 @@ pub enum ServiceError {
     /// Another daemon uses the state folder.
     #[error("{0}")]
     Store(String),
-    /// Another daemon uses the control or status socket, or it cannot be created.
+    /// Another daemon uses the control or status socket, or the socket cannot be created.
     #[error("{0}")]
     Socket(String),
     /// The runtime or a signal handler could not be set up.

@@ -1,5 +1,5 @@
-//! State and history that survive restarts and power cuts: two state files and a database of the history, in one
-//! folder.
+//! Stores state and history so that they survive restarts and power cuts: in two state files and a history database, in
+//! one folder.
 //!
 //! * Learned results and alarm changes are written to disk before they are announced. An announcement waits at most 200
 //!   ms for the disk ([`commit_barrier`]). Learned results are stored with the whole state. An alarm change is stored
@@ -263,7 +263,7 @@ impl Store {
 
     /// Writes the last state, and waits a limited time until it is on disk.
     pub fn finish(mut self, monitor: &Monitor, now: Timestamp) {
-        // If the disk fails, only the runtime folder has the last second.
+        // If the disk fails, only the runtime folder contains the changes of the last second.
         if let Some(runtime) = &self.runtime {
             runtime.put(self.document(monitor, now));
         }

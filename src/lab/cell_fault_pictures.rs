@@ -28,7 +28,7 @@ struct Shown {
     kinds: &'static [CellFaultKind],
 }
 
-/// The pictures in the order of a report. Charge is first, because it has no finding.
+/// The pictures in the order of a report. Charge is first, because no finding is based on charge.
 const SHOWN: [Shown; STATES] = [
     Shown {
         state: SOC,

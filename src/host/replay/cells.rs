@@ -1,4 +1,4 @@
-//! The cells at the end of a replay, for its summary.
+//! Collects the state of the cells at the end of a replay, for the replay's summary.
 
 use std::collections::BTreeMap;
 

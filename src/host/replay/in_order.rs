@@ -7,8 +7,8 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Mutex, PoisonError};
 use std::thread;
 
-/// Number of items per thread that may be started beyond the first unfinished item. It is larger than 1, so that the
-/// other threads can continue for some time while one thread processes a long item.
+/// Number of items per thread that may be started beyond the first unfinished item. The number is larger than 1, so
+/// that the other threads can continue for some time while one thread processes a long item.
 const AHEAD: usize = 4;
 
 /// Items that are not yet started, and the queue of receivers for their results, in the same order.

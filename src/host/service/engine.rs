@@ -162,7 +162,7 @@ impl Engine {
     }
 
     /// Sends the core's frames to the interfaces and its events to the log, and writes both to their files. Returns the
-    /// ticket of their commit.
+    /// ticket of the commit that stores the learned results.
     fn dispatch_outputs(&mut self, time: Timestamp) -> Option<u64> {
         let ticket = self.commit_learned(time);
         for transmit in &self.outputs.frames {
@@ -183,7 +183,7 @@ impl Engine {
         ticket
     }
 
-    /// Commits learned results. Unless the store has failed, their announcement waits for the commit.
+    /// Commits learned results. Unless the store has failed, the frames that announce the results wait for the commit.
     fn commit_learned(&mut self, now: Timestamp) -> Option<u64> {
         let ticket = self.store.as_mut()?.learned(&self.outputs.events, &self.monitor, now)?;
         if self.store_works {

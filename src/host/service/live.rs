@@ -190,7 +190,7 @@ impl ServiceLoop {
         for received in &self.batch {
             self.engine.handle(received);
         }
-        // Outputs are sent after the last record, when all frames have their estimates.
+        // The latency is counted after the last record, when all frames of the batch have been handled.
         self.status_publisher.note_frames(&self.batch, self.clock.now());
         self.batch.clear();
     }

@@ -1,5 +1,5 @@
-//! Holds the answers to commands until their changes are on disk, because a client that has received the answer may cut
-//! the power.
+//! Holds the answer to a command until the command's changes are on disk, because a client that has received the answer
+//! may cut the power.
 //!
 //! In: the outcome of a command and the ticket (number) of its commit; the progress of the store; the time. Out: the
 //! answer, which states whether the outcome is stored. If the disk fails, the answer is sent at once. If the disk is

@@ -1,8 +1,9 @@
 //! Determines the reports to the service manager: the readiness and a status line.
 //!
 //! The service is ready when the configuration is valid and the first usable reading has arrived or the wait for it has
-//! ended. The line states every problem. It is reported when it changes, but at most once per [`STATUS_PERIOD`]. The
-//! caller passes the times and sends the returned reports, so this file needs no service manager.
+//! ended. The status line states every problem. The line is reported when it changes, but at most once per
+//! [`STATUS_PERIOD`]. The caller passes the times and sends the returned reports, so this file needs no service
+//! manager.
 
 use std::time::Duration;
 
@@ -15,8 +16,8 @@ use crate::quantity::Channel;
 
 /// Longest configurable wait for the first reading, s. The unit's `TimeoutStartSec` is longer.
 pub const MAX_READY_TIMEOUT_S: f64 = 60.0;
-/// Default wait for the first reading, s. It is ten times the wake-up time of a bus, but too short to look like a start
-/// that hangs.
+/// Default wait for the first reading, s. This wait is ten times the wake-up time of a bus, but too short to look like
+/// a start that hangs.
 pub const DEFAULT_READY_TIMEOUT_S: f64 = 10.0;
 /// Shortest time between two reports of the line.
 const STATUS_PERIOD: Duration = Duration::from_secs(1);
@@ -79,7 +80,7 @@ impl Readiness {
         }
     }
 
-    /// Notes an event of the core.
+    /// Updates the readiness with an event of the core.
     pub(super) fn note(&mut self, event: &Event) {
         match event.kind {
             EventKind::Bus { bus, what } => {
@@ -99,7 +100,7 @@ impl Readiness {
         self.is_changed = true;
     }
 
-    /// Notes the result of a reload. `refused` is the reason why it was rejected.
+    /// Records the result of a reload. `refused` is the reason if the configuration was rejected.
     pub(super) fn note_reload(&mut self, refused: Option<String>) {
         self.refused = refused;
         self.is_changed = true;

@@ -61,7 +61,7 @@ pub(super) struct Reload {
 }
 
 impl Reload {
-    /// Starts catching SIGHUP, so that it does not end the program. Must be called inside the runtime.
+    /// Starts catching SIGHUP, so that the signal does not end the program. Must be called inside the runtime.
     ///
     /// # Errors
     /// Fails if the signal cannot be caught.

@@ -1,5 +1,5 @@
-//! Runs the thread that serialises documents and sends them to clients. In: drafts from the loop. Out: lines to
-//! clients.
+//! Runs the thread that serialises documents and sends them to clients. In: drafts (documents that are not serialised
+//! yet) from the daemon's loop. Out: lines to clients.
 
 use std::io;
 use std::path::PathBuf;
@@ -57,7 +57,7 @@ struct PublishedLine {
 
 type Latest = watch::Receiver<Option<PublishedLine>>;
 
-/// The running sockets. Dropping this closes them and deletes their files.
+/// The running sockets. Dropping this value closes the sockets and deletes their files.
 #[derive(Debug)]
 pub struct StatusServer {
     /// Channel to the thread; `None` only during the drop.

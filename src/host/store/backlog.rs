@@ -1,4 +1,4 @@
-//! Rows that wait for the disk, in limited memory.
+//! Queues history rows that wait for the disk, in limited memory.
 //!
 //! In: batches of rows. Out: the same batches, oldest first. If there is no room, the oldest half-cycles are dropped
 //! first, because they are details. After the half-cycles, the oldest other rows are dropped. Dropped rows are counted,
@@ -19,8 +19,8 @@ pub(super) struct Backlog {
     batches: VecDeque<RowBatch>,
     rows: usize,
     lost: LossCount,
-    /// The numbers of dropped rows that the rows taken last report. They are subtracted from `lost` when that report is
-    /// on disk.
+    /// Numbers of dropped rows that were reported with the last `take`. `commit`
+    /// subtracts them from `lost`.
     reported: LossCount,
 }
 
@@ -53,7 +53,7 @@ impl Backlog {
         batches
     }
 
-    /// Notes that the rows taken last are on disk, including their report of losses.
+    /// Confirms that the rows taken last are on disk, including their report of losses.
     pub(super) fn commit(&mut self) {
         let LossCount { details, rows } = std::mem::take(&mut self.reported);
         self.lost.details -= details;

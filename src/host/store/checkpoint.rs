@@ -1,5 +1,5 @@
-//! Decides when the next checkpoint of the state is due. A checkpoint writes the whole state, and flash memory wears
-//! out.
+//! Decides when the next checkpoint of the state is due. Each checkpoint writes the whole state and wears the flash
+//! memory.
 //!
 //! In: the bytes and the time of each commit. Alarm changes and learned results are written at once. The bytes that
 //! they write delay the next checkpoint. A pack of 96 cells (state of 70 kB) gets a checkpoint every 7 minutes, a pack
@@ -23,7 +23,7 @@ const MAX_PERIOD_S: f64 = 3600.0;
 pub(super) struct CheckpointSchedule {
     /// Shortest period, s.
     period_s: f64,
-    /// Time of the last state.
+    /// Time when the state was last written.
     last: Option<Timestamp>,
     /// Bytes written beyond the daily rate, and the time to which this number refers.
     ahead: (f64, Timestamp),
@@ -43,7 +43,7 @@ impl CheckpointSchedule {
         elapsed_s >= self.period_s.max(period_s) && may_write
     }
 
-    /// Notes a commit with its number of rows and the size of its state; `None` = a commit without a state.
+    /// Records a commit of `rows` rows and a state of `state_bytes` bytes; `None` = a commit without a state.
     pub(super) fn note_written(&mut self, now: Timestamp, rows: usize, state_bytes: Option<u64>) {
         let bytes = state_bytes.map_or(COMMIT_BYTES, |bytes| bytes as f64) + ROW_BYTES * rows as f64;
         self.ahead = (self.ahead_at(now) + bytes, now);
@@ -60,8 +60,8 @@ impl CheckpointSchedule {
 mod tests {
     use super::*;
 
-    /// Returns the checkpoints and bytes of a day. States have this size, and rows are committed in each second for
-    /// which `commits` is true.
+    /// Returns the number of checkpoints and of bytes of a day. Each state has `bytes` bytes. A row is committed in
+    /// every second that `commits` selects.
     fn day(bytes: u64, commits: impl Fn(u32) -> bool) -> (u32, f64) {
         let (mut schedule, mut checkpoints, mut written) = (CheckpointSchedule::new(60.0), 0, 0.0);
         for second in 0..86_400_u32 {

@@ -16,8 +16,8 @@ use crate::monitor::Transmit;
 
 /// Longest wait of a frame for the disk.
 const MAX_WAIT: Duration = Duration::from_millis(200);
-/// Maximum number of held frames. If more frames are held, they are released. The largest pack, with an alarm for each
-/// cell, sends this many frames in twice the time [`MAX_WAIT`].
+/// Maximum number of held frames. If more frames are held, all of them are released. The largest pack, with an alarm
+/// for each cell, sends this many frames in twice the time [`MAX_WAIT`].
 const MAX_HELD: usize = 4096;
 
 /// Holds announcing frames while commits are running.
@@ -29,7 +29,7 @@ pub struct CommitBarrier {
 }
 
 impl CommitBarrier {
-    /// Opens a ticket. Announcing frames wait until it is closed.
+    /// Opens a ticket. Announcing frames wait until the ticket is closed.
     pub fn begin(&mut self, ticket: u64, now: Instant) {
         self.tickets.push_back((ticket, now + MAX_WAIT));
     }

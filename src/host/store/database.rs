@@ -12,7 +12,7 @@
 //! | `alarm` | a change of an alarm | as long as its segment |
 //! | `reset` | a reset, a pack change, or a damaged file | as long as its segment |
 //! | `segment` | a day of rows, with the end of their hash chain (`segments`) | always |
-//! | `meta` | the number of segments, and the vehicle; the only row | always |
+//! | `meta` | the number of segments, and the vehicle (one row) | always |
 //!
 //! The rows from `half_cycle` to `reset` are numbered across their tables. The oldest segments are deleted first; their
 //! rows in `segment` remain. Cells count from 0, times are nanoseconds. `PRAGMA user_version` is the format.

@@ -1,6 +1,6 @@
-//! The state folder: locks it for one daemon and opens its database, even if it is damaged.
+//! Locks the state folder for one daemon and opens the history database in the folder.
 //!
-//! A damaged database is renamed, reported, and replaced by an empty one.
+//! A damaged database is renamed, reported, and replaced by an empty database.
 
 use std::fmt;
 use std::fs::{self, File, TryLockError};
@@ -102,7 +102,7 @@ impl Folder {
         Ok((Database::open(&path, now, pack)?, vec![HistoryRow::Own { reason: "damaged", detail }]))
     }
 
-    /// Notes that the database is damaged. The next call of [`open`](Self::open) replaces it.
+    /// Marks the database as damaged. The next call of [`open`](Self::open) replaces the database.
     pub(super) fn mark_damaged(&mut self, why: &str) {
         self.damage = Some(why.to_owned());
     }

@@ -137,7 +137,7 @@ impl HistoryFilter {
         }
         if let EventKind::RemainingLife { cycles, cycles_low, .. } = *kind {
             // The distance from the median to the lower end of the interval is a little less than two standard
-            // deviations, so half of it is used.
+            // deviations, so half of this distance is used.
             return self.is_life_worth_writing(
                 cycles.zip(cycles_low).map(|(median, low)| (median, 0.5 * (median - low))),
                 now,

@@ -31,7 +31,7 @@ pub fn replace_pack(path: &Path) -> Result<i64, String> {
     })?;
     let now = Stamp::now(Timestamp::from_nanos(Reading::now().realtime_ns), BootId::current());
     let known = StateFiles::open(path).1.newest.map_or(0, |state| state.pack);
-    // The folder is opened as in the daemon, so that damage is found and recorded in the history before it is closed.
+    // The folder is opened as in the daemon, so that damage is found, and recorded before the history is closed.
     let mut replace = || {
         let (mut database, rows) = folder.open(&now, known).map_err(|error| named(error.to_string()))?;
         let replaced = database.commit(&[RowBatch { stamp: now, rows }]).and_then(|()| database.replace_pack(&now));

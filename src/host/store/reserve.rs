@@ -94,8 +94,8 @@ impl Reserve {
         self.left = self.left.saturating_sub(STEP_BYTES);
         self.tried = Some(Instant::now());
         let path = self.folder.join(FILE_NAME);
-        // The file is synced, because a file system gives the space to another file only after the change is in its
-        // journal.
+        // The file is synced, because the space can be given to another file only after the change is in the file
+        // system's journal.
         let freed = File::options().write(true).open(&path).and_then(|file| {
             file.set_len(self.left as u64)?;
             file.sync_all()

@@ -1,7 +1,7 @@
 //! Writes the state to the runtime folder every second, so that a crash of the daemon alone loses at most one second.
 //!
 //! The folder is in memory and exists until the computer restarts (systemd keeps it over restarts of the service). A
-//! separate thread writes the latest state, so that a slow disk does not delay it.
+//! separate thread writes the latest state, so that a slow disk does not delay this state.
 
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};

@@ -1,10 +1,11 @@
-//! Segments of the history. A segment has the rows of a day, but at most about 10,000 rows. Rows are chained by hash.
+//! Divides the history into segments, chains the rows by hash, and verifies the chain. A segment has the rows of a day,
+//! but at most about 10,000 rows.
 //!
 //! Every row has a number, counted across the tables. The hash of a segment is a SHA-256 chain over its rows, which
 //! starts from the hash of the segment before. The hash reveals rows that were changed, removed, inserted or moved. The
 //! number of segments is stored separately; it reveals that segments at the end are missing. The oldest segments are
 //! deleted as a whole but keep their hashes, so the remaining segments can still be verified. A person who can write
-//! the file can recompute the whole chain. A copy of the chain's end that is kept elsewhere reveals this too
+//! the file can recompute the whole chain. A copy of the chain's end that is kept elsewhere reveals a recomputed chain
 //! ([`contradiction`]).
 
 use std::collections::BTreeMap;
@@ -32,7 +33,7 @@ const MAX_ROWS: i64 = 10_000;
 /// A segment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Segment {
-    /// Number of the segment, from 1; 0 = before the first.
+    /// Number of the segment, from 1; 0 = the start before the first segment.
     pub id: i64,
     /// Day on the wall clock, since 1970.
     pub day: i64,
@@ -40,7 +41,7 @@ pub(super) struct Segment {
     pub first: i64,
     /// Number of the last row.
     pub last: i64,
-    /// Moment of the last row.
+    /// Number of the last row's moment (a row of the table `moment`).
     pub last_moment: i64,
     /// Number of half-cycles among the rows.
     pub half_cycles: i64,
@@ -235,7 +236,7 @@ pub struct ChainReport {
     pub rows: i64,
     /// Rows that the store has deleted.
     pub deleted_rows: i64,
-    /// Hash of the last row. Users can note it elsewhere and compare it later.
+    /// Hash of the last row. Users can keep this hash elsewhere and compare it later.
     pub head: String,
     /// The first broken segment; `None` = the chain is intact.
     pub broken: Option<BrokenSegment>,

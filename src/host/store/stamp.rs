@@ -1,4 +1,4 @@
-//! The time when a state was stored, as every clock showed it, and the age of this state at a later time.
+//! Stores the time of a state as shown by every clock, and computes the age of the state at a later time.
 //!
 //! The wall clock of a vehicle computer may show 1970 until it is set, and it may step. The boot clock never steps, but
 //! it starts again with every boot. Therefore the times of both clocks are stored, together with the identity of the

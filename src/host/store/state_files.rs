@@ -210,7 +210,7 @@ impl StateFiles {
         (files, found)
     }
 
-    /// Makes the next write set the newest state aside. It is kept until a start can restore it.
+    /// Makes the next write set the newest state aside. The state is then kept until a start can restore it.
     pub(super) fn set_aside(&mut self) {
         self.aside = Some(1 - self.next);
     }

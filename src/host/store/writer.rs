@@ -25,7 +25,7 @@ use super::state_files::{StateDocument, StateFiles};
 use crate::config::VehicleIdentity;
 use crate::quantity::Timestamp;
 
-/// First pause after a failure; each further pause doubles.
+/// First pause after a failure. Each further pause is twice as long as the pause before.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 /// Longest pause. If the disk works again, the writer detects it within this time.
 const LAST_PAUSE: Duration = Duration::from_secs(15);
@@ -109,7 +109,7 @@ impl WriteQueue {
         self.lock().backlog.push(rows);
     }
 
-    /// Notes that the stored state was not restored, so that the next state does not overwrite it.
+    /// Requests that the stored state, which was not restored, is set aside before the next state is written.
     pub(super) fn set_aside(&self) {
         self.lock().sets_aside = true;
     }
@@ -183,7 +183,7 @@ pub(super) struct Retry {
 }
 
 impl Retry {
-    /// Notes that an attempt has failed now.
+    /// Schedules the next attempt after an attempt has failed.
     pub(super) fn after_failure(&mut self) {
         let pause = self.pause.map_or(FIRST_PAUSE, |pause| (2 * pause).min(LAST_PAUSE));
         (self.pause, self.at) = (Some(pause), Some(Instant::now() + pause));
@@ -226,8 +226,8 @@ impl Writer {
         }
     }
 
-    /// Writes rows and state. If this fails, they wait for the next attempt. Without a state, nothing is written, but a
-    /// database that was closed after a failure is opened again if possible.
+    /// Writes rows and state. If writing fails, rows and state wait for the next attempt. Without a state, nothing is
+    /// written, but a database that was closed after a failure is opened again if possible.
     fn write(
         &mut self,
         mut batches: Vec<RowBatch>,

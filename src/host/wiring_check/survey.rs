@@ -40,7 +40,7 @@ pub struct Survey {
 }
 
 impl Survey {
-    /// Returns the position of a key as `file:line`, and its value. If the key is absent, the position is that of its
+    /// Returns the position of a key as `file:line`, and its value. If the key is absent, returns the position of the
     /// table.
     pub fn locate(&self, table: &str, key: &str) -> Option<(String, Option<String>)> {
         let place = self.places.get(table)?;

@@ -52,7 +52,8 @@ impl Axis {
         Self { range: Some((low, high)), ..self }
     }
 
-    /// Returns the ends of the axis for these values. They always differ. If `margin` is set, both ends get additional room.
+    /// Returns the ends of the axis for these values. The two ends always differ. If `margin` is set, both ends get
+    /// additional room.
     pub(super) fn ends(&self, values: impl Iterator<Item = f64>, margin: bool) -> (f64, f64) {
         if let Some(range) = self.range {
             return widened(range, 0.0);

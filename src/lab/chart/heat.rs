@@ -1,4 +1,4 @@
-//! Draws heat maps: values over rows and columns of time, each drawn in one of nine colours, with a legend.
+//! Draws heat maps: one row per cell, columns of time, each value in one of nine colours, and a legend.
 
 use super::Size;
 use super::axis::Axis;

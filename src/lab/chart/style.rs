@@ -1,7 +1,8 @@
 //! Defines the colours: CSS classes for strokes, fills and text, and their values on a light and a dark page.
 //!
-//! The inks are those of Okabe and Ito, which people with any colour vision can distinguish; they are lighter on a dark page. The steps
-//! of heat maps are from cividis (Nuñez, Anderton, Renslow 2018), which has the same property.
+//! The inks are the colours of Okabe and Ito, which people with any colour vision can distinguish. The inks are lighter
+//! on a dark page. The steps of heat maps are from cividis (Nuñez, Anderton, Renslow 2018), which has the same
+//! property.
 
 use std::fmt::Write as _;
 

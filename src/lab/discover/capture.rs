@@ -20,7 +20,7 @@ const WINDOW_S: f64 = 2.0;
 /// Maximum number of messages (identifiers on an interface) that are kept. A car has a few hundred messages; a flood of random
 /// identifiers has more.
 const MAX_MESSAGES: usize = 4096;
-/// First data byte in answers from BMW controllers, by which their extended addressing is recognised without a definition.
+/// First data byte of answers from BMW controllers. The byte reveals extended addressing without a definition.
 const TESTER: u8 = 0xF1;
 
 /// An identifier on an interface.
@@ -98,7 +98,7 @@ impl Payloads {
         self.ends.push(self.data.len());
     }
 
-    /// Keeps the payloads for which `is_kept` returns true; it receives the number and the time of a payload.
+    /// Keeps a payload if `is_kept` returns true for the number and the time of the payload.
     fn retain(&mut self, mut is_kept: impl FnMut(usize, f64) -> bool) {
         let mut kept = Self::default();
         for (index, (time_s, payload)) in self.iter().enumerate() {

@@ -368,7 +368,7 @@ impl Writer<'_> {
                 .iter()
                 .map(|index| self.signal(*index).series.period_s().unwrap_or(0.0))
                 .fold(0.0, f64::max);
-            // Not below the default of the configuration.
+            // At least 2 s, which is the default for voltages.
             let age_s = (3.0 * period_s).max(2.0).ceil();
             let _ = write!(text, "\n[limits.{name}]\nmax_age_s = {age_s:.1}\n");
         }

@@ -1,4 +1,5 @@
-//! A signal of the log. Its description (name, position, scaling) comes from a file, or the search has found it.
+//! A signal of the log. The signal's description (name, position, scaling) comes from a file, or the search has found
+//! it.
 
 use super::capture::AnswerKey;
 use crate::can::CanId;
@@ -8,7 +9,8 @@ use crate::import::DiagnosticSignal;
 use crate::quantity::BusIndex;
 use crate::wiring::evidence::{Series, SignalLabel};
 
-/// A field of a message: the key of the message and, if the first byte selects a page (multiplexer), the value of this byte.
+/// A field of a message: the message's identifier, the signal and, if the first byte selects a page (multiplexer), the
+/// value of that byte.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct MessageField {
     pub(super) id: CanId,

@@ -99,8 +99,8 @@ fn configuration_needs_cell_count_and_has_all_inputs() {
     assert!(pack.open.iter().any(|question| question.contains("cell_model")), "{:?}", pack.open);
 }
 
-/// A controller like that of a Leaf. Group 01 contains current and pack voltage, group 02 contains 96 cells in mV; both are requested
-/// every second.
+/// A controller like the one in a Nissan Leaf. Group 01 contains current and pack voltage, group 02 contains 96 cells
+/// in mV; both are requested every second.
 fn answers(seconds: i32, is_asked: bool) -> Discoverer {
     let mut discoverer = Discoverer::default();
     for step in 0..seconds {

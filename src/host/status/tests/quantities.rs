@@ -1,5 +1,5 @@
 //! Generates the manual's page of quantities from the catalogue. `PACKWATCH_WRITE_PAGES=1 cargo test quantities`
-//! rewrites it.
+//! rewrites the page.
 
 use std::fmt::Write as _;
 

@@ -1,5 +1,5 @@
-//! Tests estimates after a power cut. They are restored from a state file, whose numbers are rounded. Their age comes
-//! from the clocks.
+//! Tests estimates after a power cut. The estimates are restored from a state file with rounded numbers; the clocks
+//! give the age of the state.
 
 use nalgebra::DMatrix;
 use serde_json::Value;
@@ -36,8 +36,8 @@ fn compare(before: (&Value, &Value), after: (&Value, &Value), what: &str) {
         }
     }
     assert_eq!(kept, kept.transpose(), "{what}");
-    // The smallest eigenvalue shows how far the covariance is from one that cannot be factorised. Quantities that are
-    // configured not to be learned have no variance and are left out.
+    // The smallest eigenvalue shows how close the covariance is to a matrix that cannot be factorised. Quantities that
+    // are configured not to be learned have no variance and are left out.
     let varied: Vec<usize> = (0..mean.len()).filter(|&i| covariance[(i, i)] > 0.0).collect();
     let scaled = DMatrix::from_fn(varied.len(), varied.len(), |a, b| {
         let (i, j) = (varied[a], varied[b]);

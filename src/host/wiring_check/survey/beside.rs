@@ -1,7 +1,8 @@
-//! Signals in the DBC files that are not configured but can be compared with configured ones.
+//! Finds signals in the DBC files that are not configured but can be compared with configured signals.
 //!
 //! In: the DBC files and the configured signals. Out: signals that measure the pack's voltage or a state of charge,
-//! according to their names and units. Each signal is bound to every interface, because a DBC does not state its bus.
+//! according to their names and units. Each signal is bound to every interface, because a DBC does not state which bus
+//! it describes.
 
 use crate::can::dbc::{Message, Signal};
 use crate::can::decode::Binding;
