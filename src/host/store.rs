@@ -137,7 +137,8 @@ pub struct Store {
 }
 
 impl Store {
-    /// Opens the store. Returns no store if it is disabled or its folder cannot be used.
+    /// Opens the store. Returns no store if the store is disabled, or if the folder is a default folder that systemd
+    /// did not create and that cannot be used.
     ///
     /// # Errors
     /// Fails if another daemon uses the folder.
@@ -244,7 +245,7 @@ impl Store {
     }
 
     /// Writes the runtime state every second, and a checkpoint when it is due. `is_fresh` states whether frames have
-    /// arrived since the last checkpoint. Returns whether a checkpoint was written.
+    /// arrived since the last checkpoint. Returns whether a checkpoint was queued.
     pub fn tick(&mut self, monitor: &Monitor, now: Timestamp, is_fresh: bool) -> bool {
         let last = self.runtime_written;
         if let Some(runtime) = &self.runtime

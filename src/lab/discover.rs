@@ -3,8 +3,8 @@
 //!
 //! Input: frames with times; optionally DBC files and definitions of diagnostic answers. Output: for each quantity,
 //! ranked candidates with their reasons in plain words. Answers to diagnostic requests are read regardless of which
-//! device sent the requests. In answers without a definition, the search looks for rows of cell voltages and other
-//! fields. Memory is bounded. Any frames are accepted.
+//! device sent the requests. In the bits of answers that no definition describes, the search looks for rows of cell
+//! voltages and other fields. Memory is bounded. Any frames are accepted.
 //!
 //! The owner must confirm the result, because names can mislead and a parked car shows little. If a field has no definition, its scale
 //! is guessed from plausible values.

@@ -45,8 +45,9 @@ impl Ticks {
     }
 
     /// Announces a record at `time`. The caller then calls [`pop`](Self::pop) until `None`, and processes the record.
-    /// Returns whether the recorder was asleep before this record, that is, whether it is the first record or follows a
-    /// sleep gap. A record slightly older than the latest record (interfaces merged out of order) causes no tick.
+    /// Returns whether this record wakes the recorder: the record is the first one or follows a sleep gap, or the
+    /// recorder's clock was set back. A record slightly older than the latest record (interfaces merged out of order)
+    /// causes no tick.
     #[inline]
     pub fn advance(&mut self, time: Timestamp) -> bool {
         let time_ns = time.nanos();

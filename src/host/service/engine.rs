@@ -315,8 +315,8 @@ fn state_of_history(
 }
 
 /// Restores the first valid stored state. Returns the age of this state and, if the state in the state file does not
-/// fit, the reason. If there is a journal, writes the state next to it, because a replay of the journal starts from
-/// this state.
+/// fit, the reason. If there is a journal, writes the state next to the journal, because a replay of the journal starts
+/// from this state.
 fn restore_first_valid(
     monitor: &mut Monitor,
     states: Vec<StateCandidate>,

@@ -17,7 +17,8 @@ use crate::token_bucket::{BucketSize, TokenBucket};
 /// one per hour. Further capacities (of a hybrid that reverses every minute) are written only if they have changed,
 /// because each row takes 100 bytes for years.
 const CAPACITIES: BucketSize = BucketSize { burst: 64.0, period_s: 3600.0 };
-/// Smallest change for which a further capacity is written, in standard deviations.
+/// Smallest change of a capacity or remaining life that is written even if the allowance is used up, in standard
+/// deviations.
 const MIN_CHANGE_STD: f64 = 0.25;
 /// How often deferred rows are written with a checkpoint or with other rows: 60 times at once (one hour of
 /// checkpoints), then once an hour. Each time, up to two rows per cell are written, which are kept for years.
@@ -115,7 +116,8 @@ impl HistoryFilter {
         self.deferred.push(row);
     }
 
-    /// Whether to write a remaining life. If the allowance is used up, it is written only if it has changed.
+    /// Whether to write a remaining life. If the allowance (token bucket) is used up, the remaining life is written
+    /// only if it has changed.
     fn is_life_worth_writing(&mut self, cycles: Option<(f64, f64)>, now: Timestamp) -> bool {
         let written = &mut self.written_life;
         let has_moved = match (written.cycles, cycles) {
@@ -130,7 +132,7 @@ impl HistoryFilter {
     }
 
     /// Whether to write an event. A capacity without a measurement is written only if the usable capacity has changed.
-    /// If the allowance is used up, a capacity is written only if it has changed by [`MIN_CHANGE_STD`].
+    /// If the allowance (token bucket) is used up, a capacity is written only if it has changed by [`MIN_CHANGE_STD`].
     fn is_worth_writing(&mut self, kind: &EventKind, now: Timestamp) -> bool {
         if matches!(kind, EventKind::PackReplaced { .. }) {
             self.written_life.cycles = None;
@@ -171,7 +173,7 @@ impl HistoryFilter {
 /// When and how an event is stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Urgency {
-    /// The event is stored with the next commit. Filter resets are deferred, because they may be frequent and are not
+    /// The event is stored with a later commit. Filter resets are deferred, because they may be frequent and are not
     /// announced.
     Deferred,
     /// The event is stored as a row before it is announced. A start can reapply it from the row.

@@ -1,11 +1,11 @@
 //! Finds bit fields that behave like pack voltage, current or cell voltages. Used if no DBC is given.
 //!
-//! * Voltage: fields of 16 bits at every byte and of 12 bits at every half byte, in both byte orders, with common scales. The value is
-//!   plausible for a pack, changes slightly, and its last digits vary.
+//! * Voltage: fields of 16 bits at every byte and of 12 bits at every half byte, in both byte orders, with common
+//!   scales. The value is plausible for a pack and changes slightly, and the last digits of the value vary.
 //! * Current: the same positions, but signed. The changes of the field match the changes of a voltage across a
 //!   resistance. The scale is a guess: the common scale that gives the most typical resistance.
-//! * Cells: neighbouring fields of 8, 12 or 16 bits with similar values. Each message or page (selected by the first byte) has at least
-//!   three of them, and all together at least eight.
+//! * Cells: neighbouring fields of 8, 12 or 16 bits with similar values. Each message or page (selected by the first
+//!   byte) has at least three such fields, and all messages together have at least eight.
 //!
 //! Temperatures and SOC are not searched for, because they show no characteristic behaviour within minutes.
 

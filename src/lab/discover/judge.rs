@@ -169,7 +169,8 @@ fn raw_current(mut evidence: Evidence, signal: &LogSignal) -> Evidence {
         evidence.add(1.0, evidence.has_both_signs(), "has both signs");
         return evidence;
     };
-    // The values of a signed field of 24 or 32 bits fit into 16 bits, so the upper bits repeat the sign. This is hardly a coincidence.
+    // If the values of a signed field of 24 or 32 bits fit into 16 bits, the upper bits only repeat the sign. This is
+    // hardly a coincidence.
     let needed = 32_768.0 * field.factor;
     let is_extended = field.length > 16 && evidence.low >= -needed && evidence.high <= needed && evidence.low < 0.0;
     // The 32-bit field contains the shorter fields, so it gets more points.
@@ -266,8 +267,8 @@ fn cell_group(group: &SignalGroup, signals: &[LogSignal]) -> Option<Evidence> {
     Some(Evidence { members, name, bus, score, low, high, positive: None, is_sum: false })
 }
 
-/// Returns the mean correlation between the changes of the first few members and the changes of the first one, and whether it is at
-/// least 0.3.
+/// Returns the mean correlation between the changes of the first member and the changes of the next few members, and
+/// whether this mean is at least 0.3.
 fn moves_together(members: &[usize], signals: &[LogSignal]) -> (f64, bool) {
     let first = &signals[members[0]].series;
     let others = members.iter().skip(1).take(8);

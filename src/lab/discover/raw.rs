@@ -1,8 +1,9 @@
-//! Searches diagnostic answers without a definition for bytes that behave like cell voltages, pack voltage, current or temperatures.
+//! Searches the bytes of diagnostic answers that no definition describes for cell voltages, pack voltage, current or
+//! temperatures.
 //!
-//! A row of cell voltages is a run of at least [`MIN_CELLS`] neighbouring values of 8 or 16 bits. At one of the common scales, all of
-//! them are plausible voltages and similar to each other. Other fields are tried at every byte with common scales. As for named
-//! signals, the values decide which quantity a field is.
+//! A row of cell voltages is a run of at least [`MIN_CELLS`] neighbouring values of 8 or 16 bits. At one of the common
+//! scales, all these values are plausible voltages and similar to each other. Other fields are tried at every byte with
+//! common scales. As for named signals, the values decide which quantity a field is.
 
 use std::collections::BTreeMap;
 

@@ -1,5 +1,6 @@
-//! Collects the signals of a log with their values: from DBC files, from definitions of diagnostic answers, and fields of answers
-//! without a definition.
+//! Collects the signals of a log with their values. The signals are described by DBC files or by definitions of
+//! diagnostic answers, or the search finds them in undescribed bytes of answers and, if there is no DBC file, of
+//! messages.
 
 use super::capture::{AnswerKey, Answers, Capture, MessageKey, Payloads};
 use super::log_signal::{LogSignal, SignalOrigin};

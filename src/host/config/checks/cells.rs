@@ -88,7 +88,7 @@ pub(crate) fn check(pack: &Pack) {
     check_file(&pack.place, pack.cell_model.as_ref());
 }
 
-/// Reads all modules and leaves out faulty modules.
+/// Reads all modules and leaves out modules without a valid model.
 pub(crate) fn modules<'a>(path: &Path, raw: &'a RawTables, file: ReadFile<'_>) -> Vec<Module<'a>> {
     let Some(pack) = &raw.pack else { return Vec::new() };
     if raw.is_pack_total() {

@@ -90,7 +90,8 @@ fn voltages(raw: &RawTables) {
     }
 }
 
-/// Checks that balancing signals belong to cells of a pack that balances, and that the bleed current is plausible.
+/// Checks that balancing signals are given only for a pack with cell voltages and a BMS that balances, and that the
+/// bleed current is plausible.
 fn balancing(raw: &RawTables, model: Option<&CellModel>) {
     let (Some(keys), Some(pack)) = (&raw.balancing, &raw.pack) else { return };
     if raw.is_pack_total() {

@@ -230,7 +230,7 @@ fn needed(channel: Channel) -> Option<(Quantity, &'static str)> {
     }
 }
 
-/// Reports DBC units that differ from the input's unit; each unit is reported once.
+/// Reports DBC units that differ from the input's unit; each unit is reported once per table.
 fn units(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&CellModel>, u16)) {
     let mut seen: Vec<&str> = Vec::new();
     for resolved in signals {
@@ -244,7 +244,7 @@ fn units(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&Cel
         seen.push(text);
         let name = name(resolved, resolved.signal);
         if unit.quantity == Quantity::PERCENTAGE && quantity == unit.quantity {
-            continue; // its scale defaults to 0.01
+            continue; // the scale of a percentage defaults to 0.01
         }
         if unit.quantity == quantity {
             let is_held = needed_values(resolved.channel, pack).is_none_or(|(low, high)| {
@@ -281,7 +281,7 @@ fn other_quantity(place: &TablePlace, found: Quantity, (name, unit, wanted): (&s
 }
 
 /// Checks that `scale` and `offset` convert the DBC's unit to the input's unit. `is_held` states whether the bits can
-/// encode a plausible value in the DBC's unit. If they cannot, the DBC's unit is wrong.
+/// encode a plausible value in the DBC's unit. If the bits cannot, the DBC's unit is wrong.
 fn conversion(
     place: &TablePlace,
     (resolved, unit, is_held): (&ResolvedSignal<'_>, SignalUnit, bool),
@@ -336,7 +336,7 @@ struct AllowedRange<'a> {
     input: Option<&'a TablePlace>,
 }
 
-/// Reports ranges of plausible readings that are empty.
+/// Reports ranges of plausible readings that are empty, and voltage ranges that exclude all voltages of the cell model.
 pub(crate) fn ranges(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Option<&CellModel>) {
     let Some(pack) = &raw.pack else { return };
     let readable: Vec<ResolvedSignal<'_>> = found.iter().filter(|input| input.binding().is_ok()).cloned().collect();
@@ -479,7 +479,7 @@ pub(crate) fn rated_capacity(raw: &RawTables, model: Option<&CellModel>) {
     }
 }
 
-/// Returns a hint if parallel cells explain why the capacity is `ratio` times that of one cell.
+/// Returns a hint if parallel cells explain why the capacity is `ratio` times the capacity of one cell.
 fn parallel_cells(ratio: f64, strings: u16) -> String {
     // Different sources state capacities of the same cell that differ by less than 5 %.
     let is_about = |cells: f64| (ratio / cells - 1.0).abs() <= 0.05;

@@ -1,7 +1,7 @@
-//! Looks up the configured signal names in the DBC files.
+//! Looks up the configured signal names in the DBC files and in the diagnostic answers.
 //!
-//! Every name must be in exactly one of the files, and every cell must have exactly one signal. A signal of a message
-//! longer than 8 bytes requires an interface with `fd = true`. Checking continues after a fault.
+//! Every name must occur exactly once, and every cell must have exactly one signal. A signal of a message longer than 8
+//! bytes requires an interface with `fd = true`. Checking continues after a fault.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -264,7 +264,7 @@ impl<'d> Search<'_, 'd> {
     fn add(&mut self, channel: Channel, source: &SignalSource<'_>, sign: f64, named: NamedSignal<'d>) {
         let NamedSignal { file, message, signal, answer } = named;
         let Some(bus) = self.raw.bus_of(source.interface) else {
-            return; // the cross checks report unknown interfaces
+            return; // `input_tables` reports unknown interfaces
         };
         let full_name = named.full_name();
         let fd = self.raw.interfaces.get(bus.index()).is_some_and(|interface| interface.fd);

@@ -87,7 +87,7 @@ impl RawTables {
     }
 
     /// The interface with this name, or the first interface if no name is given. `None` = there is no such interface
-    /// (the cross checks report this fault).
+    /// (another check reports this fault).
     pub(crate) fn bus_of(&self, interface: Option<&str>) -> Option<BusIndex> {
         let index = match interface {
             Some(name) => self.interfaces.iter().position(|interface| interface.name == name)?,
