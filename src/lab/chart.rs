@@ -1,9 +1,10 @@
 //! Draws pictures as SVG: lines, bands, points and thresholds over an axis of numbers or dates; bands of states; heat maps.
 //!
-//! Input: values in the units that the labels name. Output: SVG in one style. A value that is not finite interrupts a line. Elements
-//! have CSS classes, and the page or file defines their colours for a light and a dark background ([`style`]). A long series is reduced to the lowest and
-//! highest value of each pixel column, so peaks stay visible and files stay small. Labels are above the drawing area and never cover
-//! the data. Tool tips are `<title>` elements and need no script.
+//! Input: values in the units that the labels name. Output: SVG in one style. A value that is not finite interrupts a
+//! line. Elements have CSS classes, and the page or file defines their colours for a light and a dark background
+//! ([`style`]). A long series is reduced to the lowest and highest value of each pixel column, so peaks stay visible
+//! and files stay small. Labels are outside the drawing area and never cover the data. Tool tips are `<title>` elements
+//! and need no script.
 
 mod axis;
 mod files;

@@ -22,7 +22,7 @@ pub struct ReplaySummary {
     /// Counts of the logs.
     #[serde(flatten)]
     pub log: LogCounts,
-    /// Records outside `from` and `until`.
+    /// Records before `from`, which were skipped.
     pub skipped_records: u64,
     /// Ticks passed to the core.
     pub ticks: u64,

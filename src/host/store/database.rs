@@ -300,7 +300,7 @@ fn prepare(connection: &Connection) -> rusqlite::Result<()> {
     connection.pragma_update(None, "page_size", 1024)?;
     let mode: String = connection.query_row("PRAGMA journal_mode = WAL", [], |row| row.get(0))?;
     if mode != "wal" {
-        // The file system has no shared memory. Commits are as safe, but each is written and synced twice.
+        // The file system has no shared memory. Commits are as safe, but each commit is written and synced twice.
         tracing::warn!(mode, "no write-ahead log on this file system: every commit is written twice");
     }
     connection.pragma_update(None, "synchronous", "FULL")?;

@@ -35,7 +35,7 @@ const MAX_ROWS: i64 = 10_000;
 pub(super) struct Segment {
     /// Number of the segment, from 1; 0 = the start before the first segment.
     pub id: i64,
-    /// Day on the wall clock, since 1970.
+    /// Day on the wall clock, counted from 1970-01-01.
     pub day: i64,
     /// Number of the first row.
     pub first: i64,
@@ -196,9 +196,9 @@ fn pairs(connection: &Connection) -> rusqlite::Result<Vec<(Segment, Segment)>> {
     Ok(pairs)
 }
 
-/// Deletes the rows of the oldest segment that still has rows, if the history has more than `max_rows` rows or if this
-/// segment ended before `horizon_ns`. A segment written while the wall clock was unset is at least as old as the
-/// segments after it.
+/// Deletes the rows of the oldest segment that still has rows, if the history has more than `max_rows` rows or if any
+/// segment but the newest ended before `horizon_ns`. Times of an unset wall clock are ignored, because a segment with
+/// such a time is at least as old as the segments after it.
 pub(super) fn delete_oldest(
     connection: &Connection,
     newest: &Segment,
@@ -242,16 +242,16 @@ pub struct ChainReport {
     pub broken: Option<BrokenSegment>,
 }
 
-/// A segment with a changed, missing or inserted row.
+/// A segment with changed, missing or inserted rows, or with a wrong number.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct BrokenSegment {
     /// Number of the segment.
     pub segment: i64,
-    /// Numbers of its first and last row.
+    /// Numbers of the first and last row of the segment.
     pub rows: [i64; 2],
-    /// The hash computed from its rows.
+    /// What the verification expects: a hash, or numbers of segments and rows.
     pub expected: String,
-    /// The hash in the store.
+    /// What the store contains instead.
     pub found: String,
 }
 

@@ -1,7 +1,7 @@
 //! The [`Plan`] of `packwatch doctor`: what a configuration expects from the buses, even if it has faults.
 //!
 //! In: the configuration file. Out: the plan, all faults as [`config::load`](crate::config::load) reports them, and the
-//! position of each key. A configuration without any signal in a DBC file is rejected.
+//! position of each key. A configuration is rejected if it has no interface or if none of its signals is found.
 
 mod beside;
 
@@ -40,7 +40,7 @@ pub struct Survey {
 }
 
 impl Survey {
-    /// Returns the position of a key as `file:line`, and its value. If the key is absent, returns the position of the
+    /// Returns the position of a key as `file:line`, and its value. If the key is absent, returns the position of its
     /// table.
     pub fn locate(&self, table: &str, key: &str) -> Option<(String, Option<String>)> {
         let place = self.places.get(table)?;

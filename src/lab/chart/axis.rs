@@ -71,7 +71,8 @@ impl Axis {
         }
     }
 
-    /// Returns the label of the axis. For dates, it includes the days at both ends, because the ticks may be hours.
+    /// Returns the label of the axis. For dates, the label includes the days at both ends, because the ticks may be
+    /// hours.
     pub(super) fn caption(&self, ends: (f64, f64)) -> String {
         match self.scale {
             Scale::Number => self.label.clone(),

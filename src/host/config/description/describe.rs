@@ -36,7 +36,7 @@ pub struct Description {
     pub pack: Vec<String>,
     /// Interfaces and their kernel filters.
     pub interfaces: Vec<InterfaceUse>,
-    /// Every configured signal, as found in its DBC file.
+    /// Every configured signal, as found in its DBC file or diagnostic answer.
     pub signals: Vec<SignalUse>,
     /// Ranges of plausible readings.
     pub limits: Vec<String>,
@@ -65,7 +65,7 @@ pub struct InterfaceUse {
     pub own_ids: Vec<String>,
 }
 
-/// A configured signal as found in its DBC.
+/// A configured signal as found in its DBC file or diagnostic answer.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct SignalUse {
     /// Input that the signal feeds: `pack current`, `cell 7 voltage`.
@@ -74,7 +74,7 @@ pub struct SignalUse {
     pub interface: String,
     /// Identifier in candump notation.
     pub id: String,
-    /// DBC file.
+    /// DBC file, or table of the diagnostic answer.
     pub dbc: String,
     /// Message name.
     pub message: String,

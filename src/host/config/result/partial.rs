@@ -19,7 +19,7 @@ pub(crate) struct PartialConfig {
     pub faults: Vec<String>,
     /// The tables of the file and its drop-ins.
     pub raw: RawTables,
-    /// The DBC files.
+    /// The DBC files and diagnostic answers.
     pub databases: Databases,
     /// The cell model.
     pub model: Option<CellModel>,
