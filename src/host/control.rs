@@ -1,6 +1,7 @@
 //! The control socket: lists the alarms of a running daemon on the same computer and sends it commands.
 //!
-//! It is a Unix stream socket. Requests and answers are lines of JSON. Answers have the order of the requests:
+//! The control socket is a Unix stream socket. Requests and answers are lines of JSON. Answers have the order of the
+//! requests:
 //! ```text
 //! {"version":1,"request":"alarms"}                    {"version":1,"ok":true,"time":...,"alarms":[...],...}
 //! {"version":1,"request":"clear","rule":"soc_low"}    {"version":1,"ok":true,"changed":1,"refused":0,...}

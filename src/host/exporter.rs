@@ -1,5 +1,5 @@
-//! The exporter serves the daemon's status as metrics over HTTP. It is a separate process, so that no fault in it can
-//! affect the estimation loop.
+//! The exporter serves the daemon's status as metrics over HTTP. It is a separate process, so that no fault of the
+//! exporter can affect the estimation loop.
 //!
 //! * `/metrics`: each scrape reads the status socket within [`STATUS_LIMIT`]. If there is no fresh document, the answer
 //!   contains only `packwatch_up 0`. Clients that accept OpenMetrics 1.0 receive it; other clients receive Prometheus'
@@ -43,7 +43,7 @@ use super::status::metrics::{openmetrics, prometheus_text};
 const MAX_CONNECTIONS: usize = 16;
 /// Maximum number of connections of one address.
 const MAX_PER_ADDRESS: usize = 8;
-/// Longest head of a request, bytes. It is the smallest limit that hyper supports.
+/// Longest head of a request, bytes. This is the smallest limit that hyper supports.
 const MAX_REQUEST_BYTES: usize = 8192;
 /// Maximum number of headers of a request.
 const MAX_HEADERS: usize = 64;
@@ -51,10 +51,10 @@ const MAX_HEADERS: usize = 64;
 const HEAD_LIMIT: Duration = Duration::from_secs(30);
 /// Longest life of a connection, so that a slow reader does not keep its slot for ever.
 const CONNECTION_LIMIT: Duration = Duration::from_secs(300);
-/// Time to finish the current answer when a connection reaches [`CONNECTION_LIMIT`]. It equals the longest duration of
-/// a scrape.
+/// Time to finish the current answer when a connection reaches [`CONNECTION_LIMIT`]. This time equals the longest
+/// duration of a scrape.
 const ANSWER_LIMIT: Duration = Duration::from_secs(10);
-/// Longest time to read the daemon's status. It is less than the ten seconds that a scrape may take.
+/// Longest time to read the daemon's status. This is less than the ten seconds that a scrape may take.
 const STATUS_LIMIT: Duration = Duration::from_secs(3);
 /// Time to finish running answers when the exporter stops.
 const DRAIN_LIMIT: Duration = Duration::from_secs(1);

@@ -1,8 +1,8 @@
-//! The failure of a command: the message for the terminal and the exit code. Every program of packwatch uses it.
+//! The failure of a command: the message for the terminal and the exit code. Every program of packwatch uses this type.
 
 use crate::config::ConfigFaults;
 
-/// Exit code of a bad configuration (EX_CONFIG; systemd does not restart on it).
+/// Exit code of a bad configuration (EX_CONFIG; systemd does not restart a service after this code).
 pub const EXIT_CONFIG: u8 = 78;
 
 /// Why a command failed.

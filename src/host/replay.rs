@@ -142,7 +142,7 @@ pub fn run(
     report: &mut dyn FnMut(ReplayProgress),
 ) -> Result<(ReplaySummary, Option<Snapshot>), ReplayError> {
     let mut replay = Replay::new(monitor, sinks, settings)?;
-    // If a replay is paced or stops before the end of the log, it must not read beyond the current record.
+    // If a replay is paced or stops before the end of the log, the replay must not read beyond the current record.
     let one_by_one = replay.pace.speed.is_some() || replay.window.until.is_some();
     let mut batch = Batch::new(if one_by_one { 1 } else { Batch::MAX });
     let mut unreported: usize = 0;
@@ -166,7 +166,7 @@ fn progress(source: &LogSource, frames: u64, span: &RecordSpan) -> ReplayProgres
     ReplayProgress { bytes, frames, times_real_time: span.times_real_time() }
 }
 
-/// Sends the frames of `source` at their times; returns their number. `send` may block.
+/// Sends the frames of `source` at their times; returns the number of frames sent. `send` may block.
 ///
 /// # Errors
 /// Fails if a log cannot be read or `send` fails.

@@ -309,7 +309,7 @@ impl Store {
 #[derive(Debug)]
 struct OpenedFolder {
     state_files: StateFiles,
-    /// The open database; `None` = it cannot be used at present.
+    /// The open database; `None` = the database cannot be used at present.
     database: Option<Database>,
     /// Rows to add to the history about opening the folder.
     rows: Vec<HistoryRow>,

@@ -1,5 +1,5 @@
-//! The loops of `packwatch doctor`. They pass replayed logs or live input to the core's [`WiringObserver`] and, if the
-//! configuration is valid, also to a [`Monitor`].
+//! The loops of `packwatch doctor`. The loops pass replayed logs or live input to the core's [`WiringObserver`] and, if
+//! the configuration is valid, also to a [`Monitor`].
 //!
 //! Listening is passive: nothing is sent. An [`Interrupt`] ends both loops early. The report then covers what was
 //! received until that time.
@@ -36,7 +36,7 @@ pub struct CheckProgress {
     pub seconds: f64,
 }
 
-/// Flag that ends the loops; SIGINT and SIGTERM set it.
+/// Flag that ends the loops; SIGINT and SIGTERM set the flag.
 #[derive(Debug, Clone, Default)]
 pub struct Interrupt(Arc<AtomicBool>);
 

@@ -29,7 +29,7 @@ pub struct PendingRequest {
     pub answer: oneshot::Sender<Answer>,
 }
 
-/// The running socket. When it is dropped, the socket is closed and its file is deleted.
+/// The running socket. When this value is dropped, the socket is closed and its file is deleted.
 #[derive(Debug)]
 pub struct ControlServer {
     _tasks: JoinSet<()>,

@@ -55,7 +55,7 @@ pub struct ObservedFrames {
     pub last: Option<Timestamp>,
     /// Whether one of the frames with the test marker reported the end of the test.
     pub ended: bool,
-    /// Frames of other rules with the test marker. They show that another test is running.
+    /// Frames of other rules with the test marker. Such frames show that another test is running.
     pub foreign: u64,
     /// Number of frames without the test marker, for each pair of rule code and state code.
     pub genuine: BTreeMap<(u8, u8), u64>,
@@ -70,7 +70,7 @@ impl ChannelReport {
         self.observed.tests > 0 && self.error.is_none() && self.is_intact()
     }
 
-    /// Whether no frame was damaged or missing. It is also true if the frames are not protected.
+    /// Whether no frame was damaged or missing. Also true if the frames are not protected.
     pub fn is_intact(&self) -> bool {
         let good = [Status::Ok, Status::Initial];
         self.protection.is_none_or(|counts| counts.iter().all(|(status, count)| count == 0 || good.contains(&status)))

@@ -16,10 +16,10 @@ use super::segments::{SegmentLimits, SegmentWriter};
 
 /// Number of bytes that are collected before they are sent to the thread. A flush sends fewer bytes.
 const PIECE_BYTES: usize = 64 * 1024;
-/// Maximum number of waiting pieces. They take 4 MB, which is ten seconds of a full 1 Mbit/s bus.
+/// Maximum number of waiting pieces. So many pieces take 4 MB, which is ten seconds of a full 1 Mbit/s bus.
 const MAX_PIECES: usize = 64;
 
-/// Longest wait for the last bytes when the file is finished. It is half of the time after which systemd kills the
+/// Longest wait for the last bytes when the file is finished. This is half of the time after which systemd kills the
 /// service.
 pub const MAX_FINISH: Duration = Duration::from_secs(5);
 
@@ -117,7 +117,7 @@ pub fn ends_in_time<T>(thread: &JoinHandle<T>) -> bool {
     true
 }
 
-/// Renames the file of an earlier run to `NAME.1`, because it may show the cause of a crash.
+/// Renames the file of an earlier run to `NAME.1`, because that file may show the cause of a crash.
 fn keep_earlier(path: &Path) -> io::Result<()> {
     let Ok(earlier) = std::fs::metadata(path) else { return Ok(()) };
     if !earlier.is_file() || earlier.len() == 0 {

@@ -68,7 +68,7 @@ pub enum Line<'a> {
 pub struct LineError {
     /// Byte position in the line, from 1.
     pub column: usize,
-    /// What the grammar allows there.
+    /// What the grammar allows at this column.
     pub expected: &'static str,
 }
 

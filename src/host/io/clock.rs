@@ -24,8 +24,8 @@ use nix::time::{ClockId, clock_gettime};
 
 use crate::quantity::Timestamp;
 
-/// Half of the time for which the smallest offset of a hardware stamp is remembered, ns. In this time, a quartz with an
-/// error of 100 ppm drifts by 1 ms.
+/// Half of the time during which the smallest offset of a hardware stamp is remembered, ns. In this time, a quartz with
+/// an error of 100 ppm drifts by 1 ms.
 const HARDWARE_WINDOW_NS: i64 = 10_000_000_000;
 
 /// Maximum number of readings of the wall clock for one [`Reading`].
@@ -80,7 +80,7 @@ fn nanos_of(clock: ClockId) -> i64 {
     clock_gettime(clock).map_or(0, nanos)
 }
 
-/// Nanoseconds of a kernel time, which is never negative. Its seconds have 32 or 64 bits, depending on the machine.
+/// Nanoseconds of a kernel time, which is never negative. The seconds have 32 or 64 bits, depending on the machine.
 pub(super) fn nanos(time: TimeSpec) -> i64 {
     i64::try_from(Duration::from(time).as_nanos()).unwrap_or(i64::MAX)
 }

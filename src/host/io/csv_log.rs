@@ -137,7 +137,8 @@ pub struct SampleColumns<'a> {
     /// Maps a role to a column; `None` = the user cannot map columns.
     mapping: Option<&'a [(String, String)]>,
     /// Whether the file is in the Battery Data Format. A positive current in this format is a charge. The format does
-    /// not state the sign, but its net capacity is charged minus discharged capacity, and cyclers use this sign.
+    /// not state the sign, but net capacity in this format is charged minus discharged capacity, and cyclers use this
+    /// sign.
     pub is_bdf: bool,
 }
 

@@ -18,8 +18,9 @@
 //! `SECURED` is a frame of an authenticated message. Its last field is the freshness value with which the authenticator
 //! was valid (`-`: the authenticator was not valid), so a replay needs no key. `RELOAD` means that another
 //! configuration applies after this line. The journal does not contain this configuration. `RESTORE` is the first line
-//! of a run that restored a stored state. It contains the downtime (`-`: the downtime follows from the stamps). If the
-//! last line has no line feed, a power cut has torn it. Such a line counts as a bad line, even if it can be parsed.
+//! of a run that restored a stored state. `RESTORE` contains the downtime (`-`: the downtime follows from the stamps).
+//! If the last line has no line feed, a power cut has torn it. Such a line counts as a bad line, even if it can be
+//! parsed.
 
 use std::io::{self, Write};
 
@@ -39,8 +40,7 @@ pub fn is_mark(line: &[u8]) -> bool {
     line.iter().position(|&b| b == b' ').is_some_and(|space| KEYWORDS.contains(&&line[..space]))
 }
 
-/// Parses a journal line for which [`is_mark`] is true. Returns `None` if `bus` does not know the interface of the
-/// line.
+/// Parses a journal line that [`is_mark`] recognises. Returns `None` if `bus` does not know the interface of the line.
 ///
 /// # Errors
 /// Fails if the line breaks the journal's grammar.

@@ -96,7 +96,8 @@ impl Lines {
         self.number
     }
 
-    /// Bytes read but not yet returned. They may end within a line, and may be empty although the source has not ended.
+    /// Bytes read but not yet returned. These bytes may end within a line, and may be empty although the source has not
+    /// ended.
     #[inline]
     pub(super) fn unread(&self) -> &[u8] {
         &self.buffer[self.start..self.end]

@@ -403,7 +403,7 @@ impl ReadState {
             Line::Dropped { interface, frames } => {
                 self.counts.dropped_frames = self.counts.dropped_frames.saturating_add(frames);
                 let bus = self.bus(interface)?;
-                // The line has no stamp. It belongs to the preceding frame, if any.
+                // The line has no stamp. The line belongs to the preceding frame, if any.
                 let time = self.latest?.plus_nanos(-self.shift_ns);
                 (!self.fresh).then_some(Record::bus(time, bus, BusEvent::Dropped { frames }))
             }

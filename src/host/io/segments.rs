@@ -117,7 +117,7 @@ pub(super) fn next_log(files: &mut VecDeque<PathBuf>) -> io::Result<Option<LogPa
     Ok(Some(LogParts { paths, deleted }))
 }
 
-/// Files that are read as one file. They are opened one at a time.
+/// Files that are read as one file. The files are opened one at a time.
 pub(super) struct JoinedFiles {
     open: File,
     rest: VecDeque<PathBuf>,
@@ -234,9 +234,9 @@ impl SegmentWriter {
 }
 
 fn begin(path: &Path) -> io::Result<Encoder<'static, CountedFile>> {
-    // Compression level of zstd. It shrinks frames of a pack of 96 cells by a factor of 8.0. Level 3 needs 2 MB more
-    // memory and gives a factor of 7.2. The vehicle's package (`packaging/debian/build`) leaves out the compressors of
-    // the other levels.
+    // Compression level of zstd. This level shrinks frames of a pack of 96 cells by a factor of 8.0. Level 3 needs 2 MB
+    // more memory and gives a factor of 7.2. The vehicle's package (`packaging/debian/build`) leaves out the
+    // compressors of the other levels.
     Encoder::new(CountedFile { file: File::create(path)?, bytes: 0 }, 1)
 }
 

@@ -148,7 +148,7 @@ impl Header {
     /// Index of the first of these columns that the table has.
     ///
     /// # Errors
-    /// Fails if the table has none of them.
+    /// Fails if the table has none of these columns.
     pub fn required(&self, names: &[&str]) -> Result<usize, TableError> {
         let missing = || self.fault(format!("no column {}, found {}", names.join(" or "), self.names.join(",")));
         self.find_any(names).ok_or_else(missing)
@@ -221,7 +221,7 @@ impl<'t> Row<'t> {
     }
 }
 
-/// Parses a field: `Some(None)` if it is empty, `None` if it is not a finite number.
+/// Parses a field: `Some(None)` if the field is empty, `None` if it is not a finite number.
 pub(super) fn parse_field(field: &[u8]) -> Option<Option<f64>> {
     let field = field.strip_prefix(b"\"").and_then(|field| field.strip_suffix(b"\"")).unwrap_or(field);
     if field.is_empty() {

@@ -26,7 +26,7 @@ pub struct Ticks {
     limit_ns: i64,
     /// Time of the latest record; `None` before the first record and after [`Ticks::sleep`].
     latest_ns: Option<i64>,
-    /// Time of the first tick after a sleep gap. It is popped after the ticks before the gap.
+    /// Time of the first tick after a sleep gap. This tick is popped after the ticks before the gap.
     wake_ns: Option<i64>,
 }
 

@@ -40,8 +40,8 @@ impl Journal {
     pub(super) fn new() -> io::Result<Self> {
         let socket = UnixDatagram::unbound()?;
         socket.set_nonblocking(true)?;
-        // journald ignores an empty datagram. Sending it fails if journald does not listen. If the queue is full,
-        // journald listens.
+        // journald ignores an empty datagram. Sending fails if journald does not listen. If the queue is full, journald
+        // listens.
         match socket.send_to(&[], SOCKET) {
             Err(error) if error.kind() != ErrorKind::WouldBlock => Err(error),
             Ok(_) | Err(_) => Ok(Self { socket }),

@@ -230,7 +230,8 @@ impl Engine {
         self.barrier.release(u64::MAX, |transmit| send(&self.links, self.key.as_ref(), transmit));
     }
 
-    /// Sends frames that have waited too long, and lets the store write its checkpoints. It is called with every tick.
+    /// Sends frames that have waited too long, and lets the store write its checkpoints. The loop calls this function
+    /// with every tick.
     pub(super) fn poll_store(&mut self, time: Timestamp) {
         if let Some(ticket) = self.barrier.overdue(Instant::now()) {
             self.barrier.release(ticket, |transmit| send(&self.links, self.key.as_ref(), transmit));

@@ -70,8 +70,8 @@ impl ServiceLoop {
                         notify(&[NotifyState::Watchdog]);
                         fed = now;
                     }
-                    // The files are flushed every second, so that a crash of the daemon loses at most their last
-                    // second.
+                    // The files are flushed every second, so that a crash of the daemon loses at most the last second
+                    // of these files.
                     if now.duration_since(flushed) >= Duration::from_secs(1) {
                         self.engine.flush();
                         flushed = now;

@@ -35,7 +35,7 @@ impl PendingAnswers {
         self.waiting.push(PendingAnswer { ticket, until: now + MAX_WAIT, outcome, answer });
     }
 
-    /// Sends the answers for which the store has succeeded or failed.
+    /// Sends the answers whose commits have succeeded or failed.
     pub(super) fn note_progress(&mut self, progress: &StoreProgress) {
         self.send_if(Some(progress.works), |waiting| waiting.ticket <= progress.ticket);
     }

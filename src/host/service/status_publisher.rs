@@ -19,8 +19,8 @@ pub(super) struct StatusPublisher {
     counters: ServiceCounters,
     latency: Latency,
     published: Option<Instant>,
-    /// Counts of earlier runs. They are taken with the first document, when the first tick has restored the stored
-    /// state and no frame has been counted yet.
+    /// Counts of earlier runs. The counts are taken with the first document, when the first tick has restored the
+    /// stored state and no frame has been counted yet.
     before: Option<CounterBaseline>,
 }
 

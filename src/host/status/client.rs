@@ -10,7 +10,7 @@ use serde::Deserialize;
 use super::document::{StatusDocument, VERSION};
 use super::{MAX_SILENCE, standard_path};
 
-/// Longest wait. It is one second longer than a daemon waits for a fresh document.
+/// Longest wait. This is one second longer than a daemon waits for a fresh document.
 pub const PATIENCE: Duration = Duration::from_secs(1 + MAX_SILENCE.as_secs());
 /// Longest document, bytes. A document with 1,024 cells and as many alarms takes less than 1 MB.
 pub const MAX_DOCUMENT_BYTES: usize = 8 << 20;

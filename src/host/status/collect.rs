@@ -20,7 +20,7 @@ use crate::monitor::{BusStatistics, CommandCounts, ControllerCount, Event, Event
 use crate::quantity::{BusIndex, Timestamp};
 use crate::sample::ReadingCounts;
 
-/// Number of events in the document. They fill one screen.
+/// Number of events in the document. So many events fill one screen.
 pub const MAX_EVENTS: usize = 32;
 
 /// The latest events. Events that occur once per cell and half-cycle are left out, because they would displace all

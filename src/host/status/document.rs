@@ -125,7 +125,7 @@ pub struct ConfigFile {
     #[serde(default)]
     pub drop_ins: Vec<String>,
     /// SHA-256 of the file followed by its drop-ins, hexadecimal, as printed by `cat FILE FILE.d/*.toml | sha256sum`.
-    /// It does not cover other files that these files name.
+    /// The checksum does not cover other files that these files name.
     pub sha256: String,
 }
 
@@ -180,7 +180,7 @@ impl AlarmStatus {
     }
 }
 
-/// Counters. All counters start at 0 when the program starts, including those of interfaces, protected messages,
+/// Counters. All counters start at 0 when the program starts, including the counters of interfaces, protected messages,
 /// controllers and floods. The only exception is `lifetime`. The reason: after a power cut, a stored count may be a
 /// minute old, but readers that sum differences need counters that never decrease.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -262,9 +262,9 @@ impl PollStatus {
 pub struct ControllerStatus {
     /// Interface of the controller.
     pub interface: String,
-    /// Identifier of its answers, formatted as in [`MessageProtection`].
+    /// Identifier of the controller's answers, formatted as in [`MessageProtection`].
     pub id: String,
-    /// Counts of its answers.
+    /// Counts of the controller's answers.
     #[serde(flatten)]
     pub counts: ControllerCounts,
 }

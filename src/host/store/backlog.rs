@@ -9,8 +9,8 @@ use std::collections::VecDeque;
 use super::rows::{HistoryRow, RowBatch};
 use super::stamp::Stamp;
 
-/// Maximum number of rows that wait for the disk. They take half a megabyte of memory. For a pack of 96 cells they
-/// cover about 25 half-cycles of each cell, which are days of driving.
+/// Maximum number of rows that wait for the disk. So many rows take half a megabyte of memory. For a pack of 96 cells,
+/// they cover about 25 half-cycles of each cell, which are days of driving.
 pub(super) const MAX_ROWS: usize = 5_000;
 
 /// Waiting rows, oldest first.

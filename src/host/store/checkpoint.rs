@@ -1,9 +1,9 @@
 //! Decides when the next checkpoint of the state is due. Each checkpoint writes the whole state and wears the flash
 //! memory.
 //!
-//! In: the bytes and the time of each commit. Alarm changes and learned results are written at once. The bytes that
-//! they write delay the next checkpoint. A pack of 96 cells (state of 70 kB) gets a checkpoint every 7 minutes, a pack
-//! of 12 cells every minute.
+//! In: the bytes and the time of each commit. Alarm changes and learned results are written at once. The bytes of these
+//! commits delay the next checkpoint. A pack of 96 cells (state of 70 kB) gets a checkpoint every 7 minutes, a pack of
+//! 12 cells every minute.
 
 use crate::quantity::Timestamp;
 

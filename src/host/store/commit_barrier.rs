@@ -3,7 +3,7 @@
 //! During a commit, every announcing frame ([`Transmit::announces`]) waits. These are the frames of the input that led
 //! to the result, and the cyclic frames that would repeat the result. If the first packet of a transfer waits, its
 //! later packets wait too. The frames are sent in order. The status frame is not held, because its state of charge and
-//! validity must be up to date. About alarms, it states only the number of raised alarms.
+//! validity must be up to date. About alarms, the status frame states only the number of raised alarms.
 //!
 //! No frame waits longer than [`MAX_WAIT`], because an alarm on the bus is more important than an alarm on disk.
 

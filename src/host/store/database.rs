@@ -1,4 +1,4 @@
-//! The history database. It is checked when it is opened, and written in transactions.
+//! Opens, checks, reads and writes the history database. All writes are transactions.
 //!
 //! | table | contents of a row | kept |
 //! | --- | --- | --- |

@@ -1,5 +1,5 @@
-//! The store of a replay. It has the same files as the daemon's store, but writes them synchronously and stamps them
-//! with bus time.
+//! The store of a replay. A [`Recorder`] writes the same files as the daemon's store, but synchronously and with bus
+//! times.
 
 use std::path::Path;
 

@@ -1,8 +1,8 @@
 //! Reserves disk space for the time when the disk is full. The reserve is a file, which is shortened step by step so
-//! that learned results and alarms can be stored. It is restored when the disk has room again.
+//! that learned results and alarms can be stored. The reserve is restored when the disk has room again.
 //!
-//! One step provides room for several commits. A state without new rows does not use the reserve; it waits until the
-//! disk has room.
+//! One step provides room for several commits. A state without new rows does not use the reserve; such a state waits
+//! until the disk has room.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 /// Name of the file in the state folder.
 const FILE_NAME: &str = "packwatch.reserve";
-/// Size of the file, bytes. It equals the largest size of the write-ahead log.
+/// Size of the file, bytes. This is the largest size of the write-ahead log.
 const BYTES: usize = 1 << 20;
 /// Bytes released at once. This is more than a commit writes, because another program that fills the disk may take some
 /// of the space.

@@ -3,7 +3,7 @@
 //!
 //! Every row has a number, counted across the tables. The hash of a segment is a SHA-256 chain over its rows, which
 //! starts from the hash of the segment before. The hash reveals rows that were changed, removed, inserted or moved. The
-//! number of segments is stored separately; it reveals that segments at the end are missing. The oldest segments are
+//! number of segments is stored separately; this number reveals missing segments at the end. The oldest segments are
 //! deleted as a whole but keep their hashes, so the remaining segments can still be verified. A person who can write
 //! the file can recompute the whole chain. A copy of the chain's end that is kept elsewhere reveals a recomputed chain
 //! ([`contradiction`]).

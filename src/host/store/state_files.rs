@@ -36,8 +36,8 @@ pub(super) const ASIDE: &str = "state-aside.json.zst";
 const PART: &str = "state.json.zst.part";
 /// Log and history text about a state that is set aside.
 pub(super) const SET_ASIDE: &str = "set aside for the first start at which it fits";
-/// Compression level. It is low because announcements wait for the compression. Level 19 makes files a sixth smaller
-/// and takes fifty times as long.
+/// Compression level. The level is low because announcements wait for the compression. Level 19 makes files a sixth
+/// smaller and takes fifty times as long.
 const LEVEL: i32 = 1;
 /// Largest size of the JSON, bytes: ten times the size for the largest pack.
 const MAX_JSON_BYTES: u64 = 64 << 20;
@@ -51,7 +51,7 @@ pub(super) struct StateDocument {
     pub format: u32,
     /// Number of the state, counting all written states.
     pub number: i64,
-    /// The state folder that the state belongs to. It is stored because two daemons may share a runtime folder.
+    /// The state folder that the state belongs to. The folder is stored because two daemons may share a runtime folder.
     pub folder: String,
     /// Number of the pack that was connected; 0 = unknown.
     pub pack: i64,
@@ -129,7 +129,7 @@ impl StateDocument {
         Self::parse(&json)
     }
 
-    /// Reads a file; `None` = it does not exist.
+    /// Reads a file; `None` = the file does not exist.
     fn read(path: &Path) -> Result<Option<Self>, StateFault> {
         match fs::read(path) {
             Ok(file) => Self::decode(&file).map(Some),

@@ -2,8 +2,8 @@
 //!
 //! The loop queues rows and the latest state, and gets a number for them: the ticket. The thread takes all queued work,
 //! commits the rows, and writes the state if it is due. Then it reports the last ticket, and whether the attempt
-//! succeeded. It retries a failing disk after increasing pauses. During a pause, every ticket is reported at once as
-//! failed. A failing database does not prevent the state from being written.
+//! succeeded. The thread retries a failing disk after increasing pauses. During a pause, every ticket is reported at
+//! once as failed. A failing database does not prevent the state from being written.
 //!
 //! A start reapplies the alarm changes of rows that are newer than the stored state. Therefore the rows in the database
 //! must directly follow the stored state. To ensure this, the first rows after a start, after a failure and in a new
@@ -198,8 +198,8 @@ impl Writer {
     /// Writes until [`WriteQueue::stop`].
     pub(super) fn run(mut self) {
         self.reserve.make();
-        // If the vehicle cannot be written, the database is closed here. It is opened again later, and a failure is
-        // reported then.
+        // If the vehicle cannot be written, the database is closed here. The database is opened again later, and a
+        // failure is reported then.
         self.database = self.database.take().filter(|database| database.set_vehicle(&self.vehicle).is_ok());
         loop {
             let work = self.write_queue.take(self.retry.at);

@@ -15,7 +15,8 @@ use crate::quantity::{BusIndex, Timestamp};
 const MAX_BYTES: usize = 48 << 20;
 /// Maximum number of bytes kept per kind of answer: a thousand answers of 64 bytes.
 const MAX_ANSWER_BYTES: usize = 64 << 10;
-/// Length of a window, s. It is long relative to the period of a multiplexer page, and short relative to a drive.
+/// Length of a window, s. A window is long compared with the period of a multiplexer page, and short compared with a
+/// drive.
 const WINDOW_S: f64 = 2.0;
 /// Maximum number of messages (identifiers on an interface) that are kept. A car has a few hundred messages; a flood of random
 /// identifiers has more.

@@ -1,8 +1,8 @@
 //! Writes the best candidates as a configuration, or returns the questions that prevent it.
 //!
-//! Everything that the log determines is written. The configuration lists what remains to be decided: the cell model, the assignment of
-//! sensors to cells, limits and alarms. The sign of the current and the number of cells are never guessed. Without evidence, they
-//! become questions.
+//! Everything that the log determines is written. The configuration lists what remains to be decided: the cell model,
+//! the assignment of sensors to cells, limits and alarms. The sign of the current and the number of cells are never
+//! guessed. Without evidence, both become questions.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -39,7 +39,8 @@ pub struct PackSettings {
 pub struct PackConfiguration {
     /// TOML.
     pub text: String,
-    /// DBC of the fields that no given DBC describes. It must be saved as the file that [`PackSettings::own_database`] names.
+    /// DBC of the fields that no given DBC describes. The DBC must be saved as the file that
+    /// [`PackSettings::own_database`] names.
     pub database: Option<String>,
     /// Questions that the log does not answer and the user must decide.
     pub open: Vec<String>,
@@ -354,7 +355,8 @@ impl Writer<'_> {
         }
     }
 
-    /// Writes the maximum ages of readings. They follow from the periods in the log, because diagnostic answers are rare.
+    /// Writes the maximum ages of readings. These ages follow from the periods in the log, because diagnostic answers
+    /// are rare.
     fn limits(&self, selection: &Selection<'_>, text: &mut String) {
         let named = [
             ("current", Some(selection.current)),

@@ -206,7 +206,7 @@ fn currents<'a>(messages: impl Iterator<Item = &'a Samples<'a>>, voltages: &[&Lo
             let distance = |factor: &f64| {
                 // A typical pack has 0.1 ohm at 400 V.
                 let unusual = (slope.ohm.abs() / factor / mean_v / 2.5e-4).ln().abs();
-                // The first scale is preferred, because it is the most common one.
+                // The first scale is preferred, because it is the most common scale.
                 if *factor == CURRENT_SCALES[0] { unusual - 0.25 } else { unusual }
             };
             let factor = CURRENT_SCALES.iter().copied().min_by(|a, b| distance(a).total_cmp(&distance(b)));

@@ -90,7 +90,7 @@ pub(crate) fn load_with(path: &Path, read: ReadFile<'_>, faults: &Faults) -> Opt
     Some(SourcedModel { model, source })
 }
 
-/// The table `[provenance]`; empty if the file has none. Its faults were reported when the file was parsed.
+/// The table `[provenance]`; empty if the file has none. Syntax faults were reported when the file was parsed.
 fn provenance(path: &Path, read: ReadFile<'_>) -> toml::Table {
     let text = read(path).ok().and_then(|bytes| String::from_utf8(bytes).ok()).unwrap_or_default();
     let notes = text.parse::<toml::Table>().ok().and_then(|mut table| table.remove("provenance"));
@@ -108,8 +108,8 @@ impl Measured {
     }
 }
 
-/// Returns how the open-circuit curve ages, and reports impossible values. It is called only if the tables have no
-/// fault.
+/// Returns how the open-circuit curve ages, and reports impossible values. Returns the default if any fault was already
+/// reported.
 fn ageing(head: &Head, tables: &Tables, electrodes: Option<&ElectrodesKeys>, faults: &Faults) -> AgedOcv {
     if !faults.is_empty() {
         return AgedOcv::default();

@@ -151,8 +151,8 @@ impl SourcedModel {
         Some(if left <= 0.7 * before { KnownBy::Data } else { KnownBy::Prior })
     }
 
-    /// Root mean square of the model's voltage error over all SOC values, V. It is computed at the temperature of the
-    /// open-circuit curve. `None` = the model states no error.
+    /// Root mean square of the model's voltage error over all SOC values, V. The error is computed at the temperature
+    /// of the open-circuit curve. `None` = the model states no error.
     pub fn error_v(&self) -> Option<f64> {
         let errors =
             self.model.soc.iter().map(|&soc| self.model.voltage_error_v(&self.model.grid_position(soc, CURVE_C)));

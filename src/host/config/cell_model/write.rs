@@ -6,7 +6,7 @@ use toml::{Table as TomlTable, Value};
 use super::source::SourcedModel;
 use crate::cell::{AgeingLaw, CellModel, Electrodes, ModelSpread, Table};
 
-/// Returns the contents of the file. `head` becomes the comment in its first line and must not contain line breaks.
+/// Returns the contents of the file. `head` becomes the comment in the first line and must not contain line breaks.
 pub fn text(sourced: &SourcedModel, head: &str) -> String {
     let SourcedModel { model, source } = sourced;
     let mut out = format!("# {head}\nformat = 1\nname = {}\n", quoted(&model.name));

@@ -208,8 +208,8 @@ fn rounded(value: f64) -> f64 {
     format!("{value:.9e}").parse().unwrap_or(value)
 }
 
-/// Reports a threshold outside 0 to 1 for a value that is a fraction. Its percent sign is probably missing: every
-/// value, or no value, would exceed this threshold.
+/// Reports a threshold outside 0 to 1 for a value that is a fraction. The percent sign of the threshold is probably
+/// missing: every value, or no value, would exceed this threshold.
 fn check_unit(alarm: &Alarm, key: &str, set: f64) {
     let is_fraction = matches!(alarm.rule.spec().unit, Unit::Fraction | Unit::FractionPerDay);
     if is_fraction && !(0.0..=1.0).contains(&set) {

@@ -16,7 +16,7 @@ use crate::wiring::AnswerSource;
 /// One configured answer.
 #[derive(Debug)]
 pub(crate) struct AnswerDefinition {
-    /// Path of the table that defines it, such as `input.diagnostic[2]`.
+    /// Path of the table that defines the answer, such as `input.diagnostic[2]`.
     pub table: String,
     /// CAN identifier of the requests and, with extended addressing, their first byte.
     request: (CanId, Option<u8>),
@@ -140,7 +140,7 @@ fn definition(keys: &DiagnosticInput) -> Option<AnswerDefinition> {
     })
 }
 
-/// An 11-bit identifier if it fits, else a 29-bit identifier.
+/// An 11-bit identifier if the number fits, else a 29-bit identifier.
 fn can_id(raw: u32) -> CanId {
     match u16::try_from(raw) {
         Ok(standard @ 0..=0x7FF) => CanId::Standard(standard),
@@ -188,7 +188,7 @@ fn check_numbers(keys: &AnswerSignalKeys) {
     }
 }
 
-/// Returns the signal as a DBC would declare it. Bit positions in its layout count from its own first byte.
+/// Returns the signal as a DBC would declare it. Bit positions in the layout count from the signal's first byte.
 fn as_in_a_dbc(keys: &AnswerSignalKeys, name: String, bit: usize) -> Signal {
     let in_byte = u16::try_from(bit % 8).unwrap_or_default();
     let (byte_order, start_bit) = match keys.byte_order {

@@ -173,8 +173,8 @@ fn health(raw: &RawTables, model: Option<&CellModel>) {
         recharge.place.fault(key, if key == "to_soc" { &what } else { &other });
     }
     if let (Some(capacity), Some(estimator)) = (&raw.capacity, &raw.estimator) {
-        // The paper's filter keeps the capacity constant between half-cycles, while packwatch's filter estimates it. A
-        // combination of the two methods is not supported.
+        // The paper's filter keeps the capacity constant between half-cycles, while packwatch's filter estimates the
+        // capacity. A combination of the two methods is not supported.
         let (key, needed) = match (capacity.method, estimator.capacity_state) {
             (MethodKey::Swing, CapacityState::Joint) | (MethodKey::Nominal, CapacityState::Held) => ("", ""),
             (MethodKey::Swing, CapacityState::Held) => ("swing", "joint"),

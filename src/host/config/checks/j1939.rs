@@ -129,7 +129,7 @@ fn failure_mode(rule: Rule, severity: Severity) -> u8 {
     }
 }
 
-/// The lamp of a severity. The malfunction lamp is not used because it concerns emissions.
+/// The lamp of a severity. The malfunction lamp is not used because that lamp concerns emissions.
 fn lamp(severity: Severity) -> Lamp {
     match severity {
         Severity::Info => Lamp::Protect,

@@ -37,7 +37,7 @@ pub(crate) fn signals(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Opti
 /// Range of values that can occur, in the channel's unit. A signal must be able to encode at least a part of this
 /// range. `None` = not checked.
 fn needed_values(channel: Channel, (model, series): (Option<&CellModel>, u16)) -> Option<(f64, f64)> {
-    // Without a model, the range is that of any lithium-ion cell.
+    // Without a model, the range covers any lithium-ion cell.
     let (low, high) = model.map_or((1.2, 4.6), |model| (model.voltage_min_v, model.voltage_max_v));
     match channel {
         Channel::CellVoltage(_) => Some((low, high)),

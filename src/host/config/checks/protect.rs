@@ -10,7 +10,7 @@ use crate::config::schema::keys::ProtectedInput;
 use crate::quantity::{BusIndex, Channel};
 
 /// Returns the guards of the protected messages; faults are reported. `inputs_whole` states whether every configured
-/// signal was found. Only then does a missing message mean that its name is wrong.
+/// signal was found. Only then does a missing message mean that the configured name is wrong.
 pub(crate) fn guards(raw: &RawTables, found: &[ResolvedSignal<'_>], inputs_whole: bool) -> Vec<GuardConfig> {
     let mut guards: Vec<(GuardConfig, &ProtectedInput)> = Vec::new();
     for keys in &raw.protected {
@@ -95,7 +95,7 @@ fn check_profile(keys: &ProtectedInput) {
 }
 
 /// Checks that the protection header fits into the message, and that no input and no multiplexor of an input overlaps
-/// it.
+/// the header.
 fn check_layout(keys: &ProtectedInput, inputs: &[&ResolvedSignal<'_>]) {
     let (profile, Some(first)) = (keys.profile, inputs.first()) else { return };
     let (shortest, longest) = (profile.header_bytes(), profile.max_bytes());

@@ -41,7 +41,7 @@ pub(crate) struct NamedSignal<'d> {
     pub message: &'d Message,
     /// The signal.
     pub signal: &'d Signal,
-    /// Position of the signal in its answer; `None` if it is in a DBC file.
+    /// Position of the signal in its answer; `None` if the signal is in a DBC file.
     pub answer: Option<AnswerPlace<'d>>,
 }
 
@@ -70,9 +70,9 @@ pub(crate) struct ResolvedSignal<'d> {
     pub message: &'d Message,
     /// The signal.
     pub signal: &'d Signal,
-    /// Position of the signal in its answer; `None` if it is in a DBC file.
+    /// Position of the signal in its answer; `None` if the signal is in a DBC file.
     pub answer: Option<AnswerPlace<'d>>,
-    /// Factor from the DBC's unit and sign to packwatch's. It is negative if charge is positive on the bus.
+    /// Factor from the DBC's unit and sign to packwatch's. The factor is negative if charge is positive on the bus.
     pub scale: f64,
     /// Offset in packwatch's unit and sign, added after the scale.
     pub offset: f64,
@@ -142,7 +142,7 @@ impl Databases {
     }
 }
 
-/// Reads one DBC file; `None` = it cannot be read (reported).
+/// Reads one DBC file; `None` = the file cannot be read (reported).
 pub(crate) fn read_dbc(path: &Path, read: ReadFile<'_>, faults: &Faults) -> Option<Database> {
     let file = path.display().to_string();
     let bytes = read(path).map_err(|error| faults.add(&file, 0, format!("cannot be read: {error}"))).ok()?;

@@ -97,8 +97,8 @@ pub struct SignalUse {
     pub offset: f64,
     /// DBC unit.
     pub unit: String,
-    /// Factor from the DBC's unit and sign to packwatch's (positive = discharge). It is negative if charge is positive
-    /// on the bus.
+    /// Factor from the DBC's unit and sign to packwatch's (positive = discharge). The factor is negative if charge is
+    /// positive on the bus.
     pub scale: f64,
     /// Offset in packwatch's unit and sign, added after the scale.
     pub added: f64,

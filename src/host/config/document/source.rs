@@ -90,7 +90,7 @@ impl SourceFile {
         &self.name
     }
 
-    /// The text to parse. Its positions are positions in the sequence of all texts.
+    /// The text to parse. Positions in this text are positions in the sequence of all texts.
     pub(crate) fn placed_text(&self) -> &str {
         &self.placed
     }
@@ -120,8 +120,8 @@ impl Sources {
     fn new(texts: Vec<(String, String)>) -> Self {
         let (mut files, mut start) = (Vec::new(), 0);
         for (name, text) in texts {
-            // A byte order mark is valid only at the start of a text. In the padded text it would follow the blanks, so
-            // it is removed.
+            // A byte order mark is valid only at the start of a text. In the padded text, the mark would follow the
+            // blanks, so the mark is removed.
             let text = text.strip_prefix('\u{feff}').unwrap_or(&text);
             let placed = " ".repeat(start) + text;
             let end = placed.len();
@@ -167,7 +167,7 @@ pub(crate) fn read_file(path: &Path) -> std::io::Result<Vec<u8>> {
     std::fs::read(path)
 }
 
-/// The file as UTF-8 text; `None` = it cannot be read (reported).
+/// The file as UTF-8 text; `None` = the file cannot be read (reported).
 pub(crate) fn read_text(path: &Path, read: ReadFile<'_>, faults: &Faults) -> Option<String> {
     let file = path.display().to_string();
     let bytes = read(path).map_err(|error| faults.add(&file, 0, format!("cannot be read: {error}"))).ok()?;

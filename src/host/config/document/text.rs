@@ -41,7 +41,7 @@ fn text(document: &Document<'_>) -> String {
 fn table(document: &Document<'_>, path: &str, table: &DeTable<'_>, page: &mut String) {
     let mut entries: Vec<_> = table.iter().collect();
     entries.sort_by_key(|(key, _)| key.span().start);
-    // Values are written before tables: after the header of a subtable they would belong to that subtable.
+    // Values are written before tables: after the header of a subtable, values would belong to that subtable.
     let (tables, values): (Vec<_>, Vec<_>) = entries.into_iter().partition(|(_, value)| has_header(document, value));
     for (key, value) in values {
         let (name, text) = (document.written(&key.span()), document.written(&value.span()));

@@ -27,8 +27,8 @@ pub fn load_with(files: &ConfigFiles, read: ReadFile<'_>) -> Result<Config, Conf
     read_and(files, read, |_, _, _| ()).map(|(config, ())| config)
 }
 
-/// Like [`load_with`], but also calls `then` with the tables, the configuration and the signals found, and returns its
-/// result.
+/// Like [`load_with`], but also calls `then` with the tables, the configuration and the signals found, and returns the
+/// result of `then`.
 ///
 /// # Errors
 /// Returns every fault found, not only the first.
@@ -40,8 +40,8 @@ pub(crate) fn read_and<T>(
     let faults = Faults::default();
     match read_config(files, read, &faults, then) {
         Some(good) if faults.is_empty() => Ok(good),
-        // If a part is missing although no fault was reported, packwatch itself has a bug. Report it instead of hiding
-        // it.
+        // If a part is missing although no fault was reported, packwatch itself has a bug. This bug is reported instead
+        // of hidden.
         None if faults.is_empty() => Err(ConfigFaults(vec![format!(
             "{}: cannot be used, but no fault was found: this is a bug in packwatch",
             files.main.display()

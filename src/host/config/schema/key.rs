@@ -113,7 +113,7 @@ pub(crate) struct Key {
     pub name: &'static str,
     /// Meaning of the key, as printed in the reference page.
     pub about: &'static str,
-    /// Unit of the value; empty if it has none.
+    /// Unit of the value; empty if the value has no unit.
     pub unit: &'static str,
     /// Type of the value in words.
     pub kind: &'static str,
@@ -174,7 +174,7 @@ pub(crate) struct TableReader<'a> {
     pub document: &'a Document<'a>,
     /// Whether a part of the table may be unreadable. If so, missing keys are not reported.
     pub broken: bool,
-    /// The table; `None` = the file does not contain it.
+    /// The table; `None` = the file does not contain the table.
     pub table: Option<&'a DeTable<'a>>,
     /// Place of the table in the file.
     pub place: TablePlace,

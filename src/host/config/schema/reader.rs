@@ -108,7 +108,7 @@ impl<'a> SchemaReader<'a> {
         }
     }
 
-    /// Checks a value for which the schema expects a table.
+    /// Checks a value that must be a table according to the schema.
     fn table_below(&mut self, schema: &str, shown: &str, value: &'a Spanned<DeValue<'a>>, known: &[SectionInfo]) {
         let line = self.document.line(&value.span());
         let many = known.iter().any(|info| info.path == schema && info.many);

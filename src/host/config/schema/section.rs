@@ -51,7 +51,7 @@ impl SectionInfo {
         Self { path: S::PATH, many: true, about: S::ABOUT, keys: Some(S::KEYS) }
     }
 
-    /// A table of notes for people who read the file; the program ignores it.
+    /// A table of notes for people who read the file; the program ignores the table.
     pub(crate) const fn notes(path: &'static str, about: &'static str) -> Self {
         Self { path, many: false, about, keys: None }
     }
@@ -161,9 +161,10 @@ pub(crate) use table_field;
 /// Lists the tables of a file in the order of the reference page. The macro generates the struct of these tables and
 /// the function that reads it.
 ///
-/// A table is `one`, `optional` or `many`. A table `one` is always read: if the file does not contain it, its keys have
-/// their defaults, and missing required keys are reported. A table `optional` is read only if the file contains it. A
-/// table `many` is repeatable (`[[path]]`). `with` names further tables that a key of the table contains.
+/// A table is `one`, `optional` or `many`. A table `one` is always read: if the file does not contain the table, its
+/// keys have their defaults, and missing required keys are reported. A table `optional` is read only if the file
+/// contains it. A table `many` is repeatable (`[[path]]`). `with` names further tables that a key of the table
+/// contains.
 macro_rules! tables {
     ($(#[$about:meta])* $name:ident, $sections:ident { $($field:ident: $kind:ident $section:ident $(with $below:ident)?),+ $(,)? }) => {
         $(#[$about])*

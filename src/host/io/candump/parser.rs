@@ -60,8 +60,8 @@ pub struct LineParser {
 pub struct ParsedLine<'a> {
     /// The line.
     pub line: Line<'a>,
-    /// Number of bytes before the line feed, or of the whole text if there is no line feed. It is 0 for [`Line::Other`]
-    /// and [`Line::Dropped`].
+    /// Number of bytes before the line feed, or of the whole text if there is no line feed. The length is 0 for
+    /// [`Line::Other`] and [`Line::Dropped`].
     pub len: usize,
 }
 
@@ -70,8 +70,8 @@ pub struct ParsedLine<'a> {
 pub(crate) struct LineHead<'a> {
     pub time: Timestamp,
     pub interface: &'a [u8],
-    /// Number of the interface if the parser knows its name. It is always `None` if the name has more than seven bytes
-    /// or follows more than one space.
+    /// Number of the interface if the parser knows its name. The number is always `None` if the name has more than
+    /// seven bytes or follows more than one space.
     pub bus: Option<BusIndex>,
     /// The rest of the line.
     pub rest: Cursor<'a>,
@@ -169,8 +169,8 @@ impl LineParser {
     }
 }
 
-/// Parses the fraction of a ten-digit stamp. Returns it in nanoseconds, with the length of the stamp and the space
-/// after it.
+/// Parses the fraction of a ten-digit stamp. Returns the fraction in nanoseconds, with the length of the stamp and the
+/// space after it.
 #[inline(always)]
 fn fraction(text: &[u8; 24]) -> Option<(i64, usize)> {
     if text[18] == b')' {
@@ -191,7 +191,7 @@ fn drop_count(line: &[u8]) -> Option<Line<'_>> {
     Some(Line::Dropped { interface, frames })
 }
 
-/// A position in a line. Functions for rare forms take the cursor by value, so that it stays in registers.
+/// A position in a line. Functions for rare forms take the cursor by value, so that the cursor stays in registers.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Cursor<'a> {
     pub(super) text: &'a [u8],
@@ -273,7 +273,7 @@ impl<'a> Cursor<'a> {
         Ok(())
     }
 
-    /// Parses any interface name with the spaces around it. Also returns the position after them.
+    /// Parses any interface name with the spaces around it. Also returns the position after the spaces.
     #[inline(never)]
     pub(super) fn interface(mut self) -> Result<(&'a [u8], usize), LineError> {
         while self.take(b' ') {}

@@ -1,8 +1,8 @@
 //! A reader that decompresses ahead on its own thread, because decompression costs several times as much as parsing.
 //!
-//! Bytes and errors keep their order. At most [`BLOCKS`] blocks exist at a time. They are reused, so memory is bounded
-//! and nothing is allocated while reading. After the reader is dropped, the thread ends with its next block. The drop
-//! does not wait for the thread, because the source may be a pipe that stays silent for a long time.
+//! Bytes and errors keep their order. At most [`BLOCKS`] blocks exist at a time. The blocks are reused, so memory is
+//! bounded and nothing is allocated while reading. After the reader is dropped, the thread ends with its next block.
+//! The drop does not wait for the thread, because the source may be a pipe that stays silent for a long time.
 
 use std::io::{self, Read};
 use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};

@@ -1,4 +1,4 @@
-//! Counters of a link since the program's start. The link's task writes them, and other tasks read them.
+//! Counters of a link since the program's start. The link's task writes the counters, and other tasks read them.
 
 use std::sync::{Mutex, PoisonError};
 
@@ -57,7 +57,7 @@ impl SharedHealth {
         self.change(|health| note(&mut health.counts));
     }
 
-    /// Sets the interface's state. Must be called only when it has changed.
+    /// Sets the interface's state. Must be called only when the state has changed.
     pub(super) fn enter(&self, state: LinkState) {
         self.change(|health| {
             health.state = state;

@@ -56,7 +56,7 @@ pub struct LinkConfig {
     pub receive_buffer_bytes: usize,
 }
 
-/// The sending end of a link. When it is dropped, the link ends after sending the queued frames.
+/// The sending end of a link. When this value is dropped, the link ends after sending the queued frames.
 #[derive(Debug)]
 pub struct LinkOutput {
     queue: mpsc::Sender<QueuedFrame>,
@@ -297,7 +297,7 @@ impl Link {
     /// Forwards one frame or event.
     async fn take(&mut self, mapper: &mut StampMapper, received: &RawRead, reading: Reading) {
         let time = mapper.arrival(received.stamps, reading);
-        // Frames that were in the socket when the interface went down do not show that it is up again.
+        // Frames that were in the socket when the interface went down do not show that the interface is up again.
         if self.state != LinkState::Up && time > self.state_since {
             self.enter_at(LinkState::Up, time).await;
         }
@@ -373,7 +373,7 @@ impl Link {
         true
     }
 
-    /// Waits while there is no socket, and drops the frames to send.
+    /// Waits before the next attempt to open a socket, and drops the frames to send.
     async fn wait(&mut self) -> ServiceEnd {
         let until = Instant::now() + self.lengthen_pause();
         loop {

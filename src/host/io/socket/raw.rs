@@ -1,5 +1,5 @@
-//! One SocketCAN raw socket. Its filters are set before it is bound, so it receives only wanted identifiers. It reads
-//! several frames with their stamps in one system call, and writes without blocking.
+//! One SocketCAN raw socket. The filters are set before the socket is bound, so the socket receives only wanted
+//! identifiers. One system call reads several frames with their stamps. Writing does not block.
 //!
 //! The kernel's drop counter is read separately, for two reasons. The control message of a frame contains the counter
 //! only after a later frame was received. In addition, the size of the control message changes with the first drop (see
@@ -23,9 +23,9 @@ use super::wire::{self, FD_BYTES, Wire};
 use crate::can::{CanId, Frame};
 use crate::io::clock::{KernelStamps, nanos};
 
-/// Size of the receive buffer to request, bytes. It holds about 2,700 frames, because the kernel counts 768 bytes per
-/// frame including its bookkeeping. A full 1 Mbit/s bus sends that many in a third of a second. The kernel limits the
-/// size to net.core.rmem_max.
+/// Size of the receive buffer to request, bytes. The buffer holds about 2,700 frames, because the kernel counts 768
+/// bytes per frame including its bookkeeping. A full 1 Mbit/s bus sends that many in a third of a second. The kernel
+/// limits the size to net.core.rmem_max.
 pub const DEFAULT_RECEIVE_BUFFER_BYTES: usize = 1 << 20;
 
 /// Maximum number of frames read in one system call. With 16 frames, the call itself no longer dominates the cost of a
@@ -67,7 +67,7 @@ impl Slots {
             let messages = recvmmsg(fd, &mut self.headers, slices.iter_mut(), MsgFlags::MSG_DONTWAIT, None)?;
             for (message, length) in messages.zip(&mut lengths) {
                 *length = message.bytes.min(FD_BYTES);
-                // An error means that a control message was cut off. It is treated like a missing stamp.
+                // An error means that a control message was cut off. This error is treated like a missing stamp.
                 let stamps = message.cmsgs().map_or(KernelStamps::default(), read_control);
                 into.push(RawRead { what: Wire::Malformed, stamps });
             }
@@ -107,8 +107,8 @@ pub(super) fn explained(error: &io::Error) -> String {
 }
 
 impl RawSocket {
-    /// Opens and binds the socket. If `fd`, it also receives FD frames. Filters are set before the bind, so that no
-    /// unwanted frame is queued.
+    /// Opens and binds the socket. If `fd`, the socket also receives FD frames. Filters are set before the bind, so
+    /// that no unwanted frame is queued.
     ///
     /// # Errors
     /// Returns `ENODEV` if the interface does not exist. If the interface is down, the call succeeds, and
@@ -161,8 +161,8 @@ impl RawSocket {
         SLOTS.with_borrow_mut(|slots| slots.receive(self.socket.as_raw_fd(), into))
     }
 
-    /// Number of frames lost since the socket was opened because its receive buffer was full, modulo 2^32. It is 0 if
-    /// the kernel does not support this.
+    /// Number of frames lost since the socket was opened because its receive buffer was full, modulo 2^32. The number
+    /// is 0 if the kernel has no such counter.
     pub(super) fn dropped_total(&self) -> u32 {
         // SO_MEMINFO returns nine numbers. The last one counts drops (linux/sock_diag.h, since Linux 4.12).
         let mut bytes = [0; 9 * size_of::<u32>()];

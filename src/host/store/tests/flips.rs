@@ -6,8 +6,8 @@
 
 use super::*;
 
-/// Bits between two flips of the sample. It is a prime, so that the flips reach every bit of a byte and every place of
-/// a page.
+/// Bits between two flips of the sample. The step is a prime, so that the flips reach every bit of a byte and every
+/// place of a page.
 const SAMPLE_STEP: usize = 397;
 
 /// Effects of the flips.

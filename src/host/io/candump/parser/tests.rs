@@ -7,8 +7,8 @@ use super::*;
 /// Text that follows the line in the log.
 const MORE: &str = "\n(1700000000.123456) can0 123#1122334455667788\n(1700000000.123457) can0 123#\n";
 
-/// Reads the line with a parser that has read it before, knows its interface and sees more text after it. The result
-/// must equal the result of a new parser, which reads only this line and takes no fast path.
+/// Reads the line with a parser that has already read this line, knows the interface, and sees more text after the
+/// line. The result must equal the result of a new parser, which reads only this line and takes no fast path.
 fn read(line: &[u8]) -> Result<Line<'_>, LineError> {
     let plain = crate::io::candump::parse_line(line);
     let name = match plain {
