@@ -1,8 +1,8 @@
 //! The replay loop reads records, runs the core, writes results and returns a summary.
 //!
 //! Guarantee: the same logs and configuration give the same result files, byte for byte. The replay of a journal gives
-//! the results of the run that recorded it. Plain logs and CSV get the ticks of [`Ticks`]; journals contain ticks. Wall
-//! time is used only for pacing (`speed`) and for reports.
+//! the results of the run that recorded it. Plain logs and CSV get the ticks of [`Ticks`]; journals already contain
+//! ticks. Wall time is used only for pacing (`speed`) and for reports.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write};

@@ -11,9 +11,9 @@
 //!   exporter runs as a separate user. With the shipped unit, only root and the exporter can reach the sockets. The
 //!   service runs as a dynamic user, and systemd keeps the service's folder inside a closed folder. Only the control
 //!   socket can change anything, and other users cannot connect to it.
-//! * Once a second the loop copies structs into a draft and offers it. A separate thread serialises the draft and
-//!   serves the clients, so no client affects the loop. A draft offered while the thread is busy is dropped and
-//!   counted.
+//! * Once a second, the service loop copies the values of a document into a draft and offers the draft to a separate
+//!   thread. That thread serialises the draft and serves the clients, so no client affects the loop. A draft offered
+//!   while the thread is busy is dropped and counted.
 //! * At most [`MAX_CLIENTS`] clients are served. Further clients are rejected immediately and counted. A client that
 //!   does not read within [`MAX_SILENCE`] is dropped and counted.
 //! * A document older than [`STALE`] is not sent. The client waits for a fresh document, and receives nothing if no

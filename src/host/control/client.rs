@@ -10,7 +10,8 @@ use serde::Deserialize;
 use super::protocol::{Request, contents};
 use super::standard_path;
 
-/// Longest wait for a list of alarms. The daemon answers between two ticks, so a daemon that needs longer is hanging.
+/// Longest wait for a list of alarms. A working daemon answers within milliseconds, so a daemon that needs longer is
+/// hanging.
 const PATIENCE: Duration = Duration::from_secs(5);
 /// Longest answer, bytes: ten times the size of an answer with 1,000 alarms of 400 bytes each.
 const MAX_ANSWER_BYTES: u64 = 4 << 20;

@@ -24,7 +24,7 @@ use crate::quantity::{BusIndex, Timestamp};
 
 /// Period at which the sockets are read. Results do not depend on this period, because the kernel stamps the frames.
 const READ_PERIOD: Duration = Duration::from_millis(10);
-/// Longest delay of the last frame after the end of the test, equal to fifty ticks of the daemon.
+/// Longest delay of the last frame after the end of the test, equal to fifty ticks (steps of 10 ms) of the daemon.
 const GRACE: Duration = Duration::from_millis(500);
 
 /// The alarm frames of one interface.

@@ -173,7 +173,7 @@ impl LogSource {
         &self.read_bytes
     }
 
-    /// Whether the current log contains its own ticks.
+    /// Whether the current log contains ticks (times at which the core ran without another input), as journals do.
     pub fn carries_ticks(&self) -> bool {
         matches!(self.current, Some(OpenLog { form: LogForm::Text { journal: true, .. }, .. }))
     }

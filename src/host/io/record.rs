@@ -32,7 +32,7 @@ impl Batch {
         &self.slots[..self.len]
     }
 
-    /// Whether the log contains its own ticks.
+    /// Whether the log contains ticks, as journals do.
     pub fn carries_ticks(&self) -> bool {
         self.carries_ticks
     }

@@ -1,4 +1,4 @@
-//! Ends the loop on SIGTERM, on SIGINT, or after a set time.
+//! Ends the daemon's loop on SIGTERM, on SIGINT, or after a set time.
 
 use std::io;
 use std::time::Duration;

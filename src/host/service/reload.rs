@@ -1,5 +1,5 @@
-//! Reloads the configuration on SIGHUP, outside the loop. If the new configuration is rejected, the old configuration
-//! stays in use.
+//! Reloads the configuration on SIGHUP, outside the service loop. If the new configuration is rejected, the old
+//! configuration stays in use.
 //!
 //! Only one reading runs at a time. Signals that arrive during a reading cause one further reading, which starts at
 //! least [`MIN_PERIOD`] after the start of the last reading. Many signals in a short time therefore neither fill the
@@ -103,7 +103,7 @@ impl Reload {
         self.is_requested = false;
         self.not_before = Instant::now() + MIN_PERIOD;
         let (path, fixed) = (self.path.clone(), Arc::clone(&self.fixed));
-        // Reading a large DBC takes longer than a tick.
+        // Reading a large DBC takes longer than one tick (10 ms) of the service loop.
         self.reading = Some(tokio::task::spawn_blocking(move || {
             let new = config::load(&path).map_err(|faults| faults.0)?;
             fixed.check(&new).map_err(|why| vec![why])?;

@@ -1,5 +1,5 @@
-//! Collects the status document from the core, the interfaces and the loop's counters. The functions copy structs and
-//! serialise nothing.
+//! Collects the status document from the core, the interfaces and the counters of the service loop. The functions copy
+//! values and serialise nothing.
 
 use std::collections::VecDeque;
 

@@ -1,5 +1,5 @@
-//! Counters of the loop and of the status clients, and the latency of frames. The counters are plain numbers that the
-//! loop owns.
+//! Counters of the service loop and of the status clients, and the latency of frames. The counters are plain numbers
+//! that the loop owns.
 //!
 //! In: the lateness of ticks and the latency of frames, s. Out: structs of the status document. Nothing is allocated or
 //! locked per frame.

@@ -60,7 +60,7 @@ pub struct StatusDocument {
     pub cells: Vec<CellView>,
     /// Alarms that need attention.
     pub alarms: AlarmStatus,
-    /// Counters of the core, the loop and the clients.
+    /// Counters of the core, the service loop and the clients.
     pub counters: StatusCounters,
     /// Protected input messages, and the authenticated command message.
     pub protection: Vec<MessageProtection>,

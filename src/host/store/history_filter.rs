@@ -138,8 +138,8 @@ impl HistoryFilter {
             self.written_life.cycles = None;
         }
         if let EventKind::RemainingLife { cycles, cycles_low, .. } = *kind {
-            // The distance from the median to the lower end of the interval is a little less than two standard
-            // deviations, so half of this distance is used.
+            // The lower end of the interval is a little less than two standard deviations below the median. Half of
+            // this distance replaces the standard deviation.
             return self.is_life_worth_writing(
                 cycles.zip(cycles_low).map(|(median, low)| (median, 0.5 * (median - low))),
                 now,

@@ -4,11 +4,11 @@
 //! it starts again with every boot. Therefore the times of both clocks are stored, together with the identity of the
 //! boot.
 //!
-//! The age of a state from an earlier boot can only be measured with the wall clock, and only if a hardware clock ran
-//! while the computer was off. Without a battery-backed clock, the wall clock continues from its last saved value
-//! (systemd saves this value at every boot). A week without power then looks like seconds, and the wall clock itself
-//! does not show that it is wrong. The wall clock is therefore trusted only if a hardware clock agrees with it
-//! ([`WallClock`]) or a time server has set it.
+//! Only the wall clock can measure the age of a state from an earlier boot. The measured age is right only if a
+//! hardware clock ran while the computer was off. Without a battery-backed clock, the wall clock continues from its
+//! last saved value (systemd saves this value at every boot). A week without power then looks like seconds, and the
+//! wall clock itself does not show that it is wrong. The wall clock is therefore trusted only if a hardware clock
+//! agrees with it ([`WallClock`]) or a time server has set it.
 
 use std::fmt;
 use std::path::Path;

@@ -127,7 +127,8 @@ fn signal_plan(source: &SignalSource<'_>, message: &Message, signal: &Signal, bi
     }
 }
 
-/// Consecutive signals that match the pattern of the cells beyond the configured number of cells.
+/// Returns further signals that match the cell pattern: their numbers directly follow the configured cells without a
+/// gap.
 fn more_cells(raw: &RawTables, databases: &Databases) -> Vec<SignalPlan> {
     let (Some(keys), Some(pack)) = (&raw.cell_voltage, &raw.pack) else { return Vec::new() };
     let source = keys.config();

@@ -1,9 +1,9 @@
 //! Decides which signal carries which quantity. Points are given for names and units
 //! ([`SignalLabel`](crate::wiring::evidence::SignalLabel)), for ranges and for behaviour, each with a reason in words.
 //!
-//! The points are weights of evidence that were chosen on three cars. A value outside the range of a quantity excludes that quantity. A
-//! unit or a name gives 1 to 3 points. Behaviour that hardly any other signal shows gives 3 to 4 points, for example a voltage that
-//! falls with the current, or one that equals the sum of the cells.
+//! The points are weights of evidence that were chosen on three cars. A value outside the range of a quantity excludes
+//! that quantity. A unit or a name gives 1 to 3 points. Behaviour that hardly any other signal shows gives 3 to 4
+//! points. Examples are a voltage that falls when the current rises, and a voltage that equals the sum of the cells.
 
 use super::groups::{SignalGroup, groups};
 use super::log_signal::{LogSignal, SignalOrigin};

@@ -1,6 +1,5 @@
-//! Collects the signals of a log with their values. The signals are described by DBC files or by definitions of
-//! diagnostic answers, or the search finds them in undescribed bytes of answers and, if there is no DBC file, of
-//! messages.
+//! Collects the signals of a log with their values. DBC files and definitions of diagnostic answers describe signals.
+//! The search finds further signals in undescribed bytes of answers and, without DBC files, in messages.
 
 use super::capture::{AnswerKey, Answers, Capture, MessageKey, Payloads};
 use super::log_signal::{LogSignal, SignalOrigin};

@@ -152,8 +152,8 @@ fn check_needs(alarm: &Alarm, raw: &RawTables) {
     }
 }
 
-/// Checks that each clear threshold lies on the healthy side of its set threshold, and that a more severe threshold
-/// lies farther from the healthy side than a milder one.
+/// Checks that each clear threshold lies on the healthy side of its set threshold. Also checks that a more severe
+/// threshold lies farther from the healthy side than a milder threshold.
 fn check_thresholds(alarm: &Alarm, rated: &RatedCell) {
     let (place, sign) = (&alarm.place, beyond_sign(alarm.rule));
     let side = if sign > 0.0 { "below" } else { "above" };

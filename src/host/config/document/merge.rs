@@ -82,7 +82,8 @@ impl<'t> Document<'t> {
         shorten(&words.join(" "))
     }
 
-    /// Returns the text that a fault quotes as the value found. `span` is the position of `value` or of a part of it.
+    /// Returns the text that a fault quotes as the value found. `span` is the position of `value`, or of a part of
+    /// `value`.
     pub(crate) fn found(&self, value: &Spanned<DeValue<'_>>, span: &Range<usize>) -> String {
         let is_inline = self.written(&value.span()).starts_with('{');
         if value.get_ref().is_table() && !is_inline {

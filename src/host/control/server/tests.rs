@@ -1,5 +1,5 @@
 //! Tests the control socket with good and bad clients. Each client is answered or dropped, and no client blocks the
-//! loop or another client.
+//! daemon's loop or another client.
 
 use std::path::{Path, PathBuf};
 
