@@ -142,13 +142,13 @@ impl StampMapper {
         }
     }
 
-    /// Notes that the socket was found empty at `reading`: frames that are read later arrived after `reading`.
+    /// Records that the socket was found empty at `reading`: frames that are read later arrived after `reading`.
     pub fn socket_empty(&mut self, reading: Reading) {
         self.emptied_ns = reading.boottime_ns;
         self.emptied_offset_ns = reading.offset_ns();
     }
 
-    /// Notes that one call returned the latest frame at `reading` and emptied the socket. Frames that are read later
+    /// Records that one call returned the latest frame at `reading` and emptied the socket. Frames that are read later
     /// arrived after that frame.
     pub fn socket_emptied(&mut self, reading: Reading) {
         self.emptied_ns = self.latest.nanos().saturating_sub(self.clock.origin_ns);

@@ -47,12 +47,12 @@ impl Activity {
         Self(Arc::new(Mutex::new(Some(Instant::now()))))
     }
 
-    /// Notes that a request has been received.
+    /// Records that a request has been received.
     pub(crate) fn begin_request(&self) {
         self.set(None);
     }
 
-    /// Notes that the answer is ready to be sent.
+    /// Records that the answer is ready to be sent.
     pub(crate) fn end_request(&self) {
         self.set(Some(Instant::now()));
     }

@@ -1,6 +1,6 @@
 //! Writes core events as log lines with fields; the severity decides the log level. Error frames, lost frames and
-//! unsent frames are logged once and then as counts, because a bus without another node causes thousands of them per
-//! second. In the JSON format, every event is written.
+//! unsent frames are logged once and then as counts, because a bus without another node causes thousands of error
+//! frames per second. In the JSON format, every event is written.
 
 mod text;
 

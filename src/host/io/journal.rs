@@ -15,7 +15,7 @@
 //! RELOAD (1700000000.600000000)
 //! ```
 //!
-//! `SECURED` is a frame of an authenticated message. Its last field is the freshness value with which the authenticator
+//! `SECURED` is a frame of an authenticated message. The last field is the freshness value with which the authenticator
 //! was valid (`-`: the authenticator was not valid), so a replay needs no key. `RELOAD` means that another
 //! configuration applies after this line. The journal does not contain this configuration. `RESTORE` is the first line
 //! of a run that restored a stored state. `RESTORE` contains the downtime (`-`: the downtime follows from the stamps).
