@@ -1,5 +1,5 @@
-//! The loops of `packwatch doctor`. The loops pass replayed logs or live input to the core's [`WiringObserver`] and, if
-//! the configuration is valid, also to a [`Monitor`].
+//! Runs the two loops of `packwatch doctor`, which pass replayed logs or live input to the core's [`WiringObserver`]
+//! and, if the configuration is valid, also to a [`Monitor`].
 //!
 //! Listening is passive: nothing is sent. An [`Interrupt`] ends both loops early. The report then covers what was
 //! received until that time.

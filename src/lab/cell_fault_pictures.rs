@@ -28,7 +28,7 @@ struct Shown {
     kinds: &'static [CellFaultKind],
 }
 
-/// The pictures in the order of a report. Charge is first, because no finding is based on charge.
+/// The pictures in the order of a report. The SOC is first, because no finding is based on the SOC alone.
 const SHOWN: [Shown; STATES] = [
     Shown {
         state: SOC,

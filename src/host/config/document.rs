@@ -1,4 +1,5 @@
-//! The files of a configuration: their texts parsed and merged, the positions of keys, and the list of faults.
+//! Reads the files of a configuration: parses and merges their texts, and keeps the positions of keys and the list of
+//! faults.
 //!
 //! | file | content |
 //! | --- | --- |

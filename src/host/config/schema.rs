@@ -1,4 +1,4 @@
-//! The tables and keys of the files: every key is declared once, with meaning, type, unit, range and default.
+//! Declares the tables and keys of the files. Every key is declared once, with meaning, type, unit, range and default.
 //!
 //! | file | content |
 //! | --- | --- |

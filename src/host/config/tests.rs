@@ -1,4 +1,5 @@
-//! Valid and invalid configuration files. Users read the fault messages, so the tests compare them in full.
+//! Tests valid and invalid configuration files. Users read the fault messages, so the tests compare these messages in
+//! full.
 
 #![allow(clippy::unwrap_used, reason = "tests may panic")]
 

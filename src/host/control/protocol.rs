@@ -1,4 +1,4 @@
-//! Requests and answers of the control socket, one line of JSON each.
+//! Defines the requests and answers of the control socket. Each is one line of JSON.
 //!
 //! | request | keys | answer |
 //! | --- | --- | --- |

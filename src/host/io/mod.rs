@@ -1,4 +1,4 @@
-//! Files and sockets: logs in every format, journals, result files and CAN interfaces.
+//! Reads and writes files and sockets: logs in every format, journals, result files and CAN interfaces.
 
 pub mod background_file;
 pub mod can_key;

@@ -1,4 +1,4 @@
-//! Locations of the daemon's files, as given by the command line or systemd.
+//! Determines the locations of the daemon's files from the command line and from systemd.
 
 use std::path::{Path, PathBuf};
 

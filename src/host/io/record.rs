@@ -1,4 +1,4 @@
-//! Batches of records in reused memory.
+//! Holds batches of records in reused memory, so that reading a log allocates nothing per record.
 
 use crate::monitor::Record;
 use crate::quantity::Timestamp;

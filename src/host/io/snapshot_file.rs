@@ -1,4 +1,4 @@
-//! The core's state as a JSON file, which is written completely or not at all.
+//! Writes and reads the core's state as a JSON file, which is written completely or not at all.
 
 use std::io::{self, Write};
 use std::path::Path;

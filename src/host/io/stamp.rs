@@ -1,4 +1,4 @@
-//! Points in time as users and tables write them: seconds, or ISO 8601 dates in UTC.
+//! Parses and formats points in time as users and tables write them: seconds, or ISO 8601 dates in UTC.
 
 use crate::quantity::Timestamp;
 

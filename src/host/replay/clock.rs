@@ -1,4 +1,4 @@
-//! The times of a replay: the selected part of the log, the time that it covers, and the pace.
+//! Manages the times of a replay: the selected part of the log, the time covered by that part, and the pace.
 
 use std::time::{Duration, Instant};
 

@@ -1,4 +1,4 @@
-//! Settings for reading logs with a configuration: the user's settings, completed from the configuration.
+//! Completes the user's settings for reading logs with settings from the configuration.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,4 @@
-//! Summary of a replay: counts, alarms, and the cells at the end.
+//! Summarises a replay: counts, alarms, and the cells at the end.
 
 use std::collections::BTreeMap;
 

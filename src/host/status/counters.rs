@@ -1,4 +1,4 @@
-//! Counters of the service loop and of the status clients, and the latency of frames. The counters are plain numbers
+//! Counts the work of the service loop, the status clients and the latency of frames. The counters are plain numbers
 //! that the loop owns.
 //!
 //! In: the lateness of ticks and the latency of frames, s. Out: structs of the status document. Nothing is allocated or

@@ -1,4 +1,4 @@
-//! The status document that the status sockets send as JSON. This file is its reference.
+//! The status document that the status sockets send as JSON. This file is the reference of the document.
 //!
 //! * Version 1. New keys may be added within a version, so readers must ignore unknown keys. Removing a key or changing
 //!   its meaning requires a new version.

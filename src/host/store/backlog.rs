@@ -19,8 +19,7 @@ pub(super) struct Backlog {
     batches: VecDeque<RowBatch>,
     rows: usize,
     lost: LossCount,
-    /// Numbers of dropped rows that were reported with the last `take`. `commit`
-    /// subtracts them from `lost`.
+    /// Numbers of dropped rows that were reported with the last `take`. `commit` subtracts these numbers from `lost`.
     reported: LossCount,
 }
 

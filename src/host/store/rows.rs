@@ -1,4 +1,4 @@
-//! The tables of the history, and the rows made from the core's events.
+//! Defines the tables of the history, and makes their rows from the core's events.
 //!
 //! A column that has the name of an event's field contains that field. Cells count from 0; units are in the names. A
 //! number that is not finite is stored as NULL.

@@ -1,4 +1,4 @@
-//! The stored state: two files next to the database, which are written in turn. Damage or a power cut therefore
+//! Writes and reads the stored state: two files next to the database, written in turn. Damage or a power cut therefore
 //! destroys at most the newer state.
 //!
 //! | file | contents |

@@ -1,4 +1,4 @@
-//! The [`Plan`] of `packwatch doctor`: what a configuration expects from the buses, even if it has faults.
+//! Builds the [`Plan`] of `packwatch doctor`: what a configuration expects from the buses, even if it has faults.
 //!
 //! In: the configuration file. Out: the plan, all faults as [`config::load`](crate::config::load) reports them, and the
 //! position of each key. A configuration is rejected if it has no interface or if none of its signals is found.

@@ -1,5 +1,5 @@
-//! A signal of the log. The signal's description (name, position, scaling) comes from a file, or the search has found
-//! it.
+//! Defines a signal of the log. The signal's description (name, position, scaling) comes from a file, or the search has
+//! found it.
 
 use super::capture::AnswerKey;
 use crate::can::CanId;

@@ -1,4 +1,4 @@
-//! Every key of a cell model file.
+//! Declares every key of a cell model file: name, unit, range, default and meaning.
 
 use toml::Spanned;
 use toml::de::DeValue;

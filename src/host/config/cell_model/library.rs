@@ -1,4 +1,4 @@
-//! The available cell models: the files in the usual folders, or in folders that the caller names.
+//! Lists the available cell models: the model files in the usual folders, or in folders that the caller names.
 
 use std::path::{Path, PathBuf};
 

@@ -1,4 +1,4 @@
-//! The origin of a cell model (file, label or the vehicle's own data), and its measurement conditions.
+//! Describes the origin of a cell model (file, label or the vehicle's own data) and the conditions of the measurements.
 
 use toml::{Table, Value};
 

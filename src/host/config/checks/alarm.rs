@@ -1,4 +1,4 @@
-//! The keys of `[[alarm]]`: checks them against each other, and builds the rules.
+//! Checks the keys of `[[alarm]]` against each other, and builds the alarm rules of the core.
 
 use crate::config::schema::RawTables;
 use crate::config::schema::keys::{Alarm, Recharge, ReportedSocInput, ReportedSohInput, Usable};

@@ -1,4 +1,4 @@
-//! `[[input.diagnostic]]`: the diagnostic requests and answers, and the signals in the answers.
+//! Checks `[[input.diagnostic]]`: the diagnostic requests and answers, and the signals in the answers.
 //!
 //! Each table of the file becomes one [`AnswerDefinition`]. The signals of a definition look like signals of a DBC, so
 //! that `[input.*]` can name them in the same way. `polling` makes the answers that the core decodes.

@@ -1,4 +1,4 @@
-//! The cells of the pack: the pack's own cells, described by a model file or a label, and modules of other cells
+//! Checks the cells of the pack: the pack's own cells, described by a model file or a label, and modules of other cells
 //! (`[[pack.module]]`).
 //!
 //! In: the tables and the cell model files they name. Out: the models. Reports missing keys and keys that contradict

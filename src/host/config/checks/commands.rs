@@ -1,4 +1,4 @@
-//! Commands from the bus: turns `[commands]` into the plan that decodes them and the guard that checks them.
+//! Turns `[commands]` into the plan that decodes commands from the bus, and the guard that checks these commands.
 
 use super::signals::{ResolvedSignal, check_no_input};
 use crate::can::dbc::{Database, FrameFormat};

@@ -1,5 +1,5 @@
-//! The sent frames: layout, identifiers, interfaces, periods, protection. No sent frame may have the identifier of an
-//! input.
+//! Checks the sent frames and builds their settings: layout, identifiers, interfaces, periods and protection. No sent
+//! frame may have the identifier of an input.
 
 use std::path::Path;
 

@@ -1,4 +1,5 @@
-//! Signal name patterns: `CellVoltages{m}.CellVoltage{n}`, where `{n}` is the cell's number and `{m}` any number.
+//! Parses and matches signal name patterns such as `CellVoltages{m}.CellVoltage{n}`, where `{n}` is the cell's number
+//! and `{m}` any number.
 
 /// One piece of a pattern.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -1,4 +1,4 @@
-//! The diagnostic answers that are read, and the requests that `[poll]` sends for them.
+//! Builds the list of diagnostic answers that the core decodes, and the list of requests that `[poll]` sends.
 
 use super::signals::ResolvedSignal;
 use crate::can::poll::{PollConfig, PollRequest};

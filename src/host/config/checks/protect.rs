@@ -1,4 +1,4 @@
-//! End-to-end protection of inputs: builds the core's guards from `[[input.protected]]`.
+//! Builds the core's guards, which check the end-to-end protection of inputs, from `[[input.protected]]`.
 
 use super::signals::ResolvedSignal;
 use crate::can::dbc::{Message, Signal};

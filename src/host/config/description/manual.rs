@@ -1,5 +1,5 @@
-//! The manual page packwatch.toml(5): the reference of all keys as roff, from the same declarations as the Markdown
-//! page.
+//! Generates the manual page packwatch.toml(5): the reference of all keys as roff, from the same declarations as the
+//! Markdown page.
 
 use std::fmt::Write as _;
 

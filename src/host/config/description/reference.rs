@@ -1,4 +1,4 @@
-//! The reference page of all keys, generated from the same declarations as the faults.
+//! Generates the reference page of all keys from the same declarations as the fault messages.
 
 use std::fmt::Write as _;
 

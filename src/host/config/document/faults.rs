@@ -1,4 +1,4 @@
-//! The list of faults in the files of a configuration, each with file and line.
+//! Collects the faults in the files of a configuration, each with file and line.
 //!
 //! A fault reads `FILE:LINE: KEY = FOUND, must be ALLOWED`. Checking continues after a fault, so all faults are found.
 

@@ -1,4 +1,4 @@
-//! The configuration file, its drop-ins, and their texts.
+//! Finds and reads the configuration file and its drop-ins.
 //!
 //! The drop-ins of `FILE` are the files `FILE.d/*.toml`, sorted by name. In: paths. Out: the texts, the main file
 //! first. Positions count the bytes of all texts together, so a position identifies a file and a line.

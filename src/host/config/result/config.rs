@@ -1,4 +1,4 @@
-//! The checked configuration.
+//! The checked configuration, as the daemon and the other commands use it.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,4 @@
-//! The location of the key for authenticated frames: `[authentication]`.
+//! Reads the location of the key for authenticated frames from `[authentication]`.
 
 use std::path::{Path, PathBuf};
 

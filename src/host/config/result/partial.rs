@@ -1,4 +1,4 @@
-//! The readable part of a configuration and all its faults, for `packwatch doctor`.
+//! Reads as much of a faulty configuration as possible, and all faults, for `packwatch doctor`.
 
 use std::path::Path;
 

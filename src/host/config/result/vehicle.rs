@@ -1,4 +1,4 @@
-//! The vehicle and the pack: `[vehicle]`.
+//! The names of the vehicle and the pack, from the table `[vehicle]`.
 
 use std::fmt;
 

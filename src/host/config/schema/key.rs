@@ -1,4 +1,4 @@
-//! The properties of a declared key (meaning, type, range) and how its value is read from a table.
+//! Defines the properties of a declared key (meaning, type, range), and reads the value of a key from a table.
 
 use std::fmt;
 use std::ops::Range;

@@ -1,4 +1,4 @@
-//! The types that a key may have, and how each is read from TOML.
+//! Defines the types that a key may have, and reads each type from TOML.
 
 use std::ops::RangeInclusive;
 

@@ -1,4 +1,4 @@
-//! The tables of a configuration file: one line per table.
+//! Lists the tables of a configuration file, one line per table, and looks up their keys.
 
 use super::keys::{
     Alarm, AnswerSignalKeys, Authentication, BalancingInput, Capacity, CellVoltageInput, Commands, ContactorInput,

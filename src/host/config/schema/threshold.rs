@@ -1,4 +1,4 @@
-//! Thresholds of alarms as written in the file (`2.08`, `"80 %"`, `{ set = ..., clear = ... }`), and the key `when`.
+//! Reads thresholds of alarms (`2.08`, `"80 %"`, `{ set = ..., clear = ... }`) and the key `when`.
 
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};

@@ -1,4 +1,4 @@
-//! `[[alarm]]` and `[commands]`: tests the resulting settings, and compares the full text of every fault.
+//! Tests `[[alarm]]` and `[commands]`: the resulting settings, and the full text of every fault.
 
 use super::*;
 

@@ -1,4 +1,4 @@
-//! `[input.balancing]`: the bits that show which cells the BMS discharges to balance them.
+//! Tests `[input.balancing]`: the bits that show which cells the BMS discharges to balance the pack.
 
 use super::*;
 use crate::can::encode::InputEncoder;

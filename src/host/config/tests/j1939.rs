@@ -1,4 +1,4 @@
-//! `[j1939]`: tests the resulting settings, and compares the full text of every fault.
+//! Tests `[j1939]`: the resulting settings, and the full text of every fault.
 
 use super::*;
 use crate::can::j1939::{Lamp, NameFields};

@@ -1,4 +1,4 @@
-//! Cells described by their label: chemistry, capacity and voltages in `[pack]` instead of a model file.
+//! Tests cells described by their label: chemistry, capacity and voltages in `[pack]` instead of a model file.
 
 use super::*;
 use crate::cell::Chemistry;

@@ -1,4 +1,4 @@
-//! `[[pack.module]]`: modules with a different cell model.
+//! Tests `[[pack.module]]`: modules with a different cell model.
 
 use super::*;
 

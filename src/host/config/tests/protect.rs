@@ -1,4 +1,4 @@
-//! `[[input.protected]]`: tests the resulting settings, and compares the full text of every fault.
+//! Tests `[[input.protected]]`: the resulting settings, and the full text of every fault.
 
 use super::*;
 use crate::can::e2e::CheckConfig;

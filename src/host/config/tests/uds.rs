@@ -1,4 +1,4 @@
-//! `[[input.diagnostic]]`: tests the resulting settings, and compares the full text of every fault.
+//! Tests `[[input.diagnostic]]`: the resulting settings, and the full text of every fault.
 
 #![allow(clippy::panic, reason = "tests may panic")]
 

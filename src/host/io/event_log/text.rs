@@ -1,4 +1,5 @@
-//! Channels and commands in words, for log lines. Cells and sensors are counted from 1, as in all texts for users.
+//! Describes channels and commands in words, for log lines. Cells and sensors are counted from 1, as in all texts for
+//! users.
 
 use crate::alarm::Selector;
 use crate::monitor::Command;

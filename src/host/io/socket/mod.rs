@@ -1,4 +1,4 @@
-//! SocketCAN interfaces.
+//! Sends and receives on SocketCAN interfaces, for the daemon and for commands.
 //!
 //! * [`CanSender`]: a blocking sender for `replay --to` and `simulate --to`:
 //!   `CanSender::open("vcan0", fd)?`, then `sender.send(&frame)?`, which waits for a full transmit queue up to a limit.

@@ -1,4 +1,4 @@
-//! The status sockets, tested with real sockets in real time.
+//! Tests the status sockets with real sockets in real time.
 
 use std::io::Read;
 use std::os::unix::net::UnixStream;

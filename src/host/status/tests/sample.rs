@@ -1,4 +1,4 @@
-//! A sample document for tests, in which nearly all values are known.
+//! Creates a sample document for tests, in which nearly all values are known.
 
 use crate::alarm::{Alarm, AlarmState, Rule, Severity};
 use crate::can::poll::PollSilence;

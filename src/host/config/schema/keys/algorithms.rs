@@ -1,5 +1,5 @@
-//! The tables of the algorithms: cell filter, transitions, capacity, recharge, usable capacity. Each table gives the
-//! parameters of its algorithm; the default of an optional key is computed next to the key.
+//! Declares the tables of the algorithms: cell filter, transitions, capacity, recharge, usable capacity. Each table
+//! gives the parameters of its algorithm; the default of an optional key is computed next to the key.
 
 use super::choices::{DEVIATION, MethodKey, TEMPERATURE_C};
 use crate::cell::{

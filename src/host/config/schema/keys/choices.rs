@@ -1,4 +1,4 @@
-//! Keys with a fixed choice of words, and ranges that several tables share.
+//! Declares the types of keys with a fixed choice of words, and ranges that several tables share.
 
 use crate::alarm::Rule;
 use crate::can::e2e::Profile;

@@ -1,4 +1,4 @@
-//! The tables that describe what is read from the buses: `[input]` and the signal tables below it.
+//! Declares the tables that describe what is read from the buses: `[input]` and its subtables.
 
 use super::choices::{PositiveCurrent, WireOrder};
 use crate::can::e2e::Profile;

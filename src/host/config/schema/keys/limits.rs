@@ -1,4 +1,4 @@
-//! The tables of plausible readings, `[limits.*]`. They give the [`Limits`] of the sample stage.
+//! Declares the tables of plausible readings, `[limits.*]`, which give the [`Limits`] of the sample stage.
 
 use super::choices::TEMPERATURE_C;
 use crate::cell::CellModel;

@@ -1,4 +1,4 @@
-//! The tables of the vehicle, its pack and interfaces, the alarms and the store.
+//! Declares the tables of the vehicle, its pack and interfaces, the alarms and the store.
 
 use super::choices::TEMPERATURE_C;
 use crate::alarm::{Comparison, Rule};

@@ -1,4 +1,4 @@
-//! The tables of sent frames and received commands: `[output]`, `[j1939]`, `[commands]`.
+//! Declares the tables of sent frames, requests and received commands, such as `[output]`, `[j1939]` and `[commands]`.
 
 use super::choices::E2eKey;
 use crate::can::secoc;
