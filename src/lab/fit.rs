@@ -1,8 +1,9 @@
 //! Fits a cell model to measured files: the work of `packwatch fit` without the terminal.
 //!
-//! Input: measured CSV files ([`super::measured`]), slow tests, and the data of the cell from the command line. Output: a
-//! [`FitOutcome`] with the tables of the model, the residuals of each file, and all values for the TOML file ([`toml`]). If the SOC of
-//! some files cannot be determined, a single error lists these files with the reasons.
+//! Input: measured CSV files ([`super::measured`]), slow tests (discharges so slow that they show the open-circuit
+//! voltage), and the data of the cell from the command line. Output: a [`FitOutcome`] with the tables of the model, the
+//! residuals of each file, and all values for the TOML file ([`toml`]). If the SOC of some files cannot be determined,
+//! a single error lists these files with the reasons.
 
 mod cells;
 mod chemistry;
@@ -121,7 +122,7 @@ pub struct FitOutcome {
     pub electrodes: Option<FittedElectrodes>,
     /// Thermal parameters; `None` = the data do not determine them.
     pub thermal: Option<Thermal>,
-    /// Standard deviation of the model's voltage error, averaged over 100 s, V, in node order.
+    /// Voltage error of the model at each node, V: standard deviation of the 100 s averages.
     pub voltage_error_v: Vec<f64>,
     /// Ranges in which the cell was measured.
     pub measured: MeasuredRange,
@@ -208,9 +209,9 @@ fn ageing_electrodes(fitted: &FittedTables, capacity_ah: f64) -> Option<FittedEl
 }
 
 /// Extends the open-circuit curve of an ageing cell below the cut-off of its discharges, where there are no data. The
-/// extension is a straight line with the slope of the curve in the [`LOW_END_SOC`] above the cut-off. Without the
-/// extension, the last rows under load would make the curve so steep that the estimator's innovation gates reject the
-/// first rest of an aged cell.
+/// extension is a straight line with the slope of the curve in the lowest [`LOW_END_SOC`] of SOC above the cut-off.
+/// Without the extension, the last rows under load would make the curve so steep that the estimator's innovation gates
+/// reject the first rest of an aged cell.
 fn continue_low_end(fitted: &mut FittedTables) {
     let soc = &fitted.grid.soc;
     let cut_off = soc.partition_point(|&node| node < ageing::SOC_LEFT);

@@ -1,8 +1,9 @@
 //! Applies Gaussian process regression to files: tables, cross-validation, trained models, predictions, forecasts, pictures.
 //!
-//! [`ColumnTable`] reads columns of CSV files. [`cross_validate`] runs the experiment of the paper. [`TrainedModel`] is a model that
-//! can be saved and loaded, with the names of its columns. [`forecast`] predicts future rows from past rows, without future inputs. The
-//! arithmetic is in [`crate::regress`]. This module prints nothing.
+//! [`ColumnTable`] reads columns of CSV files. [`cross_validate`] cross-validates one kernel on a table.
+//! [`TrainedModel`] is a model that can be saved and loaded, with the names of its columns. [`forecast`] predicts
+//! future rows from past rows, without future inputs. The arithmetic is in [`crate::regress`]. This module prints
+//! nothing.
 
 pub mod forecast;
 mod pictures;

@@ -20,7 +20,7 @@ use crate::ident::record::Record;
 const PERIOD_S: f64 = 5.0;
 /// Standard deviations before the fit: ln capacity, ln resistance, sensor offset (V), leakage (share of the capacity per h), SOC.
 const PRIOR: [f64; OWN + 1] = [0.15, 0.4, 0.003, 0.002, 0.15];
-/// Number of unknowns of a cell without the SOC at the start of each stretch.
+/// Number of unknowns of a cell, not counting its SOC at the start of each stretch (a part of a log without gaps).
 const OWN: usize = 4;
 /// Standard deviation of the error of a difference, V. Next constant: correlation time of this error, s.
 const DISTANCE_V: f64 = 0.002;

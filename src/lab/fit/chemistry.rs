@@ -1,7 +1,8 @@
 //! Tests whether another chemistry explains the logs better than the chemistry on the label.
 //!
-//! Input: stretches of the mean cell, and the label. Output: a sentence if another chemistry is clearly better. All chemistries are
-//! compared on the same rows, with the recording and the fit that the daemon uses.
+//! Input: the mean voltage of the cells in each stretch (a part of a log without gaps), and the label of the cell.
+//! Output: a sentence if another chemistry is clearly better. All chemistries are compared on the same rows, with the
+//! recording and the fit that the daemon uses.
 
 use crate::cell::notebook::Row;
 use crate::cell::own_model::fit;

@@ -1,9 +1,9 @@
 //! Finds the voltage limits of a cell in its measured data, with the row that shows each limit.
 //!
 //! Input: measured files. Output: lowest and highest voltage, V, each with a note that states file, row, value and the
-//! option to change it. Pulses do not count as limits: a row counts only if the current has kept its direction, or been
-//! at rest, for [`HELD_S`]. If the data are whole cycles, the limits are the first voltage of a discharge below its
-//! cut-off, and the voltage at which charges are held.
+//! option to change it. Pulses do not count as limits: a row counts only if the current has kept its direction, or has
+//! been near zero, for [`HELD_S`]. If the data are whole cycles, the lower limit is the cut-off voltage of the
+//! discharges, and the upper limit is the voltage at which charges are held.
 
 use super::FitRequest;
 use crate::error::LabError;

@@ -3,9 +3,9 @@
 //! Input: a configuration with a cell model or a label, and logs as the daemon reads them. Output: a [`FitOutcome`]. Where the logs
 //! contain no information, the tables stay as in the configured model.
 //!
-//! Every log is replayed through the monitor, so limits, decoding and fault handling are the same as in the daemon. Only cells of the
-//! configured kind are used, and their mean voltage is fitted like the voltage of a single cell. After a gap in the record, a new
-//! stretch starts; its SOC is another unknown.
+//! Every log is replayed through the monitor, so limits, decoding and fault handling are the same as in the daemon.
+//! Only cells of the configured kind are used, and their mean voltage is fitted like the voltage of a single cell. A
+//! stretch is a part of a log without gaps. The SOC at the start of each stretch is an additional unknown.
 
 use std::cell::RefCell;
 use std::path::{Path, PathBuf};
@@ -43,28 +43,30 @@ const LEAST_ROWS: usize = 20;
 const BEGINNING_STD: f64 = 0.02;
 /// A stretch starts full if its open-circuit voltage is at least the OCV at this SOC.
 const FULL_SOC: f64 = 0.975;
-/// The open-circuit voltage at the start is computed with this share of the model's series resistance. No cell has
-/// less.
+/// Share of the model's series resistance with which the open-circuit voltage at the start is computed. No cell has a
+/// smaller resistance.
 const LEAST_RESISTANCE: f64 = 0.4;
 /// Standard deviation of the initial SOC of a stretch that starts full.
 const FULL_STD: f64 = 0.01;
-/// A cold cell is limited by diffusion below this SOC times (Arrhenius factor - 1). No circuit models the voltage there, so its error
-/// would be mistaken for lost capacity. Chosen on Panasonic 18650PF cells.
+/// Below an SOC of this value times (Arrhenius factor - 1), a cold cell is limited by diffusion. A circuit model does
+/// not describe the voltage there, so the voltage error would be mistaken for lost capacity. Chosen on Panasonic
+/// 18650PF cells.
 const KNEE_SOC: f64 = 0.13;
 /// Upper limit of [`KNEE_SOC`] times (Arrhenius factor - 1).
 const MOST_KNEE_SOC: f64 = 0.35;
 /// A cold cell does not settle within a drive. The error of its voltage corresponds to an SOC error of this value times (Arrhenius
 /// factor - 1). Rests of 20 min of Panasonic 18650PF cells at 10 to -20 degrees C show 0.013 to 0.024; rests during drives are shorter.
 const COLD_SOC: f64 = 0.03;
-/// If the residual is above this value, V, the logs do not come from one kind of cell. In the cold, the limit is multiplied by a power
-/// of the Arrhenius factor. Fits of the cells of `tests/label` leave 5 to 20 mV when warm and 27 mV at 0 degrees C.
+/// Residual, V, above which the logs cannot come from a single kind of cell. In the cold, the limit is multiplied by a
+/// power of the Arrhenius factor. Fits of the cells of `tests/label` leave 5 to 20 mV when warm and 27 mV at 0 degrees
+/// C.
 const UNFIT_V: f64 = 0.04;
-/// A charge is complete if the voltage is at most [`HELD_V`] below the highest voltage, V, and the remaining current
-/// would need more than [`FADED_H`], h, to charge the rated capacity.
+/// A charge is complete if the voltage is within [`HELD_V`] (V) of the maximum voltage, and the remaining current would
+/// need more than [`FADED_H`] (h) to charge the rated capacity.
 const HELD_V: f64 = 0.012;
 const FADED_H: f64 = 15.0;
-/// Smallest error of the configured model's curve, V: first the error that is smooth over [`CURVE_SOC`], then the error of each
-/// breakpoint alone.
+/// Smallest assumed error of the configured model's open-circuit curve, V. The first value applies to errors that vary
+/// smoothly over [`CURVE_SOC`], the second to independent errors of the breakpoints.
 const CURVE_V: (f64, f64) = (0.004, 0.002);
 const CURVE_SOC: f64 = 0.1;
 /// SOC breakpoints of the fitted tables.
@@ -79,7 +81,7 @@ pub struct LogRequest<'a> {
     pub monitor: &'a MonitorConfig,
     /// Names of the interfaces.
     pub interfaces: Vec<String>,
-    /// If a gap in a log is longer than this, s, the recorder was asleep.
+    /// Longest gap in a log, s, before the recorder counts as asleep.
     pub sleep_gap_s: f64,
     /// Creates the options for reading one log.
     pub options: &'a (dyn Fn() -> LogOptions + Sync),
@@ -151,7 +153,7 @@ impl MeanCell {
             return;
         }
         let last_s = self.stretches.last().and_then(|stretch| stretch.part.time_s.last().copied());
-        // A gap longer than this starts a new stretch, s. It is longer than the interval of any logger, and shorter than a stop.
+        // Longest gap within a stretch, s. It is longer than the interval of any logger, and shorter than a stop.
         let has_hole = last_s.is_none_or(|last_s| time_s - last_s > 120.0 || time_s < last_s);
         if std::mem::take(&mut self.begins) || has_hole {
             let beginning = (soc, soc_std.hypot(BEGINNING_STD));
@@ -202,8 +204,7 @@ fn fit_stretches(
     let known = known(model, &grid, request.monitor);
     let fit = unanchored::fit(&settings, &known, &records, |pass, cost| progress(FitProgress::Pass(pass, cost)))
         .map_err(LabError::Data)?;
-    // If the logs come from two packs or from cells of an unknown kind, the fit describes neither, so the prior is
-    // used.
+    // If the logs come from two packs or from cells of an unknown kind, the fit is not valid, so the prior is used.
     let unfit_v = Some(fit.fitted.total.rmse_v).filter(|rmse_v| *rmse_v > unfit_v(&grid));
     let fit =
         if unfit_v.is_some() { unanchored::prior(&settings, &known, &records).map_err(LabError::Data)? } else { fit };

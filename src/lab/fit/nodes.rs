@@ -8,7 +8,8 @@ use crate::ident::grid::interpolate;
 
 /// Maximum SOC error of the linear interpolation, fraction.
 const MOST_POINTS: f64 = 0.005;
-/// Width over which the slope is computed, SOC. It is wide, because an estimate that moves crosses the steps of a plateau.
+/// Width over which the slope is computed, SOC. It is wide because an SOC estimate that changes crosses the steps of a
+/// plateau.
 const SLOPE_WIDTH: f64 = 0.04;
 /// Smallest distance between breakpoints, and between the SOC values at which the error is computed.
 const LEAST_DISTANCE: f64 = 0.01;

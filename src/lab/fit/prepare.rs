@@ -1,4 +1,5 @@
-//! Converts measured files to records. This determines voltage limits, capacity, slow tests, SOC and temperature.
+//! Converts measured files to records for the fit: determines voltage limits, capacity and temperatures, evaluates slow
+//! tests, and assigns an SOC to every row.
 
 use super::FitRequest;
 use super::limits::{DISCONNECTED_V, voltage_limits};

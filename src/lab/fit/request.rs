@@ -25,8 +25,8 @@ pub struct FitRequest {
     pub voltage_min_v: Option<f64>,
     /// Highest voltage under charge, V; `None` = from the data.
     pub voltage_max_v: Option<f64>,
-    /// Shift of the open-circuit curve with lost capacity. `None` = determined by the electrodes found in a slow test; if none were
-    /// found, 0, or for an ageing cell [`super::AGEING_SHIFT`].
+    /// Shift of the open-circuit curve with lost capacity. `None` = from the electrodes found in a slow test. If no
+    /// electrodes were found, the shift is 0, or [`super::AGEING_SHIFT`] for an ageing cell.
     pub ageing_shift: Option<f64>,
     /// Slow tests.
     pub ocv: Vec<PathBuf>,

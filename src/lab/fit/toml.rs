@@ -1,4 +1,5 @@
-//! Writes the file of a cell model: tables, thermal parameters, provenance. It contains no date, so the same data give the same bytes.
+//! Writes the file of a cell model: tables, thermal parameters, provenance. The output contains no date, so the same
+//! data give the same bytes.
 
 use std::fmt::Write as _;
 

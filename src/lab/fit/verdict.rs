@@ -68,7 +68,7 @@ fn accuracy(rows: &[(f64, f64)]) -> Vec<String> {
     said
 }
 
-/// Lists the SOC breakpoints at which the curve is too flat for the model's error at every temperature.
+/// Lists the SOC breakpoints at which the curve is too flat, at every temperature, to find the SOC from voltage.
 fn flat(soc: &[f64], points: &[f64], columns: usize) -> Option<String> {
     // Above this SOC error, points, the voltage at a breakpoint is useless.
     let is_flat = |s: &usize| points.iter().skip(*s).step_by(columns).all(|points| *points > 5.0);

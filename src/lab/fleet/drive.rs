@@ -22,7 +22,7 @@ pub type OpenedLog = (LogSource, Option<String>);
 pub struct LogAccess<'a> {
     /// Opens logs with a configuration. The logs are read one after the other, as one recording.
     pub open: &'a (dyn Fn(&Config, &[PathBuf]) -> OpenedLog + Sync),
-    /// If a gap in a log is longer than this, s, the recorder was asleep.
+    /// Longest gap in a log, s, before the recorder counts as asleep.
     pub sleep_gap_s: f64,
 }
 

@@ -62,8 +62,8 @@ pub struct ExportSettings<'a> {
     pub format: TableFormat,
     /// Folder that contains the folders of the logs.
     pub out: PathBuf,
-    /// Maximum frequency of estimates: one per cell in each period of this length, s. 0 = all estimates; `None` = no table of
-    /// estimates.
+    /// Length of a period, s; at most one estimate per cell and period is written. 0 = all estimates; `None` = no table
+    /// of estimates.
     pub period_s: Option<f64>,
     /// Number of threads; `None` = all cores.
     pub jobs: Option<usize>,

@@ -35,7 +35,7 @@ pub enum Horizon {
     Days(f64),
 }
 
-/// Use, truth and end of life of a log, by which its alarms are judged.
+/// Data by which the alarms of a log are judged.
 #[derive(Debug, Clone, Copy)]
 pub struct LogLife<'a> {
     /// Charge moved, and learned capacities.
@@ -172,7 +172,7 @@ mod tests {
         Timestamp::from_secs(day * DAY_S)
     }
 
-    /// Creates the use of one equivalent full cycle per day.
+    /// Creates a track with one equivalent full cycle per day.
     fn track() -> Track {
         let mut track = Track::new(1.0, EndOfLifeSource::Learned);
         for end in 1..=100 {

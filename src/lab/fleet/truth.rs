@@ -1,8 +1,9 @@
 //! Reads the true capacities of a log from a CSV file in the same folder.
 //!
-//! There are two formats, which are recognised by their columns. A table with a column `cell` was written by `simulate --truth`; it
-//! contains the capacity of every cell between the open-circuit voltages of a full and an empty cell. A table with `cycle` and `type`
-//! has the format of `score --cycles`; it contains published capacities of the discharges of one cell, at the load of those discharges.
+//! There are two formats, which are recognised by their columns. A table with a column `cell` was written by `simulate
+//! --truth`; it contains the capacity of every cell, counted from the open-circuit voltage of a full cell to that
+//! voltage of an empty cell. A table with `cycle` and `type` has the format of `score --cycles`; it contains the
+//! published capacity of one cell for each discharge, at the load of this discharge.
 //!
 //! For a log `NAME.log`, `NAME.csv` etc., these files are searched in its folder: `NAME.truth.csv`, `NAME_truth.csv` and
 //! `NAME_cycles.csv`, and also `truth.csv` if no other given log is in this folder. Each may end in `.gz` or `.zst`.
@@ -118,7 +119,7 @@ fn read_simulated(mut table: CapacityTable) -> Result<Truth, TableError> {
     Ok(Truth { kind: EndOfLifeSource::Truth, cells, span })
 }
 
-/// Finds the truth in the folder of each log, if it exists.
+/// Finds the file with the true capacities of each log, if the file exists.
 pub fn find_next_to(logs: &[PathBuf]) -> Vec<Option<PathBuf>> {
     let alone = |log: &PathBuf| logs.iter().filter(|other| other.parent() == log.parent()).count() == 1;
     logs.iter().map(|log| find(log, alone(log))).collect()

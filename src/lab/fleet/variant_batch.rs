@@ -1,9 +1,9 @@
 //! Evaluates the alarms of many settings in one replay.
 //!
-//! Estimates do not depend on alarm thresholds, and the alarms of one threshold do not depend on other thresholds. So the alarm inputs
-//! of one monitor are passed to additional alarm engines, the *lanes*. Lane n watches the n-th distinct threshold of each rule and
-//! severity. For example, a grid of five thresholds of one rule by five thresholds of another rule needs five lanes instead of
-//! twenty-five; still, every threshold of the grid is watched in a lane.
+//! Estimates do not depend on alarm thresholds, and the alarms of one threshold do not depend on other thresholds. So
+//! the alarm inputs of one monitor are passed to additional alarm engines, the *lanes*. Lane n watches the n-th
+//! distinct threshold of each rule and severity. For example, five thresholds of one rule and five thresholds of
+//! another rule make 25 combinations but need only five lanes.
 
 use crate::alarm::{AlarmChange, AlarmEngine, AlarmInput, Change, Rule, RuleConfig, Severity};
 use crate::quantity::{CellIndex, Timestamp};

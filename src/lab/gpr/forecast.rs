@@ -6,10 +6,11 @@
 //! Errors of one step therefore do not enter the next step, and each horizon has its own noise. Without information, the forecast is
 //! the mean change, which is close to persistence (the value stays constant).
 //!
-//! The interval is calibrated on real forecasts. The process is fitted again to the first training rows and forecasts the block of rows
-//! after them; this is repeated block by block. The ratios |error| / standard deviation of these forecasts determine the local width of
-//! the interval ([`spread`]). Leaving out single rows would not work, because windows overlap and the neighbours of a row reveal its
-//! value. No row after the origin is used.
+//! The interval is calibrated on real forecasts. The process is fitted again to the first training rows and forecasts
+//! the block of rows after them; this is repeated block by block. The ratios |error| / standard deviation of these
+//! forecasts determine the local width of the interval ([`spread`]). Leaving out single rows would not work, because
+//! windows overlap and the neighbours of a row reveal its value. No row after the origin (the end of the known rows) is
+//! used.
 
 mod spread;
 mod windows;
@@ -85,7 +86,7 @@ pub struct HorizonForecast {
     pub trained: usize,
     /// Number of forecasts on which the interval was calibrated.
     pub calibrated: usize,
-    /// Half of the interval in standard deviations, at windows whose errors have average size.
+    /// Half the width of the interval, in standard deviations, at a window whose errors have average size.
     pub factor: f64,
     /// Duration of fit and calibration, s.
     pub fit_s: f64,
@@ -101,8 +102,8 @@ pub struct HorizonForecast {
     pub persistence_rmse: Option<f64>,
 }
 
-/// Returns the horizons that get a process. Up to [`MAX_HORIZONS`] steps, these are all horizons. Otherwise, they are
-/// this number of horizons at constant ratios, including the first and the last.
+/// Returns the horizons that get a process. If there are at most [`MAX_HORIZONS`] steps, every step is a horizon.
+/// Otherwise, [`MAX_HORIZONS`] horizons are spaced at constant ratios, including the first and the last step.
 pub fn horizons(steps: usize) -> Vec<usize> {
     if steps <= MAX_HORIZONS {
         return (1..=steps).collect();
@@ -202,8 +203,8 @@ impl HorizonTask<'_> {
         (self.windows.width() + 2).max(20)
     }
 
-    /// Fits a process to windows that end before row `end`. Returns it with the number of windows, or `None` if there are too few. If
-    /// `fixed` hyperparameters are given, they are not searched.
+    /// Fits a process to windows that end before row `end`. Returns the process with the number of windows, or `None`
+    /// if there are too few windows. If `fixed` hyperparameters are given, they are not searched.
     fn fitted(
         &self,
         end: usize,
@@ -309,8 +310,9 @@ pub fn write(path: &Path, data: &ColumnTable, forecast: &TableForecast) -> Resul
     write_csv(path, heads.map(str::to_owned).to_vec(), rows)
 }
 
-/// Divides the rows into equal stretches and returns one row of each, at most `most` rows. Its position differs between stretches. A
-/// fixed distance would always select rows of the same phase if rows repeat, for example in cycles.
+/// Divides the rows into equal stretches and returns one row of each, at most `most` rows. The position of this row
+/// differs between stretches. If rows repeat, for example in cycles, a fixed position would always select rows of the
+/// same phase.
 fn chosen(all: &[usize], most: usize) -> Vec<usize> {
     let count = all.len().min(most);
     // The fractional parts of multiples of the golden ratio fill a stretch evenly and never repeat.

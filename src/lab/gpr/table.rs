@@ -1,8 +1,9 @@
 //! Reads columns of CSV files by name, for regressions. Any column may be an output or an input.
 //!
-//! Input: CSV (plain, gzip or zstd) with one header line and numbers in the requested columns. Output: the values of these columns, row
-//! by row, with the file and line of each row. An empty field or NaN is a missing value. It causes an error that names its place, or
-//! the row is left out and counted. Any other field that is not a finite number is always an error.
+//! Input: CSV (plain, gzip or zstd) with one header line and numbers in the requested columns. Output: the values of
+//! these columns, row by row, with the file and line of each row. An empty field or NaN is a missing value.
+//! [`MissingPolicy`] decides whether a missing value causes an error that names its place, or the row is left out and
+//! counted. Any other field that is not a finite number is always an error.
 
 use std::path::{Path, PathBuf};
 

@@ -1,4 +1,5 @@
-//! Determines the SOC of the first cycles of an ageing cell: full charges alternating with full discharges, without a counter.
+//! Determines the SOC of the first cycles of an ageing cell: full charges alternating with full discharges, recorded
+//! without a charge counter.
 //!
 //! The SOC is anchored at two points. At the end of every full charge, the SOC is 1; this is the state in which the charger leaves the
 //! cell. At the knee of each discharge, the SOC has one common value, because the voltage falls fastest there and little charge is

@@ -2,9 +2,10 @@
 //!
 //! 1. A part must start with a full cell. Its first voltage must be within [`REST_SAG_V`] of the highest voltage, or within
 //!    [`LOAD_SAG_V`] if current already flows.
-//! 2. The counter of the cycler rises during discharge and falls during charge. If it starts within [`COUNTER_NEAR`] of 0, SOC = 1 -
-//!    counter / capacity. If it starts lower, it was reset before the charge, so the first value is subtracted. If it starts higher,
-//!    charge had already been taken out of the full cell, so the part is rejected.
+//! 2. The counter of the cycler rises during discharge and falls during charge. If the counter starts within
+//!    [`COUNTER_NEAR`] of 0, SOC = 1 - counter / capacity. If the counter starts lower, it was reset before the charge,
+//!    so its first value is subtracted. If the counter starts higher, charge had already been taken out of the full
+//!    cell, so the part is rejected.
 //! 3. Without a counter, the current is integrated, starting at SOC 1.
 
 use super::{MeasuredPart, charge_ah};

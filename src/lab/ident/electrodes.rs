@@ -1,9 +1,9 @@
 //! Identifies the electrodes of a new cell from its open-circuit curve: materials, and lithium contents at empty and at full.
 //!
-//! Input: OCV, V, over SOC, fraction. Output: the pair of materials that fits best, with the residual, V. For each pair, damped
-//! Gauss-Newton steps fit the four lithium contents (of two electrodes, at empty and at full). A curve without steps does not determine
-//! the size of an electrode, so a weak prior keeps the contents near those of commercial cells. On identifiability: Lee et al., J.
-//! Electrochem. Soc. 167 (2020) 090509.
+//! Input: OCV (V) over SOC (fraction). Output: the pair of materials that fits best, with the residual (V). For each
+//! pair, damped Gauss-Newton steps fit the four lithium contents (of two electrodes, at empty and at full). A curve
+//! without steps does not determine the size of an electrode, so a weak prior keeps the contents near those of
+//! commercial cells. On identifiability: Lee et al., J. Electrochem. Soc. 167 (2020) 090509.
 
 use nalgebra::{Matrix4, Vector4};
 
@@ -14,7 +14,7 @@ use crate::filter::levenberg_marquardt::{Damping, minimise};
 const POINTS: u32 = 51;
 /// Deviation of a real cell from a potential in the library, V. Materials with the same name differ.
 const MATERIAL_V: f64 = 0.01;
-/// Deviation below [`LOW_SOC`], V, where curves fall steeply.
+/// Deviation of a real cell, V, below [`LOW_SOC`], where curves fall steeply.
 const LOW_SOC_V: f64 = 0.03;
 /// Upper end of the steep part of the curves, SOC.
 const LOW_SOC: f64 = 0.05;
@@ -26,9 +26,10 @@ const BOUNDS: [(f64, f64); 4] = [(0.0005, 0.25), (0.4, 0.999), (0.55, 0.9995), (
 const STEPS: usize = 60;
 const DAMPING: Damping =
     Damping { first: 1e-2, fall: 0.3, fall_after_growth: 0.3, growth: 10.0, least: 1e-9, most: f64::INFINITY };
-/// Largest accepted residual, V. A larger residual means that the library lacks the materials of the cell. Curves of published cells
-/// fit their own materials within 5 mV, and most other materials only beyond 10 mV. Wrong materials within this limit can predict
-/// ageing better or worse than a shifted curve, so the limit is a compromise.
+/// Largest accepted residual, V. A larger residual means that the library lacks the materials of the cell. For curves
+/// of published cells, the residual is at most 5 mV with their own materials, and above 10 mV with most other
+/// materials. Wrong materials within this limit can predict ageing better or worse than a shifted curve, so the limit
+/// is a compromise.
 pub const MAX_RESIDUAL_V: f64 = 0.008;
 
 /// The electrodes found.

@@ -20,7 +20,8 @@ use super::record::Record;
 const BLOCK_S: f64 = 100.0;
 /// Upper limit of the error of a block, V; also the error if no temperature has data.
 const MOST_V: f64 = 0.1;
-/// Each node gets the mean error of its temperature, weighted like data with this much charge moved, as SOC.
+/// Every node also takes the mean error of its temperature. This mean has the weight of data in which this charge, as
+/// SOC, was moved.
 const LEAN_SOC: f64 = 1.0;
 /// Growth of the variance on data outside the fit: 1 + this constant / number of files.
 const UNSEEN: f64 = 3.0;

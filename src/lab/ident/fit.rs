@@ -1,4 +1,5 @@
-//! Runs a whole fit: starting values, prior, passes over all records in parallel, residuals, nodes without data.
+//! Runs a whole fit of a cell model: sets starting values and prior, passes over all records in parallel until the cost
+//! stops falling, and computes residuals and a list of nodes without data.
 
 use rayon::prelude::*;
 

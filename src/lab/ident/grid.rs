@@ -1,8 +1,9 @@
 //! Defines the grid of the tables, and finds the position of a point (SOC, temperature) in this grid.
 //!
-//! The rules are those of [`CellModel::grid_position`](crate::cell::CellModel::grid_position). Along SOC, all values are linear. Below
-//! 0 and above 1, the OCV is extrapolated and the other values stay constant. Along temperature, the OCV and the time constants are
-//! linear, and resistances follow Arrhenius' law. Outside the temperature range, the values of the nearest temperature apply.
+//! The rules are the same as in [`CellModel::grid_position`](crate::cell::CellModel::grid_position). Along SOC, all
+//! values are linear. Below 0 and above 1, the OCV is extrapolated and the other values stay constant. Along
+//! temperature, the OCV and the time constants are linear, and resistances follow Arrhenius' law. Outside the
+//! temperature range, the values of the nearest temperature apply.
 
 pub use crate::cell::arrhenius;
 use crate::filter::{self, locate};
@@ -25,7 +26,7 @@ pub struct GridPoint {
     pub t: usize,
     /// Weight of the upper column, in [0, 1].
     pub along_s: f64,
-    /// Weight of the upper column without these limits, for the OCV.
+    /// Weight of the upper column for the OCV; it may be outside [0, 1].
     pub beyond_s: f64,
     /// Weight of the upper row for the OCV, in [0, 1]; 0 with a single temperature.
     pub along_t: f64,

@@ -1,6 +1,6 @@
 //! Defines the parameter vector: for every node the OCV (V), ln R0, and ln R and ln tau of each branch.
 //!
-//! The kinds of parameters follow each other. Each kind is in node order (temperature row by temperature row). The capacitance of a
+//! Parameters of one kind are consecutive and in node order (temperature row by temperature row). The capacitance of a
 //! node is C = tau / R.
 
 use super::grid::Grid;

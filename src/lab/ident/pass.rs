@@ -24,9 +24,9 @@ pub const HUBER_V: f64 = 0.05;
 const SIGMA_V: f64 = 0.010;
 /// Correlation time of the model error, s. Residuals count as one independent residual per correlation time.
 const REPEATS_S: f64 = 50.0;
-/// Correlation time if the SOC is unknown, s. Between 50 and 500 s, and for a wide range of the next two constants, the SOC errors of
-/// Panasonic 18650PF and of a simulated LG M50 change by less than 0.1 points on average. The EVE cell with its flat curve needs at
-/// least this value.
+/// Correlation time if the SOC is unknown, s. With 50 to 500 s, and with a wide range of the next two constants, the
+/// mean SOC errors of Panasonic 18650PF cells and of a simulated LG M50 change by less than 0.1 points. The EVE cell
+/// with its flat curve needs at least this value.
 const FREE_REPEATS_S: f64 = 250.0;
 /// Error of a circuit, as a share of the voltage drop.
 const DROP_ERROR: f64 = 0.05;

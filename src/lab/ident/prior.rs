@@ -48,8 +48,8 @@ impl PriorDeviations {
         tau_level: 0.7,
     };
 
-    /// Prior with a slow test: a smooth correction that fades away from the drives. Tuned by leaving out one drive at a time, on two
-    /// cells at five and six temperatures.
+    /// Prior with a slow test: the OCV is the slow test plus a smooth correction, which fades where drives have no
+    /// data. Tuned by leaving out one drive at a time, on two cells at five and six temperatures.
     pub const SLOW_TEST: Self = Self {
         ocv_curvature_v: 0.025,
         ocv_by_temperature_v: 0.02,
@@ -129,8 +129,8 @@ impl Prior {
         prior
     }
 
-    /// Creates the prior around known resistances and time constants in `start`; it constrains their shape and their size. Of the OCV,
-    /// it constrains only the differences between temperatures.
+    /// Creates the prior around known resistances and time constants in `start`; it constrains their shape and their
+    /// size. For the OCV, the prior constrains only the differences between temperatures.
     pub fn about(grid: &Grid, layout: &Layout, start: &[f64], deviations: &PriorDeviations) -> Self {
         let mut prior = Self(Vec::new());
         let of = |first: usize| &start[first..first + layout.nodes];

@@ -1,9 +1,10 @@
 //! Prepares measured rows for the fit: joins them to blocks, positions them in the tables, and weights them by time.
 //!
-//! A block collects raw rows until it is [`BLOCK_S`] long. Voltage, current, temperature and SOC of the block are those of its last
-//! row, because the series resistance acts immediately. The branches use the mean current of the block, so no charge is lost. A block
-//! ends early at a gap. It also ends before a current step that follows a steady current, so that both sides of the edge of a pulse are
-//! kept. If charge moved during a gap without rows, the branches are relaxed after the gap.
+//! A block collects raw rows until it is [`BLOCK_S`] long. Voltage, current, temperature and SOC of the block are the
+//! values of its last row, because the series resistance acts immediately. The branches use the mean current of the
+//! block, so no charge is lost. A block ends early at a gap. It also ends before a current step that follows a steady
+//! current, so that both sides of the edge of a pulse are kept. If charge moved during a gap without rows, the branches
+//! are relaxed after the gap.
 
 use super::MeasuredPart;
 use super::grid::{Corners, Grid};
@@ -16,7 +17,8 @@ const BLOCK_S: f64 = 1.0;
 const EDGE_SHARE: f64 = 0.1;
 /// Time with steady current before an edge, s; drives are rarely steady that long.
 const STEADY_S: f64 = 3.0;
-/// Maximum number of seconds that one row represents. Without it, rests logged once a minute would outweigh drives.
+/// Maximum number of seconds that one row represents. Without this limit, rests logged once a minute would outweigh
+/// drives.
 const MAX_WEIGHT_S: f64 = 20.0;
 /// Shortest gap that may hide charge, s.
 const GAP_S: f64 = 60.0;

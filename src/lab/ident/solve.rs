@@ -14,8 +14,8 @@ use crate::filter::levenberg_marquardt::{self, Damping};
 const MAX_PASSES: usize = 60;
 /// The fit has converged if the relative fall of the cost is below this value twice in a row.
 const CONVERGED: f64 = 3e-4;
-/// Damping of the steps. After a step that needed more damping before it succeeded, the damping falls less, because it
-/// is close to its limit.
+/// Damping of the steps. After a step that needed more damping before it succeeded, the damping falls less, because
+/// much weaker damping would probably fail again.
 const DAMPING: Damping = Damping { first: 0.3, fall: 0.1, fall_after_growth: 0.6, growth: 8.0, least: 1e-4, most: 1e8 };
 /// With less damping than this, a step is nearly undamped.
 const DAMPING_WEAK: f64 = 0.02;

@@ -1,7 +1,7 @@
 //! Defines the columns of the exported tables: name, type, unit, meaning and value.
 //!
-//! These lines define the writers, the schema of the Parquet files and the page `docs/src/reference/export.md`. An unknown value is
-//! null (an empty field in CSV), never NaN. Cells count from 0; a positive current discharges.
+//! The writers, the schema of the Parquet files and the page `docs/src/reference/export.md` all use this definition. An
+//! unknown value is null (an empty field in CSV), never NaN. Cells count from 0; a positive current discharges.
 
 use std::borrow::Cow;
 use std::fmt::Write as _;

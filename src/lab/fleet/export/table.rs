@@ -1,7 +1,7 @@
 //! Writes a table of rows as a Parquet or CSV file.
 //!
-//! Input: rows, and the metadata of the file. Memory holds the rows of one row group. The file gets its final name when it is complete
-//! ([`ResultFile`]). A missing value, or a value whose type is not that of the column, causes an error and is never written.
+//! Input: rows, and the metadata of the file. Memory holds the rows of one row group. The file gets its final name when
+//! it is complete ([`ResultFile`]). A value that is missing or has the wrong type causes an error and is never written.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

@@ -17,8 +17,8 @@ use crate::regress::GAUSSIAN;
 const NEAR: usize = 20;
 /// Weight of the mean of all ratios relative to one window.
 const SHRINKAGE: f64 = 4.0;
-/// If there are fewer judged windows, the interval has the same width everywhere. It is then at least as wide as that of a normal
-/// distribution.
+/// If there are fewer judged windows, the interval has the same width everywhere. The interval is then at least as wide
+/// as the interval of a normal distribution.
 const FEWEST: usize = 100;
 
 /// Judged windows.

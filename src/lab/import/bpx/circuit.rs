@@ -8,9 +8,10 @@
 //! | concentration of the electrolyte | `2 R T (1 - t)^2 / (F^2 A c) (L_n / 3 D_n + L_s / D_s + L_p / 3 D_p)` | `sum(L / D) sum(e L) / pi^2` | the same; slowest mode of a layer without exchange at its ends |
 //! | diffusion in a particle, each electrode | `abs(dU/dx) r / (5 D F c_max S)` | `r^2 / 35 D` | sphere under constant flux; first moment of its step response |
 //!
-//! `S` is the surface of all particles, `A` the area of all electrode pairs; `k` and `D` of a layer are the electrolyte's times the layer's
-//! transport efficiency. Each property follows Arrhenius' law with its activation energy, or with [`USUAL_J_PER_MOL`] if none is stated.
-//! Deviation: BPX has no double layer, so charge transfer has no time constant. Effect: none after about 0.1 s.
+//! `S` is the surface of all particles, `A` the area of all electrode pairs; `k` and `D` of a layer are the values of
+//! the electrolyte, multiplied by the transport efficiency of the layer. Each property follows Arrhenius' law with its
+//! activation energy, or with [`USUAL_J_PER_MOL`] if none is stated. Deviation: BPX has no double layer, so charge
+//! transfer has no time constant. Effect: none after about 0.1 s.
 
 use super::curve::Curve;
 use super::document::{BpxCell, Electrode, Layer, Transport};
@@ -53,7 +54,8 @@ impl Resistances {
     }
 }
 
-/// Resistances at a SOC and a temperature, K: the electrolyte's branch if the file describes it, then the electrodes'.
+/// Returns the resistances at a SOC and a temperature (K). The branch of the electrolyte comes first, if the file
+/// describes the electrolyte; the branches of the electrodes follow.
 pub(super) fn resistances(cell: &BpxCell, curve: &Curve<'_>, soc: f64, temperature_k: f64) -> Resistances {
     let (x, y) = curve.contents(soc);
     let at = |energy: Option<f64>| arrhenius(energy, cell.reference_k, temperature_k);

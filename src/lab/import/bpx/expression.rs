@@ -1,9 +1,9 @@
 //! Parses and evaluates expressions of one variable `x` as in BPX files: a subset of Python's grammar, evaluated without Python.
 //!
-//! Input: a text with numbers, `x`, `+ - * / **`, signs, parentheses and the functions of [`FUNCTIONS`]. Output: a program for a stack
-//! machine. It is evaluated with `libm`, so the same text gives the same bytes on every machine. As in Python, `**` is
-//! right-associative and binds more tightly than a sign before it (`-x**2` is `-(x**2)`). A fault states the column, what was found and
-//! what is allowed.
+//! Input: a text with numbers, `x`, `+ - * / **`, signs, parentheses and the functions of [`FUNCTIONS`]. Output: a
+//! program for a stack machine. The program is evaluated with `libm`, so the same text gives the same bytes on every
+//! machine. As in Python, `**` is right-associative and binds more tightly than a sign before it (`-x**2` is
+//! `-(x**2)`). A fault states the column, what was found and what is allowed.
 
 /// Maximum length of a text, bytes; the longest known potential has 500 bytes.
 const MAX_BYTES: usize = 20_000;
@@ -51,8 +51,8 @@ pub(super) struct Expression(Vec<Step>);
 impl Expression {
     /// Parses a text.
     ///
-    /// # Errors
-    /// The column from 1, what was found and what is allowed.
+    /// # Errors The text is not a valid expression. The error states the column (from 1), what was found and what is
+    /// allowed.
     pub(super) fn parse(text: &str) -> Result<Self, String> {
         if text.len() > MAX_BYTES {
             return Err(format!("has {} bytes, must be at most {MAX_BYTES}", text.len()));

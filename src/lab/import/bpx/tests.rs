@@ -68,7 +68,8 @@ fn electrode_ah() -> f64 {
 
 #[test]
 fn straight_potentials_give_a_straight_curve() {
-    // Equal electrodes: x + y = 1.1. 4.5 V: x = 0.8, 3.3 V: x = 0.2, regardless of the stated minimum of x.
+    // The electrodes are equal, so x + y = 1.1. Therefore x = 0.8 at 4.5 V and x = 0.2 at 3.3 V, regardless of the
+    // stated minimum of x.
     let model = model_of(&straight());
     assert!((model.capacity_ah - 0.6 * electrode_ah()).abs() < 1e-4, "{}", model.capacity_ah);
     for soc in [0.0, 0.13, 0.5, 0.99, 1.0] {
@@ -94,7 +95,7 @@ fn entropic_change_shifts_the_curve_with_temperature() {
     value["Parameterisation"]["Positive electrode"]["Entropic change coefficient [V.K-1]"] = json!(2e-4);
     value["Parameterisation"]["Negative electrode"]["Entropic change coefficient [V.K-1]"] = json!("-1e-4 * x");
     let model = model_of(&value);
-    // SOC 0.5: x = 0.5; 15 K warmer.
+    // At SOC 0.5, x = 0.5. The cell is 15 K warmer than the reference temperature.
     let voltage_v = model.ocv_v(&model.grid_position(0.5, 40.0));
     assert!((voltage_v - (3.9 + 15.0 * 2.5e-4)).abs() < 2e-6, "{voltage_v}");
 }

@@ -1,4 +1,4 @@
-//! Writes the cell model of a BPX file. It contains no date, so the same file gives the same bytes.
+//! Writes the cell model of a BPX file. The output contains no date, so the same file gives the same bytes.
 
 use super::circuit::Resistances;
 use super::curve::Curve;
