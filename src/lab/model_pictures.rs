@@ -1,9 +1,9 @@
 //! Draws a cell model: open-circuit curve, slope of the curve, resistances over SOC and over temperature, and the SOC error that
 //! follows from them.
 //!
-//! Bands are 95 % intervals ([`ModelBands`]). If a model does not state the error of its curve, the curve has no band, and the
-//! description of the picture says so. A line is dashed where nothing was measured: outside the measured range, and where it is a
-//! prior.
+//! Bands are 95 % intervals ([`ModelBands`]). If a model does not state the error of its curve, the curve has no band,
+//! and the description of the picture says so. A line is dashed where nothing was measured: outside the measured range,
+//! and where the value is only a prior.
 
 use crate::cell::model_bands::CURVE_C;
 use crate::cell::{CellModel, ModelBands};

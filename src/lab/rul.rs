@@ -1,8 +1,8 @@
 //! Forecasts the remaining useful life from measured capacity histories: a forecast at the end of a history, and forecasts at earlier
 //! points of the life, which are scored against the truth.
 //!
-//! The forecast is the one of the monitor ([`crate::health::forecast`]). It receives one reading after the other, and uses no reading
-//! that is later than the time of the forecast.
+//! Forecasts are made by the filter of the monitor ([`crate::health::forecast`]). The filter receives one reading after
+//! the other, and no reading that is later than the time of the forecast.
 //!
 //! Terms: *use* is the number of discharges since the first reading, or the number of days if the file lists no discharges. The
 //! capacities are fitted by the non-increasing curve with the least squared error (isotonic fit). The *end of life* is the use at which
@@ -24,7 +24,8 @@ pub use document::{now_json, scored_json};
 pub use history::{History, MeasuredCapacity};
 pub use truth::end_of_life;
 
-/// Upper limit of an error, as a share of the life. Without it, a baseline that never reaches the end of life would dominate the mean.
+/// Upper limit of an error, as a share of the life. Without this limit, a baseline that never reaches the end of life
+/// would dominate the mean.
 pub const WORST_ERROR: f64 = 1.0;
 
 /// The capacity at which a life ends.

@@ -50,9 +50,9 @@ pub struct ScoreSettings {
     pub settle_s: f64,
     /// Standard deviation of the initial SOC, fraction; `None` = the value of [`ScoreSettings::initial_soc_std`].
     pub soc_std: Option<f64>,
-    /// Standard deviation of the initial capacity, as a fraction of the model's; `None` = as configured.
+    /// Standard deviation of the initial capacity, as a fraction of the model's capacity; `None` = as configured.
     pub capacity_std: Option<f64>,
-    /// If a gap in a file is longer than this, s, the recorder was asleep.
+    /// Longest gap in a file, s, before the recorder counts as asleep.
     pub sleep_gap_s: f64,
     /// Capacity threshold, Ah; the first discharge below it is reported.
     pub threshold_ah: f64,

@@ -1,8 +1,9 @@
 //! Determines the condition of a battery for a passport: every value with its time and standard deviation, or the reason why it is
 //! unknown.
 //!
-//! Input: a [`Record`], the configuration, the current cell model, and data that only people know ([`Terms`]). Measured and learned
-//! values are known; a configured start value, an untrusted estimate and an incomplete sum are not.
+//! Input: a [`Record`], the configuration, the current cell model, and data that only people know ([`Terms`]). Measured
+//! and learned values are known; a configured start value, an untrusted estimate and an incomplete sum count as
+//! unknown.
 
 use super::energy::Discharge;
 use super::field::Field;
@@ -358,7 +359,7 @@ impl Quantity {
         Self { value: factor * self.value, std: self.std.map(|std| factor * std), ..self }
     }
 
-    /// Converts a ratio to new to an increase in percent.
+    /// Converts a ratio relative to new to an increase in percent.
     fn increase(self) -> Self {
         Self { value: 100.0 * (self.value - 1.0), std: self.std.map(|std| 100.0 * std), ..self }
     }

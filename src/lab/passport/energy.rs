@@ -21,7 +21,7 @@ pub(super) struct Discharge {
 }
 
 impl Discharge {
-    /// Discharges a cell of this capacity, Ah, and resistance relative to new.
+    /// Computes the discharge of a cell from its capacity, Ah, and its resistance relative to new.
     pub(super) fn new(model: &CellModel, load: &UsableConfig, capacity_ah: f64, resistance_ratio: f64) -> Self {
         let top_v = model.voltage_max_v.max(load.cutoff_v);
         let voltage_v = |step: u32| top_v - (top_v - load.cutoff_v) * f64::from(step) / f64::from(VOLTAGES);

@@ -1,16 +1,16 @@
 //! Detects charge that a replay did not see because the current was unknown.
 //!
-//! Input: events and estimates of a replay, in order. Output: lost seconds, or the first gap with unlimited charge. A replay reports
-//! a missing current in these ways:
+//! Input: events and estimates of a replay, in order. Output: lost seconds, or the first gap in which an unknown charge
+//! may have moved. A replay reports a missing current in these ways:
 //!
 //! | report | charge |
 //! | --- | --- |
-//! | the current's signal turns bad or stale | lost until it is good again, except while the last reading may be used |
+//! | the current's signal turns bad or stale | lost until the signal is good again, except while its last reading may be used |
 //! | the buses fall asleep | none: the core reports it only while no current flows |
 //! | a gap: nothing was recorded | none if the buses slept or the pack rested before; otherwise unknown |
 //!
-//! Assumption: a pack that rests when the recording stops rests until it continues. Use that starts and ends with a rest and was not
-//! recorded cannot be detected.
+//! Assumption: if the pack rests when the recording stops, it rests until the recording continues. If the pack was used
+//! in such a gap but rested at both ends, this use cannot be detected.
 
 use crate::monitor::{Estimate, Event, EventKind};
 use crate::quantity::{Channel, Fault, Timestamp};
@@ -38,7 +38,7 @@ pub(super) struct Losses {
     /// End of the latest time in which nothing was recorded and no charge moved.
     paused_until: Option<Timestamp>,
     lost_s: f64,
-    /// The first gap with unlimited charge.
+    /// Describes the first gap in which an unknown charge may have moved.
     gap: Option<String>,
 }
 
@@ -63,7 +63,8 @@ impl Losses {
     pub(super) fn take_event(&mut self, event: &Event) {
         match event.kind {
             EventKind::SignalBad { channel: Channel::Current, fault } => {
-                // A stale reading was used until now; the last one before a bad reading may be used from now on.
+                // If the signal is stale, its last reading was used until now. With any other fault, the last good
+                // reading may still be used for a limited time from now on.
                 let held_s = if fault == Fault::Stale { 0.0 } else { self.limits.current_age_s };
                 self.lost_since.get_or_insert(event.time.plus_secs(held_s));
             }
@@ -104,7 +105,8 @@ impl Losses {
         }
     }
 
-    /// Why the charge of the record is unknown; `None` = it is known. The record ends at `end` and has charges and discharges of `used_s`.
+    /// Why the charge of the record is unknown; `None` = it is known. The record ends at `end`; its charges and
+    /// discharges take `used_s`.
     pub(super) fn finish(&mut self, end: Timestamp, used_s: f64) -> Option<String> {
         self.end_loss(end);
         let lost_s = self.lost_s;
@@ -113,7 +115,7 @@ impl Losses {
     }
 }
 
-/// Whether the lost share of a time, s, is so large that its sum is unknown.
+/// Whether `lost_s` is so large a share of `used_s` that the sum over this time is unknown.
 pub(super) fn is_too_much(lost_s: f64, used_s: f64) -> bool {
     // Maximum share of the charging and discharging time without a current reading. It tolerates single lost frames,
     // and its error is far below the gain error of a current sensor.

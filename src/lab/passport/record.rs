@@ -108,8 +108,8 @@ impl Record {
         Ok(record)
     }
 
-    /// Compares the half-cycles in a store with the number that was counted when they were written. If the state is as old as the rows,
-    /// the sums in the state replace rows that the store has deleted.
+    /// Compares the half-cycles in a store with the number that was counted when they were written. If the state counts
+    /// all these half-cycles, its sums replace rows that the store has deleted.
     fn note_missing_rows(&mut self, extent: &HistoryExtent) {
         let HistoryExtent { half_cycles, deleted_half_cycles: deleted, written_half_cycles, .. } = *extent;
         let counted = self.snapshot().map_or(0, Snapshot::half_cycles);
@@ -181,7 +181,7 @@ impl Record {
         }
     }
 
-    /// Receives an estimate of a replay: adds the energy since the cell's previous one.
+    /// Receives an estimate of a replay: adds the energy since the previous estimate of the cell.
     fn take_estimate(&mut self, estimate: &Estimate) {
         self.losses.take_estimate(estimate);
         let longest_s = self.limits.voltage_age_s;

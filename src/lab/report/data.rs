@@ -50,7 +50,7 @@ pub(super) struct CapacityRecord {
     pub(super) resistance: (f64, f64),
 }
 
-/// A charge that covered the SOC window.
+/// A charge that covered the SOC window of the recharge period.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct RechargeRecord {
     pub(super) time_s: f64,
@@ -296,7 +296,8 @@ impl Data {
         self.incidents.push((time_s, what));
     }
 
-    /// Removes the data of the old pack. The report of a replay, like that of a store, describes the pack that is connected at the end.
+    /// Removes the data of the old pack. The report of a replay, like the report of a store, describes the pack that is
+    /// connected at the end.
     fn forget_pack(&mut self) {
         self.halves.clear();
         self.learned.clear();

@@ -67,9 +67,9 @@ pub(super) fn stds(cell: u16) -> CellStds {
     CellStds { capacity_ah, usable_ah, resistance, losses: [0.02, 0.07, 0.12].map(|std| std + 0.01 * own) }
 }
 
-/// Creates a pack at the end of [`HALVES`] half-cycles. The last cell has the smallest capacity. The first cell has the smallest usable
-/// capacity and the largest resistance. The losses of lithium, of the negative and of the positive electrode are largest in the second,
-/// third and first cell.
+/// Creates a pack at the end of [`HALVES`] half-cycles. The last cell has the smallest capacity. The first cell has the
+/// smallest usable capacity and the largest resistance. The losses of lithium, of the negative and of the positive
+/// electrode are largest in the second, third and first cell, in this order.
 pub(super) fn worn(cells: u16) -> Data {
     let mut data = Data::new(Origin::Replay);
     for half in 0..HALVES {

@@ -15,12 +15,12 @@ use crate::health::{Axis, CapacityReading, Forecast, InsufficientData, Remaining
 const DAY_S: f64 = 86_400.0;
 /// Number of points of a fan.
 const POINTS: usize = 60;
-/// Upper limits of the fan's length: this multiple of the median time to the end of life, and the next constant times the record's
-/// length.
+/// Upper limits of the fan's length: [`MAX_MEDIANS`] times the median time to the end of life, and [`MAX_RECORDS`]
+/// times the length of the record.
 const MAX_MEDIANS: f64 = 2.5;
 const MAX_RECORDS: f64 = 2.0;
-/// The first limit is at least this multiple of the record's length, because the median may be near while the end may
-/// come late.
+/// The first limit is at least this multiple of the record's length, because the end of life may come much later than a
+/// near median.
 const LEAST_RECORDS: f64 = 0.2;
 
 /// Forecast of the capacity at a time.
@@ -244,8 +244,8 @@ mod tests {
         let outlook = outlook(&data, &PageContext::default()).expect("enough readings");
         assert_eq!((outlook.cell, outlook.end_ah), (1, 1.6));
         let left = outlook.life.cycles.expect("cycles");
-        // From 1.7 Ah, fading by 0.006 Ah per cycle: 17 full cycles along a straight line, fewer with the expected
-        // knee.
+        // A capacity of 1.7 Ah that fades by 0.006 Ah per cycle reaches its end after 17 full cycles along a straight
+        // line, and earlier with the expected knee.
         assert!(left.low < 17.0 && left.high > 17.0 && (8.5..17.0).contains(&left.median), "{left:?}");
         let (first, last) = (outlook.fan[0], outlook.fan[POINTS - 1]);
         assert_eq!(first.time_s, data.halves.last().map(|half| half.time_s).expect("halves"));

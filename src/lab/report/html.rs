@@ -163,7 +163,7 @@ fn heading(data: &Data, context: &PageContext<'_>) -> Markup {
         1 => "one cell".to_owned(),
         cells => format!("{cells} cells"),
     };
-    // In the order of the page.
+    // The links are in the order of the sections on the page.
     let links = SECTIONS.iter().flat_map(|section| {
         let alarms = (section.id == ALARMS_AFTER).then_some(("alarms", "Alarms"));
         [Some((section.id, section.title)), alarms].into_iter().flatten()

@@ -1,4 +1,5 @@
-//! Finds the limits of the alarms. They come from the configuration; if there is none, from the alarms in the record.
+//! Finds the limits of the alarms. The limits come from the configuration; without a configuration, they come from the
+//! alarms in the record.
 
 use super::context::PageContext;
 use super::data::Data;

@@ -94,7 +94,7 @@ pub(super) fn columns(data: &Data, pick: ValueSelector) -> Vec<Vec<Option<f64>>>
     rows
 }
 
-/// Mean temperature of every half-cycle: lowest and highest over the cells.
+/// Returns the time of every half-cycle, with the lowest and highest mean temperature of the cells.
 pub(super) fn temperatures(data: &Data) -> Vec<(f64, f64, f64)> {
     let rows = data.halves.chunk_by(|a, b| a.time_s == b.time_s);
     rows.filter_map(|rows| {

@@ -1,5 +1,5 @@
-//! Creates the summary at the top of the page: the condition of the battery, since when it has lasted, and what to do. If data are
-//! missing, the summary says "unknown".
+//! Creates the summary at the top of the page: the condition of the battery, how long this condition has lasted, and
+//! what to do. If data are missing, the summary says "unknown".
 
 use std::collections::BTreeSet;
 
@@ -299,8 +299,8 @@ fn tiles(
     estimates
 }
 
-/// Returns a remark for the capacity of a cell. If no half-cycle has measured the capacity, it is the configured value minus the
-/// assumed fade, and the remark says so. Otherwise, the remark is empty.
+/// Returns a remark for the capacity of a cell. If no half-cycle has measured the capacity, the capacity is the
+/// configured value minus the assumed fade, and the remark says so. Otherwise, the remark is empty.
 fn assumed(data: &Data, cell: usize) -> &'static str {
     let is_measured = data.learned.iter().any(|row| row.cell == cell && row.measured_ah.is_some());
     if is_measured { "" } else { "; assumed, not measured yet" }

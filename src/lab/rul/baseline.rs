@@ -33,7 +33,8 @@ pub(super) fn double_exponential(points: &[[f64; 2]], threshold: f64) -> Option<
         return None;
     }
     let fit = |exponents: [f64; 2]| linear(points, scale, exponents);
-    // Starting exponents, e-folds over the use so far: both falling, one rising, nearly straight.
+    // Starting exponents, in e-folds over the use so far: for two falling terms, for one rising term, and for a nearly
+    // straight curve.
     let found =
         [[-0.1, 0.5], [-0.2, -2.0], [-0.05, 3.0], [-0.5, 0.05]].into_iter().filter_map(|start| search(start, &fit));
     let (_, [a, c], [b, d]) = found.min_by(|x, y| x.0.total_cmp(&y.0))?;

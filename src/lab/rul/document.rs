@@ -1,4 +1,4 @@
-//! Forecasts as one JSON document, ending in a line feed.
+//! Writes forecasts as one JSON document that ends in a line feed.
 
 use serde::Serialize;
 

@@ -38,11 +38,11 @@ pub struct Case {
     /// Error of the initial SOC, points; `None` = no initial SOC: the estimator starts from the first voltage.
     #[serde(rename = "told_points")]
     pub soc_error_points: Option<f64>,
-    /// Error of the initial capacity, percent of the model's.
+    /// Error of the initial capacity, percent of the model's capacity.
     pub capacity_error_percent: f64,
     /// Offset of the sensor: added to every measured current before the monitor sees it, A.
     pub current_offset_a: f64,
-    /// Seed of the windows; `None` = no windows.
+    /// Seed of the windows, outside which the monitor sees no rows of a half-cycle; `None` = no windows.
     pub seed: Option<u64>,
 }
 

@@ -29,7 +29,7 @@ pub struct ScoreRequest {
     pub soc_error_points: Vec<Option<f64>>,
     /// Standard deviation of the initial SOC, points.
     pub soc_std_points: Option<f64>,
-    /// Errors of the initial capacity, percent of the model's.
+    /// Errors of the initial capacity, percent of the model's capacity.
     pub capacity_error_percent: Vec<f64>,
     /// Standard deviation of the initial capacity, percent.
     pub capacity_std_percent: Option<f64>,
@@ -39,7 +39,7 @@ pub struct ScoreRequest {
     pub settle_s: f64,
     /// Charge from full to empty that defines the true SOC, Ah; `None` = the model's capacity.
     pub truth_capacity_ah: Option<f64>,
-    /// If a gap in a file is longer than this, s, the recorder was asleep.
+    /// Longest gap in a file, s, before the recorder counts as asleep.
     pub sleep_gap_s: f64,
     /// Tables of published capacities, one per file; empty without tables.
     pub cycles: Vec<PathBuf>,

@@ -1,10 +1,10 @@
 //! Converts OBDb addresses to the CAN identifiers of requests and answers.
 //!
-//! | `hdr` | request | answer |
+//! | form of `hdr` | request | answer |
 //! | --- | --- | --- |
-//! | 3 digits | 11 bits, `hdr` | `rax`; without it `hdr` + 8, for 7E0 to 7E7 only (ISO 15765-4) |
-//! | the same with `eax` | first data byte `eax` | first data byte `tst`, without it the low byte of `hdr` (6F1: F1) |
-//! | 4 digits, `TTAA` | 29 bits, `pri` (18) `TTAA` `tst` (F1) | `pri` DA `tst` `rax`; without it AA, for TT = DA only (ISO 15765-2, normal fixed) |
+//! | 3 digits | identifier of 11 bits: `hdr` | identifier `rax`; if `rax` is missing and `hdr` is 7E0 to 7E7, `hdr` + 8 (ISO 15765-4) |
+//! | 3 digits, with `eax` | the first data byte is also `eax` | the first data byte is also `tst`; if `tst` is missing, the low byte of `hdr` (F1 for 6F1) |
+//! | 4 digits, `TTAA` | identifier of 29 bits: `pri` (default 18), `TT`, `AA`, `tst` (default F1) | identifier `pri`, DA, `tst`, last byte of `rax`; if `rax` is missing and `TT` is DA, `AA` (ISO 15765-2, normal fixed) |
 //!
 //! Any other form is rejected with the reason.
 

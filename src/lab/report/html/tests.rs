@@ -304,7 +304,7 @@ fn every_plus_minus_is_one_standard_deviation() {
     let page = page(&data, &context);
     assert!(page.contains(STATEMENT));
     let [first, second, third, last] = [0, 1, 2, 3].map(examples::stds);
-    // The worst cell for each loss.
+    // Standard deviations of the worst cell for each loss.
     let [lithium, negative, positive] = [second.losses[0], third.losses[1], first.losses[2]].map(|std| 100.0 * std);
     for card in cards(&page) {
         let expected = match card.name {
@@ -318,7 +318,7 @@ fn every_plus_minus_is_one_standard_deviation() {
     }
     let offset = between(&page, "reading minus true current</td><td>", "</td>").expect("a row");
     assert!(states(offset, &[0.034]), "{offset}");
-    // No other plus-minus signs: one in the statement, six on cards, one for the offset.
+    // The page has only these plus-minus signs: one in the statement, six on cards, one for the offset.
     assert_eq!(page.matches(PLUS_MINUS).count(), 8);
     assert!(!page.contains("+-"), "another plus-minus sign");
 }
