@@ -41,60 +41,80 @@
 //!
 //! | change | file |
 //! | --- | --- |
-//! | a new alarm rule | `core/alarm/rule.rs` (its table row); its value: from inputs `core/monitor/stages/watch.rs`, from learned values `core/monitor/stage/learning.rs`, from cell comparison `core/monitor/stage/findings.rs` |
+//! | a new alarm rule | `core/alarm/rule.rs` (table of the rules) |
+//! | the value of a rule about inputs | `core/monitor/stages/watch.rs` |
+//! | the value of a rule about learned values | `core/monitor/stage/learning.rs` |
+//! | the value of a rule about cell comparison | `core/monitor/stage/findings.rs` |
 //! | debounce, hysteresis, latch of an alarm | `core/alarm/machine.rs` (states), `core/alarm/limit.rs` (thresholds) |
 //! | a new event | `core/monitor/message/event.rs` |
 //! | a value in a sent frame | `/config/packwatch.dbc` (written by hand, compiled in), then `core/can/encode/output.rs` |
-//! | the order and repetition of sent alarms | `core/monitor/stage/sending/alarm_queue.rs`; the contract with receivers: `/docs/src/ecu/contract.md` |
-//! | an end-to-end profile | `core/can/e2e.rs` (profiles, checksums), `core/can/e2e/receiver.rs` (states); its name in TOML: `host/config/schema/keys/choices.rs` |
-//! | authentication: layout and freshness; which commands are executed; the key | `core/can/secoc.rs`, `core/can/secoc/window.rs`; `core/monitor/stage/intake/command_gate.rs`; `host/io/can_key.rs` |
-//! | a second sender of a message; frames with our own identifiers; a frozen current | `core/can/rate.rs`; `core/can/own_frames.rs`; `core/sample/frozen.rs` |
+//! | the order and repetition of sent alarms | `core/monitor/stage/sending/alarm_queue.rs`, `/docs/src/ecu/contract.md` (contract with receivers) |
+//! | an end-to-end profile | `core/can/e2e.rs` (profiles, checksums), `core/can/e2e/receiver.rs` (states), `host/config/schema/keys/choices.rs` (name in TOML) |
+//! | layout and freshness of authenticated commands | `core/can/secoc.rs` (layout), `core/can/secoc/window.rs` (freshness) |
+//! | which authenticated commands are executed | `core/monitor/stage/intake/command_gate.rs` |
+//! | the key of the authentication | `host/io/can_key.rs` |
+//! | detection of a second sender of a message | `core/can/rate.rs` |
+//! | detection of foreign frames with our own identifiers | `core/can/own_frames.rs` |
+//! | detection of a frozen current | `core/sample/frozen.rs` |
 //! | upper bounds of external numbers | `core/quantity/bounds.rs` |
-//! | ISO-TP; decoding of diagnostic answers; which requests are sent, and when | `core/can/isotp.rs`; `core/can/uds.rs`; `core/can/poll.rs` |
+//! | ISO-TP | `core/can/isotp.rs` |
+//! | decoding of diagnostic answers | `core/can/uds.rs` |
+//! | which diagnostic requests are sent, and when | `core/can/poll.rs` |
 //! | detection of bus sleep | `core/monitor/stage/sleep.rs` |
 //! | plausibility of a reading | `core/sample/signal.rs` |
 //! | the filter's process or measurement noise | `core/cell/estimator/bank/kernel/predict.rs`, `core/cell/estimator/bank/kernel/update.rs` |
-//! | the open-circuit curve of an aged cell, half-cell potentials | `core/cell/aged_ocv.rs`, `core/cell/electrodes.rs`; their fit: `lab/ident/electrodes.rs` |
-//! | the model learned on board | `core/cell/own_model/fit.rs` (fit), `core/monitor/stage/modelling.rs` (when); on another thread: `host/service/live.rs` |
-//! | the signature of a cell fault; when it is reported | `core/cell_faults/difference.rs`, `core/cell_faults/channels.rs`; `core/cell_faults/fault.rs` |
+//! | the open-circuit curve of an aged cell | `core/cell/aged_ocv.rs` |
+//! | half-cell potentials | `core/cell/electrodes.rs` (library), `lab/ident/electrodes.rs` (fit) |
+//! | the model learned on board | `core/cell/own_model/fit.rs` (fit), `core/monitor/stage/modelling.rs` (time of a fit), `host/service/live.rs` (thread of the fit) |
+//! | the signature of a cell fault | `core/cell_faults/difference.rs`, `core/cell_faults/channels.rs` |
+//! | when a cell fault is reported | `core/cell_faults/fault.rs` |
 //! | capacity learned from a half-cycle | `core/health/learner.rs` |
 //! | what is kept of exchanged packs | `core/monitor/stages/pack_memory.rs` |
-//! | contents of the stored state | the stage's state, `core/monitor/snapshot.rs`; its restore: `core/monitor/lifecycle/restore.rs` |
+//! | contents of the stored state | the state of the stage, `core/monitor/snapshot.rs`, `core/monitor/lifecycle/restore.rs` (restore) |
 //! | a configuration key | its table in `host/config/schema/keys/` (`pack`, `input`, `limits`, `algorithms`, `traffic`); `host/config/mod.rs` lists the steps |
 //! | discovery and merging of drop-ins | `host/config/document/source.rs`, `host/config/document/merge.rs` |
 //! | identity of the vehicle | `host/config/result/vehicle.rs` |
 //! | a published number of pack or cell (status, metrics, MQTT, VSS) | `core/quantity/catalogue.rs` (its row), `core/monitor/view.rs` (its value) |
-//! | another status field | `host/status/document.rs` (type), `host/status/collect.rs` (value); on screen: `cli/status` |
+//! | another status field | `host/status/document.rs` (type), `host/status/collect.rs` (value), `cli/status` (screen) |
 //! | another metric | `host/status/metrics.rs` |
-//! | another MQTT entity; its topics; the queue for a lost link | `uplink/mqtt/entity.rs`; `uplink/mqtt/mod.rs`; `uplink/mqtt/queue.rs` |
-//! | another VSS signal, standard or overlay | `uplink/kuksa/signals/derived.rs` (the page: `packwatch vss --reference`) |
+//! | another MQTT entity | `uplink/mqtt/entity.rs` |
+//! | MQTT topics | `uplink/mqtt/mod.rs` |
+//! | the queue for a lost MQTT link | `uplink/mqtt/queue.rs` |
+//! | another VSS signal, standard or overlay | `uplink/kuksa/signals/derived.rs` (`packwatch vss --reference` prints the manual page) |
 //! | order of values sent to the databroker | `uplink/kuksa/outgoing.rs` |
-//! | a history table or column | `host/store/rows.rs`; tables of packs, moments and segments: `host/store/database.rs` |
-//! | the files of the stored state; when a checkpoint is due | `host/store/state_files.rs`; `host/store/checkpoint.rs` |
+//! | a history table or column | `host/store/rows.rs`, `host/store/database.rs` (tables of packs, moments and segments) |
+//! | the files of the stored state | `host/store/state_files.rs` |
+//! | when a checkpoint is due | `host/store/checkpoint.rs` |
 //! | verification and retention of the history | `host/store/segments.rs` |
 //! | values restored from the history at start | `host/store/learned.rs`, `core/monitor/lifecycle/relearn.rs` |
 //! | a command over the control socket | `host/control/protocol.rs` |
-//! | a log format | `host/io/log.rs`; lines of candump: `host/io/candump/parser.rs` |
+//! | a log format | `host/io/log.rs`, `host/io/candump/parser.rs` (lines of candump) |
 //! | segments of a recording | `host/io/segments.rs` |
 //! | a column of `replay --estimates` | `host/replay/rows.rs` |
 //! | a column of `export` (Parquet, CSV) | `lab/fleet/export/columns.rs` |
-//! | conversion of an OBDb signal set | `lab/import/obdb.rs`, one signal: `lab/import/obdb/signal.rs` |
+//! | conversion of an OBDb signal set | `lab/import/obdb.rs`, `lab/import/obdb/signal.rs` (one signal) |
 //! | conversion of a BPX file | `lab/import/bpx/curve.rs` (open-circuit voltage), `lab/import/bpx/circuit.rs` (resistances) |
-//! | signals that `discover` proposes, and the reasons | `lab/discover/judge.rs` (points), `core/wiring/evidence/label.rs` (names, units); fields without a definition: `lab/discover/raw.rs` (answers), `lab/discover/fields.rs` (messages) |
+//! | signals that `discover` proposes, and the reasons | `lab/discover/judge.rs` (points), `core/wiring/evidence/label.rs` (names, units) |
+//! | fields without a definition that `discover` proposes | `lab/discover/raw.rs` (in answers), `lab/discover/fields.rs` (in messages) |
 //! | a finding of the doctor | `core/wiring/judge` |
 //! | uncertainty of a cell model, advised measurement | `core/cell/model_bands.rs`, `core/cell/model_bands/advice.rs` |
-//! | contents of a cell model file | `host/config/cell_model/keys.rs`, `read.rs` (read), `host/config/cell_model/write.rs` (written) |
+//! | contents of a cell model file | `host/config/cell_model/keys.rs` (keys), `host/config/cell_model/read.rs` (reading), `host/config/cell_model/write.rs` (writing) |
 //! | a plot of a cell model | `lab/model_pictures.rs` |
-//! | a section or plot of the report | `lab/report/html.rs`, `lab/report/pictures.rs`; its headline and cards: `lab/report/summary.rs` |
-//! | a value of a battery passport, its place in a standard; requirements of a standard | `lab/passport/field.rs`, `lab/passport/condition.rs`; `lab/passport/standards.rs` |
-//! | a fuzz target, an invariant it checks | `/fuzz/src/doors`; seeds and past failures: `/fuzz/seeds` |
-//! | allowed dependencies; the bill of materials; reproducible builds | `/deny.toml`; `/packaging/debian/sbom`; `/packaging/debian/build` |
-//! | a package: its files; its program and processor; all of them | `/packaging/tree`; `/packaging/program`, `/packaging/architectures`; `/packaging/packages` |
+//! | a section or plot of the report | `lab/report/html.rs` (sections), `lab/report/pictures.rs` (plots), `lab/report/summary.rs` (headline and cards) |
+//! | a value of a battery passport | `lab/passport/field.rs` (place in a standard), `lab/passport/condition.rs` (value) |
+//! | requirements of a passport standard | `lab/passport/standards.rs` |
+//! | a fuzz target, or an invariant that it checks | `/fuzz/src/doors`, `/fuzz/seeds` (seeds and past failures) |
+//! | allowed dependencies | `/deny.toml` |
+//! | the bill of materials | `/packaging/debian/sbom` |
+//! | reproducible builds | `/packaging/debian/build` |
+//! | files of a package | `/packaging/tree` |
+//! | program and processor of a package | `/packaging/program`, `/packaging/architectures` |
+//! | the build of all packages | `/packaging/packages` |
 //! | a command or its options | `cli/COMMAND.rs`, or `cli/COMMAND/args.rs` where that exists |
-//! | options of a score, its tables and document | `lab/score/request.rs`, `lab/score/report.rs`; the cell's configuration: `lab/single_cell.rs` |
+//! | options of a score, its tables and document | `lab/score/request.rs` (options), `lab/score/report.rs` (tables, document), `lab/single_cell.rs` (configuration of the cell) |
 //! | a column of a CSV log or measured file, the Battery Data Format | `host/io/csv_log.rs` (`SampleColumns`) |
 //! | a column of a capacity table (history, cycles, truth, reference) | `lab/capacity_table.rs` |
-//! | a class or function of the Python module | `python/NAME.rs`, its type in `python/packwatch/_packwatch.pyi` |
+//! | a class or function of the Python module | `python/NAME.rs` (code), `python/packwatch/_packwatch.pyi` (types) |
 //!
 //! # Invariants
 //! * `src/core` and `src/regress` never read a clock, a file or a socket and never log: the same inputs give the same outputs, byte

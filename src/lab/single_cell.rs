@@ -102,6 +102,6 @@ fn named_cell(files: &ConfigFiles, read: config::ReadFile<'_>) -> Result<PathBuf
         let model = table.get("pack")?.get("cell_model")?.as_str()?.to_owned();
         Some(files.main.parent().unwrap_or(Path::new("")).join(model))
     });
-    // If the configuration names no cell model, reading it reports the fault.
+    // If the configuration names no cell model, loading the configuration reports the fault.
     Ok(named.unwrap_or_default())
 }

@@ -1,5 +1,5 @@
-//! Creates Python exceptions for errors of configurations, of data and arguments, and of files. Their texts are those
-//! of the command line.
+//! Creates Python exceptions for errors of configurations, of data and arguments, and of files. The exceptions have the
+//! same texts as the errors of the command line.
 
 use std::fmt::Display;
 

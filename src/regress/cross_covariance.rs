@@ -31,8 +31,8 @@ impl Covariance {
     }
 }
 
-/// Writes the squared differences between the rows `from..from + count` and a point to `out`: first those of the first
-/// input, then those of the second input, and so on.
+/// Writes the squared differences between the rows `from..from + count` and a point to `out`: first the differences of
+/// the first input, then the differences of the second input, and so on.
 pub(super) fn squares(columns: &[f64], from: usize, count: usize, point: &[f64], out: &mut Vec<f64>) {
     let n = columns.len() / point.len();
     out.resize(count * point.len(), 0.0);

@@ -23,7 +23,7 @@
 //! | [`Form::Exact`] | n^2 | n^3 | up to a few thousand rows |
 //! | [`Form::Nearest`] | n m | n m^3 | any number of rows, few inputs |
 //!
-//! Deviations from the paper:
+//! Deviations from the paper that packwatch follows ("Battery Predictions for Electronic Prognostics"):
 //!
 //! 1. The paper used a fully independent conditional (inducing points) for its 30,723 rows. Here, [`Form::Nearest`] is
 //!    the default for that many rows, because a few hundred inducing points cannot represent a rough function over

@@ -1,4 +1,5 @@
-//! Fits cell models to measured data (paper, section 3.3.2). This module only computes: it reads no files and prints nothing.
+//! Fits cell models to measured data ("Battery Predictions for Electronic Prognostics", section 3.3.2). This module
+//! only computes: it reads no files and prints nothing.
 //!
 //! Data flow: raw rows of one file -> [`anchor`] (SOC of every row) -> [`record`] (coarser rows with positions in the tables and
 //! weights) -> [`pass`] (residuals, and their exact Jacobian from recursive sensitivities) with [`prior`] (smoothness) -> [`solve`]

@@ -11,7 +11,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::measured::MeasuredPart;
 
-/// Returns the visible rows of part number `index`. There is at least one, unless the part is empty.
+/// Returns the visible rows of part number `index`. At least one row is visible, unless the part is empty.
 pub(super) fn rows(part: &MeasuredPart, index: usize, seed: u64, (least, most): (f64, f64)) -> Range<usize> {
     let moved = moved_as(part);
     let total = moved.last().copied().unwrap_or(0.0);

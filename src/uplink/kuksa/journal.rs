@@ -1,11 +1,11 @@
-//! Counters and log lines: logs changes once, and the counters at the end of each connection.
+//! Counts events and writes log lines: logs each change once, and the counters at the end of each connection.
 
 use std::collections::HashSet;
 
 use super::routes::{DataPoints, SkippedSignal};
 
-/// Maximum number of logged reasons that are remembered: all signals with a few reasons each. Further reasons are not
-/// logged.
+/// Maximum number of logged reasons that are remembered. It is enough for all signals with a few reasons each. Further
+/// reasons are not logged.
 const MAX_LOGGED: usize = 1000;
 
 /// Counts since the start of the program.

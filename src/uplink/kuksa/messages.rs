@@ -2,7 +2,7 @@
 //!
 //! The messages are written by hand, because the generated client of the KUKSA project compiles protoc, a C++ program,
 //! at every build. Fields that this program does not read are omitted, because protobuf skips them. The field numbers
-//! are those of the published protocol.
+//! are the same as in the published protocol.
 
 use std::collections::BTreeMap;
 

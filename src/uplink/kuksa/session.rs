@@ -82,7 +82,7 @@ struct Session {
     receipts: Receipts,
 }
 
-/// Remembers since when the broker owes a receipt; `None` = it owes none.
+/// Remembers since when the broker owes a receipt; `None` = no receipt is owed.
 #[derive(Debug, Default)]
 struct Receipts {
     owed_since: Option<Instant>,
@@ -112,7 +112,7 @@ impl Receipts {
 
 impl Session {
     async fn open(settings: &KuksaSettings, journal: &mut Journal) -> Result<Self, String> {
-        // Read at each connection, because certificates and tokens are renewed.
+        // These files are read at each connection, because certificates and tokens are renewed.
         let (endpoint, token) = (endpoint(settings)?, token(settings.token_file.as_deref())?);
         let mut client = Client::new(connect(&endpoint).await?, token);
         let mut metadata = call("ListMetadata", list(&mut client, STANDARD_BRANCH)).await?;

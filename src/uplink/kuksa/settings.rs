@@ -1,4 +1,4 @@
-//! The table `[kuksa]`.
+//! Defines and checks the table `[kuksa]` of the uplink's settings.
 
 use std::net::IpAddr;
 use std::path::PathBuf;

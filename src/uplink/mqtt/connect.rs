@@ -1,4 +1,4 @@
-//! A connection to the broker: options, credentials, certificates, and descriptions of its errors.
+//! Creates a connection to the broker from options, credentials and certificates, and describes connection errors.
 //!
 //! Input: settings and the files they name. Output: a client whose last will is `offline` on the status topic.
 

@@ -1,4 +1,4 @@
-//! Home Assistant discovery messages: the entities and the sources of their values.
+//! Builds the discovery messages for Home Assistant, which announce the entities and the sources of their values.
 //!
 //! Input: the daemon's status (cells, rules, vehicle) and the settings. Output: retained messages, one per entity, all
 //! for one device. Entities of the pack are available while both the uplink and the daemon are online. Entities of the

@@ -17,7 +17,7 @@ use serde_json::Value;
 /// Kind of value of an entity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// A quantity with unit, device class and state class of Home Assistant; empty means none.
+    /// A quantity with its unit and its device class in Home Assistant (empty = none), and its number of decimals.
     Measured {
         /// Unit.
         unit: &'static str,

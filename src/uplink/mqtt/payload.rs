@@ -1,4 +1,4 @@
-//! The published documents: `info`, `spec_data`, a sample of the history, an event.
+//! Builds the published documents: `info`, `spec_data`, a sample of the history, an event.
 //!
 //! Input: the daemon's status. Output: JSON. The same status gives the same bytes. Unknown values are `null`.
 

@@ -51,7 +51,7 @@ pub struct MqttSettings {
 #[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TlsSettings {
-    /// PEM file of the authorities that may sign the broker's certificate; `None` = those of the system.
+    /// PEM file of the authorities that may sign the broker's certificate; `None` = the authorities of the system.
     pub ca_file: Option<PathBuf>,
     /// PEM file with the client's certificate; `None` = no client certificate.
     pub certificate_file: Option<PathBuf>,

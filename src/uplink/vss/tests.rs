@@ -1,4 +1,4 @@
-//! The overlay as vspec and JSON, and the manual's page.
+//! Tests the overlay as vspec and JSON, and the page of the manual.
 
 use super::*;
 

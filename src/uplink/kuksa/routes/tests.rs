@@ -1,4 +1,4 @@
-//! Ids and datatypes of a broker compared with those of the signals: skipped signals, withheld values.
+//! Tests which signals are skipped and which values are withheld, for the ids, datatypes and limits of a broker.
 
 use packwatch_host::quantity::catalogue::Quantity;
 use packwatch_host::status::client::parse;

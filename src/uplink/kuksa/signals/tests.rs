@@ -1,4 +1,4 @@
-//! Values of the signals from documents: signs, unknown values, consistency of the table.
+//! Tests the values of the signals for given documents: signs, unknown values, and consistency of the table.
 
 use std::collections::BTreeSet;
 

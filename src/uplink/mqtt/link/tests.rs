@@ -1,4 +1,4 @@
-//! What a connection publishes and when it takes messages from the queue, without a broker.
+//! Tests, without a broker, what a connection publishes and when it takes messages from the queue.
 
 use super::*;
 

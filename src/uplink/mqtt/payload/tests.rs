@@ -1,4 +1,4 @@
-//! Published documents: signs, units, and null for unknown values.
+//! Tests the published documents: signs, units, and null for unknown values.
 
 use super::*;
 
@@ -16,7 +16,7 @@ fn published_soc_is_percent_and_charge_positive() {
         ("SOC_std", json!(1.2)),
         ("state_of_health", json!(92.8)),
         ("battery_current", json!(-12.5)),
-        // 7.3 V at 12.5 A of discharge.
+        // The pack has 7.3 V and discharges with 12.5 A.
         ("stat_batt_power", json!(-91.0)),
         ("charging_state", json!("Discharging")),
         ("battery_current_offset", json!(0.034)),

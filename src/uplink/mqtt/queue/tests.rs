@@ -1,4 +1,4 @@
-//! The queue on disk: order, bounds, drops, restarts.
+//! Tests the queue on disk: order, bounds, drops, restarts.
 
 use super::*;
 
