@@ -118,7 +118,7 @@ pub struct FitOutcome {
     pub capacity_ah: f64,
     /// Lowest and highest voltage, V.
     pub voltage_v: (f64, f64),
-    /// Electrodes; `None` = a shift of the curve is given, there is no slow test, or no known electrodes fit.
+    /// Electrodes; `None` = a shift of the curve is given, slow tests are missing, or no known electrodes fit.
     pub electrodes: Option<FittedElectrodes>,
     /// Thermal parameters; `None` = the data do not determine them.
     pub thermal: Option<Thermal>,

@@ -9,7 +9,7 @@ use pyo3::prelude::*;
 
 use crate::error;
 
-/// An argument that is one value or a list of values.
+/// An argument: a single value or a list of values.
 pub(crate) struct List<T>(pub(crate) Vec<T>);
 
 impl<'py, T: FromPyObjectOwned<'py>> FromPyObject<'_, 'py> for List<T> {

@@ -15,8 +15,8 @@ use crate::ident::parameters::ParameterTables;
 use crate::ident::pass::residuals;
 use crate::ident::record::Record;
 
-/// Shortest time between two recorded differences, s. Differences change only with the SOC, so a shorter interval adds
-/// no information.
+/// Shortest time between two recorded differences, s. Errors of a difference are correlated over [`REPEATS_S`], so a
+/// shorter interval adds hardly any information.
 const PERIOD_S: f64 = 5.0;
 /// Standard deviations before the fit: ln capacity, ln resistance, sensor offset (V), leakage (share of the capacity per h), SOC.
 const PRIOR: [f64; OWN + 1] = [0.15, 0.4, 0.003, 0.002, 0.15];

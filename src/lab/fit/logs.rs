@@ -341,8 +341,8 @@ fn unanchored(stretch: &Stretch, grid: &Grid, model: &CellModel) -> UnanchoredRe
     UnanchoredRecord { record, scale, beginning, full }
 }
 
-/// Whether a stretch starts with a full cell: even with the smallest possible resistance, its open-circuit voltage is that of a full
-/// cell.
+/// Whether a stretch starts with a full cell: even with the smallest possible resistance, its open-circuit voltage
+/// reaches the voltage of a full cell.
 fn begins_full(part: &MeasuredPart, model: &CellModel) -> bool {
     let (voltage_v, current_a, temperature_c) = (part.voltage_v[0], part.current_a[0], part.temperature_c[0]);
     let drop_v = LEAST_RESISTANCE * model.r0_ohm(&model.grid_position(1.0, temperature_c)) * current_a;

@@ -39,7 +39,7 @@ pub struct VehicleRecord {
     pub settings_sha256: Option<String>,
     /// Period of the estimates, s; `None` = no table of estimates.
     pub period_s: Option<f64>,
-    /// Why there are no tables; `None` = there are tables.
+    /// Why the tables are missing; `None` = the tables exist.
     pub error: Option<String>,
     /// Number of rows of each table.
     pub rows: BTreeMap<String, u64>,

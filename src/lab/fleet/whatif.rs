@@ -25,7 +25,7 @@ use crate::monitor::{Monitor, Outputs};
 pub struct WhatifJob {
     /// The log.
     pub log: PathBuf,
-    /// CSV file of the true capacities; `None` = there is no such file.
+    /// CSV file of the true capacities; `None` = the file does not exist.
     pub truth: Option<PathBuf>,
 }
 

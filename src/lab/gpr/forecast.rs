@@ -1,10 +1,11 @@
 //! Forecasts future rows from past rows, without future inputs.
 //!
-//! Input: a table in the order of time, with the outputs in its first columns; it may consist of independent parts. A *window* at row t
-//! contains what is known at this row: for every column, the value and the last differences ([`ForecastPlan::lags`] values in total).
-//! For every output and every horizon h, a separate Gaussian process predicts the change from row t to row t + h (a direct forecast).
-//! Errors of one step therefore do not enter the next step, and each horizon has its own noise. Without information, the forecast is
-//! the mean change, which is close to persistence (the value stays constant).
+//! Input: a table in the order of time, with the outputs in its first columns; it may consist of independent parts. A
+//! *window* at row t contains what is known at this row: for every column, the value and the last differences
+//! ([`ForecastPlan::lags`] values per column). For every output and every horizon h, a separate Gaussian process
+//! predicts the change from row t to row t + h (a direct forecast). Errors of one step therefore do not enter the next
+//! step, and each horizon has its own noise. Without information, the forecast is the mean change, which is close to
+//! persistence (the value stays constant).
 //!
 //! The interval is calibrated on real forecasts. The process is fitted again to the first training rows and forecasts
 //! the block of rows after them; this is repeated block by block. The ratios |error| / standard deviation of these
@@ -203,8 +204,9 @@ impl HorizonTask<'_> {
         (self.windows.width() + 2).max(20)
     }
 
-    /// Fits a process to windows that end before row `end`. Returns the process with the number of windows, or `None`
-    /// if there are too few windows. If `fixed` hyperparameters are given, they are not searched.
+    /// Fits a process to windows whose target rows, `steps` ahead, lie before row `end`. Returns the process with the
+    /// number of windows, or `None` if there are too few windows. If `fixed` hyperparameters are given, they are not
+    /// searched.
     fn fitted(
         &self,
         end: usize,

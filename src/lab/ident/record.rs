@@ -32,7 +32,7 @@ const REST_SHARE: f64 = 0.02;
 /// One row of the fit.
 #[derive(Debug, Clone, Copy)]
 pub struct FitRow {
-    /// Seconds since the file started.
+    /// Seconds since the part started.
     pub time_s: f64,
     /// Seconds since the previous row.
     pub dt_s: f64,

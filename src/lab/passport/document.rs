@@ -1,9 +1,9 @@
 //! Writes the passport as JSON. The known values are merged into the manufacturer's part, and the result is checked against the form of
 //! its standard.
 //!
-//! Input: a [`Condition`] and the manufacturer's part. Output: the passport, and the [details](details) for which the standards have no
-//! members. Each value has one source: a manufacturer's part that states a measured value is rejected. The same inputs give the same
-//! bytes.
+//! Input: a [`Condition`] and the manufacturer's part. Output: the passport, and the [details](details) that the
+//! standards do not provide for. Each value has one source: a manufacturer's part that states a measured value is
+//! rejected. The same inputs give the same bytes.
 
 use serde_json::{Map, Value, json};
 

@@ -242,9 +242,9 @@ impl Record {
         cell.learned = Some(Learned { at_ns, capacity, usable, resistance });
     }
 
-    /// Returns the charge moved by a pack with this number of strings, Ah, and the difference between the durations of discharges and
-    /// charges, h. The values are those of the cell that moved the largest charge, so a missing row of another cell does not reduce
-    /// them.
+    /// Returns the charge moved by a pack with this number of strings, Ah, and the difference between the durations of
+    /// discharges and charges, h. The values come from the cell that moved the largest charge, so a missing row of
+    /// another cell does not reduce them.
     pub(super) fn moved(&self, strings: f64) -> (f64, f64) {
         let most = self.fullest();
         (strings * most.charge_ah, (most.discharging_s - most.charging_s).abs() / 3600.0)

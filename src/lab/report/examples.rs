@@ -1,4 +1,5 @@
-//! Creates data for the tests of the report: a recording of estimates, and a worn pack for which every card has a value.
+//! Creates data for the tests of the report: a recording of estimates, and a worn pack that gives every card of the
+//! report a value.
 //!
 //! Times are in s; cells count from 0. Standard deviations differ between quantities and between neighbouring cells. A test can
 //! therefore detect that a standard deviation is printed in place of another.

@@ -53,7 +53,7 @@ pub(super) fn end_of_life_ah(data: &Data, context: &PageContext<'_>) -> Option<f
     configured.or_else(|| threshold(data, context, Rule::CapacityLow))
 }
 
-/// Forecast of the cell whose life ends first, or the reason why there is none.
+/// Forecasts the cell whose life ends first, or returns the reason why the forecast is missing.
 pub(super) fn outlook(data: &Data, context: &PageContext<'_>) -> Result<Outlook, String> {
     let end_ah = end_of_life_ah(data, context)
         .ok_or("the record does not state the capacity at the end of life; a configuration (-c) does")?;

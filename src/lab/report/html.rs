@@ -247,7 +247,7 @@ fn gap(data: &Data, outlook: &forecast::Outlook) -> &'static str {
     }
 }
 
-/// Explains the forecast in the capacity chart, or why there is none.
+/// Explains the forecast in the capacity chart, or why the forecast is missing.
 fn forecast_note(data: &Data, outlook: &Result<forecast::Outlook, String>) -> Markup {
     let note = match outlook {
         // The section itself already states that the capacity is unknown.

@@ -227,7 +227,7 @@ fn capacity(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -
         let median = fan.iter().map(|p| (clock.x(p.time_s), p.median_ah)).collect();
         layers.push(Layer::new("", Ink::Purple, Shape::Dashed(median)));
     }
-    // Capacities measured under load are drawn with the usable capacity, if there is one.
+    // Capacities measured under load are drawn with the usable capacity, if it is known.
     if !context.reference.is_loaded || series::steps(data, series::usable, false).is_empty() {
         layers.extend(references(data, &clock, context));
     }

@@ -24,7 +24,7 @@ pub struct Learned {
 pub(super) struct Feeder(MonitorDriver);
 
 impl Feeder {
-    /// Creates a monitor that has received no row. It starts in the learned state, if there is one.
+    /// Creates a monitor that has received no row. The monitor starts in the learned state, if one is given.
     pub(super) fn new(config: MonitorConfig, sleep_gap_s: f64, learned: Option<&Learned>) -> Self {
         let mut driver = MonitorDriver::new(config, sleep_gap_s);
         if let Some(learned) = learned {

@@ -55,7 +55,8 @@ impl<'a> LagWindows<'a> {
         self.columns * self.lags
     }
 
-    /// Returns the rows from `begin` on that have a window, and for which the row `steps` ahead is in the same part and before `end`.
+    /// Returns the rows from `begin` on that have a window. The row `steps` ahead must be in the same part and before
+    /// `end`.
     pub fn between(&self, begin: usize, end: usize, steps: usize) -> Vec<usize> {
         let fits = |row: &usize| {
             let (first, last) = self.part[*row];

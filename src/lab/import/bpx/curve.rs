@@ -153,7 +153,8 @@ impl<'a> Curve<'a> {
     }
 }
 
-/// Returns an interval around `near` in which the predicate changes from true to false, or `ends` if there is none.
+/// Returns an interval around `near` in which the predicate changes from true to false, or `ends` if no such interval
+/// is found.
 fn bracket(near: f64, ends: (f64, f64), is_below: impl Fn(f64) -> bool) -> (f64, f64) {
     let mut step = 1e-4;
     while step < 1.0 {

@@ -25,7 +25,7 @@ use super::{Origin, Signal, Source, of_cells};
 type Row =
     (&'static str, DataType, Option<&'static str>, &'static str, fn(&StatusDocument) -> Option<Value>, &'static str);
 
-/// The signals; those of VSS first.
+/// Returns the signals; the VSS signals come first.
 pub(super) fn signals() -> Vec<Signal> {
     let signal = |origin| {
         move |(name, data_type, unit, fields, value, description): Row| Signal {
