@@ -1,4 +1,4 @@
-//! Defines the errors of offline commands. Their text states the place, what was found and what is allowed.
+//! Defines the errors of offline commands. The text of an error states the place, what was found and what is allowed.
 
 use std::path::Path;
 

@@ -67,9 +67,9 @@ const TAU_S: [&[f64]; 3] = [&[60.0], &[10.0, 150.0], &[5.0, 50.0, 500.0]];
 /// Temperature at which the electrodes are identified, degrees Celsius.
 const ELECTRODES_C: f64 = 25.0;
 
-/// Default shift of the open-circuit curve of an ageing cell (see `AgedOcv::of_shift`). With 0, the curve shrinks evenly; 1 is a pure
-/// loss of lithium. No fit of a new cell determines the shift, so this value is a prior and not a result. It was chosen on two measured
-/// lives.
+/// Default shift of the open-circuit curve of an ageing cell (see `AgedOcv::of_shift`). With a shift of 0, the curve
+/// shrinks evenly; a shift of 1 is a pure loss of lithium. No fit of a new cell determines the shift, so this value is
+/// a prior. The value was chosen on the measured lives of two cells.
 pub const AGEING_SHIFT: f64 = 0.5;
 
 /// Progress of the fit, for a progress bar.

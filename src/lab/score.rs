@@ -79,7 +79,7 @@ impl ScoreSettings {
 pub struct ScoreJob {
     /// The measured file.
     pub path: PathBuf,
-    /// Its table of published capacities.
+    /// Table of published capacities for the file.
     pub cycles: Option<CycleTable>,
     /// Unique name of the file, used in tables and for its plots.
     pub name: String,

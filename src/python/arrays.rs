@@ -17,7 +17,7 @@ use crate::error::data;
 /// Numbers in row-major order.
 #[derive(Debug)]
 pub(crate) struct Matrix<T: ArrowPrimitiveType> {
-    /// The values. Their memory may belong to Python. It is kept until this buffer is dropped.
+    /// The values. The memory may belong to Python and is kept until this buffer is dropped.
     pub(crate) values: ScalarBuffer<T::Native>,
     /// Number of rows.
     pub(crate) rows: usize,

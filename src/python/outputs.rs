@@ -146,7 +146,7 @@ impl EstimateColumns {
     }
 
     /// Whether this is the first estimate of its cell in its period. Periods are counted from the start of the record.
-    /// They start again if the clock goes back.
+    /// The periods start again if the clock goes back.
     fn begins_period(&mut self, period_ns: i64, estimate: &Estimate) -> bool {
         let first = *self.first.get_or_insert(estimate.time);
         let period = estimate.time.nanos().saturating_sub(first.nanos()).div_euclid(period_ns);

@@ -1,4 +1,4 @@
-//! A table of results. It is an Arrow table that other libraries read without a copy. Its columns can also be read as
+//! Defines a table of results: an Arrow table that other libraries read without a copy. The columns can also be read as
 //! NumPy arrays.
 
 use std::sync::Arc;

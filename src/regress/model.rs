@@ -406,9 +406,9 @@ impl Model {
     }
 
     /// Half width of the 95 % interval in standard deviations of a measurement, at a row where residuals have their
-    /// mean width. It is 1.96 for Gaussian residuals. With [`GprSettings::calibrate`], the factor comes from
-    /// leave-one-out predictions of training rows. The interval of a prediction is wider (narrower) if the residuals of
-    /// nearby training rows are larger (smaller) than average.
+    /// mean width. The half width is 1.96 for Gaussian residuals. With [`GprSettings::calibrate`], the factor comes
+    /// from leave-one-out predictions of training rows. The interval of a prediction is wider (narrower) if the
+    /// residuals of nearby training rows are larger (smaller) than average.
     pub fn interval_factor(&self) -> f64 {
         self.calibration.factor
     }

@@ -1,10 +1,10 @@
 //! Gaussian process with nearest neighbours: Vecchia's approximation (Vecchia 1988, Datta et al. 2016).
 //!
 //! The rows are put in a seeded random order. The density of all rows is then a product with one term per row: the
-//! density of the row given all its predecessors. The approximation uses only the `m` nearest predecessors. It is a
-//! proper density, and exact if `m` includes all predecessors. Each term needs a Cholesky factor of a matrix with about
-//! `m` rows, regardless of the number of training rows. The density is conditional on the measurements of the
-//! predecessors, which include noise.
+//! density of the row given all its predecessors. The approximation uses only the `m` nearest predecessors. The
+//! approximation is a proper density, and is exact if `m` includes all predecessors. Each term needs a Cholesky factor
+//! of a matrix with about `m` rows, regardless of the number of training rows. The density is conditional on the
+//! measurements of the predecessors, which include noise.
 //!
 //! For one term, let K be the covariance matrix of the neighbours and the row, with the row last. Let `q = K^-1
 //! e_last`, `A = K^-1 [y H]` and `a = A (1, -beta)'`. The conditional variance of the row is then `1/q_n`, and its

@@ -13,8 +13,8 @@ use super::minimise::{Evaluation, Minimum, SearchLimits, minimise};
 use super::plan::{Parameter, ParameterRole, Plan};
 use super::settings::{FitProgress, ProgressCallback};
 
-/// Returns the bounds of a parameter and the range of its random starts, in standardised units. These are the values
-/// themselves, not their logarithms.
+/// Returns the bounds of a parameter and the range of its random starts, in standardised units. Both ranges contain the
+/// values themselves, not their logarithms.
 fn ranges(role: ParameterRole) -> [(f64, f64); 2] {
     match role {
         ParameterRole::Length => [(1e-4, 1e4), (0.05, 5.0)],

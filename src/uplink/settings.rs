@@ -1,5 +1,5 @@
-//! The uplink's settings. They are in a TOML file separate from the daemon's configuration. A change of the broker
-//! therefore changes neither the daemon nor the hash of its configuration.
+//! Reads the uplink's settings from a TOML file that is separate from the daemon's configuration. A change of the
+//! broker therefore changes neither the daemon nor the hash of its configuration.
 //!
 //! Input: the file given with `-c`. Output: validated settings. An error names the file, the key and the allowed
 //! values. An error of a single key also names its line.

@@ -1,8 +1,8 @@
 //! Writes notes on quantities that the logs do not determine. For these quantities, the fit keeps the values of the initial
 //! model.
 //!
-//! Input: the measured mean voltage of the cells in each stretch (a part of a log without gaps), the fitted records,
-//! and the capacity before and after the fit (Ah). Output: notes for the user.
+//! Input: the mean voltage of the cells in each stretch (a part of a log without gaps), the fitted records, and both
+//! capacities (Ah): before and after the fit. Output: notes for the user.
 
 use crate::filter::{ends, median};
 use crate::ident::MeasuredPart;

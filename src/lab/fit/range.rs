@@ -1,9 +1,10 @@
 //! Determines the measured range of a model, and extends the model's tables beyond the measured temperatures.
 //!
-//! Input: the records of a fit, and the fitted tables. Output: the measured ranges of temperature (degrees Celsius), current (A) and
-//! SOC, and extended tables. The extended tables have an additional row [`REACH_K`] below the lowest measured temperature, and another
-//! above the highest. In these rows, the open-circuit curve and the time constants repeat the nearest measured row, and the resistances
-//! follow Arrhenius' law. This law is only approximate, so the voltage error grows with the distance.
+//! Input: the records of a fit, and the fitted tables. Output: the measured ranges of temperature (degrees Celsius),
+//! current (A) and SOC, and extended tables. The extended tables have an additional row [`REACH_K`] below the lowest
+//! measured temperature, and another above the highest. In these rows, the open-circuit curve and the time constants
+//! repeat the nearest measured row, and the resistances follow Arrhenius' law. Arrhenius' law is only approximate, so
+//! the voltage error grows with the distance.
 
 use crate::cell::arrhenius;
 use crate::filter::ends;

@@ -102,15 +102,16 @@ fn measured(out: &mut String, outcome: &FitOutcome) {
     line(out, &format!("soc = [{:.3}, {:.3}]", range.soc.0, range.soc.1));
 }
 
-/// Returns the file name with its folder. They identify the file and reveal nothing about the machine.
+/// Returns the file name with its folder: enough to identify the file, without revealing anything else about the
+/// machine.
 fn file_name(path: &std::path::Path) -> String {
     let parts: Vec<_> = path.components().map(|part| part.as_os_str().to_string_lossy().into_owned()).collect();
     parts[parts.len().saturating_sub(2)..].join("/")
 }
 
 fn tables(out: &mut String, request: &FitRequest, outcome: &FitOutcome) {
-    // The model of an ageing cell describes this cell under its own conditions. Its cycles cannot separate the effect of temperature
-    // from the effect of age.
+    // The model of an ageing cell describes this cell under its own conditions. The cycles of this cell cannot separate
+    // the effect of temperature from the effect of age.
     let is_ageing = request.first_cycles.is_some();
     let (fit, errors) = (&outcome.fit, &outcome.voltage_error_v);
     let ModelTables { grid, tables, voltage_error_v } = match is_ageing {

@@ -1,9 +1,9 @@
 //! Describes the accuracy of a fitted model in plain words.
 //!
-//! Input: the error table of the model (V, for data outside the fit), the slopes of its open-circuit curve, and the fitted rows.
-//! Output: sentences. The SOC error at a breakpoint is the voltage error divided by the slope; the root mean square over [`MIDDLE`] is
-//! stated. This is the error if the SOC is determined by voltage alone. Counting charge between readings reduces it; sensor errors
-//! increase it.
+//! Input: the error table of the model (V, for data outside the fit), the slopes of its open-circuit curve, and the
+//! fitted rows. Output: sentences. The SOC error at a breakpoint is the voltage error divided by the slope; the root
+//! mean square over [`MIDDLE`] is stated. This SOC error applies if the SOC is determined by voltage alone. Counting
+//! charge between readings reduces the error; sensor errors increase it.
 
 use super::{FitOutcome, MeasuredRange};
 use crate::ident::fit::{FittedTables, MIN_SLOPE_V, SUPPORTED_S};

@@ -7,7 +7,8 @@
 //! * **true raise**: a raise before the end of life; with a horizon, at most the horizon before it.
 //! * **false alarm**: with a horizon, a raise that is not followed by the end of life within the horizon. Without a horizon, any raise
 //!   in a record without an end of life. Raises at or after the end of life are neither true nor false.
-//! * **open**: in a record without an end of life, a raise less than the horizon before the end of the record. It cannot be judged.
+//! * **open**: in a record without an end of life, a raise less than the horizon before the end of the record. Such a
+//!   raise cannot be judged.
 //! * **lead**: time from the first true raise to the end of life, in days and in equivalent full cycles.
 //! * **missed**: the end of life was reached without a true raise.
 //! * **false raise**: a raise of `capacity_low` while the true capacity of the cell was above the threshold; counted only if the true

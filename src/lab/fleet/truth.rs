@@ -1,9 +1,9 @@
 //! Reads the true capacities of a log from a CSV file in the same folder.
 //!
 //! There are two formats, which are recognised by their columns. A table with a column `cell` was written by `simulate
-//! --truth`; it contains the capacity of every cell, counted from the open-circuit voltage of a full cell to that
-//! voltage of an empty cell. A table with `cycle` and `type` has the format of `score --cycles`; it contains the
-//! published capacity of one cell for each discharge, at the load of this discharge.
+//! --truth`; it contains the capacity of every cell between the full and the empty open-circuit voltage. A table with
+//! `cycle` and `type` has the format of `score --cycles`; it contains the published capacity of one cell for each
+//! discharge, at the load of this discharge.
 //!
 //! For a log `NAME.log`, `NAME.csv` etc., these files are searched in its folder: `NAME.truth.csv`, `NAME_truth.csv` and
 //! `NAME_cycles.csv`, and also `truth.csv` if no other given log is in this folder. Each may end in `.gz` or `.zst`.

@@ -50,7 +50,8 @@ pub struct ForecastPlan {
     pub steps: usize,
     /// Share of the rows that is known: above 0, at most 1. The origin is the end of this share.
     pub origin: f64,
-    /// Maximum number of windows to which a process is fitted. They are selected evenly from all windows, at varying phases.
+    /// Maximum number of windows to which a process is fitted. The windows are selected evenly from all windows, at
+    /// varying phases.
     pub rows: usize,
     /// Kernel of the processes, and settings of the search for hyperparameters.
     pub settings: GprSettings,

@@ -1,4 +1,5 @@
-//! A regression model that remembers the names of its columns. It is trained on a table, saved, loaded, and applied to other files.
+//! Defines a regression model that stores the names of its columns. The model is trained on a table, saved, loaded, and
+//! applied to other files.
 //!
 //! The file has one line of JSON with the names of the columns, followed by the two lines of the model itself. These two lines have a
 //! checksum (see [`Model`]).

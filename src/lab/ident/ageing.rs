@@ -106,8 +106,8 @@ fn marks(cycle: &MeasuredPart, knee_v: f64, cut_off_v: f64) -> Option<Marks> {
     Some(Marks { knee_ah: crossing(knee_v)?, cut_off_ah: crossing(cut_off_v).unwrap_or(last_ah) })
 }
 
-/// Sets the short loads with which chargers test themselves to 0. They move almost no charge, but the rows are seconds apart, so an
-/// integral would count too much.
+/// Sets the short loads with which chargers test themselves to 0. These loads move almost no charge. Because the rows
+/// are seconds apart, an integral over the rows would count too much charge.
 fn without_load_pulses(cycle: &MeasuredPart, capacity_ah: f64) -> Vec<f64> {
     let pulse = |i: f64| !cycle.is_discharge() && i > STEP_PER_AH * capacity_ah;
     cycle.current_a.iter().map(|&i| if pulse(i) { 0.0 } else { i }).collect()

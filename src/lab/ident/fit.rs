@@ -1,5 +1,5 @@
-//! Runs a whole fit of a cell model: sets starting values and prior, passes over all records in parallel until the cost
-//! stops falling, and computes residuals and a list of nodes without data.
+//! Runs a whole fit of a cell model. Sets starting values and prior, and passes over all records in parallel until the
+//! cost stops falling. The result also contains residuals and the data near each node.
 
 use rayon::prelude::*;
 

@@ -1,22 +1,21 @@
 //! Makes one pass over the data: computes the residuals, their exact Jacobian, and the normal equations.
 //!
-//! The residual of a row is e = V - (OCV(s,T) - sum U_i - R0(s,T) I). Over the step of a row, the voltage U of a branch is solved
-//! exactly:
-//! `U' = R I + x (U - R I)` with `x = exp(-dt / tau)`.
-//! Its derivatives are exact too:
-//! `dU' = x dU + (1 - x) I dR + (U - R I) x dt / tau^2 dtau`.
-//! Derivatives decay with the branch and are dropped below [`FADED_V`]. A row therefore touches only a few nodes, and the work per row
-//! does not grow with the tables.
+//! The residual of a row is e = V - (OCV(s,T) - sum U_i - R0(s,T) I). Over the step of a row, the voltage U of a branch
+//! is solved exactly: `U' = R I + x (U - R I)` with `x = exp(-dt / tau)`. The derivatives of U are exact too: `dU' = x
+//! dU + (1 - x) I dR + (U - R I) x dt / tau^2 dtau`. Derivatives decay with the branch and are dropped below
+//! [`FADED_V`]. A row therefore touches only a few nodes, and the work per row does not grow with the tables.
 //!
-//! Beyond [`HUBER_V`], the cost grows linearly (Huber), so that errors that no circuit can explain do not distort the tables. If the
-//! SOC is unknown ([`FreeScale`]), each residual is compared with the error of a circuit at this voltage drop and temperature
-//! ([`circuit_error_v`]), so that the error of the circuit in the cold is not mistaken for lost capacity.
+//! Beyond [`HUBER_V`], the cost grows linearly (Huber), so that errors that no circuit can explain do not distort the
+//! tables. If the SOC is unknown ([`FreeScale`]), each residual is compared with the error of a circuit at this voltage
+//! drop and temperature ([`circuit_error_v`]). Otherwise, the error of the circuit in the cold would be mistaken for
+//! lost capacity.
 
 use super::grid::{Corners, Grid, arrhenius};
 use super::parameters::{Layout, ParameterTables};
 use super::record::{FitRow, Record};
 
-/// Derivatives below this value are dropped, V per unit of a log parameter. It is a thousandth of the voltage resolution.
+/// Derivatives below this value are dropped, V per unit of a log parameter. The limit is a thousandth of the voltage
+/// resolution.
 const FADED_V: f64 = 1e-6;
 /// Residual above which the cost grows linearly, V.
 pub const HUBER_V: f64 = 0.05;
@@ -24,9 +23,9 @@ pub const HUBER_V: f64 = 0.05;
 const SIGMA_V: f64 = 0.010;
 /// Correlation time of the model error, s. Residuals count as one independent residual per correlation time.
 const REPEATS_S: f64 = 50.0;
-/// Correlation time if the SOC is unknown, s. With 50 to 500 s, and with a wide range of the next two constants, the
-/// mean SOC errors of Panasonic 18650PF cells and of a simulated LG M50 change by less than 0.1 points. The EVE cell
-/// with its flat curve needs at least this value.
+/// Correlation time if the SOC is unknown, s. Values from 50 to 500 s change the mean SOC errors of Panasonic 18650PF
+/// cells and of a simulated LG M50 by less than 0.1 points. The same holds for a wide range of the next two constants.
+/// The EVE cell with its flat curve needs at least this value.
 const FREE_REPEATS_S: f64 = 250.0;
 /// Error of a circuit, as a share of the voltage drop.
 const DROP_ERROR: f64 = 0.05;

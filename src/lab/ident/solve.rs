@@ -1,9 +1,10 @@
 //! Minimises the cost within bounds: projected Levenberg-Marquardt on normal equations.
 //!
-//! Some parameters form a *rising* block (the OCV over SOC). For such a block, the solver uses its first value and the rises from node
-//! to node instead of the node values. A bound on each rise keeps the curve monotone. The damped quadratic model is minimised within
-//! the bounds by block pivoting: in each iteration, the set of parameters held at a bound changes, and a Cholesky factorisation solves
-//! for the free parameters. A step is taken if it lowers the true cost.
+//! Some parameters form a *rising* block (the OCV over SOC). For such a block, the solver uses its first value and the
+//! rises from node to node instead of the node values. A bound on each rise keeps the curve monotone. The damped
+//! quadratic model is minimised within the bounds by block pivoting. Each iteration changes the set of parameters that
+//! are held at a bound, and solves for the free parameters by a Cholesky factorisation. A step is taken if it lowers
+//! the true cost.
 
 use nalgebra::{DMatrix, DVector};
 

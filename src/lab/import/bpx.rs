@@ -33,8 +33,8 @@ const GAS_J_PER_MOL_K: f64 = 8.314_462_618;
 /// Temperatures of the tables relative to the file's reference temperature, K.
 const TEMPERATURES_K: [f64; 6] = [-35.0, -25.0, -15.0, 0.0, 15.0, 30.0];
 
-/// Standard deviation of the voltage error at rest and at the reference temperature, V. It covers the difference between a real cell
-/// and its parameters.
+/// Standard deviation of the voltage error at rest and at the reference temperature, V. This error covers the
+/// difference between a real cell and its parameters.
 const ERROR_AT_REST_V: f64 = 0.010;
 
 /// Share of the voltage drop at a one-hour current that is added to the error, because the formulas hold for small currents.

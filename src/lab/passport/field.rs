@@ -1,6 +1,6 @@
 //! Lists the values of a battery passport that packwatch can determine: name, unit, definition and place in each standard.
 //!
-//! This table decides which value is written to which member; `docs/src/lab/passport.md` explains it.
+//! This list decides which value is written to which member; `docs/src/lab/passport.md` explains the choice.
 
 use serde_json::Value;
 

@@ -117,8 +117,8 @@ impl Losses {
 
 /// Whether `lost_s` is so large a share of `used_s` that the sum over this time is unknown.
 pub(super) fn is_too_much(lost_s: f64, used_s: f64) -> bool {
-    // Maximum share of the charging and discharging time without a current reading. It tolerates single lost frames,
-    // and its error is far below the gain error of a current sensor.
+    // Maximum share of the charging and discharging time without a current reading. This share tolerates single lost
+    // frames, and causes an error far below the gain error of a current sensor.
     lost_s > 1e-3 * used_s
 }
 

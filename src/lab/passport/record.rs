@@ -47,7 +47,7 @@ struct Power {
 pub(super) struct Energy {
     /// Energy of charges and discharges, Wh, added.
     pub(super) energy_wh: f64,
-    /// Time of the last part.
+    /// End of the last step that was integrated.
     pub(super) until: Option<Timestamp>,
     /// Integrated time, s, all cells added.
     counted_s: f64,

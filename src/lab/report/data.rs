@@ -1,6 +1,6 @@
 //! Collects the data of a report from the rows of a store or from the events and estimates of a replay.
 //!
-//! Times are in seconds. They are on the wall clock, or in a replay on the clock of the log. Cells count from 0.
+//! Times are in seconds on the wall clock or, in a replay, on the clock of the log. Cells count from 0.
 
 use std::collections::BTreeSet;
 

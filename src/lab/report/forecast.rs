@@ -16,7 +16,7 @@ const DAY_S: f64 = 86_400.0;
 /// Number of points of a fan.
 const POINTS: usize = 60;
 /// Upper limits of the fan's length: [`MAX_MEDIANS`] times the median time to the end of life, and [`MAX_RECORDS`]
-/// times the length of the record.
+/// times the length of the record (or the median, if it is larger).
 const MAX_MEDIANS: f64 = 2.5;
 const MAX_RECORDS: f64 = 2.0;
 /// The first limit is at least this multiple of the record's length, because the end of life may come much later than a
@@ -123,7 +123,8 @@ fn reading(row: &CapacityRecord, gain_std: f64) -> Option<CapacityReading> {
     Some(CapacityReading { capacity_ah, variance_ah2: std_ah * std_ah, shared_variance_ah2: gain_ah * gain_ah })
 }
 
-/// Points from the last half-cycle to the latest likely end of life, within the limits above.
+/// Returns points from the last half-cycle to the latest likely end of life, limited by [`MAX_MEDIANS`] and
+/// [`MAX_RECORDS`].
 fn fan(data: &Data, forecast: &Forecast, life: &RemainingLife) -> Vec<DatedFanPoint> {
     let (Some(cycles), Some(days)) = (life.cycles, life.days) else { return Vec::new() };
     let (Some(first), Some(last)) = (data.halves.first(), data.halves.last()) else { return Vec::new() };

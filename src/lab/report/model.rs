@@ -120,7 +120,7 @@ fn unknown_temperatures(sourced: &SourcedModel) -> String {
     )
 }
 
-/// Consecutive places without data, in words.
+/// Lists the ranges without data, each with the source that replaces the data.
 fn unknown(places: impl Iterator<Item = (f64, KnownBy)>, factor: f64, unit: &str) -> String {
     let places: Vec<(f64, KnownBy)> = places.collect();
     let is_known = |known_by: &KnownBy| matches!(known_by, KnownBy::Measured | KnownBy::Data);

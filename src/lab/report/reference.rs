@@ -1,4 +1,5 @@
-//! Reads measured or true capacities and SOC from a CSV file. They are drawn together with the estimates.
+//! Reads measured or true capacities and SOC from a CSV file. The report draws these values together with the
+//! estimates.
 
 use std::path::Path;
 

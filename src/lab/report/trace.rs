@@ -86,7 +86,7 @@ impl Consistency {
         (self.count > 0).then(|| self.inside as f64 / self.count as f64)
     }
 
-    /// Returns the mean normalised innovation squared. It is 1 if the variance of the filter is right.
+    /// Returns the mean normalised innovation squared. The mean is 1 if the variance of the filter is right.
     pub(super) fn mean_nis(&self) -> Option<f64> {
         (self.count > 0).then(|| self.squares / self.count as f64)
     }

@@ -185,8 +185,8 @@ impl Session {
         self.publish(None, journal);
         drop(self.outbox);
         let until_end = async { while let Ok(Some(_)) = self.incoming.message().await {} };
-        // Waits at most [`FAREWELL`], because the broker may keep the connection open. It has then had enough time to
-        // read all messages.
+        // Waits at most [`FAREWELL`], because the broker may keep the connection open. By then, the broker has had
+        // enough time to read all messages.
         let _ = timeout(FAREWELL, until_end).await;
     }
 }
@@ -291,7 +291,7 @@ mod tests {
         let begin = Instant::now();
         let at = |seconds: u64| begin + Duration::from_secs(seconds);
         let mut receipts = Receipts::default();
-        // There is no daemon and nothing is sent for an hour. Then a batch is sent.
+        // Without a daemon, nothing is sent for an hour. After this hour, a batch is sent.
         receipts.note_sent(at(3600));
         assert_eq!(receipts.check(at(3600)), Ok(()));
         receipts.note_read();

@@ -31,7 +31,7 @@ pub fn client(settings: &MqttSettings) -> Result<(AsyncClient, EventLoop), Strin
     options.set_clean_start(true);
     options.set_last_will(LastWill::new(settings.topic(topic::STATUS), OFFLINE, QoS::AtLeastOnce, true, None));
     options.set_incoming_packet_size_limit(rumqttc::IncomingPacketSizeLimit::Bytes(MAX_INCOMING_BYTES));
-    // This limits the memory for unacknowledged messages; the default is 65,535 messages.
+    // This limit bounds the memory for unacknowledged messages; the default is 65,535 messages.
     options.set_outgoing_inflight_upper_limit(IN_FLIGHT);
     let mut network = options.network_options();
     network.set_connection_timeout(CONNECT_LIMIT_S);

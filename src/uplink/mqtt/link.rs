@@ -1,4 +1,4 @@
-//! The link to the broker. It reconnects until it is stopped, publishes the present values, and forwards the queue.
+//! The link to the broker: reconnects until it is stopped, publishes the present values, and forwards the queue.
 //!
 //! Input: the daemon's documents and the [`Queue`]. Output: messages with QoS 1. Each connection starts without
 //! messages in memory, so it repeats no value of an earlier connection. Present values come from the newest document. A
@@ -228,7 +228,7 @@ async fn persist<T>(action: &str, mut attempt: impl FnMut() -> Result<T, String>
     }
 }
 
-/// What this connection has published. It is used to send only changes.
+/// What this connection has published, so that only changes are sent.
 #[derive(Debug, Default)]
 struct PublishedState {
     has_status: bool,

@@ -16,7 +16,7 @@ fn scatter(k: usize) -> f64 {
     x - x.floor() - 0.5
 }
 
-/// A current at 1 Hz that changes every 40 s, with rests. It takes out 1.9 Ah in two hours.
+/// A current at 1 Hz that changes every 40 s, with rests. The current takes out 1.9 Ah in two hours.
 fn currents() -> Vec<f64> {
     let level = |k: usize| match (k / 40) % 5 {
         0 => 0.0,

@@ -22,8 +22,8 @@ fn page_without_data_says_unknown_and_fetches_nothing() {
     assert!(!page.contains("NaN") && !page.contains("inf"), "not a number in the text");
 }
 
-/// A pack of 96 cells over 600 half-cycles of three hours, each cell fading at its own rate, with a voltage reading per
-/// cell every two minutes, and alarms that come and go in every tenth half-cycle.
+/// Creates the life of a pack of 96 cells: 600 half-cycles of three hours. Each cell fades at its own rate and has a
+/// voltage reading every two minutes. Alarms are raised and cleared in every tenth half-cycle.
 fn life() -> Data {
     let mut data = Data::new(Origin::Replay);
     for half in 0..600_u16 {

@@ -1,4 +1,5 @@
-//! Tests the time axis. It shows dates if the record has them, otherwise the time since the start in a unit that suits the record's length.
+//! Tests the time axis. The axis shows dates if the record has them. Otherwise, it shows the time since the start in a
+//! unit that suits the record's length.
 
 use super::*;
 use crate::chart::Size;
