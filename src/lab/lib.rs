@@ -1,5 +1,6 @@
-//! Offline work on measured files: fits of cell models, scores against a known truth, remaining useful life, Gaussian processes,
-//! reports and plots.
+//! Works offline on measured files, logs and stores: fits cell models, scores estimates against a known truth,
+//! forecasts remaining life, applies Gaussian processes, imports and discovers signals, evaluates fleets, and writes
+//! reports, passports and plots.
 
 pub use packwatch_core::{alarm, can, cell, cell_faults, filter, health, monitor, quantity, sample, sim, wiring};
 pub use packwatch_host::{config, io, replay, status, store};

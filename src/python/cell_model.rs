@@ -1,4 +1,4 @@
-//! `CellModel`: open-circuit voltage and resistances of a cell, from a file or a label.
+//! Implements the Python class `CellModel`: open-circuit voltage and resistances of a cell, from a file or a label.
 
 use std::path::{Path, PathBuf};
 

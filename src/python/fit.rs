@@ -1,4 +1,4 @@
-//! `fit`: fits a cell model to measured files.
+//! Implements the Python function `fit`, which fits a cell model to measured files.
 
 use std::path::PathBuf;
 use std::time::Instant;

@@ -1,4 +1,5 @@
-//! `GaussianProcess`: regression on arrays; reads and writes the model files of `gpr`.
+//! Implements the Python class `GaussianProcess`: regression on arrays. The class reads and writes the model files of
+//! `packwatch gpr`.
 
 use std::ops::ControlFlow;
 use std::path::PathBuf;

@@ -1,4 +1,5 @@
-//! `read`: reads a measured file, in packwatch's CSV or in the Battery Data Format, as a table.
+//! Implements the Python function `read`, which reads a measured file (packwatch's CSV or the Battery Data Format) as a
+//! table.
 
 use std::path::PathBuf;
 use std::sync::Arc;

@@ -1,4 +1,4 @@
-//! `Monitor`: processes rows or frames, and returns tables.
+//! Implements the Python class `Monitor`, which processes rows or frames and returns tables.
 //!
 //! Rows are converted to the frames that would have carried them, with the resolution of the configured signals, as
 //! when a CSV file is replayed. The same rows therefore give the same estimates as `packwatch replay`. After Ctrl-C,

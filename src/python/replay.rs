@@ -1,4 +1,4 @@
-//! `replay`: replays logs through the monitor like the command, with results in tables.
+//! Implements the Python function `replay`, which replays logs through the monitor like the command and returns tables.
 
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;

@@ -1,4 +1,4 @@
-//! `rul`: forecasts the remaining useful life of measured capacity histories.
+//! Implements the Python function `rul`, which forecasts the remaining useful life from measured capacity histories.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,4 @@
-//! `score`: compares estimates with the truth of measured files.
+//! Implements the Python function `score`, which compares estimates with the truth of measured files.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,4 @@
-//! The mean function and its generalised least-squares coefficients.
+//! Defines the mean function and computes its generalised least-squares coefficients.
 //!
 //! Input: the matrix `G = [y H]' K^-1 [y H]`, with the targets `y`, the values `H` of the mean function's terms at
 //! every row, and the covariance `K` of the measurements. Output: the coefficients beta and their covariance. If the

@@ -1,4 +1,4 @@
-//! Errors of rows, settings and saved models.
+//! Defines the errors of rows, settings and saved models.
 
 /// Reason why a model or a prediction failed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]

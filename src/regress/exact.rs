@@ -1,4 +1,5 @@
-//! Exact Gaussian process: uses all pairs of the n rows. Needs time proportional to n^3 and memory proportional to n^2.
+//! Implements the exact Gaussian process, which uses all pairs of the n rows. It needs time proportional to n^3 and
+//! memory proportional to n^2.
 //!
 //! Input: standardised rows and hyperparameters. Output: likelihood, gradient and predictions. If the covariance matrix
 //! is not positive definite even with the largest jitter, the result is an error.

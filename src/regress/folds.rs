@@ -1,4 +1,4 @@
-//! k-fold cross-validation: every row is predicted by a model that was fitted without this row.
+//! Performs a k-fold cross-validation: every row is predicted by a model that was fitted without this row.
 //!
 //! Input: rows, settings and the number of folds. Output: a prediction of every row, and the errors of the predictions
 //! in units of the target. The cross-validation fails if the number of folds is out of range or if a fit fails.

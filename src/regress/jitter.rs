@@ -1,5 +1,5 @@
-//! Jitter: a small number that is added to the diagonal of a covariance matrix if the matrix has no Cholesky factor
-//! without it.
+//! Finds the necessary jitter: a small number that is added to the diagonal of a covariance matrix if the matrix alone
+//! has no Cholesky factor.
 //!
 //! Input: a function that tries to factorise with a given jitter. Output: the smallest jitter that is sufficient, as a
 //! fraction of the signal variance, or an error.

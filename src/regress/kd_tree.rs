@@ -1,5 +1,5 @@
-//! A k-d tree, which finds the rows that are nearest to a point. The search may be limited to rows with numbers below a
-//! given number.
+//! Implements a k-d tree, which finds the rows that are nearest to a point. The search may be limited to rows with
+//! numbers below a given number.
 //!
 //! Input: rows, a weight for each input, and a point. Output: row numbers, nearest first. The caller checks that all
 //! inputs are finite.

@@ -1,4 +1,4 @@
-//! Covariance functions as text and as a tree. There are five shapes, which can be added and multiplied.
+//! Defines covariance functions (kernels), as text and as a tree. Kernels are sums and products of five shapes.
 //!
 //! Input: text. Output: a [`Kernel`], or an error with the column in the text. A kernel can be converted to text again.
 //!
@@ -13,8 +13,8 @@
 //! | `rational_quadratic` | (1 + r^2 / (2 alpha))^-alpha |
 //!
 //! Operators have their usual precedence, as in `a + b * (c + d)`. A name may contain dashes instead of underscores.
-//! Every shape has its own length scales. It also has its own standard deviation, except that in a product only the
-//! first factor has one, because several could not be distinguished.
+//! Every shape has its own length scales. Every shape also has its own standard deviation, except in a product: there,
+//! only the first factor has one, because several could not be distinguished.
 
 use std::fmt;
 use std::str::FromStr;

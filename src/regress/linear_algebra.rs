@@ -1,4 +1,5 @@
-//! Dense linear algebra on column-major slices. It uses the threads of the thread pool in which it is called.
+//! Provides dense linear algebra on column-major slices. The functions use the threads of the thread pool in which they
+//! are called.
 //!
 //! [`cholesky`] reports a matrix that is not positive definite. If an input is NaN, the result is NaN.
 

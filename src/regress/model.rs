@@ -1,4 +1,4 @@
-//! A fitted process, with its fit, its predictions and its hyperparameters.
+//! Fits a process to rows, predicts further rows, and returns the hyperparameters.
 //!
 //! Input: rows and settings. Output: a [`Model`] that predicts in units of the target. Invalid rows, and settings out
 //! of range, give an error.

@@ -1,4 +1,4 @@
-//! Gaussian process with nearest neighbours: Vecchia's approximation (Vecchia 1988, Datta et al. 2016).
+//! Implements the Gaussian process with nearest neighbours: Vecchia's approximation (Vecchia 1988, Datta et al. 2016).
 //!
 //! The rows are put in a seeded random order. The density of all rows is then a product with one term per row: the
 //! density of the row given all its predecessors. The approximation uses only the `m` nearest predecessors. The

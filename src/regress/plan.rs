@@ -1,6 +1,6 @@
-//! A kernel prepared for evaluation. All parameters are in one vector. The plan computes the kernel's values over a
-//! block of row pairs. It also computes the exact derivatives of a weighted sum of these values with respect to every
-//! parameter (reverse-mode differentiation).
+//! Prepares a kernel for evaluation, as a plan. All parameters are in one vector. The plan computes the kernel's values
+//! over a block of row pairs. The plan also computes the exact derivatives of a weighted sum of these values with
+//! respect to every parameter (reverse-mode differentiation).
 //!
 //! A block of `count` pairs is given as *squares*: for each input in turn, `count` squared differences. The parameters
 //! are natural logarithms of length scales, of `alpha`, and of standard deviations. The standard deviation of the noise

@@ -1,4 +1,4 @@
-//! Training rows, settings of a fit, its progress, and limits.
+//! Defines training rows, and the settings, progress and limits of a fit.
 //!
 //! Input: values from the caller. [`fit`](super::fit) checks all of them and rejects values that are out of range.
 

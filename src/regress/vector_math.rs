@@ -1,4 +1,4 @@
-//! Branch-free exponential and logarithm, which the compiler can vectorise.
+//! Computes exponential and logarithm without branches, so that the compiler can vectorise the loops.
 //!
 //! The results are accurate to a few 1e-16 of their value within the stated range of the argument. Outside this range,
 //! they are meaningless. The calling loops run inside `pulp`'s dispatcher (part of faer), which selects the widest

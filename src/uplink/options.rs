@@ -1,4 +1,4 @@
-//! Options shared by the commands that run until stopped.
+//! Defines the options of the commands that run until stopped.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,4 @@
-//! The daemon's status, one document a second.
+//! Receives the daemon's status, one document a second.
 //!
 //! Input: the daemon's stream socket. Output: [`StatusDocument`]s. When the daemon stops sending, the output is `None`
 //! once. The daemon counts as stopped if nothing arrives for [`SILENCE`], if the stream ends, or if a document cannot

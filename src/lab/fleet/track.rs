@@ -1,4 +1,4 @@
-//! Tracks use and wear during a log: charge moved, and the weakest learned capacity.
+//! Tracks use and wear during a log: charge moved, and the learned capacity of the weakest cell.
 //!
 //! Input: events of the monitor. Output: equivalent full cycles (charge moved divided by twice the rated capacity), and learned
 //! capacities. Both values are known at the ends of half-cycles. Between the ends, the cycles are interpolated, and the capacities keep

@@ -1,4 +1,4 @@
-//! The messages and three calls of the protocol `kuksa.val.v2` that a provider of values needs.
+//! Defines the messages and three calls of the protocol `kuksa.val.v2` that a provider of values needs.
 //!
 //! The messages are written by hand, because the generated client of the KUKSA project compiles protoc, a C++ program,
 //! at every build. Fields that this program does not read are omitted, because protobuf skips them. The field numbers

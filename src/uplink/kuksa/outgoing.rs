@@ -1,4 +1,4 @@
-//! The messages of one connection to the broker. A message is created only when the connection can send it.
+//! Queues the messages of one connection to the broker. A message is created only when the connection can send it.
 //!
 //! * While the connection cannot send, only the newest batch of values is kept.
 //! * An empty claim follows each batch. The broker accepts a claim after it has read every message before it, so the

@@ -1,4 +1,4 @@
-//! One connection to the broker, from opening to closing.
+//! Serves one connection to the broker, from opening to closing.
 //!
 //! Input: settings, status documents, the request to stop. Output: values, identified by the ids of this connection.
 //! The program lists the metadata, claims the signals, and then sends a batch for each document. If the daemon falls

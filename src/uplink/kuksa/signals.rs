@@ -1,4 +1,4 @@
-//! The signals that this program provides, and the derivation of each from the status document.
+//! Defines the signals that this program provides, and derives the value of each from the status document.
 //!
 //! Input: a status document (units in its field names, positive current = discharge, SOC and SOH as fractions, cells
 //! from 0). Output: VSS values (positive current = charge, percentages, cells from 0). `None` means that the value

@@ -1,4 +1,4 @@
-//! Values and their VSS datatypes.
+//! Defines values and their VSS datatypes.
 //!
 //! Input: numbers of the status document, and the limits of the broker. Output: values of the protocol. A number that
 //! is outside its datatype or outside the broker's limits becomes unknown; it is never clamped.

@@ -1,4 +1,5 @@
-//! Requests of the broker for values. When a reader asks the broker for a present value, the broker asks this program.
+//! Handles requests of the broker for values. When a reader asks the broker for a present value, the broker asks this
+//! program.
 //!
 //! While the databroker (0.7) waits for an answer (up to a second), it reads nothing else from this program. It
 //! mistakes a late answer for the answer to its next request, which may be about another signal. If a batch is sent

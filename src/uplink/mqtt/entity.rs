@@ -1,4 +1,5 @@
-//! The entities of a pack: key in `info`, name, unit and value. Nearly all are rows of the catalogue of quantities.
+//! Defines the entities of a pack: key in `info`, name, unit and value. Nearly all are rows of the catalogue of
+//! quantities.
 //!
 //! Input: the daemon's status. Output: the values as JSON. If Battery-Emulator has a quantity, its key and name are
 //! used. As in Battery-Emulator, SOC and other fractions are published in percent, and positive current and power mean

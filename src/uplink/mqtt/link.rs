@@ -1,4 +1,4 @@
-//! The link to the broker: reconnects until it is stopped, publishes the present values, and forwards the queue.
+//! Runs the link to the broker: reconnects until it is stopped, publishes the present values, and forwards the queue.
 //!
 //! Input: the daemon's documents and the [`Queue`]. Output: messages with QoS 1. Each connection starts without
 //! messages in memory, so it repeats no value of an earlier connection. Present values come from the newest document. A

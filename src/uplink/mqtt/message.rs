@@ -1,4 +1,4 @@
-//! A message to the broker.
+//! Defines a message to the broker.
 
 /// A message to the broker.
 #[derive(Debug, Clone, PartialEq, Eq)]

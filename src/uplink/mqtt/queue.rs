@@ -1,4 +1,4 @@
-//! The queue on disk: messages that the broker has not acknowledged, oldest first.
+//! Stores messages that the broker has not acknowledged in a queue on disk, oldest first.
 //!
 //! Input: messages of the recorder. Output: the oldest messages of a class, in order, until they are removed. An added
 //! message survives a power cut and a restart (SQLite with a write-ahead log, flushed at each commit).

@@ -1,4 +1,4 @@
-//! The recorder: selects the documents to queue as samples, and the new events.
+//! Implements the recorder, which selects the documents to queue as samples, and the new events.
 //!
 //! Input: the daemon's documents. Output: messages in the [`Queue`], even if the broker cannot be reached. The daemon's
 //! clock decides when a sample is due. Each document lists the latest events. The recorder finds new events by

@@ -1,4 +1,5 @@
-//! Table `[mqtt]` of the uplink's settings: the broker, what is published when, and the queue for a lost link.
+//! Defines and checks the table `[mqtt]` of the uplink's settings: the broker, what is published when, and the queue
+//! for a lost link.
 //!
 //! Input: TOML. Output: validated settings. A value that is outside its range is reported with its line. The files
 //! named here are read at each connection, so a new certificate or password needs no restart.

@@ -1,4 +1,4 @@
-//! Fits of simulated records whose tables are known, and requests that a fit must reject.
+//! Tests fits of simulated records whose tables are known, and requests that a fit must reject.
 
 use super::*;
 use crate::cell::circuit::BranchAt;

@@ -1,4 +1,4 @@
-//! A parameter of a BPX file that may depend on a variable. It is a number, an expression of `x`, or a table.
+//! Defines a parameter of a BPX file that may depend on a variable: a number, an expression of `x`, or a table.
 
 use serde_json::Value;
 

@@ -1,4 +1,5 @@
-//! Signals outside the catalogue: derived from several values, from the alarms, or from the state of the daemon.
+//! Defines the signals outside the catalogue of quantities: derived from several values, from the alarms, or from the
+//! state of the daemon.
 //!
 //! VSS signals have the names, datatypes and units of releases 3 to 6. These VSS signals are omitted, because the
 //! status document has no value for them:

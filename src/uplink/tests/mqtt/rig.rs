@@ -1,4 +1,4 @@
-//! Test rig of the uplink: a broker, a reader, a daemon's status socket.
+//! Provides the test rig of the uplink: a broker, a reader, a daemon's status socket.
 
 #![expect(clippy::unwrap_used, reason = "a step that fails ends the test")]
 
