@@ -1,8 +1,8 @@
 //! packwatch: streaming battery health monitoring over SocketCAN.
 //!
 //! # Map
-//! Each folder under `src` is a crate, so the compiler enforces what may use what. A folder inside a crate is a module; it uses
-//! only modules above it in this table (`tests/integration/layering.rs` checks this).
+//! Each folder under `src` is a crate, so the compiler enforces which crate may use which. A folder inside a crate is a module.
+//! A module uses only modules above it in this table (`tests/integration/layering.rs` checks this rule).
 //!
 //! | crate | module | what lives there |
 //! | --- | --- | --- |
@@ -21,23 +21,27 @@
 //! | `src/host` | [`config`] | TOML to validated settings; reports all faults at once |
 //! | | [`io`] | log files, CSV, CAN sockets, clock, journal, result and event files |
 //! | | [`store`] | learned state in two files, history in SQLite |
-//! | | [`status`], [`control`], [`exporter`], [`logging`] | status document, metrics, command socket, Prometheus, log lines |
+//! | | [`status`] | status document, metrics |
+//! | | [`control`] | command socket |
+//! | | [`exporter`] | metrics for Prometheus |
+//! | | [`logging`] | log lines |
 //! | | [`service`] | the live loop: links, ticks, readiness, reload, watchdog |
-//! | | [`replay`], [`wiring_check`] | finite loops: recorded logs, the doctor |
+//! | | [`replay`] | finite loop over recorded logs |
+//! | | [`wiring_check`] | finite loop of the doctor |
 //! | | `failure` | text and exit code of a failed command, for every program |
 //! | `src/lab` | `lab` | fit, score, remaining life, Gaussian processes, reports, passports, what-if, export, fleets, plots, import, discover (feature `lab`) |
 //! | `src/uplink` | `mqtt`, `kuksa`, `vss` | program `packwatch-uplink`, separate from the vehicle's program: sends the status to MQTT brokers and a KUKSA databroker |
 //! | `src/python` | `python` | the Python module: the library as classes and functions; stubs and Python code are in its folder `packwatch` |
-//! | `src/cli` | [`cli`] | one file (and folder) per command with the command's name; `common` holds what commands share; `main.rs` only calls it |
+//! | `src/cli` | [`cli`] | one file (and folder) per command with the command's name; `common` holds what commands share; `main.rs` only calls [`cli`] |
 //!
 //! # The path of a frame
-//! `host/io/socket` receives it and `host/service/live.rs` passes it to the [`monitor`]. The stages are `intake` (protection, rate
+//! `host/io/socket` receives the frame, and `host/service/live.rs` passes it to the [`monitor`]. The stages are `intake` (protection, rate
 //! limit) → `can/decode` (for a diagnostic answer: `can/isotp`, `can/uds`) → `sampling` → `estimation` ([`cell`]) → `learning`
 //! ([`health`]) → `alarming` ([`alarm`]) → `sending` (`can/encode`). A replay starts at `host/replay.rs`; from the monitor on, the path
 //! is the same.
 //!
 //! # Where to change what
-//! Paths are relative to `src`; those that begin with `/` are relative to the repository.
+//! Paths are relative to `src`; paths that begin with `/` are relative to the repository.
 //!
 //! | change | file |
 //! | --- | --- |
@@ -71,10 +75,10 @@
 //! | capacity learned from a half-cycle | `core/health/learner.rs` |
 //! | what is kept of exchanged packs | `core/monitor/stages/pack_memory.rs` |
 //! | contents of the stored state | the state of the stage, `core/monitor/snapshot.rs`, `core/monitor/lifecycle/restore.rs` (restore) |
-//! | a configuration key | its table in `host/config/schema/keys/` (`pack`, `input`, `limits`, `algorithms`, `traffic`); `host/config/mod.rs` lists the steps |
+//! | a configuration key | `host/config/schema/keys/` (tables `pack`, `input`, `limits`, `algorithms`, `traffic`), `host/config/mod.rs` (list of the steps) |
 //! | discovery and merging of drop-ins | `host/config/document/source.rs`, `host/config/document/merge.rs` |
 //! | identity of the vehicle | `host/config/result/vehicle.rs` |
-//! | a published number of pack or cell (status, metrics, MQTT, VSS) | `core/quantity/catalogue.rs` (its row), `core/monitor/view.rs` (its value) |
+//! | a published number of pack or cell (status, metrics, MQTT, VSS) | `core/quantity/catalogue.rs` (row), `core/monitor/view.rs` (value) |
 //! | another status field | `host/status/document.rs` (type), `host/status/collect.rs` (value), `cli/status` (screen) |
 //! | another metric | `host/status/metrics.rs` |
 //! | another MQTT entity | `uplink/mqtt/entity.rs` |

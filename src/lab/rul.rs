@@ -51,7 +51,7 @@ pub struct ForecastScore {
     /// Why there is no forecast.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub refused: Option<String>,
-    /// Whether the median is within a relative error of alpha of the truth.
+    /// Whether the relative error of the median is at most alpha.
     pub within_alpha: bool,
     /// Whether the interval contains the truth.
     pub covered: bool,
@@ -76,7 +76,8 @@ pub struct HistoryScore {
     pub axis: Axis,
     /// Capacity at which the life ends, Ah.
     pub threshold_ah: f64,
-    /// Use at the end of life; `None` = it is not reached, or was passed before the first reading, so nothing is scored.
+    /// Use at the end of life; `None` = the end of life is not reached, or was passed before the first reading, so
+    /// nothing is scored.
     pub end_of_life: Option<f64>,
     /// Smallest capacity of the file, Ah.
     pub least_capacity_ah: f64,
@@ -93,7 +94,7 @@ pub struct ScoreTotal {
     pub refused: usize,
     /// Share of forecasts whose interval contains the truth. A rejected forecast counts as a miss.
     pub coverage: f64,
-    /// Share of forecasts whose median is within a relative error of alpha of the truth. A rejected forecast counts as a miss.
+    /// Share of forecasts whose median has a relative error of at most alpha. A rejected forecast counts as a miss.
     pub within_alpha: f64,
     /// Mean error, as a share of the life.
     pub mean_error: f64,

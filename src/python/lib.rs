@@ -10,9 +10,13 @@
 //! | `monitor.rs`, `replay.rs` | rows, frames and logs through the monitor |
 //! | `outputs.rs`, `table.rs` | estimates, events and frames as Arrow tables |
 //! | `score.rs`, `fit.rs`, `rul.rs`, `gp.rs` | the commands of these names |
-//! | `cell_model.rs`, `measured.rs` | cell models, measured files |
-//! | `arrays.rs`, `error.rs`, `arguments.rs` | arrays from Python, exceptions, shared arguments |
-//! | `background_task.rs`, `exclusive_state.rs` | progress and Ctrl-C; one call of a monitor at a time |
+//! | `cell_model.rs` | cell models |
+//! | `measured.rs` | measured files |
+//! | `arrays.rs` | arrays from Python |
+//! | `error.rs` | exceptions |
+//! | `arguments.rs` | shared arguments |
+//! | `background_task.rs` | progress and Ctrl-C |
+//! | `exclusive_state.rs` | one call of a monitor at a time |
 
 mod arguments;
 mod arrays;

@@ -95,7 +95,8 @@ fn nearest_with_all_rows_agrees_with_exact() {
         let exact = fitted(Form::Exact, fixed);
         let queries: Vec<f64> = wavy_plane(40, 77).0;
         let expected = exact.predict(&queries).expect("finite");
-        // A prediction is conditioned on one row more than any term of the likelihood.
+        // With 120 neighbours, each prediction uses all 120 rows, and each term of the likelihood uses all rows before
+        // it.
         let nearest = fitted(Form::Nearest { neighbours: 120 }, fixed);
         let likelihoods = (nearest.log_marginal_likelihood(), exact.log_marginal_likelihood());
         assert!((likelihoods.0 - likelihoods.1).abs() < 1e-5, "{likelihoods:?}");

@@ -15,7 +15,7 @@ pub(super) const DISCONNECTED_V: f64 = 0.5;
 const HELD_S: f64 = 30.0;
 /// Current below which a cell rests, as a share of the largest current in this part of the file.
 const REST_SHARE: f64 = 0.02;
-/// For each group of this many rows, one outlier is ignored.
+/// For each group of this many rows, one outlier is ignored at either end of the voltage range.
 const STRAY: usize = 10_000;
 /// Error of a reading at a limit, V.
 const READING_V: f64 = 0.005;

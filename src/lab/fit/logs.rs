@@ -298,7 +298,7 @@ fn colder(temperature_c: f64) -> f64 {
 fn stretches(request: &LogRequest<'_>, log: usize, path: &Path) -> Result<Vec<Stretch>, LabError> {
     let mean = Rc::new(RefCell::new(MeanCell::new(usize::from(request.monitor.sample.cells))));
     let watched = Rc::clone(&mean);
-    // Cells in modules of another kind have another open-circuit curve.
+    // Cells in modules of another kind have another open-circuit curve, so they are left out.
     let is_own: Vec<bool> =
         (0..request.monitor.sample.cells).map(|cell| request.monitor.is_own(CellIndex(cell))).collect();
     let watch: OutputWatch = Box::new(move |record, out| {

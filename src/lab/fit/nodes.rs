@@ -1,7 +1,8 @@
 //! Places SOC breakpoints where the open-circuit curve of the slow tests bends.
 //!
 //! Input: slow tests (SOC, V). Output: breakpoints, fraction. A model is linear between breakpoints, which causes an
-//! SOC error. A breakpoint is added where this error is largest, until it is below [`MOST_POINTS`] everywhere.
+//! SOC error. A breakpoint is added where this error is largest, until the error is below [`MOST_POINTS`] everywhere or
+//! there are [`MOST_NODES`] breakpoints.
 
 use crate::ident::fit::{MIN_SLOPE_V, OcvCurve};
 use crate::ident::grid::interpolate;
@@ -13,7 +14,7 @@ const MOST_POINTS: f64 = 0.005;
 const SLOPE_WIDTH: f64 = 0.04;
 /// Smallest distance between breakpoints, and between the SOC values at which the error is computed.
 const LEAST_DISTANCE: f64 = 0.01;
-/// Maximum number of breakpoints. The time of a fit grows with the square of their number.
+/// Maximum number of breakpoints; more would make a fit slow.
 const MOST_NODES: usize = 31;
 
 /// Adds nodes to `first` where the curves bend.

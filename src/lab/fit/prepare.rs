@@ -10,7 +10,8 @@ use crate::ident::grid::Grid;
 use crate::ident::record::{self, Limits, Record};
 use crate::measured::{MeasuredFile, MeasuredPart};
 
-/// A voltage is not credible if it is this far below the lowest or above the highest voltage of the cell, V.
+/// Largest credible distances, V: of a voltage below the lowest voltage of the cell, and of a voltage above the highest
+/// voltage.
 pub(super) const CREDIBLE_BEYOND_V: (f64, f64) = (1.0, 0.3);
 /// Weight of a charge of an ageing cell relative to a discharge. It is smaller because the voltage of a charge contains slower
 /// relaxation.

@@ -26,7 +26,7 @@ const MAX_BYTES: u64 = 1 << 32;
 pub struct TrainedModel {
     /// Column that is predicted.
     pub output: String,
-    /// Columns from which it is predicted, in the order of the model.
+    /// Columns from which the output is predicted, in the order of the model.
     pub inputs: Vec<String>,
     /// The Gaussian process.
     pub model: Model,

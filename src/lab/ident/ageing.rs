@@ -16,7 +16,8 @@ pub(crate) const SOC_LEFT: f64 = 0.045;
 const KNEE_SHARE: f64 = 0.2;
 /// Current above which a row counts as under load, as a share of the median current of the discharge.
 const LOADED_SHARE: f64 = 0.5;
-/// If the current changes by more than this between two rows, A per Ah, voltage and current may not belong to the same instant.
+/// Current step between two rows, A per Ah of capacity, above which voltage and current may not belong to the same
+/// instant.
 const STEP_PER_AH: f64 = 0.25;
 /// Rows after the cut-off, without load, are not judged below this SOC, because the voltage recovers more slowly than any branch.
 const RECOVERY_SOC: f64 = 0.5;

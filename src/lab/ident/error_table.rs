@@ -40,7 +40,7 @@ struct NodeSums {
 pub struct WeightedRecord<'a> {
     /// Rows of the record.
     pub record: &'a Record,
-    /// Number of the file. All records of a file describe one cell on one day.
+    /// Number of the file. All records of a file describe the same cell.
     pub file: usize,
     /// Weight of the record: 1 for a drive.
     pub share: f64,

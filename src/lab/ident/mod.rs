@@ -1,9 +1,14 @@
 //! Fits cell models to measured data ("Battery Predictions for Electronic Prognostics", section 3.3.2). This module
 //! only computes: it reads no files and prints nothing.
 //!
-//! Data flow: raw rows of one file -> [`anchor`] (SOC of every row) -> [`record`] (coarser rows with positions in the tables and
-//! weights) -> [`pass`] (residuals, and their exact Jacobian from recursive sensitivities) with [`prior`] (smoothness) -> [`solve`]
-//! (projected Levenberg-Marquardt) -> [`fit`] (whole fit, residuals per file, nodes without data).
+//! Data flow of a fit:
+//!
+//! 1. [`anchor`] determines the SOC of every raw row of a file.
+//! 2. [`record`] joins raw rows to coarser rows, with positions in the tables and weights.
+//! 3. [`pass`] computes the residuals, and their exact Jacobian from recursive sensitivities.
+//! 4. [`prior`] adds the prior, which keeps the tables smooth.
+//! 5. [`solve`] minimises the cost (projected Levenberg-Marquardt).
+//! 6. [`fit`] runs the whole fit, and determines residuals and nodes without data.
 //!
 //! For records that start at an unknown SOC, [`unanchored`] estimates the SOC together with the tables. After a fit, [`error_table`]
 //! estimates the model's error, and [`thermal`] fits heat capacity and thermal resistance.

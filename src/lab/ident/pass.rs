@@ -53,7 +53,8 @@ impl NormalEquations {
         Self { n, h: vec![0.0; n * n], g: vec![0.0; n], cost: 0.0 }
     }
 
-    /// Adds an observation. `j` contains the derivatives de/dtheta of the residual e = measured - model by the parameters in `index`.
+    /// Adds an observation. `j` contains the derivatives de/dtheta of the residual e = measured - model with respect to
+    /// the parameters in `index`.
     pub fn add(&mut self, index: &[usize], j: &[f64], residual: f64, weight: f64) {
         for (a, &row) in index.iter().enumerate() {
             let weighted = weight * j[a];
@@ -207,8 +208,8 @@ impl FreeScale<'_> {
     }
 }
 
-/// Adds the residuals and derivatives of a record to `normal`. The weights of its rows are multiplied by `scale`. If `free` is given,
-/// the derivatives by the unknowns of the SOC are added too.
+/// Adds the residuals and derivatives of a record to `normal`. The weights of its rows are multiplied by `scale`. If
+/// `free` is given, the derivatives with respect to the unknowns of the SOC are added too.
 pub fn accumulate(
     record: &Record,
     scale: f64,
@@ -249,7 +250,7 @@ pub fn accumulate(
     }
 }
 
-/// Collects the derivatives of the residual by every parameter that affects the row.
+/// Collects the derivatives of the residual with respect to every parameter that affects the row.
 fn derivatives(
     row: &FitRow,
     layout: &Layout,

@@ -10,8 +10,8 @@ use super::pass::NormalEquations;
 /// Standard deviations of the prior's terms.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PriorDeviations {
-    /// Second difference of the OCV over SOC, scaled to the node spacing, V. With a slow test, it applies to the correction of the slow
-    /// test; otherwise to the curve itself.
+    /// Second difference of the OCV over SOC, scaled to the node spacing, V. With a slow test, this difference is of
+    /// the correction of the slow test; otherwise, of the curve itself.
     pub ocv_curvature_v: f64,
     /// Difference of the OCV, or of its correction, between neighbouring temperatures, V.
     pub ocv_by_temperature_v: f64,

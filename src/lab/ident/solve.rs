@@ -20,7 +20,7 @@ const CONVERGED: f64 = 3e-4;
 const DAMPING: Damping = Damping { first: 0.3, fall: 0.1, fall_after_growth: 0.6, growth: 8.0, least: 1e-4, most: 1e8 };
 /// With less damping than this, a step is nearly undamped.
 const DAMPING_WEAK: f64 = 0.02;
-/// Maximum number of changes of the held set per step. After them, the step is clamped to the bounds.
+/// Maximum number of changes of the held set per step. After these changes, the step is clamped to the bounds.
 const MAX_EXCHANGES: usize = 30;
 
 /// Bounds and structure of the parameters.

@@ -96,7 +96,7 @@ mod tests {
             let soc: Vec<f64> = time_s.iter().map(|t| 1.0 - t / 3600.0).collect();
             let warm = |t: f64| 25.0 + 4.0 + (start_c - 29.0) * libm::exp(-t / 400.0);
             let temperature_c: Vec<f64> = time_s.iter().map(|&t| warm(t)).collect();
-            // 0.4 W, 10 K/W and 40 J/K.
+            // The cell produces 0.4 W. Its thermal resistance is 10 K/W, and its heat capacity is 40 J/K.
             let (current_a, voltage_v) = (vec![2.0; 3000], vec![3.4; 3000]);
             let raw = MeasuredPart { time_s, current_a, voltage_v, temperature_c, soc, ..MeasuredPart::default() };
             Record::prepare(&raw, &[], &grid, &limits)

@@ -50,7 +50,7 @@ pub struct Known {
 /// A record whose rows have a charge instead of a SOC.
 #[derive(Debug, Clone)]
 pub struct UnanchoredRecord {
-    /// Rows. Their `soc` is minus the charge taken out since the first row, Ah.
+    /// Rows. The `soc` of a row is minus the charge taken out since the first row, Ah.
     pub record: Record,
     /// Weight of each second.
     pub scale: f64,
@@ -295,7 +295,8 @@ fn place(record: &Record, settings: &FitSettings, beginning_soc: f64, [log_capac
         let place = grid.place(row.soc, row.temperature_c);
         (row.ocv, row.resistance, row.tau) =
             (grid.ocv_corners(&place), grid.resistance_corners(&place), grid.tau_corners(&place));
-        // A cell warms up during a drive. Its resistances follow Arrhenius' law outside the nodes as well as between them.
+        // A cell warms up during a drive. The resistances of the cell follow Arrhenius' law outside the nodes as well
+        // as between them.
         let inside_c = row.temperature_c.clamp(coldest_c, warmest_c);
         let factor = arrhenius(row.temperature_c) / arrhenius(inside_c);
         row.resistance.weight.iter_mut().for_each(|weight| *weight *= factor);

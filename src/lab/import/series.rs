@@ -1,8 +1,8 @@
 //! Joins signals whose names differ only in one number to a single line with `{n}`.
 //!
-//! A series is a run of signals at rising positions of one answer. The signals are equal except for one number in their names, which
-//! increases by one, and their bits, which have a constant distance. Leading zeros of the number are dropped, because `{n}` in a
-//! pattern matches a number with any leading zeros.
+//! A series is a run of signals at rising positions of one answer. The signals differ only in one number in their
+//! names, which increases by one, and in their positions, which have a constant distance. Leading zeros of the number
+//! are dropped, because `{n}` in a pattern matches a number with any leading zeros.
 
 use crate::import::{DiagnosticSignal, NumberRange};
 

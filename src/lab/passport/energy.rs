@@ -54,7 +54,7 @@ mod tests {
     use crate::cell::AgedOcv;
     use crate::cell::model::{Branch, Table};
 
-    /// Open-circuit voltage 3 + 1.2 s, almost without resistance.
+    /// A cell with the open-circuit voltage 3 V + 1.2 V x SOC, almost without resistance.
     fn model() -> CellModel {
         let row = |value: f64| Table { values: vec![vec![value; 2]] };
         CellModel {
@@ -79,7 +79,7 @@ mod tests {
     fn energy_is_the_area_below_the_voltage() {
         let load = UsableConfig { current_a: 0.2, temperature_c: 25.0, cutoff_v: 3.0, taper_current_a: 0.05 };
         let discharge = Discharge::new(&model(), &load, 2.0, 1.0);
-        // 2 Ah at 3.6 V on average; the first half at 3.9 V.
+        // The cell delivers 2 Ah at 3.6 V on average, and the first half at 3.9 V on average.
         assert!((discharge.energy_wh(2.0) - 7.2).abs() < 0.01, "{}", discharge.energy_wh(2.0));
         assert!((discharge.energy_wh(1.0) - 3.9).abs() < 0.01, "{}", discharge.energy_wh(1.0));
         assert!(
@@ -94,7 +94,7 @@ mod tests {
         let load = UsableConfig { current_a: 2.0, temperature_c: 25.0, cutoff_v: 3.0, taper_current_a: 0.05 };
         let mut model = model();
         model.r0_ohm = Table { values: vec![vec![0.05; 2]] };
-        // 0.1 V less at 2 A, and the last 0.1 V of the curve is unusable.
+        // At 2 A, the voltage is 0.1 V lower, and the last 0.1 V of the curve is unusable.
         let charge_ah = 2.0 * (1.0 - 0.1 / 1.2);
         let energy_wh = Discharge::new(&model, &load, 2.0, 1.0).energy_wh(charge_ah);
         assert!((energy_wh - charge_ah * (3.0 + 4.1) / 2.0).abs() < 0.01, "{energy_wh}");

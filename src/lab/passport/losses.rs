@@ -6,7 +6,7 @@
 //! | report | charge |
 //! | --- | --- |
 //! | the current's signal turns bad or stale | lost until the signal is good again, except while its last reading may be used |
-//! | the buses fall asleep | none: the core reports it only while no current flows |
+//! | the buses fall asleep | none: the core reports sleep only while no current flows |
 //! | a gap: nothing was recorded | none if the buses slept or the pack rested before; otherwise unknown |
 //!
 //! Assumption: if the pack rests when the recording stops, it rests until the recording continues. If the pack was used

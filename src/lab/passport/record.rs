@@ -317,7 +317,8 @@ mod tests {
     #[test]
     fn energy_counts_both_directions_but_no_gaps() {
         let mut record = Record::of_replay(LIMITS);
-        // 7.2 W for 50 s in each direction, two minutes without data between them, and a voltage without a current.
+        // The record has 7.2 W for 50 s in each direction, two minutes without data in between, and a voltage without a
+        // current.
         for (time_s, current_a) in
             [(0.0, 2.0), (50.0, 2.0), (180.0, -2.0), (230.0, -2.0), (250.0, f64::NAN), (260.0, 2.0)]
         {

@@ -1,8 +1,8 @@
 //! Reads capacity histories: a [`CapacityTable`] in order of time.
 //!
-//! With a column `type`, only discharges are readings, and each discharge counts as a full cycle. Without this column, the file does
-//! not contain the use, so days are counted. `duration_s` is the time in use that starts at a row; the time from its end to the next
-//! row counts as rest.
+//! With a column `type`, only discharges are readings, and each discharge counts as a full cycle. Without this column,
+//! the file does not contain the use, so days are counted. `duration_s` is the time in use from a row on; the remaining
+//! time to the next row counts as rest.
 
 use std::path::Path;
 

@@ -59,8 +59,8 @@ pub struct SocScore {
     pub coverage: f64,
     /// Mean half-width of the interval, points.
     pub mean_half_width_points: f64,
-    /// Mean of (innovation / standard deviation) squared. If the filter's statistics are right, it is at most about 1. At high sample
-    /// rates it is far below 1, because the filter counts information per second.
+    /// Mean of (innovation / standard deviation) squared. If the filter's statistics are right, the mean is at most
+    /// about 1. At high sample rates, the mean is far below 1, because the filter counts information per second.
     pub mean_normalised_innovation_squared: f64,
 }
 
@@ -95,7 +95,8 @@ pub(super) fn score(samples: &[SocSample], settle_s: f64, left_out_rows: usize) 
     }
 }
 
-/// Start of the first stretch of [`CONVERGED_HOLD_S`] within [`CONVERGED_POINTS`].
+/// Returns the start of the first time of at least [`CONVERGED_HOLD_S`] in which the error stays within
+/// [`CONVERGED_POINTS`].
 fn converged_at(samples: &[SocSample]) -> Option<f64> {
     let near = |sample: &SocSample| sample.error_points().abs() <= CONVERGED_POINTS;
     let stretches = samples.chunk_by(|a, b| near(a) == near(b)).filter(|stretch| near(&stretch[0]));

@@ -19,7 +19,8 @@ pub(super) fn rows(part: &MeasuredPart, index: usize, seed: u64, (least, most): 
         return 0..part.len();
     }
     let mut generator = ChaCha8Rng::seed_from_u64(seed);
-    // Each part has its own random stream, so its window depends only on the seed and its number.
+    // Each part has its own random stream, so the window of a part depends only on the seed and on the number of the
+    // part.
     generator.set_stream(index as u64);
     let share = least + (most - least) * uniform(&mut generator);
     let begin = (1.0 - share) * uniform(&mut generator);

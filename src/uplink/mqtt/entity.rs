@@ -1,4 +1,4 @@
-//! Defines the entities of a pack: key in `info`, name, unit and value. Nearly all are rows of the catalogue of
+//! Defines the entities of a pack: key in `info`, name, unit and value. Most entities are rows of the catalogue of
 //! quantities.
 //!
 //! Input: the daemon's status. Output: the values as JSON. If Battery-Emulator has a quantity, its key and name are

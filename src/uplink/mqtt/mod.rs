@@ -3,11 +3,13 @@
 //! | module | what lives there |
 //! | --- | --- |
 //! | `settings` | the table `[mqtt]` |
-//! | `entity`, `payload` | the table of entities; the published documents |
+//! | `entity` | the table of entities |
+//! | `payload` | the published documents |
 //! | `discovery` | Home Assistant discovery messages |
 //! | `queue` | pending messages on disk |
 //! | `recorder` | which documents and events are queued |
-//! | `connect`, `link` | one connection; publishing and forwarding |
+//! | `connect` | one connection |
+//! | `link` | publishing and forwarding |
 //!
 //! The recorder and the link share one thread and the queue. The recorder never waits for the link.
 

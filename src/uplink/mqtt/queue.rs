@@ -252,7 +252,7 @@ fn prepare(path: &Path, latest: i64) -> Result<Connection, OpenFault> {
             )));
         }
     }
-    // With AUTOINCREMENT, a number is never reused, even if the queue was empty.
+    // With AUTOINCREMENT, a number is never reused, even after the queue was empty.
     database.execute_batch(&format!(
         "BEGIN;
          CREATE TABLE IF NOT EXISTS message (id INTEGER PRIMARY KEY AUTOINCREMENT, class INTEGER NOT NULL, body TEXT NOT NULL);

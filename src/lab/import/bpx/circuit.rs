@@ -11,7 +11,7 @@
 //! `S` is the surface of all particles, `A` the area of all electrode pairs; `k` and `D` of a layer are the values of
 //! the electrolyte, multiplied by the transport efficiency of the layer. Each property follows Arrhenius' law with its
 //! activation energy, or with [`USUAL_J_PER_MOL`] if none is stated. Deviation: BPX has no double layer, so charge
-//! transfer has no time constant. Effect: none after about 0.1 s.
+//! transfer has no time constant. This deviation has no effect after about 0.1 s.
 
 use super::curve::Curve;
 use super::document::{BpxCell, Electrode, Layer, Transport};
@@ -19,8 +19,8 @@ use super::{FARADAY_C_PER_MOL, GAS_J_PER_MOL_K};
 use crate::cell::model::ACTIVATION_ENERGY_J_PER_MOL as USUAL_J_PER_MOL;
 use crate::quantity::bounds::{Bounds, CAPACITANCE_F, RESISTANCE_OHM};
 
-/// Distance over which the slope of a potential is taken, lithium content: wide enough that the noise of a table does
-/// not count as slope.
+/// Distance in lithium content over which the slope of a potential is taken. It is wide enough that the noise of a
+/// table does not count as slope.
 const SLOPE_STEP: f64 = 0.005;
 
 /// Smallest resistance, ohm, and smallest time constant, s: a flat potential gives 0, but a model needs a positive value.

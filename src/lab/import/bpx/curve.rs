@@ -58,7 +58,8 @@ impl<'a> Curve<'a> {
         let ends = (((lithium_ah - q_p) / q_n).max(0.0) + 1e-9, (lithium_ah / q_n).min(1.0) - 1e-9);
         let mut faults = Vec::new();
         let mut content = |key: &str, cut_off_v: f64| {
-            // Search outwards from the stated lithium content, so that a bend of a potential far from it is not found.
+            // Search outwards from the stated lithium content, so that a bend of a potential far from this content is
+            // not found.
             let [full, empty] = [n.stoichiometry[1], n.stoichiometry[0]].map(|x| x.clamp(ends.0, ends.1));
             let near = if key == "Upper" { full } else { empty };
             let (low, high) = bracket(near, ends, |x| voltage_v(x) < cut_off_v);
@@ -104,7 +105,7 @@ impl<'a> Curve<'a> {
         p.ocp_v.at(y) - n.ocp_v.at(x) + warmer_k * (p.entropic.at(y) - n.entropic.at(x))
     }
 
-    /// The curve at suitable breakpoints.
+    /// Returns the curve at suitable breakpoints.
     ///
     /// # Errors
     /// The open-circuit voltage at a breakpoint is not a finite number above 0.
@@ -167,7 +168,7 @@ fn bracket(near: f64, ends: (f64, f64), is_below: impl Fn(f64) -> bool) -> (f64,
     ends
 }
 
-/// The row with each value at least [`LEAST_RISE_V`] above the previous one.
+/// Returns the row with each value raised, if necessary, to [`LEAST_RISE_V`] above the previous value.
 fn rising(row: &[f64], raised_v: &mut f64) -> Vec<f64> {
     let mut least_v = f64::NEG_INFINITY;
     let mut raise = |voltage_v: f64| {

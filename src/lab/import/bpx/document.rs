@@ -156,7 +156,7 @@ impl<'a> Section<'a> {
         number
     }
 
-    /// Reads a number. If it is missing or invalid, this is reported and the result is NaN.
+    /// Reads a number. A missing or invalid number is reported, and the result is NaN.
     fn number(&self, key: &str, range: Above, faults: &mut Vec<String>) -> f64 {
         self.require(key, "a number", faults);
         self.optional_number(key, range, faults).unwrap_or(f64::NAN)
@@ -185,7 +185,7 @@ impl<'a> Section<'a> {
         self.optional_function(key, faults).unwrap_or(Function::Constant(f64::NAN))
     }
 
-    /// The whole cell; `None` if the file is of another kind.
+    /// Reads the whole cell; `None` = the file is of another kind.
     fn cell(&self, faults: &mut Vec<String>) -> Option<BpxCell> {
         if self.keys.is_none() {
             faults.push("the file does not contain a JSON object, must be BPX".to_owned());

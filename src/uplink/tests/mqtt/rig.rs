@@ -126,7 +126,7 @@ impl Daemon {
         loop {
             let mut client = self.client.borrow_mut();
             let stream = client.get_or_insert_with(|| self.listener.accept().unwrap().0);
-            // A client sends nothing, so an end of file means that it was killed.
+            // A client sends nothing, so an end of file means that the client was killed.
             stream.set_nonblocking(true).unwrap();
             let has_gone = matches!(std::io::Read::read(stream, &mut [0]), Ok(0));
             stream.set_nonblocking(false).unwrap();
