@@ -75,7 +75,7 @@
 //! | capacity learned from a half-cycle | `core/health/learner.rs` |
 //! | what is kept of exchanged packs | `core/monitor/stages/pack_memory.rs` |
 //! | contents of the stored state | the state of the stage, `core/monitor/snapshot.rs`, `core/monitor/lifecycle/restore.rs` (restore) |
-//! | a configuration key | `host/config/schema/keys/` (tables `pack`, `input`, `limits`, `algorithms`, `traffic`), `host/config/mod.rs` (list of the steps) |
+//! | a configuration key | `host/config/schema/keys/` (files `pack`, `input`, `limits`, `algorithms`, `traffic`), `host/config/mod.rs` (list of the steps) |
 //! | discovery and merging of drop-ins | `host/config/document/source.rs`, `host/config/document/merge.rs` |
 //! | identity of the vehicle | `host/config/result/vehicle.rs` |
 //! | a published number of pack or cell (status, metrics, MQTT, VSS) | `core/quantity/catalogue.rs` (row), `core/monitor/view.rs` (value) |

@@ -2,10 +2,12 @@
 //!
 //! Input: for some rows, the difference between the voltage of every cell and the mean voltage (V); and the fitted
 //! records of the mean cell. Output: a [`CellDeviation`] per cell. All cells share one curve and one current sensor, so
-//! errors of the model and of the current cancel. The difference d is linear in the deviations of the cell: `d = slope
-//! (dSOC + (q / C) dlnC - (t / C) leakage) - drop dlnR + offset` Here `slope` is the slope of the OCV over SOC, and
-//! `drop` is the voltage drop under load. The charge taken out is q, the time is t, and the capacity is C. One
-//! least-squares solution per cell gives the deviations.
+//! errors of the model and of the current cancel. The difference d is linear in the deviations of the cell:
+//!
+//! `d = slope (dSOC + (q / C) dlnC - (t / C) leakage) - drop dlnR + offset`
+//!
+//! Here `slope` is the slope of the OCV over SOC, and `drop` is the voltage drop under load. The charge taken out is q,
+//! the time is t, and the capacity is C. One least-squares solution per cell gives the deviations.
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;

@@ -1,9 +1,16 @@
 //! Makes one pass over the data: computes the residuals, their exact Jacobian, and the normal equations.
 //!
 //! The residual of a row is e = V - (OCV(s,T) - sum U_i - R0(s,T) I). Over the step of a row, the voltage U of a branch
-//! is solved exactly: `U' = R I + x (U - R I)` with `x = exp(-dt / tau)`. The derivatives of U are exact too: `dU' = x
-//! dU + (1 - x) I dR + (U - R I) x dt / tau^2 dtau`. Derivatives decay with the branch and are dropped below
-//! [`FADED_V`]. A row therefore touches only a few nodes, and the work per row does not grow with the tables.
+//! is solved exactly:
+//!
+//! `U' = R I + x (U - R I)` with `x = exp(-dt / tau)`.
+//!
+//! The derivatives of U are exact too:
+//!
+//! `dU' = x dU + (1 - x) I dR + (U - R I) x dt / tau^2 dtau`.
+//!
+//! Derivatives decay with the branch and are dropped below [`FADED_V`]. A row therefore touches only a few nodes, and
+//! the work per row does not grow with the tables.
 //!
 //! Beyond [`HUBER_V`], the cost grows linearly (Huber), so that errors that no circuit can explain do not distort the
 //! tables. If the SOC is unknown ([`FreeScale`]), each residual is compared with the error of a circuit at this voltage

@@ -63,7 +63,8 @@ impl MeasuredCapacity {
 impl History {
     /// Reads a file.
     ///
-    /// # Errors The file cannot be read, or a field is wrong. The error states file, line, column, what was found and
+    /// # Errors
+    /// The file cannot be read, or a field is wrong. The error states file, line, column, what was found and
     /// what is allowed.
     pub fn read(path: &Path) -> Result<Self, TableError> {
         let mut table = CapacityTable::open_in_order(path)?;

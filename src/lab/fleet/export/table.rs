@@ -81,7 +81,8 @@ impl<R> TableFile<R> {
 
     /// Writes a row.
     ///
-    /// # Errors The row cannot be written, or a value has the wrong type for its column.
+    /// # Errors
+    /// The row cannot be written, or a value has the wrong type for its column.
     pub(super) fn push(&mut self, row: &R) -> Result<(), LabError> {
         self.rows += 1;
         match &mut self.writer {

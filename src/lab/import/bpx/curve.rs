@@ -48,7 +48,8 @@ impl Electrode {
 impl<'a> Curve<'a> {
     /// Finds the lithium contents at the cut-offs.
     ///
-    /// # Errors The voltage does not reach a cut-off. Each fault states the path, what was found and what is allowed.
+    /// # Errors
+    /// The voltage does not reach a cut-off. Each fault states the path, what was found and what is allowed.
     pub(super) fn new(cell: &'a BpxCell) -> Result<Self, Vec<String>> {
         let (n, p) = (&cell.negative, &cell.positive);
         let [q_n, q_p] = [n, p].map(|electrode| electrode.capacity_ah(cell.area_m2));

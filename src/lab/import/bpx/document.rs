@@ -93,7 +93,8 @@ const SHARE: Above = (0.0, 1.0);
 
 /// Reads the JSON.
 ///
-/// # Errors The JSON has faults. Each fault states the path, what was found and what is allowed.
+/// # Errors
+/// The JSON has faults. Each fault states the path, what was found and what is allowed.
 pub(super) fn read(root: &Value) -> Result<BpxCell, Vec<String>> {
     let mut faults = Vec::new();
     let cell = Section::root(root).cell(&mut faults);

@@ -51,7 +51,8 @@ pub(super) struct Expression(Vec<Step>);
 impl Expression {
     /// Parses a text.
     ///
-    /// # Errors The text is not a valid expression. The error states the column (from 1), what was found and what is
+    /// # Errors
+    /// The text is not a valid expression. The error states the column (from 1), what was found and what is
     /// allowed.
     pub(super) fn parse(text: &str) -> Result<Self, String> {
         if text.len() > MAX_BYTES {
