@@ -10,8 +10,8 @@ use crate::ident::grid::Grid;
 use crate::ident::record::{self, Limits, Record};
 use crate::measured::{MeasuredFile, MeasuredPart};
 
-/// Largest credible distances, V: of a voltage below the lowest voltage of the cell, and of a voltage above the highest
-/// voltage.
+/// Largest credible distances, V: below the lowest voltage of the cell (first value) and above the highest voltage
+/// (second value).
 pub(super) const CREDIBLE_BEYOND_V: (f64, f64) = (1.0, 0.3);
 /// Weight of a charge of an ageing cell relative to a discharge. It is smaller because the voltage of a charge contains slower
 /// relaxation.

@@ -35,7 +35,7 @@ pub struct AnchoredHalfCycle {
     pub judged: Vec<bool>,
 }
 
-/// Range of the charge of a full charge, as a share of the charge that was missing. Other charges are left out.
+/// Allowed charge of a full charge, as a share of the missing charge. Other charges are left out.
 const FULL_CHARGE: std::ops::RangeInclusive<f64> = 0.8..=1.25;
 
 /// Charge from the start of a discharge to its knee and to its cut-off, Ah.

@@ -10,8 +10,8 @@ use super::pass::NormalEquations;
 /// Standard deviations of the prior's terms.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PriorDeviations {
-    /// Second difference of the OCV over SOC, scaled to the node spacing, V. With a slow test, this difference is of
-    /// the correction of the slow test; otherwise, of the curve itself.
+    /// Second difference over SOC, scaled to the node spacing, V: of the correction if there is a slow test, otherwise
+    /// of the OCV.
     pub ocv_curvature_v: f64,
     /// Difference of the OCV, or of its correction, between neighbouring temperatures, V.
     pub ocv_by_temperature_v: f64,

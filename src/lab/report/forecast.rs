@@ -245,8 +245,8 @@ mod tests {
         let outlook = outlook(&data, &PageContext::default()).expect("enough readings");
         assert_eq!((outlook.cell, outlook.end_ah), (1, 1.6));
         let left = outlook.life.cycles.expect("cycles");
-        // A capacity of 1.7 Ah that fades by 0.006 Ah per cycle reaches its end after 17 full cycles along a straight
-        // line, and earlier with the expected knee.
+        // A capacity of 1.7 Ah that fades by 0.006 Ah per cycle reaches the end of life after 17 full cycles along a
+        // straight line, and earlier with the expected knee.
         assert!(left.low < 17.0 && left.high > 17.0 && (8.5..17.0).contains(&left.median), "{left:?}");
         let (first, last) = (outlook.fan[0], outlook.fan[POINTS - 1]);
         assert_eq!(first.time_s, data.halves.last().map(|half| half.time_s).expect("halves"));

@@ -1,8 +1,8 @@
 //! Reads capacity histories: a [`CapacityTable`] in order of time.
 //!
 //! With a column `type`, only discharges are readings, and each discharge counts as a full cycle. Without this column,
-//! the file does not contain the use, so days are counted. `duration_s` is the time in use from a row on; the remaining
-//! time to the next row counts as rest.
+//! the file does not contain the use, so days are counted. `duration_s` states how long the cell was in use from the
+//! time of a row; the remaining time to the next row counts as rest.
 
 use std::path::Path;
 

@@ -95,7 +95,7 @@ pub(super) fn score(samples: &[SocSample], settle_s: f64, left_out_rows: usize) 
     }
 }
 
-/// Returns the start of the first time of at least [`CONVERGED_HOLD_S`] in which the error stays within
+/// Returns the start of the first period of at least [`CONVERGED_HOLD_S`] in which the error stays within
 /// [`CONVERGED_POINTS`].
 fn converged_at(samples: &[SocSample]) -> Option<f64> {
     let near = |sample: &SocSample| sample.error_points().abs() <= CONVERGED_POINTS;
