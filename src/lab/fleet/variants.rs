@@ -1,6 +1,6 @@
 //! Implements `--set KEY=V1,V2`: replaces values of a configuration, and builds all combinations of the replaced values.
 //!
-//! Input: the text of a configuration, and choices (one per `--set`). Output: one checked configuration per
+//! Input: the file of a configuration, and choices (one per `--set`). Output: one checked configuration per
 //! combination, with the original first, and the information which of them can share a replay. Configurations can share
 //! a replay if they differ only in `[[alarm]]` tables. Tables of the rule `input_missing` are an exception, because
 //! their time-outs also affect the inputs of the alarms. A combination that is not a valid configuration is left out

@@ -35,8 +35,8 @@ struct VehicleFolder {
 /// Merges the vehicles in `folders` into `out`. `wanted` lists the expected vehicles; any other vehicle is an error.
 ///
 /// # Errors
-/// A vehicle is missing, is found twice with different contents, was replayed by another version, or was replayed with another period
-/// of estimates; or a table cannot be read or written.
+/// A vehicle is missing, is incomplete, is found twice with different contents, or was replayed by another version or
+/// with another period of estimates. A table cannot be read or written.
 pub fn merge(folders: &[PathBuf], wanted: Option<&[Vehicle]>, out: &Path) -> Result<MergeSummary, LabError> {
     let vehicles = read_all(folders)?;
     check(&vehicles, wanted)?;

@@ -18,7 +18,7 @@ pub(super) enum Target {
     Threshold { rule: Rule, severity: &'static str, part: &'static str },
     /// Another key of all `[[alarm]]` tables of a rule.
     Alarm { rule: Rule, key: &'static str },
-    /// Any key.
+    /// Any other key: its parts, each with the number in brackets, if it has one.
     Key(Vec<(String, Option<usize>)>),
 }
 
@@ -155,7 +155,7 @@ fn set_threshold(root: &mut Table, rule: Rule, severity: &str, part: &str, value
     }
     let Some(alarm) = alarms_of(root, rule).nth(place) else { return Err(format!("no [[alarm]] of {}", rule.name())) };
     match (alarm.get_mut(severity), part) {
-        // The clear value in the file stays.
+        // The other value in the file (`set` or `clear`) stays.
         (Some(Value::Table(both)), part) => {
             both.insert(part.to_owned(), value.clone());
         }
