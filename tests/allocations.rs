@@ -1,6 +1,6 @@
-//! In steady state, no code that a frame passes through allocates. Covered: reading a log, the core with the example's
-//! 96 cells, its ticks, and the frames that it sends. The first frames (growing buffers), transitions and events may
-//! allocate.
+//! Checks that in steady state no code on the path of a frame allocates memory: the log reader, and the core with the
+//! 96 cells of `config/example.toml`, including ticks and sent frames. The first frames (growing buffers), transitions
+//! and events may allocate.
 //!
 //! All threads of the process are counted. If a test fails, `dhat-heap.json` shows the allocations.
 
@@ -18,18 +18,18 @@ use packwatch::monitor::{Monitor, Outputs, Record, RecordKind, TICK_PERIOD_MS};
 #[global_allocator]
 static ALLOCATOR: dhat::Alloc = dhat::Alloc;
 
-/// If a gap in the record is longer than this, s, the recorder was asleep. This record has no gap.
+/// Length of a gap in the record, s, above which the recorder counts as asleep. This record has no gap.
 const SLEEP_GAP_S: f64 = 30.0;
 /// Length of the log, s.
 const LOG_S: f64 = 160.0;
-/// Length of the warm-up, s: the health frames go through all 96 cells once.
+/// Length of the warm-up, s. In this time the health frames show each of the 96 cells once.
 const WARM_S: f64 = 110.0;
 /// Minimum number of frames after the warm-up. The remaining 50 s contain more: 10 currents and 32 other frames every
 /// 100 ms.
 const MIN_FRAMES: u64 = 20_000;
 
-/// Maximum number of blocks that may be allocated when a row ends, for 96 cells. A row holds the sums of each cell's
-/// samples over a few minutes, from which findings are made.
+/// Maximum number of memory blocks that 96 cells may allocate when a row of the diagnosis ends. A row holds the sums of
+/// each cell's samples over a few minutes. The diagnosis computes its findings from rows.
 const BLOCKS_OF_A_ROW: u64 = 64;
 
 /// Serialises the tests, because each counts the allocations of the whole process.
@@ -184,7 +184,7 @@ fn frame_through_core_allocates_nothing() {
     assert!(steady.len() as u64 > MIN_FRAMES, "{} frames", steady.len());
     before.iter().for_each(|record| core.feed(record));
     (core.sent, core.events) = (0, 0);
-    // A row of findings ends at most once a minute and may then allocate.
+    // A row of the diagnosis ends at most once a minute and may then allocate.
     allocating_at_most(BLOCKS_OF_A_ROW, "the core", || steady.iter().for_each(|record| core.feed(record)));
     assert!(core.sent > 500, "{} frames sent: status ten times a second, health, alarms", core.sent);
     assert!(core.monitor.latest().flatten().count() == 96, "every cell must have an estimate");

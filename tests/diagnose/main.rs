@@ -3,13 +3,15 @@
 //! `tests/diagnose/run [--quick] [--packs N] [--days N] [--period MS] [--jobs N] [--seed N] [--only WORD] [--list] [--write]`
 //!
 //! A pack drives, parks with sleeping buses and charges every day (scenario `ev-day`); its cells differ. Each kind of
-//! fault is injected at a random cell on a random day of the first third. This is done in packs with good, usual and
-//! poor sensors, and with three kinds of balancing: none, unreported, and reported by bits that show the bled cells.
+//! fault is injected at a random cell on a random day in the first third of the simulated time. This is done in packs
+//! with good, usual and poor sensors, and with three kinds of balancing: none, unreported, and reported by bits that
+//! show the bled cells.
 //! Needs only the repository's cell model.
 //!
 //! - `--packs`: total number of packs, distributed over the rows, at least one per row
 //! - `--quick`: one pack per fault, with usual sensors and balancing
-//! - `--only WORD`: only faults whose name contains the word; `--only healthy --packs 3000` gives the rate of false findings
+//! - `--only WORD`: only faults whose name contains the word; `--only healthy --packs 3000` gives the rate of false
+//!   findings
 //! - `--list`: prints each unexpected finding with its pack
 //! - `--write`: writes `tests/diagnose.md`
 #![expect(clippy::print_stdout, clippy::print_stderr, reason = "a program whose output is its table")]
@@ -64,7 +66,7 @@ const FAULTS: [(&str, usize, &str); 21] = [
     ("temperature off", 1, "temperature-off:S"),
 ];
 
-/// Suffix of a fault that grows for ten days, and its number of steps.
+/// Suffix of the name of a fault that grows for ten days; duration of the growth, s; number of steps.
 const SLOWLY: &str = " in 10 days";
 const SLOW_S: f64 = 10.0 * 86_400.0;
 const SLOW_STEPS: u32 = 80;
@@ -174,7 +176,7 @@ fn cases(options: &Options) -> Result<Vec<(Row, Case)>, String> {
     Ok(cases)
 }
 
-/// The same fault, growing in small steps.
+/// Splits a resistance fault into small steps of growth.
 fn slowly(fault: Option<Fault>) -> Vec<Fault> {
     let Some(Fault { kind: FaultKind::Resistance { cell, change }, from_s }) = fault else { return Vec::new() };
     let change = (1.0 + change).powf(1.0 / f64::from(SLOW_STEPS)) - 1.0;

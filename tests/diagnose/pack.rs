@@ -1,4 +1,4 @@
-//! Runs one simulated pack through the whole core: truth, sensors, frames of a DBC, `Monitor`.
+//! Simulates one pack and runs it through the whole core: true cells, sensors, CAN frames, `Monitor`.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -15,12 +15,12 @@ use packwatch_host::io::ticks::Ticks;
 
 use crate::finding::kind_of;
 
-/// If a gap in the record is longer than this, s, the vehicle slept.
+/// Length of a gap in the record, s, above which the vehicle counts as asleep.
 const SLEEP_GAP_S: f64 = 30.0;
 /// Interval between two checks of the findings while the buses are awake, s.
 const LOOK_S: f64 = 300.0;
-/// Minimum current of a drive, as a fraction of the capacity per hour; and the time without discharge that ends a
-/// drive, s.
+/// Minimum discharge current of a drive, 1/h (current divided by capacity); time without discharge that ends a drive,
+/// s.
 const DRIVE_PER_H: f64 = 0.05;
 const PARKED_S: f64 = 1800.0;
 /// Cells per temperature sensor.
@@ -79,7 +79,7 @@ pub(crate) struct FirstFinding {
     pub(crate) found: CellFault,
 }
 
-/// Writes to `folder` the configuration of a pack whose BMS reports which cells it bleeds.
+/// Writes the configuration of a pack whose BMS reports which cells it bleeds to `folder`, and loads it.
 pub(crate) fn configuration(folder: &Path, size: PackSize) -> Result<MonitorConfig, String> {
     let sensors = size.cells.div_ceil(CELLS_PER_SENSOR);
     let write = |name: &str, text: String| std::fs::write(folder.join(name), text).map_err(|e| e.to_string());
@@ -109,7 +109,7 @@ fn dbc(cells: u16, sensors: u16) -> String {
     text
 }
 
-/// The repository's example cell model, scaled.
+/// The repository's example cell model, scaled to a capacity.
 fn cell_model(capacity_ah: f64) -> Result<String, String> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/cells/example_nmc_2600.toml");
     let text = std::fs::read_to_string(&path).map_err(|e| format!("{}: {e}", path.display()))?;

@@ -68,8 +68,8 @@ impl Score {
         )
     }
 
-    /// Delay within which the fault was found in this share of all packs. If it was not found in a pack, the pack's
-    /// delay is infinite.
+    /// Delay within which the fault was found in this share of all packs. If the fault was not found in a pack, the
+    /// pack's delay is infinite.
     fn delay(&self, quantile: f64) -> String {
         let mut delays = self.delays_days.clone();
         delays.sort_by(f64::total_cmp);
@@ -95,7 +95,7 @@ fn poisson_upper(count: f64) -> f64 {
     n * (1.0 - 1.0 / (9.0 * n) + NORMAL_95 / (3.0 * n.sqrt())).powi(3)
 }
 
-/// Ranges of cells (first, last) that a correct finding may name. Empty if it must name the whole pack.
+/// Ranges of cells (first, last) that a correct finding may name. Empty if the finding must name the whole pack.
 fn places(fault: &FaultKind) -> Vec<(CellIndex, CellIndex)> {
     let sensor = |i: u16| (CellIndex(i * CELLS_PER_SENSOR), CellIndex((i + 1) * CELLS_PER_SENSOR - 1));
     match *fault {

@@ -1,5 +1,6 @@
-//! Authenticated commands among a million frames: forged, replayed, delayed and outdated frames are never executed, and
-//! genuine frames always are. A journal replays without the key. Sent frames never reuse a freshness value.
+//! Mixes authenticated commands with a million hostile frames. Forged, replayed, delayed and outdated frames must never
+//! be executed. A genuine command must be executed, at the latest when its sender repeats it. A journal replays without
+//! the key. Sent frames never reuse a freshness value.
 
 mod ecu;
 
@@ -133,7 +134,8 @@ fn attack(profile: Profile, frames: u64, seed: u64) {
             }
         }
         if round % 300 == 0 {
-            // Kill the daemon and restart it from a state up to six seconds old. The clock is right, unknown or late.
+            // Kill the daemon and restart it from a state up to six seconds old. The downtime follows from the clock,
+            // is unknown, or is stated as 3 s. The clock may have been set back.
             let downtime = [Downtime::AsStamped, Downtime::Unknown, Downtime::Seconds(3.0)][(round / 300 % 3) as usize];
             let away_ms = [50, 30_000, -4_000, 4_000_000][(round / 300 % 4) as usize];
             daemon.restart(stored.clone(), downtime, away_ms);

@@ -17,7 +17,7 @@ use packwatch::quantity::{CellIndex, Channel, Timestamp};
 use packwatch::sim::{Balancing, Scenario, SensorQuality, Sensors, Settings, Simulation, Wiring};
 
 const CELLS: u16 = 12;
-/// If a gap in the record is longer than this, s, the vehicle slept.
+/// Length of a gap in the record, s, above which the vehicle counts as asleep.
 const SLEEP_GAP_S: f64 = 30.0;
 
 const PACK: &str = r#"

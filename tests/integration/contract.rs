@@ -1,6 +1,6 @@
 //! Tests the contract with other ECUs. A listener loses frames, starts late and sees the daemon killed. After two
-//! cycles it must have the daemon's alarm table. The listener is built only from the written DBC and the manual's
-//! page `ecu/contract.md`.
+//! cycles the listener must have the daemon's alarm table. The listener is built only from the written DBC and the
+//! manual's page `ecu/contract.md`.
 //!
 //! `PACKWATCH_CONTRACT_RUNS` sets the number of runs (default 200); the full test has 10,000.
 
@@ -30,7 +30,7 @@ const PAGES: usize = (CELLS / PAGE_CELLS) as usize;
 const LOSS: f64 = 0.1;
 /// Restarts in a run.
 const RESTARTS: u32 = 10;
-/// Interval at which the daemon's table is compared, ms.
+/// Interval between two looks at the daemon's table for a change, ms.
 const STEP_MS: i64 = 100;
 /// Maximum wait until no alarm has changed for two cycles, ms. The share of bad readings changes for up to a minute.
 const MAX_WAIT_MS: i64 = 600_000;

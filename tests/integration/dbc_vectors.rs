@@ -68,7 +68,7 @@ struct Tally {
     values: usize,
     /// Number of compared values per signal, by full name.
     per_signal: BTreeMap<String, usize>,
-    /// Number of short frames per signal that extends past its message.
+    /// For each signal that extends past its message: number of frames, all of them too short for the signal.
     short: BTreeMap<String, usize>,
 }
 
@@ -154,8 +154,8 @@ fn shipped_dbc_signals_decode_as_cantools() {
     }
 }
 
-/// Nested pages, code ranges, two parallel multiplexors, an extended identifier, both byte orders, floats, 64 bits
-/// across nine bytes, a payload of 64 bytes.
+/// A DBC with nested pages, code ranges, two parallel multiplexors, an extended identifier, both byte orders, floats,
+/// 64 bits across nine bytes, and a payload of 64 bytes.
 const EXTENDED: &str = r#"VERSION ""
 
 NS_ :

@@ -66,7 +66,7 @@ fn leak_cost_matches_simulator_and_names_cell() {
     assert_eq!((pack["discharge_limit"]["cell"].as_u64(), first_empty), (Some(LEAKING), LEAKING));
     assert_eq!((&pack["discharge_limit"]["reason"], &pack["unknown"]), (&Value::from("leak"), &Value::Null));
     assert_eq!(pack["left_out"], serde_json::json!([{ "cell": STUCK, "reason": "faulty_channel" }]));
-    // The state has no cell model from a file, hence no energy.
+    // The stored state contains no cell model from a file, so the energy is unknown.
     assert_eq!(pack["usable"]["kwh"], Value::Null);
 
     let lines = packwatch(&["diagnose", "--state", &state]);

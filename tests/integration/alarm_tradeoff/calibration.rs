@@ -37,7 +37,7 @@ pub(crate) fn bins(fleet: &Fleet) -> Vec<(usize, f64, f64)> {
     EDGES.windows(2).map(bin).collect()
 }
 
-/// Capacity errors and their stated standard deviation, over all evaluations at ageing cells.
+/// Capacity errors and their stated standard deviation, over all evaluations of ageing cells.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Errors {
     /// In percent of the rated capacity: mean error, standard deviation of the lives' mean errors, scatter within a

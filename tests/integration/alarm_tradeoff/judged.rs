@@ -1,5 +1,5 @@
-//! Judges a life by one rule: when the alarm was raised, how long before the end of life, and whether the truth was
-//! then below the threshold.
+//! Judges one alarm rule on one life: when the alarm was raised, how long before the end of life, and whether the true
+//! capacity was below the threshold at that time.
 
 use packwatch::alarm::{AlarmEngine, Change, Comparison, Observation, Rule, RuleConfig, Severity};
 use packwatch::quantity::CellIndex;
@@ -44,7 +44,7 @@ pub(crate) const P95: usize = 6;
 pub(crate) struct RuleOutcome {
     /// The evaluation at which the alarm was first raised.
     pub(crate) first: Option<Evaluation>,
-    /// Raises while the truth was above the threshold: by any amount, and by more than 1 % of rated.
+    /// Raises while the true capacity was above the threshold: by any amount, and by more than 1 % of rated.
     pub(crate) false_raises: u32,
     pub(crate) far_false_raises: u32,
     /// Times the alarm cleared before the end of life.
@@ -52,7 +52,7 @@ pub(crate) struct RuleOutcome {
 }
 
 impl RuleOutcome {
-    /// Whether the truth was above the threshold by more than `margin` of rated at the first raise.
+    /// Whether the true capacity exceeded the threshold by more than `margin` (fraction of rated) at the first raise.
     pub(crate) fn is_false(&self, margin: f64) -> bool {
         self.first.is_some_and(|evaluation| evaluation.true_ah > (THRESHOLD + margin) * RATED_AH)
     }

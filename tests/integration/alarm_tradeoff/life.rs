@@ -18,13 +18,13 @@ use packwatch::sim::{Ageing, Hysteresis, Pack, PackSettings, Settings};
 use super::dice::Dice;
 
 pub(crate) const RATED_AH: f64 = 2.6;
-/// The alarm threshold and the end of life, as parts of the rated capacity.
+/// The alarm threshold and the end of life, as fractions of the rated capacity.
 pub(crate) const THRESHOLD: f64 = 0.80;
 pub(crate) const END_OF_LIFE: f64 = 0.70;
 
 /// Interval between two readings, s.
 const SAMPLE_S: f64 = 10.0;
-/// The load changes this long after the previous reading, s, so each reading covers a single load.
+/// Time from the last reading under a load to the next load, s. Each reading therefore covers a single load.
 const SWITCH_S: f64 = 0.1;
 /// Ticks per reading. After 5 s without a tick the Monitor assumes that the computer was suspended.
 const TICKS: u32 = 4;
@@ -35,7 +35,7 @@ const TAPER_END_A: f64 = RATED_AH / 10.0;
 /// Average charge moved per cycle, relative to the rated capacity. Converts cycles into ampere-hours.
 const MOVED_PER_CYCLE: f64 = 2.0 * 0.55 * 0.85;
 
-/// Streams of a life's random numbers.
+/// Numbers of a life's random streams.
 const CELL: u64 = 0;
 const USAGE: u64 = 1;
 const SENSORS: u64 = 2;
@@ -133,7 +133,8 @@ pub(crate) struct Life {
     pub(crate) resets: u32,
 }
 
-/// Capacity fade: from `start`, by `loss * x^curvature`, where x = charge moved / `span_ah`.
+/// Ageing: the capacity (fraction of rated) falls from `start` by `loss * x^curvature`, where x = charge moved /
+/// `span_ah`. The resistance grows by `growth * x`.
 #[derive(Debug, Clone, Copy)]
 struct Fade {
     start: f64,

@@ -1,9 +1,9 @@
 //! Compares lead time and false alarms on simulated lives, for `when = "mean"` and `when = { probability = p }`.
 //!
 //! Each simulated life runs through the whole core: a cell with its own fade, sensors with their own errors, frames,
-//! Monitor. Every rule then judges the Monitor's capacity estimates. The Monitor itself runs three of the rules and
-//! must agree. Each test run judges a few lives. The whole study (200 ageing and 100 healthy lives, each with three
-//! sensor sets) writes `tests/alarm_tradeoff.md` and takes some minutes:
+//! Monitor. Every rule then judges the Monitor's capacity estimates. The Monitor itself also runs three of the rules
+//! and must raise their alarms at the same half-cycles. Each test run judges a few lives. The whole study (200 ageing
+//! and 100 healthy lives, each with three sensor sets) writes `tests/alarm_tradeoff.md` and takes some minutes:
 //! `PACKWATCH_WRITE_TRADEOFF=1 cargo test --workspace --test integration alarm_tradeoff -- --nocapture`
 
 mod calibration;

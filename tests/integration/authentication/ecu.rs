@@ -1,4 +1,4 @@
-//! Simulates a sender of authenticated commands built from the manual's description, and a bus that connects it to
+//! Simulates a sender of authenticated commands, built from the manual's description, and a bus between this sender and
 //! the core.
 
 use std::cell::RefCell;
@@ -27,7 +27,7 @@ pub(crate) fn key(byte: u8) -> CanKey {
     CanKey::parse(&[byte, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15]).unwrap()
 }
 
-/// A configuration with the authentication profile instead of unauthenticated commands.
+/// The rig's configuration, with commands authenticated by `profile` instead of protected end to end.
 pub(crate) fn config(profile: &str, more: &str) -> MonitorConfig {
     let secoc = format!("secoc = \"{profile}\"\n");
     let fd = if profile == "fd" { "fd = true\n" } else { "" };
@@ -37,7 +37,7 @@ pub(crate) fn config(profile: &str, more: &str) -> MonitorConfig {
     config_texts::load(&format!("{pack}{tables}{more}"), DBC).monitor
 }
 
-/// The sender. It keeps no state across a restart: create a new one with [`Ecu::new`].
+/// The sender. It keeps no state across restarts: to restart the sender, create a new one with [`Ecu::new`].
 pub(crate) struct Ecu {
     key: CanKey,
     pub(crate) authentication: Authentication,

@@ -1,5 +1,6 @@
-//! Estimates the capacity from swings by least squares, as published: y = Q x, with x the change of SOC (fraction), y
-//! the charge (Ah) and Q the capacity (Ah). sx and sy are the standard deviations of x and y.
+//! Estimates the capacity by published least-squares methods. Their input is swings: a swing is a change of SOC x
+//! (fraction) and the charge y (Ah) that caused it. y = Q x, with Q the capacity (Ah). sx and sy are the standard
+//! deviations of x and y.
 //!
 //! G. L. Plett, "Recursive approximate weighted total least squares estimation of battery cell total capacity", J.
 //! Power Sources 196 (2011) 2319. All methods have fading memory:

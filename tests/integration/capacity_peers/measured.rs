@@ -1,5 +1,5 @@
-//! Compares estimates on whole measured lives (NASA PCoE B0005, B0006), complete and in windows, against their
-//! published capacities.
+//! Compares capacity estimates with the published capacities of two measured cells (NASA PCoE B0005, B0006). The
+//! records are replayed complete, and in windows (a random part of each record).
 //!
 //! Discharges are numbered from 1; scores start at number 11. The published capacity first falls below 1.4 Ah at
 //! discharge 125 (B0005) and 109 (B0006).
@@ -157,7 +157,7 @@ impl Life {
         let number = |key: &str| event[key].as_f64().unwrap();
         let ours = ScalarGaussian::from_std(number("usable_capacity_ah"), number("usable_capacity_std_ah"));
         let (capacity_ah, ratio) = (number("capacity_ah"), number("resistance_ratio"));
-        // Find the SOC of the full cell with which `usable_ah` gives the usable capacity that the monitor has reported.
+        // Find the SOC at full charge with which `usable_ah` gives the usable capacity that the monitor has reported.
         let (mut low, mut high) = (0.5, 1.5);
         for _ in 0..30 {
             let middle = 0.5 * (low + high);
@@ -172,8 +172,8 @@ impl Life {
         self.config.health.usable.as_ref().unwrap()
     }
 
-    /// Usable capacity for a given capacity. Includes the uncertainty of the resistance; its correlation with a peer's
-    /// capacity is unknown.
+    /// Converts a capacity to usable capacity. The standard deviation includes the uncertainty of the resistance,
+    /// treated as independent of the capacity.
     fn to_usable_capacity(&self, reported: &DischargeReport, capacity: ScalarGaussian) -> ScalarGaussian {
         let at = |capacity_ah: f64, ratio: f64| {
             usable_ah(&self.config.model, self.usable(), reported.full_soc, capacity_ah, (ratio, 1.0))
@@ -275,7 +275,7 @@ fn usable_capacity_of_whole_lives_matches_best_peer() {
     }
 }
 
-/// Maximum ratio of packwatch's error to that of the best peer, over all windows. The peer's memory factor is chosen
+/// Maximum ratio of packwatch's error to the best peer's error, over all windows. The peer's memory factor is chosen
 /// afterwards by the result.
 const LEVEL: f64 = 1.1;
 
@@ -306,8 +306,8 @@ fn usable_capacity_from_windows_matches_best_peer() {
         best_ah = best_ah.min(score.mean_absolute);
     }
     assert!(ours.mean_absolute <= LEVEL * best_ah, "{ours:?}, the best peer {best_ah}");
-    // packwatch's coverage is higher than that of every peer but still too low, because the interval does not include
-    // errors of the open-circuit curve that differ between the two ends of a swing.
+    // packwatch's coverage is too low, because the interval does not include errors of the open-circuit curve that
+    // differ between the two ends of a swing.
     assert!(ours.covered > 0.5, "{ours:?}");
 }
 

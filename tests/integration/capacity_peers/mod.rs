@@ -1,16 +1,16 @@
 //! Compares packwatch's capacity with recursive total least squares (Plett 2011) on the same swings.
 //!
-//! The peers get swings from three sources:
+//! A swing is a change of SOC and the charge that caused it. The peers get swings from three sources:
 //!
-//! - `filter`: the filter's own SOC at both ends (event `half_cycle`, with its deviation; in windows the same ends as
-//!   `voltage`)
+//! - `filter`: the filter's own SOC at both ends, with its deviation, from the event `half_cycle`. In windows, the ends
+//!   are the same as for `voltage`
 //! - `voltage`: the SOC at both ends by inversion of the open-circuit curve (`swings`). The present capacity estimate
 //!   is used only to compute how ageing changes the curve's shape
 //! - `filter, capacity held`: the filter's SOC, always counted with the wrong initial capacity
 //!
-//! Measured lives publish the capacity delivered at 2 A, not the capacity between open-circuit voltages. Each peer's
-//! capacity is therefore converted by the product's own usable capacity (same resistance, same full SOC), so that only
-//! the capacities differ.
+//! The published capacity of a measured cell is the one delivered at 2 A, not the capacity between open-circuit
+//! voltages. Each peer's capacity is therefore converted by packwatch's calculation of the usable capacity, with the
+//! same resistance and the same full SOC, so that only the capacities differ.
 //! `cargo test --workspace --test integration capacity_peers -- --nocapture` prints the tables of tests/candidates.md.
 
 mod least_squares;
@@ -39,7 +39,7 @@ const PEERS: [(&str, Method, f64); 11] = [
     ("AWTLS gamma 0.20", Method::Awtls, 0.2),
 ];
 
-/// A swing of one source, and its start time.
+/// A swing, by source.
 #[derive(Debug, Clone, Copy)]
 enum Source {
     Filter(Swing),

@@ -1,6 +1,7 @@
 //! Simulated lives with known true capacity: the paper's life, one that ages a tenth as fast, and one without ageing
-//! (as total least squares assumes). The sensors are as in the paper's scenario (5 mV; 20 mA + 10 mA offset + 0.5 %
-//! gain), with 1 s samples. The SOC runs from 30 to 90 %, and the initial capacity is 20 % wrong.
+//! (as total least squares assumes). The sensors are as in the paper's scenario: voltage noise 5 mV; current noise 20
+//! mA, offset 10 mA and gain error 0.5 %; 1 s samples. The SOC runs from 30 to 90 %, and the initial capacity is 20 %
+//! wrong.
 //!
 //! The third source of swings is the filter's SOC with its capacity held at the wrong initial value.
 

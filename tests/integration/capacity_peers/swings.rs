@@ -14,9 +14,9 @@ use packwatch::health::CapacityConfig;
 
 use super::least_squares::Swing;
 
-/// If the interval between two readings is longer than this, s, the charge in between is unknown.
+/// Interval between two readings, s, above which the charge in between is unknown.
 const GAP_S: f64 = 60.0;
-/// Below this current the cell rests, A.
+/// Current below which the cell counts as resting, A.
 const REST_A: f64 = 0.05;
 /// Three time constants of the models' slowest branch, after which its unknown initial voltage has decayed.
 const SETTLING_S: f64 = 180.0;

@@ -1,4 +1,5 @@
-//! Tests replies to commands, the digest's pages, and counters across a kill of the daemon, with hand-made frames.
+//! Tests replies to commands, the pages of the digest (a cyclic summary of all alarms), and counters across a kill of
+//! the daemon, with hand-made frames.
 
 use packwatch::alarm::Rule;
 use packwatch::can::e2e::{Profile, Protection};
@@ -236,7 +237,7 @@ fn protected_rig(profile: Profile) -> Rig {
     Rig::with(config_texts::load(&format!("{pack}{}{HOT}", more.concat()), DBC).monitor)
 }
 
-/// Counters of the frames with an identifier. All frames must be intact.
+/// Counters of the frames with this identifier. All frames must be intact.
 fn counters(rig: &Rig, id: u32, protection: Protection) -> Vec<i64> {
     let counter = |frame: &Frame| protection.verified_counter(frame.data()).unwrap().into();
     rig.frames_with(id).iter().map(counter).collect()
