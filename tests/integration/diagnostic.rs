@@ -1,5 +1,5 @@
-//! Cells read by diagnostic requests, end to end: a simulated pack is replayed and estimated. Also reads the log of a
-//! polled car.
+//! Tests cells that are read by diagnostic requests, end to end: a simulated pack is replayed and its cells are
+//! estimated. Also reads the log of a real car whose controllers were polled.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -12,7 +12,7 @@ use packwatch::can::{CanId, Frame};
 use packwatch::monitor::{Monitor, Outputs, Record};
 use packwatch::quantity::{BusIndex, CellIndex, Channel, Timestamp};
 
-/// A Nissan Leaf: 96 cells of 16 bits in group 2 of service 0x21; current and pack values in group 1.
+/// A Nissan Leaf: 96 cell voltages of 16 bits in group 2 of service 0x21; current and pack values in group 1.
 const LEAF: &str = r#"[pack]
 cells = 96
 cell_model = "CELL"

@@ -55,7 +55,7 @@ impl Trial<'_> {
     }
 }
 
-/// Simulates a pack that publishes these signals.
+/// Simulates a pack that sends the signals in `inputs`. Returns the log.
 fn simulate(folder: &Path, name: &str, dbc: &Path, inputs: &str, cells: u32) -> PathBuf {
     let text = format!(
         "[pack]\ncells = {cells}\nstrings = 25\ncell_model = {:?}\n[[interface]]\nname = \"can0\"\n[input]\ndbc = [{:?}]\n{inputs}",
@@ -69,7 +69,7 @@ fn simulate(folder: &Path, name: &str, dbc: &Path, inputs: &str, cells: u32) -> 
     log
 }
 
-/// Adds every other message of the DBC twice a second, with random bytes.
+/// Adds all remaining messages of the DBC, twice a second, with random bytes.
 fn add_other_messages(log: &Path, dbc: &Path) {
     let text = std::fs::read_to_string(log).unwrap();
     let stamp = |line: &str| line[1..line.find(')').unwrap()].parse::<f64>().unwrap();

@@ -14,7 +14,7 @@ use rand_chacha::rand_core::{Rng, SeedableRng};
 /// Payloads per profile.
 const PAYLOADS: usize = 100_000;
 
-/// The interpreter. Prints a note and returns `None` if none is set.
+/// The interpreter that `PACKWATCH_PYTHON` names. If the variable is not set, prints a note and returns `None`.
 fn python() -> Option<OsString> {
     let python = std::env::var_os("PACKWATCH_PYTHON");
     if python.is_none() {
@@ -46,7 +46,7 @@ fn bytes(hex: &str) -> Vec<u8> {
 /// One payload, protected by both sides.
 struct Case {
     protection: Protection,
-    /// Our next counter.
+    /// packwatch's next counter.
     counter: u8,
     /// Payload before protection, with the previous counter value.
     raw: Vec<u8>,

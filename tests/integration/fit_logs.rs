@@ -28,8 +28,8 @@ fn json(args: &[&str]) -> Value {
     serde_json::from_str(&out).unwrap()
 }
 
-/// A cell of the chemistry with an open-circuit curve 15 mV higher in the middle, another capacity and other
-/// resistances.
+/// The true cell: the label's chemistry, but with an open-circuit curve that is 15 mV higher in the middle, another
+/// capacity and other resistances.
 fn true_model() -> CellModel {
     let mut model = Label::usual(Chemistry::NcaGraphite, TRUE_AH).model().unwrap();
     let soc = model.soc.clone();
@@ -72,7 +72,8 @@ fn drive(folder: &Path, name: &str, mut soc: f64, seed: u32) -> PathBuf {
     path
 }
 
-/// Returns the root mean square error in points and the fraction within the interval. The run must have one score.
+/// Root mean square error of the SOC in points, and fraction of the samples inside the interval, from the first score
+/// of a run.
 fn soc_score(args: &[&str]) -> (f64, f64) {
     let found = json(args);
     let soc = &found["scores"][0]["soc"];

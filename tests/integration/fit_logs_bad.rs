@@ -45,7 +45,7 @@ const DRIVE: Drive = Drive {
 };
 
 impl Drive {
-    /// The true cell: the label's, with an open-circuit curve 15 mV higher in the middle.
+    /// The true cell: as its label says, but with an open-circuit curve that is 15 mV higher in the middle.
     fn model(&self) -> CellModel {
         let mut model = Label::usual(self.chemistry, self.capacity_ah).model().unwrap();
         let soc = model.soc.clone();
@@ -206,7 +206,8 @@ fn wrong_label_chemistry_is_named() {
 #[test]
 fn current_offset_over_days_keeps_chemistry() {
     let folder = tempfile::tempdir().unwrap();
-    // C/50 for more than two days: the counted charge is wrong by more than the capacity.
+    // The current sensor is off by C/50 for more than two days, so the counted charge is wrong by more than the
+    // capacity.
     let drive = Drive { offset_a: TRUE_AH / 50.0, every_s: 10, ..DRIVE };
     let (out, back) = (Drive { soc: (0.9, 0.2), ..drive }, Drive { soc: (0.2, 0.9), ..drive });
     let logs = [log(folder.path(), "a.csv", &[out, back].repeat(10))];

@@ -76,7 +76,7 @@ fn cross_validation_reports_every_kernel() {
     assert_eq!(names, ["exponential", "squared_exponential", "exponential + matern52"]);
     for kernel in kernels {
         let number = |name: &str| kernel[name].as_f64().unwrap();
-        // 20 mV of noise cannot be predicted; the mean alone would leave 280 mV.
+        // 20 mV of noise cannot be predicted. Predicting the mean alone would leave an error of 280 mV.
         assert!((0.019..0.06).contains(&number("rmse")), "{kernel}");
         assert!(number("mean_absolute_error") < number("rmse") && number("training_s") > 0.0, "{kernel}");
         assert!((0.89..=0.995).contains(&number("coverage_95")), "{kernel}");
@@ -219,8 +219,8 @@ fn bad_input_error_names_place_and_range() {
     assert!(steps.contains("windows of 5 lags and"), "{steps}");
 }
 
-/// Two autoregressive series, x(t) = 1.6 x(t-1) - 0.64 x(t-2) + e. The first also drives the second. The rows come in
-/// parts of 400.
+/// Two series: the voltage is autoregressive, x(t) = 1.6 x(t-1) - 0.64 x(t-2) + e, and drives the temperature. The rows
+/// come in parts of 400.
 fn process(folder: &Path) {
     let mut draw = noise(11);
     let mut text = "cycle,time_s,voltage_v,temperature_c\n".to_owned();

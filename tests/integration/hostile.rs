@@ -2,8 +2,8 @@
 //! valid.
 //!
 //! The runs use random absurd readings, random configurations (every number of the reference page, within and at the
-//! ends of its range), a second sender, frames with our own identifiers, and a frozen current. `PACKWATCH_CONFIGS` sets
-//! the number of configurations.
+//! ends of its range), a second sender, frames with packwatch's own identifiers, and a frozen current.
+//! `PACKWATCH_CONFIGS` sets the number of configurations.
 
 use std::path::Path;
 
@@ -200,7 +200,7 @@ fn own_identifiers_are_reported_but_echo_is_not() {
     );
 }
 
-/// Events of a drive, and the time from which the frozen current is wrong by 1 % of the largest current, s.
+/// Events of a drive. From time `differs_s`, s, the frozen current is wrong by 1 % of the largest current.
 struct Drive {
     events: Vec<(f64, EventKind)>,
     validity: Validity,
@@ -259,7 +259,7 @@ fn frozen_current_is_found_without_false_finding() {
     let Drive { events, .. } = drive(None, 3600.0);
     assert_eq!(frozen_at(&events), None);
     assert!(!events.iter().any(|(_, kind)| matches!(kind, EventKind::SecondSender(_) | EventKind::OwnIdentifier(_))));
-    // After the second time, the car cruises for 100 s, and the voltages carry no information.
+    // After 333.3 s the car cruises for 100 s, and the voltages carry no information about the frozen current.
     for frozen_s in [120.0, 333.3] {
         let Drive { events, validity, differs_s } = drive(Some(frozen_s), frozen_s + 240.0);
         let after_s = frozen_at(&events).zip(differs_s).map(|(at_s, differs_s)| at_s - differs_s);

@@ -1,6 +1,6 @@
 //! Compares our ISO-TP with an independent implementation, PyPI `can-isotp`, run by the interpreter that
-//! `PACKWATCH_PYTHON` names. We reassemble its segmented messages despite loss, delay and interleaved senders, and it
-//! reassembles ours.
+//! `PACKWATCH_PYTHON` names. packwatch must reassemble the peer's segmented messages despite loss, delay and
+//! interleaved senders, and the peer must reassemble packwatch's.
 
 use std::collections::BTreeMap;
 use std::io::Write;

@@ -38,7 +38,7 @@ const TABLE: &[(&str, &[&str], Core)] = &[
     ("wiring_check", MODULES.split_at(19).0, Core::Shell),
     ("failure", &["config"], Core::Shell),
     ("lab", BELOW_LAB, Core::Shell),
-    // A separate program: it reads the daemon's status and uses nothing of its loop.
+    // A separate program: it reads the daemon's status and uses nothing of the daemon's loop.
     ("uplink", &["quantity", "alarm", "monitor", "io", "logging", "control", "status", "failure"], Core::Shell),
     ("python", &MODULES, Core::Shell),
     ("cli", &MODULES, Core::Shell),
@@ -101,7 +101,7 @@ const IMPURE_MACROS: &[&str] = &["println", "eprintln", "print", "eprint", "dbg"
 /// Paths forbidden to a single module: the simulated truth must not use the code that is judged against it.
 const FORBIDDEN_TO: &[(&str, &str)] = &[("sim", "crate::cell::estimator")];
 
-/// Tests that may name one more module: a replay drives the store that it records to.
+/// Tests that may name one more module: the store's tests run a replay that records to the store.
 const ALLOWED_IN_TESTS: &[(&str, &str)] = &[("host/store/tests.rs", "crate::replay")];
 
 /// A word or a punctuation mark of the source, without comments and literals.

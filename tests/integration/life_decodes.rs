@@ -19,7 +19,7 @@ fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// The interpreter. Prints a note and returns `None` if none is set.
+/// The interpreter that `PACKWATCH_PYTHON` names. If the variable is not set, prints a note and returns `None`.
 fn python() -> Option<OsString> {
     let python = std::env::var_os("PACKWATCH_PYTHON");
     if python.is_none() {
@@ -48,8 +48,8 @@ fn config(name: &str, replaced: &[(&str, &str)]) -> String {
     text
 }
 
-/// Writes the life's frames, estimates and events to `folder` and returns the tool's findings. Panics on any
-/// disagreement.
+/// Writes the life's frames, estimates and events to `folder`. Returns the findings of `tests/tools/life_decodes.py`.
+/// Panics if a value disagrees.
 fn decode(python: &OsString, life: &Life, folder: &Path) -> serde_json::Value {
     fs::write(folder.join("pack.toml"), &life.config).unwrap();
     let mut simulate = vec!["simulate", "paper", "-c", "pack.toml", "-o", "in.log"];

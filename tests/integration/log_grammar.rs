@@ -173,7 +173,7 @@ proptest! {
     }
 }
 
-/// Options for frames with the current in byte 0, as the tests' row encoder makes them.
+/// Options whose row encoder writes the current to byte 0 and the cell voltage to byte 1.
 fn options(strict: bool) -> LogOptions {
     LogOptions {
         interfaces: vec!["can0".into(), "can1".into()],

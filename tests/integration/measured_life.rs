@@ -1,4 +1,4 @@
-//! Replays whole lives of measured cells (NASA PCoE B0005, B0006) and compares the capacities with the published
+//! Replays whole lives of measured cells (NASA PCoE B0005, B0006) and compares the estimated with the published
 //! capacities.
 //!
 //! The published capacity is the charge delivered at 2 A down to 2.7 V (for both cells, even where the cycler

@@ -1,11 +1,12 @@
 //! A monitor restored from a snapshot on the same clock, after any input, continues with byte-identical frames, events
 //! and estimates.
 //!
-//! A pack of three cells with protected inputs, all kinds of alarms, commands from both sides, a J1939 node and
-//! diagnostic requests runs through random drives, faults, gaps, sleep and backward clock steps. One monitor runs
-//! through; the other is replaced by its own snapshot (through JSON) after random inputs. The same is done with a pack
-//! that learns its cell model, and with one whose frames are authenticated. Authenticated frames are compared without
-//! the freshness, which restarts by design. `PACKWATCH_CUTS` sets the number of cuts.
+//! A pack of three cells runs through random drives, faults, gaps, sleep and backward clock steps. It has protected
+//! inputs, all kinds of alarms, commands from the bus and from the operator, a J1939 node and diagnostic requests. One
+//! monitor runs through. The other is replaced by a monitor that is restored from its snapshot (through JSON) after
+//! random inputs; such a replacement is a cut. The same is done with a pack that learns its cell model, and with a pack
+//! whose frames are authenticated. Authenticated frames are compared without the freshness, which restarts by design.
+//! `PACKWATCH_CUTS` sets the number of cuts.
 
 use packwatch::alarm::{Rule, Selector};
 use packwatch::can::e2e::{Profile, Protection};
@@ -20,7 +21,7 @@ use crate::support::config_texts;
 use crate::support::dice::Dice;
 use crate::support::rig::{PACK, command_frame};
 
-/// The rig's signals, with space for the protection of the current's message.
+/// The signals of `support::rig`, with space for a protection header in the current's message.
 const DBC: &str = r#"VERSION ""
 NS_ :
 BS_:

@@ -257,7 +257,7 @@ fn low_soc_is_not_judged_by_old_value() {
         } else {
             rig.deci += 360_000;
         }
-        // Charged during the sleep. Only voltages are received at first, which leave the SOC ambiguous.
+        // The pack was charged during the sleep. At first only voltages are received, which leave the SOC ambiguous.
         (rig.voltages_v, rig.current_a) = ([Some(4.0); 2], None);
         rig.seconds(1);
         assert_eq!(rig.stands(Rule::SocLow), (AlarmState::Suppressed, 1, false), "{restarted} {away_s}");
@@ -270,7 +270,7 @@ fn low_soc_is_not_judged_by_old_value() {
             assert!(!restarted || heard.len() == 3, "{heard:?}");
         }
     }
-    // The opposite case: full before, empty after.
+    // The opposite case: the pack is full before the downtime and empty after it.
     let mut rig = Rig::new("[[alarm]]\nrule = \"soc_low\"\nwarning = \"20 %\"\n");
     rig.voltages_v = [Some(4.0); 2];
     rig.seconds(60);
@@ -290,7 +290,7 @@ fn untrusted_estimate_is_suppressed_once() {
         "[[alarm]]\nrule = \"estimate_untrusted\"\nwarning = 4\n[estimator]\nlost_after_s = 1e6\ngate_sigma = 1e3\n",
     );
     rig.seconds(30);
-    // A load that does not appear in the voltages.
+    // Let the first cell's voltage jump although no current flows.
     rig.voltages_v = [Some(3.0), Some(3.7)];
     rig.seconds(2);
     for _ in 0..200 {
@@ -409,7 +409,7 @@ fn changed_identity_means_new_pack() {
     rig.restart(Downtime::Seconds(3600.0));
     rig.seconds(2);
     assert_eq!((packs(&rig).1, rig.monitor.capacity(CellIndex(0))), (0, learned));
-    // The pack is changed while the computer is off.
+    // The pack is replaced while the computer is off.
     rig.restart(Downtime::Seconds(3600.0));
     rig.identity = Some(1002.0);
     (0..4).for_each(|_| rig.tick_with_frames());

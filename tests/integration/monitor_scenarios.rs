@@ -531,7 +531,7 @@ fn state_restored_on_earlier_clock_keeps_sending() {
         let time = Timestamp::from_secs(-1e6).plus_nanos(tick * 10_000_000);
         monitor.handle(&Record::tick(time), &mut out);
     }
-    // Three seconds give a status frame, five health pages and four digest pages each. The state may have been taken
-    // anywhere in the period.
+    // Each of the three seconds gives a status frame, five health pages and four digest pages. The state may have been
+    // taken anywhere in the period.
     assert!((21..=36).contains(&out.frames.len()), "{} frames", out.frames.len());
 }

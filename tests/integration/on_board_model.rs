@@ -1,7 +1,7 @@
 //! Learns the model of a cell that is known only by its label, from simulated drives and charges, through the whole
 //! monitor.
 //!
-//! Input: cycles of the paper's scenario by a cell with less capacity and other resistances than its label says, with a
+//! The cell has less capacity and other resistances than its label says. It runs cycles of the paper's scenario, with a
 //! night between cycles.
 
 use std::path::Path;

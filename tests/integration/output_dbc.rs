@@ -318,7 +318,7 @@ impl Maker {
         (self.plan.digest(page, &fields, &mut self.counters).unwrap(), wanted)
     }
 
-    /// Makes an executed, a rejected or an unreadable command, in turn.
+    /// Makes the reply to an executed, a rejected or an unreadable command, in turn.
     fn reply(&mut self, turn: usize) -> (Frame, Wanted) {
         const KINDS: [Command; 3] = [Command::Acknowledge, Command::Clear, Command::PackReplaced];
         let (kind, rule) = (turn % KINDS.len(), 1 + turn % RULES.len());

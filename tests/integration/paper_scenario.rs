@@ -1,5 +1,5 @@
-//! Runs the paper's scenario through the whole core: truth -> sensors -> frames of the DBC -> Monitor, judged per
-//! cycle.
+//! Runs the paper's scenario through the whole core (true cell -> sensors -> frames of the DBC -> Monitor) and judges
+//! the errors of each cycle.
 //!
 //! A cell of 2.6 Ah is cycled between SOC 0.3 and 0.9 with 1 s samples. It fades by 0.05 Ah per cycle to 0.25 Ah.
 //! Sensor errors: voltage 5 mV; current 20 mA noise + 10 mA offset + 0.5 % gain. The paper's figures show |SOC error|

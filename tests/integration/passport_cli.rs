@@ -514,7 +514,7 @@ fn record_with_gap_has_no_sums() {
     life.simulate("life.log", "1700000000", &["--cycles", "2"]);
     let text = fs::read_to_string(life.path("life.log")).expect("a log");
     let stamp = |line: &str| line.split(['(', ')']).nth(1).and_then(|stamp| stamp.parse::<f64>().ok()).unwrap_or(0.0);
-    // Ten minutes of the first hour, during a discharge.
+    // Remove ten minutes of the first hour, during a discharge.
     let is_kept = |line: &&str| !(1_700_001_200.0..1_700_001_800.0).contains(&stamp(line));
     let cut: Vec<&str> = text.lines().filter(is_kept).collect();
     fs::write(life.path("cut.log"), cut.join("\n")).expect("written");

@@ -324,7 +324,7 @@ fn flood_of_one_identifier_is_limited() {
     let mut bench = Bench::running();
     let mut sent = 0;
     for _ in 0..20 {
-        // 10,000 frames a second, five times the limit, of an unprotected message.
+        // Send 10,000 frames a second of an unprotected message: five times the limit.
         for _ in 0..1000 {
             bench.now = bench.now.plus_nanos(100_000);
             bench.give(cell_2(3.9));

@@ -1,4 +1,5 @@
-//! Tests normalised recharge periods through the whole core: simulated cells -> sensors -> frames -> Monitor.
+//! Tests normalised recharge periods through the whole core: simulated cells -> sensors -> frames -> Monitor. The
+//! normalised period is the time that a charge over the SOC window would take at the reference current.
 //!
 //! Simulates a fleet of cells of 1.4 to 2.6 Ah. Each cell has its own charger (0.3 to 1.2 C, constant current, then
 //! constant voltage), temperature (5 to 40 degrees C) and depth of discharge. Its current sensor has 20 mA noise, and
@@ -370,7 +371,7 @@ fn weaker_charger_changes_only_raw_period() {
     assert!(worst < 0.03, "worst error {worst}");
 }
 
-/// Alarms of a few charges with a threshold of 3000 s, for the given `alarm_on`; and the last health frame.
+/// Number of alarms in a few charges with a threshold of 3000 s and the given `alarm_on`, and the last health frame.
 fn alarms(usage: &Usage, alarm_on: RechargeAlarm) -> (u32, Option<[u8; 8]>) {
     let output = config::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml")).ok();
     let mut config = configuration();
@@ -404,7 +405,8 @@ fn normalised_period_alarm_ignores_charger() {
         charge_a: RATED_AH,
         discharge_a: 0.5 * RATED_AH,
     };
-    // 2.5 Ah: 4154 s at C/2, 2060 s with this charger. 1.7 Ah: 2825 s at C/2, 4900 s with a weak one.
+    // Periods: a cell of 2.5 Ah takes 4154 s at C/2 and 2060 s with this charger. A cell of 1.7 Ah takes 2825 s at C/2
+    // and 4900 s with a weak charger.
     let worn = Usage { capacity_ah: 1.7, charge_a: 0.3 * RATED_AH, ..usual };
     let partly = Usage { depth: DEPTHS[4], ..worn };
     let raised = |usage: &Usage, alarm_on| alarms(usage, alarm_on).0;

@@ -18,13 +18,13 @@ use packwatch::quantity::CellIndex;
 use packwatch::sim::{Scenario, Settings};
 
 const CAPACITY_AH: f64 = 30.0;
-/// The simulated cell matches the model, so only sensor noise and the kinks of the interpolated tables cause errors.
-/// The default of 0.15, which is for measured cells, would make the capacity lag behind the loss of 1 Ah: 2.2 % at the
-/// end.
+/// Model error. The simulated cell matches the model, so only sensor noise and the kinks of the interpolated tables
+/// cause errors. The default of 0.15 is for measured cells. With it, the capacity would lag behind the loss of 1 Ah per
+/// cycle, by 2.2 % at the end.
 const MODEL_ERROR_V_SQRT_S: f64 = 0.03;
 /// Fade of the example's cell per full cycle: 1 Ah in a cycle of 60 %.
 const NOISE_AH_PER_CYCLE: f64 = 1.7;
-/// The example's claim for the end.
+/// Final SOC error that the example claims.
 const MAX_FINAL_SOC_ERROR: f64 = 0.005;
 /// Largest relative capacity error at the end.
 const MAX_CAPACITY_ERROR: f64 = 0.01;

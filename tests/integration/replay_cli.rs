@@ -119,7 +119,7 @@ fn snapshot_beyond_log_fails_without_file() {
     assert!(!Path::new(snapshot).exists());
 }
 
-/// Candump logs of a cell's voltage, one frame per second, with the given durations.
+/// CSV logs of a cell, one row per second, with the given durations.
 fn trips(folder: &Path, seconds: [u32; 3]) -> [String; 3] {
     [0, 1, 2].map(|n| {
         let path = folder.join(format!("trip{n}.csv"));

@@ -1,6 +1,6 @@
 //! Checks forecasts of the remaining useful life: on measured lives, on simulated fades of many shapes that no
-//! parameter was tuned for, and on board. `tests/rul.md` has the results; `cargo test --test integration rul --
-//! --nocapture` prints them.
+//! parameter was tuned for, and by the Monitor on a simulated life. `tests/rul.md` has the results; `cargo test --test
+//! integration rul -- --nocapture` prints them.
 
 use std::path::{Path, PathBuf};
 

@@ -44,7 +44,7 @@ impl Bench {
         fs::write(self.path(name), text).unwrap();
     }
 
-    /// A discharge of `hours` at 1 A from full, one row per second. The voltages are those of a cell whose SOC is higher
+    /// A discharge of `hours` at 1 A from full, one row per second. The voltages belong to a cell whose SOC is higher
     /// by `offset`.
     fn write_discharge(&self, name: &str, hours: f64, offset: f64) {
         let mut text = String::from("time_s,current_a,voltage_v,temperature_c,discharged_ah\n");
@@ -91,8 +91,8 @@ fn perfect_cell_converges_from_20_points() {
 
 #[test]
 fn cell_error_appears_in_score() {
-    // The voltages indicate 8 points more than the counter, so an estimator that trusts them is 8 points off and
-    // outside its interval.
+    // The voltages indicate a SOC 8 points above the counted charge. An estimator that trusts the voltages is therefore
+    // 8 points off, and the truth is outside its interval.
     let bench = Bench::new();
     bench.write_discharge("drive.csv", 1.5, 0.08);
     let score = &bench.json(&["drive.csv", "--start", "middle", "--told", "0", "--soc-std", "30"])["scores"][0];
@@ -125,7 +125,7 @@ fn start_in_middle_drops_earlier_rows() {
 
 #[test]
 fn current_offset_is_added_before_core() {
-    // 0.1 A integrate to 7.5 points of 2 Ah in 1.5 h.
+    // In 1.5 h, 0.1 A integrate to 7.5 points of 2 Ah.
     let bench = Bench::new();
     bench.write_discharge("drive.csv", 1.5, 0.0);
     let args = ["drive.csv", "--told", "0", "--current-offset=-0.1,0,0.1"];
@@ -134,8 +134,8 @@ fn current_offset_is_added_before_core() {
         document["scores"].as_array().unwrap().iter().map(|s| s["current_offset_a"].as_f64().unwrap()).collect();
     assert_eq!(offsets, [-0.1, 0.0, 0.1]);
     let errors: Vec<_> = (0..3).map(|i| number(&document["scores"][i], "mean_error_points")).collect();
-    // More charge seems to leave than really does, so the estimate falls below the truth. The voltage keeps the error
-    // far below the integral's 7.5 points.
+    // With an offset of +0.1 A, more charge seems to leave than really does, so the estimate falls below the truth. The
+    // voltage keeps the error far below the integral's 7.5 points.
     assert!(errors[0] > errors[1] + 0.02 && errors[2] < errors[1] - 0.02, "{errors:?}");
     assert!(errors.iter().all(|error| error.abs() < 1.5), "{errors:?}");
     let table = String::from_utf8(bench.score(&args).success().get_output().stdout.clone()).unwrap();

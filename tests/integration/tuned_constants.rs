@@ -90,7 +90,7 @@ fn quoted(line: &str) -> Vec<&str> {
     line.split('`').skip(1).step_by(2).collect()
 }
 
-/// The rows of the page as (constant, file, value, test); the test is `None` if the row names none.
+/// The rows of the page as (constant, file, value, test). The test is `None` if the row names no test.
 fn rows(page: &str) -> Vec<(&str, &str, &str, Option<&str>)> {
     page.lines()
         .filter(|line| line.starts_with("| `"))

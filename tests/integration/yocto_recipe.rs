@@ -1,5 +1,6 @@
-//! Compares the Yocto recipe (`packaging/yocto`) with the sources: the files that it names exist, and its version, licence texts and Rust
-//! version match the repository. Whether bitbake accepts it is checked by hand; see the manual, page Install.
+//! Compares the Yocto recipe (`packaging/yocto`) with the sources: the files that the recipe names exist, and its
+//! version, licence texts and Rust version match the repository. Whether bitbake accepts the recipe is checked by hand;
+//! see the manual, page Install.
 
 use std::fs;
 use std::path::{Path, PathBuf};

@@ -133,7 +133,7 @@ def measure_alarm(count):
             return i == ALARM and (bits(data, *RULE), bits(data, *STATE)) == change
 
         answered, seen = (None, listener.read()) if wait else listener.stamp_of(is_answer)
-        # Enough for two half-cycles of six frames each.
+        # Keep enough frames for two half-cycles of six frames each.
         cells = cells[-12:] + [(stamp, current_of(data)) for stamp, i, data in seen if i == CELL]
         low, high = WEAK_AH if strong else STRONG_AH
         given_ah, asked = last_half_cycle(cells, sign)

@@ -1,5 +1,5 @@
-//! Creates healthy packs for the doctor's tests: configurations, DBC files and simulated logs. The tests put faults
-//! into them.
+//! Creates healthy packs for the tests of `packwatch doctor`: configurations, DBC files and simulated logs. The tests
+//! put faults into these packs.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -172,7 +172,7 @@ impl BrokenPack {
         Self { bench, config: bench.config(), dbc: bench.dbc(), log: log(bench, seed), extra: Vec::new() }
     }
 
-    /// Replaces a text in the configuration; it must exist.
+    /// Replaces a text in the configuration. The text must exist.
     pub(crate) fn config(&mut self, from: &str, to: &str) {
         assert!(self.config.contains(from), "{:?} does not contain {from}", self.bench);
         self.config = self.config.replace(from, to);

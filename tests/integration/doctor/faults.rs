@@ -61,7 +61,7 @@ fn without_units(broken: &mut BrokenPack) {
     }
 }
 
-/// A second cell model: the example's with every number of some tables changed.
+/// Replaces the cell model by the example's model, with `change` applied to every number of the given tables.
 fn other_cell(broken: &mut BrokenPack, tables: &[&str], change: impl Fn(f64) -> f64) {
     let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("config/cells");
     let mut model: toml::Table =
@@ -313,7 +313,7 @@ pub(crate) const FAULTS: &[Fault] = &[
         4,
     ),
     fault(
-        // Either a smaller pack or a dead module.
+        // The pack may be smaller than configured, or a module may be dead.
         "last cells without values",
         |b| {
             b.data("110", |d| {

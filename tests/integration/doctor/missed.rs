@@ -1,4 +1,4 @@
-//! Lists faults that the doctor once missed, in the same table form.
+//! Lists faults that `packwatch doctor` once missed, in the form of `faults`.
 
 use packwatch::wiring::Topic;
 
@@ -6,14 +6,14 @@ use super::bench::Bench::{Pack12, Pack96, Pulses, Steady, Total, Walk};
 use super::bench::BrokenPack;
 use super::faults::{Fault, fault};
 
-/// Swaps `@1` and `@0` but leaves the start bits of the cells unchanged.
+/// Changes the byte order of the cells from `@1` to `@0` but leaves their start bits unchanged.
 fn byte_order_alone(broken: &mut BrokenPack) {
     for start in [16, 32, 48] {
         broken.dbc(&format!("{start}|16@1+ (0.0001"), &format!("{start}|16@0+ (0.0001"));
     }
 }
 
-/// Drops one of every `of` frames with an identifier.
+/// Drops one of every `of` frames with the identifier `wanted`.
 fn lose(broken: &mut BrokenPack, wanted: &str, of: u32) {
     let mut n = 0;
     broken.frames(|stamp, interface, id, data| {
@@ -29,8 +29,8 @@ fn set(data: &mut [u8], page: u8, at: usize, value: i32) {
     }
 }
 
-/// Adds a second bus on which another sender uses identifier 100. It sends the first sender's current, inverted and
-/// delayed. The configured current is on interface `on`.
+/// Adds a second bus on which another sender uses identifier 100. This sender sends the first sender's current,
+/// inverted and delayed. The configured current is on interface `on`.
 fn second_bus(broken: &mut BrokenPack, on: &str) {
     broken.config("[[interface]]\nname = \"can0\"", "[[interface]]\nname = \"can1\"\n\n[[interface]]\nname = \"can0\"");
     broken.table("[input.cell_voltage]", "interface = \"can0\"");
@@ -48,7 +48,7 @@ fn second_bus(broken: &mut BrokenPack, on: &str) {
     });
 }
 
-/// Adds a signal of the pack voltage, whose value is `by` times the number of cells times the first cell's mean voltage.
+/// Adds a pack voltage signal. Its value is `by` x number of cells x mean voltage of the first cell.
 fn pack_voltage(broken: &mut BrokenPack, by: f64) {
     let cells = if broken.bench == Pack96 { 96.0 } else { 12.0 };
     let (mut sum, mut n) = (0.0, 0.0);
@@ -233,7 +233,7 @@ pub(crate) const MISSED: &[Fault] = &[
     ),
     fault(
         "a third of the strings",
-        // Three packs in parallel: a third of the resistance.
+        // Triple the current, as if three packs were connected in parallel.
         |b| {
             b.data("100", |d| {
                 let code = i16::from_le_bytes([d[0], d[1]]);

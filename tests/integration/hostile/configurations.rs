@@ -127,7 +127,7 @@ fn configuration(dice: &mut Dice, keys: &[NumberKey]) -> (String, String) {
                 "max_v" => dice.between(4.3, 1000.0),
                 "min_c" => dice.between(-100.0, -10.0),
                 "max_c" | "to_soc" => dice.between(0.5, 1.0) * key.high,
-                // Only for a cell without a model file.
+                // These keys are valid only for a cell without a model file.
                 "voltage_min_v" | "voltage_max_v" => continue,
                 _ => key.draw(dice),
             };

@@ -6,7 +6,7 @@ use std::io::Write;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-/// The interpreter. Prints a note and returns `None` if none is set.
+/// The interpreter that `PACKWATCH_PYTHON` names. If the variable is not set, prints a note and returns `None`.
 pub(crate) fn python() -> Option<OsString> {
     let python = std::env::var_os("PACKWATCH_PYTHON");
     if python.is_none() {

@@ -1,5 +1,5 @@
-//! Runs a simulated cell through the whole core in one process: truth -> sensors -> frames of the DBC -> Monitor, with
-//! the ticks of a replay. Shared by the tests that judge the estimates.
+//! Runs a simulated cell through the whole core in one process: true cell -> sensors -> frames of the DBC -> Monitor,
+//! with the ticks of a replay. Shared by the tests that judge the estimates.
 
 use packwatch::can::encode::InputEncoder;
 use packwatch::io::ticks::Ticks;
@@ -7,7 +7,7 @@ use packwatch::monitor::{Event, Monitor, MonitorConfig, Outputs, Record, TICK_PE
 use packwatch::quantity::Timestamp;
 use packwatch::sim::{Simulation, Wiring};
 
-/// If a gap in the record is longer than this, s, the recorder was asleep. This record has no gap.
+/// Length of a gap in the record, s, above which the recorder counts as asleep. This record has no gap.
 const SLEEP_GAP_S: f64 = 30.0;
 
 /// Runs `settings` to the end. After each step calls `each` with the time, the truth, the core and the core's events.
