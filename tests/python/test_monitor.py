@@ -334,7 +334,7 @@ def test_monitor_is_unusable_after_internal_failure():
             except pw.DataError as error:
                 print(error)
     """)
-    # No thread can have such a stack, so starting it panics.
+    # No thread can have a stack of this size, so starting a thread panics.
     environment = os.environ | {"RUST_MIN_STACK": str(2**62)}
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, env=environment)
     text = "an earlier call failed inside packwatch; create a new Monitor"

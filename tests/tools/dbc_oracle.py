@@ -58,7 +58,7 @@ def decode(path, strict):
     messages = {m.name: m for m in load(path, strict).messages}
     past = list(reaches_past(path))
     for name, _, _, needed in past:
-        # cantools cannot decode such a message at all. Give it zero bytes and omit the signals.
+        # cantools cannot decode a message that has a signal past its end. Lengthen the message and omit these signals.
         message = messages[name]
         message.length = max(message.length, needed)
         message.refresh(strict=False)

@@ -60,7 +60,7 @@ def with_soc(cycles):
     knees = [knee(*d[1:4]) for d in discharges]
     end = [np.interp(-2.7, -d[3][d[2] > 1], ampere_hours(*d[1:3])[d[2] > 1]) for d in discharges]
     beyond_knee = np.mean(np.array(end) - knees)
-    capacity = (np.mean(knees) + beyond_knee) / (1 - SOC_LEFT)      # of the mean of the first five
+    capacity = (np.mean(knees) + beyond_knee) / (1 - SOC_LEFT)      # mean capacity of the first five discharges
     soc_knee = SOC_LEFT + beyond_knee / capacity
     out, left, n = [], None, 0
     for kind, t, i, v, temp in cycles[1:]:

@@ -24,7 +24,7 @@ MODES = {"unknown": 0, "charge": 1, "rest": 2, "discharge": 3}
 SEVERITIES = {"info": 1, "warning": 2, "severe": 3}
 STATES = {"inactive": 0, "active": 1, "clearing": 1, "cleared": 2, "pending": 3, "latched": 4, "suppressed": 5, "unknown": 6}
 MAX_PRINTED = 20
-WAIT_NS = 2 * 10**9  # longest wait of a first frame for the budget
+WAIT_NS = 2 * 10**9  # longest time that the first frame after an event waits for the frame budget
 LOSS_SIGNALS = ("Lli", "LliStd", "LamNe", "LamNeStd", "LamPe", "LamPeStd")
 
 
@@ -75,7 +75,7 @@ class Life:
         self.pack = None
         self.mode = "unknown"
         self.bad, self.untrusted = set(), set()
-        self.changed = {}  # the same key: the last event, raised or not
+        self.changed = {}  # all alarms by (rule, cell, severity): the last event, raised or not
         self.alarms = {}  # raised alarms by (rule, cell, severity): the last event
         self.recharge = None  # the last reported period
         self.normalised = None
@@ -242,7 +242,7 @@ def compare(reader, life, estimates, events, frame_list):
     done = 0
     estimate, event = 0, 0
     for time, frame_id, data in frame_list:
-        # Reports with the frame's own time were processed before it.
+        # Reports with the frame's own time were processed before the frame.
         while estimate < len(estimates) and estimates[estimate][0] <= time:
             life.take_estimate(estimates[estimate][1])
             estimate += 1
@@ -316,7 +316,7 @@ def compare_alarm(result, life, time, values, pending):
         result.value(time, "Alarm", "Acknowledged", values["Acknowledged"], event["acknowledged"])
         result.value(time, "Alarm", threshold, values[threshold], factor * event["threshold"])
     elif values["State"] == STATES["unknown"]:
-        # Not raised, and it is unknown whether it should be.
+        # The alarm is not raised, and it is unknown whether it should be.
         result.value(time, "Alarm", name, values[name], None)
         result.frames["Alarm unknown"] += 1
     elif key in life.changed:
@@ -324,7 +324,7 @@ def compare_alarm(result, life, time, values, pending):
         result.value(time, "Alarm", "State", values["State"], STATES[life.changed[key]["state"]])
         result.frames["Alarm repeated"] += 1
     elif values["State"] == STATES["inactive"]:
-        # Was announced as unknown and is known again.
+        # The alarm was announced as unknown and is known again.
         result.frames["Alarm known again"] += 1
     else:
         result.fault(time, "Alarm", f"{key} was sent but is not raised")

@@ -49,10 +49,10 @@ replayed() {
     done
 }
 
-# restart_bar LOG...: allowed SOC difference, in points, between a restarted daemon and one that kept running. It is 0.2 if
-# restarts took at most 2.5 s. If they took longer (see the logs), it is the SOC that the drive's largest current moves in
-# that time: 6.2 A of 2.6 Ah are 0.066 points a second. A tenth is added for the time between the last sample and the state's
-# time stamp.
+# restart_bar LOG...: allowed SOC difference, in points, between a restarted daemon and one that kept running. If all restarts
+# took at most 2.5 s (see the logs), 0.2 points are allowed. Otherwise the bar is the SOC that the drive's largest current moves
+# during the longest restart: 6.2 A of 2.6 Ah are 0.066 points a second. A tenth of this and 0.02 points are added for the time
+# between the last sample and the state's time stamp.
 restart_bar() {
     cat -- "$@" | sed -nE 's/.*state (taken up|restored).* away=([0-9.]+).*/\2/p' |
         awk '$1 > away { away = $1 } END { print (away > 2.5 ? 0.073 * away + 0.02 : 0.2) }'

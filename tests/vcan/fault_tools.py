@@ -38,7 +38,7 @@ def frames(lines, interface="vcan0"):
                 yield int(name, 16), bytes.fromhex(data)
 
 
-# ---- this program's frames, as its built-in DBC lays them out -----------------------------------------------------------------------
+# ---- packwatch's frames, as its built-in DBC lays them out -----------------------------------------------------------------------
 
 STATUS, HEALTH, ALARM, SAMPLE, PLAYED = 0x6B0, 0x6B1, 0x6B2, 0x7F0, 0x7F1
 VALID, ACTIVE, CLEARED = 1, 1, 2
@@ -46,7 +46,7 @@ MOVING = (1, 3)  # charge, discharge
 # Properties of fast_pack.
 PERIOD_S, MAX_RATE_PER_S = 0.01, 0.32
 MEMORY = 300  # samples
-LOST = 0.75  # minimum share of estimates within two standard deviations; a smaller share means that a fault made them wrong (calibration: tests/integration/restart.rs)
+LOST = 0.75  # minimum share of estimates within two standard deviations; a smaller share means that a fault made the estimates wrong (calibration: tests/integration/restart.rs)
 TOO_LATE_S, STEP_S = 0.1, 600.0
 
 
@@ -194,7 +194,7 @@ def learned(args) -> None:
 
 
 OF_NOW = ("input_missing", "input_implausible", "bus_fault", "store_failed")
-RAISED = ("active", "latched", "suppressed")  # suppressed: without its input
+RAISED = ("active", "latched", "suppressed")  # suppressed: the alarm's input is missing
 
 
 def learned_of(snapshot: dict) -> tuple[list, list]:

@@ -12,8 +12,8 @@ tools() { python3 "$here/fault_tools.py" "$@"; }
 # pack SECONDS: writes fast_pack's files to $fast; the daemon uses $fast/fast.toml.
 pack() { "$here/fast_pack" "$fast" --seconds "$1"; }
 
-# feed: continues the pack on vcan0, regardless of the interface's state. dump.log contains its samples and our frames, of all
-# feeds.
+# feed: continues to play the pack on vcan0, regardless of the interface's state. dump.log contains the pack's samples and
+# packwatch's frames of all feeds.
 feed() {
     if [[ -z ${pids[dump]-} ]]; then
         start dump candump -L any,6B0:7F0,7F0:7FE

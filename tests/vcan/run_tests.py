@@ -35,7 +35,7 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 # Tests mostly wait: three boots use two cores about half of the time.
 JOBS = 3
-# with-vcan's limit for a test without one, s.
+# Time limit that with-vcan applies to a test that states no limit, s.
 DEFAULT_LIMIT_S = 120
 # Maximum boot time on a busy machine, s.
 BOOT_S = 60

@@ -31,7 +31,7 @@ systemd_prepare() {
     done
 }
 
-# drop_in UNIT NAME LINE...: adds a drop-in before the boot; after the boot also run `in_system systemctl daemon-reload`.
+# drop_in UNIT NAME LINE...: adds a drop-in. After the boot it also runs `systemctl daemon-reload`.
 drop_in() {
     local folder=$units/$1.d name=$2
     shift 2
