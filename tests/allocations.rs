@@ -90,7 +90,7 @@ fn next(source: &mut LogSource) -> Option<Record> {
     source.next_record().expect("a good log")
 }
 
-/// Whether the log has reached its steady part.
+/// Whether the warm-up is over at this record.
 fn is_warm(record: &Record, first: &Record) -> bool {
     record.time.since(first.time) >= WARM_S
 }
@@ -130,7 +130,7 @@ fn frame_read_from_log_allocates_nothing() {
     while !is_warm(&next(&mut source).expect("a long log"), &first) {}
     let mut frames = 0;
     without_allocating("reading a log", || {
-        // Leave the last frames: work at the end of a file is done only once.
+        // Do not read the last frames: the end of a file causes work that is done only once.
         while frames < MIN_FRAMES {
             frames += u64::from(matches!(next(&mut source), Some(Record { kind: RecordKind::Frame { .. }, .. })));
         }

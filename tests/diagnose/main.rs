@@ -1,4 +1,4 @@
-//! Measures the diagnosis on simulated packs: healthy packs, and packs with one fault each.
+//! Measures how well the diagnosis finds faults in simulated packs: healthy packs, and packs with one fault each.
 //!
 //! `tests/diagnose/run [--quick] [--packs N] [--days N] [--period MS] [--jobs N] [--seed N] [--only WORD] [--list] [--write]`
 //!

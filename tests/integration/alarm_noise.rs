@@ -17,7 +17,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
 const DAY_S: u32 = 86_400;
-/// The value reaches its threshold within the first hour and leaves it in the last.
+/// The value reaches its threshold within the first hour and leaves it in the last hour.
 const HOUR_S: f64 = 3600.0;
 const SLEEP_GAP_S: f64 = 30.0;
 /// Alarm states on the wire, as `config/packwatch.dbc` defines them.

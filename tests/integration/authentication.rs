@@ -237,7 +237,7 @@ fn journal_replay_without_key_equals_live_run() {
         assert!(!daemon.receive(&frame));
     }
     let live = serde_json::to_string(&daemon.monitor.snapshot()).unwrap();
-    // The same inputs as a journal stores them, without the key.
+    // Replay the inputs as a journal stores them, without the key.
     let (mut replay, mut out) = (Monitor::new(config), Outputs::default());
     for (ms, frame) in daemon.journal.take().unwrap() {
         let time = Timestamp::from_nanos(ms * 1_000_000);

@@ -1,5 +1,6 @@
-//! Rules that compare each cell with its pack. Simulated packs with one fault run through the whole core, and the test
-//! checks the alarms of every cell. A row is the sum of each cell's samples over a few minutes.
+//! Tests the rules that compare each cell with its pack. Simulated packs with one fault run through the whole core, and
+//! the test checks the alarms of every cell. The diagnosis works on rows; a row holds the sums of each cell's samples
+//! over a few minutes.
 
 use std::fmt::Write as _;
 
@@ -357,7 +358,7 @@ fn balancing_bits_reveal_leaks_of_other_cells() {
     assert_eq!(found_in_balanced(faults, 1.0, without_bits), [leak_of(6)]);
 }
 
-/// While a cell's balancing bit is missing or unknown, its loss may be due to bleeding.
+/// While a cell's balancing bit is missing or unknown, the cell's loss may be due to bleeding.
 #[test]
 fn loss_explained_by_bleeding_raises_no_leak() {
     let unseen = with_balancing(|it| BalancingConfig { is_only_while_sent: false, max_age_s: 10.0, ..it });
@@ -428,7 +429,7 @@ fn detached_temperature_sensor_is_found_despite_offsets() {
 
 #[test]
 fn swapped_channels_are_found_and_keep_their_cells() {
-    // Cells far apart, and adjacent cells.
+    // Swap cells that are far apart, and adjacent cells.
     for (fault, other) in [("weak:3:-12% swap:3:8@day3", 7), ("weak:3:-12% swap:3:4@day3", 3)] {
         let mut pack = FaultyPack::of(MonitorConfig { is_balanced: false, ..config() }, fault);
         pack.run_to(1.9);

@@ -213,7 +213,7 @@ impl<'a> Daemon<'a> {
         }
     }
 
-    /// Applies a random change of the vehicle, or a command.
+    /// Applies a random change to the vehicle, or sends a command.
     fn act(&mut self) {
         let time = self.now();
         match self.random.random_range(0..10) {
@@ -337,7 +337,7 @@ fn listener_needs_digest_to_remove_alarms() {
     daemon.run_for(3_000);
     let raised = daemon.listener.as_mut().unwrap().table(daemon.now_ms);
     assert!(raised.contains_key(&(9, 2, 2047)), "{raised:?}");
-    // Kill the daemon and discard its alarms. No frame announces their end; only the digest shows it.
+    // Kill the daemon and discard its alarms. No frame announces the end of these alarms; only the digest shows it.
     daemon.monitor = Monitor::new(config.monitor.clone());
     daemon.temperature_c = Some(25.0);
     daemon.run_for(3_000);

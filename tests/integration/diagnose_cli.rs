@@ -17,8 +17,8 @@ fn packwatch(args: &[&str]) -> String {
     String::from_utf8(output.stdout).expect("text")
 }
 
-/// Computes from the last true state of every cell: usable charge and the charge that balancing would recover, as
-/// fractions of the mean cell's capacity, and the cell that ends a discharge.
+/// Computes three values from the last true state of every cell: the usable charge and the charge that balancing would
+/// recover (fractions of the mean cell's capacity), and the cell that ends a discharge.
 fn truth(path: &Path) -> (f64, f64, u64) {
     let mut cells: BTreeMap<u64, (f64, f64)> = BTreeMap::new();
     for row in csv::Reader::from_path(path).expect("the truth").deserialize() {

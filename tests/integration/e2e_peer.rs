@@ -1,6 +1,6 @@
-//! Compares our end-to-end protection with two independent implementations, PyPI `autosar-e2e` (profiles 1A, 1C and 5)
-//! and `cantools` (profile 5), run by the interpreter that `PACKWATCH_PYTHON` names. packwatch and the peer must accept
-//! each other's payloads, produce equal bytes, and reject a payload with one wrong bit.
+//! Compares packwatch's end-to-end protection with two independent implementations, PyPI `autosar-e2e` (profiles 1A, 1C
+//! and 5) and `cantools` (profile 5), run by the interpreter that `PACKWATCH_PYTHON` names. packwatch and the peer must
+//! accept each other's payloads, produce equal bytes, and reject a payload with one wrong bit.
 
 use std::ffi::OsString;
 use std::io::Write;
@@ -82,8 +82,8 @@ impl Case {
         format!("{} {data_id} {} {} {}", profile.name(), hex(&self.raw), hex(&self.ours), hex(&self.flipped))
     }
 
-    /// Checks one peer's answer: its payload, whether it accepts our payload, and whether it rejects the payload with a
-    /// wrong bit.
+    /// Checks one peer's answer: the peer's payload, whether the peer accepts packwatch's payload, and whether it
+    /// rejects the payload with a wrong bit.
     fn compare(&self, peer: &str, answer: &[&str]) {
         let what = self.question();
         let [theirs, accepts, accepts_flipped] = answer else { panic!("{peer} answers {answer:?} to {what}") };

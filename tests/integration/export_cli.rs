@@ -1,4 +1,4 @@
-//! Runs `packwatch export` as a user does. The tables contain what a replay reports. A failed export leaves no
+//! Runs `packwatch export` as a user does. The tables must contain what a replay reports. A failed export must leave no
 //! partial table.
 
 use std::collections::BTreeMap;

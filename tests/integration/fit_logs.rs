@@ -1,5 +1,5 @@
-//! Tests models from labels and from ordinary drives (`score --chemistry`, `fit --log`), on simulated and measured
-//! cells.
+//! Tests cell models that come from a label (`score --chemistry`) or are fitted to ordinary drives (`fit --log`), on
+//! simulated and measured cells.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};

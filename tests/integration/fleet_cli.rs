@@ -1,5 +1,5 @@
-//! Runs `packwatch fleet` as a user does. The output is byte-identical for any division into parts, and neither a kill
-//! nor a damaged log loses data.
+//! Runs `packwatch fleet` as a user does. The output is byte-identical, however the fleet is divided into parts.
+//! Neither a kill nor a damaged log loses data.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -51,7 +51,7 @@ impl Fleet {
         command
     }
 
-    /// Replays a part and returns its output.
+    /// Replays a part of the fleet and returns the command's output.
     fn run(&self, out: &str, more: &[&str]) -> String {
         let mut command = self.command(&["fleet", "run", "fleet.jsonl", "--estimates", "60", "-o", out, "-c"]);
         let ran = command.arg(config()).args(more).assert().success();

@@ -1,6 +1,6 @@
-//! Compares our exact Gaussian process with scikit-learn's, run by the interpreter that `PACKWATCH_PYTHON` names. With
-//! the same rows and hyperparameters, means and standard deviations agree to 1e-8. `tests/peers/run --only gp` also
-//! compares the fit times, alternating in one run with the same number of threads.
+//! Compares packwatch's exact Gaussian process with scikit-learn's, run by the interpreter that `PACKWATCH_PYTHON`
+//! names. With the same rows and hyperparameters, means and standard deviations agree to 1e-8. `tests/peers/run --only
+//! gp` also compares the fit times, alternating in one run with the same number of threads.
 
 use std::io::{BufRead, BufReader, Write};
 use std::ops::ControlFlow;

@@ -199,7 +199,7 @@ fn bad_input_error_names_place_and_range() {
     let found = json(place, &some);
     assert_eq!((&found["rows"], &found["skipped"]), (&38.into(), &2.into()));
     assert!(printed(place, &some).contains("2 rows left out: a value is missing"));
-    // Too few rows, an unknown kernel, not a model, a damaged model.
+    // Test too few rows, an unknown kernel, a file that is not a model, and a damaged model.
     std::fs::write(place.join("few.csv"), text.lines().take(4).collect::<Vec<_>>().join("\n")).unwrap();
     let few = refused(place, 1, &[&["cv", "few.csv"], &COLUMNS[..]].concat());
     assert!(few.contains("folds = 5, must be"), "{few}");

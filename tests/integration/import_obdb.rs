@@ -3,7 +3,7 @@
 //!
 //! The reference decoder clamps a value to its range; packwatch reports such a value as out of range. No other
 //! difference is allowed. Some cases were recorded with missing characters, so their lines are not CAN frames;
-//! packwatch reads no answer from them.
+//! packwatch reads no answer from such cases.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;

@@ -1,4 +1,4 @@
-//! Compares our ISO-TP with an independent implementation, PyPI `can-isotp`, run by the interpreter that
+//! Compares packwatch's ISO-TP with an independent implementation, PyPI `can-isotp`, run by the interpreter that
 //! `PACKWATCH_PYTHON` names. packwatch must reassemble the peer's segmented messages despite loss, delay and
 //! interleaved senders, and the peer must reassemble packwatch's.
 

@@ -8,7 +8,7 @@
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
-/// Each row: module, modules it may import, whether it belongs to the pure core. Lowest first.
+/// Each row: module, modules it may import, whether it belongs to the pure core. The lowest modules come first.
 ///
 /// The crates under `src` re-export the modules of lower crates, so a module has the same name everywhere.
 const TABLE: &[(&str, &[&str], Core)] = &[

@@ -11,7 +11,7 @@ fn hottest_sensor_raises_despite_lost_sensor() {
     let mut rig = Rig::new("[[alarm]]\nrule = \"temperature_high\"\nwarning = { set = 50, clear = 45 }\n");
     rig.seconds(2);
     assert_eq!((rig.changes(Rule::TemperatureHigh), rig.unknown_rules()), (vec![], 0));
-    // One sensor is lost. The known temperature is low, but the other may be high.
+    // One sensor is lost. The known temperature is low, but the unknown one may be high.
     rig.temperatures_c[1] = None;
     rig.seconds(4);
     assert_eq!((rig.changes(Rule::TemperatureHigh), rig.unknown_rules()), (vec![], 2));

@@ -3,9 +3,10 @@
 //!
 //! A pack of three cells runs through random drives, faults, gaps, sleep and backward clock steps. It has protected
 //! inputs, all kinds of alarms, commands from the bus and from the operator, a J1939 node and diagnostic requests. One
-//! monitor runs through. The other is replaced by a monitor that is restored from its snapshot (through JSON) after
-//! random inputs; such a replacement is a cut. The same is done with a pack that learns its cell model, and with a pack
-//! whose frames are authenticated. Authenticated frames are compared without the freshness, which restarts by design.
+//! monitor runs without interruption. The other is replaced by a monitor that is restored from its snapshot (through
+//! JSON) after random inputs; such a replacement is a cut. The same is done with a pack that learns its cell model, and
+//! with a pack whose frames are authenticated. Authenticated frames are compared without the freshness, which restarts
+//! by design.
 //! `PACKWATCH_CUTS` sets the number of cuts.
 
 use packwatch::alarm::{Rule, Selector};

@@ -40,7 +40,7 @@ impl Rig {
         finite && !self.events.iter().any(|event| is_odd(&format!("{event:?}")))
     }
 
-    /// Feeds 1,000 samples of the two cells with a charge, a discharge, and rests. Returns the time of the first
+    /// Feeds 500 samples of each cell: a charge, a rest, a discharge and a rest. Returns the second of the first
     /// implausible output.
     fn first_odd_second(&mut self) -> Option<i64> {
         (0..500).find(|second| {
@@ -103,7 +103,7 @@ fn rejected_state_names_number_and_range() {
     assert!(rig.monitor.latest().flatten().count() == 2);
 }
 
-/// Names of a JSON object's own members, in order. No string in it may contain a bracket.
+/// Names of a JSON object's own members, in order. No string in the object may contain a bracket.
 fn names_of(text: &str) -> Vec<&str> {
     let (mut depth, mut names, mut rest) = (0, Vec::new(), text);
     while let Some(at) = rest.find(['{', '}', '[', ']', '"']) {

@@ -135,8 +135,8 @@ fn differences(config: &MonitorConfig, records: &[Record], splits: &[usize], awa
     found
 }
 
-/// Random splits. If `same_stamp` is set (for `away` = 0 s, which means that no time passed), they lie between two
-/// inputs of equal time.
+/// Random splits. If `same_stamp` is set (for `away` = 0 s, which means that no time passed), each split lies between
+/// two inputs of equal time.
 fn splits(records: &[Record], count: usize, same_stamp: bool) -> Vec<usize> {
     draws(0x9E37_79B9_7F4A_7C15, records.len() - 2)
         .map(|k| k + 1)
@@ -260,7 +260,8 @@ fn reload_of_thresholds_changes_no_estimate() {
     }
 }
 
-/// Compares a run with all ticks and one with only those at `next_due`: frames and events must be equal, in order.
+/// Compares a run with all ticks and a run with only the ticks at `next_due`: frames and events must be equal, in
+/// order.
 fn assert_early_ticks_have_no_effect(config: &MonitorConfig, records: &[Record]) {
     let (mut all, mut few) = (Monitor::new(config.clone()), Monitor::new(config.clone()));
     let (mut out_all, mut out_few) = (outputs_with_estimates(), outputs_with_estimates());

@@ -184,7 +184,7 @@ fn assumed_capacity_is_not_published_as_certain() {
 #[test]
 fn stop_and_go_drive_gives_half_cycle() {
     let mut b = Bench::new(load("paper.toml"), 0.95);
-    // 2.6 A = 1 C. 60 s on, 30 s off, from 95 % to 12 %.
+    // Discharge at 2.6 A (1 C) from 95 % to 12 %: 60 s on, 30 s off.
     for _ in 0..50 {
         b.run(2.6, 60);
         b.run(0.0, 30);

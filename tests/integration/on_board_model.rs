@@ -1,5 +1,4 @@
-//! Learns the model of a cell that is known only by its label, from simulated drives and charges, through the whole
-//! monitor.
+//! Tests that the monitor learns the model of a cell from simulated drives and charges. Only the cell's label is known.
 //!
 //! The cell has less capacity and other resistances than its label says. It runs cycles of the paper's scenario, with a
 //! night between cycles.

@@ -363,7 +363,7 @@ impl Maker {
     }
 }
 
-/// Checks that a receiver with the DBC reads the same protection header as our own check.
+/// Checks that a receiver with the DBC reads the same protection header as packwatch's own check.
 fn check_header(case: Case, number: u16, frame: &Frame, read: &HashMap<String, f64>, expected: &mut [u8; 7]) {
     let Some(profile) = case.profile else {
         assert!(!read.contains_key("E2eCrc") && frame.data()[..2] == [0, 0], "{case:?}");

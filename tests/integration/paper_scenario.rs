@@ -2,9 +2,9 @@
 //! the errors of each cycle.
 //!
 //! A cell of 2.6 Ah is cycled between SOC 0.3 and 0.9 with 1 s samples. It fades by 0.05 Ah per cycle to 0.25 Ah.
-//! Sensor errors: voltage 5 mV; current 20 mA noise + 10 mA offset + 0.5 % gain. The paper's figures show |SOC error|
-//! of 1 to 5 % during life and about 20 % at the end. The capacity in these figures lags by one event and falls to 2.2
-//! Ah at the first event. To print the table: `cargo test --workspace --test integration paper_scenario --
+//! Sensor errors: voltage noise 5 mV; current noise 20 mA, offset 10 mA, gain error 0.5 %. The paper's figures show
+//! |SOC error| of 1 to 5 % during life and about 20 % at the end. The capacity in these figures lags by one event and
+//! falls to 2.2 Ah at the first event. To print the table: `cargo test --workspace --test integration paper_scenario --
 //! --nocapture`.
 
 use std::path::Path;

@@ -259,7 +259,7 @@ fn soce_needs_certified_energy() {
     let condition = passport(&with(&args, &["--static", &accidents, "--certified-energy-kwh", "0.014"]));
     let energy_kwh = condition["RemainingEnergy"]["RemainingEnergyValue"].as_f64().unwrap();
     let soce = condition["StateOfCertifiedEnergy"]["StateOfCertifiedEnergyValue"].as_f64().unwrap();
-    // 3.8 Ah at about 3.6 V.
+    // The energy of 3.8 Ah at about 3.6 V.
     assert!((0.011..0.0150).contains(&energy_kwh), "{energy_kwh} kWh");
     assert!((soce - 100.0 * energy_kwh / 0.014).abs() < 0.01, "{soce} %");
     let path = life.write("manufacturer.json", &manufacturer());

@@ -156,7 +156,7 @@ fn forecast_interval_covers_many_fade_shapes() {
 
 #[test]
 fn on_board_life_is_forecast_from_half_cycles() {
-    // The paper's life: 2.6 Ah, fading by 0.05 Ah per cycle of 60 %. Here it ends at 1.3 Ah, after 26 cycles.
+    // The paper's life: 2.6 Ah, fading by 0.05 Ah per cycle of 60 %. Here the life ends at 1.3 Ah, after 26 cycles.
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml");
     let mut config = config::load(&path).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n"))).monitor;
     config.health.end_of_life_ah = 1.3;

@@ -1,5 +1,5 @@
-//! Tests the sample stage on a measured life (NASA B0005, uneven time steps, real glitches). It must reject exactly the
-//! glitches, and each cycle's charge must match the data set's own table.
+//! Tests the sample stage on a measured life (NASA B0005, uneven time steps, real glitches). The stage must reject
+//! exactly the glitches, and each cycle's charge must match the data set's own table.
 
 use std::collections::BTreeMap;
 use std::path::Path;

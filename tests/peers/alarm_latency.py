@@ -39,7 +39,7 @@ PEERS = {
     "player": "candump | sed | canplayer",
     "cansend": "candump | cansend for each frame",
 }
-# Delay of the first look for the answer, and maximum wait.
+# Delay of the first look for the answer, s, and maximum wait for the answer, s.
 LOOK_S, PATIENCE_S = 0.003, 2.0
 
 
@@ -127,7 +127,7 @@ def measure_alarm(count):
         sender.send(cell(sign * IDLE_A))
         time.sleep(MODE_S)
         sender.send(cell(sign * IDLE_A))
-        # The half-cycle that has just ended is the previous one: before a strong half-cycle, a weak one.
+        # The half-cycle that has just ended is the opposite of the coming one: a weak one before a strong one.
         change = (CAPACITY_LOW, ACTIVE if strong else CLEARED)
         def is_answer(i, data, change=change):
             return i == ALARM and (bits(data, *RULE), bits(data, *STATE)) == change

@@ -35,7 +35,7 @@ journalled_times() { (($(grep -cE -- "$2" "$tmp/$1.journal") >= $3)); }
 # ID#DATA of the frames on an interface in a candump log or journal.
 frames_of() { awk -v on="$2" '$1 ~ /^\(/ && $2 == on { print $3 }' "$1"; }
 
-# Sum of the last words of all lines with the expression: frames dropped, frames not sent.
+# sum_of FILE EXPRESSION: sum of the last words of all matching lines, for example of dropped frames or of frames not sent.
 sum_of() { awk -v wanted="$2" '$0 ~ wanted { n += $NF } END { print n + 0 }' "$1"; }
 
 # replayed NAME CONFIG ARGS...: a replay of NAME's journal must give NAME's frames and events, byte for byte.

@@ -175,7 +175,7 @@ impl Fade {
     }
 }
 
-/// The Monitor's configuration, assuming the sensor set's data sheet.
+/// The Monitor's configuration, with values from the sensor set's data sheet.
 pub(crate) fn configuration(set: &SensorSet) -> MonitorConfig {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     let numbers = [

@@ -51,8 +51,8 @@ pub(crate) struct Peer {
 }
 
 impl Peer {
-    /// Starts from a prior capacity as Plett does: one full swing (x = 1) with that charge. The prior's standard
-    /// deviation is split between x and y.
+    /// Starts from a prior capacity as Plett does: with one full swing (x = 1) whose charge is that capacity. The
+    /// prior's standard deviation is split between x and y.
     pub(crate) fn new(method: Method, gamma: f64, start: ScalarGaussian) -> Self {
         let mut peer = Self { method, gamma, c: [0.0; 6], x_information: 0.0, y_information: 0.0 };
         let y_variance = 0.5 * start.variance;
@@ -187,7 +187,7 @@ mod tests {
         }
     }
 
-    /// Swings of a 10 Ah cell with the stated deviations and errors drawn from them.
+    /// Draws swings of a 10 Ah cell: true values plus errors with the stated deviations.
     fn swings(random: &mut Random, count: usize, even: bool) -> Vec<Swing> {
         let one = |random: &mut Random| {
             let wide = if even { 1.0 } else { 0.5 + random.uniform() };

@@ -49,7 +49,7 @@ fn configuration(folder: &Path, cell: &str, start: f64, held: bool) -> PathBuf {
     let new_ah = if cell == "B0005" { 1.9216 } else { 2.1059 };
     text = text.replace("[pack]\n", &format!("[pack]\ninitial_capacity_ah = {}\n", start * new_ah));
     if held {
-        // Nominal measurements must not change the capacity either.
+        // Also keep nominal measurements from changing the capacity.
         let fixed = "[capacity]\nmethod = \"nominal\"\nnominal_swing = 0.9\nnominal_variance_ah2 = 1e6\nnoise_ah_per_cycle = 0.0\n";
         text = text.replace("[capacity]\n", fixed) + "\n[estimator]\ncapacity_state = \"held\"\n";
     }
@@ -220,7 +220,7 @@ fn print(life: &str, name: &str, source: &str, (score, below): (Score, Option<us
     );
 }
 
-/// Prints the product's row and returns its score.
+/// Prints packwatch's row and returns its score.
 fn print_ours(name: &str, life: &Life) -> Score {
     assert!(life.reported.len() > 145, "{name}: {} discharges", life.reported.len());
     let ours = life.ours();
@@ -247,12 +247,12 @@ fn heading() {
     println!("| --- | --- | --- | --- | --- | --- |");
 }
 
-/// Margin by which the best peer may lead on swings of the filter's SOC, Ah. That SOC depends on the capacity that
+/// Maximum lead of the best peer on swings of the filter's SOC, Ah. The filter's SOC depends on the capacity that
 /// packwatch has learned, which helps the peer.
 const NEAR_AH: f64 = 0.006;
 
-/// Margin by which the best peer may lead on voltage swings, Ah: an eighth of a percent of the capacity. The peer has
-/// an advantage, because its memory factor is chosen afterwards by the result.
+/// Maximum lead of the best peer on voltage swings, Ah: an eighth of a percent of the capacity. The peer has an
+/// advantage, because its memory factor is chosen afterwards by the result.
 const LEVEL_AH: f64 = 0.0025;
 
 #[test]
@@ -279,8 +279,8 @@ fn usable_capacity_of_whole_lives_matches_best_peer() {
 /// afterwards by the result.
 const LEVEL: f64 = 1.1;
 
-/// Here the filter's swings use the same ends as the voltage swings, because swing and charge of a `half_cycle` event
-/// can disagree after a gap.
+/// In this test the filter's swings use the same ends as the voltage swings, because swing and charge of a `half_cycle`
+/// event can disagree after a gap.
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn usable_capacity_from_windows_matches_best_peer() {

@@ -1,7 +1,7 @@
-//! Simulated lives with known true capacity: the paper's life, one that ages a tenth as fast, and one without ageing
-//! (as total least squares assumes). The sensors are as in the paper's scenario: voltage noise 5 mV; current noise 20
-//! mA, offset 10 mA and gain error 0.5 %; 1 s samples. The SOC runs from 30 to 90 %, and the initial capacity is 20 %
-//! wrong.
+//! Runs the comparison on simulated lives with known true capacity: the paper's life, a life that ages a tenth as fast,
+//! and a life without ageing (as total least squares assumes). The sensors are as in the paper's scenario: voltage
+//! noise 5 mV; current noise 20 mA, offset 10 mA and gain error 0.5 %; 1 s samples. The SOC runs from 30 to 90 %, and
+//! the initial capacity is 20 % wrong.
 //!
 //! The third source of swings is the filter's SOC with its capacity held at the wrong initial value.
 
@@ -54,7 +54,8 @@ fn configuration(start: f64, held: bool) -> MonitorConfig {
 
 fn live(config: &MonitorConfig, settings: Settings) -> Life {
     let mut life = Life { reported: Vec::new(), filter: Vec::new(), readings: Vec::new() };
-    // True capacity a minute ago: a half-cycle is reported after its end, when further fade has been applied.
+    // Keep the true capacity of a minute ago, because a half-cycle is reported after its end, when further fade has
+    // been applied.
     let mut past_ah = std::collections::VecDeque::from(vec![settings.pack.capacity_ah; 60]);
     simulated_cell::live(config.clone(), settings, |time, sim, monitor, events| {
         past_ah.push_back(sim.pack().cells()[0].capacity_ah);
@@ -137,7 +138,7 @@ const LIVES: [(&str, f64); 3] = [("none", 0.0), ("0.005 Ah per cycle", 0.005), (
 /// Number of cycles in the paper's life.
 const CYCLES: u32 = 48;
 
-/// Relative margin by which a peer on the filter's own SOC may lead: 0.1 %. That SOC contains the capacity that
+/// Maximum relative lead of a peer on the filter's own SOC: 0.1 %. The filter's SOC contains the capacity that
 /// packwatch has learned, and all methods share the current sensor's gain error of 0.5 %.
 const NEAR: f64 = 0.001;
 

@@ -9,7 +9,8 @@ use packwatch::can::{CanId, Frame};
 /// Maps rule, severity and cell, as the frames carry them, to state and acknowledgement.
 pub(crate) type AlarmTable = BTreeMap<(u64, u64, u64), (u64, bool)>;
 
-/// Number of passes per cycle, and number of passes without a frame of an alarm after which the alarm is removed.
+/// Number of passes per cycle (in one pass each raised alarm is sent once), and number of passes without a frame of an
+/// alarm after which the listener removes the alarm.
 const CYCLE_PASSES: i64 = 4;
 const TIMEOUT_PASSES: i64 = 7;
 

@@ -223,7 +223,7 @@ fn end_of_unknown_is_announced_across_kill() {
     }
 }
 
-/// A protected message of the counter test: identifier, data id, frames per period, period in tenths of a second.
+/// The protected messages of the counter tests: identifier, data id, frames per period, period in tenths of a second.
 const COUNTED: [(u32, u16, i64, i64); 4] =
     [(STATUS, 1, 1, 1), (HEALTH, 2, 5, 10), (ALARM, 3, 1, 5), (DIGEST, 4, 4, 10)];
 
@@ -246,8 +246,9 @@ fn counters(rig: &Rig, id: u32, protection: Protection) -> Vec<i64> {
 /// Time from the stored state to the kill, and from the kill to the first tick of the next run, in tenths of a second.
 const KILLS: [(i64, i64); 5] = [(0, 3), (7, 0), (16, 2), (130, 25), (31, 600)];
 
-/// Kills a daemon with one raised alarm. Returns for each message of [`COUNTED`] the counter steps from the last frame
-/// before the kill to the first one after it, and the minimum and maximum steps of a daemon that never stopped.
+/// Kills a daemon with one raised alarm. Returns two values for each message of [`COUNTED`]. The first is the number of
+/// counter steps from the last frame before the kill to the first frame after the kill. The second is the minimum and
+/// maximum number of steps of a daemon that never stopped.
 fn steps_over_a_kill(profile: Profile, unstored_deci: i64, away_deci: i64) -> [(i64, [i64; 2]); 4] {
     let mut rig = protected_rig(profile);
     // Raise the alarm and send its repetitions. After that the alarm is sent only in its cycle.

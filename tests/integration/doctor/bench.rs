@@ -13,7 +13,7 @@ use packwatch::wiring_check::{self, Interrupt};
 /// A kind of healthy pack.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Bench {
-    /// 12 cells, drive at 100 Hz and 10 Hz.
+    /// 12 cells in a drive: current at 100 Hz, cells at 10 Hz.
     Pack12,
     /// 96 cells, the shipped example.
     Pack96,
@@ -27,7 +27,7 @@ pub(crate) enum Bench {
     Steady,
     /// One cell, charged steadily.
     Charge,
-    /// Random five-minute loads.
+    /// One cell with random five-minute loads.
     Walk,
     /// A whole morning with parking and charging, 4 cells.
     Day,
@@ -188,7 +188,8 @@ impl BrokenPack {
         self.dbc = self.dbc.replace(from, to);
     }
 
-    /// Changes every frame: `(stamp, interface, identifier, data)`; `None` removes the frame.
+    /// Changes every frame. `change` receives (stamp, interface, identifier, data) and returns the new line; `None`
+    /// removes the frame.
     pub(crate) fn frames(&mut self, mut change: impl FnMut(&str, &str, &str, &str) -> Option<String>) {
         let line = |line: &str| {
             let mut words = line.split(' ');

@@ -1,4 +1,4 @@
-//! Lists the faults that the doctor must find, one per row.
+//! Lists the faults that `packwatch doctor` must find, one per row.
 
 use packwatch::wiring::Topic;
 

@@ -22,7 +22,7 @@ fn lose(broken: &mut BrokenPack, wanted: &str, of: u32) {
     });
 }
 
-/// Replaces two bytes of a page's data.
+/// Writes `value` to two bytes of the data, if the data belong to the page.
 fn set(data: &mut [u8], page: u8, at: usize, value: i32) {
     if data[0] == page {
         data[at..at + 2].copy_from_slice(&i16::try_from(value).unwrap().to_le_bytes());

@@ -75,7 +75,7 @@ impl NumberKey {
     }
 }
 
-/// Draws a number of random order of magnitude.
+/// Draws a number with a random order of magnitude.
 fn magnitude(dice: &mut Dice, low: f64, high: f64) -> f64 {
     dice.between(low.ln(), high.ln()).exp()
 }
