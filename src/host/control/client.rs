@@ -9,6 +9,7 @@ use serde::Deserialize;
 
 use super::protocol::{Request, contents};
 use super::standard_path;
+use crate::io::unix_socket::explain_no_daemon;
 
 /// Longest wait for a list of alarms. A working daemon answers within milliseconds, so a daemon that needs longer is
 /// hanging.
@@ -66,16 +67,11 @@ impl ControlClient {
     }
 
     fn explain(&self, request: Request, error: &io::Error) -> String {
-        let option = match self.path == standard_path() {
-            true => String::new(),
-            false => format!(" --control {}", self.path.display()),
-        };
         let path = self.path.display();
         match error.kind() {
-            ErrorKind::NotFound | ErrorKind::ConnectionRefused => format!(
-                "{path}: no daemon listens there; start one with \"packwatch run -c FILE{option}\", or give the path of its \
-                 socket with --control"
-            ),
+            ErrorKind::NotFound | ErrorKind::ConnectionRefused => {
+                explain_no_daemon(&self.path, "control", &standard_path(), "--control")
+            }
             ErrorKind::PermissionDenied => {
                 format!("{path}: permission denied; the daemon's own user, its group and root may connect")
             }

@@ -35,6 +35,27 @@ fn own_folder() -> Option<PathBuf> {
     Some(first_folder("XDG_RUNTIME_DIR")?.join("packwatch"))
 }
 
+/// Explains that no daemon listens at `path`, and names the next step. `socket` is "status" or "control"; `standard` is
+/// the default path of this socket. `setting` is the option or the key with which the user chooses the path.
+pub fn explain_no_daemon(path: &Path, socket: &str, standard: &Path, setting: &str) -> String {
+    let shown = path.display();
+    if let Some(file) = other_file(path) {
+        return format!("{shown}: is {file}, must be the {socket} socket of a daemon; give its path with {setting}");
+    }
+    let option = if path == standard { String::new() } else { format!(" --{socket} {shown}") };
+    format!(
+        "{shown}: no daemon listens there; start one with \"packwatch run -c FILE{option}\", or give the path of its \
+         {socket} socket with {setting}"
+    )
+}
+
+/// Names the kind of a file that is not a socket; `None` = a socket, or no file.
+fn other_file(path: &Path) -> Option<&'static str> {
+    let kind = std::fs::metadata(path).ok()?.file_type();
+    let names = [(kind.is_socket(), None), (kind.is_file(), Some("a regular file")), (kind.is_dir(), Some("a folder"))];
+    names.into_iter().find(|(is_kind, _)| *is_kind).map_or(Some("not a socket"), |(_, name)| name)
+}
+
 /// Creates the default folder if systemd has not created it. If this fails, the bind fails too and is reported.
 fn make_default_folder(path: &Path) {
     let Some(folder) = path.parent().filter(|folder| *folder == runtime_folder()) else { return };

@@ -9,6 +9,7 @@ use serde::Deserialize;
 
 use super::document::{StatusDocument, VERSION};
 use super::{MAX_SILENCE, standard_path};
+use crate::io::unix_socket::explain_no_daemon;
 
 /// Longest wait. This is one second longer than a daemon waits for a fresh document.
 pub const PATIENCE: Duration = Duration::from_secs(1 + MAX_SILENCE.as_secs());
@@ -70,19 +71,17 @@ pub fn check_length(bytes: usize) -> io::Result<()> {
 /// Explains why no document was received, and names the next step. `setting` is the option or the key with which the user
 /// chooses the status socket `path`.
 pub fn explain(path: &Path, setting: &str, error: &io::Error) -> String {
-    let option = if path == standard_path() { String::new() } else { format!(" --status {}", path.display()) };
-    let path = path.display();
+    let shown = path.display();
     match error.kind() {
-        ErrorKind::NotFound | ErrorKind::ConnectionRefused => format!(
-            "{path}: no daemon listens there; start one with \"packwatch run -c FILE{option}\", or give the path of its status \
-             socket with {setting}"
-        ),
-        ErrorKind::PermissionDenied => format!("{path}: only root may read the service's folder; try sudo"),
-        ErrorKind::WouldBlock | ErrorKind::TimedOut => format!("{path}: the daemon sent no status in time"),
-        ErrorKind::UnexpectedEof | ErrorKind::ConnectionReset => {
-            format!("{path}: the daemon has no fresh status, or too many clients; try again")
+        ErrorKind::NotFound | ErrorKind::ConnectionRefused => {
+            explain_no_daemon(path, "status", &standard_path(), setting)
         }
-        _ => format!("{path}: {error}"),
+        ErrorKind::PermissionDenied => format!("{shown}: only root may read the service's folder; try sudo"),
+        ErrorKind::WouldBlock | ErrorKind::TimedOut => format!("{shown}: the daemon sent no status in time"),
+        ErrorKind::UnexpectedEof | ErrorKind::ConnectionReset => {
+            format!("{shown}: the daemon has no fresh status, or too many clients; try again")
+        }
+        _ => format!("{shown}: {error}"),
     }
 }
 

@@ -65,6 +65,9 @@ fn client_receives_one_document_then_eof() {
     drop(server);
     assert!(!path.exists() && !stream_path(&path).exists(), "the server must delete its sockets");
     assert!(StatusClient::new(Some(&path)).line().unwrap_err().contains("no daemon listens there"));
+    std::fs::write(&path, "a file").unwrap();
+    let expected = "status.sock: is a regular file, must be the status socket of a daemon; give its path with --socket";
+    assert!(StatusClient::new(Some(&path)).line().unwrap_err().ends_with(expected));
 }
 
 #[test]
