@@ -283,10 +283,16 @@ fn syntax_error_does_not_affect_other_faults() {
     }
     assert!(!all.iter().any(|fault| fault.contains("missing")), "{all:#?}");
     let all = read_texts(PACK, DBC, DBC).unwrap_err();
-    assert_eq!(
-        (all.len(), all[10].as_str()),
-        (11, "cell.toml:11: and 7 more syntax faults from here on; is this file really TOML?")
-    );
+    let expected = [
+        (0, "cell.toml: has no [tables], must be a cell model file (format, name, [tables], ...)"),
+        (11, "cell.toml:11: and 7 more syntax faults from here on; is this file really TOML?"),
+        (
+            12,
+            "pack.toml:3: pack.cell_model = \"cell.toml\", must be a cell model file, relative to the folder of the configuration",
+        ),
+    ];
+    assert_eq!(all.len(), 13);
+    expected.iter().for_each(|&(index, fault)| assert_eq!(all[index], fault));
 }
 
 #[test]

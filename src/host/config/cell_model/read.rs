@@ -31,8 +31,10 @@ pub fn load_sourced(path: &Path) -> Result<SourcedModel, ConfigFaults> {
 pub(crate) fn load_with(path: &Path, read: ReadFile<'_>, faults: &Faults) -> Option<SourcedModel> {
     let sources = Sources::read(&ConfigFiles::alone(path), read, faults)?;
     let document = Document::parse(&sources, faults);
-    if document.find("pack").is_some() && document.find("tables").is_none() {
-        faults.add(&document.file, 0, "is a configuration, must be a cell model file (format, name, [tables], ...)");
+    let is_configuration = document.find("pack").is_some();
+    if document.find("tables").is_none() && (is_configuration || document.broken) {
+        let found = if is_configuration { "is a configuration" } else { "has no [tables]" };
+        faults.add(&document.file, 0, format!("{found}, must be a cell model file (format, name, [tables], ...)"));
         return None;
     }
     let reader = SchemaReader::new(&document, SECTIONS);

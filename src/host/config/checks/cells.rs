@@ -8,7 +8,7 @@ use std::path::Path;
 
 use crate::cell::{CellModel, Chemistry, Label};
 use crate::config::cell_model::{self, SourcedModel};
-use crate::config::document::{ReadFile, TablePlace, beside};
+use crate::config::document::{Document, Faults, ReadFile, TablePlace, beside};
 use crate::config::schema::RawTables;
 use crate::config::schema::keys::{Pack, PackModule};
 use crate::quantity::CellIndex;
@@ -32,10 +32,20 @@ pub(crate) fn label(pack: &Pack) -> Option<Label> {
     })
 }
 
-/// The model of the pack's own cells: from the file `named`, else from `chemistry`.
-pub(crate) fn own_model(path: &Path, named: Option<&str>, raw: &RawTables, read: ReadFile<'_>) -> Option<SourcedModel> {
-    if let Some(named) = named {
-        return cell_model::load_with(&beside(path, named), read, &raw.faults);
+/// The model of the pack's own cells: from the file `pack.cell_model`, else from `chemistry`.
+pub(crate) fn own_model(
+    path: &Path,
+    document: &Document<'_>,
+    raw: &RawTables,
+    read: ReadFile<'_>,
+) -> Option<SourcedModel> {
+    // The key is read from the document, because `raw` has no pack if another key of the pack is faulty.
+    let key = document.find("pack.cell_model");
+    if let Some((key, named)) = key.and_then(|key| Some((key.span(), key.get_ref().as_str()?))) {
+        return file_model(path, named, read, &raw.faults, |what| {
+            let text = format!("pack.cell_model = {}, {what}", document.quote(&key));
+            raw.faults.add_at(&document.line(&key), text);
+        });
     }
     let pack = raw.pack.as_ref()?;
     check_label(&pack.place, pack.chemistry, pack.rated_capacity_ah)?;
@@ -51,6 +61,22 @@ pub(crate) fn own_model(path: &Path, named: Option<&str>, raw: &RawTables, read:
             usual.voltage_max_v
         );
         pack.place.fault("chemistry", what);
+    }
+    model
+}
+
+/// The model in the file `named`. If the file cannot be used at all, `fault` reports this at the key that names it.
+fn file_model(
+    path: &Path,
+    named: &str,
+    read: ReadFile<'_>,
+    faults: &Faults,
+    fault: impl FnOnce(&str),
+) -> Option<SourcedModel> {
+    let file = beside(path, named);
+    let model = cell_model::load_with(&file, read, faults);
+    if faults.is_unusable(&file.display().to_string()) {
+        fault("must be a cell model file, relative to the folder of the configuration");
     }
     model
 }
@@ -142,7 +168,9 @@ fn numbers(keys: &PackModule) -> impl Iterator<Item = u16> {
 fn model(path: &Path, keys: &PackModule, file: ReadFile<'_>) -> Option<CellModel> {
     let model = match &keys.cell_model {
         Some(_) if check_file(&keys.place, keys.cell_model.as_ref()) => return None,
-        Some(named) => cell_model::load_with(&beside(path, named), file, &keys.place.faults)?.model,
+        Some(named) => {
+            file_model(path, named, file, &keys.place.faults, |what| keys.place.fault("cell_model", what))?.model
+        }
         None => {
             let (chemistry, rated_ah) = check_label(&keys.place, keys.chemistry, keys.rated_capacity_ah)?;
             cell_model::of_label(&Label::usual(chemistry, rated_ah))?.model

@@ -74,6 +74,11 @@ impl Faults {
         self.len() == 0
     }
 
+    /// Whether a fault concerns the file as a whole, so that none of its contents were used.
+    pub(crate) fn is_unusable(&self, file: &str) -> bool {
+        self.0.borrow().faults.iter().any(|(at, _)| at.file == file && at.line == 0)
+    }
+
     /// The faults, one line each. Files are in the order in which they first failed; faults of a file are sorted by
     /// line.
     pub(crate) fn lines(&self) -> ConfigFaults {

@@ -56,11 +56,6 @@ impl<'t> Document<'t> {
         Some(value)
     }
 
-    /// The string at a dotted path, even if another key of its table is faulty.
-    pub(crate) fn text(&self, path: &str) -> Option<&str> {
-        self.find(path)?.get_ref().as_str()
-    }
-
     /// The first line of the file.
     pub(crate) fn first_line(&self) -> SourceLine {
         SourceLine { file: self.file.clone(), line: 1 }

@@ -42,7 +42,7 @@ impl PartialConfig {
             let document = Document::parse(&sources, &again);
             let raw = RawTables::read(&document);
             let databases = Databases::load(path, &raw, &read_file)?;
-            let model = cells::own_model(path, document.text("pack.cell_model"), &raw, &read_file);
+            let model = cells::own_model(path, &document, &raw, &read_file);
             Some((raw, databases, model.map(|sourced| sourced.model)))
         };
         match read() {

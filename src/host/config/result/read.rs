@@ -60,7 +60,7 @@ fn read_config<T>(
     let sources = Sources::read(files, read, faults)?;
     let document = Document::parse(&sources, faults);
     let raw = RawTables::read(&document);
-    let sourced = cells::own_model(path, document.text("pack.cell_model"), &raw, read);
+    let sourced = cells::own_model(path, &document, &raw, read);
     let (model, model_source) = sourced.map(|SourcedModel { model, source }| (model, source)).unzip();
     let modules = cells::modules(path, &raw, read);
     let ranged = model.as_ref().map(|model| cells::with_voltages_of(model, &modules));

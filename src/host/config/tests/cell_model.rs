@@ -77,6 +77,25 @@ fn cell_model_faults_are_reported() {
 }
 
 #[test]
+fn unusable_cell_model_file_is_reported_at_its_key() {
+    for name in ["no.toml", "no\\ntoml"] {
+        let expected = [
+            format!("{name}: cannot be read: entity not found"),
+            format!(
+                "pack.toml:3: pack.cell_model = \"{name}\", must be a cell model file, relative to the folder of the configuration"
+            ),
+        ];
+        assert_eq!(faults(&pack_with("\"cell.toml\"", &format!("\"{name}\""))), expected);
+    }
+    let module = "[[pack.module]]\ncells = \"3\"\ncell_model = \"pack.toml\"\n";
+    let expected = [
+        "pack.toml: is a configuration, must be a cell model file (format, name, [tables], ...)",
+        "pack.toml:17: pack.module[1].cell_model = \"pack.toml\", must be a cell model file, relative to the folder of the configuration",
+    ];
+    assert_eq!(faults(&format!("{PACK}{module}")), expected);
+}
+
+#[test]
 fn electrode_data_determine_curve_ageing() {
     let with = |contents: &str| {
         let keys =

@@ -41,8 +41,6 @@ fn faults_state_file_line_key_found_and_allowed() {
             "cells = 4\nrated_capacity_ah = 0",
             "pack.toml:3: pack.rated_capacity_ah = 0, must be 0.001 to 100000",
         ),
-        ("\"cell.toml\"", "\"no.toml\"", "no.toml: cannot be read: entity not found"),
-        ("\"cell.toml\"", "\"no\\ntoml\"", "no\\ntoml: cannot be read: entity not found"),
         ("[[interface]]", "[interface]", "pack.toml:4: interface = [interface], must be tables [[interface]]"),
         ("[input]", "[[input]]", "pack.toml:6: input = [[input]], must be one table [input]"),
         (
