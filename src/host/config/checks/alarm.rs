@@ -40,6 +40,16 @@ impl RatedCell {
             Level::Relative(part) => self.whole(rule).map(|whole| part * whole),
         }
     }
+
+    /// Formats a level for a message: `1.4 Ah`, or `80 % (2.08 Ah)` for a relative level.
+    fn shown(&self, rule: Rule, level: Level) -> String {
+        let with_unit = |value: f64| format!("{} {}", rounded(value), rule.spec().unit.symbol()).trim_end().to_owned();
+        let value = self.value(rule, level).map(with_unit).unwrap_or_default();
+        match level {
+            Level::Absolute(_) => value,
+            Level::Relative(part) => format!("{} % ({value})", rounded(100.0 * part)),
+        }
+    }
 }
 
 impl Alarm {
@@ -157,27 +167,28 @@ fn check_needs(alarm: &Alarm, raw: &RawTables) {
 fn check_thresholds(alarm: &Alarm, rated: &RatedCell) {
     let (place, sign) = (&alarm.place, beyond_sign(alarm.rule));
     let side = if sign > 0.0 { "below" } else { "above" };
-    let mut milder: Option<(&str, f64)> = None;
+    let shown = |level| rated.shown(alarm.rule, level);
+    let mut milder: Option<(&str, f64, Level)> = None;
     for (key, _, threshold) in alarm.thresholds() {
         let Some(set) = rated.value(alarm.rule, threshold.set) else {
             place.fault(key, "must be a number: percentages are not defined for this rule");
             continue;
         };
         check_unit(alarm, key, set);
-        match threshold.clear.map(|clear| rated.value(alarm.rule, clear)) {
-            Some(None) => place.fault(key, "must clear at a number: percentages are not defined for this rule"),
-            Some(Some(clear)) if sign * (clear - set) > 0.0 => {
-                let [set, clear] = [set, clear].map(rounded);
+        match threshold.clear.map(|level| (level, rated.value(alarm.rule, level))) {
+            Some((_, None)) => place.fault(key, "must clear at a number: percentages are not defined for this rule"),
+            Some((level, Some(clear))) if sign * (clear - set) > 0.0 => {
+                let [set, clear] = [threshold.set, level].map(shown);
                 place.fault(key, format!("must clear at {set} or {side}, not at {clear}"));
             }
-            Some(Some(_)) | None => {}
+            Some((_, Some(_))) | None => {}
         }
         check_reachable(alarm, key, rated, set, &threshold);
-        if let Some((other, value)) = milder.filter(|(_, value)| sign * (set - value) <= 0.0) {
-            let (beyond, value) = (if sign > 0.0 { "above" } else { "below" }, rounded(value));
+        if let Some((other, _, level)) = milder.filter(|(_, value, _)| sign * (set - value) <= 0.0) {
+            let (beyond, value) = (if sign > 0.0 { "above" } else { "below" }, shown(level));
             place.fault(key, format!("must be {beyond} {other} = {value}: it is the more severe threshold"));
         }
-        milder = Some((key, set));
+        milder = Some((key, set, threshold.set));
     }
 }
 

@@ -32,15 +32,15 @@ fn alarm_and_command_faults_are_reported() {
         ),
         (
             "[[alarm]]\nrule = \"capacity_low\"\nwarning = { set = 1.5, clear = \"74 %\" }\n",
-            "pack.toml:17: alarm[1].warning = { set = 1.5, clear = \"74 %\" }, must clear at 1.5 or above, not at 1.48",
+            "pack.toml:17: alarm[1].warning = { set = 1.5, clear = \"74 %\" }, must clear at 1.5 Ah or above, not at 74 % (1.48 Ah)",
         ),
         (
             "[[alarm]]\nrule = \"temperature_high\"\nsevere = { set = 60, clear = 61 }\n",
-            "pack.toml:17: alarm[1].severe = { set = 60, clear = 61 }, must clear at 60 or below, not at 61",
+            "pack.toml:17: alarm[1].severe = { set = 60, clear = 61 }, must clear at 60 degrees C or below, not at 61 degrees C",
         ),
         (
             "[[alarm]]\nrule = \"capacity_low\"\nwarning = 1.4\nsevere = 1.5\n",
-            "pack.toml:18: alarm[1].severe = 1.5, must be below warning = 1.4: it is the more severe threshold",
+            "pack.toml:18: alarm[1].severe = 1.5, must be below warning = 1.4 Ah: it is the more severe threshold",
         ),
         (
             "[[alarm]]\nrule = \"soc_low\"\nwarning = 10\n",
