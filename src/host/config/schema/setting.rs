@@ -105,7 +105,7 @@ impl CellRanges {
 }
 
 impl Setting for CellRanges {
-    const KIND: &'static str = "cell numbers from 1, like \"1-12, 15\"";
+    const KIND: &'static str = "cell numbers from 1, ranges ascending, like \"1-12, 15\"";
 
     fn read(value: &Spanned<DeValue<'_>>, _: &ValueRange) -> Result<Self, ValueFault> {
         typed(value, value.get_ref().as_str().and_then(Self::parse))

@@ -126,7 +126,7 @@ fn signal_faults_state_contents_of_dbc() {
         (
             "Status.Temperature\"",
             "Status.Temperature\"\ncells = \"4-3\"",
-            "pack.toml:15: input.temperature[1].cells = \"4-3\", must be cell numbers from 1, like \"1-12, 15\"",
+            "pack.toml:15: input.temperature[1].cells = \"4-3\", must be cell numbers from 1, ranges ascending, like \"1-12, 15\"",
         ),
     ];
     each_edit_gives(table);
