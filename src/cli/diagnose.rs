@@ -133,14 +133,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 }
 
 fn stored(folder: &std::path::Path) -> Result<Snapshot, Failure> {
-    let reader = HistoryReader::open(folder).map_err(Failure::new)?;
-    let snapshot = reader.snapshot();
-    snapshot.ok_or_else(|| {
-        Failure::new(format!(
-            "{}: contains no usable state; give the state folder of `packwatch run`",
-            folder.display()
-        ))
-    })
+    HistoryReader::open(folder).and_then(|reader| reader.required_snapshot()).map_err(Failure::new)
 }
 
 fn replayed(args: &Args, config: &Config) -> Result<Snapshot, Failure> {

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use super::common::control::{ControlArgs, replace_pack};
 use super::common::output::print;
-use crate::store;
+use crate::store::{self, ReplacedPack};
 use packwatch_host::failure::Failure;
 
 /// Arguments of `reset`.
@@ -31,11 +31,12 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return replace_pack(args.yes, &client);
     }
     let folder = args.state.clone().unwrap_or_else(store::standard_folder);
-    let pack = store::replace_pack(&folder).map_err(Failure::new)?;
+    let ReplacedPack { next, damage } = store::replace_pack(&folder).map_err(Failure::new)?;
+    let folder = folder.display();
+    let damage = damage.map_or_else(String::new, |damage| format!("{folder}: the history was damaged: {damage}\n"));
     print(&format!(
-        "no daemon runs. {}: closed the history of pack {}, started the history of pack {pack}; discarded the stored \
-        state with its alarms\n",
-        folder.display(),
-        pack - 1
+        "{damage}no daemon runs. {folder}: closed the history of pack {}, started the history of pack {next}; discarded \
+        the stored state with its alarms\n",
+        next - 1
     ))
 }

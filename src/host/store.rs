@@ -61,7 +61,7 @@ use writer::{Retry, WriteQueue, Writer};
 
 pub use reader::{HistoryEntry, HistoryExtent, HistoryQuery, HistoryReader};
 pub use recorder::Recorder;
-pub use replace::replace_pack;
+pub use replace::{ReplacedPack, replace_pack};
 pub use rows::HistoryTable;
 pub use segments::{BrokenSegment, ChainReport, NotedHead};
 pub use writer::StoreProgress;

@@ -68,8 +68,7 @@ pub(super) fn load(path: &Path) -> Result<(String, SourcedModel), Failure> {
 fn load_with(path: &Path, config: Option<Config>) -> Result<(String, SourcedModel), Failure> {
     if path.is_dir() {
         let reader = HistoryReader::open(path).map_err(Failure::new)?;
-        let no_state = || Failure::new(format!("{}: contains no state, or a damaged one", path.display()));
-        return of_snapshot(path, &reader.snapshot().ok_or_else(no_state)?, config);
+        return of_snapshot(path, &reader.required_snapshot().map_err(Failure::new)?, config);
     }
     if is_snapshot(path) {
         return of_snapshot(path, &snapshot_file::read(path).map_err(Failure::new)?, config);

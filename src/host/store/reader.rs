@@ -8,9 +8,9 @@ use rusqlite::{Connection, OpenFlags};
 
 use super::database;
 use super::folder::DATABASE;
-use super::rows::HistoryTable;
+use super::rows::{HistoryRow, HistoryTable};
 use super::segments::{self, ChainReport, NotedHead, hex};
-use super::state_files::{StateDocument, StateFiles};
+use super::state_files::{FILES, FoundStates, StateDocument, StateFiles};
 use crate::config::VehicleIdentity;
 use crate::io::place::with_suffix;
 use crate::monitor::Snapshot;
@@ -156,6 +156,29 @@ impl HistoryReader {
     /// The stored snapshot; `None` = missing or damaged.
     pub fn snapshot(&self) -> Option<Snapshot> {
         self.state().map(|document| *document.snapshot)
+    }
+
+    /// The stored snapshot, for a command that cannot work without it.
+    ///
+    /// # Errors
+    /// Fails if the folder contains no state, or only states that cannot be used. The error names the files.
+    pub fn required_snapshot(&self) -> Result<Snapshot, String> {
+        let folder = self.path.parent().unwrap_or(Path::new(""));
+        let FoundStates { newest, faults, .. } = StateFiles::open(folder).1;
+        newest.map(|document| *document.snapshot).ok_or_else(|| {
+            let faults: Vec<&str> = faults.iter().filter_map(HistoryRow::detail).collect();
+            let why = match faults.is_empty() {
+                true => format!(
+                    "contains no stored state ({}); give the state folder of a daemon that has run",
+                    FILES.join(", ")
+                ),
+                false => format!(
+                    "the stored state cannot be used: {}; start the daemon to store a new one",
+                    faults.join("; ")
+                ),
+            };
+            format!("{}: {why}", folder.display())
+        })
     }
 
     /// The stored snapshot, and the wall clock when it was taken, ns since 1970; `None` = missing or damaged.

@@ -4,19 +4,27 @@ use std::path::Path;
 
 use super::database::is_damage;
 use super::folder::{self, DATABASE, Folder};
-use super::rows::RowBatch;
+use super::rows::{HistoryRow, RowBatch};
 use super::stamp::{BootId, Stamp};
 use super::state_files::{self, StateFiles};
 use crate::io::clock::Reading;
 use crate::quantity::Timestamp;
 
-/// Closes the history of the pack in a state folder, opens the history of the next pack, and deletes the state. Returns
-/// the number of the next pack.
+/// A replaced pack.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ReplacedPack {
+    /// Number of the next pack.
+    pub next: i64,
+    /// The damage of the history, and the name under which it was set aside; `None` = no damage.
+    pub damage: Option<String>,
+}
+
+/// Closes the history of the pack in a state folder, opens the history of the next pack, and deletes the state.
 ///
 /// # Errors
 /// Fails if the folder contains no store, if a daemon uses it, or if it cannot be written. In these cases nothing has
 /// changed.
-pub fn replace_pack(path: &Path) -> Result<i64, String> {
+pub fn replace_pack(path: &Path) -> Result<ReplacedPack, String> {
     let file = path.join(DATABASE);
     let named = |error: String| format!("{}: {error}", file.display());
     if !folder::is_used(path) {
@@ -34,18 +42,20 @@ pub fn replace_pack(path: &Path) -> Result<i64, String> {
     // The folder is opened as in the daemon, so that damage is found, and recorded before the history is closed.
     let mut replace = || {
         let (mut database, rows) = folder.open(&now, known).map_err(|error| named(error.to_string()))?;
+        let damage = rows.iter().find_map(HistoryRow::detail).map(str::to_owned);
         let replaced = database.commit(&[RowBatch { stamp: now, rows }]).and_then(|()| database.replace_pack(&now));
-        replaced.map_err(|error| {
+        let next = replaced.map_err(|error| {
             if is_damage(&error) {
                 folder.mark_damaged(&error.to_string());
             }
             named(error.to_string())
-        })
+        })?;
+        Ok(ReplacedPack { next, damage })
     };
     // If the first attempt finds damage, the second attempt sets the database aside.
-    let pack = replace().or_else(|_| replace())?;
+    let replaced = replace().or_else(|_: String| replace())?;
     // A state of a closed pack is not restored. If the history were lost, the store would not know that the pack is
     // closed, so the state is deleted.
     state_files::forget(path).map_err(|error| named(error.to_string()))?;
-    Ok(pack)
+    Ok(replaced)
 }

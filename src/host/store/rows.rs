@@ -124,6 +124,14 @@ impl HistoryTable {
 }
 
 impl HistoryRow {
+    /// The details of a report of the store itself; `None` = an event of the core.
+    pub(super) fn detail(&self) -> Option<&str> {
+        match self {
+            Self::Own { detail, .. } => Some(detail),
+            Self::Event(_) => None,
+        }
+    }
+
     /// Returns the row's table and the values of its columns; `None` = the history has no row for this event.
     pub(super) fn values(&self) -> Option<(HistoryTable, Vec<Value>)> {
         let text = |text: &str| Value::Text(text.to_owned());

@@ -80,10 +80,35 @@ fn capacities_of_other_cells_are_not_used() {
 fn lost_history_does_not_restore_old_pack() {
     let (place, _) = replayed_store();
     let state = place.path().join("state");
-    assert_eq!(replace_pack(&state).unwrap(), 2);
+    assert_eq!(replace_pack(&state).unwrap().next, 2);
     std::fs::write(state.join(DATABASE), "nothing").unwrap();
     let (_store, found) = open(place.path());
     assert!(found.states.is_empty() && found.learned.is_empty());
+}
+
+#[test]
+fn pack_replacement_reports_damaged_history() {
+    let (place, _) = replayed_store();
+    let state = place.path().join("state");
+    std::fs::write(state.join(DATABASE), "nothing").unwrap();
+    let replaced = replace_pack(&state).unwrap();
+    assert!(replaced.damage.unwrap().ends_with("set aside as packwatch.db.damaged-1; a new history starts"));
+    assert_eq!(replace_pack(&state).unwrap().damage, None);
+}
+
+#[test]
+fn missing_and_damaged_state_give_different_errors() {
+    let (place, _) = replayed_store();
+    let state = place.path().join("state");
+    let required = || HistoryReader::open(&state).unwrap().required_snapshot();
+    assert!(required().is_ok());
+    without_states(place.path());
+    let damaged = required().unwrap_err();
+    assert!(damaged.contains(
+        "the stored state cannot be used: state-a.json.zst: damaged: no hash at the end of the file; state-b.json.zst: damaged"
+    ));
+    state_files::forget(&state).unwrap();
+    assert!(required().unwrap_err().contains("contains no stored state (state-a.json.zst, state-b.json.zst)"));
 }
 
 /// Returns a change of an alarm that the configuration of these tests contains.
