@@ -42,7 +42,8 @@ pub(crate) struct Args {
     state: Option<PathBuf>,
     #[command(flatten)]
     input: InputArgs,
-    /// Write an SVG plot of every difference into this folder
+    /// Write SVG plots into this folder, one per quantity (SOC, capacity, resistance, leak, ...); each shows how far each
+    /// cell is from the middle of the pack
     #[arg(long, value_name = "DIR")]
     plots: Option<PathBuf>,
     /// Print JSON
