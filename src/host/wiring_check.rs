@@ -17,7 +17,7 @@ use crate::can::encode::{InputEncoder, InputProtector};
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogCounts, LogError, LogOptions, LogSource};
-use crate::io::socket::PassiveSocket;
+use crate::io::socket::{PassiveSocket, explained};
 use crate::io::stop::Stop;
 use crate::monitor::{BusEvent, Monitor, Outputs, Record, RecordKind};
 use crate::quantity::BusIndex;
@@ -123,7 +123,7 @@ impl Session {
 /// Replays logs, at most their first `limit_s` seconds.
 ///
 /// # Errors
-/// Fails if a log cannot be read.
+/// Fails if a log cannot be read, or if the logs have no records.
 pub fn replay(
     survey: &Survey,
     logs: &[PathBuf],
@@ -167,7 +167,20 @@ pub fn replay(
             each(CheckProgress { bytes, frames: session.observer.frames(), seconds: session.observer.seconds() });
         }
     }
-    Ok((session.finish(), source.counts().clone()))
+    let counts = source.counts().clone();
+    if records == 0 {
+        return Err(no_records(logs, &counts));
+    }
+    Ok((session.finish(), counts))
+}
+
+/// Explains that logs have no records, so that nothing can be said about the wiring.
+fn no_records(logs: &[PathBuf], counts: &LogCounts) -> LogError {
+    let names: Vec<_> = logs.iter().map(|log| log.display().to_string()).collect();
+    let bad = counts.first_bad_line.as_ref().map_or_else(String::new, |first| {
+        format!("; {} of {} lines cannot be read, first {first}", counts.bad_lines, counts.lines)
+    });
+    LogError::Data(format!("{}: no CAN frames; give a journal, a candump log or a CSV log{bad}", names.join(", ")))
 }
 
 /// A listener on one interface.
@@ -228,7 +241,8 @@ impl BusListener {
                 session.observer.handle_bus(self.bus, if is_up { BusEvent::Up } else { BusEvent::Down });
             }
             Err(error) if error.raw_os_error() == Some(Errno::EAFNOSUPPORT as i32) => {
-                return Err(std::io::Error::other(format!("{}: this kernel has no SocketCAN: {error}", self.name)));
+                let why = explained(&error);
+                return Err(std::io::Error::other(format!("{}: {why}, or give a log to replay instead", self.name)));
             }
             Err(_) => session.observer.handle_bus(self.bus, BusEvent::Missing),
         }

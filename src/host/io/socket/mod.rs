@@ -18,4 +18,5 @@ pub use counters::{LinkCounts, LinkHealth, LinkState};
 pub use link::{Link, LinkConfig, LinkOutput};
 pub use passive_socket::PassiveSocket;
 pub use raw::DEFAULT_RECEIVE_BUFFER_BYTES;
+pub(crate) use raw::explained;
 pub use sender::CanSender;

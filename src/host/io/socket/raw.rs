@@ -96,7 +96,7 @@ pub(super) struct RawSocket {
 }
 
 /// Describes an error of a CAN socket, with its cause and the next step if these are known.
-pub(super) fn explained(error: &io::Error) -> String {
+pub(crate) fn explained(error: &io::Error) -> String {
     let cause = match error.raw_os_error().map(Errno::from_raw) {
         Some(Errno::EAFNOSUPPORT) => ": this kernel has no SocketCAN; load the module can_raw",
         Some(Errno::ENODEV) => ": there is no interface of this name; \"ip link\" lists the interfaces",
