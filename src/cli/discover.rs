@@ -90,7 +90,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
     match args.json {
         true => unless_closed(print_json(&json!({ "version": 1, "discovery": discovery })))?,
-        false => print(&page(&discovery))?,
+        false => print(&(page(&discovery) + no_definitions(args, &discovery)))?,
     }
     match (&args.write, &args.model) {
         (Some(file), Some(model)) => write(args, &discoverer, &discovery, file, model),
@@ -199,6 +199,15 @@ fn page(discovery: &Discovery) -> String {
         };
     }
     text
+}
+
+/// The next step if nothing was found because nothing describes the frames; empty if this is not the case.
+fn no_definitions(args: &Args, discovery: &Discovery) -> &'static str {
+    if !discovery.candidates.is_empty() || !args.dbc.is_empty() {
+        return "";
+    }
+    "\nWithout a DBC file, only diagnostic answers can be searched; the log has none with plausible values. Give the DBC file \
+     of the vehicle with --dbc FILE.dbc.\n"
 }
 
 fn row(candidate: &Candidate) -> Vec<String> {

@@ -17,6 +17,10 @@ use crate::fit::quoted;
 use crate::import::{DiagnosticSignal, DiagnosticTable, series};
 use crate::wiring::evidence::PackQuantity;
 
+/// Why a signal is missing, and the next step.
+const NO_CANDIDATE: &str =
+    "no signal in the log looks like it: give the DBC file that describes it with --dbc, or a log of a drive";
+
 /// Decisions of the user.
 #[derive(Debug, Clone, Default)]
 pub struct PackSettings {
@@ -110,7 +114,7 @@ impl Writer<'_> {
         let mut questions = Vec::new();
         let current = self.best(PackQuantity::Current);
         if current.is_none() {
-            questions.push("which signal is the pack current? the log shows no candidate".to_owned());
+            questions.push(format!("which signal is the pack current? {NO_CANDIDATE}"));
         }
         let positive = self.settings.positive.or(current.and_then(|current| current.positive));
         if let (Some(current), None) = (current, positive) {
@@ -135,8 +139,7 @@ impl Writer<'_> {
                 None
             }
             (None, None, _) => {
-                questions
-                    .push("which signal is the voltage? the log shows none of the pack or of the cells".to_owned());
+                questions.push(format!("which signal is the voltage of the cells or of the pack? {NO_CANDIDATE}"));
                 None
             }
         };
