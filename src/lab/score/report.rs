@@ -170,6 +170,12 @@ impl ScoreReport {
         for score in &self.scores {
             let (name, case) = (&score.name, describe(&score.case));
             let left_out = score.soc.as_ref().map_or(0, |soc| soc.left_out_rows);
+            if score.soc.as_ref().is_some_and(|soc| soc.samples == 0) {
+                let settle_s = self.settings.settle_s;
+                note(format_args!(
+                    "{name}, {case}: no SOC scored, because the file ends before {settle_s:.0} s; give a shorter --settle"
+                ));
+            }
             if left_out > 0 {
                 let rows = score.rows;
                 note(format_args!("{name}, {case}: {left_out} of {rows} rows left out (no truth or no estimate)"));
