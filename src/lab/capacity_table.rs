@@ -16,6 +16,9 @@ use std::path::Path;
 use crate::io::table::{Header, Row, Table, TableError};
 use crate::quantity::{CellIndex, Timestamp};
 
+/// The columns that state a capacity.
+const CAPACITY: [&str; 2] = ["capacity_ah", "capacity_ah_source"];
+
 /// A table being read.
 pub(crate) struct CapacityTable {
     table: Table,
@@ -44,17 +47,30 @@ pub(crate) struct CapacityRow<'t> {
 }
 
 impl CapacityTable {
-    /// Opens a table whose rows may have any order.
+    /// Opens a table of capacities whose rows may have any order.
+    ///
+    /// # Errors
+    /// The file cannot be read, or the column of times or of capacities is missing.
+    pub(crate) fn open(path: &Path) -> Result<Self, TableError> {
+        Self::open_with(path, &CAPACITY)
+    }
+
+    /// Opens a table of capacities, SOC or both, whose rows may have any order.
     ///
     /// # Errors
     /// The file cannot be read, the column of times is missing, or the file has neither capacities nor SOC.
-    pub(crate) fn open(path: &Path) -> Result<Self, TableError> {
+    pub(crate) fn open_reference(path: &Path) -> Result<Self, TableError> {
+        Self::open_with(path, &[CAPACITY[0], CAPACITY[1], "soc"])
+    }
+
+    /// Opens a table that has at least one of the columns `values`.
+    fn open_with(path: &Path, values: &[&str]) -> Result<Self, TableError> {
         let table = Table::open(path)?;
         let header = table.header();
-        header.required(&["capacity_ah", "capacity_ah_source", "soc"])?;
+        header.required(values)?;
         Ok(Self {
             time: header.required(&["time_s", "start", "date", "time"])?,
-            capacity: header.find_any(&["capacity_ah", "capacity_ah_source"]),
+            capacity: header.find_any(&CAPACITY),
             soc: header.find("soc"),
             cell: header.find("cell"),
             cycle: header.find("cycle"),
@@ -65,7 +81,7 @@ impl CapacityTable {
         })
     }
 
-    /// Opens a table whose rows must be in order of time.
+    /// Opens a table of capacities whose rows must be in order of time.
     pub(crate) fn open_in_order(path: &Path) -> Result<Self, TableError> {
         Ok(Self { last: Some(Timestamp::from_nanos(i64::MIN)), ..Self::open(path)? })
     }

@@ -200,7 +200,7 @@ mod tests {
         assert!(
             read("a,b\n1,2\n")
                 .expect_err("bad")
-                .starts_with("t.csv:1: no column capacity_ah or capacity_ah_source or soc, found a,b")
+                .starts_with("t.csv:1: no column capacity_ah or capacity_ah_source, found a,b")
         );
         assert!(read("time_s,cell,capacity_ah\n").expect_err("bad").contains("no row"));
     }

@@ -23,7 +23,7 @@ pub struct Reference {
 /// # Errors
 /// The file cannot be read, a column is missing, or a value is not a number or is out of range; the error names file and line.
 pub fn read(path: &Path) -> Result<Reference, TableError> {
-    let mut table = CapacityTable::open(path)?;
+    let mut table = CapacityTable::open_reference(path)?;
     let has_cells = table.header().find("cell").is_some();
     let mut reference = Reference { is_loaded: !has_cells, ..Reference::default() };
     while let Some(row) = table.next_row()? {

@@ -163,7 +163,7 @@ mod tests {
         }
         assert_eq!(
             read("date,ah\n"),
-            Err("cell.csv:1: no column capacity_ah or capacity_ah_source or soc, found date,ah".into())
+            Err("cell.csv:1: no column capacity_ah or capacity_ah_source, found date,ah".into())
         );
     }
 }

@@ -130,7 +130,7 @@ mod tests {
         let fault = read("cycle,type,start\n1,discharge,1\n");
         assert_eq!(
             fault,
-            Err("cycles.csv:1: no column capacity_ah or capacity_ah_source or soc, found cycle,type,start".into())
+            Err("cycles.csv:1: no column capacity_ah or capacity_ah_source, found cycle,type,start".into())
         );
         let fault = read("cycle,type,start,capacity_ah_source\n1,charge,1,\n");
         assert_eq!(fault, Err("cycles.csv: no discharge with a capacity".into()));
