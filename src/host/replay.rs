@@ -23,7 +23,9 @@ use crate::io::event_log;
 use crate::io::log::{Batch, LogCounts, LogError, LogSource};
 use crate::io::result_file::ResultFile;
 use crate::io::ticks::Ticks;
-use crate::monitor::{Downtime, Monitor, Outputs, Record, RecordKind, RestoreError, Snapshot, TICK_PERIOD_MS};
+use crate::monitor::{
+    Downtime, MERGE_TOLERANCE_NS, Monitor, Outputs, Record, RecordKind, RestoreError, Snapshot, TICK_PERIOD_MS,
+};
 use crate::quantity::catalogue::RecordedValues;
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
@@ -411,6 +413,12 @@ impl Replay {
             summary.notes.push(format!(
                 "the beginning of the journal is missing, {} segments: results differ from the recorded run",
                 counts.deleted_segments
+            ));
+        }
+        if let Some(count) = summary.events.get("time_backwards") {
+            summary.notes.push(format!(
+                "the time goes back {count} times by more than {} s; each counts as a gap of unknown length. If no clock was                  set back, sort the log by time",
+                MERGE_TOLERANCE_NS / 1_000_000_000
             ));
         }
         if counts.frames == 0 && !counts.foreign.is_empty() {

@@ -48,12 +48,15 @@ fn log_rows(log: &LogCounts) -> Vec<(&'static str, String)> {
     let mut rows = vec![("lines", log.lines.to_string()), ("frames", log.frames.to_string())];
     rows.push(("bad lines", log.bad_lines.to_string()));
     rows.extend(log.first_bad_line.clone().map(|line| ("first bad line", line)));
+    if let Some(first) = &log.first_time_backwards {
+        rows.push(("stamps backwards", log.time_backwards.to_string()));
+        rows.push(("first backwards", first.clone()));
+    }
     let counted = [
         ("ignored lines", log.ignored_lines),
         ("CAN XL frames", log.xl_frames),
         ("error frames", log.error_frames),
         ("frames the recorder lost", log.dropped_frames),
-        ("stamps backwards", log.time_backwards),
         ("unknown gaps", log.unknown_gaps),
         ("values no frame carries", log.uncarried_values),
         ("segments missing at the beginning", log.deleted_segments),

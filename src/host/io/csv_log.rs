@@ -34,6 +34,8 @@ pub struct CsvOptions {
 /// Time of a row, and whether an unknown gap precedes the row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RowTime {
+    /// Line of the file, from 1.
+    pub line: u64,
     /// Time of the row.
     pub time: Timestamp,
     /// Whether an unknown time has passed between this row and the previous row.
@@ -96,7 +98,7 @@ impl CsvLog {
             self.values.push((channel, if flip { value.map(|v| -v) } else { value }));
         }
         let Some(sections) = &mut self.sections else {
-            return Ok(Some(Ok(RowTime { time, after_unknown_gap: false })));
+            return Ok(Some(Ok(RowTime { line: row.line, time, after_unknown_gap: false })));
         };
         Ok(Some(sections.place(&row, time)))
     }
@@ -114,7 +116,7 @@ impl Sections {
         }
         let after_unknown_gap = is_new && !is_first && self.start.is_none();
         let time = self.start.map_or(time, |start| start.plus_nanos(time.nanos()));
-        Ok(RowTime { time, after_unknown_gap })
+        Ok(RowTime { line: row.line, time, after_unknown_gap })
     }
 }
 

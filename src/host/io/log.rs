@@ -72,6 +72,8 @@ pub struct LogCounts {
     pub foreign: BTreeMap<String, u64>,
     /// Records whose stamp is before the stamp of the preceding record.
     pub time_backwards: u64,
+    /// The first such record: file, line, its stamp and the latest stamp before it.
+    pub first_time_backwards: Option<String>,
     /// Number of files and CSV sections that follow a gap of unknown length.
     pub unknown_gaps: u64,
     /// CSV values that no input frame can carry (out of the signal's range, or no such signal).
@@ -187,9 +189,9 @@ impl LogSource {
             if let Some(record) = self.queue.pop_front() {
                 return Ok(Some(record));
             }
-            if let Some(OpenLog { form: LogForm::Text { lines, .. }, .. }) = &mut self.current
+            if let Some(OpenLog { form: LogForm::Text { lines, .. }, name }) = &mut self.current
                 && let mut slot = [UNUSED]
-                && self.state.next_frames(lines, &mut slot) > 0
+                && self.state.next_frames(lines, name, &mut slot) > 0
             {
                 return Ok(Some(slot[0]));
             }
@@ -206,7 +208,7 @@ impl LogSource {
             let more = match &mut open.form {
                 LogForm::Text { lines, journal } => match self.state.next_text(lines, *journal, &open.name)? {
                     Some(record) => {
-                        let (gap, time) = self.state.place(record.time);
+                        let (gap, time) = self.state.place(record.time, &open.name, lines.number());
                         let record = Record { time, ..record };
                         let Some(gap) = gap else { return Ok(Some(record)) };
                         self.queue.push_back(record);
@@ -214,8 +216,8 @@ impl LogSource {
                     }
                     None => false,
                 },
-                LogForm::Csv(log) => self.state.next_row(log)?.is_some_and(|raw| {
-                    let (gap, time) = self.state.place(raw);
+                LogForm::Csv(log) => self.state.next_row(log)?.is_some_and(|(line, raw)| {
+                    let (gap, time) = self.state.place(raw, &open.name, line);
                     self.queue.extend(gap);
                     let uncarried = (self.encode_row)(&log.values, &mut self.frames);
                     self.state.counts.uncarried_values += uncarried as u64;
@@ -242,7 +244,7 @@ impl LogSource {
             && self.queue.is_empty()
         {
             batch.carries_ticks = *journal;
-            batch.len = self.state.next_frames(lines, &mut batch.slots);
+            batch.len = self.state.next_frames(lines, &open.name, &mut batch.slots);
             if batch.len > 0 {
                 return Ok(true);
             }
@@ -288,10 +290,10 @@ fn is_remark(line: &[u8]) -> bool {
 impl ReadState {
     /// Fills slots with the next frames of a text log whose complete lines are already in the buffer. The first record
     /// of the file is excluded. Returns the number of frames.
-    fn next_frames(&mut self, lines: &mut Lines, slots: &mut [Record]) -> usize {
+    fn next_frames(&mut self, lines: &mut Lines, name: &str, slots: &mut [Record]) -> usize {
         let Some(mut latest) = self.latest.filter(|_| !self.fresh) else { return 0 };
         let all = lines.unread();
-        let (mut text, mut count, mut read_lines, mut backwards) = (all, 0, 0, 0);
+        let (mut text, mut count, mut read_lines) = (all, 0, 0);
         while let Some(slot) = slots.get_mut(count)
             && let Ok(LineHead { time, interface, bus, rest }) = self.parser.parse_head(text)
         {
@@ -316,8 +318,7 @@ impl ReadState {
             }
             count += 1;
             if time < latest {
-                std::hint::cold_path();
-                backwards += 1;
+                self.note_backwards(time, latest, name, lines.number() + read_lines);
             } else {
                 latest = time;
             }
@@ -326,9 +327,18 @@ impl ReadState {
         lines.take_lines(len, read_lines);
         self.counts.lines += read_lines;
         self.counts.frames += count as u64;
-        self.counts.time_backwards += backwards;
         self.latest = Some(latest);
         count
+    }
+
+    /// Counts a record at `time`, which is before the time `latest` of an earlier record.
+    #[cold]
+    fn note_backwards(&mut self, time: Timestamp, latest: Timestamp, name: &str, line: u64) {
+        self.counts.time_backwards += 1;
+        self.counts.first_time_backwards.get_or_insert_with(|| {
+            let [stamp_s, latest_s] = [time, latest].map(|time| time.plus_nanos(-self.shift_ns).secs());
+            format!("{name}:{line}: stamp {stamp_s:.6} s is before {latest_s:.6} s")
+        });
     }
 
     fn bad(&mut self, what: impl FnOnce() -> String) -> Result<(), LogError> {
@@ -435,8 +445,8 @@ impl ReadState {
         None
     }
 
-    /// The time of the next good row, on the file's own clock.
-    fn next_row(&mut self, log: &mut CsvLog) -> Result<Option<Timestamp>, LogError> {
+    /// Line and time of the next good row, on the file's own clock.
+    fn next_row(&mut self, log: &mut CsvLog) -> Result<Option<(u64, Timestamp)>, LogError> {
         loop {
             let row = match log.next_row() {
                 Ok(None) => return Ok(None),
@@ -448,19 +458,20 @@ impl ReadState {
             };
             self.counts.lines += 1;
             match row {
-                Ok(RowTime { time, after_unknown_gap }) => {
+                Ok(RowTime { line, time, after_unknown_gap }) => {
                     if after_unknown_gap {
                         (self.fresh, self.unknown) = (true, true);
                     }
-                    return Ok(Some(time));
+                    return Ok(Some((line, time)));
                 }
                 Err(error) => self.bad(|| error.to_string())?,
             }
         }
     }
 
-    /// Converts a file's stamp to the common clock; also returns the gap that must precede the record, if any.
-    fn place(&mut self, raw: Timestamp) -> (Option<Record>, Timestamp) {
+    /// Converts the stamp in a line of a file to the common clock; also returns the gap that must precede the record, if
+    /// any.
+    fn place(&mut self, raw: Timestamp, name: &str, line: u64) -> (Option<Record>, Timestamp) {
         let mut gap = false;
         if std::mem::take(&mut self.fresh) {
             self.shift_ns = 0;
@@ -472,8 +483,8 @@ impl ReadState {
             }
         }
         let time = raw.plus_nanos(self.shift_ns);
-        if self.latest.is_some_and(|latest| time < latest) {
-            self.counts.time_backwards += 1;
+        if let Some(latest) = self.latest.filter(|&latest| time < latest) {
+            self.note_backwards(time, latest, name, line);
         }
         self.latest = Some(self.latest.map_or(time, |latest| latest.max(time)));
         self.counts.unknown_gaps += u64::from(gap);
