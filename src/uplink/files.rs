@@ -29,13 +29,14 @@ pub(crate) fn read(path: &Path) -> Result<Vec<u8>, String> {
     Ok(bytes)
 }
 
-/// Reads a secret or a certificate. A relative path is relative to the unit's credentials folder, if it has one.
+/// Reads a secret or a certificate, which the key `key` of the settings names. A relative path is relative to the unit's
+/// credentials folder, if it has one.
 ///
 /// # Errors
-/// Fails like [`read`].
-pub(crate) fn read_credential(path: &Path) -> Result<Vec<u8>, String> {
+/// Fails like [`read`]. The message also names the key.
+pub(crate) fn read_credential(key: &str, path: &Path) -> Result<Vec<u8>, String> {
     let folder = std::env::var_os(CREDENTIALS).map(PathBuf::from).unwrap_or_default();
-    read(&folder.join(path))
+    read(&folder.join(path)).map_err(|error| format!("{key}: {error}"))
 }
 
 #[cfg(test)]

@@ -35,6 +35,10 @@ const FAREWELL: Duration = Duration::from_millis(500);
 /// If the broker reads no batch for this time, the connection is closed, because readers would mistake old values for
 /// current ones.
 const UNREAD_LIMIT: Duration = Duration::from_secs(30);
+/// Key of the certificates' file, for messages.
+const CA_FILE: &str = "kuksa.ca_file";
+/// Key of the token's file, for messages.
+const TOKEN_FILE: &str = "kuksa.token_file";
 /// Longest token, bytes.
 const MAX_TOKEN_BYTES: usize = 16 << 10;
 
@@ -234,12 +238,13 @@ fn endpoint(settings: &KuksaSettings) -> Result<Endpoint, String> {
     let at = &settings.address;
     let mut endpoint = Endpoint::from_shared(at.clone()).map_err(|error| format!("{at}: {error}"))?;
     if let Some(file) = &settings.ca_file {
-        let pem = read_credential(file)?;
+        let pem = read_credential(CA_FILE, file)?;
         let mut tls = ClientTlsConfig::new().ca_certificate(Certificate::from_pem(pem));
         if let Some(name) = &settings.server_name {
             tls = tls.domain_name(name);
         }
-        endpoint = endpoint.tls_config(tls).map_err(|error| format!("{}: {}", file.display(), causes(&error)))?;
+        endpoint =
+            endpoint.tls_config(tls).map_err(|error| format!("{CA_FILE}: {}: {}", file.display(), causes(&error)))?;
     }
     let endpoint = endpoint.connect_timeout(PATIENCE).http2_keep_alive_interval(PING_PERIOD);
     Ok(endpoint.keep_alive_timeout(PATIENCE).keep_alive_while_idle(true))
@@ -269,8 +274,8 @@ fn causes(error: &dyn std::error::Error) -> String {
 /// Builds the header with the token of `file`.
 fn token(file: Option<&Path>) -> Result<Option<MetadataValue<Ascii>>, String> {
     let Some(file) = file else { return Ok(None) };
-    let at = file.display();
-    let text = String::from_utf8(read_credential(file)?).map_err(|error| format!("{at}: {error}"))?;
+    let at = format!("{TOKEN_FILE}: {}", file.display());
+    let text = String::from_utf8(read_credential(TOKEN_FILE, file)?).map_err(|error| format!("{at}: {error}"))?;
     let token = text.trim();
     if token.is_empty() || token.len() > MAX_TOKEN_BYTES {
         return Err(format!("{at}: the token has {} bytes, must be 1 to {MAX_TOKEN_BYTES}", token.len()));

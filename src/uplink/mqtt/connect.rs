@@ -52,11 +52,16 @@ pub fn client(settings: &MqttSettings) -> Result<(AsyncClient, EventLoop), Strin
 fn certificates(tls: &TlsSettings) -> Result<TlsConfiguration, String> {
     // The check of the settings ensures that both files or neither are given.
     let client_auth = match (&tls.certificate_file, &tls.key_file) {
-        (Some(certificate), Some(key)) => Some((read_credential(certificate)?, read_credential(key)?)),
+        (Some(certificate), Some(key)) => Some((
+            read_credential("mqtt.tls.certificate_file", certificate)?,
+            read_credential("mqtt.tls.key_file", key)?,
+        )),
         _ => None,
     };
     match &tls.ca_file {
-        Some(path) => Ok(TlsConfiguration::Simple { ca: read_credential(path)?, alpn: None, client_auth }),
+        Some(path) => {
+            Ok(TlsConfiguration::Simple { ca: read_credential("mqtt.tls.ca_file", path)?, alpn: None, client_auth })
+        }
         None => TlsConfiguration::try_default_rustls().map_err(|error| format!("authorities of the system: {error}")),
     }
 }

@@ -13,6 +13,9 @@ use crate::files::read_credential;
 /// Longest topic, bytes; leaves ample room for suffixes below MQTT's limit of 65,535.
 const MAX_TOPIC_BYTES: usize = 200;
 
+/// Key of the password's file, for messages.
+const PASSWORD_FILE: &str = "mqtt.password_file";
+
 /// The broker, and what is sent to it.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -172,12 +175,12 @@ impl MqttSettings {
     /// Fails if the file cannot be read or is empty.
     pub fn password(&self) -> Result<Option<Vec<u8>>, String> {
         let Some(path) = &self.password_file else { return Ok(None) };
-        let mut password = read_credential(path)?;
+        let mut password = read_credential(PASSWORD_FILE, path)?;
         while matches!(password.last(), Some(b'\n' | b'\r')) {
             password.pop();
         }
         if password.is_empty() {
-            return Err(format!("{}: contains no password", path.display()));
+            return Err(format!("{PASSWORD_FILE}: {}: contains no password", path.display()));
         }
         Ok(Some(password))
     }
@@ -239,6 +242,7 @@ mod tests {
         std::fs::write(file.path(), "\n").unwrap();
         assert!(settings.password().unwrap_err().ends_with("contains no password"));
         std::fs::remove_file(file.path()).unwrap();
-        assert!(settings.password().unwrap_err().contains("No such file"));
+        let error = settings.password().unwrap_err();
+        assert!(error.starts_with("mqtt.password_file: /") && error.contains("No such file"), "{error}");
     }
 }
