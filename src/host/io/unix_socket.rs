@@ -1,5 +1,6 @@
-//! Opens and deletes Unix sockets and their files. If the file of a socket already exists, it is replaced only if the
-//! daemon that created the file has ended. Otherwise, the file is kept and opening fails.
+//! Opens and deletes Unix sockets and their files. When a daemon opens a socket whose file already exists, it replaces
+//! the file if the daemon that created it has ended. If that daemon still runs, the file is kept and opening fails.
+//! [`explain_no_daemon`] is the message of a client that finds no daemon.
 
 use std::fs::Permissions;
 use std::io::{self, ErrorKind};
@@ -52,8 +53,12 @@ pub fn explain_no_daemon(path: &Path, socket: &str, standard: &Path, setting: &s
 /// Names the kind of a file that is not a socket; `None` = a socket, or no file.
 fn other_file(path: &Path) -> Option<&'static str> {
     let kind = std::fs::metadata(path).ok()?.file_type();
-    let names = [(kind.is_socket(), None), (kind.is_file(), Some("a regular file")), (kind.is_dir(), Some("a folder"))];
-    names.into_iter().find(|(is_kind, _)| *is_kind).map_or(Some("not a socket"), |(_, name)| name)
+    match (kind.is_socket(), kind.is_file(), kind.is_dir()) {
+        (true, ..) => None,
+        (_, true, _) => Some("a regular file"),
+        (.., true) => Some("a folder"),
+        _ => Some("not a socket"),
+    }
 }
 
 /// Creates the default folder if systemd has not created it. If this fails, the bind fails too and is reported.
