@@ -13,11 +13,12 @@ use super::common::files::{database, named_from, read};
 use super::common::numbers::integer;
 use super::common::output::{failure, print, print_json, table, unless_closed};
 use super::common::progress::Bar;
-use crate::config;
+use crate::config::{self, ConfigFaults};
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogOptions, LogSource};
 use crate::io::result_file::{ResultFile, check_place};
 use crate::lab::discover::{Candidate, Discoverer, Discovery, PackSettings, PositiveDirection};
+use crate::lab::error::LabError;
 use crate::lab::import::obdb::ObdbSettings;
 use crate::monitor::RecordKind;
 use crate::replay::ReplayProgress;
@@ -119,10 +120,10 @@ fn write(
             Positive::Discharge => PositiveDirection::Discharge,
         }),
     };
-    let failed = |what: &str| {
-        Failure::new(format!("{}: not written, because the configuration would be invalid:\n{what}", file.display()))
-    };
-    let pack = discoverer.configuration(discovery, &settings).map_err(|error| failed(&error.to_string()))?;
+    let failed =
+        |why: &str, what: &str| Failure::new(format!("{}: not written, because {why}:\n{what}", file.display()));
+    let open = |error: LabError| failed("the log leaves questions open", &error.to_string());
+    let pack = discoverer.configuration(discovery, &settings).map_err(open)?;
     let own = file.with_extension("dbc");
     let read = |path: &Path| match &pack.database {
         _ if path == file => Ok(pack.text.clone().into_bytes()),
@@ -130,7 +131,8 @@ fn write(
         _ => std::fs::read(path),
     };
     let files = config::ConfigFiles { main: file.to_owned(), drop_ins: Vec::new() };
-    config::load_with(&files, &read).map_err(|faults| failed(&faults.0.join("\n")))?;
+    let invalid = |faults: ConfigFaults| failed("the configuration would be invalid", &faults.0.join("\n"));
+    config::load_with(&files, &read).map_err(invalid)?;
     if let Some(database) = &pack.database {
         check_place(&own, args.dbc.iter().chain([&args.log])).map_err(Failure::new)?;
         write_whole(&own, database)?;
