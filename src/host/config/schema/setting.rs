@@ -117,7 +117,7 @@ impl Setting for CellRanges {
 pub(crate) struct NumberRange(pub RangeInclusive<u16>);
 
 impl Setting for NumberRange {
-    const KIND: &'static str = "a range of numbers, like \"1-32\"";
+    const KIND: &'static str = "an ascending range of numbers, like \"1-32\"";
 
     fn read(value: &Spanned<DeValue<'_>>, _: &ValueRange) -> Result<Self, ValueFault> {
         let parse = |text: &str| {

@@ -137,7 +137,7 @@ fn answer_faults_are_reported() {
         (
             "numbers = \"1-3\"",
             "numbers = \"3-1\"",
-            "pack.toml:23: input.diagnostic[1].signals[1].numbers = \"3-1\", must be a range of numbers, like \"1-32\"",
+            "pack.toml:23: input.diagnostic[1].signals[1].numbers = \"3-1\", must be an ascending range of numbers, like \"1-32\"",
         ),
         (
             "minimum = 1, maximum = 5",
