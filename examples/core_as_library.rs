@@ -1,5 +1,5 @@
-//! Uses the core as a library: passes records to the core, and receives events and frames. The core needs no CAN
-//! interface and reads no clock.
+//! Uses the core as a library: passes the records of a log to the core, and receives events and frames. The core needs
+//! no CAN interface and reads no clock.
 //!
 //! ```sh
 //! cargo run --example core_as_library -- examples/pack/pack.toml examples/pack/drive.log
@@ -18,7 +18,7 @@ use packwatch::io::log::{LogOptions, LogSource};
 use packwatch::io::ticks::Ticks;
 use packwatch::monitor::{Monitor, Outputs, Record, TICK_PERIOD_MS};
 
-/// If a gap in the log is longer than this time in seconds, the recorder was asleep.
+/// If a gap in the log is longer than this time in seconds, the program assumes that the recorder was asleep.
 const SLEEP_GAP_S: f64 = 5.0;
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -27,7 +27,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     monitor_log(Path::new(config), Path::new(log), &mut io::stdout().lock())
 }
 
-/// Passes a log through the core.
+/// Passes a log to the core and prints the events and the last state of the pack.
 pub(crate) fn monitor_log(config: &Path, log: &Path, out: &mut impl Write) -> Result<(), Box<dyn Error>> {
     // Outside the core: read the files, check the settings and convert the lines of the log to records.
     let config = config::load(config)?;

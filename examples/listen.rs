@@ -56,8 +56,8 @@ struct Listener {
     database: Database,
     /// Time of the latest frame of each raised alarm.
     alarms: BTreeMap<Key, f64>,
-    /// Duration of a pass in seconds, as the latest digest states it. Before the first digest, the cycle time of the
-    /// alarm frames.
+    /// Duration of a pass in seconds, from the latest digest frame that states it. Before that frame, the cycle time of
+    /// the alarm frames.
     pass_time_s: f64,
     status_at_s: Option<f64>,
     validity: String,
@@ -169,7 +169,8 @@ fn decode(message: &Message, data: &[u8]) -> Signals {
     present.filter_map(|signal| Some((signal.name.clone(), value(signal, data)?))).collect()
 }
 
-/// The DBC's name for the value or, if it has none, the number. `None` if the frame is too short for the signal.
+/// The DBC's name for the value or, if the DBC has no name for it, the number. `None` if the frame is too short for the
+/// signal.
 fn value(signal: &Signal, data: &[u8]) -> Option<String> {
     let plan = signal.layout.plan().ok()?;
     let code = i64::try_from(plan.raw(data).ok()?).ok();

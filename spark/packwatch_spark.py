@@ -42,7 +42,7 @@ def replay_vehicle(line: str, command: list[str]) -> dict:
 
 def replay(spark, lines: list[str], config: str, out: str, binary: str = "packwatch", estimates: float | None = None,
            more: list[str] | None = None):  # fmt: skip
-    """Returns a DataFrame with a row per vehicle of these manifest lines. Evaluating it replays them, so evaluate it once."""
+    """Returns a DataFrame with a row per manifest line. Each evaluation of the DataFrame replays the vehicles, so evaluate it once."""
     command = [binary, "fleet", "run", "--json", "--jobs", "1", "--config", config, "--out", out]
     if estimates is not None:
         command += ["--estimates", str(estimates)]
@@ -57,7 +57,7 @@ def replay(spark, lines: list[str], config: str, out: str, binary: str = "packwa
 
     # The executors' Python needs this module.
     spark.sparkContext.addPyFile(os.path.abspath(__file__))
-    # One task per vehicle, the largest vehicles first, so that the last tasks are short.
+    # One task per vehicle. The vehicles with the largest logs come first, so that the last tasks are short.
     largest = sorted(lines, key=lambda line: -json.loads(line)["bytes"])
     numbered = spark.sparkContext.parallelize([(line,) for line in largest], max(1, len(largest)))
     return spark.createDataFrame(numbered, "line string").mapInArrow(tasks, SCHEMA)

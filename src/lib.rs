@@ -1,8 +1,9 @@
 //! packwatch: streaming battery health monitoring over SocketCAN.
 //!
 //! # Map
-//! Each folder under `src` is a crate, so the compiler enforces which crate may use which. A folder inside a crate is a module.
-//! A module uses only modules above it in this table (`tests/integration/layering.rs` checks this rule).
+//! Each folder under `src` is a crate, so the compiler enforces which crate may use which. Only `src/cli` is a module
+//! of this crate. A folder inside a crate is a module. A module uses only modules above it in this table
+//! (`tests/integration/layering.rs` checks this rule).
 //!
 //! | crate | module | what lives there |
 //! | --- | --- | --- |
@@ -20,14 +21,14 @@
 //! | `src/regress` | `regress` | Gaussian process regression: pure numbers (feature `lab`) |
 //! | `src/host` | [`config`] | TOML to validated settings; reports all faults at once |
 //! | | [`io`] | log files, CSV, CAN sockets, clock, journal, result and event files |
+//! | | [`logging`] | log lines |
+//! | | [`control`] | command socket |
 //! | | [`store`] | learned state in two files, history in SQLite |
 //! | | [`status`] | status document, metrics |
-//! | | [`control`] | command socket |
-//! | | [`exporter`] | metrics for Prometheus |
-//! | | [`logging`] | log lines |
 //! | | [`service`] | the live loop: links, ticks, readiness, reload, watchdog |
-//! | | [`replay`] | finite loop over recorded logs |
-//! | | [`wiring_check`] | finite loop of the doctor |
+//! | | [`exporter`] | metrics for Prometheus |
+//! | | [`replay`] | the loop over recorded logs |
+//! | | [`wiring_check`] | the two loops of `packwatch doctor`: over logs and over live input |
 //! | | `failure` | text and exit code of a failed command, for every program |
 //! | `src/lab` | `lab` | fit, score, remaining life, Gaussian processes, reports, passports, what-if, export, fleets, plots, import, discover (feature `lab`) |
 //! | `src/uplink` | `mqtt`, `kuksa`, `vss` | program `packwatch-uplink`, separate from the vehicle's program: sends the status to MQTT brokers and a KUKSA databroker |
@@ -35,10 +36,10 @@
 //! | `src/cli` | [`cli`] | one file (and folder) per command with the command's name; `common` holds what commands share; `main.rs` only calls [`cli`] |
 //!
 //! # The path of a frame
-//! `host/io/socket` receives the frame, and `host/service/live.rs` passes it to the [`monitor`]. The stages are `intake` (protection, rate
-//! limit) → `can/decode` (for a diagnostic answer: `can/isotp`, `can/uds`) → `sampling` → `estimation` ([`cell`]) → `learning`
-//! ([`health`]) → `alarming` ([`alarm`]) → `sending` (`can/encode`). A replay starts at `host/replay.rs`; from the monitor on, the path
-//! is the same.
+//! `host/io/socket` receives the frame, and `host/service/live.rs` passes it to the [`monitor`]. The stages are
+//! `intake` (protection, rate limit) → `can/decode` (for a diagnostic answer: `can/isotp`, `can/uds`) → `sampling` →
+//! `estimation` ([`cell`]) → `learning` ([`health`]) → `alarming` ([`alarm`]) → `sending` (`can/encode`). A replay
+//! starts at `host/replay.rs`; from the monitor on, the path is the same.
 //!
 //! # Where to change what
 //! Paths are relative to `src`; paths that begin with `/` are relative to the repository.
@@ -73,7 +74,7 @@
 //! | the signature of a cell fault | `core/cell_faults/difference.rs`, `core/cell_faults/channels.rs` |
 //! | when a cell fault is reported | `core/cell_faults/fault.rs` |
 //! | capacity learned from a half-cycle | `core/health/learner.rs` |
-//! | what is kept of exchanged packs | `core/monitor/stages/pack_memory.rs` |
+//! | learned values of packs that were exchanged | `core/monitor/stages/pack_memory.rs` |
 //! | contents of the stored state | the state of the stage, `core/monitor/snapshot.rs`, `core/monitor/lifecycle/restore.rs` (restore) |
 //! | a configuration key | `host/config/schema/keys/` (files `pack`, `input`, `limits`, `algorithms`, `traffic`), `host/config/mod.rs` (list of the steps) |
 //! | discovery and merging of drop-ins | `host/config/document/source.rs`, `host/config/document/merge.rs` |
@@ -121,10 +122,11 @@
 //! | a class or function of the Python module | `python/NAME.rs` (code), `python/packwatch/_packwatch.pyi` (types) |
 //!
 //! # Invariants
-//! * `src/core` and `src/regress` never read a clock, a file or a socket and never log: the same inputs give the same outputs, byte
-//!   for byte.
-//! * In the core, current is positive for discharge and SOC is a fraction; only [`can`] sees wire units.
-//! * A bad reading is data with a fault. An unknown value never looks healthy.
+//! * `src/core` and `src/regress` never read a clock, a file or a socket and never log: the same inputs give the same
+//!   outputs, byte for byte.
+//! * In the core, current is positive for discharge and SOC is a fraction; only [`can`] handles the signs and units of
+//!   signals.
+//! * A bad reading is passed on, marked with its fault. An unknown value never looks healthy.
 
 pub use packwatch_core::{alarm, can, cell, cell_faults, filter, health, monitor, quantity, sample, sim, wiring};
 pub use packwatch_host::{config, control, exporter, io, logging, replay, service, status, store, wiring_check};

@@ -2,7 +2,7 @@
 //! 96 cells of `config/example.toml`, including ticks and sent frames. The first frames (growing buffers), transitions
 //! and events may allocate.
 //!
-//! All threads of the process are counted. If a test fails, `dhat-heap.json` shows the allocations.
+//! The allocations of all threads of the process are counted. If a test fails, `dhat-heap.json` shows the allocations.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -18,7 +18,7 @@ use packwatch::monitor::{Monitor, Outputs, Record, RecordKind, TICK_PERIOD_MS};
 #[global_allocator]
 static ALLOCATOR: dhat::Alloc = dhat::Alloc;
 
-/// Length of a gap in the record, s, above which the recorder counts as asleep. This record has no gap.
+/// If a gap in the log is longer than this, s, the recorder counts as asleep. This log has no gap.
 const SLEEP_GAP_S: f64 = 30.0;
 /// Length of the log, s.
 const LOG_S: f64 = 160.0;

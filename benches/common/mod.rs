@@ -1,4 +1,4 @@
-//! Provides estimator inputs for several benches: the example pack's cells and their readings.
+//! Provides inputs for several benches: the configuration of the example pack, and readings of its cells.
 
 use packwatch_host::cell::CellStep;
 use packwatch_host::config::{self, Config};

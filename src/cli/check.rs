@@ -1,8 +1,8 @@
 //! `packwatch check`: checks a configuration and describes it.
 //!
 //! Opens every file that the configuration names. If the configuration is valid, prints warnings and then its
-//! description on standard output; the exit code is 0. If it is not valid, prints every fault on a line of standard
-//! error; the exit code is 78.
+//! description on standard output; the exit code is 0. If the configuration is not valid, prints each fault on its own
+//! line of standard error; the exit code is 78.
 
 use std::fs::File;
 use std::io;
@@ -100,7 +100,7 @@ fn show(description: &Description, page: &mut String) {
     }
 }
 
-/// The first line of the output, which states the result.
+/// The result, shown in the first line of the output.
 fn verdict(warnings: usize) -> String {
     match warnings {
         0 => "good".to_owned(),
@@ -109,7 +109,7 @@ fn verdict(warnings: usize) -> String {
     }
 }
 
-/// Appends a heading and indented lines. If `lines` is empty, appends `none` instead.
+/// Appends a heading and indented lines. If `lines` is empty, appends the text `none` instead of them.
 fn list(heading: &str, lines: &[String], none: &str, page: &mut String) {
     page.push_str(&format!("\n{heading}\n"));
     for line in lines.iter().map(String::as_str).chain(Some(none).filter(|none| lines.is_empty() && !none.is_empty())) {

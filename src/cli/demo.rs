@@ -129,7 +129,7 @@ impl Demo {
         self.show_alarm_frames()
     }
 
-    /// Simulates until one cycle after both alarms, or for [`MAX_CYCLES`].
+    /// Simulates until one cycle after the later of the two alarms, at most [`MAX_CYCLES`] cycles.
     fn live(&mut self) -> io::Result<()> {
         let (mut samples, mut cycles) = (0_u64, 0);
         let mut frames = Vec::new();
@@ -190,11 +190,11 @@ impl Demo {
 
     fn is_complete(&self) -> bool {
         let last = self.first(Rule::CapacityLow).zip(self.first(Rule::RechargePeriodLow));
-        // The demo ends one cycle after the last alarm.
+        // The demo ends one cycle after the later alarm.
         last.is_some_and(|(a, b)| self.sim.pack().cycles() + 1 > a.cycle.max(b.cycle) + 1)
     }
 
-    /// A table row with the present estimate and the true value.
+    /// A table row with the present estimates and the true values.
     fn row(&self, moment: &Moment, cycles: u32) -> String {
         let soc = match self.monitor.latest().next().flatten() {
             Some(e) => format!("{:6.1} +-{:5.1}", 100.0 * e.soc, 100.0 * e.soc_std),

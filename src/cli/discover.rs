@@ -1,7 +1,7 @@
 //! `packwatch discover`: finds the signals of the traction battery in a log.
 //!
-//! The exit code is 1 if a file cannot be read or the log has no frames. If no signals are found, the output says so
-//! and the exit code is 0.
+//! The exit code is 1 if a file cannot be read, the log has no frames, or the configuration cannot be written. If no
+//! signals are found, the output says so; without `--write`, the exit code is 0.
 
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
@@ -99,7 +99,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
 }
 
-/// Writes the configuration if it is valid.
+/// If the configuration is valid, writes it, and a DBC with the fields that no given DBC describes.
 fn write(
     args: &Args,
     discoverer: &Discoverer,
@@ -203,7 +203,7 @@ fn page(discovery: &Discovery) -> String {
     text
 }
 
-/// The next step if nothing was found because nothing describes the frames; empty if this is not the case.
+/// If nothing was found and no DBC file was given, advises to give one; otherwise empty.
 fn no_definitions(args: &Args, discovery: &Discovery) -> &'static str {
     if !discovery.candidates.is_empty() || !args.dbc.is_empty() {
         return "";
@@ -221,7 +221,7 @@ fn row(candidate: &Candidate) -> Vec<String> {
     vec![rank, candidate.signal.clone(), candidate.interface.clone(), values, candidate.reasons.join("; ")]
 }
 
-/// Formats with at most three decimals.
+/// Formats a number with at most three decimals.
 fn number(value: f64) -> String {
     let text = format!("{value:.3}");
     text.trim_end_matches('0').trim_end_matches('.').to_owned()

@@ -1,8 +1,8 @@
-//! `packwatch doctor`: listens to a pack or replays a record, and reports probable faults of the wiring and of the
+//! `packwatch doctor`: listens to a pack or replays logs, and reports probable faults of the wiring and of the
 //! configuration.
 //!
-//! Exit codes: 0 = no errors and no warnings, 1 = findings, 78 = invalid configuration (the parts of it that can be
-//! read are still checked).
+//! Exit codes: 0 = no errors and no warnings found; 1 = errors or warnings found, or the check failed; 78 = invalid
+//! configuration (its readable parts are still checked).
 
 mod page;
 

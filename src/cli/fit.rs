@@ -1,7 +1,7 @@
 //! `packwatch fit`: fits a cell model to measured data.
 //!
-//! Prints a table of the files with their residuals, then warnings, a verdict, and the result of the fit. Writes the
-//! model file only if it is complete.
+//! Prints a table of the files with their residuals, then notes, a verdict, and the result of the fit. The model file
+//! gets its final name only when it is complete.
 
 mod report;
 
@@ -148,7 +148,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     unless_closed(report::table(&outcome, seconds, &args.out))
 }
 
-/// Fits to logs. Parts of the request that are not given come from the configuration.
+/// Fits to logs. If no name is given, the name comes from the configuration; the rated capacity always does.
 fn fit_logs(
     args: &Args,
     request: &mut FitRequest,

@@ -10,7 +10,7 @@ use clap_mangen::Man;
 use super::common::output::print;
 use packwatch_host::failure::Failure;
 
-/// Text of the main page in addition to the definition of the command line.
+/// Text of the main page that follows the part generated from the command line.
 const MAIN_PAGE: &str = "\
 .SH EXIT STATUS
 0: success. 1: failure. 2: wrong command line. 78: wrong configuration. A command with further codes lists them.
@@ -53,7 +53,7 @@ enum GenerateCommand {
     },
 }
 
-/// Shells of Linux; other generators would only add code to the vehicle's program.
+/// Common shells on Linux. Completions for other shells would only enlarge the program on the vehicle.
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum Shell {
     Bash,
@@ -61,7 +61,7 @@ enum Shell {
     Fish,
 }
 
-/// Runs the command; `all` is the whole command line.
+/// Runs the command; `all` is the definition of the whole command line.
 pub(crate) fn run(args: &Args, all: &clap::Command) -> Result<(), Failure> {
     match &args.what {
         GenerateCommand::Man { folder } => write_all(folder, &manual_pages(all)),
@@ -69,7 +69,7 @@ pub(crate) fn run(args: &Args, all: &clap::Command) -> Result<(), Failure> {
     }
 }
 
-/// The command line without hidden commands.
+/// Definition of the command line without hidden commands.
 fn visible(all: &clap::Command) -> clap::Command {
     let shown = all.get_subcommands().filter(|command| !command.is_hide_set()).cloned();
     let mut command = clap::Command::new("packwatch").propagate_version(true).subcommands(shown);

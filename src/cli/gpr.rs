@@ -118,7 +118,7 @@ struct ColumnArgs {
 }
 
 impl ColumnArgs {
-    /// Reads the inputs, then the output.
+    /// Reads the columns: first the inputs, then the output.
     fn table(&self, files: &FileArgs) -> Result<ColumnTable, Failure> {
         let columns: Vec<String> = self.inputs.iter().chain([&self.output]).cloned().collect();
         let wanted = ColumnSelection { columns: &columns, optional: &[], missing: files.missing() };

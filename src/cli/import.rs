@@ -1,8 +1,8 @@
 //! `packwatch import`: converts signal lists of a car, or a BPX cell, to configuration files.
 //!
-//! Standard error shows how many items were left out for each reason. The written file lists these items with their
-//! positions. The exit code is 1 if the file cannot be read, has another format, or contains nothing that can be
-//! converted.
+//! If signals or commands of an OBDb signal set are left out, standard error shows how many for each reason, and the
+//! written file lists them with their positions. The exit code is 1 if the file cannot be read, has another format, or
+//! contains nothing that can be converted.
 
 use std::path::{Path, PathBuf};
 

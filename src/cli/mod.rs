@@ -219,8 +219,8 @@ pub fn main() -> ExitCode {
     }
 }
 
-/// Lets every option accept a negative number, so that its parser rejects `--sleep-gap -1` and states what is allowed.
-/// Otherwise clap would report `-1` as an unknown option.
+/// Lets every option accept a negative number. The option's own parser then rejects `--sleep-gap -1` and states what is
+/// allowed. Otherwise clap would report `-1` as an unknown option.
 fn with_negative_numbers(command: clap::Command) -> clap::Command {
     let accept = |arg: clap::Arg| {
         let takes_value = !arg.is_positional() && arg.get_action().takes_values();

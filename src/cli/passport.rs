@@ -1,5 +1,5 @@
-//! `packwatch passport`: writes a battery passport as JSON from a store or a replay, merged with the manufacturer's
-//! part.
+//! `packwatch passport`: writes a battery passport as JSON. The passport merges measured values, from a store or a
+//! replay, with the manufacturer's part.
 
 use std::cell::RefCell;
 use std::fs::File;
@@ -24,7 +24,7 @@ use crate::replay::{OutputSink, Sinks};
 use crate::store::HistoryReader;
 use packwatch_host::failure::Failure;
 
-/// Largest file with the manufacturer's part, bytes; a passport has about 10 kB.
+/// Maximum size of the file with the manufacturer's part, bytes. A passport has about 10 kB.
 const MAX_STATIC_BYTES: u64 = 16 << 20;
 
 /// Standards by name.

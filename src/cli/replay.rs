@@ -1,4 +1,5 @@
-//! `packwatch replay`: replays records through the same core as live data, or onto an interface.
+//! `packwatch replay`: replays logs through the same core that handles live data, or sends their frames on an
+//! interface.
 
 mod args;
 mod each;
@@ -78,7 +79,8 @@ fn play(args: &Args, source: &mut LogSource, settings: &ReplaySettings, interfac
 }
 
 fn settings(args: &Args, config: &Config) -> Result<ReplaySettings, Failure> {
-    // Frames that are sent on an interface keep their timing. A replay through the core runs as fast as possible.
+    // Without `--speed`, frames sent on an interface keep their timing, and a replay through the core runs as fast as
+    // possible.
     let speed = args.speed.or(args.to.is_some().then_some(1.0));
     Ok(ReplaySettings {
         speed: speed.filter(|speed| speed.is_finite()),
@@ -96,7 +98,7 @@ fn settings(args: &Args, config: &Config) -> Result<ReplaySettings, Failure> {
     })
 }
 
-/// Settings for the selected part of the log, at full speed, without storing anything.
+/// Settings for a replay of the selected part of the log at full speed, without storing anything.
 fn plain_settings(args: &Args, config: &Config) -> ReplaySettings {
     let plain = ReplaySettings::plain(args.input.sleep_gap, config.interface_names());
     ReplaySettings { from: args.from, until: args.until, ..plain }

@@ -110,7 +110,7 @@ impl Args {
     }
 }
 
-/// Data, provenance, vehicle and last state of a report.
+/// What a report is made from: data, provenance, vehicle and last state.
 type ReportInput = (Data, Provenance, VehicleIdentity, Option<Snapshot>);
 
 /// Lines of the provenance: name and value.

@@ -73,12 +73,12 @@ fn each<T>(args: &Args, work: impl Fn(&rul::History, &str, Threshold) -> T) -> R
     Ok(all)
 }
 
-/// Parses a percentage above 0 and below 100 to a fraction.
+/// Parses a percentage above 0 and below 100, and returns a fraction.
 fn below_100(percent: &str) -> Option<f64> {
     finite(percent).ok().filter(|percent| *percent > 0.0 && *percent < 100.0).map(|percent| percent / 100.0)
 }
 
-/// Parses a percentage to a fraction.
+/// Parses a percentage above 0 and below 100, with or without a percent sign. Returns a fraction.
 fn part(text: &str) -> Result<f64, String> {
     below_100(text.trim().trim_end_matches('%')).ok_or_else(|| "must be a percentage above 0 and below 100".to_owned())
 }

@@ -1,8 +1,8 @@
-//! `packwatch simulate`: simulates a pack with known true state, as frames of the configured DBC.
+//! `packwatch simulate`: simulates a pack and encodes its measurements as frames of the configured DBC.
 //!
 //! Output: a candump log (`-o`, compressed if its name ends in `.gz`) or frames on an interface (`--to`), and the true
-//! state as CSV (`--truth`). The same seed gives the same bytes on every machine. Frames of one sample are spaced as on
-//! a 1 Mbit/s bus, or closer if the next sample would otherwise be late.
+//! state as CSV (`--truth`). The same seed gives the same bytes on every machine. The frames of one sample are spaced
+//! as on a 1 Mbit/s bus, or closer if they would otherwise delay the next sample.
 
 mod output;
 mod player;
@@ -22,7 +22,7 @@ use output::{LogWriter, TruthColumns, TruthWriter};
 use packwatch_host::failure::Failure;
 use player::Player;
 
-/// Time between frames sent together, ns: a classic frame of 8 bytes at 1 Mbit/s.
+/// Time between the frames of one sample, ns: the duration of a classic frame of 8 bytes at 1 Mbit/s.
 const FRAME_SPACING_NS: i64 = 130_000;
 
 /// Arguments of `simulate`.
@@ -183,8 +183,8 @@ fn wiring(sample: &SampleConfig) -> Wiring {
     Wiring { strings: sample.strings.max(1), temperature_at: (0..sensors).map(cell_of).collect() }
 }
 
-/// Encodes the frames of a moment. Frames with the current come first, because the voltages contain the voltage drop
-/// that this current causes.
+/// Encodes the frames of one sample. The frames with the current come first, because this current causes a part of the
+/// voltages.
 struct FrameMaker {
     encoder: InputEncoder,
     protector: InputProtector,

@@ -85,7 +85,7 @@ fn shown(value: Option<f64>, decimals: usize, unit: &str) -> String {
     value.map_or_else(|| "-".to_owned(), |value| format!("{value:.decimals$}{unit}"))
 }
 
-/// Formats a value with its standard deviation, if that is known; an unknown value becomes a dash.
+/// Formats a value, with its standard deviation if this is known. An unknown value becomes a dash.
 fn with_std<const IS_PACK: bool>(values: &Values<IS_PACK>, quantity: Quantity, decimals: usize) -> String {
     let (unit, factor) = screen_unit(quantity.row().unit);
     match values.get(quantity) {
@@ -156,7 +156,7 @@ fn store(document: &StatusDocument) -> String {
     text
 }
 
-/// Describes the configuration: its name and the start of its hash.
+/// Describes the configuration: its path, the number of drop-ins, and the start of its hash.
 fn config(document: &StatusDocument) -> String {
     let file = |config: &crate::status::document::ConfigFile| {
         let drop_ins = match config.drop_ins.len() {

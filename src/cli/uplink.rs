@@ -1,7 +1,7 @@
 //! `packwatch mqtt`, `kuksa` and `vss`: replace this process by the program `packwatch-uplink`, which is in a separate
 //! package.
 //!
-//! The program is searched for first in the folder of this program, then in `PATH`.
+//! `packwatch-uplink` is searched for first in the folder of this program, then in `PATH`.
 
 use std::ffi::OsString;
 use std::io;
@@ -33,8 +33,8 @@ pub(crate) fn run(command: &str, args: &Args) -> Result<(), Failure> {
     }))
 }
 
-/// Path of `packwatch-uplink` in the folder of this program. If it is not there, returns its name, which is then
-/// searched for in `PATH`.
+/// Path of `packwatch-uplink` in the folder of this program. If that file does not exist, returns only the name, which
+/// is then searched for in `PATH`.
 fn program() -> PathBuf {
     let beside = std::env::current_exe().ok().map(|own| own.with_file_name(PROGRAM));
     beside.filter(|path| path.is_file()).unwrap_or_else(|| PROGRAM.into())

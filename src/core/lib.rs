@@ -1,7 +1,8 @@
 //! The pure core: frames in; estimates, alarms and frames out. The core never reads a clock, a file or a socket and
 //! never logs. The same inputs therefore give the same outputs, byte for byte. No dependency of this crate does I/O.
-//! Keys for authenticated frames stay in the driver, which creates and checks authenticators and passes the results to
-//! the core.
+//! Keys for authenticated frames stay in the driver, the program that feeds the core. The driver writes the
+//! authenticators into sent frames. It also checks the authenticators of received frames and passes the results to the
+//! core.
 //!
 //! # Data path
 //! [`monitor::Monitor`] handles every record. Data flows in one direction. `monitor/message` defines the records that
@@ -60,8 +61,9 @@
 //!
 //! # Invariants
 //! * Internally, current is positive for discharge and SOC is a fraction; only [`can`] deals with wire units.
-//! * A bad reading is data with a fault; an unknown value never looks healthy.
-//! * Time never goes backwards. A gap in the input does not count towards any duration.
+//! * A bad reading is passed on with its fault. An unknown value never counts as healthy.
+//! * If the driver's clock was set back, the elapsed time counts as unknown. A gap in the input does not count towards
+//!   the debounce of a measured value, and it interrupts the timing of a recharge period.
 
 pub mod alarm;
 pub mod can;

@@ -12,9 +12,10 @@ pub mod catalogue;
 
 use serde::{Deserialize, Serialize};
 
-/// A point in time on the driver's clock, in integer nanoseconds.
+/// A point in time on the clock of the driver (the program that feeds the core), in integer nanoseconds.
 ///
-/// The driver chooses the origin: the daemon uses the wall time of its start, a replay the time stamps of its log. The
+/// The driver chooses the origin. The daemon counts from 1970: it reads the wall clock at its start, and then a clock
+/// that never steps. A replay uses the time stamps of its log. Apart from the freshness of authenticated messages, the
 /// core uses only differences.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default, Serialize, Deserialize)]
 #[serde(transparent)]
@@ -85,7 +86,7 @@ impl InvalidState {
         if is_sound { Ok(()) } else { Err(Self { what, found, allowed }) }
     }
 
-    /// Rejects numbers that are not finite or larger than 1e20 in size. Squares and cubes of the other numbers do not
+    /// Rejects numbers that are not finite or whose size exceeds 1e20. Squares and cubes of smaller numbers do not
     /// overflow.
     pub fn unless_number(what: &'static str, found: f64) -> Result<(), Self> {
         bounds::NUMBER.check(what, found)

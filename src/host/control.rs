@@ -1,19 +1,20 @@
-//! The control socket: lists the alarms of a running daemon on the same computer and sends it commands.
+//! The control socket. Over this socket, clients on the same computer list the alarms of a running daemon and send
+//! commands to it.
 //!
-//! The control socket is a Unix stream socket. Requests and answers are lines of JSON. Answers have the order of the
-//! requests:
+//! The control socket is a Unix stream socket. Requests and answers are lines of JSON. Requests are answered in order:
 //! ```text
 //! {"version":1,"request":"alarms"}                    {"version":1,"ok":true,"time":...,"alarms":[...],...}
 //! {"version":1,"request":"clear","rule":"soc_low"}    {"version":1,"ok":true,"changed":1,"refused":0,...}
 //! {"version":1,"request":"nonsense"}                  {"version":1,"ok":false,"error":"..."}
 //! ```
-//! [`protocol`] defines every request and answer; in requests and answers, cells count from 0, as in events.
+//! [`protocol`] defines every request and answer. In both, cells count from 0, as in events.
 //!
 //! * The socket's owner and group may read (mode 0660). Commands are executed only for the daemon's own user and for
 //!   root. The kernel identifies the user (`SO_PEERCRED`). Other users get an error.
-//! * Each connection is a task. It sends the daemon's loop one request at a time over a bounded queue. A connection
-//!   that never reads or writes does not block other connections and is closed. If all slots are taken, a new
-//!   connection replaces the one that has been idle longest.
+//! * Each connection is a task. The task sends the daemon's loop one request at a time over a bounded queue. A client
+//!   that never reads or writes does not block other clients, and its connection is closed.
+//! * If all slots are taken, a new connection replaces the one that has been idle longest. If none has been idle
+//!   for long enough, the new connection is rejected.
 //! * A command reaches the core as an input, so the journal records the command and a replay repeats it.
 
 pub mod answer;
@@ -36,24 +37,24 @@ pub const MAX_CONNECTIONS: usize = 8;
 pub const MAX_PER_PROCESS: usize = 4;
 /// Longest request, bytes, including the end of the line. The longest valid request has less than 200 bytes.
 pub const MAX_REQUEST_BYTES: usize = 4096;
-/// Time within which a client must send its request, and time within which it must read the answer. A script needs
-/// milliseconds, and a client must not keep one of the few slots for ever.
+/// Time that a client has to send a request, and again to read the answer. A script needs milliseconds. Without this
+/// limit, a silent client could keep one of the few slots for ever.
 pub const MAX_SILENCE: Duration = Duration::from_secs(10);
-/// Maximum number of alarms in an answer. So many alarms make a line of a few hundred kilobytes, which is serialised in
-/// a few milliseconds. Further alarms are counted.
+/// Maximum number of alarms in an answer. An answer with this many alarms has a few hundred kilobytes and is serialised
+/// in a few milliseconds. Further alarms are only counted.
 pub const MAX_LISTED: usize = 1024;
 
-/// The socket's name in the folder of the daemon.
+/// File name of the socket in the daemon's runtime folder.
 const FILE_NAME: &str = "control.sock";
 /// File mode of the socket: owner and group may connect.
 const MODE: u32 = 0o660;
 
-/// The default path of a daemon's socket.
+/// The default path at which a daemon opens its socket.
 pub fn daemon_path() -> PathBuf {
     runtime_folder().join(FILE_NAME)
 }
 
-/// The socket's default path for clients.
+/// The default path at which clients look for the socket.
 pub fn standard_path() -> PathBuf {
     client_folder().join(FILE_NAME)
 }

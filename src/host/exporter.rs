@@ -1,14 +1,16 @@
-//! The exporter serves the daemon's status as metrics over HTTP. It is a separate process, so that no fault of the
-//! exporter can affect the estimation loop.
+//! The exporter serves the daemon's status as metrics over HTTP. The exporter is a separate process, so its faults
+//! cannot affect the estimation loop.
 //!
-//! * `/metrics`: each scrape reads the status socket within [`STATUS_LIMIT`]. If there is no fresh document, the answer
-//!   contains only `packwatch_up 0`. Clients that accept OpenMetrics 1.0 receive it; other clients receive Prometheus'
-//!   text format 0.0.4.
+//! * `/metrics`: each scrape reads the daemon's status from its socket. If no status arrives within [`STATUS_LIMIT`],
+//!   the answer contains only `packwatch_up 0`. Clients that accept OpenMetrics 1.0 receive that format; other clients
+//!   receive Prometheus' text format 0.0.4.
 //! * `/`: a short page; `/-/healthy`: a liveness check.
 //! * At most [`MAX_CONNECTIONS`] connections are open, and [`MAX_PER_ADDRESS`] per client address. A further connection
-//!   replaces the one that has been idle longest ([`ConnectionSlots`]). The head of a request may have up to
-//!   [`MAX_REQUEST_BYTES`] bytes and must arrive within [`HEAD_LIMIT`]. Bodies are not read. SIGTERM and SIGINT stop
-//!   the exporter cleanly.
+//!   replaces the one that has been idle longest. If none has been idle for long enough, the further connection is
+//!   closed ([`ConnectionSlots`]).
+//! * The head of a request may have up to [`MAX_REQUEST_BYTES`] bytes and must arrive within [`HEAD_LIMIT`]. Bodies are
+//!   not read.
+//! * SIGTERM and SIGINT stop the exporter cleanly.
 
 use std::cell::Cell;
 use std::convert::Infallible;
@@ -51,12 +53,12 @@ const MAX_HEADERS: usize = 64;
 const HEAD_LIMIT: Duration = Duration::from_secs(30);
 /// Longest life of a connection, so that a slow reader does not keep its slot for ever.
 const CONNECTION_LIMIT: Duration = Duration::from_secs(300);
-/// Time to finish the current answer when a connection reaches [`CONNECTION_LIMIT`]. This time equals the longest
-/// duration of a scrape.
+/// Time to finish the current answer when a connection reaches [`CONNECTION_LIMIT`]. By default, Prometheus waits this
+/// long for a scrape.
 const ANSWER_LIMIT: Duration = Duration::from_secs(10);
-/// Longest time to read the daemon's status. This is less than the ten seconds that a scrape may take.
+/// Longest time to read the daemon's status. This is less than the ten seconds that Prometheus waits for a scrape.
 const STATUS_LIMIT: Duration = Duration::from_secs(3);
-/// Time to finish running answers when the exporter stops.
+/// Time to finish the current answers when the exporter stops.
 const DRAIN_LIMIT: Duration = Duration::from_secs(1);
 /// Pause after a connection could not be accepted.
 const ACCEPT_PAUSE: Duration = Duration::from_secs(1);
@@ -75,7 +77,7 @@ struct StatusSource {
     is_up: Cell<Option<bool>>,
 }
 
-/// Serves the status of the daemon at `socket` on the address `listen`, until a signal.
+/// Reads the daemon's status from `socket` and serves it on the address `listen`, until a signal stops the exporter.
 ///
 /// # Errors
 /// Fails if the address cannot be bound.
@@ -123,8 +125,8 @@ async fn serve(listener: TcpListener, source: Rc<StatusSource>) -> io::Result<()
     }
     notify(&[NotifyState::Stopping]);
     drop(listener);
-    // Running answers are finished within a short wait. Then all connections are closed, because idle connections have
-    // nothing to finish.
+    // The current answers get a short time to finish. Then the remaining connections are closed, because an idle
+    // connection would stay open.
     let drained = async { while connections.join_next().await.is_some() {} };
     let _ = timeout(DRAIN_LIMIT, drained).await;
     tracing::info!("exporter stopped");
@@ -206,7 +208,7 @@ fn wants_openmetrics(headers: &HeaderMap) -> bool {
 }
 
 impl StatusSource {
-    /// Reads the daemon's status; `None` = no status was received in time. Logs when the daemon starts or stops
+    /// Reads the daemon's status; `None` = no valid status was received in time. Logs when the daemon starts or stops
     /// answering.
     async fn read(&self) -> Option<StatusDocument> {
         let line = timeout(STATUS_LIMIT, self.line()).await.unwrap_or_else(|late| Err(late.into()));

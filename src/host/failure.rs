@@ -2,7 +2,8 @@
 
 use crate::config::ConfigFaults;
 
-/// Exit code of a bad configuration (EX_CONFIG; systemd does not restart a service after this code).
+/// Exit code of a bad configuration (EX_CONFIG). The service files tell systemd not to restart a service after this
+/// code.
 pub const EXIT_CONFIG: u8 = 78;
 
 /// Why a command failed.

@@ -91,7 +91,7 @@ fn targets(text: &str) -> Result<Targets, String> {
     Ok(filter.with_targets(members))
 }
 
-/// Whether standard error is the journal. systemd identifies the journal's stream by device and inode.
+/// Whether standard error is connected to journald. systemd identifies this stream by device and inode.
 fn stderr_is_journal() -> bool {
     let Ok(stream) = std::env::var("JOURNAL_STREAM") else { return false };
     std::fs::metadata("/proc/self/fd/2").is_ok_and(|file| stream == format!("{}:{}", file.st_dev(), file.st_ino()))

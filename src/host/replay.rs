@@ -41,7 +41,7 @@ use rows::{write_estimate, write_estimates_header, write_frame};
 pub use summary::ReplaySummary;
 use summary::{note_event, peak_memory_kib};
 
-/// Records between two progress reports.
+/// Number of records between two progress reports.
 const REPORT_EVERY: usize = 4096;
 
 /// Settings of a replay. The default replays everything as fast as possible and stores nothing.
@@ -123,9 +123,9 @@ pub enum ReplayError {
 /// Progress of a replay.
 #[derive(Debug, Clone, Copy)]
 pub struct ReplayProgress {
-    /// Bytes of the logs read.
+    /// Bytes read from the logs.
     pub bytes: u64,
-    /// Frames passed to the core.
+    /// Frames read from the logs by [`run`], or frames sent by [`play`].
     pub frames: u64,
     /// Average speed, as a multiple of real time.
     pub times_real_time: f64,
@@ -168,7 +168,7 @@ fn progress(source: &LogSource, frames: u64, span: &RecordSpan) -> ReplayProgres
     ReplayProgress { bytes, frames, times_real_time: span.times_real_time() }
 }
 
-/// Sends the frames of `source` at their times; returns the number of frames sent. `send` may block.
+/// Sends the frames of `source` at the speed of the settings; returns the number of frames sent. `send` may block.
 ///
 /// # Errors
 /// Fails if a log cannot be read or `send` fails.
@@ -213,15 +213,15 @@ struct Replay {
     window: TimeWindow,
     sinks: Sinks,
     settings: ReplaySettings,
-    /// Time of the snapshot, once the first stamp is known.
+    /// Requested time of the snapshot; `None` before the first record, and when the snapshot has been taken.
     snapshot_at: Option<Timestamp>,
     snapshot: Option<Snapshot>,
     summary: ReplaySummary,
     /// Whether the summary already notes a reload of the recorded run.
     reloaded: bool,
     learned: BTreeMap<CellIndex, RecordedValues>,
-    /// Number of voltage readings that had reached an estimator when the restored state was stored; `None` until the
-    /// first input.
+    /// Number of voltage readings that the estimators handled before this replay: 0 without a restored state. With a
+    /// restored state, `None` until the first input has been handled.
     steps_before: Option<u64>,
 }
 
@@ -292,7 +292,7 @@ impl Replay {
         }
     }
 
-    /// Handles the first record.
+    /// Prepares the first record: computes the time of the snapshot and restores the initial state.
     fn begin(&mut self, record: &Record) -> Result<(), ReplayError> {
         let first = self.window.first.unwrap_or(record.time);
         self.snapshot_at = self.settings.snapshot_at.filter(|_| self.settings.snapshot).map(|at| at.resolve(first));

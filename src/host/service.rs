@@ -65,7 +65,7 @@ pub struct Service {
     pub restore: Option<Snapshot>,
     /// Age of the initial state.
     pub downtime: Downtime,
-    /// File for the state when the daemon stops.
+    /// File to which the daemon writes the state when it stops.
     pub snapshot: Option<PathBuf>,
     /// Time after which the service stops; `None` = it runs until a signal.
     pub duration: Option<Duration>,
@@ -140,7 +140,8 @@ impl Service {
         let (links, outputs) = self.start_links(clock, &sender);
         engine.links = outputs;
         drop(sender);
-        // The first input is a tick at the time of the start. The frames that it causes wait for the interfaces.
+        // The first input is a tick at the time of the start. The frames that this tick causes wait in the send queues
+        // until the tasks of the interfaces run.
         engine.handle(&Record::tick(clock.now()));
         engine.report_store_health(clock.now());
         let status_publisher = StatusPublisher::new(status, self.identity(clock));
@@ -205,7 +206,7 @@ fn log_commands(config: &Config) {
     }
 }
 
-/// Notifies the service manager, if there is one.
+/// Notifies the service manager, if it expects notifications.
 pub(super) fn notify(states: &[NotifyState<'_>]) {
     if let Err(error) = sd_notify::notify(states) {
         tracing::warn!(%error, "service manager not notified");

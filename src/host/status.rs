@@ -8,9 +8,9 @@
 //! | `status-stream.sock` | one [`StatusDocument`] as a line of JSON every second, until the client closes |
 //!
 //! * Every user who can reach the sockets may read (mode 0666), because the document contains no secrets and the
-//!   exporter runs as a separate user. With the shipped unit, only root and the exporter can reach the sockets. The
-//!   service runs as a dynamic user, and systemd keeps the service's folder inside a closed folder. Only the control
-//!   socket can change anything, and other users cannot connect to it.
+//!   exporter runs as a separate user. With the shipped units, only root, the exporter and the uplinks can reach the
+//!   sockets: the service runs as a dynamic user, and systemd keeps the folder of such a service inside a folder that
+//!   only root can enter. A client can change something only through the control socket, which not every user may open.
 //! * Once a second, the service loop copies the values of a document into a draft and offers the draft to a separate
 //!   thread. That thread serialises the draft and serves the clients, so no client affects the loop. A draft offered
 //!   while the thread is busy is dropped and counted.
@@ -42,7 +42,7 @@ use crate::io::unix_socket::{client_folder, runtime_folder};
 /// Maximum number of clients of both sockets together. A vehicle needs far fewer: a display, an exporter and a few
 /// scripts. Each client uses a descriptor and a few kilobytes.
 pub const MAX_CLIENTS: usize = 64;
-/// Longest time in which a client must read a document.
+/// Longest time that a client may take to read a document, and longest wait of a client for a fresh document.
 pub const MAX_SILENCE: Duration = Duration::from_secs(5);
 /// Time between documents.
 pub const PERIOD: Duration = Duration::from_secs(1);

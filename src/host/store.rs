@@ -5,9 +5,9 @@
 //!   ms for the disk ([`commit_barrier`]). Learned results are stored with the whole state. An alarm change is stored
 //!   as a small row of the history. A start restores the newest state, then reapplies newer alarm changes (`learned`).
 //! * Rows are committed before the state that contains them (`writer`). If the power is cut between these two writes,
-//!   the rows were not announced. The next start reapplies their alarm changes. Learned results are learned again and
-//!   get a second row. A pack change is not undone: the history says that the state's pack is closed, so the state is
-//!   not restored.
+//!   the results in these rows were not announced. The next start reapplies the alarm changes in the rows. Learned
+//!   results are learned again and get a second row. A pack change is not undone: the history shows that the pack of
+//!   the state has been replaced, so the state is not restored.
 //! * The state is also written at checkpoints (`checkpoint`), on stop, and every second to the runtime folder, which is
 //!   in memory.
 //! * The state is written to two files in turn (`state_files`) and does not depend on the database. If there is no
@@ -311,7 +311,7 @@ struct OpenedFolder {
     state_files: StateFiles,
     /// The open database; `None` = the database cannot be used at present.
     database: Option<Database>,
-    /// Rows to add to the history about opening the folder.
+    /// Rows to add to the history. They report what was found while the folder was opened.
     rows: Vec<HistoryRow>,
     /// Number of the connected pack; 0 = unknown.
     pack: i64,
@@ -373,8 +373,8 @@ fn read<T>(database: Option<&Database>, read: impl Fn(&Database) -> rusqlite::Re
     found.inspect_err(|error| tracing::error!(%error, "the history cannot be read")).ok().flatten().unwrap_or_default()
 }
 
-/// Returns a row for the history if the state knows newer rows than the database has. Damage to SQLite's log has no
-/// other symptom.
+/// Returns a row for the history if the database has fewer rows than when the state was stored. Damage to SQLite's log
+/// has no other symptom.
 fn lost_rows(state: &StateDocument, database: &Database) -> Option<HistoryRow> {
     let (known, found) = (state.history_rows, database.rows());
     let detail = format!("the history ends with row {found}, the stored state knew {known}");

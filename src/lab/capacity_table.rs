@@ -6,9 +6,9 @@
 //! | `capacity_ah` or `capacity_ah_source` | capacity, Ah, above 0; empty = not measured |
 //! | `soc` | SOC, fraction; empty = not measured |
 //! | `cell` | number of the cell, from 0 |
-//! | `cycle` | number of the part of a measured file |
+//! | `cycle` | number of the part of a measured file that the row describes |
 //! | `type` | kind of the cycle: `discharge` or another word |
-//! | `duration_s` | time in use, s |
+//! | `duration_s` | how long the cell was in use from the time of the row on, s |
 
 use std::borrow::Cow;
 use std::path::Path;
@@ -94,7 +94,8 @@ impl CapacityTable {
     /// Returns the next row, or `None` at the end of the file.
     ///
     /// # Errors
-    /// The file cannot be read, or a field is wrong. The error names the file, line and column, what was found and what is allowed.
+    /// The file cannot be read, or a field is wrong. The error names the file, line and column, what was found and what
+    /// is allowed.
     pub(crate) fn next_row(&mut self) -> Result<Option<CapacityRow<'_>>, TableError> {
         let Some(row) = self.table.next_row()? else { return Ok(None) };
         let time = row.stamp(self.time)?;

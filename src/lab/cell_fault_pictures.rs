@@ -1,5 +1,5 @@
-//! Draws the results of a cell fault detector. For each estimated state, one picture shows how far each cell is from the median of its
-//! pack.
+//! Draws the results of a cell fault detector. For each estimated quantity, one picture shows how far each cell is from
+//! the median of its pack.
 //!
 //! A bar is a 95 % interval. A cell is red if the detector has reported one of the findings that the picture shows.
 
@@ -113,7 +113,7 @@ fn picture(shown: &Shown, cells: &[[Option<ScalarGaussian>; STATES]], findings: 
     let is_found = |cell: usize| {
         findings.iter().any(|found| shown.kinds.contains(&found.kind) && found.is_of(CellIndex(cell as u16)))
     };
-    // Number, value and half of the interval of each cell.
+    // Number, value and half the width of the interval of each cell.
     let shown_of = |wanted: bool| {
         let of_one = move |(cell, states): (usize, &[Option<ScalarGaussian>; STATES])| {
             let size = states[shown.state].filter(|_| is_found(cell) == wanted)?;

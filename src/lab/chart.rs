@@ -1,4 +1,5 @@
-//! Draws pictures as SVG: lines, bands, points and thresholds over an axis of numbers or dates; bands of states; heat maps.
+//! Draws pictures as SVG: lines, bands, points and thresholds over an axis of numbers or dates; bands of states; heat
+//! maps.
 //!
 //! Input: values in the units that the labels name. Output: SVG in one style. A value that is not finite interrupts a
 //! line. Elements have CSS classes, and the page or file defines their colours for a light and a dark background

@@ -1,13 +1,13 @@
-//! Finds the signals of the traction battery in a log: pack current and voltage, cell voltages, temperatures, and the battery
-//! controller's own SOC and SOH.
+//! Finds the signals of the traction battery in a log: pack current and voltage, cell voltages, temperatures, and the
+//! battery controller's own SOC and SOH.
 //!
 //! Input: frames with times; optionally DBC files and definitions of diagnostic answers. Output: for each quantity,
 //! ranked candidates with their reasons in plain words. Answers to diagnostic requests are read regardless of which
-//! device sent the requests. In the bits of answers that no definition describes, the search looks for rows of cell
-//! voltages and other fields. Memory is bounded. Any frames are accepted.
+//! device sent the requests. If no definition describes some bits of an answer, the search looks in these bits for rows
+//! of cell voltages and for other fields. Memory is bounded. Any frames are accepted.
 //!
-//! The owner must confirm the result, because names can mislead and a parked car shows little. If a field has no definition, its scale
-//! is guessed from plausible values.
+//! The owner must confirm the result, because names can mislead and a parked car shows little. If a field has no
+//! definition, its scale is guessed from plausible values.
 
 mod capture;
 mod configuration;

@@ -1,7 +1,7 @@
 //! Finds the values of an event or of a history row by name.
 //!
-//! Events and the rows of a store use the same names for the same values. An unknown value is null or a number that is not finite; it
-//! is returned as `None`. Finite numbers are returned unchanged.
+//! Events and the rows of a store use the same names for the same values. An unknown value is null or a number that is
+//! not finite; it is returned as `None`. Finite numbers are returned unchanged.
 
 use serde_json::{Map, Value};
 

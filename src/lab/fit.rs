@@ -58,8 +58,8 @@ const AGEING_SOC_NODES: [f64; 25] = [
     0.0, 0.03, 0.045, 0.06, 0.075, 0.09, 0.105, 0.12, 0.14, 0.17, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.85,
     0.9, 0.93, 0.96, 0.98, 1.0,
 ];
-/// Width of the SOC interval above the cut-off. The curve of an ageing cell continues below the cut-off with the slope of this
-/// interval.
+/// Width of the SOC interval above the cut-off. The curve of an ageing cell continues below the cut-off with the slope
+/// of this interval.
 const LOW_END_SOC: f64 = 0.03;
 /// Initial time constants, s, for models with 1, 2 and 3 branches.
 const TAU_S: [&[f64]; 3] = [&[60.0], &[10.0, 150.0], &[5.0, 50.0, 500.0]];
@@ -112,13 +112,14 @@ impl FileResidual {
 /// A fitted model with its provenance and quality.
 #[derive(Debug, Clone)]
 pub struct FitOutcome {
-    /// Tables and residuals per record.
+    /// Fitted tables, and the residual over all records.
     pub fit: FittedTables,
     /// Capacity, Ah.
     pub capacity_ah: f64,
     /// Lowest and highest voltage, V.
     pub voltage_v: (f64, f64),
-    /// Electrodes; `None` = a shift of the curve is given, slow tests are missing, or no known electrodes fit.
+    /// Electrodes that explain the open-circuit curve; `None` = no known electrodes explain it, a shift of the curve is
+    /// given, or a fit to measured files has no slow test.
     pub electrodes: Option<FittedElectrodes>,
     /// Thermal parameters; `None` = the data do not determine them.
     pub thermal: Option<Thermal>,
@@ -130,7 +131,7 @@ pub struct FitOutcome {
     pub by_kind: Option<(Residual, Residual)>,
     /// Residuals of each file; slow tests come last.
     pub files: Vec<FileResidual>,
-    /// The records fitted, in the order of the files; for plots.
+    /// The fitted records, in the order of the files; for plots.
     pub records: Vec<Record>,
     /// For each record, the index of its file in `files`.
     pub file_of_record: Vec<usize>,
@@ -138,7 +139,7 @@ pub struct FitOutcome {
     pub logs: Option<LogsOutcome>,
     /// Notes and warnings to print.
     pub notes: Vec<String>,
-    /// Accuracy of the model, to print at the end.
+    /// Sentences on the accuracy of the model, to print at the end.
     pub verdict: Vec<String>,
 }
 
@@ -154,8 +155,8 @@ pub struct LogsOutcome {
 /// Reads and prepares the files, and fits the model.
 ///
 /// # Errors
-/// [`FitRequest::check`] rejects the request, files cannot be read or used, or the data do not support a fit. The error has one line
-/// per fault.
+/// [`FitRequest::check`] rejects the request, files cannot be read or used, or the data do not support a fit. The error
+/// has one line per fault.
 pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Result<FitOutcome, LabError> {
     request.check()?;
     let (files, slow) = read_all(request, &mut progress)?;
@@ -208,10 +209,10 @@ fn ageing_electrodes(fitted: &FittedTables, capacity_ah: f64) -> Option<FittedEl
         .filter(|found| AgedOcv::of_electrodes(&found.electrodes, soc, capacity_ah, &rows).is_some())
 }
 
-/// Extends the open-circuit curve of an ageing cell below the cut-off of its discharges, where there are no data. The
+/// Extends the open-circuit curve of an ageing cell below the cut-off of its discharges, where data are missing. The
 /// extension is a straight line with the slope of the curve in the lowest [`LOW_END_SOC`] of SOC above the cut-off.
 /// Without the extension, the last rows under load would make the curve so steep that the estimator's innovation gates
-/// reject the first rest of an aged cell.
+/// reject the voltages of an aged cell's first rest.
 fn continue_low_end(fitted: &mut FittedTables) {
     let soc = &fitted.grid.soc;
     let cut_off = soc.partition_point(|&node| node < ageing::SOC_LEFT);
@@ -261,8 +262,8 @@ fn settings(request: &FitRequest, prepared: &prepare::FitInputs) -> FitSettings 
         tau_s,
         voltage_v: prepared.voltage_v,
         ocv: prepared.ocv.clone(),
-        // Smallest slope of the OCV of an ageing cell. Without this limit, relaxation that is slower than the branch would bend the top
-        // of the curve down.
+        // Smallest slope of the OCV of an ageing cell. Without this limit, relaxation that is slower than the branch
+        // would bend the top of the curve down.
         min_slope_v: if ageing { [(0.0, 0.2), (0.9, 1.0)].to_vec() } else { vec![] },
         deviations,
     }

@@ -1,4 +1,5 @@
-//! Applies Gaussian process regression to files: tables, cross-validation, trained models, predictions, forecasts, pictures.
+//! Applies Gaussian process regression to files: tables, cross-validation, trained models, predictions, forecasts,
+//! pictures.
 //!
 //! [`ColumnTable`] reads columns of CSV files. [`cross_validate`] cross-validates one kernel on a table.
 //! [`TrainedModel`] is a model that can be saved and loaded, with the names of its columns. [`forecast`] predicts
@@ -98,8 +99,9 @@ fn interval(p: &Prediction) -> [String; 4] {
     [p.mean, p.measurement_variance.sqrt(), p.low_95, p.high_95].map(|number| number.to_string())
 }
 
-/// Resets the peak memory that the operating system has recorded, so that the next peak belongs to the next Gaussian-process kernel. If
-/// this fails, the recorded peaks cover the time since the process started and are still upper bounds.
+/// Resets the peak memory that the operating system has recorded, so that the next peak belongs to the next
+/// Gaussian-process kernel. If this fails, the recorded peaks cover the time since the process started and are still
+/// upper bounds.
 fn reset_peak() {
     let _ = std::fs::write("/proc/self/clear_refs", "5");
 }

@@ -1,7 +1,7 @@
 //! Converts descriptions of a car's signals or of a cell from other formats to parts of a packwatch configuration.
 //!
-//! Input: the text of a file. Output: TOML that a person can read and edit, and a list of the parts that were left out, each with its
-//! path in the file and the reason. This module reads and writes no files.
+//! Input: the text of a file. Output: TOML that a person can read and edit, and a list of the parts that were left out,
+//! each with its path in the file and the reason. This module reads and writes no files.
 
 pub mod bpx;
 pub mod dbc;

@@ -33,5 +33,5 @@ fn without_compression(name: &str) -> &str {
     [".gz", ".zst"].iter().find_map(|ending| name.strip_suffix(ending)).unwrap_or(name)
 }
 
-/// Half of the 95 % interval of a normal distribution, in standard deviations.
+/// Half the width of the 95 % interval of a normal distribution, in standard deviations.
 const OF_95: f64 = 1.96;

@@ -1,11 +1,12 @@
 //! Reads the files of a cycler: CSV (plain, gzip or zstd) with time, current, voltage, temperature and ampere-hours.
 //!
-//! Columns are found by name. Required are `time_s`, `current_a` (positive = discharge) and `voltage_v`. Optional are `temperature_c`,
-//! `discharged_ah` (positive = taken out), `type` or `status`, and a part column (`cycle`, `segment` or `ref`). The time restarts at
-//! each new value of the part column. An empty field becomes NaN. A field that is not a number is an error that names the line.
+//! Columns are found by name. Required are `time_s`, `current_a` (positive = discharge) and `voltage_v`. Optional are
+//! `temperature_c`, `discharged_ah` (positive = taken out), `type`, and a part column (`cycle`, `segment` or `ref`).
+//! The time restarts at each new value of the part column. An empty field becomes NaN, except the time. An empty time,
+//! or a field that is not a number, causes an error that names the line.
 //!
-//! Files in the Battery Data Format are recognised by their columns ([`BDF_COLUMNS`]). The signs of their current and charge are
-//! inverted.
+//! Files in the Battery Data Format are recognised by their columns ([`BDF_COLUMNS`]). The signs of their current and
+//! charge are inverted.
 
 use std::path::{Path, PathBuf};
 
@@ -42,8 +43,8 @@ impl MeasuredFile {
     /// Reads a whole file.
     ///
     /// # Errors
-    /// The file cannot be read, a column is missing, a field is not a number, or there are no rows. The error states the place and what
-    /// was found.
+    /// The file cannot be read, a column is missing, a field is not a number, or the file has no rows. The error states
+    /// the place and what was found.
     pub fn read(path: &Path) -> Result<Self, TableError> {
         let mut table = Table::open(path)?;
         let columns = Columns::find(table.header())?;

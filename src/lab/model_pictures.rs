@@ -1,5 +1,5 @@
-//! Draws a cell model: open-circuit curve, slope of the curve, resistances over SOC and over temperature, and the SOC error that
-//! follows from them.
+//! Draws a cell model: open-circuit curve, slope of the curve, resistances over SOC and over temperature, and the SOC
+//! error that follows from them.
 //!
 //! Bands are 95 % intervals ([`ModelBands`]). If a model does not state the error of its curve, the curve has no band,
 //! and the description of the picture says so. A line is dashed where nothing was measured: outside the measured range,
@@ -10,13 +10,13 @@ use crate::cell::{CellModel, ModelBands};
 use crate::chart::{Axis, Chart, Ink, Layer, Picture, Shape};
 use crate::config::cell_model::{KnownBy, SourcedModel};
 
-/// Points of a line over SOC or temperature.
+/// Number of steps of a line over SOC or temperature.
 const POINTS: u32 = 200;
 /// Range of the picture over temperature, degrees Celsius; the picture ends earlier if the tables do.
 const SHOWN_C: (f64, f64) = (-20.0, 50.0);
 /// Cold temperature that is drawn in addition to the temperature of the curve, degrees Celsius.
 const COLD_C: f64 = 0.0;
-/// Below this SOC, percent, a curve or resistance may leave the picture, because both rise steeply there.
+/// Below this SOC, percent, a slope or a resistance may leave the picture, because both rise steeply towards empty.
 const STEEP_PERCENT: f64 = 12.0;
 
 /// Returns all pictures, each with the name of its file.
@@ -54,7 +54,8 @@ fn soc_axis() -> Axis {
     Axis::number("SOC, %").within(0.0, 100.0)
 }
 
-/// Draws a line that is dashed where nothing was measured. The solid and the dashed part share the point at which they meet.
+/// Draws a line that is dashed where nothing was measured. The solid and the dashed part share the point at which they
+/// meet.
 fn line(label: &str, ink: Ink, points: &[(f64, f64)], is_measured: impl Fn(f64) -> bool) -> Vec<Layer> {
     let part = |wanted: bool| -> Vec<(f64, f64)> {
         let near = |k: usize| {
@@ -116,7 +117,8 @@ fn slope(sourced: &SourcedModel) -> Picture {
     )
 }
 
-/// Draws the settled resistance over `x`, in milliohms, with its 95 % interval. `place` converts `x` to SOC and temperature.
+/// Draws the settled resistance over `x`, in milliohms, with its 95 % interval. `place` converts `x` to SOC and
+/// temperature.
 fn resistance_layers(
     sourced: &SourcedModel,
     (label, ink): (&str, Ink),

@@ -1,6 +1,7 @@
-//! Formats what the differences between cells cost the pack, as lines with a name and a value.
+//! Formats the differences between the cells of a pack, and the charge and energy that the pack loses by them, as lines
+//! with a name and a value.
 //!
-//! Cells count from 1. Every "±" is one standard deviation. Ah and kWh refer to one string.
+//! Cells count from 1. The number after "±" is the standard deviation. Ah and kWh refer to one string.
 
 use crate::cell::CellModel;
 use crate::cell_faults::imbalance::{CellSpread, LeftOut, LimitingCell, mean_ocv_v};
@@ -39,7 +40,7 @@ pub fn lines(imbalance: &Result<Imbalance, UnknownImbalance>, model: Option<&Cel
     lines.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
 }
 
-/// Returns the energy, kWh, of the share `part` of the mean cell's capacity, summed over all cells of a string.
+/// Returns the energy, kWh, if every cell of a string moves the share `part` of the mean cell's capacity.
 pub fn energy_kwh(pack: &Imbalance, part: ScalarGaussian, model: &CellModel) -> ScalarGaussian {
     let string_v = mean_ocv_v(model, pack.mean_ah.mean) * (pack.cells + pack.left_out.len()) as f64;
     let ScalarGaussian { mean, variance } = pack.ah(part);

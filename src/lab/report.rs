@@ -1,7 +1,8 @@
 //! Writes the report: one self-contained HTML file from the history of a store or from a replay.
 //!
-//! [`Data`] is collected from the store or the replay. [`page`] renders the page, and [`write_plots`] writes the pictures as separate
-//! files. Nothing here reads a clock, so the same data give the same bytes. An unknown value is shown as unknown, with the reason.
+//! [`Data`] is collected from the store or the replay. [`page`] renders the page, and [`write_plots`] writes the
+//! pictures as separate files. Nothing here reads a clock, so the same data give the same bytes. An unknown value is
+//! shown as unknown, with the reason.
 
 mod bins;
 mod context;

@@ -1,13 +1,13 @@
-//! Forecasts the remaining useful life from measured capacity histories: a forecast at the end of a history, and forecasts at earlier
-//! points of the life, which are scored against the truth.
+//! Forecasts the remaining useful life from measured capacity histories: a forecast at the end of a history, and
+//! forecasts at earlier points of the life, which are scored against the truth.
 //!
 //! Forecasts are made by the filter of the monitor ([`crate::health::forecast`]). The filter receives one reading after
 //! the other, and no reading that is later than the time of the forecast.
 //!
-//! Terms: *use* is the number of discharges since the first reading, or the number of days if the file lists no discharges. The
-//! capacities are fitted by the non-increasing curve with the least squared error (isotonic fit). The *end of life* is the use at which
-//! this curve falls below the threshold, interpolated between the two readings around it. A temporary recovery after a rest therefore
-//! hardly moves the end of life.
+//! Terms: *use* is the number of discharges since the first reading, or the number of days if the file lists no
+//! discharges. The capacities are fitted by the non-increasing curve with the least squared error (isotonic fit). The
+//! *end of life* is the use at which this curve falls below the threshold, interpolated between the readings before and
+//! after. A temporary recovery after a rest therefore hardly moves the end of life.
 
 mod baseline;
 mod document;
@@ -61,7 +61,8 @@ pub struct ForecastScore {
     pub straight: Option<f64>,
     /// Error of the straight line, computed like `error`.
     pub straight_error: f64,
-    /// Remaining life from a double exponential fitted by least squares; `None` = the curve never reaches the threshold.
+    /// Remaining life from a double exponential fitted by least squares; `None` = the curve never reaches the
+    /// threshold.
     pub double_exponential: Option<f64>,
     /// Error of the double exponential, computed like `error`.
     pub double_exponential_error: f64,
@@ -173,7 +174,8 @@ pub fn now(history: &History, name: &str, threshold: Threshold) -> CurrentForeca
     }
 }
 
-/// Makes forecasts after these shares of the life and scores them. `progress` is called before each forecast; it may unwind to abort.
+/// Makes forecasts after these shares of the life and scores them. `progress` is called before each forecast; it may
+/// unwind to abort.
 pub fn score(
     history: &History,
     name: &str,
@@ -226,7 +228,7 @@ fn judge(history: &History, threshold_ah: f64, end: f64, at: f64, alpha: f64) ->
         Ok(forecast) => (forecast, None),
         Err(why) => (None, Some(why.to_string())),
     };
-    // Remaining use, counted from the time of the forecast; 0 if the line is already below the threshold.
+    // Remaining use, counted from the time of the forecast; 0 if the baseline is already below the threshold.
     let ahead = |crossing: Option<f64>| crossing.map(|used| (used - moment).max(0.0));
     let straight = ahead(baseline::straight(&known, threshold_ah));
     let double_exponential = ahead(baseline::double_exponential(&known, threshold_ah));
@@ -261,7 +263,7 @@ fn forecast_until(history: &History, moment: f64) -> Forecast {
     for row in &history.rows {
         let passed = row.since(&before);
         if row.used > moment {
-            // Adds the share of use up to the forecast, but not the capacity of the next reading.
+            // Adds the use until the time of the forecast, but not the capacity of the next reading.
             let part = (moment - before.used) / (row.used - before.used);
             let (cycles, days, rest_days) = (part * passed.cycles, part * passed.days, part * passed.rest_days);
             forecast.update(Usage { cycles, days, rest_days }, None);

@@ -1,13 +1,16 @@
-//! Scores estimates against a known truth: measured files run through the real monitor, and its estimates are compared with the truth.
+//! Scores estimates against a known truth: measured files run through the real monitor, and its estimates are compared
+//! with the truth.
 //!
-//! Input: the files of cyclers ([`MeasuredFile`]), the configuration of a monitor, and the cases. A case states where in the file the
-//! estimator starts, and with which SOC and capacity. Each row of a file becomes the frame that would have carried it ([`feed`]), so
-//! every stage of the monitor takes part. Output, per file and case: the errors of the SOC in points (percent of a full cell), and the
-//! share of samples whose 95 % interval contains the truth. For whole lives, the same is computed for the usable capacity.
+//! Input: the files of cyclers ([`MeasuredFile`]), the configuration of a monitor, and the cases. A case states where
+//! in the file the estimator starts, and with which SOC and capacity. Each row of a file becomes the frame that would
+//! have carried it ([`feed`]), so every stage of the monitor takes part. Output, per file and case: the errors of the
+//! SOC in points (percent of a full cell), and the share of samples whose 95 % interval contains the truth. For whole
+//! lives, the same is computed for the usable capacity.
 //!
-//! The true SOC is 1 - `discharged_ah` / C, with the same C for all files. The true usable capacity comes from a table of published
-//! capacities. Every estimate counts once and is not weighted by time, so a part logged at 10 Hz counts more than a rest logged once a
-//! minute. Estimates without a truth and rows without an estimate are counted but not scored.
+//! The true SOC is 1 - `discharged_ah` / C, with the same C for all files. The true usable capacity comes from a table
+//! of published capacities. Every estimate counts once and is not weighted by time, so a part logged at 10 Hz counts
+//! more than a rest logged once a minute. Estimates without a truth and rows without an estimate are counted but not
+//! scored.
 
 mod case;
 mod cycles;
@@ -44,31 +47,35 @@ pub struct ScoreSettings {
     pub monitor: MonitorConfig,
     /// Charge from full to empty that defines the true SOC, Ah.
     pub truth_capacity_ah: f64,
-    /// For a start in the middle of a file: the share of `truth_capacity_ah` that has been taken out before the start, fraction.
+    /// For a start in the middle of a file: the share of `truth_capacity_ah` that has been taken out before the start,
+    /// fraction.
     pub remove: f64,
     /// Time after the start that is left out of the statistics, s.
     pub settle_s: f64,
-    /// Standard deviation of the initial SOC, fraction; `None` = the value of [`ScoreSettings::initial_soc_std`].
+    /// Standard deviation of the initial SOC, fraction; `None` = derived from the initial error (see
+    /// [`ScoreSettings::initial_soc_std`]).
     pub soc_std: Option<f64>,
     /// Standard deviation of the initial capacity, as a fraction of the model's capacity; `None` = as configured.
     pub capacity_std: Option<f64>,
-    /// Longest gap in a file, s, before the recorder counts as asleep.
+    /// If a gap between two rows is longer than this, s, the recorder counts as asleep.
     pub sleep_gap_s: f64,
     /// Capacity threshold, Ah; the first discharge below it is reported.
     pub threshold_ah: f64,
     /// Number of discharges at the start of a life that are left out of the statistics.
     pub skip_cycles: usize,
-    /// Smallest and largest share of the charge of each half-cycle that the monitor sees; `None` = it sees everything.
+    /// Smallest and largest size of a window, as a share of the charge that a half-cycle moves. The monitor sees only
+    /// the rows in the windows; `None` = the monitor sees all rows.
     pub window: Option<(f64, f64)>,
-    /// State that the monitor learned before each scored file; `None` = it starts without history.
+    /// State in which the monitor starts each file, learned from [`ScoreRequest::learn`]; `None` = the monitor starts
+    /// without learned values.
     pub learned: Option<Learned>,
     /// Folder for the plots.
     pub plots: Option<PathBuf>,
 }
 
 impl ScoreSettings {
-    /// Returns the standard deviation of the initial SOC, fraction. Without a configured value, it is the size of the initial error, at
-    /// least 5 points.
+    /// Returns the standard deviation of the initial SOC, fraction. Without a configured value, it is the size of the
+    /// initial error, but at least 5 points.
     pub fn initial_soc_std(&self, error_points: f64) -> f64 {
         self.soc_std.unwrap_or((error_points.abs() / 100.0).max(0.05))
     }
@@ -85,8 +92,9 @@ pub struct ScoreJob {
     pub name: String,
 }
 
-/// Scores every file in every case; several files run in parallel. The results are in the order of `jobs`, and within a file in the
-/// order of `cases`. `progress` receives the index of the file, and the fraction of its work that was completed since the last call.
+/// Scores every file in every case; several files run in parallel. The results are in the order of `jobs`, and within a
+/// file in the order of `cases`. `progress` receives the index of the file, and the fraction of its work that was
+/// completed since the last call.
 ///
 /// # Errors
 /// The error of the first file (in order) that cannot be scored.
@@ -97,7 +105,7 @@ pub fn run(
     progress: &(dyn Fn(usize, f64) + Sync),
 ) -> Result<Vec<CaseScore>, LabError> {
     let score = |(index, job)| score_file(job, cases, settings, &|part| progress(index, part));
-    // One file at a time, because the lengths of files differ greatly.
+    // Each parallel task has only one file, because the lengths of files differ greatly.
     let lists: Vec<_> = jobs.par_iter().enumerate().with_max_len(1).map(score).collect();
     let lists: Result<Vec<_>, _> = lists.into_iter().collect();
     Ok(lists?.into_iter().flatten().collect())

@@ -1,7 +1,8 @@
-//! Creates the configuration of one measured cell: a given configuration, or the built-in one with another cell model or label.
+//! Creates the configuration of one measured cell, from a given configuration file or from the built-in one. The cell
+//! model can be replaced by another file or, in the built-in configuration, by a label.
 //!
-//! Input: paths, or the data of a label. Output: a checked configuration with the input signals of `measured.dbc`. Estimator keys have
-//! their defaults unless the given configuration states them. A fault names its file.
+//! Input: paths, or the data of a label. Output: a checked configuration. The built-in configuration has the input
+//! signals of `measured.dbc` and the default estimator keys. A fault names its file.
 
 use std::path::{Path, PathBuf};
 
@@ -16,7 +17,7 @@ const BUILT_IN: [(&str, &[u8]); 2] =
 pub struct LabelKeys {
     /// Name of the chemistry.
     pub chemistry: String,
-    /// Capacity, Ah; the configuration requires it.
+    /// Rated capacity, Ah. Without it, the configuration is faulty.
     pub rated_ah: Option<f64>,
     /// Lowest voltage, V; `None` = typical for the chemistry.
     pub voltage_min_v: Option<f64>,
@@ -24,14 +25,15 @@ pub struct LabelKeys {
     pub voltage_max_v: Option<f64>,
 }
 
-/// Source of a cell's configuration. A label has priority. Otherwise, `cell` replaces the cell model that the configuration names.
+/// Source of a cell's configuration. If there is a label, `config` and `cell` are ignored. Otherwise, `cell` replaces
+/// the cell model that the configuration names.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct CellSource {
     /// Configuration; `None` = the built-in one.
     pub config: Option<PathBuf>,
     /// Cell model file.
     pub cell: Option<PathBuf>,
-    /// Label.
+    /// Label, which replaces the cell model of the built-in configuration.
     pub label: Option<LabelKeys>,
 }
 
@@ -102,6 +104,7 @@ fn named_cell(files: &ConfigFiles, read: config::ReadFile<'_>) -> Result<PathBuf
         let model = table.get("pack")?.get("cell_model")?.as_str()?.to_owned();
         Some(files.main.parent().unwrap_or(Path::new("")).join(model))
     });
-    // If the configuration names no cell model, loading the configuration reports the fault.
+    // If the configuration names no cell model, no file is replaced. Loading then reports the missing model, unless the
+    // configuration has a chemistry.
     Ok(named.unwrap_or_default())
 }

@@ -1,9 +1,9 @@
-//! Converts arrays from Python. Everything that NumPy reads as numbers is accepted. An array is not copied if it is
-//! contiguous, aligned and of the right type.
+//! Converts arrays from Python. Everything that NumPy reads as real or whole numbers is accepted. An array is not
+//! copied if it is contiguous, aligned and of the right type.
 //!
 //! Masked and missing reals become NaN. Whole numbers are never rounded and never wrap around. A whole number that is
-//! missing, has a fraction or is out of range gives an error with its index. An array of another type gives an error
-//! with its dtype.
+//! missing, has a fraction or is out of range gives an error with its index. An array that does not contain
+//! numbers gives an error with its dtype.
 
 use arrow_array::cast::AsArray;
 use arrow_array::types::{ArrowPrimitiveType, Float64Type, UInt8Type, UInt32Type};
@@ -56,7 +56,7 @@ impl<T: ArrowPrimitiveType> Matrix<T> {
     }
 }
 
-/// Converts to reals of one or two dimensions; `name` is the argument.
+/// Converts to reals of one or two dimensions. `name` is the name of the argument, for errors.
 pub(crate) fn reals(name: &str, values: &Bound<'_, PyAny>) -> PyResult<Reals> {
     matrix(name, &float64(name, values)?)
 }
@@ -131,7 +131,8 @@ fn is_masked(array: &Bound<'_, PyAny>) -> PyResult<bool> {
     array.py().import("numpy.ma")?.call_method1("isMaskedArray", (array,))?.extract()
 }
 
-/// Rejects arrays of strings, times, complex numbers or records, because NumPy and pandas silently convert some of them to reals.
+/// Rejects arrays of strings, times, complex numbers or records, because NumPy and pandas silently convert some of them
+/// to reals.
 fn check_numbers(name: &str, array: &Bound<'_, PyAny>) -> PyResult<()> {
     let dtype = array.getattr("dtype")?;
     let kind: String = dtype.getattr("kind")?.extract()?;

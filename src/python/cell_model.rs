@@ -125,7 +125,7 @@ impl CellModel {
         Table::new(columns)
     }
 
-    /// Returns the SOC at an open-circuit voltage, a fraction.
+    /// Returns the SOC, a fraction, at an open-circuit voltage.
     #[pyo3(signature = (voltage_v, temperature_c=25.0))]
     fn soc_of_ocv(&self, voltage_v: f64, temperature_c: f64) -> PyResult<f64> {
         if !voltage_v.is_finite() || !temperature_c.is_finite() {
@@ -136,7 +136,7 @@ impl CellModel {
         Ok(self.model().soc_of_ocv(voltage_v, temperature_c))
     }
 
-    /// Returns the text of the cell model file, as `model export` writes it.
+    /// Returns the text of a cell model file, in the format of `model export`.
     fn text(&self) -> String {
         cell_model::text(&self.0, "Written by packwatch.")
     }

@@ -1,8 +1,9 @@
 //! Gives one call at a time access to a monitor's state, from any thread.
 //!
-//! A call that waits does not hold the interpreter's lock, and a signal ends the wait. Two kinds of calls fail instead
-//! of waiting. The first is a call from a signal handler that has interrupted another call on the same thread. The
-//! second is any call after a panic, which left the state inconsistent.
+//! A call that waits does not hold the interpreter's lock. If a signal handler raises an exception, as for Ctrl-C, the
+//! wait ends. Two kinds of calls fail instead of waiting. The first is a call from a signal handler that has
+//! interrupted another call on the same thread. The second is any call after a panic, which left the state
+//! inconsistent.
 
 use std::ops::{Deref, DerefMut};
 use std::sync::{Mutex, MutexGuard, PoisonError, TryLockError};
@@ -13,7 +14,7 @@ use pyo3::prelude::*;
 
 use crate::error::data;
 
-/// A monitor's state, which one call at a time may use.
+/// A monitor's state. Only one call at a time may use it.
 pub(crate) struct ExclusiveState<S> {
     state: Mutex<S>,
     /// Thread of the running call.

@@ -93,7 +93,8 @@ impl GaussianProcess {
         py.detach(|| self.0.save(&path)).map_err(of_library)
     }
 
-    /// Predicts rows: mean, standard deviation of a measurement, and the ends of its 95 % interval.
+    /// Predicts rows. Returns the mean, the standard deviation of a measurement, and the ends of the 95 % interval of a
+    /// measurement.
     fn predict(&self, py: Python<'_>, inputs: &Bound<'_, PyAny>) -> PyResult<Table> {
         let inputs = arrays::reals("inputs", inputs)?;
         check_known("inputs", &inputs)?;

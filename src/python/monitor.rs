@@ -36,7 +36,7 @@ pub(crate) struct Monitor {
     is_pack_total: bool,
 }
 
-/// State after all inputs already processed.
+/// State after the inputs processed so far.
 struct State {
     driver: MonitorDriver,
     columns: Columns,
@@ -96,7 +96,7 @@ impl Monitor {
         self.interfaces.clone()
     }
 
-    /// Number of values, in all rows already processed, that no frame of the configuration can carry.
+    /// Number of values that no frame of the configuration can carry, in all rows processed so far.
     #[getter]
     fn uncarried_values(&self, py: Python<'_>) -> PyResult<usize> {
         Ok(self.state.wait(py)?.driver.uncarried_values)
@@ -162,7 +162,7 @@ impl Monitor {
         })
     }
 
-    /// Continues the record at `time_s`, after a gap of unknown length.
+    /// Continues at `time_s`, after a gap of unknown length.
     fn gap(&self, py: Python<'_>, time_s: f64) -> PyResult<Outputs> {
         if !time_s.is_finite() {
             return Err(data(format!("time_s = {time_s}, must be a finite number")));
@@ -172,7 +172,7 @@ impl Monitor {
         state.finish(py, &self.interfaces)
     }
 
-    /// Ends the record, so that the last samples become estimates.
+    /// Ends the input, so that the last samples become estimates.
     fn finish(&self, py: Python<'_>) -> PyResult<Outputs> {
         let mut state = self.state.wait(py)?;
         state.driver.finish();
@@ -204,7 +204,7 @@ impl Monitor {
         found.map(BusIndex).ok_or_else(|| data(format!("interface {name:?}, must be one of {allowed}")))
     }
 
-    /// Processes rows and returns the tables.
+    /// Processes rows or frames with `take` and returns the tables.
     fn work(
         &self,
         py: Python<'_>,

@@ -108,8 +108,9 @@ struct EstimateColumns {
     cell: Vec<u16>,
     reals: [Vec<f64>; REALS],
     accepted: Vec<bool>,
-    /// Time of the record's first estimate.
+    /// Time of the first estimate.
     first: Option<Timestamp>,
+    /// Period of the latest row of each cell.
     periods: Vec<Option<i64>>,
     /// The latest period, and the number of cells that have a row in this period.
     latest: Option<(i64, usize)>,
@@ -145,8 +146,8 @@ impl EstimateColumns {
         self.reals.iter_mut().zip(values).for_each(|(column, value)| column.push(value));
     }
 
-    /// Whether this is the first estimate of its cell in its period. Periods are counted from the start of the record.
-    /// The periods start again if the clock goes back.
+    /// Whether this is the first estimate of its cell in its period. Periods are counted from the first estimate.
+    /// If the clock goes back, an earlier period begins again.
     fn begins_period(&mut self, period_ns: i64, estimate: &Estimate) -> bool {
         let first = *self.first.get_or_insert(estimate.time);
         let period = estimate.time.nanos().saturating_sub(first.nanos()).div_euclid(period_ns);

@@ -1,4 +1,5 @@
-//! Implements the Python function `replay`, which replays logs through the monitor like the command and returns tables.
+//! Implements the Python function `replay`, which replays logs through the monitor, like the command `replay`, and
+//! returns tables.
 
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
@@ -16,7 +17,8 @@ use crate::background_task::{self, BackgroundTask, Progress};
 use crate::error::{self, data};
 use crate::outputs::{Columns, Outputs, Wanted};
 
-// The Python signatures of `replay` and of `Monitor` repeat this number as a literal, because Python shows them.
+// The Python signatures of `replay` and of `Monitor` repeat this number as a literal, because Python shows the
+// signatures to users.
 const _: () = assert!(SLEEP_GAP_S == 30.0);
 
 /// Results of a replay.
@@ -58,7 +60,7 @@ impl Replay {
     }
 }
 
-/// Replays logs as one record.
+/// Replays logs as one continuous recording.
 #[pyfunction]
 #[pyo3(signature = (config, logs, *, columns=None, csv_sign="discharge", start_times=None, strict=false, sleep_gap_s=30.0,
                     estimates_period_s=0.0, progress=false))]

@@ -72,7 +72,8 @@ impl Table {
         self.0.column_by_name(name).is_some()
     }
 
-    /// Returns a column as a NumPy array, without a copy if it has no nulls; null becomes NaN.
+    /// Returns a column as a NumPy array. A column of numbers is not copied if it has no nulls; otherwise, its nulls
+    /// become NaN. Other columns are copied.
     fn __getitem__<'py>(&self, py: Python<'py>, name: &str) -> PyResult<Bound<'py, PyAny>> {
         let missing = || PyKeyError::new_err(format!("no column {name}, found {}", self.column_names().join(",")));
         let array = self.0.column_by_name(name).ok_or_else(missing)?;
@@ -100,7 +101,7 @@ impl Table {
         slf.py().import("pyarrow")?.call_method1("table", (slf,))
     }
 
-    /// Returns a `pandas.DataFrame`; null becomes NaN.
+    /// Returns a `pandas.DataFrame`. In columns of numbers, null becomes NaN.
     fn to_pandas<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
         let (py, columns) = (slf.py(), PyDict::new(slf.py()));
         for name in slf.get().column_names() {

@@ -101,7 +101,7 @@ impl Coefficients {
         (0..self.beta.len()).map(|k| self.beta[k] * basis.value(row, k)).sum()
     }
 
-    /// Variance of a prediction that is due to the uncertainty of the coefficients. `rest` is `h(x) - H' K^-1 k(x)`,
+    /// Contribution of the coefficients' uncertainty to the variance of a prediction. `rest` is `h(x) - H' K^-1 k(x)`,
     /// where `h(x)` are the terms of the mean function at the row x, and `k(x)` are the covariances of x with the
     /// training rows.
     pub(super) fn variance(&self, rest: &[f64]) -> f64 {
@@ -135,7 +135,7 @@ mod tests {
 
     #[test]
     fn coefficients_agree_with_least_squares() {
-        // y = 2 + 3 x at x = 0, 1, 2, 3 with unit covariance. Only the last y is 1 too large.
+        // y = 2 + 3 x at x = 0, 1, 2, 3 with unit covariance, but the last y is larger by 1.
         let rows = [(2.0, 0.0), (5.0, 1.0), (8.0, 2.0), (12.0, 3.0)];
         let mut g = vec![0.0; 9];
         for (y, x) in rows {

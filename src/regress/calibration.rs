@@ -121,7 +121,8 @@ mod tests {
         let (narrow, wide) = (calibration.half_width(&[800.0]), calibration.half_width(&[3100.0]));
         assert!((0.90..1.1).contains(&narrow) && (2.6..2.95).contains(&wide), "{narrow}, {wide}");
         let held = |from: u32, half: f64| (from..from + 2000).filter(|k| ratio(*k) <= half).count();
-        // Shrinkage makes the narrow half slightly too wide and the wide half too narrow; together they contain 95 %.
+        // Shrinkage makes the interval slightly too wide in the first half and too narrow in the second. Together, the
+        // intervals contain 95 %.
         let (first, second) = (held(0, narrow), held(2000, wide));
         assert!(second >= 1760 && (3740..=3860).contains(&(first + second)), "{first}, {second}");
     }

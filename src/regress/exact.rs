@@ -23,7 +23,7 @@ use super::linear_algebra::{add, cholesky, dot, log_determinant, parallelism, so
 use super::plan::{Covariance, Plan, Work};
 use super::scale::StandardisedRows;
 
-/// Maximum number of rows that are predicted in one block.
+/// Maximum number of rows that are predicted or left out in one block.
 const BLOCK_QUERIES: usize = 256;
 
 /// State for predictions.
@@ -40,10 +40,10 @@ pub(super) struct Posterior {
     alpha: Vec<f64>,
     /// `K^-1 H`, column-major.
     basis_solved: Vec<f64>,
-    /// Negative log likelihood.
+    /// Negative logarithm of the marginal likelihood.
     pub value: f64,
     pub jitter: Jitter,
-    /// Jitter on the diagonal, as a fraction of the prior variance; 0 = no jitter was necessary.
+    /// Jitter on the diagonal, as a fraction of the signal variance; 0 = no jitter was necessary.
     used_jitter: f64,
 }
 

@@ -27,7 +27,7 @@ pub struct Fold {
     pub hyperparameters: Vec<Hyperparameter>,
     /// Log marginal likelihood of the training rows.
     pub log_marginal_likelihood: f64,
-    /// Half width of the 95 % interval, in standard deviations of a measurement.
+    /// Factor of the 95 % interval (see [`Model::interval_factor`](super::Model::interval_factor)).
     pub interval_factor: f64,
     /// Jitter that the fit needed.
     pub jitter: Jitter,
@@ -39,7 +39,7 @@ pub struct Folds {
     /// Prediction of every row, in the order of the rows. Each row is predicted by the model of the fold that held it
     /// out.
     pub predictions: Vec<Prediction>,
-    /// Fold that held out each row, from 0.
+    /// Number of the fold that held out each row, from 0.
     pub fold_of_row: Vec<usize>,
     /// The result of each fold.
     pub folds: Vec<Fold>,

@@ -1,8 +1,8 @@
 //! Finds the necessary jitter: a small number that is added to the diagonal of a covariance matrix if the matrix alone
 //! has no Cholesky factor.
 //!
-//! Input: a function that tries to factorise with a given jitter. Output: the smallest jitter that is sufficient, as a
-//! fraction of the signal variance, or an error.
+//! Input: a function that tries to factorise with a given jitter. Output: the smallest of the tried
+//! jitters that is sufficient, as a fraction of the signal variance, or an error.
 
 use serde::{Deserialize, Serialize};
 

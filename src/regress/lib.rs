@@ -2,9 +2,9 @@
 //!
 //! The model of a target y at the inputs x is `y = h(x)' beta + f(x) + noise`. It has three parts: a mean function
 //! `h(x)' beta` (zero, a constant or a plane) with generalised least-squares coefficients beta, a Gaussian process `f`
-//! with a covariance function ([`Kernel`]), and white noise. The hyperparameters maximise the marginal likelihood; the
-//! search uses its exact gradient. Source: Rasmussen and Williams, *Gaussian Processes for Machine Learning*, 2006,
-//! chapters 2, 5 and 8.
+//! with a covariance function ([`Kernel`]), and white noise. The hyperparameters maximise the marginal likelihood. The
+//! search uses the exact gradient of the likelihood. Source: Rasmussen and Williams, *Gaussian Processes for Machine
+//! Learning*, 2006, chapters 2, 5 and 8.
 //!
 //! Data flow:
 //!
@@ -25,9 +25,9 @@
 //!
 //! Deviations from the paper that packwatch follows ("Battery Predictions for Electronic Prognostics"):
 //!
-//! 1. The paper used a fully independent conditional (inducing points) for its 30,723 rows. Here, [`Form::Nearest`] is
-//!    the default for that many rows, because a few hundred inducing points cannot represent a rough function over
-//!    months.
+//! 1. For its 30,723 rows, the paper used a fully independent conditional approximation (inducing points). Here,
+//!    [`Form::Nearest`] is the default for that many rows, because a few hundred inducing points cannot represent a
+//!    rough function over months.
 //! 2. The variance of a prediction includes the uncertainty of the mean function's coefficients.
 //! 3. The half width of the 95 % interval is not fixed at 1.96 standard deviations. It is calibrated for each predicted
 //!    row with leave-one-out predictions of training rows ([`GprSettings::calibrate`]).

@@ -1,5 +1,5 @@
-//! Provides dense linear algebra on column-major slices. The functions use the threads of the thread pool in which they
-//! are called.
+//! Provides dense linear algebra on column-major slices. The factorisation and the solvers use all threads of the
+//! thread pool in which they are called.
 //!
 //! [`cholesky`] reports a matrix that is not positive definite. If an input is NaN, the result is NaN.
 

@@ -91,7 +91,8 @@ fn line_search<E>(
             if slope < 0.0 && value <= at.value + 1e-4 * slope {
                 return Ok(Some(Minimum { x, value, gradient, iterations: at.iterations + 1 }));
             }
-            // The next step leads to the minimum of the parabola through both points, within limits.
+            // The next trial goes to the minimum of the parabola through both points, but the step becomes neither
+            // shorter than 10 % nor longer than 50 % of the present one.
             let bend = 2.0 * (value - at.value - slope);
             step *= if bend > 0.0 { (-slope / bend).clamp(0.1, 0.5) } else { 0.5 };
         } else {

@@ -1,7 +1,7 @@
-//! Fits a process to rows, predicts further rows, and returns the hyperparameters.
+//! Fits a Gaussian process to rows, predicts further rows, and returns the hyperparameters.
 //!
-//! Input: rows and settings. Output: a [`Model`] that predicts in units of the target. Invalid rows, and settings out
-//! of range, give an error.
+//! Input: rows and settings. Output: a [`Model`] that predicts in units of the target. Invalid rows and invalid settings
+//! give an error.
 
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
@@ -49,14 +49,14 @@ pub struct Prediction {
     pub function_variance: f64,
     /// Variance of a new measurement: the variance of the function plus the variance of the noise.
     pub measurement_variance: f64,
-    /// Lower end of the interval that contains 95 % of new measurements (see [`Model::interval_factor`]). Its half
-    /// width is not 1.96 standard deviations if residuals are not Gaussian or if their width varies.
+    /// Lower end of the interval that contains 95 % of new measurements (see [`Model::interval_factor`]). If residuals
+    /// are not Gaussian or if their width varies, the half width of the interval differs from 1.96 standard deviations.
     pub low_95: f64,
     /// Upper end of the interval that contains 95 % of new measurements.
     pub high_95: f64,
 }
 
-/// A fitted process.
+/// A fitted Gaussian process.
 #[derive(Debug)]
 pub struct Model {
     /// Structure of the model.
@@ -81,7 +81,7 @@ pub struct ModelSpec {
     pub basis: Basis,
     /// Whether every input has its own length scale.
     pub ard: bool,
-    /// Exact, or by nearest neighbours.
+    /// Whether the covariance is exact or approximated with nearest neighbours.
     pub form: Form,
     /// Number of inputs of a row.
     pub dimensions: usize,
@@ -120,7 +120,7 @@ impl Posterior {
         }
     }
 
-    /// Returns the residual and the measurement variance of each given row when this row is left out.
+    /// Predicts each given row from all other rows. Returns the residual and the measurement variance of each row.
     fn left_out(&self, rows: &[u32], noise_variance: f64) -> Result<Vec<(f64, f64)>, RegressionError> {
         match self {
             Self::Exact(posterior) => Ok(posterior.left_out(rows)),
@@ -135,7 +135,8 @@ impl Posterior {
     }
 }
 
-/// Fits a process to rows. Calls `watcher` after every step of a search. `watcher` can cancel the fit.
+/// Fits a Gaussian process to rows. Calls `watcher` before the first step and after every step of a search. `watcher`
+/// can cancel the fit.
 pub fn fit(
     rows: &TrainingRows,
     settings: &GprSettings,
@@ -405,10 +406,10 @@ impl Model {
         self.outcome.log_likelihood - self.rows() as f64 * self.scale.target_deviation.ln()
     }
 
-    /// Half width of the 95 % interval in standard deviations of a measurement, at a row where residuals have their
-    /// mean width. The half width is 1.96 for Gaussian residuals. With [`GprSettings::calibrate`], the factor comes
-    /// from leave-one-out predictions of training rows. The interval of a prediction is wider (narrower) if the
-    /// residuals of nearby training rows are larger (smaller) than average.
+    /// Half width of the 95 % interval, divided by the standard deviation of a measurement. The factor is 1.96 for
+    /// Gaussian residuals. With [`GprSettings::calibrate`], the factor comes from leave-one-out predictions of training
+    /// rows, and applies to a row whose neighbours have residuals of average size. If the residuals of nearby training
+    /// rows are larger (smaller) than average, the interval of a prediction is wider (narrower).
     pub fn interval_factor(&self) -> f64 {
         self.calibration.factor
     }

@@ -1,10 +1,10 @@
 //! Implements the Gaussian process with nearest neighbours: Vecchia's approximation (Vecchia 1988, Datta et al. 2016).
 //!
 //! The rows are put in a seeded random order. The density of all rows is then a product with one term per row: the
-//! density of the row given all its predecessors. The approximation uses only the `m` nearest predecessors. The
-//! approximation is a proper density, and is exact if `m` includes all predecessors. Each term needs a Cholesky factor
-//! of a matrix with about `m` rows, regardless of the number of training rows. The density is conditional on the
-//! measurements of the predecessors, which include noise.
+//! density of the row given all its predecessors. In the approximation, each term is the density of the row given only
+//! its `m` nearest predecessors. The approximation is a proper density. If every row has at most `m` predecessors, the
+//! approximation is exact. Each term needs a Cholesky factor of a matrix with about `m` rows, regardless of the number
+//! of training rows. The density is conditional on the measurements of the predecessors, which include noise.
 //!
 //! For one term, let K be the covariance matrix of the neighbours and the row, with the row last. Let `q = K^-1
 //! e_last`, `A = K^-1 [y H]` and `a = A (1, -beta)'`. The conditional variance of the row is then `1/q_n`, and its
@@ -18,8 +18,8 @@
 //! 0.
 //!
 //! The search for hyperparameters may use a seeded subset of the terms. The neighbours of these terms are selected
-//! among all rows, so the sum over the subset gives an unbiased estimate of the sum over all terms. When the length
-//! scales have changed, neighbours are selected again.
+//! among all rows, so the sum over the subset gives an unbiased estimate of the sum over all terms. If the length
+//! scales have changed the order of distances, the neighbours are selected again.
 //!
 //! Input: standardised rows and hyperparameters. Output: likelihood, gradient and predictions. If a covariance matrix
 //! is not positive definite even with the largest jitter, the result is an error.
@@ -55,8 +55,8 @@ pub(super) struct LikelihoodSums {
     pub jitter: Jitter,
 }
 
-/// A batch of terms, the sum of their contributions to `[y H]' K^-1 [y H]`, and the sum of the logarithms of their
-/// variances.
+/// A batch of terms. `g` is the sum of the terms' contributions to `[y H]' K^-1 [y H]`. `log` is half the sum of
+/// `ln(2 pi variance)` over the terms.
 struct FactorBatch {
     factors: Vec<ConditionalFactor>,
     g: Vec<f64>,
@@ -143,7 +143,8 @@ impl ConditionalFactors {
 struct Scratch<'a> {
     data: &'a StandardisedRows,
     covariance: &'a Covariance,
-    /// Squared differences of all pairs (lower triangle, column-major). The last pair consists of two equal rows.
+    /// Squared differences of all pairs of rows below the diagonal (column-major). One more pair at the end has the
+    /// difference 0 and stands for the diagonal.
     squares: Vec<f64>,
     matrix: Vec<f64>,
     weights: Vec<f64>,
@@ -231,9 +232,9 @@ impl<'a> Scratch<'a> {
     }
 }
 
-/// Replaces `matrix` by the lower Cholesky factor (column-major) of the covariance matrix. The matrix consists of the
-/// kernel's lower triangle, with the prior variance and the noise on the diagonal. Returns the jitter, as a fraction of
-/// the prior variance.
+/// Replaces `matrix` by the lower Cholesky factor (column-major) of the covariance matrix. The covariance matrix has the
+/// kernel values in its lower triangle, and the sum of prior variance, jitter and noise variance on its diagonal. Returns
+/// the jitter, as a fraction of the prior variance.
 fn factorise(matrix: &mut Vec<f64>, kernel: &[f64], n: usize, covariance: &Covariance) -> Result<f64, RegressionError> {
     matrix.resize(n * n, 0.0);
     until_positive(|jitter| {
@@ -254,7 +255,8 @@ fn cholesky(matrix: &mut [f64], n: usize) -> bool {
     for j in 0..n {
         let (before, rest) = matrix.split_at_mut(j * n);
         let column = &mut rest[j..n];
-        // Four columns are processed at a time, because loading and storing this column dominates the cost.
+        // Four earlier columns are subtracted at a time, because loading and storing the current column dominates the
+        // cost.
         let mut k = 0;
         while k + 4 <= j {
             let c = |i: usize| &before[(k + i) * n + j..(k + i + 1) * n];

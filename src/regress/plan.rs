@@ -1,6 +1,6 @@
-//! Prepares a kernel for evaluation, as a plan. All parameters are in one vector. The plan computes the kernel's values
-//! over a block of row pairs. The plan also computes the exact derivatives of a weighted sum of these values with
-//! respect to every parameter (reverse-mode differentiation).
+//! Converts a kernel to a plan, which can be evaluated fast. All parameters are in one vector. The plan computes the
+//! kernel's values over a block of row pairs. The plan also computes the exact derivatives of a weighted sum of these
+//! values with respect to every parameter (reverse-mode differentiation).
 //!
 //! A block of `count` pairs is given as *squares*: for each input in turn, `count` squared differences. The parameters
 //! are natural logarithms of length scales, of `alpha`, and of standard deviations. The standard deviation of the noise
@@ -86,7 +86,8 @@ struct LeafValues {
 pub(super) struct Work {
     values: Vec<Vec<f64>>,
     adjoints: Vec<Vec<f64>>,
-    /// For each shape: derivatives of the value with respect to the squared distance and, in `alphas`, to ln alpha.
+    /// For each shape, the derivatives of the values with respect to the squared distance. `alphas` contains the
+    /// derivatives with respect to ln alpha.
     slopes: Vec<Vec<f64>>,
     alphas: Vec<Vec<f64>>,
 }
@@ -146,7 +147,7 @@ impl Plan {
 }
 
 impl Covariance {
-    /// Evaluates the plan at these parameters.
+    /// Combines the plan with the parameters `theta`.
     pub(super) fn new(plan: Plan, theta: &[f64]) -> Self {
         let leaves = plan.leaves.iter().map(|leaf| plan.leaf_values(leaf, theta)).collect();
         let noise_variance = (2.0 * theta[plan.parameters.len() - 1]).exp();
@@ -156,7 +157,7 @@ impl Covariance {
         covariance
     }
 
-    /// Weights of the inputs for the distance between rows. The weight of an input follows from its shortest length
+    /// Weights of the inputs for the distance between rows. The weight of an input is the inverse of its shortest length
     /// scale.
     pub(super) fn metric(&self) -> Vec<f64> {
         let of = |d: usize| self.leaves.iter().map(|leaf| leaf.inverse_squares[d].sqrt()).fold(0.0, f64::max);
@@ -256,7 +257,7 @@ fn combine(below: &[Vec<f64>], children: &[usize], out: &mut [f64], join: impl F
     }
 }
 
-/// Sets the adjoint of each factor. It is the adjoint of the product, multiplied by the values of all other factors.
+/// Sets the adjoint of each factor: the adjoint of the product, multiplied by the values of all other factors.
 fn product_adjoints(at: usize, children: &[usize], work: &mut Work) {
     let (below, here) = work.adjoints.split_at_mut(at);
     for child in children {
@@ -285,7 +286,8 @@ fn distances(inverse_squares: &[f64], squares: &[f64], out: &mut [f64]) {
 
 /// Replaces squared distances by kernel values. Fills `slopes` and `alphas`, unless they are empty.
 fn shape_values(shape: Shape, values: &LeafValues, out: &mut [f64], slopes: &mut [f64], alphas: &mut [f64]) {
-    /// Avoids a division by zero at distance 0. The result is later multiplied by squared differences that are also 0.
+    /// Avoids a division by zero at distance 0. At this distance all squared differences are 0. The slope is later
+    /// multiplied by them, so it has no effect.
     const TINY: f64 = 1e-150;
     let (s, a) = (values.variance, values.alpha);
     match shape {

@@ -1,9 +1,10 @@
 //! Saves models as text and loads them.
 //!
 //! The text has two lines of JSON. The first line is a header with the version and a checksum of the second line. The
-//! second line is the model: its (standardised) rows, its hyperparameters and the result of its fit. Loading computes
-//! everything else again, which needs time proportional to n^3 for an exact model with n rows. A damaged text and a
-//! text of another version give an error.
+//! second line is the model: its (standardised) rows, its hyperparameters, the result of its fit, and the ratios that
+//! calibrate its intervals. For [`Form::Nearest`], the line also has the coefficients of the mean function. Loading
+//! computes everything else again. For an exact model with n rows, loading needs time proportional to n^3. A damaged
+//! text and a text of another version give an error.
 
 use serde::{Deserialize, Serialize};
 
@@ -38,12 +39,14 @@ struct Body {
     outcome: FitOutcome,
     inputs: Vec<f64>,
     targets: Vec<f64>,
-    /// Coefficients; empty if loading computes them again. The same holds for their covariance.
+    /// Coefficients of the mean function. An exact model does not store them or their covariance; loading computes them
+    /// again.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     beta: Vec<f64>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     beta_covariance: Vec<f64>,
-    /// Numbers of the rows that were left out to calibrate the intervals. `ratios` has a ratio for each of them.
+    /// Numbers of the rows that were left out to calibrate the intervals. `ratios` has one entry per row: the residual
+    /// without sign, divided by the predicted standard deviation.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     left_out: Vec<u32>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]

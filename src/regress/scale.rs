@@ -1,7 +1,7 @@
 //! Checks rows, and standardises inputs and targets by mean and standard deviation.
 //!
-//! Input: rows. Output: standardised rows. Wrong lengths and numbers that are not finite give an error, which names the
-//! line of the row.
+//! Input: rows. Output: standardised rows. Wrong lengths give an error. A number that is not finite gives an error that
+//! names the line of the row.
 
 use serde::{Deserialize, Serialize};
 

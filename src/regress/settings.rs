@@ -27,7 +27,7 @@ pub struct TrainingRows<'a> {
     pub dimensions: usize,
     /// The values that the model predicts, one per row.
     pub targets: &'a [f64],
-    /// Line of each row in its file, for error messages. If it is empty, error messages count the rows from 1.
+    /// Line of each row in its file, for error messages. If `lines` is empty, error messages count the rows from 1.
     pub lines: &'a [u64],
 }
 
@@ -37,8 +37,8 @@ pub struct TrainingRows<'a> {
 pub enum Form {
     /// Uses the covariance of all pairs of rows, without approximation.
     Exact,
-    /// Vecchia's approximation. The rows are put in a seeded order, and the density of each row depends only on the
-    /// nearest of the rows before it. A prediction depends only on the nearest of all rows.
+    /// Vecchia's approximation. The rows are put in a seeded random order. In this order, the density of a row depends
+    /// only on its nearest predecessors. A prediction depends only on the nearest training rows.
     Nearest {
         /// Number of neighbours, 1 to 500.
         neighbours: usize,
@@ -71,19 +71,19 @@ pub struct GprSettings {
     /// Whether inputs are standardised to mean 0 and standard deviation 1. If so, length scales are multiples of the
     /// inputs' standard deviations.
     pub standardise: bool,
-    /// Exact, or by nearest neighbours.
+    /// Whether the covariance is exact or approximated with nearest neighbours.
     pub form: Form,
     /// Number of additional searches, each from a seeded random start.
     pub restarts: usize,
     /// Seed of the random starts, of the order of the rows, and of the folds.
     pub seed: u64,
-    /// Maximum number of steps of one search; 0 = the start is not changed.
+    /// Maximum number of steps of one search; 0 = the hyperparameters keep their initial values.
     pub max_iterations: usize,
     /// Initial hyperparameters, in the order and units of [`Model::hyperparameters`](super::Model::hyperparameters). If
     /// this list is empty, the start is derived from the rows.
     pub start: Vec<f64>,
-    /// Whether the 95 % interval is calibrated by nearby training rows, each predicted from all other training rows.
-    /// Otherwise, the interval is Gaussian.
+    /// Whether the 95 % interval is calibrated with training rows. For the calibration, each training row is predicted
+    /// from all other training rows. Without calibration, the interval is Gaussian.
     pub calibrate: bool,
     /// Number of threads, at least 1.
     pub threads: usize,
@@ -128,6 +128,6 @@ pub struct FitProgress {
     pub log_likelihood_per_row: f64,
 }
 
-/// A callback that is called after each step of a search. If it returns `Break`, the fit ends with
-/// [`RegressionError::Cancelled`](super::RegressionError::Cancelled).
+/// A callback that is called before the first step and after each step of a search. If the callback returns `Break`, the
+/// fit ends with [`RegressionError::Cancelled`](super::RegressionError::Cancelled).
 pub type ProgressCallback<'a> = dyn FnMut(FitProgress) -> ControlFlow<()> + 'a;

@@ -1,4 +1,5 @@
-//! Compares the exact and the nearest-neighbour form with each other and with finite differences, and tests whole fits.
+//! Compares the exact form with the nearest-neighbour form, compares gradients with finite differences, and tests whole
+//! fits.
 
 use std::ops::ControlFlow;
 
@@ -16,7 +17,8 @@ fn noise(seed: u64) -> impl FnMut() -> f64 {
     }
 }
 
-/// Returns rows of a function of two inputs: a plane plus a wave plus noise.
+/// Returns inputs and targets of rows. A target is a function of two inputs plus noise. The function is the sum of a
+/// constant, a sine of the first input, and half the product of both inputs.
 fn wavy_plane(rows: usize, seed: u64) -> (Vec<f64>, Vec<f64>) {
     let mut draw = noise(seed);
     let inputs: Vec<f64> = (0..2 * rows).map(|_| 2.0 * draw()).collect();

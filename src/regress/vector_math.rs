@@ -1,7 +1,7 @@
 //! Computes exponential and logarithm without branches, so that the compiler can vectorise the loops.
 //!
-//! The results are accurate to a few 1e-16 of their value within the stated range of the argument. Outside this range,
-//! they are meaningless. The calling loops run inside `pulp`'s dispatcher (part of faer), which selects the widest
+//! Each function states the range of its argument. Within this range, the relative error of the result is a few 1e-16.
+//! Outside this range, the result is meaningless. The calling loops run inside `pulp`'s dispatcher (part of faer), which selects the widest
 //! vector instructions of the machine at run time. Multiplications and additions are not fused, so the results are the
 //! same on every machine.
 
@@ -50,7 +50,8 @@ pub(crate) fn exp(x: f64) -> f64 {
 pub(crate) fn ln(x: f64) -> f64 {
     const MANTISSA: u64 = (1 << 52) - 1;
     let bits = x.to_bits();
-    // The bits of the number 2^52 + exponent contain the exponent. Subtracting 2^52 gives the exponent as a number.
+    // The bits of `x` contain the exponent plus 1023. These bits, combined with the bits of 2^52, are the number
+    // 2^52 + 1023 + exponent. Subtracting 2^52 + 1023 gives the exponent as a number.
     let exponent = f64::from_bits((bits >> 52) | 0x4330_0000_0000_0000) - (4_503_599_627_370_496.0 + 1023.0);
     let mantissa = f64::from_bits((bits & MANTISSA) | 0x3ff0_0000_0000_0000);
     let halve = mantissa > std::f64::consts::SQRT_2;

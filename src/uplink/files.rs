@@ -1,4 +1,4 @@
-//! Reads files named by the settings: settings, passwords, tokens, certificates.
+//! Reads the settings file, and the files that the settings name: passwords, tokens, certificates.
 //!
 //! Only regular files of limited size are read. A pipe or a device could block the program, so it gives an error.
 
@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 /// Folder of the unit's credentials (`LoadCredential=`).
 const CREDENTIALS: &str = "CREDENTIALS_DIRECTORY";
-/// Largest file, bytes: ten times the size of a file with the certificates of all public authorities.
+/// Largest file, bytes. A file with the certificates of all public authorities is several times smaller.
 const MAX_BYTES: u64 = 1 << 20;
 
 /// Reads a file.
@@ -29,8 +29,8 @@ pub(crate) fn read(path: &Path) -> Result<Vec<u8>, String> {
     Ok(bytes)
 }
 
-/// Reads a secret or a certificate, which the key `key` of the settings names. A relative path is relative to the unit's
-/// credentials folder, if it has one.
+/// Reads the secret or the certificate that the key `key` of the settings names. If the unit has a credentials folder, a
+/// relative path is relative to this folder.
 ///
 /// # Errors
 /// Fails like [`read`]. The message also names the key.

@@ -2,7 +2,8 @@
 //!
 //! Input: settings, and status documents of the daemon. Output: values in the databroker, one batch a second. After a
 //! lost connection, the program reconnects. The pauses between attempts grow from [`FIRST_PAUSE`] to [`LONGEST_PAUSE`].
-//! Documents that arrive while there is no connection are dropped, never queued. `SIGTERM` withdraws the values.
+//! Documents are never queued: the first batch of a connection contains only the newest document. On `SIGTERM` and
+//! `SIGINT`, the program sends a batch without values and ends.
 //!
 //! | module | what lives there |
 //! | --- | --- |
@@ -60,7 +61,8 @@ async fn serve(settings: &Settings) -> std::io::Result<()> {
     let (mut pause, mut latest_error) = (FIRST_PAUSE, String::new());
     loop {
         let connections = journal.counts.connections;
-        // The first batch of a connection contains the present document, or unknown values if there is no document.
+        // The first batch of a connection contains the newest document. While the daemon is silent, the first batch
+        // contains unknown values.
         documents.mark_changed();
         let Err(error) = session::run(&settings.kuksa, &mut documents, &mut stop, &mut journal).await else { break };
         let was_connected = journal.counts.connections > connections;
@@ -91,7 +93,7 @@ fn stop_requests() -> std::io::Result<watch::Receiver<bool>> {
             _ = interrupt.recv() => {}
         }
         sender.send_replace(true);
-        // The sender must stay alive, because all waits for a stop would end without it.
+        // The sender must stay alive, because all waits for a stop end when the sender is dropped.
         sender.closed().await;
     });
     Ok(receiver)

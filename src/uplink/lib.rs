@@ -1,18 +1,18 @@
-//! Sends the daemon's status to other software in and outside the vehicle: MQTT brokers (`mqtt`) and KUKSA databrokers
+//! Sends the daemon's status to other software inside or outside the vehicle: MQTT brokers (`mqtt`) and KUKSA databrokers
 //! (`kuksa`).
 //!
 //! This crate is a separate program, which reads the daemon's status stream like the exporter. A slow, missing or
-//! hostile broker can therefore not delay the estimates, and the program in the vehicle needs no network library.
+//! hostile broker can therefore not delay the estimates, and the daemon needs no network library.
 //! `packwatch mqtt`, `packwatch kuksa` and `packwatch vss` start this program.
 //!
 //! | module | what lives there |
 //! | --- | --- |
-//! | `files` | bounded reads of files named by the settings |
+//! | `files` | bounded reads of the settings file and of the files that it names |
 //! | `kuksa` | provider of a KUKSA databroker |
 //! | `mqtt` | the MQTT broker: current values, discovery, the queue for a lost link |
 //! | `options` | options of the commands that run until stopped |
 //! | `settings` | the settings file (`-c`): TOML to validated settings |
-//! | `status_stream` | documents of the daemon, one a second; `None` while there are none |
+//! | `status_stream` | documents of the daemon, one a second; `None` while the daemon is silent |
 //! | `vss` | the overlay of the vehicle signal specification |
 
 mod files;

@@ -1,8 +1,9 @@
-//! Reads the uplink's settings from a TOML file that is separate from the daemon's configuration. A change of the
-//! broker therefore changes neither the daemon nor the hash of its configuration.
+//! Reads the uplink's settings from a TOML file that is separate from the daemon's configuration. A new broker address
+//! therefore changes neither the daemon nor the hash of the daemon's configuration.
 //!
 //! Input: the file given with `-c`. Output: validated settings. An error names the file, the key and the allowed
-//! values. An error of a single key also names its line.
+//! values. If the error occurs while the TOML is parsed, it also names the line. Later checks (of `[kuksa]` and of
+//! combinations of keys) name no line.
 
 use std::path::{Path, PathBuf};
 
@@ -43,7 +44,8 @@ impl Settings {
     /// Reads the file at `path`.
     ///
     /// # Errors
-    /// Fails if the file cannot be read or is invalid. The message names file, line and reason.
+    /// Fails if the file cannot be read or is invalid. The message names the file and the reason, and the line if the
+    /// file cannot be parsed.
     pub fn read(path: &Path) -> Result<Self, String> {
         let at = path.display();
         let text = String::from_utf8(files::read(path)?).map_err(|error| format!("{at}: {error}"))?;
@@ -61,7 +63,7 @@ impl Settings {
             let found = text.lines().nth(line - 1).unwrap_or_default().trim();
             let message = error.message().replace('\n', ", ");
             let message = message.replace("expected u16", "must be a whole number from 0 to 65535");
-            // A wrong value: the line shows the key and the value found.
+            // For a wrong value, the message quotes the line, which shows the key and the value found.
             if message.starts_with("must ") || message.starts_with("invalid ") {
                 format!("{line}: {found}, {message}")
             } else {

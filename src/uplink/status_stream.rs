@@ -1,9 +1,9 @@
 //! Receives the daemon's status, one document a second.
 //!
-//! Input: the daemon's stream socket. Output: [`StatusDocument`]s. When the daemon stops sending, the output is `None`
-//! once. The daemon counts as stopped if nothing arrives for [`SILENCE`], if the stream ends, or if a document cannot
-//! be parsed. The stream is opened again every [`RETRY`]. A reader that is slower than the daemon gets only the newest
-//! document.
+//! Input: the daemon's stream socket. Output: [`StatusDocument`]s. When the daemon falls silent, the output is `None`
+//! once. The daemon counts as silent if nothing arrives for [`SILENCE`], if the stream ends, or if a document cannot
+//! be parsed. After each failure, the program waits for [`RETRY`] and opens the stream again. A reader that is slower
+//! than the daemon gets only the newest document.
 
 use std::io;
 use std::path::Path;

@@ -163,8 +163,9 @@ fn temperature_day(alarm: &str) -> Day {
     })
 }
 
-/// A cell is discharged to 10 % in the first hour, kept within 0.6 % of that level (period four minutes), and charged
-/// in the last hour. Both sensors are noisy (50 mA, 10 mV). The rule compares the filter's estimate, which is smoother.
+/// In the first hour, a cell is discharged to 10 % SOC. Its SOC then oscillates around 10 % (amplitude 0.6 %, period
+/// four minutes). In the last hour, the cell is charged. Both sensors are noisy (50 mA, 10 mV). The rule compares the
+/// filter's estimate, which is smoother.
 fn soc_day(alarm: &str) -> Day {
     let (mut noise, mut soc) = (Noise::new(2), 0.3);
     day(configuration(alarm), Rule::SocLow, |config, t| {

@@ -1,6 +1,6 @@
 //! Mixes authenticated commands with a million hostile frames. Forged, replayed, delayed and outdated frames must never
-//! be executed. A genuine command must be executed, at the latest when its sender repeats it. A journal replays without
-//! the key. Sent frames never reuse a freshness value.
+//! be executed. A genuine command must be executed, at the latest when its sender repeats it. A journal can be
+//! replayed without the key. Sent frames never reuse a freshness value.
 
 mod ecu;
 
@@ -294,8 +294,8 @@ fn sent_freshness_rises_across_restarts() {
             daemon.pass(1000);
             for frame in daemon.sent.iter().filter(|frame| matches!(frame.id().raw(), 0x6B0 | 0x6B4)) {
                 let (authentication, last) = (of(frame.id().raw()), &mut last[usize::from(frame.id().raw() == 0x6B0)]);
-                // Reconstruct the freshness as a receiver does: the lowest value above the last one with these low
-                // bits.
+                // Reconstruct the freshness as a receiver does: of the values with the received low bits, the lowest
+                // one above the last freshness.
                 let sent = authentication.sent_freshness(frame.data()).unwrap();
                 let freshness = *last + 1 + (sent.wrapping_sub(*last + 1) & 0xFFFF_FFFF);
                 let freshness =

@@ -109,7 +109,7 @@ fn silent_cells_among_active_inputs_raise_fault() {
     rig.seconds(60);
     // Four alarms: two cells with two severities each.
     assert_eq!((sleeps(&rig.events), rig.changes(Rule::InputMissing)), (vec![], vec![Change::Raised; 4]));
-    // The other inputs fall asleep later; the missing inputs stay missing.
+    // The other inputs fall silent later, so the buses count as asleep. The missing cells stay missing.
     fall_silent(&mut rig);
     rig.seconds(60);
     assert_eq!((sleeps(&rig.events).len(), rig.changes(Rule::InputMissing).len()), (1, 4));

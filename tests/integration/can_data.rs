@@ -87,7 +87,8 @@ fn kona_pack_signals_come_from_powertrain_bus_only() {
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn same_identifier_on_other_bus_decodes_wrongly() {
-    // Shows why a binding includes the interface: a decoder that looks at the identifier alone would add these values.
+    // Shows why a binding includes the interface: a decoder that looks only at the identifier would also return these
+    // wrong values.
     let folder = measured::path("can_ev");
     let (currents, _) = read(&pack(&folder, 1), &frames(&folder));
     assert_eq!(currents.len(), 108);

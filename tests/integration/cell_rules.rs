@@ -18,7 +18,7 @@ use packwatch::quantity::{CellIndex, Channel, Timestamp};
 use packwatch::sim::{Balancing, Scenario, SensorQuality, Sensors, Settings, Simulation, Wiring};
 
 const CELLS: u16 = 12;
-/// Length of a gap in the record, s, above which the vehicle counts as asleep.
+/// If no input arrives for longer than this, s, the vehicle counts as asleep.
 const SLEEP_GAP_S: f64 = 30.0;
 
 const PACK: &str = r#"
@@ -73,7 +73,7 @@ rule = "cell_imbalance"
 warning = "8 %"
 "#;
 
-/// Rules about a cell's voltages.
+/// Rules that judge a cell by its voltages.
 const OF_CELL: [Rule; 6] = [
     Rule::CapacityLow,
     Rule::UsableCapacityLow,
@@ -122,7 +122,7 @@ fn settings() -> Settings {
     settings
 }
 
-/// A pack with a fault, and all events of the core.
+/// A simulated pack with a fault, the core that monitors it, and all events of the core.
 struct FaultyPack {
     sim: Simulation,
     encoder: InputEncoder,
@@ -239,7 +239,7 @@ fn loose_contact_raises_alarm_for_its_cell() {
     pack.run_to(4.0);
     assert_eq!(pack.raised(Rule::ConnectionResistance), [Some(2)]);
     assert_eq!(pack.raised(Rule::ChannelFaulty), []);
-    // At first a loose contact may look like a loss of charge.
+    // At first, a loose contact of a cell may look like a loss of the cell's charge.
     assert!(pack.raised(Rule::CellLeak).iter().all(|cell| *cell == Some(2)));
     assert_ne!(pack.state(Rule::CellLeak, 2), AlarmState::Active);
     let contact = pack.value(Rule::ConnectionResistance, 2).unwrap();
@@ -348,7 +348,7 @@ fn with_balancing(change: fn(BalancingConfig) -> BalancingConfig) -> impl Fn(Mon
     move |config| MonitorConfig { balancing: config.balancing.map(change), ..config }
 }
 
-/// Without the bits, only the lowest cell counts as leaking: cell 3 may have been bled.
+/// Without the bits, only the lowest cell (7) counts as leaking, because the BMS may have bled cell 3.
 #[test]
 fn balancing_bits_reveal_leaks_of_other_cells() {
     let leak_of = |cell| (CellFaultKind::Leak, Some((CellIndex(cell), CellIndex(cell))));
@@ -385,7 +385,7 @@ fn downtime_reduces_knowledge_of_leak() {
         let mut pack = FaultyPack::simulated(config, settings(), Wiring::single(), "");
         pack.sim = pack.sim.with_balancing_bits();
         pack.run_to(0.01);
-        // The daemon stops during the drive and starts after the vehicle was parked for nine hours.
+        // The daemon stops during the drive and starts again nine hours after the start of the simulation.
         let stored = pack.monitor.snapshot();
         while pack.sim.advance().unwrap().time < Timestamp::from_secs(9.0 * 3600.0) {}
         pack.monitor = Monitor::new(pack.config.clone());

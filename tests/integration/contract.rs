@@ -30,9 +30,10 @@ const PAGES: usize = (CELLS / PAGE_CELLS) as usize;
 const LOSS: f64 = 0.1;
 /// Restarts in a run.
 const RESTARTS: u32 = 10;
-/// Interval between two looks at the daemon's table for a change, ms.
+/// Interval at which the test checks whether the daemon's alarm table has changed, ms.
 const STEP_MS: i64 = 100;
-/// Maximum wait until no alarm has changed for two cycles, ms. The share of bad readings changes for up to a minute.
+/// Maximum wait until no alarm has changed for two cycles, ms. After the last random change, the share of bad readings
+/// still changes for up to a minute.
 const MAX_WAIT_MS: i64 = 600_000;
 const BUS: BusIndex = BusIndex(0);
 
@@ -183,7 +184,7 @@ impl<'a> Daemon<'a> {
         self.out.clear();
     }
 
-    /// Advances the time. Sends input frames twice a second, and ticks when they have an effect.
+    /// Advances the time. Sends input frames twice a second, and those ticks that are due.
     fn run_for(&mut self, duration_ms: i64) {
         let end_ms = self.now_ms + duration_ms;
         while self.now_ms < end_ms {
@@ -299,7 +300,7 @@ fn run(config: &Config, database: &Database, seed: u64) -> (usize, i64) {
         if now != state {
             (state, since_ms) = (now, daemon.now_ms);
         }
-        // The listener's cycle time may be as old as its last digest.
+        // The listener learns the cycle time from digests, so it may have changed since the last check.
         two_cycles_ms = 2 * daemon.listener.as_ref().unwrap().listener.cycle_ms();
         assert!(daemon.now_ms < began_ms + MAX_WAIT_MS, "seed {seed}: alarms never settle");
     }

@@ -68,7 +68,8 @@ struct Tally {
     values: usize,
     /// Number of compared values per signal, by full name.
     per_signal: BTreeMap<String, usize>,
-    /// For each signal that extends past its message: number of frames, all of them too short for the signal.
+    /// Number of payloads per signal that extends past the end of its message. All these payloads are too short for the
+    /// signal.
     short: BTreeMap<String, usize>,
 }
 

@@ -98,7 +98,7 @@ fn add_other_messages(log: &Path, dbc: &Path) {
     std::fs::write(log, all).unwrap();
 }
 
-/// Writes the raw frames of a car's test cases as a log: each request followed by its answer, one per second.
+/// Writes the raw frames of a car's test cases as a log. Each request is followed by its answer.
 fn log_of_cases(folder: &Path, car: &str, year: &str, identifiers: &[&str], log: &Path) {
     let mut streams: Vec<Vec<Case>> = Vec::new();
     for identifier in identifiers {

@@ -28,8 +28,8 @@ fn json(args: &[&str]) -> Value {
     serde_json::from_str(&out).unwrap()
 }
 
-/// The true cell: the label's chemistry, but with an open-circuit curve that is 15 mV higher in the middle, another
-/// capacity and other resistances.
+/// The true cell: the label's chemistry, but with an open-circuit curve that is 15 mV higher in the middle and another
+/// capacity. `drive` also scales its resistances.
 fn true_model() -> CellModel {
     let mut model = Label::usual(Chemistry::NcaGraphite, TRUE_AH).model().unwrap();
     let soc = model.soc.clone();

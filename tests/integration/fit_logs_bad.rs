@@ -55,7 +55,8 @@ impl Drive {
         model
     }
 
-    /// Current at the given second, A. Repeats 20 s at 1C, 20 s at C/3 and 20 s of rest, with longer rests of 10 min. A
+    /// Current at the given second, A. Repeats 20 s at 1C, 20 s at C/3 and 20 s of rest, with longer rests of 10 min.
+    /// If `has_rests` is false, the current is C/5 instead of the short rests, and the longer rests are left out. A
     /// charge has half of these currents.
     fn current_a(&self, second: u32) -> f64 {
         let discharge_a = match second % 60 {

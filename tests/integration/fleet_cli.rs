@@ -155,7 +155,7 @@ fn killed_run_continues_and_keeps_complete_vehicles() {
     let count = |word: &str| outcomes.iter().filter(|vehicle| vehicle["outcome"] == word).count();
     let kept: usize =
         printed.split(" already complete").next().and_then(|text| text.rsplit(' ').next()?.parse().ok()).unwrap();
-    // One of the recorded vehicles may be the one with the broken log.
+    // One of the vehicles that were complete before may be the one with the broken log, which is replayed again.
     assert!((before - 1..=before).contains(&kept) && kept > 0, "{before} were complete: {printed}");
     assert_eq!((count("complete"), count("failed")), (6, 1), "a failed vehicle is replayed again");
     assert!(wanted == fleet.merged(&["killed"], "continued"));

@@ -82,7 +82,7 @@ fn cross_validation_reports_every_kernel() {
         assert!((0.89..=0.995).contains(&number("coverage_95")), "{kernel}");
         assert!(number("peak_memory_kib") > 1000.0 && kernel["folds"].as_array().unwrap().len() == 3, "{kernel}");
     }
-    // The score is computed from the written rows.
+    // The score must equal the score that the test calculates from the written rows.
     let text = std::fs::read_to_string(place.join("all.csv")).unwrap();
     assert_eq!(
         text.lines().next().unwrap(),

@@ -200,7 +200,8 @@ fn own_identifiers_are_reported_but_echo_is_not() {
     );
 }
 
-/// Events of a drive. From time `differs_s`, s, the frozen current is wrong by 1 % of the largest current.
+/// Events of a drive. `differs_s` is the first time, s, at which the frozen current differs from the true current by
+/// more than 1 % of the largest valid current.
 struct Drive {
     events: Vec<(f64, EventKind)>,
     validity: Validity,

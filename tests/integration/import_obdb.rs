@@ -59,7 +59,7 @@ impl ImportedCar {
              signal = \"Other.Current\"\npositive = \"charge\"\n[input.cell_voltage]\nsignal = \"Other.Cell{{n}}\"\n"
         );
         for (number, (name, _)) in (1..).zip(&signals) {
-            // An explicit scale accepts the unit.
+            // With an explicit scale, packwatch accepts any unit of the signal.
             writeln!(config, "[[input.temperature]]\nsignal = \"{name}\"\nscale = 1.0\ncells = \"{number}\"").unwrap();
         }
         let folder = tempfile::tempdir().unwrap();

@@ -186,7 +186,7 @@ fn usable_capacity_converges_from_wrong_start() {
     }
 }
 
-/// Seed and unit of the windows.
+/// For each run: the seed of the windows, and the unit of their length.
 const RUNS: [(u64, WindowUnit); 4] =
     [(1, WindowUnit::Duration), (2, WindowUnit::Duration), (3, WindowUnit::Charge), (4, WindowUnit::Charge)];
 
@@ -214,7 +214,8 @@ fn usable_capacity_is_learned_from_windows() {
             assert!(life.mean_absolute_ah < 0.085, "{cell} {by} {seed}: {} Ah", life.mean_absolute_ah);
             (sum_ah, sum_covered) = (sum_ah + life.mean_absolute_ah, sum_covered + life.covered);
         }
-        // A single set of windows can be bad throughout, since each error of the voltage curve recurs at its SOC.
+        // One set of windows can be bad as a whole, because the voltage curve has the same error each time that the SOC
+        // is the same. The limit of the mean is therefore lower.
         let (mean_ah, covered) = (sum_ah / RUNS.len() as f64, sum_covered / RUNS.len() as f64);
         assert!(mean_ah < 0.065, "{cell}: {mean_ah} Ah");
         // Coverage is too low: the interval does not include curve errors that differ between the two ends of a window.

@@ -30,7 +30,7 @@ impl Rig {
         self.out.want_estimates = true;
         self.events.clear();
         self.tick_with_frames();
-        // Signals age in seconds, so one step of a second replaces ten of 0.1 s.
+        // A signal counts as missing only after some seconds, so one step of 1 s replaces ten steps of 0.1 s.
         self.deci += 9;
         let finite = self.out.estimates.drain(..).all(|estimate| {
             let e =

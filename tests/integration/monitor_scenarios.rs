@@ -299,7 +299,7 @@ fn soc_jump_is_not_a_recharge_period() {
     c.rules = vec![rule(Rule::RechargePeriodLow, 1500.0, 0.0)];
     let mut b = Bench::new(c, 0.2);
     b.run(-1.3, 60);
-    // The filter is lost during a charge and restarts at 0.9, as after a sleep or with wrong wiring.
+    // Let the true SOC jump to 0.88 during a charge, as after a sleep or with wrong wiring. The filter then restarts.
     b.soc = 0.88;
     b.run(-1.3, 200);
 

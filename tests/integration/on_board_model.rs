@@ -58,7 +58,7 @@ fn true_model(config: &MonitorConfig) -> CellModel {
 
 /// SOC ranges of deep cycles.
 const DEEP: [(f64, f64); 1] = [(0.08, 0.97)];
-/// SOC ranges of partial cycles: 60 % of the charge, occasionally charged until full.
+/// SOC ranges of partial cycles. Each cycle moves 60 % of the capacity, and every third cycle charges until full.
 const PARTIAL: [(f64, f64); 3] = [(0.4, 1.0), (0.1, 0.7), (0.25, 0.85)];
 
 /// Frames of some cycles of a cell with the given capacity, Ah, in time order. The SOC ranges are used in turn.
@@ -89,7 +89,7 @@ fn vehicle(
     all
 }
 
-/// Adds frames at rest after each cycle: the vehicle stays awake for some minutes.
+/// Adds frames at rest after each cycle, as if the vehicle stayed awake for some minutes.
 fn with_rests(
     config: &MonitorConfig,
     frames: Vec<(Timestamp, BusIndex, Frame)>,
@@ -217,7 +217,8 @@ fn restored_state_continues_learning_unchanged() {
     let mut whole = Live::new(&config);
     let (mut twin, mut from): (Option<Live>, usize) = (None, 0);
     for (at, frame) in frames.iter().enumerate() {
-        // Follow each stored state for a night, then take the next one.
+        // Restore a twin from a stored state seven times. Compare each twin with the uninterrupted monitor until the
+        // next twin replaces it.
         if at % (frames.len() / 7) == frames.len() / 14 {
             twin = Some(Live::restored(&config, whole.monitor.snapshot()));
             from = whole.said.len();

@@ -1,5 +1,6 @@
-//! The written DBC must load strictly in `cantools`. Every frame encoded by the same layout must decode to the original
-//! values within one bit. The test covers every kind of frame, protection, identifier and cell.
+//! Checks that `cantools` loads the written DBC in strict mode, and that every sent frame decodes to the original
+//! values within half a step of each signal. The test covers every sent message, every protection profile, standard and
+//! extended identifiers, classic and FD frames, and two rated capacities.
 
 use std::collections::{BTreeSet, HashMap};
 use std::path::Path;
@@ -22,7 +23,8 @@ use rand_chacha::rand_core::{Rng, SeedableRng};
 /// Frames per message and configuration.
 const FRAMES: usize = 40;
 
-/// Rules in numerical order: factor from the internal unit to the wire unit, and the largest tested value.
+/// Rules in the order of their numbers. Each row: name, factor from the internal unit to the unit in the frame, and
+/// largest tested value.
 const RULES: [(&str, f64, f64); 17] = [
     ("CapacityLow", 1.0, 5.0),
     ("UsableCapacityLow", 1.0, 5.0),
@@ -130,7 +132,8 @@ impl Maker {
         self.random.next_u32() % count
     }
 
-    /// Half the step of a signal in the layout. The test thus checks the resolution that the layout promises.
+    /// Half the step of a signal in the layout. With this tolerance the test checks the resolution that the layout
+    /// promises.
     fn half_step(&self, name: &str) -> f64 {
         self.database.signal(name).unwrap().1.layout.factor / 2.0
     }

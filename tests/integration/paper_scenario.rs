@@ -21,9 +21,9 @@ const SETTLING_CYCLES: usize = 1;
 const LEARNING_CYCLES: usize = 3;
 /// Largest |SOC error| of any sample. The paper's figures: 0.05, and 0.20 at the end of life.
 const MAX_SOC_ERROR: f64 = 0.005;
-/// Largest relative |capacity error| after a half-cycle. The current sensor's gain error alone makes up half of it.
+/// Largest relative |capacity error| at the end of a cycle. The current sensor's gain error alone causes half of it.
 const MAX_CAPACITY_ERROR: f64 = 0.01;
-/// Smallest fraction of cycles whose true capacity lies within two stated standard deviations.
+/// Minimum fraction of cycles in which the true capacity lies within two stated standard deviations of the estimate.
 const MIN_COVERAGE: f64 = 0.90;
 
 /// Errors of one cycle.

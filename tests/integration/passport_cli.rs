@@ -361,7 +361,7 @@ fn missing_static_members_are_named() {
     ];
     let mut pointers = Vec::new();
     members(&manufacturer(), "", &mut pointers);
-    // Skip members of list items whose names begin with `c` or `header`, mostly those of documents.
+    // Skip the members of list items, mostly of documents, whose names begin with `c` or `header`.
     let is_wanted = |pointer: &&String| !pointer.contains("/0/c") && !pointer.contains("/0/header");
     let mut document = manufacturer();
     let mut expected = Vec::new();
@@ -538,7 +538,7 @@ fn sleep_between_trips_loses_no_charge() {
     life.rest("first.log");
     life.simulate("second.log", "1700040000", &["--cycles", "1"]);
     let text = fs::read_to_string(life.path("pack.toml")).expect("a file");
-    // With the shorter age the buses fall asleep before the recorder.
+    // With the shorter age, the buses count as asleep before the recorder does.
     for age in ["max_age_s = 60.0", "max_age_s = 5.0"] {
         fs::write(life.path("pack.toml"), text.replace("max_age_s = 60.0", age)).expect("written");
         let args = of_logs(&life, &["first.log", "second.log"]);

@@ -24,7 +24,8 @@ use rand_chacha::ChaCha8Rng;
 
 const RATED_AH: f64 = 2.6;
 const FLEET: usize = 40;
-/// SOC ranges of the charges: three cover the window of 30 to 90 %, two cover only a part.
+/// SOC ranges of the charges. The window is 30 to 90 %. Three ranges extend beyond the window, one equals the window,
+/// and one covers only a part.
 const DEPTHS: [(f64, f64); 5] = [(0.20, 0.95), (0.25, 0.92), (0.10, 0.98), (0.30, 0.90), (0.40, 0.85)];
 /// Number of cycles before the fleet is judged.
 const CYCLES: u32 = 4;
@@ -95,7 +96,7 @@ struct Rig {
     reported: ChargeReport,
     alarms: u32,
     health: Option<[u8; 8]>,
-    /// Counted charge (A s) and estimated SOC when this charge entered the window, and now.
+    /// Counted charge (A s) and estimated SOC: first when the present charge entered the window, then now.
     own: Option<[(f64, f64); 2]>,
     counted_as: f64,
 }

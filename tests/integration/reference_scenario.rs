@@ -3,10 +3,10 @@
 //! error below 0.5 %.
 //!
 //! The example's tables are not published. This test uses the tables of `config/cells/example_nmc_2600.toml`, scaled to
-//! 30 Ah, that is eleven and a half such cells in parallel: resistances are divided by 30 / 2.6, capacitances
-//! multiplied by this ratio. Samples and sensors are as in the paper's scenario: one sample per second; voltage noise 5
-//! mV; current noise 20 mA, offset 10 mA, gain error 0.5 %. The gain error limits the capacity accuracy of any
-//! estimator. To print the table: `cargo test --workspace --test integration reference_scenario -- --nocapture`.
+//! 30 Ah, as if eleven and a half such cells were connected in parallel: resistances are divided by 30 / 2.6,
+//! capacitances are multiplied by 30 / 2.6. Samples and sensors are as in the paper's scenario: one sample per second;
+//! voltage noise 5 mV; current noise 20 mA, offset 10 mA, gain error 0.5 %. The gain error limits the capacity accuracy
+//! of any estimator. To print the table: `cargo test --workspace --test integration reference_scenario -- --nocapture`.
 
 use std::path::Path;
 

@@ -219,7 +219,8 @@ fn start_waiting(
     let (up, still): (Vec<_>, Vec<_>) = waiting.drain(..).partition(|(up, ..)| time >= *up);
     *waiting = still;
     for (up, mode, state) in up {
-        // Skip a restart if the bus fell asleep before its first estimate: another test covers this case.
+        // If no frame follows the restart within a second, the bus has fallen asleep. Skip this restart: another test
+        // covers the case.
         if time.since(up) > 1.0 {
             continue;
         }

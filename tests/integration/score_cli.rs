@@ -103,7 +103,8 @@ fn cell_error_appears_in_score() {
 
 #[test]
 fn truth_uses_given_capacity() {
-    // 1.5 Ah leave 25 % of 2 Ah, or 50 % of 3 Ah: with 3 Ah the estimate ends 25 points below the truth.
+    // After a discharge of 1.5 Ah, a cell of 2 Ah has 25 % left and a cell of 3 Ah has 50 % left. With a true capacity
+    // of 3 Ah, the estimate therefore ends 25 points below the truth.
     let bench = Bench::new();
     bench.write_discharge("drive.csv", 1.5, 0.0);
     let score = &bench.json(&["drive.csv", "--told", "0", "--truth-capacity", "3", "--settle", "0"])["scores"][0];
@@ -117,15 +118,15 @@ fn start_in_middle_drops_earlier_rows() {
     bench.write_discharge("drive.csv", 1.5, 0.0);
     let document = bench.json(&["drive.csv", "--start", "full,middle", "--told=-10", "--remove", "0.25"]);
     let rows: Vec<u64> = document["scores"].as_array().unwrap().iter().map(|s| s["rows"].as_u64().unwrap()).collect();
-    // A SOC of 0.75 is reached after removing 0.25 of 2 Ah, 1800 s at 1 A.
+    // The SOC reaches 0.75 when 0.25 of 2 Ah has been removed: after 1800 s at 1 A.
     assert_eq!(rows, [5401, 5401 - 1800]);
-    // The initial SOC is 10 points below the true 75 %; the first voltage has already corrected it.
+    // The initial SOC is 10 points below the true 75 %. The first voltage already corrects a part of this error.
     assert!((-10.1..-0.1).contains(&number(&document["scores"][1], "first_error_points")), "{document}");
 }
 
 #[test]
 fn current_offset_is_added_before_core() {
-    // In 1.5 h, 0.1 A integrate to 7.5 points of 2 Ah.
+    // In 1.5 h, a current of 0.1 A moves 7.5 % of 2 Ah.
     let bench = Bench::new();
     bench.write_discharge("drive.csv", 1.5, 0.0);
     let args = ["drive.csv", "--told", "0", "--current-offset=-0.1,0,0.1"];
@@ -135,7 +136,7 @@ fn current_offset_is_added_before_core() {
     assert_eq!(offsets, [-0.1, 0.0, 0.1]);
     let errors: Vec<_> = (0..3).map(|i| number(&document["scores"][i], "mean_error_points")).collect();
     // With an offset of +0.1 A, more charge seems to leave than really does, so the estimate falls below the truth. The
-    // voltage keeps the error far below the integral's 7.5 points.
+    // voltage keeps the error far below 7.5 points.
     assert!(errors[0] > errors[1] + 0.02 && errors[2] < errors[1] - 0.02, "{errors:?}");
     assert!(errors.iter().all(|error| error.abs() < 1.5), "{errors:?}");
     let table = String::from_utf8(bench.score(&args).success().get_output().stdout.clone()).unwrap();

@@ -83,7 +83,8 @@ fn lead_times_follow_truth_file() {
         let later = row(&document, log, 2)["first"]["days"].as_f64();
         assert!(later.is_none_or(|later| later >= raised), "{later:?} before {raised}");
     }
-    // Without an end of life the same raises are false, or undecided if the horizon is longer than the log.
+    // If the cell never reaches its end of life (here 1.0 Ah), the same raises are false. If the horizon is also longer
+    // than the log, the raises are undecided.
     let healthy = [&set[..3], &["1.0", "a.log.gz"]].concat();
     let document = bench.whatif(&healthy);
     assert_eq!(row(&document, 0, 1)["false_alarms"], row(&document, 0, 1)["raises"]);

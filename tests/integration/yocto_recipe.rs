@@ -1,6 +1,6 @@
-//! Compares the Yocto recipe (`packaging/yocto`) with the sources: the files that the recipe names exist, and its
-//! version, licence texts and Rust version match the repository. Whether bitbake accepts the recipe is checked by hand;
-//! see the manual, page Install.
+//! Compares the Yocto recipe (`packaging/yocto`) with the sources. Every file that the recipe installs must exist. The
+//! recipe's version, units, licence checksums and build flags must match the repository. Whether bitbake accepts the
+//! recipe is checked by hand; see the manual, page Install.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -24,7 +24,7 @@ fn recipe() -> (String, String) {
     (path.file_name().unwrap().to_str().unwrap().to_owned(), fs::read_to_string(path).unwrap())
 }
 
-/// Words of a variable's value, without the quotes.
+/// Words of the value that the recipe assigns to a variable, without the quotes.
 fn words<'a>(text: &'a str, variable: &str) -> Vec<&'a str> {
     let (_, rest) =
         text.split_once(&format!("\n{variable} = \"")).unwrap_or_else(|| panic!("the recipe has no {variable}"));

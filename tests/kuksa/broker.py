@@ -1,6 +1,6 @@
-"""Databrokers for the test: a strict one built from kuksa-client's published stubs, and the real one if its program is named.
+"""Databrokers for the test: a strict one built from kuksa-client's published stubs, and the real one if PACKWATCH_DATABROKER names its program.
 
-Both serve the same VSS files, and kuksa-client reads both. The strict one records violations by the provider.
+Both serve the same VSS files, and kuksa-client reads both. The strict one records each violation of the protocol by the provider.
 """
 
 import concurrent.futures
@@ -50,7 +50,7 @@ def leaves(files: list[Path]) -> dict[str, dict]:
 
 
 class StrictBroker:
-    """Serves kuksa.val.v2 for a provider and for readers, and kuksa.val.v1 for readers; aborts at the first violation."""
+    """Serves kuksa.val.v2 for a provider and for readers, and kuksa.val.v1 for readers. Aborts a call at its first violation."""
 
     def __init__(self, port: int, files: list[Path], token: str | None = None, tls: tuple[bytes, bytes] | None = None,
                  twins: tuple[str, str] | None = None, is_stalled: bool = False):
@@ -110,7 +110,7 @@ class StrictBroker:
         return entry
 
     def fault(self, path: str, point: types_v2.Datapoint) -> str | None:
-        """The fault of a data point for this path, or None."""
+        """What is wrong with a data point of this path, or None."""
         node = self.nodes[path]
         if not point.HasField("timestamp") or abs(point.timestamp.seconds - time.time()) > 60:
             return f"{path}: no current time stamp"
@@ -197,7 +197,7 @@ class V2(rpc_v2.VALServicer):
         outgoing.put(None)
 
     def GetValue(self, request, context):
-        """Like the databroker 0.7: returns the provider's answer or, if there is none within a second, the stored value.
+        """Like the databroker 0.7: returns the provider's answer or, after a second without an answer, the stored value.
 
         A late answer is mistaken for the answer to the next request.
         """

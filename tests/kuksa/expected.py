@@ -6,7 +6,7 @@ import struct
 STANDARD = "Vehicle.Powertrain.TractionBattery."
 OVERLAY = STANDARD + "Packwatch."
 
-# VSS's own signals of the battery (release 6): datatype and range.
+# Battery signals of VSS itself (release 6), with their datatypes.
 VSS = {
     "CurrentVoltage": "float", "CurrentCurrent": "float", "CurrentPower": "float",
     "Temperature.Average": "float", "Temperature.Min": "float", "Temperature.Max": "float", "Temperature.CellTemperature": "float[]",

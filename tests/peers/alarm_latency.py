@@ -1,13 +1,13 @@
 """Measures the time from a frame on vcan0 to the answering frame. The kernel stamps both on one listening socket.
 
 usage: alarm_latency.py alarm FILE COUNT   sends half-cycles to a daemon with the configuration of alarm_latency.test; measures
-                                           from the frame that completes a half-cycle to the alarm frame it causes
+                                           the time from the frame that ends a half-cycle to the alarm frame
        alarm_latency.py loop FILE COUNT    sends frames 0x123 to a program that answers each with the same data under 0x321
        alarm_latency.py echo               runs such a program, as the lower bound of the time
        alarm_latency.py report FOLDER      prints and judges the results; also needs the daemon's files
 
-FILE gets {"late_ns": [...], ...}. After sending a frame this program sleeps before it looks for the answer, because with one
-CPU it would otherwise delay the answering program.
+The times are written to FILE as {"late_ns": [...], ...}. After sending a frame this program sleeps before it looks for the
+answer, because with one CPU it would otherwise delay the answering program.
 """
 import json
 import random
@@ -26,10 +26,11 @@ RULE, STATE = (16, 5), (21, 3)
 CAPACITY_LOW, ACTIVE, CLEARED = 1, 1, 2
 # The first frame after 10 ms (min_duration_s of the configuration) confirms a new mode (charge or discharge).
 MODE_S = 0.012
-# A half-cycle has almost no current except in one pulse. A weak pulse gives 0.25 Ah with the configuration's swing, a strong one 2.1 Ah.
+# In each half-cycle the current is almost zero except for one pulse. With the configuration's swing, a weak pulse gives a capacity
+# of 0.25 Ah, and a strong pulse 2.1 Ah.
 IDLE_A, WEAK_A, STRONG_A, PULSE_S = 0.008, 0.35, 3.0, 0.03
-# Charge according to the frames' time stamps, Ah. A busy machine lengthens pulses and pauses: half-cycles that are not clearly
-# below or above the alarm's thresholds, or impossible for a cell of 2.6 Ah, are not judged.
+# Ranges of the capacity (charge over swing) according to the frames' time stamps, Ah. A busy machine lengthens pulses and pauses.
+# If the capacity is near the alarm's thresholds, or impossible for a cell of 2.6 Ah, the half-cycle is not judged.
 SWING, WEAK_AH, STRONG_AH = 1.2e-5, (0.0, 0.8), (1.4, 4.0)
 # The first half-cycles have no complete predecessor.
 WARM_UP = 4
@@ -66,8 +67,8 @@ def current_of(data):
 
 
 def last_half_cycle(cells, sign):
-    """Charge of the half-cycle before the latest change of sign, Ah, and the stamp of the frame that ended it (the second one with the
-    new sign). None if a busy machine has not delivered that frame yet."""
+    """Capacity (charge over swing, Ah) of the half-cycle before the latest change of sign, and the stamp of the frame that ended
+    this half-cycle: the second frame with the new sign. The stamp is None if a busy machine has not delivered that frame yet."""
     end = max((n for n, (_, current_a) in enumerate(cells) if current_a * sign < 0), default=-1) + 1
     begin = max((n for n, (_, current_a) in enumerate(cells[:end]) if current_a * sign > 0), default=-1) + 1
     frames = cells[begin : end + 1]
@@ -100,7 +101,7 @@ class Listener:
             seen.append((seconds * 10**9 + nanoseconds, can_id, payload[:length]))
 
     def stamp_of(self, is_answer):
-        """The stamp of the first matching frame, or None after the maximum wait; and all received frames."""
+        """(stamp of the first matching frame, or None after the maximum wait; all received frames)"""
         seen, deadline = [], time.monotonic() + PATIENCE_S
         time.sleep(LOOK_S)
         while True:
@@ -127,7 +128,7 @@ def measure_alarm(count):
         sender.send(cell(sign * IDLE_A))
         time.sleep(MODE_S)
         sender.send(cell(sign * IDLE_A))
-        # The half-cycle that has just ended is the opposite of the coming one: a weak one before a strong one.
+        # If a strong half-cycle begins now, the one that has just ended was weak, so it raises the alarm.
         change = (CAPACITY_LOW, ACTIVE if strong else CLEARED)
         def is_answer(i, data, change=change):
             return i == ALARM and (bits(data, *RULE), bits(data, *STATE)) == change
@@ -183,12 +184,12 @@ def echo():
 
 
 def at(late_ns, share):
-    """Nearest rank, in ms."""
+    """Percentile by nearest rank, ms."""
     return sorted(late_ns)[max(0, -(-len(late_ns) * share // 100) - 1)] / 1e6
 
 
 def decided_by_frame(folder, late_ns):
-    """Keeps the results in which a frame decided. The daemon also checks the clock ten times a second; if a check falls between
+    """Keeps the results of the alarms that a frame triggered. The daemon also checks the clock ten times a second; if a check falls between
     the two frames, the check confirms the mode. The daemon's events contain the time of the input at which each alarm changed."""
     stamp = re.compile(r"^\((\d+)\.(\d{9})\)", re.MULTILINE)
     frames = {int(a + b) for a, b in stamp.findall((folder / "watched.journal").read_text())}

@@ -1,4 +1,5 @@
-//! Packwatch's part of the parsing comparison with `parse.c` and `parse.py`: blocks of the file, lines, frames, DBC signals.
+//! Packwatch's part of the parsing comparison with `parse.c` and `parse.py`: reads blocks of the file, splits lines,
+//! parses frames and decodes DBC signals.
 //!
 //! `cargo run --release --example parse -- LOG DBC [FRAMES]` prints: frames, sum of all values, seconds. It uses the same
 //! readers as `packwatch replay` up to the sample stage, and an [`InputMap`] with every signal of the DBC.

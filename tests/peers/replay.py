@@ -2,10 +2,10 @@
 
 replay.py LOG CONFIG SOCS      prints: frames steps seconds; writes the SOC after each step to SOCS, one number per line
 
-The filter is the same as in src/cell/estimator.rs: states [SOC, U1, ln rho, C], and the same tables, circuit, process and measurement
+The filter is the same as in src/core/cell/estimator.rs: states [SOC, U1, ln rho, C], and the same tables, circuit, process and measurement
 noises (defaults of docs/src/reference/keys.md). The sigma points come from filterpy's own class and are redrawn before the update.
-The peer omits, to its advantage: gate, consistency check, gaps in the current (an error here), learning at transitions, alarms, sent
-frames.
+The peer has less work than packwatch, because it omits the gate, the consistency check, learning at transitions, alarms and sent
+frames. A gap in the current ends the peer with an error.
 """
 import bisect
 import math

@@ -1,5 +1,5 @@
-"""Rows and frames through the monitor give the results of a replay, in any portions; bad input raises an exception that names
-the fault."""
+"""Rows and frames given to a Monitor, in one call or in portions, produce the results of a replay. Bad input raises an exception
+that names the fault."""
 
 import os
 import signal

@@ -45,7 +45,7 @@ def load(path, strict):
     """The DBC as cantools reads it, with the file's own names.
 
     If a file gives long names (over 32 characters), cantools renames a multiplexor but not the references to it in the dependent
-    signals, and then cannot decode them. These attributes are therefore removed.
+    signals, and then cannot decode these signals. The attributes with the long names are therefore removed.
     """
     import cantools
 
@@ -70,7 +70,7 @@ def decode(path, strict):
             data = bytes.fromhex(payload).ljust(message.length, b"\0")
             values = message.decode(data, decode_choices=False, scaling=True)
             print("\t".join(f"{k}={v!r}" for k, v in values.items() if (name, k) not in left_out))
-        except Exception as error:  # for example an unknown page
+        except Exception as error:  # for example an unknown multiplexer value
             print(f"!{type(error).__name__}: {error}".replace("\n", " "))
 
 

@@ -234,7 +234,7 @@ class Comparison:
 def compare(reader, life, estimates, events, frame_list):
     rules = {code: snake(str(word)) for code, word in reader.signals["PACKWATCH_Alarm", "Rule"].choices.items()}
     result = Comparison(reader, rules)
-    pending = defaultdict(list)  # alarm events by time that still need an immediate frame
+    pending = defaultdict(list)  # by time: alarm events that still need an immediate frame
     for event in events:
         if event["event"] == "alarm":
             pending[event["time"]].append(event)
@@ -290,15 +290,15 @@ def compare_digest(result, life, time, values):
 
 
 def compare_alarm(result, life, time, values, pending):
-    """The first frame after an alarm event must match that event. The others repeat alarms that are raised, unknown, or changed
-    before."""
+    """The first frame after an alarm event must match that event. The other frames repeat alarms that are raised or unknown,
+    or that changed earlier."""
     rule, cell = result.rules[values["Rule"]], values["Cell"]
     severity = {number: word for word, number in SEVERITIES.items()}[values["Severity"]]
     name = next(signal for signal in values if signal.startswith("Value_"))
     threshold = name.replace("Value_", "Threshold_")
     factor = 100 if result.reader.signals["PACKWATCH_Alarm", name].unit == "%" else 1
     key = rule, cell, severity
-    # If there are more changes than the frame budget allows, they are sent one after another, each alarm in its present state.
+    # If more alarms change than the frame budget allows, their frames are sent one after another, each with the alarm's present state.
     waiting = [(at, e) for at in pending if time - WAIT_NS <= at <= time for e in pending[at] if (e["rule"], e["cell"], e["severity"]) == key]
     at_once = waiting[-1][1] if waiting else None
     result.value(time, "Alarm", "Test", values["Test"], 0)

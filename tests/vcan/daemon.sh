@@ -7,8 +7,8 @@ packwatch=${PACKWATCH_BIN:?names the program under test}
 config=$tmp/config
 cp -r "$(dirname "${BASH_SOURCE[0]}")/../../config" "$config"
 
-# daemon NAME CONFIG ARGS...: runs without a control socket unless ARGS name one, because a packwatch installed on this
-# machine may use the default socket.
+# daemon NAME CONFIG ARGS...: runs without control socket, status socket and state folder unless ARGS name them, because a
+# packwatch installed on this machine may use the default ones.
 daemon() {
     local name=$1 file=$2 base=$tmp/$1
     shift 2
@@ -50,9 +50,9 @@ replayed() {
 }
 
 # restart_bar LOG...: allowed SOC difference, in points, between a restarted daemon and one that kept running. If all restarts
-# took at most 2.5 s (see the logs), 0.2 points are allowed. Otherwise the bar is the SOC that the drive's largest current moves
-# during the longest restart: 6.2 A of 2.6 Ah are 0.066 points a second. A tenth of this and 0.02 points are added for the time
-# between the last sample and the state's time stamp.
+# took at most 2.5 s (see the logs), 0.2 points are allowed. Otherwise the allowed difference is the SOC change that the drive's
+# largest current causes during the longest restart: 6.2 A of 2.6 Ah are 0.066 points a second. A tenth of this and 0.02 points are
+# added for the time between the last sample and the state's time stamp.
 restart_bar() {
     cat -- "$@" | sed -nE 's/.*state (taken up|restored).* away=([0-9.]+).*/\2/p' |
         awk '$1 > away { away = $1 } END { print (away > 2.5 ? 0.073 * away + 0.02 : 0.2) }'

@@ -181,7 +181,8 @@ def reported_by(files: list[Path]) -> tuple[int, int, int]:
 
 
 def learned(args) -> None:
-    """Reads the reports before the store: a value that is stored and reported in between is then only an extra row."""
+    """Reads the reports before the store. If the daemon stores and reports a value in between, the store then has an extra row,
+    which is allowed."""
     reported, stored = reported_by(args.events), Store(args.state).counts()
     print(" ".join(map(str, stored)))
     if any(of_store < of_events for of_store, of_events in zip(stored, reported)):
@@ -222,7 +223,7 @@ def same(args) -> None:
 
 
 def apart(args) -> None:
-    """Status frames of two daemons on one bus."""
+    """Compares the SOC in the status frames of two daemons on one bus."""
     latest, worst, pairs, unsure = {}, 0.0, 0, 0
     names = [int(args.whole, 16), int(args.other, 16)]
     for name, data in frames(open(args.dump), args.interface):
@@ -299,7 +300,7 @@ def play(args) -> None:
 
 
 def flood(args) -> None:
-    """Sends bursts every 10 ms, because the user-mode kernel does not support shorter sleeps."""
+    """Sends a burst of frames every 10 ms, as many as the rate requires."""
     bus, rng = Bus(args.interface), random.Random(1)
     ids = [0x200 + n for n in range(min(args.ids, 0x480))] + [0x18000000 + 977 * n for n in range(args.ids - 0x480)]
     data = [rng.randbytes(8) for _ in range(64)]

@@ -11,7 +11,7 @@ The first lines of a test state its needs:
     # run-tests: 12 s, smoke                       `--smoke` (and `tests/all --quick`) runs only these
 
 Tests with --disk and tests that boot by themselves ("with-vcan: on the host") also have separate kernels. The others share
-boots: each boot takes the next test from a common queue until it is empty (in-boot). Every test has its own network,
+boots: each boot takes the next test from a common queue until the queue is empty (in-boot). Every test has its own network,
 processes, mounts and root. If a kernel dies, its current test fails and the next boot continues with the rest. If the host's
 kernel has vcan, each test runs in its own namespaces without a boot.
 

@@ -60,7 +60,7 @@ pub fn configuration(data: &[u8]) {
     }
 }
 
-/// Loads arbitrary bytes as the cell model, or the example's cell model with one to six changed numbers. Runs a monitor
+/// Loads arbitrary bytes as the cell model, or the example cell model with one to six changed numbers. Runs a monitor
 /// if the model is accepted.
 pub fn cell_model(data: &[u8]) {
     let mut source = Source::new(data);

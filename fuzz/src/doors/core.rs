@@ -36,7 +36,8 @@ const MS: i64 = 1_000_000;
 /// If no input arrives for longer than this time in seconds, a restored monitor assumes that the program was off.
 const BREAK_S: f64 = 30.0;
 
-/// Feeds the inputs to a monitor and checks its outputs. A second run with the same inputs must give the same outputs.
+/// Feeds the inputs to a monitor and checks its outputs. In one of eight executions, a second run with the same inputs
+/// must give the same outputs.
 pub fn core(data: &[u8]) {
     let mut source = Source::new(data);
     let is_repeated = source.byte().is_multiple_of(8);
@@ -56,8 +57,8 @@ pub fn cuts(data: &[u8]) {
     let (mut expected, mut found) = (outputs(), outputs());
     let (mut until_cut, mut cuts) = (steps[0], 0);
     for (nth, record) in records.iter().enumerate() {
-        // Measure the break from the monitor's clock, not from the previous stamp: after a stamp in the far future, the
-        // monitor does not immediately set its clock back to earlier stamps.
+        // Measure the break from the monitor's clock, not from the previous stamp: if earlier stamps follow a stamp in
+        // the far future, the monitor does not immediately set its clock back.
         let is_break = record.time.since(whole.now()).abs() > BREAK_S;
         if until_cut == 0 && cuts < MAX_CUTS && !is_break {
             cuts += 1;

@@ -10,10 +10,10 @@
 //! | `cell_model` | a cell model file | as for `configuration` |
 //! | `dbc` | a DBC file | a written DBC reads back unchanged |
 //! | `log`, `journal` | candump logs, CSV, journals | reading records one by one and in batches gives the same records |
-//! | `table` | measured CSV of `fit`, `rul`, `gpr` | rows are finite |
-//! | `obdb`, `bpx` | files of `import` | a written cell model is accepted |
+//! | `table` | measured CSV of `fit`, `rul`, `gpr` | all rows have the same number of values |
+//! | `obdb`, `bpx` | files of `import` | a cell model that is written from BPX is accepted |
 //! | `control` | a line on the control socket | a written line reads back unchanged |
-//! | `store` | a database or state file with changed bytes | opening succeeds or reports a reason; a daemon can run on a store that opens |
+//! | `store` | a database or state file that is damaged or cut off | opening succeeds or reports a reason; a daemon can run on a store that opens |
 
 mod configuration;
 mod core;
@@ -27,7 +27,7 @@ mod world;
 /// An entry point: takes arbitrary bytes and panics if an invariant is broken.
 pub type Door = fn(&[u8]);
 
-/// All entry points. The fuzz target and the folder of seeds have the same name.
+/// All entry points by name. The fuzz target and the seed folder of an entry point also have this name.
 pub const DOORS: &[(&str, Door)] = &[
     ("core", core::core),
     ("cuts", core::cuts),

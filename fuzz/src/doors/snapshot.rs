@@ -1,5 +1,5 @@
-//! Fuzz entry point for a stored state with some numbers replaced, or for arbitrary bytes. The state is either
-//! rejected, or the monitor starts from this state, runs, and accepts the state that it then writes.
+//! Fuzz entry point for a stored state with some numbers replaced, or for arbitrary bytes. Either the state is
+//! rejected, or the monitor must start from this state, run, and accept the state that it then writes.
 
 use std::sync::OnceLock;
 

@@ -1,4 +1,4 @@
-//! Splits bytes into values: numbers, choices, times. After the last byte every value is zero, so an input of any
+//! Splits bytes into numbers and choices. After the last byte, every further byte reads as zero, so an input of any
 //! length is valid.
 
 /// The remaining bytes.

@@ -1,5 +1,5 @@
-//! Fuzz entry point for a store whose database or state file has changed bytes. Reading and opening the store must
-//! succeed or report a reason. If the store opens, a daemon must be able to run on it.
+//! Fuzz entry point for a store whose database or state file has changed bytes or is cut off. Reading and opening the
+//! store must succeed or report a reason. If the store opens, a daemon must be able to run on it.
 
 use std::path::Path;
 use std::sync::OnceLock;

@@ -1,12 +1,12 @@
-//! Converts alarms to table rows. If many cells have the same alarm, they share one row with their number, the list of
-//! cells and the worst value.
+//! Converts alarms to table rows. If many cells have the same alarm, the alarms share one row, which shows the number
+//! of cells, the list of cells and the worst value.
 
 use crate::alarm::{Alarm, Direction, Rule, Unit};
 use crate::quantity::CellIndex;
 
-/// Alarms of different cells share a row if at least this many cells have the same alarm.
+/// If at least this many cells have the same alarm, their alarms share a row.
 const MANY: usize = 4;
-/// Longest list of cells, characters; longer lists are cut.
+/// Length, in characters, at which a list of cells is cut.
 const MAX_LIST: usize = 24;
 
 /// One row of the alarm table.
@@ -40,7 +40,7 @@ impl AlarmGroup {
     }
 }
 
-/// Groups alarms of several cells that differ only in their values. The order of the alarms is kept.
+/// Groups alarms of many cells that have the same rule, severity, state and acknowledgement. Keeps the order.
 pub(crate) fn grouped(alarms: &[Alarm]) -> Vec<AlarmGroup> {
     let is_alike = |a: &Alarm, b: &Alarm| {
         let kind = |alarm: &Alarm| (alarm.rule, alarm.severity, alarm.state, alarm.is_acknowledged);

@@ -80,7 +80,7 @@ pub(crate) fn check_stored(done: &CommandOutcome) -> Result<(), Failure> {
     ))
 }
 
-/// Parses a rule's name; the error for an unknown name lists all names and the nearest.
+/// Parses the name of a rule. The error for an unknown name lists all names and suggests similar ones.
 pub(crate) fn rule_parser() -> impl TypedValueParser<Value = Rule> {
     let find = |name: String| Rule::ALL.into_iter().find(|rule| rule.name() == name).ok_or("unknown rule");
     PossibleValuesParser::new(Rule::ALL.map(Rule::name)).try_map(find)

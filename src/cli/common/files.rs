@@ -1,4 +1,4 @@
-//! Reads files that describe signals, and names them in a configuration.
+//! Reads files that describe signals, and gives the names of such files for use in a configuration.
 
 use std::path::Path;
 
@@ -7,7 +7,7 @@ use packwatch_host::failure::Failure;
 use super::output::named;
 use crate::can::dbc::Database;
 
-/// Largest file read, bytes; the largest known signal set has 0.5 MB.
+/// Maximum size of a text file, bytes. The largest known signal set has 0.5 MB.
 const MAX_BYTES: u64 = 64 << 20;
 
 /// Reads a DBC file.

@@ -43,7 +43,7 @@ impl LogArgs {
         Ok(())
     }
 
-    /// Opens logs as one record, read with a configuration.
+    /// Opens logs as one continuous recording. The configuration determines how they are read.
     pub(crate) fn open(&self, config: &Config, logs: &[PathBuf]) -> OpenedLog {
         open(&self.input, config, logs)
     }
@@ -71,7 +71,7 @@ impl LogArgs {
     }
 }
 
-/// Opens logs as one record, read with a configuration.
+/// Opens logs as one continuous recording. The configuration determines how they are read.
 pub(crate) fn open(input: &InputArgs, config: &Config, logs: &[PathBuf]) -> OpenedLog {
     let mut options = log_options(input, config);
     // A table of cycles next to a log gives the times of that log only, so it is not used with several logs.

@@ -24,7 +24,7 @@ pub(crate) fn named(path: &Path, what: impl Display) -> Failure {
     Failure::new(format!("{}: {what}", path.display()))
 }
 
-/// Treats an error that means "the reader has closed the output" as success.
+/// If the reader has closed the output, treats the error as success.
 pub(crate) fn unless_closed(written: io::Result<()>) -> Result<(), Failure> {
     match written {
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),

@@ -1,4 +1,5 @@
-//! Replays logs for the commands that print a page about them. Returns statistics, and the state at the end.
+//! Replays logs for the commands that describe a battery (`diagnose`, `passport`, `report`). Returns statistics, and
+//! the state at the end.
 
 use std::path::PathBuf;
 
@@ -20,7 +21,7 @@ pub(crate) struct Replayed {
     pub(crate) snapshot: Option<Snapshot>,
 }
 
-/// Replays logs as one record at full speed, with a progress bar.
+/// Replays logs as one continuous recording, at full speed and with a progress bar.
 pub(crate) fn replay(logs: &[PathBuf], input: &InputArgs, config: &Config, sinks: Sinks) -> Result<Replayed, Failure> {
     let mut source = LogSource::new(logs.to_owned(), log_options(input, config));
     let plain = ReplaySettings::plain(input.sleep_gap, config.interface_names());

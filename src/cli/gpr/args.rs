@@ -92,7 +92,7 @@ pub(super) struct ModelArgs {
 }
 
 impl ModelArgs {
-    /// Returns the settings for a number of rows.
+    /// Returns the settings of a model with this kernel and number of rows.
     pub(super) fn settings(&self, kernel: &Kernel, rows: usize) -> GprSettings {
         let mut settings = GprSettings::new(kernel.clone(), rows);
         settings.form = match self.form {

@@ -14,7 +14,7 @@ use crate::regress::{FitProgress, Fold, Form, GprSettings, Hyperparameter, Jitte
 
 /// Version of the JSON documents.
 pub(super) const VERSION: u32 = 1;
-/// Number of progress steps per fold.
+/// Number of progress steps per fit.
 const TICKS: usize = 100;
 
 /// Creates a progress bar over a number of fits.
@@ -22,7 +22,7 @@ pub(super) fn fit_bar(fits: usize) -> ProgressBar {
     progress_bar((fits * TICKS) as u64, "{bar:32} {percent} % {msg}, {elapsed}, eta {eta}")
 }
 
-/// Shows one step of a search. `before` is the number of fits that were finished before this cross-validation.
+/// Shows one step of a hyperparameter search. `before` is the number of fits that were finished before this kernel.
 pub(super) fn show_step(bar: &ProgressBar, what: &str, before: usize, p: FitProgress) -> ControlFlow<()> {
     let part = (p.search - 1) * p.max_iterations + p.iteration;
     let whole = (p.searches * p.max_iterations).max(1);
@@ -38,7 +38,7 @@ pub(super) fn show_fits(bar: &ProgressBar, fits: usize, what: &str) {
     bar.set_message(what.to_owned());
 }
 
-/// Name of a form.
+/// Describes the form of the covariance matrix.
 pub(super) fn form(form: Form) -> String {
     match form {
         Form::Exact => "exact".to_owned(),
@@ -78,7 +78,7 @@ pub(super) fn score_json(s: &PredictionScore) -> Value {
     })
 }
 
-/// Formats a number with four significant digits.
+/// Formats a number with four significant digits if zero to nine decimals allow it.
 pub(super) fn short(value: f64) -> String {
     let digits = (3.0 - value.abs().max(1e-12).log10().floor()).clamp(0.0, 9.0) as usize;
     format!("{value:.digits$}")
@@ -98,7 +98,7 @@ fn total(validated: &CrossValidation, of: impl Fn(&Fold) -> f64) -> f64 {
     validated.folds.folds.iter().map(of).sum()
 }
 
-/// Number of matrices with jitter, and the largest jitter, over the folds.
+/// Total number of matrices with jitter, and the largest jitter, over all folds.
 fn jitter(validated: &CrossValidation) -> Jitter {
     validated.folds.folds.iter().fold(Jitter::default(), |all, fold| Jitter {
         matrices: all.matrices + fold.jitter.matrices,
@@ -245,7 +245,7 @@ pub(super) struct PredictReport<'a> {
 }
 
 impl PredictReport<'_> {
-    /// Prints a summary, on standard error when the rows go to standard output.
+    /// Prints a summary. If the rows go to standard output, the summary goes to standard error.
     pub(super) fn text(&self, to_stderr: bool) -> io::Result<()> {
         let mut text = Vec::new();
         let (rows, output) = (self.table.len(), &self.trained.output);

@@ -47,7 +47,7 @@ fn difference(found: &Difference, factor: f64, unit: &str) -> String {
     format!("{:.1} {unit} rms, at worst {at_worst} at {:.0} %", factor * rms, 100.0 * worst.soc)
 }
 
-/// Formats one decimal with a sign; zero gets a plus sign.
+/// Formats a number with its sign and one decimal. Zero gets a plus sign.
 fn signed(value: f64) -> String {
     format!("{:+.1}", (10.0 * value).round() / 10.0 + 0.0)
 }

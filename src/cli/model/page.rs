@@ -99,7 +99,7 @@ struct BranchPart {
     tau_s: f64,
 }
 
-/// The measurement that would improve the model most.
+/// A measurement that would improve the model.
 #[derive(Debug, Serialize)]
 struct AdviceRow {
     measurement: String,
@@ -211,7 +211,7 @@ impl ModelPage {
         format!("{}\n{}", self.name, output::table::<&str>(&[], rows, 2))
     }
 
-    /// Describes the expected SOC error, and the most useful measurement.
+    /// Describes the expected SOC error, and the most useful measurements.
     fn verdict(&self) -> String {
         let Some(points) = self.soc_error_points else {
             return "\nexpected error of the SOC in use: unknown, because the model states no error; `packwatch fit` writes one\n"
@@ -325,7 +325,7 @@ impl ResistanceRow {
     }
 }
 
-/// Formats a resistance in milliohm with three digits.
+/// Formats a resistance in milliohm with about three significant digits.
 fn milliohm(ohm: f64) -> String {
     let value = 1e3 * ohm;
     let decimals = (2.0 - value.abs().log10().floor()).clamp(0.0, 4.0) as usize;

@@ -35,7 +35,7 @@ impl SourceArgs {
     /// Returns the model and its display name.
     ///
     /// # Errors
-    /// Fails if the source cannot be read, and returns all its faults.
+    /// If the source cannot be read, the error lists all faults of the source.
     pub(super) fn load(&self) -> Result<(String, SourcedModel), Failure> {
         let config = self.config.as_deref().map(config::load).transpose()?;
         match (self.state.as_ref().or(self.source.as_ref()), config, self.label.label()) {
@@ -59,7 +59,7 @@ impl SourceArgs {
 /// Returns the model of a SOURCE and its display name.
 ///
 /// # Errors
-/// Fails if the source cannot be read, and returns all its faults.
+/// If the source cannot be read, the error lists all faults of the source.
 pub(super) fn load(path: &Path) -> Result<(String, SourcedModel), Failure> {
     load_with(path, None)
 }
@@ -123,7 +123,7 @@ fn of_label_text(path: &Path) -> Result<(String, SourcedModel), Failure> {
     of_label_named(source, &Label::usual(known, rated_ah))
 }
 
-/// Whether a file is a state in JSON, by its name or its first byte.
+/// Whether a file contains a stored state (JSON), judged by its name or its first byte.
 fn is_snapshot(path: &Path) -> bool {
     let mut first = [0];
     let read = File::open(path).and_then(|mut file| file.read_exact(&mut first));

@@ -84,7 +84,7 @@ fn folders(args: &Args) -> [Option<&Path>; 3] {
     [args.estimates.as_deref(), args.events.as_deref(), args.frames.as_deref()]
 }
 
-/// The files of one log.
+/// The result files of one log.
 fn results(args: &Args, log: &Path) -> [Option<PathBuf>; 3] {
     let [estimates, events, frames] = folders(args);
     let file = |folder: Option<&Path>, ending: &str| folder.map(|folder| folder.join(name(log) + ending));
@@ -118,7 +118,7 @@ fn replay_one(args: &Args, config: &Config, log: &Path, bar: &EachBar) -> Result
     result.map(|(summary, _)| summary)
 }
 
-/// Adds the log's name to an error that does not contain it.
+/// Adds the log's name to an error that does not begin with it.
 fn named(log: &Path, error: &ReplayError) -> String {
     let (name, text) = (log.display().to_string(), error.to_string());
     if text.starts_with(&name) { text } else { format!("{name}: {text}") }
@@ -195,7 +195,7 @@ impl LogProgress<'_> {
     fn show(&mut self, now: ReplayProgress) {
         let awake_s = (now.times_real_time * self.began.elapsed().as_secs_f64()).max(self.awake_s);
         self.bar.frames.fetch_add(now.frames.saturating_sub(self.frames), Ordering::Relaxed);
-        // The cast saturates only at times that are far longer than any record.
+        // The cast saturates only at times that are far longer than any log.
         self.bar.awake_ms.fetch_add(((awake_s - self.awake_s) * 1e3) as u64, Ordering::Relaxed);
         self.bar.bar.inc(now.bytes.saturating_sub(self.bytes));
         (self.bytes, self.frames, self.awake_s) = (now.bytes, now.frames, awake_s);

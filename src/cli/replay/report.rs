@@ -8,7 +8,7 @@ use crate::monitor::{Event, EventKind};
 use crate::quantity::catalogue::Quantity;
 use crate::replay::{ProtectedSummary, ReplaySummary};
 
-/// Maximum number of alarms in the table. The JSON summary has more.
+/// Maximum number of alarms in the table. The JSON summary lists more.
 const MAX_SHOWN_ALARMS: usize = 20;
 /// Maximum number of cells in the table. The JSON summary has all cells.
 const MAX_SHOWN_CELLS: usize = 16;
@@ -32,7 +32,7 @@ pub(super) fn table(summary: &ReplaySummary, to_stderr: bool) -> io::Result<()> 
     if to_stderr { io::stderr().write_all(&text) } else { io::stdout().write_all(&text) }
 }
 
-/// Prints the counts of frames sent on an interface.
+/// Prints the number of frames sent on an interface, and the counts of the log.
 pub(super) fn played(sent: u64, interface: &str, counts: &LogCounts, as_json: bool) -> io::Result<()> {
     let mut out = io::stdout().lock();
     if as_json {

@@ -6,7 +6,7 @@ use crate::cli::common::output::write_table;
 use crate::health::{Axis, Remaining};
 use crate::lab::rul::{self, CurrentForecast, ForecastScore, HistoryScore, ScoreTotal, WORST_ERROR};
 
-/// Prints forecasts at the end of the histories as a table.
+/// Prints a table of forecasts, each made at the end of a history.
 pub(super) fn now_table(forecasts: &[CurrentForecast]) -> io::Result<()> {
     let mut out = io::stdout().lock();
     writeln!(out, "remaining: median (5 to 95 %) from the last reading; days at the recent rate of use\n")?;
@@ -76,7 +76,7 @@ fn judged_row(file: &HistoryScore, judged: &ForecastScore) -> Vec<String> {
     ]
 }
 
-/// Prints the files that were not scored, and the missing forecasts.
+/// Prints the end of life of each file, or that the file was not scored. Lists the forecasts that were not possible.
 fn notes(out: &mut impl Write, files: &[HistoryScore]) -> io::Result<()> {
     for file in files {
         let (name, threshold_ah) = (&file.name, file.threshold_ah);

@@ -177,7 +177,7 @@ fn capacity_error(text: &str) -> Result<f64, String> {
     within(text, |value| value > -100.0 && value <= 100.0, "above -100 and at most 100")
 }
 
-/// Seconds of `600`, `600s`, `10min`, `1h`.
+/// Parses a duration such as `600`, `600s`, `10min` or `1h`, and returns seconds.
 fn duration(text: &str) -> Result<f64, String> {
     let units = [("min", 60.0), ("h", 3600.0), ("s", 1.0)];
     let text = text.trim();

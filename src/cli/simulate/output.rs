@@ -70,7 +70,7 @@ impl LogWriter {
 pub(super) struct TruthColumns {
     /// Number of RC branches of the cell model.
     pub(super) branches: usize,
-    /// Leak, balancing and contact resistance.
+    /// Whether the truth has the columns for leak, balancing and contact resistance.
     pub(super) faults: bool,
 }
 
@@ -94,7 +94,7 @@ impl TruthWriter {
         Ok(Self { target, columns, period_ns: Timestamp::from_secs(period_s).nanos(), next: None })
     }
 
-    /// Writes one row per cell if a row is due and the cells were sampled.
+    /// If rows are due and the cells were sampled, writes one row per cell.
     pub(super) fn write(&mut self, start: Timestamp, moment: &Moment, sim: &Simulation) -> Result<(), Failure> {
         if !moment.cells_sampled || self.next.is_some_and(|next| moment.time < next) {
             return Ok(());

@@ -1,4 +1,4 @@
-//! Sends simulated frames on a CAN interface, in real time or a multiple of it.
+//! Sends simulated frames on a CAN interface, in real time, or faster or slower by a factor.
 
 use std::time::{Duration, Instant};
 

@@ -11,9 +11,9 @@ use crate::quantity::catalogue::{PackValues, Quantity};
 use crate::status::counters::LATENCY_BOUNDS_S;
 use crate::status::document::{Intruder, IntruderKind, StatusDocument};
 
-/// Maximum number of cells that are listed without `--cells`. With this number, the table fits a screen.
+/// Maximum number of cells that are listed without `--cells`, so that the table fits a screen.
 const MAX_LISTED: usize = 16;
-/// A cell is an outlier if its distance from the median is more than this many times the median distance.
+/// A cell can be an outlier only if its distance from the median exceeds this many times the median distance.
 const OUTLYING: f64 = 3.0;
 /// Maximum number of outliers that are listed.
 const MAX_OUTLIERS: usize = 8;
@@ -263,7 +263,8 @@ fn spread(text: &mut String, cells: &[CellView]) {
     }
 }
 
-/// Cells whose estimate is not trusted or unknown, and cells far from the median of a quantity, sorted by cell number.
+/// Cells whose estimate is not trusted, cells with an unknown value, and cells far from the median of a quantity.
+/// Sorted by cell number.
 fn outliers(cells: &[CellView]) -> Vec<&CellView> {
     let mut ranked: Vec<(f64, &CellView)> = cells.iter().map(|cell| (0.0, cell)).collect();
     for (_, quantity, _, floor, relative_floor) in COMPARISONS {
@@ -273,7 +274,8 @@ fn outliers(cells: &[CellView]) -> Vec<&CellView> {
         let Some(&median) = known.get(known.len() / 2) else { continue };
         let mut distances: Vec<f64> = known.iter().map(|value| (value - median).abs()).collect();
         distances.sort_by(f64::total_cmp);
-        // With this divisor, the distance of an outlier exceeds both the floor and `OUTLYING` median distances.
+        // If a distance divided by `typical` exceeds `OUTLYING`, the distance exceeds both the floor and `OUTLYING`
+        // times the median distance.
         let floor = floor.max(relative_floor * median.abs());
         let typical = distances[distances.len() / 2].max(floor / OUTLYING);
         for (rank, cell) in &mut ranked {
@@ -284,7 +286,7 @@ fn outliers(cells: &[CellView]) -> Vec<&CellView> {
     for (rank, cell) in &mut ranked {
         *rank = if cell.trusted == Some(false) { f64::MAX } else { *rank };
     }
-    // The sort is stable, so of several cells with equal rank the first ones are listed.
+    // The sort is stable: if more cells of equal rank are found than are listed, the lowest cell numbers are listed.
     ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
     let mut found: Vec<&CellView> =
         ranked.into_iter().filter(|(rank, _)| *rank > OUTLYING).take(MAX_OUTLIERS).map(|(_, cell)| cell).collect();

@@ -24,7 +24,7 @@ use tokio::time::interval;
 
 use app::App;
 
-/// Longest time between redraws, so that the screen shows the time since the last document.
+/// Longest time between redraws. It limits how long a stale document stays on the screen.
 const DRAW_PERIOD: Duration = Duration::from_secs(1);
 /// Capacity of the key queue: more than a user types between two redraws.
 const KEYS: usize = 64;
@@ -41,7 +41,7 @@ pub(super) fn run(socket: &Path) -> Result<(), String> {
                 .to_owned(),
         );
     }
-    // See https://no-color.org: disables colour if set and not empty.
+    // If NO_COLOR is set and not empty, the view has no colours (https://no-color.org).
     let has_colour = std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
     let app = App::new(socket.to_owned(), has_colour);
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
@@ -73,7 +73,7 @@ async fn watch(mut terminal: DefaultTerminal, mut app: App) -> io::Result<()> {
                     Some(key) => app.handle_key(key),
                     None => continue,
                 },
-                // Resized: redraw.
+                // For example, the terminal was resized: redraw.
                 Some(_) => {}
                 // The terminal was closed.
                 None => return Ok(()),
@@ -99,7 +99,7 @@ fn read_keys() -> io::Result<mpsc::Receiver<Event>> {
     Ok(keys)
 }
 
-/// Converts a key to an action. Every key that quits gives Esc; an unknown key gives `None`.
+/// Maps a key to the key that the view handles. Every key that quits gives Esc; an unknown key gives `None`.
 fn meaning(key: KeyEvent) -> Option<KeyCode> {
     let has_control = key.modifiers.contains(KeyModifiers::CONTROL);
     match key.code {

@@ -10,7 +10,7 @@ use crate::lab::fleet::judge::Horizon;
 use crate::lab::fleet::variants::VariantGrid;
 use crate::lab::fleet::whatif::{EndOfLife, LogResult, ThresholdScore, WhatifSettings};
 
-/// Number of columns that follow the alarm's columns and the columns of the settings.
+/// Number of columns that follow the alarm column and the columns of the settings.
 const OWN_COLUMNS: usize = 9;
 const SUMMARY_HEADS: [&str; OWN_COLUMNS] =
     ["threshold", "raised", "lead, days", "lead, cycles", "missed", "false", "open", "false raises", "flickers"];
@@ -25,7 +25,7 @@ pub(super) struct WhatifReport<'a> {
     /// Rules to show.
     pub(super) rules: &'a [Rule],
     pub(super) logs: &'a [&'a LogResult],
-    /// Logs that failed.
+    /// One error message for each log that failed.
     pub(super) failed: Vec<String>,
 }
 
@@ -167,7 +167,7 @@ impl WhatifReport<'_> {
         })
     }
 
-    /// Rows of a log to show.
+    /// Rows of a log whose rule is shown.
     pub(super) fn rows<'l>(&'l self, log: &'l LogResult) -> impl Iterator<Item = &'l ThresholdScore> {
         log.alarms.iter().filter(|row| self.rules.contains(&row.rule))
     }

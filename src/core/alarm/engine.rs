@@ -1,8 +1,9 @@
-//! Holds one alarm machine per rule, severity and cell, and reports changes of the alarms.
+//! Holds one alarm (a state machine) per rule, severity and cell, and reports changes of the alarms.
 //!
-//! In: commands, and values in each rule's unit with the time of their comparison. Out: [`AlarmChange`]s and the list
-//! of raised alarms in the order rule, severity, cell (the pack first). A rule may have one threshold per severity;
-//! each threshold has its own alarms. Values are ignored if their rule is not configured or does not watch their cell.
+//! Input: commands, and values in the unit of their rule, each with the time at which it is compared. Output:
+//! [`AlarmChange`]s and the list of raised alarms in the order rule, severity, cell (the pack first). A rule may have
+//! one threshold per severity; each threshold has its own alarms. If a rule is not configured or does not watch a cell,
+//! values of the rule for this cell are ignored.
 
 pub mod summary;
 
@@ -176,7 +177,7 @@ impl RuleSlots {
 pub struct AlarmEngine {
     /// Sorted by wire number, then severity.
     rules: Vec<RuleSlots>,
-    /// Range in `rules` of each rule's thresholds, by wire number.
+    /// For each rule, by wire number: the range of its thresholds in `rules`.
     by_rule: [Range<usize>; Rule::ALL.len() + 1],
     machines: Vec<Machine>,
     /// Raised slots in ascending order, for `raised`.
@@ -229,7 +230,7 @@ impl AlarmEngine {
         })
     }
 
-    /// Stores a value for display. The caller makes sure that [`is_quiet`](Self::is_quiet) holds for it.
+    /// Stores a value for display. The caller makes sure that [`is_quiet`](Self::is_quiet) is true for this value.
     #[inline]
     pub fn show(&mut self, rule: Rule, cell: Option<CellIndex>, value: f64) {
         for slots in &self.rules[self.by_rule[usize::from(rule as u8)].clone()] {
@@ -239,8 +240,8 @@ impl AlarmEngine {
         }
     }
 
-    /// Advances the debounce of values that stay valid until the next value arrives
-    /// ([`RuleSpec::is_learned`](super::rule::RuleSpec::is_learned)).
+    /// Advances the debounce of alarms on learned values ([`RuleSpec::is_learned`](super::rule::RuleSpec::is_learned)).
+    /// A learned value stays valid until the next value arrives.
     pub fn poll(&mut self, now: Timestamp, changes: &mut Vec<AlarmChange>) {
         let mut next = 0;
         while let Some(&slot) = self.counting.get(next) {
@@ -320,8 +321,8 @@ impl AlarmEngine {
         AlarmSnapshot { alarms: self.rules.iter().flat_map(of_rule).collect() }
     }
 
-    /// Restores a stored state whose times the caller has rebased. Times of raises after `now` are set to `now`.
-    /// Returns the alarms that no configured threshold watches any longer; the caller reports them.
+    /// Restores a stored state whose times the caller has rebased. If an alarm was raised later than `now`, that time
+    /// is set to `now`. Returns the alarms that no configured threshold watches any longer; the caller reports them.
     pub fn restore(&mut self, now: Timestamp, state: &AlarmSnapshot) -> Vec<StoredAlarm> {
         let cells = self.cells();
         *self = Self::new(self.rules.drain(..).map(|rule| rule.config).collect(), cells);
@@ -368,9 +369,9 @@ impl AlarmEngine {
         }
     }
 
-    /// Replaces the rules. An alarm whose rule, severity and cell are still watched is kept. If its threshold changed,
-    /// its value is compared again. All other alarms are forgotten. Returns how many of the forgotten alarms were
-    /// pending or had been raised.
+    /// Replaces the rules. An alarm whose rule, severity and cell are still watched is kept; if any setting of its
+    /// threshold changed, its value is compared again. All other alarms are forgotten. Returns how many of the
+    /// forgotten alarms were pending or had been raised.
     pub fn reconfigure(
         &mut self,
         now: Timestamp,

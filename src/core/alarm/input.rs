@@ -1,9 +1,10 @@
 //! Represents every input of an alarm engine as a value, so that another engine can replay the same inputs.
 //!
-//! In: values that the [`Monitor`](crate::monitor::Monitor) passes to its rules. Out: the changes that the
-//! corresponding methods of the engine give. These values do not depend on thresholds. Therefore an engine with other
-//! thresholds gives the same changes as a monitor with those thresholds. Exception: for `input_missing`, the strictest
-//! threshold decides whether the monitor reports a silence to the engine at all.
+//! In: the inputs that the [`Monitor`](crate::monitor::Monitor) passes to its engine. Out: changes of alarms. The
+//! inputs do not depend on the thresholds. Therefore an engine with other thresholds that replays the inputs reports
+//! the same changes as a monitor with those thresholds. Exception: until a CAN signal gives its first reading after a
+//! start or a sleep, the monitor passes the signal's silence to `input_missing` only if the silence exceeds the lowest
+//! threshold.
 
 use super::engine::{AlarmChange, AlarmEngine};
 use super::limit::Observation;
@@ -22,8 +23,8 @@ pub enum AlarmInput {
         cell: Option<CellIndex>,
         observation: Observation,
     },
-    /// Whether the inputs of a learned value are valid now. While the inputs are invalid, the value cannot be renewed
-    /// and changes no alarm. Ignored for rules whose value is not learned.
+    /// Whether the inputs of a learned value are valid now. While they are invalid, the value cannot be renewed, so the
+    /// latest value counts as unknown. Ignored for rules whose value is not learned.
     InputsValid {
         rule: Rule,
         /// The cell; `None` = the pack.
@@ -44,7 +45,7 @@ pub enum AlarmInput {
 }
 
 impl AlarmEngine {
-    /// Handles one input at `now`; returns the outcome of a command.
+    /// Handles one input at `now`. Returns the outcome of a command; for all other inputs, both numbers are 0.
     pub fn apply(&mut self, now: Timestamp, input: &AlarmInput, changes: &mut Vec<AlarmChange>) -> CommandOutcome {
         match *input {
             AlarmInput::Observe { rule, cell, observation } => self.observe(now, rule, cell, &observation, changes),

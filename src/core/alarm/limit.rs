@@ -1,4 +1,5 @@
-//! Compares a value with a rule's thresholds. The outcome is beyond, between, healthy or unknown.
+//! Compares a value with a rule's set threshold, which raises the alarm, and its clear threshold, which clears the
+//! alarm. The outcome is beyond, between, healthy or unknown.
 //!
 //! A rule compares the value itself (`when = "mean"`), or the probability P that the true value is beyond the threshold
 //! (`when = { probability = p }`). For P, the value is assumed to be normally distributed with its standard deviation.
@@ -10,8 +11,8 @@
 //! ```
 //!
 //! where c is 0.05 for a learned value and 0.5 otherwise. Therefore only a value at the clear threshold or better
-//! clears an alarm; a growing uncertainty does not. The clear threshold is on the healthy side of the set threshold.
-//! Therefore the second probability is the larger of the two, and no value is beyond and healthy at the same time. With
+//! clears an alarm; a growing uncertainty does not. The clear threshold is never on the bad side of the set threshold.
+//! Therefore the second probability is never below the first, and no value is beyond and healthy at the same time. With
 //! p = 0.5, the result is the same as for `when = "mean"`. If the standard deviation is needed but missing, the result
 //! is unknown.
 //!
@@ -91,13 +92,13 @@ impl Observation {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum LimitCheck {
-    /// The value is on the bad side of the set threshold.
+    /// The value counts as beyond the set threshold (see the module).
     Beyond,
-    /// The value is between the set and the clear threshold.
+    /// The value is neither beyond nor healthy.
     Between,
-    /// The value is at the clear threshold or better.
+    /// The value counts as healthy (see the module).
     Healthy,
-    /// There is no usable value.
+    /// The value or a needed standard deviation is missing, or the value is a bound and not beyond.
     Unknown,
 }
 
@@ -115,7 +116,7 @@ impl LimitCheck {
         };
         let (set, clear) = (good_by(rule.threshold), good_by(rule.clear));
         let probability = std.map(|std| probability_beyond(set, std));
-        // An alarm clears only if the probability of being beyond the clear threshold is at most this.
+        // An alarm clears only if the true value is beyond the clear threshold with at most this probability.
         let clear_level = if rule.rule.spec().is_learned { 0.05 } else { 0.5 };
         let (is_beyond, is_healthy) = match rule.when {
             Comparison::Mean => {

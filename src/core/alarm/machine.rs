@@ -8,21 +8,24 @@
 //! | active | stay | stay | count towards the end | suppressed | mark | refuse |
 //! | clearing | active | active | count towards the end | suppressed | mark | refuse |
 //! | suppressed | active | active | count towards the end | hold | mark | refuse |
-//! | latched | count towards active | stay | stay | hold | mark | inactive; unknown if the value is; refuse while counting |
-//! | cleared | count towards active | stay | stay | unknown | inactive | inactive, forget |
+//! | latched | count towards active | stay | stay | hold | mark | release |
+//! | cleared | count towards active | stay | stay | unknown | mark, inactive | forget, inactive |
 //!
-//! * A name of a state: enter this state.
+//! * The name of a state: enter this state.
 //! * Rest: enter `cleared` if the alarm was raised and not acknowledged, else `inactive`.
 //! * End: enter `latched` for a latching rule, else rest.
-//! * Count: both the time and the number of new values of the debounce must be reached.
+//! * Count: once both the time and the number of new values of the debounce are reached, enter the state or the end.
+//!   Until then, an alarm that is not raised is `pending`, a latched alarm stays `latched`, and any other is
+//!   `clearing`.
 //! * Hold: stay, and keep the time and the number of values counted.
 //! * Mark: acknowledge the latest occurrence. Forget: reset the number of occurrences. Refuse: change nothing.
+//! * Release: refuse while counting; else enter `inactive`, or `unknown` if the value is unknown.
 //!
 //! An alarm is raised while it is active, clearing, suppressed or latched.
 //!
-//! Time counts only between two observations of known values on the same side. Time before or after an unknown value
-//! does not count. An unknown value does not reset the count either; otherwise, a flickering input could prevent an
-//! alarm forever.
+//! Time counts only between two observations of known values on the same side. The time between a known and an unknown
+//! value does not count. For a learned value, time also counts up to each poll, because the value stays valid. An
+//! unknown value does not reset the count; otherwise, a flickering input could prevent an alarm forever.
 
 use serde::{Deserialize, Serialize};
 use strum::IntoStaticStr;
@@ -112,10 +115,10 @@ pub(super) struct Machine {
     /// Whether the latest observation could be compared.
     #[serde(skip)]
     pub(super) is_known: bool,
-    /// The latest observation, and the probability that it is beyond the threshold. A learned value is kept while its
-    /// inputs are lost.
+    /// The latest observation. A learned value is kept while its inputs are lost.
     #[serde(skip)]
     pub(super) observation: Observation,
+    /// Probability that the true value is beyond the threshold; `None` = unknown.
     #[serde(skip)]
     pub(super) probability: Option<f64>,
     /// How often the alarm was raised since its history was last forgotten.
@@ -166,8 +169,8 @@ impl Machine {
     }
 
     /// Handles a value. If the inputs of a learned value are lost, a value may still arrive, because the loss ends a
-    /// half-cycle. This value may raise the alarm. It does not change an alarm that is already raised. Otherwise, it
-    /// would clear the alarm or make it look up to date.
+    /// half-cycle. This value may raise the alarm. It does not change a suppressed alarm; otherwise, it would clear the
+    /// alarm or make it look up to date.
     pub(super) fn observe(&mut self, now: Timestamp, rule: &RuleConfig, observation: &Observation) -> Option<Change> {
         self.observation = *observation;
         if self.is_suspended && self.state == AlarmState::Suppressed {
@@ -276,7 +279,7 @@ impl Machine {
         Self { is_known: false, observation: value, probability: None, first_raised, last_raised, ..self }
     }
 
-    /// Enters the state that was published as `shown`.
+    /// Enters a state that fits the published state `shown`. The debounce starts again.
     pub(super) fn enter_shown(&mut self, shown: AlarmState) {
         self.enter(match shown {
             AlarmState::Active | AlarmState::Clearing | AlarmState::Suppressed => AlarmState::Active,

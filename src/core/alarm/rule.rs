@@ -1,7 +1,7 @@
 //! Alarm rules and severities.
 //!
-//! The table in [`Rule::spec`] specifies what each rule compares. The configuration, the reference page, the frames and
-//! the engine use this table.
+//! The table in [`Rule::spec`] specifies what each rule compares. The configuration, the reference page, the reports
+//! and the engine use this table.
 
 use serde::{Deserialize, Serialize};
 
@@ -83,7 +83,7 @@ pub enum Unit {
     Fraction,
     /// Fraction per day, 0 to 1.
     FractionPerDay,
-    /// A multiple of a reference (of the value when new, of the expected value).
+    /// A multiple of a reference, such as the value when new or the expected value.
     Ratio,
     Celsius,
     Cycles,
@@ -124,7 +124,7 @@ pub struct RuleSpec {
 }
 
 impl Rule {
-    /// Every rule, in wire order.
+    /// Every rule, in the order of the wire codes.
     pub const ALL: [Self; 17] = [
         Self::CapacityLow,
         Self::UsableCapacityLow,
@@ -145,7 +145,7 @@ impl Rule {
         Self::ChannelFaulty,
     ];
 
-    /// The rule with a wire number; `None` = no such rule.
+    /// The rule with a wire code; `None` = no such rule.
     pub fn from_number(number: u8) -> Option<Self> {
         Self::ALL.into_iter().find(|rule| *rule as u8 == number)
     }

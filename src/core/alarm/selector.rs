@@ -1,4 +1,4 @@
-//! Selects the alarms of a command, and reports the command's outcome.
+//! Selects the alarms that a command changes, and reports the command's outcome.
 
 use serde::{Deserialize, Serialize};
 
@@ -16,7 +16,7 @@ pub struct Selector {
 }
 
 impl Selector {
-    /// Whether the selector matches an alarm (`cell`: `None` = the pack's).
+    /// Whether the selector matches the alarm of a rule, a severity and a cell; `cell`: `None` = the pack.
     pub fn matches(&self, rule: Rule, severity: Severity, cell: Option<CellIndex>) -> bool {
         self.rule.is_none_or(|wanted| wanted == rule)
             && self.severity.is_none_or(|wanted| wanted == severity)

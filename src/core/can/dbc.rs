@@ -1,13 +1,15 @@
 //! Parses DBC text to messages and signals.
 //!
 //! In: the text of a DBC file (grammar: the `can-dbc` crate). Out: a [`Database`] of messages and signals, with value
-//! tables, units, cycle times, frame formats and end-to-end protection. Multiplexing is resolved to conditions on raw
-//! selector codes. [`Database::to_dbc`] writes a database as text, and parsing this text gives an equal database.
+//! tables, units, cycle times, frame formats and end-to-end protection. Multiplexing becomes conditions on the raw
+//! codes of multiplexors. [`Database::to_dbc`] writes a database as text, and parsing this text gives an equal
+//! database.
 //!
 //! The parser returns a [`DbcError`] with the line in four cases: the file is not a DBC, a number is out of range or
 //! not finite, a name is defined twice, or multiplexing cannot be resolved. It accepts a signal that extends beyond its
-//! message; decoding this signal gives [`Fault::ShortFrame`](crate::quantity::Fault::ShortFrame). It also accepts an
-//! invalid layout, which [`SignalLayout::plan`] rejects.
+//! message. If a frame has the message's length, decoding this signal gives
+//! [`Fault::ShortFrame`](crate::quantity::Fault::ShortFrame). The parser also accepts an invalid layout, which
+//! [`SignalLayout::plan`] rejects.
 
 use std::collections::{HashMap, HashSet};
 
@@ -55,7 +57,7 @@ pub enum FrameFormat {
     },
 }
 
-/// How a message is repeated after an event; `None` = not stated in the DBC.
+/// How a message is repeated after an event; `None` = 0, or not stated in the DBC.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Repetition {
     /// Number of frames after the first frame (`GenMsgNrOfRepetition`).
@@ -69,7 +71,7 @@ pub struct Repetition {
 /// One message.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Message {
-    /// Identifier; extended when the DBC's bit 31 is set.
+    /// Identifier; extended if bit 31 of the number in the DBC is set.
     pub id: CanId,
     /// Name, unique in its database.
     pub name: String,
@@ -155,7 +157,7 @@ impl Database {
             let what = "the file is UTF-16 text, must be UTF-8 or Latin-1: save it in one of these encodings";
             return Err(DbcError { line: 1, what: what.to_owned() });
         }
-        // Remove the byte-order mark U+FEFF in UTF-8, which some editors also put before Latin-1 text.
+        // Remove the UTF-8 byte-order mark. Some editors put it before Latin-1 text, too.
         let bytes = bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes);
         match std::str::from_utf8(bytes) {
             Ok(text) => Self::parse(text),
@@ -217,7 +219,7 @@ impl Signal {
     }
 }
 
-/// A fault of a message or signal whose line is not known yet.
+/// A fault of a message or signal, before the line of the fault is known.
 struct MessageFault {
     message: String,
     signal: Option<String>,

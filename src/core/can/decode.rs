@@ -16,7 +16,7 @@ use crate::quantity::{BusIndex, Fault};
 
 pub use crate::quantity::{Channel, Reading, SensorIndex};
 
-/// Condition for the presence of a bound signal. The code of one multiplexor, the selector, must lie in one of the
+/// Condition for the presence of a configured signal. The code of one multiplexor, the selector, must lie in one of the
 /// ranges, ends included.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MuxTest {
@@ -56,8 +56,8 @@ pub struct Binding {
 }
 
 impl Binding {
-    /// Binds a DBC signal to a channel with scale 1, offset 0, only the DBC's range, and the "not available" codes of
-    /// the value table. The caller applies the configuration.
+    /// Binds a DBC signal to a channel. The scale is 1, the offset is 0, only the DBC limits the range, and the "not
+    /// available" codes come from the value table. The caller then applies the configuration.
     ///
     /// # Errors
     /// The layout of the signal or of one of its multiplexors is invalid.

@@ -11,8 +11,9 @@
 //! | 1C | as 1A; byte 1, high nibble: bits 8 to 11 of the id | CRC-8 0x1D, 0 | id low, 0, payload from byte 1 | 0 to 14 |
 //! | 5 | bytes 0 and 1: CRC, low byte first; byte 2: counter | CRC-16 0x1021, 0xFFFF | payload from byte 2, id low, id high | 0 to 255 |
 //!
-//! In 1A the high nibble of byte 1 is free for a signal of the message; `protect` does not change it.
-//! The CRC of profile 1 equals the AUTOSAR library's CRC-8 with its start value and final XOR (0xFF) cancelled.
+//! In 1A the high nibble of byte 1 is free for a signal of the message; `protect` does not change it. AUTOSAR computes
+//! the CRC of profile 1 with the CRC-8 of its library, but cancels the library's start value and final XOR (both 0xFF).
+//! The table shows the result.
 //!
 //! A sender rejects a payload that is shorter than the header; a receiver reports such a payload as a wrong CRC.
 //! Source: AUTOSAR "SWS E2E Library", as implemented by two test peers and four open-source receivers; vectors in the
@@ -20,15 +21,15 @@
 //!
 //! * Deviation 1: in AUTOSAR, the check of profile 5 has no statuses SYNC and INITIAL; the state machine above it
 //!   provides them. Here, profile 5 uses the receiver of profile 1 with the counter modulo 256, so that both profiles
-//!   have the same statuses and counts. Effect: the first frame of profile 5 is INITIAL and not used, where AUTOSAR's
-//!   check alone might return OK. The allowed step grows while frames are missing. As in AUTOSAR's check of profile 5,
-//!   the sequence continues from a counter that jumped too far. Therefore, a restart of the sender costs one frame
-//!   instead of up to 256.
+//!   have the same statuses and counts. Effects: the first frame of profile 5 is INITIAL and not used, although
+//!   AUTOSAR's check alone might return OK. While frames are missing, the allowed step of the counter grows. As in
+//!   AUTOSAR's check of profile 5, the sequence continues from a counter that jumped too far. Therefore, a restart of
+//!   the sender costs one frame instead of up to 256.
 //! * Deviation 2: the largest value of the setting for repetitions (`max_no_new_or_repeated_data`) is 14 for both
 //!   profiles, and 14 means "any number".
 //! * Deviation 3: AUTOSAR calls its check once a period, with or without a frame. Here it is called once per frame and,
 //!   if the period is known, once for each period without a frame. If the period is unknown, the allowed step grows
-//!   with bad frames only.
+//!   only with frames that are not accepted.
 //! * Deviation 4: in AUTOSAR, the counter 15 of profile 1, which no sender may use, has no status (the check returns an
 //!   error). Here it is [`Status::WrongCrc`], because no valid sender creates such a payload.
 

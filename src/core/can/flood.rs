@@ -3,10 +3,10 @@
 //!
 //! In: time and identifier of each received frame. Out: whether the frame is admitted. Dropped frames are counted, and
 //! a [`FloodChange`] reports when dropping starts and ends. Each message has a leaky bucket, stored as one number: the
-//! time up to which the allowed rate is spent. At once, a bucket admits the frames of a tenth of a second at the
-//! allowed rate, or two frames per multiplexer page if this is more. In the long run, it admits the allowed rate. The
-//! result depends only on the time stamps, and nothing is allocated after the start. Messages that are not configured
-//! always pass, because they are not decoded and cost almost no time.
+//! time up to which the allowed rate is spent. In one burst, a bucket admits as many frames as the allowed rate permits
+//! in a tenth of a second, or two frames per multiplexer page if this is more. In the long run, it admits the allowed
+//! rate. The result depends only on the time stamps, and nothing is allocated after the start. Messages that are not
+//! configured always pass, because they are not decoded and cost almost no time.
 
 use std::num::NonZeroU32;
 
@@ -134,9 +134,9 @@ impl FloodGate {
         false
     }
 
-    /// Ends each flood whose frames have stopped.
+    /// Ends each flood in which no frame was dropped for a second.
     pub fn poll(&mut self, now: Timestamp) {
-        // A flood ends after this time without a dropped frame, s. Shorter pauses belong to the same flood.
+        // Shorter pauses belong to the same flood.
         self.end(|last| now.since(last) >= 1.0);
     }
 

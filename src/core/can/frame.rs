@@ -76,8 +76,8 @@ pub enum FrameKind {
     },
 }
 
-/// Payload bytes, followed by zeros. The alignment makes decoding faster: a word that is loaded soon after a copy of
-/// the frame comes from a single store. A load that spans two stores must wait for both stores.
+/// Payload bytes, followed by zeros. The alignment makes decoding faster: if a word is loaded soon after the frame was
+/// copied, a single store has written the whole word. A load that spans two stores must wait for both stores.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(align(8))]
 struct Data([u8; MAX_DATA]);
@@ -97,7 +97,7 @@ impl Frame {
         (data.len() <= 8).then(|| Self::build(id, FrameKind::Classic, data))
     }
 
-    /// An FD data frame; `None` for a length that FD does not support (above 64, or between its steps).
+    /// An FD data frame; `None` for a length that FD does not support.
     pub fn fd(id: CanId, brs: bool, esi: bool, data: &[u8]) -> Option<Self> {
         is_frame_length(data.len()).then(|| Self::build(id, FrameKind::Fd { brs, esi }, data))
     }

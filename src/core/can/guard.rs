@@ -4,10 +4,10 @@
 //! [`Status`] of each frame and counts per message. A [`GuardChange`] reports that a message starts to fail its check
 //! or becomes usable again.
 //!
-//! If a message's cycle time is known, each period without a frame counts as one [`Status::NoNewData`]. The first is
-//! counted one and a half periods after the last frame; the half period allows for jitter. Each further period counts
-//! one more. While the check allows this number of lost frames, no change is reported, because the next frame will be
-//! usable. Otherwise, a sender with jitter would fill the log.
+//! If a message's cycle time is known, each period without a frame counts as one [`Status::NoNewData`]. The first
+//! missing frame is counted one and a half periods after the last frame; the half period allows for jitter. Each
+//! further period counts one more. As long as the check allows as many lost frames as are missing, no change is
+//! reported, because the next frame will be usable. Otherwise, a sender with jitter would fill the log.
 //!
 //! A time without listening is not the sender's fault. After sleep, a restart of the program or a clock step, the
 //! receivers wait for a first frame again ([`Guards::restart`]). For the same reason, a restarted program restores the
@@ -79,7 +79,7 @@ struct Guard {
     missed_at: Option<Timestamp>,
     /// Consecutive periods without a frame.
     missed: u64,
-    /// Number of failed checks since the last usable frame; 0 = the message is usable, or no frame has arrived.
+    /// Number of failed checks since the last usable frame; 0 = no failure has been reported since then.
     failed: u64,
 }
 
@@ -98,8 +98,8 @@ impl Guards {
         configs.sort_by_key(|config| (config.bus, config.id));
         configs.dedup_by_key(|config| (config.bus, config.id));
         let guard = |config| Guard { config, receiver: Receiver::default(), missed_at: None, missed: 0, failed: 0 };
-        // A check adds at most one change, and a poll adds at most one change per message, so nothing is allocated
-        // later.
+        // A check adds at most two changes (frames were missing, the message is usable again), and a poll adds at most
+        // one change per message. Therefore nothing is allocated later.
         Self { changes: Vec::with_capacity(configs.len() + 1), guards: configs.into_iter().map(guard).collect() }
     }
 

@@ -1,9 +1,10 @@
 //! ISO-TP (ISO 15765-2): reassembles messages of up to 65,535 bytes from single, first and consecutive frames, and
 //! segments them.
 //!
-//! In: payloads of one sender's frames with their times. Out: complete messages, and a fault for each lost message.
-//! Supports classic frames and CAN FD (length escapes), normal and extended addressing. A [`Receiver`] only listens,
-//! because the tester sends flow control. It stores one message, and only the bytes that have arrived.
+//! In: payloads of one sender's frames with their times. Out: complete messages, and the faults of lost messages.
+//! Supports normal and extended addressing, classic frames and, for reassembly, CAN FD (length escapes). A [`Receiver`]
+//! only listens, because the tester sends flow control. A receiver stores one message, and only the bytes that have
+//! arrived.
 
 use crate::quantity::Timestamp;
 
@@ -24,7 +25,7 @@ const CLASSIC: usize = 8;
 pub enum IsoTpFault {
     /// A consecutive frame does not have the next number: a frame is missing, duplicated or out of order.
     WrongSequence,
-    /// No consecutive frame within a second.
+    /// The next consecutive frame did not arrive within a second.
     Timeout,
     /// Another message started before the previous message ended, because there are two senders or the sender gave up.
     Overlap,
@@ -35,7 +36,7 @@ pub enum IsoTpFault {
     WrongLength,
     /// The message is longer than [`MAX_MESSAGE`].
     TooLong,
-    /// A frame is shorter than the first frame requires.
+    /// A consecutive frame is too short: it must fill the length of the first frame or complete the message.
     ShortFrame,
     /// A consecutive frame arrived, but no message has started.
     NotBegun,
@@ -105,13 +106,12 @@ pub struct Receiver {
     /// Payload length of the first frame (RX_DL), without the extension.
     frame_len: usize,
     latest: Timestamp,
-    /// Whether the message being received is lost and the loss is reported. Its further frames then cause no further
-    /// fault.
+    /// Whether a message was lost and its further frames are ignored without another fault.
     is_discarding: bool,
 }
 
 impl Receiver {
-    /// Creates a receiver before its first frame.
+    /// Creates a receiver that waits for its first frame.
     pub fn new(extension: Option<u8>) -> Self {
         let latest = Timestamp::from_nanos(0);
         Self { extension, message: Vec::new(), length: 0, next: 0, frame_len: 0, latest, is_discarding: false }
@@ -259,7 +259,7 @@ impl Received {
     }
 }
 
-/// The payload after the extension; `None` = the extension belongs to another address.
+/// The payload after the extension; `None` = the extension is missing or belongs to another address.
 fn without_extension(extension: Option<u8>, payload: &[u8]) -> Option<&[u8]> {
     match extension {
         None => Some(payload),

@@ -12,7 +12,7 @@ use crate::can::id_table::IdTable;
 use crate::can::{CanId, Frame};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// Longest time in which an echo returns, s.
+/// Longest delay of an echo (a sent frame that returns), s.
 const ECHO_S: f64 = 1.0;
 /// Maximum number of stored sent frames: one second of status, health and alarm frames on two interfaces.
 const MAX_SENT: usize = 128;
@@ -42,7 +42,7 @@ pub struct OwnIdUse {
     frames: u64,
 }
 
-/// A sent frame, with a checksum instead of its payload, so that storing it allocates no memory.
+/// A sent frame, with a checksum instead of its payload, which is up to 64 bytes long.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 struct SentFrame {
     time: Timestamp,
@@ -51,9 +51,10 @@ struct SentFrame {
     sum: u64,
 }
 
-/// Checksum of a payload and its length. It is like FNV-1a, but uses words of eight bytes, because it is computed for
-/// every sent frame. It identifies copies and is not secure. Two different payloads of the same length never have the
-/// same checksum if the length is at most eight bytes.
+/// Checksum of a payload and its length. It is FNV-1a with words of eight bytes instead of single bytes. This is
+/// faster, which matters because the checksum is computed for every sent frame. The checksum identifies copies and is
+/// not secure. Two different payloads of the same length never have the same checksum if the length is at most eight
+/// bytes.
 fn sum(data: &[u8]) -> u64 {
     let start = 0xCBF2_9CE4_8422_2325 ^ data.len() as u64;
     data.chunks(8).fold(start, |sum, chunk| {
@@ -146,7 +147,7 @@ impl OwnFrames {
         });
     }
 
-    /// How long another sender has been present, s; 0 = no other sender.
+    /// Longest time that another sender has been present, s; 0 = no other sender.
     pub fn longest_s(&self, now: Timestamp) -> f64 {
         // At least 1 ns, because 0 means that there is no other sender.
         self.state.uses.iter().map(|other| now.since(other.since).max(1e-9)).fold(0.0, f64::max)
@@ -157,7 +158,8 @@ impl OwnFrames {
         self.state.uses.iter().map(|other| (other.bus, other.id))
     }
 
-    /// Forgets every other sender and every expected echo. Called after a time without listening or a clock step.
+    /// Reports that every other sender has stopped, and forgets every expected echo. Called after a time without
+    /// listening or a clock step.
     pub fn restart(&mut self) {
         self.poll(Timestamp::from_nanos(i64::MAX));
         self.state.uses.clear();

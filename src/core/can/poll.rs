@@ -28,9 +28,9 @@ const ANSWER_WITHIN_NS: i64 = 1_000_000_000;
 /// State of the car, as derived from the pack current.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Serialize, Deserialize)]
 pub enum CarState {
-    /// The pack is discharged.
+    /// The pack is being discharged.
     Drive,
-    /// The pack is charged.
+    /// The pack is being charged.
     Charge,
     /// No current flows, or the current is unknown.
     #[default]
@@ -93,9 +93,9 @@ impl PollSilence {
 pub enum PollChange {
     /// Polling stopped.
     Silent { reason: PollSilence },
-    /// Polling started again.
+    /// Polling started, for the first time or again.
     Asking,
-    /// A controller rejected a request permanently; it is never sent again.
+    /// A controller rejected a request permanently; the request is never sent again.
     Refused {
         /// The controller, by the identifier of its responses.
         id: CanId,
@@ -392,8 +392,9 @@ impl Poller {
         self.config.requests[index].every_s[self.progress.state as usize]
     }
 
-    /// Index of the request to send now. If request `index` asks for voltages, the request for the current is sent
-    /// first, unless it was sent last, fails or was refused.
+    /// Index of the request to send now. If the response to request `index` contains voltages but not the current, the
+    /// request for the current is sent first, unless the request for the current was the last one sent, failed last
+    /// time or was refused.
     fn with_current_before(&self, index: usize) -> usize {
         let wanted = &self.config.requests[index];
         if !wanted.has_voltages || wanted.has_current {
@@ -422,7 +423,7 @@ impl Poller {
         let period_s = self.period_s(index).unwrap_or(0.0);
         let item = &mut self.progress.items[index];
         let next = item.due.plus_secs(period_s);
-        // If a request was sent on time, its next due time is one period after the last due time.
+        // If the request is less than a period late, the next due time follows one period after the last due time.
         item.due = if item.due <= now && next > now { next } else { now.plus_secs(period_s) };
     }
 
@@ -440,7 +441,7 @@ impl Poller {
         let item = &mut self.progress.items[index];
         item.failures = item.failures.saturating_add(1);
         let pause_s = period_s * 2.0_f64.powi(item.failures.min(16).cast_signed());
-        // Longest pause after failures, s.
+        // Longest pause after failures, s, unless the period is longer.
         item.due = item.due.max(now.plus_secs(pause_s.clamp(period_s, period_s.max(600.0))));
     }
 

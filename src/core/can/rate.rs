@@ -29,13 +29,14 @@ use crate::can::id_table::IdTable;
 use crate::quantity::{BusIndex, Timestamp};
 
 const WINDOW_NS: i64 = 1_000_000_000;
-/// A window has too many frames if their number is above this multiple of the expected number. A second sender with the
-/// same cycle time doubles the number.
+/// A window is suspicious if the number of frames is above this multiple of the expected number and the window has a
+/// sign of a second sender ([`SIGNS`]). A second sender with the same cycle time doubles the number.
 const EXCESS: f64 = 1.5;
-/// Number of additional frames that are allowed, because arbitration may have delayed them into the window.
+/// Number of additional frames that a normal window may have, because arbitration may have delayed them into the
+/// window.
 const DELAYED: f64 = 1.5;
-/// A second sender is found after this number of consecutive windows with too many frames. A burst after a pause of the
-/// bus affects only one window.
+/// A second sender is found after this number of consecutive suspicious windows. A burst after a pause of the bus
+/// affects only one window.
 const WINDOWS: u32 = 3;
 /// The second sender counts as gone after this number of consecutive normal windows.
 const GONE_WINDOWS: u32 = 10;
@@ -48,8 +49,8 @@ const STEADY: (f64, f64) = (0.2, 1.0);
 const LEAST_PER_S: f64 = 3.0;
 /// An interval shorter than this fraction of the mean is short.
 const SHORT: f64 = 0.5;
-/// A second sender is indicated if the number of short intervals, or of alternating currents, is at least this multiple
-/// of the expected number of frames.
+/// A window has a sign of a second sender if the number of unusual short intervals, or of alternating currents, is at
+/// least this multiple of the expected number of frames, and at least 1.
 const SIGNS: f64 = 0.4;
 /// Fraction of the frames that follow a short interval by chance, because other messages delay them.
 const CHANCE_SHORT: f64 = 0.02;
@@ -80,7 +81,7 @@ pub struct MessageRate {
     /// Smoothed rate (1/s), and the number of consecutive windows with this rate.
     candidate: f64,
     steady: u32,
-    /// Consecutive windows with too many frames, and consecutive normal windows.
+    /// Number of consecutive suspicious windows, and of consecutive normal windows.
     excess: u32,
     calm: u32,
     /// Start of the window; `None` = no frame since listening started or since a pause.
@@ -190,8 +191,8 @@ impl SecondSenders {
         self.rates.clone()
     }
 
-    /// Restores stored statistics. Call [`restart`](Self::restart) afterwards if the program was not running in
-    /// between.
+    /// Restores stored statistics. If the program did not run between storing and restoring, call
+    /// [`restart`](Self::restart) afterwards.
     pub fn restore(&mut self, stored: &[MessageRate]) {
         for of in stored.iter().filter(|of| of.is_possible()) {
             if let Some(rate) = self.rates.get_mut(self.numbers.number(of.bus, of.id)) {
@@ -276,8 +277,9 @@ impl MessageRate {
         (self.frames, self.short, self.contradictions) = (0, 0, 0);
     }
 
-    /// Number of signs of a second sender in the window. A short interval counts only once the usual share of short
-    /// intervals is learned.
+    /// Number of signs of a second sender in the window: short intervals or alternating currents, whichever are more.
+    /// Short intervals do not count until the rate of the message is learned. Then only those above the usual number
+    /// count.
     fn signs(&self, frames: f64) -> f64 {
         let usual = frames * self.usual_short.max(CHANCE_SHORT);
         let short = self.learned_per_s.map_or(0.0, |_| f64::from(self.short) - usual);

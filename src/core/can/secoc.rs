@@ -20,7 +20,8 @@
 //! and width of the authenticated fields. The lengths of the profiles `fd` and `announcement` are packwatch's own.
 //!
 //! Deviation: AUTOSAR leaves the management of freshness to the manufacturer. Here, the receiver of commands announces
-//! the freshness ([`FreshnessWindow`]); the values that packwatch sends increase by one with each frame.
+//! the freshness that commands must carry ([`FreshnessWindow`]). The freshness of the other authenticated frames that
+//! packwatch sends increases by one with each frame.
 
 mod window;
 
@@ -115,7 +116,7 @@ impl MacInput {
 
 impl Authentication {
     /// Input of the authenticator for this payload and freshness; `None` = the payload is shorter than the trailer, or
-    /// the data is longer than a frame.
+    /// the data does not fit into a frame.
     pub fn mac_input(&self, payload: &[u8], freshness: u64) -> Option<MacInput> {
         let data = payload.get(..payload.len().checked_sub(self.profile.trailer_bytes())?)?;
         let mut input = MacInput { bytes: [0; MAX_INPUT], len: 0 };
@@ -181,7 +182,7 @@ impl Authentication {
 /// sends 4 bits (16 codes).
 const MAX_CANDIDATES: usize = 2;
 
-/// A payload's possible freshness values: everything needed to check its authenticator, except the key.
+/// The possible freshness values of a payload. With the payload and the key, they suffice to check its authenticator.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct MacCheck {
     authentication: Authentication,

@@ -88,12 +88,12 @@ pub struct SignalPlan {
     high_code: i128,
 }
 
-/// `code` as a float: exact up to 2^53, rounded to nearest above.
+/// `code` as a float. It is exact up to 2^53; a larger code is rounded to the nearest float.
 pub(crate) fn float_of(code: u64) -> f64 {
     code as f64
 }
 
-/// `code` as a float: exact within +-2^53, rounded to nearest beyond.
+/// `code` as a float. It is exact within +-2^53; a code outside is rounded to the nearest float.
 pub(crate) fn float_of_signed(code: i64) -> f64 {
     code as f64
 }
@@ -107,7 +107,7 @@ fn integer_of(whole: f64) -> i128 {
 /// the ends of `i64`; NaN gives 0.
 fn nearest(number: f64) -> i64 {
     let towards_zero = number as i64;
-    // Exact: numbers above 2^52 have no fraction.
+    // The difference is exact, because numbers above 2^52 have no fraction.
     let rest = number - float_of_signed(towards_zero);
     towards_zero.saturating_add(i64::from(rest >= 0.5) - i64::from(rest <= -0.5))
 }

@@ -130,7 +130,8 @@ pub struct ControllerCounts {
     pub pending: u64,
     /// Code of the latest negative response, except "response pending".
     pub latest_refusal: Option<u8>,
-    /// Decoded responses without a request in the preceding five seconds.
+    /// Decoded responses that do not answer the latest request, or that arrive more than five seconds after it. A
+    /// "response pending" restarts the five seconds.
     pub unasked: u64,
     /// Lost messages, indexed like [`IsoTpFault::ALL`].
     pub lost: [u64; IsoTpFault::ALL.len()],
@@ -428,7 +429,7 @@ impl Link {
         self.receiver.handle_flow_control(extension, payload)
     }
 
-    /// Counts a loss; reports it unless a loss was reported recently.
+    /// Counts a loss; reports it unless a loss of this controller was reported within the last minute.
     fn note(&mut self, now: Timestamp, fault: Option<IsoTpFault>, losses: &mut Vec<MessageLoss>) {
         let Some(fault) = fault else { return };
         let place = IsoTpFault::ALL.iter().position(|other| *other == fault);

@@ -7,10 +7,10 @@
 //!
 //! # One curve per capacity
 //! The capacity alone does not show how much lithium and how much active material was lost. Assumption: if the cell has
-//! lost a fraction x of its capacity, each electrode has lost the fraction [`MATERIAL_SHARE`] x of its active material.
-//! The rest of the lost capacity is explained by lost lithium. The uncertain share of each electrode is called a mix.
-//! [`OffsetLine::mixes_v`] is the change of the offset if the share of one electrode is higher by
-//! [`MATERIAL_SHARE_STD`].
+//! lost a fraction x of its capacity, each electrode has lost the fraction [`MATERIAL_SHARE`] times x of its active
+//! material. The rest of the lost capacity is explained by lost lithium. The share is uncertain. The uncertainty of one
+//! electrode's share is called a mix. [`OffsetLine::mixes_v`] has one entry per mix: the change of the offset if the
+//! share of that electrode is higher by [`MATERIAL_SHARE_STD`].
 
 use super::electrodes::{Electrodes, LostMaterial};
 use crate::filter::locate;
@@ -18,7 +18,7 @@ use crate::filter::locate;
 /// How the curve's change with ageing is computed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum AgeingLaw {
-    /// The change is computed from a shift of the SOC axis; 0 = the curve shrinks evenly.
+    /// The change is computed from a shift of the SOC axis; 0 = the curve over SOC does not change.
     Shift(f64),
     /// The change is computed from the electrodes of the new cell.
     Electrodes(Electrodes),
@@ -41,8 +41,9 @@ pub const MATERIAL_SHARE_STD: f64 = 0.3;
 /// Standard deviation of a shift.
 pub const SHIFT_STD: f64 = 0.3;
 
-/// Capacities of aged cells in the table, relative to the new cell's capacity, rising. Above the highest capacity in
-/// the table, the curve stays constant: such a cell is a larger cell, not a newer one.
+/// Capacities of aged cells in the table, relative to the new cell's capacity, rising. The table also has rows for the
+/// new cell and, above it, for one larger capacity. Beyond that capacity, the curve stays constant: such a cell is a
+/// larger cell, not a newer one.
 const LOST_CAPACITIES: [f64; 10] = [0.4, 0.5, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95];
 
 /// The electrodes must give curves down to this fraction of the new cell's capacity, which is a usual end of life.
@@ -66,8 +67,8 @@ pub struct AgedOcv {
     spread_v: [Vec<f64>; MIXES],
 }
 
-/// Number of uncertain mixes of losses: additional material lost from the negative electrode, and from the positive
-/// electrode.
+/// Number of mixes: additional material lost from the negative electrode, and from the positive electrode. With a
+/// shift, the first mix is the uncertainty of the shift, and the second mix is 0.
 pub const MIXES: usize = 2;
 
 /// A quantity over one interval of SOC: its value at SOC 0 and its slope per unit of SOC.
@@ -150,7 +151,8 @@ impl AgedOcv {
 
     /// Ageing that follows from a shift: OCV(s + a s (1 - s)) with a = shift (1 - C / C_new). `rows` contains the new
     /// cell's open-circuit voltages (V), one row per temperature. The offsets are computed for the middle row. With
-    /// shift 1, the top of the curve keeps its ampere-hours; with shift 0, the curve shrinks evenly.
+    /// shift 1, each point near the top of the curve keeps its distance from full in Ah. With shift 0, all these
+    /// distances shrink in proportion to the capacity.
     pub fn of_shift(shift: f64, soc: &[f64], new_capacity_ah: f64, rows: &[Vec<f64>]) -> Self {
         let mut table = Self { law: AgeingLaw::Shift(shift), ..Self::default() };
         let middle_v = &rows[rows.len() / 2];
@@ -228,7 +230,7 @@ impl AgedOcv {
         &self.spread_v
     }
 
-    /// Offset at a capacity over the interval from SOC breakpoint `s`.
+    /// Offset at a capacity, over the interval that starts at SOC breakpoint `s`.
     pub fn line(&self, soc: &[f64], s: usize, capacity_ah: f64) -> OffsetLine {
         let line = |rows: &[Vec<f64>], change: bool| {
             let Some(ends) = self.between(rows, [s, s + 1], capacity_ah) else { return SocLine::default() };

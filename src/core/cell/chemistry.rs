@@ -191,7 +191,8 @@ pub(super) fn cold_share(temperature_c: f64) -> f64 {
     ((25.0 - temperature_c) / 25.0).max(0.0)
 }
 
-/// Sag of the curve under load from 25 to 0 degrees C, mean and standard deviation, V.
+/// Sag of the curve under load: how much lower it is at 0 degrees C than at 25 degrees C, mean and standard deviation,
+/// V.
 ///
 /// The charge-transfer resistance is larger at small currents than at large currents (Butler-Volmer), especially in the
 /// cold. The model's resistances hold at large currents, so the difference is nearly a constant voltage. It was
@@ -225,7 +226,7 @@ impl Label {
         let full_v = self.chemistry.full_below_v().map(|below_v| self.voltage_max_v - below_v);
         let cell_type = CellType {
             positives: &self.chemistry.positives(),
-            // The library's electrodes with the plateaus of graphite against lithium.
+            // The negative materials that have the plateaus of graphite against lithium.
             negatives: &[Negative::GraphiteSiox, Negative::Graphite, Negative::GraphiteStaged],
             empty_v: self.voltage_min_v,
             full_v: &full_v,
@@ -251,8 +252,8 @@ impl Label {
             slow_branch: 0.5,
             // Tolerance and age of the cell.
             capacity: 0.1,
-            // An error of 40 % of the drop that persists for 100 s: cells differ in how their resistance depends on
-            // time, SOC and temperature. Chosen on LG HG2 from 0 to -10 degrees C.
+            // This is an error of 40 % of the drop; the error persists for 100 s. Cells differ in how their resistance
+            // depends on time, SOC and temperature. Chosen on LG HG2 from 0 to -10 degrees C.
             drop_sqrt_s: 4.0,
         };
         let CurvePrior { mean_v, electrodes, .. } = curve.clone();
@@ -263,8 +264,8 @@ impl Label {
     }
 
     /// The model of a cell with this present capacity (Ah), curve and resistances. `drop_std` is the standard deviation
-    /// of ln(voltage drop) at each temperature of the tables. At [`USUAL_LOAD_PER_H`], this deviation counts as voltage
-    /// error of the model.
+    /// of ln(voltage drop) at each temperature of the tables. Multiplied by the voltage drop at [`USUAL_LOAD_PER_H`],
+    /// it counts as voltage error of the model.
     pub fn model_of(
         &self,
         capacity_ah: f64,
@@ -328,8 +329,8 @@ impl Label {
     }
 }
 
-/// Load at which an error of the resistances counts as voltage error of the model: C/2, stated as current divided by
-/// rated capacity, 1/h.
+/// Load at which an error of the resistances is converted to a voltage error of the model: C/2, stated as current
+/// divided by rated capacity, 1/h.
 pub const USUAL_LOAD_PER_H: f64 = 0.5;
 
 #[cfg(test)]

@@ -28,8 +28,8 @@ impl BranchAt {
         Self { r_ohm: model.branch_r_ohm(i, position) * resistance_ratio, tau_s: model.branch_tau_s(i, position) }
     }
 
-    /// The branch's voltage after `dt_s` at a constant `current_a`. With Euler's rule, steps longer than the time
-    /// constant (gaps) would be unstable, so such steps are always exact.
+    /// The branch's voltage after `dt_s` at a constant `current_a`. Euler's rule overshoots in steps longer than the
+    /// time constant (gaps), so such steps are always exact.
     pub fn voltage_after(&self, rule: Discretisation, branch_v: f64, current_a: f64, dt_s: f64) -> f64 {
         let settled_v = self.r_ohm * current_a;
         match rule {

@@ -80,7 +80,8 @@ pub struct InitialState {
 pub struct ProcessNoise {
     /// SOC process noise, fraction per sqrt(s).
     pub soc_per_sqrt_s: f64,
-    /// SOC process noise caused by random errors of the current: fraction per square root of the SOC moved.
+    /// SOC process noise caused by random errors of the current: fraction per square root of the charge moved, where
+    /// the charge is a fraction of the capacity.
     pub charge_per_sqrt_soc: f64,
     /// Branch voltage process noise, V per sqrt(s).
     pub branch_v_per_sqrt_s: f64,
@@ -97,11 +98,11 @@ pub struct GapSettings {
     pub self_discharge_per_s: f64,
     /// Maximum rate at which the SOC changes by use or charging while the program does not run, fraction of SOC per s.
     pub away_use_per_s: f64,
-    /// Largest current of a resting cell, A per cell. A larger current before or after a gap may have flowed during the
-    /// gap.
+    /// Largest current of a resting cell, A per cell. If the current before or after a gap is larger, it may also have
+    /// flowed during the gap.
     pub rest_current_a: f64,
-    /// Whether the cell counts as resting in every longer gap without readings, regardless of the current before and
-    /// after the gap.
+    /// Whether the cell counts as resting in every gap of more than 5 s without a measured current, regardless of the
+    /// current before and after the gap.
     pub silence_is_rest: bool,
 }
 
@@ -130,7 +131,7 @@ pub struct VoltageError {
 pub struct SensorErrors {
     /// Offset of a cell's voltage, V. It includes a constant error of the model's open-circuit curve.
     pub voltage_offset_v: f64,
-    /// Uncertainty (A) of the current sensor's offset per cell that remains after learning.
+    /// Uncertainty of the current sensor's offset that remains after learning, A per cell.
     pub current_offset_a: f64,
     /// Gain error of the current, fraction.
     pub current_gain: f64,

@@ -1,7 +1,7 @@
 //! Determines the ranges of SOC and temperature that the data cover.
 //!
 //! In: SOC (fraction) and temperature (degrees C) of readings, or of notebook rows (means over several readings); NaN
-//! and infinities are ignored. Out: shares and ranges.
+//! and infinities are ignored. Out: the covered share of the SOC range, and the covered ranges of SOC and temperature.
 
 use std::collections::BTreeMap;
 
@@ -12,7 +12,7 @@ const PARTS: usize = 10;
 /// Width of a temperature class, K.
 const CLASS_K: f64 = 10.0;
 
-/// Readings per part of the SOC range and per temperature class.
+/// Number of readings per part of the SOC range and per temperature class.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Coverage {
     soc: [u64; PARTS],

@@ -261,9 +261,9 @@ impl Electrodes {
         [negative, positive, negative * self.negative_content[1] + positive * self.positive_content[1]]
     }
 
-    /// The cell after it has lost the material `lost`, and lithium until only the fraction `capacity` of its capacity
-    /// remains. Returns `None` in three cases: there is no such cell; it cannot reach its end voltages; or the new cell
-    /// contains more lithium than it can use, so the capacity does not determine the loss.
+    /// The cell after it has lost the material `lost`, and so much lithium that only the fraction `capacity` of the new
+    /// capacity remains. Returns `None` in three cases: such a cell does not exist; it cannot reach its end voltages;
+    /// or the new cell contains more lithium than it can use, so the capacity does not determine the loss.
     pub fn aged(&self, lost: LostMaterial, capacity: f64) -> Option<AgedElectrodes> {
         let [negative, positive, new_lithium] = self.new_contents();
         let ends_v = [0.0, 1.0].map(|soc| self.voltage_v(soc));

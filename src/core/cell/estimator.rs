@@ -20,9 +20,9 @@
 //! Deviation 4: model^2 = base^2 + (k drop)^2 + (k' load)^2. The base is the cell model's stated error over SOC and
 //! temperature, or a configured constant. The drop is the present voltage drop in the cell. The load is the voltage
 //! drop caused by the load of the last minutes. Reason: most of the model error comes from the resistances and from
-//! diffusion that is slower than the branches. Effect: the filter no longer treats voltages as exact at the start of a
-//! record under load, in the constant-voltage part of a charge, and in cold cells. At rest, the error repeats instead
-//! of averaging out. A rest of duration t therefore gives only as much information as the time t_r ln(1 + t/t_r) under
+//! diffusion that is slower than the branches. Effect: the filter no longer treats voltages as exact when a log starts
+//! under load, in the constant-voltage part of a charge, and in cold cells. At rest, the error repeats instead of
+//! averaging out. A rest of duration t therefore gives only as much information as the time t_r ln(1 + t/t_r) under
 //! load, with t_r = 1000 s.
 //! Deviation 5: the OCV curve changes with the lost capacity ([`AgedOcv`](crate::cell::AgedOcv)), as learned up to the
 //! end of the last half-cycle. Effect: readings at the top and at the bottom of an aged cell's curve give the same

@@ -71,8 +71,8 @@ mod tests {
         LossModes::of_capacity(&table(&M50), NEW_AH, capacity)
     }
 
-    /// Lithium lost by an LG M50 cell with the fraction `part` of its capacity, computed without the table. `negative`,
-    /// `positive`: material lost per lost capacity.
+    /// Lithium lost by an LG M50 cell that has kept the fraction `part` of its capacity, computed without the table.
+    /// `negative`, `positive`: material lost per lost capacity.
     fn lithium(part: f64, negative: f64, positive: f64) -> f64 {
         let lost = LostMaterial { negative: negative * (1.0 - part), positive: positive * (1.0 - part) };
         M50.aged(lost, part).expect("such a cell").lithium_lost()

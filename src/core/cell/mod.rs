@@ -2,7 +2,7 @@
 //!
 //! In: a checked cell model, settings and one [`CellStep`] per voltage reading (V, A with positive = discharge, s,
 //! degrees C). Out: SOC, resistance ratio and capacity (Ah), each with its standard deviation, and branch voltages (V).
-//! Readings beyond the gate (outliers) do not change an estimate.
+//! Readings beyond the gate (outliers) do not correct an estimate.
 
 pub mod aged_ocv;
 pub mod chemistry;

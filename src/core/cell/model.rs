@@ -55,7 +55,7 @@ pub struct Thermal {
 }
 
 /// A checked cell model: breakpoints and OCV rise strictly, all resistances and capacitances are positive and finite,
-/// and the tables are complete. Created by `config::cell_model`.
+/// and the tables are complete. Created by `config::cell_model` from a file, or by `cell::chemistry` from a label.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CellModel {
     /// Display name.
@@ -88,8 +88,8 @@ pub struct CellModel {
     pub spread: Option<ModelSpread>,
 }
 
-/// Standard deviations of a cell's properties from a model that was not fitted to its type. The modes of the
-/// open-circuit curve are stored with the modes of ageing ([`AgedOcv::add_spread`]).
+/// Standard deviations of the properties of cells around their model. The modes in which the open-circuit curve varies
+/// between cells are stored with the mixes of losses ([`AgedOcv::add_spread`]).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ModelSpread {
     /// Constant error of the open-circuit curve in addition to its modes, V.
@@ -157,13 +157,13 @@ impl Table {
 /// phases.
 const TWO_PHASE_SLOPE_V: f64 = 0.15;
 
-/// Standard deviation of the hysteresis of a two-phase electrode around the middle of both branches, V. For LFP, the
-/// branches are 10 to 25 mV apart.
+/// Hysteresis of a two-phase electrode: standard deviation of the voltage around the middle between the charge curve
+/// and the discharge curve, V. For LFP, the two curves are 10 to 25 mV apart.
 const TWO_PHASE_HYSTERESIS_V: f64 = 0.01;
 
 impl CellModel {
-    /// Spread of the cells around the model. If the model states none: the usual spread of cells of one type, and the
-    /// hysteresis of a two-phase electrode if the curve is flat.
+    /// Spread of the cells around the model. If the model states no spread: the usual spread of cells of one type. If
+    /// the curve is flat, this usual spread includes the hysteresis of a two-phase electrode.
     pub fn spread(&self) -> ModelSpread {
         self.spread.unwrap_or_else(|| {
             let curve_v = if self.is_two_phase() { TWO_PHASE_HYSTERESIS_V } else { 0.0 };
@@ -241,8 +241,8 @@ impl CellModel {
             + self.offset(position, capacity_ah).offset_v.0[1]
     }
 
-    /// Returns a model whose new cells are the cells aged to this capacity, Ah: the aged curve becomes the new cells'
-    /// curve. Further ageing follows from the same electrodes.
+    /// Returns a model in which a cell aged to this capacity (Ah) counts as new: the aged curve becomes the new cell's
+    /// curve. Further ageing follows the same law.
     pub fn rebased(&self, capacity_ah: f64) -> Self {
         let last = self.soc.len() - 2;
         let offset_v = |s: usize| self.aged_ocv.line(&self.soc, s.min(last), capacity_ah).offset_v.at(self.soc[s]);

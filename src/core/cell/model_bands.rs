@@ -1,15 +1,16 @@
 //! Uncertainty of a cell model: bands of its open-circuit curve and resistances, and the resulting SOC errors.
 //!
-//! In: a [`CellModel`]. Out: standard deviations of a cell's voltage (V), resistance (fraction) and SOC from the model;
-//! `None` if the model states no error of its curve. The estimator starts with the same standard deviations.
+//! In: a [`CellModel`]. Out: standard deviations of a cell's voltage (V), resistance (fraction) and SOC around the
+//! model. If the model states no error of its curve, voltage and SOC have `None`. The estimator starts with the same
+//! standard deviations.
 //!
 //! * Curve: the modes of the spread between cells, and the smallest `voltage_error_v` of all temperatures at this SOC.
 //!   At the temperature with the smallest error, the resistances matter least, so this error is mostly an error of the
 //!   curve. If the model has no such table, the constant error of the spread is used.
-//! * Resistances: a common error (`log_resistance` of the spread, else the spread of cells of one type), and an error
-//!   that differs between SOC and temperatures. The second error consists of the voltage drop's standard deviation over
-//!   [`ERROR_WINDOW_S`] and of the part of `voltage_error_v` beyond the curve's error, relative to the drop at a usual
-//!   load.
+//! * Resistances: a common error (`log_resistance` of the spread; if the model states no spread, the usual value for
+//!   cells of one type), and an error that differs between SOC and temperatures. The second error has two parts: the
+//!   standard deviation of the voltage drop over [`ERROR_WINDOW_S`], and the part of `voltage_error_v` beyond the
+//!   curve's error. Both are relative to the drop at a usual load.
 
 mod advice;
 
@@ -19,7 +20,7 @@ use super::chemistry::USUAL_LOAD_PER_H;
 use super::model::{CellModel, ERROR_WINDOW_S, GridPosition, ModelSpread};
 use crate::filter::square;
 
-/// Temperature of a displayed curve, degrees C. If the table does not include it, the nearest breakpoint is used.
+/// Temperature of a displayed curve, degrees C. If it is outside the table, the nearest breakpoint is used.
 pub const CURVE_C: f64 = 25.0;
 
 /// Variance of an unknown SOC: uniform over 0 to 1.
@@ -129,8 +130,8 @@ impl<'a> ModelBands<'a> {
     }
 }
 
-/// Variance of the SOC after a voltage reading, from the variance `before` it. `voltage_variance`: variance of the
-/// voltage, V^2; `slope_v`: slope of the curve, V per unit of SOC.
+/// Variance of the SOC after a voltage reading. `before`: variance of the SOC before the reading; `voltage_variance`:
+/// variance of the voltage, V^2; `slope_v`: slope of the curve, V per unit of SOC.
 fn soc_variance(voltage_variance: f64, slope_v: f64, before: f64) -> f64 {
     1.0 / (slope_v * slope_v / voltage_variance + 1.0 / before)
 }

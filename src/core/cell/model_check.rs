@@ -1,8 +1,8 @@
 //! Checks in windows of an hour of use whether the configured model fits the cell.
 //!
 //! In: innovations (V) with their variances (V^2), SOC and the learned resistance, every 10 s of use. Out: after 10
-//! minutes of use, [`ModelCheck::mismatch`], which is above 1 if the model belongs to another cell. Readings without an
-//! update, after a gap or outside the innovation gate do not count as evidence.
+//! minutes of use, [`ModelCheck::mismatch`], which is above 1 if the model belongs to another cell. Readings at rest,
+//! after a gap, without an update or outside the innovation gate do not count as evidence.
 //!
 //! A filter with a wrong model hides the error from its innovations, because it corrects first the resistance and then
 //! the SOC. Two kinds of evidence (witnesses) remain:
@@ -35,7 +35,7 @@ const WINDOW_S: f64 = 3600.0;
 /// unit of SOC).
 const CURVE_STD_V: [f64; 2] = [0.2, 0.4];
 
-/// Maximum weight of a witness, relative to the other witness.
+/// A witness counts at most this many times as much as the other witness.
 const CORROBORATED: f64 = 4.0;
 
 /// Minimum sum of the witnesses that counts as a mismatch: three parts (constant, slope, resistance) of 1.4 standard
@@ -62,8 +62,7 @@ pub struct ModelCheck {
 }
 
 /// Sums over the readings of a window, relative to the mean SOC of the readings. While the SOC hardly changes, sums
-/// relative to a fixed SOC would give small differences of large numbers, and a checkpoint stores only six digits of a
-/// number.
+/// relative to a fixed SOC would give small differences of large numbers, and the store rounds numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(from = "[f64; 5]", into = "[f64; 5]")]
 struct VoltageSums {
@@ -189,7 +188,7 @@ impl ModelCheck {
     /// Whether evidence is due.
     #[inline]
     pub fn is_due(&self) -> bool {
-        // Every 10 s: short compared with the 100 s over which a model states its error.
+        // Every 10 s: short compared with the 100 s over which the error that a model states is averaged.
         self.since_s >= 10.0 && self.is_open()
     }
 
@@ -350,7 +349,7 @@ mod tests {
         assert!((sums.explained() / expected - 1.0).abs() < 1e-9, "{} {expected}", sums.explained());
     }
 
-    /// The store keeps only 20 bits of a number in a delta.
+    /// Keeps only 20 bits of the mantissa of each sum, fewer than the store keeps.
     #[test]
     fn rounded_sums_keep_their_evidence() {
         let mut sums = VoltageSums::default();

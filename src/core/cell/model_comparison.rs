@@ -9,13 +9,14 @@ use super::model_bands::CURVE_C;
 
 /// Number of SOC steps over the curve.
 const CURVE_STEPS: u32 = 100;
-/// Number of SOC steps for looking up a voltage, at rest or under load. Must be a multiple of `CURVE_STEPS`.
+/// Number of SOC steps in the table that gives the SOC of a voltage, at rest or under load. Must be a multiple of
+/// `CURVE_STEPS`.
 const READ_STEPS: u32 = 400;
 /// SOC range in which SOC errors count. Outside this range, curves are so steep that the SOC errors of any model are
 /// small.
 const MIDDLE: (f64, f64) = (0.05, 0.95);
 
-/// A quantity at one SOC.
+/// A difference at one SOC.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AtSoc {
     /// SOC, fraction.
@@ -96,8 +97,8 @@ fn ocv_v(model: &CellModel, soc: f64) -> f64 {
     model.ocv_v(&model.grid_position(soc, CURVE_C))
 }
 
-/// Whether a temperature is within the tables of a model. A table with a single temperature counts as measured at the
-/// temperature of the curve.
+/// Whether a temperature is within the tables of a model. A table with a single temperature counts as measured at
+/// [`CURVE_C`].
 fn has(model: &CellModel, temperature_c: f64) -> bool {
     match model.temperature_c[..] {
         [_] => temperature_c == CURVE_C,
@@ -123,8 +124,8 @@ fn at_temperature(first: &CellModel, second: &CellModel, temperature_c: f64) -> 
     }
 }
 
-/// SOC that the second model reads from a voltage of the first model, minus the true SOC. All branches are settled.
-/// `load_per_h` is the load current divided by the rated capacity.
+/// SOC that the second model reads from a voltage of the first model, minus the SOC of the first model. All branches
+/// are settled. `load_per_h` is the load current divided by the rated capacity.
 fn soc_difference(first: &CellModel, second: &CellModel, temperature_c: f64, load_per_h: f64) -> Difference {
     let drop_v = |model: &CellModel, soc: f64| {
         load_per_h * model.rated_capacity_ah * model.settled_ohm(&model.grid_position(soc, temperature_c))

@@ -1,14 +1,15 @@
 //! Condenses readings of a vehicle's cells into rows. The on-board fit of a cell model uses these rows.
 //!
 //! In: one [`CellStep`] per voltage reading of any cell (A, V, s, degrees C). Out: at most [`MAX_ROWS`] rows of the
-//! mean cell.
+//! mean cell, which is the average of all cells.
 //!
 //! A row is the mean over a time in which the SOC hardly changes. A *stretch* is a period with a continuously measured
-//! current. In addition to the voltage, a row contains all inputs of its prediction in linear form: the charge since
-//! the start of the stretch, the current, and the current after first-order filters with the time constants of the
-//! branches. Single rows can therefore be removed from a stretch. A mean hides current steps, so these are stored as
-//! the sums of a small regression. Rows are classified by SOC, temperature and direction of the current. A full
-//! notebook removes the oldest row of the class with the most rows, and thus keeps rare rows.
+//! current. In addition to the voltage, a row contains all inputs from which the fit predicts this voltage: the charge
+//! since the start of the stretch, the current, and the current after first-order filters with the time constants of
+//! the branches. A row can therefore be predicted without its neighbours, and single rows can be removed from a
+//! stretch. A mean hides current steps, so these are stored as the sums of a small regression. Rows are classified by
+//! SOC, temperature and direction of the current. A full notebook removes the oldest row of the class with the most
+//! rows, and thus keeps rare rows.
 
 use serde::{Deserialize, Serialize};
 
@@ -28,7 +29,7 @@ const CLASS_SOC: f64 = 0.1;
 /// Maximum current that counts as rest, in units of the 1 C current.
 const REST_PER_H: f64 = 0.02;
 
-/// Number of current filters: one per branch of a label's model.
+/// Number of current filters: one per branch of a model made from a label.
 pub const FILTERS: usize = 3;
 
 /// The mean cell over a short time.
@@ -134,7 +135,7 @@ pub struct Notebook {
     rows: Vec<Row>,
     /// Number of the present stretch.
     number: u32,
-    /// Rows since [`Self::mark_read`].
+    /// Number of rows added since the last [`Self::mark_read`] that are still present.
     unread: u32,
     readings: Readings,
     present: Option<Stretch>,
@@ -143,7 +144,7 @@ pub struct Notebook {
 /// Settings for turning readings into rows.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct NotebookConfig {
-    /// Cells that report.
+    /// Number of cells that report.
     pub cells: u32,
     /// Rated capacity of a cell, Ah.
     pub rated_ah: f64,
@@ -152,7 +153,7 @@ pub struct NotebookConfig {
 }
 
 impl NotebookConfig {
-    /// Settings for a pack whose cells are known by a label.
+    /// Settings for a pack whose cell model is made from a label.
     pub fn new(cells: u32, rated_ah: f64) -> Self {
         Self { cells, rated_ah, tau_s: TAU_S }
     }
@@ -169,7 +170,7 @@ impl Notebook {
         &self.rows
     }
 
-    /// Rows added since the last [`Self::mark_read`].
+    /// Number of rows added since the last [`Self::mark_read`] that are still present.
     pub fn unread(&self) -> usize {
         self.unread as usize
     }
@@ -235,12 +236,12 @@ impl Notebook {
         }
         // The mean cell has at most one reading per second.
         let is_due = readings.count >= config.cells && readings.measured_s >= f64::from(config.cells);
-        // Before the first reading of a stretch, no time is measured.
+        // Outside a stretch, no measured time is needed: one reading per cell begins a stretch.
         let begins = self.present.is_none() && readings.count >= config.cells;
         (is_due || begins) && self.close_readings(config, step.ambient_c)
     }
 
-    /// Turns the readings into one reading of the mean cell.
+    /// Turns the readings into one reading of the mean cell. Returns whether a row is complete.
     fn close_readings(&mut self, config: &NotebookConfig, ambient_c: f64) -> bool {
         let Readings { count, temperatures, measured_s, unmeasured_s, charge_as, current_a, voltage_v, temperature_c } =
             std::mem::take(&mut self.readings);
@@ -286,7 +287,7 @@ impl Notebook {
         let [i, x, v] = [current_a, filtered_a[0], voltage_v];
         let [last_i, last_x, last_v] = std::mem::replace(&mut stretch.last, [i, x, v]);
         let row = &mut stretch.row;
-        // A difference between readings that are further apart does not count as a step.
+        // A difference between readings more than 3 s apart does not count as a step.
         if dt_s <= 3.0 {
             let [di, dx, dv] = [i - last_i, x - last_x, v - last_v];
             let products = [di * di, di * dx, dx * dx, di * dv, dx * dv];
@@ -334,7 +335,8 @@ impl Notebook {
         self.make_room(config);
     }
 
-    /// Ends the present row if it is long enough, when the vehicle rests or the stretch ends.
+    /// Ends the present row when the vehicle rests or the stretch ends. If the row is shorter than 20 s or the first
+    /// row of the stretch, does nothing.
     pub fn finish_row(&mut self, config: &NotebookConfig) {
         let before = self.rows.last().filter(|row| row.stretch == self.number).copied();
         if let (Some(stretch), Some(before)) = (&self.present, before)

@@ -1,7 +1,8 @@
 //! Model of this pack's own cells: the label's model, corrected by the vehicle's readings.
 //!
-//! In: a [`Label`] and a [`Notebook`](super::notebook::Notebook). Out: an [`OwnModel`], from which the [`CellModel`] of
-//! the filters is made. Where the notebook has no readings, the model and the spread of the label remain.
+//! In: a [`Label`] and the rows (averaged readings) of a [`Notebook`](super::notebook::Notebook). Out: an [`OwnModel`],
+//! from which the [`CellModel`] of the filters is made. Where the notebook has no rows, the label's model and its
+//! uncertainty remain.
 
 pub mod fit;
 pub mod task;
@@ -26,17 +27,17 @@ pub struct OwnModel {
     pub curve_v: [f64; SOC_NODES],
     /// Modes of the curve's uncertainty, V per standard deviation.
     pub modes_v: [[f64; SOC_NODES]; 2],
-    /// Standard deviation of the curve without the modes, V.
+    /// Standard deviation of the curve that the modes do not explain, V.
     pub rest_v: [f64; SOC_NODES],
     /// Resistances relative to the resistances of the label's model.
     pub factors: ResistanceFactors,
-    /// Standard deviation of ln(voltage drop) at the temperatures of the tables.
+    /// Standard deviation of ln(voltage drop) at each temperature breakpoint of the model.
     pub drop_std: [f64; TEMPERATURE_NODES],
-    /// Sag of the curve from 25 to 0 degrees C, V.
+    /// Fall of the curve from 25 to 0 degrees C, V.
     pub cold_sag_v: ScalarGaussian,
     /// Capacity, Ah.
     pub capacity: ScalarGaussian,
-    /// Root mean square of the rows' residuals, V.
+    /// Root mean square of the rows' residuals (predicted minus measured voltage), V.
     pub residual_v: f64,
 }
 
@@ -116,7 +117,8 @@ impl OwnModel {
     }
 }
 
-/// Cost of rows with a model (`None` = the label's): minus the logarithm of their density. `None` without rows.
+/// Cost of rows: minus the logarithm of the probability density that a model (`own`; `None` = the label's model) gives
+/// the rows. Returns `None` without rows.
 pub fn rows_cost(prior: &LabelPrior, own: Option<&OwnModel>, rows: &[Row]) -> Option<f64> {
     fit::rows_cost(prior, own, rows)
 }

@@ -1,10 +1,11 @@
-//! Measures from the BMS's balancing bits how long the BMS bled one cell.
+//! Measures from the BMS's balancing bits how long the BMS bled one cell, that is, discharged the cell through a
+//! balancing resistor.
 //!
-//! In: balancing bits with their time and validity; starts and ends of rows (a few minutes of samples each). Out: three
-//! durations within the time from the middle of one row to the middle of the next: the cell was bled, the state was
-//! unknown, no bits were received. The charge that a row shows is the charge at the middle of the row, so half of the
-//! row's bleed time counts in the next row. If the cell is bled between two rows, while the buses sleep, this time
-//! counts in the later row.
+//! In: balancing bits with their time and validity; starts and ends of rows (a few minutes of samples each). Out: for
+//! the time from the middle of one row to the middle of the next, how long the cell was bled, how long the bit could
+//! not be read, and how long no bit was valid. The charge that a row shows is the charge at the middle of the row, so
+//! half of the row's bleed time counts in the next row. If the cell is bled between two rows, while the buses sleep,
+//! this time counts in the later row.
 
 use serde::{Deserialize, Serialize};
 
@@ -15,7 +16,7 @@ use crate::quantity::{InvalidState, Timestamp};
 pub struct BalancingConfig {
     /// Current that the balancing resistor of one cell takes, A.
     pub bleed_a: f64,
-    /// Maximum validity of a bit, s.
+    /// A bit expires after this time, s, unless a newer bit replaces it earlier.
     pub max_age_s: f64,
     /// Whether the BMS bleeds cells only while it sends bits. If false, it is unknown whether cells are bled while no
     /// bits are sent.

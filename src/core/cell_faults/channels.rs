@@ -1,5 +1,5 @@
 //! Finds voltage channels that do not show the voltage of their own cell, because they are frozen at one value or show
-//! another cell.
+//! another cell. The middle voltage of the pack is the mean of the middle half of the cell voltages.
 
 use serde::{Deserialize, Serialize};
 
@@ -9,15 +9,15 @@ use crate::quantity::InvalidState;
 /// A channel is frozen if its value stays the same while the middle voltage of the pack changes by more than this, V.
 const FROZEN_V: f64 = 0.03;
 /// Minimum number of voltage changes within a row (a few minutes of samples); with fewer changes, channels are not
-/// compared. `doubled` also requires ten consecutive rows that agree: with a resolution of 2.5 mV, two of 96 healthy
-/// cells agreed in three rows.
+/// compared. [`Channel::doubled`] also requires that the channels agree in ten consecutive rows: with a resolution of
+/// 2.5 mV, two of 96 healthy cells agreed in three rows.
 const LEAST_CHANGES: u32 = 10;
 
 /// State of one voltage channel.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct Channel {
     /// Middle voltage of the pack, V, in the row in which the channel's value last changed. Before the first change,
-    /// the middle voltage in the first row.
+    /// the middle voltage in the first row after the start or after a gap.
     middle_v: Option<f64>,
     pub(super) is_frozen: bool,
     /// The channel that shows the same values, and the number of consecutive rows in which the two channels agreed.
@@ -40,7 +40,7 @@ impl Channel {
         self.middle_v = None;
     }
 
-    /// The other channel that shows the same values; `None` if too few rows agree.
+    /// The other channel that shows the same values; `None` if the two channels have agreed in too few rows.
     pub(super) fn doubled(&self) -> Option<u16> {
         self.same_as.filter(|(_, rows)| *rows >= 10).map(|(other, _)| other)
     }

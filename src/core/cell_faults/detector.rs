@@ -23,10 +23,10 @@ use crate::quantity::{CellIndex, InvalidState, Timestamp};
 use balancing::Bleed;
 use judge::Population;
 
-/// Length of a row. A row ends when `ROW_SOC` of the capacity has moved, or after `ROW_S` seconds. During a long rest,
-/// the row ends after `REST_PART` of the time at rest, because more samples add no information. Shorter rows would show
-/// a bad contact sooner. With shorter rows, however, the detector would mistake an aged cell for a bad contact, and
-/// would miss exchanged channels.
+/// Length of a row. A row ends when the fraction `ROW_SOC` of the capacity has been charged or discharged, or after
+/// `ROW_S` seconds. During a long rest, the row may last for the fraction `REST_PART` of the rest's duration, because
+/// more samples add no information. Shorter rows would show a bad contact sooner. With shorter rows, however, the
+/// detector would mistake an aged cell for a bad contact, and would miss exchanged channels.
 const ROW_SOC: f64 = 0.02;
 const ROW_S: f64 = 300.0;
 const REST_PART: f64 = 0.5;
@@ -76,11 +76,12 @@ pub struct MeanCell {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct WatchedCell {
-    /// Whether the cell is of the pack's main kind. Cells of another kind are not compared.
+    /// Whether the cell is of the pack's main type. Cells of another type (in a module with its own cell model) are not
+    /// compared.
     #[serde(default = "yes", skip_serializing_if = "Clone::clone")]
     is_compared: bool,
     difference: Difference,
-    /// Means of the states before the rows that contradict the prediction.
+    /// Means of the states before the latest rows that contradict the prediction.
     settled: [f64; STATES],
     /// Means of the states before the last sudden change.
     before_jump: [f64; STATES],
@@ -146,8 +147,8 @@ pub struct CellFaultDetector {
 }
 
 impl CellFaultDetector {
-    /// Creates a detector for a pack in which only the cells `compared` are of the same kind. The caller may
-    /// [add](Self::add) samples of these cells only.
+    /// Creates a detector for a pack in which only the cells `compared` are of the same type. The caller must not
+    /// [add](Self::add) samples of other cells.
     pub fn among(cells: usize, compared: &[usize]) -> Self {
         let mut diagnosis = Self::new(if compared.len() < LEAST_CELLS { 0 } else { cells });
         diagnosis.compare_only(compared);
@@ -203,8 +204,8 @@ impl CellFaultDetector {
     }
 
     /// A cell's states minus the median of the pack. `None` if the detector is inactive or the pack has no such cell. A
-    /// state is `None` if it is unknown: every state of a cell of another kind, and the leak of a cell that the BMS may
-    /// bleed.
+    /// state is `None` if it is unknown: every state of a cell that is not compared, and the leak of a cell that the
+    /// BMS may bleed.
     pub fn relative(&self, cell: CellIndex) -> Option<[Option<ScalarGaussian>; STATES]> {
         let WatchedCell { is_compared, difference, .. } = self.cells.get(cell.index())?;
         Some(std::array::from_fn(|state| {
@@ -243,8 +244,8 @@ impl CellFaultDetector {
         }
     }
 
-    /// Adds the mean cell's values, after all samples with the same time. Returns whether the row is complete. If so,
-    /// the caller ends the row with [`Self::close_row`].
+    /// Adds the mean cell's values at `time`. Before this call, the caller adds all samples with the same time. Returns
+    /// whether the row is complete. If so, the caller ends the row with [`Self::close_row`].
     pub fn note(&mut self, time: Timestamp, mean: &MeanCell, capacity_ah: f64) -> bool {
         if ![mean.soc, mean.current_a, mean.drop_v, mean.temperature_c, mean.charge_ah].iter().all(|it| it.is_finite())
         {
@@ -275,7 +276,8 @@ impl CellFaultDetector {
             || time.since(begun) >= ROW_S.max(REST_PART * self.rest_s)
     }
 
-    /// Handles the probability and size of a fault of a sensor that all cells share. Returns the finding if it is new.
+    /// Lists, updates or withdraws the finding for a sensor that all cells share, depending on `probability`. Returns
+    /// the finding if it is new.
     pub fn note_sensor(
         &mut self,
         time: Timestamp,
@@ -338,7 +340,7 @@ impl CellFaultDetector {
         let before = self.findings.clone();
         if self.observe(time, seconds, &row) {
             self.observe_temperatures(time, seconds);
-            // A BMS bleeds cells near the end of a charge.
+            // A BMS bleeds cells near the end of a charge, at about SOC 0.9.
             let slope_v = || model.ocv_slope_v(&model.grid_position(0.9, row.temperature_c), capacity_ah);
             self.judge(time, is_balanced.then(slope_v));
         }
@@ -577,8 +579,8 @@ impl Row<'_> {
         self.model.r0_ohm(&self.model.grid_position(self.soc, self.temperature_c))
     }
 
-    /// Series resistance at SOC 0.5 and 25 degrees C, ohm. Contact resistance is stated as a fraction of this value,
-    /// because it depends on neither SOC nor temperature.
+    /// Series resistance at SOC 0.5 and 25 degrees C, ohm. The contact resistance depends on neither SOC nor
+    /// temperature, so it is stated as a fraction of this value.
     fn contact_ohm(&self) -> f64 {
         self.model.r0_ohm(&self.model.grid_position(0.5, 25.0))
     }

@@ -28,7 +28,7 @@ pub const SOC: usize = 0;
 pub const CAPACITY: usize = 1;
 /// State: difference in resistance, fraction of the mean cell's resistance.
 pub const RESISTANCE: usize = 2;
-/// State: difference in contact resistance, fraction of the mean cell's series resistance.
+/// State: difference in contact resistance, fraction of the mean cell's series resistance at SOC 0.5 and 25 degrees C.
 pub const CONTACT: usize = 3;
 /// State: offset of the voltage channel, V.
 pub const CHANNEL: usize = 4;
@@ -40,8 +40,8 @@ const PAIRS: usize = STATES * (STATES + 1) / 2;
 
 /// Standard deviations before the first row. The value for the voltage channel is typical of cell monitors.
 const FIRST_STD: [f64; STATES] = [0.05, 0.1, 0.2, 0.5, 0.005, 0.05];
-/// Random walk of the states: standard deviations gained within one day. `MOVED_STD` is the standard deviation of the
-/// SOC gained in a row, per unit of SOC moved.
+/// Random walk of the states: standard deviations gained within one day. `MOVED_STD`: standard deviation that the state
+/// [`SOC`] gains from one row to the next, per unit of SOC that the mean cell moves.
 const DAILY_STD: [f64; STATES] = [1e-4, 3e-4, 5e-3, 5e-3, 3e-4, 1e-4];
 const MOVED_STD: f64 = 5e-4;
 /// Standard deviations added after a sudden change of a single cell: its contact or its channel has changed, or the
@@ -53,8 +53,8 @@ const REPLACED_STD: [f64; STATES] = [0.05, 0.1, 0.3, 0.1, 0.005, 0.01];
 /// cause must be the contact.
 const RESISTANCE_STD: [f64; STATES] = [0.0, 0.0, 0.01, 0.5, 0.0, 0.0];
 /// If a BMS may bleed a cell: standard deviation of the charge that the cell loses, fraction of the capacity per day.
-/// After a time without rows, the loss may be larger; `open_charge` handles this case. With 0.01 per day, the detector
-/// would miss exchanged channels and modules.
+/// After a time without rows, the loss may be larger; `open_charge` handles this case. If the value were 0.01, the
+/// detector would miss exchanged channels and modules.
 const BLED_PER_DAY: f64 = 0.002;
 /// Limits of the innovation, in standard deviations. Above `HUBER`, a row has a reduced weight. Above `JUMP` (for the
 /// mean voltage) or `STEPS_JUMP` (for the resistance from current steps), a row is odd. Three consecutive odd rows
@@ -85,8 +85,8 @@ pub(super) enum Jump {
     Replaced,
 }
 
-/// Counts consecutive deviations with the same sign that reach `limit`. If three such deviations make a jump, resets
-/// the count and returns true.
+/// Counts consecutive deviations with the same sign that reach `limit`. The third such deviation is a jump: resets the
+/// count and returns true.
 fn count_odd(odd: &mut i8, deviations: f64, limit: f64) -> bool {
     let side = if deviations.abs() < limit { 0 } else { deviations.signum() as i8 };
     *odd = if side == 0 || odd.signum() * side < 0 { side } else { *odd + side };
@@ -225,7 +225,8 @@ impl Difference {
     }
 
     /// Updates with a row's mean voltage. Returns true if the cell has changed suddenly, that is, if consecutive rows
-    /// contradict the prediction. In this case the states stay unchanged, and the caller calls [`Self::open`].
+    /// contradict the prediction. In this case the states stay unchanged, and the caller calls [`Self::open`] or
+    /// exchanges the filters of two cells.
     pub(super) fn observe(&mut self, observed: &Observation) -> bool {
         let off = self.deviations(observed);
         let is_jump = count_odd(&mut self.odd_rows, off, JUMP);
@@ -322,8 +323,8 @@ impl Difference {
 mod tests {
     use super::*;
 
-    /// Simulates days of driving and rest for a cell with the differences `truth` and an ideal voltage channel. Returns
-    /// the filter afterwards.
+    /// Simulates days of driving and rest for a cell with the differences `truth` and a voltage channel without noise.
+    /// Returns the filter afterwards.
     fn watched(truth: [f64; STATES], days: usize) -> Difference {
         let (mut filter, mut charge, mut soc) = (Difference::new(), truth[SOC], 0.8);
         for row in 0..days * 60 {

@@ -7,25 +7,29 @@ use serde::{Deserialize, Serialize};
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Kind of a finding. CAN frames contain this number, so a number is never reused. The unit of the finding's size is
-/// stated for each kind.
+/// Kind of a finding. Events, reports and the stored state contain the name of the kind. The number of a kind is its
+/// position, counted from 1, in a stored array of each cell. A number therefore never changes and is never reused. The
+/// unit of the finding's size is stated for each kind.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
 pub enum CellFaultKind {
     /// The cell loses more charge than the other cells. Size: fraction of its capacity per day.
     Leak = 1,
-    /// The contact resistance of the cell is higher than in the other cells. Size: fraction of the cell's series
-    /// resistance.
+    /// The contact resistance of the cell is higher than in the other cells. Size: difference, fraction of the mean
+    /// cell's series resistance at SOC 0.5 and 25 degrees C.
     Contact = 2,
-    /// The cell's capacity is lower than the other cells' capacity. Size: fraction.
+    /// The cell's capacity is lower than the other cells' capacity. Size: difference (negative), fraction of the
+    /// capacity.
     WeakCell = 3,
-    /// The cell's resistance is higher than the other cells' resistance, as in an aged cell. Size: fraction.
+    /// The cell's resistance is higher than the other cells' resistance, as in an aged cell. Size: difference, fraction
+    /// of the resistance.
     HighResistance = 4,
-    /// The cell's capacity is higher than the other cells' capacity, because the cell was replaced. Size: fraction.
+    /// The cell's capacity is higher than the other cells' capacity, because the cell was replaced. Size: difference,
+    /// fraction of the capacity.
     ForeignCell = 5,
-    /// Neighbouring cells have changed suddenly, because a module was replaced. Size: mean change of these cells'
-    /// capacity, fraction.
+    /// The capacities of neighbouring cells have been higher than the other cells' capacity since about the same time,
+    /// because a module was replaced. Size: mean difference, fraction of the capacity.
     Module = 6,
     /// The cell's voltage channel has a constant offset. Size: V.
     VoltageChannel = 7,
@@ -46,7 +50,7 @@ pub enum CellFaultKind {
 }
 
 impl CellFaultKind {
-    /// All kinds, ordered by their numbers in CAN frames.
+    /// All kinds, ordered by their numbers.
     pub const ALL: [Self; 14] = [
         Self::Leak,
         Self::Contact,
@@ -153,8 +157,8 @@ impl CellFaultKind {
         self.is_of_channel() || matches!(self, Self::SwappedChannels)
     }
 
-    /// Size above which a finding of this kind applies, in the unit of the kind. 0.5 for kinds that are either present
-    /// or absent.
+    /// Magnitude of the size above which a finding of this kind applies, in the unit of the size. 0.5 for kinds whose
+    /// size is not judged here.
     pub(super) const fn limit(self) -> f64 {
         match self {
             Self::Leak => LEAK_PER_DAY,
@@ -182,7 +186,7 @@ pub struct CellFault {
     pub reported: Timestamp,
     /// Probability that the size exceeds the limit of the kind.
     pub probability: f64,
-    /// Size, in the unit of the kind.
+    /// Size, in the unit that [`CellFaultKind`] states for the kind.
     pub size: ScalarGaussian,
 }
 
@@ -219,10 +223,10 @@ impl fmt::Display for CellFault {
     }
 }
 
-/// Limit of the leak, fraction of the capacity per day. The losses of healthy cells in one pack differ by less than 0.5
-/// % per month.
+/// Limit of the leak, fraction of the capacity per day. In a healthy pack, the losses of the cells differ by less than
+/// 0.5 % per month.
 pub const LEAK_PER_DAY: f64 = 5e-4;
-/// Limit of the contact resistance, fraction of the cell's series resistance.
+/// Limit of the difference in contact resistance, fraction of the mean cell's series resistance.
 pub const CONTACT: f64 = 0.1;
 /// Limit of the difference in capacity, fraction.
 pub const CAPACITY: f64 = 0.05;

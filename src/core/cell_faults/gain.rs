@@ -12,11 +12,12 @@ use super::fault::{GAIN, REPORTED};
 use crate::filter::{ScalarGaussian, median, normal_cdf};
 use crate::quantity::{InvalidState, Timestamp};
 
-/// Maximum number of days that are compared with each other. Slower changes are caused by the seasons or by ageing.
+/// Maximum number of days that are compared with each other. Changes that take longer are caused by the seasons or by
+/// ageing.
 const DAYS: usize = 10;
 const DAY_S: f64 = 86_400.0;
-/// Maximum time within which the resistances must fall, s. The estimated resistances follow within hours, so two
-/// consecutive daily checks may each see a part of the fall.
+/// Time within which the resistances must fall, s. The estimated resistances follow within hours, so two consecutive
+/// daily checks may each see a part of the fall.
 const APART_S: f64 = 2.5 * DAY_S;
 /// Standard deviation of changes with other causes than the gain, within `DAYS` days, fraction.
 const ERROR: f64 = 0.005;

@@ -32,7 +32,7 @@ use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Timestamp};
 
 /// From this standard deviation on, a cell's SOC or capacity counts as unknown. This is half of the standard deviation
-/// before the first row.
+/// before the first row (a few minutes of samples).
 const UNKNOWN_SOC_STD: f64 = 0.025;
 const UNKNOWN_CAPACITY_STD: f64 = 0.05;
 const OCV_PARTS: u32 = 100;
@@ -76,9 +76,11 @@ pub struct LimitingCell {
     pub cell: CellIndex,
     /// Reason that corresponds to the larger of the two causes: SOC or capacity.
     pub reason: LimitReason,
-    /// Charge that the cell lacks relative to the mean cell because of its SOC, fraction of the mean capacity.
+    /// How much less charge this cell delivers (if it is empty first) or accepts (if it is full first) than the mean
+    /// cell because of its SOC, fraction of the mean capacity.
     pub by_charge: f64,
-    /// Charge that the cell lacks relative to the mean cell because of its capacity, fraction of the mean capacity.
+    /// How much less charge this cell delivers or accepts than the mean cell because of its capacity, fraction of the
+    /// mean capacity.
     pub by_capacity: f64,
 }
 
@@ -138,7 +140,7 @@ pub enum LeftOut {
 /// Reason why a pack's imbalance is unknown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum UnknownImbalance {
-    /// No row has ended since the start or since a gap of unknown length.
+    /// No row (a few minutes of samples) has ended since the start or since a gap of unknown length.
     #[error("the cells have not been compared yet")]
     NotCompared,
     /// Too few cells can be compared.

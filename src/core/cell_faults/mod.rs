@@ -1,13 +1,14 @@
 //! Finds failing cells and sensors by comparing each cell with the others of its pack.
 //!
-//! In: samples of the cells of one series pack, and the estimators' values for the mean cell. Out: [`CellFault`]s. All
-//! cells carry the same current. Errors that all cells share (model, SOC, current sensor) therefore cancel in the
-//! differences between cells, and a failing cell can be recognised by a few millivolts. With fewer than three cells,
-//! the detector is inactive.
+//! In: samples of the cells of one series pack, and the estimators' values for the mean cell. Out: findings
+//! ([`CellFault`]). All cells carry the same current. Errors that all cells share (model, SOC, current sensor)
+//! therefore cancel in the differences between cells, and a failing cell can be recognised by a few millivolts. With
+//! fewer than three cells, the detector is inactive.
 //!
 //! Terms: a *row* contains the sums of each cell's samples over a few minutes. The *mean cell* is an imaginary cell
-//! with the typical values of the pack. The *middle cell* is the real cell closest to the pack's median; the mean cell
-//! gets its estimates from this cell. A cell is *bled* while a balancing resistor discharges it.
+//! with the typical values of the pack. The *middle cell* is the real cell closest to the pack's median; the estimates
+//! of the middle cell serve as the estimates of the mean cell. A cell is *bled* while a balancing resistor discharges
+//! it.
 //!
 //! | file | purpose |
 //! | --- | --- |

@@ -1,8 +1,9 @@
 //! Scalar linear Kalman filter with A = C = 1: a random walk that is measured directly.
 //!
 //! State x (any unit), variance P. Predict: P += Q. Update with the measurement z and its variance R: K = P / (P + R),
-//! x += K (z - x), P = (1 - K) P. Source: the paper's capacity filter (section 3.3.4), in which x is the capacity in Ah
-//! and each charge/discharge transition is a step. Inputs are not checked: a NaN as input gives a NaN as result.
+//! x += K (z - x), P = (1 - K) P. Source: the capacity filter in section 3.3.4 of the paper that packwatch follows
+//! (docs/src/theory.md), in which x is the capacity in Ah and each charge/discharge transition is a step. Inputs are
+//! not checked: a NaN as input gives a NaN as result.
 
 use serde::{Deserialize, Serialize};
 
@@ -33,7 +34,7 @@ impl From<ScalarGaussian> for Estimate {
 }
 
 impl ScalarGaussian {
-    /// Creates the value from a mean and its standard deviation.
+    /// Creates an estimate from a mean and its standard deviation.
     pub fn from_std(mean: f64, std: f64) -> Self {
         Self { mean, variance: std * std }
     }

@@ -1,7 +1,7 @@
-//! Scalar Kalman filter, interpolation, statistics and minimisation. This module knows nothing about batteries.
+//! Mathematics of the estimators: scalar Kalman filter, interpolation, bisection, minimisation, statistics and
+//! arithmetic on several numbers at once. This module knows nothing about batteries.
 //!
-//! In: means, (co)variances and measurements in any unit. Out: the means and (co)variances after a prediction or an
-//! update.
+//! In and out: numbers in any unit.
 
 pub mod bisection;
 pub mod interpolation;

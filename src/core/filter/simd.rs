@@ -251,7 +251,7 @@ impl<const L: usize> ExpSeries<L> {
         Self { shifted, even, odd: odd * r }
     }
 
-    /// Applies `change` (add or subtract) to the bits of `sum` and the bits of n, shifted to the exponent.
+    /// Multiplies `sum` by 2^n or 2^-n: `change` adds n to the exponent bits of `sum` or subtracts n from them.
     #[inline(always)]
     fn scaled(&self, sum: Lanes<L>, change: fn(u64, u64) -> u64) -> Lanes<L> {
         // The shift drops the bits above n.
@@ -276,9 +276,9 @@ fn ln(x: f64) -> f64 {
     2.0 * s * series + e * std::f64::consts::LN_2
 }
 
-/// At and below this x, e^x counts as 0, because smaller results would be subnormal.
+/// At and below this x, [`Lanes::exp`] returns 0, because smaller results would be subnormal.
 const LEAST: f64 = -708.0;
-/// If this number is added to a number x below 2^51, the sum rounds x to an integer.
+/// If this number is added to a number x with |x| < 2^51, the sum contains x rounded to an integer.
 const ROUNDER: f64 = 6_755_399_441_055_744.0; // 1.5 * 2^52
 /// 2^52.
 const LARGE: f64 = 4_503_599_627_370_496.0;

@@ -1,4 +1,5 @@
-//! Settings for learning at charge/discharge transitions. The host's `config` module checks the ranges.
+//! Settings for learning at charge/discharge transitions. Each charge and each discharge is a half-cycle. The host's
+//! `config` module checks the ranges.
 
 /// Settings for classifying the current as charge, rest or discharge.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -13,13 +14,13 @@ pub struct TransitionConfig {
     pub min_swing: f64,
 }
 
-/// Source of a half-cycle's capacity measurement.
+/// How a half-cycle's charge gives a measurement of the capacity.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum CapacityMethod {
     /// Charge divided by the SOC swing that follows from the voltages; the variance follows from the uncertainty of the
     /// swing.
     Swing,
-    /// As in the paper: charge divided by a fixed nominal swing; the variance is also fixed.
+    /// As in the paper that packwatch follows: charge divided by a fixed nominal swing; the variance is also fixed.
     Nominal {
         /// Assumed swing, fraction (paper: 0.6).
         swing: f64,
@@ -31,7 +32,7 @@ pub enum CapacityMethod {
 /// Settings of the capacity filter, a random walk that steps once per half-cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CapacityConfig {
-    /// Source of the measurement.
+    /// How the capacity is measured.
     pub method: CapacityMethod,
     /// Process noise: standard deviation gained per equivalent full cycle (`Swing`) or per half-cycle (`Nominal`), Ah.
     pub noise_ah_per_cycle: f64,
@@ -71,7 +72,7 @@ pub struct RechargeConfig {
     pub to_soc: f64,
     /// Current of the reference charger per cell, A, positive.
     pub reference_current_a: f64,
-    /// Fraction of the window that a charge must cover; otherwise its normalised period is not reported.
+    /// If a charge covers less than this fraction of the window, the normalised period of the charge is not reported.
     pub min_coverage: f64,
     /// Which period the alarm rule uses.
     pub alarm_on: RechargeAlarm,

@@ -7,17 +7,18 @@
 //!
 //! A half-cycle's capacity is charge / (s_high - s_low). An error e (V) of the open-circuit curve at one end changes
 //! the SOC at this end by e / slope, and the capacity by (C / swing) (e / slope). The errors are defined at SOC nodes.
-//! The errors are independent of each other and are interpolated linearly between the nodes. The size of the errors
-//! follows from the voltage error that the cell model states. If the model states no error, the errors are 0 here; the
-//! filter's constant voltage offset then also covers errors of the curve.
+//! The errors are independent of each other and are interpolated linearly between the nodes. The size of the errors is
+//! `end_error_v` of the settings or, by default, follows from the voltage error that the cell model states. If the
+//! settings and the model state no error, the errors are 0 here; the constant voltage offset of the cell's estimator
+//! then also covers errors of the curve.
 
 use super::CapacityConfig;
 use super::half_cycle::HalfCycle;
 use crate::cell::CellModel;
 use crate::quantity::Mode;
 
-/// Number of errors, one per SOC node. The nodes are evenly spaced from SOC 0 to 1. In real cells, errors of the curve
-/// differ if they are a quarter of the SOC range apart.
+/// Number of errors, one per SOC node. The nodes are evenly spaced from SOC 0 to 1. In real cells, the error of the
+/// curve differs between SOC values that are a quarter of the SOC range apart.
 pub(super) const END_ERRORS: usize = 5;
 
 /// Change of a half-cycle's capacity, Ah, per standard deviation of each error; zero if the SOC at the half-cycle's

@@ -2,7 +2,7 @@
 //! end-of-life threshold.
 //!
 //! In: use between readings (equivalent full cycles, days) and learned capacities (Ah) with their variances. Out:
-//! median and 90 % interval, or the reason why there is no forecast ([`InsufficientData`]). Negative and non-finite
+//! median and 90 % interval, or the reason why no forecast is given ([`InsufficientData`]). Negative and non-finite
 //! numbers are ignored.
 //!
 //! The forecast is a linear Kalman filter over the learned capacities, with one step per reading. Cost and memory do
@@ -30,10 +30,10 @@
 //! range from 10 to 20 % of loss. There, fade accelerates in many cells: resistance and current per active area grow
 //! with the loss, and lithium plates. The forecast expects this acceleration before a reading shows it.
 //!
-//! Deviation: the expected acceleration increases the variance of the rate in the filter, but not the rate's mean.
-//! Reason: otherwise, for cells without a knee (the NASA cells), the filter would overestimate the rate after each
-//! recovery. Effect: the filter's mean shows that a knee has begun only after readings show it. `tests/rul.md` lists
-//! the alternatives and figures.
+//! Deviation: although the forecast expects the knee, the filter does not. In the filter, the knee increases the
+//! variance of the rate, but not the mean. Reason: with an expected knee, the filter would overestimate the rate after
+//! each recovery of cells without a knee (the NASA cells). Effect: the filter's rate rises only after readings have
+//! shown the knee. `tests/rul.md` lists the alternatives and figures.
 
 mod distribution;
 #[cfg(test)]
@@ -74,7 +74,7 @@ pub const MIN_FADE_DEVIATIONS: f64 = 1.0;
 /// Maximum ratio of the interval's upper end to the median. This limit does not apply if the upper end is below the use
 /// since the first reading.
 pub const MAX_SPREAD: f64 = 10.0;
-/// Time constant of the average that gives the recent rate of use, days.
+/// Time constant of the exponentially weighted sums that give the recent rate of use, days.
 const RECENT_DAYS: f64 = 30.0;
 
 /// Quantiles of the forecast: 5, 50 and 95 %.
@@ -200,7 +200,7 @@ pub struct Forecast {
     x: [f64; N],
     p: [[f64; N]; N],
     shared_variance: f64,
-    /// Equivalent full cycles and days, averaged with the time constant `RECENT_DAYS`.
+    /// Recent equivalent full cycles and recent days: exponentially weighted sums with the time constant `RECENT_DAYS`.
     recent: [f64; 2],
 }
 
@@ -222,11 +222,11 @@ impl Usage {
 }
 
 impl Forecast {
-    /// Creates a filter for a cell that had the capacity `reference_ah`, Ah, when new. An approximate value suffices,
-    /// because the value only sets the range of the knee: 10 to 20 % below `reference_ah`.
+    /// Creates a filter for a cell that had the capacity `reference_ah`, Ah, when new. An approximate value suffices:
+    /// the value scales the assumed noise and sets the range of the knee, 10 to 20 % below `reference_ah`.
     pub fn new(axis: Axis, reference_ah: f64) -> Self {
         let mut p = [[0.0; N]; N];
-        // Wide priors: the level is practically unknown, and the rate has a standard deviation of 2 % per cycle.
+        // Wide priors: the level is practically unknown, and the rate has a standard deviation of 2 % per unit of use.
         p[LEVEL][LEVEL] = 1.0;
         p[RATE][RATE] = 0.02 * 0.02;
         let rest = if axis == Axis::Days { RECOVERY_IN_REST } else { 0.0 };
@@ -258,7 +258,8 @@ impl Forecast {
         }
     }
 
-    /// Adds use and days to the exponential average. The result does not depend on how a period is divided into steps.
+    /// Adds cycles and days to the exponentially weighted sums. The result does not depend on how a period is divided
+    /// into steps.
     fn count_recent(&mut self, passed: &Usage) {
         let ages = passed.days / RECENT_DAYS;
         let kept = libm::exp(-ages);
@@ -318,7 +319,7 @@ impl Forecast {
     pub fn remaining(&self, threshold_ah: f64) -> Result<RemainingLife, InsufficientData> {
         self.check_readings()?;
         let threshold = threshold_ah / self.reference_ah;
-        // The level has passed the threshold with a probability of 95 %.
+        // If the level has passed the threshold with a probability of at least 95 %, the remaining use is 0.
         let has_passed = self.x[LEVEL] + 1.645 * self.level_variance().sqrt() < threshold;
         let remaining = if has_passed { Remaining::default() } else { self.time_to(threshold)? };
         let [cycles, days] = self.recent;
@@ -336,7 +337,7 @@ impl Forecast {
         self.check_fade()?;
         let crossing = self.crossing(threshold);
         let [low, median, high] = QUANTILES.map(|quantile| crossing.quantile(quantile));
-        // The lower end is not checked, because near the threshold it tends to 0 however precise the filter is.
+        // The lower end is not checked: near the threshold, the lower end tends to 0 however precise the filter is.
         if high > MAX_SPREAD * median && high > self.used {
             return Err(InsufficientData::Spread { median, high });
         }
@@ -408,7 +409,8 @@ impl Forecast {
         // Assumes an error of 0.3 % in addition to the reading's variance.
         let noise = 0.003 * 0.003 + reading.variance_ah2 / scale;
         let innovation = reading.capacity_ah / self.reference_ah - self.x[LEVEL] - self.x[RECOVERY];
-        // If the innovation is an outlier, raises its variance until the innovation is five standard deviations.
+        // If the innovation exceeds five standard deviations, raises the innovation's variance until the innovation
+        // equals five standard deviations.
         let miss = innovation / 5.0;
         let innovation_variance = (ph[LEVEL] + ph[RECOVERY] + noise).max(miss * miss);
         update_states(&mut self.x, &mut self.p, &ph, innovation, innovation_variance);

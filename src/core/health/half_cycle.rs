@@ -10,9 +10,9 @@ pub struct HalfCycle {
     pub mode: Mode,
     /// Charge moved, Ah, positive.
     pub charge_ah: f64,
-    /// Change of the SOC (fraction) with its variance; positive if the SOC changed in the direction of the charge. The
-    /// variance treats the SOC errors at the two ends as independent. `None` if the SOC at the start or the end was not
-    /// estimated.
+    /// Change of the SOC (fraction) with its variance; positive if the SOC rose during a charge or fell during a
+    /// discharge. The variance treats the SOC errors at the two ends as independent. `None` if the SOC at the start or
+    /// the end was not estimated.
     pub swing: Option<ScalarGaussian>,
     /// SOC at the end, fraction; `None` if it was not estimated.
     pub end_soc: Option<f64>,

@@ -1,17 +1,19 @@
 //! Learns from every completed half-cycle of every cell: charge moved, SOC swing and capacity.
 //!
 //! In: times and temperatures of samples, SOC of the cells at the start and end of half-cycles, charge (A s). Out:
-//! half-cycles and capacity updates (Ah). A half-cycle without an estimated SOC gives no capacity.
+//! half-cycles and capacity updates (Ah). While a cell's SOC is not estimated, the caller does not call
+//! [`Learner::learn`] for this cell.
 //!
 //! A half-cycle lasts from the beginning of a charge or discharge to its end; the transition detector determines both
 //! times. A *mark* is a copy of all totals at such a time. Two filters estimate the capacity of a cell. The *sample
 //! filter* ([`CellEstimator`]) takes a step at every sample. The *event filter* takes one step per half-cycle and holds
-//! the published capacity (a random walk; paper, section 3.3.4). With `Swing`, the event filter also estimates the fade
-//! ([`super::drift`]). Its measurement is computed by one of two methods:
+//! the published capacity (a random walk; paper, section 3.3.4). The event filter's measurement is computed by one of
+//! two methods:
 //! * `Swing`: the information about the capacity in all voltages since the last half-cycle. The sample filter estimates
 //!   the capacity together with its correlation with the SOC. The measurement is computed from the sample filter's
 //!   previous estimate and its present estimate (`ScalarGaussian::information_until`). Dividing the charge by the swing
-//!   of the sample filter's SOC would be circular: that SOC was computed with the assumed capacity.
+//!   of the sample filter's SOC would be circular: that SOC was computed with the assumed capacity. With this method,
+//!   the event filter also estimates the fade ([`super::drift`]).
 //! * `Nominal`: as in the paper, charge divided by a nominal swing, with a fixed variance.
 
 use serde::{Deserialize, Serialize};
@@ -33,16 +35,16 @@ const CONTRADICTION: f64 = 4.0;
 /// Standard deviation of the capacity of cells of one type, fraction. A smaller difference is never a contradiction.
 const NEW_SPREAD: f64 = 0.1;
 
-/// Result of the capacity filter's step over a half-cycle.
+/// Result of the event filter's step for one half-cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CapacityUpdate {
     /// Measurement from this half-cycle alone; `None` if the half-cycle contains no information about the capacity.
     pub measurement: Option<Measurement>,
-    /// The published capacity. Its variance includes the gain error of the current sensor.
+    /// The published capacity. With `Swing`, its variance includes the gain error of the current sensor.
     pub capacity: ScalarGaussian,
 }
 
-/// Totals of one cell since the start, and its SOC, at one time.
+/// Totals of one cell since the learner was created, and the cell's SOC, at one time.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct CellMark {
     soc: Option<ScalarGaussian>,
@@ -70,7 +72,7 @@ impl CellMark {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Mark {
     time: Timestamp,
-    /// Cumulative charge per cell, A s, positive = discharge.
+    /// Cumulative charge, A s per cell, positive = discharge.
     charge_as: f64,
     cells: Vec<CellMark>,
 }
@@ -79,22 +81,22 @@ struct Mark {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Learner {
     totals: Vec<CellMark>,
-    /// Start of the present half-cycle.
+    /// Mark at the start of the present half-cycle.
     start: Option<Mark>,
-    /// Start of the candidate: a mode that the transition detector has not confirmed yet.
+    /// Mark at the start of the candidate, a mode that the transition detector has not confirmed yet.
     candidate: Option<Mark>,
     /// Per cell: capacity in the sample filter after the event filter's last step.
     prior: Vec<ScalarGaussian>,
     /// Per cell: capacity in the event filter.
     capacity: Vec<ScalarGaussian>,
-    /// Time without current since the last half-cycle, s.
+    /// Time without charge or discharge since the last half-cycle, s.
     rest_s: f64,
     /// Start of the present mode.
     mode_since: Option<Timestamp>,
-    /// Whether the present half-cycle continues the previous one, which moved too little charge. `start` then keeps its
-    /// value.
+    /// Whether the charge moved since `start` was too small for a half-cycle when the last charge or discharge ended.
+    /// If so, `start` stays, and the next charge or discharge extends this half-cycle.
     joining: bool,
-    /// Whether each cell has a measured capacity.
+    /// Per cell: whether the capacity has been learned.
     learned: Vec<bool>,
     /// Per cell: filter of capacity and fade (`Swing`).
     drift: Vec<DriftFilter>,
@@ -102,7 +104,7 @@ pub struct Learner {
     in_doubt: Vec<usize>,
     /// Offset of the current sensor.
     offset: CurrentOffset,
-    /// Per cell: whether half-cycles leave its capacity unchanged.
+    /// Per cell: whether the cell learns no capacity from half-cycles ([`Self::hold`]).
     #[serde(skip)]
     is_held: Vec<bool>,
 }
@@ -121,8 +123,8 @@ impl Learner {
         }
     }
 
-    /// Restores the capacity of a cell that was learned in an earlier run. The caller must already have set it in the
-    /// sample filter.
+    /// Sets a cell's capacity to `capacity`, which was learned in an earlier run. The caller must already have set this
+    /// capacity in the sample filter.
     pub fn relearn(
         &mut self,
         config: &CapacityConfig,
@@ -160,7 +162,7 @@ impl Learner {
         }
     }
 
-    /// Adds a cell's sample to its totals.
+    /// Adds a sample of `cell` to the totals of this cell.
     ///
     /// `measured_s` and `gap_s` are the times since the previous sample with and without a measured current, s. The gap
     /// is infinite before the first sample and after a gap of unknown length. Returns whether the candidate began
@@ -190,7 +192,7 @@ impl Learner {
         }
     }
 
-    /// Ends the present half-cycle after all cells have learned from it.
+    /// Resets the time at rest after all cells have learned from a half-cycle.
     pub fn finish(&mut self) {
         self.rest_s = 0.0;
     }
@@ -205,8 +207,9 @@ impl Learner {
 
     /// Ends the mode `from` after the detector has confirmed the candidate.
     ///
-    /// If the charge moved since the last half-cycle reaches the configured swing, appends one half-cycle per cell to
-    /// `half_cycles`, in cell order. A charge or discharge that moved less is merged with the next half-cycle.
+    /// If `from` is a charge or discharge, and the charge moved since the last half-cycle reaches the configured swing,
+    /// appends one half-cycle per cell to `half_cycles`, in cell order. A charge or discharge that moved less is merged
+    /// with the next half-cycle.
     pub fn complete(
         &mut self,
         config: &TransitionConfig,
@@ -237,7 +240,8 @@ impl Learner {
         }
     }
 
-    /// Selects the cells whose capacity half-cycles do not change, because their cell model is still too uncertain.
+    /// Selects the cells that learn no capacity from half-cycles, because their cell model is too uncertain or their
+    /// readings are doubtful. Has no effect with `Nominal`.
     pub fn hold(&mut self, is_held: impl Fn(usize) -> bool) {
         self.is_held = (0..self.capacity.len()).map(is_held).collect();
     }
@@ -272,8 +276,9 @@ impl Learner {
     }
 
     /// Handles a restart of a cell's sample filter, which happens if the voltages contradict the learned values. Raises
-    /// the variance of the capacity to at least that of a new cell (`new_variance_ah2`). From the present half-cycle,
-    /// only a lower bound is then learned: the capacity is at least the charge moved.
+    /// the variance of the capacity to at least `new_variance_ah2`, the variance for a new cell. From the present
+    /// half-cycle, only a lower bound is then learned: the capacity is at least the charge moved. Has no effect with
+    /// `Nominal`.
     pub fn doubt(
         &mut self,
         config: &CapacityConfig,
@@ -405,7 +410,7 @@ impl Learner {
         &self.offset
     }
 
-    /// The learned offset of the current, for changes.
+    /// Mutable access to the learned offset of the current.
     pub fn current_offset_mut(&mut self) -> &mut CurrentOffset {
         &mut self.offset
     }
@@ -434,7 +439,7 @@ impl Learner {
         marks.flat_map(|mark| &mark.cells).chain(&self.totals).try_for_each(CellMark::check)
     }
 
-    /// Time and charge (A s per cell) at the start of the current half-cycle and of the candidate.
+    /// Time and charge (A s per cell) at the start of the present half-cycle and at the start of the candidate.
     pub fn marks(&self) -> impl Iterator<Item = (Timestamp, f64)> + '_ {
         [&self.start, &self.candidate].into_iter().flatten().map(|mark| (mark.time, mark.charge_as))
     }

@@ -2,7 +2,7 @@
 //!
 //! In: currents (A), samples and estimates of the cells. Out: one [`HalfCycle`] and one [`CapacityUpdate`] per cell and
 //! half-cycle, values of the pack, recharge periods (s), usable capacity (Ah) and [`Forecast`]s. Stored states are
-//! checked before they are used. A half-cycle without estimates updates nothing.
+//! checked before they are used. A half-cycle without an estimated SOC gives no capacity.
 
 pub mod config;
 pub mod drift;

@@ -48,9 +48,9 @@ impl CurrentOffset {
         self.part.unwrap_or(1.0)
     }
 
-    /// Updates with the evidence. Over the innovations, `information` is the sum of d^2 / R, and `score` is the sum of
-    /// d x innovation / R. The effect of one standard deviation of the offset on an innovation is d. The variance of
-    /// the innovation is R. Returns the correction in units of the previous standard deviation.
+    /// Updates with the evidence. For each innovation, d is the effect of one standard deviation of the offset, and R
+    /// is the variance of the innovation. `information` is the sum of d^2 / R over the innovations; `score` is the sum
+    /// of d x innovation / R. Returns the correction in units of the standard deviation before the update.
     pub fn update(&mut self, configured_a: f64, (information, score): (f64, f64)) -> f64 {
         let std_a = self.std_a(configured_a);
         if !(information > 0.0 && score.is_finite() && std_a > 0.0) {
@@ -66,8 +66,8 @@ impl CurrentOffset {
         corrected
     }
 
-    /// Adds the uncertainty of a drift over `seconds`: a tenth of the initial standard deviation per day. Sensors drift
-    /// this much with temperature.
+    /// Adds the uncertainty of a drift over `seconds`. The drift is a random walk; its standard deviation after one day
+    /// is a tenth of the initial standard deviation. Sensors drift this much with temperature.
     pub fn drift(&mut self, seconds: f64) {
         if let Some(part) = &mut self.part {
             *part = (*part * *part + 0.1 * 0.1 * seconds.max(0.0) / 86_400.0).sqrt().min(1.0);
@@ -101,7 +101,7 @@ mod tests {
         assert!((offset.std_a(0.05) - 0.025).abs() < 1e-12);
         assert_eq!(offset.learned(0.05), Some(ScalarGaussian::from_std(offset.mean_a(), offset.std_a(0.05))));
         assert_eq!(offset.learned(0.0), None, "offset learning is off");
-        // Evidence for an offset of the remaining half of a standard deviation.
+        // Evidence for a remaining offset of half the present standard deviation.
         offset.update(0.05, (99.0, 50.0));
         assert!((offset.mean_a() - 0.05).abs() < 1e-12 && (offset.std_a(0.05) - 0.0025).abs() < 1e-12, "{offset:?}");
     }

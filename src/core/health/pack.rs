@@ -72,7 +72,7 @@ impl PackState {
     /// The first impossible number.
     pub fn check(&self) -> Result<(), InvalidState> {
         bounds::STORED_SOC.check("the pack's SOC", self.soc)?;
-        // The capacity is 0 while one cell is full and another is empty.
+        // The capacity is close to 0 while one cell is almost full and another is almost empty.
         let capacity_ah = self.capacity_ah;
         let is_possible = (0.0..=bounds::CAPACITY_AH.high).contains(&capacity_ah);
         InvalidState::unless(is_possible, "the pack's capacity", capacity_ah, "0 to 1e9 Ah")?;

@@ -1,10 +1,11 @@
-//! Recharge period: duration of a charge between two SOC values (paper, section 3.3.5), raw and normalised.
+//! Recharge period: duration of a charge between two SOC values, the *window* (paper, section 3.3.5), raw and
+//! normalised.
 //!
 //! In: the estimated SOC with its time, the mode, the learned capacity (Ah). Out: periods, s. If the estimated SOC
 //! jumps, the caller discards the charge that is being timed.
 //!
-//! Raw: the time between the two estimated SOC values, if one uninterrupted charge covers the whole window. The raw
-//! period becomes shorter with a stronger charger, but also with a faded cell.
+//! Raw: the time that the estimated SOC takes through the window, if one uninterrupted charge covers the whole window.
+//! The raw period becomes shorter with a stronger charger, but also with a faded cell.
 //!
 //! Normalised: the time that a reference charger would need for the same window of the same pack:
 //! `t = 3600 (to - from) C / I_ref`.

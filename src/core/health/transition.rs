@@ -31,8 +31,8 @@ pub struct ModeChange {
 pub struct TransitionOutcome {
     /// The change of mode that this observation confirms, if any.
     pub change: Option<ModeChange>,
-    /// Whether a new candidate mode begins with this observation. If so, the caller stores the present state of the
-    /// cells as the candidate's mark.
+    /// Whether a new candidate mode begins with this observation. If so, the caller stores the totals and the SOC of
+    /// all cells. If the candidate is confirmed, the next half-cycle starts from these values.
     pub candidate_begins: bool,
 }
 

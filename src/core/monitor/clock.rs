@@ -1,9 +1,9 @@
-//! The monitor's clock, which follows the times of the inputs and never runs backwards. The clock detects that the
-//! computer was asleep, or that the driver's clock was set back.
+//! The monitor's clock, which follows the times of the inputs. The clock detects that the computer was asleep, or that
+//! the driver's clock was set back.
 //!
 //! In: the time of each input. Out: the time that the stages use, and a [`TimeJump`] if an input does not closely
-//! follow the previous input. An input that is late by at most [`MERGE_TOLERANCE_NS`] is counted and treated as if it
-//! arrived now.
+//! follow the previous input. If the time of an input is before the clock's time by at most [`MERGE_TOLERANCE_NS`], the
+//! input is counted and treated as if it had the clock's time.
 
 use super::message::MERGE_TOLERANCE_NS;
 use crate::quantity::Timestamp;
@@ -86,7 +86,7 @@ mod tests {
         let at = Timestamp::from_secs;
         let mut clock = Clock { now: at(100.0), ..Clock::default() };
         assert_eq!((clock.advance(at(105.0)), clock.now), (None, at(105.0)));
-        // An input that was merged out of order is counted, and the time stays.
+        // An input that was merged out of order is counted, and the clock's time stays.
         assert_eq!((clock.advance(at(104.5)), clock.now), (None, at(105.0)));
         assert_eq!((clock.advance(at(100.0)), clock.now), (Some(TimeJump::Backwards { seconds: 5.0 }), at(105.0)));
         assert_eq!((clock.advance(at(111.0)), clock.now), (Some(TimeJump::Asleep { seconds: 6.0 }), at(105.0)));

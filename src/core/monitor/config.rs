@@ -67,7 +67,7 @@ pub struct MonitorConfig {
     pub j1939: Option<J1939Config>,
 }
 
-/// Requirement on the supply voltage before requests are sent.
+/// Supply voltage required before diagnostic requests are sent.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SupplyConfig {
     /// Minimum voltage, V.
@@ -96,7 +96,8 @@ pub struct OutputConfig {
     pub status_period_s: f64,
     /// Period of the health frame (all its pages), s.
     pub health_period_s: f64,
-    /// Period of the alarm frames, s: each raised alarm is sent once per period, within the budget of frames.
+    /// Period of the alarm frames, s. Each raised alarm is sent once per period if the limit on the rate of alarm
+    /// frames allows it.
     pub alarm_period_s: f64,
     /// Period of the digest (all its pages), s.
     pub digest_period_s: f64,
@@ -131,9 +132,9 @@ pub struct AlarmCode {
 /// Effects of a new configuration.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Reconfigured {
-    /// Changed tables, as written in the configuration file.
+    /// Names of the changed tables, as written in the configuration file.
     pub changed: Vec<&'static str>,
-    /// Number of raised or past alarms that ended because the new configuration has no threshold for them.
+    /// Number of pending, raised or past alarms that ended because the new configuration has no threshold for them.
     pub alarms_ended: usize,
 }
 
@@ -150,8 +151,8 @@ pub struct ReconfigureError {
 }
 
 impl MonitorConfig {
-    /// Whether the daemon must receive every frame of an interface. This is necessary on an interface for requests,
-    /// because the daemon sends requests only while the bus is awake.
+    /// Whether the daemon must receive every frame of an interface. This is necessary if the daemon sends requests on
+    /// the interface, because it sends them only while the bus is awake.
     pub fn wants_all(&self, bus: BusIndex) -> bool {
         self.poll.as_ref().is_some_and(|poll| poll.requests.iter().any(|it| it.question.controller.bus == bus))
     }
@@ -192,8 +193,9 @@ impl MonitorConfig {
         self.output.iter().flat_map(of)
     }
 
-    /// Unprotected input messages, each with the cycle time (s) of the frames if this time is known. For a multiplexed
-    /// message, the cycle time counts as unknown, because the stated cycle time may apply to each page.
+    /// Unprotected input messages, each with the cycle time (s) of its frames if this time is known. For a multiplexed
+    /// message, the cycle time counts as unknown, because the stated time may be the period of each page (multiplexer
+    /// value).
     pub(crate) fn unprotected(&self) -> impl Iterator<Item = (BusIndex, CanId, Option<f64>)> + '_ {
         let is_protected = |bus, id| self.guards.iter().any(|guard| (guard.bus, guard.id) == (bus, id));
         let cycle_s = |bus, id| self.cycle_times_s.iter().find(|of| (of.0, of.1) == (bus, id)).map(|of| of.2);
@@ -215,7 +217,7 @@ impl MonitorConfig {
         ids
     }
 
-    /// Further extended identifiers to receive, as identifier and mask.
+    /// Patterns of further identifiers (extended, 29 bits) to receive on an interface: identifier and mask.
     pub fn wanted_patterns(&self, bus: BusIndex) -> Vec<(u32, u32)> {
         let node = self.j1939.iter().filter(|j1939| j1939.bus == bus);
         node.flat_map(|j1939| Node::new(&j1939.node).wanted()).collect()
@@ -241,7 +243,8 @@ impl MonitorConfig {
         if let Some((key, found, allowed)) = counts.into_iter().find(|(_, found, allowed)| found != allowed) {
             return Err(ReconfigureError { key, found: found.to_string(), allowed: allowed.to_string() });
         }
-        // The rated capacity only scales published values, so it may change.
+        // The rated capacity may change: it scales published values and sets some limits, but the learned values stay
+        // valid.
         let same_model = CellModel { rated_capacity_ah: self.model.rated_capacity_ah, ..new.model.clone() };
         let reported = |sample: &SampleConfig| (sample.reported_soc.is_some(), sample.reported_soh.is_some());
         let is_nominal = |config: &Self| matches!(config.health.capacity.method, CapacityMethod::Nominal { .. });

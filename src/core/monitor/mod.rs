@@ -280,9 +280,9 @@ impl Monitor {
         is_command.then(|| self.intake.command_gate.mac_check(secoc, frame.data()))
     }
 
-    /// The model fit that has just started; returned once. A fit takes longer than handling a tick may take, so a live
-    /// driver runs the fit on another thread and passes the findings to [`Self::give_model_fit`]. Otherwise, the
-    /// monitor runs the fit when it is due, with the same result.
+    /// The model fit that has just started; returned once. A fit takes too long for one tick, so a live driver runs
+    /// the fit on another thread and passes the findings to [`Self::give_model_fit`]. Otherwise, the monitor runs the
+    /// fit when it is due, with the same result.
     pub fn take_model_fit(&mut self) -> Option<FitTask> {
         self.stages.modelling.take_task()
     }
@@ -384,7 +384,7 @@ impl Monitor {
         self.find_due();
     }
 
-    /// Ends everything in progress, because no input arrives until the clock is set again.
+    /// Ends everything in progress at the clock's time, because a gap follows.
     fn fall_asleep(&mut self, out: &mut Outputs) {
         let now = self.clock.now;
         self.stages.step_waiting(now, true, out);

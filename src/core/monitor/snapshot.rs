@@ -1,8 +1,8 @@
 //! The monitor's state as a versioned document: contents and checks.
 //!
-//! In: a [`Snapshot`] from a store or a file. Out: a monitor that continues from the snapshot at its first input, or an
-//! error that names the damaged number. Vehicles store snapshots as JSON, so names and order of the fields must not
-//! change.
+//! In: a [`Snapshot`] from a store or a file. Out: a monitor that continues from the snapshot at its first input, or
+//! the reason why the snapshot cannot be used. Vehicles store snapshots as JSON, so names and order of the fields must
+//! not change.
 
 use serde::{Deserialize, Serialize};
 
@@ -155,7 +155,7 @@ impl Snapshot {
         self.cells.iter().map(|cell| cell.health.throughput).collect()
     }
 
-    /// Rated capacity of a cell when its record started, Ah; `None` without cells.
+    /// Rated capacity, Ah, that was configured when the life forecast of the first cell started; `None` without cells.
     pub fn rated_capacity_ah(&self) -> Option<f64> {
         self.cells.first().map(|cell| cell.forecast.reference_ah())
     }

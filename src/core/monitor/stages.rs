@@ -110,7 +110,8 @@ impl Stages {
         }
     }
 
-    /// Handles a reading of a diagnostic answer. If `moment` is given, the reading was measured at that earlier moment.
+    /// Handles a reading of a diagnostic answer. If `moment` is given, a voltage counts as measured at that earlier
+    /// moment.
     pub(crate) fn handle_answer_reading(
         &mut self,
         now: Timestamp,
@@ -174,7 +175,7 @@ impl Stages {
     }
 
     /// Steps the cells that have a waiting sample, without waiting for the other cells. Callers do this before they use
-    /// estimates. `is_current`: whether the samples are recent, so that the rule on innovations may judge them.
+    /// estimates. `is_current`: whether the samples are recent; if not, the rule on innovations does not judge them.
     pub(crate) fn step_waiting(&mut self, now: Timestamp, is_current: bool, out: &mut Outputs) {
         if self.estimation.batch.waiting.is_empty() {
             return;
@@ -216,7 +217,7 @@ impl Stages {
         self.estimation.estimate(index, self.learning.capacity(index))
     }
 
-    /// Passes the pack current (`None` if stale) to the mode detector. At a change of mode, the cells learn.
+    /// Passes the pack current (`None` if stale) to the mode detector. When the mode changes, the cells learn.
     fn observe_current(&mut self, now: Timestamp, current_a: Option<f64>, out: &mut Outputs) {
         let Learning { config, state, .. } = &mut self.learning;
         let observed = state.detector.observe(&config.transition, now, current_a);
@@ -244,7 +245,7 @@ impl Stages {
         learning.complete_mode(change, &mut estimation.bank, (teaches_capacity, &doubtful), &mut publisher);
     }
 
-    /// Fits the model of the cells to the rows of the notebook and adopts the result.
+    /// Fits the model of the cells to the rows of the notebook. If the fit changes the model, adopts the new model.
     fn learn_model(&mut self, now: Timestamp, out: &mut Outputs) {
         self.step_waiting(now, true, out);
         let Self { estimation, modelling, learning, .. } = self;
@@ -261,7 +262,7 @@ impl Stages {
         }
     }
 
-    /// After a change of the model, passes the capacities of the pack's own cells to the rules on capacity.
+    /// After a change of the model, passes the capacities of the cells that use it to the rules on capacity.
     fn restate_capacities(&mut self, now: Timestamp, out: &mut Outputs) {
         for index in self.estimation.bank.own_cells().to_vec() {
             let capacity = self.learning.learned_capacity(index);
@@ -347,9 +348,9 @@ impl Stages {
         self.estimation.batch.begin();
     }
 
-    /// Ends everything in progress, because no input follows for a while; `now` is the time of the last input. The mode
-    /// becomes unknown, recharge periods are not timed across the gap, and the pack's values become unknown until every
-    /// cell has a new reading.
+    /// Ends everything in progress, because no reading follows for a while; `now` is the time of the last input. The
+    /// mode becomes unknown, recharge periods are not timed across the gap, and the pack's values become unknown until
+    /// every cell has a new reading.
     pub(crate) fn fall_asleep(&mut self, now: Timestamp, out: &mut Outputs) {
         self.observe_current(now, None, out);
         if self.modelling.is_due() {
@@ -408,7 +409,7 @@ impl Stages {
             }
         }
         if !self.sampling.sampler.voltages_fresh(now) {
-            // A cell without a fresh voltage may be the weakest.
+            // A cell without a fresh voltage may be the cell that limits the pack.
             self.forget_pack_state();
         }
         // A frozen or contradicted reading of the current, or a message with a second sender, makes the estimates

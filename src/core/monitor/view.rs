@@ -36,7 +36,7 @@ impl Monitor {
         self.clock.time_backwards
     }
 
-    /// Per protected input message: the count of each status of its check.
+    /// Per protected input message: how often the check had each result.
     pub fn protected(&self) -> impl Iterator<Item = GuardCounts> + '_ {
         self.intake.protected()
     }
@@ -114,9 +114,9 @@ impl Monitor {
         self.stages.sampling.has_usable_reading
     }
 
-    /// Configured signals whose last good value is too old, because no reading arrived or all readings were bad. For a
-    /// signal that has never had a reading, the age counts from the time at which the first reading should have
-    /// arrived.
+    /// Configured signals whose last good value is too old, because no reading arrived or all readings were bad. A
+    /// signal that has never had a reading counts once the time since the start or the last waking exceeds the signal's
+    /// maximum age.
     pub fn lost_inputs(&self) -> impl Iterator<Item = Channel> + '_ {
         let sampler = &self.stages.sampling.sampler;
         sampler.channels().iter().copied().filter(|&channel| sampler.is_lost(channel, self.now()))
@@ -148,12 +148,12 @@ impl Monitor {
         (0..self.stages.estimation.cells()).map(|index| self.stages.estimate(index))
     }
 
-    /// Values of the pack, from its limiting cells; `None` before every cell has an estimate.
+    /// Values of the pack, from its limiting cells; `None` unless every cell has an estimate and a fresh voltage.
     pub fn pack(&self) -> Option<&PackState> {
         self.stages.learning.state.pack.as_ref()
     }
 
-    /// Charge, rest or discharge.
+    /// Operating mode of the pack.
     pub fn mode(&self) -> Mode {
         self.stages.learning.mode()
     }
@@ -169,7 +169,7 @@ impl Monitor {
         self.stages.learning.state.normalised_recharge
     }
 
-    /// Usable capacity of a cell, Ah, after its last half-cycle.
+    /// Usable capacity of a cell, Ah, after its last discharge; before the first discharge, after the first charge.
     pub fn usable_capacity(&self, cell: CellIndex) -> Option<ScalarGaussian> {
         self.stages.learning.cells.get(cell.index())?.usable
     }

@@ -1,4 +1,4 @@
-//! Physical bounds of the quantities of cells, sensors and clocks, regardless of the content of a file or a frame.
+//! Physical bounds of the quantities of cells, sensors and clocks.
 //!
 //! The same bounds apply to configuration keys, cell models, stored states and running filters. A filter whose state
 //! leaves its bounds restarts. The bounds are wide: a number outside is certainly wrong, but a number inside may be
@@ -46,8 +46,8 @@ impl Bounds {
 /// Capacity of a cell in the configuration, Ah: from a watch cell to a hundred times the largest cell on the market.
 pub const CONFIGURED_CAPACITY_AH: Bounds = Bounds::new(1e-3, 1e5, "0.001 to 1e5 Ah");
 
-/// Estimated capacity of a cell, Ah: from a thousandth of the smallest cell's capacity to ten thousand times the
-/// largest cell's capacity.
+/// Estimated capacity of a cell, Ah: from a thousandth of the smallest to ten thousand times the largest
+/// [configured capacity](CONFIGURED_CAPACITY_AH).
 pub const CAPACITY_AH: Bounds = Bounds::new(1e-6, 1e9, "1e-6 to 1e9 Ah");
 
 /// SOC in a running filter. A model's curve is extrapolated to these bounds, beyond empty and full. A filter restarts
@@ -101,10 +101,10 @@ pub const STAMP_NS: Bounds = Bounds::new(-4.6e18, 4.6e18, "within 145 years of t
 /// Any number without a more specific bound: its square and its cube do not overflow.
 pub const NUMBER: Bounds = Bounds::new(-1e20, 1e20, "at most 1e20 in size");
 
-/// Variance, in the square of its unit. The caller can divide by the square of the variance.
+/// Variance of any quantity, in the square of the quantity's unit. The caller can divide by the square of the variance.
 pub const VARIANCE: Bounds = Bounds::new(1e-150, 1e20, "1e-150 to 1e20");
 
-/// Standard deviation or noise density in the configuration, in its unit.
+/// Configured standard deviation or noise density of any quantity, in the quantity's unit.
 pub const DEVIATION: Bounds = Bounds::new(0.0, 1e3, "0 to 1000");
 
 /// Standard deviation of a voltage sensor's noise, V. No converter is better than the lower bound.

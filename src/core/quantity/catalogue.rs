@@ -57,7 +57,7 @@ pub enum Part {
 /// Unit of a quantity inside the program. Each output converts the unit with a `match`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Unit {
-    /// Fraction of a full or of a new battery, 0 to 1.
+    /// State of charge or state of health: fraction of a full battery or of a new battery.
     Level,
     /// Any other fraction, 0 to 1.
     Fraction,

@@ -1,8 +1,8 @@
-//! Defines the sample that the sampler passes to a cell's estimator, and the moment that voltages share if they were
-//! measured together.
+//! Defines [`CellSample`], which the sampler passes to a cell's estimator, and [`Moment`], which voltages share if they
+//! were measured together.
 //!
-//! In: a voltage (V), the fresh current (A) and temperature (degrees C), and the charge counted up to the voltage's
-//! time (As). Stored samples are checked ([`CellSample::check`]).
+//! A sample contains a voltage (V), the fresh current (A) and temperature (degrees C), and the charge counted up to the
+//! time of the voltage (As). Stored samples are checked ([`CellSample::check`]).
 
 use serde::{Deserialize, Serialize};
 

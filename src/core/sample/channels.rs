@@ -1,4 +1,4 @@
-//! Lists the channels in use, the limits of each channel, and the clock of each channel's stuck check.
+//! Lists the channels in use, and gives for each channel the limits and the clock of the stuck check.
 
 use super::charge::ChargeTotals;
 use super::config::{Limits, SampleConfig, VoltageSource};

@@ -7,10 +7,10 @@
 //!   the interval is unmeasured. Unmeasured time is never interpolated, regardless of its cause (bad readings, lost
 //!   frames, sleep, a restart).
 //!
-//! After the latest reading, the current is also held for `max_age_s`. The next reading replaces the held value by the
-//! trapezoid. While a valid reading says that the contactors are open, the current counts as zero, regardless of the
-//! current sensor. Unmeasured time never decreases and never grows faster than time. Before the first current reading,
-//! all time is unmeasured.
+//! After the latest reading, the current is also held for `max_age_s`. If the next reading arrives within this time,
+//! the trapezoid replaces the held value. While a valid reading says that the contactors are open, the current counts
+//! as zero, regardless of the current sensor. Unmeasured time never decreases and never grows faster than time. Before
+//! the first current reading, all time is unmeasured.
 
 use serde::{Deserialize, Serialize};
 

@@ -5,13 +5,14 @@
 //!
 //! A constant reading alone proves nothing. A parked pack, a charger and a laboratory hold a current for hours, and a
 //! coarse sensor then shows one value. In these cases, the voltages rest or drift in one direction. A changing load
-//! moves the voltages back and forth. The check requires that the median of the cells moves in one direction and turns
-//! back within [`MAX_TURN_S`], and that both movements exceed the noise of the median. The sensor is frozen if its
-//! reading is still the same [`MIN_FROZEN_S`] after the turn and at least [`MIN_READINGS`] readings were equal. The
-//! delay allows for a reading that arrives later than the voltages.
+//! moves the voltages back and forth. The check takes the median of the cells' voltages in each *round* (one voltage
+//! per cell). The median must move in one direction and turn back within [`MAX_TURN_S`]. Both movements must be at
+//! least as large as the *step*, which exceeds the noise of the median. The sensor counts as frozen if at least
+//! [`MIN_READINGS`] readings were equal and the reading has still not changed when [`MIN_FROZEN_S`] have passed since
+//! the turn. The delay allows for a reading that arrives later than the voltages.
 //!
-//! Limits: the check does not detect a frozen sensor if the load does not turn back or moves the voltages by less than
-//! the step. The check does not detect a faulty sensor whose last digits still change. In that case, the voltages
+//! Limits: the check does not detect a frozen sensor if the voltages do not turn back, or if they move by less than the
+//! step. The check does not detect a faulty sensor whose last digits still change. In that case, the voltages
 //! contradict the estimate.
 
 use serde::{Deserialize, Serialize};
@@ -26,21 +27,23 @@ const MIN_FROZEN_S: f64 = 5.0;
 /// Longest time between an extreme voltage and the return from this extreme, s. The voltages of cells that rest, cool
 /// or balance turn more slowly.
 const MAX_TURN_S: f64 = 60.0;
-/// Step that exceeds a voltage's noise, in configured standard deviations.
+/// Step that exceeds a voltage's noise, as a multiple of the configured standard deviation.
 const STEP_SIGMA: f64 = 5.0;
-/// Step that exceeds a voltage's noise, as a multiple of the median change of the voltage per round. This step applies
-/// if the real noise exceeds the configured noise. The multiple corresponds to 8 standard deviations, so that two
-/// consecutive readings do not exceed the step by chance within a day.
+/// Step that exceeds a voltage's noise, as a multiple of the usual change from round to round (the median of the latest
+/// changes). This step applies if the real noise exceeds the configured noise. The multiple corresponds to 8 standard
+/// deviations, so that two consecutive readings do not exceed the step by chance within a day.
 const STEP_MOVES: f64 = 8.4;
-/// Maximum and minimum number of voltage changes from which the median change is calculated.
+/// Maximum and minimum number of changes from which the usual change is calculated.
 const MAX_MOVES: usize = 32;
 const MIN_MOVES: usize = 8;
-/// Smallest step, V. A smaller step may be a charger's ripple, or a load within one step of a coarse current sensor.
+/// Smallest step, V. A smaller movement may come from a charger's ripple, or from a load that changes by less than the
+/// resolution of a coarse current sensor.
 const MIN_STEP_V: f64 = 0.02;
-/// Maximum number of cells whose median is calculated. The first cells are used; these cells are enough to distinguish
-/// a glitch from a load.
+/// Maximum number of cells in the median. The first cells of the pack are used; they are enough to distinguish a glitch
+/// from a load.
 const MAX_MEDIAN: usize = 15;
-/// Longest time between two current readings, s. After a longer pause the check restarts.
+/// Longest time between two current readings, s. After a longer pause, the check restarts, unless the sensor already
+/// counts as frozen.
 const MAX_PAUSE_S: f64 = 5.0;
 
 /// Detects turning points of a voltage.
@@ -101,9 +104,9 @@ pub(super) struct FrozenCheck {
     reversals: Reversals,
     /// Time of the first current reading after the voltages turned back.
     turned_at: Option<Timestamp>,
-    /// Voltages of the round, V, at most [`MAX_MEDIAN`]. The first cell starts a round.
+    /// Voltages of the present round, V, at most [`MAX_MEDIAN`]. The first cell starts a round.
     round_v: Vec<f64>,
-    /// Whether the round of voltages started before the reading of the current changed.
+    /// Whether the present round started before the reading of the current changed.
     is_mixed: bool,
     /// Median of the previous round, V.
     median_v: f64,

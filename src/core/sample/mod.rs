@@ -1,7 +1,7 @@
 //! Combines readings that arrive at different times and rates into samples for the cells' estimators.
 //!
 //! In: readings (V, A with positive = discharge, degrees C) with their time. Out: one [`CellSample`] per good voltage
-//! reading, and a [`SignalChange`] when a signal turns bad or good. A bad reading does not change any sample.
+//! reading, and a [`SignalChange`] when a signal turns bad or good. The value of a bad reading never enters a sample.
 //! * [`signal`] checks one signal: range, rate, stuck, stale;
 //! * [`charge`] counts charge and the time without a current measurement;
 //! * [`cell_sample`] defines the input of a cell's estimator;

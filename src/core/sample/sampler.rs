@@ -1,11 +1,12 @@
 //! Combines the signals of all configured channels and the charge counter into samples.
 //!
 //! In: readings with their time (V, A, degrees C). Out: a [`CellSample`] per good voltage. A sample contains the
-//! current and temperature that are fresh at that time, and the charge and unmeasured time up to that time. A bad
-//! voltage gives no sample. Readings of channels that are not used are counted ([`Sampler::reading_counts`]).
+//! current and temperature that are fresh at the time of the voltage, and the charge and unmeasured time up to then. A
+//! bad voltage gives no sample. Readings of channels that are not used are counted ([`Sampler::reading_counts`]).
 //!
-//! The sampler holds one record per channel, allocated at the start. Handling a reading allocates nothing. The records
-//! are an array of structs, because a reading touches one whole record.
+//! The sampler holds one `Signal` per channel, allocated at the start. After the first readings have filled the
+//! buffers, handling a reading allocates nothing. The signals are an array of structs, because a reading touches all
+//! fields of one signal.
 
 use serde::{Deserialize, Serialize};
 
@@ -107,7 +108,7 @@ struct SharedInputs {
     totals: ChargeTotals,
     cell_current_a: Option<f64>,
     cell_charge_as: f64,
-    /// The sensor of the last sample with the sensor's value. Neighbouring cells often share a sensor.
+    /// The temperature sensor that the last sample used, and its value. Neighbouring cells often share a sensor.
     sensor: Option<(SensorIndex, Option<f64>)>,
 }
 
@@ -214,7 +215,7 @@ impl Sampler {
         }
     }
 
-    /// Whether the reading of the current is frozen while the voltages show another load.
+    /// Whether the reading of the current is frozen while the voltages show a changing load.
     pub fn is_current_frozen(&self) -> bool {
         self.state.frozen.is_frozen()
     }
@@ -380,8 +381,8 @@ impl Sampler {
         self.silence_s(channel, now).is_none_or(|silence_s| silence_s > limits(&self.config, channel).max_age_s)
     }
 
-    /// The longest silence of a channel, s, and the largest share of bad readings; `None` = a channel is silent or has
-    /// no reading yet.
+    /// The longest silence of a channel, s, and the largest share of bad readings; `None` = a channel is silent, or has
+    /// no reading since the start or the last waking.
     pub fn worst_input(&self, now: Timestamp) -> Option<(f64, f64)> {
         let began = self.state.began?;
         let (mut longest_s, mut share) = (0.0_f64, 0.0_f64);

@@ -1,6 +1,7 @@
 //! Determines the course of the current: a scenario's next demand, given the pack's true state.
 //!
-//! Each course is called once per current sample and returns the current until the next sample.
+//! The simulation asks the course for a demand at each sample of the current. A demand is one of: a current until the
+//! next sample, a sleep, the end of the course.
 
 mod cycle;
 mod demand;
@@ -34,7 +35,7 @@ impl Course {
         }
     }
 
-    /// The demand for the next `dt_s` seconds. At the end of a cycle, completes the pack's cycle.
+    /// The demand for the next `dt_s` seconds. At the end of a cycle, also applies the ageing per cycle to the pack.
     pub(crate) fn next(&mut self, pack: &mut Pack, dt_s: f64) -> Demand {
         match self {
             Self::Cycle(course) => course.next(pack, dt_s),

@@ -18,7 +18,7 @@ pub struct Fault {
     pub from_s: f64,
 }
 
-/// Path of a leak inside a cell.
+/// Size of a leak inside a cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Leak {
     /// A constant leakage current, A.

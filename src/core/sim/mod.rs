@@ -1,8 +1,8 @@
 //! The simulator: a pack with a known true state, its sensors, and the scenarios that load it.
 //!
 //! In: a cell model, settings and a seed. Out: readings at their sampling times, as a BMS would measure them, and the
-//! true state. All randomness is seeded and all functions come from `libm`, so the same seed gives the same bytes on
-//! every machine.
+//! true state. All randomness is seeded, and functions such as `exp` and `sin` come from `libm`. The same seed
+//! therefore gives the same bytes on every machine.
 //!
 //! | file | purpose |
 //! | --- | --- |

@@ -1,10 +1,11 @@
-//! The simulation's loop: steps true state, course and sensors together, and returns readings.
+//! The simulation's loop: steps the true state, the course of the current and the sensors together, and returns
+//! readings.
 //!
-//! At each moment, the current until the next moment is known. The readings and the true state of a moment belong
-//! together: the voltage includes the drop that this current causes. Cells are stepped once per cell sampling period,
-//! with the mean current of the period. With this simplification, the charge remains exact, but the branch voltages
-//! differ slightly from a simulation that steps the cells at every current sample. The relative difference is less than
-//! `period / (2 tau)`, where `tau` is the branch's time constant.
+//! At each moment, the current until the next moment is already known. The voltages of the moment include the drop that
+//! this current causes. Cells are stepped once per cell sampling period, with the mean current of the period. With this
+//! simplification, the charge remains exact, but the branch voltages differ slightly from a simulation that steps the
+//! cells at every current sample. The relative difference is less than `period / (2 tau)`, where `tau` is the branch's
+//! time constant.
 
 use super::balancing::{Balancer, Balancing};
 use super::course::{Course, Demand};
@@ -104,13 +105,13 @@ pub struct Simulation {
     balancer: Option<Balancer>,
     has_bits: bool,
     asleep: Option<Asleep>,
-    /// Voltages, V: first at the taps; after the sensor faults were applied, at the channels.
+    /// Voltages of the cells, V: first at the taps; after the sensor faults were applied, at the channels.
     sensed_v: Vec<f64>,
 }
 
 impl Simulation {
-    /// Creates a simulation at its start. The cells have the capacity `settings.pack.capacity_ah`; everything else
-    /// follows `model`.
+    /// Creates a simulation at its start. Apart from the spread, the cells have the capacity
+    /// `settings.pack.capacity_ah`; everything else follows `model`.
     pub fn new(model: CellModel, settings: Settings, wiring: Wiring) -> Self {
         Self {
             pack: Pack::new(model, settings.pack, settings.seed),

@@ -1,12 +1,12 @@
 //! Defines the named scenarios and their settings.
 //!
-//! Amounts are given for a cell with the nominal capacity of the source. These amounts scale with the capacity of the
-//! configured cell model, so that any configuration can be simulated.
+//! The currents and charges below apply to a cell with the nominal capacity of the source. They scale with the capacity
+//! of the configured cell model, so that any configuration can be simulated.
 //!
 //! | scenario | nominal capacity | source | course |
 //! | --- | --- | --- | --- |
-//! | `paper` | 2.6 Ah | the paper's own run | 1.325 A in both directions between SOC 0.3 and 0.9; each cycle loses 0.05 Ah; ends at a capacity of 0.25 Ah, after 48 cycles (2.23e5 s) |
-//! | `reference` | 30 Ah | a published example | discharge by random pulses (mean 15 A) to SOC 0.3, charge by 15 A to SOC 0.9; each cycle loses 1 Ah |
+//! | `paper` | 2.6 Ah | the run in the paper that packwatch follows | 1.325 A in both directions between SOC 0.3 and 0.9; 48 cycles (2.23e5 s), from a capacity of 2.6 Ah down to 0.25 Ah; each completed cycle loses 0.05 Ah, and the last cycle does not count as completed |
+//! | `reference` | 30 Ah | a published example | discharge with random pulses (mean 15 A) to SOC 0.3, charge with 15 A to SOC 0.9; each cycle loses 1 Ah |
 //! | `random-walk` | 2.1 Ah | the protocol of NASA's randomized set | loads of 5 min with currents of -4.5 to 4.5 A, within 3.2 to 4.2 V; two reference cycles after every 1,500 loads |
 //! | `ev-day` | 50 Ah | packwatch | drive, park (buses asleep), drive, fast charge, drive, park; 96 cells |
 
@@ -45,7 +45,8 @@ pub struct Settings {
     pub cycles: Option<u32>,
     /// The simulation ends after this time, s; `None` = no limit.
     pub duration_s: Option<f64>,
-    /// The simulation ends when the weakest cell would fall below this capacity, Ah; 0 = no limit.
+    /// The simulation ends after the cycle in which the weakest cell reaches this capacity, Ah; 0 = no limit. `ev-day`
+    /// ignores this limit.
     pub end_capacity_ah: f64,
     /// Lower and upper SOC of the cycling scenarios: charging starts at the lower SOC, discharging at the upper SOC.
     pub soc_window: (f64, f64),
@@ -123,8 +124,8 @@ impl Settings {
         s
     }
 
-    /// Sets sampling periods of 10 ms for the current and 100 ms for the cells. Sets the errors of a typical pack: 0.5
-    /// % gain, 1 mV noise, 1 % capacity spread.
+    /// Sets sampling periods of 10 ms for the current and 100 ms for the cells. Sets the sensor errors and the spread
+    /// of a typical pack, for example 0.5 % gain error, 1 mV noise and 1 % capacity spread.
     fn set_ev_day(&mut self) {
         let capacity_ah = self.pack.capacity_ah;
         self.pack.cells = 96;
@@ -135,7 +136,7 @@ impl Settings {
         let (noise_std, offset) = (0.002 * capacity_ah, 0.0005 * capacity_ah);
         self.sensors.current = SensorError { noise_std, offset, gain: 0.005, ..SensorError::default() };
         self.sensors.voltage.noise_std = 0.001;
-        // At ten samples a second, more noise would look like a change of 5 K/s.
+        // At ten samples a second, more noise would look like a temperature change of 5 K/s, a usual limit.
         self.sensors.temperature.noise_std = 0.02;
         (self.current_period_ns, self.cell_period_ns) = (SECOND_NS / 100, SECOND_NS / 10);
         (self.end_capacity_ah, self.duration_s) = (0.0, Some(86_400.0));

@@ -54,8 +54,9 @@ pub struct Sensors {
 /// | `Usual` | 5 mV | 1 mV | 0.5 % + 50 mA | 10 mA | 1 K |
 /// | `Poor` | 15 mV | 5 mV | 2 % + 300 mA | 60 mA | 3 K |
 ///
-/// The errors are standard deviations across channels, clipped at two standard deviations, and constant in time. The
-/// standard deviation of the noise per sample equals one step. Temperatures have steps of 0.1 K and noise of 0.02 K.
+/// The offsets and gains are standard deviations across channels. Each channel's offset and gain are clipped at two
+/// standard deviations and constant in time. For voltage and current, the standard deviation of the noise per sample
+/// equals one step. Temperatures have steps of 0.1 K and noise of 0.02 K.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SensorQuality {
     /// Laboratory equipment, or the best vehicles.

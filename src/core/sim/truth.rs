@@ -1,15 +1,16 @@
 //! Simulates the true state of the pack, which the estimator must infer from readings.
 //!
 //! Each cell is the circuit of [`CellModel`] with its own capacity, resistance and temperature, and with effects that
-//! the estimator does not model. Current is positive for discharge. During a step of `dt` seconds, the current and the
-//! values from the tables are constant. Under this condition, every equation is solved exactly:
-//! * `SOC -= (I + I_leak) dt / (3600 C)`; not clamped, because SOC 0 and SOC 1 are defined by two open-circuit voltages
-//!   and are not physical limits.
-//! * `U_i = U_i a + R_i I (1 - a)`, `a = exp(-dt / tau_i)`. Ageing scales every resistance but no time constant.
+//! the estimator does not model. Current is positive for discharge. During a step of `dt` seconds, the current, the
+//! leak, the heat and the values from the tables are constant. Under this condition, every equation is solved exactly:
+//! * `SOC -= (I + I_leak) dt / (3600 C)`. `I_leak` includes self-discharge, an injected leak and the balancing
+//!   resistor. The SOC is not clamped, because SOC 0 and SOC 1 are defined by two open-circuit voltages and are not
+//!   physical limits.
+//! * `U_i = U_i a + R_i I (1 - a)`, `a = exp(-dt / tau_i)`. Ageing scales the resistances, but not the time constants.
 //! * hysteresis, one state h in [-1, 1] (Plett): `h = h e - (1 - e) sign(I)`, `e = exp(-|I dt| gamma / (3600 C))`;
 //! * heat: `T = T_end + (T - T_end) exp(-dt / (R_th C_th))`, `T_end = T_ambient + R_th (I^2 R0 + sum U_i^2 / R_i)`.
 //!
-//! Terminal voltage `V = OCV(SOC, T) + M h - sum U_i - I R0`.
+//! Terminal voltage `V = OCV(SOC, T, C) + M h - sum U_i - I R0`.
 //! Ageing changes capacity and resistance, but not the SOC as a fraction (like the plant of the reference example).
 
 use super::fault::{ContactResistance, FaultKind, Leak};
@@ -22,7 +23,8 @@ use crate::quantity::CellIndex;
 pub struct Hysteresis {
     /// Distance of the settled charge curve and of the settled discharge curve from the OCV, V; 0 = no hysteresis.
     pub magnitude_v: f64,
-    /// How fast the voltage changes from one curve to the other, in e-foldings per full charge moved.
+    /// How fast the voltage changes from one curve to the other, in e-foldings while the current moves one full
+    /// capacity.
     pub rate: f64,
 }
 
@@ -56,7 +58,7 @@ pub struct Spread {
     pub soc: f64,
 }
 
-/// Settings of a pack of cells in series that are equal except for their spread.
+/// Settings of a pack. Its cells are in series, and equal except for their spread.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PackSettings {
     /// Number of cells in series, at least 1.
@@ -77,7 +79,7 @@ pub struct PackSettings {
     pub ambient_c: f64,
 }
 
-/// The spread is clipped at this many standard deviations, so that no cell gets a negative capacity.
+/// The spread is clipped at this many standard deviations, so that no cell is an extreme outlier.
 const SPREAD_LIMIT: f64 = 3.0;
 
 /// True state of one cell.
@@ -101,7 +103,8 @@ pub struct TruthCell {
     pub leak: Option<Leak>,
     /// Current of the balancing resistor, A; 0 = off.
     pub bleed_a: f64,
-    /// Contact resistance of an injected fault, ohm, between the cell and its voltage taps; not part of `voltage_v`.
+    /// Contact resistance of an injected fault, ohm. It lies between the cell's voltage taps but outside the cell, so
+    /// `voltage_v` does not include its voltage drop.
     pub contact_ohm: f64,
     floor_ah: f64,
 }

@@ -11,7 +11,7 @@
 //! | --- | --- |
 //! | `plan` | expected interfaces, messages and signals |
 //! | [`evidence`] | evidence about signals from values, names and bits; `discover` also scores its candidates with this evidence |
-//! | `other_current` | statistics of the message with the configured current, if another interface also receives this message |
+//! | `other_current` | statistics of a message that arrives on another interface but has the identifier of the current's message |
 //! | `observer` | [`WiringObserver`]: collects frames, events and estimates |
 //! | `judge` | turns everything received into a [`WiringReport`] |
 //! | `report` | findings with their evidence, and the lines to change |

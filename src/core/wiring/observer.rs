@@ -76,7 +76,7 @@ pub struct WiringObserver {
     pub(crate) unconfigured: Vec<Series>,
     /// Indexes of the signals in each message.
     by_id: BTreeMap<(BusIndex, CanId), Vec<(SignalList, usize)>>,
-    /// Reassembles diagnostic answers with signals.
+    /// Reassembles diagnostic answers that carry signals.
     listener: Listener,
     /// Indexes of the signals in the answer to each diagnostic question.
     by_question: BTreeMap<Question, Vec<(SignalList, usize)>>,
@@ -174,7 +174,7 @@ impl WiringObserver {
     }
 
     /// If the frame has the identifier of the configured current's message but arrives on another interface, reads the
-    /// current from it.
+    /// current from the frame.
     fn read_other_current(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
         let is_current = |signal: &&SignalPlan| signal.binding.channel == Channel::Current;
         let Some(signal) = self.plan.signals.iter().find(is_current) else { return };
@@ -205,7 +205,7 @@ impl WiringObserver {
         self.by_id.insert(key, signals);
     }
 
-    /// Reads the signals of a diagnostic answer that the frame completes.
+    /// If the frame completes a diagnostic answer, reads the signals of the answer.
     fn read_answer(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
         self.listener.losses.clear();
         let FrameOutcome::Whole { answer, data, .. } = self.listener.handle(time, bus, frame) else { return };
@@ -262,8 +262,7 @@ impl WiringObserver {
         &self.responses[0]
     }
 
-    /// Slope of the pack's voltage against its current. Of the two block lengths, uses the length that gives the more
-    /// certain slope.
+    /// Slope of the median cell's voltage against the current, with the block length that `best_response` selects.
     pub(super) fn slope(&self) -> Option<Slope> {
         best_response(&self.responses).slope()
     }
@@ -329,7 +328,7 @@ impl WiringObserver {
         }
     }
 
-    /// How long the observer has listened, s, without sleep.
+    /// How long the observer has listened, s. For a recording, the time in which the buses slept is left out.
     pub fn seconds(&self) -> f64 {
         self.listened_s.unwrap_or(self.awake_s)
     }

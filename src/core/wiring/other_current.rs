@@ -2,7 +2,7 @@
 //! interface.
 //!
 //! Buses of one vehicle may use the same identifier for different messages, or carry the messages of several packs.
-//! If the voltages follow the message on the other interface, the configured interface is wrong.
+//! If the voltages follow the current in the message on the other interface, the configured interface is wrong.
 
 use super::evidence::Series;
 use super::evidence::Slope;
@@ -36,7 +36,7 @@ impl OtherCurrent {
         &mut self.responses
     }
 
-    /// Slope of the pack's voltage against this current.
+    /// Slope of the median cell's voltage against this current.
     pub(crate) fn slope(&self) -> Option<Slope> {
         best_response(&self.responses).slope()
     }

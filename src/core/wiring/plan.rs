@@ -15,7 +15,8 @@ pub struct Plan {
     pub interfaces: Vec<InterfacePlan>,
     /// Configured signals that were found in a DBC.
     pub signals: Vec<SignalPlan>,
-    /// Signals of the DBC that look like voltages of cells beyond `pack.cells`, in the order of their numbers.
+    /// Signals of the DBC that look like voltages of cells beyond `pack.cells`, in the order of the cell
+    /// numbers.
     pub more_cells: Vec<SignalPlan>,
     /// Signals of the DBC that are not configured but look like the pack's voltage (if cell voltages are configured) or
     /// a state of charge. The binding of each entry names the channel that the signal probably carries. A signal has
@@ -23,7 +24,7 @@ pub struct Plan {
     pub unconfigured: Vec<SignalPlan>,
     /// The pack.
     pub pack: PackPlan,
-    /// Ages, s: an older reading of a current, a voltage or a temperature is stale; `None` = never stale.
+    /// Maximum age of a current, of a voltage and of a temperature, s. An older reading is stale; `None` = never stale.
     pub max_ages_s: [Option<f64>; 3],
     /// Smallest and largest plausible value of current, cell voltage and temperature; infinite = unlimited.
     pub limits: [(f64, f64); 3],
@@ -55,7 +56,7 @@ pub struct PackPlan {
     pub ambient_c: f64,
     /// Largest absolute current at which the pack counts as resting, A.
     pub dead_band_a: f64,
-    /// White noise of a voltage reading that the estimator assumes, V.
+    /// White noise that the estimator assumes in a voltage reading (standard deviation), V.
     pub voltage_noise_v: f64,
 }
 
@@ -71,7 +72,7 @@ pub struct InterfacePlan {
 /// One configured signal.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SignalPlan {
-    /// Position, channel, scale, offset and codes.
+    /// Position, channel, scale, offset and the codes for "not available".
     pub binding: Binding,
     /// Layout as written in the DBC.
     pub layout: SignalLayout,
@@ -133,7 +134,7 @@ pub struct MessagePlan {
     pub name: String,
     /// Cycle time stated in the DBC (`GenMsgCycleTime`), s.
     pub cycle_time_s: Option<f64>,
-    /// Multiplexer pages with configured signals.
+    /// Number of multiplexer pages with configured signals.
     pub pages: usize,
 }
 

@@ -72,7 +72,7 @@ pub struct Change {
     pub table: String,
     /// Name of the key.
     pub key: String,
-    /// Value proposed, as TOML.
+    /// Proposed value as TOML, or a description of the value.
     pub proposed: String,
     /// File and line. The caller sets it, because only the caller has read the file.
     pub place: Option<String>,

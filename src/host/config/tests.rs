@@ -110,7 +110,7 @@ fn faults(pack: &str) -> Vec<String> {
     read_texts(pack, CELL, DBC).unwrap_err()
 }
 
-/// `PACK` with `from`, which it must contain, replaced by `to`.
+/// Returns `PACK` with the first `from` replaced by `to`. `PACK` must contain `from`.
 fn pack_with(from: &str, to: &str) -> String {
     assert!(PACK.contains(from), "{from}");
     PACK.replacen(from, to, 1)
@@ -370,7 +370,7 @@ fn documented_defaults_are_the_real_ones() {
             }
         }
     }
-    // This file sets no optional key, so reading it parses every default.
+    // Reading this file parses the defaults of the keys that it does not set.
     good(PACK);
 }
 

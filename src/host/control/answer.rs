@@ -12,7 +12,7 @@ pub fn list(engine: &AlarmEngine, time: Timestamp, all: bool) -> Answer {
     Answer::Alarms(alarm_list(engine, time, all))
 }
 
-/// Lists the alarms like [`list`], but without the envelope of an answer.
+/// Lists the alarms like [`list`], but returns the bare list instead of an [`Answer`].
 pub fn alarm_list(engine: &AlarmEngine, time: Timestamp, all: bool) -> AlarmList {
     let mut alarms: Vec<Alarm> = engine.all().filter(|alarm| all || needs_attention(alarm)).collect();
     let omitted = shorten(&mut alarms);
@@ -71,8 +71,8 @@ fn describe(which: &Selector) -> String {
     if words.is_empty() { "\"all\"".to_owned() } else { words.join(", ") }
 }
 
-/// Computes the outcome of a command from the command's events and from the alarms after the command. The caller sets
-/// `is_stored`.
+/// Computes the outcome of a command from the events that the command caused and from the alarms after the command. The
+/// caller sets `is_stored`.
 ///
 /// # Errors
 /// Fails if the core has not reported an outcome.

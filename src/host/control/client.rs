@@ -11,8 +11,8 @@ use super::protocol::{Request, contents};
 use super::standard_path;
 use crate::io::unix_socket::explain_no_daemon;
 
-/// Longest wait for a list of alarms. A working daemon answers within milliseconds, so a daemon that needs longer is
-/// hanging.
+/// Longest wait for a list of alarms. A working daemon answers within milliseconds, so a daemon that has not answered
+/// by then is hanging.
 const PATIENCE: Duration = Duration::from_secs(5);
 /// Longest answer, bytes: ten times the size of an answer with 1,000 alarms of 400 bytes each.
 const MAX_ANSWER_BYTES: u64 = 4 << 20;
@@ -55,8 +55,8 @@ impl ControlClient {
         let mut stream = UnixStream::connect(&self.path)?;
         stream.set_read_timeout(Some(patience(request)))?;
         stream.set_write_timeout(Some(PATIENCE))?;
-        // Writing fails if a daemon without a free slot has already answered and closed the connection. The answer is
-        // read even then.
+        // If the daemon has no free slot, it sends an error and closes the connection, so writing may fail. The error
+        // is read even then.
         let written = stream.write_all(request.to_line().as_bytes());
         let mut line = Vec::new();
         BufReader::new(stream.take(MAX_ANSWER_BYTES)).read_until(b'\n', &mut line)?;

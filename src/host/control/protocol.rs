@@ -5,7 +5,7 @@
 //! | `alarms` | `all` (default false): also lists alarms that need no attention | [`AlarmList`] |
 //! | `acknowledge`, `clear` | `rule`, `severity`, `cell` (from 0); a missing key selects all | [`CommandOutcome`] |
 //! | `pack_replaced` | | [`CommandOutcome`] |
-//! | `poll` | `standby`: stops sending diagnostic requests | [`CommandOutcome`] |
+//! | `poll` | `standby`: true stops sending diagnostic requests, false resumes it | [`CommandOutcome`] |
 //! | `test` | `rule`, `seconds` (0 ends a test) | [`CommandOutcome`] |
 //!
 //! Every line has the key `version`. The answer to an invalid line is an error with the value found and the values
@@ -63,7 +63,7 @@ pub struct AlarmList {
     pub thresholds: usize,
     /// Thresholds with alarms that cannot be evaluated because their value is unknown.
     pub unknown: Vec<UnknownAlarms>,
-    /// Alarms, ordered by rule, severity and cell.
+    /// Alarms, ordered by rule, severity and cell. If alarms are omitted, the raised alarms come first.
     pub alarms: Vec<Alarm>,
     /// Number of further alarms that did not fit into the answer.
     pub omitted: usize,
@@ -87,8 +87,8 @@ pub struct CommandOutcome {
     pub time: Timestamp,
     /// Number of alarms that were changed.
     pub changed: u32,
-    /// Number of refused changes. A change is refused if the alarm's value is not healthy; a test is refused if no
-    /// output is configured.
+    /// Number of refused changes. Clearing a raised alarm is refused until its value has been healthy for long enough.
+    /// A test is refused if no output is configured.
     pub refused: u32,
     /// The refused alarms.
     pub refused_alarms: Vec<Alarm>,
@@ -98,7 +98,7 @@ pub struct CommandOutcome {
     pub is_stored: Option<bool>,
 }
 
-/// The keys that every answer has, and the contents of the answer.
+/// An answer as sent: the keys that every answer has, and the contents.
 #[derive(Serialize)]
 struct Envelope<'a, T> {
     version: u64,

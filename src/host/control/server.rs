@@ -20,7 +20,7 @@ use crate::io::unix_socket::{BoundSocket, SocketFile, bind};
 /// would fail too.
 const ACCEPT_PAUSE: Duration = Duration::from_secs(1);
 
-/// A request on its way to the loop.
+/// A request that waits for the daemon's loop.
 #[derive(Debug)]
 pub struct PendingRequest {
     /// The request.
@@ -37,11 +37,11 @@ pub struct ControlServer {
 }
 
 impl ControlServer {
-    /// Opens the socket and sends the received requests to `requests`. Returns `None` if the socket cannot be opened
-    /// (logged).
+    /// Opens the socket and sends the received requests to `requests`. Returns `None` if the socket is switched off, or
+    /// if the default socket cannot be opened (logged).
     ///
     /// # Errors
-    /// Fails if another daemon uses the socket, or if a socket that the user requested cannot be created.
+    /// Fails if another daemon uses the socket, or if the socket at a path given by the user cannot be opened.
     pub async fn start(setting: &PlaceSetting, requests: mpsc::Sender<PendingRequest>) -> Result<Option<Self>, String> {
         let Some((path, is_needed)) = setting.resolve(|| (daemon_path(), false)) else { return Ok(None) };
         match bind(&path, MODE).await {

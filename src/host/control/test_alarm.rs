@@ -1,8 +1,8 @@
 //! Tests the alarm of a rule from outside: asks the daemon to send the alarm, and listens for its frames on the bus.
 //!
 //! In: the daemon's configuration, a rule, a duration. Out: a [`ChannelReport`] per interface. Frames are received on a
-//! separate socket with the kernel's stamps. Alarm frames without the test marker are genuine alarms and are counted
-//! separately.
+//! separate socket, and the kernel stamps them with their time. Alarm frames without the test marker are genuine alarms
+//! and are counted separately.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -24,7 +24,7 @@ use crate::quantity::{BusIndex, Timestamp};
 
 /// Period at which the sockets are read. Results do not depend on this period, because the kernel stamps the frames.
 const READ_PERIOD: Duration = Duration::from_millis(10);
-/// Longest delay of the last frame after the end of the test, equal to fifty ticks (steps of 10 ms) of the daemon.
+/// Longest wait for the last frame after the end of the test: fifty ticks (steps of 10 ms) of the daemon.
 const GRACE: Duration = Duration::from_millis(500);
 
 /// The alarm frames of one interface.
@@ -53,7 +53,7 @@ pub struct ObservedFrames {
     pub first: Option<Timestamp>,
     /// Time of the last frame of the tested rule with the test marker.
     pub last: Option<Timestamp>,
-    /// Whether one of the frames with the test marker reported the end of the test.
+    /// Whether the last frame of the tested rule with the test marker reported the end of the test.
     pub ended: bool,
     /// Frames of other rules with the test marker. Such frames show that another test is running.
     pub foreign: u64,
@@ -91,7 +91,7 @@ impl AlarmReader {
         Some(Self { rule: plan("Rule")?, state: plan("State")?, test: plan("Test")? })
     }
 
-    /// Rule, state and marker; `None` = the frame is too short, or the rule's code is too large.
+    /// Rule, state and test marker; `None` = the frame is too short, or a code exceeds 255.
     fn read(&self, frame: &Frame) -> Option<(u8, u8, bool)> {
         let raw = |plan: &SignalPlan| plan.raw(frame.data()).ok().and_then(|code| u8::try_from(code).ok());
         Some((raw(&self.rule)?, raw(&self.state)?, raw(&self.test)? != 0))
@@ -154,7 +154,8 @@ impl ObservedFrames {
 /// Runs the test. `SIGINT` and `SIGTERM` end the test early; the daemon then also stops sending the alarm.
 ///
 /// # Errors
-/// Fails if no alarm frame is configured, an interface cannot be opened, or the daemon refuses.
+/// Fails if no alarm frame is configured, if an interface cannot be opened, or if the daemon does not answer or
+/// refuses.
 pub fn run(
     config: &Config,
     client: &ControlClient,

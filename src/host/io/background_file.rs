@@ -1,7 +1,8 @@
 //! Writes a file on a separate thread, so that a slow disk never delays the daemon's loop.
 //!
-//! Bytes are collected and sent to the thread in pieces. After a failed write, or if too many pieces wait for a slow
-//! disk, every further write is an error. The caller then gives up the file and continues.
+//! Bytes are collected and sent to the thread in pieces. If the thread could not write a piece, or if too many pieces
+//! wait for a slow disk, the next piece cannot be sent, and `write` or `flush` returns an error. The caller then gives
+//! up the file and continues.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -14,9 +15,9 @@ use super::place::with_suffix;
 use super::result_file::name_folder;
 use super::segments::{SegmentLimits, SegmentWriter};
 
-/// Number of bytes that are collected before they are sent to the thread. A flush sends fewer bytes.
+/// Number of bytes that are collected before they are sent to the thread. A flush sends the bytes collected so far.
 const PIECE_BYTES: usize = 64 * 1024;
-/// Maximum number of waiting pieces. So many pieces take 4 MB, which is ten seconds of a full 1 Mbit/s bus.
+/// Maximum number of waiting pieces. Together, these pieces have 4 MB: ten seconds of a full 1 Mbit/s bus.
 const MAX_PIECES: usize = 64;
 
 /// Longest wait for the last bytes when the file is finished. This is half of the time after which systemd kills the
@@ -33,10 +34,10 @@ pub struct BackgroundFile {
 }
 
 impl BackgroundFile {
-    /// Creates the file and its thread.
+    /// Creates the file and its thread. A file of an earlier run is renamed to `NAME.1`.
     ///
     /// # Errors
-    /// Fails if the file cannot be created.
+    /// Fails if the earlier file cannot be renamed, or if the file or the thread cannot be created.
     pub fn create(path: &Path) -> io::Result<Self> {
         keep_earlier(path)?;
         let file = File::create(path).map_err(|error| name_folder(path, error))?;
@@ -47,7 +48,7 @@ impl BackgroundFile {
     /// first segment starts with the caller's bytes, which must begin with `header`.
     ///
     /// # Errors
-    /// Fails if the first segment cannot be created.
+    /// Fails if the first segment or the thread cannot be created.
     pub fn create_segments(path: &Path, header: &'static str, limits: SegmentLimits) -> io::Result<Self> {
         let segments = SegmentWriter::create(path, header, limits);
         let mut segments = segments.map_err(|error| name_folder(path, error))?;
@@ -65,10 +66,12 @@ impl BackgroundFile {
         Ok(Self { piece: Vec::with_capacity(PIECE_BYTES), pieces: Some(pieces), writer: Some(writer) })
     }
 
-    /// Writes the remaining bytes, synchronises the file to disk, and waits until this is done.
+    /// Writes the remaining bytes, synchronises the file to disk, and waits until this is done, but at most
+    /// [`MAX_FINISH`].
     ///
     /// # Errors
-    /// Returns the first error of any write.
+    /// Fails if the thread could not write or did not finish in time, or if the remaining bytes could not be sent to
+    /// it.
     pub fn finish(mut self) -> io::Result<()> {
         let sent = self.send_piece();
         self.join()?;

@@ -1,8 +1,9 @@
 //! Reads the key of authenticated frames once at the start, from a systemd credential or a file. The key is never
 //! shown.
 //!
-//! In: the location of the key. Out: the AES-128-CMAC of given bytes. It is an error if the key is missing, if other
-//! users can read it, or if it does not have 16 bytes or 32 hex digits. The error never contains the key.
+//! In: the location of the key. Out: the AES-128-CMAC of given bytes. It is an error if the key is missing, if it does
+//! not have 16 bytes or 32 hex digits, or if all its bytes are equal. A key file must also be closed to other users; a
+//! credential is protected by the service manager. Errors never contain the key.
 
 use std::ffi::OsString;
 use std::fmt;
@@ -52,13 +53,13 @@ impl CanKey {
         let unreadable = |why: std::io::Error| {
             error(format!("cannot be read: {why}, must be a file of {KEY_BYTES} bytes or {} hex digits", 2 * KEY_BYTES))
         };
-        // Opening a named pipe would wait for a writer.
+        // This check comes before the file is opened, because opening a named pipe would wait for a writer.
         if path.metadata().is_ok_and(|found| !found.is_file()) {
             return Err(error("is not a regular file".to_owned()));
         }
         let file = File::open(path).map_err(unreadable)?;
         let mode = file.metadata().map_err(|why| error(why.to_string()))?.mode() & 0o7777;
-        // The mask 0o077 selects the permissions of other users.
+        // The mask 0o077 selects the permissions of the group and of all other users.
         if is_private && mode & 0o077 != 0 {
             return Err(error(format!("mode {mode:04o}, must be 0600 or 0400: no other user may read it")));
         }

@@ -1,13 +1,14 @@
 //! Parses and writes candump log lines, the format that `candump -L` writes and `canplayer` reads.
 //!
-//! Input is text that begins with a line; output is a [`Line`] that borrows the interface name. The usual form of a
-//! line is `(1700000000.123456) can0 123#1122`. The parser also accepts nanosecond and relative stamps, padded names,
-//! the direction suffix of `-x`, and drop counts of `-d`. It accepts remote frames, raw length codes, CAN FD, error
-//! frames, and bytes separated by dots. CAN XL is recognised but not decoded. Like canplayer, the parser ignores lines
-//! that do not begin with `(` ([`Line::Other`]). A line that begins with `(` and violates the grammar is a
-//! [`LineError`] with its column.
+//! In: text that begins with a line. Out: a [`Line`] that borrows the interface's name from the text. The usual form of
+//! a line is `(1700000000.123456) can0 123#1122`. The parser also accepts nanosecond and relative stamps, interface
+//! names padded with spaces, the direction that `candump -x` appends, and the drop counts that `candump -d` writes. It
+//! accepts remote frames, raw length codes, CAN FD, error frames, and bytes separated by dots. CAN XL is recognised but
+//! not decoded. Like canplayer, the parser ignores all other lines that do not begin with `(` ([`Line::Other`]). If a
+//! line begins with `(` and violates the grammar, the result is a [`LineError`], which states the column.
 //!
-//! FD payloads of a length that the bus cannot carry are padded with zeros to the next valid length, as canplayer does.
+//! If a CAN FD payload has a length that FD frames cannot have, the parser pads it with zeros to the next valid length,
+//! as canplayer does.
 
 mod digits;
 mod parser;
@@ -58,7 +59,7 @@ pub enum Line<'a> {
         /// Frames lost since the last such line.
         frames: u64,
     },
-    /// Any line that does not begin with `(`: a comment, a blank line, another tool's line.
+    /// Any other line that does not begin with `(`: a comment, a blank line, another tool's line.
     Other,
 }
 
@@ -73,7 +74,7 @@ pub struct LineError {
 }
 
 impl LineError {
-    /// Formats the error with the text found in `line`, which is the parsed line.
+    /// Formats the error. `line` is the line that was parsed; the result quotes the text at the column of the error.
     pub fn describe(&self, line: &[u8]) -> String {
         const SHOWN: usize = 24;
         let rest = line.get(self.column - 1..).unwrap_or_default();

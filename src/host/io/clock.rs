@@ -24,8 +24,8 @@ use nix::time::{ClockId, clock_gettime};
 
 use crate::quantity::Timestamp;
 
-/// Half of the time during which the smallest offset of a hardware stamp is remembered, ns. In this time, a quartz with
-/// an error of 100 ppm drifts by 1 ms.
+/// Length of a window, ns. The smallest offset of a hardware stamp is remembered for one to two windows. In one window,
+/// a quartz with an error of 100 ppm drifts by 1 ms.
 const HARDWARE_WINDOW_NS: i64 = 10_000_000_000;
 
 /// Maximum number of readings of the wall clock for one [`Reading`].
@@ -122,7 +122,7 @@ impl MappedClock {
 #[derive(Debug, Clone)]
 pub struct StampMapper {
     clock: MappedClock,
-    /// Boot time when the socket was last found empty, ns.
+    /// Earliest boot time at which an unread frame can have arrived, ns.
     emptied_ns: i64,
     /// Wall time minus boot time when the socket was last found empty, ns.
     emptied_offset_ns: i64,
@@ -182,8 +182,8 @@ impl StampMapper {
     fn software(&self, stamp: Option<i64>, reading: Reading) -> i64 {
         let candidates =
             [reading.offset_ns(), self.emptied_offset_ns].map(|offset| stamp.map(|s| s.saturating_sub(offset)));
-        // Both candidates are plausible only around a step. Frames are read soon after they arrive, so the later
-        // candidate is used.
+        // The candidates differ only around a step. Frames are read soon after they arrive. If both candidates are
+        // plausible, the later one is therefore used.
         candidates.into_iter().flatten().filter(|&t| self.possible(t, reading)).max().unwrap_or(reading.boottime_ns)
     }
 
@@ -222,7 +222,7 @@ impl HardwareClock {
         stamp_ns.saturating_add(current.min(previous))
     }
 
-    /// Starts again after a jump of the adapter's clock (the adapter was reset or suspended).
+    /// Starts again after a long silence, or after a jump of the adapter's clock (the adapter was reset or suspended).
     fn restart(&mut self, stamp_ns: i64, arrived_ns: i64) -> i64 {
         let offset = arrived_ns.saturating_sub(stamp_ns);
         *self = Self { least_ns: Some((offset, offset)), window_start_ns: arrived_ns };

@@ -1,5 +1,6 @@
-//! Limits a server's connections, in total and per client. A new connection replaces the one that has been idle
-//! longest, so that silent and slow clients cannot keep others out.
+//! Limits a server's connections, in total and per client. If a limit is reached, a new connection replaces the
+//! connection that has been idle longest, so that silent and slow clients cannot keep others out. If a client reaches
+//! its limit, the client loses one of its connections.
 //!
 //! A connection is idle while the client has to act: to send a request, or to read the answer. A connection is never
 //! closed while its request is being processed, or within [`GRACE`] of becoming idle. If such connections take all

@@ -1,6 +1,6 @@
-//! Writes core events as log lines with fields; the severity decides the log level. Error frames, lost frames and
-//! unsent frames are logged once and then as counts, because a bus without another node causes thousands of error
-//! frames per second. In the JSON format, every event is written.
+//! Writes core events as log lines with fields. The kind of an event decides its log level; for an alarm, the severity
+//! also counts. Error frames, lost frames and unsent frames are logged once and then as counts, because a bus without
+//! another node causes thousands of error frames per second. In the JSON format, every event is written.
 
 mod text;
 
@@ -28,7 +28,7 @@ pub fn write_line(out: &mut impl Write, event: &Event) -> io::Result<()> {
     out.write_all(b"\n")
 }
 
-/// Writes the first line of an event file, which identifies the vehicle, if one is configured.
+/// If a vehicle is configured, writes the first line of an event file, which identifies the vehicle.
 pub fn write_head(out: &mut impl Write, vehicle: &VehicleIdentity) -> io::Result<()> {
     if !vehicle.is_stated() {
         return Ok(());
@@ -42,7 +42,7 @@ pub fn write_head(out: &mut impl Write, vehicle: &VehicleIdentity) -> io::Result
 struct EventSum {
     reported: Option<Timestamp>,
     unreported: u64,
-    /// Time until the next count is logged, s.
+    /// Shortest time between the latest log line and the next log line, s.
     period_s: f64,
 }
 
@@ -240,8 +240,8 @@ impl EventLog {
     }
 }
 
-/// Rounds to nine significant digits, which removes the digits that binary arithmetic adds. No logged value has more
-/// significant digits.
+/// Rounds to nine significant digits, which removes the digits that binary arithmetic adds. No logged value is known
+/// more exactly.
 fn rounded(value: f64) -> f64 {
     format!("{value:.8e}").parse().unwrap_or(value)
 }

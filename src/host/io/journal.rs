@@ -18,9 +18,9 @@
 //! `SECURED` is a frame of an authenticated message. The last field is the freshness value with which the authenticator
 //! was valid (`-`: the authenticator was not valid), so a replay needs no key. `RELOAD` means that another
 //! configuration applies after this line. The journal does not contain this configuration. `RESTORE` is the first line
-//! of a run that restored a stored state. `RESTORE` contains the downtime (`-`: the downtime follows from the stamps).
-//! If the last line has no line feed, a power cut has torn it. Such a line counts as a bad line, even if it can be
-//! parsed.
+//! of a run that restored a stored state. `RESTORE` contains the downtime (`-`: the downtime follows from the stamps;
+//! `unknown`: the downtime is not known). If the last line has no line feed, a power cut has torn it. Such a line
+//! counts as a bad line, even if it can be parsed.
 
 use std::io::{self, Write};
 
@@ -35,7 +35,7 @@ pub const HEADER: &str = "PACKWATCH-JOURNAL 1";
 /// Keywords of lines that are not frames.
 const KEYWORDS: [&[u8]; 8] = [b"SECURED", b"TICK", b"BUS", b"GAP", b"RESTORE", b"COMMAND", b"STORE", b"RELOAD"];
 
-/// Whether a line that does not begin with `(` is a journal line.
+/// Whether a line begins with a keyword of the journal.
 pub fn is_mark(line: &[u8]) -> bool {
     line.iter().position(|&b| b == b' ').is_some_and(|space| KEYWORDS.contains(&&line[..space]))
 }

@@ -138,7 +138,8 @@ impl Lines {
         }
     }
 
-    /// Returns the first line, without its line feed, and does not consume it.
+    /// Returns the first line, without its line feed, and does not consume it. Must be called before any line is
+    /// consumed. If the line is longer than the buffer, returns its beginning.
     ///
     /// # Errors
     /// Returns the errors of the source.

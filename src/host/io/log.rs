@@ -31,7 +31,8 @@ pub use super::table::TableError as LogError;
 /// "...".
 const MAX_FOREIGN_NAMES: usize = 64;
 
-/// Maximum number of interfaces, configured and adopted together. Usual logs have fewer than ten.
+/// Maximum number of interfaces that get a number: the configured interfaces, and the interfaces that
+/// [`LogSource::adopt_foreign`] adds. Usual logs have fewer than ten.
 pub const MAX_ADOPTED: usize = 64;
 
 /// Encodes the values of a CSV row in the frames that carry them. Returns the number of values that no frame can carry.
@@ -60,7 +61,7 @@ pub struct LogCounts {
     pub bad_lines: u64,
     /// The first bad line: file, line, found and allowed.
     pub first_bad_line: Option<String>,
-    /// Lines without a record: headers, comments and blank lines.
+    /// Lines without a record, such as headers, comments and blank lines.
     pub ignored_lines: u64,
     /// CAN XL frames, which are not supported.
     pub xl_frames: u64,
@@ -70,7 +71,7 @@ pub struct LogCounts {
     pub dropped_frames: u64,
     /// Frames and events of unconfigured interfaces, by name.
     pub foreign: BTreeMap<String, u64>,
-    /// Records whose stamp is before the stamp of the preceding record.
+    /// Records whose stamp is before the latest stamp of the earlier records.
     pub time_backwards: u64,
     /// The first such record: file, line, its stamp and the latest stamp before it.
     pub first_time_backwards: Option<String>,
@@ -119,7 +120,7 @@ struct ReadState {
     fresh: bool,
     /// Whether the time between the latest record and the next record is unknown.
     unknown: bool,
-    /// Whether a file's stamps were moved to follow the previous file.
+    /// Whether the stamps of a file or section were moved, so that they follow the latest record.
     has_moved_stamps: bool,
 }
 
@@ -165,7 +166,8 @@ impl LogSource {
         &self.state.counts
     }
 
-    /// Whether a file began before the end of the previous file, so that its stamps were moved and are not real dates.
+    /// Whether a file or section began before the latest record. In that case, its stamps were moved and are not real
+    /// dates.
     pub fn has_moved_stamps(&self) -> bool {
         self.state.has_moved_stamps
     }
@@ -288,8 +290,8 @@ fn is_remark(line: &[u8]) -> bool {
 }
 
 impl ReadState {
-    /// Fills slots with the next frames of a text log whose complete lines are already in the buffer. The first record
-    /// of the file is excluded. Returns the number of frames.
+    /// Fills slots with the next frames of a text log, as far as complete lines are already in the buffer. Does nothing
+    /// before the first record of a file. Returns the number of frames.
     fn next_frames(&mut self, lines: &mut Lines, name: &str, slots: &mut [Record]) -> usize {
         let Some(mut latest) = self.latest.filter(|_| !self.fresh) else { return 0 };
         let all = lines.unread();
@@ -428,7 +430,7 @@ impl ReadState {
         }
     }
 
-    /// Returns the interface's number. Unconfigured interfaces are counted.
+    /// Returns the interface's number. If the interface has no number, counts the line and returns `None`.
     fn bus(&mut self, interface: &[u8]) -> Option<BusIndex> {
         let name = String::from_utf8_lossy(interface);
         if let Some(index) = self.interfaces.iter().position(|known| *known == name) {
@@ -469,8 +471,8 @@ impl ReadState {
         }
     }
 
-    /// Converts the stamp in a line of a file to the common clock; also returns the gap that must precede the record, if
-    /// any.
+    /// Converts the stamp in a line of a file to the common clock. If a gap must precede the record, also returns the
+    /// gap.
     fn place(&mut self, raw: Timestamp, name: &str, line: u64) -> (Option<Record>, Timestamp) {
         let mut gap = false;
         if std::mem::take(&mut self.fresh) {

@@ -36,7 +36,7 @@ impl ResultFile {
         Ok(Self { path: path.to_owned(), part, out: BufWriter::with_capacity(256 * 1024, file) })
     }
 
-    /// Completes the file. When this function returns, all bytes are on disk under the final name.
+    /// Completes the file. If the function succeeds, all bytes of a regular file are on disk under the final name.
     ///
     /// # Errors
     /// Fails if the file cannot be written; the message names it.
@@ -81,8 +81,8 @@ pub fn write_file(path: &Path, bytes: &[u8]) -> io::Result<()> {
     file.finish()
 }
 
-/// Checks that the result's path can be written and is not one of the inputs. Commands call this function first, before
-/// hours of work.
+/// Checks that the result's folder exists and that the result is not one of the inputs. Commands call this function
+/// first, before hours of work.
 ///
 /// # Errors
 /// Returns an error that states the result's path and the fault.

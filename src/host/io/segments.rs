@@ -191,7 +191,8 @@ impl SegmentWriter {
         Ok(Self { base: base.to_owned(), header, limits, number: 1, open, complete })
     }
 
-    /// Appends a piece of the text and hands it to the operating system. A full segment ends with the last whole line.
+    /// Appends a piece of the text and hands it to the operating system. If the segment is full, it ends after the last
+    /// whole line of the piece, and the rest of the piece begins the next segment.
     pub(super) fn write(&mut self, piece: &[u8]) -> io::Result<()> {
         let is_full = self.open.get_ref().bytes >= self.limits.segment_bytes;
         let end = memchr::memrchr(b'\n', piece).filter(|_| is_full).map(|last| last + 1);

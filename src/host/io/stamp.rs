@@ -2,8 +2,8 @@
 
 use crate::quantity::Timestamp;
 
-/// Parses decimal seconds (`12.5`, `-3`, `1e3`) without losing digits. Returns `None` if the text is not a finite
-/// number.
+/// Parses decimal seconds (`12.5`, `-3`, `1e3`). A number without an exponent keeps every digit, up to ten digits
+/// before and nine digits after the point. Returns `None` if the text is not a finite number.
 pub fn parse_seconds(text: &[u8]) -> Option<Timestamp> {
     let text = text.trim_ascii();
     parse_exact(text).or_else(|| {
@@ -12,7 +12,7 @@ pub fn parse_seconds(text: &[u8]) -> Option<Timestamp> {
     })
 }
 
-/// Parses digits with at most nine decimals exactly. Returns `None` for every other form.
+/// Parses at most ten digits before and nine digits after the point exactly. Returns `None` for every other form.
 fn parse_exact(text: &[u8]) -> Option<Timestamp> {
     let (negative, digits) = match text.strip_prefix(b"-") {
         Some(rest) => (true, rest),

@@ -1,9 +1,9 @@
-//! Reads all CSV tables. Columns are found by name, rows are streamed, and every fault has its position.
+//! Reads CSV tables. Columns are found by name, rows are streamed, and every fault has its position.
 //!
 //! In: CSV with one header line, uncompressed or as gzip or zstd. Out: [`Row`]s whose fields are read as text, numbers
 //! or stamps. Blanks around fields and a byte order mark are removed. Rows may be shorter or longer than the header; a
-//! missing field counts as empty. A row of more than a megabyte ends the reading. A fault reads `FILE:LINE: column
-//! NAME: found X, must be ALLOWED`. A fault does not end the reading, so the caller may skip the row.
+//! missing field counts as empty. A row of more than a megabyte ends the reading. The message of a fault is `FILE:LINE:
+//! column NAME: found X, must be ALLOWED`. A fault does not end the reading, so the caller may skip the row.
 
 use std::borrow::Cow;
 use std::cell::Cell;

@@ -4,10 +4,11 @@
 //! awake. A plain log only states when frames arrived. This module generates the same ticks for a plain log, at
 //! multiples of the period. A tick at time T comes after every record of time T and before the first later record.
 //!
-//! After each record, the recorder counts as awake for the sleep gap, even if no further record follows. The ticks in
-//! this time let the core detect a lost input, as the daemon does on a silent bus. After the sleep gap, the recorder
-//! counts as asleep, and there are no ticks. The first record of the log and the first record after sleep wake the
-//! recorder, which gives one tick with the time of that record. There are no ticks after the last record.
+//! After each record, the recorder counts as awake for the duration of the sleep gap, even if the next record arrives
+//! later. The ticks in this time let the core detect a lost input, as the daemon does on a silent bus. When the sleep
+//! gap has passed, the recorder counts as asleep, and the ticks stop. The first record of the log and the first record
+//! after sleep wake the recorder, which gives one tick with the time of that record. The ticks end with the log's last
+//! record.
 //!
 //! The caller passes the time of the core's next necessary tick ([`Ticks::pop`]'s `due`). Earlier ticks are skipped
 //! because they would change nothing.
@@ -26,13 +27,13 @@ pub struct Ticks {
     limit_ns: i64,
     /// Time of the latest record; `None` before the first record and after [`Ticks::sleep`].
     latest_ns: Option<i64>,
-    /// Time of the first tick after a sleep gap. This tick is popped after the ticks before the gap.
+    /// Time of the tick with which the recorder wakes. This tick is popped after the ticks before the gap.
     wake_ns: Option<i64>,
 }
 
 impl Ticks {
-    /// Generates ticks every `period_ms` (at least 1). Ticks stop `sleep_gap_s` after a record if no other record
-    /// follows.
+    /// Generates ticks every `period_ms` (at least 1). If no other record arrives within `sleep_gap_s` after a record,
+    /// the ticks stop.
     pub fn new(period_ms: u32, sleep_gap_s: f64) -> Self {
         Self {
             period_ns: i64::from(period_ms.max(1)) * 1_000_000,
@@ -81,7 +82,7 @@ impl Ticks {
         }
     }
 
-    /// Whether [`pop`](Self::pop) may return a tick, regardless of what the core needs. Returns `false` for most
+    /// Whether the caller must call [`pop`](Self::pop), regardless of what the core needs. Returns `false` after most
     /// records.
     #[inline]
     pub fn is_pending(&self) -> bool {

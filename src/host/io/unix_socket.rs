@@ -17,15 +17,16 @@ use super::result_file::name_folder;
 /// The folder of the service, and of a daemon that root starts from a shell.
 const STANDARD_FOLDER: &str = "/run/packwatch";
 
-/// Default folder of a daemon's sockets: the folder that systemd created, else `/run/packwatch` for root, else the
-/// user's own folder.
+/// Default folder of a daemon's sockets: the folder that systemd created, else the user's own folder (never for root),
+/// else `/run/packwatch`.
 pub fn runtime_folder() -> PathBuf {
     let is_root = || std::fs::metadata("/proc/self").is_ok_and(|process| process.uid() == 0);
     let own = || own_folder().filter(|_| !is_root());
     first_folder("RUNTIME_DIRECTORY").or_else(own).unwrap_or_else(|| PathBuf::from(STANDARD_FOLDER))
 }
 
-/// Default folder of the sockets for clients: the folder of the service if it exists, else the user's own folder.
+/// Default folder of the sockets for clients: the folder that systemd created, else the folder of the service. If the
+/// folder of the service does not exist, but the user's own folder does, the default is the user's own folder.
 pub fn client_folder() -> PathBuf {
     let standard = PathBuf::from(STANDARD_FOLDER);
     let own = || own_folder().filter(|own| !standard.exists() && own.exists());
@@ -50,7 +51,7 @@ pub fn explain_no_daemon(path: &Path, socket: &str, standard: &Path, setting: &s
     )
 }
 
-/// Names the kind of a file that is not a socket; `None` = a socket, or no file.
+/// Names the kind of a file that is not a socket. `None` = the file is a socket or does not exist.
 fn other_file(path: &Path) -> Option<&'static str> {
     let kind = std::fs::metadata(path).ok()?.file_type();
     match (kind.is_socket(), kind.is_file(), kind.is_dir()) {
@@ -61,7 +62,8 @@ fn other_file(path: &Path) -> Option<&'static str> {
     }
 }
 
-/// Creates the default folder if systemd has not created it. If this fails, the bind fails too and is reported.
+/// Creates the folder of `path` if it is the default folder and systemd has not created it. If this fails, the bind
+/// fails too and is reported.
 fn make_default_folder(path: &Path) {
     let Some(folder) = path.parent().filter(|folder| *folder == runtime_folder()) else { return };
     if first_folder("RUNTIME_DIRECTORY").is_none() && std::fs::create_dir(folder).is_ok() {
@@ -132,7 +134,7 @@ pub async fn bind(path: &Path, mode: u32) -> Result<BoundSocket, BindError> {
     Ok(BoundSocket { listener, file })
 }
 
-/// Removes the socket of a daemon that has ended.
+/// Removes the socket of a daemon that has ended. If the daemon still runs, fails and keeps the socket.
 async fn remove_stale(path: &Path) -> Result<(), BindError> {
     match std::fs::symlink_metadata(path) {
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),

@@ -17,7 +17,7 @@ use super::note_left_out;
 
 /// The socket of journald.
 const SOCKET: &str = "/run/systemd/journal/socket";
-/// Longest value, bytes. An entry with a few values of this length fits into a datagram.
+/// Longest value, bytes. Longer values are cut. An entry with a few values of this length fits into a datagram.
 const MAX_VALUE: usize = 8 * 1024;
 /// Permanent ids of messages that programs search for (`journalctl MESSAGE_ID=...`), by their text.
 const MESSAGE_IDS: [(&str, &str); 3] = [
@@ -26,22 +26,22 @@ const MESSAGE_IDS: [(&str, &str); 3] = [
     ("configuration rejected, the old one stays", "870d888fffdd45d08f0fbc3c3a1489e9"),
 ];
 
-/// The connection to journald.
+/// The socket that sends entries to journald.
 #[derive(Debug)]
 pub(super) struct Journal {
     socket: UnixDatagram,
 }
 
 impl Journal {
-    /// Connects to the running journald.
+    /// Opens a socket and checks that journald listens.
     ///
     /// # Errors
     /// Fails if journald is not running, or its socket cannot be reached.
     pub(super) fn new() -> io::Result<Self> {
         let socket = UnixDatagram::unbound()?;
         socket.set_nonblocking(true)?;
-        // journald ignores an empty datagram. Sending fails if journald does not listen. If the queue is full, journald
-        // listens.
+        // journald ignores an empty datagram. If journald does not listen, sending fails. If journald's queue is full
+        // (`WouldBlock`), journald listens.
         match socket.send_to(&[], SOCKET) {
             Err(error) if error.kind() != ErrorKind::WouldBlock => Err(error),
             Ok(_) | Err(_) => Ok(Self { socket }),

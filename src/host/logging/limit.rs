@@ -1,10 +1,10 @@
 //! Limits the number of log lines of each kind: a burst, then a low rate. Further lines are dropped and counted. The
 //! count is logged once a minute.
 //!
-//! A bus that changes state all day must not wear out the flash memory. All lines that one place in the program logs
-//! are of one kind. A thousand lines about cells therefore do not suppress the line about an interface. Two kinds are
-//! never dropped: lines about alarms, which the rules debounce, and lines below `info`, which are logged only on
-//! request.
+//! A bus that changes state all day must not wear out the flash memory. Each place in the program that logs has its own
+//! kind of line. A thousand lines about cells therefore do not suppress the line about an interface. Some lines are
+//! never dropped: lines about alarms, which the rules debounce, the line with the count, and lines of the levels
+//! `debug` and `trace`, which are logged only on request.
 
 use std::collections::HashMap;
 use std::sync::Mutex;

@@ -17,7 +17,8 @@ pub struct CellSummary {
     pub soc: f64,
     /// Standard deviation of the SOC, fraction.
     pub soc_std: f64,
-    /// Capacity and usable capacity after the last capacity update, and resistance relative to a new cell.
+    /// Capacity and resistance (relative to a new cell) of the latest estimate, and the usable capacity after the last
+    /// capacity update.
     #[serde(flatten)]
     pub values: RecordedValues,
 }

@@ -27,8 +27,7 @@ pub struct MonitorDriver {
 }
 
 impl MonitorDriver {
-    /// Creates a monitor before its first input. A gap of more than `sleep_gap_s` (s) means that the recorder was
-    /// asleep.
+    /// Creates a driver with a new monitor. A gap of more than `sleep_gap_s` (s) means that the recorder was asleep.
     pub fn new(config: MonitorConfig, sleep_gap_s: f64) -> Self {
         Self {
             row_frames: RowFrames::new(&config),
@@ -40,7 +39,7 @@ impl MonitorDriver {
         }
     }
 
-    /// Handles one row. `None` and NaN mean that there is no value.
+    /// Handles one row. `None` and NaN mean that a value is missing.
     pub fn handle_row(&mut self, time: Timestamp, values: &[(Channel, Option<f64>)]) {
         self.advance(time);
         let mut frames = std::mem::take(&mut self.frames);

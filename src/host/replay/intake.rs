@@ -1,4 +1,5 @@
-//! Summarises, for a replay, the checks of frames before they are decoded: end-to-end protection and dropped frames.
+//! Summarises, for a replay, what happened to frames before they were decoded: end-to-end protection, dropped frames
+//! and diagnostic answers.
 
 use std::collections::BTreeMap;
 
@@ -19,7 +20,7 @@ pub struct ProtectedSummary {
     pub counts: BTreeMap<&'static str, u64>,
 }
 
-/// Counts of one monitor's checks.
+/// Counts of protected messages, dropped frames and diagnostic answers.
 type Summaries = (Vec<ProtectedSummary>, Vec<MessageFlood>, Vec<ControllerStatus>);
 
 /// The counts of a monitor's protected messages, dropped frames and diagnostic answers.

@@ -24,7 +24,7 @@ pub struct LogReading {
     pub columns: Vec<(String, String)>,
     /// For CSV logs: whether a positive current is a charge.
     pub charge_positive: bool,
-    /// For CSV logs: table with the section column and `start`.
+    /// For CSV logs: table with the start of each section, see [`CsvOptions::start_times`].
     pub start_times: Option<PathBuf>,
 }
 
@@ -50,7 +50,7 @@ impl LogReading {
     }
 }
 
-/// Encodes rows of values as frames, as their senders would, including protection.
+/// Encodes rows of values as frames in the same way as the senders of these frames, including protection.
 #[derive(Debug)]
 pub struct RowFrames {
     encoder: InputEncoder,

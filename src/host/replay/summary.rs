@@ -19,7 +19,7 @@ const MAX_LISTED_ALARMS: usize = 1000;
 /// Summary of a replay.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct ReplaySummary {
-    /// Counts of the logs.
+    /// Counts of the lines and frames of the logs.
     #[serde(flatten)]
     pub log: LogCounts,
     /// Records before `from`, which were skipped.

@@ -60,7 +60,7 @@ pub(super) struct Engine {
     pub(super) recent: RecentEvents,
     /// Progress of the store; `None` = no progress was reported.
     progress: Option<StoreProgress>,
-    /// Number of results that were announced before they were stored.
+    /// How often results were announced before they were stored.
     late: u64,
 }
 
@@ -127,8 +127,8 @@ impl Engine {
         })
     }
 
-    /// Handles one record. The authenticator of an authenticated frame is checked first. Returns the ticket (number) of
-    /// the commit that stores the record's changes; `None` = nothing to store, or no store.
+    /// Handles one record. If the record is an authenticated frame, its authenticator is checked first. Returns the
+    /// ticket (number) of the commit that stores the record's changes; `None` = nothing to store, or no store.
     pub(super) fn handle(&mut self, record: &Record) -> Option<u64> {
         if let RecordKind::Frame { bus, frame } = &record.kind
             && let Some(check) = self.monitor.mac_check(*bus, frame)
@@ -148,7 +148,7 @@ impl Engine {
         self.dispatch_outputs(record.time)
     }
 
-    /// Applies another configuration to the core, and records that in the journal.
+    /// Applies another configuration to the core, and records the reload in the journal.
     ///
     /// # Errors
     /// Returns the reasons why the core rejects the configuration. In this case nothing has changed.
@@ -294,8 +294,8 @@ fn send(links: &[LinkOutput], key: Option<&CanKey>, transmit: &Transmit) {
     }
 }
 
-/// Creates a state from the learned values and alarms in the history; `None` = the history has no values for these
-/// cells.
+/// Creates a state from the learned values and alarms in the history. `None` = the history is empty, or its values
+/// belong to other cells.
 fn state_of_history(
     config: &MonitorConfig,
     learned: &[LearnedCell],
@@ -315,9 +315,9 @@ fn state_of_history(
     Some(StateCandidate { snapshot, downtime: Downtime::Unknown, source: HISTORY_SOURCE })
 }
 
-/// Restores the first valid stored state. Returns the age of this state and, if the state in the state file does not
-/// fit, the reason. If there is a journal, writes the state next to the journal, because a replay of the journal starts
-/// from this state.
+/// Restores the first stored state that fits. Returns the age of this state and, if the state in the state file does
+/// not fit, the reason. If a journal is recorded, writes the state next to the journal, because a replay of the journal
+/// starts from this state.
 fn restore_first_valid(
     monitor: &mut Monitor,
     states: Vec<StateCandidate>,

@@ -107,7 +107,8 @@ impl ServiceLoop {
         }
     }
 
-    /// Notifies the service manager when the service is ready and when the status line changes.
+    /// Notifies the service manager when the service is ready and when the status line changes. Once a minute, also
+    /// logs the number of dropped log lines.
     fn notify_manager(&mut self, now: Instant) {
         if now.duration_since(self.left_out_reported) >= Duration::from_secs(60) {
             self.left_out_reported = now;
@@ -240,7 +241,8 @@ impl ServiceLoop {
         if timeout(DRAIN_LIMIT, drained).await.is_err() {
             tracing::warn!("some queued frames were not sent before the stop");
         }
-        // The state is stored first, because files may block on a disk that does not respond.
+        // The state is stored before the files are closed, because closing a file may block if its disk does not
+        // respond.
         self.engine.close_store(self.clock.now());
         let stored = snapshot.map_or(Ok(()), |path| {
             snapshot_file::write(path, &self.engine.monitor.snapshot())

@@ -1,9 +1,9 @@
 //! Determines the reports to the service manager: the readiness and a status line.
 //!
-//! The service is ready when the configuration is valid and the first usable reading has arrived or the wait for it has
-//! ended. The status line states every problem. The line is reported when it changes, but at most once per
-//! [`STATUS_PERIOD`]. The caller passes the times and sends the returned reports, so this file needs no service
-//! manager.
+//! A service with a valid configuration is ready when the first usable reading has arrived, or when the wait for this
+//! reading has ended. The status line states every problem. The line is reported when it changes, but at most once per
+//! [`STATUS_PERIOD`]; readiness and the result of a reload are reported at once. The caller passes the times and sends
+//! the returned reports, so this file needs no service manager.
 
 use std::time::Duration;
 

@@ -24,7 +24,8 @@ use crate::status::document::ConfigFile;
 
 /// Shortest time between the starts of two readings.
 const MIN_PERIOD: Duration = Duration::from_secs(1);
-/// Maximum number of faults that are logged one by one. A file of another kind has thousands of faults.
+/// Maximum number of faults that are logged one by one. A file that is not a configuration may have thousands of
+/// faults.
 const MAX_FAULTS_LOGGED: usize = 50;
 
 /// A step of a reload.

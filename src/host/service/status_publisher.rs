@@ -35,7 +35,7 @@ impl StatusPublisher {
         self.counters.note_tick(due.elapsed().as_secs_f64(), f64::from(TICK_PERIOD_MS) / 1e3);
     }
 
-    /// Counts the frames of a batch, whose estimates are available at `now`.
+    /// Records the latency of each frame of a batch. The estimates of the batch are available at `now`.
     pub(super) fn note_frames(&mut self, batch: &[Record], now: Timestamp) {
         let frames = batch.iter().filter(|received| matches!(received.kind, RecordKind::Frame { .. }));
         frames.for_each(|received| self.latency.record(now.since(received.time)));

@@ -68,8 +68,8 @@ pub fn check_length(bytes: usize) -> io::Result<()> {
     ))
 }
 
-/// Explains why no document was received, and names the next step. `setting` is the option or the key with which the user
-/// chooses the status socket `path`.
+/// Explains why no document was received, and names the next step. `setting` is the option or the key with which the
+/// user chooses the status socket `path`.
 pub fn explain(path: &Path, setting: &str, error: &io::Error) -> String {
     let shown = path.display();
     match error.kind() {

@@ -20,7 +20,7 @@ use crate::monitor::{BusStatistics, CommandCounts, ControllerCount, Event, Event
 use crate::quantity::{BusIndex, Timestamp};
 use crate::sample::ReadingCounts;
 
-/// Number of events in the document. So many events fill one screen.
+/// Maximum number of events in the document. This many events fill one screen.
 pub const MAX_EVENTS: usize = 32;
 
 /// The latest events. Events that occur once per cell and half-cycle are left out, because they would displace all
@@ -51,7 +51,7 @@ pub struct ServiceIdentity {
     pub interfaces: Vec<String>,
 }
 
-/// Counts of earlier runs, as contained in the stored state.
+/// Counts of earlier runs, which the restored state contained.
 #[derive(Debug, Clone, Default)]
 pub struct CounterBaseline {
     statistics: Statistics,
@@ -127,8 +127,8 @@ impl Sources<'_> {
             alarms: alarms(monitor),
             counters: StatusCounters {
                 core,
-                // The counts are stored per interface number. If the order of the interfaces were changed, counts of
-                // different interfaces would be mixed.
+                // The counts are stored by interface number. If the configuration changed the order of the interfaces,
+                // the counts of different interfaces would be mixed. Therefore these counts are left out.
                 lifetime: Statistics { buses: Vec::new(), ..monitor.statistics().clone() },
                 readings: monitor.reading_counts().since(&before.readings),
                 time_backwards: monitor.time_backwards().saturating_sub(before.time_backwards),

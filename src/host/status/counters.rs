@@ -38,7 +38,7 @@ impl Default for Latency {
 }
 
 impl Latency {
-    /// Counts one frame. A negative latency (stamps of two clocks) counts as zero.
+    /// Counts one frame. The two stamps of a latency may come from different clocks. A negative latency counts as zero.
     #[inline]
     pub fn record(&mut self, seconds: f64) {
         let seconds = seconds.max(0.0);
@@ -50,8 +50,8 @@ impl Latency {
         self.sum_s += seconds;
     }
 
-    /// Returns the upper bound, s, of the first bucket at which the frames counted so far are at least the fraction
-    /// `share` of all frames. `None` = there are no frames, or this is the last, unbounded bucket.
+    /// Returns a latency, s, that at least the fraction `share` of all frames did not exceed: the lowest bucket bound
+    /// with this property. `None` = no frame was counted, or too many frames are in the last, unbounded bucket.
     pub fn quantile_s(&self, share: f64) -> Option<f64> {
         let wanted = (share * self.frames as f64).ceil().max(1.0);
         let mut so_far = 0;

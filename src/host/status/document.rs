@@ -70,7 +70,7 @@ pub struct StatusDocument {
     /// Controllers that answer diagnostic requests.
     #[serde(default)]
     pub controllers: Vec<ControllerStatus>,
-    /// Time since which the buses are asleep; `None` = awake.
+    /// Time when the buses fell asleep; `None` = awake.
     #[serde(default)]
     pub asleep_since: Option<Timestamp>,
     /// Diagnostic requests of this program; `None` = polling is not configured.
@@ -81,7 +81,7 @@ pub struct StatusDocument {
     /// Unexpected senders on the buses.
     #[serde(default)]
     pub intruders: Vec<Intruder>,
-    /// Whether the current reading is frozen, because the voltages show a different load.
+    /// Whether the reading of the pack current is frozen while the voltages show a changing load.
     #[serde(default)]
     pub current_frozen: bool,
     /// Findings about cells and sensors, in the format of `--events`.
@@ -316,7 +316,8 @@ pub enum IntruderKind {
 pub struct Intruder {
     /// Interface.
     pub interface: String,
-    /// Identifier of the latest frames of the sender.
+    /// Identifier that the sender uses. If the sender uses several identifiers of this program on an interface: the
+    /// latest one.
     pub id: String,
     /// What the sender does.
     pub kind: IntruderKind,

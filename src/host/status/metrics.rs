@@ -3,7 +3,8 @@
 //! * Units are in the names (`_volts`, `_amperes`, `_celsius`, `_ratio`, `_seconds`, `_amperehours`). Counters end with
 //!   `_total`. Cells count from 1.
 //! * Unknown values are omitted, so a value that is present is valid.
-//! * All counters start with the daemon's process (`packwatch_uptime_seconds`), as readers that sum increases expect.
+//! * All counters start at 0 when the daemon starts (see `packwatch_uptime_seconds`). Readers that sum increases expect
+//!   this.
 //! * Without a daemon there is only `packwatch_up 0`.
 
 use std::collections::HashSet;
@@ -35,8 +36,8 @@ pub fn openmetrics(document: Option<StatusDocument>) -> String {
     text
 }
 
-/// Converts OpenMetrics text to Prometheus' older format. In that format a counter's description has the full name, and
-/// there are no lines for units.
+/// Converts OpenMetrics text to Prometheus' older format. In that format, the `HELP` and `TYPE` lines of a counter
+/// contain its name with `_total`, and units have no lines.
 pub fn prometheus_text(openmetrics: &str) -> String {
     let typed = |wanted: &str| -> HashSet<&str> {
         let types = openmetrics.lines().filter_map(|line| line.strip_prefix("# TYPE ")?.split_once(' '));
@@ -75,7 +76,7 @@ struct Metrics(Option<StatusDocument>);
 /// Labels of a sample.
 type Labels = Vec<(&'static str, String)>;
 
-/// Writes metric families with the known samples.
+/// Writes metric families. Samples with unknown values are omitted.
 struct Families<'a>(DescriptorEncoder<'a>);
 
 impl Families<'_> {

@@ -21,7 +21,8 @@ use crate::io::place::PlaceSetting;
 use crate::io::unix_socket::{BindError, BoundSocket, bind};
 use crate::monitor::Event;
 
-/// Pause after a connection could not be accepted because no descriptor is left. An immediate retry would fail too.
+/// Pause after a connection could not be accepted. The usual reason is that no descriptor is left. An immediate retry
+/// would then fail too.
 const ACCEPT_PAUSE: Duration = Duration::from_secs(1);
 /// Shortest time between two log lines about rejected clients.
 const REFUSAL_LOG_PERIOD: Duration = Duration::from_secs(60);
@@ -160,7 +161,7 @@ fn run(
     }
 }
 
-/// Serves until the loop drops the channel.
+/// Serves until the daemon's loop closes the channel of drafts.
 async fn serve([once, stream]: [BoundSocket; 2], context: &ClientContext, mut drafts: mpsc::Receiver<Box<Draft>>) {
     let (published, latest) = watch::channel(None);
     let mut clients = JoinSet::new();
@@ -243,7 +244,7 @@ async fn serve_once(mut client: UnixStream, context: ClientContext, mut latest: 
         latest.wait_for(|published| published.as_ref().is_some_and(|it| it.at.elapsed() < context.limits.stale));
     let line = match timeout(context.limits.max_silence, fresh).await {
         Ok(Ok(published)) => published.as_ref().map(|published| Arc::clone(&published.line)),
-        // The loop publishes no document, or has ended.
+        // The daemon's loop publishes no document, or has ended.
         Ok(Err(_)) | Err(_) => None,
     };
     if let Some(line) = line {
@@ -251,7 +252,8 @@ async fn serve_once(mut client: UnixStream, context: ClientContext, mut latest: 
     }
 }
 
-/// Sends every document that is published after the client connected. A slow client misses some documents.
+/// Sends the latest document if it is fresh, then every document that is published. A slow client misses some
+/// documents.
 async fn serve_stream(mut client: UnixStream, context: ClientContext, mut latest: Latest) {
     while latest.changed().await.is_ok() {
         let fresh =
@@ -265,7 +267,8 @@ async fn serve_stream(mut client: UnixStream, context: ClientContext, mut latest
     }
 }
 
-/// Writes a line. Returns `false` if the client has closed, or was dropped because it did not read in time.
+/// Writes a line. Returns `false` if the client has closed the connection, or if the client must be dropped because it
+/// did not read in time.
 async fn send_line(client: &mut UnixStream, line: &[u8], context: &ClientContext) -> bool {
     match timeout(context.limits.max_silence, client.write_all(line)).await {
         Ok(written) => written.is_ok(),

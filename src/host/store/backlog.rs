@@ -1,16 +1,16 @@
 //! Queues history rows that wait for the disk, in limited memory.
 //!
 //! In: batches of rows. Out: the same batches, oldest first. If there is no room, the oldest half-cycles are dropped
-//! first, because they are details. After the half-cycles, the oldest other rows are dropped. Dropped rows are counted,
-//! and the count is written with the next rows.
+//! first, because they are details. After the half-cycles, the oldest other rows are dropped, except pack changes.
+//! Dropped rows are counted, and the count is written with the next rows.
 
 use std::collections::VecDeque;
 
 use super::rows::{HistoryRow, RowBatch};
 use super::stamp::Stamp;
 
-/// Maximum number of rows that wait for the disk. So many rows take half a megabyte of memory. For a pack of 96 cells,
-/// they cover about 25 half-cycles of each cell, which are days of driving.
+/// Maximum number of rows that wait for the disk. This many rows take half a megabyte of memory. For a pack of 96
+/// cells, they cover about 25 half-cycles of each cell, that is, days of driving.
 pub(super) const MAX_ROWS: usize = 5_000;
 
 /// Waiting rows, oldest first.
@@ -59,8 +59,8 @@ impl Backlog {
         self.lost.rows -= rows;
     }
 
-    /// Takes rows back that could not be written; they become the oldest rows again. The next rows report the losses
-    /// again.
+    /// Queues rows again after a write has failed. They become the oldest rows. Their report of losses is dropped; the
+    /// next `take` reports the losses again.
     pub(super) fn put_back(&mut self, batches: Vec<RowBatch>) {
         self.reported = LossCount::default();
         let is_loss = |row: &HistoryRow| matches!(row, HistoryRow::Own { reason: "rows_lost", .. });

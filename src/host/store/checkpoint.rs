@@ -7,8 +7,8 @@
 
 use crate::quantity::Timestamp;
 
-/// Bytes written per day before checkpoints are delayed. In total 20 MB may be written per day; bursts of alarms take
-/// the rest.
+/// Bytes that may be written per day before checkpoints are delayed. In total, 20 MB may be written per day; the rest
+/// is left for bursts of alarms.
 const BYTES_PER_DAY: f64 = 15e6;
 /// Bytes that a commit without a state writes. SQLite writes three of its pages, first to its log and later to its
 /// file. Each write is rounded up to whole pages of the system.
@@ -30,13 +30,13 @@ pub(super) struct CheckpointSchedule {
 }
 
 impl CheckpointSchedule {
-    /// A schedule with this shortest period, s.
+    /// A schedule with the shortest period `period_s`, s.
     pub(super) fn new(period_s: f64) -> Self {
         Self { period_s, last: None, ahead: (0.0, Timestamp::ZERO) }
     }
 
-    /// Whether a checkpoint is due, at least `period_s` after the last state. The first checkpoint is due one period
-    /// after the start.
+    /// Whether a checkpoint is due. Between two states, at least `period_s` and the shortest period of the schedule
+    /// must pass. The same time must pass between the first call and the first checkpoint.
     pub(super) fn is_due(&mut self, now: Timestamp, period_s: f64) -> bool {
         let elapsed_s = now.since(*self.last.get_or_insert(now));
         let may_write = self.ahead_at(now) <= 0.0 || elapsed_s >= MAX_PERIOD_S;
@@ -60,8 +60,8 @@ impl CheckpointSchedule {
 mod tests {
     use super::*;
 
-    /// Returns the number of checkpoints and of bytes of a day. Each state has `bytes` bytes. A row is committed in
-    /// every second that `commits` selects.
+    /// Simulates a day and returns the number of checkpoints and the number of bytes written. Each state has `bytes`
+    /// bytes. A row is committed in every second that `commits` selects.
     fn day(bytes: u64, commits: impl Fn(u32) -> bool) -> (u32, f64) {
         let (mut schedule, mut checkpoints, mut written) = (CheckpointSchedule::new(60.0), 0, 0.0);
         for second in 0..86_400_u32 {

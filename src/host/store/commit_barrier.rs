@@ -1,9 +1,10 @@
 //! Holds frames until the results that they announce are on disk.
 //!
-//! During a commit, every announcing frame ([`Transmit::announces`]) waits. These are the frames of the input that led
-//! to the result, and the cyclic frames that would repeat the result. If the first packet of a transfer waits, its
-//! later packets wait too. The frames are sent in order. The status frame is not held, because its state of charge and
-//! validity must be up to date. About alarms, the status frame states only the number of raised alarms.
+//! During a commit, every announcing frame ([`Transmit::announces`]) waits: the frames that announce the result, the
+//! cyclic frames that would repeat the result, and all other frames of the same kinds. If the first packet of a
+//! transfer waits, its later packets wait too. The frames are sent in order. The status frame is not held, because its
+//! state of charge and validity must be up to date. All that the status frame states about alarms is the number of
+//! raised alarms.
 //!
 //! No frame waits longer than [`MAX_WAIT`], because an alarm on the bus is more important than an alarm on disk.
 

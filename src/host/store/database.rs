@@ -14,7 +14,7 @@
 //! | `segment` | a day of rows, with the end of their hash chain (`segments`) | always |
 //! | `meta` | the number of segments, and the vehicle (one row) | always |
 //!
-//! The rows from `half_cycle` to `reset` are numbered across their tables. The oldest segments are deleted first; their
+//! The tables from `half_cycle` to `reset` share one numbering of rows. The oldest segments are deleted first; their
 //! rows in `segment` remain. Cells count from 0, times are nanoseconds. `PRAGMA user_version` is the format.
 //!
 //! * The database is one file in write-ahead mode with `synchronous=FULL`. A commit that has returned survives a power
@@ -92,8 +92,9 @@ impl From<rusqlite::Error> for OpenError {
     }
 }
 
-/// Whether an error means that the file's contents are wrong. True for every error not caused by the disk or another
-/// process. If damage were not recognised, the store would never be written again.
+/// Whether an error means that the file's contents are wrong. An SQLite error counts as damage unless it has another
+/// known cause, such as the disk, the permissions or another process. If damage were not recognised, the store would
+/// never be written again.
 pub(super) fn is_damage(error: &rusqlite::Error) -> bool {
     match error {
         rusqlite::Error::SqliteFailure(failure, _) => !matches!(
@@ -241,8 +242,8 @@ impl Database {
         learned::read(&self.connection, self.pack)
     }
 
-    /// Closes the history of the pack, noting the last capacity of its weakest cell, and opens the history of the next
-    /// pack. Returns the number of the new pack.
+    /// Closes the history of the pack and opens the history of the next pack. The row that closes the history contains
+    /// the last learned capacity of the weakest cell. Returns the number of the new pack.
     pub(super) fn replace_pack(&mut self, now: &Stamp) -> rusqlite::Result<i64> {
         let learned = self
             .connection
@@ -300,7 +301,8 @@ fn prepare(connection: &Connection) -> rusqlite::Result<()> {
     connection.pragma_update(None, "page_size", 1024)?;
     let mode: String = connection.query_row("PRAGMA journal_mode = WAL", [], |row| row.get(0))?;
     if mode != "wal" {
-        // The file system has no shared memory. Commits are as safe, but each commit is written and synced twice.
+        // The file system does not support shared memory. Without the log, commits are just as safe, but each commit is
+        // written and synced twice.
         tracing::warn!(mode, "no write-ahead log on this file system: every commit is written twice");
     }
     connection.pragma_update(None, "synchronous", "FULL")?;
@@ -308,8 +310,8 @@ fn prepare(connection: &Connection) -> rusqlite::Result<()> {
     connection.pragma_update(None, "cache_size", -256)?;
     connection.pragma_update(None, "temp_store", "MEMORY")?;
     connection.pragma_update(None, "cell_size_check", true)?;
-    // SQLite copies a log of half a megabyte (about fifty commits) into the main file, and truncates a log of more than
-    // 1 MiB.
+    // When the log reaches half a megabyte (about fifty commits), SQLite copies the log into the main file. SQLite
+    // truncates a log that is longer than 1 MiB.
     connection.query_row("PRAGMA journal_size_limit = 1048576", [], |_| Ok(()))?;
     connection.query_row("PRAGMA wal_autocheckpoint = 512", [], |_| Ok(()))
 }

@@ -17,11 +17,11 @@ use crate::io::place::with_suffix;
 pub(super) const DATABASE: &str = "packwatch.db";
 /// Name of the file that a daemon keeps locked.
 const LOCK: &str = "packwatch.lock";
-/// Suffixes of SQLite's files of a database. The write-ahead log is moved first, because SQLite would otherwise apply
-/// it to the next database.
+/// Suffixes of the files that SQLite keeps for a database. The write-ahead log is moved first. If the log stayed behind
+/// after a power cut, SQLite would apply it to the next database.
 const FILES: [&str; 3] = ["-wal", "-shm", ""];
-/// Maximum number of damaged databases that are kept, so that a disk that damages every file does not fill up with
-/// them.
+/// Maximum number of damaged databases that are kept. Without this limit, a disk that damages every file would fill up
+/// with damaged databases.
 const MAX_SET_ASIDE: u32 = 8;
 
 /// The state folder.
@@ -41,7 +41,7 @@ impl fmt::Display for Folder {
 }
 
 impl Folder {
-    /// Creates the value for a folder that may not exist yet.
+    /// The state folder at `path`, which may not exist yet.
     pub(super) fn new(path: PathBuf) -> Self {
         Self { path, lock: None, damage: None }
     }
@@ -78,8 +78,8 @@ impl Folder {
         }
     }
 
-    /// Opens the database for the pack that the stored state knows. If the database is damaged, opens an empty one
-    /// instead. Also returns the history rows that report this.
+    /// Opens the database. `pack` is the number of the pack in the stored state (0 = unknown). If the database is
+    /// damaged, sets it aside and creates an empty database. Also returns the history rows that report the damage.
     pub(super) fn open(&mut self, now: &Stamp, pack: i64) -> Result<(Database, Vec<HistoryRow>), OpenError> {
         self.lock().map_err(|error| OpenError::Unavailable(format!("{}: {error}", self.path.display())))?;
         let path = self.path.join(DATABASE);
@@ -128,7 +128,8 @@ impl Folder {
     fn free_place(&self) -> PathBuf {
         let place = |number: u32| self.path.join(format!("{DATABASE}.damaged-{number}"));
         let free = (1..MAX_SET_ASIDE).map(place).find(|place| !place.exists());
-        // If all names are in use, the last one is replaced, because the first damaged database is the most useful.
+        // If all names are in use, the database with the last name is replaced. The first damaged database is the most
+        // useful and is kept.
         free.unwrap_or_else(|| place(MAX_SET_ASIDE))
     }
 }

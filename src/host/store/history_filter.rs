@@ -13,9 +13,10 @@ use crate::quantity::catalogue::Quantity;
 use crate::quantity::{CellIndex, Timestamp};
 use crate::token_bucket::{BucketSize, TokenBucket};
 
-/// Number of capacities of one cell that are written unconditionally: 64 at once (two days of an electric car), then
-/// one per hour. Further capacities (of a hybrid that reverses every minute) are written only if they have changed,
-/// because each row takes 100 bytes for years.
+/// Number of measured capacities of one cell that are written even if they have not changed: 64 at once (two days of an
+/// electric car), then one per hour. Further capacities are written only if they have changed, because each row takes
+/// 100 bytes and is kept for years. Without this limit, a hybrid that changes between charge and discharge every minute
+/// would write too many rows. Remaining lives have the same limit.
 const CAPACITIES: BucketSize = BucketSize { burst: 64.0, period_s: 3600.0 };
 /// Smallest change of a capacity or remaining life that is written even if the allowance is used up, in standard
 /// deviations.
@@ -39,7 +40,7 @@ struct WrittenLife {
     token_bucket: TokenBucket,
 }
 
-/// The rows to commit before the events of one input are announced.
+/// Rows to commit together. If they come from the events of an input, the events are announced after the commit.
 #[derive(Debug, PartialEq)]
 pub(super) struct HistoryCommit {
     pub rows: Vec<HistoryRow>,
@@ -132,14 +133,15 @@ impl HistoryFilter {
     }
 
     /// Whether to write an event. A capacity without a measurement is written only if the usable capacity has changed.
-    /// If the allowance (token bucket) is used up, a capacity is written only if it has changed by [`MIN_CHANGE_STD`].
+    /// If the allowance (token bucket) is used up, a capacity is written only if it or the usable capacity has changed
+    /// by [`MIN_CHANGE_STD`].
     fn is_worth_writing(&mut self, kind: &EventKind, now: Timestamp) -> bool {
         if matches!(kind, EventKind::PackReplaced { .. }) {
             self.written_life.cycles = None;
         }
         if let EventKind::RemainingLife { cycles, cycles_low, .. } = *kind {
             // The lower end of the interval is a little less than two standard deviations below the median. Half of
-            // this distance replaces the standard deviation.
+            // this distance serves as the standard deviation.
             return self.is_life_worth_writing(
                 cycles.zip(cycles_low).map(|(median, low)| (median, 0.5 * (median - low))),
                 now,

@@ -55,7 +55,8 @@ impl Recorder {
         })
     }
 
-    /// Writes the rows of the events of one input, and the checkpoint if it is due.
+    /// Writes the rows of the events of one input. If the events have no rows to write now, writes a checkpoint if one
+    /// is due.
     pub fn record(&mut self, events: &[Event], monitor: &Monitor, now: Timestamp) -> Result<(), String> {
         let is_due = self.schedule.is_due(now, 0.0);
         match self.history_filter.take(events) {

@@ -22,8 +22,8 @@ pub struct ReplacedPack {
 /// Closes the history of the pack in a state folder, opens the history of the next pack, and deletes the state.
 ///
 /// # Errors
-/// Fails if the folder contains no store, if a daemon uses it, or if it cannot be written. In these cases nothing has
-/// changed.
+/// Fails if the folder contains no store, if a daemon uses the folder, or if the folder cannot be written. In the first
+/// two cases, nothing has changed.
 pub fn replace_pack(path: &Path) -> Result<ReplacedPack, String> {
     let file = path.join(DATABASE);
     let named = |error: String| format!("{}: {error}", file.display());
@@ -39,7 +39,7 @@ pub fn replace_pack(path: &Path) -> Result<ReplacedPack, String> {
     })?;
     let now = Stamp::now(Timestamp::from_nanos(Reading::now().realtime_ns), BootId::current());
     let known = StateFiles::open(path).1.newest.map_or(0, |state| state.pack);
-    // The folder is opened as in the daemon, so that damage is found, and recorded before the history is closed.
+    // The folder is opened as in the daemon, so that damage is found and is recorded before the history is closed.
     let mut replace = || {
         let (mut database, rows) = folder.open(&now, known).map_err(|error| named(error.to_string()))?;
         let damage = rows.iter().find_map(HistoryRow::detail).map(str::to_owned);

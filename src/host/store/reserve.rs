@@ -48,7 +48,7 @@ impl Reserve {
         self.left > 0
     }
 
-    /// Tries to restore the file once per pause, unless the disk is full.
+    /// Tries to restore the file, at most once per [`PAUSE`]. While the disk is full, the attempt fails.
     pub(super) fn restore(&mut self) {
         if self.is_whole() || self.tried.is_some_and(|tried| tried.elapsed() < PAUSE) {
             return;
@@ -105,7 +105,7 @@ impl Reserve {
     }
 }
 
-/// Writes bytes other than zeros, which a file system could store as a hole.
+/// Writes bytes that are not all zero. A file system could store zeros as a hole, which takes no space.
 fn write(mut file: &File, bytes: usize) -> io::Result<()> {
     let contents: Vec<u8> = (0..=u8::MAX).cycle().take(bytes).collect();
     file.write_all(&contents)?;

@@ -21,7 +21,7 @@ pub(super) enum HistoryRow {
     Event(EventKind),
     /// A report of the store itself.
     Own {
-        /// Name of the event: `damaged`, `state_damaged`, `rows_lost`.
+        /// Name of the event, such as `damaged`, `state_damaged` or `rows_lost`.
         reason: &'static str,
         /// Details for the reader.
         detail: String,
@@ -48,7 +48,7 @@ pub enum HistoryTable {
     LossModes,
     /// Forecasts of the remaining life. Each forecast is for the cell that reaches its end of life first.
     RemainingLife,
-    /// Changes of the cell model learned on board.
+    /// Changes of the cell model that the daemon learns.
     Model,
     /// Changes of alarms.
     Alarm,
@@ -152,7 +152,7 @@ impl HistoryRow {
                 (HistoryTable::Model, vec![("taken_back", Value::Integer(i64::from(*is_taken_back)))])
             }
             EventKind::Alarm { .. } => (HistoryTable::Alarm, vec![]),
-            // No threshold monitors this alarm any more, so it has ended without a deciding value.
+            // No threshold monitors this alarm any more, so the alarm has ended regardless of its value.
             EventKind::AlarmDropped { .. } => {
                 let no = Value::Integer(0);
                 let own = [("change", text(DROPPED)), ("state", text("inactive")), ("active", no.clone())];

@@ -1,5 +1,5 @@
-//! Divides the history into segments, chains the rows by hash, and verifies the chain. A segment has the rows of a day,
-//! but at most about 10,000 rows.
+//! Divides the history into segments, chains the rows by hash, and verifies the chain. A segment contains the rows of a
+//! day, but at most about 10,000 rows.
 //!
 //! Every row has a number, counted across the tables. The hash of a segment is a SHA-256 chain over its rows, which
 //! starts from the hash of the segment before. The hash reveals rows that were changed, removed, inserted or moved. The
@@ -148,7 +148,8 @@ impl Segment {
     }
 }
 
-/// Computes the hash of a row from the hash before it, the table, the number, and every value with its type and length.
+/// Computes the hash of a row from the hash of the row before, the table, the number, and every value with its type and
+/// length.
 fn link<'v>(before: &Hash, table: HistoryTable, seq: i64, values: impl IntoIterator<Item = &'v Value>) -> Hash {
     let mut hasher = Sha256::new();
     hasher.update(before);
@@ -197,8 +198,8 @@ fn pairs(connection: &Connection) -> rusqlite::Result<Vec<(Segment, Segment)>> {
 }
 
 /// Deletes the rows of the oldest segment that still has rows, if the history has more than `max_rows` rows or if any
-/// segment but the newest ended before `horizon_ns`. Times of an unset wall clock are ignored, because a segment with
-/// such a time is at least as old as the segments after it.
+/// segment but the newest ended before `horizon_ns`. If a segment has the time of an unset wall clock, its time is not
+/// compared. Such a segment is deleted when a later segment ended before `horizon_ns`.
 pub(super) fn delete_oldest(
     connection: &Connection,
     newest: &Segment,
@@ -323,8 +324,8 @@ fn judge_number(
     }))
 }
 
-/// Returns up to `limit` newest segments with rows after row `after`, oldest first. Damaged segments are reported and
-/// left out.
+/// Returns the newest segments that have rows after row `after`: at most `limit` segments, oldest first. Damaged
+/// segments are logged and left out.
 pub(super) fn intact(connection: &Connection, after: i64, limit: usize) -> rusqlite::Result<Vec<Segment>> {
     let mut pairs = pairs(connection)?;
     pairs.retain(|(_, segment)| !segment.is_deleted && segment.last > after);

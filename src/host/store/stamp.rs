@@ -44,7 +44,7 @@ const BOOT_ID_VARIABLE: &str = "PACKWATCH_BOOT_ID";
 impl BootId {
     /// The identity of a boot that the kernel does not report.
     const UNKNOWN: Self = Self([0; 16]);
-    /// Marks the bus time of a replayed record, which has no boot.
+    /// Stands for the boot in the stamps of a replay, which contain bus times.
     pub const REPLAY: Self = Self(*b"packwatch replay");
 
     /// The boot of the running system.
@@ -137,7 +137,7 @@ impl Stamp {
         Self { wall_ns: realtime_ns, time, boottime_ns, boot }
     }
 
-    /// Returns the bus time of a replayed record, which has no other clock.
+    /// Returns the stamp of a replayed record: every clock shows the bus time, because a replay has no other clock.
     pub(super) fn replayed(time: Timestamp) -> Self {
         Self { wall_ns: time.nanos(), time, boottime_ns: time.nanos(), boot: BootId::REPLAY }
     }

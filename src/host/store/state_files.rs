@@ -1,5 +1,5 @@
-//! Writes and reads the stored state: two files next to the database, written in turn. Damage or a power cut therefore
-//! destroys at most the newer state.
+//! Writes and reads the stored state: two files next to the database, written in turn. A power cut or damage to one
+//! file therefore destroys at most one of the two states.
 //!
 //! | file | contents |
 //! | --- | --- |
@@ -66,7 +66,7 @@ pub(super) struct StateDocument {
 /// Why a state cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum StateFault {
-    /// The file has changed since it was written.
+    /// The file cannot be read, or has changed since it was written.
     Damaged(String),
     /// Another version of the program wrote the state.
     Unfit(String),
@@ -97,7 +97,7 @@ impl StateDocument {
     /// Encodes the contents of the state's file.
     ///
     /// # Errors
-    /// Fails if the result could not be read back, because a number that is not finite is written as `null`.
+    /// Fails if the result cannot be read back. The reason is a number that is not finite, which is written as `null`.
     fn encode(&self) -> Result<Vec<u8>, String> {
         let mut json = Vec::new();
         self.serialize(&mut serde_json::Serializer::with_formatter(&mut json, Rounding(CompactFormatter)))
@@ -148,8 +148,8 @@ impl Formatter for Rounding {
     }
 }
 
-/// Rounds a number below 1,000 to nine digits, and a larger number to six decimals. Whole numbers (identities) and very
-/// large numbers (times) stay exact.
+/// Rounds a number below 1,000 to nine significant digits, and a larger number to six decimals. Whole numbers
+/// (identities) and very large numbers (times) stay exact.
 fn rounded(value: f64) -> f64 {
     let text = match value.abs() {
         size if value.fract() == 0.0 || size >= 1e9 => return value,
@@ -163,11 +163,11 @@ fn rounded(value: f64) -> f64 {
 #[derive(Debug)]
 pub(super) struct StateFiles {
     folder: PathBuf,
-    /// Index in [`FILES`] of the next state.
+    /// Index in [`FILES`] of the file that the next state is written to.
     next: usize,
     /// Number of the latest state.
     number: i64,
-    /// Index of a state that the next write sets aside first; `None` = no state.
+    /// Index in [`FILES`] of a state that the next write sets aside first; `None` = no state.
     aside: Option<usize>,
 }
 

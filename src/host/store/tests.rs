@@ -281,7 +281,7 @@ fn database_damaged_while_running_is_set_aside() {
     let (store, found) =
         Store::open(&PlaceSetting::At(place.path().to_owned()), &config().store, &VehicleIdentity::default()).unwrap();
     let mut store = store.unwrap();
-    // If the damaged pages were still in SQLite's cache, only the next start finds the damage.
+    // If SQLite had the pages in its cache when the file was damaged, only the next start finds the damage.
     assert!(!found.works || place.path().join("packwatch.db.damaged-1").exists());
     assert_eq!(found.states.len(), 1, "the state does not depend on the database");
     let ticket = learn(&mut store, 10.0);
@@ -348,8 +348,8 @@ fn unfit_state_waits_for_matching_start() {
     finish(store, 3.0);
     let (store, found) = open();
     assert_eq!(states(&found), [(STATE_SOURCE, 3.0), (ASIDE, 1.0)]);
-    // The pack matches the state that was set aside first, so that state becomes current and the other one is set
-    // aside.
+    // In this start, the pack fits the state that was set aside. That state becomes current, and the newest state is
+    // set aside in its place.
     store.set_state_aside("snapshot is of 5 cells", Timestamp::from_secs(4.0));
     finish(store, 4.0);
     let (store, found) = open();

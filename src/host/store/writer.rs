@@ -2,8 +2,9 @@
 //!
 //! The loop queues rows and the latest state, and gets a number for them: the ticket. The thread takes all queued work,
 //! commits the rows, and writes the state if it is due. Then it reports the last ticket, and whether the attempt
-//! succeeded. The thread retries a failing disk after increasing pauses. During a pause, every ticket is reported at
-//! once as failed. A failing database does not prevent the state from being written.
+//! succeeded. The thread retries a failing disk after increasing pauses. During a pause, a ticket is reported at once
+//! as failed, unless rows are queued and the reserve has space left. A failing database does not prevent the state from
+//! being written.
 //!
 //! A start reapplies the alarm changes of rows that are newer than the stored state. Therefore the rows in the database
 //! must directly follow the stored state. To ensure this, the first rows after a start, after a failure and in a new
@@ -74,7 +75,7 @@ struct QueueState {
     stop: bool,
 }
 
-/// Work that the writer takes from the queue at once.
+/// Work that the writer takes from the queue in one step.
 struct PendingWrite {
     batches: Vec<RowBatch>,
     /// The state after these rows.
@@ -121,12 +122,12 @@ impl WriteQueue {
         self.wake.notify_one();
     }
 
-    /// Rows dropped for lack of room that are not yet reported in the history.
+    /// Number of rows that were dropped for lack of room and are not yet reported in the history.
     pub(super) fn lost_rows(&self) -> u64 {
         self.lock().backlog.lost()
     }
 
-    /// Waits for work, or until the time of the next retry.
+    /// Waits for work or for the time of the next retry, then takes all queued work.
     fn take(&self, retry_at: Option<Instant>) -> PendingWrite {
         let mut queue = self.lock();
         while !queue.wanted {
@@ -271,9 +272,9 @@ impl Writer {
         }
     }
 
-    /// Calls [`Writer::commit`]. If rows cannot be written, tries again at once, after each step that the reserve
-    /// releases. Also tries again once without a release: space may be available again, and a second attempt sets a
-    /// damaged database aside.
+    /// Calls [`Writer::commit`]. If rows cannot be written, tries again after each step that the reserve releases. Also
+    /// tries again once without a release: space may be available again, and a second attempt sets a damaged database
+    /// aside.
     fn commit_urgently(
         &mut self,
         batches: &mut Vec<RowBatch>,

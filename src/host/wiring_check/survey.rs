@@ -1,4 +1,5 @@
-//! Builds the [`Plan`] of `packwatch doctor`: what a configuration expects from the buses, even if it has faults.
+//! Builds the [`Plan`] of `packwatch doctor`: what a configuration expects from the buses. The configuration may have
+//! faults.
 //!
 //! In: the configuration file. Out: the plan, all faults as [`config::load`](crate::config::load) reports them, and the
 //! position of each key. A configuration is rejected if it has no interface or if none of its signals is found.
@@ -127,8 +128,8 @@ fn signal_plan(source: &SignalSource<'_>, message: &Message, signal: &Signal, bi
     }
 }
 
-/// Returns further signals that match the cell pattern: their numbers directly follow the configured cells without a
-/// gap.
+/// Returns signals that match the pattern of the cell voltages but are not configured. Their numbers continue the
+/// numbers of the configured cells without a gap.
 fn more_cells(raw: &RawTables, databases: &Databases) -> Vec<SignalPlan> {
     let (Some(keys), Some(pack)) = (&raw.cell_voltage, &raw.pack) else { return Vec::new() };
     let source = keys.config();

@@ -34,7 +34,7 @@ impl Heat {
         let values = || self.rows.iter().flatten().flatten().copied().filter(|value| value.is_finite());
         let (low, high) = Axis::default().ends(values(), false);
         let top = self.legend(&mut svg, top, size.width, (low, high));
-        // Height available for all rows, pixels.
+        // The rows share a height of 300 pixels.
         let row = (300.0 / self.rows.len().max(1) as f64).clamp(ROW.0, ROW.1).floor();
         let left = text_width(&self.rows.len().to_string(), 11.5) + 12.0;
         let height = row * self.rows.len() as f64;

@@ -62,7 +62,7 @@ impl Layer {
     }
 }
 
-/// One pair of axes.
+/// Layers over one pair of axes.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Chart {
     pub title: String,

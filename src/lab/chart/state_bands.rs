@@ -6,8 +6,9 @@ use super::plot::{Area, title};
 use super::style::Ink;
 use super::svg::{Svg, text_width};
 
-/// Height of a band's name, pixels. The next constant is the height of its spans, pixels.
+/// Height of a band's name, pixels.
 const NAME: f64 = 16.0;
+/// Height of a band's spans, pixels.
 const BAR: f64 = 12.0;
 /// Minimum width of a span, pixels, so that even the shortest alarm is visible.
 const LEAST: f64 = 3.0;

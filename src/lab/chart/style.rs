@@ -1,7 +1,7 @@
 //! Defines the colours: CSS classes for strokes, fills and text, and their values on a light and a dark page.
 //!
-//! The inks are the colours of Okabe and Ito, which people with any colour vision can distinguish. The inks are lighter
-//! on a dark page. The steps of heat maps are from cividis (Nuñez, Anderton, Renslow 2018), which has the same
+//! The inks follow the colours of Okabe and Ito, which people with any colour vision can distinguish. The inks are
+//! lighter on a dark page. The steps of heat maps are from cividis (Nuñez, Anderton, Renslow 2018), which has the same
 //! property.
 
 use std::fmt::Write as _;
@@ -9,7 +9,7 @@ use std::fmt::Write as _;
 /// Colour of a drawn element.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Ink {
-    /// Colour of text; used for the truth and for measurements.
+    /// Colour of text; used for true values and for measurements.
     Plain,
     Blue,
     Orange,

@@ -11,7 +11,7 @@ pub fn escape(text: &str) -> String {
             '<' => out.push_str("&lt;"),
             '>' => out.push_str("&gt;"),
             '"' => out.push_str("&quot;"),
-            // XML does not allow this character.
+            // XML does not allow most control characters.
             c if c.is_control() && c != '\n' && c != '\t' => out.push('\u{fffd}'),
             c => out.push(c),
         }
@@ -95,8 +95,8 @@ impl Svg {
     }
 }
 
-/// A path through points. The start is absolute and the steps are relative, which keeps the text short. Rounding errors do not
-/// accumulate.
+/// A path through points. The start is absolute and the steps are relative, which keeps the text short. Rounding errors
+/// do not accumulate.
 #[derive(Debug, Default)]
 pub(super) struct PathBuilder {
     pub(super) d: String,

@@ -1,7 +1,7 @@
 //! Reduces long series to the resolution of a picture.
 
-/// Divides a line into `bins` bins along x, and keeps the first, lowest, highest and last point of each bin, in order. A short line is
-/// returned unchanged.
+/// Divides a line into `bins` bins along x, and keeps the first, lowest, highest and last point of each bin, in order.
+/// A short line is returned unchanged.
 pub(super) fn line(points: &[(f64, f64)], bins: usize) -> Vec<(f64, f64)> {
     let mut kept = Vec::with_capacity(points.len().min(4 * bins));
     if points.len() <= 4 * bins {
@@ -20,8 +20,8 @@ pub(super) fn line(points: &[(f64, f64)], bins: usize) -> Vec<(f64, f64)> {
     kept
 }
 
-/// Returns the lowest lower end and the highest upper end of each bin, at the first and last x of the bin. A short band is returned
-/// unchanged.
+/// Returns the lowest lower end and the highest upper end of each bin, at the first and last x of the bin. A short band
+/// is returned unchanged.
 pub(super) fn band(points: &[(f64, f64, f64)], bins: usize) -> Vec<(f64, f64, f64)> {
     if points.len() <= 2 * bins {
         return points.to_vec();

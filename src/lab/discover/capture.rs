@@ -1,9 +1,9 @@
 //! Stores the frames and diagnostic answers of a log within a memory limit.
 //!
-//! All frames are kept until they exceed [`MAX_BYTES`]. Then whole windows of [`WINDOW_S`] are dropped: first every second window, then
-//! three of four, and so on. All identifiers keep the same windows, so the pages of multiplexed messages stay complete. Answers are
-//! reassembled from all frames, before any are dropped. Each kind of answer keeps at most [`MAX_ANSWER_BYTES`] and is halved in the
-//! same way.
+//! All frames are kept until they exceed [`MAX_BYTES`]. Then whole windows of [`WINDOW_S`] are dropped: first every
+//! second window, then three of four, and so on. All identifiers keep the same windows, so the pages of multiplexed
+//! messages stay complete. Answers are reassembled from all frames of the kept identifiers, also from frames in dropped
+//! windows. If the answers of one kind exceed [`MAX_ANSWER_BYTES`], every second one of them is dropped.
 
 use std::collections::BTreeMap;
 
@@ -13,15 +13,16 @@ use crate::quantity::{BusIndex, Timestamp};
 
 /// Maximum number of bytes of frames that are kept: about two million classic frames.
 const MAX_BYTES: usize = 48 << 20;
-/// Maximum number of bytes kept per kind of answer: a thousand answers of 64 bytes.
+/// Maximum number of bytes kept per kind of answer: about 800 answers of 64 bytes.
 const MAX_ANSWER_BYTES: usize = 64 << 10;
 /// Length of a window, s. A window is long compared with the period of a multiplexer page, and short compared with a
 /// drive.
 const WINDOW_S: f64 = 2.0;
-/// Maximum number of messages (identifiers on an interface) that are kept. A car has a few hundred messages; a flood of random
-/// identifiers has more.
+/// Maximum number of messages (identifiers on an interface) that are kept. A car has a few hundred messages; a flood of
+/// random identifiers has more.
 const MAX_MESSAGES: usize = 4096;
-/// First data byte of answers from BMW controllers. The byte reveals extended addressing without a definition.
+/// First data byte of answers from BMW controllers. This byte shows that addressing is extended, even if no
+/// `[[input.diagnostic]]` describes the controller.
 const TESTER: u8 = 0xF1;
 
 /// An identifier on an interface.
@@ -30,7 +31,7 @@ pub(super) type MessageKey = (BusIndex, CanId);
 /// Payloads of one message, with their times.
 #[derive(Debug, Default)]
 pub(super) struct Payloads {
-    /// Time since the first frame of the log, s.
+    /// Times since the first frame of the log, s.
     times: Vec<f64>,
     data: Vec<u8>,
     /// End of each payload in `data`.
@@ -53,7 +54,8 @@ type HeardRequest = (f64, CanId, Option<u8>);
 /// Answers of one kind.
 #[derive(Debug, Default)]
 pub(super) struct Answers {
-    /// CAN identifier of the requests, and their first data byte if addressing is extended; `None` = no request was received.
+    /// CAN identifier of the requests, and their first data byte if addressing is extended; `None` = no request was
+    /// received.
     pub(super) request: Option<(CanId, Option<u8>)>,
     /// Data of the answers after the echoed service and identifier.
     pub(super) payloads: Payloads,
@@ -67,7 +69,7 @@ pub(super) struct Answers {
 pub(super) struct Capture {
     pub(super) messages: BTreeMap<MessageKey, Payloads>,
     pub(super) answers: BTreeMap<AnswerKey, Answers>,
-    /// Number of frames received.
+    /// Number of frames received, without remote frames.
     pub(super) frames: u64,
     /// Number of frames that were ignored because [`MAX_MESSAGES`] was exceeded.
     pub(super) ignored: u64,
@@ -99,7 +101,7 @@ impl Payloads {
         self.ends.push(self.data.len());
     }
 
-    /// Keeps a payload if `is_kept` returns true for the number and the time of the payload.
+    /// Keeps only the payloads whose index and time satisfy `is_kept`.
     fn retain(&mut self, mut is_kept: impl FnMut(usize, f64) -> bool) {
         let mut kept = Self::default();
         for (index, (time_s, payload)) in self.iter().enumerate() {
@@ -154,7 +156,8 @@ impl Capture {
     }
 
     fn receive(&mut self, time: Timestamp, time_s: f64, key: MessageKey, data: &[u8]) {
-        // BMW testers send requests from 6F1 with the target in the first byte; in the answer, the first byte is the tester.
+        // BMW testers send requests from 6F1 with the target in the first byte; in the answer, the first byte names the
+        // tester.
         let is_extended = |byte: &u8| *byte == TESTER || key.1 == CanId::Standard(0x600 | u16::from(TESTER));
         let extensions = [None, data.first().copied().filter(is_extended)];
         for (index, extension) in extensions.into_iter().enumerate() {
@@ -217,7 +220,7 @@ impl Answers {
     }
 }
 
-/// Returns the number of the window of a time. Negative times (before the first stamp) belong to window 0.
+/// Returns the number of the window that contains a time. Negative times (before the first stamp) belong to window 0.
 fn window(time_s: f64) -> u64 {
     (time_s / WINDOW_S) as u64
 }

@@ -26,11 +26,11 @@ const NO_CANDIDATE: &str =
 pub struct PackSettings {
     /// Name of the log, for the first line of the configuration.
     pub source: String,
-    /// Paths of the DBC files in the configuration, in the order in which they were added.
+    /// Paths of the DBC files as the configuration names them, in the order in which the files were added.
     pub databases: Vec<String>,
-    /// Path, in the configuration, of the new DBC for fields that no given DBC describes.
+    /// Path of the new DBC as the configuration names it. The new DBC describes the fields that no given DBC describes.
     pub own_database: String,
-    /// Path of the cell model in the configuration.
+    /// Path of the cell model as the configuration names it.
     pub cell_model: String,
     /// Number of cells in series, for a pack that sends only its total voltage.
     pub cells: Option<u16>,
@@ -60,7 +60,7 @@ struct Selection<'a> {
     reported: Vec<(&'static str, &'a Candidate)>,
 }
 
-/// Inputs of the text of the configuration.
+/// Writer of the configuration's text, with its inputs.
 pub(super) struct Writer<'a> {
     pub(super) discovery: &'a Discovery,
     pub(super) capture: &'a Capture,
@@ -164,7 +164,8 @@ impl Writer<'_> {
         candidate.members.iter().any(is_raw)
     }
 
-    /// Returns the number of cells of a group; `None` if its numbers have gaps.
+    /// Returns the number of cells of a group; `None` if the cell numbers have gaps or the group has fewer than two
+    /// cells.
     fn row(&self, group: &Candidate) -> Option<u16> {
         let numbers = self.numbers(group)?;
         let first = *numbers.first()?;
@@ -286,7 +287,8 @@ impl Writer<'_> {
         }
     }
 
-    /// Returns the given definitions reduced to the used signals, and the used fields without a definition.
+    /// Returns the given definitions, reduced to the signals in use; and, per kind of answer, the fields in use that no
+    /// definition describes.
     fn used_tables(
         &self,
         selection: &Selection<'_>,
@@ -359,7 +361,7 @@ impl Writer<'_> {
     }
 
     /// Writes the maximum ages of readings. These ages follow from the periods in the log, because diagnostic answers
-    /// are rare.
+    /// may be many seconds apart.
     fn limits(&self, selection: &Selection<'_>, text: &mut String) {
         let named = [
             ("current", Some(selection.current)),
@@ -392,7 +394,7 @@ fn guessed_request(response: CanId) -> CanId {
     }
 }
 
-/// Makes a text that fits into one comment line.
+/// Replaces control characters by spaces, so that the text stays within one comment line.
 fn plain(text: &str) -> String {
     text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect()
 }

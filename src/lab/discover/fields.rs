@@ -1,9 +1,10 @@
 //! Finds bit fields that behave like pack voltage, current or cell voltages. Used if no DBC is given.
 //!
 //! * Voltage: fields of 16 bits at every byte and of 12 bits at every half byte, in both byte orders, with common
-//!   scales. The value is plausible for a pack and changes slightly, and the last digits of the value vary.
-//! * Current: the same positions, but signed. The changes of the field match the changes of a voltage across a
-//!   resistance. The scale is a guess: the common scale that gives the most typical resistance.
+//!   scales. The value is plausible for a pack, varies by at most 35 % and takes at least five different codes.
+//! * Current: the same positions, but signed. The changes of the field correlate with the changes of a voltage, as with
+//!   a current through a resistance. The scale is a guess: of the common scales, the one whose resistance is closest to
+//!   a typical resistance.
 //! * Cells: neighbouring fields of 8, 12 or 16 bits with similar values. Each message or page (selected by the first
 //!   byte) has at least three such fields, and all messages together have at least eight.
 //!
@@ -29,10 +30,10 @@ const CURRENT_SCALES: [f64; 7] = [0.1, 0.01, 0.05, 0.025, 0.25, 0.5, 1.0];
 /// Plausible voltages of a cell, V. The next constant is the largest difference between cells of a pack, V.
 const CELL_V: (f64, f64) = (2.5, 4.4);
 const MAX_SPREAD_V: f64 = 0.25;
-/// For each length of a cell voltage in bits: the scales to try, V per code.
+/// Lengths of a cell voltage in bits, each with the scales to try, V per code.
 const CELL_FORMS: [(u16, &[f64]); 3] = [(16, &[0.001, 0.0001, 0.002, 0.0005]), (12, &[0.001, 0.002]), (8, &[0.02])];
 
-/// Name of a message that no DBC describes. The identifier is decimal, so that its digits form one number.
+/// Returns the name of a message that no DBC describes. The identifier is decimal, so that its digits form one number.
 pub(super) fn message_name(id: CanId) -> String {
     format!("Message{}", id.raw())
 }
@@ -112,7 +113,8 @@ fn layouts(bytes: usize, signed: bool) -> Vec<SignalLayout> {
     found
 }
 
-/// Returns the layout of a field from its first bit in wire order. Bits of little-endian fields are counted up from bit 0 of each byte.
+/// Returns the layout of a field whose first bit is `first`. The bytes follow the wire. Within a byte, bits are counted
+/// from the lowest bit for little-endian fields, from the highest bit for big-endian fields.
 fn layout(first: u16, bits: u16, byte_order: ByteOrder, value_type: ValueType, factor: f64) -> SignalLayout {
     let start_bit = match byte_order {
         ByteOrder::LittleEndian => first,
@@ -153,7 +155,7 @@ fn signal(
     LogSignal::unnamed(full_name, key.0, origin, quantity, series)
 }
 
-/// Returns the position of a field for its name: first bit and byte order.
+/// Returns the part of a field's name that states its length, start bit and byte order.
 fn place(layout: &SignalLayout) -> String {
     let order = if layout.byte_order == ByteOrder::LittleEndian { "little" } else { "big" };
     format!("{}bits_at_{}_{order}", layout.length_bits, layout.start_bit)
@@ -163,7 +165,7 @@ fn voltages_of(samples: &Samples<'_>) -> Vec<LogSignal> {
     let mut found = Vec::new();
     for layout in layouts(samples.bytes, false) {
         let codes = samples.values(&layout, None);
-        // Within a log, the voltage of a pack changes by at most this share.
+        // Within a log, the voltage of a pack varies by at most this share of its maximum.
         let is_alive = codes.bad() == 0 && codes.distinct() >= 5 && swing(&codes) <= 0.35;
         if !is_alive || codes.is_counter() {
             continue;
@@ -220,7 +222,8 @@ fn currents<'a>(messages: impl Iterator<Item = &'a Samples<'a>>, voltages: &[&Lo
     found.into_iter().take(12).map(|(_, signal)| signal).collect()
 }
 
-/// Whether a field overlaps a layout of the same message on any interface. Gateways repeat messages on other interfaces.
+/// Whether a field overlaps a layout in the message `id`, on any interface: gateways repeat messages on other
+/// interfaces.
 fn shares_bits(field: &LogSignal, id: CanId, layout: &SignalLayout) -> bool {
     matches!(&field.origin, SignalOrigin::Field(own) if own.id == id && own.signal.layout.overlaps(layout))
 }
@@ -235,7 +238,8 @@ impl LogSignal {
     }
 }
 
-/// Finds rows of neighbouring cells in messages and pages. All rows have the same form, and the cells are numbered consecutively.
+/// Finds rows of neighbouring cells in messages and pages. All rows have the same field length, scale and byte order,
+/// and their cells are numbered consecutively.
 fn cells(messages: &[Samples<'_>]) -> Vec<LogSignal> {
     let mut best: Vec<LogSignal> = Vec::new();
     for (bits, scales) in CELL_FORMS {
@@ -282,8 +286,8 @@ fn continues(cells: &[LogSignal], key: MessageKey, row: &[(SignalLayout, Series)
     })
 }
 
-/// Returns the pages of a message: the values of the first byte if they are consecutive, otherwise a single `None` for the whole
-/// message.
+/// Returns the pages of a message: the values of the first byte if they are 2 to 64 consecutive numbers that repeat,
+/// otherwise a single `None` for the whole message.
 fn pages(payloads: &Payloads) -> Vec<Option<u8>> {
     let values: BTreeSet<u8> = payloads.iter().filter_map(|(_, data)| data.first().copied()).collect();
     let span = values.first().zip(values.last()).map_or(0, |(first, last)| usize::from(last - first) + 1);
@@ -328,7 +332,7 @@ pub(super) fn database(fields: &[&MessageField]) -> Database {
     Database { nodes: Vec::new(), comment: Some(comment), messages }
 }
 
-/// Creates a message without fields; if it has pages, it gets a multiplexor.
+/// Creates a message without fields. If the field lies on a page, the message gets a multiplexor.
 fn empty_message(field: &MessageField) -> Message {
     let layout = layout(0, 8, ByteOrder::LittleEndian, ValueType::Unsigned, 1.0);
     let page =

@@ -2,7 +2,7 @@
 //! ([`SignalLabel`](crate::wiring::evidence::SignalLabel)), for ranges and for behaviour, each with a reason in words.
 //!
 //! The points are weights of evidence that were chosen on three cars. A value outside the range of a quantity excludes
-//! that quantity. A unit or a name gives 1 to 3 points. Behaviour that hardly any other signal shows gives 3 to 4
+//! that quantity. A unit or a name gives 1 to 3 points. Behaviour that hardly any other signal shows gives up to 4
 //! points. Examples are a voltage that falls when the current rises, and a voltage that equals the sum of the cells.
 
 use super::groups::{SignalGroup, groups};
@@ -30,7 +30,8 @@ pub(super) struct Evidence {
 }
 
 impl Evidence {
-    /// Creates the evidence from the label; `None` = the label names another quantity, or values are outside the range (ends included).
+    /// Creates the evidence from the label. Returns `None` if the label excludes the quantity, or if a value lies
+    /// outside the range (both ends belong to the range).
     fn new(index: usize, signal: &LogSignal, quantity: PackQuantity, range: (f64, f64)) -> Option<Self> {
         let (low, high) = (signal.series.extent.min, signal.series.extent.max);
         let mut score = signal.label.score(quantity).filter(|_| low >= range.0 && high <= range.1)?;
@@ -38,7 +39,7 @@ impl Evidence {
         if signal.is_unnamed() {
             score = Score::default();
         }
-        // Temperatures and SOC of a pack hardly change within minutes.
+        // Temperatures, SOC and SOH of a pack hardly change within minutes.
         let points = match quantity {
             PackQuantity::Temperature | PackQuantity::Soh => 0.0,
             PackQuantity::Soc => -0.5,
@@ -54,7 +55,7 @@ impl Evidence {
         self.score.add(points, holds, reason);
     }
 
-    /// Whether the values vary by at most 35 %, as in a pack in use.
+    /// Whether the values vary by at most 35 %, like the voltage of a pack in use.
     fn is_steady(&self) -> bool {
         self.high - self.low <= 0.35 * self.high
     }
@@ -95,8 +96,9 @@ pub(super) fn candidates(signals: &[LogSignal], interfaces: &[String]) -> Vec<Ca
     all.into_iter().flat_map(|(quantity, evidence)| ranked(quantity, evidence, interfaces)).collect()
 }
 
-/// Returns the partition of a signal: its interface and source. Only signals of one partition form groups. Numbers in the name of an
-/// answer do not count cells.
+/// Returns the partition of a signal: its interface and source. Only signals of one partition form groups. The fields
+/// of an answer without a definition have their own partition, because the numbers in the answer's name do not count
+/// them. Cells of such answers are numbered across the answers of a controller, so the controller is their partition.
 fn partition(signal: &LogSignal) -> String {
     let source = match &signal.origin {
         SignalOrigin::Dbc(_) => String::new(),
@@ -188,7 +190,7 @@ impl LogSignal {
         good >= 0.8 * (good + bad)
     }
 
-    /// Whether no name or unit of the signal is known, only its values.
+    /// Whether only the values of the signal are known, but not its name or unit.
     fn is_unnamed(&self) -> bool {
         matches!(self.origin, SignalOrigin::Raw(..) | SignalOrigin::Field(_))
     }
@@ -205,7 +207,7 @@ impl LogSignal {
         own == others && spans.is_some_and(|(a, b)| a.0 <= b.1 && b.0 <= a.1)
     }
 
-    /// Returns the field of an answer without a definition.
+    /// Returns the field if the signal was found in an answer without a definition.
     fn field(&self) -> Option<&crate::import::DiagnosticSignal> {
         match &self.origin {
             SignalOrigin::Raw(_, field) => Some(field),
@@ -315,7 +317,7 @@ fn soh(index: usize, signal: &LogSignal) -> Option<Evidence> {
     Evidence::new(index, signal, PackQuantity::Soh, (40.0, 110.0))
 }
 
-/// Compares every pack voltage with the sum of each group of cells.
+/// Compares every steady pack voltage with the sum of each group of at least eight cells.
 fn compare_sums(voltages: &mut [Evidence], cells: &mut [Evidence], signals: &[LogSignal]) {
     for group in cells.iter_mut().filter(|group| group.members.len() >= 8) {
         let sum: f64 = group.members.iter().map(|index| signals[*index].series.extent.mean()).sum();
@@ -334,15 +336,17 @@ fn compare_sums(voltages: &mut [Evidence], cells: &mut [Evidence], signals: &[Lo
     }
 }
 
-/// Finds for each current the voltage that responds best, and for each voltage the best current. The direction of the response gives
-/// the sign of the current. A group of cells is represented by its first cell.
+/// Finds for each current the voltage that responds best. The direction of the response gives the sign of the current.
+/// If several currents select the same voltage, the voltage gets points only for the first of them, the best-ranked. A
+/// group of cells is represented by its first cell.
 fn compare_currents(
     voltages: &mut [Evidence],
     cells: &mut [Evidence],
     currents: &mut [Evidence],
     signals: &[LogSignal],
 ) {
-    // A voltage without a name is compared only if no better voltage is known.
+    // Known voltages have a name, belong to a group, or equal the sum of the cells. If any voltage is known, only known
+    // voltages are compared.
     let is_known =
         |voltage: &Evidence| voltage.is_sum || !signals[voltage.members[0]].is_unnamed() || voltage.members.len() > 1;
     let has_known = voltages.iter().chain(cells.iter()).any(is_known);

@@ -1,5 +1,5 @@
-//! Defines a signal of the log. The signal's description (name, position, scaling) comes from a file, or the search has
-//! found it.
+//! Defines a signal of the log. The signal's description (name, position, scaling) comes from a file or from the
+//! search.
 
 use super::capture::AnswerKey;
 use crate::can::CanId;
@@ -21,9 +21,9 @@ pub(super) struct MessageField {
 /// Origin of a signal's description.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum SignalOrigin {
-    /// A DBC file, given by its number.
+    /// A DBC file, given by its index.
     Dbc(usize),
-    /// A definition of diagnostic answers, given by the number of its table.
+    /// A definition of diagnostic answers, given by the index of its table.
     Defined(usize),
     /// No description: a field found in a diagnostic answer.
     Raw(AnswerKey, Box<DiagnosticSignal>),
@@ -49,7 +49,7 @@ pub(super) struct LogSignal {
 }
 
 impl LogSignal {
-    /// Creates an unnamed field: its label says nothing about the meaning.
+    /// Creates an unnamed field. Its label contains only a unit, the unit of the assumed quantity.
     pub(super) fn unnamed(
         name: String,
         bus: BusIndex,
@@ -62,8 +62,8 @@ impl LogSignal {
     }
 }
 
-/// Returns the longest run of items in which `goes_with` holds between the first item and every other one. If several runs are equally
-/// long, the last one is returned. A `None` in `items` ends a run.
+/// Returns the longest run of items in which `goes_with` holds between the first item and every other one. If several
+/// runs are equally long, the last one is returned. A `None` in `items` ends a run.
 pub(super) fn longest_run<T>(items: impl Iterator<Item = Option<T>>, goes_with: impl Fn(&T, &T) -> bool) -> Vec<T> {
     let (mut best, mut run) = (Vec::new(), Vec::new());
     for item in items.chain([None]) {

@@ -1,9 +1,9 @@
-//! Searches the bytes of diagnostic answers that no definition describes for cell voltages, pack voltage, current or
-//! temperatures.
+//! Searches diagnostic answers for cell voltages, pack voltage, current and temperatures, in the bytes that no
+//! definition describes.
 //!
 //! A row of cell voltages is a run of at least [`MIN_CELLS`] neighbouring values of 8 or 16 bits. At one of the common
 //! scales, all these values are plausible voltages and similar to each other. Other fields are tried at every byte with
-//! common scales. As for named signals, the values decide which quantity a field is.
+//! common scales. [`judge`](super::judge) then decides from the values which quantity a field carries.
 
 use std::collections::BTreeMap;
 
@@ -21,23 +21,25 @@ pub(super) const CELL: &str = "Cell";
 const MIN_CELLS: usize = 8;
 /// Plausible voltages of a cell in use, V.
 const CELL_V: (f64, f64) = (2.0, 4.5);
-/// For each length of a cell voltage in bits: the scales to try, V per code.
+/// Lengths of a cell voltage in bits, each with the scales to try, V per code.
 const CELL_SCALES: [(u32, &[f64]); 2] = [(16, &[0.001, 0.0001, 0.002, 0.005, 0.01]), (8, &[0.02, 0.01, 0.05])];
 /// Plausible voltages of a pack, V.
 const PACK_V: (f64, f64) = (100.0, 950.0);
 /// Scales of a pack voltage of 16 bits, V per code.
 const PACK_SCALES: [f64; 5] = [0.1, 0.01, 0.5, 0.25, 1.0];
-/// For each length of a current in bits: the scales to try, A per code.
+/// Lengths of a current in bits, each with the scales to try, A per code.
 const CURRENT_FORMS: [(u32, &[f64]); 3] =
     [(16, &[0.1, 0.01, 0.05, 0.5, 0.025]), (24, &[0.001, 0.01]), (32, &[1.0 / 1024.0, 0.001])];
 /// Smallest number of answers in which a field is searched.
 const MIN_ANSWERS: usize = 3;
 
-/// For each form of a row, the number of cells found so far. A row of the same form in the next answer continues the cell numbers.
+/// For each form of a row, the number of cells found so far. A row of the same form in the next answer continues the
+/// cell numbers.
 #[derive(Debug, Default)]
 pub(super) struct CellRows(BTreeMap<RowForm, u32>);
 
-/// Form of a row: controller (bus, CAN identifier, address byte), first bit, length, and the bits of the scale.
+/// Form of a row: controller (bus, CAN identifier, address byte), first bit, length, and scale (as the bits of an
+/// `f64`).
 type RowForm = (BusIndex, CanId, Option<u8>, u32, u32, u64);
 
 /// Returns the possible signals in these answers. The bits in `described` (first, last) are left out.
@@ -144,8 +146,8 @@ fn is_plausible(signal: &LogSignal) -> bool {
     }
 }
 
-/// Finds the best row of temperatures: bytes at a constant distance with similar values that change slowly. Bytes of missing sensors
-/// (0xFF) may lie between them.
+/// Finds the best row of temperatures: bytes at a constant distance with similar values that change slowly. If sensors
+/// are missing, their bytes (0xFF) are skipped.
 fn temperatures(key: &AnswerKey, answers: &Answers, bytes: usize) -> Vec<LogSignal> {
     let mut best: Vec<LogSignal> = Vec::new();
     let mut best_weight = 0;
@@ -225,7 +227,8 @@ fn cells(key: &AnswerKey, answers: &Answers, bytes: usize, rows: &mut CellRows) 
     (0..count).filter_map(|n| signal(key, answers, form.of_series(n))).collect()
 }
 
-/// Returns length and first byte of the longest run of plausible neighbours that start at `first`, `first + width`, ...
+/// Returns the length and the first byte of the longest run of plausible cell voltages. Voltages are read at the bytes
+/// `first`, `first + width`, ...
 fn row(answers: &Answers, bytes: usize, first: usize, width: usize, scale: f64) -> Option<(usize, usize)> {
     let code = |data: &[u8], start: usize| {
         data[start..start + width].iter().fold(0_u32, |code, byte| code << 8 | u32::from(*byte))

@@ -21,7 +21,8 @@ pub(super) struct Descriptions {
     pub(super) tables: Vec<DiagnosticTable>,
 }
 
-/// Returns all signals of the log that have values, in a fixed order, and remarks on described battery signals without values.
+/// Returns all signals of the log that have values, in a fixed order, and remarks on described battery signals without
+/// values.
 pub(super) fn signals(capture: &Capture, descriptions: &Descriptions) -> (Vec<LogSignal>, Vec<String>) {
     let mut signals = Vec::new();
     let mut rows = raw::CellRows::default();
@@ -116,8 +117,8 @@ fn of_definition(
     each.collect()
 }
 
-/// Returns the values of a defined signal. An unsigned current is read as signed if this reduces the range of its values to less than a
-/// quarter. Read as unsigned, a few negative amperes look like thousands.
+/// Returns the values of a defined signal. An unsigned current is read as signed if this reduces the range of its
+/// values to less than a quarter. Read as unsigned, a few negative amperes look like thousands.
 fn values(answers: &Answers, signal: &DiagnosticSignal, conversion: (f64, f64), is_current: bool) -> (Series, bool) {
     let collect = |signal: &DiagnosticSignal| {
         let value = |data: &[u8]| {

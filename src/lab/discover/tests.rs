@@ -100,7 +100,7 @@ fn configuration_needs_cell_count_and_has_all_inputs() {
 }
 
 /// A controller like the one in a Nissan Leaf. Group 01 contains current and pack voltage, group 02 contains 96 cells
-/// in mV; both are requested every second.
+/// in mV; both are sent every second. If `is_asked` is set, the log also contains the requests.
 fn answers(seconds: i32, is_asked: bool) -> Discoverer {
     let mut discoverer = Discoverer::default();
     for step in 0..seconds {
@@ -241,7 +241,7 @@ proptest::proptest! {
         let mut discoverer = pack(1.0);
         let ids = [0x100, 0x7BB, 0x79B, 0x6F1];
         for (at, id, mut data) in frames {
-            // Multi-frame messages are rare among random bytes.
+            // Random first bytes rarely belong to multi-frame messages.
             if let Some(first) = data.first_mut() {
                 *first &= 0x3F;
             }

@@ -1,4 +1,5 @@
-//! Determines how the cells of a pack differ from their mean: capacity, resistance and charge of each cell, and notes on outliers.
+//! Determines how the cells of a pack differ from their mean: capacity, resistance and charge of each cell, and notes
+//! on outliers.
 //!
 //! Input: for some rows, the difference between the voltage of every cell and the mean voltage (V); and the fitted
 //! records of the mean cell. Output: a [`CellDeviation`] per cell. All cells share one curve and one current sensor, so
@@ -20,7 +21,8 @@ use crate::ident::record::Record;
 /// Shortest time between two recorded differences, s. Errors of a difference are correlated over [`REPEATS_S`], so a
 /// shorter interval adds hardly any information.
 const PERIOD_S: f64 = 5.0;
-/// Standard deviations before the fit: ln capacity, ln resistance, sensor offset (V), leakage (share of the capacity per h), SOC.
+/// Standard deviations before the fit: ln capacity, ln resistance, sensor offset (V), leakage (share of the capacity
+/// per h), SOC.
 const PRIOR: [f64; OWN + 1] = [0.15, 0.4, 0.003, 0.002, 0.15];
 /// Number of unknowns of a cell, not counting its SOC at the start of each stretch (a part of a log without gaps).
 const OWN: usize = 4;
@@ -29,7 +31,7 @@ const DISTANCE_V: f64 = 0.002;
 const REPEATS_S: f64 = 50.0;
 /// Smallest number of cells for a comparison.
 const LEAST_CELLS: usize = 4;
-/// A cell is an outlier if its distance from the median exceeds three limits. The first is this number of robust
+/// A cell is an outlier if its distance from the median exceeds all of three limits. The first is this number of robust
 /// standard deviations of all cells. The second is [`OWN_DEVIATIONS`] standard deviations of the cell's value; it does
 /// not apply to the residual. The third is [`FLOOR`]: the smallest relevant difference of capacity, of resistance, of
 /// the residual (V) and of the leakage (share of the capacity per h).
@@ -47,7 +49,8 @@ pub(super) struct CellDistances {
 }
 
 impl CellDistances {
-    /// Records the differences of the cells from their mean `mean_v`, unless the last recorded time is less than [`PERIOD_S`] ago.
+    /// Records the differences of the cells from their mean `mean_v`, unless the last recorded time is less than
+    /// [`PERIOD_S`] ago.
     pub(super) fn push(&mut self, time_s: f64, mean_v: f64, voltage_v: &[f64]) {
         if voltage_v.len() >= LEAST_CELLS && self.time_s.last().is_none_or(|last_s| time_s - last_s >= PERIOD_S) {
             self.time_s.push(time_s);
@@ -81,7 +84,8 @@ struct Factors {
     drop_v: f64,
 }
 
-/// Returns the deviations of all cells. The list is empty if there are fewer than [`LEAST_CELLS`] cells or no differences.
+/// Returns the deviations of all cells. The list is empty if there are fewer than [`LEAST_CELLS`] cells or no
+/// differences.
 pub(super) fn fit(
     cells: usize,
     distances: &[&CellDistances],
@@ -156,7 +160,7 @@ fn fit_cell(cell: usize, stretches: usize, factors: &[Factors], all_v: &[&[f32]]
             }
         }
     }
-    // The prior makes every diagonal element positive, so the matrix has an inverse.
+    // The prior adds a positive number to every diagonal element, so the matrix is positive definite.
     let Some(inverse) = normal.cholesky().map(|factor| factor.inverse()) else { return CellDeviation::unknown() };
     let x = &inverse * right;
     let (mut squares, mut weights) = (0.0, 0.0);

@@ -1,8 +1,8 @@
 //! Tests whether another chemistry explains the logs better than the chemistry on the label.
 //!
 //! Input: the mean voltage of the cells in each stretch (a part of a log without gaps), and the label of the cell.
-//! Output: a sentence if another chemistry is clearly better. All chemistries are compared on the same rows, with the
-//! recording and the fit that the daemon uses.
+//! Output: a sentence if another chemistry is clearly better. All chemistries are compared on the same rows. The rows
+//! are recorded and fitted as in the daemon.
 
 use crate::cell::notebook::Row;
 use crate::cell::own_model::fit;
@@ -43,7 +43,7 @@ fn rows<'a>(label: &Label, offset_a: f64, stretches: impl Iterator<Item = (&'a M
                 unmeasured_s: 0.0,
                 current_a: Some(part.current_a[k] - offset_a),
                 temperature_c: Some(part.temperature_c[k]).filter(|t| t.is_finite()),
-                // Assumed temperature of a log without one, degrees C.
+                // Assumed ambient temperature, degrees C; used if a reading has no temperature.
                 ambient_c: 25.0,
                 voltage_v: part.voltage_v[k],
             };
@@ -56,9 +56,10 @@ fn rows<'a>(label: &Label, offset_a: f64, stretches: impl Iterator<Item = (&'a M
     notebook.rows().to_vec()
 }
 
-/// Compares the chemistries, using the capacity (Ah) and the current offset (A) of a fit; `None` = the chemistry of the label is
-/// confirmed. `error_ratio` is the error of the circuit model relative to its error when warm. Log likelihoods shrink with the square
-/// of this ratio.
+/// Compares the chemistries, using the capacity (Ah) and the current offset (A) of a fit. Returns a sentence if another
+/// chemistry is clearly better, or if the rows are too few for a comparison. `error_ratio` is the error of the circuit
+/// model at the coldest temperature, relative to its error when warm. Log likelihoods shrink with the square of this
+/// ratio.
 pub(super) fn note<'a>(
     label: &Label,
     (capacity_ah, offset_a): (f64, f64),

@@ -1,5 +1,5 @@
-//! Writes notes on quantities that the logs do not determine. For these quantities, the fit keeps the values of the initial
-//! model.
+//! Writes notes on quantities that the logs do not determine. For these quantities, the fit keeps the values of the
+//! initial model.
 //!
 //! Input: the mean voltage of the cells in each stretch (a part of a log without gaps), the fitted records, and both
 //! capacities (Ah): before and after the fit. Output: notes for the user.
@@ -18,7 +18,8 @@ pub(super) struct Capacity {
 /// Returns the notes.
 pub(super) fn notes(parts: &[&MeasuredPart], records: &[Record], before: Capacity, after: Capacity) -> Vec<String> {
     let mut notes = Vec::new();
-    // The logs do not show the capacity if more than this share of its relative standard deviation remains after the fit.
+    // The logs do not show the capacity if more than this share of its relative standard deviation remains after the
+    // fit.
     let is_unshown = after.std_ah / after.mean_ah > 0.7 * before.std_ah / before.mean_ah;
     if is_unshown {
         notes.push(

@@ -113,7 +113,7 @@ fn held_rows(part: &MeasuredPart, held_s: f64) -> Vec<usize> {
 ///
 /// A discharge ends with its first row below the cut-off. Cut-offs are multiples of 0.1 V. The lower limit is therefore
 /// the highest voltage of these rows, rounded up to 0.1 V; aborted discharges do not count. Charges hold their voltage,
-/// so the upper limit is the median of their highest voltages.
+/// so the upper limit is the median of their highest voltages, rounded to 0.05 V.
 fn cycle_limits(files: &[MeasuredFile], first: usize) -> Option<(Limit<'_>, Limit<'_>)> {
     let (mut ends, mut tops) = (Vec::new(), Vec::new());
     for file in files {
@@ -139,7 +139,8 @@ fn cycle_limits(files: &[MeasuredFile], first: usize) -> Option<(Limit<'_>, Limi
     Some(((cut_off_v, low), ((high.voltage_v * 20.0).round() / 20.0, high)))
 }
 
-/// Returns the row under load with the lowest voltage of a discharge (`sign` = 1) or the highest voltage of a charge (`sign` = -1).
+/// Returns the row under load with the lowest voltage of a discharge (`sign` = 1) or the highest voltage of a charge
+/// (`sign` = -1).
 fn extreme(part: &MeasuredPart, sign: f64) -> Option<usize> {
     let most_a = part.current_a.iter().fold(0.0_f64, |most, i| most.max(i * sign));
     let loaded = (0..part.len()).filter(|&k| part.current_a[k] * sign > REST_SHARE * most_a);

@@ -1,7 +1,7 @@
 //! Fits a cell model to logs of a whole pack: ordinary drives and charges that start at any SOC.
 //!
-//! Input: a configuration with a cell model or a label, and logs as the daemon reads them. Output: a [`FitOutcome`]. Where the logs
-//! contain no information, the tables stay as in the configured model.
+//! Input: a configuration with a cell model or a label, and logs as the daemon reads them. Output: a [`FitOutcome`].
+//! Where the logs contain no information, the tables stay as in the configured model.
 //!
 //! Every log is replayed through the monitor, so limits, decoding and fault handling are the same as in the daemon.
 //! Only cells of the configured kind are used, and their mean voltage is fitted like the voltage of a single cell. A
@@ -39,11 +39,12 @@ use crate::replay::{self, OutputWatch, ReplaySettings, Sinks};
 
 /// A stretch with fewer rows is not used.
 const LEAST_ROWS: usize = 20;
-/// Smallest standard deviation of the SOC at the start of a stretch.
+/// Standard deviation that is added (as a root sum of squares) to the uncertainty of the estimated SOC at the start of
+/// a stretch.
 const BEGINNING_STD: f64 = 0.02;
 /// A stretch starts full if its open-circuit voltage is at least the OCV at this SOC.
 const FULL_SOC: f64 = 0.975;
-/// Share of the model's series resistance with which the open-circuit voltage at the start is computed. No cell has a
+/// The open-circuit voltage at the start is computed with this share of the model's series resistance. No cell has a
 /// smaller resistance.
 const LEAST_RESISTANCE: f64 = 0.4;
 /// Standard deviation of the initial SOC of a stretch that starts full.
@@ -54,12 +55,13 @@ const FULL_STD: f64 = 0.01;
 const KNEE_SOC: f64 = 0.13;
 /// Upper limit of [`KNEE_SOC`] times (Arrhenius factor - 1).
 const MOST_KNEE_SOC: f64 = 0.35;
-/// A cold cell does not settle within a drive. The error of its voltage corresponds to an SOC error of this value times (Arrhenius
-/// factor - 1). Rests of 20 min of Panasonic 18650PF cells at 10 to -20 degrees C show 0.013 to 0.024; rests during drives are shorter.
+/// A cold cell does not settle within a drive. The error of its voltage corresponds to an SOC error of this value times
+/// (Arrhenius factor - 1). Rests of 20 min of Panasonic 18650PF cells at 10 to -20 degrees C show 0.013 to 0.024; rests
+/// during drives are shorter.
 const COLD_SOC: f64 = 0.03;
 /// Residual, V, above which the logs cannot come from a single kind of cell. In the cold, the limit is multiplied by a
-/// power of the Arrhenius factor. Fits of the cells of `tests/label` leave 5 to 20 mV when warm and 27 mV at 0 degrees
-/// C.
+/// power of the Arrhenius factor. Fits of the cells of `tests/label` leave residuals of 5 to 20 mV when warm and 27 mV
+/// at 0 degrees C.
 const UNFIT_V: f64 = 0.04;
 /// A charge is complete if the voltage is within [`HELD_V`] (V) of the maximum voltage, and the remaining current would
 /// need more than [`FADED_H`] (h) to charge the rated capacity.
@@ -95,7 +97,7 @@ struct Stretch {
     log: usize,
     part: MeasuredPart,
     cells: CellDistances,
-    /// SOC at the first row, with its standard deviation.
+    /// SOC that the estimator found at the first row, with its standard deviation.
     beginning: (f64, f64),
 }
 
@@ -311,7 +313,8 @@ fn stretches(request: &LogRequest<'_>, log: usize, path: &Path) -> Result<Vec<St
     let sinks = Sinks { watch: Some(watch), ..Sinks::default() };
     let mut source = LogSource::new([path.to_owned()], (request.options)());
     let settings = ReplaySettings::plain(request.sleep_gap_s, request.interfaces.clone());
-    // The model that is fitted must not change during the replay.
+    // Without a label, the monitor does not learn a model, so the model from which the fit starts stays the same during
+    // the replay.
     let monitor = Monitor::new(MonitorConfig { label: None, ..request.monitor.clone() });
     replay::run(&mut source, monitor, sinks, settings, &mut |_| ())
         .map_err(|error| LabError::Data(error.to_string()))?;
@@ -321,7 +324,7 @@ fn stretches(request: &LogRequest<'_>, log: usize, path: &Path) -> Result<Vec<St
     Ok(stretches.into_iter().map(|stretch| Stretch { log, ..stretch }).collect())
 }
 
-/// Converts a stretch to rows of the fit. The `soc` of a row is minus the charge taken out, Ah.
+/// Converts a stretch to rows of the fit. The `soc` of a row is minus the charge taken out since the first row, Ah.
 fn unanchored(stretch: &Stretch, grid: &Grid, model: &CellModel) -> UnanchoredRecord {
     let mut part = stretch.part.clone();
     let first_s = part.time_s[0];
@@ -359,8 +362,8 @@ fn knee_v(model: &CellModel, current_a: f64, temperature_c: f64) -> f64 {
     model.ocv_v(&position) - model.settled_ohm(&position) * current_a.max(0.0)
 }
 
-/// Finds the last row at which a charge is complete: the voltage is at its highest and the current has faded. Returns the charge taken
-/// out, Ah, and the time, h, of this row.
+/// Finds the last row at which a charge is complete: the voltage is at its highest and the current has faded. Returns
+/// the charge taken out, Ah, and the time, h, of this row.
 fn full(part: &MeasuredPart, model: &CellModel) -> Option<(f64, f64)> {
     let most_a = model.rated_capacity_ah / FADED_H;
     let is_full = |&k: &usize| {
@@ -369,7 +372,8 @@ fn full(part: &MeasuredPart, model: &CellModel) -> Option<(f64, f64)> {
     (0..part.len()).rev().find(is_full).map(|k| (-part.soc[k], part.time_s[k] / 3600.0))
 }
 
-/// Returns one node per group of similar temperatures. Stretches without a measured temperature have the ambient temperature.
+/// Returns one node per group of similar temperatures. Stretches without a measured temperature have the ambient
+/// temperature.
 fn temperature_nodes(stretches: &[Stretch]) -> Vec<f64> {
     let of_stretch = |stretch: &Stretch| median(stretch.part.temperature_c.iter().copied());
     let mut medians: Vec<f64> = stretches.iter().filter_map(of_stretch).collect();
@@ -414,7 +418,8 @@ fn known(model: &CellModel, grid: &Grid, monitor: &MonitorConfig) -> Known {
         curve_row,
         capacity_ah: initial.capacity_ah,
         capacity_std: initial.capacity_std_ah / initial.capacity_ah,
-        // Smallest standard deviation of the current sensor's offset: the current that discharges the rated capacity in this time, h.
+        // Smallest standard deviation of the current sensor's offset: the current that discharges the rated capacity in
+        // this time, h.
         offset_std_a: monitor.estimator.sensor.current_offset_a.max(model.rated_capacity_ah / 1000.0),
     }
 }

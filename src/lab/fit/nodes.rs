@@ -9,8 +9,8 @@ use crate::ident::grid::interpolate;
 
 /// Maximum SOC error of the linear interpolation, fraction.
 const MOST_POINTS: f64 = 0.005;
-/// Width over which the slope is computed, SOC. It is wide because an SOC estimate that changes crosses the steps of a
-/// plateau.
+/// Width over which the slope is computed, SOC. The width spans the steps of a plateau, because a changing SOC estimate
+/// crosses them.
 const SLOPE_WIDTH: f64 = 0.04;
 /// Smallest distance between breakpoints, and between the SOC values at which the error is computed.
 const LEAST_DISTANCE: f64 = 0.01;
@@ -31,7 +31,8 @@ pub(super) fn by_curvature(first: &[f64], curves: &[OcvCurve]) -> Vec<f64> {
     nodes
 }
 
-/// Returns the largest SOC error of any curve at the SOC `at`, fraction, if the curves are linear between `nodes`.
+/// Returns the SOC error (fraction) that linear interpolation between `nodes` causes at the SOC `at`: the largest error
+/// of all curves.
 fn misread(curves: &[OcvCurve], nodes: &[f64], at: f64) -> f64 {
     let of_curve = |curve: &OcvCurve| {
         let voltage_v = |soc: f64| interpolate(&curve.soc, &curve.voltage_v, soc);

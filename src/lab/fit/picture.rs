@@ -17,7 +17,7 @@ pub fn write(path: &Path, outcome: &FitOutcome) -> Result<(), LabError> {
     Ok(chart::write_stack(path, &panels)?)
 }
 
-/// Draws the panel of one file. The parts of the file follow each other.
+/// Draws the panel of one file. On the time axis, the parts of the file follow each other without gaps.
 fn panel(outcome: &FitOutcome, number: usize) -> Picture {
     let file = &outcome.files[number];
     let mut points = Vec::new();

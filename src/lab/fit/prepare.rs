@@ -10,14 +10,14 @@ use crate::ident::grid::Grid;
 use crate::ident::record::{self, Limits, Record};
 use crate::measured::{MeasuredFile, MeasuredPart};
 
-/// Largest credible distances, V: below the lowest voltage of the cell (first value) and above the highest voltage
-/// (second value).
+/// A voltage is credible if it is at most this far below the lowest voltage of the cell (first value, V) and at most
+/// this far above the highest voltage (second value, V).
 pub(super) const CREDIBLE_BEYOND_V: (f64, f64) = (1.0, 0.3);
-/// Weight of a charge of an ageing cell relative to a discharge. It is smaller because the voltage of a charge contains slower
-/// relaxation.
+/// Weight of a charge of an ageing cell relative to a discharge. It is smaller because the voltage of a charge contains
+/// slower relaxation.
 const AGEING_CHARGE_SCALE: f64 = 0.6;
 
-/// A part of a file with its SOC, before it has a position in the grid.
+/// A part of a file with the SOC of its rows, before the rows have positions in the grid.
 pub(super) struct AnchoredPart {
     /// Number of the file.
     pub(super) file: usize,
@@ -36,7 +36,8 @@ pub(super) struct FitInputs {
     pub(super) notes: Vec<String>,
 }
 
-/// Removes rows without current or voltage, and rows whose time runs backwards. A missing temperature repeats the previous one.
+/// Removes rows without current or voltage, and rows whose time runs backwards. If a temperature is missing, the
+/// previous temperature is used; at the start of the part, the first known temperature.
 fn clean(part: &MeasuredPart) -> MeasuredPart {
     let known = part.temperature_c.iter().copied().find(|t| t.is_finite());
     // Assumed temperature of a file without temperatures, degrees Celsius.
@@ -106,7 +107,8 @@ pub(super) fn prepare(
 /// Number of the file, a part of it, and for every row the charge taken out since the cell was full, Ah.
 type PartDischarge = (usize, MeasuredPart, Vec<f64>);
 
-/// Returns the charge taken out for every part of every file. If files do not start full, a single error lists all of them.
+/// Returns the charge taken out for every part of every file. If parts do not start with a full cell, a single error
+/// lists all of them.
 fn taken_out(request: &FitRequest, files: &[MeasuredFile], voltage_max_v: f64) -> Result<Vec<PartDischarge>, LabError> {
     let (mut taken, mut refused) = (Vec::new(), Vec::new());
     for (number, file) in files.iter().enumerate() {
@@ -173,7 +175,7 @@ fn slow_test(file: &MeasuredFile, voltage_max_v: f64) -> Result<SlowDischarge, L
     Ok(test)
 }
 
-/// Converts the discharge of a slow test to data of the fit.
+/// Converts a slow test to data of the fit.
 fn slow_source(
     file: &MeasuredFile,
     number: usize,
@@ -236,7 +238,7 @@ impl FitInputs {
         };
         let record = |source: &AnchoredPart| Record::prepare(&source.part, &source.judged, grid, &limits);
         let records: Vec<Record> = self.sources.iter().map(record).collect();
-        // Without drives, slow tests and pulse tests have full weight.
+        // If the data contain no drive, slow tests and pulse tests have full weight.
         let most = records.iter().map(record::share).fold(0.0, f64::max);
         let by_share = |r: &Record| record::weight(r) * record::share(r) / most;
         let scale = self.sources.iter().zip(&records).map(|(s, r)| s.scale.unwrap_or_else(|| by_share(r)));
@@ -254,8 +256,8 @@ impl FitInputs {
         (of_kind(true), of_kind(false))
     }
 
-    /// Returns the temperatures of the files; similar temperatures are averaged. The temperature of a file is the lower decile of its
-    /// rows, because cells warm up under load.
+    /// Returns the temperatures of the parts; similar temperatures are averaged. The temperature of a part is the lower
+    /// decile of its rows, because cells warm up under load.
     pub(super) fn temperature_nodes(&self) -> Vec<f64> {
         let coldest = |source: &AnchoredPart| {
             let mut seen = source.part.temperature_c.clone();
@@ -268,7 +270,7 @@ impl FitInputs {
         let mut last = f64::NEG_INFINITY;
         for t in all {
             match nodes.last_mut() {
-                // Files share a node if their temperatures differ by less than this, K.
+                // Parts share a node if their temperatures differ by less than this, K.
                 Some((sum, count)) if t - last < 5.0 => (*sum, *count) = (*sum + t, *count + 1.0),
                 _ => nodes.push((t, 1.0)),
             }

@@ -2,9 +2,10 @@
 //!
 //! Input: the records of a fit, and the fitted tables. Output: the measured ranges of temperature (degrees Celsius),
 //! current (A) and SOC, and extended tables. The extended tables have an additional row [`REACH_K`] below the lowest
-//! measured temperature, and another above the highest. In these rows, the open-circuit curve and the time constants
-//! repeat the nearest measured row, and the resistances follow Arrhenius' law. Arrhenius' law is only approximate, so
-//! the voltage error grows with the distance.
+//! measured temperature, and another above the highest. If the nodes do not reach an end of the measured temperatures,
+//! that end also gets a row. In the added rows, the open-circuit curve and the time constants repeat the nearest
+//! measured row, and the resistances follow Arrhenius' law. Arrhenius' law is only approximate, so the voltage error
+//! grows with the distance.
 
 use crate::cell::arrhenius;
 use crate::filter::ends;
@@ -16,12 +17,13 @@ use crate::ident::record::Record;
 
 /// Distance of an additional row from the measured temperatures, K.
 const REACH_K: f64 = 40.0;
-/// Standard deviation of the activation energy of a cell's resistances, J/mol. The energy is assumed to be uniformly distributed from
-/// 15 to 35 kJ/mol.
+/// Standard deviation of the activation energy of a cell's resistances, J/mol. The energy is assumed to be uniformly
+/// distributed from 15 to 35 kJ/mol.
 const ENERGY_STD_J_PER_MOL: f64 = 6_000.0;
 /// 0 degrees Celsius in K.
 const ZERO_CELSIUS_K: f64 = 273.15;
-/// Share of the time that is ignored at either end of the temperature range, because sensors settle and have stray values.
+/// Share of the time that is ignored at either end of the temperature range, because sensors settle and have stray
+/// values.
 const STRAY: f64 = 0.005;
 
 /// Ranges of a fit's data.
@@ -111,7 +113,8 @@ impl ModelTables {
         all
     }
 
-    /// Adds a row for the temperature `to_c`: the fitted row `row`, valid at `from_c`, scaled by Arrhenius' law.
+    /// Adds a row for the temperature `to_c`: the fitted row `row`, valid at `from_c`, with its resistances scaled by
+    /// Arrhenius' law.
     fn add_row(
         &mut self,
         (fitted, voltage_error_v): (&FittedTables, &[f64]),

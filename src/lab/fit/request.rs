@@ -1,7 +1,7 @@
 //! Defines and checks the request for a fit, which the command line and the Python module make.
 //!
-//! Input: files, and known data of the cell. Output: a checked request. Only [`FitRequest::check`] defines the allowed ranges. Errors
-//! name the argument of the command.
+//! Input: files, and known data of the cell. Output: a checked request. Only [`FitRequest::check`] defines the allowed
+//! ranges. Errors name the argument of the command.
 
 use std::path::PathBuf;
 
@@ -17,7 +17,8 @@ pub const MAX_SOC_NODES: usize = 101;
 pub struct FitRequest {
     /// Name of the cell.
     pub name: String,
-    /// Capacity that defines the SOC, Ah; `None` = the capacity of the slow test or of the deepest discharge.
+    /// Capacity that defines the SOC, Ah; `None` = the capacity of the slow test or of the deepest discharge; for an
+    /// ageing cell, the mean capacity of the discharges.
     pub capacity_ah: Option<f64>,
     /// Capacity on the label, Ah; `None` = `capacity_ah`.
     pub rated_ah: Option<f64>,
@@ -38,8 +39,8 @@ pub struct FitRequest {
     pub temperature_c: Option<Vec<f64>>,
     /// SOC breakpoints, rising from 0 to 1; `None` = the defaults.
     pub soc: Option<Vec<f64>>,
-    /// Number of half-cycles to use from the start of an ageing cell's life; `ocv` and `capacity_ah` must then be
-    /// empty. `None` = the cell is not ageing.
+    /// For an ageing cell: only the parts whose number in the column `cycle` is at most this number are used; `ocv` and
+    /// `capacity_ah` must then be empty. `None` = the cell is not ageing.
     pub first_cycles: Option<usize>,
     /// Files to fit; at least one.
     pub files: Vec<PathBuf>,
@@ -49,7 +50,8 @@ impl FitRequest {
     /// Checks the range of every argument, and that the arguments are compatible.
     ///
     /// # Errors
-    /// The first argument that is out of its range, with what was found and what is allowed.
+    /// An argument is out of its range, or two arguments are not compatible. The error names the first such argument,
+    /// what was found and what is allowed.
     pub fn check(&self) -> Result<(), LabError> {
         if self.files.is_empty() {
             return Err("no files, must be one or more".into());

@@ -140,7 +140,7 @@ pub(crate) fn list(values: &[f64]) -> String {
     values.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
 }
 
-/// `key = [[..], [..]]` with at least `digits` decimals; smaller numbers keep five significant digits.
+/// Writes `key = [[..], [..]]`. Numbers have `digits` decimals, or more if five significant digits need more.
 pub(crate) fn table(out: &mut String, key: &str, rows: &[Vec<f64>], digits: usize) {
     line(out, &format!("{key} = ["));
     for row in rows {

@@ -8,8 +8,8 @@
 use super::{FitOutcome, MeasuredRange};
 use crate::ident::fit::{FittedTables, MIN_SLOPE_V, SUPPORTED_S};
 
-/// SOC range over which errors are averaged. Below it, the curve is so steep that any model is accurate, and cells are rarely used
-/// there.
+/// SOC range over which errors are averaged. Below it, the curve is so steep that any model is accurate, and cells are
+/// rarely used there.
 const MIDDLE: std::ops::RangeInclusive<f64> = 0.1..=0.95;
 
 /// Returns the sentences for the end of the output.
@@ -28,7 +28,7 @@ pub(super) fn verdict(outcome: &FitOutcome) -> Vec<String> {
     said
 }
 
-/// Returns the error at every node of an SOC determined by voltage alone, points.
+/// Returns the SOC error at every node if voltage alone determines the SOC, percentage points.
 fn soc_points(fit: &FittedTables, voltage_error_v: &[f64]) -> Vec<f64> {
     let (soc, columns) = (&fit.grid.soc, fit.grid.soc.len());
     let of_node = |node: usize| {
@@ -46,7 +46,7 @@ fn mean_points(soc: &[f64], points: &[f64]) -> f64 {
     (middle.iter().sum::<f64>() / middle.len().max(1) as f64).sqrt()
 }
 
-/// Formats points, rounded to halves and at least one half.
+/// Formats an error in points, rounded to half points, at least half a point.
 fn rounded(points: f64) -> String {
     let halves = ((2.0 * points).round() / 2.0).max(0.5);
     format!("{halves} {}", if halves == 1.0 { "point" } else { "points" })
@@ -70,7 +70,7 @@ fn accuracy(rows: &[(f64, f64)]) -> Vec<String> {
 
 /// Lists the SOC breakpoints at which the curve is too flat, at every temperature, to find the SOC from voltage.
 fn flat(soc: &[f64], points: &[f64], columns: usize) -> Option<String> {
-    // Above this SOC error, points, the voltage at a breakpoint is useless.
+    // Above this SOC error, points, the voltage at a breakpoint does not show the SOC.
     let is_flat = |s: &usize| points.iter().skip(*s).step_by(columns).all(|points| *points > 5.0);
     let flat: Vec<String> = (0..columns).filter(is_flat).map(|s| soc[s].to_string()).collect();
     let list = flat.join(", ");

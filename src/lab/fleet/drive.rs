@@ -29,9 +29,9 @@ pub struct LogAccess<'a> {
 /// Summary of a replayed log.
 #[derive(Debug, Clone, Default)]
 pub struct DriveSummary {
-    /// Counts of the records read.
+    /// Counts of lines, frames and faults in the log.
     pub counts: LogCounts,
-    /// First and last stamp.
+    /// Earliest and latest stamp; `None` = the log contains no record.
     pub span: Option<(Timestamp, Timestamp)>,
     /// Notes for the user.
     pub notes: Vec<String>,
@@ -44,8 +44,8 @@ impl DriveSummary {
     }
 }
 
-/// Replays a log. `each` receives the outputs after every input and must clear them. `report` receives the number of bytes read since
-/// its last call.
+/// Replays a log. `each` receives the outputs after every input and must clear them. `report` receives the number of
+/// bytes read since its last call.
 ///
 /// # Errors
 /// The log cannot be read, or `each` fails.

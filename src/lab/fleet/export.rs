@@ -38,7 +38,7 @@ pub(super) const ABOUT: &str = "about.json";
 /// Format of the tables.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TableFormat {
-    /// Apache Parquet, Snappy.
+    /// Apache Parquet, compressed with Snappy.
     Parquet,
     /// Comma-separated values with a header line.
     Csv,
@@ -86,7 +86,8 @@ pub struct ExportResult {
     pub notes: Vec<String>,
 }
 
-/// Exports all logs. Returns the result or the error of each log. `report` receives the number of bytes read since its last call.
+/// Exports all logs. Returns the result or the error of each log. `report` receives the number of bytes read since its
+/// last call.
 ///
 /// # Errors
 /// No threads can be started.
@@ -136,8 +137,8 @@ pub(super) fn export(
     Ok(exported)
 }
 
-/// Removes the `about.json` of an earlier export, because the tables are then replaced one by one. Returns a note if the earlier tables
-/// came from another log.
+/// Removes the `about.json` of an earlier export, because the tables are then replaced one by one. Returns a note if
+/// the earlier tables came from another log.
 fn remove_about(folder: &Path, log: &Path) -> Result<Option<String>, LabError> {
     let path = folder.join(ABOUT);
     let Ok(text) = std::fs::read(&path) else { return Ok(None) };
@@ -193,8 +194,8 @@ fn write_about(
     Ok(crate::write_file(&exported.folder.join(ABOUT), &serde_json::to_vec_pretty(&document)?)?)
 }
 
-/// Returns a folder name per log: the file name without endings. If several logs have the same name, the name of their folder is put in
-/// front, or a number is appended.
+/// Returns a folder name per log: the file name without endings. If several logs have the same name, the name of their
+/// folder is put in front, or a number is appended.
 pub(super) fn names(logs: &[PathBuf]) -> Vec<String> {
     let text = |name: Option<&std::ffi::OsStr>| name.unwrap_or_default().to_string_lossy().into_owned();
     let short = |log: &PathBuf| {
@@ -234,11 +235,11 @@ struct LogTables {
     alarms: TableFile<AlarmRow>,
     period_ns: i64,
     first: Option<Timestamp>,
-    /// For each cell, the period of the last estimate that was written.
+    /// For each cell, the number of the period to which the last written estimate belongs.
     periods: Vec<Option<i64>>,
     rated_ah: f64,
     moved_ah: Vec<f64>,
-    /// Values of a half-cycle for which the capacity event has not yet been received.
+    /// Cell and values of the last half-cycle, until its capacity event arrives.
     half_cycle: Option<(CellIndex, Fields)>,
 }
 

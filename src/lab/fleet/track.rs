@@ -1,8 +1,8 @@
 //! Tracks use and wear during a log: charge moved, and the learned capacity of the weakest cell.
 //!
-//! Input: events of the monitor. Output: equivalent full cycles (charge moved divided by twice the rated capacity), and learned
-//! capacities. Both values are known at the ends of half-cycles. Between the ends, the cycles are interpolated, and the capacities keep
-//! their last value.
+//! Input: events of the monitor. Output: equivalent full cycles (charge moved divided by twice the rated capacity), and
+//! learned capacities. Both values are known at the ends of half-cycles. Between the ends, the cycles are interpolated,
+//! and the capacities keep their last value.
 
 use std::collections::BTreeMap;
 
@@ -89,8 +89,9 @@ impl Track {
         self.learned
     }
 
-    /// Returns the time from which the weakest learned capacity stays below `end_ah` until the end of the log, and the cell. `None` =
-    /// it is not below `end_ah` at the end, or nothing was learned.
+    /// Returns the time from which the weakest learned capacity stays below `end_ah` until the end of the log, and the
+    /// weakest cell at this time. `None` = the capacity is not below `end_ah` at the end of the log, or nothing was
+    /// learned.
     pub fn stays_below(&self, end_ah: f64) -> Option<(Timestamp, CellIndex)> {
         let below = self.weakest.iter().rev().take_while(|(_, ah, _)| *ah < end_ah).last();
         below.map(|&(time, _, cell)| (time, cell))

@@ -1,12 +1,13 @@
 //! Reads the true capacities of a log from a CSV file in the same folder.
 //!
 //! There are two formats, which are recognised by their columns. A table with a column `cell` was written by `simulate
-//! --truth`; it contains the capacity of every cell between the full and the empty open-circuit voltage. A table with
+//! --truth`; it contains, for every cell, the capacity from the full to the empty open-circuit voltage. A table with
 //! `cycle` and `type` has the format of `score --cycles`; it contains the published capacity of one cell for each
 //! discharge, at the load of this discharge.
 //!
-//! For a log `NAME.log`, `NAME.csv` etc., these files are searched in its folder: `NAME.truth.csv`, `NAME_truth.csv` and
-//! `NAME_cycles.csv`, and also `truth.csv` if no other given log is in this folder. Each may end in `.gz` or `.zst`.
+//! For a log `NAME.log`, `NAME.csv` etc., the folder of the log is searched for these files: `NAME.truth.csv`,
+//! `NAME_truth.csv` and `NAME_cycles.csv`, and also `truth.csv` if no other given log is in the folder. Each may end in
+//! `.gz` or `.zst`.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -18,7 +19,7 @@ use crate::io::table::TableError;
 use crate::quantity::{CellIndex, Timestamp};
 use crate::score::CycleTable;
 
-/// Endings of the file names that are searched.
+/// Endings of the file names that are searched for.
 const ENDINGS: [&str; 3] = [".truth.csv", "_truth.csv", CYCLES];
 const CYCLES: &str = "_cycles.csv";
 const COMPRESSED: [&str; 3] = ["", ".gz", ".zst"];
@@ -65,8 +66,8 @@ pub struct Truth {
 impl Truth {
     /// Reads a truth table in either format.
     /// # Errors
-    /// The file cannot be read, has neither format, or a field is wrong. The error states file, line, what was found and what is
-    /// allowed.
+    /// The file cannot be read, has neither format, or a field is wrong. The error states file, line, what was found
+    /// and what is allowed.
     pub fn read(path: &Path) -> Result<Self, TableError> {
         let table = CapacityTable::open_in_order(path)?;
         if table.header().find("cell").is_some() { read_simulated(table) } else { Self::of_table(path) }
@@ -101,7 +102,7 @@ impl Truth {
     }
 }
 
-/// Keeps the rows at which a capacity changed by more than 0.02 %.
+/// Reads a table that `simulate --truth` wrote. Keeps only the rows at which a capacity changed by more than 0.02 %.
 fn read_simulated(mut table: CapacityTable) -> Result<Truth, TableError> {
     let (mut cells, mut span): (BTreeMap<CellIndex, Vec<(Timestamp, f64)>>, _) = (BTreeMap::new(), None);
     while let Some(row) = table.next_row()? {

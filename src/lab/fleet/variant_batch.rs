@@ -1,9 +1,9 @@
 //! Evaluates the alarms of many settings in one replay.
 //!
 //! Estimates do not depend on alarm thresholds, and the alarms of one threshold do not depend on other thresholds. So
-//! the alarm inputs of one monitor are passed to additional alarm engines, the *lanes*. Lane n watches the n-th
-//! distinct threshold of each rule and severity. For example, five thresholds of one rule and five thresholds of
-//! another rule make 25 combinations but need only five lanes.
+//! the alarm inputs of one monitor are passed to additional alarm engines, the *lanes*. For each pair of rule and
+//! severity, lane n watches the n-th distinct threshold. For example, five thresholds of one rule and five thresholds
+//! of another rule make 25 combinations but need only five lanes.
 
 use crate::alarm::{AlarmChange, AlarmEngine, AlarmInput, Change, Rule, RuleConfig, Severity};
 use crate::quantity::{CellIndex, Timestamp};
@@ -101,7 +101,7 @@ fn has_rule(watched: &BatchThreshold, rule: Rule, severity: Severity) -> bool {
 /// The alarm engines of all lanes during one replay.
 #[derive(Debug)]
 pub(super) struct LaneEngines {
-    /// Each engine with the rules that it watches, one bit per wire number of a rule.
+    /// Each engine with the rules that it watches: bit n is set for the rule with wire number n.
     engines: Vec<(AlarmEngine, u32)>,
     changes: Vec<AlarmChange>,
 }

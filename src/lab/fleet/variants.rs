@@ -1,14 +1,16 @@
-//! Implements `--set KEY=V1,V2`: replaces values of a configuration, and builds all combinations of the replaced values.
+//! Implements `--set KEY=V1,V2`: replaces values of a configuration, and builds all combinations of the replaced
+//! values.
 //!
 //! Input: the file of a configuration, and choices (one per `--set`). Output: one checked configuration per
-//! combination, with the original first, and the information which of them can share a replay. Configurations can share
-//! a replay if they differ only in `[[alarm]]` tables. Tables of the rule `input_missing` are an exception, because
-//! their time-outs also affect the inputs of the alarms. A combination that is not a valid configuration is left out
-//! and reported.
+//! combination, with the original first, each with the number of its replay. Combinations share a replay if their
+//! configurations differ only in `[[alarm]]` tables. Tables of the rule `input_missing` are an exception, because their
+//! time-outs also affect the inputs of the alarms. A combination that is not a valid configuration is left out and
+//! reported.
 //!
-//! Keys for alarms: `RULE.info`, `.warning` and `.severe` (each also with `.set` or `.clear`); `RULE.threshold` for the most severe
-//! level in the file; `RULE.probability` for `when = { probability = ... }`; and any other key of the rule's `[[alarm]]` tables. All
-//! other keys are dotted keys of the configuration. A table that occurs several times is selected by `[n]`, counted from 1.
+//! Keys for alarms: `RULE.info`, `.warning` and `.severe` (each also with `.set` or `.clear`); `RULE.threshold` for the
+//! most severe level in the file; `RULE.probability` for `when = { probability = ... }`; and any other key of the
+//! rule's `[[alarm]]` tables. All other keys are dotted keys of the configuration. A table that occurs several times is
+//! selected by `[n]`, counted from 1.
 
 mod target;
 
@@ -153,7 +155,7 @@ pub fn grid(path: &Path, choices: &[Choice]) -> Result<VariantGrid, Vec<String>>
     Ok(grid)
 }
 
-/// Returns the configuration of a combination, and the key of the replay that it can share.
+/// Returns the configuration of a combination, and its replay key. Combinations with equal replay keys share a replay.
 fn variant(
     path: &Path,
     root: &Table,
@@ -167,7 +169,7 @@ fn variant(
     let text = toml::to_string(&root).map_err(|error| vec![error.to_string()])?;
     let read = |file: &Path| if file == path { Ok(text.clone().into_bytes()) } else { std::fs::read(file) };
     let config = config::load_with(&ConfigFiles::alone(path), &read).map_err(|faults| {
-        // The line numbers of these faults would refer to a generated text.
+        // Remove the line numbers of these faults, because they refer to a generated text.
         let file = format!("{}:", path.display());
         let without_line = |fault: &String| {
             let rest = fault.strip_prefix(&file).map(|rest| rest.trim_start_matches(|c: char| c.is_ascii_digit()));

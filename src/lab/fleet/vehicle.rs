@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 /// Version of `vehicle.json`.
 pub(super) const VERSION: u32 = 1;
-/// Name of the file in a vehicle's folder that contains the result.
+/// Name of the file with the result, in the vehicle's folder.
 pub(super) const RECORD: &str = "vehicle.json";
 
 /// A vehicle: a line of the manifest.
@@ -34,8 +34,8 @@ pub struct VehicleRecord {
     pub packwatch: String,
     /// The line of the manifest.
     pub line: Vehicle,
-    /// SHA-256 of all settings (configuration with its DBC files and cell model, and the options for reading logs); `None` = the
-    /// configuration cannot be read.
+    /// SHA-256 of all settings (configuration with its DBC files and cell model, and the options for reading logs);
+    /// `None` = the configuration cannot be read.
     pub settings_sha256: Option<String>,
     /// Period of the estimates, s; `None` = no table of estimates.
     pub period_s: Option<f64>,
@@ -43,7 +43,7 @@ pub struct VehicleRecord {
     pub error: Option<String>,
     /// Number of rows of each table.
     pub rows: BTreeMap<String, u64>,
-    /// Number of cells of the pack.
+    /// Number of cells of the pack; 0 = the configuration cannot be read.
     pub cells: u32,
     /// Rated capacity of a cell, Ah; `None` = the configuration cannot be read.
     pub rated_ah: Option<f64>,

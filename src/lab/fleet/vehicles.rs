@@ -3,7 +3,7 @@
 //! | function | input | output |
 //! | --- | --- | --- |
 //! | [`plan`] | logs, and folders that each contain the logs of one vehicle | the vehicles, sorted by name |
-//! | [`Shard::choose`] | all vehicles | the vehicles of one part; parts have similar sizes and are the same on every machine |
+//! | [`Shard::choose`] | all vehicles | the vehicles of one part; parts have similar sizes, the same on every machine |
 //! | [`run`] | vehicles | a folder for each vehicle with `vehicle.json` and the tables of [`export`](super::export) |
 //!
 //! `vehicle.json` is written last. If it exists for the same manifest line, settings and program and contains no error,
@@ -30,8 +30,9 @@ const LOCK: &str = ".lock";
 /// Maximum number of parts of a fleet.
 const MAX_SHARDS: usize = 100_000;
 
-/// Lists the vehicles in `paths`, sorted by name. A log is a vehicle. A folder with logs is also a vehicle; its logs are read in the
-/// order of their names. Paths are made absolute, because the vehicles may be replayed from other folders.
+/// Lists the vehicles in `paths`, sorted by name. Each log is a vehicle. Each folder with logs is also a vehicle; its
+/// logs are read in the order of their names. Paths are made absolute, because the vehicles may be replayed from other
+/// folders.
 ///
 /// # Errors
 /// A path cannot be read, or a folder contains no log.
@@ -97,7 +98,8 @@ pub fn manifest(vehicles: &[Vehicle]) -> Result<String, LabError> {
 /// Reads a manifest.
 ///
 /// # Errors
-/// The file cannot be read, a line is not a vehicle, or two lines have the same vehicle name. The error names the line.
+/// The file cannot be read or contains no vehicle, a line is not a vehicle, or two lines have the same vehicle name. If
+/// a line is at fault, the error names it.
 pub fn read_manifest(path: &Path) -> Result<Vec<Vehicle>, LabError> {
     let shown = path.display();
     let text = std::fs::read_to_string(path)
@@ -152,8 +154,8 @@ impl FromStr for Shard {
 }
 
 impl Shard {
-    /// Returns the vehicles of this part. The vehicles are distributed by falling size; each goes to the part with the fewest bytes so
-    /// far.
+    /// Returns the vehicles of this part. The vehicles are distributed by falling size; each goes to the part with the
+    /// fewest bytes so far.
     pub fn choose<'v>(&self, vehicles: &'v [Vehicle]) -> Vec<&'v Vehicle> {
         let mut largest: Vec<&Vehicle> = vehicles.iter().collect();
         largest.sort_by(|a, b| b.bytes.cmp(&a.bytes).then_with(|| a.vehicle.cmp(&b.vehicle)));
@@ -179,8 +181,9 @@ pub enum Outcome {
     Failed(VehicleRecord),
 }
 
-/// Replays the vehicles. Returns the outcomes in the same order. `config_of` reads the configuration of a vehicle. `report` receives
-/// the number of bytes read since its last call; for a complete vehicle, this is the size of its logs.
+/// Replays the vehicles. Returns the outcomes in the same order. `config_of` reads the configuration of a vehicle.
+/// `report` receives the number of bytes read since its last call; for a complete vehicle, this is the size of its
+/// logs.
 ///
 /// # Errors
 /// No threads can be started, or a record cannot be written.

@@ -1,8 +1,8 @@
 //! Evaluates the alarms of every combination of settings in each log.
 //!
-//! Input: a [`VariantGrid`], logs, and their true capacities. Output: for each log, its life, and an [`AlarmScore`] per combination and
-//! threshold. Combinations that differ only in alarms share one replay per log ([`VariantBatch`]). The life (charge moved, learned
-//! capacity) comes from the original configuration.
+//! Input: a [`VariantGrid`], logs, and their true capacities. Output: for each log, its life, and an [`AlarmScore`] per
+//! combination and threshold. Combinations that differ only in alarms share one replay per log ([`VariantBatch`]). The
+//! life (charge moved, learned capacity) comes from the original configuration.
 
 use std::path::PathBuf;
 
@@ -44,7 +44,7 @@ pub struct WhatifSettings<'a> {
     pub jobs: Option<usize>,
 }
 
-/// The end of a life.
+/// The end of a cell's life.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct EndOfLife {
     /// Time on the clock of the log, s.
@@ -105,7 +105,8 @@ struct ReplayResult {
     truth: Option<Truth>,
 }
 
-/// Replays all logs. Returns the result or the error of each log. `report` receives the number of bytes read since its last call.
+/// Replays all logs. Returns the result or the error of each log. `report` receives the number of bytes read since its
+/// last call.
 ///
 /// # Errors
 /// No threads can be started.
@@ -115,7 +116,7 @@ pub fn run(
     settings: &WhatifSettings<'_>,
     report: &(dyn Fn(u64) + Sync),
 ) -> Result<Vec<Result<LogResult, LabError>>, LabError> {
-    // The replays of one log are independent, so even a single log uses all cores.
+    // The replays of one log are independent, so several cores can work on a single log.
     let tasks: Vec<(usize, usize)> = (0..jobs.len()).flat_map(|job| (0..grid.replays).map(move |r| (job, r))).collect();
     let replays = super::in_parallel(&tasks, settings.jobs, |_, &(job, number)| {
         replay(grid, number, &jobs[job], settings, report)
@@ -129,7 +130,8 @@ pub fn run(
     Ok(jobs.iter().map(of_job).collect())
 }
 
-/// Returns the thresholds of replay `number`, and for each combination the numbers of its thresholds.
+/// Returns the thresholds of replay `number`, and for each combination that shares this replay, the index of the
+/// combination and the numbers of its thresholds.
 fn watch(grid: &VariantGrid, number: usize) -> (VariantBatch, Vec<(usize, Vec<usize>)>) {
     let mut batch = VariantBatch::default();
     let own = grid.variants.iter().enumerate().filter(|(_, variant)| variant.replay == number);
@@ -150,7 +152,7 @@ fn replay(
 ) -> Result<ReplayResult, LabError> {
     let variant = grid.variants.iter().find(|variant| variant.replay == number);
     let config: &Config = &variant.ok_or("a replay without a setting")?.config;
-    // The truth is read before the replay, which may take hours, so that an unreadable table is reported immediately.
+    // Read the truth first: if the table is unreadable, this replay, which may take hours, is skipped.
     let truth = job.truth.as_deref().filter(|_| number == 0).map(Truth::read).transpose()?;
     let monitor = &config.monitor;
     let (mut batch, _) = watch(grid, number);

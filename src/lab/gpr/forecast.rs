@@ -4,8 +4,8 @@
 //! *window* at row t contains what is known at this row: for every column, the value and the last differences
 //! ([`ForecastPlan::lags`] values per column). For every output and every horizon h, a separate Gaussian process
 //! predicts the change from row t to row t + h (a direct forecast). Errors of one step therefore do not enter the next
-//! step, and each horizon has its own noise. Without information, the forecast is the mean change, which is close to
-//! persistence (the value stays constant).
+//! step, and each horizon has its own noise. If the window contains no information, the forecast is the mean change,
+//! which is close to persistence (the value stays constant).
 //!
 //! The interval is calibrated on real forecasts. The process is fitted again to the first training rows and forecasts
 //! the block of rows after them; this is repeated block by block. The ratios |error| / standard deviation of these
@@ -34,9 +34,9 @@ pub use windows::{LagWindows, RowSpacing};
 pub const MAX_LAGS: usize = 200;
 /// Maximum number of rows between the origin and a forecast.
 pub const MAX_STEPS: usize = 10_000;
-/// Maximum number of horizons with a process. There are no forecasts between these horizons.
+/// Maximum number of horizons with a process. Rows between these horizons are not forecast.
 pub const MAX_HORIZONS: usize = 10;
-/// Ends of the blocks for the calibration of the interval, as shares of the training rows.
+/// Boundaries of the blocks for the calibration of the interval, as shares of the training rows.
 const BLOCKS: [f64; 5] = [0.4, 0.55, 0.7, 0.85, 1.0];
 
 /// Arguments of a forecast.
@@ -50,8 +50,8 @@ pub struct ForecastPlan {
     pub steps: usize,
     /// Share of the rows that is known: above 0, at most 1. The origin is the end of this share.
     pub origin: f64,
-    /// Maximum number of windows to which a process is fitted. The windows are selected evenly from all windows, at
-    /// varying phases.
+    /// Maximum number of windows to which a process is fitted. The windows are selected evenly from all windows, but
+    /// not at a fixed distance, so that repeating cycles are sampled at different points.
     pub rows: usize,
     /// Kernel of the processes, and settings of the search for hyperparameters.
     pub settings: GprSettings,
@@ -88,7 +88,8 @@ pub struct HorizonForecast {
     pub trained: usize,
     /// Number of forecasts on which the interval was calibrated.
     pub calibrated: usize,
-    /// Half the width of the interval, in standard deviations, at a window whose errors have average size.
+    /// Half the width of the interval at average spread, as a multiple of the standard deviation. [`spread`] scales it
+    /// for each window.
     pub factor: f64,
     /// Duration of fit and calibration, s.
     pub fit_s: f64,
@@ -98,14 +99,14 @@ pub struct HorizonForecast {
     pub at_origin: Prediction,
     /// Forecasts after the origin, each with the row from which it was made.
     pub held_out: Vec<(usize, Prediction)>,
-    /// Errors of these forecasts; `None` = there are no rows after the origin.
+    /// Errors of these forecasts; `None` = no forecast after the origin can be compared with a measured value.
     pub score: Option<PredictionScore>,
-    /// Root mean squared error, over the same rows, of persistence (the value stays constant).
+    /// Root mean squared error of persistence (the value stays constant), over the same rows.
     pub persistence_rmse: Option<f64>,
 }
 
 /// Returns the horizons that get a process. If there are at most [`MAX_HORIZONS`] steps, every step is a horizon.
-/// Otherwise, [`MAX_HORIZONS`] horizons are spaced at constant ratios, including the first and the last step.
+/// Otherwise, at most [`MAX_HORIZONS`] horizons are spaced at constant ratios, including the first and the last step.
 pub fn horizons(steps: usize) -> Vec<usize> {
     if steps <= MAX_HORIZONS {
         return (1..=steps).collect();
@@ -120,7 +121,8 @@ pub fn horizons(steps: usize) -> Vec<usize> {
 /// Makes the forecasts. `done` receives the number of finished horizons and the number of all horizons.
 ///
 /// # Errors
-/// A number of the plan is out of range, there are too few rows for the lags and steps, or a matrix is not positive definite.
+/// A number of the plan is out of range, there are too few rows for the lags and steps, or a matrix is not positive
+/// definite.
 pub fn run(
     table: &ColumnTable,
     plan: &ForecastPlan,
@@ -206,8 +208,8 @@ impl HorizonTask<'_> {
     }
 
     /// Fits a process to windows whose target rows, `steps` ahead, lie before row `end`. Returns the process with the
-    /// number of windows, or `None` if there are too few windows. If `fixed` hyperparameters are given, they are not
-    /// searched.
+    /// number of windows, or `None` if there are too few windows. If `fixed` contains hyperparameters, they are used
+    /// without a search.
     fn fitted(
         &self,
         end: usize,
@@ -262,7 +264,7 @@ impl HorizonTask<'_> {
         Ok(Spread::new(judged, &features, ratios, self.steps + self.plan.lags))
     }
 
-    /// Returns the forecasts of the value that are made at these rows.
+    /// Returns the forecasts made at these rows: predictions of the value, not of its change.
     fn predict(&self, model: &Model, rows: &[usize], spread: &Spread) -> Result<Vec<Prediction>, LabError> {
         if rows.is_empty() {
             return Ok(Vec::new());

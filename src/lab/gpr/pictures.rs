@@ -1,5 +1,5 @@
-//! Draws pictures of regressions (predicted over measured values, a stretch of rows with its interval, the error of every row) and of
-//! forecasts (the fan at the origin, error and coverage over the horizon).
+//! Draws pictures of regressions (predicted over measured values, a stretch of rows with its interval, the error of
+//! every row) and of forecasts (the fan at the origin, error and coverage over the horizon).
 
 use std::path::Path;
 
@@ -45,7 +45,7 @@ fn write_charts(folder: &Path, name: &str, charts: Vec<Chart>) -> Result<(), Plo
     chart::write_stack(&folder.join(format!("{name}.svg")), &pictures)
 }
 
-/// Replaces characters that are not letters or digits, for a file name.
+/// Makes a file name from a text: its words, joined by `_`. If the text contains `*`, `_product` is appended.
 fn slug(text: &str) -> String {
     let words: Vec<&str> = text.split(|c: char| !c.is_ascii_alphanumeric()).filter(|word| !word.is_empty()).collect();
     let joined = match text.contains('*') {
@@ -179,7 +179,7 @@ fn coverage(output: &OutputForecast) -> Chart {
     Chart::new(title, "rows ahead", Axis::number("inside, %").within(0.0, 100.0), layers)
 }
 
-/// Draws forecasts of the last horizon and measured values, at the rows that were forecast.
+/// Draws the forecasts of the last horizon that has a score, and the measured values, at the rows that were forecast.
 fn held_out(data: &ColumnTable, output: &OutputForecast) -> Chart {
     let Some(horizon) = output.horizons.iter().rfind(|h| h.score.is_some()) else { return Chart::default() };
     let for_row = |row: usize| (row + horizon.steps) as f64 + 1.0;

@@ -2,23 +2,23 @@
 //!
 //! Input: CSV (plain, gzip or zstd) with one header line and numbers in the requested columns. Output: the values of
 //! these columns, row by row, with the file and line of each row. An empty field or NaN is a missing value.
-//! [`MissingPolicy`] decides whether a missing value causes an error that names its place, or the row is left out and
-//! counted. Any other field that is not a finite number is always an error.
+//! [`MissingPolicy`] decides what a missing value in a required column causes: an error that names the place, or the
+//! row is left out and counted. Any other field that is not a finite number is always an error.
 
 use std::path::{Path, PathBuf};
 
 use crate::error::LabError;
 use crate::io::table::{PART_COLUMNS, Row, Table as CsvTable, TableError};
 
-/// Endings of column names that are units. For example, the name `voltage` matches the column `voltage_v`.
+/// Units that may end the name of a column. For example, the name `voltage` matches the column `voltage_v`.
 const UNITS: [&str; 36] = [
     "a", "ma", "ah", "mah", "v", "mv", "w", "kw", "wh", "kwh", "c", "k", "f", "s", "ms", "us", "ns", "min", "h", "d",
     "days", "cycles", "hz", "ohm", "mohm", "percent", "pct", "ppm", "kg", "m", "mm", "pa", "bar", "n", "nm", "rpm",
 ];
-/// Maximum number of rows of a regression; this number needs some gigabytes of memory.
+/// Maximum number of rows of a regression. So many rows need several gigabytes of memory.
 const MAX_ROWS: usize = 5_000_000;
 
-/// What happens to a row with a missing required value.
+/// What happens to a row in which a required value is missing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MissingPolicy {
     /// An error that names file and line.
@@ -30,11 +30,11 @@ pub enum MissingPolicy {
 /// Columns to read.
 #[derive(Debug, Clone)]
 pub struct ColumnSelection<'a> {
-    /// Columns that every row must have, by name with or without unit.
+    /// Required columns, by name with or without the unit.
     pub columns: &'a [String],
-    /// Columns that may be missing, and whose values may be missing (NaN).
+    /// Optional columns. The column or any of its values may be missing (NaN).
     pub optional: &'a [String],
-    /// Treatment of rows with a missing required value.
+    /// Treatment of rows in which a required value is missing.
     pub missing: MissingPolicy,
 }
 
@@ -68,7 +68,7 @@ pub struct ColumnTable {
     pub values: Vec<f64>,
     /// Line of each row in its file.
     pub lines: Vec<u64>,
-    /// The files, each with the number of rows up to the end of the file.
+    /// Each file with the total number of rows of the table up to the end of this file.
     pub files: Vec<(PathBuf, usize)>,
     /// Number of rows left out because a value is missing.
     pub skipped: usize,
@@ -82,8 +82,8 @@ impl ColumnTable {
     /// Reads files and appends their rows.
     ///
     /// # Errors
-    /// A file cannot be read, a column is unknown or ambiguous, a value is missing or not a number, or there are too many rows. The
-    /// error states file, line, column, what was found and what is allowed.
+    /// A file cannot be read, a column is unknown or ambiguous, a value is missing or not a number, or there are too
+    /// many rows. The error states file, line, column, what was found and what is allowed.
     pub fn read(paths: &[PathBuf], wanted: &ColumnSelection<'_>, part: &PartColumn) -> Result<Self, LabError> {
         let mut table = Self { has: vec![true; wanted.optional.len()], ..Self::default() };
         for path in paths {
@@ -94,7 +94,7 @@ impl ColumnTable {
         Ok(table)
     }
 
-    /// Ignores a default part column whose values differ in every row, because such a column counts the rows.
+    /// If the default part column changes in every row, ignores the column, because it only counts the rows.
     fn ignore_row_counter(&mut self, part: &PartColumn) {
         if *part == PartColumn::Default && self.parts.len() == self.len() {
             let begins = [0].into_iter().chain(self.files.iter().map(|(_, end)| *end));

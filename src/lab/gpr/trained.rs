@@ -1,8 +1,8 @@
 //! Defines a regression model that stores the names of its columns. The model is trained on a table, saved, loaded, and
 //! applied to other files.
 //!
-//! The file has one line of JSON with the names of the columns, followed by the two lines of the model itself. These two lines have a
-//! checksum (see [`Model`]).
+//! The file has one line of JSON with the names of the columns, followed by the two lines of the model itself. These
+//! two lines have a checksum (see [`Model`]).
 
 use std::path::Path;
 
@@ -45,7 +45,8 @@ impl TrainedModel {
     /// Fits a model to a table whose last column is the output.
     ///
     /// # Errors
-    /// There are too few rows, a setting is out of range, a matrix is not positive definite, or the watcher stopped the work.
+    /// There are too few rows, a setting is out of range, a matrix is not positive definite, or the watcher stopped the
+    /// work.
     pub fn fit(
         table: &ColumnTable,
         settings: &GprSettings,
@@ -115,7 +116,8 @@ impl TrainedModel {
     }
 }
 
-/// Writes predictions of the rows of a table. The last column of the table is the output; its value is NaN if it is unknown.
+/// Writes predictions of the rows of a table. The last column of the table is the output; its value is NaN if it is
+/// unknown.
 ///
 /// # Errors
 /// The file cannot be written.

@@ -1,10 +1,11 @@
-//! Determines the SOC of the first cycles of an ageing cell: full charges alternating with full discharges, recorded
-//! without a charge counter.
+//! Determines the SOC in the first cycles of an ageing cell. Full charges and full discharges alternate, and the record
+//! has no charge counter.
 //!
-//! The SOC is anchored at two points. At the end of every full charge, the SOC is 1; this is the state in which the charger leaves the
-//! cell. At the knee of each discharge, the SOC has one common value, because the voltage falls fastest there and little charge is
-//! left. With these anchors, neither the fade from cycle to cycle nor the gain error of the charger's current distorts the curves. The
-//! charge that remains below the cut-off under load is assumed to be [`SOC_LEFT`]. Half-cycles before the first discharge start at an
+//! The SOC is anchored at two points. At the end of every full charge, where the charger stops, the SOC is 1. At the
+//! knee, where a discharge falls through a fixed voltage ([`KNEE_SHARE`]), the SOC is the same in every discharge,
+//! because the voltage falls fastest there and little charge is left. With these anchors, neither the fade from cycle
+//! to cycle nor the gain error of the charger's current distorts the curves. When the voltage under load reaches the
+//! cut-off, the SOC is assumed to be [`SOC_LEFT`] on average. Half-cycles before the first discharge start at an
 //! unknown SOC and are left out.
 
 use super::{MeasuredPart, charge_ah};
@@ -12,14 +13,15 @@ use crate::filter::median;
 
 /// SOC of a new cell at the cut-off under load.
 pub(crate) const SOC_LEFT: f64 = 0.045;
-/// Voltage of the knee, as a share of the range between lowest and highest voltage: 3.0 V for 2.7 to 4.2 V.
+/// Voltage of the knee, as a share of the range from the lowest to the highest voltage: 3.0 V for 2.7 to 4.2 V.
 const KNEE_SHARE: f64 = 0.2;
 /// Current above which a row counts as under load, as a share of the median current of the discharge.
 const LOADED_SHARE: f64 = 0.5;
-/// Current step between two rows, A per Ah of capacity, above which voltage and current may not belong to the same
-/// instant.
+/// If the current changes by more than this between two rows, A per Ah of capacity, the voltage and the current of the
+/// row may belong to different instants.
 const STEP_PER_AH: f64 = 0.25;
-/// Rows after the cut-off, without load, are not judged below this SOC, because the voltage recovers more slowly than any branch.
+/// Below this SOC, rows of a discharge without load are not judged, because the voltage recovers more slowly than any
+/// branch of the model.
 const RECOVERY_SOC: f64 = 0.5;
 
 /// A half-cycle with its SOC.
@@ -35,7 +37,8 @@ pub struct AnchoredHalfCycle {
     pub judged: Vec<bool>,
 }
 
-/// Allowed charge of a full charge, as a share of the missing charge. Other charges are left out.
+/// A charge counts as full if the ampere-hours charged, divided by the ampere-hours missing before it, are in this
+/// range. Other charges are left out.
 const FULL_CHARGE: std::ops::RangeInclusive<f64> = 0.8..=1.25;
 
 /// Charge from the start of a discharge to its knee and to its cut-off, Ah.
@@ -44,10 +47,11 @@ struct Marks {
     cut_off_ah: f64,
 }
 
-/// Returns the capacity (Ah, mean of the discharges), and every half-cycle from the first discharge on with its SOC.
+/// Returns the capacity (Ah, mean over the discharges), and the half-cycles from the first discharge on, each with its
+/// SOC. Charges that are not full are left out.
 ///
 /// # Errors
-/// There is no discharge, or a discharge has no knee.
+/// The cycles contain no discharge, or a discharge has no knee.
 pub fn anchor(cycles: &[MeasuredPart], voltage_v: (f64, f64)) -> Result<(f64, Vec<AnchoredHalfCycle>), String> {
     let first = cycles.iter().position(MeasuredPart::is_discharge).ok_or("no discharge among the first cycles")?;
     let knee_v = voltage_v.0 + KNEE_SHARE * (voltage_v.1 - voltage_v.0);
@@ -80,7 +84,7 @@ pub fn anchor(cycles: &[MeasuredPart], voltage_v: (f64, f64)) -> Result<(f64, Ve
             out_ah.iter().map(|ah| 1.0 - ah * per_ah).collect()
         } else {
             let all_ah = out_ah[out_ah.len() - 1];
-            // A charge that was aborted, or that has only two samples, does not fill the cell.
+            // Skip charges that do not fill the cell, such as aborted charges, and charges with too few samples.
             if !FULL_CHARGE.contains(&(-all_ah / ((1.0 - left) * capacity_ah))) {
                 continue;
             }

@@ -1,7 +1,7 @@
 //! Determines the SOC of every raw row by explicit rules. A file that starts at an unknown SOC is rejected.
 //!
-//! 1. A part must start with a full cell. Its first voltage must be within [`REST_SAG_V`] of the highest voltage, or within
-//!    [`LOAD_SAG_V`] if current already flows.
+//! 1. A part must start with a full cell. Its first voltage must be within [`REST_SAG_V`] of the highest voltage, or
+//!    within [`LOAD_SAG_V`] if current already flows.
 //! 2. The counter of the cycler rises during discharge and falls during charge. If the counter starts within
 //!    [`COUNTER_NEAR`] of 0, SOC = 1 - counter / capacity. If the counter starts lower, it was reset before the charge,
 //!    so its first value is subtracted. If the counter starts higher, charge had already been taken out of the full
@@ -10,21 +10,22 @@
 
 use super::{MeasuredPart, charge_ah};
 
-/// Largest difference between the highest voltage and the voltage of a full cell at rest, V. The voltage relaxes after a charge, and a
-/// charge in the cold ends early.
+/// Largest difference between the highest voltage and the voltage of a full cell at rest, V. The voltage relaxes after
+/// a charge, and a charge in the cold ends early.
 const REST_SAG_V: f64 = 0.1;
 /// Largest such difference for a full cell under load, V.
 const LOAD_SAG_V: f64 = 0.35;
 /// Current above which a cell is under load, as a share of its capacity per hour.
 const LOAD_SHARE: f64 = 0.02;
-/// A counter whose first value is below this share of the capacity started at the full cell.
+/// If the first value of a counter is at most this share of the capacity away from 0, the counter started at the full
+/// cell.
 const COUNTER_NEAR: f64 = 0.003;
 
 impl MeasuredPart {
     /// Returns the charge taken out since the cell was full, for every row, Ah.
     ///
     /// # Errors
-    /// The part does not start with a full cell, or its first SOC is unknown.
+    /// The part does not start with a full cell, or its counter shows that charge was taken out before the first row.
     pub fn taken_out_ah(&self, voltage_max_v: f64, capacity_hint_ah: f64) -> Result<Vec<f64>, String> {
         self.begins_full(voltage_max_v, capacity_hint_ah)?;
         if self.discharged_ah[0].is_nan() {

@@ -1,13 +1,14 @@
-//! Estimates the error of the fitted model over SOC and temperature: the standard deviation of its voltage error, averaged over
-//! [`BLOCK_S`].
+//! Estimates the error of the fitted model over SOC and temperature: the root mean square of the voltage errors, each
+//! averaged over a block of [`BLOCK_S`].
 //!
-//! Errors of a model are correlated over minutes, so they are averaged over blocks of 100 s. A block is weighted by the charge that was
-//! moved in it, and is shared among the nodes around it. A node with little charge follows the mean of its temperature.
+//! Errors of a model are correlated over minutes, so they are averaged over blocks. A block is weighted by the charge
+//! that was moved in it, and is shared among the nodes around it. If little charge was moved near a node, the error of
+//! the node follows the mean error at its temperature.
 //!
-//! The residuals of a fit understate the error on a new drive. Therefore the variance is multiplied by 1 + 3 / n, where n is the number
-//! of files that visit the node. A pulse test or slow test counts as 0.3 of a file, because it says little about a drive. The life of
-//! an ageing cell counts as one file, no matter how many cycles it has. A temperature without data takes the errors of the nearest
-//! temperature with data, scaled by a power of the Arrhenius factor.
+//! The residuals of a fit understate the error on a new drive. Therefore the variance is multiplied by 1 + 3 / n, where
+//! n is the number of files that visit the node. A pulse test or slow test counts as 0.3 of a file, because it says
+//! little about a drive. The life of an ageing cell counts as one file, no matter how many cycles it has. A temperature
+//! without data takes the errors of the nearest temperature with data, scaled by a power of the Arrhenius factor.
 
 use std::collections::BTreeMap;
 
@@ -20,8 +21,8 @@ use super::record::Record;
 const BLOCK_S: f64 = 100.0;
 /// Upper limit of the error of a block, V; also the error if no temperature has data.
 const MOST_V: f64 = 0.1;
-/// Every node also takes the mean error of its temperature. This mean has the weight of data in which this charge, as
-/// SOC, was moved.
+/// The error of a node also includes the mean error at its temperature. The mean has the same weight as data that moved
+/// this charge, as SOC.
 const LEAN_SOC: f64 = 1.0;
 /// Growth of the variance on data outside the fit: 1 + this constant / number of files.
 const UNSEEN: f64 = 3.0;
@@ -114,7 +115,7 @@ impl ErrorBlock {
     }
 }
 
-/// Returns the errors of one temperature; `None` = there are no data.
+/// Returns the errors of one temperature; `None` = no file visits its nodes.
 fn row(sums: &NodeSums, t: usize, columns: usize) -> Option<Vec<f64>> {
     let range = t * columns..(t + 1) * columns;
     let weight: f64 = sums.weight[range.clone()].iter().sum();
@@ -177,8 +178,8 @@ mod tests {
             let judged = files.map(|file| WeightedRecord { record: &record, file, share });
             table(&fit, &judged, 2.0)
         };
-        // The error is 10 mV everywhere. The variance is multiplied by 4 for one drive, by 1.75 for four drives, and by 11 for one
-        // pulse test.
+        // The error is 10 mV everywhere. The variance is multiplied by 4 for one drive, by 1.75 for four drives, and by
+        // 11 for one pulse test.
         let cases = [([7; 4], 1.0, 4.0_f64), ([0, 1, 2, 3], 1.0, 1.75), ([7; 4], 0.3, 11.0)];
         for (files, share, growth) in cases {
             let (found, expected_v) = (error_v(files, share), 0.01 * growth.sqrt());

@@ -1,5 +1,5 @@
 //! Runs a whole fit of a cell model. Sets starting values and prior, and passes over all records in parallel until the
-//! cost stops falling. The result also contains residuals and the data near each node.
+//! cost stops falling. The result also contains the residuals, and the seconds of data near each node.
 
 use rayon::prelude::*;
 
@@ -11,8 +11,8 @@ use super::record::Record;
 use super::solve::{Space, minimise};
 use crate::filter::median;
 
-/// Number of groups of records. Each group is summed separately, and then the sums of the groups are added in order. The result
-/// therefore does not depend on the number of cores.
+/// Number of groups of records. Each group is summed separately, and then the sums of the groups are added in order.
+/// The result therefore does not depend on the number of cores.
 const GROUPS: usize = 4;
 /// Smallest number of judged rows for a fit.
 pub const MIN_ROWS: usize = 50;
@@ -59,7 +59,7 @@ pub struct FitSettings {
 /// Error statistics of one record.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Residual {
-    /// Judged seconds.
+    /// Seconds that the judged rows represent.
     pub seconds: f64,
     /// Root mean square, V, weighted by time.
     pub rmse_v: f64,
@@ -135,8 +135,8 @@ pub fn fit(
 
 type Group<'a> = Vec<(&'a Record, f64)>;
 
-/// Distributes the records over [`GROUPS`], the longest first, each to the group with the fewest rows. All groups then take about
-/// equally long.
+/// Distributes the records over at most [`GROUPS`] groups. The longest record comes first, and each record goes to the
+/// group with the fewest rows. All groups then take about equally long.
 fn groups<'a>(records: &'a [Record], scale: &[f64]) -> Vec<Group<'a>> {
     let mut order: Vec<usize> = (0..records.len()).collect();
     order.sort_by_key(|&i| std::cmp::Reverse(records[i].rows.len()));
@@ -167,7 +167,8 @@ fn sum_of_groups(groups: &[Group<'_>], layout: &Layout, theta: &[f64]) -> Normal
     })
 }
 
-/// Returns the starting values: the OCV of the slow test or a straight line, and resistances from steps of the current.
+/// Returns the starting values: the OCV of the slow test or a straight line, resistances from steps of the current, and
+/// the time constants of the settings.
 fn start(settings: &FitSettings, layout: &Layout, records: &[Record]) -> Result<Vec<f64>, String> {
     let grid = &settings.grid;
     let mut theta = match settings.ocv.is_empty() {
@@ -189,8 +190,8 @@ fn straight_ocv(settings: &FitSettings) -> Vec<f64> {
     settings.grid.soc.iter().map(|s| low + s * (high - low)).collect()
 }
 
-/// Returns the OCV at every node from slow tests. Between the temperatures of the tests it is linear; outside, the nearest test
-/// applies.
+/// Returns the OCV at every node from slow tests. Between the temperatures of two tests, the OCV is interpolated
+/// linearly. Outside, the nearest test applies.
 pub fn ocv_nodes(grid: &Grid, curves: &[OcvCurve]) -> Vec<f64> {
     let temperatures: Vec<f64> = curves.iter().map(|c| c.temperature_c).collect();
     let at = |t: f64, soc: f64| {
@@ -204,8 +205,8 @@ pub fn ocv_nodes(grid: &Grid, curves: &[OcvCurve]) -> Vec<f64> {
         .collect()
 }
 
-/// Returns the voltage of a curve. Below the SOC at which a test in the cold ended, the curve continues with the shape of the next
-/// warmer one.
+/// Returns the voltage of a curve. Below the SOC at which a test in the cold ended, its curve continues with the shape
+/// of the next warmer curve.
 fn curve_at(curves: &[OcvCurve], which: usize, soc: f64) -> f64 {
     let curve = &curves[which];
     let end = curve.soc[0];
@@ -215,7 +216,8 @@ fn curve_at(curves: &[OcvCurve], which: usize, soc: f64) -> f64 {
     curve.voltage_v[0] + curve_at(curves, which + 1, soc) - curve_at(curves, which + 1, end)
 }
 
-/// Returns the median resistance at 25 degrees C from steps of the current between rows; `None` = there are no steps.
+/// Returns the median resistance at 25 degrees C from steps of the current between rows; `None` = the current has no
+/// usable step.
 fn resistance_of_steps(records: &[Record]) -> Option<f64> {
     let mut found = Vec::new();
     for record in records {

@@ -24,11 +24,11 @@ pub struct GridPoint {
     pub s: usize,
     /// Lower temperature row.
     pub t: usize,
-    /// Weight of the upper column, in [0, 1].
+    /// Weight of the upper column for resistances and time constants, in [0, 1].
     pub along_s: f64,
     /// Weight of the upper column for the OCV; it may be outside [0, 1].
     pub beyond_s: f64,
-    /// Weight of the upper row for the OCV, in [0, 1]; 0 with a single temperature.
+    /// Weight of the upper row for the OCV and the time constants, in [0, 1]; 0 with a single temperature.
     pub along_t: f64,
     /// Weight of the upper row for resistances.
     pub warped_t: f64,
@@ -46,7 +46,7 @@ pub struct Corners {
 }
 
 impl Corners {
-    /// Nodes with their weights.
+    /// Returns the valid nodes with their weights.
     pub fn iter(&self) -> impl Iterator<Item = (usize, f64)> + '_ {
         (0..self.len).map(|i| (self.node[i], self.weight[i]))
     }

@@ -4,14 +4,14 @@
 //! Data flow of a fit:
 //!
 //! 1. [`anchor`] determines the SOC of every raw row of a file.
-//! 2. [`record`] joins raw rows to coarser rows, with positions in the tables and weights.
+//! 2. [`record`] joins raw rows into coarser rows, and gives each a weight and its position in the tables.
 //! 3. [`pass`] computes the residuals, and their exact Jacobian from recursive sensitivities.
 //! 4. [`prior`] adds the prior, which keeps the tables smooth.
 //! 5. [`solve`] minimises the cost (projected Levenberg-Marquardt).
 //! 6. [`fit`] runs the whole fit, and determines residuals and nodes without data.
 //!
-//! For records that start at an unknown SOC, [`unanchored`] estimates the SOC together with the tables. After a fit, [`error_table`]
-//! estimates the model's error, and [`thermal`] fits heat capacity and thermal resistance.
+//! For records that start at an unknown SOC, [`unanchored`] estimates the SOC together with the tables. After a fit,
+//! [`error_table`] estimates the model's error, and [`thermal`] fits heat capacity and thermal resistance.
 
 pub mod ageing;
 pub mod anchor;
@@ -68,8 +68,8 @@ impl MeasuredPart {
         self.discharged_ah.push(discharged_ah);
     }
 
-    /// Returns the charge, Ah, that the tester took out after the load by holding the lowest voltage while the current fell. Returns 0
-    /// if the discharge does not end in this way.
+    /// After the load, some testers hold the lowest voltage while the current falls. Returns the charge taken out in
+    /// this phase, Ah; 0 if the discharge does not end with such a phase.
     pub(crate) fn held_ah(&self) -> f64 {
         let Some(last) = self.current_a.iter().rposition(|&current_a| current_a > 0.0) else { return 0.0 };
         let charge_ah = charge_ah(&self.time_s[..=last], &self.current_a[..=last]);
@@ -79,7 +79,8 @@ impl MeasuredPart {
         let lowest_v = self.voltage_v[..=last].iter().copied().fold(f64::INFINITY, f64::min);
         let is_held = |row: usize| {
             let current_a = self.current_a[row];
-            // The voltage is held if it is within 50 mV of its lowest value while the current is below 97 % of the load.
+            // The voltage is held if it is within 50 mV of its lowest value while the current is below 97 % of the
+            // load.
             current_a > 0.0 && current_a < 0.97 * load_a && self.voltage_v[row] <= lowest_v + 0.05
         };
         let first = (0..=last).rev().take_while(|&row| is_held(row)).last().unwrap_or(last);
@@ -92,7 +93,8 @@ impl MeasuredPart {
     }
 }
 
-/// Returns the charge taken out since the first row, for every row, Ah, by the trapezoidal rule. A gap counts like any other step.
+/// For every row, returns the charge taken out since the first row, Ah, by the trapezoidal rule. A gap counts like any
+/// other step.
 pub fn charge_ah(time_s: &[f64], current_a: &[f64]) -> Vec<f64> {
     let mut sum = 0.0;
     let mut charges = Vec::with_capacity(time_s.len());
@@ -122,7 +124,7 @@ mod tests {
         let mut held = load.to_vec();
         held.extend([(1900.0, 1.8, 2.502), (2260.0, 0.2, 2.498), (2300.0, 0.0, 2.6)]);
         assert!((discharge(&held).held_ah() - 0.1).abs() < 1e-12, "360 s at 1 A");
-        // Under a varying load, the voltage changes, so it does not count as held.
+        // Under a varying load, the voltage changes, so the voltage does not count as held.
         assert_eq!(
             discharge(&[(0.0, 3.0, 3.4), (600.0, 3.0, 3.2), (1200.0, 1.0, 3.3), (1800.0, 2.0, 3.1)]).held_ah(),
             0.0

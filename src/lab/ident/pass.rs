@@ -1,7 +1,7 @@
 //! Makes one pass over the data: computes the residuals, their exact Jacobian, and the normal equations.
 //!
-//! The residual of a row is e = V - (OCV(s,T) - sum U_i - R0(s,T) I). Over the step of a row, the voltage U of a branch
-//! is solved exactly:
+//! The residual of a row is e = V - (OCV(s,T) - sum U_i - R0(s,T) I). From one row to the next, the equation of the
+//! voltage U of a branch is solved exactly:
 //!
 //! `U' = R I + x (U - R I)` with `x = exp(-dt / tau)`.
 //!
@@ -13,9 +13,9 @@
 //! the work per row does not grow with the tables.
 //!
 //! Beyond [`HUBER_V`], the cost grows linearly (Huber), so that errors that no circuit can explain do not distort the
-//! tables. If the SOC is unknown ([`FreeScale`]), each residual is compared with the error of a circuit at this voltage
-//! drop and temperature ([`circuit_error_v`]). Otherwise, the error of the circuit in the cold would be mistaken for
-//! lost capacity.
+//! tables. If the SOC is unknown ([`FreeScale`]), each residual is compared with the error that a circuit usually has
+//! at the row's voltage drop and temperature ([`circuit_error_v`]). Otherwise, the error of the circuit in the cold
+//! would be mistaken for lost capacity.
 
 use super::grid::{Corners, Grid, arrhenius};
 use super::parameters::{Layout, ParameterTables};
@@ -26,9 +26,11 @@ use super::record::{FitRow, Record};
 const FADED_V: f64 = 1e-6;
 /// Residual above which the cost grows linearly, V.
 pub const HUBER_V: f64 = 0.05;
-/// Size of an independent residual that costs one half, V: the error of a good circuit model.
+/// Standard deviation of an independent residual, V: the error of a good circuit model. A residual of this size adds
+/// 0.5 to the cost.
 const SIGMA_V: f64 = 0.010;
-/// Correlation time of the model error, s. Residuals count as one independent residual per correlation time.
+/// Correlation time of the model error, s. All residuals within one correlation time together count as one independent
+/// residual.
 const REPEATS_S: f64 = 50.0;
 /// Correlation time if the SOC is unknown, s. Values from 50 to 500 s change the mean SOC errors of Panasonic 18650PF
 /// cells and of a simulated LG M50 by less than 0.1 points. The same holds for a wide range of the next two constants.
@@ -116,7 +118,8 @@ impl BranchRun {
         }
     }
 
-    /// Advances the voltage by the step of a row, without derivatives. Returns the decay x and dU'/dtau.
+    /// Advances the voltage by the step of a row, but not the stored derivatives. Returns the decay x, and the
+    /// derivative dU'/dtau that this step adds.
     fn step_voltage(&mut self, row: &FitRow, r_ohm: &[f64], tau_s: &[f64]) -> (f64, f64) {
         let (r, tau) = (row.resistance.at(r_ohm), row.tau.at(tau_s));
         let settled = r * row.mean_current_a;
@@ -179,8 +182,8 @@ pub fn residuals(record: &Record, tables: &ParameterTables) -> Vec<f64> {
     record.rows.iter().map(of_row).collect()
 }
 
-/// Unknowns of a record whose SOC is not measured: SOC = beginning - (charge - offset x time) / capacity. The parameters are the SOC
-/// at the beginning, the capacity, and the offset of the current sensor.
+/// Unknowns of a record whose SOC is not measured: SOC = beginning - (charge - offset x time) / capacity. The
+/// parameters are the SOC at the beginning, the capacity, and the offset of the current sensor.
 #[derive(Debug, Clone, Copy)]
 pub struct FreeScale<'a> {
     /// Breakpoints.
@@ -198,7 +201,8 @@ pub struct FreeScale<'a> {
 }
 
 impl FreeScale<'_> {
-    /// Adds the derivatives of a row's residual. Only the effect of the SOC on the open-circuit voltage is included.
+    /// Adds the derivatives of a row's residual with respect to these unknowns. Only the effect of the SOC on the
+    /// open-circuit voltage is included.
     fn derivatives(&self, row: &FitRow, tables: &ParameterTables, index: &mut Vec<usize>, j: &mut Vec<f64>) {
         let place = self.grid.place(row.soc, row.temperature_c);
         let columns = self.grid.soc.len();
@@ -286,13 +290,14 @@ fn derivatives(
     }
 }
 
-/// Returns the voltage error of a circuit at a voltage drop and a temperature, V.
+/// Returns the expected voltage error of a circuit at a voltage drop and a temperature, V.
 fn circuit_error_v(drop_v: f64, temperature_c: f64) -> f64 {
     SIGMA_V.hypot(DROP_ERROR * drop_v) * libm::pow(arrhenius(temperature_c).max(1.0), COLD_POWER)
 }
 
-/// Returns the cost per second of a residual with this error, and the weight of its square in the normal equations. The cost includes
-/// the logarithm of the error, because the error grows with the voltage drop, which depends on the parameters.
+/// Returns the cost per second of a residual if the expected error is `error_v`, and the weight of the residual's
+/// square in the normal equations. The cost includes the logarithm of the error, because the error grows with the
+/// voltage drop, which depends on the parameters.
 fn free_cost(residual: f64, error_v: f64) -> (f64, f64) {
     let errors = residual.abs() / error_v;
     let (cost, robust) = if errors <= HUBER_ERRORS {
@@ -303,7 +308,7 @@ fn free_cost(residual: f64, error_v: f64) -> (f64, f64) {
     ((cost + libm::log(error_v / SIGMA_V)) / FREE_REPEATS_S, robust / (error_v * error_v * FREE_REPEATS_S))
 }
 
-/// Returns the cost of a residual, and the weight of its square in the normal equations.
+/// Returns the cost of a residual, and the weight of the residual's square in the normal equations.
 fn huber(residual: f64) -> (f64, f64) {
     let size = residual.abs();
     if size <= HUBER_V { (0.5 * residual * residual, 1.0) } else { (HUBER_V * (size - 0.5 * HUBER_V), HUBER_V / size) }

@@ -1,7 +1,7 @@
 //! Defines the prior of a fit: smooth tables, Arrhenius' law between temperatures, and an OCV near the slow test.
 //!
-//! Each term is a linear combination of node parameters with a target and a standard deviation. The curvature at a node is the change
-//! of the slope, multiplied by the mean of the distances to both neighbours.
+//! Each term is a linear combination of node parameters with a target and a standard deviation. The curvature at a node
+//! is the change of the slope, multiplied by the mean of the distances to both neighbours.
 
 use super::grid::{Grid, arrhenius};
 use super::parameters::Layout;
@@ -10,10 +10,10 @@ use super::pass::NormalEquations;
 /// Standard deviations of the prior's terms.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PriorDeviations {
-    /// Second difference over SOC, scaled to the node spacing, V: of the correction if there is a slow test, otherwise
-    /// of the OCV.
+    /// Second difference over SOC, scaled to the node spacing, V. With a slow test, this is the difference of the
+    /// correction; without a slow test, of the OCV.
     pub ocv_curvature_v: f64,
-    /// Difference of the OCV, or of its correction, between neighbouring temperatures, V.
+    /// Difference of the correction (with a slow test) or of the OCV (without) between neighbouring temperatures, V.
     pub ocv_by_temperature_v: f64,
     /// Deviation of the OCV from the slow test, V per node; unused without a slow test.
     pub ocv_pull_v: f64,
@@ -61,8 +61,8 @@ impl PriorDeviations {
         ..Self::FREE_OCV
     };
 
-    /// Prior around the resistances of a chemistry: the spread of five fitted cells (`cell::chemistry`), common to all
-    /// nodes of a table.
+    /// Prior around the usual resistances of a chemistry (`cell::chemistry`), with the spread of five fitted cells. A
+    /// cell's deviation is mostly common to all nodes of a table.
     pub const CHEMISTRY: Self = Self {
         ocv_by_temperature_v: 0.006,
         r0_curvature: 0.15,
@@ -75,10 +75,10 @@ impl PriorDeviations {
         ..Self::FREE_OCV
     };
 
-    /// Prior for an ageing cell. Each discharge and charge has one current, so only the first rows separate R0 from the branch. R0
-    /// therefore hardly bends, and the time constant stays fixed. At the empty end, OCV and branch are both steep and cannot be
-    /// separated either. The branch bends no more than drives allow ([`PriorDeviations::SLOW_TEST`]), so that the knee belongs to the
-    /// OCV.
+    /// Prior for an ageing cell. Each discharge and charge has one current, so only the first rows separate R0 from the
+    /// branch. R0 therefore hardly bends, and the time constant stays fixed. At the empty end, OCV and branch are both
+    /// steep and cannot be separated either. The branch bends no more than drives allow
+    /// ([`PriorDeviations::SLOW_TEST`]), so that the knee belongs to the OCV.
     pub const AGEING: Self = Self {
         ocv_curvature_v: 0.5,
         r0_curvature: 0.005,
@@ -129,7 +129,7 @@ impl Prior {
         prior
     }
 
-    /// Creates the prior around known resistances and time constants in `start`; it constrains their shape and their
+    /// Creates the prior around known resistances and time constants in `start`. The prior constrains their shape and
     /// size. For the OCV, the prior constrains only the differences between temperatures.
     pub fn about(grid: &Grid, layout: &Layout, start: &[f64], deviations: &PriorDeviations) -> Self {
         let mut prior = Self(Vec::new());

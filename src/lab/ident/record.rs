@@ -1,17 +1,17 @@
-//! Prepares measured rows for the fit: joins them to blocks, positions them in the tables, and weights them by time.
+//! Prepares measured rows for the fit: joins them into blocks, positions them in the tables, and weights them by time.
 //!
 //! A block collects raw rows until it is [`BLOCK_S`] long. Voltage, current, temperature and SOC of the block are the
 //! values of its last row, because the series resistance acts immediately. The branches use the mean current of the
 //! block, so no charge is lost. A block ends early at a gap. It also ends before a current step that follows a steady
-//! current, so that both sides of the edge of a pulse are kept. If charge moved during a gap without rows, the branches
-//! are relaxed after the gap.
+//! current, so that both sides of the edge of a pulse are kept. A gap hides charge if the currents at both ends of the
+//! gap do not explain the change of the SOC. After such a gap, the branches start relaxed (at 0 V).
 
 use super::MeasuredPart;
 use super::grid::{Corners, Grid};
 use crate::filter::ends;
 
-/// Maximum length of a block, s. The time constants of the branches are several times longer, and the current of drives changes about
-/// once a second.
+/// Maximum length of a block, s. The time constants of the branches are several times longer, and the current of drives
+/// changes about once a second.
 const BLOCK_S: f64 = 1.0;
 /// Current step that ends a block early after a steady current, as a share of the largest current.
 const EDGE_SHARE: f64 = 0.1;
@@ -22,7 +22,7 @@ const STEADY_S: f64 = 3.0;
 const MAX_WEIGHT_S: f64 = 20.0;
 /// Shortest gap that may hide charge, s.
 const GAP_S: f64 = 60.0;
-/// If the charge moved during a gap exceeds this SOC, the state of the branches is unknown.
+/// If a gap hides more charge than this, as SOC, the state of the branches is unknown.
 const HIDDEN_SOC: f64 = 0.002;
 /// If current flows after such a gap, rows are not judged for this time, s, because the branches are still wrong.
 const UNKNOWN_S: f64 = 600.0;
@@ -65,7 +65,7 @@ pub struct Record {
     pub rows: Vec<FitRow>,
     /// Number of raw rows.
     pub raw_rows: usize,
-    /// Rows left out because their voltage is not plausible for this cell (disconnected sensor).
+    /// Number of rows that are not judged because their voltage is not plausible for this cell (disconnected sensor).
     pub outliers: usize,
 }
 
@@ -81,7 +81,8 @@ pub struct Limits {
 }
 
 impl Record {
-    /// Prepares a part. If `judged[k]` is false, only the current of raw row k is used. If `judged` is empty, all rows are judged.
+    /// Prepares a part. If `judged[k]` is false, the voltage of raw row k is not judged. If `judged` is empty, this
+    /// rule excludes no rows.
     pub fn prepare(raw: &MeasuredPart, judged: &[bool], grid: &Grid, limits: &Limits) -> Self {
         let largest_a = raw.current_a.iter().fold(0.0_f64, |most, i| most.max(i.abs()));
         let ends = block_ends(raw, largest_a);
@@ -127,7 +128,8 @@ const TEST_SHARE: f64 = 0.3;
 /// more than the second share of its mean.
 const DRIVE: (f64, f64) = (0.5, 0.3);
 
-/// Returns 1 for a drive (varying current for a large part of the time), and less for pulse tests with rests and for constant current.
+/// Returns 1 for a drive (varying current for a large part of the time), and [`TEST_SHARE`] for pulse tests with rests
+/// and for constant current.
 pub fn share(record: &Record) -> f64 {
     let largest = record.rows.iter().fold(0.0_f64, |most, row| most.max(row.current_a.abs()));
     let (mut all, mut flowing, mut first, mut second) = (0.0, 0.0, 0.0, 0.0);
@@ -144,7 +146,8 @@ pub fn share(record: &Record) -> f64 {
     if flowing > DRIVE.0 * all && variation > DRIVE.1 { 1.0 } else { TEST_SHARE }
 }
 
-/// Returns the weight of a second of the record. A record counts by the SOC range that it covers, not by its length.
+/// Returns the weight of each second of the record. The weight of the whole record depends on the SOC range that it
+/// covers, not on its length.
 pub fn weight(record: &Record) -> f64 {
     let (low, high) = record.judged_ends();
     let seconds: f64 = record.rows.iter().filter(|row| row.weight_s > 0.0).map(|row| row.weight_s).sum();
@@ -195,7 +198,8 @@ fn block_row(raw: &MeasuredPart, before: usize, end: usize, grid: &Grid) -> FitR
     }
 }
 
-/// Whether the SOC change during a gap differs from the charge that the currents at both ends of the gap would move.
+/// Whether the SOC change during a gap differs by more than [`HIDDEN_SOC`] from the charge that the currents at both
+/// ends of the gap would move.
 fn hides_charge(raw: &MeasuredPart, before: usize, end: usize, capacity_ah: f64) -> bool {
     (before + 1..=end).any(|k| {
         let dt_s = raw.time_s[k] - raw.time_s[k - 1];
@@ -204,7 +208,7 @@ fn hides_charge(raw: &MeasuredPart, before: usize, end: usize, capacity_ah: f64)
     })
 }
 
-/// Weights each row by half of the time to both neighbours, at most [`MAX_WEIGHT_S`]. Rows with a negative weight get 0.
+/// Weights each row by half of the time to both neighbours, at most [`MAX_WEIGHT_S`]. A negative weight becomes 0.
 fn weigh(rows: &mut [FitRow]) {
     for k in 0..rows.len() {
         let after_s = rows.get(k + 1).map_or(0.0, |row| row.dt_s);

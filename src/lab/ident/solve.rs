@@ -13,14 +13,16 @@ use crate::filter::levenberg_marquardt::{self, Damping};
 
 /// Maximum number of passes over the data.
 const MAX_PASSES: usize = 60;
-/// The fit has converged if the relative fall of the cost is below this value twice in a row.
+/// The fit has converged if the cost falls by less than this fraction twice in a row, in steps with weak damping
+/// ([`DAMPING_WEAK`]).
 const CONVERGED: f64 = 3e-4;
 /// Damping of the steps. After a step that needed more damping before it succeeded, the damping falls less, because
 /// much weaker damping would probably fail again.
 const DAMPING: Damping = Damping { first: 0.3, fall: 0.1, fall_after_growth: 0.6, growth: 8.0, least: 1e-4, most: 1e8 };
-/// With less damping than this, a step is nearly undamped.
+/// Up to this damping, a step is nearly undamped.
 const DAMPING_WEAK: f64 = 0.02;
-/// Maximum number of changes of the held set per step. After these changes, the step is clamped to the bounds.
+/// Maximum number of times that one step changes the set of parameters held at a bound. The result is clamped to the
+/// bounds.
 const MAX_EXCHANGES: usize = 30;
 
 /// Bounds and structure of the parameters.
@@ -202,8 +204,8 @@ fn solve_free(
     d.iter().all(|d| d.is_finite()).then_some(())
 }
 
-/// Holds free parameters that left their bounds, and frees held parameters that the gradient pushes inwards. Returns whether anything
-/// changed.
+/// Holds free parameters that left their bounds, and frees held parameters that the gradient pushes inwards. Returns
+/// whether anything changed.
 fn exchange(
     damped: &DMatrix<f64>,
     g: &DVector<f64>,
@@ -233,7 +235,7 @@ fn exchange(
 mod tests {
     use super::*;
 
-    /// Fits a line through points, with its first value and rises as parameters; each rise is at least 0.5.
+    /// Fits a curve to four points. The parameters are its first value and its rises; each rise is at least 0.5.
     #[test]
     fn rising_block_reaches_the_bounded_optimum() {
         let points = [0.0, 2.0, 1.9, 4.0];

@@ -1,9 +1,9 @@
-//! Fits heat capacity C and thermal resistance R of a cell: C dT/dt = I (OCV - V) - (T - Ta)/R, integrated and solved by linear least
-//! squares.
+//! Fits heat capacity C and thermal resistance R of a cell: C dT/dt = I (OCV - V) - (T - Ta)/R, integrated and solved
+//! by linear least squares.
 //!
-//! The surroundings are assumed to have the temperature at which a record starts. Some records start while the cell is still warm or
-//! cold. Therefore each discharge is fitted alone, and the medians of the credible results are used. Reversible heat is left out, so
-//! the values are effective values for the duty cycle of the data.
+//! The surroundings are assumed to have the temperature at which a record starts. Some records start while the cell is
+//! still warm or cold. Therefore each discharge is fitted alone, and the medians of the credible results are used.
+//! Reversible heat is left out, so the values are effective values for the duty cycle of the data.
 
 use super::parameters::ParameterTables;
 use super::record::Record;
@@ -50,7 +50,7 @@ fn of_record(record: &Record, tables: &ParameterTables) -> Option<Thermal> {
     let (mut hh, mut ha, mut aa, mut ht, mut at) = (0.0, 0.0, 0.0, 0.0, 0.0);
     let start_c = record.rows[0].temperature_c;
     let (mut heat, mut above) = (0.0, 0.0);
-    // If charge moved during a gap without rows, the heat that it produced is unknown.
+    // Stop at a gap that hides charge, because the heat that this charge produced is unknown.
     for row in record.rows.iter().skip(1).take_while(|row| !row.relaxed) {
         let rise = row.temperature_c - start_c;
         heat += row.mean_current_a * (row.ocv.at(&tables.ocv_v) - row.voltage_v) * row.dt_s;

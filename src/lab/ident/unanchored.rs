@@ -1,12 +1,13 @@
 //! Fits tables to records whose SOC is unknown: ordinary drives and charges that start at any SOC.
 //!
-//! Input: records with the charge taken out since their first row, priors of the open-circuit curve (V, V^2) and of the resistances,
-//! and the capacity on the label (Ah). Output: tables, capacity, and the SOC at which each record starts.
+//! Input: records with the charge taken out since their first row, priors of the open-circuit curve (V, V^2) and of the
+//! resistances, and the capacity on the label (Ah). Output: tables, capacity, and the SOC at which each record starts.
 //!
-//! `SOC = s_k - (q - o t) / C`. Here q is the charge taken out and t the time since the first row. The SOC s_k at the start of record
-//! k, ln C, and the offset o of the current sensor (A) are parameters in addition to the tables. All parameters are estimated together
-//! (maximum a posteriori, Gauss-Newton in [`super::solve`]). If the records contain no information on a value, it stays at the prior.
-//! The positions of the rows in the tables depend on the SOC, so every pass computes them again.
+//! `SOC = s_k - (q - o t) / C`. Here q is the charge taken out and t the time since the first row. The SOC s_k at the
+//! start of record k, ln C, and the offset o of the current sensor (A) are parameters in addition to the tables. All
+//! parameters are estimated together (maximum a posteriori, Gauss-Newton in [`super::solve`]). If the records contain
+//! no information on a value, it stays at the prior. The positions of the rows in the tables depend on the SOC, so
+//! every pass computes them again.
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
@@ -56,8 +57,8 @@ pub struct UnanchoredRecord {
     pub scale: f64,
     /// Estimated SOC at the first row, with its standard deviation.
     pub beginning: (f64, f64),
-    /// Charge taken out, Ah, and time since the first row, h, at the end of a full charge (SOC 1); `None` = the record has no full
-    /// charge.
+    /// Charge taken out, Ah, and time since the first row, h, at the end of a full charge (SOC 1); `None` = the record
+    /// has no full charge.
     pub full: Option<(f64, f64)>,
 }
 
@@ -78,7 +79,7 @@ pub struct UnanchoredFit {
     pub records: Vec<Record>,
 }
 
-/// Prior of the curve, scaled to unit variance: residual = row . (ocv - mean).
+/// Prior of the curve, scaled to unit variance. Each row of `whitening` gives one residual: row . (ocv - mean).
 struct CurvePriorRows {
     first: usize,
     whitening: DMatrix<f64>,
@@ -107,7 +108,8 @@ impl CurvePriorRows {
     }
 }
 
-/// All unknowns in one vector, with the tables first.
+/// A fit whose unknowns form one vector: the tables, ln(capacity), the current offset, and the SOC at the start of each
+/// record.
 struct Problem<'a> {
     settings: &'a FitSettings,
     known: &'a Known,
@@ -195,7 +197,8 @@ impl<'a> Problem<'a> {
         normal
     }
 
-    /// Converts a solution. `std` returns the standard deviation of an unknown by its index (open-circuit voltage or ln(capacity)).
+    /// Converts a solution. `std` returns the standard deviation of an unknown by its index (open-circuit voltage or
+    /// ln(capacity)).
     fn outcome(&self, solution: &Solution, std: impl Fn(usize) -> f64) -> UnanchoredFit {
         let theta = &solution.theta;
         let tables = ParameterTables::new(&self.layout, theta);
@@ -219,7 +222,8 @@ impl<'a> Problem<'a> {
         }
     }
 
-    /// Adds the priors of the capacity, of the current offset, and of the SOC at the start and at the full charge of each record.
+    /// Adds the priors of the capacity, of the current offset, and of the SOC at the start and at the full charge of
+    /// each record.
     fn add_capacity_and_beginnings(&self, theta: &[f64], normal: &mut NormalEquations) {
         let (log_capacity, offset) = (self.log_capacity(), self.offset());
         let mut near = |at: usize, mean: f64, std: f64| {
@@ -295,8 +299,8 @@ fn place(record: &Record, settings: &FitSettings, beginning_soc: f64, [log_capac
         let place = grid.place(row.soc, row.temperature_c);
         (row.ocv, row.resistance, row.tau) =
             (grid.ocv_corners(&place), grid.resistance_corners(&place), grid.tau_corners(&place));
-        // A cell warms up during a drive. The resistances of the cell follow Arrhenius' law outside the nodes as well
-        // as between them.
+        // A cell warms up during a drive. The resistances of the cell follow Arrhenius' law between the temperatures of
+        // the tables, and also outside them.
         let inside_c = row.temperature_c.clamp(coldest_c, warmest_c);
         let factor = arrhenius(row.temperature_c) / arrhenius(inside_c);
         row.resistance.weight.iter_mut().for_each(|weight| *weight *= factor);

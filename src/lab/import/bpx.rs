@@ -1,9 +1,9 @@
 //! Converts a BPX file (Battery Parameter eXchange, JSON) to a cell model.
 //!
-//! Input: the text of a BPX file of version 0.x or 1.x with the model SPM, SPMe or DFN. Output: the TOML of a cell model. The
-//! open-circuit curve is the difference of the electrodes' potentials (`curve.rs`). The resistances are derived from the physical
-//! parameters (`circuit.rs`). `[provenance]` states each derivation. If the input is wrong, every fault is reported with its path in
-//! the JSON, what was found and what is allowed.
+//! Input: the text of a BPX file of version 0.x or 1.x with the model SPM, SPMe or DFN. Output: the TOML of a cell
+//! model. The open-circuit curve is the difference of the electrodes' potentials (`curve.rs`). The resistances are
+//! derived from the physical parameters (`circuit.rs`). `[provenance]` states each derivation. If the input is wrong,
+//! every fault is reported with its path in the JSON, what was found and what is allowed.
 //!
 //! Source: BPX standard, Faraday Institution (https://bpxstandard.com).
 
@@ -37,7 +37,8 @@ const TEMPERATURES_K: [f64; 6] = [-35.0, -25.0, -15.0, 0.0, 15.0, 30.0];
 /// difference between a real cell and its parameters.
 const ERROR_AT_REST_V: f64 = 0.010;
 
-/// Share of the voltage drop at a one-hour current that is added to the error, because the formulas hold for small currents.
+/// This share of the voltage drop at 1C is also part of the error (root of the sum of squares), because the formulas
+/// hold only for small currents.
 const ERROR_OF_DROP: f64 = 0.3;
 
 /// Settings of a conversion.
@@ -74,8 +75,8 @@ struct Model {
 /// Converts the text of a BPX file.
 ///
 /// # Errors
-/// The text is not valid JSON, or not a BPX file that can be converted. Each fault has one line with path, what was found and what is
-/// allowed.
+/// The text is not valid JSON, or not a BPX file that can be converted. The error has one line per fault, with the
+/// path, what was found and what is allowed.
 pub fn import(text: &str, settings: &BpxSettings) -> Result<BpxImport, LabError> {
     let source = &settings.source;
     let text = text.strip_prefix('\u{feff}').unwrap_or(text);

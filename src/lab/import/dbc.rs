@@ -1,9 +1,9 @@
-//! Finds the signals of a DBC that are probably battery signals, and writes them as the `[input]` part of a configuration. Only name,
-//! unit and range are considered.
+//! Finds the signals of a DBC that are probably battery signals, and writes them as the `[input]` part of a
+//! configuration. Only name, unit and range are considered.
 //!
-//! Input: a parsed DBC and its name. Output: TOML with the best candidate for each input; the next candidates are comments. `packwatch
-//! discover` can check the values in a log, and the owner must confirm the result. A DBC does not show the sign of the current, so the
-//! sign is left open. The part is not a valid configuration until it is completed.
+//! Input: a parsed DBC and its name. Output: TOML with the best candidate for each input; the next candidates are
+//! comments. `packwatch discover` can check the values in a log, and the owner must confirm the result. A DBC does not
+//! show the sign of the current, so the sign is left open. The part is not a valid configuration until it is completed.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -61,21 +61,20 @@ fn judge(message: &Message, signal: &Signal) -> Vec<(PackQuantity, f64)> {
             PackQuantity::PackVoltage => (largest > 60.0 && !label.says_cell(), points),
             PackQuantity::Current | PackQuantity::Temperature | PackQuantity::Soc | PackQuantity::Soh => (true, points),
         };
-        // A signal gets three points, for example, for a matching unit and a name that contains the quantity or the
-        // battery.
+        // A matching unit and a name that contains the quantity give at least three points, before deductions.
         (fits && points >= 3.0 && signal.layout.length_bits >= 4).then_some((quantity, points))
     };
     PackQuantity::ALL.into_iter().filter_map(points).collect()
 }
 
-/// Returns the largest value: as stated in the DBC, or else as limited by the number of bits.
+/// Returns the largest value that the bits can represent, or the maximum in the DBC if it is smaller.
 fn largest(signal: &Signal) -> f64 {
     let layout = &signal.layout;
     let top = 2_f64.powi(i32::from(layout.length_bits)) * layout.factor.abs() + layout.offset;
     if layout.has_range() { layout.maximum.min(top) } else { top }
 }
 
-/// Joins signals whose names differ only in a number to one pattern. Patterns come before single signals.
+/// If the names of at least three signals differ only in a number, joins these signals to one pattern and adds points.
 fn with_patterns(cells: Vec<Ranked>) -> Vec<Ranked> {
     let names: Vec<(String, &str)> = cells.iter().map(|(_, name)| (String::new(), name.as_str())).collect();
     let found = groups(&names);

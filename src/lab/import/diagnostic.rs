@@ -41,7 +41,7 @@ pub(crate) struct DiagnosticSignal {
     pub(crate) signed: bool,
     /// Whether the least significant byte is first.
     pub(crate) little_endian: bool,
-    /// Units of the value per code.
+    /// Change of the value if the code increases by 1.
     pub(crate) factor: f64,
     /// Value of code 0.
     pub(crate) offset: f64,
@@ -97,8 +97,8 @@ impl DiagnosticSignal {
         Self { signed: true, range: None, ..self.clone() }
     }
 
-    /// Returns the value in the data after the echoed service and identifier; `None` = the data are too short, or the value is not
-    /// available or out of range.
+    /// Returns the value in the data after the echoed service and identifier; `None` = the data are too short, or the
+    /// value is not available or out of range.
     pub(crate) fn value(&self, data: &[u8]) -> Option<f64> {
         let (first, last) = (self.bit / 8, (self.bit + self.length - 1) / 8);
         let bytes = data.get(usize::try_from(first).ok()?..=usize::try_from(last).ok()?)?;
@@ -115,13 +115,13 @@ impl DiagnosticSignal {
         (is_inside && !self.not_available.contains(&code)).then_some(value)
     }
 
-    /// Smallest and largest code.
+    /// Returns the smallest and largest code.
     pub(crate) fn codes(&self) -> (f64, f64) {
         let top = 2_f64.powi(i32::try_from(self.length).unwrap_or(64));
         if self.signed { (-top / 2.0, top / 2.0 - 1.0) } else { (0.0, top - 1.0) }
     }
 
-    /// Smallest and largest value that the bits can represent.
+    /// Returns the smallest and largest value that the bits can represent.
     pub(crate) fn representable(&self) -> (f64, f64) {
         let (low, high) = self.codes();
         let (a, b) = (low * self.factor + self.offset, high * self.factor + self.offset);

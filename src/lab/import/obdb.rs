@@ -1,12 +1,13 @@
 //! Converts an OBDb signal set (one JSON file per car model) to `[[input.diagnostic]]` tables.
 //!
-//! Input: the text of the JSON, a model year, and a name. Output: TOML with one table per command and one signal per line. The tables
-//! are in the order of the controllers. The licence of the source, CC BY-SA 4.0, also applies to the TOML; the TOML states it.
+//! Input: the text of the JSON, a model year, and a name. Output: TOML with one table per command and one signal per
+//! line. The tables are sorted by the identifiers of requests and answers, so the commands of one controller are
+//! together. The licence of the source, CC BY-SA 4.0, also applies to the TOML; the TOML states it.
 //!
 //! Signals are named `NAME.REST`. If all ids of a file start with the same word, REST is the `id` without this word,
 //! and NAME is the given name or this word. Otherwise, REST is the whole `id`, and NAME is the given name or `Car`. A
 //! file that is not an OBDb signal set is an error. A command or signal that cannot be converted becomes an
-//! [`Exclusion`], and the rest is converted. An unknown field is a warning.
+//! [`Exclusion`], and the rest is converted. An unknown field is ignored and causes a warning.
 
 mod address;
 mod document;
@@ -39,7 +40,8 @@ pub struct ObdbSettings {
 /// Converts the text of a signal set.
 ///
 /// # Errors
-/// The text is not an OBDb signal set, or nothing in it can be converted. The error states place, what was found and what is allowed.
+/// The text is not an OBDb signal set, or nothing in it can be converted. The error states place, what was found and
+/// what is allowed.
 pub fn import(text: &str, settings: &ObdbSettings) -> Result<ImportResult, LabError> {
     let (document, converter) = convert(text, settings)?;
     let Converter { tables, exclusions, warnings, .. } = converter;
@@ -203,7 +205,7 @@ impl Converter {
     }
 }
 
-/// Service and identifier of a command.
+/// Returns service and identifier of a command.
 fn request(command: &CommandDocument) -> Result<(u8, u16), (ExclusionReason, String)> {
     let mut entries = command.cmd.iter();
     let (Some((service, identifier)), None) = (entries.next(), entries.next()) else {
@@ -230,7 +232,7 @@ fn request(command: &CommandDocument) -> Result<(u8, u16), (ExclusionReason, Str
     Ok((service, number))
 }
 
-/// Remarks for a person who wants to poll.
+/// Returns remarks for a user who wants to poll the command.
 fn remarks(command: &CommandDocument) -> Vec<String> {
     let mut remarks = Vec::new();
     if let Some(seconds) = command.freq {

@@ -31,7 +31,7 @@ pub(crate) fn join(signals: Vec<DiagnosticSignal>) -> Vec<DiagnosticSignal> {
     joined
 }
 
-/// The series that starts with the first of `signals`, and its length.
+/// Returns the series that starts with the first of `signals`, and its length.
 fn series(name: &NumberedName<'_>, signals: &[DiagnosticSignal]) -> (DiagnosticSignal, usize) {
     let first = &signals[0];
     let step = signals.get(1).map_or(0, |second| second.bit.saturating_sub(first.bit));

@@ -1,5 +1,5 @@
-//! Determines the condition of a battery for a passport: every value with its time and standard deviation, or the reason why it is
-//! unknown.
+//! Determines the condition of a battery for a passport: every value with its time and standard deviation, or the
+//! reason why it is unknown.
 //!
 //! Input: a [`Record`], the configuration, the current cell model, and data that only people know ([`Terms`]). Measured
 //! and learned values are known; a configured start value, an untrusted estimate and an incomplete sum count as
@@ -17,7 +17,7 @@ use crate::quantity::{CellIndex, Channel, Timestamp, catalogue};
 /// A time stamp before this one (2001-01-01, s since 1970) is not a date. A clock that was not set starts in 1970, 1980
 /// or 2000; a log that counts from its own start is shorter than 30 years.
 const FIRST_DATE_S: f64 = 978_307_200.0;
-/// Largest accepted difference between two values of the same new battery, fraction; the values may be rounded.
+/// Two statements of the same value of a new battery may differ by this fraction, because they may be rounded.
 pub(super) const RATED_TOLERANCE: f64 = 0.01;
 
 /// Data from the command line that no record contains; `None` = not given.
@@ -52,7 +52,8 @@ pub struct Condition {
     rated: Rated,
 }
 
-/// Values of the new battery from configuration and command line. A passport with other values belongs to another battery.
+/// Values of the new battery from configuration and command line. A passport with other values belongs to another
+/// battery.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Rated {
     /// Capacity, Ah.
@@ -65,7 +66,7 @@ impl Condition {
     /// Determines all values.
     ///
     /// # Errors
-    /// There is no state, it has no date, or it does not fit the configuration.
+    /// The state is missing, has no date, or does not fit the configuration.
     pub fn new(record: &Record, config: &Config, model: &CellModel, terms: &Terms) -> Result<Self, String> {
         let battery = Battery::new(record, config, model)?;
         let moved = battery.moved_ah(terms);
@@ -85,7 +86,7 @@ impl Condition {
         self.rated
     }
 
-    /// A value.
+    /// Returns a value, or the reason why it is unknown.
     pub fn get(&self, field: Field) -> Result<Quantity, &str> {
         let found = self.values.iter().find(|(one, _)| *one == field);
         found.map_or(Err("not determined"), |(_, known)| known.as_ref().copied().map_err(String::as_str))
@@ -204,7 +205,7 @@ impl<'a> Battery<'a> {
         time.plus_nanos(self.offset_ns)
     }
 
-    /// Total charge moved.
+    /// Returns the total charge moved, Ah.
     fn moved_ah(&self, terms: &Terms) -> Known {
         let now = self.wall(self.monitor.now());
         if let Some(value) = terms.moved_ah {
@@ -245,7 +246,7 @@ impl<'a> Battery<'a> {
         Ok(Quantity { value, std, time })
     }
 
-    /// Fails, naming the cell, if an estimate is untrusted.
+    /// If the estimate of a cell is untrusted, returns an error that names the cell.
     fn check_trust(&self) -> Result<(), String> {
         let mut cells = (0..self.config.monitor.sample.cells).map(CellIndex);
         match cells.find(|&cell| !self.monitor.is_trusted(cell)) {
@@ -278,7 +279,7 @@ impl<'a> Battery<'a> {
         Ok(Quantity { value, std: None, time: self.wall(time) })
     }
 
-    /// Learned values of every cell.
+    /// Returns the learned values of every cell.
     fn learned(&self) -> Result<Vec<(usize, Learned)>, String> {
         self.check_trust()?;
         let of_cell = |index: usize| {
@@ -321,7 +322,7 @@ impl<'a> Battery<'a> {
         Ok(Quantity { value, std: Some(std), time: Timestamp::from_nanos(oldest_ns) })
     }
 
-    /// Series resistance of a new cell, ohm.
+    /// Returns the series resistance of a new cell at SOC 0.5 and 25 degrees C, ohm.
     fn new_ohm(&self) -> Result<f64, String> {
         match self.monitor.model().state {
             ModelState::Given | ModelState::Learned => Ok(self.model.r0_ohm(&self.model.grid_position(0.5, 25.0))),
@@ -332,7 +333,7 @@ impl<'a> Battery<'a> {
         }
     }
 
-    /// Energy of a discharge from full, at the configured load, until the weakest cell is empty.
+    /// Returns the energy of a discharge from full, at the configured load, until the weakest cell is empty, kWh.
     fn energy_kwh(&self) -> Known {
         let Some(load) = &self.config.monitor.health.usable else {
             return Err("no load is configured ([usable], the load of the certification)".to_owned());

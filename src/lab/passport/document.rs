@@ -1,5 +1,5 @@
-//! Writes the passport as JSON. The known values are merged into the manufacturer's part, and the result is checked against the form of
-//! its standard.
+//! Writes the passport as JSON. The known values are merged into the manufacturer's part, and the result is checked
+//! against the form of its standard.
 //!
 //! Input: a [`Condition`] and the manufacturer's part. Output: the passport, and the [details](details) that the
 //! standards do not provide for. Each value has one source: a manufacturer's part that states a measured value is
@@ -18,8 +18,8 @@ use crate::io::stamp::format_utc;
 /// Merges the known values into the manufacturer's part and checks the result.
 ///
 /// # Errors
-/// The manufacturer's part is faulty, or required values are missing. The error has one line per fault with its path, and one per
-/// missing value with the reason.
+/// The manufacturer's part is faulty, or required values are missing. The error has one line per fault with its path,
+/// and one per missing value with the reason.
 pub fn passport(standard: Standard, condition: &Condition, manufacturer: Value) -> Result<Value, Vec<String>> {
     let Value::Object(mut root) = manufacturer else {
         return Err(vec!["static part: must be an object".to_owned()]);
@@ -87,7 +87,7 @@ fn insert(root: &mut Map<String, Value>, group: &str, name: &str, value: Value) 
     let mut object = root;
     for step in group.split('.') {
         let next = object.entry(step).or_insert_with(|| Value::Object(Map::new()));
-        // If another value is in this place, the check of the form reports it.
+        // If this place contains something other than an object, the check of the form reports it.
         let Some(next) = next.as_object_mut() else { return Ok(()) };
         object = next;
     }
@@ -101,7 +101,8 @@ fn insert(root: &mut Map<String, Value>, group: &str, name: &str, value: Value) 
     Ok(())
 }
 
-/// Returns faults that show that the manufacturer's part belongs to another battery. Only Catena-X states the rated values.
+/// Returns faults that show that the manufacturer's part belongs to another battery. Only Catena-X states the rated
+/// values.
 fn other_battery(rated: Rated, document: &Value) -> impl Iterator<Item = String> {
     let both = [
         ("capacity", rated.capacity_ah, "Ah by the configuration (cell model and strings)"),

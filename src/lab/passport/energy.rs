@@ -1,9 +1,9 @@
 //! Computes the energy of a discharge at the configured load.
 //!
-//! Input: model, load, capacity (Ah) and resistance ratio of a cell. Output: the energy (Wh) until a given charge (Ah) has been
-//! delivered. The voltage under load follows from the usable capacity ([`usable_ah`]): a table contains the charge q(v) that a
-//! discharge delivers down to each voltage v. The energy is the sum of v dq over this table. Any additional charge is delivered at the
-//! cut-off voltage.
+//! Input: model, load, capacity (Ah) and resistance ratio of a cell. Output: the energy (Wh) until a given charge (Ah)
+//! has been delivered. The voltage under load follows from the usable capacity ([`usable_ah`]): a table contains the
+//! charge q(v) that a discharge delivers down to each voltage v. The energy is the sum of v dq over this table. Any
+//! additional charge is delivered at the cut-off voltage.
 
 use crate::cell::CellModel;
 use crate::health::UsableConfig;
@@ -28,13 +28,14 @@ impl Discharge {
         let point = |step: u32| {
             let cutoff_v = voltage_v(step);
             let load = UsableConfig { cutoff_v, ..*load };
-            // The slowest branch counts as new: its ageing changes the mean voltage by millivolts only.
+            // The additional ageing of the slowest branch is ignored, because it changes the mean voltage only by
+            // millivolts.
             (cutoff_v, usable_ah(model, &load, 1.0, capacity_ah, (resistance_ratio, 1.0)))
         };
         Self { points: (0..=VOLTAGES).map(point).collect(), cutoff_v: load.cutoff_v }
     }
 
-    /// Energy, Wh, until `charge_ah` has been delivered.
+    /// Returns the energy, Wh, until `charge_ah` has been delivered.
     pub(super) fn energy_wh(&self, charge_ah: f64) -> f64 {
         let mut energy_wh = 0.0;
         let mut delivered_ah = 0.0;

@@ -1,4 +1,5 @@
-//! Lists the values of a battery passport that packwatch can determine: name, unit, definition and place in each standard.
+//! Lists the values of a battery passport that packwatch can determine: name, unit, definition and place in each
+//! standard.
 //!
 //! This list decides which value is written to which member; `docs/src/lab/passport.md` explains the choice.
 
@@ -78,7 +79,7 @@ impl Place {
 }
 
 impl Field {
-    /// All values, in the order of lists.
+    /// All values, in the order in which they are listed.
     pub const ALL: [Self; 13] = [
         Self::FullCycles,
         Self::CapacityThroughput,
@@ -182,7 +183,7 @@ impl Field {
         }
     }
 
-    /// The number for a passport: both standards count whole cycles.
+    /// Returns the number for a passport. Both standards count whole cycles.
     pub(super) fn number(self, value: f64) -> Value {
         match self {
             // Whole numbers below 2^53 are exact.
@@ -192,7 +193,7 @@ impl Field {
     }
 }
 
-/// Rounds to seven digits, far below every standard deviation; a zero is positive.
+/// Rounds to seven significant digits. The rounding error is far below every standard deviation. A zero is positive.
 pub(super) fn rounded(value: f64) -> f64 {
     format!("{value:.6e}").parse().unwrap_or(value) + 0.0
 }

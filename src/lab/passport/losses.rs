@@ -18,9 +18,9 @@ use crate::quantity::{Channel, Fault, Timestamp};
 /// Limits for the readings of a replay's current and voltages.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct ReadingLimits {
-    /// Longest use of a current reading, s.
+    /// Maximum age of a current reading that is still used, s.
     pub current_age_s: f64,
-    /// Longest use of a voltage reading, s.
+    /// Maximum age of a voltage reading that is still used, s.
     pub voltage_age_s: f64,
     /// Largest current of a resting pack, A per string.
     pub rest_a: f64,
@@ -90,7 +90,7 @@ impl Losses {
         current_a.abs() <= self.limits.rest_a
     }
 
-    /// Whether nothing was recorded and no charge moved in a part of the time since `from`.
+    /// Whether, after `from`, there was a time in which nothing was recorded and no charge moved.
     pub(super) fn has_paused_since(&self, from: Timestamp) -> bool {
         self.paused_until.is_some_and(|until| until > from)
     }
@@ -105,8 +105,8 @@ impl Losses {
         }
     }
 
-    /// Why the charge of the record is unknown; `None` = it is known. The record ends at `end`; its charges and
-    /// discharges take `used_s`.
+    /// Returns why the charge of the record is unknown; `None` = the charge is known. The record ends at `end`. Its
+    /// charges and discharges last `used_s` in total.
     pub(super) fn finish(&mut self, end: Timestamp, used_s: f64) -> Option<String> {
         self.end_loss(end);
         let lost_s = self.lost_s;

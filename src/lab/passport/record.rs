@@ -1,8 +1,9 @@
-//! Collects the record of the connected pack from a store or a replay: sums of half-cycles, energy, latest learned values, last state.
+//! Collects the record of the connected pack from a store or a replay: sums of half-cycles, energy, latest learned
+//! values, last state.
 //!
-//! Times are nanoseconds since 1970, on the wall clock of a store or the log's clock of a replay. Rows of a store and events of a replay
-//! use the same names, so both give the same sums. Energy needs every voltage, which a store does not contain. If a part of a
-//! sum is missing, [`Record::gap`] states the reason.
+//! Times are nanoseconds since 1970, on the wall clock of a store or the log's clock of a replay. Rows of a store and
+//! events of a replay use the same field names, so both give the same sums. Energy needs every voltage, which a store
+//! does not contain. If a part of a sum is missing, [`Record::gap`] states the reason.
 
 use super::losses::{Losses, ReadingLimits, is_too_much};
 use crate::fields::Fields;
@@ -28,7 +29,7 @@ pub(super) struct Learned {
 pub(super) struct CellRecord {
     pub(super) moved: Throughput,
     pub(super) learned: Option<Learned>,
-    /// In a replay: the last reading of voltage and current.
+    /// In a replay: power of the last reading of voltage and current.
     power: Option<Power>,
 }
 
@@ -56,13 +57,13 @@ pub(super) struct Energy {
 }
 
 impl Energy {
-    /// Why the energy is unknown; `None` = it is known.
+    /// Returns why the energy is unknown; `None` = the energy is known.
     pub(super) fn gap(&self) -> Option<&'static str> {
         is_too_much(self.lost_s, self.counted_s).then_some("voltages are missing from the record while current flowed")
     }
 }
 
-/// Sources of a passport, besides the configuration.
+/// Recorded data for a passport.
 #[derive(Debug, Default)]
 pub struct Record {
     pub(super) cells: Vec<CellRecord>,
@@ -80,7 +81,7 @@ pub struct Record {
 }
 
 impl Record {
-    /// Creates the record of a replay, without any event.
+    /// Creates an empty record of a replay.
     pub fn of_replay(limits: ReadingLimits) -> Self {
         Self { energy: Some(Energy::default()), limits, losses: Losses::new(limits), ..Self::default() }
     }
@@ -88,7 +89,7 @@ impl Record {
     /// Reads the record of the connected pack from a store.
     ///
     /// # Errors
-    /// The file cannot be read, or its chained rows were changed.
+    /// The file cannot be read, or rows of its hash chain were changed.
     pub fn of_store(reader: &HistoryReader) -> Result<Self, String> {
         if let Some(broken) = reader.verify()?.broken {
             return Err(format!("the history was changed: {broken}; packwatch does not write a passport from it"));
@@ -108,8 +109,8 @@ impl Record {
         Ok(record)
     }
 
-    /// Compares the half-cycles in a store with the number that was counted when they were written. If the state counts
-    /// all these half-cycles, its sums replace rows that the store has deleted.
+    /// Compares the half-cycles in a store with the number that was counted when they were written. If the store has
+    /// deleted rows, but the state counts all half-cycles, the sums of the state are used instead of the rows.
     fn note_missing_rows(&mut self, extent: &HistoryExtent) {
         let HistoryExtent { half_cycles, deleted_half_cycles: deleted, written_half_cycles, .. } = *extent;
         let counted = self.snapshot().map_or(0, Snapshot::half_cycles);

@@ -1,9 +1,9 @@
 //! Defines the form that a standard requires of a JSON document, and checks documents against this form.
 //!
-//! Input: rows of path and kind, for example `identification.codes[].key|value`. In a path, `|` separates members of the same form,
-//! `[]` is a list, and `{}` is a list without duplicates. A member that may be missing ends in `?` in the first row that names it.
-//! Output: every fault with its path, and the required members that are missing. A member that the standard does not define is also a
-//! fault, because a misspelt name would otherwise stay unnoticed.
+//! Input: rows of path and kind, for example `identification.codes[].key|value`. In a path, `|` separates members of
+//! the same form, `[]` is a list, and `{}` is a list without duplicates. If a member may be missing, the first row that
+//! names it marks it with `?`. Output: every fault with its path, and the required members that are missing. A member
+//! that the standard does not define is also a fault, because a misspelt name would otherwise stay unnoticed.
 
 use std::collections::HashSet;
 use std::ops::Range;
@@ -37,7 +37,7 @@ pub(super) enum Kind {
     LocalKey(&'static [&'static str]),
     /// A list of documents: content, contentType, header.
     Documents,
-    /// A list of places: facility, a BPNA.
+    /// A list of facilities, each a business partner number that starts with BPNA.
     Facilities,
     /// A measured value: value and time.
     Reading,
@@ -115,8 +115,8 @@ impl Shape {
         }
     }
 
-    /// Checks a document. A missing object counts as one missing member. If `is_opened` returns true for the path of the object, its
-    /// own required members count instead.
+    /// Checks a document. A missing object counts as one missing member. If `is_opened` returns true for the path of
+    /// the object, the required members of the object count instead.
     pub(super) fn check(&self, document: &Value, is_opened: &dyn Fn(&str) -> bool) -> Verdict {
         let mut verdict = Verdict::default();
         self.check_at("", document, is_opened, &mut verdict);
@@ -174,7 +174,7 @@ fn check_object(
     }
 }
 
-/// The path of a member.
+/// Returns the path of a member.
 pub(super) fn joined(path: &str, name: &str) -> String {
     if path.is_empty() { name.to_owned() } else { format!("{path}.{name}") }
 }
@@ -183,7 +183,7 @@ fn named(path: &str) -> &str {
     if path.is_empty() { "the document" } else { path }
 }
 
-/// Short description of a value of the wrong type.
+/// Returns a short description of a value of the wrong type.
 fn short(value: &Value) -> String {
     match value {
         Value::Object(_) => "an object".to_owned(),
@@ -246,7 +246,7 @@ fn is_date(text: &str) -> bool {
     (1..=days).contains(&day)
 }
 
-/// Whether a text is date and time. Seconds may have decimals. The zone is `Z`, an offset, or missing.
+/// Whether a text is a date with a time. Seconds may have decimals. The zone is `Z`, an offset, or missing.
 fn is_time(text: &str) -> bool {
     let Some((date, clock)) = text.split_once('T') else { return false };
     let zone_at = clock.find(['Z', '+', '-']).unwrap_or(clock.len());

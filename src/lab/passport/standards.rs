@@ -1,7 +1,8 @@
 //! Defines the two standards as rows of path and kind, derived from their aspect models.
 //!
-//! Sources: IDTA 02035-5 "Digital Battery Passport, Part 5: Product Condition" 1.0.1 (aspect model `product_condition`), and Catena-X
-//! `io.catenax.battery.battery_pass` 6.0.0. Units follow the aspect models; see [`super::field`].
+//! Sources: IDTA 02035-5 "Digital Battery Passport, Part 5: Product Condition" 1.0.1 (aspect model
+//! `product_condition`), and Catena-X `io.catenax.battery.battery_pass` 6.0.0. Units follow the aspect models; see
+//! [`super::field`].
 
 use super::field::Standard;
 use super::shape::{Kind, Shape};
@@ -85,7 +86,7 @@ const SOURCE: Kind = Choice(&[
 const PRODUCT_CONDITION: &[(&str, Kind)] = &[
     ("EnergyThroughput?.EnergyThroughputValue", Number),
     ("CapacityThroughput?.CapacityThroughputValue", Number),
-    // Largest number of an unsigned integer of 32 bits, the model's type for cycles.
+    // Largest unsigned integer of 32 bits. The aspect model uses this type for the number of cycles.
     ("NumberOfFullCycles.NumberOfFullCyclesValue", Within(0.0, 4_294_967_295.0)),
     ("StateOfCertifiedEnergy?.StateOfCertifiedEnergyValue", Number),
     ("RemainingEnergy?.RemainingEnergyValue", Number),
@@ -231,7 +232,7 @@ const BATTERY_PASS: &[(&str, Kind)] = &[
     ("handling.applicable", Flag),
 ];
 
-/// The form of a standard.
+/// Returns the form of a standard.
 pub(super) fn shape(standard: Standard) -> Shape {
     Shape::of_rows(match standard {
         Standard::ProductCondition => PRODUCT_CONDITION,

@@ -19,7 +19,7 @@ pub struct PageContext<'a> {
     pub model: Option<SourcedModel>,
     /// Findings about single cells; `None` = the cells were not compared.
     pub diagnosis: Option<&'a CellFaultDetector>,
-    /// Cost of the differences between cells for the pack; `None` = the cells were not compared.
+    /// What the differences between the cells cost the pack; `None` = the cells were not compared.
     pub imbalance: Option<Result<Imbalance, UnknownImbalance>>,
     /// Measured or true values.
     pub reference: Reference,

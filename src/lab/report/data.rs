@@ -39,18 +39,19 @@ pub(super) struct CapacityRecord {
     pub(super) cell: usize,
     /// Capacity from this half-cycle alone, Ah.
     pub(super) measured_ah: Option<f64>,
-    /// Standard deviation of that capacity, Ah.
+    /// Standard deviation of `measured_ah`, Ah.
     pub(super) measured_std_ah: Option<f64>,
     /// Learned capacity, Ah: mean and standard deviation.
     pub(super) capacity_ah: (f64, f64),
     pub(super) usable_ah: Option<(f64, f64)>,
-    /// Losses of lithium, of the negative and of the positive electrode, fractions: mean and standard deviation each.
+    /// Losses of lithium, of the negative electrode and of the positive electrode, as fractions. Each loss has a mean
+    /// and a standard deviation.
     pub(super) losses: Option<[(f64, f64); 3]>,
     /// Resistance relative to new: mean and standard deviation.
     pub(super) resistance: (f64, f64),
 }
 
-/// A charge that covered the SOC window of the recharge period.
+/// A charge that covered the SOC window of the recharge period, or enough of it.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct RechargeRecord {
     pub(super) time_s: f64,
@@ -78,7 +79,8 @@ pub(super) struct ModelRecord {
     pub(super) time_s: f64,
     /// Name of a [`ModelState`](crate::monitor::ModelState).
     pub(super) state: String,
-    /// Mean and standard deviation, Ah; `None` = as on the label.
+    /// Learned capacity of the mean cell, Ah: mean and standard deviation. `None` = nothing was learned, so the label's
+    /// capacity applies.
     pub(super) capacity_ah: Option<(f64, f64)>,
     /// Root mean square of the residuals, V.
     pub(super) residual_v: Option<f64>,
@@ -108,7 +110,7 @@ pub struct Data {
     pub(super) recharges: Vec<RechargeRecord>,
     pub(super) alarms: Vec<AlarmRecord>,
     pub(super) models: Vec<ModelRecord>,
-    /// Time and text of resets, damages and losses of trust.
+    /// Time and text of other events: resets, changes of trust, replaced packs, and a clock that was set back.
     pub(super) incidents: Vec<(f64, String)>,
     pub(super) trace: Trace,
     /// Cells whose estimate is untrusted at the end.
@@ -232,7 +234,8 @@ impl Data {
         });
     }
 
-    /// Adds the losses of a cell to its capacity record of the same time, which was received first.
+    /// Adds the losses of a cell to the capacity record of the same cell and time. That record is received before the
+    /// losses.
     fn take_losses(&mut self, time_s: f64, fields: &Fields) {
         let Some(cell) = cell_of(fields) else { return };
         let [lithium, negative, positive] =

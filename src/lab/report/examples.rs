@@ -1,8 +1,8 @@
 //! Creates data for the tests of the report: a recording of estimates, and a worn pack that gives every card of the
 //! report a value.
 //!
-//! Times are in s; cells count from 0. Standard deviations differ between quantities and between neighbouring cells. A test can
-//! therefore detect that a standard deviation is printed in place of another.
+//! Times are in s; cells count from 0. Standard deviations differ between quantities and between neighbouring cells. A
+//! test can therefore detect that a standard deviation is printed in place of another.
 
 use std::path::Path;
 
@@ -12,15 +12,16 @@ use crate::monitor::{Estimate, Event, EventKind, MeasuredValues};
 use crate::quantity::catalogue::{Quantity, RecordedValues};
 use crate::quantity::{CellIndex, Mode, Timestamp};
 
-/// Half-cycles of the worn pack: enough for a remaining life of every cell.
+/// Number of half-cycles of the worn pack. With this number, the remaining life of every cell is known.
 pub(super) const HALVES: u16 = 60;
-/// End of the first half-cycle (2023-11-14), s since 1970. Next constant: time between two ends, s.
+/// End of the first half-cycle (2023-11-14), s since 1970.
 const FIRST_END_S: f64 = 1.7e9;
+/// Time between the ends of two half-cycles, s.
 const HALF_CYCLE_S: f64 = 21_600.0;
-/// Number of estimates of a recording after the first.
+/// Number of estimates of a recording, not counting the first.
 const STEPS: u16 = 60;
 
-/// The demo's configuration: cells of 2.6 Ah rated, end of life at 2.08 Ah.
+/// The demo's configuration: cells with a rated capacity of 2.6 Ah, and the end of life at 2.08 Ah.
 pub(super) fn config() -> Config {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/demo.toml");
     config::load(&path).expect("shipped")
@@ -61,7 +62,7 @@ pub(super) struct CellStds {
     pub(super) losses: [f64; 3],
 }
 
-/// Returns the standard deviations of a cell, equal in every half-cycle.
+/// Returns the standard deviations of a cell. They are the same in every half-cycle.
 pub(super) fn stds(cell: u16) -> CellStds {
     let own = f64::from(cell % 4);
     let [capacity_ah, usable_ah, resistance] = [0.031, 0.052, 0.073].map(|std| std + 0.001 * own);
@@ -69,8 +70,8 @@ pub(super) fn stds(cell: u16) -> CellStds {
 }
 
 /// Creates a pack at the end of [`HALVES`] half-cycles. The last cell has the smallest capacity. The first cell has the
-/// smallest usable capacity and the largest resistance. The losses of lithium, of the negative and of the positive
-/// electrode are largest in the second, third and first cell, in this order.
+/// smallest usable capacity and the largest resistance. The second cell has the largest loss of lithium,
+/// the third cell of the negative electrode, and the first cell of the positive electrode.
 pub(super) fn worn(cells: u16) -> Data {
     let mut data = Data::new(Origin::Replay);
     for half in 0..HALVES {

@@ -1,8 +1,8 @@
-//! Forecasts the remaining life from the record, with the monitor's own filter (`health::Forecast`), and computes the fan that shows
-//! the forecast in the capacity chart.
+//! Forecasts the remaining life from the record, with the monitor's own filter (`health::Forecast`), and computes the
+//! fan that shows the forecast in the capacity chart.
 //!
-//! A store's rows and a replay's events both contain the filter's inputs, so both give the same result as the monitor. A
-//! record that lacks its beginning gives a wider interval.
+//! A store's rows and a replay's events both contain the filter's inputs, so both give the same result as the monitor.
+//! A record that lacks its beginning gives a wider interval.
 
 use std::collections::BTreeMap;
 
@@ -19,8 +19,8 @@ const POINTS: usize = 60;
 /// times the length of the record (or the median, if it is larger).
 const MAX_MEDIANS: f64 = 2.5;
 const MAX_RECORDS: f64 = 2.0;
-/// The first limit is at least this multiple of the record's length, because the end of life may come much later than a
-/// near median.
+/// The first limit is at least this multiple of the record's length. Even if the median is near, the end of life may
+/// come much later.
 const LEAST_RECORDS: f64 = 0.2;
 
 /// Forecast of the capacity at a time.
@@ -47,7 +47,8 @@ pub(super) struct Outlook {
     pub(super) unknown: Option<String>,
 }
 
-/// Capacity at the end of life, Ah: as configured, or else the mildest limit in the record's alarms.
+/// Capacity at the end of life, Ah, from the configuration. Without a configuration, it is the limit of the least
+/// severe capacity alarm in the record.
 pub(super) fn end_of_life_ah(data: &Data, context: &PageContext<'_>) -> Option<f64> {
     let configured = context.config.map(|config| config.monitor.health.end_of_life_ah);
     configured.or_else(|| threshold(data, context, Rule::CapacityLow))
@@ -92,7 +93,8 @@ fn display(why: InsufficientData) -> String {
 
 /// The forecast of every cell at the end of the record, with the same inputs as in `monitor::life`.
 pub(super) fn cells(data: &Data, context: &PageContext<'_>) -> Vec<Forecast> {
-    // Standard deviation of the current sensor's gain without a configuration: the default of `capacity.current_gain_std`.
+    // Standard deviation of the current sensor's gain without a configuration: the default of
+    // `capacity.current_gain_std`.
     let gain_std = context.config.map_or(0.005, |config| config.monitor.health.capacity.current_gain_std);
     let key = |time_s: f64, cell: usize| (time_s.to_bits(), cell);
     let learned: BTreeMap<_, &CapacityRecord> =
@@ -149,7 +151,8 @@ impl Outlook {
         is_over(&self.life)
     }
 
-    /// Returns for example "14 cycles". As in the monitor, the life of a pack is unknown until the life of every cell is known.
+    /// Returns for example "14 cycles". If the life of another cell is unknown, the result is "unknown", as in the
+    /// monitor, unless the end of life has passed.
     pub(super) fn value(&self) -> String {
         match self.life.cycles {
             Some(left) if self.unknown.is_none() => median(left),
@@ -194,7 +197,7 @@ mod tests {
     use crate::report::Origin;
     use crate::report::data::HalfCycleRecord;
 
-    /// Full cycles of three hours each, twice a day; each cell loses its own share of 2 Ah per half-cycle.
+    /// Half-cycles of three hours, one every six hours. In each half-cycle, each cell loses its own share of 2 Ah.
     fn worn(halves: u32, losses: &[f64]) -> Data {
         let mut data = Data::new(Origin::Store);
         for half in 0..halves {

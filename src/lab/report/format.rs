@@ -20,7 +20,8 @@ pub(super) fn without_minus_zero(digits: String) -> String {
     if is_zero { digits.trim_start_matches(['-', '+']).to_owned() } else { digits }
 }
 
-/// Formats a duration in a unit in which it has two digits or more: `90 s`, `45.0 min`, `6.0 h`, `3 days`.
+/// Formats a duration in the largest unit in which it is at least 2: `90 s`, `45.0 min`, `6.0 h`, `3 days`. A duration
+/// below 2 s is also in s.
 pub(super) fn length(seconds: f64) -> String {
     match seconds {
         s if s < 120.0 => format!("{s:.0} s"),
@@ -41,7 +42,8 @@ pub(super) fn amount(value: f64, rule: &str) -> String {
     format!("{digits} {}", unit.replace("degrees C", "\u{b0}C")).trim_end().to_owned()
 }
 
-/// Formats an alarm, for example "a cell's usable capacity was 1.38 Ah, limit 1.4 Ah (cell 3)". `verb` is "is" or "was".
+/// Formats an alarm, for example "a cell's usable capacity was 1.38 Ah, limit 1.4 Ah (cell 3)". `verb` is "is" or
+/// "was".
 pub(super) fn alarm_text(row: &AlarmRecord, verb: &str) -> String {
     let amount = |value: f64| amount(value, &row.rule);
     let value = row.value.map_or_else(|| "unknown".to_owned(), amount);

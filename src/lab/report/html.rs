@@ -317,7 +317,8 @@ fn alarms(
     }
 }
 
-/// Groups alarm changes of many cells. A group contains the same change of a rule and severity within a second, each for another cell.
+/// Groups alarm changes of many cells. The changes of a group belong to different cells, are less than a second apart
+/// from the first change, and have the same rule, severity and kind of change.
 ///
 /// The groups are in the order of their first change.
 fn group_alike(alarms: &[AlarmRecord]) -> Vec<Vec<&AlarmRecord>> {
@@ -328,8 +329,8 @@ fn group_alike(alarms: &[AlarmRecord]) -> Vec<Vec<&AlarmRecord>> {
     };
     let mut groups: Vec<Vec<&AlarmRecord>> = Vec::new();
     for row in alarms {
-        // The alarms of several rules arrive cell by cell, so the matching group is not always the latest one. But a change must not be
-        // listed before an earlier change of the same alarm.
+        // The alarms of several rules arrive cell by cell, so the matching group is not always the latest one. But a
+        // change must not be listed before an earlier change of the same alarm.
         let may_precede = |group: &&mut Vec<&AlarmRecord>| {
             (group[0].time_s - row.time_s).abs() < 1.0 && group.iter().all(|other| !is_same_alarm(other, row))
         };
@@ -341,7 +342,7 @@ fn group_alike(alarms: &[AlarmRecord]) -> Vec<Vec<&AlarmRecord>> {
     groups
 }
 
-/// A table of the first [`MAX_ROWS`] rows, with a note on the total number of rows.
+/// A table of the first [`MAX_ROWS`] rows. If there are more rows, a note states their number.
 fn table(names: &[&str], rows: impl Iterator<Item = Vec<String>>, count: usize) -> Markup {
     html! {
         div.scroll {
@@ -360,7 +361,7 @@ fn table(names: &[&str], rows: impl Iterator<Item = Vec<String>>, count: usize) 
     }
 }
 
-/// Findings about single cells, and their cost for the pack.
+/// Findings about single cells, and what the differences between the cells cost the pack.
 fn findings(context: &PageContext<'_>) -> Markup {
     let Some(diagnosis) = context.diagnosis else { return html! {} };
     let found = diagnosis.findings();
@@ -459,7 +460,7 @@ fn origin(data: &Data, context: &PageContext<'_>) -> Markup {
     }
 }
 
-/// Cell model, cells and limits of a configuration.
+/// Rows for the cell model, the number of cells and the limits of a configuration.
 fn settings(config: &Config) -> Vec<(String, String)> {
     let model = &config.monitor.model;
     let capacity = format!("{} Ah (rated {} Ah)", model.capacity_ah, model.rated_capacity_ah);

@@ -5,12 +5,12 @@ use super::context::PageContext;
 use super::data::Data;
 use crate::alarm::{Rule, Severity};
 
-/// Returns the mildest threshold of a rule, from the configuration or else from the alarms of the rule.
+/// Returns the rule's threshold with the lowest severity.
 pub(super) fn threshold(data: &Data, context: &PageContext<'_>, rule: Rule) -> Option<f64> {
     thresholds(data, context, rule).first().map(|(value, _)| *value)
 }
 
-/// Every threshold of a rule with its severity, the mildest first.
+/// Every threshold of a rule with its severity, the lowest severity first.
 pub(super) fn thresholds(data: &Data, context: &PageContext<'_>, rule: Rule) -> Vec<(f64, String)> {
     let mut all: Vec<(f64, String)> = match context.config {
         Some(config) => {
@@ -27,7 +27,7 @@ pub(super) fn thresholds(data: &Data, context: &PageContext<'_>, rule: Rule) -> 
     all
 }
 
-/// Rank of a severity by name, the mildest first.
+/// Rank of the severity with this name; 0 = the lowest severity, or an unknown name.
 pub(super) fn rank(severity: &str) -> usize {
     Severity::ALL.iter().position(|known| known.name() == severity).unwrap_or(0)
 }

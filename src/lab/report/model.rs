@@ -1,4 +1,5 @@
-//! Creates the section "How well the battery is known": rows that describe the cell model, and advice on useful measurements.
+//! Creates the section "How well the battery is known": rows that describe the cell model, and advice on useful
+//! measurements.
 
 use super::context::PageContext;
 use super::data::{Data, ModelRecord};

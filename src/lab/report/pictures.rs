@@ -233,7 +233,7 @@ fn capacity(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -
     }
     let limits: Vec<Layer> = levels(data, context, Rule::CapacityLow).collect();
     let end = forecast::end_of_life_ah(data, context).map(Shape::Level);
-    // The end of life would be hidden behind a limit at the same value.
+    // If a limit has the same value as the end of life, only the limit is drawn.
     let end = end.filter(|end| limits.iter().all(|limit| limit.shape != *end));
     layers.extend(end.map(|end| Layer::new("end of life", Ink::Grey, end)));
     layers.extend(limits);
@@ -243,8 +243,8 @@ fn capacity(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -
     chart(title, description, clock.axis, within_reason(&steps, &layers, "capacity, Ah"), layers)
 }
 
-/// Returns an axis that shows the filtered values with their intervals. Single half-cycles may lie outside, because they can be far
-/// off.
+/// Returns an axis that covers the learned values with their intervals, the limits and the reference values. Capacities
+/// of single half-cycles can be far off and may lie outside.
 fn within_reason(steps: &[CellStep], layers: &[Layer], label: &str) -> Axis {
     let mut low = steps.iter().map(|s| s.range.0.min(s.worst.0 - OF_95 * s.worst.1)).fold(f64::INFINITY, f64::min);
     let mut high = steps.iter().map(|s| s.range.1.max(s.worst.0 + OF_95 * s.worst.1)).fold(0.0, f64::max);
@@ -277,7 +277,7 @@ fn references(data: &Data, clock: &TimeAxis, context: &PageContext<'_>) -> Optio
     (!points.is_empty()).then(|| Layer::new(words, Ink::Plain, Shape::Points(points)))
 }
 
-/// The true SOC between two times: one line for one cell, the lowest and the highest for several.
+/// The true SOC between two times: one line, or one line each for the lowest and the highest cell if they differ.
 fn true_soc(context: &PageContext<'_>, clock: &TimeAxis, (first_s, last_s): (f64, f64)) -> Vec<Layer> {
     let within = context.reference.socs.iter().filter(|row| row.0 >= first_s && row.0 <= last_s);
     let rows: Vec<(f64, f64, f64)> =
@@ -506,7 +506,7 @@ fn coverage(data: &Data) -> Option<Picture> {
     let clock = TimeAxis::of(data);
     let line = life.iter().filter_map(|(time_s, bin)| Some((clock.x(time_s), 100.0 * bin.health.coverage()?)));
     let line: Vec<(f64, f64)> = line.collect();
-    // The axis starts at 80 % if no value is lower.
+    // The axis starts at 80 % if all values are higher.
     let lowest = if line.iter().all(|point| point.1 > 80.0) { 80.0 } else { 0.0 };
     let layers = vec![
         Layer::line("within their own 95 % interval", Ink::Blue, line),

@@ -1,4 +1,5 @@
-//! Determines the state at the end of the record: raised alarms with their values, and cells whose estimate is untrusted.
+//! Determines the state at the end of the record: raised alarms with their values, and cells whose estimate is
+//! untrusted.
 
 use std::collections::BTreeMap;
 
@@ -16,7 +17,7 @@ const MAX_NAMED: usize = 8;
 
 /// An alarm that is raised at the end of the data.
 pub(super) struct ActiveAlarm<'a> {
-    /// The row that raised it.
+    /// The row that raised the alarm.
     pub(super) row: &'a AlarmRecord,
     pub(super) since_s: f64,
 }
@@ -78,7 +79,7 @@ impl AlarmGroup<'_> {
     }
 }
 
-/// Formats cell numbers from 1: `cell 3`, `cells 1, 2 and 94 more`, or `pack`.
+/// Formats cell numbers, counted from 1: `cell 3`, `cells 1, 2`, `cells 1, 2, 3, 4, 5, 6, 7, 8 and 88 more`, or `pack`.
 pub(super) fn cells(cells: impl Iterator<Item = usize>) -> String {
     let numbers: Vec<String> = cells.map(|cell| (cell + 1).to_string()).collect();
     match numbers.len() {
@@ -89,7 +90,8 @@ pub(super) fn cells(cells: impl Iterator<Item = usize>) -> String {
     }
 }
 
-/// Returns the value that an alarm compares with its threshold, at the end of the record; `None` = the record does not contain it.
+/// Returns the value that the alarm's rule compares with the threshold, as known at the end of the record; `None` =
+/// unknown.
 pub(super) fn value(
     row: &AlarmRecord,
     data: &Data,

@@ -17,11 +17,12 @@ pub struct Reference {
     pub socs: Vec<(f64, f64, f64)>,
 }
 
-/// Reads a [`CapacityTable`]. If it has a column `cell`, rows with the same time are joined to the capacity of the weakest cell, and to
-/// the lowest and highest SOC.
+/// Reads a [`CapacityTable`]. If the table has a column `cell`, consecutive rows with the same time are joined: the
+/// reference then has the capacity of the weakest cell, and the lowest and highest SOC.
 ///
 /// # Errors
-/// The file cannot be read, a column is missing, or a value is not a number or is out of range; the error names file and line.
+/// The file cannot be read, a column is missing, or a value is not a number or is out of range; the error names file
+/// and line.
 pub fn read(path: &Path) -> Result<Reference, TableError> {
     let mut table = CapacityTable::open_reference(path)?;
     let has_cells = table.header().find("cell").is_some();
@@ -49,7 +50,8 @@ pub fn read(path: &Path) -> Result<Reference, TableError> {
     Ok(reference)
 }
 
-/// Keeps the points at which the capacity has changed by more than 0.02 %, and the last point.
+/// Keeps the points at which the capacity differs by more than 0.02 % from the last point that was kept, and the last
+/// point of all.
 fn thin(points: &mut Vec<(f64, f64)>) {
     let last = points.last().copied();
     let mut kept_ah = f64::INFINITY;

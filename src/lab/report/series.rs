@@ -1,5 +1,5 @@
-//! Computes series over the life of a pack: the worst cell and the range over all cells after every half-cycle, and the value of every
-//! cell in each time column of a heat map.
+//! Computes series over the life of a pack: the worst cell and the range over all cells after every half-cycle, and the
+//! value of every cell in each time column of a heat map.
 
 use super::data::{CapacityRecord, Data};
 use crate::filter::ends;
@@ -11,8 +11,9 @@ pub(super) const COLUMNS: usize = 120;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct CellStep {
     pub(super) time_s: f64,
-    /// The worst cell, with its mean and standard deviation.
+    /// Index of the worst cell, from 0.
     pub(super) cell: usize,
+    /// Mean and standard deviation of the worst cell.
     pub(super) worst: (f64, f64),
     /// Lowest and highest mean over the cells.
     pub(super) range: (f64, f64),
@@ -52,8 +53,8 @@ pub(super) fn resistance(row: &CapacityRecord) -> Option<(f64, f64)> {
     Some(row.resistance).filter(|value| value.0.is_finite())
 }
 
-/// Returns the worst cell after every half-cycle: the cell with the lowest value, or with the highest if `high_is_bad`. A cell keeps
-/// its value until it gets a new one.
+/// Returns the worst cell after every half-cycle: the cell with the lowest value, or with the highest if `high_is_bad`.
+/// A cell keeps its value until it gets a new one.
 pub(super) fn steps(data: &Data, pick: ValueSelector, high_is_bad: bool) -> Vec<CellStep> {
     let mut cells: Vec<Option<(f64, f64)>> = vec![None; data.cells()];
     let mut steps = Vec::new();
@@ -73,7 +74,7 @@ pub(super) fn steps(data: &Data, pick: ValueSelector, high_is_bad: bool) -> Vec<
     steps
 }
 
-/// The value of every cell at the end of each column.
+/// The value of every cell at the end of each time column; one row per cell.
 pub(super) fn columns(data: &Data, pick: ValueSelector) -> Vec<Vec<Option<f64>>> {
     let mut rows = vec![vec![None; COLUMNS]; data.cells()];
     let Some((first_s, last_s)) = data.ends_s() else { return rows };
@@ -104,8 +105,8 @@ pub(super) fn temperatures(data: &Data) -> Vec<(f64, f64, f64)> {
     .collect()
 }
 
-/// Returns the equivalent full cycles of the cell that was used most: charge moved divided by twice the rated capacity. If the rated
-/// capacity is unknown, the first learned capacity replaces it.
+/// Returns the equivalent full cycles of the cell that was used most: charge moved divided by twice the rated capacity.
+/// If the rated capacity is unknown, the first learned capacity replaces it.
 pub(super) fn full_cycles(data: &Data, rated_ah: Option<f64>) -> Option<f64> {
     let mut moved_ah = vec![0.0; data.cells()];
     data.halves.iter().for_each(|half| moved_ah[half.cell] += half.charge_ah.max(0.0));

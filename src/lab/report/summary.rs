@@ -52,7 +52,8 @@ pub(super) struct Tile {
     pub(super) name: &'static str,
     pub(super) value: String,
     pub(super) note: String,
-    /// Untrusted cells on which the figure depends; `None` = the estimate is trusted, or the figure is not an estimate.
+    /// Untrusted cells on which the figure depends; `None` = all cells are trusted, or the figure is unknown
+    /// or not an estimate.
     pub(super) doubt: Option<String>,
 }
 
@@ -96,8 +97,8 @@ pub(super) fn of(data: &Data, context: &PageContext<'_>, outlook: &Result<Outloo
     }
 }
 
-/// Returns the most severe alarm. If its rule has raised alarms of the same severity for several cells, returns the alarm whose value
-/// is the worst at the end of the record.
+/// Returns the most severe alarm. If its rule has raised alarms of the same severity for several cells, returns the
+/// alarm whose value is the worst at the end of the record.
 fn worst<'a>(
     alarms: &[&'a ActiveAlarm<'a>],
     value: impl Fn(&ActiveAlarm<'_>) -> Option<f64>,
@@ -306,7 +307,7 @@ fn assumed(data: &Data, cell: usize) -> &'static str {
     if is_measured { "" } else { "; assumed, not measured yet" }
 }
 
-/// Returns the tile of the cell that has lost most lithium.
+/// Returns the tile of the losses of lithium and of both electrodes. Each loss is the largest of all cells.
 fn losses_tile(data: &Data) -> Tile {
     let last = |pick| series::steps(data, pick, true).last().copied();
     let figure = |step: series::CellStep| format!("{:.0} \u{b1} {:.0} %", step.worst.0, step.worst.1);
@@ -318,7 +319,7 @@ fn losses_tile(data: &Data) -> Tile {
     tile("Lithium lost", last(series::lithium_lost).map(figure), note)
 }
 
-/// Returns the tile of the latest recharge period, normalised if known, with the first for comparison.
+/// Returns the tile of the latest recharge period, normalised if known, with the first recharge period for comparison.
 fn recharge_tile(data: &Data) -> Tile {
     let normalised = || data.recharges.iter().filter_map(|row| row.normalised_s.map(|(mean, _)| mean));
     let raw = || data.recharges.iter().filter_map(|row| row.raw_s);
@@ -418,7 +419,7 @@ mod tests {
         let one_missing = verdict(&[cell(1)], vec![limit(1.0)], None);
         assert_eq!(one_missing.headline, "Unknown: nothing has been learned yet about 1 of 2 cells.");
         assert_eq!(verdict(&[cell(0), learned(3.0, 1, None)], vec![limit(1.0)], None).verdict, Condition::Unknown);
-        // Below the end of life, although no alarm has been raised.
+        // The capacity is below the end of life, although no alarm is raised.
         assert_eq!(verdict(&[cell(0), cell(1)], vec![limit(1.6)], None).verdict, Condition::Watch);
         let changed = verdict(&[cell(0), cell(1)], vec![limit(1.0)], Some("the history was changed"));
         assert_eq!(changed.headline, "Unknown: the history was changed.");

@@ -124,7 +124,7 @@ impl Trace {
     /// Starts new bins for a charge or discharge.
     pub(super) fn turn(&mut self, time_s: f64) {
         self.recent.push_back(Bins::new(time_s));
-        // The last charges and discharges are kept in detail, each with the rest after it.
+        // The last six charges and discharges are kept in detail, each with the rest after it.
         while self.recent.len() > 6 {
             self.recent.pop_front();
         }

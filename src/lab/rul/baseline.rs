@@ -1,5 +1,5 @@
-//! Computes baselines for comparison with forecasts: a straight line through the last points, and a least-squares double
-//! exponential.
+//! Computes baselines for comparison with forecasts: a straight line through the last points, and a least-squares
+//! double exponential.
 //!
 //! Input: points of [use, capacity]. Output: the use at which the curve first falls below the threshold.
 
@@ -7,12 +7,12 @@
 const STEPS: u32 = 20_000;
 /// First step of the search, and the step below which the search ends.
 const SEARCH: (f64, f64) = (0.5, 1e-4);
-/// Largest exponents, in e-folds over the use so far.
+/// Largest magnitude of an exponent. The unit of an exponent is e-folds over the use so far.
 const STEEPEST: f64 = 50.0;
 
-/// Least-squares line through the last points; `None` = it does not fall.
+/// Returns where the least-squares line through the last points meets the threshold; `None` = the line does not fall.
 pub(super) fn straight(points: &[[f64; 2]], threshold: f64) -> Option<f64> {
-    // Share of the points, counted from the last one, through which the line is fitted.
+    // The line is fitted to the last 30 % of the points, but to at least five points.
     let wanted = ((0.3 * points.len() as f64) as usize).max(5);
     let last = &points[points.len().saturating_sub(wanted)..];
     let count = last.len() as f64;
@@ -26,20 +26,20 @@ pub(super) fn straight(points: &[[f64; 2]], threshold: f64) -> Option<f64> {
     (slope < 0.0).then(|| used + (threshold - capacity) / slope)
 }
 
-/// C = a e^(b t) + c e^(d t): a and c are linear for given exponents, which are searched.
+/// Fits C = a e^(b t) + c e^(d t) and returns where C falls below the threshold. The exponents b and d are searched.
+/// For given exponents, the factors a and c follow from a linear fit.
 pub(super) fn double_exponential(points: &[[f64; 2]], threshold: f64) -> Option<f64> {
     let scale = points.last()?[0];
     if points.len() < 4 || scale <= 0.0 {
         return None;
     }
     let fit = |exponents: [f64; 2]| linear(points, scale, exponents);
-    // Starting exponents, in e-folds over the use so far: for two falling terms, for one rising term, and for a nearly
-    // straight curve.
+    // Starts of the search: pairs of exponents, in e-folds over the use so far. The best result of all starts counts.
     let found =
         [[-0.1, 0.5], [-0.2, -2.0], [-0.05, 3.0], [-0.5, 0.05]].into_iter().filter_map(|start| search(start, &fit));
     let (_, [a, c], [b, d]) = found.min_by(|x, y| x.0.total_cmp(&y.0))?;
     let capacity = |used: f64| a * (b * used / scale).exp() + c * (d * used / scale).exp();
-    // The curve is followed until 20 times the use so far.
+    // The curve is evaluated from the use so far to 20 times the use so far.
     let step = 19.0 * scale / f64::from(STEPS);
     (0..=STEPS).map(|index| scale + step * f64::from(index)).find(|&used| capacity(used) < threshold)
 }
@@ -47,12 +47,12 @@ pub(super) fn double_exponential(points: &[[f64; 2]], threshold: f64) -> Option<
 /// A fit: sum of squared errors, factors `[a, c]`, exponents `[b, d]`.
 type ExponentialFit = (f64, [f64; 2], [f64; 2]);
 
-/// Pattern search: moves to a better neighbour and doubles the step, or else halves the step.
+/// Pattern search: moves to the best neighbour and doubles the step. If no neighbour is better, halves the step.
 fn search(start: [f64; 2], fit: &dyn Fn([f64; 2]) -> Option<ExponentialFit>) -> Option<ExponentialFit> {
     let neighbours: [[f64; 2]; 8] =
         [[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]];
     let (mut best, mut step) = (fit(start)?, SEARCH.0);
-    // Maximum number of moves. A search that needs more moves creeps along a flat valley.
+    // Maximum number of iterations. A search that needs more iterations creeps along a flat valley.
     for _ in 0..400 {
         if step < SEARCH.1 {
             break;
@@ -66,7 +66,7 @@ fn search(start: [f64; 2], fit: &dyn Fn([f64; 2]) -> Option<ExponentialFit>) -> 
     Some(best)
 }
 
-/// The best factors for these exponents; `None` = they cannot be separated.
+/// The best factors for these exponents; `None` = the two exponentials cannot be separated.
 fn linear(points: &[[f64; 2]], scale: f64, exponents: [f64; 2]) -> Option<ExponentialFit> {
     let at = |used: f64| exponents.map(|exponent| (exponent * used / scale).exp());
     let (mut xx, mut xy, mut yy, mut xc, mut yc) = (0.0, 0.0, 0.0, 0.0, 0.0);
@@ -79,7 +79,8 @@ fn linear(points: &[[f64; 2]], scale: f64, exponents: [f64; 2]) -> Option<Expone
         yc += y * capacity;
     }
     let determinant = xx * yy - xy * xy;
-    // If the determinant is too small relative to its terms, both exponentials coincide. The comparison also rejects NaN.
+    // If the determinant is too small relative to its terms, both exponentials nearly coincide. The comparison also
+    // rejects NaN.
     if !matches!(determinant.partial_cmp(&(1e-12 * xx * yy)), Some(std::cmp::Ordering::Greater)) {
         return None;
     }

@@ -26,7 +26,7 @@ struct ScoredDocument<'a> {
     total: Option<ScoreTotal>,
 }
 
-/// Forecasts at the end of the histories.
+/// Returns the JSON document of the forecasts at the end of the histories.
 ///
 /// # Errors
 /// Never: every value can be written as JSON.
@@ -34,7 +34,7 @@ pub fn now_json(forecasts: &[CurrentForecast]) -> Result<String, LabError> {
     pretty(&NowDocument { version: VERSION, interval: INTERVAL, forecasts })
 }
 
-/// Scored forecasts.
+/// Returns the JSON document of the scored forecasts.
 ///
 /// # Errors
 /// Never: every value can be written as JSON.

@@ -86,7 +86,7 @@ impl History {
 }
 
 impl UseCounter {
-    /// Counts a line; returns its reading, if it has one.
+    /// Counts a line. Returns the line's reading, if it has one.
     fn add_row(&mut self, axis: Axis, row: &CapacityRow<'_>) -> Option<MeasuredCapacity> {
         self.pass(row.time);
         let capacity_ah = row.capacity_ah.filter(|_| row.is_discharge);
@@ -98,7 +98,8 @@ impl UseCounter {
         reading
     }
 
-    /// Counts the time since the previous line. After the time in use that the previous line states, the cell rested.
+    /// Adds the rest since the previous line: the time between the lines, minus the time in use that the previous line
+    /// states.
     fn pass(&mut self, time: Timestamp) {
         if let Some(last) = self.last {
             self.rest_days += (time.since(last) / 86_400.0 - self.used_days).max(0.0);

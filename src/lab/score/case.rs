@@ -17,14 +17,15 @@ use crate::quantity::Timestamp;
 
 /// Number of rows between two progress reports.
 const REPORT_EVERY: usize = 4096;
-/// An initial SOC outside 0 to 1 by at most this value is clamped, because a counter may not start at exactly 0.
+/// If the initial SOC is outside 0 to 1 by at most this value, it is clamped. This can happen because a counter does
+/// not always start at exactly 0.
 const SOC_SLACK: f64 = 0.005;
 
 /// Where in a file the estimator starts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Start {
-    /// At the first row.
+    /// At the first row with a true SOC, or at the first row of a file without an ampere-hour counter.
     Full,
     /// At the row where a given share of the charge has been taken out; earlier rows are dropped.
     Middle,
@@ -35,14 +36,15 @@ pub enum Start {
 pub struct Case {
     /// Start of the estimator in the file.
     pub start: Start,
-    /// Error of the initial SOC, points; `None` = no initial SOC: the estimator starts from the first voltage.
+    /// Error of the initial SOC, points; `None` = the estimator gets no initial SOC and starts from the
+    /// first voltage.
     #[serde(rename = "told_points")]
     pub soc_error_points: Option<f64>,
     /// Error of the initial capacity, percent of the model's capacity.
     pub capacity_error_percent: f64,
     /// Offset of the sensor: added to every measured current before the monitor sees it, A.
     pub current_offset_a: f64,
-    /// Seed of the windows, outside which the monitor sees no rows of a half-cycle; `None` = no windows.
+    /// Seed of the random windows. The monitor sees only the rows in the windows; `None` = the monitor sees all rows.
     pub seed: Option<u64>,
 }
 
@@ -86,9 +88,9 @@ pub struct CaseScore {
     pub final_resistance_ratio: Option<f64>,
     /// Standard deviation of the resistance.
     pub final_resistance_ratio_std: Option<f64>,
-    /// Score of the SOC; `None` = the file has no ampere-hour counter.
+    /// Score of the SOC; `None` = no row has both an estimate and a true SOC.
     pub soc: Option<SocScore>,
-    /// Score of the usable capacity; `None` = no table.
+    /// Score of the usable capacity; `None` = no table of published capacities.
     pub life: Option<LifeScore>,
     /// Path of the plot.
     pub plot: Option<PathBuf>,
@@ -97,7 +99,8 @@ pub struct CaseScore {
 /// Runs `file` through the monitor.
 ///
 /// # Errors
-/// The file has no truth or never reaches the start of the case, the initial SOC is out of range, or a plot cannot be written.
+/// The file has no truth or never reaches the start of the case, the initial SOC is out of range, or a plot cannot be
+/// written.
 pub(super) fn run(
     job: &ScoreJob,
     file: &MeasuredFile,
@@ -207,7 +210,7 @@ struct CaseRun<'a> {
     feeder: Feeder,
     current_offset_a: f64,
     cycles: Option<CycleTable>,
-    /// First and latest stamp fed.
+    /// Time of the first row that was fed, and the latest time of all rows.
     span: Option<(Timestamp, Timestamp)>,
     rows: usize,
     left_out: usize,
@@ -240,7 +243,7 @@ impl<'a> CaseRun<'a> {
         }
     }
 
-    /// Feeds the rows `seen` of a part; `report` receives the number of rows fed.
+    /// Feeds the rows `seen` of a part; `report` receives the number of rows since its last call.
     fn part(&mut self, part: &MeasuredPart, seen: Range<usize>, report: &mut dyn FnMut(usize)) {
         let Some(&first_s) = part.time_s.get(seen.start).filter(|_| !seen.is_empty()) else { return };
         let known = self.cycles.as_ref().and_then(|table| table.start(&part.key));

@@ -1,4 +1,5 @@
-//! Reads tables of published capacities: a [`CapacityTable`] with `cycle` and `type`, one line per cycle.
+//! Reads tables of published capacities: a [`CapacityTable`] with the columns `cycle` and `type`, and one line per
+//! cycle.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -29,7 +30,8 @@ impl CycleTable {
     /// Reads a table.
     ///
     /// # Errors
-    /// The file cannot be read, a column is missing, a field is wrong (with file and line), or no discharge has a capacity.
+    /// The file cannot be read, a column is missing, a field is wrong (with file and line), or no discharge has a
+    /// capacity.
     pub fn read(path: &Path) -> Result<Self, TableError> {
         let mut file = CapacityTable::open(path)?;
         for name in ["cycle", "type"] {
@@ -49,8 +51,8 @@ impl CycleTable {
         Ok(table)
     }
 
-    /// Reduces each capacity to the charge that the load takes out down to its cut-off. Charge that the tester took out later, at
-    /// a held voltage, is subtracted.
+    /// Limits each capacity to the charge drawn by the load until the cut-off voltage. Charge that the tester drew
+    /// afterwards at constant voltage is subtracted.
     pub(super) fn at_load(&self, parts: &[MeasuredPart]) -> Self {
         let mut table = self.clone();
         for part in parts.iter().filter(|part| part.is_discharge()) {
@@ -68,7 +70,7 @@ impl CycleTable {
         self.starts.get(key).copied()
     }
 
-    /// Returns the number, from 1, of the latest discharge that had started at `time`; 0 = `time` is before the first.
+    /// Returns the number, from 1, of the latest discharge that has started at `time`; 0 = `time` is before the first.
     pub(super) fn number_at(&self, time: Timestamp) -> usize {
         self.discharges.partition_point(|discharge| discharge.start <= time)
     }

@@ -6,7 +6,7 @@ use crate::monitor::{Downtime, ModelState, MonitorConfig, Outputs, Snapshot};
 use crate::quantity::{CellIndex, Channel, Timestamp};
 use crate::replay::MonitorDriver;
 
-/// Assumed time between the record so far and a part whose start is unknown, ns.
+/// Assumed time between the latest row and a part whose start is unknown, ns.
 pub(super) const UNKNOWN_GAP_NS: i64 = 1_000_000_000;
 
 /// State of a monitor after the files from which it has learned.
@@ -28,7 +28,7 @@ impl Feeder {
     pub(super) fn new(config: MonitorConfig, sleep_gap_s: f64, learned: Option<&Learned>) -> Self {
         let mut driver = MonitorDriver::new(config, sleep_gap_s);
         if let Some(learned) = learned {
-            // The state was taken with the same configuration.
+            // The state was taken with the same configuration, except for the initial values.
             let restored = driver.monitor.restore(learned.snapshot.clone(), Downtime::Unknown);
             debug_assert!(restored.is_ok(), "{restored:?}");
         }
@@ -62,7 +62,7 @@ impl Feeder {
         self.0.handle_row(time, &values);
     }
 
-    /// Continues the record at `time`, after a gap of unknown length.
+    /// Continues at `time`, after a gap of unknown length.
     pub(super) fn unknown_gap(&mut self, time: Timestamp) {
         self.0.handle_unknown_gap(time);
     }

@@ -11,8 +11,8 @@ use crate::quantity::Timestamp;
 /// Number of rows between two calls of `progress`: some milliseconds of work.
 const PROGRESS_ROWS: usize = 4096;
 
-/// Runs `files` through a monitor, with a gap of unknown length between them. `progress` is called for every file and at least every
-/// [`PROGRESS_ROWS`] rows; it may unwind to abort.
+/// Runs `files` through a monitor, with a gap of unknown length between parts and between files. `progress` is called
+/// for every file and at least every [`PROGRESS_ROWS`] rows; it may unwind to abort.
 ///
 /// # Errors
 /// A file cannot be read.

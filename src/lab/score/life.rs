@@ -21,7 +21,7 @@ pub struct DischargeScore {
     pub usable_ah: f64,
     /// Standard deviation of the usable capacity, Ah.
     pub usable_std_ah: f64,
-    /// Capacity between the open-circuit voltages, Ah.
+    /// Capacity between the open-circuit voltages of full and empty, Ah.
     pub capacity_ah: f64,
     /// Standard deviation of the capacity, Ah.
     pub capacity_std_ah: f64,
@@ -50,7 +50,7 @@ pub struct LifeScore {
     pub coverage: f64,
     /// Mean half-width of the interval, Ah.
     pub mean_half_width_ah: f64,
-    /// Threshold of the two results below, Ah.
+    /// Threshold for `first_below_estimate` and `first_below_truth`, Ah.
     pub threshold_ah: f64,
     /// First discharge (without those skipped) whose estimate is below the threshold.
     pub first_below_estimate: Option<usize>,
@@ -178,7 +178,7 @@ mod tests {
             life.observe(&half_cycle(time_s, Mode::Discharge), &table);
             life.observe(&capacity_event(time_s, usable_ah), &table);
             life.observe(&half_cycle(time_s + 1.0, Mode::Charge), &table);
-            life.observe(&capacity_event(time_s + 1.0, 7.0), &table); // a charge is not a discharge
+            life.observe(&capacity_event(time_s + 1.0, 7.0), &table); // must be ignored: follows a charge
         }
         let score = score(life.each, &table, 1.4, 1);
         assert_eq!((score.discharges, score.scored, score.left_out, score.each.len()), (5, 3, 1, 5));

@@ -83,7 +83,7 @@ struct LifeTotal<'a> {
 }
 
 impl ScoreReport {
-    /// One JSON document, ending in a line feed.
+    /// Returns the scores as one JSON document that ends in a line feed.
     ///
     /// # Errors
     /// Never: every value can be written as JSON.
@@ -161,7 +161,7 @@ impl ScoreReport {
         scored.map(|(score, life)| life_row(score, life)).collect()
     }
 
-    /// Notes which values were not fed or not scored.
+    /// Adds notes on values that were not fed or not scored, and on plots.
     fn add_notes(&self, out: &mut String) {
         let mut note = |text: std::fmt::Arguments<'_>| {
             // Writing to a string cannot fail.
@@ -232,7 +232,7 @@ impl<'a> LifeTotal<'a> {
     }
 }
 
-/// Scores of one kind, with the names of their files.
+/// Scores of the SOC, or scores of lives, with the names of their files.
 fn scored<'a, T>(scores: &[&'a CaseScore], of: impl Fn(&'a CaseScore) -> Option<&'a T>) -> Vec<(&'a str, &'a T)> {
     scores.iter().filter_map(|score| Some((score.name.as_str(), of(score)?))).collect()
 }

@@ -1,7 +1,8 @@
-//! Defines and checks the request for scores, which the command line and the Python module make, and runs it.
+//! Defines the request for scores that the command line and the Python module use. Checks the request and runs it.
 //!
-//! Input: files, the configuration of the cell, starts of the estimator, settings of the statistics. Output: [`ScoreRun`], with all
-//! inputs read and checked. Errors name the file or the argument.
+//! Input: files, the configuration of the cell, starts of the estimator, settings of the statistics. Output:
+//! [`ScoreRun`], with the configuration and the tables read and checked. The measured files are read when they are
+//! scored. Errors name the file or the argument.
 
 use std::path::PathBuf;
 
@@ -12,7 +13,7 @@ use crate::health::UsableConfig;
 use crate::io::paths::{check_distinct, short_names};
 use crate::single_cell::CellSource;
 
-/// What to score. Each file runs in every combination of the lists.
+/// What to score. Each file runs in every combination of starts, errors, offsets and seeds.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ScoreRequest {
     /// Measured files.
@@ -39,7 +40,7 @@ pub struct ScoreRequest {
     pub settle_s: f64,
     /// Charge from full to empty that defines the true SOC, Ah; `None` = the model's capacity.
     pub truth_capacity_ah: Option<f64>,
-    /// Longest gap in a file, s, before the recorder counts as asleep.
+    /// If a gap between two rows is longer than this, s, the recorder counts as asleep.
     pub sleep_gap_s: f64,
     /// Tables of published capacities, one per file; empty without tables.
     pub cycles: Vec<PathBuf>,
@@ -49,7 +50,8 @@ pub struct ScoreRequest {
     pub threshold_ah: f64,
     /// Number of discharges at the start of a life that are left out of the statistics.
     pub skip_cycles: usize,
-    /// Smallest and largest share of the charge of each half-cycle that the monitor sees; `None` = it sees everything.
+    /// Smallest and largest size of a window, as a share of the charge that a half-cycle moves. The monitor sees only
+    /// the rows in the windows; `None` = the monitor sees all rows.
     pub window: Option<(f64, f64)>,
     /// Seeds of the windows.
     pub seeds: Vec<u64>,
@@ -85,7 +87,7 @@ impl Default for ScoreRequest {
     }
 }
 
-/// A checked request with its inputs.
+/// A checked request with its configuration and tables.
 #[derive(Debug)]
 pub struct ScoreRun {
     config: Config,
@@ -116,7 +118,8 @@ impl ScoreRequest {
     /// Reads the configuration, the tables and the files to learn from; `progress` as in [`learn`].
     ///
     /// # Errors
-    /// The configuration is faulty, a number is out of range, arguments are incompatible, or a table or a file to learn from cannot be read.
+    /// The configuration is faulty, a number is out of range, arguments are incompatible, or a table or a file to learn
+    /// from cannot be read.
     pub fn prepare(&self, progress: &dyn Fn()) -> Result<ScoreRun, RequestError> {
         self.check()?;
         let config = self.source.load()?;
@@ -244,7 +247,7 @@ impl ScoreRequest {
         Ok(jobs.map(|((path, name), cycles)| ScoreJob { path: path.clone(), cycles, name }).collect())
     }
 
-    /// Every combination, in the order of the lists.
+    /// Returns every combination of starts, errors, offsets and seeds, in the order of the lists.
     fn cases(&self) -> Vec<Case> {
         let seeds = match self.window {
             Some(_) => self.seeds.iter().map(|&seed| Some(seed)).collect(),

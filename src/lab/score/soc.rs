@@ -6,7 +6,8 @@ use crate::OF_95;
 
 /// Largest error of a converged estimate, points (percent of full).
 pub const CONVERGED_POINTS: f64 = 2.0;
-/// The error must stay below this limit for this time, s. A wrong estimate that only crosses the truth has not converged.
+/// The error must stay within [`CONVERGED_POINTS`] for this time, s. A wrong estimate that only crosses the truth has
+/// not converged.
 pub const CONVERGED_HOLD_S: f64 = 600.0;
 
 /// An estimate with its truth.
@@ -36,12 +37,13 @@ impl SocSample {
     }
 }
 
-/// Errors of a run's SOC, over the samples after settling; NaN (JSON: null) without samples.
+/// Errors of a run's SOC. Statistics cover the samples after settling and are NaN (JSON: null) without samples. The
+/// first error and the convergence also use earlier samples.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct SocScore {
     /// Number of samples in the statistics.
     pub samples: usize,
-    /// Number of rows left out, without truth or without estimate.
+    /// Number of rows left out because they have no truth or no estimate.
     pub left_out_rows: usize,
     /// Error of the first estimate, points.
     pub first_error_points: f64,
@@ -53,7 +55,7 @@ pub struct SocScore {
     pub mean_abs_error_points: f64,
     /// Largest |error|, points.
     pub max_abs_error_points: f64,
-    /// Time from which |error| stayed within 2 points for 10 min, s after the start; `None` = never.
+    /// Time after the start, s, from which |error| stayed within 2 points for 10 min; `None` = never.
     pub converge_s: Option<f64>,
     /// Share of samples whose 95 % interval contains the truth, fraction.
     pub coverage: f64,

@@ -1,8 +1,9 @@
-//! Selects random windows: the monitor sees only a part of each half-cycle, as in a vehicle that starts and stops at any time.
+//! Selects random windows: the monitor sees only the rows in one window of each part of a file, as in a vehicle that
+//! starts and stops at any time. A part is usually a half-cycle.
 //!
-//! The window covers a share of the charge that the part moves (|current| times time). A share of the time would be dominated by the
-//! long taper of a charger. Share and position are uniformly distributed. Rows outside the window are dropped, so the monitor sees a
-//! gap in its record.
+//! The window covers a share of the charge that the part moves (|current| times time). It does not cover a share of the
+//! time, because the long end of a charge, in which the charger reduces the current, would dominate. Share and position
+//! are uniformly distributed. Rows outside the window are dropped, so the monitor sees a gap.
 
 use std::ops::Range;
 
@@ -11,7 +12,8 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::measured::MeasuredPart;
 
-/// Returns the visible rows of part number `index`. At least one row is visible, unless the part is empty.
+/// Returns the visible rows of part number `index`. At least one row is visible, unless the part is empty. If no
+/// current flows, the whole part is visible.
 pub(super) fn rows(part: &MeasuredPart, index: usize, seed: u64, (least, most): (f64, f64)) -> Range<usize> {
     let moved = moved_as(part);
     let total = moved.last().copied().unwrap_or(0.0);

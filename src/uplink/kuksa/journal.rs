@@ -1,4 +1,5 @@
-//! Counts events and writes log lines: logs each change once, and the counters at the end of each connection.
+//! Counts events and writes log lines. Each change is logged once, and the counters are logged at the end of each
+//! connection.
 
 use std::collections::HashSet;
 
@@ -11,13 +12,13 @@ const MAX_LOGGED: usize = 1000;
 /// Counts since the start of the program.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) struct Counts {
-    /// Connections whose claim was accepted.
+    /// Connections on which the broker accepted the claim of the signals.
     pub(crate) connections: u64,
     /// Batches published.
     pub(crate) batches: u64,
     /// Signals skipped, summed over all connections.
     pub(crate) skipped: u64,
-    /// Values withheld because they exceed the broker's limits.
+    /// Values withheld because they are outside the broker's limits.
     pub(crate) withheld: u64,
     /// Values rejected by the broker.
     pub(crate) rejected: u64,
@@ -30,7 +31,7 @@ pub(crate) struct Counts {
 pub(crate) struct Journal {
     pub(crate) counts: Counts,
     logged: HashSet<String>,
-    /// Signals whose values in the latest batch exceed the broker's limits.
+    /// Signals whose values in the latest batch are outside the broker's limits.
     outside: HashSet<&'static str>,
 }
 

@@ -1,8 +1,8 @@
-//! Defines the messages and three calls of the protocol `kuksa.val.v2` that a provider of values needs.
+//! Defines the messages and the two calls of the protocol `kuksa.val.v2` that a provider of values needs.
 //!
 //! The messages are written by hand, because the generated client of the KUKSA project compiles protoc, a C++ program,
-//! at every build. Fields that this program does not read are omitted, because protobuf skips them. The field numbers
-//! are the same as in the published protocol.
+//! at every build. Fields that this program does not read are omitted, because protobuf skips unknown fields. The field
+//! numbers are the same as in the published protocol.
 
 use std::collections::BTreeMap;
 
@@ -144,7 +144,7 @@ pub(crate) struct PublishValuesRequest {
     pub(crate) data_points: BTreeMap<i32, Datapoint>,
 }
 
-/// Answer to a [`GetProviderValueRequest`].
+/// This program's answer to a [`GetProviderValueRequest`].
 #[derive(Clone, PartialEq, prost::Message)]
 pub(crate) struct GetProviderValueResponse {
     #[prost(uint32, tag = "1")]
@@ -170,7 +170,7 @@ pub(crate) enum Action {
     Answer(GetProviderValueResponse),
 }
 
-/// The broker accepts a claim.
+/// The broker's acceptance of a claim.
 #[derive(Clone, Copy, PartialEq, Eq, prost::Message)]
 pub(crate) struct ProvideSignalResponse {}
 
@@ -191,8 +191,7 @@ pub(crate) struct Rejection {
     pub(crate) message: String,
 }
 
-/// A reader has asked the broker for values. The broker forwards the request to this program, and waits a second for
-/// the answer.
+/// A reader's request for values, which the broker forwards to this program. The broker waits a second for the answer.
 #[derive(Clone, PartialEq, Eq, prost::Message)]
 pub(crate) struct GetProviderValueRequest {
     #[prost(uint32, tag = "1")]

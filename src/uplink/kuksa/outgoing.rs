@@ -1,9 +1,9 @@
 //! Queues the messages of one connection to the broker. A message is created only when the connection can send it.
 //!
 //! * While the connection cannot send, only the newest batch of values is kept.
-//! * An empty claim follows each batch. The broker accepts a claim after it has read every message before it, so the
-//!   acceptance serves as a receipt for the batch. The protocol has no other receipt. A *check* is an empty claim
-//!   without a batch.
+//! * An empty claim follows each batch. The broker reads messages in order, so when it accepts the claim, it has read the
+//!   batch. The acceptance therefore serves as a *receipt* for the batch. The protocol has no other receipt. A *check* is
+//!   an empty claim without a batch.
 //! * An answer overtakes a waiting batch. See `value_requests` for why the order matters.
 
 use std::collections::VecDeque;
@@ -32,7 +32,7 @@ pub(crate) enum ReceiptScope {
 /// Messages that were sent and are not yet confirmed as read, in the order of sending.
 type UnreadMessages = Arc<Mutex<VecDeque<ReceiptScope>>>;
 
-/// Takes the session's messages. When it is dropped, the waiting messages are sent and the stream ends.
+/// Takes the session's messages. When the outbox is dropped, the waiting messages are sent and the stream ends.
 #[derive(Debug)]
 pub(crate) struct Outbox {
     batches: watch::Sender<PublishValuesRequest>,
@@ -42,7 +42,7 @@ pub(crate) struct Outbox {
 }
 
 impl Outbox {
-    /// Creates an outbox, and its messages as a stream that begins with the claim.
+    /// Creates an outbox and the stream of its messages. The stream begins with the claim.
     pub(crate) fn open(claim: ProvideSignalRequest) -> (Self, Messages) {
         let (batches, newest) = watch::channel(PublishValuesRequest::default());
         let (answers, waiting) = mpsc::channel(MAX_ANSWERS);

@@ -34,7 +34,7 @@ pub(crate) struct SkippedSignal {
 #[derive(Debug, Default)]
 pub(crate) struct DataPoints {
     pub(crate) by_id: BTreeMap<i32, Datapoint>,
-    /// Signals whose values exceed the broker's limits.
+    /// Signals whose values are outside the broker's limits.
     pub(crate) withheld: Vec<&'static str>,
 }
 
@@ -45,12 +45,12 @@ pub(crate) struct Routes {
 }
 
 impl Routes {
-    /// Finds every signal in the broker's metadata. The overlay's signals are below `branch`.
+    /// Searches the broker's metadata for every signal. The overlay's signals are below `branch`.
     pub(crate) fn resolve(metadata: &[Metadata], branch: &str) -> (Self, Vec<SkippedSignal>) {
         let mut uses: HashMap<i32, usize> = HashMap::new();
         let mut by_path: HashMap<&str, &Metadata> = HashMap::new();
         for entry in metadata {
-            // If the overlay's branch is below the standard one, its signals are listed twice.
+            // If the standard branch is below the overlay's branch, the standard signals are listed twice.
             if by_path.insert(&entry.path, entry).is_none_or(|earlier| earlier.id != entry.id) {
                 *uses.entry(entry.id).or_default() += 1;
             }

@@ -28,11 +28,12 @@ use crate::status_stream::Documents;
 
 /// Longest wait for the connection and for the answer to each call.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// Period of pings on an idle connection. Together with [`PATIENCE`], a lost broker is noticed within 15 s.
+/// Period of pings on an idle connection. A broker that does not answer a ping within [`PATIENCE`] counts as lost, so
+/// the program notices a lost broker within 15 s.
 const PING_PERIOD: Duration = Duration::from_secs(10);
 /// Longest wait for the broker to read the last batch.
 const FAREWELL: Duration = Duration::from_millis(500);
-/// If the broker reads no batch for this time, the connection is closed, because readers would mistake old values for
+/// If the broker confirms no batch for this time, the connection is closed, because readers would mistake old values for
 /// current ones.
 const UNREAD_LIMIT: Duration = Duration::from_secs(30);
 /// Key of the certificates' file, for messages.
@@ -176,7 +177,8 @@ impl Session {
         }
     }
 
-    /// Sends a check if a receipt is needed as the proof that the broker read the latest answer in time.
+    /// Handles the time limits of answers. If the proof that the broker read the latest answer is still missing, sends a
+    /// check.
     fn handle_time(&mut self) -> Result<(), String> {
         if self.value_requests.handle_time(Instant::now())? && !self.outbox.check() {
             return Err("the broker reads no answers".to_owned());
@@ -184,7 +186,7 @@ impl Session {
         Ok(())
     }
 
-    /// Makes every value unknown, and gives the broker time to read the message that does so.
+    /// Sends a batch that makes every value unknown, and gives the broker time to read the batch.
     async fn withdraw(mut self, journal: &mut Journal) {
         self.publish(None, journal);
         drop(self.outbox);

@@ -2,8 +2,8 @@
 //!
 //! Input: a status document (units in its field names, positive current = discharge, SOC and SOH as fractions, cells
 //! from 0). Output: VSS values (positive current = charge, percentages, cells from 0). `None` means that the value
-//! depends on something unknown. An array has a value only if every cell has one: positions in the array are cell
-//! numbers, and a VSS array cannot contain an unknown number.
+//! depends on something unknown. An array has a value only if every cell has a value, because positions in the array are
+//! cell numbers and a VSS array cannot contain an unknown number.
 
 mod derived;
 
@@ -18,7 +18,7 @@ use packwatch_host::status::document::StatusDocument;
 
 use super::value::{DataType, Value, single};
 
-/// Branch of the battery signals of VSS itself.
+/// Branch of the battery signals that VSS defines.
 pub(crate) const STANDARD_BRANCH: &str = "Vehicle.Powertrain.TractionBattery";
 
 /// Where a signal is defined.
@@ -100,7 +100,7 @@ pub(crate) fn of_overlay() -> impl Iterator<Item = &'static Signal> {
     all().filter(|signal| signal.origin == Origin::Overlay)
 }
 
-/// The signals of one quantity: its mean and, if the quantity has one, its standard deviation.
+/// The signals of one quantity: the mean and, for some quantities, the standard deviation.
 fn signals_of(row: &'static QuantityRow, it: &'static Presentation, is_pack: bool) -> impl Iterator<Item = Signal> {
     let (unit, factor) = vss_unit(row.unit);
     let (owner, data_type) = if is_pack { ("pack", DataType::Float) } else { ("cells", DataType::Floats) };
@@ -149,7 +149,7 @@ fn path(path: VssPath, part: Part) -> (Origin, Cow<'static, str>) {
     }
 }
 
-/// Unit in VSS, and the conversion factor to it.
+/// Unit in VSS, and the factor that converts a number to this unit.
 const fn vss_unit(unit: Unit) -> (Option<&'static str>, f64) {
     match unit {
         Unit::Level | Unit::Fraction => (Some("percent"), 100.0),
@@ -163,8 +163,8 @@ const fn vss_unit(unit: Unit) -> (Option<&'static str>, f64) {
     }
 }
 
-/// Returns a value per cell if every cell has one and cells are numbered from 0 without a gap, because array positions
-/// are cell numbers.
+/// Returns a value per cell. If a cell has no value or if the cell numbers have a gap, returns `None`, because array
+/// positions are cell numbers.
 fn of_cells<T>(document: &StatusDocument, value: impl Fn(&CellView) -> Option<T>) -> Option<Vec<T>> {
     let cells = document.cells.iter().enumerate();
     let values = cells.map(|(index, cell)| if cell.cell.index() == index { value(cell) } else { None });

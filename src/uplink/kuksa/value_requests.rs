@@ -1,9 +1,9 @@
-//! Handles requests of the broker for values. When a reader asks the broker for a present value, the broker asks this
+//! Handles requests of the broker for values. When a reader asks the broker for a current value, the broker asks this
 //! program.
 //!
 //! While the databroker (0.7) waits for an answer (up to a second), it reads nothing else from this program. It
-//! mistakes a late answer for the answer to its next request, which may be about another signal. If a batch is sent
-//! during the wait, the broker must read it before the answer. Therefore:
+//! mistakes a late answer for the answer to its next request, which may be about another signal. If an unread batch is
+//! ahead of the answer, the broker must first read the batch, and may read the answer too late. Therefore:
 //!
 //! * A request is answered only after the broker has read all earlier messages. If this takes longer than [`DEADLINE`],
 //!   the request gets no answer, and the broker gives its reader the last value.
@@ -23,7 +23,7 @@ const DEADLINE: Duration = Duration::from_millis(500);
 /// If no further request arrives within this time after a request, a receipt is requested. A reader that asks for many
 /// values in a row proves each answer by its next request.
 const CHECK_AFTER: Duration = Duration::from_millis(100);
-/// Latest time of the proof: the broker's timeout minus 200 ms of transport latency.
+/// Latest time of the proof, counted from the request: the broker's timeout minus 200 ms of transport latency.
 const LATEST_PROOF: Duration = Duration::from_millis(800);
 /// Maximum number of waiting requests. The broker sends one request at a time.
 const MAX_REQUESTS: usize = 8;
@@ -38,7 +38,7 @@ pub(crate) struct ValueRequests {
     /// Number of the latest batch that was created. `read` is the number of the latest batch that the broker has read.
     made: u32,
     read: u32,
-    /// Arrival of the latest request whose answer is not yet proved.
+    /// Arrival of the latest answered request; `None` = the broker has proved that it read the answer in time.
     unproved: Option<Instant>,
     is_checking: bool,
 }

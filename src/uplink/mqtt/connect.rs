@@ -1,6 +1,7 @@
-//! Creates a connection to the broker from options, credentials and certificates, and describes connection errors.
+//! Creates a client of the broker from the settings, credentials and certificates, and describes connection errors.
 //!
-//! Input: settings and the files they name. Output: a client whose last will is `offline` on the status topic.
+//! Input: settings and the files they name. Output: a client. Its last will is the message `offline` on the status
+//! topic.
 
 use rumqttc::mqttbytes::QoS;
 use rumqttc::mqttbytes::v5::{ConnectReturnCode, LastWill};
@@ -14,7 +15,8 @@ use crate::files::read_credential;
 const CONNECT_LIMIT_S: u64 = 15;
 /// Maximum number of requests that wait in memory for the connection.
 const REQUESTS: usize = 64;
-/// Maximum number of unacknowledged messages, counting queued messages and present values together.
+/// Maximum number of unacknowledged messages. Messages from the disk queue and periodic messages with the latest values
+/// share this limit.
 const IN_FLIGHT: u16 = 64;
 /// Largest packet accepted from the broker, bytes. This program subscribes to nothing, so all packets are small.
 const MAX_INCOMING_BYTES: u32 = 64 << 10;
@@ -77,7 +79,7 @@ pub fn explain(error: &ConnectionError) -> String {
         ConnectionError::Io(error) if error.kind() == std::io::ErrorKind::PermissionDenied => {
             format!("{error}: blocked by a firewall or by IPAddressAllow= of the unit")
         }
-        // "TLS: I/O: ..." describes the certificate error.
+        // The library's text also describes certificate errors ("TLS: I/O: ...").
         other => other.to_string(),
     }
 }

@@ -1,8 +1,8 @@
 //! Defines the entities of a pack: key in `info`, name, unit and value. Most entities are rows of the catalogue of
 //! quantities.
 //!
-//! Input: the daemon's status. Output: the values as JSON. If Battery-Emulator has a quantity, its key and name are
-//! used. As in Battery-Emulator, SOC and other fractions are published in percent, and positive current and power mean
+//! Input: the daemon's status. Output: the values as JSON. If Battery-Emulator publishes the same quantity, the entity
+//! has Battery-Emulator's key and name. As in Battery-Emulator, SOC and other fractions are published in percent, and positive current and power mean
 //! charging. The daemon's current is therefore negated. Cells count from 1. Unknown values are `null`, never a number.
 
 use std::borrow::Cow;
@@ -93,7 +93,7 @@ impl Measure {
     }
 }
 
-/// Published form and factor of a unit.
+/// How numbers with this unit are published, and the factor by which they are multiplied.
 const fn measure(unit: Unit) -> (Measure, f64) {
     let (unit, class, decimals, factor) = match unit {
         Unit::Level => ("%", "battery", 2, 100.0),
@@ -110,7 +110,7 @@ const fn measure(unit: Unit) -> (Measure, f64) {
     (Measure { unit, class, decimals }, factor)
 }
 
-/// The entities of the catalogue, each with its standard deviation.
+/// The entities of the catalogue: the mean of each quantity and, for some quantities, the standard deviation.
 fn of_catalogue() -> impl Iterator<Item = Entity> {
     PackValues::rows().filter_map(|(row, it)| Some((row, it.mqtt_key?, it.mqtt_name))).flat_map(|(row, key, name)| {
         row.parts().map(move |(part, _)| {
@@ -194,7 +194,7 @@ fn cell_number(cell: Option<CellIndex>) -> Value {
     cell.map_or(Value::Null, |cell| Value::from(u32::from(cell.0) + 1))
 }
 
-/// Positive while charging.
+/// Power of the pack, W; positive = charging.
 fn power_w(pack: &PackValues) -> Option<f64> {
     Some(-pack.mean(Quantity::Current)? * pack.mean(Quantity::Voltage)?)
 }

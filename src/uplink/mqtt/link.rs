@@ -1,13 +1,13 @@
-//! Runs the link to the broker: reconnects until it is stopped, publishes the present values, and forwards the queue.
+//! Runs the link to the broker: reconnects until it is stopped, publishes the current values, and forwards the queue.
 //!
 //! Input: the daemon's documents and the [`Queue`]. Output: messages with QoS 1. Each connection starts without
-//! messages in memory, so it repeats no value of an earlier connection. Present values come from the newest document. A
+//! messages in memory, so it repeats no value of an earlier connection. Current values come from the newest document. A
 //! message leaves the queue only after the broker has acknowledged it.
 //!
-//! After a lost connection, the link pauses for 1 s. The pause doubles with each further loss, up to `retry_max_s`. If
-//! the connection has lasted longer than `retry_max_s`, the pause is 1 s again. A message that the broker rejects does
-//! not end the connection. A rejected message of the queue is sent again after `retry_max_s`; a rejected present value
-//! is replaced with the next document.
+//! After a lost connection or a failed attempt to connect, the link pauses for 1 s. The pause doubles with each further
+//! failure, up to `retry_max_s`. If the connection has lasted longer than `retry_max_s`, the pause is 1 s again. A
+//! message that the broker rejects does not end the connection. A rejected message of the queue is sent again after
+//! `retry_max_s`. Rejected current values are not sent again; the next message has newer values.
 
 use std::convert::Infallible;
 use std::fmt;
@@ -30,11 +30,11 @@ use crate::status_stream::Documents;
 
 /// First pause after a lost connection.
 const RETRY: Duration = Duration::from_secs(1);
-/// Maximum number of unacknowledged messages of the queue; most brokers accept this number.
+/// Maximum number of unacknowledged messages of each class of the queue; most brokers accept this number.
 const WINDOW: usize = 20;
-/// Longest wait for an acknowledgement. If none arrives within this time, the connection is closed.
+/// Longest wait for an acknowledgement. If the acknowledgement is later, the connection is closed.
 const ACKNOWLEDGEMENT: Duration = Duration::from_secs(120);
-/// Pause before the queue on disk is retried.
+/// Pause before a failed operation on the queue is tried again.
 const QUEUE_RETRY: Duration = Duration::from_secs(5);
 /// Longest time for the last messages before disconnecting.
 const FAREWELL: Duration = Duration::from_secs(2);
@@ -133,7 +133,7 @@ impl Link<'_> {
         tracing::info!("disconnected");
     }
 
-    /// Publishes the present values every period, and at once when the daemon falls silent or reports again.
+    /// Publishes the current values every period, and at once when the daemon falls silent or reports again.
     async fn current(&self, client: &AsyncClient) -> Result<Infallible, String> {
         let mut documents = self.documents.clone();
         let period = Duration::from_secs(self.settings.period_s);
@@ -228,7 +228,7 @@ async fn persist<T>(action: &str, mut attempt: impl FnMut() -> Result<T, String>
     }
 }
 
-/// What this connection has published, so that only changes are sent.
+/// What this connection has published. Apart from the current values, messages are sent only if they have changed.
 #[derive(Debug, Default)]
 struct PublishedState {
     has_status: bool,
@@ -239,7 +239,7 @@ struct PublishedState {
 }
 
 impl PublishedState {
-    /// Returns the messages that are due, in this order: the values, whether the daemon is online, the fill of the
+    /// Returns the messages to send now, in this order: the values, whether the daemon is online, the fill of the
     /// queue, whether this program is online, and the discovery messages if the entities have changed. With this order,
     /// no reader mistakes values of an earlier connection for current values.
     fn news(&mut self, settings: &MqttSettings, document: Option<&StatusDocument>, fill: Fill) -> Vec<Message> {
@@ -281,7 +281,7 @@ impl PublishedState {
     }
 }
 
-/// Describes the queue's fill.
+/// Returns the fill of the queue as JSON.
 fn uplink(fill: Fill) -> String {
     json!({
         "queue_messages": fill.messages,

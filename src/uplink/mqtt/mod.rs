@@ -40,13 +40,13 @@ pub mod topic {
     pub const STATUS: &str = "status";
     /// Whether the daemon is online: retained.
     pub const DAEMON: &str = "daemon";
-    /// Present values of the pack: retained.
+    /// Current values of the pack: retained.
     pub const INFO: &str = "info";
-    /// Present values of the cells: retained.
+    /// Current values of the cells: retained.
     pub const CELLS: &str = "spec_data";
-    /// Events, each once, in order.
+    /// Events in order. After a lost connection, some may be sent twice, with the same sequence number.
     pub const EVENTS: &str = "events";
-    /// Samples, each once, in order.
+    /// Samples in order. After a lost connection, some may be sent twice, with the same sequence number.
     pub const HISTORY: &str = "history";
     /// Fill of the queue: retained.
     pub const UPLINK: &str = "uplink";
@@ -60,7 +60,7 @@ pub const OFFLINE: &str = "offline";
 /// Runs until SIGTERM or SIGINT.
 ///
 /// # Errors
-/// Fails if the settings are invalid or have no broker, or if the queue cannot be opened.
+/// Fails if the settings are invalid or lack the table `[mqtt]`, or if the queue cannot be opened.
 pub fn run(options: &Options) -> Result<(), Failure> {
     let settings = options.start()?;
     let config = options.config.display();

@@ -20,16 +20,16 @@ pub fn info(document: &StatusDocument) -> Value {
     info.into()
 }
 
-/// Whether an alarm of the rule is raised. The result is `null` if no alarm is known to be raised and at least one is
-/// unknown.
+/// Whether an alarm of the rule is raised. If at least one alarm is unknown and no other alarm is raised, the result is
+/// `null`.
 fn alarm(alarms: &AlarmStatus, rule: Rule) -> Value {
     let is_raised = alarms.list.iter().any(|alarm| alarm.rule == rule && alarm.state.is_raised());
     let is_known = alarms.omitted == 0 && alarms.unknown.iter().all(|unknown| unknown.rule != rule);
     if is_raised || is_known { is_raised.into() } else { Value::Null }
 }
 
-/// Values of the cells: voltages in mV and, for Battery-Emulator, in V. Also SOC, capacity and resistance, each with
-/// its standard deviation.
+/// Values of the cells: voltages in mV, whether each cell is trusted, and every quantity of a cell with an MQTT key. A
+/// quantity that has a standard deviation is published with it.
 pub fn spec_data(document: &StatusDocument) -> Value {
     let each = |of: &dyn Fn(&CellView) -> Value| document.cells.iter().map(of).collect::<Value>();
     let millivolts = |cell: &CellView| whole(cell.values.mean(Quantity::Voltage).map(|volts| volts * 1000.0));
@@ -69,7 +69,8 @@ pub fn event(document: &StatusDocument, event: &Value) -> Value {
     })
 }
 
-/// Describes the event in one line: `capacity_low raised, cell 1, value 2.41, threshold 2.5`, else its name and values.
+/// Describes the event in one line. An alarm gives `capacity_low raised, cell 1, threshold 2.5, value 2.41`. Any other
+/// event gives its name and its values.
 fn message(name: &str, event: &Value) -> String {
     let text = |key: &str| event.get(key).and_then(Value::as_str).unwrap_or("?");
     let is_alarm = name == "alarm";

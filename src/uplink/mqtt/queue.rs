@@ -70,7 +70,8 @@ impl Queue {
     /// Opens the queue in its folder; creates what is missing.
     ///
     /// # Errors
-    /// Fails if the folder cannot be written, or if another uplink uses it.
+    /// Fails if the folder or the file cannot be read or written, if another uplink uses the folder, or if a newer
+    /// version wrote the file.
     pub fn open(settings: &HistorySettings) -> Result<Self, String> {
         let folder = &settings.folder;
         let at = |error: &dyn std::fmt::Display| format!("{}: {error}", folder.display());
@@ -106,8 +107,8 @@ impl Queue {
         self.added.notified()
     }
 
-    /// Adds messages, and stores `seen` for [`Self::seen`] in the same transaction. When this function returns, they
-    /// are on disk.
+    /// Adds messages, and stores `seen` for [`Self::seen`] in the same transaction. When this function returns, the
+    /// messages and `seen` are on disk.
     ///
     /// # Errors
     /// Fails if the disk fails or is full.
@@ -297,7 +298,7 @@ fn read_fill(database: &Connection) -> rusqlite::Result<Fill> {
     Ok(Fill { messages, bytes, dropped_samples: dropped(Class::Sample)?, dropped_events: dropped(Class::Event)? })
 }
 
-/// Drops the oldest sample or, if there are no samples, the oldest event. Returns `false` if the queue is empty.
+/// Drops the oldest sample. If the queue has no samples, drops the oldest event. If the queue is empty, returns `false`.
 fn drop_oldest(transaction: &Transaction<'_>, fill: &mut Fill) -> rusqlite::Result<bool> {
     let oldest = "DELETE FROM message WHERE id = (SELECT id FROM message ORDER BY class, id LIMIT 1)
                   RETURNING class, length(CAST(body AS BLOB))";

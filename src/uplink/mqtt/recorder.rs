@@ -17,8 +17,8 @@ use super::payload;
 use super::queue::{Class, Fill, Queue};
 use crate::status_stream::Documents;
 
-/// A document is also used as a sample if it is at most this much too early, because documents arrive about once a
-/// second.
+/// A document becomes a sample even if it arrives this much before the sample is due, because documents arrive only about
+/// once a second.
 const TOLERANCE_S: f64 = 0.5;
 
 /// State of the recorder.
@@ -50,7 +50,8 @@ impl<'a> Recorder<'a> {
         std::future::pending().await
     }
 
-    /// Queues what is new in a document. If the disk fails, retries with the next document.
+    /// Queues the new events of a document, and a sample if a sample is due. If the disk fails, retries with the next
+    /// document.
     pub fn take(&mut self, document: &StatusDocument) {
         let news = new_events(&self.events, &document.events);
         if !self.events.is_empty() && news.len() == document.events.len() && news.len() >= MAX_EVENTS {
@@ -94,7 +95,8 @@ impl<'a> Recorder<'a> {
         self.drops.set(is_dropping);
     }
 
-    /// Returns the time of the next sample if one is due `now`. After a pause or a clock step the schedule restarts.
+    /// If a sample is due `now`, returns the time of the next sample. After a pause or a clock step, the schedule
+    /// restarts.
     fn next_due(&self, now: Timestamp) -> Option<Timestamp> {
         if self.period_s == 0 {
             return None;

@@ -10,7 +10,7 @@ use serde::{Deserialize, Deserializer, de};
 
 use crate::files::read_credential;
 
-/// Longest topic, bytes; leaves ample room for suffixes below MQTT's limit of 65,535.
+/// Longest base topic, bytes. MQTT allows 65,535 bytes, so every suffix fits.
 const MAX_TOPIC_BYTES: usize = 200;
 
 /// Key of the password's file, for messages.
@@ -34,10 +34,11 @@ pub struct MqttSettings {
     /// Base of all topics of this pack.
     #[serde(deserialize_with = "topic")]
     pub topic: String,
-    /// Time between current values, s.
+    /// Period at which current values are published, s.
     #[serde(deserialize_with = "whole::<1, 3600, _>")]
     pub period_s: u64,
-    /// Longest silence on the connection, s. The broker publishes the last will after 1.5 times this duration.
+    /// Longest silence on the connection, s. If the connection is silent for 1.5 times this duration, the broker publishes
+    /// the last will.
     #[serde(deserialize_with = "whole::<5, 3600, _>")]
     pub keep_alive_s: u64,
     /// Longest pause between attempts to connect, s.
@@ -74,7 +75,8 @@ pub struct DiscoverySettings {
     pub prefix: String,
     /// Whether each cell voltage is an entity.
     pub cells: bool,
-    /// Name of the device; `None` = the vehicle named by the daemon's configuration, else the topic.
+    /// Name of the device; `None` = the vehicle's name in the daemon's configuration. If that name is missing too, the
+    /// topic is used.
     pub device_name: Option<String>,
 }
 
@@ -169,7 +171,7 @@ impl MqttSettings {
         Ok(())
     }
 
-    /// Reads the password; a trailing line end is removed.
+    /// Reads the password and removes line ends at its end.
     ///
     /// # Errors
     /// Fails if the file cannot be read or is empty.

@@ -21,7 +21,7 @@ const fn candidate(name: &'static str, when: Comparison, debounce_events: u32) -
     Candidate { name, when, debounce_events }
 }
 
-/// The rules to compare. The Monitor itself also runs the rules in `MONITORED`, each as one severity.
+/// The rules to compare. The Monitor itself also runs the rules in `MONITORED`, each as a different severity.
 pub(crate) const CANDIDATES: [Candidate; 8] = [
     candidate("p = 0.05", Comparison::Probability(0.05), 1),
     candidate("p = 0.2", Comparison::Probability(0.2), 1),
@@ -44,10 +44,11 @@ pub(crate) const P95: usize = 6;
 pub(crate) struct RuleOutcome {
     /// The evaluation at which the alarm was first raised.
     pub(crate) first: Option<Evaluation>,
-    /// Raises while the true capacity was above the threshold: by any amount, and by more than 1 % of rated.
+    /// Number of raises while the true capacity was above the threshold. `far_false_raises` counts only the raises with
+    /// the true capacity above the threshold by more than 1 % of the rated capacity.
     pub(crate) false_raises: u32,
     pub(crate) far_false_raises: u32,
-    /// Times the alarm cleared before the end of life.
+    /// Number of times that the alarm cleared before the end of life.
     pub(crate) flickers: u32,
 }
 

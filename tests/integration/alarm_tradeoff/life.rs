@@ -24,18 +24,20 @@ pub(crate) const END_OF_LIFE: f64 = 0.70;
 
 /// Interval between two readings, s.
 const SAMPLE_S: f64 = 10.0;
-/// Time from the last reading under a load to the next load, s. Each reading therefore covers a single load.
+/// Time between the last reading under one load and the first reading under the next load, s. The time is short, so
+/// that the charge counted from a reading belongs to the load of that reading.
 const SWITCH_S: f64 = 0.1;
 /// Ticks per reading. After 5 s without a tick the Monitor assumes that the computer was suspended.
 const TICKS: u32 = 4;
-/// An ageing cell is simulated for this many half-cycles after its end of life.
+/// The simulation of an ageing cell ends after this many half-cycles, counted from the start of the cycle in which the
+/// cell reaches its end of life.
 const AFTERLIFE: u32 = 4;
 /// A constant-voltage charge ends at this current, A.
 const TAPER_END_A: f64 = RATED_AH / 10.0;
 /// Average charge moved per cycle, relative to the rated capacity. Converts cycles into ampere-hours.
 const MOVED_PER_CYCLE: f64 = 2.0 * 0.55 * 0.85;
 
-/// Numbers of a life's random streams.
+/// Number of each random stream of a life.
 const CELL: u64 = 0;
 const USAGE: u64 = 1;
 const SENSORS: u64 = 2;
@@ -94,7 +96,7 @@ pub(crate) const SENSOR_SETS: [SensorSet; 3] = [
 /// Kind of life.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Kind {
-    /// Fades below the threshold until the end of life.
+    /// Fades below the threshold and reaches the end of life.
     Ageing,
     /// Stays above the threshold.
     Healthy,
@@ -124,7 +126,7 @@ pub(crate) struct Place {
     pub(crate) full_cycles: f64,
 }
 
-/// The recorded course of a life.
+/// What was recorded during a life.
 #[derive(Debug, Clone)]
 pub(crate) struct Life {
     pub(crate) evaluations: Vec<Evaluation>,
@@ -165,7 +167,7 @@ impl Fade {
         RATED_AH * (self.start - self.loss * libm::pow(moved_ah / self.span_ah, self.curvature))
     }
 
-    /// Fade and resistance growth per Ah for the next `ah` of charge.
+    /// Average fade and resistance growth per Ah while the next `ah` of charge flows.
     fn ageing(&self, moved_ah: f64, ah: f64) -> Ageing {
         Ageing {
             capacity_loss_ah_per_ah: (self.capacity_ah(moved_ah) - self.capacity_ah(moved_ah + ah)) / ah,
@@ -264,7 +266,8 @@ impl Sensors {
     }
 }
 
-/// Simulates one life to its end.
+/// Simulates one life. An ageing cell is followed past its end of life (`AFTERLIFE`), a healthy cell until it has moved
+/// the charge `span_ah`.
 pub(crate) fn live(config: &MonitorConfig, set: &SensorSet, kind: Kind, seed: u64) -> Life {
     let mut rig = Rig::new(config, set, kind, seed);
     let mut after = 0;
@@ -348,7 +351,7 @@ impl Rig {
         self.pause(current_a, pauses_s[1]);
     }
 
-    /// Applies the present slope of the fade curve to the next half-cycle.
+    /// Sets the fade of the next half-cycle: the average slope of the fade curve over that half-cycle.
     fn age(&mut self) {
         let moved_ah = self.truth().throughput_ah;
         self.pack.set_ageing(self.fade.ageing(moved_ah, 0.5 * MOVED_PER_CYCLE * RATED_AH));

@@ -7,7 +7,7 @@ use super::calibration::{EDGES, bins, errors};
 use super::judged::{CANDIDATES, Candidate, RuleOutcome, judge};
 use super::life::Life;
 
-/// The 5 %, 50 % and 95 % quantiles of the values.
+/// The median of the values, and their 5 % and 95 % quantiles in parentheses.
 fn range(mut values: Vec<f64>, digits: usize) -> String {
     values.sort_by(f64::total_cmp);
     let Some(last) = values.len().checked_sub(1) else { return "-".to_owned() };

@@ -104,7 +104,7 @@ pub(crate) struct Daemon {
     key: CanKey,
     out: Outputs,
     pub(crate) ms: i64,
-    /// Frames sent in response to the last input, with their authenticators.
+    /// Frames that the daemon sent during the last `pass` or `receive`, with their authenticators.
     pub(crate) sent: Vec<Frame>,
     /// Commands executed since the start.
     pub(crate) executed: u64,

@@ -39,7 +39,7 @@ pub(crate) enum Method {
     Awtls,
 }
 
-/// A recursive estimate.
+/// A recursive capacity estimate, to compare with packwatch's.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Peer {
     pub(crate) method: Method,
@@ -93,7 +93,7 @@ impl Peer {
         }
     }
 
-    /// K = sx/sy. If this ratio differs between swings, K follows from the sums of their information.
+    /// K = sx/sy, as an average over all swings: from the sums of 1/sx^2 and of 1/sy^2.
     fn scale(&self) -> f64 {
         (self.y_information / self.x_information).sqrt()
     }
@@ -137,8 +137,8 @@ fn awtls(c: &[f64; 6]) -> ScalarGaussian {
     ScalarGaussian { mean: q, variance: (q * q + 1.0).powi(3) / slope(q) }
 }
 
-/// Upward zero crossings of a polynomial between 0 and infinity. Searches in equal steps of the angle, with Q =
-/// tan(angle).
+/// Upward zero crossings of a polynomial in Q between 0 and infinity. Sets Q = tan(angle) and searches in equal steps
+/// of the angle.
 fn positive_roots(value: impl Fn(f64) -> f64, slope: impl Fn(f64) -> f64) -> Vec<f64> {
     const STEPS: u32 = 2000;
     let at = |k: u32| (f64::from(k) / f64::from(STEPS) * std::f64::consts::FRAC_PI_2).tan();
@@ -170,7 +170,8 @@ fn positive_roots(value: impl Fn(f64) -> f64, slope: impl Fn(f64) -> f64) -> Vec
 mod tests {
     use super::*;
 
-    /// Uniform numbers in [0, 1) by splitmix64. Twelve of them minus six approximate a normal number.
+    /// Uniform numbers in [0, 1) by splitmix64. The sum of twelve of them, minus six, approximates a
+    /// normal number.
     struct Random(u64);
 
     impl Random {
@@ -187,7 +188,7 @@ mod tests {
         }
     }
 
-    /// Draws swings of a 10 Ah cell: true values plus errors with the stated deviations.
+    /// Draws swings of a 10 Ah cell: true values plus random errors with the variances that the swing states.
     fn swings(random: &mut Random, count: usize, even: bool) -> Vec<Swing> {
         let one = |random: &mut Random| {
             let wide = if even { 1.0 } else { 0.5 + random.uniform() };
@@ -205,7 +206,7 @@ mod tests {
         peer
     }
 
-    /// Minimum of `f` over [low, high] by three nested grids.
+    /// Minimum of `f` over [low, high]: searches a grid, then three ever finer grids around the best point.
     fn brute_force(f: impl Fn(f64) -> f64, mut low: f64, mut high: f64) -> f64 {
         let mut best = low;
         for _ in 0..4 {
@@ -266,7 +267,7 @@ mod tests {
         println!("mean of 200 runs (true 10 Ah): WLS, TLS, AWTLS {mean:.4?}, covered {covered:.3?}");
         assert!((mean[1] - 10.0).abs() < 0.005 && (mean[2] - 10.0).abs() < 0.005, "{mean:?}");
         assert!(covered[1] > 0.9 && covered[2] > 0.9, "{covered:?}");
-        // Noise in x reduces the slope by sx^2 / <x^2>, here 3.5 parts in 10^4.
+        // Noise in x reduces the slope of WLS by sx^2 / mean(x^2), here about 3.5 parts in 10^4.
         assert!(mean[0] < mean[2], "{mean:?}");
     }
 }

@@ -58,7 +58,7 @@ fn configuration(folder: &Path, cell: &str, start: f64, held: bool) -> PathBuf {
     path
 }
 
-/// What the monitor reported after a discharge.
+/// The monitor's report after a discharge.
 struct DischargeReport {
     time_s: f64,
     discharge: usize,
@@ -220,7 +220,7 @@ fn print(life: &str, name: &str, source: &str, (score, below): (Score, Option<us
     );
 }
 
-/// Prints packwatch's row and returns its score.
+/// Prints packwatch's row of the table. Returns packwatch's score.
 fn print_ours(name: &str, life: &Life) -> Score {
     assert!(life.reported.len() > 145, "{name}: {} discharges", life.reported.len());
     let ours = life.ours();
@@ -228,7 +228,7 @@ fn print_ours(name: &str, life: &Life) -> Score {
     ours.0
 }
 
-/// Prints the peers' rows for one source of swings and returns their scores.
+/// Prints the peers' rows of the table for one source of swings. Returns the peers' scores.
 fn print_peers(name: &str, source: &str, life: &Life, swings: &[(f64, Source)]) -> Vec<Score> {
     let score = |&(peer, method, gamma): &(&str, Method, f64)| {
         let scored = life.scored(&life.peer((method, gamma), swings));
@@ -247,12 +247,12 @@ fn heading() {
     println!("| --- | --- | --- | --- | --- | --- |");
 }
 
-/// Maximum lead of the best peer on swings of the filter's SOC, Ah. The filter's SOC depends on the capacity that
-/// packwatch has learned, which helps the peer.
+/// packwatch's error may exceed the best peer's error by this, Ah, if the peers use swings of the filter's SOC. This
+/// SOC depends on the capacity that packwatch has learned, which helps the peers.
 const NEAR_AH: f64 = 0.006;
 
-/// Maximum lead of the best peer on voltage swings, Ah: an eighth of a percent of the capacity. The peer has an
-/// advantage, because its memory factor is chosen afterwards by the result.
+/// packwatch's error may exceed the best peer's error by this, Ah, if the peers use voltage swings: an eighth of a
+/// percent of the capacity. The best peer has an advantage: its memory factor is chosen after the results are known.
 const LEVEL_AH: f64 = 0.0025;
 
 #[test]
@@ -275,8 +275,8 @@ fn usable_capacity_of_whole_lives_matches_best_peer() {
     }
 }
 
-/// Maximum ratio of packwatch's error to the best peer's error, over all windows. The peer's memory factor is chosen
-/// afterwards by the result.
+/// Maximum ratio of packwatch's error to the best peer's error, over all windows. The best peer's memory
+/// factor is chosen after the results are known.
 const LEVEL: f64 = 1.1;
 
 /// In this test the filter's swings use the same ends as the voltage swings, because swing and charge of a `half_cycle`

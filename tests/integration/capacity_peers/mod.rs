@@ -46,7 +46,7 @@ enum Source {
     Voltage(VoltageSwing),
 }
 
-/// Each peer's capacity at each requested time, from the swings that began before that time.
+/// A peer's capacity at each requested time, from the swings that began before that time.
 fn follow(
     model: &CellModel,
     config: &CapacityConfig,

@@ -110,7 +110,7 @@ impl Life {
             .collect()
     }
 
-    /// Score of the errors relative to the truth, and the last error.
+    /// Score of the relative errors, and the last relative error.
     fn scored(&self, capacities: &[ScalarGaussian]) -> (Score, f64) {
         let relative = |(belief, reported): (&ScalarGaussian, &CapacityReport)| {
             (ScalarGaussian::from_std(belief.mean / reported.true_ah, belief.std() / reported.true_ah), 1.0)
@@ -138,8 +138,9 @@ const LIVES: [(&str, f64); 3] = [("none", 0.0), ("0.005 Ah per cycle", 0.005), (
 /// Number of cycles in the paper's life.
 const CYCLES: u32 = 48;
 
-/// Maximum relative lead of a peer on the filter's own SOC: 0.1 %. The filter's SOC contains the capacity that
-/// packwatch has learned, and all methods share the current sensor's gain error of 0.5 %.
+/// packwatch's relative error may exceed the best peer's by this (0.1 %), if the peers use the filter's own SOC. This
+/// SOC depends on the capacity that packwatch has learned, and all methods share the current sensor's gain error of
+/// 0.5 %.
 const NEAR: f64 = 0.001;
 
 #[test]
@@ -156,8 +157,8 @@ fn simulated_capacity_matches_best_peer() {
     }
 }
 
-/// Prints all rows of a life. Fails if packwatch is worse, or if swings counted with the wrong capacity give a good
-/// result.
+/// Prints all table rows of a life. Fails if packwatch is worse than the best peer, or if swings counted with the wrong
+/// capacity give a good result.
 fn compare(name: &str, start: f64, settings: Settings) {
     let config = configuration(start, false);
     let (life, held) = (live(&config, settings), live(&configuration(start, true), settings));

@@ -2,8 +2,9 @@
 //!
 //! The open-circuit voltage is V + I R0 rho + sum U, with V the cell's voltage, I the current (positive = discharge),
 //! R0 the series resistance, rho the filter's resistance ratio and U the voltages of the RC branches. The voltages U
-//! are simulated in open loop, starting at 0. If the record begins under load, readings count only after 180 s. All
-//! readings of the first and the last 60 s count, each with the charge that had flowed until that reading. A capacity
+//! are simulated in open loop, starting at 0. If the record begins under load, readings count only after 180 s. Each
+//! end of a swing is the mean of all readings in the swing's first or last 60 s, each with the charge that had flowed
+//! until that reading. A capacity
 //! is assumed only to compute how ageing changes the shape of the curve. The standard deviation of the SOC at an end is
 //! the one that packwatch uses (`[capacity]`).
 
@@ -14,11 +15,12 @@ use packwatch::health::CapacityConfig;
 
 use super::least_squares::Swing;
 
-/// Interval between two readings, s, above which the charge in between is unknown.
+/// If the interval between two readings is longer than this, s, the charge in between is unknown.
 const GAP_S: f64 = 60.0;
 /// Current below which the cell counts as resting, A.
 const REST_A: f64 = 0.05;
-/// Three time constants of the models' slowest branch, after which its unknown initial voltage has decayed.
+/// Three time constants of the models' slowest RC branch, s. After this time the branch's unknown initial voltage has
+/// decayed.
 const SETTLING_S: f64 = 180.0;
 /// Length of each end of a swing, s.
 const END_S: f64 = 60.0;
@@ -95,7 +97,7 @@ impl VoltageSwing {
 pub(crate) fn charge_variance(config: &CapacityConfig, charge_ah: f64, duration_s: f64) -> f64 {
     let gain_ah = config.current_gain_std * charge_ah;
     let offset_ah = config.current_offset_std_a * duration_s / 3600.0;
-    // Lower bound for a configuration with neither gain nor offset: a thousandth of the charge.
+    // A configuration may state neither gain nor offset: the standard deviation is at least a thousandth of the charge.
     (gain_ah * gain_ah + offset_ah * offset_ah).max(1e-6 * charge_ah * charge_ah)
 }
 
@@ -142,7 +144,7 @@ pub(crate) fn weigh(model: &CellModel, config: &CapacityConfig, ends: Ends, read
 /// Index of the charge reversal, once enough charge has flowed back.
 fn reversal(model: &CellModel, points: &[Point]) -> Option<usize> {
     let (first, last) = (points.first()?.charge_ah, points.last()?.charge_ah);
-    // Checking every 32nd point is enough: the charge of a reversal takes many more points to flow back.
+    // Checking at every 32nd point is enough: until the charge of a reversal has flowed back, many more points follow.
     if !points.len().is_multiple_of(32) {
         return None;
     }

@@ -9,8 +9,8 @@ use packwatch::can::{CanId, Frame};
 /// Maps rule, severity and cell, as the frames carry them, to state and acknowledgement.
 pub(crate) type AlarmTable = BTreeMap<(u64, u64, u64), (u64, bool)>;
 
-/// Number of passes per cycle (in one pass each raised alarm is sent once), and number of passes without a frame of an
-/// alarm after which the listener removes the alarm.
+/// Number of passes per cycle. In one pass each raised alarm is sent once. If the listener receives no frame of an
+/// alarm for `TIMEOUT_PASSES` passes, it removes the alarm.
 const CYCLE_PASSES: i64 = 4;
 const TIMEOUT_PASSES: i64 = 7;
 
@@ -60,7 +60,7 @@ pub(crate) struct Listener {
     raised_states: [u64; 3],
     entries: BTreeMap<(u64, u64, u64), Entry>,
     pass_ms: i64,
-    /// Count and checksum of the last digest.
+    /// Number of raised alarms and table checksum of the last digest.
     wanted: Option<(u64, u64)>,
     rules: BTreeMap<u64, u64>,
 }

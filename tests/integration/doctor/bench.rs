@@ -19,7 +19,7 @@ pub(crate) enum Bench {
     Pack96,
     /// One cell, protected end to end.
     Protected,
-    /// Total voltage of 96 cells only, and a temperature sensor.
+    /// Only the total voltage of 96 cells, and a temperature sensor.
     Total,
     /// One cell with random pulses and a voltage resolution of 32 mV.
     Pulses,

@@ -79,8 +79,9 @@ pub(crate) struct Wire {
     pub(crate) acknowledged: bool,
 }
 
-/// "Not available" for the value of an alarm frame, and for its cell.
+/// Raw value in an alarm frame that means "not available".
 pub(crate) const NO_VALUE: u16 = 0x1FFF;
+/// Cell in an alarm frame about the whole pack.
 pub(crate) const WHOLE_PACK: u16 = 0x7FF;
 
 pub(crate) struct Rig {

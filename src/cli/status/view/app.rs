@@ -55,7 +55,7 @@ impl Page {
 /// Quantities that the cell map can show. The key `v` switches to the next one.
 pub(super) const MAPPED: [(Quantity, &str); 2] = [(Quantity::Soc, "SOC"), (Quantity::Voltage, "voltage")];
 
-/// A cell's values in one document, one per quantity.
+/// A cell's values in one document, one per quantity in [`MAPPED`].
 pub(super) type CellPoint = [Option<f32>; MAPPED.len()];
 
 /// The view.
@@ -63,11 +63,12 @@ pub(super) type CellPoint = [Option<f32>; MAPPED.len()];
 pub(super) struct App {
     path: PathBuf,
     pub(super) has_colour: bool,
-    /// The latest document; `None` if it is stale.
+    /// The latest document; `None` before the first document, after a loss of the connection, and if it is stale.
     pub(super) document: Option<StatusDocument>,
-    /// Time of the last document, and the reason why no newer document arrives; set while no fresh document is known.
+    /// Time of the last document, and the reason why no newer document arrives. Set from a loss of the connection until
+    /// the next document.
     pub(super) lost: Option<(Option<Timestamp>, String)>,
-    /// Time of the latest document.
+    /// Time at which the latest document was received.
     received_at: Option<Timestamp>,
     /// History of each cell, oldest first.
     pub(super) history: Vec<VecDeque<CellPoint>>,
@@ -76,17 +77,17 @@ pub(super) struct App {
     pub(super) mapped: usize,
     /// The selected cell.
     pub(super) selected: usize,
-    /// First visible line of the pages that are not the cell map.
+    /// First visible line of a page other than the cell map.
     pub(super) scroll: usize,
     /// Number of cells in a row of the map when it was last drawn.
     pub(super) row_cells: usize,
-    /// Number of lines of a page when it was last drawn.
+    /// Number of visible lines of the page when it was last drawn.
     pub(super) page_lines: usize,
     now: Timestamp,
 }
 
 impl App {
-    /// Creates a view of the stream socket at `path`.
+    /// Creates a view. `path` is the status socket; the stream socket is next to it.
     pub(super) fn new(path: PathBuf, has_colour: bool) -> Self {
         Self {
             path,
@@ -105,7 +106,7 @@ impl App {
         }
     }
 
-    /// Path of the stream socket.
+    /// Path of the status socket.
     pub(super) fn path(&self) -> &Path {
         &self.path
     }

@@ -16,7 +16,7 @@ const NAMES: [(&str, &str); 5] = [
     ("mean_nis", "innovations over expected"),
     ("what", ""),
 ];
-/// Keys whose number counts from 0 in the document.
+/// Keys whose value is an index, which counts from 0 in the document.
 const NUMBERED: [&str; 4] = ["cell", "cell_voltage", "temperature", "sensor"];
 
 /// Formats the event without its time.

@@ -18,8 +18,8 @@ use crate::status::stream_path;
 
 /// Pause before reconnecting.
 const RETRY: Duration = Duration::from_secs(1);
-/// Longest wait for a line. After this time the connection is closed, because a suspended daemon keeps it open without
-/// sending.
+/// Longest wait for data. After this time the connection is closed, because a suspended daemon keeps a connection open
+/// without sending.
 const SILENCE: Duration = Duration::from_secs(5);
 
 /// The computer's clock.
@@ -44,7 +44,7 @@ pub(super) fn start(path: PathBuf) -> mpsc::Receiver<FeedUpdate> {
     received
 }
 
-/// Reads until the connection fails (`Err`) or the view ends.
+/// Reads until the connection fails (`Err`) or the view ends (`Ok`).
 async fn listen(path: &Path, updates: &mpsc::Sender<FeedUpdate>) -> Result<(), String> {
     let failed = |error: io::Error| explain(path, "--socket", &error);
     let mut stream = UnixStream::connect(stream_path(path)).await.map_err(failed)?;

@@ -20,11 +20,11 @@ use crate::status::document::StatusDocument;
 
 /// Width of the cell number at the start of a map row.
 const LABEL: usize = 5;
-/// Lines reserved below the map for the list of cells and the plot.
+/// Lines reserved below the map for the list of cells.
 const LIST_LINES: usize = 4;
 /// Smallest range of the SOC bars. It avoids magnifying small differences.
 const LEAST_SOC_RANGE: f64 = 0.05;
-/// Height of the selected cell's plot, including its title.
+/// Minimum height of the selected cell's plot, including its title.
 const PLOT_LINES: usize = 5;
 
 /// Draws the selected page.
@@ -48,7 +48,7 @@ fn cells(frame: &mut Frame<'_>, app: &mut App, document: &StatusDocument, theme:
     let grid = Grid::new(document.cells.len(), usize::from(area.width), lines);
     let map_lines = grid.rows.min(lines) + 1;
     let left = height.saturating_sub(map_lines);
-    // The plot gets lines that the list does not need.
+    // The plot also gets the lines that the list does not need.
     let spare = left.saturating_sub(document.cells.len() + 1);
     let plot_lines = if left >= PLOT_LINES + LIST_LINES { PLOT_LINES.max(spare) } else { 0 };
     let length = |lines: usize| Constraint::Length(u16::try_from(lines).unwrap_or(u16::MAX));
@@ -72,11 +72,12 @@ struct Grid {
 }
 
 impl Grid {
-    /// Chooses the widest bars with which all cells fit. If not even the narrowest bars fit, the map scrolls.
+    /// Chooses the widest bars with which all cells fit in at most `lines` rows, and in at most four. Otherwise,
+    /// chooses bars of one character; if the rows still do not fit, the map scrolls.
     fn new(cells: usize, width: usize, lines: usize) -> Self {
         let with = |cell_width: usize| {
             let fit = (width.saturating_sub(LABEL) / cell_width).max(1);
-            // Rows in multiples of 12 are easy to count.
+            // If the number of cells in a row is a multiple of 12, cells are easy to count.
             let per_row = if fit >= 12 { fit / 12 * 12 } else { fit };
             Self { cell_width, per_row, rows: cells.div_ceil(per_row) }
         };

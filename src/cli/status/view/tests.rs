@@ -1,5 +1,5 @@
 //! Compares drawn screens with the files in `screens/`. `PACKWATCH_WRITE_SCREENS=1 cargo test screens` rewrites the
-//! files; check them before a commit.
+//! files; check the new files before a commit.
 
 use std::path::PathBuf;
 

@@ -7,7 +7,7 @@ use crate::io::stamp;
 use crate::monitor::Validity;
 use crate::quantity::Timestamp;
 
-/// Colours of the view; without colour it uses bold and reversed text only.
+/// Colours of the view. Without colour, the view uses only attributes of the text, such as bold and reversed.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Theme {
     pub(super) has_colour: bool,

@@ -1,5 +1,5 @@
-//! Summarises thresholds and rules: counts and severities. Also selects thresholds and alarms by a counter (`turn`), so
-//! that all of them are sent one after the other.
+//! Summarises thresholds and rules: counts and severities. Also selects a threshold, or an alarm of a threshold, by a
+//! counter (`turn`), so that the sender can go through all thresholds one after the other.
 
 use super::{Alarm, AlarmEngine, Rule, Severity, ThresholdState};
 use crate::quantity::CellIndex;
@@ -43,8 +43,8 @@ impl AlarmEngine {
         waiting.map(|rule| (rule.config.rule, rule.config.severity, rule.unknown))
     }
 
-    /// An alarm that has an unknown value and is not raised; `None` = no such alarm. The alarm is from the `turn`-th
-    /// threshold with unknown values, modulo the number of these thresholds.
+    /// Takes the `turn`-th threshold with unknown values, modulo the number of these thresholds. Returns the
+    /// threshold's first alarm that has an unknown value and is not raised; `None` = no such alarm.
     pub fn unknown_alarm(&self, turn: usize) -> Option<Alarm> {
         let (_, count) = self.unknown();
         let mut waiting = self.rules.iter().enumerate().filter(|(_, rule)| rule.unknown > 0);

@@ -184,7 +184,8 @@ fn restored_engine_behaves_like_stored_engine() {
     assert_eq!(changes.len(), 1);
 }
 
-/// Whether a threshold is raised, its count, whether it is acknowledged, its times and its value.
+/// Whether an alarm is raised, how often it was raised, whether it is acknowledged, when it was raised first and last,
+/// and the value that raised it last.
 type KeptThreshold = (bool, u32, bool, [Option<Timestamp>; 2], Option<f64>);
 
 /// The part of every alarm's state that a restart keeps.

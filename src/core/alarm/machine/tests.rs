@@ -57,7 +57,7 @@ fn observe(machine: &mut Machine, rule: &RuleConfig, seconds: f64, check: LimitC
     machine.observe(at(seconds), rule, &Observation::new(value))
 }
 
-/// A machine in `state` at 100 s. If the debounce of `state` is running, the debounce started at 100 s.
+/// A machine that is in `state` at 100 s. If `state` has a running debounce, the debounce started at 100 s.
 fn machine_in(state: AlarmState) -> (Machine, RuleConfig) {
     use LimitCheck::{Beyond, Healthy, Unknown};
     let rule = rule(state == AlarmState::Latched);
@@ -78,7 +78,7 @@ fn machine_in(state: AlarmState) -> (Machine, RuleConfig) {
     (machine, rule)
 }
 
-/// Expected state after `input`, expected state after the same input at the end of the debounce, and the change that
+/// Expected state after `input`, expected state after a second `input` at the end of the debounce, and the change that
 /// the first input publishes.
 fn expected(state: AlarmState, input: MachineInput) -> (AlarmState, AlarmState, Option<Change>) {
     use AlarmState::{Active, Cleared, Clearing, Inactive, Latched, Pending, Suppressed, Unknown};
@@ -139,7 +139,8 @@ fn transitions_match_table_for_all_inputs() {
     }
 }
 
-/// Whether the value is known after `input`. A command does not change whether the value is known.
+/// Whether the value is known after `input`. A command does not change whether the value is known. The caller handles
+/// the check with an unknown value.
 fn is_known_in(state: AlarmState, input: MachineInput) -> bool {
     match input {
         MachineInput::Check(_) => true,

@@ -92,7 +92,7 @@ fn data_id(dbc: &Dbc, id: MessageId, name: &str) -> Option<u16> {
     }
 }
 
-/// The value of an enumeration attribute, which the DBC gives as the name or as its index.
+/// The name of an enumeration attribute's value. The DBC gives the name itself or its index.
 fn word(dbc: &Dbc, id: MessageId, name: &str) -> Option<String> {
     let place = match dbc.resolved_message_attribute(id, name)? {
         AttributeValue::String(word) => return Some(word.clone()),

@@ -1,4 +1,4 @@
-//! Tests with complete DBC texts, and with faulty texts that are rejected with a line number.
+//! Tests that the parser reads complete DBC texts, and that it rejects faulty texts with a line number.
 
 use super::*;
 

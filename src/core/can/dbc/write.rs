@@ -41,7 +41,8 @@ impl Database {
         text
     }
 
-    /// The DBC as bytes: Latin-1, as DBC tools expect, or UTF-8 if Latin-1 cannot represent the text.
+    /// The DBC as bytes: Latin-1, as DBC tools expect, or UTF-8 if Latin-1 cannot represent the text or if the Latin-1
+    /// bytes would be parsed as UTF-8.
     pub fn to_dbc_bytes(&self) -> Vec<u8> {
         let text = self.to_dbc();
         let latin: Option<Vec<u8>> = text.chars().map(|c| u8::try_from(c).ok()).collect();
@@ -150,7 +151,8 @@ impl Database {
     }
 }
 
-/// The text with its quotes escaped. Parsed text already has escaped quotes.
+/// The text with its quotes escaped. Parsed text already has escaped quotes. If the text ends with a backslash, appends
+/// a blank, because the backslash would escape the closing quote.
 fn quoted(text: &str) -> String {
     let mut safe = String::with_capacity(text.len());
     for c in text.chars() {

@@ -2,9 +2,9 @@
 //!
 //! In: frames. Out: readings. The good codes of a [`Binding`] are the raw codes with a valid value. They form a range,
 //! which is computed in advance. If "not available" codes split the range, its longest part is used. The binding itself
-//! decodes all other codes. It also decodes signals without such a range: floats, signals of 64 bits or spanning nine
-//! bytes, and signals whose scale is 0 or not finite. If a selector has too many codes for a table, each binding
-//! decodes the selector itself.
+//! decodes all other codes. The binding also decodes signals without such a range: floats, signals of 64 bits or
+//! spanning nine bytes, and signals whose scale is 0 or not finite. If a selector has too many codes for a table, the
+//! first binding of each group decodes the selector.
 
 use std::hint::cold_path;
 use std::ops::Range;
@@ -44,8 +44,8 @@ struct SignalGroup {
     signals: Arc<[LinearSignal]>,
     /// Index of the group's first binding among all bindings.
     first: usize,
-    /// A payload of at least this length carries all signals of the group. [`NEVER`] means that the binding decides
-    /// whether they are present.
+    /// A payload of at least this length carries all signals of the group. [`NEVER`] means that the first binding
+    /// decides whether the group is present.
     bytes_needed: usize,
 }
 
@@ -56,8 +56,8 @@ const NEVER: usize = usize::MAX;
 #[derive(Debug, Clone, PartialEq)]
 struct PageTable {
     selector: BitPosition,
-    /// A payload of at least this length carries every selector of the message. For shorter payloads, each binding
-    /// decides.
+    /// A payload of at least this length carries every selector of the message. For a shorter payload, the first
+    /// binding of each group decides whether the group is present.
     bytes_needed: usize,
     /// Range in `groups` for each code; the last entry is for all larger codes.
     codes: Vec<Range<usize>>,
@@ -191,14 +191,14 @@ impl MessageTable {
     }
 }
 
-/// Decodes a binding that is present.
+/// Decodes a signal that is present.
 #[cold]
 #[inline(never)]
 fn value_of(binding: &Binding, payload: &[u8]) -> Result<f64, Fault> {
     binding.value(payload)
 }
 
-/// Decodes the bindings of a group, if the group is present.
+/// Decodes the bindings of a group, if the group is present. If a selector is missing, every binding gives a fault.
 fn decode_one_by_one(bindings: &[Binding], payload: &[u8], each: &mut impl FnMut(Reading)) {
     let present = bindings.first().map_or(Ok(false), |first| first.holds(payload));
     if present == Ok(false) {
@@ -218,7 +218,7 @@ impl SignalGroup {
         Self { signals: bindings.iter().map(LinearSignal::new).collect(), first: run.start, bytes_needed }
     }
 
-    /// The same group, but its bindings decide whether it is present.
+    /// The same group, but its first binding decides whether the group is present.
     fn with_presence_check(&self) -> Self {
         Self { bytes_needed: NEVER, ..self.clone() }
     }

@@ -1,4 +1,4 @@
-//! Tests which frames an input map decodes and which frames it ignores.
+//! Tests which frames an input map decodes, which frames it ignores, and which readings and faults it gives.
 
 use proptest::prelude::*;
 

@@ -6,10 +6,11 @@
 //! State, with AUTOSAR's names:
 //!
 //! * WaitForFirstData: `last_valid` is `None`.
-//! * LastValidCounter: counter of the last valid frame.
+//! * LastValidCounter: counter of the last accepted frame.
 //! * MaxDeltaCounter: largest allowed counter step. It grows by one with each call, because each call may stand for a
-//!   lost frame. A valid frame resets it.
-//! * NoNewOrRepeatedDataCounter: consecutive calls without a new frame.
+//!   lost frame. An accepted frame resets it.
+//! * NoNewOrRepeatedDataCounter: number of periods without a frame and of repeated frames since the frames' counter
+//!   last changed. Damaged frames do not count.
 //! * SyncCounter: number of valid frames still required before a broken sequence is trusted again.
 
 use serde::{Deserialize, Serialize};
@@ -24,10 +25,11 @@ const MAX_REPEATED: u8 = 14;
 pub struct CheckConfig {
     /// Profile and data identifier.
     pub protection: Protection,
-    /// Number of frames that may be lost between two calls. Each call without a valid frame allows one more lost frame.
+    /// Number of frames that may be lost between two accepted frames. Each call without an accepted frame allows one
+    /// more lost frame.
     pub max_delta_counter_init: u8,
-    /// Maximum number of consecutive calls without a new frame; with more such calls, the sequence is broken. 14 = any
-    /// number.
+    /// Maximum number of periods without a frame and of repeated frames since the frames' counter last changed. With
+    /// more, the sequence is broken. 14 = any number.
     pub max_no_new_or_repeated_data: u8,
     /// Number of valid frames required after a broken sequence; each has the status [`Status::Sync`].
     pub sync_counter_init: u8,
@@ -56,7 +58,7 @@ pub enum Status {
     Sync = 3,
     /// The frame is the first intact frame, so there is no previous counter to compare with.
     Initial = 4,
-    /// The frame is intact, but has the same counter as the last frame.
+    /// The frame is intact, but has the same counter as the last accepted frame.
     Repeated = 5,
     /// The frame is intact. Some frames before it were lost, but no more than allowed.
     OkSomeLost = 6,
@@ -128,11 +130,11 @@ impl StatusCounts {
 /// State of one message's receiver. Its counts are stored separately.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Receiver {
-    /// Counter of the last valid frame; `None` = no valid frame yet.
+    /// Counter of the last accepted frame; `None` = no accepted frame yet.
     last_valid: Option<u8>,
-    /// Largest counter step that the next frame may have.
+    /// Largest allowed counter step. Each call first adds one, then compares.
     max_delta: u8,
-    /// Consecutive calls without a new frame.
+    /// Number of periods without a frame and of repeated frames since the frames' counter last changed.
     no_new_or_repeated: u8,
     /// Number of valid frames still required.
     sync: u8,

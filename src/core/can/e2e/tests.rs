@@ -195,7 +195,7 @@ proptest! {
     ) {
         for profile in PROFILES {
             if profile == Profile::P01C && bit >= 12 {
-                continue; // 1C cannot send these identifiers
+                continue; // 1C does not use these bits of the identifier
             }
             Protection { profile, data_id }.protect(&mut payload, 0).unwrap();
             let other = Protection { profile, data_id: data_id ^ 1 << bit };

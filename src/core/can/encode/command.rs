@@ -1,8 +1,9 @@
 //! Decodes the command frame, with which another ECU acknowledges or clears alarms, or reports that the pack was
 //! replaced.
 //!
-//! In: a frame whose end-to-end protection the caller has checked. Out: the command; a selector is `None` if it selects
-//! all alarms. An undefined code is an error, so that a command is applied completely or not at all.
+//! In: a frame whose end-to-end protection or authenticator the caller has checked. Out: the command; a selector (rule,
+//! severity or cell) is `None` if it selects all alarms. An undefined code is an error, so that a command is applied
+//! completely or not at all.
 
 use super::layout::LayoutMessage;
 use super::message::{PlanFaults, RULES};
@@ -16,7 +17,7 @@ use crate::quantity::{CellIndex, MAX_CELLS};
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Command {
     Acknowledge,
-    /// Clears latched alarms whose cause has ended.
+    /// Clears latched alarms whose value is not beyond the threshold, and forgets the history of past alarms.
     Clear,
     /// Reports that another pack is in the vehicle.
     PackReplaced,

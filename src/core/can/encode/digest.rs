@@ -1,8 +1,9 @@
 //! Encodes the digest frame: number and checksum of all raised alarms, the state of every rule, and one threshold in
 //! full precision.
 //!
-//! In: alarms with the codes of their frames. Out: values for the signals of `PACKWATCH_Digest`. The checksum shows a
-//! receiver whether its table of raised alarms is complete, for example after lost alarm frames or a late start.
+//! In: the raised alarms with the codes in their alarm frames, the states of the rules, and a threshold. Out: the
+//! frames of `PACKWATCH_Digest`. The checksum shows a receiver whether its table of raised alarms is complete, for
+//! example if alarm frames were lost or the receiver started late.
 
 use super::layout::LayoutMessage;
 use super::message::{OutputMessage, RULES};

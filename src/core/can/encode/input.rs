@@ -1,9 +1,10 @@
 //! Encodes channel values as input frames, for CSV replay and the simulator.
 //!
-//! Each message and multiplexer page with at least one value gives one frame. In that frame, a signal without a value
-//! is encoded as its "not available" code. If the signal has no such code, it is encoded as a code that the receiver
-//! rejects (NaN, out of range). If no such code exists, the whole frame is omitted, and its values count as not
-//! carried. A frame without any value is sent only if one of its signals has a "not available" code. Values beyond the
+//! In: rows; a row lists channels with their values at one moment. Out: frames. Each message and multiplexer page with
+//! at least one value gives one frame. In that frame, a signal without a value is encoded as its "not available" code.
+//! If the signal has no such code, it is encoded as a code that the receiver rejects (NaN, out of range). If no such
+//! code exists, the whole frame is omitted, and its values count as not carried. A frame without any value is sent only
+//! if one of its signals has a "not available" code and the row contains this signal's channel. Values beyond the
 //! signal's bits saturate. Values outside the DBC's range stay outside, so that the receiver detects the fault. A
 //! diagnostic response is encoded with its request and flow control, as on a bus with a tester.
 //!
@@ -83,7 +84,7 @@ struct InputField {
     offset: f64,
     /// Code for "no value"; `None` = no such code exists.
     missing: Option<u64>,
-    /// Whether `missing` is a configured "not available" code. If so, a frame is sent even without any value.
+    /// Whether `missing` is a configured "not available" code. If so, the channel causes a frame even without a value.
     has_not_available: bool,
 }
 
@@ -292,7 +293,7 @@ fn template(binding: &Binding) -> [u8; MAX_DATA] {
     let mut payload = [0; MAX_DATA];
     for test in &binding.mux {
         let code = test.ranges.first().map_or(0, |range| range.0);
-        // If the code does not fit the selector, the selector stays 0. No frame of that page can exist.
+        // If the code does not fit the selector, the page cannot occur on the bus, and the selector stays 0.
         let _ = test.plan.encode_raw(&mut payload, code);
     }
     payload

@@ -2,9 +2,9 @@
 //!
 //! In: a base (the built-in `config/packwatch.dbc`, or the user's own DBC) and settings per message. Out: the base's
 //! messages with the configured identifiers, frame formats, cycle times, end-to-end protection and authentication. A
-//! protected message includes the signals of its header, an authenticated message the signals of its trailer. The
-//! encoder is built from this database, and `packwatch dbc` writes this database, so the encoder and the written DBC
-//! always agree.
+//! protected message includes the signals of its header (CRC and counter). An authenticated message includes the
+//! signals of its trailer (freshness and authenticator). The encoder is built from this database, and `packwatch dbc`
+//! writes this database, so the encoder and the written DBC always agree.
 //!
 //! The built-in base is adapted:
 //!
@@ -351,7 +351,7 @@ fn set_header(message: &mut Message) {
     }));
 }
 
-/// Signals of the header, so that a consumer can check it with the DBC alone.
+/// Signals of the header. With these signals, a consumer needs only the DBC to check the header.
 fn header_signals(protection: Protection) -> Vec<Signal> {
     let Protection { profile, data_id } = protection;
     let crc = format!("CRC of end-to-end profile {}, data id {data_id}.", profile.name());
@@ -479,9 +479,9 @@ fn fit_steps(message: &mut Message, rated_capacity_ah: f64) {
     }
 }
 
-/// The smallest of 1, 2, 5, 10, ... that is not below `needed`, but at most the largest step.
+/// The smallest of 1, 2, 5, 10, ... that is not below `needed`; at most `LARGEST`.
 fn times(needed: f64) -> f64 {
-    /// The largest factor. It allows capacities up to a million times 40 Ah, more than any cell has.
+    /// The largest result. It allows capacities up to a million times 40 Ah, more than any cell has.
     const LARGEST: f64 = 1e6;
     let ladder = std::iter::successors(Some(1.0), |decade| Some(decade * 10.0)).take_while(|decade| *decade < LARGEST);
     let mut ladder = ladder.flat_map(|decade| [decade, 2.0 * decade, 5.0 * decade]);

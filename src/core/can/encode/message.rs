@@ -15,8 +15,8 @@ use crate::can::{CanId, Frame, MAX_DATA};
 #[error("{}", .0.join("\n"))]
 pub struct PlanFaults(pub Vec<String>);
 
-/// The alarm rules in the order of their numbers, which start at 1. Each has its own `Value_...` and `Threshold_...`
-/// signal, because their units differ.
+/// The alarm rules in the order of their numbers, which start at 1. Each rule has its own `Value_...` and
+/// `Threshold_...` signals, because the units of the rules differ.
 pub(super) const RULES: [&str; 17] = [
     "CapacityLow",
     "UsableCapacityLow",

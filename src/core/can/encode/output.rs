@@ -2,9 +2,9 @@
 //!
 //! Any DBC with the message and signal names of the shipped `config/packwatch.dbc` can be used. An unknown value is
 //! sent as the code that the DBC's value table calls "not available". If the table has no such code, an unknown value
-//! is sent as all ones (unsigned), the lowest code (signed) or NaN (float). A known value whose code would be this one
-//! is sent as the neighbouring code (except in signals of one bit). End-to-end headers use the counters that the caller
-//! keeps ([`SendCounters`]).
+//! is sent as all ones (unsigned), the lowest code (signed) or NaN (float). If a known value would have the same code,
+//! it is sent as the neighbouring code (except in signals of one bit). End-to-end headers use the counters that the
+//! caller keeps ([`SendCounters`]).
 //!
 //! A DBC is rejected with all its faults if signals are missing. It is also rejected if a value could be mistaken for
 //! the value of another rule or page.
@@ -142,7 +142,7 @@ pub struct AlarmFields {
 }
 
 /// The next counter of each message's end-to-end protection. The counters must survive a restart: if a counter jumps
-/// back, the receiver treats the frame as an old one.
+/// back, the receiver rejects the frame as repeated or out of sequence.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SendCounters {

@@ -1,8 +1,8 @@
 //! Encodes the reply to a command frame.
 //!
 //! In: the outcome of a command or the reason for its refusal, and the counter that the next command must have. Out:
-//! values for the signals of `PACKWATCH_Reply`. If the checksum of a command frame is wrong, the reply does not repeat
-//! the content of the command.
+//! the frame `PACKWATCH_Reply`. If the checksum, the authenticator or the freshness of a command frame is wrong, the
+//! caller omits the command, and the reply does not repeat it.
 
 use serde::{Deserialize, Serialize};
 
@@ -33,10 +33,11 @@ pub enum CommandRefusal {
     NoMeaning = 5,
     /// The authenticator is wrong: the frame is forged, or its sender has another key.
     NotAuthentic = 8,
-    /// The freshness was used before, is older than the previous announcement, or was not announced yet.
+    /// The freshness is not above the last accepted freshness, is older than the previous announcement, or was not
+    /// announced yet.
     OldFreshness = 9,
-    /// The frame is authentic, but many forged frames were received. If the sender repeats the command with another
-    /// freshness, the command is executed.
+    /// The frame is authentic, but many forged frames were received. If the sender soon repeats the command with
+    /// another freshness, the command is executed.
     RepeatNeeded = 10,
 }
 
@@ -78,7 +79,7 @@ pub struct ReplyFields {
     /// Number of changed alarms and number of alarms that refused the change, or the reason why the command was not
     /// executed.
     pub outcome: Result<(u32, u32), CommandRefusal>,
-    /// The command; `None` = the command could not be decoded.
+    /// The command; `None` = the command could not be decoded, or its frame is not intact.
     pub command: Option<CommandFields>,
     /// Counter that the next command must have; `None` = any counter.
     pub counter_expected: Option<u8>,

@@ -145,8 +145,8 @@ impl AddressClaim {
         let before = self.state;
         let (state, answer) = next(before, event);
         self.state = state;
-        // Shortest time between two claims, ns. It allows five claims within the time that the other node waits, but no
-        // flood of responses to a flood of claims.
+        // Shortest time between two claims, ns. Five claims still fit into the 250 ms that the other node waits. A
+        // flood of claims from another node does not cause a flood of responses.
         let spaced = self.last_sent.map_or(now, |sent| now.max(sent.plus_nanos(50_000_000)));
         match answer {
             ClaimAnswer::Nothing => {}

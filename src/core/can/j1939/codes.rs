@@ -1,9 +1,9 @@
 //! Limits each sent trouble code to one change a second (J1939-73).
 //!
-//! A code is added to the message as soon as it becomes active, and removed as soon as it becomes inactive. If its last
-//! change on the bus is less than a second ago, the change waits. If the code was active only while a change waited, it
-//! is still sent for at least a second. If the code was inactive only while a change waited, it stays in the message
-//! with a higher count.
+//! A code is added to the message as soon as it becomes active, and removed as soon as it becomes inactive. If the
+//! code's last change on the bus is less than a second ago, the new change waits. If the code was active only while a
+//! change waited, it is still sent for at least a second. If the code was inactive only while a change waited, it stays
+//! in the message with a higher count.
 //!
 //! The state "all values are known" follows the same rule when it becomes true. When it becomes false, the change is
 //! sent at once.
@@ -29,15 +29,15 @@ pub struct ActiveCode {
 struct FollowedCode {
     code: TroubleCode,
     is_active: bool,
-    /// Whether the code became active since its last change on the bus.
+    /// Whether the code became active while it was not on the bus, and has not been sent since.
     is_unseen: bool,
-    /// Most severe lamp since the last change on the bus.
+    /// Lamp to send: the present lamp, or a more severe lamp that the code had and that has not been sent yet.
     lamp: Lamp,
     lamp_now: Lamp,
     /// Lamp on the bus; `None` = the code is not sent.
     shown: Option<Lamp>,
     changed_at: Option<Timestamp>,
-    /// Whether the change is part of the message that is being transferred.
+    /// Whether the latest change is part of a message that is still being transferred.
     is_in_flight: bool,
 }
 
@@ -106,7 +106,7 @@ pub(super) struct Codes {
 }
 
 impl Codes {
-    /// Handles a list of active codes; follows at most [`MAX_FOLLOWED`].
+    /// Handles a list of active codes; follows at most [`MAX_FOLLOWED`] codes.
     pub(super) fn set(&mut self, now: Timestamp, active: &[ActiveCode], all_known: bool) {
         self.forget_settled(now);
         self.all_known = all_known;

@@ -22,7 +22,7 @@ pub enum NodeEvent {
     },
     /// The number of active codes that do not fit into one message changed.
     CodesLeftOut {
-        /// The number of codes; 0 = all codes are sent again.
+        /// The number of codes; 0 = the message contains all codes again.
         codes: usize,
     },
 }

@@ -2,11 +2,11 @@
 
 use crate::can::CanId;
 
-/// Requests a parameter group, to one address or to all.
+/// Requests a parameter group from one address or from all.
 pub const PGN_REQUEST: u32 = 59_904;
 /// Acknowledges a request; this node sends only negative acknowledgements.
 pub const PGN_ACKNOWLEDGEMENT: u32 = 59_392;
-/// Claims an address ("cannot claim" from [`NULL_ADDRESS`]).
+/// Claims an address. Sent from [`NULL_ADDRESS`], it means "cannot claim".
 pub const PGN_ADDRESS_CLAIMED: u32 = 60_928;
 /// Transport protocol, connection management: announces a broadcast in packets.
 pub const PGN_TRANSPORT_CONTROL: u32 = 60_416;
@@ -59,7 +59,7 @@ impl Header {
 pub(super) fn can_id(priority: u8, pgn: u32, destination: u8, source: u8) -> CanId {
     let [_, page, format, low] = pgn.to_be_bytes();
     let specific = if format < FIRST_BROADCAST_FORMAT { destination } else { low };
-    // Masked to 3 and 2 bits; callers pass the constants above, which fit.
+    // The priority has 3 bits and the page has 2 bits. The masks change nothing, because callers pass values that fit.
     CanId::Extended(u32::from_be_bytes([((priority & 7) << 2) | (page & 3), format, specific, source]))
 }
 

@@ -22,8 +22,8 @@
 //!    another address. If addresses changed, a consumer that identifies battery monitors by address could not
 //!    distinguish them.
 //! 2. Every payload of more than 8 bytes is sent by BAM, even if a single node requested it (for a single node, the
-//!    standard uses a connection with flow control). That node also receives the broadcast. The effect is a higher bus
-//!    load, which [`MAX_CODES`] limits.
+//!    standard uses a connection with flow control). That node also receives the broadcast, but cannot request a lost
+//!    packet again. [`MAX_CODES`] limits the length of a broadcast.
 //! 3. The delay before "cannot claim" is derived from the NAME instead of being random, so that a replay gives the same
 //!    frames.
 

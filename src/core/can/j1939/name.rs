@@ -32,7 +32,7 @@ pub struct NameFields {
     pub identity_number: u32,
 }
 
-/// Reports a number that does not fit its bits on the wire.
+/// Reports a number outside its allowed range.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("{field} = {found}, must be {lowest} to {highest}")]
 pub struct OutOfRange {
@@ -93,7 +93,7 @@ impl Name {
 }
 
 impl fmt::Display for Name {
-    /// 16 hexadecimal digits, as in the kernel's tools.
+    /// 16 hexadecimal digits.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{:016X}", self.0)
     }

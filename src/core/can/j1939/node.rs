@@ -115,7 +115,7 @@ impl Node {
         }
     }
 
-    /// Claims the address. Codes are sent after 300 ms without objection (see `address` for the reason).
+    /// Claims the address. If no other node objects, the node sends codes 300 ms later (`address` explains this time).
     pub fn start(&mut self, now: Timestamp, out: &mut NodeOutputs) {
         self.fall_silent();
         self.codes.restart();
@@ -125,9 +125,9 @@ impl Node {
         self.poll(now, out);
     }
 
-    /// Sets the codes that the next [`poll`](Self::poll) sends. The caller lists the most severe active code first, and
-    /// the latest previously active code first. `all_known` says whether every value that could activate a code is
-    /// known.
+    /// Sets the codes that the next [`poll`](Self::poll) sends. The caller sorts `active` by severity (most severe code
+    /// first) and `previously_active` by time (latest code first). `all_known` says whether every value that could
+    /// activate a code is known.
     pub fn set_codes(
         &mut self,
         now: Timestamp,
@@ -222,7 +222,8 @@ impl Node {
         let is_cyclic = self.next_dm1 <= now;
         let has_changed = self.codes.change_due().is_some_and(|due| due <= now);
         if (is_cyclic || has_changed) && self.can_start(now, PGN_DM1) {
-            // If this DM1 is on time, the next DM1 keeps the cycle. After a change, a new cycle starts now.
+            // If this DM1 is cyclic and less than a period late, the next DM1 keeps the cycle. Otherwise a new cycle
+            // starts now.
             let next = self.next_dm1.plus_nanos(DM1_PERIOD_NS);
             self.next_dm1 = if is_cyclic && now < next { next } else { now.plus_nanos(DM1_PERIOD_NS) };
             self.send_dm1(now, out);
@@ -239,8 +240,8 @@ impl Node {
             PendingAnswer::Refusal { .. } => true,
         });
         let Some(answer) = ready.and_then(|index| self.answers.remove(index)) else { return };
-        // Shortest time (ns) between two responses to requests. A flood of requests therefore causes at most 20 frames
-        // a second.
+        // Shortest time (ns) between two responses to requests. A flood of requests therefore causes at most 20
+        // responses a second.
         self.next_answer_at = now.plus_nanos(50_000_000);
         match answer {
             PendingAnswer::Dm1 => self.send_dm1(now, out),
@@ -294,7 +295,8 @@ impl Node {
     fn start_at(&self, now: Timestamp, pgn: u32) -> Option<Timestamp> {
         let codes = if pgn == PGN_DM1 { self.codes.count_at(now) } else { self.previously_active.len() };
         match &self.transfer {
-            // A transfer with older content must not end after a frame with newer content.
+            // Only one transfer runs at a time. A single frame of the same group waits, too, because a transfer with
+            // older content must not end after a frame with newer content.
             Some(transfer) if codes > 1 || transfer.pgn == pgn => None,
             None if codes > 1 && pgn == PGN_DM1 && self.is_turn_of_dm2() => None,
             None if codes > 1 => Some(self.transport_free_at),
@@ -320,15 +322,15 @@ impl Node {
         claim.into_iter().chain(transfer).chain(dm1).chain(answers).min()
     }
 
-    /// When a message that is due at `wanted` can be sent.
+    /// Earliest time at which a message of this group can be sent if it is due at `wanted`.
     fn startable_from(&self, pgn: u32, wanted: Timestamp) -> Option<Timestamp> {
         let from = wanted.max(self.polled_at);
         let start = self.start_at(from, pgn).map(|start| start.max(wanted));
         if pgn != PGN_DM1 || start.is_some_and(|start| start <= from) {
             return start;
         }
-        // When codes leave the message, it may become short enough to be sent during a transfer or during the pause
-        // after it.
+        // When codes leave the message, the message may become short enough to be sent during a transfer or during the
+        // pause after the transfer.
         let shorter = self.codes.changes().filter(|&change| change > from);
         shorter.filter_map(|change| self.start_at(change, pgn).map(|start| start.max(change))).chain(start).min()
     }

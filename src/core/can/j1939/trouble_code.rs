@@ -3,7 +3,7 @@
 //! ```text
 //! byte 0      lamps, 2 bits each: malfunction, red stop, amber warning, protect (00 off, 01 on, 11 not available)
 //! byte 1      flashing of the same lamps: 11 = does not flash
-//! then, each  SPN 7..0 | SPN 15..8 | SPN 18..16 and FMI | occurrence count
+//! per code    SPN 7..0 | SPN 15..8 | SPN 18..16 and FMI | occurrence count
 //! ```
 //! A message without codes has four zero bytes instead of the codes. A message with at most one code is padded with
 //! 0xFF to 8 bytes. SPN is the suspect parameter number, and FMI the failure mode identifier. The highest bit of an
@@ -15,9 +15,9 @@ use serde::{Deserialize, Serialize};
 use super::name::OutOfRange;
 
 /// Maximum number of codes in one message. 27 codes are 110 bytes in 16 packets. The packets are sent every 50 ms, each
-/// up to one tick of 10 ms late. So a transfer ends within 0.96 s, before the next DM1 is due. 17 rules need only 17
-/// codes if the thresholds of each rule share a parameter number, because only the code of the most severe threshold is
-/// sent.
+/// up to one tick of 10 ms late. So a transfer ends within 0.96 s, before the next DM1 is due. packwatch's 17 alarm
+/// rules need only 17 codes if the thresholds of each rule share a parameter number, because then only the code of the
+/// most severe threshold is sent.
 pub const MAX_CODES: usize = 27;
 
 pub(super) const MAX_PAYLOAD: usize = 2 + 4 * MAX_CODES;

@@ -1,4 +1,4 @@
-//! Tests due times of requests, the request for the current before voltages, standby and silence.
+//! Tests when requests are due, that the current is requested before voltages, and when polling stops.
 
 #![allow(clippy::unwrap_used, reason = "tests may panic")]
 

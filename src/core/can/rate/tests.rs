@@ -56,7 +56,7 @@ fn jitter_or_new_cycle_is_not_second_sender() {
     for jitter in [0.0, 0.3] {
         let waking = [(100.0, 0.0, 60.0, jitter), (10.0, 60.0, 120.0, jitter)];
         let mut rates = watched(None);
-        // A single sender changes from the first period to the second, so no current alternates between two senders.
+        // A single sender changes from the first period to the second, so the currents do not alternate.
         let mut found = Vec::new();
         for (period_ms, from_s, to_s, jitter) in waking {
             found.extend(run(&mut rates, &[(period_ms, from_s, to_s, jitter)]));

@@ -3,13 +3,14 @@
 //!
 //! The receiver announces a value once a second, each time [`ANNOUNCEMENT_STEP`] higher. A command carries the
 //! announced value, or a higher value that is below the next announcement. The sender uses each value once and in
-//! rising order. The receiver accepts a value if it is higher than all values accepted before, not older than the
-//! previous announcement, and already announced. If an attacker delays a command, the command expires after two
+//! rising order. The receiver accepts a value if it is higher than all values accepted before, not below the previous
+//! announcement, and below the next announcement. If an attacker delays a command, the command expires within two
 //! seconds. A command with an invented value is useless until the receiver announces that value.
 //!
 //! The sender stores nothing: after a restart, it waits for an announcement. The receiver stores its state. After a
-//! restart it begins [`RESTART_STEPS`] announcements beyond the stored state, and not below the value that corresponds
-//! to its clock. Therefore it never reuses a value of the previous run, even if that value was not stored.
+//! restart, the receiver begins [`RESTART_STEPS`] announcements above the stored state, or at [`ANNOUNCEMENT_STEP`]
+//! times its clock (Unix time in seconds) if that is higher. Therefore it never reuses a value of the previous run,
+//! even if that value was not stored.
 
 use serde::{Deserialize, Serialize};
 

@@ -184,7 +184,8 @@ fn flood_of_foreign_first_frames_uses_no_memory() {
         bench.hear(CanId::Standard(id), &[0x1F, 0xFF, 1, 2, 3, 4, 5, 6]);
     }
     assert_eq!(bench.listener.counts().count(), 1);
-    // Only the identifiers of responses and requests concern the listener. A frame of the responses started a message.
+    // The listener handles only the identifiers of responses and requests. The frame with the identifier of the
+    // responses started a message, which is not counted yet.
     assert_eq!(bench.counts(), ControllerCounts::default());
 }
 

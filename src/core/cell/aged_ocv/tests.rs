@@ -45,8 +45,8 @@ fn offsets_match_aged_curves_and_are_continuous() {
         let (least, edge) = (offset_v(&table, s, 0.5), offset_v(&table, s, 2.0));
         assert!((least - edge).abs() < 1e-9, "constant below the lowest capacity: {least} {edge}");
     }
-    // One standard deviation of the mix changes the offset by half of the difference between the shares 0.6 and 0 of
-    // lost negative material.
+    // One standard deviation of the mix changes the offset by half of the difference between two offsets: with a share
+    // of 0.6 of lost negative material, and with a share of 0.
     let with =
         |negative: f64| M50.aged(LostMaterial { negative: negative * 0.2, positive: 0.3 * 0.2 }, 0.8).expect("a cell");
     let expected_v = 0.5 * (with(0.6).voltage_v(SOC[2]) - with(0.0).voltage_v(SOC[2]));

@@ -2,10 +2,10 @@
 //!
 //! In: positive and negative materials, cut-off voltages (V). Out: mean (V) and covariance (V^2) over SOC breakpoints.
 //!
-//! A pair of materials and two lithium contents (full negative electrode, empty positive electrode) describe a cell.
-//! The contents of the empty negative and the full positive electrode follow from the cut-off voltages. All pairs and
-//! all contents of a grid are equally likely. Two further errors cover cells that no pair of the library describes: a
-//! smooth deviation of 10 mV (30 mV below 5 % SOC), and half of the hysteresis.
+//! A cell is described by a pair of materials and two lithium contents: the negative electrode's content in the full
+//! cell, and the positive electrode's content in the empty cell. The other two contents follow from the cut-off
+//! voltages. All pairs and all contents of a grid are equally likely. Two further errors cover cells that no pair
+//! describes: a smooth deviation of 10 mV (30 mV below 5 % SOC), and half of the hysteresis.
 
 use nalgebra::{DMatrix, SymmetricEigen};
 
@@ -95,7 +95,8 @@ pub struct CurvePrior {
     pub electrodes: Option<Electrodes>,
 }
 
-/// One cell's contents [negative empty, negative full, positive empty, positive full] and curve, V.
+/// Lithium contents and curve (V) of one cell. The contents are [negative electrode in the empty cell, negative in the
+/// full cell, positive in the empty cell, positive in the full cell].
 struct PossibleCell {
     contents: [f64; 4],
     curve_v: Vec<f64>,
@@ -107,8 +108,9 @@ impl CurvePrior {
         let CellType { positives, negatives, empty_v, full_v, hysteresis_v } = *cell_type;
         let pairs = positives.iter().flat_map(|p| negatives.iter().map(move |&n| (p, n)));
         let with_contents = |(p, n)| {
-            // Full negative electrode: from fast-charging to high-energy designs. Empty positive electrode: lithium
-            // lost in the first cycles.
+            // The first list is the content of the negative electrode in the full cell. It is low in fast-charging
+            // designs and high in high-energy designs. The second list is the content of the positive electrode in the
+            // empty cell. It is below 1, because lithium is lost in the first cycles.
             let contents =
                 [0.78, 0.84, 0.90, 0.95].iter().flat_map(|&x| [0.84, 0.88, 0.92, 0.97].iter().map(move |&y| (x, y)));
             let ends = contents.flat_map(|contents| full_v.iter().map(move |&full_v| (contents, full_v)));
@@ -124,8 +126,9 @@ impl CurvePrior {
         let mean_v: Vec<f64> =
             (0..soc.len()).map(|s| cells.iter().map(|(_, cell)| cell.curve_v[s]).sum::<f64>() / count).collect();
         let off_v = |cell: &PossibleCell, s: usize| cell.curve_v[s] - mean_v[s];
-        // Smooth deviation of a cell's materials from the library's materials of the same name; larger where the curves
-        // are steep. These are the deviations that the fit of electrodes allows (`ident::electrodes`).
+        // Smooth deviation (V) of a cell's materials from the materials of the same name in `cell::electrodes`. It is
+        // larger where the curves are steep. The fit of electrodes (`ident::electrodes` in packwatch-lab) allows the
+        // same deviations.
         let material_v = |s: usize| if soc[s] < 0.05 { 0.030 } else { 0.010 };
         let covariance = DMatrix::from_fn(soc.len(), soc.len(), |a, b| {
             let between: f64 = cells.iter().map(|(_, cell)| off_v(cell, a) * off_v(cell, b)).sum::<f64>() / count;
@@ -148,12 +151,12 @@ impl CurvePrior {
     }
 
     /// The largest independent modes of the spread, V per standard deviation, and the standard deviation of the rest,
-    /// V. Modes are ordered by their effect on the SOC that is read from a voltage.
+    /// V. Modes are ordered by their effect on the SOC that a voltage reading gives.
     pub fn modes_v(&self) -> ([Vec<f64>; MIXES], Vec<f64>) {
         let n = self.soc.len();
         let slope_v = |s: usize| {
             let (a, b) = (s.saturating_sub(1), (s + 1).min(n - 1));
-            // On a flatter curve, a voltage gives no information about the SOC.
+            // On a curve flatter than this limit, a voltage gives no information about the SOC.
             ((self.mean_v[b] - self.mean_v[a]) / (self.soc[b] - self.soc[a])).max(0.1)
         };
         let width = |s: usize| 0.5 * (self.soc[(s + 1).min(n - 1)] - self.soc[s.saturating_sub(1)]);
@@ -179,8 +182,8 @@ impl CurvePrior {
     }
 }
 
-/// The cell made of a pair of materials with these contents (full negative, empty positive) between the cut-off
-/// voltages; `None` if there is no such cell.
+/// The cell made of a pair of materials, with these lithium contents (of the negative electrode in the full cell, of
+/// the positive electrode in the empty cell) and these cut-off voltages; `None` if such a cell does not exist.
 fn possible_cell(
     (positive, negative): (&PositiveElectrode, NegativeMaterial),
     (negative_full, positive_empty): (f64, f64),

@@ -66,7 +66,7 @@ fn lithium_loss_slides_electrodes() {
 fn impossible_loss_gives_no_curve() {
     assert!(M50.aged(LostMaterial { negative: 0.5, positive: 0.0 }, 0.9).is_none());
     assert!(M50.aged(LostMaterial::default(), 3.0).is_none());
-    // With an excess of lithium, a loss of lithium leaves more capacity.
+    // In a cell with excess lithium, a small loss of lithium does not reduce the capacity.
     let excess = Electrodes {
         negative: NegativeMaterial::Mcmb,
         negative_content: [0.035, 0.956],

@@ -4,12 +4,13 @@
 //!
 //! Almost every step is ordinary: the current was measured for the whole time since the last voltage, and the voltage
 //! is within the gate. The [`kernel`] computes ordinary steps for [`WIDTH`] cells at a time, on structures of arrays
-//! with one cell per lane. It selects wider instructions at run time (without the feature `wide`, cells are stepped one
-//! by one). All other steps (a first voltage, a gap, an unknown current, a reading beyond the gate, a covariance
-//! without a Cholesky factor) use parts of the same kernel with one lane ([`SingleCell`]). The tests compare the kernel
-//! with the textbook filter: the SOC agrees within 1e-9 over 100,000 steps. The cell alone determines how its step is
-//! computed, and the bits of a lane do not depend on other lanes. Therefore, a cell's estimates do not depend on the
-//! other cells of the pack.
+//! with one cell per lane. With the feature `wide`, the bank selects the machine's widest vector instructions at run
+//! time. Without the feature or without such instructions, the bank steps the cells one by one. All other steps (for
+//! example a first voltage, a gap, an unknown current, a reading beyond the gate, a covariance without a Cholesky
+//! factor) use parts of the same kernel with one lane ([`SingleCell`]). The tests compare the kernel with the textbook
+//! filter: the SOC agrees within 1e-9 over 100,000 steps. Whether a step is ordinary depends only on the cell itself,
+//! and the bits of a lane do not depend on other lanes. Therefore, a cell's estimates do not depend on the other cells
+//! of the pack.
 
 mod filter_array;
 mod input;
@@ -43,10 +44,10 @@ pub struct EstimatorBank {
     plausible_ah: (f64, f64),
     filters: FilterArrays,
     cells: Vec<CellSlot>,
-    /// The inputs of the batch. Inputs of cells that are not in the batch are old and are not read.
+    /// The inputs of the batch. If a cell is not in the batch, its input is old, and the result is discarded.
     inputs: Vec<BlockInput>,
     results: Vec<StepResult>,
-    /// Cells of the batch whose step is not ordinary.
+    /// Cells of the batch whose step is not ordinary, each with this step.
     others: Vec<(usize, CellStep)>,
     #[cfg(feature = "wide")]
     machine: pulp::Arch,
@@ -111,7 +112,7 @@ impl EstimatorBank {
         &self.config
     }
 
-    /// Adds a cell's voltage reading to the batch, at most one per cell.
+    /// Adds a cell's voltage reading to the batch. A batch has at most one reading per cell.
     ///
     /// # Panics
     /// If there is no such cell.
@@ -196,8 +197,8 @@ impl EstimatorBank {
         })
     }
 
-    /// State of charge of the emptiest and of the fullest cell. `None` if a cell has no SOC yet, or if a cell has had
-    /// no voltage since a downtime.
+    /// State of charge of the emptiest and of the fullest cell. `None` if a cell has no SOC yet, or if a cell's SOC is
+    /// [carried over](Self::is_carried_over).
     pub fn extremes(&self) -> Option<(ScalarGaussian, ScalarGaussian)> {
         if !self.cells.iter().all(|cell| cell.has_filter && !cell.memory.is_carried_over()) {
             return None;
@@ -295,8 +296,9 @@ impl EstimatorBank {
     }
 
     /// Evidence about the current sensor's offset since the last correction: sum of d^2 / R, and sum of d x innovation
-    /// / R. d is the effect of one standard deviation of the offset on an innovation, and R the variance of the
-    /// innovation. The sums are averaged over the cells, because the models of the cells have common errors.
+    /// / R. d is the effect of one standard deviation of the offset on an innovation. R is the variance of the
+    /// innovation without this effect. The sums are averaged over the cells, because the models of the cells have
+    /// common errors.
     pub fn offset_evidence(&self) -> (f64, f64) {
         let cells = self.cells.len();
         let mean = |i: usize| {
@@ -322,7 +324,7 @@ impl EstimatorBank {
         self.change_all(|cell| cell.learn_slow_branch(&config));
     }
 
-    /// Sets the standard deviation of the current sensor's offset per cell, A.
+    /// Sets the standard deviation of the current sensor's offset, A per cell.
     pub fn set_current_offset_std(&mut self, offset_std_a: f64) {
         self.config.sensor.current_offset_a = offset_std_a;
         self.constants.sensor.current_offset_a = offset_std_a;

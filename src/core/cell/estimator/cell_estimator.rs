@@ -1,8 +1,8 @@
 //! The estimator of a single cell outside its bank: steps that are not ordinary ([`super::bank`]), restarts, learning
 //! and estimates.
 //!
-//! In: one [`CellStep`] per voltage reading. Out: a [`StepResult`], and estimates with their variances. A reading beyond
-//! the gate leaves the state unchanged; a step that cannot be computed restarts the filter.
+//! In: one [`CellStep`] per voltage reading. Out: a [`StepResult`], and estimates with their variances. A reading
+//! beyond the gate does not correct the state; a step that cannot be computed restarts the filter.
 
 use nalgebra::SMatrix;
 
@@ -68,7 +68,8 @@ impl CellEstimator {
             self.start(model, config, &step);
         }
         if let (None, Some(x)) = (&result, &mut self.filter) {
-            // The step failed, possibly because the correlation made the covariance indefinite. Remove the correlation.
+            // The step failed, possibly because the correlation made the covariance indefinite. Remove the correlation
+            // and the effects of the constant errors.
             x.correlate(LOG_RESISTANCE, CAPACITY, 0.0);
             x.by_constant.fill(0.0);
         }
@@ -119,7 +120,8 @@ impl CellEstimator {
         Some(Some(update))
     }
 
-    /// Starts SOC and branches from the voltage. Keeps the learned resistance and capacity.
+    /// Starts SOC and branches. If the configuration states a SOC, the first start uses this SOC. Otherwise, the SOC
+    /// comes from the voltage. Keeps the learned resistance and capacity.
     fn start(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
         let first = self.filter.is_none();
         (self.memory.capacity, self.memory.log_resistance) = (self.capacity(), self.log_resistance());
@@ -143,7 +145,8 @@ impl CellEstimator {
             by_constant: self.learned_by_constant(),
         };
         self.filter = Some(Gaussian::at_start(soc, &branch_variance[..model.branches.len()], &kept));
-        // A restart does not make the estimate trusted again; only the window of the consistency monitor does.
+        // A restart alone does not make the estimate trusted again: readings that fit must follow for about one window
+        // of the consistency monitor.
         self.memory.mean_nis = self.memory.mean_nis.min(config.consistency.limit * std::f64::consts::E);
         self.memory.information_s = config.voltage.max_information_s;
         (self.memory.downtime_std, self.memory.used_prior, self.memory.noted_s) = (0.0, 0.0, 0.0);
@@ -273,8 +276,8 @@ impl CellEstimator {
         self.absorb(CURRENT_OFFSET, deviations, remains);
     }
 
-    /// Corrects the ratio of the slowest branch by the evidence since the last correction, if the cell has several
-    /// branches.
+    /// If the cell has several branches, corrects the ratio of the slowest branch by the evidence since the last
+    /// correction; otherwise, discards the evidence.
     pub fn learn_slow_branch(&mut self, config: &EstimatorConfig) {
         if self.filter.as_ref().is_none_or(|x| x.states == BRANCHES + 1) {
             (self.memory.slow_branch.information, self.memory.slow_branch.score) = (0.0, 0.0);
@@ -377,7 +380,8 @@ impl CellEstimator {
     }
 }
 
-/// Predicts the temperature (degrees C) of a cell without a sensor value from the last known temperature.
+/// Predicts the temperature (degrees C) of a cell whose sensor has no value. The prediction starts from the last known
+/// temperature.
 pub(super) fn thermal_c(model: &CellModel, last_c: Option<f64>, soc: f64, log_resistance: f64, step: &CellStep) -> f64 {
     let (Some(last_c), Some(thermal)) = (last_c, &model.thermal) else { return last_c.unwrap_or(step.ambient_c) };
     let mean_current_a = if step.measured_s > 0.0 { step.charge_as / step.measured_s } else { 0.0 };

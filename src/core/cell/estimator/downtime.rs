@@ -1,24 +1,24 @@
 //! Handles the possible use of a cell while nothing is measured: the program is stopped, the bus sleeps, or the log has
 //! a gap.
 //!
-//! In: the possible change of the SOC in the downtime, fraction, and the first voltage after it, V. Out: the updated filter;
-//! `None` if the update cannot be computed.
+//! In: the possible change of the SOC in the downtime, fraction, and the first voltage after the downtime, V. Out: the
+//! updated filter; `None` if the update cannot be computed.
 //!
-//! Deviation 6: two hypotheses describe a downtime. First hypothesis, the more likely one: the cell rested. The SOC has
-//! only lost the self-discharge, and all correlations still hold. Second hypothesis: the cell was used or charged. The
-//! SOC can be anywhere within the charge that can be moved in that time, and the branches are as uncertain as at a
-//! start. The first voltage with a known current updates both hypotheses. They are weighted by their likelihoods
-//! (Bayes' rule, prior in [`Memory`]) and merged into one Gaussian with their common mean and covariance. Effect: after
-//! a night without use, the counted charge stays accurate, and the voltage at rest keeps its information about the
-//! capacity. Use that was not measured is found at the first reading; a single narrow Gaussian would need hours for
-//! this. A single wide Gaussian would lose the counted charge.
+//! Deviation 6: two hypotheses describe a downtime. First hypothesis, usually the more likely one: the cell rested. The
+//! SOC has only fallen by the self-discharge, and all correlations still hold. Second hypothesis: the cell was used or
+//! charged. The SOC can be anywhere in the range that use or charging can reach in that time, and the branches are as
+//! uncertain as at a start. The first voltage with a known current updates both hypotheses. They are weighted by their
+//! likelihoods (Bayes' rule, prior in [`Memory`]) and merged into one Gaussian with their common mean and covariance.
+//! Effect: after a night without use, the counted charge stays accurate, and the voltage at rest keeps its information
+//! about the capacity. Use that was not measured is found at the first reading; a single narrow Gaussian would need
+//! hours for this. A single wide Gaussian would lose the counted charge.
 //!
-//! Until the first voltage arrives, the published standard deviation is that of the second hypothesis.
+//! Until the first voltage arrives, the standard deviation of the second hypothesis is published.
 //!
 //! A gap (sleep, a hole in a log) is described by the same hypotheses. A load before or after the gap may have
 //! continued or ended during the gap, with equal probability. If the cell rested before and after the gap, only a
 //! charger may have been connected. This is rare, because a bus in use wakes its listeners; it is more likely in a
-//! longer gap. Without the second hypothesis, charge that was not recorded would be learned as capacity.
+//! longer gap. Without the second hypothesis, charge that was not recorded would be learned as a change of capacity.
 //!
 //! [`Memory`]: super::memory::Memory
 
@@ -30,7 +30,8 @@ use super::step::{CellStep, Update};
 use super::voltage_reach::FAR;
 use crate::cell::{CellModel, EstimatorConfig};
 
-/// If a voltage error moves the SOC this many times as far as the slope of the curve says, the curve is flat.
+/// If a voltage error moves the SOC more than this many times as far as the slope of the curve says, the curve counts
+/// as flat.
 const FLAT: f64 = 2.0;
 
 /// Updates with the first reading after a downtime. This reading does not count as evidence about the sensor's offset
@@ -60,12 +61,13 @@ pub(super) fn update_after_downtime(
     let wide = update(&mut used.clone())?;
     let reach = 3.0_f64.sqrt() * memory.downtime_std;
     let soc = model.soc_of_aged_ocv(&temperature, memory.curve.mean, step.voltage_v + drop_v);
-    // All SOCs within reach are equally likely. The prior is centred at the SOC that the voltage gives, where the curve
-    // is then linearised.
+    // All SOCs within reach are equally likely. The prior is centred at the SOC that the voltage gives. The update then
+    // linearises the curve there.
     let within_reach = |soc: f64| soc.clamp(before_soc - reach, before_soc + reach);
     used.mean[0] = within_reach(soc);
     let by_used = update(&mut used)?;
-    // On a flat part of the curve, the slope at one SOC says little: a small error of the voltage leads to a far SOC.
+    // On a flat part of the curve, the slope at one SOC says little: a small error of the voltage leads to a distant
+    // SOC.
     let voltage_variance = square(config.sensor.voltage_offset_v)
         + square(config.gate.model_error_v)
         + branch_variance
@@ -87,8 +89,8 @@ pub(super) fn update_after_downtime(
     Some(if weight > 0.5 { by_used } else { by_left_alone })
 }
 
-/// Prior of the hypothesis that the cell was used: the SOC is anywhere within reach and uncorrelated, the branches are
-/// as at a start.
+/// Prior of the hypothesis that the cell was used: the SOC is anywhere within reach and uncorrelated, and the branches
+/// are as uncertain as at a start.
 fn used_prior(x: &Gaussian, config: &EstimatorConfig, downtime_std: f64) -> Gaussian {
     let mut used = *x;
     used.covariance[(0, 0)] = widened(x.marginal(0).variance, square(downtime_std));

@@ -12,7 +12,7 @@ use crate::cell::MAX_BRANCHES;
 use crate::filter::ScalarGaussian;
 use crate::quantity::bounds;
 
-/// States of a cell with [`MAX_BRANCHES`].
+/// Number of states of a cell with [`MAX_BRANCHES`] branches.
 pub(super) const MAX_STATES: usize = BRANCHES + MAX_BRANCHES;
 
 pub(super) type Covariance = SMatrix<f64, MAX_STATES, MAX_STATES>;

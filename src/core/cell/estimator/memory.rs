@@ -14,7 +14,7 @@ use crate::filter::ScalarGaussian;
 use crate::quantity::InvalidState;
 use crate::quantity::bounds::{self, Bounds};
 
-/// If there is a load before or after a gap, this load is assumed in the gap, per rated capacity: 1 C.
+/// If there is a load before or after a gap, the gap counts as at least this load, per rated capacity: 1 C.
 const GAP_LOAD_PER_H: f64 = 1.0;
 
 /// Prior probability that a cell was used while the program did not run.
@@ -46,13 +46,13 @@ pub(super) struct Memory {
     pub(super) load_a: f64,
     /// Mean normalised innovation squared over the consistency window.
     pub(super) mean_nis: f64,
-    /// Time that the next voltage reading represents, s: the time since the last used reading.
+    /// Time that the next voltage reading represents, s: the time since the last used reading. A long rest counts less.
     pub(super) information_s: f64,
     /// Duration of the present rest, s.
     pub(super) rest_s: f64,
-    /// Information about the current sensor's offset since its last correction, in units of its standard deviation: sum
-    /// of d^2 / R. d is the effect of the offset on an innovation; R is the variance of the innovation without this
-    /// effect.
+    /// Information about the current sensor's offset since the last correction of the offset: sum of d^2 / R. d is the
+    /// effect of one standard deviation of the offset on an innovation; R is the variance of the innovation without
+    /// this effect.
     pub(super) offset_information: f64,
     /// Evidence about the current sensor's offset from the same voltages: sum of d x innovation / R.
     pub(super) offset_score: f64,
@@ -113,9 +113,9 @@ impl Memory {
     }
 
     /// Notes the unmeasured time of a step. The load before or after this time may have continued through it, or a
-    /// charger may have been connected. The next voltage with a known current decides whether this happened. If a short
-    /// gap ends with this step and its possible change is small, it is not noted as downtime; its standard deviation
-    /// (fraction of SOC) is returned instead.
+    /// charger may have been connected. The next voltage with a known current decides whether this happened. If the
+    /// current is known before and after the unmeasured time and the possible change of the SOC is negligible, no
+    /// downtime is noted. The standard deviation of the change (fraction of SOC) is returned instead.
     pub(super) fn note_gap(&mut self, config: &EstimatorConfig, step: &CellStep, capacity_ah: f64) -> f64 {
         let noted_s = std::mem::take(&mut self.noted_s).min(step.unmeasured_s);
         let is_unknown = step.current_a.is_none() && step.unmeasured_s > 0.0;
@@ -162,8 +162,8 @@ impl Memory {
         self.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs())
     }
 
-    /// Updates load and rest for the unmeasured time of a step, which follows its measured time. If there was a load
-    /// before or after a gap, the gap counts as a load of at least 1 C.
+    /// Updates load and rest for the unmeasured time of a step. The unmeasured time follows the measured time. If there
+    /// is a load before or after the gap, the gap counts as a load of at least 1 C.
     pub(super) fn pass_gap(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
         self.rest_s = 0.0;
         self.load_a *= libm::exp(-step.unmeasured_s / config.voltage.load_memory_s);
@@ -192,7 +192,8 @@ impl Memory {
         self.is_unseen || self.downtime_std_if_any().is_some()
     }
 
-    /// Consistency monitor: mean of the normalised innovation squared, with exponentially decreasing weights.
+    /// Adds an update to the consistency monitor (mean of the normalised innovation squared, with exponentially
+    /// decreasing weights) and to the run of rejected readings.
     #[inline]
     pub(super) fn record_update(&mut self, config: &EstimatorConfig, step: &CellStep, update: &Update) {
         let elapsed_s = step.measured_s + step.unmeasured_s;
@@ -216,11 +217,12 @@ impl Memory {
     pub(super) fn has_lost_cell(&self, config: &EstimatorConfig) -> bool {
         // One or two readings can be outliers.
         let long_enough = self.rejected >= 3 && self.rejected_s >= config.gate.lost_after_s;
-        // After a gap, the record is incomplete, so two readings suffice.
+        // After a gap, the counted charge is incomplete, so two readings suffice.
         long_enough || (self.rejected_after_gap && self.rejected >= 2)
     }
 
-    /// Resets an unusable capacity or resistance to its configured value; otherwise the filter would restart at every reading.
+    /// Resets an unusable capacity or resistance to its configured value; otherwise the filter would restart at every
+    /// reading.
     pub(super) fn reset_unusable(&mut self, config: &EstimatorConfig) {
         let (capacity, log_resistance) = configured(config);
         let is_usable = |x: &ScalarGaussian, bounds: Bounds| {

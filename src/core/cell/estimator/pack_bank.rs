@@ -1,4 +1,5 @@
-//! The estimators of a pack whose modules may have different cells: one [`EstimatorBank`] per kind of cell.
+//! The estimators of a pack whose modules may have different cells: one [`EstimatorBank`] for the pack's own cells, and
+//! one per replaced module. The cells of one bank are called a kind.
 //!
 //! In: one [`CellStep`] per cell and batch, by the cell's index in the pack. Out: results and estimates per cell, like
 //! an [`EstimatorBank`]. All kinds share the current sensor, so its offset is learned for the whole pack.

@@ -2,9 +2,10 @@
 //! cell.
 //!
 //! In: evidence from innovations. Out: the ratio and its standard deviation. Diffusion and the electrolyte determine
-//! the slowest branch. They vary between cells and age differently from the contacts and the charge transfer, whose
-//! resistance is the state [`LOG_RESISTANCE`](super::state_vector::LOG_RESISTANCE). A wrong voltage of the slowest
-//! branch would be mistaken for charge.
+//! the slowest branch. They vary between cells and age differently from the contacts and the charge transfer. The
+//! resistance of contacts and charge transfer mostly determines the state
+//! [`LOG_RESISTANCE`](super::state_vector::LOG_RESISTANCE). A wrong voltage of the slowest branch would be mistaken for
+//! charge.
 //!
 //! Source: Friedland (1969), separate estimation of a bias, as for the offset of the current sensor
 //! ([`crate::health::offset`]). The ratio is corrected when the mode changes. If a model has a single branch, this
@@ -41,7 +42,8 @@ pub(super) struct SlowBranch {
     pub(super) score: f64,
 }
 
-/// A correction of the ratio. `deviations` is the change of the ratio, in standard deviations before the correction.
+/// A correction of the ratio. `deviations` is the change of the ratio, divided by its standard deviation before the
+/// correction.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Correction {
     pub(super) deviations: f64,
@@ -64,7 +66,7 @@ impl SlowBranch {
         self.part * configured
     }
 
-    /// Corrects the ratio by the evidence, then clears the evidence. `None` if there is no evidence.
+    /// Corrects the ratio by the evidence and clears the evidence. `None` if there is no usable evidence.
     pub(super) fn correct(&mut self, configured: f64) -> Option<Correction> {
         let (information, score) = (self.information, self.score);
         (self.information, self.score) = (0.0, 0.0);
@@ -72,7 +74,8 @@ impl SlowBranch {
         if !(information > 0.0 && information.is_finite() && score.is_finite() && std > 0.0) {
             return None;
         }
-        // If the evidence deviates from its expectation by more than two standard deviations, it has another cause.
+        // If the evidence deviates from its expectation by more than two standard deviations, the excess has another
+        // cause.
         let most = 2.0 * (information * (1.0 + information)).sqrt();
         let counted = information.min(MAX_INFORMATION) / information;
         let (information, score) = (counted * information, counted * score.clamp(-most, most));

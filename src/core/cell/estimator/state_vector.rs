@@ -45,5 +45,5 @@ pub(super) const CURRENT_GAIN: usize = 2;
 pub(super) const SLOW_BRANCH: usize = 3;
 /// Index of the error of the open-circuit curve's capacity (capacity of the curve minus true capacity).
 pub(super) const CURVE_CAPACITY: usize = 4;
-/// Index of the first uncertain mix of losses.
+/// Index of the error of the first mix of losses (see `crate::cell::aged_ocv`); the second mix follows.
 pub(super) const CURVE_MIXES: usize = 5;

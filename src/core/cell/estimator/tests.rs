@@ -66,7 +66,7 @@ impl CellEstimator {
     }
 }
 
-/// The simulated cell: true capacity, and resistance relative to the model.
+/// The simulated cell. `ratio` is its resistance relative to the model.
 pub(crate) struct Truth {
     pub(crate) soc: f64,
     branch_v: f64,
@@ -192,7 +192,7 @@ fn unmeasured_load_widens_soc() {
     let step = CellStep { unmeasured_s: 1800.0, current_a: None, ..truth.step(&model, 1.0, 1.0) };
     let result = estimator.step(&model, &config, &step);
     assert_eq!(result.update, None);
-    // 1 A for half an hour out of 1.7 Ah is 0.29 of SOC.
+    // 1 A for half an hour takes 0.5 Ah out of 1.7 Ah: 0.29 of SOC.
     assert!(soc(&estimator).std() > before.std() + 0.1, "{:?}", soc(&estimator));
 }
 
@@ -235,7 +235,7 @@ fn slowest_branch_ratio_is_learned() {
             for k in 0..240 {
                 let current_a = if k < 80 { 0.0 } else { current_a };
                 let mut step = truth.step(&model, current_a, 15.0);
-                // The cell has half of the model's slow branch.
+                // The cell's slow branch has half of the resistance that the model states.
                 let position = model.grid_position(truth.soc, 25.0);
                 let branch = BranchAt::new(&model, 1, &position, 0.5 * truth.ratio);
                 slow_v = branch.voltage_after(Discretisation::Exact, slow_v, current_a, 15.0);

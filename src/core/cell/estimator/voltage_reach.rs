@@ -1,11 +1,12 @@
 //! Determines how far a constant error of the voltage may have moved the SOC.
 //!
-//! In: a cell model and the standard deviation of a constant voltage error, V. Out: the standard deviation of the SOC
-//! that this error causes, fraction.
+//! In: a cell model and the standard deviation of a constant voltage error, V. Out: the reach, which is the standard
+//! deviation of the SOC that this error causes, fraction.
 //!
-//! The filter linearises the open-circuit curve at its estimate. Next to a flat part of the curve, this hides how far
+//! The filter linearises the open-circuit curve at its estimate. Next to a flat part of the curve, this hides how wrong
 //! the SOC may be: at the upper end of an LFP cell, an error of one standard deviation moves the SOC by 1 %, and an
-//! error of four moves it by 25 %. The reach is therefore measured at [`FAR`] standard deviations.
+//! error of four standard deviations moves it by 25 %. The reach is therefore measured at [`FAR`] standard deviations
+//! and divided by [`FAR`].
 
 use crate::cell::CellModel;
 

@@ -5,9 +5,11 @@
 //!
 //! The expected error is the root mean square error of the SOC, averaged over SOC and over the temperatures of
 //! [`USE_C`]. The SOC is estimated from two sources: one voltage under a usual load, and the charge counted since the
-//! last reliable voltage with an uncertain capacity. A measurement is a linear observation of the curve, of
-//! ln(resistance) or of the capacity. Covariances fall with the distance in SOC and temperature, so a measurement also
-//! gives information about neighbouring points (Gaussian conditioning: p - c^2 / (v + r)).
+//! last reliable voltage. The capacity that converts this charge to SOC is uncertain. A measurement is an observation
+//! of the curve, of ln(resistance) or of the capacity. Covariances fall with the distance in SOC and temperature, so a
+//! measurement also gives information about neighbouring points: their variance p becomes p - c^2 / (v + r) (Gaussian
+//! conditioning). Here c is the covariance with the observed point, v is the variance at the observed point, and r is
+//! the error variance of the observation.
 
 use std::fmt;
 
@@ -82,7 +84,8 @@ pub fn advise(bands: &ModelBands<'_>) -> Option<(f64, Vec<Advice>)> {
     Some((first_points, advice))
 }
 
-/// Present knowledge about a model: covariances over the grid of use and the possible measurements.
+/// Present knowledge about a model: slopes, voltage drops and covariances at the points of use and at the points that
+/// can be measured.
 #[derive(Clone)]
 struct Belief {
     /// Slope of the curve, V per unit of SOC: `slope_v` at [`USE_SOC`], `rest_slope_v` at [`REST_SOC`].
@@ -148,13 +151,14 @@ impl Belief {
         match measurement {
             Measurement::Rest(soc) => {
                 let place = REST_SOC.iter().position(|known| known == soc).unwrap_or(0);
-                // Error of the voltage after an hour of rest, and error of the SOC that was counted since another rest.
+                // Two errors: of the voltage after an hour of rest, and of the SOC, which was counted since another
+                // rest.
                 let noise_v = f64::hypot(0.005, 0.02 * self.rest_slope_v[place]);
                 condition(&mut after.curve, USE_SOC.len() + place, square(noise_v));
             }
             Measurement::Drive(temperature_c) => {
                 let place = USE_C.iter().position(|(known, _)| known == temperature_c).unwrap_or(0);
-                // After a drive, ln(resistance) is known to 10 %; after a charge from below 20 % to full, the capacity
+                // After a drive, the resistance is known to 10 %; after a charge from below 20 % to full, the capacity
                 // is known to 2 %.
                 after.resistance.iter_mut().for_each(|of_soc| condition(of_soc, place, square(0.1)));
             }

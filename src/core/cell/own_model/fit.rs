@@ -1,19 +1,20 @@
 //! Fits a model to the rows of a notebook over a grid of capacities.
 //!
 //! In: a [`Label`] and rows (readings of the mean cell, averaged over a short time). Out: a [`Fit`]. For each capacity
-//! C of the grid, Gauss-Newton finds the most likely values of the other parameters (maximum a posteriori). These
-//! parameters are the open-circuit curve at the SOC breakpoints, the resistances relative to the label's model over SOC
-//! and by temperature, and the SOC s_k at the start of each stretch (a period with a continuously measured current).
-//! After the charge q, SOC = s_k - q / C. The density of a capacity is the density of its best fit times the volume of
-//! the other parameters around this fit (Laplace). If the rows allow two capacities, the density has two maxima.
+//! C of the grid, damped Gauss-Newton steps find the most likely values of the other parameters (maximum a posteriori).
+//! These parameters are the open-circuit curve at the SOC breakpoints and its fall in the cold, the resistances
+//! relative to the label's model over SOC and by temperature, the offset of the current sensor, and the SOC s_k at the
+//! start of each stretch (a period with a continuously measured current). After the charge q, corrected for the offset,
+//! SOC = s_k - q / C. The density of a capacity is the density of its best fit times the volume of the other parameters
+//! around this fit (Laplace). If the rows allow two capacities, the density has two maxima.
 //!
 //! # Errors of a row
 //! The errors of the circuit model repeat: rows at nearly the same SOC have the same errors of voltage, SOC and voltage
-//! drop. The errors of rows are therefore correlated over 12 % of SOC. Their covariance has three parts: a constant, a
-//! part proportional to the slope of the curve, and a part proportional to the voltage drop. The error of the drop
-//! grows with the drop, because charge transfer is not linear (Butler-Volmer).
+//! drop. The errors of rows are therefore correlated over 12 % of SOC. The error of a row has three parts: a constant,
+//! a part proportional to the slope of the curve, and a part that grows with the voltage drop. The third part grows
+//! faster than the drop, because charge transfer is not linear (Butler-Volmer).
 //!
-//! The constants were chosen on LG HG2, LG M50 (simulated) and the Leaf cell, all at 25 degrees C.
+//! The constants were chosen with three cells at 25 degrees C: LG HG2, LG M50 (simulated) and a Leaf cell.
 
 mod basis;
 mod noise;
@@ -33,8 +34,8 @@ use noise::{NormalEquations, RepeatedErrors};
 /// Damping of the search for the most likely parameters.
 const DAMPING: Damping =
     Damping { first: 1e-3, fall: 0.2, fall_after_growth: 0.2, growth: 8.0, least: 1e-9, most: 8e6 };
-/// Step of the capacity grid, relative to the rated capacity. The grid starts at 0.52; the search starts at the rated
-/// capacity.
+/// Step of the capacity grid, relative to the rated capacity. The grid starts at 0.52 and has `CAPACITIES` points. The
+/// search starts at the point `FIRST_CAPACITY`, which is the rated capacity.
 const CAPACITY_STEP: f64 = 0.04;
 const CAPACITIES: usize = 20;
 const FIRST_CAPACITY: usize = 12;
@@ -62,13 +63,13 @@ struct Beginning {
     /// SOC at the start, and offset of the current sensor (A). `covariance` is their covariance at the fitted capacity.
     means: [f64; 2],
     covariance: [[f64; 2]; 2],
-    /// Changes of SOC and offset with one standard deviation of the capacity.
+    /// Change of each mean if the capacity grows by one standard deviation.
     by_capacity: [f64; 2],
 }
 
 impl Fit {
-    /// Present SOC (fraction), and covariance of the SOC with the capacity (Ah); `None` if the present stretch has no
-    /// rows.
+    /// Present SOC (fraction), and covariance of the SOC with the capacity (Ah); `None` outside a stretch and while the
+    /// present stretch has no rows.
     pub fn soc(&self, present: Option<PresentStretch>) -> Option<(ScalarGaussian, f64)> {
         let (present, beginning) = present.zip(self.beginning)?;
         let Beginning { stretch, means, covariance, by_capacity } = beginning;
@@ -90,9 +91,9 @@ impl Fit {
 #[derive(Debug, Clone)]
 struct Conditional {
     theta: DVector<f64>,
-    /// Information matrix of the other parameters, without the capacity.
+    /// Information matrix of all parameters except the capacity.
     normal: DMatrix<f64>,
-    /// Minus the logarithm of the capacity's density, up to the prior's constant.
+    /// Minus the logarithm of the capacity's density, up to a constant that depends only on the prior.
     cost: f64,
     /// Root mean square of the rows' residuals in standard deviations.
     misfit: f64,
@@ -131,8 +132,8 @@ pub fn label_cost(prior: &LabelPrior, rows: &[Row], capacities_ah: &[f64]) -> Op
     Some(costs.min_by(f64::total_cmp)? - 0.5 * prior::log_determinant(&search.prior)?)
 }
 
-/// Cost of rows with a model (`None` = the label's model): minus the logarithm of their density. Each stretch starts at
-/// its most likely SOC. Returns `None` without rows.
+/// Cost of rows: minus the logarithm of the probability density that a model (`own`; `None` = the label's model) gives
+/// the rows. Each stretch starts at its most likely SOC. Returns `None` without rows.
 pub(super) fn rows_cost(prior: &LabelPrior, own: Option<&OwnModel>, rows: &[Row]) -> Option<f64> {
     let basis = Basis::new(prior, rows);
     let theta = basis.parameters(own);
@@ -143,7 +144,7 @@ pub(super) fn rows_cost(prior: &LabelPrior, own: Option<&OwnModel>, rows: &[Row]
     (!rows.is_empty()).then_some(sums.cost)
 }
 
-/// Charge range of the longest stretch, Ah.
+/// Largest charge range of a stretch, Ah.
 fn span_ah(rows: &[Row]) -> f64 {
     let of_stretch = |rows: &[Row]| {
         let charges = rows.iter().map(|row| f64::from(row.charge_ah));
@@ -166,7 +167,8 @@ impl<'a> Search<'a> {
         Some((Self { basis, prior, expected, rated_ah }, start))
     }
 
-    /// Sums of rows and prior at `theta`, without the prior of the capacity.
+    /// Normal equations of the rows and the prior at `theta`. The capacity's gradient is set to 0, so that a step keeps
+    /// the capacity.
     fn sums(&self, theta: &DVector<f64>, errors: &RepeatedErrors) -> Option<NormalEquations> {
         let off = theta - &self.expected;
         let gradient = &self.prior * &off;
@@ -240,8 +242,7 @@ impl<'a> Search<'a> {
         Some(ScalarGaussian::from_std(capacity_ah, std_ah))
     }
 
-    /// Computes the model and the start of the last stretch, both with their standard deviations, at the capacity
-    /// found.
+    /// Computes the model and the start of the last stretch at the fitted `capacity`, with their standard deviations.
     fn finish(&self, capacity: ScalarGaussian, start: &DVector<f64>) -> Option<Fit> {
         let Conditional { theta, normal, misfit, .. } = self.conditional(capacity.mean, start)?;
         let std_ah = capacity.std();
@@ -297,8 +298,8 @@ impl<'a> Search<'a> {
     }
 }
 
-/// Mean and variance, in steps, of the density exp(least - cost) over a grid of steps. Cubics interpolate the costs
-/// (Catmull-Rom).
+/// Mean and variance of the density exp(least - cost), in steps of the grid. `costs`: cost at each point of the grid;
+/// cubics (Catmull-Rom) interpolate between the points.
 fn moments(costs: &[f64], least: f64) -> (f64, f64) {
     let last = costs.len() - 1;
     let slope = |k: usize| {

@@ -1,7 +1,8 @@
-//! Describes a fit of the on-board model as a task with inputs and a result.
+//! Describes a fit of the pack's own cell model as a task with inputs and a result.
 //!
-//! A fit takes hundreds of times longer than a tick may take, and the result depends only on the inputs. A live host
-//! therefore runs the task on a separate thread. A replay runs the task on the calling thread, with the same result.
+//! A fit takes hundreds of times longer than a tick of the monitor may take, and the result depends only on the inputs.
+//! A live host therefore runs the task on a separate thread. A replay runs the task on the calling thread, with the
+//! same result.
 
 use super::fit::{self, Fit};
 use super::{OwnModel, rows_cost};
@@ -13,9 +14,9 @@ use crate::cell::notebook::{Notebook, Row};
 pub struct FitTask {
     label: Label,
     rows: Vec<Row>,
-    /// Number of rows at the end that were not used for any model yet.
+    /// Number of rows, at the end of `rows`, that no fit has used yet.
     new_rows: usize,
-    /// The present and the previous model; `None` = the label's model.
+    /// The present model (`own`) and the previous model (`before`); `None` = the label's model.
     own: Option<OwnModel>,
     before: Option<OwnModel>,
 }
@@ -35,7 +36,7 @@ pub struct FitFindings {
 }
 
 impl FitTask {
-    /// A task for the rows of a notebook, the current and the previous model.
+    /// Creates a task from the rows of a notebook, the present model and the previous model.
     pub fn new(label: Label, notebook: &Notebook, own: Option<&OwnModel>, before: Option<&OwnModel>) -> Self {
         let new_rows = notebook.new_rows().len();
         Self { label, rows: notebook.rows().to_vec(), new_rows, own: own.cloned(), before: before.cloned() }
@@ -56,7 +57,7 @@ impl FitTask {
         let new_rows = &self.rows[self.rows.len() - self.new_rows..];
         let cost = |own: Option<&OwnModel>| rows_cost(prior, own, new_rows);
         let costs = cost(Some(own)).zip(cost(self.before.as_ref()));
-        // A cost difference of 4 means 50 times more likely.
+        // A model whose cost is lower by 4 is about 50 times more likely.
         costs.is_some_and(|(present, before)| before < present - 4.0)
     }
 
@@ -64,9 +65,9 @@ impl FitTask {
     /// at the fitted capacity or at the rated capacity, whichever gives the lower cost.
     fn better_chemistry(&self, prior: &LabelPrior, fitted: Option<&Fit>) -> Option<Chemistry> {
         let Self { label, rows, .. } = self;
-        // The better chemistry must be 50 times more likely. The margin grows if the misfit exceeds 0.45. A misfit of
-        // 0.45 is typical of drives that a circuit model describes. On the drives of four cells, the costs of NCA and
-        // NMC differ by 4 to 9; the cost of LFP differs from all others by hundreds.
+        // The better chemistry must be about 50 times more likely (a margin of 4). The margin grows if the misfit
+        // exceeds 0.45, which is typical of drives that a circuit model describes well. On drives of four cells, the
+        // costs of NCA and NMC differ by 4 to 9; the cost of LFP differs from all others by hundreds.
         let margin = 4.0 * fitted.map_or(1.0, |it| (it.misfit / 0.45).max(1.0));
         let fitted_ah = fitted.map(|it| it.own.capacity.mean);
         let capacities_ah: Vec<f64> = [label.rated_ah].into_iter().chain(fitted_ah).collect();

@@ -39,9 +39,10 @@ impl CorrelatedError {
 #[serde(deny_unknown_fields)]
 pub(super) struct Bleed {
     pub(super) timer: BleedTimer,
-    /// SOC bled from this cell minus the SOC bled from the middle cells, while the BMS bleeds any of these cells.
+    /// SOC bled from this cell minus the SOC bled from the middle cells (the middle half by voltage), summed over all
+    /// rows since this difference was last 0.
     bled: CorrelatedError,
-    /// Maximum SOC that may have been bled while it was unknown whether the cell was bled.
+    /// Maximum SOC that the cell may have lost while it was unknown whether the cell was bled.
     unseen: CorrelatedError,
 }
 
@@ -84,8 +85,9 @@ impl CellFaultDetector {
         self.cells.iter_mut().for_each(|cell| cell.bleed.timer.note_missed_bits(from, to));
     }
 
-    /// For each cell, subtracts the charge that was bled since the last row, relative to the middle cells, from the
-    /// cell's difference. If `balancing` is `None`, discards everything learned from balancing bits.
+    /// Corrects the charge difference of each cell: subtracts the charge that the BMS has bled from the cell since the
+    /// last row, minus the charge bled from the middle cells. If `balancing` is `None`, discards everything learned
+    /// from balancing bits.
     pub(super) fn remove_bled_charge(&mut self, time: Timestamp, capacity_ah: f64, balancing: Option<BalancingConfig>) {
         let Some(balancing) = balancing else {
             return self.cells.iter_mut().for_each(|cell| cell.bleed = Bleed::default());
@@ -139,7 +141,7 @@ mod tests {
         diagnosis
     }
 
-    /// Standard deviation that cell 0's SOC gains until `end_s` because the cell may have been bled.
+    /// Standard deviation added to the SOC of cell 0 until `end_s`, because the cell may have been bled.
     fn lost_std(diagnosis: &mut CellFaultDetector, end_s: f64, balancing: BalancingConfig) -> f64 {
         let variance = |diagnosis: &CellFaultDetector| diagnosis.cells[0].difference.state(SOC).variance;
         let before = variance(diagnosis);

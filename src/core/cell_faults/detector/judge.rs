@@ -1,4 +1,5 @@
-//! Derives findings from the states of the cells, and decides when to report and when to withdraw a finding.
+//! Derives findings from the states of the cells, and decides when to report and when to withdraw a finding. The
+//! detector judges the cells at the end of a row, which holds the sums of a few minutes of samples.
 
 use super::CellFaultDetector;
 use crate::cell_faults::difference::{self, CHANNEL, CONTACT, Jump, LEAK, RESISTANCE, SOC, STATES};
@@ -6,12 +7,15 @@ use crate::cell_faults::fault::{self, CellFault, CellFaultKind, OUTLIER, REPORTE
 use crate::filter::{ScalarGaussian, normal_cdf};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// If cells of one replaced module are found to have more capacity, the findings are at most this far apart, s.
+/// Neighbouring cells with a higher capacity count as one replaced module if their findings are at most this far apart,
+/// s. A single cell with a higher capacity is reported only after this time.
 const SAME_MODULE_S: f64 = 3.0 * DAY_S;
-/// A size counts as known if its standard deviation is at most this many times the limit of its kind.
+/// The size of a fault counts as known if its standard deviation is at most this multiple of the limit at which a fault
+/// of this kind is reported.
 const KNOWN_LIMITS: f64 = 2.0;
 
-/// If a cell's SOC differs from the other cells' SOC by this much or more, its resistance and channel cannot be judged.
+/// If a cell's SOC differs from the other cells' SOC by this much or more, its contact, its resistance, the offset of
+/// its channel and a higher capacity cannot be judged.
 const TOO_FAR: f64 = 0.1;
 const DAY_S: f64 = 86_400.0;
 
@@ -92,8 +96,8 @@ impl CellFaultDetector {
     }
 
     /// Size of each fault, per cell and kind, relative to the median of the pack and in the unit of the kind. `None` if
-    /// the size cannot be judged: the cell's SOC is too far from the other cells' SOC, the cell's channel is faulty, or
-    /// the size is still too uncertain.
+    /// the size cannot be judged: the cell is not compared, the cell's SOC is too far from the other cells' SOC, the
+    /// cell's channel is faulty, or the size is still too uncertain.
     pub fn sizes<const N: usize>(&self, kinds: [CellFaultKind; N]) -> Vec<[Option<ScalarGaussian>; N]> {
         let populations = self.populations();
         (0..self.cells.len()).map(|cell| kinds.map(|kind| self.size(cell, kind, &populations))).collect()
@@ -242,8 +246,9 @@ impl CellFaultDetector {
         now.since(since) >= settling_s
     }
 
-    /// Lists a finding. The finding replaces the listed finding of the same kind and first cell. If the finding is no
-    /// longer likely, removes the listed finding.
+    /// Updates the list with a finding. A new finding is listed if its probability is at least [`REPORTED`] and it has
+    /// lasted long enough. A listed finding of the same kind and first cell is replaced, or removed if the probability
+    /// has become too low.
     pub(super) fn put(&mut self, finding: CellFault) {
         let first = |found: &CellFault| found.cells.map(|cells| cells.0);
         let is_same = |found: &CellFault| found.kind == finding.kind && first(found) == first(&finding);
@@ -274,8 +279,8 @@ impl CellFaultDetector {
     }
 
     /// Joins neighbouring cells into a replaced module, if they have had more capacity than the other cells since about
-    /// the same time. `foreign`: for each cell, the module finding that includes the cell, or a certain finding of more
-    /// capacity.
+    /// the same time. `foreign`: for each cell, the module finding that includes the cell. Without a module finding, it
+    /// is the finding that the cell has more capacity, if the probability of that finding is at least [`REPORTED`].
     fn find_modules(&mut self, time: Timestamp, foreign: &[Option<CellFault>]) {
         let is_same_event = |a: &Option<CellFault>, b: &Option<CellFault>| {
             a.zip(*b).is_some_and(|(a, b)| a.since.since(b.since).abs() <= SAME_MODULE_S)

@@ -1,12 +1,13 @@
 //! Computes the distribution of the use until a cell's level (its capacity without recovery) has fallen by a given
 //! loss.
 //!
-//! In: mean and covariance of the remaining loss (fraction of the reference capacity) and the rate (the same fraction
-//! per unit of use). Out: probabilities and quantiles of the use. Extreme inputs are limited to [`LOG_RANGE`].
+//! In: mean and covariance of the remaining loss (fraction of the reference capacity) and of the rate (loss per unit of
+//! use). Out: probabilities and quantiles of the use. The logarithms of extreme uses and rates are limited to
+//! [`LOG_RANGE`].
 //!
 //! Given the loss L and the initial rate r, the use is T = integral over l from 0 to L of exp(-g(l) - W(l)) / r. g(l)
-//! is the growth of the rate's logarithm in the knee. W(l) is the random walk of this logarithm, a Brownian motion with
-//! variance v(l). With m = exp(v / 2 - g):
+//! is the expected growth of the rate's logarithm in the [`knee`]. W(l) is the random walk of this logarithm, a
+//! Brownian motion with variance v(l). With m = exp(v / 2 - g):
 //! * E T = (1 / r) integral of m(l);
 //! * E T^2 = (2 / r^2) integral over l of m(l) (integral over s from 0 to l of m(s) e^v(s)).
 //!
@@ -36,7 +37,7 @@ const LOG_RANGE: (f64, f64) = (-20.0, 40.0);
 /// Number of steps of an integral over the loss.
 const STEPS: usize = 16;
 
-/// A slice: its probability, and the mean and standard deviation of the logarithm of its use.
+/// A slice of the loss: probability of the slice, and mean and standard deviation of the logarithm of the use.
 type Slice = (f64, (f64, f64));
 
 /// The distribution of the use until the crossing.
@@ -93,7 +94,7 @@ impl Crossing {
         self.passed + self.slices.iter().map(of_slice).sum::<f64>()
     }
 
-    /// Use within which the level passes the threshold with this probability.
+    /// Use within which the level passes the threshold with the probability `probability`.
     pub(super) fn quantile(&self, probability: f64) -> f64 {
         if self.passed >= probability {
             return 0.0;
@@ -114,7 +115,8 @@ fn positive(mean: f64, variance: f64) -> (f64, f64) {
     if std == 0.0 {
         return (LOG_RANGE.0, 0.0);
     }
-    // Below -8, the ratio of density to tail probability cannot be computed in f64. The rate is then close to 0 anyway.
+    // If the mean is below -8 standard deviations, the ratio of density to tail probability cannot be computed in f64.
+    // The rate is then close to 0 anyway.
     let place = (mean / std).max(-8.0);
     let density = bell(place) / (2.0 * std::f64::consts::PI).sqrt();
     let hazard = density / normal_cdf(place);

@@ -227,8 +227,8 @@ fn long_rest_hardly_changes_recent_use() {
     (0..20).for_each(|_| forecast.update(passed(1.0), None));
     let life = forecast.remaining(1.5).expect("enough is known");
     let days_per_cycle = life.days.expect("days").median / life.cycles.expect("cycles").median;
-    // 20 cycles take 5 days, plus at most 25 days of rest within the window of 30 days. The total is far below 300
-    // days.
+    // The recent rate of use is an average over about 30 days: the 5 days of the 20 cycles, and 25 days of rest. The
+    // other 275 days of rest hardly count.
     assert!((0.25..2.0).contains(&days_per_cycle), "{days_per_cycle}");
 }
 

@@ -1,13 +1,13 @@
 //! Applies a new configuration to a running monitor.
 //!
-//! In: a checked configuration. Out: the changes, with the resulting events and frames. If a restart is needed, the
-//! result is the reason, and nothing changes. The new limits, thresholds, modes, noise values and outputs apply. The
-//! monitor keeps filters, learned values, counters, schedules, and alarms whose rule and severity are still configured.
-//! Estimates therefore change only if their settings change.
+//! In: a checked configuration. Out: the changes, with the resulting events and frames. If the new configuration needs
+//! a restart, the result names the reason, and nothing changes. Otherwise, the new limits, thresholds, noise values and
+//! outputs apply at once. The monitor keeps filters, learned values, counters, schedules, and alarms whose rule and
+//! severity are still configured. Estimates therefore change only if their settings change.
 //!
-//! A measured value keeps its definition. If the recharge window or the usable load changes, the value becomes unknown,
-//! unless it can be converted exactly. Initial values only affect cells about which nothing is known. Changed initial
-//! values therefore apply when the next pack is connected.
+//! If the recharge window changes, the measured recharge periods become unknown, unless they can be converted exactly.
+//! If the load of the usable capacity changes, the usable capacity becomes unknown. Initial values only affect cells
+//! about which nothing is known. Changed initial values therefore apply when the next pack is connected.
 
 use crate::alarm::{Observation, Rule};
 use crate::health::HealthConfig;
@@ -18,8 +18,8 @@ use crate::monitor::stage::publisher::Publisher;
 use crate::quantity::Timestamp;
 
 impl Monitor {
-    /// Applies a new configuration between two inputs. `now`, the time of the request, becomes the time of the event,
-    /// but the clock does not advance.
+    /// Applies a new configuration between two inputs. `now` is the time of the request. The event has this time, or
+    /// the clock's time if that is later. The clock does not advance.
     ///
     /// # Errors
     /// The first setting that needs a restart. The monitor is then unchanged.

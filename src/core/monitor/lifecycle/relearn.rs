@@ -10,8 +10,8 @@ use crate::monitor::message::LearnedCell;
 use crate::monitor::stages::Stages;
 
 impl Monitor {
-    /// Sets the learned values of the cells. If a cell does not exist or a number is impossible, the history belongs to
-    /// another pack: returns `false` and changes nothing.
+    /// Sets the learned values of the cells. If a cell does not exist or a number is impossible, the history does not
+    /// fit this pack: returns `false` and changes nothing.
     pub fn relearn(&mut self, learned: &[LearnedCell]) -> bool {
         let Stages { estimation, learning, .. } = &mut self.stages;
         let is_valid =

@@ -56,8 +56,8 @@ impl Monitor {
     /// minute, or if the state was stored [for a restart](Snapshot::for_restart).
     ///
     /// # Errors
-    /// The snapshot's version or shape does not fit, or a number in the snapshot is impossible. The monitor then uses
-    /// nothing of the snapshot, because one damaged number casts doubt on the others.
+    /// The snapshot's version, cells or branches do not fit, or a number in the snapshot is impossible. The monitor
+    /// then uses nothing of the snapshot, because one damaged number casts doubt on the others.
     pub fn restore(&mut self, snapshot: Snapshot, downtime: Downtime) -> Result<(), RestoreError> {
         if snapshot.version != SNAPSHOT_VERSION {
             let found = snapshot.version;
@@ -212,7 +212,8 @@ impl Stages {
         self.restore_learned(&pack.cells, pack.modelling, pack.learning, batch);
         self.modelling.end_stretch();
         self.estimation.handle_unknown_gap();
-        // Balancing while the pack was absent was not counted, so the charge of the cells is unknown.
+        // Balancing while the pack was absent was not counted, so the differences between the cells' charges are
+        // unknown.
         self.findings.restore(pack.diagnosis, Some((now, now)));
         self.findings.diagnosis.forget_charge();
         self.note_faulty_channels();
@@ -223,7 +224,7 @@ impl Stages {
             capacity_std_ah: capacity.as_ref().map(ScalarGaussian::std),
         };
         out.events.push(Event { time: now, kind });
-        // The alarms of the previous pack have ended, so the rules see these values as new.
+        // The alarms of the previous pack have ended, so these values are new to the rules.
         self.restate_known(now, false, true, out);
         self.publisher(now, out).publish_alarms();
     }

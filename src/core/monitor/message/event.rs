@@ -25,7 +25,7 @@ use crate::quantity::{BusIndex, CellIndex, Fault, Mode, Timestamp};
 #[serde(rename_all = "snake_case", tag = "event")]
 #[strum(serialize_all = "snake_case")]
 pub enum EventKind {
-    /// The pack's mode changed; the new mode has held for its minimum duration.
+    /// The pack's mode (charge, rest, discharge or unknown) changed.
     Mode {
         /// The mode that ended.
         from: Mode,
@@ -40,7 +40,8 @@ pub enum EventKind {
         mode: Mode,
         /// Charge moved, Ah, positive.
         charge_ah: f64,
-        /// SOC swing, fraction, positive; `None` if the SOC at the start or the end was not estimated.
+        /// SOC swing, fraction; positive if the SOC rose during a charge or fell during a discharge. `None` if the SOC
+        /// at the start or the end was not estimated.
         swing: Option<f64>,
         /// Standard deviation of the swing.
         swing_std: Option<f64>,
@@ -48,14 +49,14 @@ pub enum EventKind {
         duration_s: f64,
         /// Mean cell current, A, positive = discharge.
         mean_current_a: f64,
-        /// Mean temperature, degrees C; `None` without a valid sensor.
+        /// Mean temperature, degrees C; `None` without a temperature reading.
         mean_temperature_c: Option<f64>,
     },
-    /// The capacity filter was updated.
+    /// The capacity estimate of a cell was updated after a half-cycle.
     Capacity {
         /// Index of the cell.
         cell: CellIndex,
-        /// Capacity measured by this half-cycle alone, Ah; `None` if the half-cycle has no information.
+        /// Capacity measured by this half-cycle alone, Ah; `None` if the half-cycle contains no usable information.
         measured_ah: Option<f64>,
         /// Standard deviation of the measurement, Ah.
         measured_std_ah: Option<f64>,
@@ -152,7 +153,7 @@ pub enum EventKind {
     BadCommand {
         /// Interface that received the frame.
         bus: BusIndex,
-        /// Whether the frame's checksum was right.
+        /// Whether the frame's checksum, or its authenticator and freshness, were right.
         intact: bool,
         /// Reason for the rejection.
         reason: CommandRefusal,
@@ -166,7 +167,7 @@ pub enum EventKind {
     },
     /// Another pack is connected. The event records the last learned capacity of the old pack.
     PackReplaced {
-        /// Capacity of the old pack's weakest cell, Ah; `None` if nothing was learned.
+        /// Capacity of the old pack's weakest cell, Ah; `None` if the capacity of a cell was not learned.
         capacity_ah: Option<f64>,
         /// Standard deviation of the capacity, Ah.
         capacity_std_ah: Option<f64>,
@@ -175,14 +176,14 @@ pub enum EventKind {
     PackReturned {
         /// Number of the pack.
         identity: f64,
-        /// Capacity of the pack's weakest cell, Ah; `None` if the capacity of a cell is unknown.
+        /// Capacity of the pack's weakest cell, Ah; `None` if the capacity of a cell has not been learned.
         capacity_ah: Option<f64>,
         /// Standard deviation of the capacity, Ah.
         capacity_std_ah: Option<f64>,
     },
     /// A new configuration applies from this time.
     Reconfigured {
-        /// Number of raised or past alarms that ended because the new configuration has no threshold for them.
+        /// Number of pending, raised or past alarms that ended because the new configuration has no threshold for them.
         alarms_ended: u32,
     },
     /// A stored alarm ended because the configuration no longer has a threshold for it.
@@ -260,7 +261,7 @@ pub enum EventKind {
         /// Duration, s; `None` = unknown.
         seconds: Option<f64>,
     },
-    /// The time of an input was before the time of the latest input.
+    /// The driver's clock was set back: an input came with a time more than one second before the latest time.
     TimeBackwards {
         /// Size of the step back, s.
         seconds: f64,
@@ -283,7 +284,7 @@ pub enum EventKind {
     },
     /// The cell-fault detector has found a fault of a cell, a module or a sensor.
     Finding(CellFault),
-    /// A cell's filter failed and was restarted from its voltage.
+    /// A cell's filter failed and was restarted from the cell's voltage.
     FilterReset {
         /// Index of the cell.
         cell: CellIndex,
@@ -292,10 +293,10 @@ pub enum EventKind {
     Trust {
         /// Index of the cell.
         cell: CellIndex,
-        /// Whether the cell's innovations agree with their covariance and the model fits the cell.
+        /// Whether the estimate is trusted: `mean_nis` is at most the consistency limit.
         trusted: bool,
-        /// Mean normalised innovation squared over the consistency window. If the model does not fit the cell, the
-        /// value is at least the model's mismatch, converted to the same scale.
+        /// Mean normalised innovation squared over the consistency window. It is higher if the model does not fit
+        /// the cell, the current is doubtful, the cell's voltage is frozen, or the estimate is impossible.
         mean_nis: f64,
     },
 }

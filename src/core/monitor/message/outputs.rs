@@ -114,8 +114,8 @@ pub struct Outputs {
     pub estimates: Vec<Estimate>,
     /// Whether the caller wants `estimates`.
     pub want_estimates: bool,
-    /// Inputs of the alarm engine; empty unless `want_alarm_inputs` is set. Changes due to a restore or a new
-    /// configuration are not included.
+    /// Inputs of the alarm engine; empty unless `want_alarm_inputs` is set. Not included: restored alarms and changed
+    /// rules.
     pub alarm_inputs: Vec<(Timestamp, AlarmInput)>,
     /// Whether the caller wants `alarm_inputs`.
     pub want_alarm_inputs: bool,

@@ -1,5 +1,5 @@
-//! Records: the inputs of the core and the contents of logs and journals. A record is a frame, a tick, a report of an
-//! interface or of the files, or a command.
+//! Records: the inputs of the core and the contents of logs and journals. A record is a frame, a tick, a report about
+//! an interface or about the files, a command, or a mark of a gap, a restore or a new configuration.
 
 use serde::{Deserialize, Serialize};
 

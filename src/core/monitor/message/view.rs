@@ -21,7 +21,7 @@ pub struct CellView {
     /// Reason why the remaining life is unknown.
     #[serde(default)]
     pub remaining_unknown: Option<String>,
-    /// Whether the cell's innovations agree with their covariance; `None` while its SOC is unknown.
+    /// Whether the cell's estimate is trusted; `None` while its SOC is unknown.
     pub trusted: Option<bool>,
 }
 

@@ -20,7 +20,8 @@ pub(crate) struct Alarming {
     pub(crate) missing_after_s: Option<f64>,
     /// Changes that wait to be published.
     pub(crate) changes: Vec<AlarmChange>,
-    /// Cells whose voltage channel is faulty according to the cell-fault detector. Nothing is known about these cells.
+    /// Cells whose voltage channel is faulty according to the cell-fault detector. New values that depend on these
+    /// voltages are not passed to the rules.
     pub(crate) faulty_channels: Vec<CellIndex>,
     pub(crate) state: AlarmingState,
 }
@@ -42,9 +43,9 @@ pub(crate) struct AlarmingState {
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct StoredAlarming {
-    /// Alarms that are raised or pending.
+    /// Pending, raised and past alarms.
     pub(crate) alarms: AlarmSnapshot,
-    /// Every alarm with its latest value, including inactive ones; empty in a state for a restart.
+    /// Every alarm that is not in its initial state, with its latest value; empty in a state for a restart.
     running: Vec<RunningAlarm>,
     state: AlarmingState,
 }
@@ -114,7 +115,7 @@ pub(crate) struct StoreHealth {
 }
 
 impl StoreHealth {
-    /// Handles the driver's report. Returns whether it differs from the previous report.
+    /// Handles the driver's report. Returns whether it is the first report or differs from the previous report.
     pub(crate) fn handle_report(&mut self, now: Timestamp, works: bool) -> bool {
         let was_failing = self.failing_since.is_some();
         let is_change = !self.is_known || was_failing == works;

@@ -1,8 +1,8 @@
 //! Estimation stage: computes the estimate of every cell from cell samples.
 //!
-//! In: batches of samples, and the learned values of half-cycles ([`Learner`]). Out: one filter step per sample, and
-//! two judgements per cell: do the innovations agree with their covariance, and does the model fit the cell
-//! ([`ModelCheck`])? If a filter fails at a sample, only that filter is reset.
+//! In: batches of samples, and the values learned from half-cycles ([`Learner`]). Out: one filter step per sample, and
+//! two judgements per cell: whether the innovations agree with their covariance, and whether the model fits the cell
+//! ([`ModelCheck`]). If a filter fails at a sample, only that filter is reset.
 
 use serde::{Deserialize, Serialize};
 
@@ -28,7 +28,7 @@ use crate::sample::CellSample;
 /// enough to trip an alarm whose threshold is the limit.
 const DOUBT: f64 = 2.0;
 
-/// Value, V, that is stored as the path of a frozen voltage. It is far outside the range of the cells' common path.
+/// Value of `Consumed::path_v` for a frozen voltage, V. It is far outside the range of [`CurrentCheck::path_v`].
 const FROZEN_PATH_V: f64 = 1e9;
 
 /// The estimation stage.
@@ -38,16 +38,16 @@ pub(crate) struct Estimation {
     /// Modules with cells of another kind.
     modules: Vec<CellModule>,
     pub(crate) batch: CellBatch,
-    /// Per cell: how far its samples have been used.
+    /// Per cell: which samples its steps have used.
     progress: Vec<CellProgress>,
-    /// Per cell: whether its innovations agree with their covariance.
+    /// Per cell: whether its estimate is trusted ([`Self::judge_trust`]).
     trusted: Vec<bool>,
     pub(crate) all_trusted: bool,
     /// Per cell: the check of its model.
     checks: Vec<ModelCheck>,
     any_check_open: bool,
     pub(crate) any_mismatched: bool,
-    /// Compares the steps of the current with the steps of the voltages.
+    /// Compares the changes of the current with the changes of the voltages.
     pub(crate) current_check: CurrentCheck,
     /// Whether the current's reading is frozen or contradicts the voltages, or an input message has a second sender.
     pub(crate) is_current_doubtful: bool,
@@ -71,8 +71,8 @@ pub(crate) struct EstimationState {
     pub(crate) current_check: CurrentCheck,
 }
 
-/// How far a cell's samples have been used. It is stored apart from the filters for cache locality, because every
-/// sample updates it.
+/// Which samples the steps of a cell have used. Stored apart from the filters for cache locality, because every sample
+/// updates this data.
 #[derive(Debug, Clone, Copy, Default)]
 struct CellProgress {
     /// Sampler totals at the last step; `None` before the first step.
@@ -81,16 +81,16 @@ struct CellProgress {
     sample: Option<CellSample>,
 }
 
-/// Totals of the sampler that a cell's steps have used.
+/// Totals of the sampler at a cell's latest step.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Consumed {
     pub(crate) time: Timestamp,
     pub(crate) charge_as: f64,
     offset_s: f64,
     pub(crate) unmeasured_s: f64,
-    /// The latest voltage, V, and the common path of the cells ([`CurrentCheck::path_v`]) at the last change of this
-    /// voltage, V.
+    /// The latest voltage, V.
     voltage_v: f64,
+    /// The sum of the cells' common changes ([`CurrentCheck::path_v`]) when this voltage last changed, V.
     path_v: f64,
 }
 
@@ -203,7 +203,7 @@ impl Estimation {
         samples
     }
 
-    /// Compares the steps of the current and of the voltages.
+    /// Compares the changes of the current with the changes of the voltages.
     fn check_current(&mut self, samples: &[CellSample]) {
         let Self { bank, current_check, .. } = self;
         let own = bank.own_cells();
@@ -266,7 +266,8 @@ impl Estimation {
         let index = sample.cell.index();
         let (charge, unmeasured) = (sample.charge_as, sample.unmeasured_s);
         let path_v = match self.progress[index].consumed {
-            // A frozen voltage counts as frozen until it changes, even if the other cells return.
+            // A frozen voltage counts as frozen until it changes, even if the voltages of the other cells return to
+            // their earlier values.
             Some(before) if before.voltage_v == sample.voltage_v && self.is_voltage_frozen(index) => FROZEN_PATH_V,
             Some(before) if before.voltage_v == sample.voltage_v => before.path_v,
             _ => self.current_check.path_v(),
@@ -322,19 +323,19 @@ impl Estimation {
         self.progress[index].consumed.is_some_and(|consumed| self.current_check.is_frozen_since(consumed.path_v))
     }
 
-    /// Records the sample of a cell's latest step. Returns whether that step reset its filter.
+    /// Records the sample of a cell's latest step. Returns whether that step reset the cell's filter.
     #[inline]
     pub(crate) fn record(&mut self, sample: &CellSample) -> bool {
         self.progress[sample.cell.index()].sample = Some(*sample);
         self.bank.result(sample.cell.index()).reset
     }
 
-    /// Whether a cell's innovations agree with their covariance.
+    /// Whether a cell's estimate is trusted.
     pub(crate) fn is_trusted(&self, index: usize) -> bool {
         self.trusted[index]
     }
 
-    /// Judges the models of the cells whose evidence is due.
+    /// Judges the models of the cells whose model check is due.
     fn check_models(&mut self, samples: &[CellSample]) {
         if !self.any_check_open {
             return;
@@ -389,7 +390,8 @@ impl Estimation {
         if mismatch.max(doubt) > 0.0 { mean_nis.max(mismatch.max(doubt) * limit) } else { mean_nis }
     }
 
-    /// Judges a cell's innovations. If the trust in the cell has changed, returns the new trust.
+    /// Judges whether a cell's estimate is trusted: its contradiction is at most the consistency limit. Returns the
+    /// result if it has changed.
     pub(crate) fn judge_trust(&mut self, cell: CellIndex) -> Option<bool> {
         let is_trusted = self.contradiction(cell.index()) <= self.bank.own_config().consistency.limit;
         if is_trusted == self.trusted[cell.index()] {
@@ -438,7 +440,7 @@ impl Estimation {
         resistance(&self.bank, index)
     }
 
-    /// Sampler totals that a cell's steps have used, to be stored.
+    /// Sampler totals at a cell's latest step, to be stored.
     pub(crate) fn consumed(&self, cell: usize) -> Option<Consumed> {
         self.progress[cell].consumed
     }
@@ -453,7 +455,7 @@ impl Estimation {
         }
     }
 
-    /// Restores stored cells (used totals, trust, model checks) and the batch.
+    /// Restores stored cells (totals at the latest step, trust, model checks) and the batch.
     pub(crate) fn restore(
         &mut self,
         cells: impl Iterator<Item = (Option<Consumed>, bool, ModelCheck)>,

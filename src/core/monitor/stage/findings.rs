@@ -1,8 +1,8 @@
 //! Findings stage: detects faults of cells and sensors from cell samples.
 //!
 //! In: the samples of all cells with their estimates. Out: an event for each new finding ([`EventKind::Finding`]). The
-//! stage only observes: no estimate and no capacity depends on it. When a row of the detector (a few minutes of
-//! samples) ends, the results of the row go to the alarm rules about single cells.
+//! stage only observes: estimates and capacities do not depend on findings. When a row of the detector (a few minutes
+//! of samples) ends, the results of the row go to the alarm rules about single cells.
 
 use super::estimation::Estimation;
 use super::learning::Learning;

@@ -1,4 +1,4 @@
-//! Intake stage: turns frames into judged readings and commands.
+//! Intake stage: turns frames into checked readings and commands.
 //!
 //! In: frames with their time, events of the interfaces. Out: the readings or the command of an admitted frame, counts,
 //! and an event for each change. If a frame fails its end-to-end check, its readings are bad, not missing. Frames
@@ -43,7 +43,7 @@ pub(crate) struct Intake {
     pub(crate) controllers: Vec<Controller>,
     /// Reassembles diagnostic answers.
     pub(crate) listener: Listener,
-    /// Per controller: moment at which the answer that is now being received started.
+    /// Per controller: start of the answer that is now being received.
     pub(crate) moments: Vec<Option<Moment>>,
     /// Time of the last report of a rejected command frame.
     pub(crate) bad_command_at: Option<Timestamp>,
@@ -81,13 +81,13 @@ pub(crate) struct IntakeState {
     pub(crate) commands: CommandGate,
     senders: Vec<MessageRate>,
     pub(crate) buses: Buses,
-    /// State of partially received messages; `None` in a state for a restart, because frames are missed during the
-    /// restart.
+    /// State that is valid only while frames are received without a break; `None` in a state for a restart, because
+    /// frames are missed during the restart.
     progress: Option<Box<IntakeProgress>>,
 }
 
 impl IntakeState {
-    /// Drops partially received answers, whose remaining frames will never arrive.
+    /// Drops the state that is valid only while frames are received without a break.
     pub(crate) fn restart(&mut self) {
         self.progress = None;
     }
@@ -148,7 +148,7 @@ impl Intake {
         // Diagnostic definitions cannot change here, so the listener keeps partially received messages.
     }
 
-    /// Judges a frame. Returns `None` if the frame is dropped, otherwise the result of the frame's end-to-end check.
+    /// Checks a frame. Returns `None` if the frame is dropped, otherwise the result of the frame's end-to-end check.
     #[inline]
     pub(crate) fn admit(
         &mut self,
@@ -290,7 +290,7 @@ impl Intake {
         self.own.uses()
     }
 
-    /// Resumes a stored state as if frames had been received without a break.
+    /// Resumes the state that is valid only while frames are received without a break.
     fn resume(&mut self, stored: &IntakeProgress) {
         self.guards.resume(&stored.protected);
         self.gate.resume(&stored.floods);

@@ -6,7 +6,7 @@
 //! * per charge: the recharge period;
 //! * the pack's state.
 //!
-//! A half-cycle without information changes no value.
+//! If the voltages of a half-cycle contain no information about the capacity, no capacity is measured.
 
 use serde::{Deserialize, Serialize};
 
@@ -310,7 +310,7 @@ impl Learning {
         update.measurement.is_some()
     }
 
-    /// Handles a stepped sample: detects when a charge tapers off at the highest voltage.
+    /// Handles a sample after its filter step: detects when a charge tapers off at the highest voltage.
     pub(crate) fn handle_sample(&mut self, sample: &CellSample, model: &CellModel) {
         let (Some(usable), Some(current_a)) = (&self.config.usable, sample.current_a) else { return };
         let is_tapering = current_a < 0.0 && -current_a <= usable.taper_current_a;
@@ -412,8 +412,8 @@ impl Learning {
         capacities.min_by(|a, b| a.1.mean.total_cmp(&b.1.mean)).filter(|_| self.state.learner.has_learned_all())
     }
 
-    /// Fields of the health frame: the worst value of any cell, and the losses of the weakest cell. Until every cell's
-    /// capacity has been learned, only the recharge period is given.
+    /// Fields of the health frame: the worst value among the cells, and the losses of the weakest cell. Until every
+    /// cell's capacity has been learned, only the raw recharge period is given.
     pub(crate) fn health_fields(&self, bank: &PackBank) -> HealthFields {
         let recharge_period_s = self.state.recharge_period_s;
         if !self.state.learner.has_learned_all() {

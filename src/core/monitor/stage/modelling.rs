@@ -4,13 +4,14 @@
 //! estimators, with the state in which they continue, and a [`ModelView`]. The stage learns a model only if the
 //! configuration describes the cells by a [`Label`]; otherwise the model comes from a file.
 //!
-//! The [`Notebook`] collects rows of data. When the vehicle rests and there are enough new rows, a new model is fitted.
-//! The estimators change to the new model during the rest, never while driving. The fit is a [`FitTask`] that starts
-//! some time before the change, so that a host can run it on another thread.
+//! The [`Notebook`] collects rows: means of the cells' data over a short time. When the vehicle rests and there are
+//! enough new rows, a new model is fitted. The estimators change to the new model during the rest, never while driving.
+//! The fit is a [`FitTask`] that starts some time before the change, so that a host can run it on another thread.
 //!
-//! Before the change, the task compares the present model and the previous model on the new rows. Neither model was
-//! fitted to these rows. The worse model is dropped. A settled model is fitted again only if the pack has reached
-//! another range of temperature or state of charge. Until then, only the half-cycles continue to learn the capacity.
+//! The task also compares the present model and the previous model on the new rows, to which neither was fitted. If the
+//! previous model predicts these rows clearly better, the present model is dropped. A settled model is fitted again
+//! only if the pack has reached another range of temperature or state of charge. Until then, only the half-cycles
+//! update the capacity.
 
 use serde::{Deserialize, Serialize};
 
@@ -31,14 +32,14 @@ const LEAST_NEW_CHARGE: f64 = 0.12;
 /// Shortest rest, s, after which a fit starts. This rest is longer than a stop at a red light.
 const REST_S: f64 = 120.0;
 
-/// Time, s, from the start of a fit to the change of the model. A slow computer needs less time for the fit.
+/// Time, s, from the start of a fit to the change of the model. Even a slow computer fits a model in less time.
 const FIT_S: f64 = 30.0;
 
-/// Largest misfit of a usable fit. With typical sensors, the misfit is at most 0.65. Heavy load in the cold, a faulty
-/// sensor, or an exchange of the pack between the rows causes a larger misfit.
+/// Largest misfit of a usable fit. With typical sensors, the misfit is at most 0.65. It is larger after heavy load in
+/// the cold, with a faulty sensor, or if the pack was exchanged between the rows.
 const MOST_MISFIT: f64 = 0.7;
-/// If the misfit of a fit exceeds this value, the present model is dropped, too: the rows deviate from every fit by
-/// more than the assumed errors.
+/// If the misfit of a fit exceeds this value, the present model is dropped, too, unless it is settled. The rows then
+/// deviate even from the best model by more than the assumed errors.
 const HOPELESS_MISFIT: f64 = 1.0;
 
 /// Largest relative standard deviation of a usable fit's capacity. The capacity from the label has a relative standard
@@ -60,9 +61,9 @@ pub struct ModelChange {
     pub capacity: Option<ScalarGaussian>,
     /// Root mean square of the residuals of the rows, V.
     pub residual_v: Option<f64>,
-    /// The chemistry that explains the voltages better than the label's chemistry.
+    /// The chemistry that explains the voltages better than the label's chemistry, if any.
     pub chemistry: Option<Chemistry>,
-    /// Whether the previous model is used again.
+    /// Whether the fit dropped a model, so that the previous model or the label's model is used again.
     pub is_taken_back: bool,
 }
 
@@ -73,13 +74,13 @@ pub struct ModelView<'a> {
     pub state: ModelState,
     /// The label; `None` = a model file is used.
     pub label: Option<Label>,
-    /// The learned model; `None` before the first fit.
+    /// The learned model; `None` while the label's model or a model file is used.
     pub own: Option<&'a OwnModel>,
     /// Rows from which the model is learned.
     pub notebook: Option<&'a Notebook>,
-    /// The chemistry that explains the voltages better than the label's chemistry.
+    /// The chemistry that explains the voltages better than the label's chemistry, if any.
     pub chemistry: Option<Chemistry>,
-    /// Number of fits.
+    /// Number of fits, including fits whose model was not used.
     pub fits: u32,
     /// Number of times a model was dropped and the previous model or the label's model was used again.
     pub taken_back: u32,
@@ -111,7 +112,7 @@ enum FitOutcome {
     Nothing,
     /// The new model is used.
     Adopted,
-    /// The previous model is used again.
+    /// A model was dropped: the previous model or the label's model is used again.
     Returned,
 }
 
@@ -152,7 +153,8 @@ pub(crate) struct Adoption {
 }
 
 impl ModellingState {
-    /// Drops everything that requires contiguous rows. Called for a restart and for a pack that is not connected.
+    /// Drops what a gap interrupts: the present rest, the fit in progress and the complete row. Called for a restart,
+    /// and for a pack that is stored until it returns.
     pub(crate) fn restart(&mut self) {
         (self.rest_since, self.fit_since, self.has_row) = (None, None, false);
     }
@@ -234,7 +236,7 @@ impl Modelling {
         };
     }
 
-    /// The present model and its settings.
+    /// The present model, and the estimators' settings for this model.
     pub(crate) fn in_force(&self) -> (CellModel, EstimatorConfig) {
         let own = self.label.as_ref().zip(self.state.own.as_ref());
         let learned = own.and_then(|(label, own)| {
@@ -289,8 +291,8 @@ impl Modelling {
         is_new.then(|| self.task()).flatten()
     }
 
-    /// Receives the findings of a task that the host has run. The findings only save the computation; the result is the
-    /// same.
+    /// Receives the findings of a task that the host has run. Without them, the stage runs the task itself, with the
+    /// same result.
     pub(crate) fn give(&mut self, task: FitTask, findings: FitFindings) {
         self.given = Some((task, findings));
     }
@@ -316,8 +318,8 @@ impl Modelling {
             && (!is_settled || notebook.rows_of_new_classes(self.notebook.rated_ah) >= LEAST_NEW_ROWS)
     }
 
-    /// Compares the present and the previous model on the new rows, then fits a model to all rows. Returns the model
-    /// that the estimators must adopt, if any.
+    /// Ends the fit in progress, or runs a new fit: compares the present and the previous model on the new rows, and
+    /// fits a model to all rows. Returns the model that the estimators must adopt, if any.
     pub(crate) fn refit(&mut self) -> Option<Adoption> {
         let label = self.label?;
         if self.state.fit_since.take().is_none() {
@@ -382,7 +384,7 @@ impl Modelling {
         Adoption { model, config, mean, with_capacity: true, is_learned: false }
     }
 
-    /// Whether the latest fit returned to the previous model.
+    /// Whether the latest fit returned to the previous model or to the label's model.
     pub(crate) fn has_returned(&self) -> bool {
         self.outcome == FitOutcome::Returned
     }
@@ -392,8 +394,8 @@ impl Modelling {
         self.label.map(|_| self.state.clone())
     }
 
-    /// Records the change that the latest fit caused, and returns the event; `None` without a change. `before`: state
-    /// of the model before the fit.
+    /// Records the change that the latest fit caused, and returns the event; `None` without a change. `before`: the
+    /// model's state before the fit.
     pub(crate) fn note_change(&mut self, time: Timestamp, before: ModelState) -> Option<Event> {
         let ModelView { state, own, chemistry, .. } = self.view();
         if state == before && self.outcome == FitOutcome::Nothing {
@@ -416,7 +418,7 @@ impl Modelling {
         self.state.view(self.label)
     }
 
-    /// Ends the stretch of contiguous rows.
+    /// Ends the present rest, the fit in progress, and the notebook's stretch of contiguous rows.
     pub(crate) fn end_stretch(&mut self) {
         (self.state.rest_since, self.state.fit_since) = (None, None);
         if self.label.is_some() {

@@ -1,9 +1,8 @@
 //! Sampling stage: turns readings into cell samples, and detects which pack is connected.
 //!
 //! In: judged readings. Out: a [`CellSample`] for each good voltage, an event for each signal that turns bad or good,
-//! and the pack's identity once enough consecutive readings agree. A bad reading changes nothing, and neither does a
-//! single reading of another identity. The identity is stored, so that an exchange of the pack during a downtime is
-//! detected.
+//! and the pack's identity once enough consecutive readings agree. Bad readings of the identity are ignored. The
+//! identity is stored, so that an exchange of the pack during a downtime is detected.
 
 use serde::{Deserialize, Serialize};
 
@@ -49,13 +48,13 @@ impl SamplingState {
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(crate) struct Identity {
     pub(crate) known: Option<f64>,
-    /// A number that differs from the known number, and the number of consecutive readings that have given it.
+    /// An identity that differs from the known identity, and how many consecutive readings have shown it.
     candidate: Option<(f64, u32)>,
 }
 
 impl Identity {
-    /// Handles a reading. If `readings` consecutive readings agree on a new number, returns the number and whether it
-    /// replaces a known number.
+    /// Handles a good reading. If the last `readings` readings agree on a new identity, returns the identity and
+    /// whether it replaces a known identity.
     fn observe(&mut self, value: f64, readings: u32) -> Option<(f64, bool)> {
         if self.known == Some(value) {
             self.candidate = None;
@@ -73,8 +72,7 @@ impl Identity {
 }
 
 impl Identity {
-    /// Whether a reading gives a number that differs from the number of the connected pack; `None` if either number is
-    /// unknown.
+    /// Whether a reading shows another identity than the connected pack has; `None` if either is unknown.
     pub(crate) fn is_other(&self, reading: Result<f64, Fault>) -> Option<bool> {
         let value = reading.ok().filter(|value| value.is_finite())?;
         Some(self.known? != value)

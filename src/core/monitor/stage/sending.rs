@@ -29,15 +29,16 @@ const TEST_PERIOD_S: f64 = 0.1;
 /// Longest duration of a test, s, so that a forgotten test ends.
 pub const MAX_TEST_S: f64 = 600.0;
 
-/// Number of immediate replies after a pause; further replies are at least [`REPLY_DELAY_MS`] apart. A small number
-/// suffices, because a sender of commands waits for each reply.
+/// Number of immediate replies after a pause; further replies are at least [`REPLY_DELAY_MS`] apart, and replies in
+/// between are dropped. A small number suffices, because a sender of commands waits for each reply.
 const REPLY_BURST: i64 = 5;
 const REPLY_DELAY_NS: i64 = REPLY_DELAY_MS as i64 * 1_000_000;
 
 /// Number of freshness values skipped at a start. An earlier process may have sent frames after its state was stored.
 /// The skipped values suffice for more than an hour of such frames at the highest rate.
 const RESTART_FRESHNESS: u64 = 1 << 20;
-/// Minimum freshness per second of the clock. This value exceeds the number of frames in a second.
+/// At a start, the freshness is at least this value times the clock's time in seconds. The value exceeds the number of
+/// frames in a second.
 const FRESHNESS_PER_S: u64 = 256;
 
 /// The sending stage.
@@ -98,7 +99,7 @@ pub(crate) struct Schedule {
     pub(crate) alarms: AlarmQueue,
     /// Counters of the frames' end-to-end protection.
     counters: SendCounters,
-    /// Time of the next announcement of the commands' freshness.
+    /// Time of the next frame that announces the freshness for commands.
     freshness: Timestamp,
     /// Freshness of the last authenticated frame; all messages share one sequence.
     sent_freshness: u64,
@@ -185,7 +186,8 @@ impl Sending {
         }
     }
 
-    /// Applies another `[output]` configuration. If the new configuration has no `[output]`, a running test ends.
+    /// Applies another `[output]` configuration. If the new configuration has no `[output]`, a running test ends, and
+    /// the alarm queue is emptied.
     pub(crate) fn reconfigure(
         &mut self,
         now: Timestamp,
@@ -230,7 +232,7 @@ impl Sending {
         self.schedule.housekeeping = self.schedule.housekeeping.min(now);
     }
 
-    /// Makes all cyclic work due now. Called after a start and after a sleep.
+    /// Makes all cyclic work due now. Called after a start, a sleep, and a gap.
     pub(crate) fn restart(&mut self, now: Timestamp) {
         self.schedule.dues().into_iter().for_each(|due| *due = now);
         self.schedule.reply = self.schedule.reply.min(now);
@@ -309,14 +311,14 @@ impl Sending {
         ])
     }
 
-    /// Whether the freshness of commands must be announced.
+    /// Whether the frame that announces the freshness for commands is due.
     pub(crate) fn take_freshness_due(&mut self, now: Timestamp) -> bool {
         let is_sent = |config: &OutputConfig| config.plan.authentication(LayoutMessage::Freshness).is_some();
         let due = &mut self.schedule.freshness;
         self.config.as_ref().is_some_and(is_sent) && take_due(due, now, f64::from(FRESHNESS_PERIOD_MS) / 1000.0)
     }
 
-    /// Announces the freshness of commands that are received on `bus`.
+    /// Announces the freshness that commands may use next. `bus`: interface on which commands are received.
     pub(crate) fn send_freshness(&mut self, time: Timestamp, bus: Option<BusIndex>, freshness: u64, out: &mut Outputs) {
         let Some(output) = &self.config else { return };
         let secoc = output.plan.authentication(LayoutMessage::Freshness);
@@ -375,7 +377,7 @@ impl Sending {
         }
     }
 
-    /// Whether the time of the next due work has changed.
+    /// Whether an alarm change has changed the time of the next due work since the last call.
     #[inline]
     pub(crate) fn take_rescheduled(&mut self) -> bool {
         std::mem::take(&mut self.is_rescheduled)
@@ -421,7 +423,7 @@ impl Sending {
     }
 
     /// Sends the reply to a command that was received on `bus`. If `bus` is not an output interface, sends the reply on
-    /// all output interfaces.
+    /// all output interfaces. If replies follow each other too fast ([`REPLY_BURST`]), drops the reply.
     pub(crate) fn send_reply(&mut self, now: Timestamp, bus: BusIndex, fields: &ReplyFields, out: &mut Outputs) {
         if self.schedule.reply > now || self.config.as_ref().is_none_or(|output| !output.plan.has_reply()) {
             return;
@@ -543,7 +545,8 @@ impl Sending {
         }
     }
 
-    /// Claims the J1939 address. Called at the start, after a sleep, and when the interface is up again.
+    /// Claims the J1939 address. Called at the start, after a sleep or gap, for a new node, and when the interface is
+    /// up again.
     pub(crate) fn claim_address(&mut self, now: Timestamp, out: &mut Outputs) {
         if let Some(j1939) = &mut self.j1939 {
             j1939.claim_address(now, out);

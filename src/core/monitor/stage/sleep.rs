@@ -1,8 +1,9 @@
-//! Detects that the vehicle is asleep: no current and no traffic on any bus.
+//! Detects that the vehicle is asleep: no current flows and no input is received on any bus.
 //!
-//! In: the time, and the time of the latest reading of any input. Out: whether the inputs may be judged, and an event
-//! at the start and end of a sleep. A single silent input, and silence under load, are faults that other modules
-//! handle. While the buses sleep, no input turns bad, no alarm is raised, and no estimate is valid.
+//! In: the time, the latest current, and the time of the latest reading of any input. Out: whether the inputs may be
+//! judged, and an event at the start and end of a sleep. A single silent input, and silence under load, are faults that
+//! other modules handle. While the buses sleep, no input turns bad, inputs and estimates are not compared with the
+//! alarm rules, and no estimate is valid.
 
 use crate::monitor::config::MonitorConfig;
 use crate::quantity::Timestamp;
@@ -15,7 +16,7 @@ pub(crate) const QUIET_S: f64 = 0.25;
 /// State of the bus sleep.
 #[derive(Debug)]
 pub(crate) struct BusSleep {
-    /// If the buses are silent for longer than this time, s, they count as asleep; `None` = never.
+    /// If all inputs are silent for longer than this time, s, the buses count as asleep; `None` = never.
     pub(crate) after_s: Option<f64>,
     /// Start of the present sleep.
     pub(crate) since: Option<Timestamp>,
@@ -24,7 +25,7 @@ pub(crate) struct BusSleep {
 /// Meaning of the silence of all inputs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Silence {
-    /// Inputs arrive or current flows, so each input is judged by its own age.
+    /// This is not a sleep: each input is judged by its own age.
     None,
     /// The buses may be falling asleep.
     Quiet,

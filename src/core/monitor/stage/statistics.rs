@@ -47,9 +47,9 @@ pub struct Statistics {
     pub bad_commands: u64,
     /// Number of times the pack was replaced.
     pub packs_replaced: u64,
-    /// Number of times a stored state was restored.
+    /// Number of times a stored state was restored at a start.
     pub restores: u64,
-    /// Number of times that writing the files started to fail.
+    /// How often the files became unwritable.
     pub store_failures: u64,
 }
 
@@ -62,7 +62,8 @@ pub struct VoltageCounts {
     /// Readings outside the filter's innovation gate, which were ignored.
     #[serde(rename = "voltages_gated")]
     pub gated: u64,
-    /// Readings that could not be compared with a prediction, because there was no current.
+    /// Readings that could not be compared with a prediction, because the current was unknown or the filter step
+    /// failed.
     #[serde(rename = "voltages_without_current")]
     pub without_current: u64,
 }

@@ -1,12 +1,13 @@
 //! Remembers the learned values of previously connected packs by pack number. When a pack returns, its values are
 //! restored.
 //!
-//! In: the learned values of the connected pack, put aside when readings start to show another number; the new number
-//! once it is confirmed. Out: the stored values of the pack with the new number, if there are any.
+//! As soon as a reading shows another number, the learned values of the connected pack are put aside. In: these values,
+//! and the new number once it is confirmed. Out: the stored values of the pack with the new number, if there are any.
 //!
-//! The memory stores capacities, resistances, remaining lives, recharge periods and the current offset (a pack often
-//! has its own sensor). The unfinished half-cycle and the state of charge are not stored; the first voltage determines
-//! the state of charge. A pack without learned values is not stored, so that bogus numbers do not displace real packs.
+//! The memory stores the learned cell model, capacities, resistances, remaining lives, recharge periods, findings and
+//! the current offset (a pack often has its own sensor). The unfinished half-cycle is not stored. The state of charge
+//! is not restored; the first voltage determines it. A pack without learned values is not stored, so that bogus pack
+//! numbers do not displace real packs.
 
 use serde::{Deserialize, Serialize};
 
@@ -46,7 +47,7 @@ pub(crate) struct StoredPack {
     pub(crate) learning: LearningState,
 }
 
-/// One cell of a snapshot.
+/// One cell of a snapshot or of a stored pack.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct StoredCell {
@@ -61,7 +62,7 @@ pub(crate) struct StoredCell {
 }
 
 impl PackMemory {
-    /// Whether the connected pack has been put aside.
+    /// Whether a pack has been put aside.
     pub(crate) fn has_aside(&self) -> bool {
         self.aside.is_some()
     }
@@ -71,7 +72,7 @@ impl PackMemory {
         self.aside = Some(Box::new(pack));
     }
 
-    /// Drops the pack that was put aside. Called if the pack's number was read again, or if its learned values no
+    /// Drops the pack that was put aside. Called if the pack's number was read again, or if the learned values no
     /// longer apply.
     pub(crate) fn drop_aside(&mut self) {
         self.aside = None;
@@ -89,7 +90,8 @@ impl PackMemory {
         found
     }
 
-    /// Forgets recharge periods measured with another window, and usable capacities computed for another load.
+    /// If the recharge settings have changed, forgets the recharge periods. If the load has changed, forgets the usable
+    /// capacities.
     pub(crate) fn forget_measures(&mut self, is_other_recharge: bool, is_other_load: bool) {
         for pack in &mut self.packs {
             if is_other_recharge {
@@ -129,7 +131,7 @@ impl StoredPack {
 }
 
 impl StoredPack {
-    /// Whether the number of cells and their branches fit the bank.
+    /// Whether the pack has as many cells as the bank, and every cell [fits](StoredCell::fits).
     pub(crate) fn fits(&self, bank: &PackBank) -> bool {
         self.cells.len() == bank.cells()
             && self.learning.learner.fits(bank.cells())

@@ -1,5 +1,4 @@
-//! Passes present values to their alarm rules every 0.1 s. (The learning stage passes learned values when it learns
-//! them.)
+//! Passes values to their alarm rules every 0.1 s. (The learning stage passes learned values when it learns them.)
 //!
 //! In: all stages. Out: values for the [alarming](crate::monitor::stage::alarming) stage. If a part of a value is
 //! unknown, the value is passed as a bound, which can raise an alarm but not clear one. Fast path: if the worst value
@@ -55,7 +54,7 @@ struct SocSpread {
 }
 
 impl Stages {
-    /// Passes all values to their rules, except the values that are learned at a change of mode.
+    /// Passes the values of inputs and pack to their rules, and says for the learned values whether they are valid.
     pub(crate) fn watch(&mut self, now: Timestamp, out: &mut Outputs) {
         let any_lost = self.sampling.sampler.any_lost();
         let worst = self.sampling.sampler.worst_input(now);
@@ -151,8 +150,8 @@ impl Stages {
         publisher.observe(Rule::InputImplausible, cell, input.bad_share);
     }
 
-    /// Marks learned values as valid only while inputs can renew them, that is, while no input of the cell is lost and
-    /// its channel is not faulty.
+    /// Marks a cell's learned values as valid only while inputs can renew them: no input of the cell is lost, and the
+    /// cell's channel is not faulty.
     fn watch_learned(&mut self, now: Timestamp, any_lost: bool, out: &mut Outputs) {
         if self.alarming.state.knows_all_valid && !out.want_alarm_inputs && !any_lost {
             return;
@@ -214,7 +213,8 @@ impl Stages {
         let (mut spread, mut known): (Option<SocSpread>, usize) = (None, 0);
         for cell in self.estimation.cell_indices() {
             let is_fresh = self.sampling.sampler.is_fresh(self.sampling.voltage_channel(cell), now);
-            // A voltage that arrived before the first reading of the current cannot be used yet.
+            // After a downtime, a voltage cannot be used before the first reading of the current. Until then, the SOC
+            // dates from before the downtime.
             let is_of_cell = !bank.is_carried_over(cell.index()) && !self.alarming.faulty_channels.contains(&cell);
             let is_present = is_fresh && is_of_cell;
             let Some(soc) = bank.soc(cell.index()).filter(|_| is_present) else { continue };
@@ -275,7 +275,7 @@ impl Stages {
         }
     }
 
-    /// Refreshes the displayed innovations, which change no alarm, once a second.
+    /// Refreshes the displayed innovations at most once a second. The caller makes sure that they change no alarm.
     pub(crate) fn show_innovations(&mut self, now: Timestamp, samples: &[CellSample]) {
         if !take_show_due(&mut self.alarming.state.innovations_shown_at, now) {
             return;
@@ -306,8 +306,7 @@ impl Stages {
     }
 
     /// Passes restored values to their rules. `was_brief`: whether the downtime was so short that measured values still
-    /// apply. `is_new`: whether the rules have not seen the values before, because they belong to a pack that returned;
-    /// false after a restart.
+    /// apply. `is_new`: true for the values of a pack that returned, which are new to the rules; false after a restart.
     pub(crate) fn restate_known(&mut self, now: Timestamp, was_brief: bool, is_new: bool, out: &mut Outputs) {
         let old = |value: ScalarGaussian| Observation { is_new, ..learned(value) };
         for index in self.estimation.cell_indices() {
@@ -342,8 +341,8 @@ impl Stages {
     }
 
     /// Passes the results of a row (a few minutes of samples) of the cell-fault detector to the rules about single
-    /// cells. `is_new`: whether the rules have not seen the results before. If so, the results of a cell whose inputs
-    /// are lost are skipped until the next row.
+    /// cells. `is_new`: whether the results are new to the rules. If they are new, skips the cells whose inputs are
+    /// lost; these cells wait for the next row.
     pub(crate) fn publish_diagnosis(&mut self, now: Timestamp, is_new: bool, out: &mut Outputs) {
         self.note_faulty_channels();
         let diagnosis = &self.findings.diagnosis;
@@ -363,7 +362,7 @@ impl Stages {
         }
     }
 
-    /// Updates the list of cells with a faulty channel. The other alarms of these cells are suppressed.
+    /// Updates the list of cells with a faulty channel. Rules that depend on a cell's voltage ignore these cells.
     pub(crate) fn note_faulty_channels(&mut self) {
         let faulty = self.findings.faulty_channels();
         if faulty != self.alarming.faulty_channels {

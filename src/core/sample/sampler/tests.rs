@@ -341,7 +341,7 @@ fn every_channel_has_its_own_slot() {
     assert!(slots.iter().enumerate().all(|(slot, found)| *found == Some(slot)));
 }
 
-/// Random readings of a cell; the majority is plausible.
+/// A random reading, usually of a cell voltage; most readings are plausible.
 fn reading() -> impl Strategy<Value = (Channel, Result<f64, Fault>)> {
     let volts = prop_oneof![
         8 => (0_i32..30).prop_map(|step| Ok(3.6 + 0.002 * f64::from(step))),

@@ -64,8 +64,8 @@ impl CycleCourse {
 
     pub(super) fn reference(settings: &Settings, scale: f64, noise: Noise) -> Self {
         let load = Pulses { noise, scale, current_a: 0.0, left_s: 0.0 };
-        // Charging current of the example, 0.5 C: A for a cell of 30 Ah. The source gives a constant current without
-        // its value.
+        // Charging current, A for a cell of 30 Ah: 0.5 C. The published example charges with a constant current, but
+        // does not state its value.
         Self::new(settings, Load::Pulses(Box::new(load)), 15.0 * scale)
     }
 
@@ -94,8 +94,8 @@ impl CycleCourse {
         Demand::Current(if self.charging { -self.charge_a } else { self.load.next_a(dt_s) })
     }
 
-    /// Whether the cycle in progress is the last cycle. The tolerance is half of the loss per cycle, because 47 losses
-    /// of 0.05 Ah do not add up to exactly 2.35 Ah in binary.
+    /// Whether the cycle in progress is the last cycle. The comparison with the end capacity has a tolerance of half
+    /// the loss per cycle, because 47 losses of 0.05 Ah do not add up to exactly 2.35 Ah in binary.
     fn is_last_cycle(&self, pack: &Pack) -> bool {
         self.cycles.is_some_and(|cycles| pack.cycles() + 1 >= cycles)
             || pack.lowest_capacity_ah() - 0.5 * self.loss_ah < self.end_capacity_ah

@@ -2,7 +2,7 @@
 //! charge.
 //!
 //! The car is a point mass that follows random target speeds with bounded acceleration. The electric power is scaled
-//! from a 60 kWh car to the simulated pack, so that every cell has the same C-rate.
+//! from a 60 kWh car to the simulated pack, so that the cells have the same C-rate as the cells of that car.
 
 use super::demand::Demand;
 use crate::sim::noise::Noise;
@@ -63,7 +63,7 @@ impl DayCourse {
     }
 
     pub(super) fn next(&mut self, pack: &mut Pack, dt_s: f64) -> Demand {
-        // Below this SOC, a drive ends early and the car charges.
+        // Below an SOC of 10 %, a drive ends early and the car charges.
         if matches!(self.phase, DayPhase::Drive { .. }) && pack.lowest_soc() < 0.10 {
             self.phase = DayPhase::FastCharge;
         }
@@ -119,7 +119,7 @@ impl DayCourse {
         // `power_w` returns the power of a car whose pack has 60,000 Wh.
         let capacities_per_hour = power_w(self.speed_m_s, acceleration) / 60_000.0;
         let (lowest_v, highest_v) = pack.extremes_v(0.0);
-        // Nominal voltage of the cells of the 60 kWh car, V.
+        // 3.65 V is the nominal voltage of the cells of the 60 kWh car.
         let current_c = capacities_per_hour * 3.65 / (0.5 * (lowest_v + highest_v));
         let current_a = self.capacity_ah * current_c.clamp(-CURRENT_LIMIT_C.0, CURRENT_LIMIT_C.1);
         if current_a > 0.0 {

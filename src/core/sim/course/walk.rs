@@ -61,7 +61,7 @@ impl WalkCourse {
                     return self.enter(WalkPhase::Charge { cycles_left: 2 }, pack, dt_s);
                 }
                 let current_a = self.draw_load(pack, low_v, high_v);
-                // Length of a load if no voltage limit ends it earlier, s.
+                // A load lasts 300 s, unless a voltage limit ends it earlier.
                 self.phase = WalkPhase::Walk { steps_left: steps_left - 1, current_a, left_s: 300.0 - dt_s };
                 Demand::Current(current_a)
             }
@@ -109,8 +109,8 @@ impl WalkCourse {
     }
 
     fn draw_load(&mut self, pack: &Pack, low_v: f64, high_v: f64) -> f64 {
-        // Draws until a load stays within the voltage range, at most 32 times; then rests. Six of the 12 loads are
-        // positive and six are negative.
+        // Draws at most 32 loads until one stays within the voltage range. If all leave the range, the pack rests. Six
+        // of the 12 loads are positive and six are negative.
         (0..32)
             .map(|_| self.scale * self.noise.choose(&LOADS_A))
             .find(|&a| pack.lowest_v(a) > low_v && pack.highest_v(a) < high_v)

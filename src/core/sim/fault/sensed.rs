@@ -37,7 +37,7 @@ impl SensorFaults {
         if self.begun.contains(&FaultKind::TemperatureOff(sensor)) { ambient_c } else { truth_c }
     }
 
-    /// Converts voltages at the taps to voltages at the channels in place, V.
+    /// Changes the voltages at the cells' taps to the voltages at the channels, V: adds offsets and swaps channels.
     pub(crate) fn distort_voltages(&self, voltages_v: &mut [f64]) {
         for fault in &self.begun {
             match *fault {

@@ -3,7 +3,7 @@
 use super::*;
 use crate::cell::{Branch, Table, Thermal};
 
-/// A cell with constant resistances, so that closed-form solutions hold for any swing.
+/// A cell with constant resistances, so that closed-form solutions hold for any change of SOC.
 pub(crate) fn plain_model(capacity_ah: f64) -> CellModel {
     let k = capacity_ah / 2.6;
     let flat = |value: f64| Table { values: vec![vec![value; 5]] };

@@ -1,8 +1,8 @@
 //! Finds cells whose voltages are always the same: one signal is configured for two cells, or a cell's value is copied.
 //!
-//! In: the cells' mean voltages, block by block, V. Out: groups of cells that never differed, each with the number of
-//! blocks in which the cells' voltages changed. Equality is exact: a copy has the same digits, while two cells in
-//! series differ at least in the last digit.
+//! In: for each block of time, the mean voltage of each cell, V. Out: groups of cells that never differed, each with
+//! the number of blocks in which the cells' voltages changed. Equality is exact: a copy has the same digits, while two
+//! cells in series differ at least in the last digit.
 
 /// Groups of cells that have never differed.
 #[derive(Debug, Clone, Default)]
@@ -10,12 +10,12 @@ pub(crate) struct EqualCells {
     /// Group number by cell.
     groups: Vec<usize>,
     last_v: Vec<f64>,
-    /// Number of blocks in which a cell's voltage changed.
+    /// For each cell, the number of blocks in which its voltage changed.
     changes: Vec<u32>,
 }
 
 impl EqualCells {
-    /// Adds the voltages of a block; ignores a block without a voltage of every cell.
+    /// Adds the voltages of a block. Ignores the block if the voltage of a cell is missing.
     pub(crate) fn push(&mut self, cells_v: &[f64]) {
         let cells = cells_v.len();
         if cells < 2 || cells_v.iter().any(|v| !v.is_finite()) {

@@ -1,9 +1,9 @@
 //! Derives evidence about a signal from the signal's name and unit.
 //!
 //! In: message name, signal name and unit as written in the DBC. Out: points for each quantity of a pack, with their
-//! reasons in words, or `None` if the unit belongs to another quantity. The points are weights that were chosen on the
-//! DBCs of three cars. A matching unit or name adds 1 to 3 points. A word that indicates another device or a limit
-//! subtracts 3 points.
+//! reasons in words, or `None` if the name or the unit excludes the quantity. The points are weights that were chosen
+//! on the DBCs of three cars. A matching unit or name adds 1 to 3 points. A word that indicates another device or a
+//! limit subtracts 3 points.
 
 use serde::Serialize;
 
@@ -30,7 +30,8 @@ pub enum PackQuantity {
 /// Points for a quantity, with their reasons.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Score {
-    /// Weight of the evidence; only the order matters.
+    /// Weight of the evidence. The number has no physical meaning: it ranks signals, and callers compare it with a
+    /// threshold.
     pub points: f64,
     /// Reasons in plain words.
     pub reasons: Vec<String>,
@@ -39,7 +40,7 @@ pub struct Score {
 /// Name and unit of a signal.
 #[derive(Debug, Clone)]
 pub struct SignalLabel {
-    /// Words of the signal's name, lower case; split at changes of case, at digits and at other characters.
+    /// Words of the signal's name, lower case; split at changes of case, at digits and at punctuation.
     words: Vec<String>,
     /// The whole name, lower case.
     name: String,
@@ -57,7 +58,8 @@ enum LabelUnit {
     Other,
 }
 
-// Words in names. A word with `=` must be a whole word of the name; any other word may be a part of the name.
+// Words in names. A word that starts with `=` must be a whole word of the name; any other word may be a part of the
+// name.
 
 /// Words that indicate the traction battery.
 const PACK: &str = "batt akku pack bms traction hvb =hv accumulator";
@@ -181,7 +183,7 @@ impl SignalLabel {
         self.has("soh stateofhealth state_of_health")
     }
 
-    /// Points for a quantity from name and unit; `None` if name or unit exclude the quantity.
+    /// Points for a quantity from name and unit; `None` if the name or the unit excludes the quantity.
     pub fn score(&self, quantity: PackQuantity) -> Option<Score> {
         let mut score = Score::default();
         let has_unit = self.has_unit_of(quantity.measured());
@@ -233,7 +235,7 @@ impl SignalLabel {
     }
 }
 
-/// Splits a name at changes of case, at digits and at other characters.
+/// Splits a name at changes of case, at digits and at punctuation.
 fn words(name: &str) -> Vec<String> {
     let chars: Vec<char> = name.chars().collect();
     let mut words = vec![String::new()];

@@ -1,4 +1,4 @@
-//! Reads the bits of a signal with other layouts: byte order, start bit, sign of the number.
+//! Reads a signal with another byte order, start bit or sign of the number.
 
 use super::sample::Extent;
 use crate::can::signal::{ByteOrder, SignalLayout, SignalPlan, ValueType};
@@ -12,7 +12,7 @@ pub(crate) const LAYOUT_FAULTS: [&str; 5] = [
     "wrong byte order and sign of the number (the start bit is right)",
 ];
 
-/// The same bits read with another layout.
+/// A signal read with another layout.
 #[derive(Debug, Clone)]
 pub(crate) struct AlternativeReading {
     /// One of [`LAYOUT_FAULTS`].
@@ -23,7 +23,7 @@ pub(crate) struct AlternativeReading {
 }
 
 impl AlternativeReading {
-    /// All alternative readings of a signal's bits.
+    /// All alternative readings of a signal.
     pub(super) fn all(layout: &SignalLayout) -> Vec<Self> {
         let other_sign = |layout: SignalLayout| match layout.value_type {
             ValueType::Unsigned => Some(SignalLayout { value_type: ValueType::Signed, ..layout }),
@@ -42,7 +42,7 @@ impl AlternativeReading {
         LAYOUT_FAULTS.into_iter().zip(others).filter_map(reading).collect()
     }
 
-    /// Reads the bits of a payload.
+    /// Reads the signal from a payload.
     pub(super) fn handle(&mut self, payload: &[u8], scale: f64, offset: f64) {
         if let Ok(physical) = self.plan.physical(payload) {
             self.extent.push(physical * scale + offset);

@@ -6,7 +6,7 @@
 //! | `label` | names and units: points for each quantity of a pack |
 //! | `series` | statistics of one signal: counts, periods, extent, roughness |
 //! | `sample` | extent and thinned sample of a stream |
-//! | `layout` | the same bits read with another byte order, start bit or sign |
+//! | `layout` | a signal read with another byte order, start bit or sign |
 //! | `loss` | frames missing from a cyclic signal |
 //! | `slope` | voltage over current: sign and size of the resistance |
 //! | `response` | how the voltages of a pack follow its current: steps, steady runs, rests |

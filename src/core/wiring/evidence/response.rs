@@ -17,7 +17,7 @@ use crate::quantity::Timestamp;
 /// Block lengths over which readings are averaged, s. Short blocks suit a load that changes all the time. Long blocks
 /// suit noisy voltages and a load that holds for a while.
 pub(crate) const BLOCKS_S: [f64; 2] = [1.0, 10.0];
-/// Longest time between two blocks that are compared, s.
+/// Two blocks, or a current and a voltage, are compared only if the time between them is at most this, s.
 const MAX_GAP_S: f64 = 40.0;
 
 /// A step of the current and of the voltages.
@@ -32,9 +32,9 @@ struct CurrentStep {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SteadyRun {
     pub(crate) current_a: f64,
-    /// Length of the evaluated part, s.
+    /// Length of the evaluated part, s. The first 20 s are not evaluated.
     pub(crate) seconds: f64,
-    /// Mean voltage of a cell, V.
+    /// Mean over time of the median cell's voltage, V.
     pub(crate) voltage_v: f64,
     /// Drift over `seconds`, V.
     pub(crate) drift_v: f64,
@@ -246,7 +246,7 @@ impl VoltageResponse {
         self.block_s
     }
 
-    /// Slope of the pack's voltage against its current, from the largest steps.
+    /// Slope of the median cell's voltage against the current, from the largest steps.
     pub(crate) fn slope(&self) -> Option<Slope> {
         self.slope_over(|step| Some(step.voltage_v))
     }

@@ -1,7 +1,9 @@
-//! Keeps the extent and the roughness of a stream of values, and a thinned sample of the stream, in bounded memory.
+//! Keeps the extent of a stream of values, its roughness (mean absolute change from value to value) and a thinned
+//! sample of the stream, in bounded memory.
 
 /// A sample of a stream. The sample keeps every value until it is full, then every second value, every fourth, and so
-/// on. Two samples of equal size that receive the same number of values keep the values at the same positions.
+/// on. If two samples have the same maximum size and receive the same number of values, they keep the values at the
+/// same positions.
 #[derive(Debug, Clone)]
 pub struct ThinnedSample {
     values: Vec<f64>,
@@ -111,7 +113,7 @@ impl Extent {
         (self.max - self.min).max(0.0)
     }
 
-    /// Mean change from one value to the next.
+    /// Mean absolute change from one value to the next.
     pub(crate) fn step(&self) -> f64 {
         self.travel / (self.count.max(2) - 1) as f64
     }

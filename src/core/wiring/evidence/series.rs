@@ -1,5 +1,5 @@
 //! Statistics of one signal: counts, periods, extent and roughness of its values. The extent is also kept for other
-//! layouts of the signal's bits.
+//! layouts of the signal.
 //!
 //! In: payloads or values with their time. Values are in the program's unit, after the configured scale and offset. No
 //! limits are applied. Memory is bounded: gaps and values are kept as thinned samples.
@@ -40,7 +40,7 @@ pub struct Series {
     pub(crate) gaps: ThinnedSample,
     pub(crate) loss: LossCounter,
     pub(crate) longest_gap_s: f64,
-    /// Number of gaps longer than the age from which a reading is stale.
+    /// Number of gaps that are longer than `max_age_s`: a reading became stale before the next reading.
     pub(crate) stale_gaps: u64,
     /// Absolute changes from one value to the next.
     pub(crate) changes: ThinnedSample,
@@ -73,7 +73,7 @@ impl Series {
 
     /// Creates the statistics of a recorded signal from its values and their times, s.
     pub fn of(readings: impl Iterator<Item = (f64, Result<f64, Fault>)>) -> Self {
-        // 4096 values suffice for a correlation, and the memory suffices for thousands of signals.
+        // 4096 values suffice for a correlation, and samples of this size fit into memory for thousands of signals.
         let sample = ThinnedSample::of_at_most(4096);
         let mut series = Self { values: sample.clone(), times_s: sample, ..Self::default() };
         for (time_s, value) in readings {
@@ -157,8 +157,8 @@ impl Series {
         self.gaps.median()
     }
 
-    /// Standard deviation of the white noise, from the changes between readings. Real steps do not affect the result if
-    /// fewer than half of the changes are steps.
+    /// Standard deviation of the white noise, from the changes between readings. The median tolerates a few real steps
+    /// of the value among the changes.
     pub(crate) fn noise(&self) -> Option<f64> {
         // The absolute difference of two normal variables with standard deviation s has the median 0.6745 sqrt(2) s.
         Some(self.changes.median()? / (0.6745 * std::f64::consts::SQRT_2))

@@ -1,4 +1,5 @@
-//! Checks interfaces, identifiers, error frames, other nodes that send the daemon's frames, and end-to-end protection.
+//! Checks interfaces, identifiers, error frames, other nodes that send with the daemon's identifiers, and end-to-end
+//! protection.
 
 use super::context::{Judge, error, find, note, warning};
 use super::text::{count, number, seconds};
@@ -34,8 +35,8 @@ fn messages_of<'d>(judge: &Judge<'d>, bus: BusIndex) -> Vec<&'d MessagePlan> {
     judge.plan.messages.iter().filter(|message| message.bus == bus).collect()
 }
 
-/// Of the other interfaces, the interface that has received the most wanted identifiers, and the number of these
-/// identifiers.
+/// Finds the interface, other than `index`, that has received the most identifiers of `wanted`. Returns the interface
+/// and the number of these identifiers.
 fn best_other<'d>(judge: &Judge<'d>, index: usize, wanted: &[&MessagePlan]) -> Option<(&'d BusStats, usize)> {
     let others = judge.observed.buses.iter().enumerate().filter(|(other, _)| *other != index);
     let counted = others.map(|(_, bus)| (bus, wanted.iter().filter(|m| bus.ids.contains_key(&m.id)).count()));

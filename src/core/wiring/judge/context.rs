@@ -11,10 +11,10 @@ use crate::wiring::observer::{BusStats, WiringObserver};
 use crate::wiring::plan::{Kind, Plan, SignalPlan};
 use crate::wiring::report::{Severity, Topic, WiringFinding, WiringReport};
 
-/// Largest plausible current of a pack, in multiples of its capacity per hour.
+/// Largest plausible current of a pack, in multiples of the pack's capacity per hour.
 pub(super) const MAX_C_RATE: f64 = 30.0;
 
-/// Smallest share of the voltage's changes that the current must explain before the size of a slope is judged. If the
+/// The size of a slope is judged only if the current explains at least this share of the voltage's changes. If the
 /// current explains less, the noise of the current makes the slope too small.
 pub(super) const EXPLAINED: f64 = 0.8;
 
@@ -32,8 +32,8 @@ pub(super) struct Judge<'d> {
     pub(super) voltage_factor: f64,
     /// Factor that converts the current, read as configured, to A.
     pub(super) current_factor: f64,
-    /// Whether a current or voltage signal is not the configured quantity, so that the response of the voltages cannot
-    /// be judged.
+    /// Whether a finding shows that the current or the voltages are not read correctly, for example from the wrong
+    /// signal or with the wrong layout. If so, the response of the voltages cannot be judged.
     pub(super) is_mixed_up: bool,
     /// Kinds of signals whose layout in the DBC is wrong.
     pub(super) wrong_layouts: Vec<Kind>,
@@ -118,7 +118,8 @@ impl<'d> Judge<'d> {
         if self.plan.pack.is_total { f64::from(self.plan.pack.cells.max(1)) } else { 1.0 }
     }
 
-    /// Median over the cells of each cell's median voltage, read as configured, V per cell; `None` without readings.
+    /// Voltage of the median cell, read as configured, V. Each cell contributes the median of its readings. `None`
+    /// without readings.
     pub(super) fn cell_voltage(&self) -> Option<f64> {
         self.median_of(Kind::Voltage, |series| series.values.median()).map(|v| v / self.cells_per_reading())
     }

@@ -4,7 +4,7 @@ use super::context::Judge;
 use crate::cell::CellModel;
 use crate::wiring::evidence::response::SteadyRun;
 
-/// Smallest significance of a drift that counts, standard deviations.
+/// A drift counts only if it is at least this many standard deviations from zero.
 const SURE: f64 = 6.0;
 
 /// Voltage drift during all steady runs together, per cell.
@@ -13,7 +13,8 @@ pub(super) struct Drift {
     pub(super) seconds: f64,
     /// Sum of the absolute drifts that the model expects, V.
     pub(super) expected_v: f64,
-    /// Absolute measured drift opposite to the direction that the model expects, V.
+    /// Mean measured drift of a run, weighted by the expected drift: absolute value, V. It is reported if the measured
+    /// drift is opposite to the expected drift.
     pub(super) against_v: f64,
     /// Ratio of measured to expected drift, weighted by the expected drift.
     pub(super) ratio: f64,
@@ -21,7 +22,8 @@ pub(super) struct Drift {
 }
 
 impl Drift {
-    /// Drift over the steady runs of the short blocks; `None` without a cell model or without a run.
+    /// Drift over the steady runs of the short blocks; `None` without a cell model, or if the model expects no drift
+    /// in any run.
     pub(super) fn of(judge: &Judge<'_>) -> Option<Self> {
         let model = judge.plan.pack.model.as_ref()?;
         let (mut xx, mut xy, mut variance, mut seconds, mut expected_v) = (0.0, 0.0, 0.0, 0.0, 0.0);

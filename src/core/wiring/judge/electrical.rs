@@ -114,7 +114,7 @@ fn resistance(judge: &mut Judge<'_>, slope: &Slope) {
     };
     let configured = judge.plan.pack.strings;
     let strings = likely_strings(configured, ohm, (fast, slow));
-    // Only a wrong unit explains such a ratio.
+    // Only a wrong unit or the model of another cell explains such a ratio.
     if ratio >= 6.0 {
         current_unit(judge, seen, power_of_ten(ohm / (fast * slow).sqrt()), ratio);
     } else if ratio >= ODD_RATIO || ratio >= 2.0 && strings.is_some_and(|n| n < configured) {
@@ -132,7 +132,8 @@ fn resistance(judge: &mut Judge<'_>, slope: &Slope) {
 /// A different number of parallel strings that would explain the resistance.
 fn likely_strings(configured: u16, ohm: f64, (fast, slow): (f64, f64)) -> Option<u16> {
     let by_string = ohm / f64::from(configured);
-    // The number of strings is at most `ODD_RATIO` x 1024.
+    // If the number exceeds `u16`, the cast saturates. The caller does not use such a number, because the ratio of the
+    // resistances is then too large.
     let strings = (((fast * slow).sqrt() / by_string).round() as u16).max(1);
     // A cell's resistance usually differs from its model's resistance by a factor of less than 1.3.
     let is_like = (fast / 1.3..=slow * 1.3).contains(&(by_string * f64::from(strings)));
@@ -160,8 +161,8 @@ fn current_unit(judge: &mut Judge<'_>, seen: String, factor: f64, ratio: f64) {
 }
 
 /// Reports a current that `factor` corrects: the current's unit or the configured cell model is wrong. If the DBC
-/// states ampere and the configuration scales nothing, the reading is probably right, so the finding names the cell
-/// model first.
+/// states ampere and the configuration does not scale the signal, the reading is probably right, so the finding names
+/// the cell model first.
 pub(super) fn wrong_unit_or_cell<'j>(
     judge: &'j mut Judge<'_>,
     signal: &SignalPlan,

@@ -66,8 +66,8 @@ fn cell_number(signal: &SignalPlan) -> Option<u16> {
 }
 
 /// If exactly the last cells are absent, reports that too many cells are configured. Returns the signals that are still
-/// to be reported. If a message or the message's values are missing, the last module may also be dead, so the signals
-/// of these cells stay in the list.
+/// to be reported. If the message was not received or its values are "not available", the last module may be dead. In
+/// this case, the signals of the absent cells stay in the list.
 fn fewer_cells<'d>(judge: &mut Judge<'d>, absent: Vec<Absent<'d>>) -> Vec<Absent<'d>> {
     let mut cells: Vec<u16> = absent.iter().filter_map(|(signal, _)| cell_number(signal)).collect();
     cells.sort_unstable();
@@ -177,7 +177,7 @@ fn cause(judge: &Judge<'_>, bus: BusIndex, id: CanId, absence: Absence) -> (&'st
     }
 }
 
-/// Finds signals of further cells that carry cell voltages.
+/// Finds signals of `plan.more_cells` that carry cell voltages: the pack has more cells than configured.
 fn more_cells(judge: &mut Judge<'_>) {
     let Some(median_v) = judge.cell_voltage() else { return };
     let plan = judge.plan;

@@ -18,7 +18,7 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     }
 }
 
-/// Finds signals whose values differ from the values of all other signals of the same kind.
+/// Finds signals whose values differ too much from the median of all signals of the same kind.
 pub(super) fn check_odd(judge: &mut Judge<'_>) {
     odd_cells(judge);
     odd_sensors(judge);
@@ -92,7 +92,7 @@ struct Fit {
 
 fn fit(judge: &Judge<'_>, series: &Series) -> Option<Fit> {
     let (low, high) = series.values.bulk()?;
-    // A voltage that is configured as the current gets the current's sign.
+    // If a voltage is configured as the current, the current's sign may make the voltage negative.
     let (low, high) = if high <= 0.0 { (-high, -low) } else { (low, high) };
     let (band, cells) = (judge.voltage_band(), judge.cells_per_reading());
     let is_slow = series.changes.median().unwrap_or(0.0) < 1.0 && high - low < 40.0;
@@ -103,8 +103,8 @@ fn fit(judge: &Judge<'_>, series: &Series) -> Option<Fit> {
     })
 }
 
-/// Finds exchanged signals among current, voltage and temperature of a single cell: the values of each signal are
-/// plausible only for the other quantity.
+/// If the pack has a single voltage signal, finds exchanged signals among current, voltage and temperature: the values
+/// of each signal are plausible only for the other quantity.
 fn by_values(judge: &mut Judge<'_>) {
     let voltages = judge.signals(Kind::Voltage);
     let (Some(current), [voltage]) = (judge.current(), voltages.as_slice()) else { return };
@@ -139,7 +139,7 @@ fn is_current_like(temperature: &Series, current: &Series) -> bool {
     temperature.jumps >= 3 && current.jumps == 0 && (5.0..=60.0).contains(&level)
 }
 
-/// Finds cells whose voltage differs from the voltages of all other cells.
+/// Finds cells whose voltage differs too much from the voltage of the median cell.
 fn odd_cells(judge: &mut Judge<'_>) {
     let voltages = judge.signals(Kind::Voltage);
     let Some(median_v) = judge.cell_voltage().filter(|_| voltages.len() >= 4) else { return };
@@ -161,7 +161,7 @@ fn odd_cells(judge: &mut Judge<'_>) {
     }
 }
 
-/// Finds temperature sensors whose value differs from the values of all other sensors.
+/// Finds temperature sensors whose value differs too much from the median of the sensors.
 fn odd_sensors(judge: &mut Judge<'_>) {
     let sensors = judge.signals(Kind::Temperature);
     // `values` reports the sensors with impossible values.

@@ -7,7 +7,7 @@ use crate::quantity::Channel;
 use crate::wiring::plan::Kind;
 use crate::wiring::report::{Severity, Topic};
 
-/// Largest deviation of the sum of the cell voltages from the pack's voltage that sensor errors explain, fraction.
+/// Sensor errors explain a deviation of the sum of the cell voltages from the pack's voltage up to this fraction.
 const SUM_TOLERANCE: f64 = 0.03;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
@@ -16,7 +16,7 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     states_of_charge(judge);
 }
 
-/// Signals of the DBC for a channel that are not configured, with their median values.
+/// The unconfigured signals that probably carry `channel`, each with the median of its values.
 fn unconfigured<'d>(judge: &Judge<'d>, channel: Channel) -> Vec<(SignalSeries<'d>, f64)> {
     let all = judge.plan.unconfigured.iter().zip(&judge.observed.unconfigured);
     let wanted = all.filter(|(signal, _)| signal.binding.channel == channel);

@@ -3,7 +3,8 @@
 use crate::can::unit::{Quantity, SignalUnit};
 use crate::wiring::plan::Kind;
 
-/// Kind of quantity, with factor and offset to the program's unit; `None` for any other unit.
+/// Kind of quantity, with factor and offset to the program's unit; `None` if the unit is not known or measures another
+/// quantity.
 pub(super) fn unit_of(text: &str) -> Option<(Kind, f64, f64)> {
     let unit = SignalUnit::parse(text)?;
     let kind = match unit.quantity {

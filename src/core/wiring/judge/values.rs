@@ -117,7 +117,7 @@ fn voltages(judge: &mut Judge<'_>) {
     }
 }
 
-/// The layout that makes the voltages plausible, if the configured layout does not.
+/// The alternative layout that makes the voltages plausible or smooth, if the configured layout does not.
 fn better_voltages<'d>(judge: &Judge<'d>, all: &[SignalSeries<'d>]) -> Option<BetterLayout<'d>> {
     let (low, high) = judge.voltage_band();
     let cells = judge.cells_per_reading();
@@ -131,7 +131,7 @@ fn better_voltages<'d>(judge: &Judge<'d>, all: &[SignalSeries<'d>]) -> Option<Be
     })
 }
 
-/// The layout that makes the temperatures plausible, if the configured layout does not.
+/// The alternative layout that makes the temperatures plausible or smooth, if the configured layout does not.
 fn better_temperatures<'d>(judge: &Judge<'d>, all: &[SignalSeries<'d>]) -> Option<BetterLayout<'d>> {
     let ambient_c = judge.plan.pack.ambient_c;
     let median_c = judge.median_of(Kind::Temperature, |series| series.values.median());
@@ -142,7 +142,7 @@ fn better_temperatures<'d>(judge: &Judge<'d>, all: &[SignalSeries<'d>]) -> Optio
     })
 }
 
-/// Whether the frames end before the signals of a kind only because of the byte order in the DBC.
+/// Whether the frames are too short for the signals of a kind only because the layout in the DBC is wrong.
 pub(super) fn is_short_by_layout(judge: &Judge<'_>, kind: Kind) -> bool {
     let all = judge.signals(kind);
     match kind {

@@ -36,13 +36,13 @@ pub struct MeasuredRange {
 pub struct ModelSource {
     /// Whether the model comes from a file, from a label or from the vehicle's own data.
     pub state: ModelState,
-    /// Chemistry, for readers.
+    /// Chemistry, for display.
     pub chemistry: Option<String>,
     /// The measured conditions.
     pub measured: MeasuredRange,
     /// `[provenance]` of the file; empty if not given.
     pub provenance: Table,
-    /// For a learned model: the label's model, and the conditions that the data covered.
+    /// For a model that is learned on board: the label's model, and the data behind the learned values.
     pub learned: Option<LearnedFrom>,
 }
 
@@ -55,7 +55,7 @@ pub struct LearnedFrom {
     pub seen: Coverage,
     /// Root mean square of the residuals, V; `None` = nothing is learned yet.
     pub residual_v: Option<f64>,
-    /// The chemistry that explains the voltages better than the one on the label.
+    /// A chemistry that explains the voltages better than the chemistry on the label.
     pub chemistry: Option<Chemistry>,
     /// Number of fits.
     pub fits: u32,
@@ -142,8 +142,9 @@ impl SourcedModel {
         self.by_prior(&std).unwrap_or_else(|| self.source.by_range(self.source.measured.temperature_c, temperature_c))
     }
 
-    /// What a part of a model learned from a label is based on; `None` for other models. `std` computes the standard
-    /// deviation of the part for a model. The result is `Data` if `std(learned) <= 0.7 * std(label)`, else `Prior`.
+    /// If the model is learned on board, returns what a part of the model is based on; `None` for other models. `std`
+    /// computes the standard deviation of the part for a model. The result is `Data` if
+    /// `std(learned) <= 0.7 * std(label)`, else `Prior`.
     fn by_prior(&self, std: &dyn Fn(&CellModel) -> Option<f64>) -> Option<KnownBy> {
         let learned = self.source.learned.as_ref()?;
         let (left, before) = (std(&self.model)?, std(&learned.prior)?);

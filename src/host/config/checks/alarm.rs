@@ -63,7 +63,7 @@ impl Alarm {
         all.into_iter().filter_map(|(key, severity, threshold)| Some((key, severity, threshold?)))
     }
 
-    /// Returns the value at which an alarm clears that was raised at the threshold `set`.
+    /// Returns the value at which the alarm clears if its threshold is `set`.
     fn clear(&self, rated: &RatedCell, set: f64, threshold: &Threshold) -> Option<f64> {
         match threshold.clear {
             Some(clear) => rated.value(self.rule, clear),
@@ -133,7 +133,8 @@ pub(crate) fn check(raw: &RawTables, rated: Option<&RatedCell>) {
     }
 }
 
-/// Reports inputs and tables that the alarm's rule requires but the file does not contain.
+/// Reports inputs and tables that the alarm's rule requires but the file does not contain. Also reports a key `when`
+/// that requires a standard deviation, if the rule's value has none.
 fn check_needs(alarm: &Alarm, raw: &RawTables) {
     let cells = raw.pack.as_ref().map_or(2, |pack| if raw.is_pack_total() { 1 } else { pack.cells });
     let is_reported = raw.is_written::<ReportedSocInput>() || raw.is_written::<ReportedSohInput>();

@@ -1,6 +1,6 @@
 //! Checks `[[input.diagnostic]]`: the diagnostic requests and answers, and the signals in the answers.
 //!
-//! Each table of the file becomes one [`AnswerDefinition`]. The signals of a definition look like signals of a DBC, so
+//! Each of these tables becomes one [`AnswerDefinition`]. The signals of a definition look like signals of a DBC, so
 //! that `[input.*]` can name them in the same way. `polling` makes the answers that the core decodes.
 
 use crate::can::CanId;
@@ -70,7 +70,7 @@ impl AnswerPlace<'_> {
         AnswerSource { question: self.definition.question(bus), first_byte: self.first_byte }
     }
 
-    /// Position of the signal's first bit in the answer, counted as in the file.
+    /// Position of the signal's first bit in the answer, counted like the key `bit`.
     pub(crate) fn bit(&self, layout: &SignalLayout) -> usize {
         let in_byte = match layout.byte_order {
             ByteOrder::BigEndian => 7 - layout.start_bit,

@@ -65,7 +65,8 @@ pub(crate) fn own_model(
     model
 }
 
-/// The model in the file `named`. If the file cannot be used at all, `fault` reports this at the key that names it.
+/// The model in the file `named`. If the file cannot be used at all, `fault` reports this at the key that names the
+/// file.
 fn file_model(
     path: &Path,
     named: &str,
@@ -109,7 +110,7 @@ fn check_file(place: &TablePlace, cell_model: Option<&String>) -> bool {
     !given.is_empty()
 }
 
-/// Reports label keys of the pack given together with a model file.
+/// Reports label keys of the pack that are given together with a model file.
 pub(crate) fn check(pack: &Pack) {
     check_file(&pack.place, pack.cell_model.as_ref());
 }
@@ -144,7 +145,7 @@ pub(crate) fn modules<'a>(path: &Path, raw: &'a RawTables, file: ReadFile<'_>) -
     raw.modules.iter().filter_map(of_keys).collect()
 }
 
-/// Reports a fault at the key `cells` for cells that do not exist or that an earlier module contains.
+/// Reports a fault at the key `cells` for cells that do not exist or that an earlier table lists.
 pub(crate) fn check_cells<'a>(
     place: &TablePlace,
     cells: &[u16],

@@ -102,7 +102,7 @@ fn balancing(raw: &RawTables, model: Option<&CellModel>) {
     if !pack.balancing {
         pack.place.fault("balancing", "must be true if [input.balancing] is given");
     }
-    // Passive balancing uses a few hundredths of the rated capacity per hour.
+    // The usual current of passive balancing is at most a few hundredths of the rated capacity per hour.
     let most_a = raw.rated_ah(model).map(|rated_ah| 0.2 * rated_ah * f64::from(pack.strings));
     if let Some(most_a) = most_a.filter(|most_a| keys.bleed_a > *most_a) {
         let what = format!("must be at most {most_a:?} A (C/5 of the pack's rated capacity)");
@@ -118,7 +118,7 @@ fn sources(raw: &RawTables) {
     }
 }
 
-/// Checks that every cell has at most one sensor, and that every numbered cell exists.
+/// Checks that every cell has at most one sensor, and that every listed cell exists.
 fn temperatures(pack: &Pack, raw: &RawTables) {
     if raw.is_pack_total() && !raw.is_written::<CellVoltageInput>() {
         for sensor in raw.temperatures.iter().skip(1) {

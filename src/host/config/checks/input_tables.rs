@@ -53,7 +53,7 @@ pub(crate) fn signals(document: &Document<'_>, raw: &RawTables, databases: &Data
     }
 }
 
-/// The input tables that have a key.
+/// The kinds of input table that may have the key `key`.
 fn with_key(key: &str) -> impl Iterator<Item = &'static SectionInfo> {
     let has = move |info: &&SectionInfo| info.keys.is_some_and(|keys| keys.iter().any(|known| known.name == key));
     SECTIONS.iter().filter(|info| info.path.starts_with("input.")).filter(has)

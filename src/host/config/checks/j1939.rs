@@ -59,7 +59,7 @@ fn name(keys: &J1939) -> Option<Name> {
     Name::new(&fields).map_err(|error| keys.place.fault(error.field, error)).ok()
 }
 
-/// Returns the trouble code of every threshold; `None` = a code is faulty (reported).
+/// Returns the trouble code of every threshold; `None` = a code is faulty, or two rules share it (reported).
 fn codes(alarms: &[Alarm]) -> Option<Vec<AlarmCode>> {
     let mut codes: Vec<(&Alarm, AlarmCode)> = Vec::new();
     let mut is_good = true;
@@ -85,8 +85,8 @@ fn codes(alarms: &[Alarm]) -> Option<Vec<AlarmCode>> {
 }
 
 fn code(alarm: &Alarm, severity: Severity) -> Option<AlarmCode> {
-    // The rule's code is also its number in alarm frames. Unverified (from memory of J1939-73): 520192 is the first
-    // number that manufacturers may assign.
+    // `rule as u8` is the rule's number in alarm frames. The default SPN is 520192 plus this number. Unverified (from
+    // memory of J1939-73): 520192 is the first number that manufacturers may assign.
     let spn = alarm.spn.unwrap_or(520_192 + u32::from(alarm.rule as u8));
     let fmi = alarm.fmi.unwrap_or_else(|| failure_mode(alarm.rule, severity));
     match TroubleCode::new(spn, fmi, 0) {

@@ -114,7 +114,7 @@ fn unreadable(place: &TablePlace, signals: &[&ResolvedSignal<'_>]) {
     }
 }
 
-/// Reports signals, and multiplexors they depend on, that extend beyond their message: one fault per table.
+/// Reports signals that extend beyond their message, and multiplexors of these signals that do so: one fault per table.
 fn ends(place: &TablePlace, signals: &[&ResolvedSignal<'_>]) {
     // The length of an answer is unknown until it arrives.
     let in_frames = signals.iter().filter(|resolved| resolved.answer.is_none());
@@ -201,8 +201,8 @@ fn is_beside(a: &ResolvedSignal<'_>, b: &ResolvedSignal<'_>) -> bool {
         && !a.signal.conditions.iter().any(is_other_page)
 }
 
-/// Whether two inputs of one message share bits. The layouts of an answer count from the signal's own first byte, so
-/// the position of that byte is added.
+/// Whether two inputs of one message share bits. In a diagnostic answer, each layout counts from the first byte of its
+/// signal, so the position of this byte is added.
 fn has_bits_of(a: &ResolvedSignal<'_>, b: &ResolvedSignal<'_>) -> bool {
     let bits = |resolved: &ResolvedSignal<'_>| {
         let first = resolved.answer?.bit(&resolved.signal.layout);
@@ -479,7 +479,7 @@ pub(crate) fn rated_capacity(raw: &RawTables, model: Option<&CellModel>) {
     }
 }
 
-/// Returns a hint if parallel cells explain why the capacity is `ratio` times the capacity of one cell.
+/// Returns a hint whether parallel cells explain why the capacity is `ratio` times the capacity of one cell.
 fn parallel_cells(ratio: f64, strings: u16) -> String {
     // Different sources state capacities of the same cell that differ by less than 5 %.
     let is_about = |cells: f64| (ratio / cells - 1.0).abs() <= 0.05;

@@ -1,4 +1,4 @@
-//! Builds the core's guards, which check the end-to-end protection of inputs, from `[[input.protected]]`.
+//! Builds the core's guards from `[[input.protected]]`. A guard checks the end-to-end protection of one message.
 
 use super::signals::ResolvedSignal;
 use crate::can::dbc::{Message, Signal};

@@ -100,8 +100,8 @@ const MAX_FRAME_BYTES: u16 = 64;
 pub(crate) const UNLIMITED: (f64, f64) = (f64::NEG_INFINITY, f64::INFINITY);
 
 impl Databases {
-    /// Reads the DBC files and the answers. Returns `None` if there are no files and no answers, or if a file is
-    /// unusable (reported), because signals cannot be looked up in that case.
+    /// Reads the DBC files and the answers. Returns `None` if there are no files and no answers, or if a file or an
+    /// answer is unusable (reported), because signals cannot be looked up in that case.
     pub(crate) fn load(config: &Path, raw: &RawTables, read: ReadFile<'_>) -> Option<Self> {
         let mut files = Vec::new();
         for name in raw.input.as_ref().map_or(&[][..], |input| &input.dbc) {
@@ -127,8 +127,7 @@ impl Databases {
         of_files.chain(of_answers)
     }
 
-    /// Returns another message of the same file with the same identifier as `message`; `None` = there is no such
-    /// message.
+    /// Returns another message of the same file with the same identifier as `message`; `None` = not found.
     fn twin(&self, file: &str, message: &Message) -> Option<&Message> {
         let databases = self.files.iter().filter(|(name, _)| name == file).map(|(_, database)| database);
         let mut messages = databases.flat_map(|database| &database.messages);
@@ -174,7 +173,7 @@ pub(crate) fn resolve<'d>(raw: &RawTables, databases: &'d Databases) -> Vec<Reso
     search.found
 }
 
-/// Reports a signal name that is in none of the files.
+/// Reports a signal name that is neither in the DBC files nor in the diagnostic answers.
 pub(crate) fn check_name(raw: &RawTables, databases: &Databases, source: &SignalSource<'_>) {
     if !databases.signals().any(|signal| signal.is_named(source.signal)) {
         Search { raw, databases, found: Vec::new() }.not_found(source);
@@ -346,7 +345,8 @@ fn list(numbers: &[u32]) -> String {
 }
 
 impl ResolvedSignal<'_> {
-    /// The signal's binding for the decoder. The binding has no range because the sample stage checks plausibility.
+    /// The signal's binding for the decoder. Only the DBC limits the range, because the sample stage checks
+    /// plausibility.
     pub(crate) fn binding(&self) -> Result<Binding, LayoutFault> {
         let mut binding = Binding::new(self.bus, self.message, self.signal, self.channel)?;
         binding.scale = self.scale;
@@ -374,8 +374,8 @@ impl ResolvedSignal<'_> {
     }
 }
 
-/// The map from frames to inputs for the decoder, without the diagnostic answers. `None` if a layout cannot be decoded,
-/// which was reported when the signal was found.
+/// The map from frames to inputs for the decoder, without the diagnostic answers. `None` if a layout cannot be decoded;
+/// `plausible` has reported this.
 pub(crate) fn input_map(found: &[ResolvedSignal<'_>]) -> Option<InputMap> {
     let in_frames = found.iter().filter(|resolved| resolved.answer.is_none());
     let bindings: Result<Vec<_>, _> = in_frames.map(ResolvedSignal::binding).collect();

@@ -10,7 +10,7 @@ use super::source::{SourceFile, Sources};
 
 /// Maximum number of characters that a fault quotes: enough to recognise the text, and few enough for one line.
 const MAX_QUOTE: usize = 48;
-/// Largest number of syntax faults that are listed one by one. A file with more faults is probably not TOML.
+/// Maximum number of syntax faults listed one by one for each file. A file with more faults is probably not TOML.
 const MAX_SYNTAX_FAULTS: usize = 10;
 
 /// The tables of a configuration: one file, or a file and its drop-ins merged.
@@ -27,8 +27,8 @@ pub(crate) struct Document<'t> {
 }
 
 impl<'t> Document<'t> {
-    /// Parses every file of `sources` and merges them in order. Syntax faults are reported; the readable rest is kept
-    /// and checked.
+    /// Parses every file of `sources` and merges the files in order. Syntax faults are reported. The parts that can be
+    /// parsed are kept, so that later checks find their faults too.
     pub(crate) fn parse(sources: &'t Sources, faults: &Faults) -> Self {
         let (mut root, mut broken) = (DeTable::new(), false);
         for source in sources.files() {
@@ -56,7 +56,7 @@ impl<'t> Document<'t> {
         Some(value)
     }
 
-    /// The first line of the file.
+    /// The first line of the main file.
     pub(crate) fn first_line(&self) -> SourceLine {
         SourceLine { file: self.file.clone(), line: 1 }
     }

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use super::faults::{ConfigFaults, Faults, SourceLine};
 
-/// Largest number of drop-ins of one file. One per table is enough, and a file has about 30 tables.
+/// Largest number of drop-ins of one file. One per table is enough, and a file has about 40 tables.
 const MAX_DROP_INS: usize = 100;
 
 /// Reads the bytes of a file. The function reads from disk or, in the demo and in tests, from memory.
@@ -109,7 +109,7 @@ pub(crate) struct Sources {
 }
 
 impl Sources {
-    /// Reads all files; `None` = one of them cannot be read (reported).
+    /// Reads all files; `None` = at least one file cannot be read (reported).
     pub(crate) fn read(files: &ConfigFiles, read: ReadFile<'_>, faults: &Faults) -> Option<Self> {
         let text = |path: &Path| Some((path.display().to_string(), read_text(path, read, faults)?));
         // Reads every file before returning, so that each fault is reported.
@@ -167,7 +167,7 @@ pub(crate) fn read_file(path: &Path) -> std::io::Result<Vec<u8>> {
     std::fs::read(path)
 }
 
-/// The file as UTF-8 text; `None` = the file cannot be read (reported).
+/// The file as UTF-8 text; `None` = the file cannot be read or is not UTF-8 (reported).
 pub(crate) fn read_text(path: &Path, read: ReadFile<'_>, faults: &Faults) -> Option<String> {
     let file = path.display().to_string();
     let bytes = read(path).map_err(|error| faults.add(&file, 0, format!("cannot be read: {error}"))).ok()?;

@@ -11,8 +11,8 @@ use super::faults::{ConfigFaults, Faults};
 use super::merge::{Document, is_list_of_tables};
 use super::source::{ConfigFiles, ReadFile, Sources, read_file};
 
-/// The configuration file and its drop-ins as one TOML text, each part with its file and line. Keys and values are not
-/// checked.
+/// The configuration file and its drop-ins as one TOML text. A comment after each key and table states its file and
+/// line. Keys and values are not checked.
 ///
 /// # Errors
 /// Fails if a file cannot be read or is not TOML, and returns every such fault.
@@ -68,12 +68,13 @@ fn tables_at(document: &Document<'_>, path: &str, value: &Spanned<DeValue<'_>>, 
     }
 }
 
-/// Whether a value gets a header: all tables do, except inline tables.
+/// Whether a value is written under a header: a table, or a list of tables, that is not written inline.
 fn has_header(document: &Document<'_>, value: &Spanned<DeValue<'_>>) -> bool {
     (value.get_ref().is_table() || is_list_of_tables(value)) && !is_inline(document, value)
 }
 
-/// Whether a value is written inline, `{ ... }` or `[ ... ]`, and no other file adds keys or elements to it.
+/// Whether the text of a value at its position contains the whole value. This is not so if a table has a header, or if
+/// another file adds keys or elements to the value.
 fn is_inline(document: &Document<'_>, value: &Spanned<DeValue<'_>>) -> bool {
     let (span, written) = (value.span(), document.written(&value.span()));
     let is_within = |part: std::ops::Range<usize>| span.start <= part.start && part.end <= span.end;

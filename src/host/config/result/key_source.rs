@@ -23,7 +23,7 @@ impl std::fmt::Display for KeySource {
     }
 }
 
-/// Location of the key for authenticated frames; `None` = no frame is authenticated, or faults are reported.
+/// Location of the key for authenticated frames; `None` = no frame is authenticated, or a fault is reported.
 pub(crate) fn key_source(raw: &RawTables, config: &Path, has_authenticated: bool) -> Option<KeySource> {
     let keys = raw.authentication.as_ref()?;
     match (&keys.credential, &keys.key_file) {

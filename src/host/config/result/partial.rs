@@ -29,7 +29,8 @@ impl PartialConfig {
     /// Reads the parts that can be read.
     ///
     /// # Errors
-    /// Fails if the file or a DBC file cannot be read, and returns every fault found.
+    /// Fails if the configuration file, a drop-in or a DBC file cannot be read, if a table `[[input.diagnostic]]` is
+    /// faulty, or if there is neither a DBC file nor such a table. The error lists every fault found.
     pub(crate) fn read(path: &Path) -> Result<Self, ConfigFaults> {
         let (config, faults) = match load(path) {
             Ok(config) => (Some(config), Vec::new()),
@@ -51,7 +52,7 @@ impl PartialConfig {
         }
     }
 
-    /// The configured signals that are found.
+    /// The configured signals that were found in the DBC files and diagnostic answers.
     pub(crate) fn signals(&self) -> Vec<ResolvedSignal<'_>> {
         signals::resolve(&self.raw, &self.databases)
     }

@@ -23,7 +23,7 @@ pub(crate) enum ValueRange {
     NotEmpty,
 }
 
-/// The range of every threshold, in the unit of its rule. No sensible threshold is outside this range.
+/// The range of alarm thresholds and of the factors and offsets of signals. No sensible value is outside this range.
 const WIDEST: ValueRange = ValueRange::Between(-1e9, 1e9);
 
 /// The range of a key with physical bounds.
@@ -65,12 +65,12 @@ pub(crate) enum ValueFault {
     Range(Range<usize>),
 }
 
-/// Returns `found`, or a type fault at the value.
+/// Returns the contents of `found`. If `found` is `None`, returns a type fault at the position of `value`.
 pub(crate) fn typed<T>(value: &Spanned<DeValue<'_>>, found: Option<T>) -> Result<T, ValueFault> {
     found.ok_or_else(|| ValueFault::Type(value.span()))
 }
 
-/// Returns `found`, or a range fault at the value.
+/// Returns the contents of `found`. If `found` is `None`, returns a range fault at the position of `value`.
 pub(crate) fn in_range<T>(value: &Spanned<DeValue<'_>>, found: Option<T>) -> Result<T, ValueFault> {
     found.ok_or_else(|| ValueFault::Range(value.span()))
 }
@@ -140,7 +140,7 @@ impl Key {
         }
     }
 
-    /// The meaning of the key in one sentence, without its full stop.
+    /// The first sentence of the key's meaning, without its full stop.
     fn meaning(&self) -> &'static str {
         let about = self.about.trim();
         about.split_once(". ").map_or(about, |(first, _)| first).trim_end_matches('.')
@@ -181,7 +181,8 @@ pub(crate) struct TableReader<'a> {
 }
 
 impl TableReader<'_> {
-    /// Returns the value of `key` or its default. Returns `None` and reports a fault if the value is faulty.
+    /// Returns the value of `key` or its default. Returns `None` if the value is faulty (reported) or if a required key
+    /// is missing (reported unless the table is `broken`).
     pub(crate) fn setting<T: Setting>(&self, key: &Key) -> Option<T> {
         let Some(value) = self.table.and_then(|table| table.get(key.name)) else {
             return self.absent(key);

@@ -1,5 +1,5 @@
-//! Reads the declared tables of a document. An unknown key is a fault; the fault suggests the known key with the most
-//! similar name.
+//! Reads the declared tables of a document. An unknown key is a fault. The fault suggests the known key with the most
+//! similar name, or lists all known keys if no name is similar.
 
 use std::collections::BTreeSet;
 
@@ -19,7 +19,7 @@ pub(crate) struct SchemaReader<'a> {
 }
 
 impl<'a> SchemaReader<'a> {
-    /// Creates a reader and reports the unknown keys of the document.
+    /// Creates a reader. Reports the unknown keys of the document, and values where a table must be.
     pub(crate) fn new(document: &'a Document<'a>, known: &[SectionInfo]) -> Self {
         let mut walk = Self { document, broken: document.broken };
         walk.refuse_unknown("", "", document.root(), known);

@@ -151,7 +151,7 @@ macro_rules! section {
 }
 pub(crate) use section;
 
-/// The field type in [`tables!`]: a list for a repeatable table.
+/// The type of a table's field in the struct of [`tables!`]: a list for a repeatable table, else an `Option`.
 macro_rules! table_field {
     (many $section:ty) => { Vec<$section> };
     ($kind:ident $section:ty) => { Option<$section> };
@@ -205,7 +205,7 @@ macro_rules! tables {
                 self.written.get(S::PATH).copied().unwrap_or_default()
             }
 
-            /// Place of each table.
+            /// Place of each table that was read without a fault.
             pub(crate) fn places(&self) -> impl Iterator<Item = &$crate::config::document::TablePlace> {
                 std::iter::empty() $( .chain(self.$field.iter().map(|keys| &keys.place)) )+
             }

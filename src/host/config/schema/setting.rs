@@ -7,7 +7,7 @@ use toml::de::{DeInteger, DeValue};
 
 use super::key::{Setting, ValueFault, ValueRange, in_range, typed};
 
-/// Maximum number of entries in a list of numbers. No pack has more cells.
+/// Maximum count of numbers in a [`NumberRange`]. No pack has more cells.
 const MAX_ROW: usize = 2048;
 
 impl<T: Setting> Setting for Option<T> {
@@ -129,7 +129,7 @@ impl Setting for NumberRange {
     }
 }
 
-/// Declares that the values of an enum are the allowed words of a key.
+/// Makes an enum the type of a key, and declares the allowed words with the value that each word stands for.
 macro_rules! choice {
     ($type:ty { $($word:literal => $value:expr),+ $(,)? }) => {
         impl $crate::config::schema::Setting for $type {

@@ -62,7 +62,7 @@ impl RawTables {
         !self.broken && self.interfaces.len() == self.count::<Interface>()
     }
 
-    /// Reports `text` about the table at `place`, or about the whole file if the table could not be read.
+    /// Reports `text` at the table `place`, or at line 1 of the file if the table could not be read.
     pub(crate) fn note(&self, place: Option<&TablePlace>, text: &str) {
         match place {
             Some(place) => self.faults.add_at(&place.at, text),
@@ -70,7 +70,7 @@ impl RawTables {
         }
     }
 
-    /// Rated capacity of one of the pack's own cells, Ah: from the configuration, else from the cell model.
+    /// Rated capacity of one cell that is not in a `[[pack.module]]`, Ah: from `[pack]`, else from the cell model.
     pub(crate) fn rated_ah(&self, model: Option<&CellModel>) -> Option<f64> {
         let configured = self.pack.as_ref().and_then(|pack| pack.rated_capacity_ah);
         configured.or(model.map(|model| model.rated_capacity_ah))
@@ -97,7 +97,8 @@ impl RawTables {
     }
 
     /// Returns the interface of a table that uses exactly one interface. Returns `None` and reports a fault if the name
-    /// is unknown, or if no name is given although there are several interfaces.
+    /// is unknown, or if no name is given although there are several interfaces. If an `[[interface]]` is faulty or
+    /// all are missing, only that fault is reported.
     pub(crate) fn one_bus(&self, interface: Option<&str>, place: &TablePlace) -> Option<BusIndex> {
         let is_clear = interface.is_some() || self.distinct_interfaces().len() <= 1;
         let bus = self.bus_of(interface).filter(|_| is_clear);
@@ -123,7 +124,7 @@ impl RawTables {
         names
     }
 
-    /// Reports, at the key `fd` of a frame's table, each interface of the frame that has no FD.
+    /// Reports a fault at the key `fd` of a frame's table for each of `buses` on which `fd = true` is not set.
     pub(crate) fn check_fd(&self, place: &TablePlace, buses: &[BusIndex]) {
         let interfaces = buses.iter().filter_map(|bus| self.interfaces.get(bus.index()));
         for interface in interfaces.filter(|interface| !interface.fd) {

@@ -43,7 +43,7 @@ fn pattern_matches_cells_across_answers() {
     let data = [0, 0, 0, 0, 180, 0, 255];
     let wanted = [(cell(0), Ok(3.6)), (cell(1), Err(Fault::OutOfRange)), (cell(2), Err(Fault::OutOfRange))];
     assert_eq!(readings(first, &data), wanted, "values are never clamped");
-    // Ten bits that start at bit 5 of the second byte: 0b0101_101000 = 360.
+    // The lower four bits of the second byte and the upper six of the third: 0b0101_101000 = 360.
     assert_eq!(readings(second, &[0xFF, 0b1111_0101, 0b1010_0011]), [(cell(3), Ok(3.6))]);
     assert_eq!(readings(second, &[0, 0xFF, 0xFF]), [(cell(3), Err(Fault::NotAvailable))]);
     assert_eq!(readings(second, &[0, 0xFF]), [(cell(3), Err(Fault::ShortFrame))]);

@@ -1,5 +1,5 @@
-//! Tests the control socket with good and bad clients. Each client is answered or dropped, and no client blocks the
-//! daemon's loop or another client.
+//! Tests the control socket with well-behaved and misbehaving clients. Each client is answered or dropped, and no
+//! client blocks the daemon's loop or another client.
 
 use std::path::{Path, PathBuf};
 
@@ -26,7 +26,7 @@ fn done(changed: u32) -> Answer {
     })
 }
 
-/// Starts a server whose loop answers every request with the number of requests received.
+/// Starts a server, and a loop that answers every request with the number of requests received so far.
 async fn serve(folder: &TempDir) -> (ControlServer, PathBuf) {
     serve_patiently(folder, MAX_SILENCE).await
 }

@@ -1,12 +1,12 @@
-//! Converts the digits of a candump line several bytes at a time. The functions use lanes of a `u64` (first byte
-//! lowest), or loops that compile to vector instructions.
+//! Converts the digits of a candump line several bytes at a time. Some functions treat a `u64` as eight lanes of one
+//! byte each, with the first byte of the text in the lowest lane. Others use loops that compile to vector instructions.
 
 /// A word with 1 in every byte. `HIGHS` has the highest bit of every byte.
 const ONES: u64 = 0x0101_0101_0101_0101;
 const HIGHS: u64 = 0x80 * ONES;
 
-/// Values of the hex digits. The value of any other character is larger than any number that the parser reads with
-/// these digits.
+/// Value of each hex digit. The value of any other character is so large that an identifier computed from it is out of
+/// range.
 pub(super) static HEX: [u32; 256] = {
     let mut table = [u16::MAX as u32; 256];
     let mut digit = 0;
@@ -37,7 +37,8 @@ pub(super) fn eight_digits(text: u64) -> Option<i64> {
     lanes(text ^ (u64::from(b'0') * ONES), 0x76 * ONES).map(number::<1>)
 }
 
-/// Returns `lanes` unchanged; `None` = a lane is 0x80 or more, either before or after `wrong` is added.
+/// Returns `lanes` unchanged if all lanes are valid; `None` = a lane is 0x80 or more, either before or after `wrong` is
+/// added. The caller chooses `wrong` so that adding it raises every lane above the largest valid value to 0x80 or more.
 #[inline(always)]
 fn lanes(lanes: u64, wrong: u64) -> Option<u64> {
     ((lanes | lanes.wrapping_add(wrong)) & HIGHS == 0).then_some(lanes)
@@ -52,15 +53,15 @@ fn number<const UNIT: u64>(digits: u64) -> i64 {
     (fours.wrapping_mul((10_000 * UNIT) << 32 | UNIT) >> 32).cast_signed()
 }
 
-/// Converts sixteen hex digits to eight bytes, first byte lowest. Every step is a loop over sixteen bytes, which
-/// compiles to one vector instruction.
+/// Converts sixteen hex digits to eight bytes, first byte lowest; `None` = a character is not a hex digit. Each
+/// operation in the loop over the sixteen bytes compiles to one vector instruction.
 #[inline(always)]
 pub(super) fn eight_hex_bytes(text: [u8; 16]) -> Option<u64> {
     let (mut values, mut wrong) = ([0; 16], [0; 16]);
     for ((&byte, value), wrong) in text.iter().zip(&mut values).zip(&mut wrong) {
         // The value is 0 to 9 for a digit and at least 16 for any other character.
         let digit = byte.wrapping_add(0xFF - b'9').saturating_sub(6).wrapping_sub(0xF0);
-        // The value is 10 to 15 for a letter of a hex digit and at least 16 for any other character.
+        // The value is 10 to 15 for the letters A to F in either case, and at least 16 for any other character.
         let letter = (byte & 0xDF).wrapping_sub(b'A').saturating_add(10);
         *value = digit.min(letter);
         *wrong = *value & 0xF0;

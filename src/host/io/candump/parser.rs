@@ -1,7 +1,7 @@
 //! Parses candump lines.
 //!
 //! In: text that begins with a line; the parser ignores what follows the line feed. Out: the line, or the first
-//! violation of the grammar. Nothing is allocated and nothing is read twice. Nearly all lines have the same whole
+//! violation of the grammar. The parser allocates no memory while it reads lines. Nearly all lines have the same whole
 //! seconds as the previous line, a known interface, and a payload of eight bytes. These three parts have fast paths,
 //! which convert several bytes at a time.
 
@@ -48,8 +48,8 @@ impl Interface {
 #[derive(Debug, Clone)]
 pub struct LineParser {
     interfaces: Vec<Interface>,
-    /// The first twelve bytes of the previous line (a stamp of ten digits, up to the decimal point) as two overlapping
-    /// words.
+    /// The first twelve bytes of the latest line whose stamp has ten digits of seconds: `(`, the digits and the decimal
+    /// point, as two overlapping words.
     head: [u64; 2],
     /// The whole seconds that `head` encodes, ns.
     second_ns: i64,
@@ -70,8 +70,8 @@ pub struct ParsedLine<'a> {
 pub(crate) struct LineHead<'a> {
     pub time: Timestamp,
     pub interface: &'a [u8],
-    /// Number of the interface if the parser knows its name. The number is always `None` if the name has more than
-    /// seven bytes or follows more than one space.
+    /// Number of the interface if the parser knows its name. The number is `None` if the name has more than seven
+    /// bytes, and may be `None` if the name follows more than one space.
     pub bus: Option<BusIndex>,
     /// The rest of the line.
     pub rest: Cursor<'a>,
@@ -140,7 +140,8 @@ impl LineParser {
     fn other_stamp(&mut self, mut cursor: Cursor<'_>) -> Result<(Timestamp, usize), LineError> {
         let time = cursor.stamp()?;
         let (text, second_ns) = (cursor.text, time.nanos() - time.nanos().rem_euclid(1_000_000_000));
-        // A stamp is remembered only if it has ten digits and adding a fraction of a second cannot overflow.
+        // A stamp is remembered only if it is not negative, has ten digits of seconds, and cannot overflow when a
+        // fraction of a second is added.
         if text.get(11) == Some(&b'.') && text.get(1) != Some(&b'-') && second_ns.checked_add(1_000_000_000).is_some() {
             (self.head, self.second_ns) = ([word(text, 0), word(text, 4)], second_ns);
         }
@@ -169,8 +170,8 @@ impl LineParser {
     }
 }
 
-/// Parses the fraction of a ten-digit stamp. Returns the fraction in nanoseconds, with the length of the stamp and the
-/// space after it.
+/// Parses the fraction of a stamp with ten digits of seconds. Returns the fraction in nanoseconds, and the length of
+/// the stamp with the space after it.
 #[inline(always)]
 fn fraction(text: &[u8; 24]) -> Option<(i64, usize)> {
     if text[18] == b')' {
@@ -233,7 +234,7 @@ impl<'a> Cursor<'a> {
         self.text.get(self.at + offset).map_or(u32::MAX, |&b| HEX[usize::from(b)])
     }
 
-    /// Parses `(` seconds `.` six or nine digits `)`; the result is in nanoseconds. A minus sign is accepted because
+    /// Parses `(` seconds `.` six or nine digits `)`. A minus sign before the seconds is accepted, because
     /// [`super::write_stamp`] writes one for times before the clock's origin.
     pub(super) fn stamp(&mut self) -> Result<Timestamp, LineError> {
         self.demand(b'(', "a stamp in parentheses")?;

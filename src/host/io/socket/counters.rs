@@ -1,4 +1,5 @@
-//! Counters of a link since the program's start. The link's task writes the counters, and other tasks read them.
+//! Counters of a link since the program's start. The link's task and the sending end write the counters, and other
+//! tasks read them.
 
 use std::sync::{Mutex, PoisonError};
 

@@ -28,13 +28,14 @@ use crate::quantity::{BusIndex, Timestamp};
 
 /// First pause before an interface that is down or missing is checked again.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
-/// Longest pause before such a check. A check costs a few system calls, but frames that arrive before the check are
-/// lost.
+/// Longest pause before such a check. A check costs a few system calls. If a missing interface returns, frames that
+/// arrive before the check are lost.
 const LONGEST_PAUSE: Duration = Duration::from_secs(1);
 /// Number of frames read before other tasks run. A full 1 Mbit/s bus sends this many frames in 8 ms, which is less than
 /// one tick of the daemon (10 ms).
 const READ_BATCH: usize = 64;
-/// Maximum number of frames that wait to be sent, many times the number of status, health and alarm frames per second.
+/// Maximum number of frames that wait to be sent. With default periods, the status, health, digest and alarm frames of
+/// one second are fewer, even in an alarm flood (at most 100 alarm frames a second).
 const SEND_QUEUE: usize = 256;
 
 /// Settings of a link.
@@ -85,7 +86,7 @@ impl LinkOutput {
     }
 }
 
-/// Why a socket is no longer used.
+/// Why the link stops using a socket.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum ServiceEnd {
     /// The daemon stops.
@@ -106,7 +107,8 @@ pub struct Link {
     state: LinkState,
     /// Time of the latest change of the state.
     state_since: Timestamp,
-    /// Number of frames lost since the last report, in the kernel or because the daemon's inbox was full.
+    /// Number of frames lost since the last report: dropped by the kernel, malformed, or dropped because the daemon's
+    /// inbox was full.
     lost: u64,
     report: Interval,
     pause: Duration,
@@ -259,7 +261,8 @@ impl Link {
         }
     }
 
-    /// Reads until the socket is empty, and yields to other tasks. Returns `false` if the socket is dead.
+    /// Reads until the socket is empty. After every [`READ_BATCH`] frames, other tasks run. Returns `false` if the
+    /// socket is dead.
     async fn receive_all(&mut self, open: &mut OpenSocket) -> bool {
         loop {
             for _ in 0..READ_BATCH / CALL_BATCH {
@@ -318,7 +321,7 @@ impl Link {
         }
     }
 
-    /// Adds the frames that the kernel dropped since the last call.
+    /// Counts the frames that the kernel has dropped since the last call.
     fn note_dropped(&mut self, open: &mut OpenSocket) {
         let total = open.socket.get_ref().dropped_total();
         let dropped = u64::from(total.wrapping_sub(std::mem::replace(&mut open.dropped_total, total)));
@@ -329,7 +332,7 @@ impl Link {
     /// Sends the waiting frame if there is room. Returns `false` if the socket is dead.
     async fn send_pending(&mut self, open: &mut OpenSocket) -> bool {
         let Some(outgoing) = open.pending.take() else { return true };
-        // A frame that has waited this long is outdated and is dropped.
+        // If the interface is not up, or the frame has waited so long that it is outdated, the frame is dropped.
         let useless = self.state != LinkState::Up || outgoing.since.elapsed() > Duration::from_millis(500);
         let result = if useless { Err(Errno::ENETDOWN) } else { open.socket.get_ref().send(&outgoing.frame) };
         match result {

@@ -1,11 +1,12 @@
 //! Sends and receives on SocketCAN interfaces, for the daemon and for commands.
 //!
 //! * [`CanSender`]: a blocking sender for `replay --to` and `simulate --to`:
-//!   `CanSender::open("vcan0", fd)?`, then `sender.send(&frame)?`, which waits for a full transmit queue up to a limit.
+//!   `CanSender::open("vcan0", fd)?`, then `sender.send(&frame)?`. If the transmit queue is full, `send` waits up to a
+//!   limit.
 //! * `PassiveSocket`: receives everything on an interface for `doctor`, or frames of some identifiers for `test-alarm`.
 //! * `Link`: the daemon's task for one interface. It receives, sends, and survives every state of the interface.
 //!
-//! These types use two layers: `raw` is one socket, and `wire` converts the kernel's frame layouts from and to bytes.
+//! These types use two layers: `raw` is one socket, and `wire` converts frames to and from the kernel's byte layouts.
 
 mod counters;
 mod link;

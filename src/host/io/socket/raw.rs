@@ -1,9 +1,9 @@
 //! One SocketCAN raw socket. The filters are set before the socket is bound, so the socket receives only wanted
 //! identifiers. One system call reads several frames with their stamps. Writing does not block.
 //!
-//! The kernel's drop counter is read separately, for two reasons. The control message of a frame contains the counter
-//! only after a later frame was received. In addition, the size of the control message changes with the first drop (see
-//! [`Slots`]).
+//! The kernel's drop counter is read separately, for two reasons. First, the control message of a frame contains only
+//! the drops before that frame, so the latest drops stay invisible until another frame arrives. Second, the first drop
+//! changes the size of the control message (see [`Slots`]).
 
 use std::cell::RefCell;
 use std::io::{self, IoSliceMut};
@@ -23,9 +23,9 @@ use super::wire::{self, FD_BYTES, Wire};
 use crate::can::{CanId, Frame};
 use crate::io::clock::{KernelStamps, nanos};
 
-/// Size of the receive buffer to request, bytes. The buffer holds about 2,700 frames, because the kernel counts 768
-/// bytes per frame including its bookkeeping. A full 1 Mbit/s bus sends that many in a third of a second. The kernel
-/// limits the size to net.core.rmem_max.
+/// Size of the receive buffer to request, bytes. The kernel doubles the requested size and counts 768 bytes per frame,
+/// so the buffer holds about 2,700 frames. A full 1 Mbit/s bus sends that many in a third of a second. The kernel
+/// limits the requested size to net.core.rmem_max.
 pub const DEFAULT_RECEIVE_BUFFER_BYTES: usize = 1 << 20;
 
 /// Maximum number of frames read in one system call. With 16 frames, the call itself no longer dominates the cost of a

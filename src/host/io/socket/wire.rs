@@ -36,7 +36,7 @@ pub(super) enum Wire {
     Malformed,
 }
 
-/// Decodes the bytes that `recvmsg` returned.
+/// Decodes the bytes of one frame that the kernel returned.
 pub(super) fn decode(bytes: &[u8]) -> Wire {
     if bytes.len() != CLASSIC_BYTES && bytes.len() != FD_BYTES {
         return Wire::Malformed;

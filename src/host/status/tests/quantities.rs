@@ -16,7 +16,7 @@ The quantities that packwatch publishes for the pack and for each cell. This pag
 * [MQTT](../operations/mqtt.md) and [VSS](vss.md): fractions are sent as percent, and a positive current charges the battery. Values of cells are sent as arrays.
 ";
 
-/// A table of one owner's quantities.
+/// The table of the quantities of `owner`, which is the pack or a cell.
 fn table(
     title: &str,
     owner: &str,

@@ -20,8 +20,8 @@ use crate::status::document::{
     PollStatus, StatusCount, StatusCounters, StatusDocument, StoreStatus, VERSION,
 };
 
-/// The document of a pack. If the pack has several cells, the last cell sends no data, and the estimate of the
-/// second-last cell is untrusted.
+/// The document of a pack. If the pack has two or more cells, the last cell sends no data. If the pack has three or
+/// more cells, the estimate of the second-last cell is untrusted.
 pub(crate) fn sample(cells: u16) -> StatusDocument {
     let mut latency = Latency::default();
     [40e-6, 80e-6, 80e-6, 300e-6, 3e-3].into_iter().for_each(|seconds| latency.record(seconds));

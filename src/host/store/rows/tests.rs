@@ -60,7 +60,7 @@ pub(in crate::store) fn remaining_life(cycles: f64) -> EventKind {
     }
 }
 
-/// A model learned on board with this capacity; `None` = a return to the model from the label.
+/// A learned cell model with this capacity; `None` = the daemon returns to the model made from the cell's label.
 pub(in crate::store) fn model(capacity_ah: Option<f64>) -> EventKind {
     EventKind::Model {
         state: capacity_ah.map_or(ModelState::Prior, |_| ModelState::Learning),

@@ -18,12 +18,12 @@ struct FlipCounts {
     set_aside: usize,
     /// Number of flips after which the newest state was not found.
     older: usize,
-    /// Flips after which the learned capacity was not found, nothing could be written, or the capacity was missing at
-    /// the next start.
+    /// Flips after which no undamaged state was found, nothing could be written, or the written state or the history's
+    /// rows were missing at the next start.
     failed: Vec<(&'static str, usize, String)>,
 }
 
-/// The undamaged store: a replayed day of one cell, as left by a daemon.
+/// The undamaged store after the replay of a log of one cell.
 struct Reference {
     files: Vec<(&'static str, Vec<u8>)>,
     /// The states in the files, newest first.
@@ -64,7 +64,7 @@ impl Reference {
         });
         std::fs::remove_file(state.join(newest_file.unwrap())).unwrap();
         let states = [json(&newest.snapshot), json(&stored(&state).snapshot)];
-        // The states are encoded as in the files.
+        // Writes the next state and reads it back. The test later compares it with a state that was read from a file.
         StateFiles::open(&state).0.write(document(2, 100, 1_900_000_000)).unwrap();
         let next = stored(&state);
         Self { files, states, now: document(2, 200, 1_900_000_100).stamp, next }

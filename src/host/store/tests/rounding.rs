@@ -17,7 +17,7 @@ fn numbers(value: &Value) -> Vec<f64> {
     value.as_array().unwrap().iter().map(|number| number.as_f64().unwrap()).collect()
 }
 
-/// Compares means and covariance of one filter before and after.
+/// Compares the means and the covariance of one filter before and after the state was stored.
 fn compare(before: (&Value, &Value), after: (&Value, &Value), what: &str) {
     let [mean, kept_mean] = [before.0, after.0].map(numbers);
     let [covariance, kept] = [before.1, after.1].map(|rows| {

@@ -1,4 +1,5 @@
-//! Finds signals in the DBC files that are not configured but can be compared with configured signals.
+//! Finds signals that the DBC files describe, that are not configured, and that can be compared with configured
+//! signals.
 //!
 //! In: the DBC files and the configured signals. Out: signals that measure the pack's voltage or a state of charge,
 //! according to their names and units. Each signal is bound to every interface, because a DBC does not state which bus
@@ -44,7 +45,7 @@ fn plan(bus: BusIndex, message: &Message, signal: &Signal, channel: Channel) -> 
     let unit = SignalUnit::parse(&signal.unit);
     let scale = match channel {
         Channel::PackVoltage => unit.map_or(1.0, |unit| unit.factor),
-        // If the unit is missing, a signal that can exceed 1.5 is in percent.
+        // A SOC with a unit is in percent. A SOC without a unit is in percent if the signal can exceed 1.5.
         _ if unit.is_some() || signal.layout.extent().1 > 1.5 => 0.01,
         _ => 1.0,
     };

@@ -131,7 +131,8 @@ pub(super) const ESTIMATES: &[Column<EstimateRow>] = &columns! { EstimateRow;
     "temperature_c" Real "degrees C" null, "temperature used", |row| real(row.estimate.measured.temperature_c);
 };
 
-/// Columns of `half_cycles`: the half-cycle, the recorded quantities after it, the losses of the cell, and its remaining life.
+/// Columns of `half_cycles`: the half-cycle, the recorded quantities after it, the losses of the cell, and its
+/// remaining life.
 pub(super) static HALF_CYCLES: LazyLock<Vec<Column<HalfCycleRow>>> = LazyLock::new(|| {
     let half_cycle = columns! { HalfCycleRow;
         "log" Word "", "name of the log and of its folder", |row| text(&row.log);

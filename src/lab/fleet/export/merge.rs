@@ -1,10 +1,10 @@
-//! Merges the tables of vehicles from several runs into one Parquet file per table. Vehicles are sorted by name; each has its own row
-//! groups.
+//! Merges the tables of vehicles from several runs into one Parquet file per table. Vehicles are sorted by name; each
+//! has its own row groups.
 //!
-//! Input: folders written by [`run`](crate::fleet::vehicles::run). Output: `vehicles.parquet` with a row for each vehicle, including
-//! vehicles that failed; `half_cycles.parquet`; `alarms.parquet`; and, if estimates were exported, `estimates.parquet`. The bytes do
-//! not depend on how the vehicles were distributed or in which order they were replayed. Column chunks are copied, so memory does not
-//! grow with the number of rows.
+//! Input: folders written by [`run`](crate::fleet::vehicles::run). Output: `vehicles.parquet` with a row for each
+//! vehicle, including vehicles that failed; `half_cycles.parquet`; `alarms.parquet`; and, if estimates were exported,
+//! `estimates.parquet`. The bytes do not depend on which machine replayed a vehicle or on the order of the replays.
+//! Column chunks are copied, so memory does not grow with the number of rows.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -35,8 +35,8 @@ struct VehicleFolder {
 /// Merges the vehicles in `folders` into `out`. `wanted` lists the expected vehicles; any other vehicle is an error.
 ///
 /// # Errors
-/// A vehicle is missing, is incomplete, is found twice with different contents, or was replayed by another version or
-/// with another period of estimates. A table cannot be read or written.
+/// A vehicle is missing, unexpected or incomplete, or is found twice with different contents. Vehicles were replayed by
+/// different versions or with different periods of estimates. A table cannot be read or written.
 pub fn merge(folders: &[PathBuf], wanted: Option<&[Vehicle]>, out: &Path) -> Result<MergeSummary, LabError> {
     let vehicles = read_all(folders)?;
     check(&vehicles, wanted)?;

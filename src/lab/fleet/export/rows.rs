@@ -16,7 +16,7 @@ pub(super) struct EstimateRow {
     pub(super) estimate: Estimate,
 }
 
-/// A half-cycle of a cell, the estimates after it, and its remaining life.
+/// A half-cycle of a cell, what was learned from the half-cycle, and the remaining life of the cell.
 pub(super) struct HalfCycleRow {
     pub(super) log: Arc<str>,
     pub(super) time: Timestamp,
@@ -26,7 +26,7 @@ pub(super) struct HalfCycleRow {
     pub(super) half: Fields,
     /// Values of the event `Capacity`.
     pub(super) capacity: Fields,
-    /// Losses of the cell; `None` = unknown.
+    /// Lithium and active material that the cell has lost; `None` = unknown.
     pub(super) losses: Option<LossModes>,
     /// Remaining life of the cell; `None` = there are not enough data.
     pub(super) remaining: Option<RemainingLife>,

@@ -1,7 +1,8 @@
 //! Writes a table of rows as a Parquet or CSV file.
 //!
 //! Input: rows, and the metadata of the file. Memory holds the rows of one row group. The file gets its final name when
-//! it is complete ([`ResultFile`]). A value that is missing or has the wrong type causes an error and is never written.
+//! it is complete ([`ResultFile`]). In a Parquet file, a required value that is missing, or a value of the wrong type,
+//! causes an error and is never written.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -37,7 +38,7 @@ enum TableWriter {
     Parquet { out: Box<SerializedFileWriter<ResultFile>>, group: Vec<ColumnBuffer>, rows: usize },
 }
 
-/// Values of one column in the present row group, and which rows have a value.
+/// Values of one column in the unfinished row group, and which rows have a value.
 struct ColumnBuffer {
     present: Vec<i16>,
     list: ColumnValues,
@@ -82,7 +83,7 @@ impl<R> TableFile<R> {
     /// Writes a row.
     ///
     /// # Errors
-    /// The row cannot be written, or a value has the wrong type for its column.
+    /// The row cannot be written, or (in a Parquet file) a value is missing or has the wrong type for its column.
     pub(super) fn push(&mut self, row: &R) -> Result<(), LabError> {
         self.rows += 1;
         match &mut self.writer {
@@ -135,7 +136,8 @@ impl<R> TableFile<R> {
     }
 }
 
-/// Copies the row groups of Parquet files with these columns into one file, in order. Returns the number of rows.
+/// Copies the row groups of Parquet files into one file, in order. The files must have these columns. Returns the
+/// number of rows.
 ///
 /// # Errors
 /// A file cannot be read or written, or has other columns.

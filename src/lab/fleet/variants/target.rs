@@ -134,7 +134,7 @@ fn alarms_of(root: &mut Table, rule: Rule) -> impl Iterator<Item = &mut Table> {
     alarms.filter(move |alarm| rule_of(alarm) == Some(rule.name())).filter_map(Value::as_table_mut)
 }
 
-/// Returns the most severe level of a rule in the configuration.
+/// Returns the most severe level that the configuration sets for a rule.
 fn gravest(root: &Table, rule: Rule) -> Result<&'static str, String> {
     let alarms = root.get("alarm").and_then(Value::as_array).into_iter().flatten();
     let of_rule: Vec<&Value> = alarms.filter(|alarm| rule_of(alarm) == Some(rule.name())).collect();

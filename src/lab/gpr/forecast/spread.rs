@@ -1,15 +1,17 @@
-//! Calibrates the local width of an interval on forecasts whose errors are known (judged forecasts).
+//! Calibrates the local width of an interval on forecasts whose errors are known. The window of such a forecast is
+//! called a judged window.
 //!
-//! The errors of a cell's voltage are tiny during a charge at constant voltage and large at the end of a discharge. One factor for all
-//! windows would be right on average and wrong everywhere. The width is therefore computed in three steps:
+//! The errors of a cell's voltage are tiny during a charge at constant voltage and large at the end of a discharge.
+//! With one factor for all windows, the interval would be too wide in the charge and too narrow at the end of the
+//! discharge. The width is therefore computed in three steps:
 //!
 //! * ratio = |error| / standard deviation, for every judged window.
-//! * spread of a window = (sum of the ratios of its n nearest judged windows + k m) / ((n + k) m), where m is the mean of all ratios
-//!   and k is [`SHRINKAGE`].
-//! * factor = 95 % quantile of ratio / spread over all judged windows. The spread of a judged window is computed here without this
-//!   window and the windows that overlap it.
+//! * spread of a window = (sum of the ratios of its n nearest judged windows + k m) / ((n + k) m), where m is the mean
+//!   of all ratios and k is [`SHRINKAGE`].
+//! * factor = 95 % quantile of ratio / spread over all judged windows. The spread of a judged window is computed here
+//!   without this window and the windows that overlap it.
 //!
-//! Half of the interval at a window is factor x spread x standard deviation.
+//! Half the width of the interval at a window is factor x spread x standard deviation.
 
 use crate::regress::GAUSSIAN;
 
@@ -17,8 +19,8 @@ use crate::regress::GAUSSIAN;
 const NEAR: usize = 20;
 /// Weight of the mean of all ratios relative to one window.
 const SHRINKAGE: f64 = 4.0;
-/// If there are fewer judged windows, the interval has the same width everywhere. The interval is then at least as wide
-/// as the interval of a normal distribution.
+/// If there are fewer judged windows, all windows have the same spread, and the interval is at least as wide as the
+/// interval of a normal distribution.
 const FEWEST: usize = 100;
 
 /// Judged windows.
@@ -38,8 +40,8 @@ pub(super) struct Spread {
 }
 
 impl Spread {
-    /// Calibrates on judged windows, given by their rows (rising), features and ratios. Windows overlap if they are less than `overlap`
-    /// rows apart.
+    /// Calibrates on judged windows, given by their rows (rising), features and ratios. Windows overlap if they are
+    /// less than `overlap` rows apart.
     pub(super) fn new(rows: Vec<usize>, features: &[f64], ratios: Vec<f64>, overlap: usize) -> Self {
         let count = rows.len();
         let width = features.len().checked_div(count).unwrap_or(0);
@@ -60,7 +62,7 @@ impl Spread {
         self.rows.len()
     }
 
-    /// Returns half of the interval at a window, in standard deviations.
+    /// Returns half the width of the interval at a window, in standard deviations.
     pub(super) fn half_width(&self, features: &[f64]) -> f64 {
         if self.rows.len() < FEWEST {
             return self.factor;
@@ -68,8 +70,8 @@ impl Spread {
         self.factor * self.at(&scaled(features, &self.units), None)
     }
 
-    /// Returns the spread of a window with scaled features. With `but` = (row, overlap), windows that overlap the window at this row
-    /// are left out.
+    /// Returns the spread of a window with scaled features. With `but` = (row, overlap), windows that overlap the
+    /// window at this row are left out.
     fn at(&self, window: &[f64], but: Option<(usize, usize)>) -> f64 {
         if self.rows.len() < FEWEST || self.mean <= 0.0 {
             return 1.0;
@@ -101,8 +103,8 @@ fn deviation<'a>(values: impl Iterator<Item = &'a f64> + Clone) -> f64 {
     if deviation > 1e-12 * mean.abs() { deviation } else { 1.0 }
 }
 
-/// Returns the 95 % quantile, corrected for small samples. If there are few ratios, chance could make the interval too narrow. The
-/// result is then at least the value of a normal distribution.
+/// Returns the 95 % quantile, corrected for small samples. If there are few ratios, chance could make the interval too
+/// narrow. The result is then at least the value of a normal distribution.
 fn factor(mut ratios: Vec<f64>) -> f64 {
     ratios.sort_by(f64::total_cmp);
     let rank = ((ratios.len() + 1) as f64 * 0.95).ceil() as usize;

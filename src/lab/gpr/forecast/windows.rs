@@ -1,5 +1,5 @@
-//! Finds the rows of a table that have a lag window. The lag window of a row has, for each column, the value and the latest
-//! differences.
+//! Finds the rows of a table that have a lag window. The lag window of a row has, for each column, the value and the
+//! latest differences.
 
 use super::super::ColumnTable;
 
@@ -9,7 +9,7 @@ pub struct LagWindows<'a> {
     table: &'a ColumnTable,
     columns: usize,
     lags: usize,
-    /// For each row, the first row of its part, and the first row after its part.
+    /// For each row, the first row of its part (an independent section of the table), and the first row after its part.
     part: Vec<(usize, usize)>,
 }
 
@@ -23,7 +23,8 @@ pub struct RowSpacing {
 }
 
 impl RowSpacing {
-    /// Returns the steps of a column within the parts of the table; `None` = there are no steps or no times.
+    /// Returns the steps of a time column within the parts of the table; `None` = no two consecutive rows of a part
+    /// have times.
     pub fn of(table: &ColumnTable, column: usize) -> Option<Self> {
         let times: Vec<f64> = table.column(column).collect();
         let steps = (1..times.len()).filter(|row| table.parts.binary_search(row).is_err());
@@ -80,7 +81,8 @@ impl<'a> LagWindows<'a> {
         self.value(row + steps, column) - self.value(row, column)
     }
 
-    /// Returns the windows of rows, one after the other: for every column the value, then the differences, the latest first.
+    /// Returns the windows of rows, one after the other: for every column the value, then the differences, the latest
+    /// first.
     pub fn features(&self, rows: &[usize]) -> Vec<f64> {
         let mut all = Vec::with_capacity(rows.len() * self.width());
         for &row in rows {

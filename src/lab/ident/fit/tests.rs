@@ -16,7 +16,7 @@ fn scatter(k: usize) -> f64 {
     x - x.floor() - 0.5
 }
 
-/// A current at 1 Hz that changes every 40 s, with rests. The current takes out 1.9 Ah in two hours.
+/// Current, sampled at 1 Hz. It changes every 40 s, includes rests, and takes out 1.9 Ah in two hours.
 fn currents() -> Vec<f64> {
     let level = |k: usize| match (k / 40) % 5 {
         0 => 0.0,
@@ -28,7 +28,7 @@ fn currents() -> Vec<f64> {
     (0..7200).map(|k| level(k) + 0.02 * scatter(k / 40)).collect()
 }
 
-/// A record of `model` at `temperature_c`, with `noise_v` on the voltage.
+/// Simulates a record of `model` at `temperature_c`. The voltage has noise between -`noise_v` and `noise_v`.
 fn simulate(model: &CellModel, temperature_c: f64, noise_v: f64, grid: &Grid) -> Record {
     let current_a = currents();
     let time_s: Vec<f64> = (0..current_a.len()).map(|k| k as f64).collect();
@@ -174,7 +174,7 @@ fn ocv_rises_where_the_data_fall() {
     let grid = grid();
     let mut records = vec![simulate(&truth(), 25.0, 0.0, &grid)];
     for row in &mut records[0].rows {
-        // The measured voltage bends down by more than the curve rises.
+        // Above SOC 0.6, the measured voltage loses 0.8 V per unit of SOC, almost the whole rise of the curve.
         row.voltage_v -= 0.8 * (row.soc - 0.6).max(0.0);
     }
     let fitted = fit(&settings(grid), &records, &[1.0], |_, _| {}).expect("a fit");

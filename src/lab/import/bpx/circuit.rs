@@ -1,4 +1,5 @@
-//! Computes the resistances and branches of a BPX cell. The cell's equations have these closed solutions for small currents:
+//! Computes the resistances and branches of a BPX cell. The cell's equations have these closed solutions for small
+//! currents:
 //!
 //! | part | resistance | time constant | source |
 //! | --- | --- | --- | --- |
@@ -8,10 +9,11 @@
 //! | concentration of the electrolyte | `2 R T (1 - t)^2 / (F^2 A c) (L_n / 3 D_n + L_s / D_s + L_p / 3 D_p)` | `sum(L / D) sum(e L) / pi^2` | the same; slowest mode of a layer without exchange at its ends |
 //! | diffusion in a particle, each electrode | `abs(dU/dx) r / (5 D F c_max S)` | `r^2 / 35 D` | sphere under constant flux; first moment of its step response |
 //!
-//! `S` is the surface of all particles, `A` the area of all electrode pairs; `k` and `D` of a layer are the values of
-//! the electrolyte, multiplied by the transport efficiency of the layer. Each property follows Arrhenius' law with its
-//! activation energy, or with [`USUAL_J_PER_MOL`] if none is stated. Deviation: BPX has no double layer, so charge
-//! transfer has no time constant. This deviation has no effect after about 0.1 s.
+//! `S` is the surface of all particles of an electrode, `A` the area of all electrode pairs. In the row of charge
+//! transfer, `k` is the rate constant. In the rows of the electrolyte, `k` and `D` of a layer are the values of the
+//! electrolyte, multiplied by the transport efficiency of the layer. Each property follows Arrhenius' law with its
+//! activation energy, or with [`USUAL_J_PER_MOL`] if none is stated. BPX has no double layer, so charge transfer has no
+//! time constant here. After about 0.1 s, this makes no difference.
 
 use super::curve::Curve;
 use super::document::{BpxCell, Electrode, Layer, Transport};
@@ -19,11 +21,12 @@ use super::{FARADAY_C_PER_MOL, GAS_J_PER_MOL_K};
 use crate::cell::model::ACTIVATION_ENERGY_J_PER_MOL as USUAL_J_PER_MOL;
 use crate::quantity::bounds::{Bounds, CAPACITANCE_F, RESISTANCE_OHM};
 
-/// Distance in lithium content over which the slope of a potential is taken. It is wide enough that the noise of a
-/// table does not count as slope.
+/// The slope of a potential is computed between the lithium contents this far below and above. This distance is so
+/// large that the noise of a table does not count as slope.
 const SLOPE_STEP: f64 = 0.005;
 
-/// Smallest resistance, ohm, and smallest time constant, s: a flat potential gives 0, but a model needs a positive value.
+/// Smallest resistance, ohm, and smallest time constant, s: a flat potential gives 0, but a model needs a positive
+/// value.
 const LEAST: f64 = 1e-7;
 
 /// Resistances and time constants at one SOC and temperature.

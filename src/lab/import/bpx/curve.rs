@@ -1,9 +1,10 @@
 //! Computes the open-circuit voltage of a BPX cell over SOC, and the charge between its cut-offs.
 //!
-//! `u(soc, T) = u_p(y) - u_n(x) + (T - T_ref) (du_p/dT(y) - du_n/dT(x))` with the lithium contents `x` (negative) and `y` (positive).
-//! The cyclable lithium follows from the full cell in the file: the negative electrode is at its maximum, the positive at its minimum.
-//! At the reference temperature, SOC 1 has the upper cut-off voltage and SOC 0 the lower one, as in PyBaMM's ElectrodeSOH (Mohtat et
-//! al., J. Power Sources 427 (2019) 101, eqs. 5 to 8). Units: V, Ah, K.
+//! `u(soc, T) = u_p(y) - u_n(x) + (T - T_ref) (du_p/dT(y) - du_n/dT(x))` with the lithium contents `x` (negative) and
+//! `y` (positive). The cyclable lithium follows from the full cell in the file: the negative electrode has its maximum
+//! lithium content, the positive electrode its minimum. At the reference temperature, SOC 1 has the upper cut-off
+//! voltage and SOC 0 the lower one, as in PyBaMM's ElectrodeSOH (Mohtat et al., J. Power Sources 427 (2019) 101, eqs. 5
+//! to 8). Units: V, Ah, K.
 
 use super::FARADAY_C_PER_MOL;
 use super::document::{BpxCell, Electrode};

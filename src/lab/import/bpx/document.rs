@@ -1,7 +1,8 @@
 //! Reads the parameters for a cell model from the JSON of a BPX file.
 //!
-//! Input: the JSON, versions 0.x and 1.x, models SPM, SPMe and DFN. Output: [`BpxCell`], in the file's SI units. Every fault is recorded
-//! with its path in the JSON, what was found and what is allowed. Reading continues after a fault, so that all faults are reported.
+//! Input: the JSON, versions 0.x and 1.x, models SPM, SPMe and DFN. Output: [`BpxCell`], in the file's SI units. Every
+//! fault is recorded with its path in the JSON, what was found and what is allowed. Reading continues after a fault, so
+//! that all faults are reported.
 
 use serde_json::{Map, Value};
 
@@ -123,12 +124,12 @@ impl<'a> Section<'a> {
         self.keys?.get(key).filter(|value| !value.is_null())
     }
 
-    /// An object below this one that may be missing.
+    /// Returns an object below this one; it may be missing.
     fn optional(&self, key: &str) -> Self {
         Self { path: self.place(key), keys: self.get(key).and_then(Value::as_object) }
     }
 
-    /// An object below this one.
+    /// Returns an object below this one. If the object is missing, adds a fault.
     fn below(&self, key: &str, faults: &mut Vec<String>) -> Self {
         let below = self.optional(key);
         if self.keys.is_some() && below.keys.is_none() {
@@ -142,7 +143,7 @@ impl<'a> Section<'a> {
         Some(self.get(key)?.as_str()?.trim().to_owned()).filter(|text| !text.is_empty())
     }
 
-    /// A number that may be missing.
+    /// Reads a number that may be missing.
     fn optional_number(&self, key: &str, (above, most): Above, faults: &mut Vec<String>) -> Option<f64> {
         let value = self.get(key)?;
         let number = value.as_f64().filter(|number| (*number > above) && *number <= most);
@@ -186,7 +187,7 @@ impl<'a> Section<'a> {
         self.optional_function(key, faults).unwrap_or(Function::Constant(f64::NAN))
     }
 
-    /// Reads the whole cell; `None` = the file is of another kind.
+    /// Reads the whole cell; `None` = the file is not BPX, or its version or model is not supported.
     fn cell(&self, faults: &mut Vec<String>) -> Option<BpxCell> {
         if self.keys.is_none() {
             faults.push("the file does not contain a JSON object, must be BPX".to_owned());
@@ -227,7 +228,7 @@ impl<'a> Section<'a> {
         Some(cell)
     }
 
-    /// Version and model of the header.
+    /// Returns version and model from the header.
     fn kind(&self, faults: &mut Vec<String>) -> Option<(String, String)> {
         self.keys?;
         let version = match self.get("BPX") {
@@ -295,7 +296,7 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// Reads electrolyte, layers and solids; `self` is the parameterisation.
+    /// Reads electrolyte, layers and solids; `self` is the section `Parameterisation`.
     fn transport(&self, state: &Section<'_>, faults: &mut Vec<String>) -> Transport {
         let electrolyte = self.below("Electrolyte", faults);
         let separator = self.below("Separator", faults);
@@ -334,7 +335,7 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// Value of a function, which must be positive.
+    /// Returns the value of a function at `x`. The value must be positive.
     fn value_at(&self, key: &str, x: f64, faults: &mut Vec<String>) -> f64 {
         let before = faults.len();
         let value = self.function(key, faults).at(x);

@@ -1,11 +1,12 @@
-//! Parses and evaluates expressions of one variable `x` as in BPX files: a subset of Python's grammar, evaluated without Python.
+//! Parses and evaluates expressions of one variable `x` as in BPX files: a subset of Python's grammar, evaluated
+//! without Python.
 //!
 //! Input: a text with numbers, `x`, `+ - * / **`, signs, parentheses and the functions of [`FUNCTIONS`]. Output: a
-//! program for a stack machine. The program is evaluated with `libm`, so the same text gives the same bytes on every
+//! program for a stack machine. The program is evaluated with `libm`, so the same text gives the same values on every
 //! machine. As in Python, `**` is right-associative and binds more tightly than a sign before it (`-x**2` is
 //! `-(x**2)`). A fault states the column, what was found and what is allowed.
 
-/// Maximum length of a text, bytes; the longest known potential has 500 bytes.
+/// Maximum length of a text, bytes; the longest known expression of a potential has 500 bytes.
 const MAX_BYTES: usize = 20_000;
 
 /// Maximum nesting of parentheses, functions, signs and powers. Deeper nesting would exhaust the stack of the parser.
@@ -66,7 +67,7 @@ impl Expression {
         }
     }
 
-    /// Returns the value at `x`; it is NaN or infinite if the expression is.
+    /// Returns the value at `x`; it may be NaN or infinite.
     pub(super) fn at(&self, x: f64) -> f64 {
         let mut stack = Vec::with_capacity(16);
         for step in &self.0 {
@@ -86,7 +87,7 @@ impl Expression {
     }
 }
 
-/// The topmost value; a parsed program never empties the stack.
+/// Removes and returns the topmost value. A parsed program never does this with an empty stack.
 fn pop(stack: &mut Vec<f64>) -> f64 {
     stack.pop().unwrap_or(f64::NAN)
 }

@@ -7,7 +7,8 @@ use super::expression::Expression;
 /// Maximum number of points of a table; measured potentials have a few thousand.
 const MAX_POINTS: usize = 100_000;
 
-/// A fault: the path below the JSON value (empty, or starting with a dot), and a text with what was found and what is allowed.
+/// A fault: the path below the JSON value (empty, or starting with a dot), and a text with what was found and what is
+/// allowed.
 type Fault = (String, String);
 
 /// A function of stoichiometry or concentration.
@@ -23,7 +24,7 @@ impl Function {
     /// Reads a JSON value.
     ///
     /// # Errors
-    /// The value is not a valid parameter. Each entry is a fault with its path below the value.
+    /// The value is not a valid parameter. Each entry of the error is a fault with its path below the value.
     pub(super) fn read(value: &Value) -> Result<Self, Vec<Fault>> {
         let fault = |text: String| vec![(String::new(), text)];
         match value {

@@ -117,7 +117,8 @@ fn single_particle_resistances_match_the_closed_forms() {
         assert!((model.branch_r_ohm(branch, &position) / diffusion - 1.0).abs() < 1e-3);
         assert!((model.branch_tau_s(branch, &position) / (25e-12 / 35e-14) - 1.0).abs() < 1e-3);
     }
-    // At 15 K colder, which is a row of the table, two factors apply: Arrhenius' law with 40 kJ/mol, and R T / F.
+    // The table has a row 15 K below the reference temperature. Two factors apply there: Arrhenius' law with 40 kJ/mol,
+    // and R T / F.
     let colder = model.r0_ohm(&model.grid_position(0.5, 10.0)) / model.r0_ohm(&position);
     let law = (40_000.0 / GAS_J_PER_MOL_K * (1.0 / 283.15 - 1.0 / 298.15)).exp() * 283.15 / 298.15;
     assert!((colder / law - 1.0).abs() < 1e-3, "{colder} {law}");

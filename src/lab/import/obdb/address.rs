@@ -41,7 +41,7 @@ fn standard(document: &AddressDocument) -> Result<Addresses, String> {
     let request = hexadecimal("hdr", &document.hdr)?;
     let response = match &document.rax {
         Some(rax) => hexadecimal("rax", rax)?,
-        // ISO 15765-4 defines this distance.
+        // ISO 15765-4 defines this difference of 8.
         None if (0x7E0..=0x7E7).contains(&request) => request + 8,
         None => return Err(format!("hdr is {} without rax, must be 7E0 to 7E7 for that", document.hdr)),
     };

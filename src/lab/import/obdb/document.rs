@@ -1,5 +1,6 @@
-//! Defines the JSON of an OBDb signal set (github.com/OBDb/.schemas, `signals.json`): the fields that the conversion uses, and known
-//! fields that it ignores. Each command and signal is read separately, so a faulty entry does not hide other entries.
+//! Defines the JSON of an OBDb signal set (github.com/OBDb/.schemas, `signals.json`): the fields that the conversion
+//! uses, and known fields that it ignores. Each command and signal is read separately, so a faulty entry does not hide
+//! other entries.
 
 use std::collections::BTreeMap;
 
@@ -50,7 +51,8 @@ pub(super) struct AddressDocument {
     pub(super) proto: Option<String>,
 }
 
-/// Model years of a command: a range, or a list of single years. If `from` is after `to`, the years between them are excluded.
+/// Model years of a command: a range, or a list of single years. If `from` is after `to`, the years between them are
+/// excluded.
 #[derive(Debug, Deserialize)]
 pub(super) struct YearFilter {
     from: Option<i64>,

@@ -1,9 +1,10 @@
 //! Converts an OBDb signal to a signal of a diagnostic input: position, scaling, range, unit.
 //!
-//! * factor = `mul` / `div`, offset = `add`. As in OBDb's own decoder, `min` defaults to 0. OBDb's decoder clamps values to `min` and
-//!   `max`; here, a value outside this range is a bad reading. If there is no `max` above `min`, the range is unlimited.
-//! * `nullmin`, `nullmax`: values at or outside these limits are not available. If only a few codes are affected, they are listed;
-//!   otherwise the allowed range ends before these limits.
+//! * factor = `mul` / `div`, offset = `add`. As in OBDb's own decoder, `min` defaults to 0. OBDb's decoder clamps
+//!   values to `min` and `max`; here, a value outside this range is a bad reading. A signal without `max` is rejected.
+//!   If `max` is not above `min`, only the bits limit the range.
+//! * `nullmin`, `nullmax`: values at or outside these limits are not available. If only a few codes are affected, they
+//!   are listed; otherwise the allowed range ends before these limits.
 //! * All units are kept, including degrees Fahrenheit. Nothing is converted.
 
 use super::document::{FormatDocument, SignalDocument};

@@ -1,4 +1,5 @@
-//! Tests the size of the page for a long life, the text of a page without data, and the cards and alarms of a worn pack.
+//! Tests the size of the page for a long life, the text of a page without data, and the cards and alarms of a worn
+//! pack.
 
 use super::*;
 use crate::alarm::{AlarmState, Change, Rule, Severity};
@@ -23,7 +24,8 @@ fn page_without_data_says_unknown_and_fetches_nothing() {
 }
 
 /// Creates the life of a pack of 96 cells: 600 half-cycles of three hours. Each cell fades at its own rate and has a
-/// voltage reading every two minutes. Alarms are raised and cleared in every tenth half-cycle.
+/// voltage reading every two minutes. In every tenth half-cycle, an alarm of one cell is raised; in the following
+/// half-cycle, an alarm of the next cell is cleared.
 fn life() -> Data {
     let mut data = Data::new(Origin::Replay);
     for half in 0..600_u16 {
@@ -177,7 +179,7 @@ struct Card<'a> {
     doubt: Option<&'a str>,
 }
 
-/// Text between the first two marks.
+/// Text between the first `from` and the next `to`.
 fn between<'a>(text: &'a str, from: &str, to: &str) -> Option<&'a str> {
     text.split_once(from)?.1.split(to).next()
 }
@@ -252,7 +254,7 @@ fn alarms_of_two_rules_are_grouped_by_rule() {
             data.take_event(&at_end(change(rule, cell, true, 1.8)));
         }
     }
-    // Changes must be grouped by cell and by time.
+    // Later changes of one cell must stay separate rows, in order of time.
     for (active, value) in [(false, 1.9), (true, 1.7)] {
         data.take_event(&at_end(change(Rule::CapacityLow, 4, active, value)));
     }
@@ -273,7 +275,7 @@ fn alarms_of_two_rules_are_grouped_by_rule() {
     assert_eq!(changes, expected);
 }
 
-/// Numbers after the plus-minus signs, each with half of its last digit.
+/// Numbers after the plus-minus signs, each with half a unit of its last digit.
 fn deviations(text: &str) -> Vec<(f64, f64)> {
     let number = |rest: &str| {
         let rest = rest.trim_start();
@@ -286,7 +288,8 @@ fn deviations(text: &str) -> Vec<(f64, f64)> {
     text.split(PLUS_MINUS).skip(1).map(number).collect()
 }
 
-/// Whether the numbers after the plus-minus signs of a text are these standard deviations, rounded to the printed digits.
+/// Whether the numbers after the plus-minus signs of a text are these standard deviations, rounded to the printed
+/// digits.
 fn states(text: &str, stds: &[f64]) -> bool {
     let printed = deviations(text);
     let is_same = |((value, half_digit), std): (&(f64, f64), &f64)| (value - std).abs() <= half_digit + 1e-9;

@@ -5,13 +5,13 @@ use super::*;
 use crate::chart::Size;
 use crate::report::{examples, page};
 
-/// Texts of a picture that have a class, in order.
+/// Texts of a picture that have this class, in order.
 fn texts<'a>(svg: &'a str, class: &str) -> Vec<&'a str> {
     let start = format!("class=\"{class}\">");
     svg.split(&start).skip(1).filter_map(|rest| rest.split('<').next()).collect()
 }
 
-/// Tick labels of the x axis, and its caption, which follows them.
+/// Tick labels and caption of the x axis. In the picture, the caption follows the tick labels.
 fn x_axis(picture: &Picture) -> (Vec<String>, String) {
     let svg = picture.draw(Size::WIDE).0;
     let after_ticks = svg.rsplit("class=\"t m\">").next().expect("ticks");

@@ -1,5 +1,5 @@
-//! Defines the signals outside the catalogue of quantities: derived from several values, from the alarms, or from the
-//! state of the daemon.
+//! Defines the signals outside the catalogue of quantities. These signals are derived from several values, from the
+//! alarms, or from the state of the daemon.
 //!
 //! VSS signals have the names, datatypes and units of releases 3 to 6. These VSS signals are omitted, because the
 //! status document has no value for them:
@@ -8,7 +8,7 @@
 //! * `StateOfCharge.CurrentEnergy` and the energies: the daemon estimates no energy.
 //! * The throughputs "over lifetime of the battery": the daemon knows only the time in which it ran.
 //! * `StateOfCharge.Displayed`: the value that the vehicle shows to the customer.
-//! * `Charging.IsCharging`: true only with a charger, but braking also charges the battery.
+//! * `Charging.IsCharging`: true only with a charger. The daemon cannot distinguish a charger from braking.
 //!
 //! Overlay booleans begin with `Is`, as VSS recommends. No overlay signal has a temperature unit, because the unit's
 //! name changed between VSS 5 and VSS 6. No overlay signal has a list of allowed values: the databroker (0.7) checks
@@ -269,8 +269,9 @@ fn average(status: &StatusDocument, quantity: Quantity) -> Option<f64> {
     Some(numbers.iter().sum::<f64>() / numbers.len() as f64)
 }
 
-/// Codes of the raised alarms: `RULE:SEVERITY`, for a cell `RULE:SEVERITY:cell3`. If none is raised, returns an empty
-/// list only if every threshold was evaluated.
+/// Codes of the raised alarms: `RULE:SEVERITY`, for a cell `RULE:SEVERITY:cell3`. An empty list means that every
+/// threshold was evaluated and no alarm is raised. If some threshold was not evaluated and no raised alarm is known,
+/// returns `None`.
 fn alarm_codes(document: &StatusDocument) -> Option<Value> {
     let alarms = &document.alarms;
     let raised = alarms.list.iter().filter(|alarm| alarm.state.is_raised());
@@ -280,12 +281,13 @@ fn alarm_codes(document: &StatusDocument) -> Option<Value> {
             format!("{}:{}{cell}", alarm.rule.name(), alarm.severity.name())
         })
         .collect();
-    // An empty list means "no error", so send it only if that is known.
+    // An empty list means "no error", so it is sent only if every threshold was evaluated.
     let is_known = !codes.is_empty() || (alarms.raised == 0 && alarms.are_judged());
     is_known.then_some(Value::Texts(codes))
 }
 
-/// Findings; `None` without estimates, because an empty list would look healthy.
+/// Codes of the findings. If the daemon has neither findings nor estimates, returns `None`, because an empty list would
+/// look healthy.
 fn findings(status: &StatusDocument) -> Option<Value> {
     let codes: Vec<String> = status
         .findings

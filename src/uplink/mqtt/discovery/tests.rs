@@ -1,10 +1,10 @@
-//! Compares discovery messages with the entities and with a table of what Home Assistant accepts.
+//! Compares discovery messages with the rules of Home Assistant, and tests the availability of entities.
 
 use std::collections::BTreeSet;
 
 use super::*;
 
-/// Home Assistant device classes in use, their accepted units, and whether the value may be a measurement.
+/// Device classes of Home Assistant that the messages use, and the units that Home Assistant accepts for each class.
 const CLASSES: &[(&str, &[&str])] = &[
     ("battery", &["%"]),
     ("current", &["A", "mA"]),

@@ -1,4 +1,4 @@
-//! Tests, without a broker, what a connection publishes and when it takes messages from the queue.
+//! Tests, without a broker, what a connection publishes and in which order.
 
 use super::*;
 

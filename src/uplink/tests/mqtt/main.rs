@@ -106,7 +106,7 @@ fn hour_without_broker_and_two_power_cuts_lose_nothing() {
         latest = latest.max(now);
     }
     assert_eq!((latest.1, samples.len() >= HOUR as usize), (HOUR + 1, true));
-    // Each power cut repeats at most 20 messages, the largest number of unacknowledged messages.
+    // Each power cut repeats at most 20 samples, the largest number of unacknowledged samples.
     assert!(samples.len() <= HOUR as usize + 2 + 2 * 20, "{} samples", samples.len());
     let current: Vec<i64> = messages
         .iter()
@@ -114,8 +114,8 @@ fn hour_without_broker_and_two_power_cuts_lose_nothing() {
         .map(|(_, value)| rig::second_of(value))
         .collect();
     assert!(current.is_sorted(), "a current value is older than one before it: {current:?}");
-    // If a reader stops before it confirms a message, the broker sends the message again. Such repetitions have the
-    // same sequence number, so the set removes them.
+    // An event may arrive twice, because unacknowledged messages are sent again. Both copies have the same sequence
+    // number, so the set keeps one of them.
     let events: BTreeSet<i64> = messages
         .iter()
         .filter(|(topic, _)| topic == "packwatch/events")

@@ -315,7 +315,7 @@ impl Reader {
         });
     }
 
-    /// Waits for the message of a topic whose time is this second.
+    /// Waits until the latest message of `topic` has the time `second`.
     pub(crate) fn wait_for_topic_time(&self, topic: &str, second: i64) {
         wait_for("the newest value", || {
             let lines = self.lines.lock().unwrap();

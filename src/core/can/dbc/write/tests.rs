@@ -52,7 +52,7 @@ fn quotes_in_text_are_escaped() {
     assert_eq!(Database::parse(&read.to_dbc()).unwrap(), read);
 }
 
-/// Words without quotes and backslashes, which would be escaped.
+/// Text without quotes and backslashes, because writing would change them.
 const TEXT: &str = "[ -!#-\\[\\]-~\u{b0}\u{b5}\u{20ac}]{0,12}";
 
 fn layouts() -> impl Strategy<Value = SignalLayout> {
@@ -105,7 +105,7 @@ fn mux_links() -> impl Strategy<Value = MuxLink> {
     (condition, any::<bool>())
 }
 
-/// Signals with their names and conditions. Nesting stays below the limit at which it counts as a loop.
+/// Gives the signals names and conditions. The nesting stays below the depth that the parser rejects as a loop.
 fn assemble(parts: Vec<(Signal, MuxLink)>) -> Vec<Signal> {
     let mut made: Vec<Signal> = Vec::new();
     for (number, (mut signal, (condition, is_multiplexor))) in parts.into_iter().enumerate() {

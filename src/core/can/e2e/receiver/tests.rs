@@ -15,7 +15,7 @@ enum State {
     Following,
     /// The sequence is broken, and 2 more valid frames are required.
     Syncing,
-    /// There were more calls without a new frame than the configuration allows.
+    /// There were more periods without a frame than the configuration allows.
     Silent,
 }
 

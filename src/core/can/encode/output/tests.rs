@@ -44,7 +44,7 @@ fn assert_decodes(name: &str, frame: &Frame, wanted: f64) {
     assert!(found.is_ok_and(|found| (found - wanted).abs() <= half), "{name}: {found:?} for {wanted}");
 }
 
-/// Asserts that a signal is "not available" and that this code is outside its range.
+/// Asserts that a signal has its "not available" code and that this code is outside the signal's range.
 fn assert_not_available(name: &str, frame: &Frame) {
     let dbc = default_database().unwrap();
     let codes = dbc.signal(&format!("PACKWATCH_{name}")).unwrap().1.not_available_codes();

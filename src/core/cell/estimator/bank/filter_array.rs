@@ -196,8 +196,8 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         true
     }
 
-    /// Predicts a cell's state separately from its lane. Returns `None` and leaves the state unchanged if the
-    /// prediction cannot be computed.
+    /// Predicts the state `x` of a cell; the cell's lane is neither read nor changed. If the prediction cannot be
+    /// computed, returns `None` and leaves `x` unchanged.
     #[inline(never)]
     pub(super) fn predict(
         &mut self,
@@ -213,8 +213,9 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         (has_factor & has_variances(&new, Lanes([0.0]))).all().then(|| *x = new.gaussian())
     }
 
-    /// Updates a cell's state with a voltage, separately from its lane; a voltage beyond the gate does not change the
-    /// state. Also returns the memory. Returns `None` and leaves the state unchanged if the update cannot be computed.
+    /// Updates the state `x` of a cell with a voltage; the cell's lane is neither read nor changed. A voltage beyond
+    /// the gate does not change `x`. Also returns the memory with the new evidence. If the update cannot be computed,
+    /// returns `None` and leaves `x` unchanged.
     #[inline(never)]
     pub(super) fn update(
         &mut self,
@@ -255,7 +256,7 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
     }
 }
 
-/// Steps one cell of a block. Not inlined into the vector code: one copy serves all widths.
+/// Steps one cell of a block. It is not inlined into the vector code, so one copy serves all instruction widths.
 #[inline(never)]
 fn step_alone<const N: usize, const T: usize, const W: usize>(
     tables: &mut Tables<W>,

@@ -1,7 +1,7 @@
 //! Inputs of the cells of a block, and the results of their steps.
 //!
-//! In: steps, lane by lane (V, A, s, degrees C). Out: the kernel's inputs, and the original step for outcomes that are
-//! not usable.
+//! In: steps, lane by lane (V, A, s, degrees C). Out: the kernel's inputs; if an outcome is not usable, the
+//! step to compute again.
 
 use super::kernel::{DecayFactors, StepInput, StepOutcome};
 use crate::cell::estimator::memory::Memory;
@@ -67,8 +67,8 @@ impl BlockInput {
         },
     };
 
-    /// Copies the step time of another lane into lanes without a step, so that the same decay factors serve all lanes.
-    /// The results of lanes without a step are discarded.
+    /// Gives each lane without a step the step time of a lane with a step, so that the same decay factors serve all
+    /// lanes. The results of lanes without a step are discarded.
     #[inline(always)]
     pub(super) fn fill_absent(&mut self) {
         if !self.is_present.all() {
@@ -78,7 +78,7 @@ impl BlockInput {
         }
     }
 
-    /// The original step of a lane.
+    /// The step that the inputs of a lane describe.
     pub(super) fn step(&self, lane: usize) -> CellStep {
         let input = &self.input;
         CellStep {
@@ -88,7 +88,7 @@ impl BlockInput {
             unmeasured_s: 0.0,
             current_a: Some(input.current_a.0[lane]),
             temperature_c: Some(input.temperature_c.0[lane]),
-            // Unused, because the temperature is known.
+            // Unused, because the step has a temperature.
             ambient_c: input.temperature_c.0[lane],
             voltage_v: input.voltage_v.0[lane],
         }
@@ -110,7 +110,7 @@ impl StepInput<WIDTH> {
         }
     }
 
-    /// Records the step of a lane, whose outcome is in lane `from`.
+    /// Records the outcome of the step in lane `lane`. The outcome is in lane `from` of `outcome`.
     #[inline(always)]
     pub(super) fn note<const L: usize>(
         &self,

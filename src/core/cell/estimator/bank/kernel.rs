@@ -2,20 +2,22 @@
 //!
 //! Computes the filter of [`estimator`](crate::cell::estimator) with the circuit of [`crate::cell::circuit`]. The
 //! results agree with the textbook form up to rounding. The following exact rearrangements save work:
-//! * Sigma points come in pairs x +- s L_k with s = sqrt(N + lambda). A function f has the values f+ and f- at the two
-//!   points of a pair and f0 at the centre. Its odd part is o_k = (f+ - f-) / 2s.
-//!   Its even part is e_k = ((f+ + f-) / 2 - f0) / s. With m = sum e_k / s, the mean is f0 + m.
+//! * Sigma points come in pairs x +- s L_k with s = sqrt(N + lambda). L_k is column k of the lower Cholesky factor of
+//!   the covariance P. A function f has the values f+ and f- at the two points of a pair and f0 at the centre.
+//!   The odd part of f is o_k = (f+ - f-) / 2s. The even part of f is e_k = ((f+ + f-) / 2 - f0) / s.
+//!   With m = sum e_k / s, the mean is f0 + m.
 //!   The covariance is sum (o_k o_k' + e_k e_k') + (beta - alpha^2) m m'.
 //!   If a linear map moves the pair, o_k is the image of L_k and e_k = 0.
-//! * Because of the order of the states, only the first three columns of the Cholesky factor L change nonlinear states.
-//!   The columns of the branches add up to P minus the contribution of the first three columns, and are never computed.
-//! * Only one pair has a different SOC, so prediction and update each read the tables at three points instead of
-//!   2 N + 1.
+//! * Because of the order of the states, only the first three columns of the Cholesky factor change nonlinear states.
+//!   The outer products of the other columns (the branches) add up to P minus the outer products of the first three
+//!   columns. The columns of the branches are therefore never computed.
+//! * Only one pair has another SOC than the centre, so prediction and update each read the tables at three points
+//!   instead of 2 N + 1.
 //! * The lines of the tables are cached from step to step: [`LineCache`].
 //! * exp(x + d) = exp(x) exp(d), and exp(-2x) = exp(-x)^2 for the branches' noise.
 //!
 //! In: states, and for each the charge, time, current, temperature and voltage. Out: the new states, and a mask of
-//! usable states: all numbers finite, the covariance positive definite, the reading within the gate.
+//! usable states: all numbers finite and possible, the covariance positive definite, the reading within the gate.
 #![expect(clippy::needless_range_loop, reason = "indices of states say more than iterators over parts of a matrix")]
 
 mod points;
@@ -64,7 +66,7 @@ pub(super) fn step<const L: usize, const N: usize, const T: usize, const W: usiz
 /// Indices of the evidence about the current's offset and the slowest branch.
 pub(super) const EVIDENCE: [usize; 4] = [OFFSET_INFORMATION, OFFSET_SCORE, SLOW_INFORMATION, SLOW_SCORE];
 
-/// Whether a state and the sum of `others` are finite, and all variances positive.
+/// Whether a state and `others`, the sum of further numbers, are finite, and whether all variances are positive.
 #[inline(always)]
 pub(super) fn has_variances<const L: usize, const N: usize, const T: usize>(
     x: &FilterState<L, N, T>,

@@ -1,7 +1,7 @@
 //! The kernel with one lane. It computes the parts of a step that is not ordinary (see [`super`]).
 //!
-//! In: a cell's state and memory, separate from its lane, and its input. Out: the changed state and memory. If a part
-//! cannot be computed, returns `None` and leaves state and memory unchanged.
+//! In: a copy of a cell's state and memory, and a step. Out: the changed copy. If a part cannot be computed, returns
+//! `None` and leaves state and memory unchanged.
 
 use super::filter_array::{FilterArrays, each_array};
 use super::kernel::{

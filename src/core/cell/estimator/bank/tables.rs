@@ -7,8 +7,8 @@
 //! look-up is a single comparison. Cached values depend only on temperature, SOC and capacity, so the results do not
 //! depend on the state of the cache.
 //!
-//! In: states of charge, degrees C. Out: V, ohm, s. A NaN in one lane gives NaN in this lane only; the step is then not
-//! usable.
+//! In: states of charge, degrees C. Out: V, ohm, s. A NaN in one lane gives a NaN voltage in this lane only; the step
+//! is then not usable.
 
 use crate::cell::aged_ocv::{MIXES, OffsetLine};
 use crate::cell::model::CellModel;
@@ -17,7 +17,7 @@ use crate::filter::simd::Lanes;
 /// Index of the open-circuit voltage (V) in a row. The slope of every quantity (per unit of SOC) follows its value.
 pub(super) const OCV_V: usize = 0;
 /// Index of the change of the open-circuit voltage with the capacity, V per Ah; the change is 0 if the curve does not
-/// age. The changes by the mixes of losses follow.
+/// age. The changes per standard deviation of each mix of losses (V) follow.
 pub(super) const OCV_PER_AH: usize = 2;
 /// Index of the series resistance, ohm.
 pub(super) const R0_OHM: usize = OCV_PER_AH + 2 + 2 * MIXES;
@@ -26,8 +26,8 @@ pub(super) const ERROR_V: usize = R0_OHM + 2;
 /// Index of the first branch's resistance (ohm). Its time constant (s) follows, then the next branch.
 const BRANCHES: usize = ERROR_V + 2;
 
-/// Number of temperatures with cached rows. It is larger than the number of sensors in a pack. The rows of further
-/// temperatures are computed again, with equal results.
+/// Number of temperatures with cached rows. A pack usually has fewer temperature sensors. If a pack has more, evicted
+/// rows are computed again, with equal results.
 const MAX_ISOTHERMS: usize = 64;
 
 /// Index of the resistance of branch `i`; its time constant follows.
@@ -108,8 +108,8 @@ impl<const W: usize> Tables<W> {
         self.has_error
     }
 
-    /// Slot of the rows of a temperature. It is valid until the next call. `hint` is the slot that the last call
-    /// returned.
+    /// Slot of the rows of a temperature, valid until the next call. `hint` is the slot that the last call for the same
+    /// lane returned.
     fn isotherm(&mut self, temperature_c: f64, hint: usize) -> usize {
         if self.temperatures_c[hint % MAX_ISOTHERMS] == temperature_c {
             hint % MAX_ISOTHERMS
@@ -240,8 +240,8 @@ impl<const W: usize> Tables<W> {
         }
     }
 
-    /// Updates the lines that depend on the capacity of a lane, Ah. [`Self::copy`] adds them to the open-circuit
-    /// voltage.
+    /// Computes the lines of a lane that depend on the capacity of the open-circuit curve, Ah. [`Self::copy`] adds the
+    /// offset to the open-circuit voltage.
     fn age<const L: usize>(&self, capacity_ah: f64, lines: &mut CachedLines<L, W>, lane: usize) {
         let OffsetLine { offset_v, per_ah_v, mixes_v } =
             self.model.aged_ocv.line(&self.model.soc, lines.interval[lane], capacity_ah);
@@ -304,7 +304,8 @@ impl<'a, const L: usize, const W: usize> TablePoint<'a, L, W> {
         (self.row[OCV_V] + slope_v * self.soc, slope_v, self.one(R0_OHM))
     }
 
-    /// Change of the open-circuit voltage with the capacity, V per Ah, and by each mix of losses, V.
+    /// Changes of the open-circuit voltage: with the capacity, V per Ah, and per standard deviation of each mix of
+    /// losses, V.
     #[inline(always)]
     pub(super) fn ocv_changes(&self) -> [Lanes<L>; 1 + MIXES] {
         std::array::from_fn(|i| self.row[OCV_PER_AH + 2 * i] + self.row[OCV_PER_AH + 2 * i + 1] * self.soc)
@@ -323,7 +324,7 @@ impl<'a, const L: usize, const W: usize> TablePoint<'a, L, W> {
     }
 }
 
-/// Row of the interval from SOC breakpoint `s` at temperature breakpoint `t`.
+/// Row of the interval that starts at SOC breakpoint `s`, at temperature breakpoint `t`.
 fn row<const W: usize>(model: &CellModel, t: usize, s: usize) -> [f64; W] {
     let mut row = [0.0; W];
     let mut set = |index: usize, value: &dyn Fn(usize) -> f64| {

@@ -257,7 +257,7 @@ fn evicted_isotherm_is_computed_again() {
     let mut pack = Pack::new(&model, 2);
     let mut socs = Vec::new();
     for time in 0..4500 {
-        // One cell keeps its temperature, the other has more temperatures than the cache.
+        // One cell keeps its temperature. The other passes through more temperatures than the cache holds.
         let at = |cell: usize| if cell == 0 { 20.0 } else { 0.01 * f64::from(time) };
         let mut steps = pack.steps(time);
         steps.iter_mut().for_each(|(cell, step)| step.temperature_c = Some(at(*cell)));
@@ -286,7 +286,7 @@ fn bank_returns_stored_estimator_unchanged() {
     assert_eq!((bank.soc(4), bank.cell(4).capacity().mean), (None, config.initial.capacity_ah));
 }
 
-/// Cells of two kinds, mixed in one pack, give the bits that each kind gives alone.
+/// The estimates of cells of two kinds in one pack equal, bit for bit, the estimates of each kind in a separate bank.
 #[test]
 fn mixed_modules_match_separate_banks() {
     let (model, other) = (small_model(), CellModel { capacity_ah: 3.0, ..small_model() });

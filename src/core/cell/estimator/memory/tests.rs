@@ -22,7 +22,8 @@ fn near(a: f64, b: f64) -> bool {
     (a - b).abs() < 1e-9 * b.abs().max(1.0)
 }
 
-/// Computes a step without a current, whose voltage is not used. Returns the time that counts as new information, s.
+/// Computes a step whose current is unknown at the reading, so its voltage is not used. Returns the time that counts as
+/// new information, s.
 fn new_information_s(estimator: &mut CellEstimator, step: CellStep) -> f64 {
     let before_s = estimator.memory.information_s;
     estimator.step(&small_model(), &config(), &CellStep { current_a: None, ..step });
@@ -126,7 +127,7 @@ fn noted_downtime_counts_once() {
     let mut at_rest = noted();
     at_rest.note_gap(&config, &step(0.0, 0.0, 60.0), 2.0);
     assert_eq!(at_rest, Memory { noted_s: 0.0, ..noted() });
-    // The load of 3 C before the gap may have continued: 0.05 of SOC.
+    // The load of 3 C after the gap may have flowed during the gap: 0.05 of SOC.
     let mut loaded = noted();
     loaded.note_gap(&config, &step(6.0, 0.0, 60.0), 2.0);
     assert!(near(loaded.downtime_std, 0.05 / 3.0_f64.sqrt()), "{loaded:?}");

@@ -118,7 +118,7 @@ fn thirty_point_error_recovers_within_minutes() {
 #[test]
 fn interval_covers_error_while_cell_relaxes() {
     for current_a in [1.0, -1.0] {
-        // The filter starts together with the load, so its only information is the voltages that relax towards rest.
+        // The filter starts together with the load, so it has never had a voltage at rest.
         let mut bench = Bench::new(0.5 + 0.3 * current_a, None, SLOW_OHM, 0.0);
         bench.run(current_a, 3600.0);
         let mut rested_s = 0.0;

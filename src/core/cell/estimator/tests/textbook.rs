@@ -118,8 +118,8 @@ impl<const N: usize> Textbook<N> {
         }
     }
 
-    /// Maximum difference of the SOC, and maximum difference of all other values, from an estimator. Differences of
-    /// evidence are relative to its size.
+    /// Compares with an estimator: returns the difference of the SOC and the maximum difference of all other values. If
+    /// a number of the memory is larger than 1, its difference is relative to the number.
     pub(in crate::cell::estimator) fn differences(&self, estimator: &CellEstimator) -> (f64, f64) {
         let near = |a: ScalarGaussian, b: ScalarGaussian| (a.mean - b.mean).abs().max((a.std() - b.std()).abs());
         let x = estimator.filter.as_ref().expect("started");

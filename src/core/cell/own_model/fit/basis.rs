@@ -12,9 +12,10 @@ use crate::cell::own_model::{FACTOR_NODES, OwnModel, SOC_NODES};
 use crate::filter::interpolation::{between, locate_clamped};
 
 /// Index of the first parameter of each group. From index 0: difference from the label's curve, V, at the SOC
-/// breakpoints. [`FACTORS`]: ln of the resistance factors over SOC. [`BY_TEMPERATURE`]: their deviation from the
-/// temperature law. [`COLD_SAG`]: difference from the label's cold sag, V. [`LOG_CAPACITY`]: ln of the capacity, Ah.
-/// [`OFFSET`]: offset of the current sensor, A (measured minus true). [`BEGINNINGS`]: SOC at the start of each stretch.
+/// breakpoints. [`FACTORS`]: ln of the resistance factors over SOC. [`BY_TEMPERATURE`]: deviation of each resistance's
+/// activation energy from the usual one, fraction. [`COLD_SAG`]: difference from the label's cold sag, V.
+/// [`LOG_CAPACITY`]: ln of the capacity, Ah. [`OFFSET`]: offset of the current sensor, A (measured minus true).
+/// [`BEGINNINGS`]: SOC at the start of each stretch.
 pub(super) const FACTORS: usize = SOC_NODES;
 pub(super) const BY_TEMPERATURE: usize = FACTORS + RESISTANCES * FACTOR_NODES;
 pub(super) const COLD_SAG: usize = BY_TEMPERATURE + RESISTANCES;
@@ -45,7 +46,8 @@ pub(super) struct Prediction {
     /// Slope of the open-circuit voltage, V per unit of SOC.
     pub(super) slope_v: f64,
     pub(super) ohm: [f64; RESISTANCES],
-    /// Derivatives of ln(resistance) with respect to the three parameters of a resistance.
+    /// Derivatives of ln(resistance) with respect to the three parameters of a resistance: its factors at two SOC nodes
+    /// and the deviation of its activation energy.
     pub(super) by_factor: [f64; 3],
     /// Indices of the parameters that change the voltage: [`CURVE_AND_SOC`] parameters first, then three parameters per
     /// resistance.
@@ -65,7 +67,7 @@ impl<'a> Basis<'a> {
         BEGINNINGS + self.stretch.last().map_or(0, |last| last + 1)
     }
 
-    /// The parameters of a model (`None` = the label's), with the most likely SOC at the start of each stretch.
+    /// The parameters of a model (`None` = the label's model), with the most likely SOC at the start of each stretch.
     pub(super) fn parameters(&self, own: Option<&OwnModel>) -> DVector<f64> {
         let mut theta = DVector::zeros(self.size());
         theta[LOG_CAPACITY] = libm::log(own.map_or(self.model.rated_capacity_ah, |own| own.capacity.mean));
@@ -137,7 +139,8 @@ impl<'a> Basis<'a> {
         Prediction { voltage_v, drop_v, soc, slope_v, ohm, by_factor, index, slope }
     }
 
-    /// The most likely SOC at the start of the stretch of parameter `k`, with all other parameters fixed.
+    /// The most likely value of the parameter `k`, which is the SOC at the start of a stretch. All other parameters
+    /// stay fixed.
     fn likeliest_beginning(&self, theta: &DVector<f64>, k: usize) -> f64 {
         let mut theta = theta.clone();
         let rows: Vec<usize> = (0..self.rows.len()).filter(|&at| BEGINNINGS + self.stretch[at] == k).collect();
@@ -147,7 +150,7 @@ impl<'a> Basis<'a> {
                 let Prediction { voltage_v, drop_v, .. } = self.predict(&theta, at);
                 let deviations =
                     (voltage_v - f64::from(self.rows[at].voltage_v)).abs() / f64::hypot(0.02, 0.1 * drop_v);
-                // Linear beyond three standard deviations.
+                // Beyond three standard deviations, the cost grows linearly.
                 if deviations <= 3.0 { 0.5 * deviations * deviations } else { 3.0 * (deviations - 1.5) }
             };
             rows.iter().map(row_cost).sum::<f64>()
@@ -156,7 +159,7 @@ impl<'a> Basis<'a> {
         tried.map(|soc| (soc, cost(soc))).min_by(|a, b| a.1.total_cmp(&b.1)).map_or(0.5, |found| found.0)
     }
 
-    /// Standard deviation of ln(drop) at half charge and a temperature.
+    /// Standard deviation of ln(voltage drop) at SOC 0.5 and a temperature, for a constant current.
     pub(super) fn drop_std(&self, theta: &DVector<f64>, covariance: &DMatrix<f64>, temperature_c: f64) -> f64 {
         let position = self.model.grid_position(0.5, temperature_c);
         let by_temperature = libm::log(arrhenius(temperature_c));

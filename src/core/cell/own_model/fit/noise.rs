@@ -1,7 +1,7 @@
 //! Computes the covariance of the errors of a notebook's rows, and the cost of residuals.
 //!
-//! In: predictions and rows (means of readings over a short time). Out: whitened residuals with their derivatives, and
-//! their cost (minus the logarithm of their density).
+//! In: predictions and rows (means of readings over a short time). Out: the normal equations of the whitened residuals,
+//! and the cost of the residuals (minus the logarithm of their density).
 
 use nalgebra::{DMatrix, DVector};
 
@@ -26,8 +26,8 @@ pub(super) struct RepeatedErrors {
 impl RepeatedErrors {
     /// Repeating errors of usual circuit models, for fitting the capacity.
     pub(super) const USUAL: Self = Self { voltage_v: 0.012, soc: 0.01, drop: 0.2 };
-    /// Repeating errors for fitting the tables. These errors are smaller than `USUAL`, so that differences that the
-    /// rows have in common go into the tables and not into the errors.
+    /// Repeating errors for fitting the tables. These errors are smaller than `USUAL`, so that a deviation that many
+    /// rows share changes the tables and does not count as an error.
     pub(super) const IN_TABLES: Self = Self { voltage_v: 0.004, soc: 0.004, drop: 0.05 };
 }
 
@@ -41,7 +41,8 @@ pub(super) struct NormalEquations {
 }
 
 impl NormalEquations {
-    /// Adds a residual with its derivatives at `index` and its weight.
+    /// Adds a residual with its weight. `index`: the parameters that change the residual; `slope`: derivatives with
+    /// respect to these parameters.
     fn add(&mut self, index: &[usize], slope: &[f64], residual: f64, weight: f64) {
         for (&i, a) in index.iter().zip(slope) {
             self.gradient[i] += weight * a * residual;
@@ -51,7 +52,7 @@ impl NormalEquations {
         }
     }
 
-    /// Adds all rows at the parameters `theta`; `None` if a number is not finite.
+    /// Adds all rows at the parameters `theta`; `None` if the covariance of the rows' errors cannot be factorised.
     pub(super) fn add_rows(&mut self, basis: &Basis<'_>, theta: &DVector<f64>, errors: &RepeatedErrors) -> Option<()> {
         let predictions: Vec<Prediction> = (0..basis.rows.len()).map(|at| basis.predict(theta, at)).collect();
         let (count, size) = (predictions.len(), theta.len());
@@ -89,13 +90,13 @@ impl NormalEquations {
         Some(())
     }
 
-    /// Adds the evidence of a row's current steps about the series resistance and the fastest branch. The row contains
-    /// the sums of the least-squares problem v = - R0 i - R1 x. The Cholesky factor of the sums of i and x turns this
+    /// Adds what a row's current steps show about the series resistance and the fastest branch. The row contains the
+    /// sums of the least-squares problem v = - R0 i - R1 x. The Cholesky factor of the sums of i and x turns this
     /// problem into two equations.
     fn add_steps(&mut self, row: &Row, prediction: &Prediction) {
         let CurrentSteps { ii, ix, xx, iv, xv } = row.steps;
         let [ii, ix, xx, iv, xv] = [ii, ix, xx, iv, xv].map(f64::from);
-        // Current steps below this size are ignored.
+        // Without current steps, the sums contain no information.
         if ii <= 1e-12 {
             return;
         }
@@ -124,7 +125,7 @@ fn covariance(predictions: &[Prediction], errors: &RepeatedErrors) -> DMatrix<f6
     let drop_v: Vec<f64> = predictions.iter().map(|it| it.drop_v * (1.0 + 3.0 * it.drop_v.abs())).collect();
     DMatrix::from_fn(predictions.len(), predictions.len(), |a, b| {
         let (x, y) = (&predictions[a], &predictions[b]);
-        // Repeating errors change over 12 % of SOC.
+        // Repeating errors are correlated over 12 % of SOC.
         let near = bell((x.soc - y.soc) / 0.12);
         let of = |v: f64, soc: f64, drop: f64| {
             v * v + soc * soc * x.slope_v * y.slope_v + drop * drop * drop_v[a] * drop_v[b]

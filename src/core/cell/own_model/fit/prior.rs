@@ -1,4 +1,4 @@
-//! Computes the prior of a cell's parameters from the cell's label: covariance and information matrix.
+//! Computes the prior of a cell's parameters from the cell's label, as an information matrix.
 
 use nalgebra::DMatrix;
 
@@ -9,20 +9,22 @@ use crate::cell::own_model::{FACTOR_NODES, SOC_NODES};
 use crate::filter::bell;
 
 /// Standard deviation, between cells, of the part of ln(resistance) that all resistances of a cell share. This constant
-/// and the next three were found on the five cells that also give the usual resistances of a chemistry.
+/// and the next three were determined from five cells. The usual resistances of the label's model come from the same
+/// cells.
 const COMMON_LOG_STD: f64 = 0.35;
 /// Standard deviation of ln(resistance) of each single resistance, in addition to the common standard deviation.
 const PART_LOG_STD: [f64; RESISTANCES] = [0.3, 0.4, 0.4, 0.5];
-/// Standard deviation of ln(resistance) over the SOC.
+/// Standard deviation by which each ln(resistance) varies over the SOC.
 const SHAPE_LOG_STD: f64 = 0.15;
-/// Standard deviation of ln(resistance) of all resistances at the first nodes, near empty. The curve is steep there, so
-/// diffusion appears as resistance.
+/// Additional standard deviation of ln(resistance) at the first three SOC nodes, near empty; all resistances share this
+/// deviation. The open-circuit curve is steep near empty, so diffusion appears as resistance.
 const LOW_LOG_STD: [f64; 3] = [0.7, 0.6, 0.5];
 
-/// Information matrix about the label's values; `None` if a covariance is not positive definite.
+/// Information matrix of the parameters' prior, whose means are the label's values. `None` if a covariance is not
+/// positive definite.
 pub(super) fn information(curve: &CurvePrior, rated_ah: f64, size: usize) -> Option<DMatrix<f64>> {
     let mut prior = DMatrix::zeros(size, size);
-    // Roughness of a curve in addition to the modes of its prior: 2 mV.
+    // Roughness of a curve in addition to the covariance of its prior: 2 mV.
     let own = DMatrix::from_diagonal_element(SOC_NODES, SOC_NODES, 0.002 * 0.002);
     let curve = (&curve.covariance + own).cholesky()?.inverse();
     prior.view_mut((0, 0), (SOC_NODES, SOC_NODES)).copy_from(&curve);
@@ -40,7 +42,7 @@ pub(super) fn information(curve: &CurvePrior, rated_ah: f64, size: usize) -> Opt
     Some(prior)
 }
 
-/// Covariance of two factors, by their index.
+/// Covariance of the logarithms of the two resistance factors with the indices `a` and `b`.
 fn factor_covariance(a: usize, b: usize) -> f64 {
     let ((i, n), (j, m)) = ((a / FACTOR_NODES, a % FACTOR_NODES), (b / FACTOR_NODES, b % FACTOR_NODES));
     let near = |width: f64| bell((FACTOR_SOC[n] - FACTOR_SOC[m]) / width);
@@ -50,7 +52,7 @@ fn factor_covariance(a: usize, b: usize) -> f64 {
     common + if i == j { part } else { 0.0 } + if a == b { 1e-4 } else { 0.0 }
 }
 
-/// Logarithm of the determinant of a positive matrix.
+/// Logarithm of the determinant of a matrix; `None` if the matrix is not positive definite.
 pub(super) fn log_determinant(matrix: &DMatrix<f64>) -> Option<f64> {
     let lower = matrix.clone().cholesky()?.unpack();
     Some((0..lower.nrows()).map(|i| 2.0 * libm::log(lower[(i, i)])).sum())

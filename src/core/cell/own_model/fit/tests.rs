@@ -1,4 +1,4 @@
-//! Tests the mean and variance of a capacity that a fit derives from the costs on its grid.
+//! Tests how a fit computes the mean and variance of the capacity from the costs on the capacity grid.
 
 use super::*;
 

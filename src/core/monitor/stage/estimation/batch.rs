@@ -1,8 +1,8 @@
 //! Collects the samples of cells that report one after another. When every cell has reported, the filters of all cells
 //! are stepped together.
 //!
-//! The waiting time of a sample does not affect the estimate, because a step uses only the time and charge of this
-//! sample and no data of other cells.
+//! The waiting time of a sample does not affect its step: the step uses the time and the charge of the sample, not the
+//! time at which the step runs.
 
 use crate::quantity::CellIndex;
 use crate::sample::CellSample;

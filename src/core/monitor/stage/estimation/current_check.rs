@@ -1,23 +1,24 @@
 //! Compares the steps of the measured current with the steps of the cells' voltages.
 //!
-//! In: rounds of voltages with the current at their time, and the series resistance that the model gives. Out: whether
-//! the current is doubtful.
+//! In: *rounds* (the voltages of the cells, read one after another, and the current at that time), and the series
+//! resistance according to the model. Out: whether the current is doubtful.
 //!
 //! A step of the current moves the voltages of all cells in the opposite direction, by the resistance times the step.
 //! The check judges each clear step between two steady levels of the voltages. The step is *explained* if the current
-//! has stepped in the opposite direction, and if the resistance is at least 1/[`MAX_FACTOR`] and at most [`MAX_FACTOR`]
-//! times the usual one. A step is the mean of two consecutive rounds minus the mean of the two rounds before them. It
-//! contains less noise than the difference of two readings, and a current that arrives one round earlier or later than
-//! the voltages still explains its step.
+//! has stepped in the opposite direction, and if the ratio of the two steps (a resistance) is at least 1/[`MAX_FACTOR`]
+//! and at most [`MAX_FACTOR`] times the usual resistance. A step is the mean of two consecutive rounds minus the mean
+//! of the two rounds before them. Such a step contains less noise than the difference of two readings. A current that
+//! arrives one round earlier or later than the voltages still explains their step.
 //!
 //! Explained and unexplained steps are evidence for and against the sensor. How much they count depends on how many
-//! steps the sensor has left unexplained so far: one unexplained step of a sensor that has explained all steps is
-//! enough for a doubt, because the charge is wrong from the first second. A logger that reads current and voltages
-//! seconds apart leaves many steps unexplained, and one more says little.
+//! steps the sensor has left unexplained so far. If a sensor has explained all steps, one unexplained step is enough
+//! for a doubt, because the charge is wrong from the first second. A logger that reads current and voltages seconds
+//! apart leaves many steps unexplained, so one more is only weak evidence.
 //!
-//! The check finds a current that is frozen, inverted, late or beyond its range, whether or not its last digits change.
-//! It finds nothing while the load is constant. It finds a current without sign only if the true current often changes
-//! its direction.
+//! The check finds a current that is frozen, inverted, late or beyond the sensor's range, whether or not the last
+//! digits of its readings change. While the load is constant, the check finds only a noisy sensor at its limit, because
+//! the readings of this sensor then repeat. A current without sign is found only if the true current often changes its
+//! direction.
 
 use serde::{Deserialize, Serialize};
 
@@ -34,7 +35,7 @@ const FORGET_STEP: f64 = 0.98;
 const MAX_USUAL_SHARE: f64 = 0.2;
 /// Evidence that makes the sensor doubtful, as ln of the odds against it.
 const DOUBTFUL: f64 = 4.0;
-/// Highest evidence. A sensor that has failed often must explain several steps.
+/// Highest evidence. It limits how many steps a doubtful sensor must explain until the doubt ends.
 const MAX_EVIDENCE: f64 = 8.0;
 /// Largest movement of voltages and current just before and just after a step, as a part of the step.
 const STEADY: f64 = 0.3;
@@ -43,19 +44,19 @@ const STEADY: f64 = 0.3;
 const MAX_FACTOR: f64 = 4.0;
 /// Smallest clear step of the voltages, V.
 const MIN_STEP_V: f64 = 0.01;
-/// Clear step in standard deviations of a reading's noise, and in scatters of the cells.
+/// Smallest clear step, as a multiple of the standard deviation of a reading and as a multiple of the cells' scatter.
 const STEP_SIGMA: f64 = 5.0;
 /// Smallest clear step, as a multiple of the resolution of the voltages.
 const STEP_READINGS: f64 = 1.5;
-/// Clear step as a multiple of the usual change between two rounds.
+/// Smallest clear step, as a multiple of the usual change between two rounds.
 const STEP_MOVES: f64 = 9.0;
-/// Factor by which a round changes the usual change (an estimate of the median).
+/// Factor by which each round raises or lowers the usual change, which thus follows the median.
 const MOVE_GAIN: f64 = 1.02;
 /// Range of the usual change between two rounds, V.
 const MOVE_V: (f64, f64) = (1e-4, 0.05);
 /// Usual change before the first rounds, V. It exceeds the noise of any sensor.
 const FIRST_MOVE_V: f64 = 0.01;
-/// Part of an explained step's ln(resistance ratio) that the usual ratio takes over.
+/// Weight of an explained step in the usual resistance (as ln).
 const RATIO_GAIN: f64 = 0.1;
 /// Longest time between two rounds, s. After a longer pause, the steps are not compared.
 const MAX_PAUSE_S: f64 = 60.0;
@@ -65,16 +66,17 @@ const FORGET_DOUBT: f64 = 0.97;
 const NOISE_GAIN: f64 = 0.02;
 /// Lowest probability that a good sensor repeats a reading exactly.
 const MIN_REPEAT: f64 = 0.01;
-/// Probability that a limited sensor repeats a reading.
+/// Probability that a sensor at its limit repeats a reading.
 const FAULTY_REPEAT: f64 = 0.5;
-/// Change of a noisy reading, in steps of the sensor. A sensor with less noise repeats its readings.
+/// Changes of a reading above this multiple of the sensor's resolution are noise. A coarse sensor also changes by one
+/// step.
 const NOISE_STEPS: f64 = 1.5;
 /// Resolution of the current before a change has been seen, A.
 const MAX_RESOLUTION_A: f64 = 1e3;
-/// Evidence of repeated readings that makes the sensor doubtful.
+/// Limit of `repeated` (ln of the odds for a good sensor). At this limit, the sensor becomes doubtful.
 const REPEATED: f64 = -10.0;
-/// Smallest common change of the cells that must also show in each voltage, V, and as a multiple of the resolution of
-/// the voltages. The larger limit applies.
+/// Common change of the cells, V, after which a voltage that has not changed is frozen. The limit is at least
+/// [`FROZEN_STEPS`] times the resolution of the voltages.
 const FROZEN_V: f64 = 0.03;
 const FROZEN_STEPS: f64 = 2.5;
 /// Resolution of the voltages before a change has been seen, V.
@@ -90,7 +92,7 @@ struct Round {
     time: Timestamp,
     /// Current of a cell, A.
     current_a: f64,
-    /// Change of the voltages since the previous round, V.
+    /// Common change of the voltages since the previous round, V.
     move_v: f64,
 }
 
@@ -106,26 +108,27 @@ pub(crate) struct CurrentCheck {
     count: usize,
     /// Evidence against the sensor: ln of the odds, at least 0.
     evidence: f64,
-    /// Numbers of unexplained and of explained steps, the latest with most weight.
+    /// Numbers of unexplained and of explained steps. Later steps have more weight.
     steps: [f64; 2],
     /// ln of the usual resistance relative to the model.
     log_ratio: f64,
-    /// Usual change of the voltages between two rounds that the current does not explain, V.
+    /// Usual size of the voltage changes that the current does not explain, V.
     usual_v: f64,
-    /// Usual difference of a cell's move between two rounds from the common move, V.
+    /// Usual difference between a cell's change since the previous round and the common change, V.
     scatter_v: f64,
     /// Share of readings of a steady current that differ from the previous reading by noise.
     noisy: f64,
     /// Smallest change of the current, A.
     resolution_a: f64,
-    /// Sum of all common changes, V, and the smallest change of a single voltage, V.
+    /// Sum of all common changes of the voltages, V.
     path_v: f64,
+    /// Smallest change of a single voltage, V.
     resolution_v: f64,
-    /// Evidence of the present run of equal readings.
+    /// Evidence of the present run of equal readings: ln of the odds for a good sensor, at most 0.
     repeated: f64,
     /// Largest reading of discharge and of charge, A.
     largest_a: [f64; 2],
-    /// Readings of either sign at which the sensor was limited, A; 0 = none.
+    /// Readings at which the sensor was at its limit, for discharge and for charge, A; 0 = never.
     limits_a: [f64; 2],
     /// Number of earlier doubts; explained steps reduce it.
     doubts: f64,
@@ -155,12 +158,12 @@ impl Default for CurrentCheck {
 }
 
 impl CurrentCheck {
-    /// Whether the steps of the voltages contradict the current.
+    /// Whether the evidence makes the current doubtful.
     pub(crate) fn is_doubtful(&self) -> bool {
         self.evidence > DOUBTFUL
     }
 
-    /// Handles a round. `samples`: the compared cells that have reported, each with its place from 0 to [`MAX_CELLS`] - 1.
+    /// Handles a round. `samples`: the compared cells that have reported, each with its place (below [`MAX_CELLS`]).
     /// `noise_v`: standard deviation of a reading. `ohm`: the model's series resistance.
     pub(crate) fn handle<'a>(
         &mut self,
@@ -204,9 +207,9 @@ impl CurrentCheck {
         }
     }
 
-    /// Judges whether the last reading of a flowing current repeats the one before. A sensor whose last digits change
-    /// all the time under a steady load and then stop is at its limit. A coarse sensor repeats itself, or changes by one
-    /// step.
+    /// Judges whether the last reading of a flowing current repeats the reading before. If the last digits of a sensor
+    /// usually change under a steady load, but now stay the same, the sensor is at its limit. A coarse sensor repeats
+    /// its readings, or changes them by one step.
     fn judge_repeat(&mut self) {
         let [.., before, now] = self.rounds;
         let change_a = (now.current_a - before.current_a).abs();
@@ -246,8 +249,8 @@ impl CurrentCheck {
         self.path_v
     }
 
-    /// Whether the cells have clearly changed in common since the path was `path_v`. If a voltage has not changed since,
-    /// it is frozen.
+    /// Whether the cells have clearly changed in common since the path was `path_v`. If a voltage has not changed
+    /// since, it is frozen.
     pub(crate) fn is_frozen_since(&self, path_v: f64) -> bool {
         (self.path_v - path_v).abs() >= FROZEN_V.max(FROZEN_STEPS * self.resolution_v)
     }
@@ -274,7 +277,8 @@ impl CurrentCheck {
         if is_explained {
             self.log_ratio = (self.log_ratio + RATIO_GAIN * libm::log(factor)).clamp(-2.0, 2.0);
         }
-        // A current that changes all the time may have been read at another moment than the voltages.
+        // A current that changes all the time may have been read at another moment than the voltages. An unexplained
+        // step then does not count.
         if is_explained || is_steady(ohm * (r1.current_a - r0.current_a), ohm * (r3.current_a - r2.current_a)) {
             self.weigh(is_explained);
         }
@@ -294,7 +298,7 @@ impl CurrentCheck {
         self.steps[usize::from(is_explained)] += 1.0;
     }
 
-    /// Adds to the evidence, and more at the start of a doubt if the sensor has been doubtful before.
+    /// Adds `log_odds` to the evidence. If a doubt starts, also adds the number of earlier doubts.
     fn add_evidence(&mut self, log_odds: f64) {
         let was_doubtful = self.is_doubtful();
         self.evidence = (self.evidence + log_odds).clamp(0.0, MAX_EVIDENCE);
@@ -343,7 +347,7 @@ impl CurrentCheck {
     }
 }
 
-/// The change that at least two thirds of the cells reach or exceed in the same direction, V; 0 without cells.
+/// The change that at least two thirds of the cells reach or exceed in the same direction, V; otherwise 0.
 fn common_move(moves_v: &mut [f64]) -> f64 {
     moves_v.sort_unstable_by(f64::total_cmp);
     let Some(last) = moves_v.len().checked_sub(1) else { return 0.0 };
@@ -358,7 +362,7 @@ fn common_move(moves_v: &mut [f64]) -> f64 {
     }
 }
 
-/// Median difference of the cells' moves from the common move, V.
+/// Median difference between the cells' changes and the common change, V.
 fn scatter(moves_v: &mut [f64], common_v: f64) -> f64 {
     moves_v.iter_mut().for_each(|move_v| *move_v = (*move_v - common_v).abs());
     moves_v.sort_unstable_by(f64::total_cmp);
@@ -387,8 +391,8 @@ mod tests {
         f64::from(time_s.wrapping_mul(time_s) % 61) / 1000.0
     }
 
-    /// Runs a drive of `seconds`, one round every 2 s. `measured` returns the reading for the load and the time. Returns
-    /// the share of rounds in doubt, and the check.
+    /// Runs a drive of `seconds`, one round every 2 s. `measured` returns the reading for the load and the time.
+    /// Returns the share of rounds in doubt.
     fn drive(check: &mut CurrentCheck, seconds: u32, measured: impl Fn(f64, u32) -> Option<f64>) -> f64 {
         let mut doubtful = 0;
         for time_s in (0..seconds).step_by(2) {
@@ -418,7 +422,7 @@ mod tests {
     #[test]
     fn good_current_is_never_doubted() {
         assert_eq!(share_in_doubt(|load_a, _| Some(load_a)), 0.0);
-        // A gateway sends the current one round late; the resistance is twice the model's.
+        // First, a gateway sends the current one round late. Second, the apparent resistance is 2.4 times the model's.
         assert_eq!(share_in_doubt(|_, time_s| Some(load_a(time_s.saturating_sub(2)))), 0.0);
         assert_eq!(share_in_doubt(|load_a, _| Some(0.5 * load_a)), 0.0);
         // One reading in four is lost.

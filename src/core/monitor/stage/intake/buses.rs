@@ -2,7 +2,7 @@
 //!
 //! An interface counts as faulty in three cases:
 //! * while it is down or missing;
-//! * from bus-off until the interface is up again or receives a frame;
+//! * from bus-off until the interface is up again, has restarted or receives a frame;
 //! * while the daemon's frames cannot be sent.
 //!
 //! The state of an interface is unknown before its first report. After a restart, a fault continues until the interface
@@ -17,8 +17,8 @@ use crate::quantity::{BusIndex, Timestamp};
 pub(crate) const CAN_ERR_BUSOFF: u32 = 0x40;
 const CAN_ERR_RESTARTED: u32 = 0x100;
 
-/// Time without a report that frames could not be sent, s. After this time, sending counts as working again. The time
-/// is four report periods of the driver.
+/// If no report of unsent frames arrives for this time, sending counts as working again, s. The time is four report
+/// periods of the driver.
 const SEND_RECOVERED_S: f64 = 1.0;
 
 #[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]
@@ -80,8 +80,9 @@ impl Buses {
         }
     }
 
-    /// Continues at `now` with the faults stored at `taken`. Faults continue until the interface reports. If frames
-    /// could not be sent, this counts as a fault for another [`SEND_RECOVERED_S`].
+    /// Continues at `now` with the faults stored at `taken`. Faults are kept, but the state of each interface is
+    /// unknown until the interface reports. If frames could not be sent at `taken`, sending counts as faulty for
+    /// another [`SEND_RECOVERED_S`].
     pub(crate) fn restored(mut self, taken: Timestamp, now: Timestamp) -> Self {
         for state in &mut self.states {
             let unsent = state.unsent.filter(|(_, latest)| taken.since(*latest) <= SEND_RECOVERED_S);

@@ -3,11 +3,13 @@
 //! In: a command frame, and the freshness that its authenticator confirms, if any. Out: permission to execute the
 //! command, or the reason for the refusal; the freshness to announce.
 //!
-//! With many attempts, an attacker can guess a short authenticator. After [`FORGED_BURST`] wrong authenticators, and
-//! for [`FORGED_PERIOD_NS`] after each further wrong authenticator, the gate is *under attack*. A command with a right
-//! authenticator must then be sent again within [`REPEAT_NS`], with another freshness, before it is executed. A genuine
-//! sender repeats a refused command, so its commands are executed even during an attack. An attacker must guess right
-//! twice.
+//! With many attempts, an attacker can guess a short authenticator. After [`FORGED_BURST`] wrong authenticators, the
+//! gate is *under attack* for [`FORGED_PERIOD_NS`]. After that, each further wrong authenticator starts another such
+//! period. For every [`FORGED_PERIOD_NS`] without a wrong authenticator, one more is tolerated again.
+//!
+//! During an attack, a command with a right authenticator is executed only after it has been sent again within
+//! [`REPEAT_NS`], with another freshness. A genuine sender repeats a refused command, so its commands are executed even
+//! during an attack. An attacker must guess right twice.
 
 use serde::{Deserialize, Serialize};
 
@@ -17,8 +19,8 @@ use crate::quantity::{InvalidState, Timestamp};
 
 /// Number of wrong authenticators tolerated after a pause.
 const FORGED_BURST: i64 = 10;
-/// Time per further wrong authenticator that is tolerated, ns. The probability of guessing an authenticator of 24 bits
-/// within a day is then 1 in 1900.
+/// Time after which one more wrong authenticator is tolerated, ns. The probability of guessing an authenticator of 24
+/// bits within a day is then 1 in 1900.
 const FORGED_PERIOD_NS: i64 = 10_000_000_000;
 /// Longest time between a command and its repetition during an attack, ns. At 2000 guesses a second (the default flood
 /// limit), the probability of guessing an authenticator of 24 bits and its repetition within a day is 1 in 800.
@@ -45,11 +47,11 @@ pub(crate) struct CommandGate {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CommandCounts {
-    /// Frames with a right authenticator and an unused freshness.
+    /// Frames with a right authenticator whose command was permitted.
     pub authentic: u64,
     /// Frames with a wrong authenticator.
     pub forged: u64,
-    /// Frames whose freshness was already used, is too old or was not announced.
+    /// Frames whose freshness was already used, was too old or had not been announced.
     pub old: u64,
     /// Frames with a right authenticator whose command must be repeated, because many wrong authenticators arrived.
     pub unconfirmed: u64,

@@ -58,13 +58,13 @@ impl CellLife {
         });
         self.forecast.update(usage, reading);
         if self.forecast.check(Axis::Cycles).is_err() {
-            // Restarts a forecast whose state has become impossible, because the use or the readings were impossible.
+            // Impossible use or readings have made the state of the forecast impossible, so the forecast restarts.
             self.forecast = Forecast::new(Axis::Cycles, model.rated_capacity_ah);
         }
         self.restate(config);
     }
 
-    /// Computes the remaining life again, for example for another threshold.
+    /// Computes the remaining life again, for example after a change of the end-of-life capacity.
     fn restate(&mut self, config: &HealthConfig) {
         self.remaining = self.forecast.remaining(config.end_of_life_ah);
     }
@@ -116,7 +116,8 @@ impl PackLife {
         self.observe(is_new, to);
     }
 
-    /// Computes the remaining lives for another end of life. The alarm value is unknown until new thresholds are set.
+    /// Computes the remaining lives for another end-of-life capacity. The alarm value is unknown until the caller calls
+    /// [`Self::observe`] with the new thresholds.
     pub(crate) fn restate(&mut self, config: &HealthConfig, to: &mut Publisher<'_>) {
         let before = self.of_pack();
         self.cells.iter_mut().for_each(|cell| cell.restate(config));
@@ -127,7 +128,8 @@ impl PackLife {
         }
     }
 
-    /// Passes the shortest known life to its rule. While the life of a cell is unknown, the value is an upper bound.
+    /// Passes the shortest known life to the alarm rule. While the life of a cell is unknown, the value is an upper
+    /// bound.
     pub(crate) fn observe(&self, is_new: bool, to: &mut Publisher<'_>) {
         let is_bound = self.of_pack().is_none();
         let cycles = self.shortest().and_then(|(_, life)| life.cycles);

@@ -1,5 +1,5 @@
 //! Decides which alarm is sent next. A changed alarm is sent immediately and then repeated. All raised alarms are also
-//! sent one after another, each once per period (*in turn*). All frames share one budget.
+//! sent *in turn*: one after another, each once per period if the budget allows. All frames share this budget.
 //!
 //! In: changed alarms, the alarm engine, the time. Out: one alarm at a time, most severe first. The budget is a token
 //! bucket: [`BURST`] frames at once, then one every [`ALARM_DELAY_MS`]. The first frames of changes have priority over
@@ -21,8 +21,8 @@ use crate::quantity::{CellIndex, Timestamp};
 const BURST: i64 = 20;
 /// Shortest time between frames in turn, in units of [`ALARM_DELAY_MS`]. Half of the budget thus remains for changes.
 const TURN_DELAYS: u32 = 2;
-/// Maximum number of alarms that are announced as unknown (17 rules with three severities are 51). Further unknown
-/// alarms are not announced, but the digest shows their rules.
+/// Maximum number of alarms that are announced as unknown. 17 rules with three severities have 51 thresholds. Further
+/// unknown alarms are not announced, but the digest shows their rules as unknown.
 const MAX_UNKNOWN: usize = 64;
 
 const NANOS_PER_MS: i64 = 1_000_000;
@@ -165,7 +165,8 @@ impl AlarmQueue {
         Some(next)
     }
 
-    /// The next alarm to announce as unknown, if any. Returns `None` if the budget is used up.
+    /// The next alarm to announce as unknown, if any. Returns `None` if the budget is used up, or if a new alarm would
+    /// exceed [`MAX_UNKNOWN`].
     pub(crate) fn take_unknown(&mut self, now: Timestamp, engine: &AlarmEngine, turn: usize) -> Option<Alarm> {
         let alarm = engine.unknown_alarm(turn).filter(|_| self.free <= now)?;
         let key = AlarmKey::of(&alarm);

@@ -1,8 +1,9 @@
 //! The J1939 node, which sends alarms as trouble codes in addition to the frames of `[output]`.
 //!
 //! In: frames of the node's interface, alarms, ticks. Out: the node's frames and events. If several raised thresholds
-//! share a suspect parameter number (SPN), the node sends only the trouble code of the most severe threshold, whichever
-//! cells raised it. The occurrence count of the code is the largest count among the threshold's alarms.
+//! of a rule share a suspect parameter number (SPN), the node sends only the trouble code of the most severe threshold.
+//! If several raised rules share an SPN, only the rule with the highest number is sent. The occurrence count of a code
+//! is the largest count among the threshold's alarms.
 
 use crate::alarm::AlarmEngine;
 use crate::can::Frame;
@@ -32,8 +33,8 @@ impl J1939 {
         }
     }
 
-    /// Applies a configuration with other trouble codes. Returns `false` and changes nothing if the node itself
-    /// differs.
+    /// Applies a configuration with other trouble codes. If the node itself differs, changes nothing and returns
+    /// `false`.
     pub(crate) fn reconfigure(&mut self, config: &J1939Config) -> bool {
         let is_same = (self.config.bus, self.config.node) == (config.bus, config.node);
         if is_same {
@@ -81,7 +82,7 @@ impl J1939 {
                 self.previously_active.push(code);
             }
         }
-        // If the list is too long, its end is cut off. Put the most severe codes first.
+        // Restores the order of rule and severity. If the list is too long, its end is cut off.
         self.previously_active.reverse();
         if is_test_running {
             self.active.push(ActiveCode { code: self.config.test_code, lamp: Lamp::None });

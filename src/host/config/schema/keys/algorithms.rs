@@ -1,5 +1,5 @@
 //! Declares the tables of the algorithms: cell filter, transitions, capacity, recharge, usable capacity. Each table
-//! gives the parameters of its algorithm; the default of an optional key is computed next to the key.
+//! gives the parameters of its algorithm. Defaults that depend on the cell or on other keys are also computed here.
 
 use super::choices::{DEVIATION, MethodKey, TEMPERATURE_C};
 use crate::cell::{
@@ -14,8 +14,9 @@ use crate::filter::ScalarGaussian;
 use crate::health::{CapacityConfig, CapacityMethod, RechargeAlarm, RechargeConfig, TransitionConfig, UsableConfig};
 use crate::quantity::bounds;
 
-/// Standard deviation of the capacity lost before a cell's first half-cycle, as a fraction of a new cell's capacity.
-/// Until that half-cycle, the cell is assumed to have a new cell's open-circuit curve.
+/// Uncertainty of the open-circuit curve before the first half-cycle is measured. Until then, the cell is assumed to
+/// have a new cell's curve. The value is the standard deviation of the capacity lost so far, as a fraction of a new
+/// cell's capacity.
 const FIRST_LOSS_STD: f64 = 0.03;
 
 section! {
@@ -89,14 +90,14 @@ section! {
 }
 
 impl Estimator {
-    /// Standard deviation of the voltage's quantisation, V (uniform: step / sqrt 12). It is 0 for steps smaller than
-    /// the sensor's noise, because that noise already contains them.
+    /// Standard deviation of the voltage's rounding error, V (uniform: step / sqrt 12). If the step does not exceed the
+    /// sensor's noise, the result is 0, because the noise then covers the rounding error.
     pub(crate) fn rounding_v(&self, step_v: f64) -> f64 {
         if step_v > self.voltage_noise_v { step_v / 12.0_f64.sqrt() } else { 0.0 }
     }
 
     /// The estimator's configuration. `initial_ah` and `initial_std_ah` are the configured capacity and its standard
-    /// deviation, `voltage_step_v` is the resolution of the cell voltages.
+    /// deviation. `voltage_step_v` is the resolution of the cell voltages.
     pub(crate) fn config(
         &self,
         (initial_ah, initial_std_ah): (Option<f64>, Option<f64>),
@@ -226,7 +227,7 @@ section! {
 }
 
 impl Capacity {
-    /// Standard deviation of the current's offset; 0 for the paper's filter, which has no offset.
+    /// Standard deviation of the current sensor's offset; 0 for method "nominal", which does not learn an offset.
     pub(crate) fn current_offset_std_a(&self, rated_ah: f64) -> f64 {
         match self.method {
             MethodKey::Swing => self.current_offset_std_a.unwrap_or(rated_ah / 100.0),
@@ -234,7 +235,8 @@ impl Capacity {
         }
     }
 
-    /// Standard deviation of the open-circuit curve's shift; 0 for the paper's filter, which has no shift.
+    /// Standard deviation of the open-circuit curve's ageing shift; 0 for method "nominal", which does not use the
+    /// shift.
     pub(crate) fn shift_std(&self) -> f64 {
         match self.method {
             MethodKey::Swing => self.ageing_shift_error,

@@ -32,12 +32,12 @@ pub(crate) enum WireOrder {
     Little,
 }
 
-/// How a half-cycle measures the capacity.
+/// How the capacity follows from the charge of a half-cycle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum MethodKey {
-    /// Charge over the SOC swing found from the voltages.
+    /// Charge divided by the SOC swing, which follows from the voltages.
     Swing,
-    /// Charge over a nominal swing.
+    /// Charge divided by a configured swing.
     Nominal,
 }
 

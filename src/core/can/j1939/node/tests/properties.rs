@@ -49,8 +49,8 @@ fn lamp_of(number: u8) -> Lamp {
 fn perform(bench: &mut Bench, act: &Act) {
     match act {
         Act::Wait(ms) => {
-            // Simulates a driver that sleeps until something is due, and polls at most once a tick (here 1 ms) like the
-            // busy driver.
+            // Simulates a driver that sleeps until something is due. It polls at most once a tick (here 1 ms), as a
+            // driver does that polls at every tick.
             let (end, mut next_tick) = (bench.now_ms + i64::from(*ms), bench.now_ms);
             while let Some(due) = bench.node.next_due().filter(|due| *due <= at(end) && next_tick <= end) {
                 bench.now_ms = next_tick.max(due.nanos().saturating_add(999_999) / 1_000_000);
@@ -102,8 +102,8 @@ fn sleeping_and_polled(acts: &[Act]) -> (Bench, Bench) {
     (sleeper, busy)
 }
 
-/// A case that the property below found. During the transfer of a DM2, the second code leaves the DM1, which then fits
-/// into one frame.
+/// A case that the property below found. During the transfer of a DM2, both codes leave the DM1, which then fits into
+/// one frame.
 #[test]
 fn dm1_shortened_during_transfer_is_due() {
     let set = |spns: &[(u8, u8)], previously| Act::Set { spns: spns.to_vec(), previously, all_known: true };

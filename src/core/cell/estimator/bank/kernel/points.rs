@@ -1,7 +1,7 @@
 //! Sigma points in pairs: columns of the Cholesky factor, and odd and even parts of a function over each pair.
 //!
 //! In: covariances. Out: columns, resistance ratios, odd and even parts (see [`super`]), in the units of the states.
-//! All results are NaN if the covariance has no factor.
+//! If the covariance has no factor, `PartialCholesky::is_positive` is false, and results can be NaN.
 
 use super::types::{KernelConstants, at};
 use crate::cell::estimator::state_vector::LOG_RESISTANCE;
@@ -41,16 +41,16 @@ impl<const L: usize, const N: usize> PartialCholesky<L, N> {
 
 /// A column of the factor.
 struct CholeskyColumn<const L: usize, const N: usize> {
-    /// The covariance that remains after the columns before it.
+    /// The same column of the covariance, minus the contributions of the previous columns.
     left: [Lanes<L>; N],
     per_pivot: Lanes<L>,
-    /// The remainder over the root of the pivot: the factor's column.
+    /// `left` divided by the root of the pivot: the factor's column.
     scaled: [Lanes<L>; N],
 }
 
 impl<const L: usize, const N: usize> CholeskyColumn<L, N> {
-    /// Computes column K from the columns before it, without waiting for their square roots. If the covariance has no
-    /// factor, the column is NaN, and so is every result.
+    /// Computes column K from the columns before it, without waiting for their square roots. If the pivot is not
+    /// positive, the column contains NaN.
     #[inline(always)]
     fn new<const T: usize, const K: usize>(covariance: &[Lanes<L>; T], done: [&Self; K]) -> Self {
         let mut left = [Lanes::splat(0.0); N];
@@ -96,7 +96,8 @@ fn is_positive<const L: usize, const N: usize>(rest: &[[Lanes<L>; N]; N]) -> Mas
 pub(super) struct ResistanceRatios<const L: usize> {
     /// Factor of the first pair's plus and minus point.
     pub(super) first: [Lanes<L>; 2],
-    /// Odd and even part of the second pair's factor: sinh d / s and (cosh d - 1) / s.
+    /// Odd and even part of the second pair's factor: sinh d / s and (cosh d - 1) / s. d is the distance of the pair's
+    /// points from the centre in ln(resistance).
     pub(super) second: [Lanes<L>; 2],
 }
 

@@ -11,8 +11,8 @@ use crate::cell::estimator::state_vector::{
 };
 use crate::filter::simd::{Lanes, Mask};
 
-/// Maximum time (s) between two readings that counts for the random walk of the resistance. A cell hardly ages in a
-/// gap.
+/// Maximum duration (s) of a step in the random walk of the resistance. A longer step counts as this long, because a
+/// cell hardly ages in a gap.
 const MAX_WALK_S: f64 = 600.0;
 
 /// Values of a branch at L table points, for the measured time.
@@ -37,16 +37,16 @@ impl<const L: usize> BranchStep<L> {
         Self { r_ohm, tau_s, decay, exact }
     }
 
-    /// Voltage, after the measured time, of a branch that starts at the voltage `u`. With the present current, a new
-    /// cell's branch would settle at `r_ohm` x `drive`.
+    /// Voltage, after the measured time, of a branch that starts at the voltage `u`. `drive` is the mean current (A)
+    /// times the resistance ratio of the cell, so the branch would settle at `r_ohm` x `drive`.
     #[inline(always)]
     fn voltage_v(&self, drive: Lanes<L>, u: Lanes<L>) -> Lanes<L> {
         self.r_ohm * drive * (Lanes::splat(1.0) - self.decay) + u * self.decay
     }
 }
 
-/// Effect of a discharge of `charge_ah` on the SOC: the decrease at the centre, and its odd and even parts over the
-/// pairs. Only the quotient of charge and capacity is nonlinear.
+/// SOC after a discharge of `charge_ah`: the decrease of the SOC at the centre, and the odd and even parts of the new
+/// SOC over the pairs. Only the quotient of charge and capacity is nonlinear.
 #[inline(always)]
 fn soc_parts<const L: usize, const N: usize>(
     c: &KernelConstants,
@@ -72,14 +72,14 @@ struct BranchPrediction<const L: usize> {
     centre_v: Lanes<L>,
     /// Remaining fraction of the branch's voltage, at the centre.
     decay: Lanes<L>,
-    /// Voltage that a current adds to the branch of a new cell, per ampere, at the centre, ohm.
+    /// Voltage per ampere that a current adds to a new cell's branch in the measured time, at the centre, ohm.
     gain_ohm: Lanes<L>,
     noise: Lanes<L>,
     parts: OddEvenParts<L>,
 }
 
-/// Predicts branch `i`. With the present current, a new cell's branch would settle at its resistance times `drive`. The
-/// pair of the first column has other table points, and the pair of the second column another resistance.
+/// Predicts branch `i`. `drive` is the mean current (A) times the resistance ratio of the cell. The first pair of sigma
+/// points has other table points and resistances than the centre; the second pair has only other resistances.
 #[inline(always)]
 fn predict_branch<const L: usize, const N: usize, const W: usize>(
     c: &KernelConstants,

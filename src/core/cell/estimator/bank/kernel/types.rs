@@ -11,14 +11,15 @@ use crate::cell::estimator::state_vector::{BRANCHES, CONSTANT_ERRORS, square};
 use crate::cell::{CellModel, Discretisation, EstimatorConfig, SensorErrors};
 use crate::filter::simd::{Lanes, Mask};
 
-/// Filter states of L cells: N means, the T elements of the covariance's lower triangle, and a memory.
+/// Filter states of L cells: N means, the T elements of the covariance's lower triangle, the effects of the constant
+/// errors, and a memory.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(in crate::cell::estimator::bank) struct FilterState<const L: usize, const N: usize, const T: usize> {
     /// Means in the order of the estimator's state.
     pub(in crate::cell::estimator::bank) mean: [Lanes<L>; N],
     /// Covariance without the constant errors, row by row to the diagonal.
     pub(in crate::cell::estimator::bank) covariance: [Lanes<L>; T],
-    /// Errors of the means by one standard deviation of each constant error.
+    /// Errors of the means caused by one standard deviation of each constant error.
     pub(in crate::cell::estimator::bank) by_constant: [[Lanes<L>; N]; CONSTANT_ERRORS],
     /// Part of the estimator's `Memory`, see [`LOAD_A`] to [`SLOW_STD`].
     pub(in crate::cell::estimator::bank) memory: [Lanes<L>; MEMORY],
@@ -50,7 +51,8 @@ pub(in crate::cell::estimator::bank) const CURVE_STD_AH: usize = 7;
 pub(in crate::cell::estimator::bank) const SLOW_INFORMATION: usize = 8;
 /// Evidence about the ratio of the slowest branch.
 pub(in crate::cell::estimator::bank) const SLOW_SCORE: usize = 9;
-/// Ratio of the slowest branch's resistance to the model's. Steps do not change it.
+/// Ratio of the slowest branch's resistance to the model's, in addition to the resistance ratio of the cell. Steps do
+/// not change it.
 pub(in crate::cell::estimator::bank) const SLOW_RATIO: usize = 10;
 /// Standard deviation of the ratio of the slowest branch. Steps do not change it.
 pub(in crate::cell::estimator::bank) const SLOW_STD: usize = 11;
@@ -60,7 +62,7 @@ pub(in crate::cell::estimator::bank) const fn at(i: usize, j: usize) -> usize {
     i * (i + 1) / 2 + j
 }
 
-/// Inputs of L cells since their last step.
+/// Inputs for one step of L cells.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::cell::estimator::bank) struct StepInput<const L: usize> {
     pub(in crate::cell::estimator::bank) measured_s: Lanes<L>,
@@ -73,7 +75,7 @@ pub(in crate::cell::estimator::bank) struct StepInput<const L: usize> {
     pub(in crate::cell::estimator::bank) decay: DecayFactors<L>,
 }
 
-/// Decay factors of a step time.
+/// Decay factors over the time of a step.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::cell::estimator::bank) struct DecayFactors<const L: usize> {
     /// Decay of the load's low-pass.
@@ -113,7 +115,8 @@ impl<const L: usize> DecayFactors<L> {
 /// Outcome of a step.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::cell::estimator::bank) struct StepOutcome<const L: usize> {
-    /// Whether the covariance was positive definite and the variance of the innovation is positive.
+    /// After an update: whether the covariance was positive definite and the variance of the innovation is positive.
+    /// After a whole step: also whether the reading is within the gate and the new state is possible.
     pub(in crate::cell::estimator::bank) is_usable: Mask<L>,
     /// Whether the innovation is within the gate.
     pub(in crate::cell::estimator::bank) is_accepted: Mask<L>,
@@ -159,7 +162,7 @@ pub(super) struct ReadingVariances {
     /// Variance of the model's error per square of the load's voltage, over one second.
     pub(super) load: f64,
     pub(super) gate: f64,
-    /// Variance, for the gate, per square of the slope of the open-circuit voltage.
+    /// Variance that the gate adds per square of the open-circuit voltage's slope.
     pub(super) gate_soc: f64,
     /// Maximum test ratio of an accepted reading.
     pub(super) gate_limit: f64,

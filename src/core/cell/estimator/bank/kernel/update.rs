@@ -26,7 +26,8 @@ struct PredictedVoltage<const L: usize> {
     parts: OddEvenParts<L>,
     /// Slope of the open-circuit voltage, V per unit of SOC.
     slope_v: Lanes<L>,
-    /// Changes of the open-circuit voltage with the capacity, V per Ah, and by the mixes of losses, V.
+    /// Changes of the open-circuit voltage: with the capacity, V per Ah, and per standard deviation of each mix of
+    /// losses (see `crate::cell::aged_ocv`), V.
     changes_v: [Lanes<L>; 1 + MIXES],
     /// Present voltage drop in the cell, V.
     lost_v: Lanes<L>,
@@ -86,8 +87,8 @@ impl<const L: usize> PredictedVoltage<L> {
     }
 }
 
-/// Contribution of a part of branch `i`'s voltage to the cell's voltage. For the slowest branch, it is multiplied by
-/// the ratio of that branch.
+/// Contribution of a part of branch `i`'s voltage to the cell's voltage. If the branch is the slowest, the part is
+/// multiplied by the learned ratio of the slowest branch.
 #[inline(always)]
 fn weighed<const L: usize, const N: usize, const T: usize>(
     x: &FilterState<L, N, T>,

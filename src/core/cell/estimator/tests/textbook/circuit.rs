@@ -72,8 +72,8 @@ fn propagate<const N: usize>(
     let here = position(x.mean[0]);
     let q = noise::process::<N>(model, config, &here, dt_s);
 
-    // The effects of the constant errors follow from the derivatives of the circuit at the mean and from the charge
-    // that the sensor counts in excess.
+    // The effects of the constant errors follow from the derivatives of the circuit at the mean and from the excess
+    // charge that the sensor counts.
     let mut by_constant = x.by_constant;
     let (per_as, ratio) = (1.0 / (3600.0 * x.mean[CAPACITY]), libm::exp(x.mean[LOG_RESISTANCE]));
     let mut excess_as = [0.0; CONSTANT_ERRORS];

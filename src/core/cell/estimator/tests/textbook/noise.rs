@@ -11,8 +11,8 @@ use crate::cell::estimator::state_vector::{
 use crate::cell::{CellModel, ERROR_WINDOW_S, EstimatorConfig, GridPosition, SensorErrors, TemperaturePosition};
 use crate::filter::ScalarGaussian;
 
-/// Maximum time (s) between two readings that counts for the random walk of the resistance. A cell hardly ages in a
-/// gap.
+/// Maximum duration (s) of a step in the random walk of the resistance. A longer step counts as this long, because a
+/// cell hardly ages in a gap.
 const MAX_WALK_S: f64 = 600.0;
 
 /// Covariance that the random walks gain in `dt_s`. The noise of the capacity is added at the end of half-cycles.
@@ -86,7 +86,7 @@ impl VoltageReading {
         }
     }
 
-    /// Effect of the constant errors on (measured minus predicted voltage), V.
+    /// Effect of each constant error on the innovation, V per standard deviation of the error.
     fn by_constant<const N: usize>(
         &self,
         x: &Gaussian<N>,

@@ -66,8 +66,8 @@ impl SigmaPointWeights {
 pub(super) struct MeasurementNoise {
     /// Variance that determines the weight of the measurement.
     pub(super) variance: f64,
-    /// Variance of the error of a single reading, for the gate. It differs from `variance` if `variance` counts
-    /// information per time.
+    /// Variance of the error of a single reading, for the gate. It differs from `variance` if `variance` depends on the
+    /// time that the reading represents.
     pub(super) gate_variance: f64,
     /// Gate width in standard deviations.
     pub(super) gate_sigma: f64,
@@ -143,7 +143,7 @@ impl<const N: usize> Gaussian<N> {
         for y in plus.iter().chain(&minus) {
             predicted += y * spread.others;
         }
-        // The centre's own offset from the mean is zero, so it adds to the variance only.
+        // The centre equals the mean, so it adds to the variance, but not to `cross`.
         let mut spread_variance = spread.covariance_0 * (centre - predicted) * (centre - predicted);
         let mut cross = SVector::<f64, N>::zeros();
         for (x, y) in points.plus.iter().chain(&points.minus).zip(plus.iter().chain(&minus)) {
