@@ -4,8 +4,9 @@
 //! only their differences are meaningful. An interval between two current readings counts as follows:
 //! * at most the current's `max_age_s`: the charge is the mean of the two readings times the elapsed time (trapezoid);
 //! * longer than `max_age_s`, the maximum age of a usable value: the first reading is held for `max_age_s`. The rest of
-//!   the interval is unmeasured. Unmeasured time is never interpolated, regardless of its cause (bad readings, lost
-//!   frames, sleep, a restart).
+//!   the interval is unmeasured, regardless of the cause (bad readings, lost frames, sleep, a restart). If the interval
+//!   is at most [`SHORT_GAP`] times as long as `max_age_s`, the trapezoid replaces the held charge, because zero would
+//!   be too little under a steady load. The time still counts as unmeasured, so the SOC becomes more uncertain.
 //!
 //! After the latest reading, the current is also held for `max_age_s`. If the next reading arrives within this time,
 //! the trapezoid replaces the held value. While a valid reading says that the contactors are open, the current counts
@@ -16,6 +17,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::quantity::bounds;
 use crate::quantity::{InvalidState, Timestamp};
+
+/// Longest interval, in multiples of `max_age_s`, in which the mean of both readings is the most likely current.
+const SHORT_GAP: f64 = 4.0;
 
 /// Cumulative charge and unmeasured time at one moment.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
@@ -57,6 +61,11 @@ impl ChargeCounter {
             Some(last_a) if dt_s <= self.hold_s(max_age_s) => {
                 self.totals.add((last_a + current_a) / 2.0, dt_s, flow_a);
                 self.totals.offset_s += dt_s * (offset_part(last_a) + offset_part(current_a)) / 2.0;
+            }
+            Some(last_a) if dt_s <= SHORT_GAP * max_age_s && self.open_until.is_none() => {
+                let before_as = self.totals.charge_as;
+                self.totals = self.totals_at(time, max_age_s);
+                self.totals.charge_as = before_as + (last_a + current_a) / 2.0 * dt_s;
             }
             _ => self.totals = self.totals_at(time, max_age_s),
         }
@@ -194,6 +203,13 @@ mod tests {
         assert_eq!(charge_and_gap(&counter, 1.0), (1.0, 0.0));
         counter.handle_current(at(2.0), 3.0, 2.0, 0.1);
         assert_eq!(charge_and_gap(&counter, 2.0), (4.0, 0.0));
+    }
+
+    #[test]
+    fn short_hole_counts_as_unmeasured_trapezoid() {
+        let mut counter = counter(&[(0.0, 1.0)]);
+        counter.handle_current(at(6.0), 3.0, 2.0, 0.1);
+        assert_eq!(charge_and_gap(&counter, 6.0), (12.0, 4.0));
     }
 
     #[test]

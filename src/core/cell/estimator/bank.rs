@@ -63,7 +63,7 @@ impl EstimatorBank {
             _ => FilterArrays::Three(FilterArray::new(model, blocks)),
         };
         let cell = CellSlot { memory: Memory::new(config), has_filter: false };
-        let idle = StepResult { update: None, reset: false };
+        let idle = StepResult { update: None, reset: false, jumped: false };
         let mut bank = Self {
             constants: KernelConstants::new(model, config),
             voltage_reach: VoltageReach::new(model, config.sensor.voltage_offset_v),

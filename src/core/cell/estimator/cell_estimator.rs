@@ -21,6 +21,11 @@ use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES, SensorErrors};
 use crate::filter::ScalarGaussian;
 use crate::quantity::bounds;
 
+/// A change of the SOC in one step that the counted charge does not explain is a jump if it exceeds both limits: this
+/// fraction, and this many standard deviations of the SOC before the step.
+const JUMP: f64 = 0.05;
+const JUMP_SIGMA: f64 = 4.0;
+
 /// State from which a cell continues with another model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdoptedState {
@@ -61,6 +66,7 @@ impl CellEstimator {
     ) -> StepResult {
         let step = CellStep { temperature_c: Some(self.temperature(model, step)), ..*step };
         self.memory.temperature_c = step.temperature_c;
+        let before = self.marginal(0);
         let result = self.try_step(&mut kernel, model, config, &step);
         let result = result.filter(|_| self.filter.as_ref().is_none_or(Gaussian::is_possible));
         let reset = result.is_none() || self.memory.has_lost_cell(config);
@@ -73,7 +79,11 @@ impl CellEstimator {
             x.correlate(LOG_RESISTANCE, CAPACITY, 0.0);
             x.by_constant.fill(0.0);
         }
-        StepResult { update: result.flatten(), reset }
+        let counted = step.charge_as / (3600.0 * self.capacity().mean);
+        let jumped = before.zip(self.marginal(0)).is_some_and(|(before, after)| {
+            (after.mean - before.mean + counted).abs() > JUMP.max(JUMP_SIGMA * before.std())
+        });
+        StepResult { update: result.flatten(), reset, jumped }
     }
 
     /// Computes the step; `None` if this is not possible.

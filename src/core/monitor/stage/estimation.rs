@@ -28,6 +28,10 @@ use crate::sample::CellSample;
 /// enough to trip an alarm whose threshold is the limit.
 const DOUBT: f64 = 2.0;
 
+/// A cell is trusted again once its contradiction has fallen to this part of the consistency limit. With the default
+/// limit, this is the mean of a correct filter.
+const RETURN: f64 = 0.25;
+
 /// Value of `Consumed::path_v` for a frozen voltage, V. It is far outside the range of [`CurrentCheck::path_v`].
 const FROZEN_PATH_V: f64 = 1e9;
 
@@ -161,6 +165,11 @@ impl Estimation {
         self.note_checks();
     }
 
+    /// Whether the current is doubtful, or a jump of the SOC waits for a step of the current that is explained.
+    pub(crate) fn is_doubtful(&self) -> bool {
+        self.is_current_doubtful || self.current_check.is_unconfirmed()
+    }
+
     /// Whether the current was doubtful at any time since the last call.
     pub(crate) fn take_doubt(&mut self) -> bool {
         std::mem::replace(&mut self.was_current_doubtful, self.is_current_doubtful)
@@ -196,6 +205,13 @@ impl Estimation {
             self.bank.add(cell, &step);
         }
         self.bank.step();
+        // A small current that is not exactly zero shows that the sensor works and the pack rests.
+        let rest_a = self.bank.own_config().gap.rest_current_a;
+        let is_rest = |sample: &CellSample| sample.current_a.is_some_and(|a| a != 0.0 && a.abs() <= rest_a);
+        if samples.iter().any(|sample| self.bank.result(sample.cell.index()).jumped && !is_rest(sample)) {
+            self.current_check.demand_step();
+        }
+        self.was_current_doubtful |= self.current_check.is_unconfirmed();
         self.check_models(&samples);
         if modelling.has_row() {
             modelling.close_row(self.mean_soc());
@@ -385,7 +401,7 @@ impl Estimation {
         let (mean_nis, check) = (self.bank.mean_nis(index), &self.checks[index]);
         let limit = self.bank.own_config().consistency.limit;
         let mismatch = if check.is_mismatched() { check.mismatch() } else { 0.0 };
-        let is_doubtful = self.is_current_doubtful || self.is_voltage_frozen(index) || !self.bank.is_plausible(index);
+        let is_doubtful = self.is_doubtful() || self.is_voltage_frozen(index) || !self.bank.is_plausible(index);
         let doubt = if is_doubtful { DOUBT } else { 0.0 };
         if mismatch.max(doubt) > 0.0 { mean_nis.max(mismatch.max(doubt) * limit) } else { mean_nis }
     }
@@ -393,7 +409,8 @@ impl Estimation {
     /// Judges whether a cell's estimate is trusted: its contradiction is at most the consistency limit. Returns the
     /// result if it has changed.
     pub(crate) fn judge_trust(&mut self, cell: CellIndex) -> Option<bool> {
-        let is_trusted = self.contradiction(cell.index()) <= self.bank.own_config().consistency.limit;
+        let returns = if self.trusted[cell.index()] { 1.0 } else { RETURN };
+        let is_trusted = self.contradiction(cell.index()) <= returns * self.bank.own_config().consistency.limit;
         if is_trusted == self.trusted[cell.index()] {
             return None;
         }

@@ -264,8 +264,8 @@ impl Stages {
     /// Whether the innovations of all cells change neither an alarm nor the trust in a cell. If so, the innovations
     /// only need to be displayed.
     pub(crate) fn are_innovations_quiet(&self, out: &Outputs) -> bool {
-        let Estimation { all_trusted, any_mismatched, is_current_doubtful, .. } = self.estimation;
-        let is_known_good = all_trusted && !any_mismatched && !is_current_doubtful;
+        let Estimation { all_trusted, any_mismatched, .. } = self.estimation;
+        let is_known_good = all_trusted && !any_mismatched && !self.estimation.is_doubtful();
         is_known_good && !out.want_alarm_inputs && {
             let bank = &self.estimation.bank;
             let worst = bank.worst_nis();

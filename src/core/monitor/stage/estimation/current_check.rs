@@ -32,7 +32,7 @@ const FIRST_STEPS: [f64; 2] = [0.2, 20.0];
 /// Part of the counts that remains after another step.
 const FORGET_STEP: f64 = 0.98;
 /// Largest share of unexplained steps that counts as usual for a good sensor.
-const MAX_USUAL_SHARE: f64 = 0.2;
+const MAX_USUAL_SHARE: f64 = 0.1;
 /// Evidence that makes the sensor doubtful, as ln of the odds against it.
 const DOUBTFUL: f64 = 4.0;
 /// Highest evidence. It limits how many steps a doubtful sensor must explain until the doubt ends.
@@ -132,6 +132,8 @@ pub(crate) struct CurrentCheck {
     limits_a: [f64; 2],
     /// Number of earlier doubts; explained steps reduce it.
     doubts: f64,
+    /// Whether a jump of the SOC in a downtime waits for an explained step.
+    is_unconfirmed: bool,
 }
 
 impl Default for CurrentCheck {
@@ -153,6 +155,7 @@ impl Default for CurrentCheck {
             largest_a: [0.0; 2],
             limits_a: [0.0; 2],
             doubts: 0.0,
+            is_unconfirmed: false,
         }
     }
 }
@@ -161,6 +164,17 @@ impl CurrentCheck {
     /// Whether the evidence makes the current doubtful.
     pub(crate) fn is_doubtful(&self) -> bool {
         self.evidence > DOUBTFUL
+    }
+
+    /// Handles a jump of the SOC in a downtime: the cells may have been used, or a sensor may have failed. The next
+    /// explained step of the current decides. If no step has ever been judged, the check waits for none.
+    pub(crate) fn demand_step(&mut self) {
+        self.is_unconfirmed = self.steps != FIRST_STEPS;
+    }
+
+    /// Whether the SOC has jumped in a downtime, and no step of the current has been explained since.
+    pub(crate) fn is_unconfirmed(&self) -> bool {
+        self.is_unconfirmed
     }
 
     /// Handles a round. `samples`: the compared cells that have reported, each with its place (below [`MAX_CELLS`]).
@@ -289,6 +303,7 @@ impl CurrentCheck {
         let [unexplained, explained] = self.steps;
         let usual_share = (unexplained / (unexplained + explained)).min(MAX_USUAL_SHARE);
         if is_explained {
+            self.is_unconfirmed = false;
             self.add_evidence(libm::log((1.0 - FAULTY_SHARE) / (1.0 - usual_share)));
             self.doubts *= FORGET_DOUBT;
         } else {
@@ -465,6 +480,21 @@ mod tests {
             assert!(!check.is_doubtful());
         }
         assert!(shares.is_sorted() && shares[0] < 0.1 && shares[2] < 0.5, "{shares:?}");
+    }
+
+    #[test]
+    fn jump_waits_for_explained_step() {
+        let mut check = CurrentCheck::default();
+        check.demand_step();
+        assert!(!check.is_unconfirmed(), "no step has been judged");
+        drive(&mut check, 600, |load_a, _| Some(load_a));
+        check.demand_step();
+        check.interrupt();
+        assert!(check.is_unconfirmed());
+        drive(&mut check, 60, |load_a, _| Some(-load_a));
+        assert!(check.is_unconfirmed());
+        drive(&mut check, 60, |load_a, _| Some(load_a));
+        assert!(!check.is_unconfirmed());
     }
 
     #[test]
