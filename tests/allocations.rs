@@ -1,6 +1,7 @@
-//! Checks that in steady state no code on the path of a frame allocates memory: the log reader, and the core with the
-//! 96 cells of `config/example.toml`, including ticks and sent frames. The first frames (growing buffers), transitions
-//! and events may allocate.
+//! Checks that processing a frame allocates no memory in steady state. The tests cover the log reader and the core with
+//! the 96 cells of `config/example.toml`, including ticks and sent frames. Allocations are permitted for the first
+//! frames (buffers grow), for transitions between charge, discharge and rest, for events, and at the end of a row of
+//! the diagnosis (see `BLOCKS_OF_A_ROW`).
 //!
 //! The allocations of all threads of the process are counted. If a test fails, `dhat-heap.json` shows the allocations.
 
@@ -22,14 +23,14 @@ static ALLOCATOR: dhat::Alloc = dhat::Alloc;
 const SLEEP_GAP_S: f64 = 30.0;
 /// Length of the log, s.
 const LOG_S: f64 = 160.0;
-/// Length of the warm-up, s. In this time the health frames show each of the 96 cells once.
+/// Length of the warm-up, s. In this time, health frames for all 96 cells are sent.
 const WARM_S: f64 = 110.0;
 /// Minimum number of frames after the warm-up. The remaining 50 s contain more: 10 currents and 32 other frames every
 /// 100 ms.
 const MIN_FRAMES: u64 = 20_000;
 
-/// Maximum number of memory blocks that 96 cells may allocate when a row of the diagnosis ends. A row holds the sums of
-/// each cell's samples over a few minutes. The diagnosis computes its findings from rows.
+/// Maximum number of memory blocks that the core with 96 cells may allocate when a row of the diagnosis ends. A row
+/// holds the sums of each cell's samples over a few minutes. The diagnosis computes its findings from rows.
 const BLOCKS_OF_A_ROW: u64 = 64;
 
 /// Serialises the tests, because each counts the allocations of the whole process.
@@ -48,7 +49,7 @@ fn allocating_at_most(most: u64, what: &str, work: impl FnOnce()) {
     let profiler = dhat::Profiler::builder().testing().build();
     work();
     let blocks = dhat::HeapStats::get().total_blocks;
-    // dhat's own assertion saves the allocation sites.
+    // If it fails, dhat's own assertion saves the allocation sites in `dhat-heap.json`.
     dhat::assert!(blocks <= most, "{what}: {blocks} blocks allocated");
     drop(profiler);
 }
@@ -57,7 +58,7 @@ fn example() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("config/example.toml")
 }
 
-/// The example's pack on its bus: current every 10 ms, the cells every 100 ms.
+/// Simulates a log of the example's pack, with the current every 10 ms and the cells every 100 ms. Returns its path.
 fn pack_log(folder: &Path) -> PathBuf {
     let log = folder.join("pack.log");
     let mut simulate = Command::new(env!("CARGO_BIN_EXE_packwatch"));
@@ -90,7 +91,7 @@ fn next(source: &mut LogSource) -> Option<Record> {
     source.next_record().expect("a good log")
 }
 
-/// Whether the warm-up is over at this record.
+/// Whether the warm-up is over at the time of `record`.
 fn is_warm(record: &Record, first: &Record) -> bool {
     record.time.since(first.time) >= WARM_S
 }
@@ -130,7 +131,7 @@ fn frame_read_from_log_allocates_nothing() {
     while !is_warm(&next(&mut source).expect("a long log"), &first) {}
     let mut frames = 0;
     without_allocating("reading a log", || {
-        // Do not read the last frames: the end of a file causes work that is done only once.
+        // Stop before the end of the file: there, the reader does work that occurs only once per file.
         while frames < MIN_FRAMES {
             frames += u64::from(matches!(next(&mut source), Some(Record { kind: RecordKind::Frame { .. }, .. })));
         }
@@ -184,7 +185,7 @@ fn frame_through_core_allocates_nothing() {
     assert!(steady.len() as u64 > MIN_FRAMES, "{} frames", steady.len());
     before.iter().for_each(|record| core.feed(record));
     (core.sent, core.events) = (0, 0);
-    // A row of the diagnosis ends at most once a minute and may then allocate.
+    // A row of the diagnosis may end in this part of the log, and may then allocate.
     allocating_at_most(BLOCKS_OF_A_ROW, "the core", || steady.iter().for_each(|record| core.feed(record)));
     assert!(core.sent > 500, "{} frames sent: status ten times a second, health, alarms", core.sent);
     assert!(core.monitor.latest().flatten().count() == 96, "every cell must have an estimate");

@@ -79,7 +79,7 @@ fn line_search<E>(
     }
     // A step changes no variable by more than 2. Variables are logarithms, so this is a factor of about 7.
     let mut step = (2.0 / longest).min(1.0);
-    // A step is shortened at most 12 times.
+    // At most 12 step lengths are tried.
     for _ in 0..12 {
         let x: Vec<f64> =
             (0..at.x.len()).map(|k| (at.x[k] + step * direction[k]).clamp(limits.low[k], limits.high[k])).collect();

@@ -1,7 +1,7 @@
 //! Fits a Gaussian process to rows, predicts further rows, and returns the hyperparameters.
 //!
-//! Input: rows and settings. Output: a [`Model`] that predicts in units of the target. Invalid rows and invalid settings
-//! give an error.
+//! Input: rows and settings. Output: a [`Model`] that predicts in units of the target. Invalid rows and invalid
+//! settings give an error.
 
 use rand::SeedableRng;
 use rand::seq::SliceRandom;

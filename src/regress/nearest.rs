@@ -232,9 +232,9 @@ impl<'a> Scratch<'a> {
     }
 }
 
-/// Replaces `matrix` by the lower Cholesky factor (column-major) of the covariance matrix. The covariance matrix has the
-/// kernel values in its lower triangle, and the sum of prior variance, jitter and noise variance on its diagonal. Returns
-/// the jitter, as a fraction of the prior variance.
+/// Replaces `matrix` by the lower Cholesky factor (column-major) of the covariance matrix. The covariance matrix has
+/// the kernel values in its lower triangle, and the sum of prior variance, jitter and noise variance on its diagonal.
+/// Returns the jitter, as a fraction of the prior variance.
 fn factorise(matrix: &mut Vec<f64>, kernel: &[f64], n: usize, covariance: &Covariance) -> Result<f64, RegressionError> {
     matrix.resize(n * n, 0.0);
     until_positive(|jitter| {

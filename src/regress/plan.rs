@@ -157,8 +157,8 @@ impl Covariance {
         covariance
     }
 
-    /// Weights of the inputs for the distance between rows. The weight of an input is the inverse of its shortest length
-    /// scale.
+    /// Weights of the inputs for the distance between rows. The weight of an input is the inverse of its shortest
+    /// length scale.
     pub(super) fn metric(&self) -> Vec<f64> {
         let of = |d: usize| self.leaves.iter().map(|leaf| leaf.inverse_squares[d].sqrt()).fold(0.0, f64::max);
         (0..self.plan.dimensions).map(of).collect()

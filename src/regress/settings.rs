@@ -128,6 +128,6 @@ pub struct FitProgress {
     pub log_likelihood_per_row: f64,
 }
 
-/// A callback that is called before the first step and after each step of a search. If the callback returns `Break`, the
-/// fit ends with [`RegressionError::Cancelled`](super::RegressionError::Cancelled).
+/// A callback that is called before the first step and after each step of a search. If the callback returns `Break`,
+/// the fit ends with [`RegressionError::Cancelled`](super::RegressionError::Cancelled).
 pub type ProgressCallback<'a> = dyn FnMut(FitProgress) -> ControlFlow<()> + 'a;

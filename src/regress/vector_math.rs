@@ -1,9 +1,9 @@
 //! Computes exponential and logarithm without branches, so that the compiler can vectorise the loops.
 //!
 //! Each function states the range of its argument. Within this range, the relative error of the result is a few 1e-16.
-//! Outside this range, the result is meaningless. The calling loops run inside `pulp`'s dispatcher (part of faer), which selects the widest
-//! vector instructions of the machine at run time. Multiplications and additions are not fused, so the results are the
-//! same on every machine.
+//! Outside this range, the result is meaningless. The calling loops run inside `pulp`'s dispatcher (part of faer),
+//! which selects the widest vector instructions of the machine at run time. Multiplications and additions are not
+//! fused, so the results are the same on every machine.
 
 use std::f64::consts::LOG2_E;
 

@@ -29,8 +29,8 @@ pub(crate) fn read(path: &Path) -> Result<Vec<u8>, String> {
     Ok(bytes)
 }
 
-/// Reads the secret or the certificate that the key `key` of the settings names. If the unit has a credentials folder, a
-/// relative path is relative to this folder.
+/// Reads the secret or the certificate that the key `key` of the settings names. If the unit has a credentials folder,
+/// a relative path is relative to this folder.
 ///
 /// # Errors
 /// Fails like [`read`]. The message also names the key.

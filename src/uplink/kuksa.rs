@@ -2,7 +2,7 @@
 //!
 //! Input: settings, and status documents of the daemon. Output: values in the databroker, one batch a second. After a
 //! lost connection, the program reconnects. The pauses between attempts grow from [`FIRST_PAUSE`] to [`LONGEST_PAUSE`].
-//! Documents are never queued: the first batch of a connection contains only the newest document. On `SIGTERM` and
+//! Documents are never queued: the first batch of a connection has the values of the newest document. On `SIGTERM` and
 //! `SIGINT`, the program sends a batch without values and ends.
 //!
 //! | module | what lives there |
@@ -61,8 +61,8 @@ async fn serve(settings: &Settings) -> std::io::Result<()> {
     let (mut pause, mut latest_error) = (FIRST_PAUSE, String::new());
     loop {
         let connections = journal.counts.connections;
-        // The first batch of a connection contains the newest document. While the daemon is silent, the first batch
-        // contains unknown values.
+        // The first batch of a connection has the values of the newest document. While the daemon is silent, the values
+        // of the first batch are unknown.
         documents.mark_changed();
         let Err(error) = session::run(&settings.kuksa, &mut documents, &mut stop, &mut journal).await else { break };
         let was_connected = journal.counts.connections > connections;

@@ -1,5 +1,5 @@
-//! Sends the daemon's status to other software inside or outside the vehicle: MQTT brokers (`mqtt`) and KUKSA databrokers
-//! (`kuksa`).
+//! Sends the daemon's status to other software inside or outside the vehicle: MQTT brokers (`mqtt`) and KUKSA
+//! databrokers (`kuksa`).
 //!
 //! This crate is a separate program, which reads the daemon's status stream like the exporter. A slow, missing or
 //! hostile broker can therefore not delay the estimates, and the daemon needs no network library.

@@ -1,9 +1,9 @@
-//! `vss`: writes an overlay of the Vehicle Signal Specification (VSS). The overlay contains the signals that VSS does not
-//! have.
+//! `vss`: writes an overlay of the Vehicle Signal Specification (VSS). The overlay contains the signals that VSS does
+//! not have.
 //!
-//! Input: the branch in the settings. Output: `packwatch.vspec`, which vss-tools merge into VSS (`vspec export json -l`), and
-//! `packwatch.json`, which a databroker reads in addition to VSS's own file (`--vss vss.json,packwatch.json`).
-//! `--reference` prints every signal as Markdown, for the manual.
+//! Input: the branch in the settings. Output: `packwatch.vspec`, which vss-tools merge into VSS
+//! (`vspec export json -l`), and `packwatch.json`, which a databroker reads in addition to VSS's own file
+//! (`--vss vss.json,packwatch.json`). `--reference` prints every signal as Markdown, for the manual.
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;

@@ -3,7 +3,7 @@
 use packwatch_core::cell_faults::CellFaultKind;
 use packwatch_core::sim::FaultKind;
 
-/// The expected finding; `None` if packwatch has no finding for this fault.
+/// The expected kind of finding. At present, every fault has one.
 pub(crate) fn kind_of(fault: &FaultKind) -> Option<CellFaultKind> {
     match fault {
         FaultKind::Leak { .. } => Some(CellFaultKind::Leak),

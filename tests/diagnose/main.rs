@@ -2,14 +2,16 @@
 //!
 //! `tests/diagnose/run [--quick] [--packs N] [--days N] [--period MS] [--jobs N] [--seed N] [--only WORD] [--list] [--write]`
 //!
-//! A pack drives, parks with sleeping buses and charges every day (scenario `ev-day`); its cells differ. Each kind of
-//! fault is injected at a random cell on a random day in the first third of the simulated time. This is done in packs
-//! with good, usual and poor sensors, and with three kinds of balancing: none, unreported, and reported by bits that
-//! show the bled cells.
-//! Needs only the repository's cell model.
+//! A pack drives, parks with sleeping buses and charges every day (scenario `ev-day`). Its cells differ. Each kind of
+//! fault begins at a random time between 10 and 35 % of the simulated time. If the fault concerns a cell or a
+//! temperature sensor, the cell or sensor is random. Every fault is simulated with good, usual and poor sensors, and
+//! with three kinds of balancing: none, unreported, and reported by bits that show the bled cells.
+//! The program needs only the repository's cell model.
 //!
-//! - `--packs`: total number of packs, distributed over the rows, at least one per row
-//! - `--quick`: one pack per fault, with usual sensors and balancing
+//! - `--packs`: total number of packs, distributed over the rows of the table, at least one per row
+//! - `--days`, `--period`, `--jobs`, `--seed`: simulated days per pack; time between two readings, ms; number of
+//!   threads; seed of the first pack
+//! - `--quick`: one pack per fault, with usual sensors and unreported balancing
 //! - `--only WORD`: only faults whose name contains the word; `--only healthy --packs 3000` gives the rate of false
 //!   findings
 //! - `--list`: prints each unexpected finding with its pack
@@ -66,9 +68,11 @@ const FAULTS: [(&str, usize, &str); 21] = [
     ("temperature off", 1, "temperature-off:S"),
 ];
 
-/// Suffix of the name of a fault that grows for ten days; duration of the growth, s; number of steps.
+/// If the name of a fault has this suffix, the fault grows for ten days.
 const SLOWLY: &str = " in 10 days";
+/// Duration of the growth, s.
 const SLOW_S: f64 = 10.0 * 86_400.0;
+/// Number of steps of the growth.
 const SLOW_STEPS: u32 = 80;
 
 struct Options {
@@ -150,7 +154,7 @@ fn cpu_s() -> Option<f64> {
     Some((ticks(11)? + ticks(12)?) / TICKS_PER_S)
 }
 
-/// A row of the table, in sort order: fault, sensor quality, balancing.
+/// A row of the table: index in `FAULTS`, index in `QUALITIES`, balancing. The table is sorted in this order.
 type Row = (usize, usize, PackBalancing);
 
 fn cases(options: &Options) -> Result<Vec<(Row, Case)>, String> {
@@ -165,7 +169,7 @@ fn cases(options: &Options) -> Result<Vec<(Row, Case)>, String> {
     for i in 0..each {
         for row @ (f, q, balancing) in rows.iter().copied() {
             let (name, size, text) = FAULTS[f];
-            // Use the same pack in every row, so that rows differ only in fault and sensors.
+            // Use the same seeds in every row. Rows of equal pack size differ only in fault, sensors and balancing.
             let seed = options.seed + i as u64;
             let (size, quality, days) = (SIZES[size], QUALITIES[q].1, options.days);
             let fault = fault_of(text, size, seed, days)?;
@@ -176,7 +180,7 @@ fn cases(options: &Options) -> Result<Vec<(Row, Case)>, String> {
     Ok(cases)
 }
 
-/// Splits a resistance fault into small steps of growth.
+/// Splits a resistance fault into small steps of growth. Returns no steps for any other fault.
 fn slowly(fault: Option<Fault>) -> Vec<Fault> {
     let Some(Fault { kind: FaultKind::Resistance { cell, change }, from_s }) = fault else { return Vec::new() };
     let change = (1.0 + change).powf(1.0 / f64::from(SLOW_STEPS)) - 1.0;
@@ -196,7 +200,7 @@ fn fault_of(text: &str, size: PackSize, seed: u64, days: u32) -> Result<Option<F
     let cells = u32::from(size.cells);
     let (a, step, sensor) =
         (below(cells), 1 + below(cells - 1), below(u32::from(size.cells.div_ceil(pack::CELLS_PER_SENSOR))));
-    let hours = 24 * days / 10 + below((24 * days).div_ceil(4)); // in the first third
+    let hours = 24 * days / 10 + below((24 * days).div_ceil(4)); // 10 to 35 % of the simulated time
     let places = [("A", a), ("B", (a + step) % cells), ("S", sensor)];
     let text = places
         .iter()
@@ -224,7 +228,7 @@ fn run_all(cases: &[(Row, Case)], configs: &[MonitorConfig], options: &Options) 
     scores.into_inner().unwrap_or_default()
 }
 
-/// Prints the findings that the fault does not explain.
+/// Prints the findings of another kind than the fault's, and all findings before the fault began.
 fn list((f, q, balancing): Row, case: &Case, seen: &[FirstFinding]) {
     let (from_s, kind) =
         case.fault().map_or((f64::INFINITY, None), |fault| (fault.from_s, finding::kind_of(&fault.kind)));

@@ -1,4 +1,4 @@
-//! Simulates one pack and runs it through the whole core: true cells, sensors, CAN frames, `Monitor`.
+//! Simulates one pack (true cells, sensors, CAN frames) and runs the whole core (`Monitor`) on its frames.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -15,13 +15,13 @@ use packwatch_host::io::ticks::Ticks;
 
 use crate::finding::kind_of;
 
-/// Length of a gap in the record, s, above which the vehicle counts as asleep.
+/// If no frame arrives for longer than this, s, the vehicle counts as asleep.
 const SLEEP_GAP_S: f64 = 30.0;
 /// Interval between two checks of the findings while the buses are awake, s.
 const LOOK_S: f64 = 300.0;
-/// Minimum discharge current of a drive, 1/h (current divided by capacity); time without discharge that ends a drive,
-/// s.
+/// A discharge current above this value, 1/h (current divided by capacity), counts as driving.
 const DRIVE_PER_H: f64 = 0.05;
+/// If the pack has not been driving for longer than this, s, the next drive begins with the next driving current.
 const PARKED_S: f64 = 1800.0;
 /// Cells per temperature sensor.
 pub(crate) const CELLS_PER_SENSOR: u16 = 4;
@@ -62,7 +62,7 @@ pub(crate) struct Case {
     pub(crate) size: PackSize,
     pub(crate) quality: SensorQuality,
     pub(crate) balancing: PackBalancing,
-    /// The fault; a growing fault consists of several steps.
+    /// Steps of the fault: none in a healthy pack, one if the fault appears at once, several if it grows.
     pub(crate) faults: Vec<Fault>,
     pub(crate) seed: u64,
     pub(crate) days: u32,
@@ -72,14 +72,15 @@ pub(crate) struct Case {
 /// A finding at its first occurrence.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct FirstFinding {
-    /// Time since the start, s.
+    /// Time since the start of the simulation, s.
     pub(crate) at_s: f64,
-    /// Drives since the start of the fault, including the one in which it began.
+    /// Number of drives with the fault so far (see `Drives`).
     pub(crate) drives: u32,
     pub(crate) found: CellFault,
 }
 
-/// Writes the configuration of a pack whose BMS reports which cells it bleeds to `folder`, and loads it.
+/// Writes a pack's configuration to `folder` and loads it. In this configuration, the BMS reports which cells it
+/// bleeds.
 pub(crate) fn configuration(folder: &Path, size: PackSize) -> Result<MonitorConfig, String> {
     let sensors = size.cells.div_ceil(CELLS_PER_SENSOR);
     let write = |name: &str, text: String| std::fs::write(folder.join(name), text).map_err(|e| e.to_string());
@@ -180,7 +181,7 @@ fn pack(size: PackSize, sensors: u16) -> String {
 }
 
 impl Case {
-    /// The first step of the fault.
+    /// The first step of the fault; `None` in a healthy pack.
     pub(crate) fn fault(&self) -> Option<Fault> {
         self.faults.first().copied()
     }
@@ -207,8 +208,8 @@ impl Case {
         }
     }
 
-    /// Runs the pack. Returns the findings in the order of their first occurrence, without those that correctly
-    /// describe the sensors' own errors.
+    /// Runs the pack. Returns the findings in the order of their first occurrence. If a finding correctly describes one
+    /// of the sensors' own errors, it is omitted, unless its kind is the expected one.
     pub(crate) fn run(&self, config: &MonitorConfig) -> Vec<FirstFinding> {
         let mut sim = self.simulation(config);
         let encoder = InputEncoder::new(&config.input);
@@ -262,7 +263,7 @@ fn median(values: &[f64]) -> f64 {
     0.5 * (sorted[(sorted.len() - 1) / 2] + sorted[sorted.len() / 2])
 }
 
-/// Collects the first occurrence of each finding.
+/// Collects the first occurrence of each finding (kind and cells).
 #[derive(Debug, Default)]
 struct FindingHistory {
     first: Vec<FirstFinding>,
@@ -279,7 +280,8 @@ impl FindingHistory {
     }
 }
 
-/// Counts drives, starting with the one in which a fault begins.
+/// Counts the drives with a fault. If the fault begins during a drive, this drive is number 1. Otherwise the next drive
+/// is number 1.
 #[derive(Debug, Default)]
 struct Drives {
     begun: u32,
@@ -287,7 +289,7 @@ struct Drives {
 }
 
 impl Drives {
-    /// Handles a reading during a drive.
+    /// Handles a reading with a driving current.
     fn note(&mut self, now_s: f64, from_s: f64) {
         let is_new = self.last_s.replace(now_s).is_none_or(|last_s| now_s - last_s > PARKED_S);
         if now_s >= from_s && (is_new || self.begun == 0) {

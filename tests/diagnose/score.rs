@@ -7,27 +7,27 @@ use crate::finding::kind_of;
 use crate::pack::{CELLS_PER_SENSOR, Case, FirstFinding};
 
 const DAY_S: f64 = 86_400.0;
-/// Days of a month.
+/// Days in a month.
 const MONTH_DAYS: f64 = 30.0;
 
-/// Counts of one row of the table.
+/// Results of one row of the table.
 #[derive(Debug, Default, Clone)]
 pub(crate) struct Score {
     packs: u32,
     days: f64,
-    /// Days from the start of the fault to the right finding, for packs in which it was found.
+    /// Days from the start of the fault to the right finding, for each pack with a right finding.
     delays_days: Vec<f64>,
-    /// Packs in which the fault was found before the second drive with the fault began.
+    /// Packs in which the fault was found before its second drive.
     in_one_drive: u32,
-    /// Packs whose fault was found on another cell only.
+    /// Packs with a finding of the right kind, but only on wrong cells.
     wrong_cell: u32,
     /// Packs with a finding of another kind after the start of the fault.
     wrong_kind: u32,
     /// Packs with any finding after the start of the fault.
     any: u32,
-    /// Findings before the start of the fault, or in a healthy pack.
+    /// Findings before the start of the fault, and all findings in healthy packs.
     false_findings: u32,
-    /// Days without a fault.
+    /// Simulated days without a fault.
     healthy_days: f64,
 }
 
@@ -51,7 +51,7 @@ impl Score {
         self.any += u32::from(after().next().is_some());
     }
 
-    /// The row's cells in Markdown.
+    /// The columns from "packs" to "false" of the row, in Markdown.
     pub(crate) fn row(&self) -> String {
         let share = |count: usize| format!("{:.0} %", 100.0 * count as f64 / f64::from(self.packs.max(1)));
         let rate = self.false_rate();
@@ -68,8 +68,8 @@ impl Score {
         )
     }
 
-    /// Delay within which the fault was found in this share of all packs. If the fault was not found in a pack, the
-    /// pack's delay is infinite.
+    /// Delay, days, within which the fault was found in the share `quantile` of all packs; `-` if it was found in fewer
+    /// packs.
     fn delay(&self, quantile: f64) -> String {
         let mut delays = self.delays_days.clone();
         delays.sort_by(f64::total_cmp);
@@ -88,14 +88,16 @@ impl Score {
     }
 }
 
-/// Mean of a Poisson distribution that gives `count` or fewer in 5 % of cases (Wilson and Hilferty; 1 % too low at 0).
+/// Mean of a Poisson distribution that gives `count` or fewer in 5 % of cases. Uses the approximation of Wilson and
+/// Hilferty, which is 1 % too low at `count` 0.
 fn poisson_upper(count: f64) -> f64 {
     const NORMAL_95: f64 = 1.645;
     let n = count + 1.0;
     n * (1.0 - 1.0 / (9.0 * n) + NORMAL_95 / (3.0 * n.sqrt())).powi(3)
 }
 
-/// Ranges of cells (first, last) that a correct finding may name. Empty if the finding must name the whole pack.
+/// Ranges of cells (first, last) that a correct finding may name. Empty if a correct finding names no cells, because it
+/// concerns the whole pack.
 fn places(fault: &FaultKind) -> Vec<(CellIndex, CellIndex)> {
     let sensor = |i: u16| (CellIndex(i * CELLS_PER_SENSOR), CellIndex((i + 1) * CELLS_PER_SENSOR - 1));
     match *fault {
@@ -117,7 +119,7 @@ fn places(fault: &FaultKind) -> Vec<(CellIndex, CellIndex)> {
 fn is_right_place(places: &[(CellIndex, CellIndex)], found: Option<(CellIndex, CellIndex)>) -> bool {
     match found {
         None => places.is_empty(),
-        // The sensor of the last cells may have fewer cells.
+        // The last temperature sensor may have fewer cells than the others.
         Some((first, last)) => places.iter().any(|place| place.0 == first && last <= place.1 && last >= place.0),
     }
 }

@@ -263,7 +263,7 @@ fn announcement_expires_after_two_seconds() {
         daemon.pass(1000);
         daemon.sent.iter().for_each(|frame| ecu.handle_frame(frame));
         daemon.pass(20);
-        // Stop the ticks (a hung loop or a suspended computer). The announcement was made 20 ms after a whole second.
+        // Stop the ticks until about `stalled_ms` after the announcement, as if the loop hung.
         let frame = ecu.command(1, 2047).unwrap();
         daemon.ms += stalled_ms - 20;
         assert_eq!(daemon.receive(&frame), is_executed, "{stalled_ms}");

@@ -385,7 +385,7 @@ fn downtime_reduces_knowledge_of_leak() {
         let mut pack = FaultyPack::simulated(config, settings(), Wiring::single(), "");
         pack.sim = pack.sim.with_balancing_bits();
         pack.run_to(0.01);
-        // The daemon stops during the drive and starts again nine hours after the start of the simulation.
+        // The daemon stops during the first drive and starts again in the second drive, after the vehicle was parked.
         let stored = pack.monitor.snapshot();
         while pack.sim.advance().unwrap().time < Timestamp::from_secs(9.0 * 3600.0) {}
         pack.monitor = Monitor::new(pack.config.clone());
@@ -410,7 +410,7 @@ fn frozen_current_is_found_once() {
     assert_eq!(pack.events.iter().filter(is_it).count(), 1);
 }
 
-/// With offsets of several kelvins, the median of three readings may be the detached sensor itself.
+/// With offsets of several kelvins, the median of three readings may be the reading of the detached sensor.
 #[test]
 fn detached_temperature_sensor_is_found_despite_offsets() {
     let mut settings = settings();

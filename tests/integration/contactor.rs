@@ -64,7 +64,7 @@ fn stale_contactor_state_uses_measured_current() {
     rig.seconds(3);
     assert_eq!(current_a(&rig), Some(1.0));
     assert!(rig.monitor.lost_inputs().eq([Channel::Contactor]));
-    // Invalid readings of the contactors do not count: before the first valid one, the measured current applies.
+    // If no contactor reading has been valid yet, the measured current applies.
     let mut silent = Rig::new(CONTACTOR);
     silent.current_a = Some(1.0);
     silent.seconds(10);

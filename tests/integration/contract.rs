@@ -1,6 +1,6 @@
 //! Tests the contract with other ECUs. A listener loses frames, starts late and sees the daemon killed. After two
-//! cycles the listener must have the daemon's alarm table. The listener is built only from the written DBC and the
-//! manual's page `ecu/contract.md`.
+//! cycles the listener must have the daemon's alarm table. In one cycle the daemon sends each raised alarm four times.
+//! The listener is built only from the written DBC and the manual's page `ecu/contract.md`.
 //!
 //! `PACKWATCH_CONTRACT_RUNS` sets the number of runs (default 200); the full test has 10,000.
 
@@ -126,7 +126,7 @@ struct Daemon<'a> {
     config: &'a Config,
     random: ChaCha8Rng,
     monitor: Monitor,
-    /// State on disk, stored at every alarm change as the service does.
+    /// State on disk. As in the service, it is stored after every alarm change. It is also stored after every command.
     stored: Snapshot,
     encoder: InputEncoder,
     out: Outputs,

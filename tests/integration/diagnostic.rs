@@ -129,8 +129,8 @@ fn answer_values_are_dated_to_first_frame() {
     assert_eq!(measured, [(Timestamp::from_nanos(100_000_000), 10.0); 8]);
 }
 
-/// Reproduces a fault of a public car definition: the pack voltage lacks a division by ten and is limited to the range
-/// its author expected.
+/// Reproduces a fault of a public car definition: the pack voltage lacks a division by ten. The definition also limits
+/// the voltage to the range that its author expected.
 #[test]
 fn doctor_finds_pack_voltage_off_by_ten() {
     let folder = tempfile::tempdir().unwrap();

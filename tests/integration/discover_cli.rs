@@ -39,8 +39,8 @@ struct Trial<'a> {
 }
 
 impl Trial<'_> {
-    /// Returns how many expected signals are among the first three candidates, and the number of quantities. Prints
-    /// misses.
+    /// Returns how many expected signals are among the first three candidates, and how many are expected. Prints the
+    /// rank of each expected signal.
     fn run(&self) -> (usize, usize) {
         let mut args = vec!["discover", self.log.to_str().unwrap(), "--json"];
         args.extend(self.options.iter().map(String::as_str));

@@ -144,8 +144,8 @@ fn two_drives_identify_measured_cell() {
     let model = model.to_str().unwrap();
     let label = ["--chemistry", "nca-graphite", "--rated", "2.9"];
     let truth = ["score", "--json", "--truth-capacity", "2.99", &c];
-    // tests/label.md lists all cells. This cell: SOC RMSE 2.9 points with the label's model, 0.5 points after the fit to
-    // two drives.
+    // tests/label.md lists all cells. This cell: SOC RMSE 2.9 points with the label's model, 0.5 points after the fit
+    // to two drives.
     let (label_rmse, label_inside) = soc_score(&[&truth[..], &label].concat());
     assert!(label_rmse < 4.0 && label_inside > 0.85, "{label_rmse} {label_inside}");
     json(&[&["fit", "--json", "--log", &a, &b, "-o", model][..], &label].concat());

@@ -1,6 +1,6 @@
-//! Runs every seed, every input that once broke an invariant (`fuzz/seeds`), and mutated copies of them through the
-//! fuzz entry points (`fuzz/src/doors`), with the stable compiler and without a fuzzer. `PACKWATCH_FUZZ_CHANGES` sets
-//! the number of copies per entry point.
+//! Runs inputs through the fuzz entry points (`fuzz/src/doors`), with the stable compiler and without a fuzzer. The
+//! inputs are the files in `fuzz/seeds` (seeds, and inputs that once broke an invariant) and mutated copies of them.
+//! `PACKWATCH_FUZZ_CHANGES` sets the number of copies per entry point.
 
 use std::path::Path;
 
@@ -10,7 +10,8 @@ use self::doors::DOORS;
 #[expect(unreachable_pub, dead_code, reason = "the fuzz targets look up an entry point by name")]
 mod doors;
 
-/// Number of mutated copies per entry point; tests/fuzz runs the fuzzers.
+/// Number of mutated copies per entry point; the entry point `store` gets a tenth. `tests/fuzz` runs the fuzzers
+/// themselves.
 const CHANGES: usize = 200;
 
 /// A pseudo-random stream (xorshift64*).
@@ -25,7 +26,7 @@ impl Stream {
     }
 }
 
-/// A copy with some bytes changed, moved, repeated or removed.
+/// A copy of the seed with some bytes changed, repeated or inserted, or with its end cut off.
 fn changed(seed: &[u8], stream: &mut Stream) -> Vec<u8> {
     let mut bytes = seed.to_vec();
     for _ in 0..=stream.below(6) {

@@ -256,7 +256,8 @@ fn forecast_interval_holds_and_error_grows() {
         for (k, coverage) in inside.iter().enumerate() {
             assert!((0.90..=0.985).contains(coverage), "{}, {k}: {inside:?}", output["name"]);
         }
-        // Allow for the finite sample.
+        // The error must grow with the horizon. Because the sample is finite, it may fall slightly between two
+        // horizons.
         assert!(rmse.windows(2).all(|pair| pair[1] > 0.98 * pair[0]), "{}: {rmse:?}", output["name"]);
         assert!(rmse[rmse.len() - 1] > 2.0 * rmse[0] && width[width.len() - 1] > 2.0 * width[0]);
         let persistence = of("persistence_rmse");

@@ -215,7 +215,7 @@ fn near(found: f64, expected: f64) -> bool {
     (found - expected).abs() <= 6e-6 + 1e-6 * expected.abs()
 }
 
-/// The name without leading zeros in its numbers; a series drops them.
+/// The name without leading zeros in its numbers, because names in a series have no leading zeros.
 fn without_zeros(name: &str) -> String {
     let mut short = String::new();
     let mut chars = name.chars().peekable();

@@ -1,5 +1,5 @@
-//! Replays whole simulated lives. `cantools` decodes every frame with the DBC that `packwatch dbc` writes; the values
-//! must match the estimates and events of the same replay to within one bit.
+//! Replays whole simulated lives. `cantools` decodes every frame with the DBC that `packwatch dbc` writes. The
+//! values must match the estimates and events of the same replay to within one step of the signal.
 
 use std::ffi::OsString;
 use std::fs;

@@ -391,7 +391,7 @@ fn lost_frame_counts_saturate() {
     let journal = file(folder.path(), "j", format!("PACKWATCH-JOURNAL 1\n{line}{line}").as_bytes());
     let (records, counts) = read(&[journal], true, |_| {}).expect("read");
     assert_eq!((records, counts.bad_lines), (vec![lost, lost], 0));
-    // A number above the largest is invalid.
+    // A number of lost frames above the largest possible one makes the line invalid.
     let beyond = MOST_DROPPED.replace("dropped 18446744073709551615", "dropped 18446744073709551616");
     let (records, counts) = read(&[file(folder.path(), "b.log", beyond.as_bytes())], false, |_| {}).expect("read");
     assert_eq!((records.len(), counts.dropped_frames, counts.ignored_lines), (1, 0, 2));

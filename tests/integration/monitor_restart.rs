@@ -38,7 +38,7 @@ fn state_from_future_has_unknown_age() {
     rig.seconds(1);
     assert_eq!(rig.gaps(), [None]);
     assert!(rig.soc_std(0) > 0.25, "{}", rig.soc_std(0));
-    // Frames of several interfaces may arrive slightly out of order, which does not mean that the clock was set.
+    // Frames of several interfaces may arrive slightly out of order. This does not mean that the clock was set back.
     let mut rig = learned();
     (rig.current_a, rig.deci) = (None, rig.deci - 5);
     rig.restart(Downtime::AsStamped);

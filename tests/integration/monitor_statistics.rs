@@ -54,7 +54,7 @@ fn bad_commands_are_counted_and_reports_limited() {
     let mut rig = Rig::new("");
     rig.seconds(1);
     for _ in 0..5 {
-        // No rule has this number, so the command is bad.
+        // Command code 0 and rule number 30 do not exist, so the command is bad.
         rig.command(0, 30, 0x7FF);
     }
     let reported = rig.events.iter().filter(|event| format!("{event:?}").contains("BadCommand")).count();

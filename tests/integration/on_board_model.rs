@@ -1,7 +1,7 @@
 //! Tests that the monitor learns the model of a cell from simulated drives and charges. Only the cell's label is known.
 //!
-//! The cell has less capacity and other resistances than its label says. It runs cycles of the paper's scenario, with a
-//! night between cycles.
+//! The cell has less capacity than its label says, and not the usual resistances of its chemistry. It runs cycles of
+//! the paper's scenario, with a night between cycles.
 
 use std::path::Path;
 

@@ -29,7 +29,7 @@ fn learned(rig: &Rig) -> Vec<String> {
     rig.monitor.cell_views().map(cell).collect()
 }
 
-/// Resistances relative to new after the next voltages, which change them slightly.
+/// Feeds one more round of voltages, which changes the resistances slightly. Returns the resistances relative to new.
 fn resistances(rig: &mut Rig) -> Vec<f64> {
     rig.tick_with_frames();
     rig.monitor.cell_views().map(|view| view.values.mean(Quantity::ResistanceRatio).unwrap()).collect()

@@ -85,7 +85,7 @@ fn new_module_starts_fresh_others_continue() {
     let [own, old] = [0, 1].map(|cell| before.monitor.capacity(CellIndex(cell)));
     assert!(own.std() < 0.25 && old.std() < 0.25, "both learned: {own:?} {old:?}");
     let snapshot = before.monitor.snapshot();
-    // A cell with other branches and another capacity.
+    // The second cell now has other RC branches and another capacity.
     let text = format!("{PACK}{MODULE}initial_capacity_ah = 2.4\ninitial_capacity_std_ah = 0.5\n");
     let mut rig = Rig::with(config_texts::load(&text, DBC).monitor);
     assert_ne!(rig.config.model.branches.len(), rig.config.modules[0].model.branches.len());

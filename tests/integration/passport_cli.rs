@@ -495,7 +495,7 @@ fn record_without_current_has_no_sums() {
     let life = Life::configured("");
     let text = fs::read_to_string(life.path("pack.toml")).expect("a file");
     fs::write(life.path("pack.toml"), text.replace("max_age_s = 60.0", "max_age_s = 5.0")).expect("written");
-    // Each current reading is valid for half of the interval to the next.
+    // Each current reading is valid for only half of the interval to the next reading.
     life.simulate("sparse.log", "1700000000", &["--cycles", "2", "--period", "10000"]);
     let args = of_logs(&life, &["sparse.log"]);
     let printed = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--throughput-before-ah", "0"]));

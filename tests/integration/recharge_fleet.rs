@@ -76,8 +76,8 @@ struct ChargeReport {
     raw_s: Option<f64>,
     normalised_s: Option<f64>,
     std_s: Option<f64>,
-    /// For comparison, the period calculated from this charge alone: charge divided by estimated swing inside the
-    /// window, at the reference current, s.
+    /// For comparison: the period calculated from this charge alone, s. The charge per SOC, measured inside the window,
+    /// is multiplied by the window's width and divided by the reference current.
     own_charge_s: Option<f64>,
 }
 

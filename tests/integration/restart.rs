@@ -1,7 +1,7 @@
 //! Measures the cost of a restart: compares a run that is killed, or loses power, with an uninterrupted run.
 //!
 //! Input: days of the simulated electric car. After each drive the car rests with the bus awake, then the bus falls
-//! asleep. The state is stored every second, as by the daemon. At random times a second monitor starts from an older
+//! asleep. The state is stored every second, as the daemon does. At random times a second monitor starts from an older
 //! state, misses the frames of the downtime, and then receives the same frames as the first monitor. The test prints
 //! the results and checks their limits.
 

@@ -1,6 +1,6 @@
-//! Checks forecasts of the remaining useful life: on measured lives, on simulated fades of many shapes that no
-//! parameter was tuned for, and by the Monitor on a simulated life. `tests/rul.md` has the results; `cargo test --test
-//! integration rul -- --nocapture` prints them.
+//! Checks forecasts of the remaining useful life: on measured lives, on simulated fades of many shapes (no parameter
+//! was tuned to these shapes), and by the Monitor on a simulated life. `tests/rul.md` has the results; `cargo test
+//! --test integration rul -- --nocapture` prints them.
 
 use std::path::{Path, PathBuf};
 
@@ -87,7 +87,7 @@ impl Shape {
 }
 
 /// A life of random length and depth, with noise, correlated variation, and capacity that recovers after long rests. On
-/// the axis of days the file does not state which days were rest.
+/// the axis of days, the cell also ages during these rests.
 fn life(shape: Shape, axis: Axis, dice: &mut Dice) -> (History, f64) {
     let (readings, depth) = (dice.between(40.0, 300.0).floor(), dice.between(0.2, 0.4));
     let days_each = if axis == Axis::Cycles { dice.between(0.15, 0.25) } else { dice.between(2.0, 5.0) };

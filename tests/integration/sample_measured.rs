@@ -1,5 +1,5 @@
 //! Tests the sample stage on a measured life (NASA B0005, uneven time steps, real glitches). The stage must reject
-//! exactly the glitches, and each cycle's charge must match the data set's own table.
+//! exactly the glitches, and each cycle's charge must match the table of the data set.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -61,7 +61,7 @@ fn measured_life_loses_only_glitches() {
     assert!(compared > 300, "compared only {compared} cycles");
 }
 
-/// Compares every cycle with the table's own integral. Returns the number of compared cycles.
+/// Compares each cycle's charge with the charge in the table. Returns the number of compared cycles.
 fn compare(folder: &Path, charges_ah: &BTreeMap<u32, (f64, f64)>) -> usize {
     let mut compared = 0;
     let mut table = csv::Reader::from_path(folder.join("B0005_cycles.csv")).expect("the table exists");

@@ -1,5 +1,5 @@
-//! Runs `packwatch whatif` as a user does: one replay for all alarm settings, and the alarms that each would have
-//! raised.
+//! Runs `packwatch whatif` as a user does: one replay for all alarm settings, and the alarms that each setting would
+//! have raised.
 
 use std::path::{Path, PathBuf};
 

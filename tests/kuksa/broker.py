@@ -1,6 +1,7 @@
-"""Databrokers for the test: a strict one built from kuksa-client's published stubs, and the real one if PACKWATCH_DATABROKER names its program.
+"""Databrokers for the test: a strict one, and the real one if PACKWATCH_DATABROKER names its program.
 
-Both serve the same VSS files, and kuksa-client reads both. The strict one records each violation of the protocol by the provider.
+The strict one is built from kuksa-client's published stubs and records each violation of the protocol by the provider. Both
+serve the same VSS files, and kuksa-client reads both.
 """
 
 import concurrent.futures

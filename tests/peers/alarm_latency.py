@@ -189,8 +189,9 @@ def at(late_ns, share):
 
 
 def decided_by_frame(folder, late_ns):
-    """Keeps the results of the alarms that a frame triggered. The daemon also checks the clock ten times a second; if a check falls between
-    the two frames, the check confirms the mode. The daemon's events contain the time of the input at which each alarm changed."""
+    """Keeps the results of the alarms that a frame triggered. The daemon also checks the clock ten times a second; if a check falls
+    between the two frames, the check confirms the mode. The daemon's events contain the time of the input at which each alarm
+    changed."""
     stamp = re.compile(r"^\((\d+)\.(\d{9})\)", re.MULTILINE)
     frames = {int(a + b) for a, b in stamp.findall((folder / "watched.journal").read_text())}
     events = map(json.loads, (folder / "watched.events").read_text().splitlines())

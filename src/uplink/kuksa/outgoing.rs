@@ -1,9 +1,9 @@
 //! Queues the messages of one connection to the broker. A message is created only when the connection can send it.
 //!
 //! * While the connection cannot send, only the newest batch of values is kept.
-//! * An empty claim follows each batch. The broker reads messages in order, so when it accepts the claim, it has read the
-//!   batch. The acceptance therefore serves as a *receipt* for the batch. The protocol has no other receipt. A *check* is
-//!   an empty claim without a batch.
+//! * An empty claim follows each batch. The broker reads messages in order, so when it accepts the claim, it has read
+//!   the batch. The acceptance therefore serves as a *receipt* for the batch. The protocol has no other receipt. A
+//!   *check* is an empty claim without a batch.
 //! * An answer overtakes a waiting batch. See `value_requests` for why the order matters.
 
 use std::collections::VecDeque;

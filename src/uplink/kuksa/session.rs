@@ -33,8 +33,8 @@ const PATIENCE: Duration = Duration::from_secs(5);
 const PING_PERIOD: Duration = Duration::from_secs(10);
 /// Longest wait for the broker to read the last batch.
 const FAREWELL: Duration = Duration::from_millis(500);
-/// If the broker confirms no batch for this time, the connection is closed, because readers would mistake old values for
-/// current ones.
+/// If the broker confirms no batch for this time, the connection is closed, because readers would mistake old values
+/// for current ones.
 const UNREAD_LIMIT: Duration = Duration::from_secs(30);
 /// Key of the certificates' file, for messages.
 const CA_FILE: &str = "kuksa.ca_file";
@@ -177,8 +177,8 @@ impl Session {
         }
     }
 
-    /// Handles the time limits of answers. If the proof that the broker read the latest answer is still missing, sends a
-    /// check.
+    /// Handles the time limits of answers. If the proof that the broker read the latest answer is still missing, sends
+    /// a check.
     fn handle_time(&mut self) -> Result<(), String> {
         if self.value_requests.handle_time(Instant::now())? && !self.outbox.check() {
             return Err("the broker reads no answers".to_owned());

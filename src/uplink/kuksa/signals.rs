@@ -2,8 +2,8 @@
 //!
 //! Input: a status document (units in its field names, positive current = discharge, SOC and SOH as fractions, cells
 //! from 0). Output: VSS values (positive current = charge, percentages, cells from 0). `None` means that the value
-//! depends on something unknown. An array has a value only if every cell has a value, because positions in the array are
-//! cell numbers and a VSS array cannot contain an unknown number.
+//! depends on something unknown. An array has a value only if every cell has a value, because positions in the array
+//! are cell numbers and a VSS array cannot contain an unknown number.
 
 mod derived;
 
@@ -163,8 +163,8 @@ const fn vss_unit(unit: Unit) -> (Option<&'static str>, f64) {
     }
 }
 
-/// Returns a value per cell. If a cell has no value or if the cell numbers have a gap, returns `None`, because array
-/// positions are cell numbers.
+/// Returns a value per cell. Array positions are cell numbers. If the document lists no cells, if a cell has no value,
+/// or if the cell numbers have a gap, returns `None`.
 fn of_cells<T>(document: &StatusDocument, value: impl Fn(&CellView) -> Option<T>) -> Option<Vec<T>> {
     let cells = document.cells.iter().enumerate();
     let values = cells.map(|(index, cell)| if cell.cell.index() == index { value(cell) } else { None });

@@ -1,7 +1,7 @@
 //! Defines values and their VSS datatypes.
 //!
-//! Input: numbers of the status document, and the limits of the broker. Output: values of the protocol. A number outside
-//! the range of its datatype or outside the broker's limits becomes unknown; it is never clamped.
+//! Input: numbers of the status document, and the limits of the broker. Output: values of the protocol. A number
+//! outside the range of its datatype or outside the broker's limits becomes unknown; it is never clamped.
 
 use super::messages::{Flags, Floats, Texts, TypedValue};
 

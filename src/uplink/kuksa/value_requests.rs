@@ -38,7 +38,7 @@ pub(crate) struct ValueRequests {
     /// Number of the latest batch that was created. `read` is the number of the latest batch that the broker has read.
     made: u32,
     read: u32,
-    /// Arrival of the latest answered request; `None` = the broker has proved that it read the answer in time.
+    /// Arrival of the latest answered request; `None` = no answer waits for a proof.
     unproved: Option<Instant>,
     is_checking: bool,
 }

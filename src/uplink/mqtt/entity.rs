@@ -2,8 +2,9 @@
 //! quantities.
 //!
 //! Input: the daemon's status. Output: the values as JSON. If Battery-Emulator publishes the same quantity, the entity
-//! has Battery-Emulator's key and name. As in Battery-Emulator, SOC and other fractions are published in percent, and positive current and power mean
-//! charging. The daemon's current is therefore negated. Cells count from 1. Unknown values are `null`, never a number.
+//! has Battery-Emulator's key and name. As in Battery-Emulator, SOC and other fractions are published in percent, and
+//! positive current and power mean charging. The daemon's current is therefore negated. Cells count from 1. Unknown
+//! values are `null`, never a number.
 
 use std::borrow::Cow;
 use std::sync::LazyLock;

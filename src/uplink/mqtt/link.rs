@@ -32,7 +32,7 @@ use crate::status_stream::Documents;
 const RETRY: Duration = Duration::from_secs(1);
 /// Maximum number of unacknowledged messages of each class of the queue; most brokers accept this number.
 const WINDOW: usize = 20;
-/// Longest wait for an acknowledgement. If the acknowledgement is later, the connection is closed.
+/// Longest wait for an acknowledgement. If a message is not acknowledged within this time, the connection is closed.
 const ACKNOWLEDGEMENT: Duration = Duration::from_secs(120);
 /// Pause before a failed operation on the queue is tried again.
 const QUEUE_RETRY: Duration = Duration::from_secs(5);

@@ -44,9 +44,9 @@ pub mod topic {
     pub const INFO: &str = "info";
     /// Current values of the cells: retained.
     pub const CELLS: &str = "spec_data";
-    /// Events in order. After a lost connection, some may be sent twice, with the same sequence number.
+    /// Events in order. An event that was not acknowledged is sent again with the same sequence number.
     pub const EVENTS: &str = "events";
-    /// Samples in order. After a lost connection, some may be sent twice, with the same sequence number.
+    /// Samples in order. A sample that was not acknowledged is sent again with the same sequence number.
     pub const HISTORY: &str = "history";
     /// Fill of the queue: retained.
     pub const UPLINK: &str = "uplink";

@@ -28,8 +28,8 @@ fn alarm(alarms: &AlarmStatus, rule: Rule) -> Value {
     if is_raised || is_known { is_raised.into() } else { Value::Null }
 }
 
-/// Values of the cells: voltages in mV, whether each cell is trusted, and every quantity of a cell with an MQTT key. A
-/// quantity that has a standard deviation is published with it.
+/// Values of the cells: voltages in mV, whether each cell is trusted, and every quantity of a cell with an MQTT key. If
+/// a quantity has a standard deviation, the standard deviation is published too.
 pub fn spec_data(document: &StatusDocument) -> Value {
     let each = |of: &dyn Fn(&CellView) -> Value| document.cells.iter().map(of).collect::<Value>();
     let millivolts = |cell: &CellView| whole(cell.values.mean(Quantity::Voltage).map(|volts| volts * 1000.0));

@@ -298,7 +298,8 @@ fn read_fill(database: &Connection) -> rusqlite::Result<Fill> {
     Ok(Fill { messages, bytes, dropped_samples: dropped(Class::Sample)?, dropped_events: dropped(Class::Event)? })
 }
 
-/// Drops the oldest sample. If the queue has no samples, drops the oldest event. If the queue is empty, returns `false`.
+/// Drops the oldest sample. If the queue has no samples, drops the oldest event. If the queue is empty, returns
+/// `false`.
 fn drop_oldest(transaction: &Transaction<'_>, fill: &mut Fill) -> rusqlite::Result<bool> {
     let oldest = "DELETE FROM message WHERE id = (SELECT id FROM message ORDER BY class, id LIMIT 1)
                   RETURNING class, length(CAST(body AS BLOB))";

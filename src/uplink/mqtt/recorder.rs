@@ -17,8 +17,8 @@ use super::payload;
 use super::queue::{Class, Fill, Queue};
 use crate::status_stream::Documents;
 
-/// A document becomes a sample even if it arrives this much before the sample is due, because documents arrive only about
-/// once a second.
+/// A document becomes a sample even if it arrives this much before the sample is due, because documents arrive only
+/// about once a second.
 const TOLERANCE_S: f64 = 0.5;
 
 /// State of the recorder.

@@ -37,8 +37,8 @@ pub struct MqttSettings {
     /// Period at which current values are published, s.
     #[serde(deserialize_with = "whole::<1, 3600, _>")]
     pub period_s: u64,
-    /// Longest silence on the connection, s. If the connection is silent for 1.5 times this duration, the broker publishes
-    /// the last will.
+    /// Longest silence on the connection, s. If the connection is silent for 1.5 times this duration, the broker
+    /// publishes the last will.
     #[serde(deserialize_with = "whole::<5, 3600, _>")]
     pub keep_alive_s: u64,
     /// Longest pause between attempts to connect, s.

@@ -1,15 +1,15 @@
-//! Checks the uncertainty that the Monitor states: stated probabilities against observed frequencies, capacity errors
-//! against stated standard deviations.
+//! Compares the uncertainty that the Monitor states with the truth: stated probabilities with observed frequencies, and
+//! stated standard deviations with capacity errors.
 
 use super::Fleet;
 use super::life::{Evaluation, Life, RATED_AH, THRESHOLD};
 
 /// Bin edges of the stated probability.
 pub(crate) const EDGES: [f64; 9] = [0.0, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 0.99, 1.0];
-/// Half-cycles skipped at the start of a life, because the assumed initial capacity still affects the estimate.
+/// Number of half-cycles skipped at the start of a life, because the initial capacity still affects the estimate.
 const SETTLING: usize = 10;
 
-/// Probability that the true capacity is below the threshold, computed as the rule does.
+/// Probability that the true capacity is below the threshold, computed as the alarm rule does.
 pub(crate) fn stated(evaluation: &Evaluation) -> f64 {
     0.5 * libm::erfc((evaluation.mean_ah - THRESHOLD * RATED_AH) / (evaluation.std_ah * std::f64::consts::SQRT_2))
 }
@@ -22,8 +22,8 @@ fn evaluations(lives: &[Life]) -> impl Iterator<Item = &Evaluation> {
     lives.iter().flat_map(|life| life.evaluations.iter().skip(SETTLING)).filter(|evaluation| evaluation.is_measured)
 }
 
-/// For each bin of the stated probability: number of evaluations, mean stated probability, share truly below the
-/// threshold.
+/// For each bin of the stated probability: number of evaluations, mean stated probability, and share of the evaluations
+/// at which the true capacity is below the threshold.
 pub(crate) fn bins(fleet: &Fleet) -> Vec<(usize, f64, f64)> {
     let bin = |edges: &[f64]| {
         let inside = |p: f64| p >= edges[0] && (p < edges[1] || edges[1] == 1.0);
@@ -37,11 +37,12 @@ pub(crate) fn bins(fleet: &Fleet) -> Vec<(usize, f64, f64)> {
     EDGES.windows(2).map(bin).collect()
 }
 
-/// Capacity errors and their stated standard deviation, over all evaluations of ageing cells.
+/// Capacity errors of the ageing cells and their stated standard deviation. The evaluations that `evaluations` skips
+/// do not count.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Errors {
-    /// In percent of the rated capacity: mean error, standard deviation of the lives' mean errors, scatter within a
-    /// life, stated standard deviation.
+    /// In percent of the rated capacity: mean error, standard deviation of the lives' mean errors, standard deviation
+    /// of the error within a life, stated standard deviation.
     pub(crate) mean: f64,
     pub(crate) between_lives: f64,
     pub(crate) within_life: f64,

@@ -7,7 +7,7 @@ use rand_chacha::ChaCha8Rng;
 pub(crate) struct Dice(ChaCha8Rng);
 
 impl Dice {
-    /// Creates stream number `stream` of `seed`.
+    /// Creates random stream number `stream` of the generator with this seed.
     pub(crate) fn new(seed: u64, stream: u64) -> Self {
         let mut generator = ChaCha8Rng::seed_from_u64(seed);
         generator.set_stream(stream);
@@ -25,7 +25,7 @@ impl Dice {
         std * radius * libm::cos(std::f64::consts::TAU * self.uniform(0.0, 1.0))
     }
 
-    /// A factor whose logarithm is normal.
+    /// A factor whose logarithm is normal with mean 0.
     pub(crate) fn factor(&mut self, std: f64) -> f64 {
         libm::exp(self.normal(std))
     }

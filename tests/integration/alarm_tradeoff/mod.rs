@@ -1,4 +1,5 @@
-//! Compares lead time and false alarms on simulated lives, for `when = "mean"` and `when = { probability = p }`.
+//! Compares alarm rules on simulated lives: `when = "mean"` and `when = { probability = p }`. Reports the lead time
+//! (from the alarm to the end of life) and the false alarms.
 //!
 //! Each simulated life runs through the whole core: a cell with its own fade, sensors with their own errors, frames,
 //! Monitor. Every rule then judges the Monitor's capacity estimates. The Monitor itself also runs three of the rules

@@ -123,8 +123,8 @@ fn awtls_cost([c1, c2, c3, c4, c5, c6]: &[f64; 6], q: f64) -> f64 {
 }
 
 /// Minimum of [`awtls_cost`] among its stationary points. The cost's derivative is 2 P(Q) / (Q^2 + 1)^3 with
-/// `P = c5 Q^4 + (2 c4 - c1 - c6) Q^3 + 3 (c2 - c5) Q^2 + (c1 - 2 c3 + c6) Q - c2`. At a root of P the second derivative is
-/// 2 P' / (Q^2 + 1)^3.
+/// `P = c5 Q^4 + (2 c4 - c1 - c6) Q^3 + 3 (c2 - c5) Q^2 + (c1 - 2 c3 + c6) Q - c2`. At a root of P the second
+/// derivative is 2 P' / (Q^2 + 1)^3.
 fn awtls(c: &[f64; 6]) -> ScalarGaussian {
     let [c1, c2, c3, c4, c5, c6] = *c;
     let p = [c5, 2.0 * c4 - c1 - c6, 3.0 * (c2 - c5), c1 - 2.0 * c3 + c6, -c2];
@@ -170,8 +170,8 @@ fn positive_roots(value: impl Fn(f64) -> f64, slope: impl Fn(f64) -> f64) -> Vec
 mod tests {
     use super::*;
 
-    /// Uniform numbers in [0, 1) by splitmix64. The sum of twelve of them, minus six, approximates a
-    /// normal number.
+    /// Uniform numbers in [0, 1) by splitmix64. The sum of twelve of them, minus six, approximates a normal
+    /// number.
     struct Random(u64);
 
     impl Random {

@@ -1,8 +1,8 @@
 //! Compares capacity estimates with the published capacities of two measured cells (NASA PCoE B0005, B0006). The
 //! records are replayed complete, and in windows (a random part of each record).
 //!
-//! Discharges are numbered from 1; scores start at number 11. The published capacity first falls below 1.4 Ah at
-//! discharge 125 (B0005) and 109 (B0006).
+//! Discharges are numbered from 1, and scores count from discharge 11 on. The published capacity first falls below
+//! 1.4 Ah at discharge 125 (B0005) and 109 (B0006).
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -75,7 +75,7 @@ struct Life {
     filter: Vec<(f64, Source)>,
     outer: Vec<(f64, Source)>,
     loaded: Vec<(f64, Source)>,
-    /// The filter's SOC at the ends of `loaded`.
+    /// Swings of the filter's SOC between the same ends as in `loaded`.
     filter_at_ends: Vec<(f64, Source)>,
 }
 

@@ -2,10 +2,10 @@
 //!
 //! A swing is a change of SOC and the charge that caused it. The peers get swings from three sources:
 //!
-//! - `filter`: the filter's own SOC at both ends, with its deviation, from the event `half_cycle`. In windows, the ends
-//!   are the same as for `voltage`
-//! - `voltage`: the SOC at both ends by inversion of the open-circuit curve (`swings`). The present capacity estimate
-//!   is used only to compute how ageing changes the curve's shape
+//! - `filter`: the filter's own SOC at both ends, with its deviation, from the event `half_cycle`. If the log
+//!   contains only windows (a random part of each record), the ends are the same as for `voltage`
+//! - `voltage`: the SOC at both ends by inversion of the open-circuit curve (`swings`). The peer's present capacity
+//!   estimate is used only to compute how ageing changes the curve's shape
 //! - `filter, capacity held`: the filter's SOC, always counted with the wrong initial capacity
 //!
 //! The published capacity of a measured cell is the one delivered at 2 A, not the capacity between open-circuit
@@ -24,7 +24,7 @@ use packwatch::health::CapacityConfig;
 use least_squares::{Method, Peer, Swing};
 use swings::VoltageSwing;
 
-/// The peers by name. None of these memory factors is best for every life, so several of each method are listed.
+/// The peers: name, method and memory factor. No memory factor is best for every life, so each method has several.
 const PEERS: [(&str, Method, f64); 11] = [
     ("WLS   gamma 0.95", Method::Wls, 0.95),
     ("WLS   gamma 0.50", Method::Wls, 0.5),
@@ -74,7 +74,7 @@ fn follow(
     capacities
 }
 
-/// Mean absolute error and share covered by the 95 % interval.
+/// Mean absolute error, and share of the true values that lie in the 95 % interval.
 #[derive(Debug, Clone, Copy)]
 struct Score {
     mean_absolute: f64,

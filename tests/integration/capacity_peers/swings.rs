@@ -4,9 +4,8 @@
 //! R0 the series resistance, rho the filter's resistance ratio and U the voltages of the RC branches. The voltages U
 //! are simulated in open loop, starting at 0. If the record begins under load, readings count only after 180 s. Each
 //! end of a swing is the mean of all readings in the swing's first or last 60 s, each with the charge that had flowed
-//! until that reading. A capacity
-//! is assumed only to compute how ageing changes the shape of the curve. The standard deviation of the SOC at an end is
-//! the one that packwatch uses (`[capacity]`).
+//! until that reading. A capacity is assumed only to compute how ageing changes the shape of the curve. The standard
+//! deviation of the SOC at an end is the one that packwatch uses (`[capacity]`).
 
 use packwatch::cell::aged_ocv::SHIFT_STD;
 use packwatch::cell::circuit::BranchAt;
@@ -44,7 +43,7 @@ pub(crate) struct Reading {
     pub(crate) soc_variance: f64,
 }
 
-/// SOC, charge and variance of one reading, or the mean of several.
+/// SOC, charge and variance of one reading, or the means of several readings.
 #[derive(Debug, Clone, Copy, Default)]
 struct Point {
     time_s: f64,

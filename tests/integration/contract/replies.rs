@@ -251,7 +251,8 @@ const KILLS: [(i64, i64); 5] = [(0, 3), (7, 0), (16, 2), (130, 25), (31, 600)];
 /// maximum number of steps of a daemon that never stopped.
 fn steps_over_a_kill(profile: Profile, unstored_deci: i64, away_deci: i64) -> [(i64, [i64; 2]); 4] {
     let mut rig = protected_rig(profile);
-    // Raise the alarm and send its repetitions. After that the alarm is sent only in its cycle.
+    // Raise the alarm and send its repetitions. After that the daemon sends the alarm only at its regular
+    // period.
     rig.heat(60.0, 6);
     let stored = rig.monitor.snapshot();
     (0..unstored_deci).for_each(|_| rig.tick_with_frames());

@@ -21,7 +21,7 @@ pub(crate) enum Bench {
     Protected,
     /// Only the total voltage of 96 cells, and a temperature sensor.
     Total,
-    /// One cell with random pulses and a voltage resolution of 32 mV.
+    /// One cell, discharged with random pulses; the voltage has 32 mV of noise.
     Pulses,
     /// One cell, discharged steadily.
     Steady,
@@ -29,11 +29,11 @@ pub(crate) enum Bench {
     Charge,
     /// One cell with random five-minute loads.
     Walk,
-    /// A whole morning with parking and charging, 4 cells.
+    /// 4 cells in a drive of 55 minutes. The simulation ends while the car is parked.
     Day,
 }
 
-/// One cell in 8 bytes behind a profile 1A header.
+/// A message of 8 bytes: a profile 1A header, then the values of one cell.
 const PROTECTED_DBC: &str = r#"VERSION ""
 BU_: BMS
 BO_ 256 MeasuredCell: 8 BMS

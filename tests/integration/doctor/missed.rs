@@ -22,7 +22,7 @@ fn lose(broken: &mut BrokenPack, wanted: &str, of: u32) {
     });
 }
 
-/// Writes `value` to two bytes of the data, if the data belong to the page.
+/// If the data belong to the page, writes `value` to two bytes of the data.
 fn set(data: &mut [u8], page: u8, at: usize, value: i32) {
     if data[0] == page {
         data[at..at + 2].copy_from_slice(&i16::try_from(value).unwrap().to_le_bytes());
@@ -82,7 +82,7 @@ pub(crate) fn two_socs(broken: &mut BrokenPack, dash: u8) {
     });
 }
 
-/// A name and the change of a healthy pack.
+/// Name of a healthy pack, and the change that makes this pack.
 type Change = (&'static str, fn(&mut BrokenPack));
 
 /// Further healthy packs, with the additional inputs that the doctor checks.

@@ -1,6 +1,6 @@
 //! Tests `packwatch doctor` against injected faults. Healthy packs are simulated with several configurations, scenarios
-//! and seeds. Then one fault is put into the configuration, the DBC or the log. The first finding must be the right one.
-//! On healthy packs the doctor must find nothing.
+//! and seeds. Then one fault is put into the configuration, the DBC or the log. The doctor's first finding must be this
+//! fault. On healthy packs the doctor must find nothing.
 //!
 //! `faults` is the table: name, how to break the pack, expected first finding, proposed line.
 
@@ -91,7 +91,7 @@ fn silent_interface_reports_listening_time() {
     assert_eq!(report.seconds, 60.0);
 }
 
-/// Faults found first, found later, and missed.
+/// Number of cases in which the fault was the first finding, was a later finding, or was missed.
 #[derive(Default)]
 struct Tally {
     first: usize,

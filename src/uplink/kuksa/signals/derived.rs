@@ -8,7 +8,7 @@
 //! * `StateOfCharge.CurrentEnergy` and the energies: the daemon estimates no energy.
 //! * The throughputs "over lifetime of the battery": the daemon knows only the time in which it ran.
 //! * `StateOfCharge.Displayed`: the value that the vehicle shows to the customer.
-//! * `Charging.IsCharging`: true only with a charger. The daemon cannot distinguish a charger from braking.
+//! * `Charging.IsCharging`: true only with a charger, but the daemon's mode `charge` includes braking.
 //!
 //! Overlay booleans begin with `Is`, as VSS recommends. No overlay signal has a temperature unit, because the unit's
 //! name changed between VSS 5 and VSS 6. No overlay signal has a list of allowed values: the databroker (0.7) checks

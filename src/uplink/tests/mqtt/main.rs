@@ -114,8 +114,8 @@ fn hour_without_broker_and_two_power_cuts_lose_nothing() {
         .map(|(_, value)| rig::second_of(value))
         .collect();
     assert!(current.is_sorted(), "a current value is older than one before it: {current:?}");
-    // An event may arrive twice, because unacknowledged messages are sent again. Both copies have the same sequence
-    // number, so the set keeps one of them.
+    // If the reader has not confirmed a message when the connection ends, the broker sends the message again. Both
+    // copies have the same sequence number, so the set keeps one of them.
     let events: BTreeSet<i64> = messages
         .iter()
         .filter(|(topic, _)| topic == "packwatch/events")
