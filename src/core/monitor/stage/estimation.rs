@@ -211,7 +211,6 @@ impl Estimation {
         if samples.iter().any(|sample| self.bank.result(sample.cell.index()).jumped && !is_rest(sample)) {
             self.current_check.demand_step();
         }
-        self.was_current_doubtful |= self.current_check.is_unconfirmed();
         self.check_models(&samples);
         if modelling.has_row() {
             modelling.close_row(self.mean_soc());
