@@ -42,8 +42,8 @@ pub(crate) struct Args {
     /// Start from the state in this file, which --snapshot has written
     #[arg(long, value_name = "FILE")]
     restore: Option<PathBuf>,
-    /// Time since the restored state was written. Needed only if the state came from a log, so that its time stamp does not
-    /// give its age
+    /// Time since the restored state was written. Needed only if the state came from a replayed log: the time stamp in
+    /// the state is then the log's time and does not give the age
     #[arg(long, value_name = "SECONDS|unknown", requires = "restore", value_parser = away)]
     away: Option<Downtime>,
     /// Folder for state and history; `none` keeps nothing [default: $STATE_DIRECTORY under systemd, else

@@ -417,7 +417,8 @@ impl Replay {
         }
         if let Some(count) = summary.events.get("time_backwards") {
             summary.notes.push(format!(
-                "the time goes back {count} times by more than {} s; each counts as a gap of unknown length. If no clock was                  set back, sort the log by time",
+                "the time goes back {count} times by more than {} s; each counts as a gap of unknown length. If no \
+                 clock was set back, sort the log by time",
                 MERGE_TOLERANCE_NS / 1_000_000_000
             ));
         }

@@ -2,9 +2,10 @@
 //! battery controller's own SOC and SOH.
 //!
 //! Input: frames with times; optionally DBC files and definitions of diagnostic answers. Output: for each quantity,
-//! ranked candidates with their reasons in plain words. Answers to diagnostic requests are read regardless of which
-//! device sent the requests. If no definition describes some bits of an answer, the search looks in these bits for rows
-//! of cell voltages and for other fields. Memory is bounded. Any frames are accepted.
+//! ranked candidates with their reasons in plain words. The search reads the answers to diagnostic requests, regardless
+//! of which device sent the requests. If no definition describes some bits of an answer, the search looks in these bits
+//! for consecutive cell voltages and for other fields. The search needs a bounded amount of memory and accepts any
+//! frames.
 //!
 //! The owner must confirm the result, because names can mislead and a parked car shows little. If a field has no
 //! definition, its scale is guessed from plausible values.

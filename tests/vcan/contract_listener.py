@@ -1,7 +1,7 @@
 """An independent ECU that listens to packwatch and keeps the table of raised alarms. It follows only the DBC and docs/src/ecu/contract.md.
 
     listener = ContractListener("out.dbc", loss=0.1, seed=1)
-    listener.handle(time_s, frame_id, data)     each frame of the bus; drops a random part
+    listener.handle(time_s, frame_id, data)     call this for each frame of the bus; ignores a random part (`loss`) of them
     listener.table(now_s)                       {(rule, severity, cell): (state, acknowledged)}
     listener.is_confirmed(now_s)                the digest agrees with the table
 """

@@ -14,9 +14,9 @@
 //! * The name of a state: enter this state.
 //! * Rest: enter `cleared` if the alarm was raised and not acknowledged, else `inactive`.
 //! * End: enter `latched` for a latching rule, else rest.
-//! * Count: once both the time and the number of new values of the debounce are reached, enter the state or the end.
-//!   Until then, an alarm that is not raised is `pending`, a latched alarm stays `latched`, and any other is
-//!   `clearing`.
+//! * Count: add up the time and the new values. The debounce of the rule sets a minimum for each of the two sums. When
+//!   both sums have reached their minimum, enter the state that the table names, or apply "End". Until then, an alarm
+//!   that is not raised is `pending`, a latched alarm stays `latched`, and any other alarm is `clearing`.
 //! * Hold: stay, and keep the time and the number of values counted.
 //! * Mark: acknowledge the latest occurrence. Forget: reset the number of occurrences. Refuse: change nothing.
 //! * Release: refuse while counting; else enter `inactive`, or `unknown` if the value is unknown.
@@ -168,9 +168,9 @@ impl Machine {
         (self.observation, self.probability) = (Observation { value: Some(value), ..Observation::default() }, None);
     }
 
-    /// Handles a value. If the inputs of a learned value are lost, a value may still arrive, because the loss ends a
-    /// half-cycle. This value may raise the alarm. It does not change a suppressed alarm; otherwise, it would clear the
-    /// alarm or make it look up to date.
+    /// Handles a value. When the inputs of a learned value are lost, the running half-cycle ends, and its result may
+    /// still arrive as a new value. This value may raise the alarm. If the alarm is suppressed, the value does not
+    /// change its state; otherwise, the value would clear the alarm or make it look up to date.
     pub(super) fn observe(&mut self, now: Timestamp, rule: &RuleConfig, observation: &Observation) -> Option<Change> {
         self.observation = *observation;
         if self.is_suspended && self.state == AlarmState::Suppressed {
@@ -271,8 +271,8 @@ impl Machine {
         self.occurrences > 0 || self.state == AlarmState::Pending
     }
 
-    /// The machine after a restore at `now`. The value is unknown until the next observation. Times of raises after
-    /// `now` are set to `now`.
+    /// Returns the machine as it continues after a restore at the time `now`. The value is unknown until the next
+    /// observation. If a stored time of a raise is later than `now`, it becomes `now`.
     pub(super) fn restored(self, now: Timestamp) -> Self {
         let (first_raised, last_raised) = (self.first_raised.min(now), self.last_raised.min(now));
         let value = Observation::default();

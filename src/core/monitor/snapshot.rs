@@ -42,7 +42,8 @@ pub struct Snapshot {
     pub version: u32,
     /// Time of the snapshot, on the clock of the inputs.
     pub time: Timestamp,
-    /// Whether the same clock may continue; `false` if the snapshot was stored [for a restart](Self::for_restart).
+    /// Whether a monitor may continue from this state on the same clock, as if the program had not stopped. `false` if
+    /// the snapshot was made [for a restart](Self::for_restart).
     pub(crate) may_continue: bool,
     pub(crate) time_backwards: u64,
     pub(crate) intake: IntakeState,
@@ -181,8 +182,8 @@ impl Snapshot {
         Ok(stored.stored_view(label))
     }
 
-    /// Whether the waiting samples belong to different cells of the snapshot, and all these cells have reported in the
-    /// unfinished batch.
+    /// Whether the waiting samples agree with the cells: each cell has at most one waiting sample, and each cell with a
+    /// waiting sample is in the snapshot and has reported in the unfinished batch.
     pub(crate) fn waiting_fits(&self) -> bool {
         let mut has_come: Vec<bool> = self.cells.iter().map(|cell| cell.updated_in_round).collect();
         let mut is_first = |cell: usize| has_come.get_mut(cell).is_some_and(std::mem::take);
@@ -212,7 +213,8 @@ impl Snapshot {
     pub(crate) fn check_charges(&self, config: &SampleConfig) -> Result<(), RestoreError> {
         let (strings, limits) = (f64::from(config.strings.max(1)), &config.current);
         let most_a = limits.min.abs().max(limits.max.abs()) / strings;
-        // The charge at a cell's latest voltage includes the current that was held until then.
+        // The charge stored with a cell's latest voltage was counted as if the latest current reading lasted until that
+        // voltage. Count in the same way up to the time of the state.
         let charge_as = self.sampling.sampler.charge_as(self.time, limits.max_age_s) / strings;
         let check = |time: Timestamp, before_as: f64| {
             // The sampler may have held a current for `max_age_s` before the next reading replaced it.

@@ -1,5 +1,5 @@
-//! Statistics of a message that has the identifier of the configured current's message but arrives on another
-//! interface.
+//! Statistics of a current that is not on the configured interface. Its message has the same identifier as the message
+//! of the configured current but arrives on another interface.
 //!
 //! Buses of one vehicle may use the same identifier for different messages, or carry the messages of several packs.
 //! If the voltages follow the current in the message on the other interface, the configured interface is wrong.
@@ -41,7 +41,8 @@ impl OtherCurrent {
         best_response(&self.responses).slope()
     }
 
-    /// Ends the open blocks and runs before a period in which the observer does not listen.
+    /// Closes the open blocks of readings and the open runs of steady current. The observer calls this function at each
+    /// gap in the observation, and at the end of the observation.
     pub(crate) fn pause(&mut self) {
         self.series.pause();
         self.responses.iter_mut().for_each(VoltageResponse::pause);

@@ -205,7 +205,7 @@ impl<'a> SampleColumns<'a> {
     }
 }
 
-/// The names in the Battery Data Format of packwatch's column `ours`.
+/// Returns the names that the Battery Data Format uses for packwatch's column `ours`.
 fn bdf_names(ours: &str) -> Vec<&'static str> {
     BDF_COLUMNS.iter().filter(|of| of.0 == ours).flat_map(|of| [of.1, of.2]).collect()
 }

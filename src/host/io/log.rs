@@ -234,11 +234,11 @@ impl LogSource {
         }
     }
 
-    /// Reads the next records, at least one. Returns the records that are available without reading more of the file.
-    /// The result is `false` at the end of the last log.
+    /// Puts the next records into `batch`: at least one record, and more only if they are already in the buffer. At the
+    /// end of the last log, returns `false`; the batch is then empty.
     ///
     /// # Errors
-    /// Fails like [`next_record`](Self::next_record), after all records before the error were returned.
+    /// Fails like [`next_record`](Self::next_record). Earlier calls have then returned all records before the error.
     pub fn next_batch(&mut self, batch: &mut Batch) -> Result<bool, LogError> {
         batch.len = 0;
         if let Some(open) = &mut self.current

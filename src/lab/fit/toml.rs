@@ -54,7 +54,8 @@ fn electrodes(out: &mut String, found: &FittedElectrodes) {
     line(
         out,
         &format!(
-            "\n# These electrodes reproduce the open-circuit curve within {:.1} mV. Contents: in the empty and in the full cell.",
+            "\n# These electrodes reproduce the open-circuit curve within {:.1} mV. The two contents of an electrode: \
+             in the empty and in the full cell.",
             1e3 * found.residual_v
         ),
     );

@@ -149,7 +149,7 @@ fn notes(cell: &BpxCell, curve: &Curve<'_>, model: &Model) -> Vec<String> {
     }
     if model.curve.raised_v > 0.0 {
         notes.push(format!(
-            "open-circuit voltage raised by up to {:.2} mV so that it rises",
+            "open-circuit voltage raised by up to {:.2} mV to make it increase with SOC",
             1e3 * model.curve.raised_v
         ));
     }

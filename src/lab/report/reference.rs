@@ -50,8 +50,8 @@ pub fn read(path: &Path) -> Result<Reference, TableError> {
     Ok(reference)
 }
 
-/// Keeps the points at which the capacity differs by more than 0.02 % from the last point that was kept, and the last
-/// point of all.
+/// Removes points at which the capacity hardly changes. If a capacity differs by at most 0.02 % from the capacity of
+/// the point that was kept before, its point is removed. The first and the last point always stay.
 fn thin(points: &mut Vec<(f64, f64)>) {
     let last = points.last().copied();
     let mut kept_ah = f64::INFINITY;

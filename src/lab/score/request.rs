@@ -105,7 +105,8 @@ impl ScoreRun {
     /// Scores every file in every case; `progress` as in [`super::run`].
     ///
     /// # Errors
-    /// The error of the first file (in order) that cannot be scored, or the folder of the plots cannot be created.
+    /// The folder for the plots cannot be created, or a file cannot be scored. If several files cannot be scored,
+    /// the error of the first of them (in order) is returned.
     pub fn run(self, progress: &(dyn Fn(usize, f64) + Sync)) -> Result<ScoreReport, LabError> {
         self.settings.plots.as_deref().map_or(Ok(()), create_folder)?;
         let scores: Vec<CaseScore> = super::run(&self.jobs, &self.cases, &self.settings, progress)?;

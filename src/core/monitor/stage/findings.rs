@@ -20,7 +20,8 @@ use crate::sample::CellSample;
 pub(crate) struct Findings {
     pub(crate) diagnosis: CellFaultDetector,
     cells: usize,
-    /// The cells that are compared: the pack's own kind, without the modules of another kind.
+    /// The cells that the detector compares with each other: all cells of the pack's own kind. The cells in modules of
+    /// another kind are excluded.
     compared: Vec<usize>,
     /// Whether the BMS discharges fuller cells after a charge (passive balancing).
     is_balanced: bool,
@@ -90,7 +91,8 @@ impl Findings {
         }
     }
 
-    /// Handles samples that have been stepped. Returns whether a row ended.
+    /// Handles samples that the estimator has already processed. Returns whether these samples completed a row of the
+    /// detector.
     #[inline]
     pub(crate) fn observe(
         &mut self,

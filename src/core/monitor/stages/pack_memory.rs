@@ -109,7 +109,7 @@ impl PackMemory {
         self.aside.take_if(|pack| !fits(pack));
     }
 
-    /// Checks that every number is possible.
+    /// Checks that every stored value is possible.
     pub(crate) fn check(&self) -> Result<(), InvalidState> {
         for pack in self.packs.iter().chain(self.aside.as_deref()) {
             InvalidState::unless(pack.number.is_finite(), "the number of a pack", pack.number, "a finite number")?;

@@ -177,7 +177,8 @@ impl VoltageResponse {
         }
     }
 
-    /// Ends the open block and run before a period in which the observer does not listen.
+    /// Closes the open block of readings and the open run of steady current. The observer calls this function at each
+    /// gap in the observation, and at the end of the observation.
     pub(crate) fn pause(&mut self) {
         self.close_block();
         self.close_run();
@@ -269,8 +270,8 @@ impl VoltageResponse {
             return Slope::of(points(0.2 * largest));
         }
         let all: Vec<(f64, f64)> = points(0.0).collect();
-        // If even the largest step is small for this pack, it is noise, or the unit is wrong: use only the larger
-        // steps, without outliers.
+        // Exception: the largest step is small for this pack, so the steps are either noise or in a wrong unit. In that
+        // case, use only the steps of at least a fifth of the largest step, without outliers.
         if largest < 5.0 * self.tolerance_a { Slope::of(points(0.2 * largest)) } else { Slope::fit(&all) }
     }
 

@@ -1,4 +1,5 @@
-//! Checks the sign of the current and the resistance: do the voltages follow the current as in the cell model?
+//! Checks the sign and unit of the current, and the resistance of the cells. To do so, compares the measured response
+//! of the voltages to the current with the response of the cell model.
 
 use super::context::{EXPLAINED, Judge, error, find, warning};
 use super::drift::Drift;
@@ -160,9 +161,9 @@ fn current_unit(judge: &mut Judge<'_>, seen: String, factor: f64, ratio: f64) {
     wrong_unit_or_cell(judge, signal, factor, severity).seen(seen).why(why);
 }
 
-/// Reports a current that `factor` corrects: the current's unit or the configured cell model is wrong. If the DBC
-/// states ampere and the configuration does not scale the signal, the reading is probably right, so the finding names
-/// the cell model first.
+/// Reports that the current fits the cell model only if it is multiplied by `factor`. Either the unit of the current or
+/// the configured cell model is wrong. If the DBC states ampere and the configuration does not scale the signal, the
+/// unit is probably right. In that case, the finding names the cell model first.
 pub(super) fn wrong_unit_or_cell<'j>(
     judge: &'j mut Judge<'_>,
     signal: &SignalPlan,

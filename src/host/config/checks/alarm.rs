@@ -208,7 +208,8 @@ fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, thresh
         Unit::AmpereHours | Unit::Seconds | Unit::Ratio | Unit::Cycles => (0.0, f64::INFINITY),
         Unit::Celsius => return,
     };
-    let is_within = (0.0..=high).contains(&set); // otherwise `set` is reported elsewhere, or no value reaches it
+    // If `set` is outside this range, another check reports it, or no value reaches it.
+    let is_within = (0.0..=high).contains(&set);
     if is_within && !(low..=high).contains(&clear) {
         let range = if high.is_finite() { format!("{low} to {high}") } else { format!("{low} or more") };
         alarm.place.fault(written, format!("must clear {key} at {range}, not at {}", rounded(clear)));

@@ -9,8 +9,8 @@ use crate::config::schema::RawTables;
 use crate::config::schema::keys::Output;
 use crate::monitor::{CommandConfig, OutputConfig};
 
-/// Returns the plan that decodes commands, and the guard that checks commands without authentication. `None` = commands
-/// are disabled, or a fault was reported.
+/// Returns the plan that decodes commands. If the commands have a checksum and a counter instead of an authenticator,
+/// also returns the guard that checks them. If commands are disabled or a fault was reported, returns `None`.
 pub(crate) fn commands(
     raw: &RawTables,
     found: &[ResolvedSignal<'_>],

@@ -119,7 +119,7 @@ pub(super) const ESTIMATES: &[Column<EstimateRow>] = &columns! { EstimateRow;
     "u1_v" Real "V" null, "voltage of the first RC branch", |row| branch(row, 0);
     "u2_v" Real "V" null, "voltage of the second branch, if the model has one", |row| branch(row, 1);
     "u3_v" Real "V" null, "voltage of the third branch, if the model has one", |row| branch(row, 2);
-    "capacity_ah" Real "Ah" null, "learned capacity between the open-circuit voltages", |row| real(row.estimate.capacity_ah);
+    "capacity_ah" Real "Ah" null, "learned capacity: charge between the full and the empty open-circuit voltage", |row| real(row.estimate.capacity_ah);
     "capacity_std_ah" Real "Ah" null, "its standard deviation", |row| real(row.estimate.capacity_std_ah);
     "resistance_ratio" Real "" null, "resistance relative to new", |row| real(row.estimate.resistance_ratio);
     "resistance_ratio_std" Real "" null, "its standard deviation", |row| real(row.estimate.resistance_ratio_std);
@@ -139,7 +139,7 @@ pub(super) static HALF_CYCLES: LazyLock<Vec<Column<HalfCycleRow>>> = LazyLock::n
         "time" Time "UTC", "end of the half-cycle", |row| FieldValue::Time(row.time);
         "since_start_s" Real "s", "time since the log's first result", |row| real(row.since_s);
         "cell" Whole "", "cell, from 0", |row| FieldValue::Whole(row.half.whole("cell"));
-        "full_cycles" Real "cycles" null, "equivalent full cycles of the connected pack so far: charge moved over twice the rated capacity", |row| real(row.full_cycles);
+        "full_cycles" Real "cycles" null, "equivalent full cycles of the connected pack so far: charge moved divided by twice the rated capacity", |row| real(row.full_cycles);
         "mode" Word "", "charge or discharge", |row| text(row.half.text("mode"));
         "charge_ah" Real "Ah", "charge moved", |row| number(&row.half, "charge_ah");
         "swing" Real "fraction" null, "change of the state of charge, from the voltages", |row| number(&row.half, "swing");

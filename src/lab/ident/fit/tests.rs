@@ -1,4 +1,5 @@
-//! Tests fits of simulated records whose tables are known, and requests that a fit must reject.
+//! Tests the fit of a cell model. The records are simulated with known tables, so the tests can compare the fitted
+//! tables with the known tables. Other tests check that the fit rejects unusable data.
 
 use super::*;
 use crate::cell::circuit::BranchAt;
@@ -111,7 +112,8 @@ fn settings(grid: Grid) -> FitSettings {
 fn gradient_agrees_with_finite_differences() {
     let grid = grid();
     let layout = Layout::new(&grid, 2);
-    // A point between the temperature nodes, so that all four corners contribute. The offsets keep the residuals large.
+    // The temperatures of the rows lie between the grid's two temperatures, so all four corners of a grid cell
+    // contribute. The offsets that are added to `theta` below keep the residuals large.
     let record = {
         let mut record = simulate(&truth(), 25.0, 0.005, &grid);
         for row in &mut record.rows {
@@ -174,7 +176,8 @@ fn ocv_rises_where_the_data_fall() {
     let grid = grid();
     let mut records = vec![simulate(&truth(), 25.0, 0.0, &grid)];
     for row in &mut records[0].rows {
-        // Above SOC 0.6, the measured voltage loses 0.8 V per unit of SOC, almost the whole rise of the curve.
+        // Above SOC 0.6, subtract 0.8 V per unit of SOC from the measured voltage. This removes almost the whole rise
+        // of the open-circuit curve, which is 0.825 V per unit of SOC.
         row.voltage_v -= 0.8 * (row.soc - 0.6).max(0.0);
     }
     let fitted = fit(&settings(grid), &records, &[1.0], |_, _| {}).expect("a fit");

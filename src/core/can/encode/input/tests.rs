@@ -92,8 +92,8 @@ fn missing_value_without_code_is_encoded_as_invalid() {
 
 #[test]
 fn frame_without_code_for_missing_is_omitted_and_counted() {
-    // Every code of the third cell is a valid voltage. Without this voltage, the cell's page cannot be sent, but the
-    // other page can.
+    // The signal of the third cell has no code for a missing value, because each of its codes is a valid voltage. If
+    // this voltage is missing, the page with the third cell cannot be sent. The other page can be sent.
     let (frames, lost) = encode(&map(), &[(sensor(1), Some(1.0))]);
     assert_eq!((frames.len(), lost), (1, 0));
     let two = InputMap::new(vec![bind("Cells.Cell3", cell(2)), bind("Cells.Air", sensor(1))]);

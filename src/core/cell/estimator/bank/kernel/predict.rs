@@ -45,8 +45,9 @@ impl<const L: usize> BranchStep<L> {
     }
 }
 
-/// SOC after a discharge of `charge_ah`: the decrease of the SOC at the centre, and the odd and even parts of the new
-/// SOC over the pairs. Only the quotient of charge and capacity is nonlinear.
+/// Predicts the SOC after a discharge of `charge_ah`. Returns the decrease of the SOC at the centre, and the odd and
+/// even parts of the new SOC for each pair of sigma points. The new SOC is a nonlinear function of the state only
+/// because the charge is divided by the capacity.
 #[inline(always)]
 fn soc_parts<const L: usize, const N: usize>(
     c: &KernelConstants,
@@ -72,7 +73,8 @@ struct BranchPrediction<const L: usize> {
     centre_v: Lanes<L>,
     /// Remaining fraction of the branch's voltage, at the centre.
     decay: Lanes<L>,
-    /// Voltage per ampere that a current adds to a new cell's branch in the measured time, at the centre, ohm.
+    /// Voltage that a mean current of 1 A adds to the branch of a new cell in the measured time. It is computed at the
+    /// centre, in V per A (ohm).
     gain_ohm: Lanes<L>,
     noise: Lanes<L>,
     parts: OddEvenParts<L>,
