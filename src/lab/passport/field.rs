@@ -102,7 +102,7 @@ impl Field {
             Self::FullCycles => (
                 "full_cycles",
                 "1",
-                "charge moved in both directions over twice the rated capacity; whole ones in the passport",
+                "charge moved in both directions divided by twice the rated capacity; whole ones in the passport",
             ),
             Self::CapacityThroughput => {
                 ("capacity_throughput", "Ah", "charge moved in complete charges and discharges, both directions added")

@@ -205,10 +205,12 @@ impl Estimation {
             self.bank.add(cell, &step);
         }
         self.bank.step();
-        // A small current that is not exactly zero shows that the sensor works and the pack rests.
+        // A wrong current makes most cells jump. A small current that is not exactly zero shows that the sensor works
+        // and the pack rests.
         let rest_a = self.bank.own_config().gap.rest_current_a;
         let is_rest = |sample: &CellSample| sample.current_a.is_some_and(|a| a != 0.0 && a.abs() <= rest_a);
-        if samples.iter().any(|sample| self.bank.result(sample.cell.index()).jumped && !is_rest(sample)) {
+        let has_jumped = |sample: &&CellSample| self.bank.result(sample.cell.index()).jumped && !is_rest(sample);
+        if 2 * samples.iter().filter(has_jumped).count() > samples.len() {
             self.current_check.demand_step();
         }
         self.check_models(&samples);
