@@ -32,6 +32,8 @@ struct Bench {
     capacity_ah: f64,
     config: MonitorConfig,
     voltage_error: f64,
+    /// The measured current is the true current times this factor.
+    current_factor: f64,
 }
 
 impl Bench {
@@ -48,6 +50,7 @@ impl Bench {
             capacity_ah: config.model.capacity_ah,
             config,
             voltage_error: 0.0,
+            current_factor: 1.0,
         }
     }
     fn take(&mut self) {
@@ -95,7 +98,7 @@ impl Bench {
         }
         let v = self.truth(i, 1.0) + self.voltage_error;
         if current || voltage {
-            self.send(current.then_some(i), voltage.then_some(v));
+            self.send(current.then_some(self.current_factor * i), voltage.then_some(v));
         }
     }
     fn quiet(&mut self, seconds: u32) {
@@ -291,6 +294,52 @@ fn jumping_voltage_is_not_trusted() {
     }
     assert!(valid < 600, "SOC valid for {valid} of 3600 s");
     assert!(b.count(|k| alarm(k, Rule::EstimateUntrusted, true)) > 0);
+
+    // Load steps end the doubt about the current.
+    b.voltage_error = 0.0;
+    for _ in 0..90 {
+        b.run(1.3, 20);
+        b.run(-1.3, 20);
+    }
+    assert!(b.count(|k| matches!(k, EventKind::Trust { trusted: true, .. })) > 0);
+}
+
+/// A drive with steps of the load, then 14 hours without any frame.
+fn drive_and_sleep() -> Bench {
+    let mut b = Bench::new(load("paper.toml"), 0.8);
+    for _ in 0..10 {
+        b.run(2.6, 20);
+        b.run(0.02, 20);
+    }
+    assert_eq!(b.status().validity, 1, "{:?}", b.status());
+    (b.t, b.u1) = (b.t + 50_000.0, 0.0);
+    b
+}
+
+#[test]
+fn jump_in_gap_waits_for_explained_step() {
+    let mut b = drive_and_sleep();
+    b.current_factor = -1.0;
+    b.run(2.6, 60);
+    assert_ne!(b.status().validity, 1, "{:?}", b.status());
+
+    b.current_factor = 1.0;
+    b.run(0.02, 20);
+    for _ in 0..3 {
+        b.run(2.6, 20);
+        b.run(0.02, 20);
+    }
+    assert_eq!(b.status().validity, 1, "{:?}", b.status());
+}
+
+#[test]
+fn unseen_charge_is_trusted_at_rest() {
+    let mut b = drive_and_sleep();
+    let before = b.status().soc;
+    b.soc += 0.15;
+    b.run(0.02, 60);
+    assert!(b.status().soc > before + 10.0, "{:?}", b.status());
+    assert_eq!(b.status().validity, 1, "{:?}", b.status());
 }
 
 #[test]

@@ -21,7 +21,7 @@ use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES, SensorErrors};
 use crate::filter::ScalarGaussian;
 use crate::quantity::bounds;
 
-/// A change of the SOC in one step that the counted charge does not explain is a jump if it exceeds both limits: this
+/// A change of the SOC over a gap that the counted charge does not explain is a jump if it exceeds both limits: this
 /// fraction, and this many standard deviations of the SOC before the step.
 const JUMP: f64 = 0.05;
 const JUMP_SIGMA: f64 = 4.0;
@@ -66,7 +66,8 @@ impl CellEstimator {
     ) -> StepResult {
         let step = CellStep { temperature_c: Some(self.temperature(model, step)), ..*step };
         self.memory.temperature_c = step.temperature_c;
-        let before = self.marginal(0);
+        let has_gap = step.unmeasured_s > 0.0 || self.memory.downtime_std_if_any().is_some();
+        let before = self.marginal(0).filter(|_| has_gap);
         let result = self.try_step(&mut kernel, model, config, &step);
         let result = result.filter(|_| self.filter.as_ref().is_none_or(Gaussian::is_possible));
         let reset = result.is_none() || self.memory.has_lost_cell(config);

@@ -43,6 +43,6 @@ pub struct StepResult {
     pub update: Option<Update>,
     /// Whether the filter was restarted from the voltage.
     pub reset: bool,
-    /// Whether the SOC has changed by far more than the counted charge and the earlier uncertainty explain.
+    /// Whether the SOC has changed over a gap by far more than the counted charge and the earlier uncertainty explain.
     pub jumped: bool,
 }

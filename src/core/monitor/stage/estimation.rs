@@ -410,8 +410,8 @@ impl Estimation {
     /// Judges whether a cell's estimate is trusted: its contradiction is at most the consistency limit. Returns the
     /// result if it has changed.
     pub(crate) fn judge_trust(&mut self, cell: CellIndex) -> Option<bool> {
-        let returns = if self.trusted[cell.index()] { 1.0 } else { RETURN };
-        let is_trusted = self.contradiction(cell.index()) <= returns * self.bank.own_config().consistency.limit;
+        let relative = self.contradiction(cell.index()) / self.bank.own_config().consistency.limit;
+        let is_trusted = is_trusted(relative, self.trusted[cell.index()]);
         if is_trusted == self.trusted[cell.index()] {
             return None;
         }
@@ -510,4 +510,22 @@ pub(crate) fn resistance(bank: &PackBank, index: usize) -> ScalarGaussian {
     let log_resistance = bank.log_resistance(index);
     let ratio = libm::exp(log_resistance.mean);
     ScalarGaussian::from_std(ratio, ratio * log_resistance.std())
+}
+
+/// Whether a cell is trusted. `relative`: its contradiction as a multiple of the consistency limit. `was_trusted`:
+/// whether the cell was trusted before.
+fn is_trusted(relative: f64, was_trusted: bool) -> bool {
+    relative <= if was_trusted { 1.0 } else { RETURN }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn trust_is_lost_above_limit_and_returns_far_below() {
+        assert!(is_trusted(1.0, true) && !is_trusted(1.01, true));
+        assert!(is_trusted(0.25, false) && !is_trusted(0.9, false));
+        assert!(!is_trusted(f64::NAN, true), "an unknown contradiction is not trusted");
+    }
 }

@@ -406,25 +406,32 @@ mod tests {
         f64::from(time_s.wrapping_mul(time_s) % 61) / 1000.0
     }
 
+    /// Handles a round of all cells. `voltage_v` returns the voltage of a cell.
+    fn round(check: &mut CurrentCheck, time_s: u32, current_a: Option<f64>, voltage_v: impl Fn(usize) -> f64) {
+        let samples: Vec<CellSample> = (0..CELLS)
+            .map(|cell| CellSample {
+                time: Timestamp::from_secs(f64::from(time_s)),
+                cell: CellIndex(cell as u16),
+                voltage_v: voltage_v(cell),
+                current_a,
+                charge_as: 0.0,
+                offset_s: 0.0,
+                unmeasured_s: 0.0,
+                temperature_c: None,
+            })
+            .collect();
+        check.handle(samples.iter().enumerate(), 0.001, OHM);
+    }
+
     /// Runs a drive of `seconds`, one round every 2 s. `measured` returns the reading for the load and the time.
     /// Returns the share of rounds in doubt.
     fn drive(check: &mut CurrentCheck, seconds: u32, measured: impl Fn(f64, u32) -> Option<f64>) -> f64 {
         let mut doubtful = 0;
         for time_s in (0..seconds).step_by(2) {
-            let noise_a = noise_a(time_s);
-            let samples: Vec<CellSample> = (0..CELLS)
-                .map(|cell| CellSample {
-                    time: Timestamp::from_secs(f64::from(time_s)),
-                    cell: CellIndex(cell as u16),
-                    voltage_v: 3.7 - 1.2 * OHM * load_a(time_s) + 1e-4 * ((time_s as usize + cell) % 5) as f64,
-                    current_a: measured(load_a(time_s), time_s).map(|current_a| current_a + noise_a),
-                    charge_as: 0.0,
-                    offset_s: 0.0,
-                    unmeasured_s: 0.0,
-                    temperature_c: None,
-                })
-                .collect();
-            check.handle(samples.iter().enumerate(), 0.001, OHM);
+            let current_a = measured(load_a(time_s), time_s).map(|current_a| current_a + noise_a(time_s));
+            round(check, time_s, current_a, |cell| {
+                3.7 - 1.2 * OHM * load_a(time_s) + 1e-4 * ((time_s as usize + cell) % 5) as f64
+            });
             doubtful += u32::from(check.is_doubtful());
         }
         f64::from(doubtful) / f64::from(seconds / 2)
@@ -511,19 +518,11 @@ mod tests {
         let mut check = CurrentCheck::default();
         for k in 0..20_u32 {
             let since_load = k.checked_sub(5).map(f64::from);
-            let samples: Vec<CellSample> = (0..CELLS)
-                .map(|cell| CellSample {
-                    time: Timestamp::from_secs(f64::from(600 + 2 * k)),
-                    cell: CellIndex(cell as u16),
-                    voltage_v: 3.7 - since_load.map_or(0.102, |rounds| 0.03 * libm::exp(-rounds / 3.0)),
-                    current_a: Some(if since_load.is_none() { 30.0 } else { 0.0 }),
-                    charge_as: 0.0,
-                    offset_s: 0.0,
-                    unmeasured_s: 0.0,
-                    temperature_c: None,
-                })
-                .collect();
-            check.handle(samples.iter().enumerate(), 0.001, OHM);
+            let (voltage_v, current_a) = match since_load {
+                None => (3.7 - 0.102, 30.0),
+                Some(rounds) => (3.7 - 0.03 * libm::exp(-rounds / 3.0), 0.0),
+            };
+            round(&mut check, 600 + 2 * k, Some(current_a), |_| voltage_v);
         }
         assert!(!check.is_doubtful(), "{check:?}");
     }

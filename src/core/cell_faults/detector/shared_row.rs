@@ -1,0 +1,65 @@
+//! Computes what a cell's voltage difference in a row says about the cell's states.
+//!
+//! In: the values of the row that all cells share, the means of a cell's states, and the cell's voltage minus the middle
+//! voltage of the pack, V. Out: an [`Observation`].
+
+use crate::cell::CellModel;
+use crate::cell_faults::difference::{CHANNEL, CONTACT, Observation, RESISTANCE, SOC, STATES};
+
+/// Standard deviations of the errors of a row: `ROW_V` of the voltage, V; `ROW_DROP` of the voltage drop, as a fraction
+/// of the drop; `ROW_CURVE` of the SOC on the open-circuit curve, fraction.
+const ROW_V: f64 = 0.002;
+const ROW_DROP: f64 = 0.03;
+const ROW_CURVE: f64 = 0.001;
+/// Additional errors of a cell per unit of SOC difference from the mean cell: `FAR_V` of the open-circuit curve, V;
+/// `FAR_DROP` of the voltage drop, fraction. `MOST_ELSEWHERE` limits the ratio between the model's resistances at the
+/// two SOC values.
+const FAR_V: f64 = 0.05;
+const FAR_DROP: f64 = 1.0;
+const MOST_ELSEWHERE: f64 = 3.0;
+/// Values of a row that all cells share.
+pub(super) struct Row<'a> {
+    pub(super) model: &'a CellModel,
+    pub(super) capacity_ah: f64,
+    pub(super) soc: f64,
+    pub(super) temperature_c: f64,
+    pub(super) current_a: f64,
+    pub(super) drop_v: f64,
+    pub(super) charge_ah: f64,
+}
+
+impl Row<'_> {
+    /// Observation of `difference_v`, a cell's voltage minus the middle voltage of the pack, linearised at the means of
+    /// the cell's states.
+    pub(super) fn observation(&self, means: &[f64; STATES], difference_v: f64) -> Observation {
+        let (model, temperature) = (self.model, self.model.temperature_position(self.temperature_c));
+        let at = |soc: f64| model.grid_position_at(&temperature, soc.clamp(0.0, 1.0));
+        let (own, middle) = (at(self.soc + means[SOC]), at(self.soc));
+        let slope_v = model.ocv_slope_v(&own, self.capacity_ah).max(0.0);
+        let contact_v = self.current_a * self.contact_ohm();
+        let slope = [slope_v, 0.0, -self.drop_v, -contact_v, 1.0, 0.0];
+        let curve_v = model.aged_ocv_v(&own, self.capacity_ah) - model.aged_ocv_v(&middle, self.capacity_ah);
+        // The resistance depends on the SOC, so even a healthy cell has another resistance at another SOC.
+        let elsewhere = (model.r0_ohm(&own) / model.r0_ohm(&middle)).clamp(1.0 / MOST_ELSEWHERE, MOST_ELSEWHERE) - 1.0;
+        let expected_v = curve_v - self.drop_v * elsewhere
+            + slope[RESISTANCE] * means[RESISTANCE]
+            + slope[CONTACT] * means[CONTACT]
+            + means[CHANNEL];
+        let far = means[SOC].abs();
+        let (drop_v, on_curve_v) = ((ROW_DROP + far * FAR_DROP) * self.drop_v, ROW_CURVE * slope_v);
+        let far_v = far * FAR_V;
+        let variance = ROW_V * ROW_V + far_v * far_v + drop_v * drop_v + on_curve_v * on_curve_v;
+        Observation { innovation: difference_v - expected_v, slope, variance }
+    }
+
+    /// Series resistance of the mean cell in the row, ohm.
+    pub(super) fn ohm(&self) -> f64 {
+        self.model.r0_ohm(&self.model.grid_position(self.soc, self.temperature_c))
+    }
+
+    /// Series resistance at SOC 0.5 and 25 degrees C, ohm. The contact resistance depends on neither SOC nor
+    /// temperature, so it is stated as a fraction of this value.
+    pub(super) fn contact_ohm(&self) -> f64 {
+        self.model.r0_ohm(&self.model.grid_position(0.5, 25.0))
+    }
+}
