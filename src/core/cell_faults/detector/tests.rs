@@ -1,6 +1,7 @@
 //! Tests the cell fault detector with cells that are not compared.
 
 use super::*;
+use crate::cell_faults::difference::SOC;
 
 #[test]
 fn cell_no_longer_compared_is_reset() {
