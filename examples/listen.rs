@@ -51,7 +51,7 @@ fn parse(line: &str) -> Option<(f64, Frame)> {
 /// Rule, severity and cell of an alarm, as words.
 type Key = (String, String, String);
 
-/// The receiver. All times are frame times, s.
+/// The receiver. All times are frame times (s).
 struct Listener {
     database: Database,
     /// Time of the latest frame of each raised alarm.

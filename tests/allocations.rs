@@ -19,11 +19,11 @@ use packwatch::monitor::{Monitor, Outputs, Record, RecordKind, TICK_PERIOD_MS};
 #[global_allocator]
 static ALLOCATOR: dhat::Alloc = dhat::Alloc;
 
-/// If a gap in the log is longer than this, s, the recorder counts as asleep. This log has no gap.
+/// If a gap in the log is longer than this (s), the recorder counts as asleep. This log has no gap.
 const SLEEP_GAP_S: f64 = 30.0;
-/// Length of the log, s.
+/// Length of the log (s).
 const LOG_S: f64 = 160.0;
-/// Length of the warm-up, s. In this time, health frames for all 96 cells are sent.
+/// Length of the warm-up (s). In this time, health frames for all 96 cells are sent.
 const WARM_S: f64 = 110.0;
 /// Minimum number of frames after the warm-up. The remaining 50 s contain more: 10 currents and 32 other frames every
 /// 100 ms.

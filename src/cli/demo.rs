@@ -33,7 +33,7 @@ const FILES: [(&str, &str); 3] = [
     ("measured.dbc", include_str!("../../config/measured.dbc")),
     ("cells/example_nmc_2600.toml", include_str!("../../config/cells/example_nmc_2600.toml")),
 ];
-/// Loss of capacity per cycle, Ah. With this loss, the capacity alarm and the recharge-period alarm are raised within
+/// Loss of capacity per cycle (Ah). With this loss, the capacity alarm and the recharge-period alarm are raised within
 /// about ten cycles.
 const LOSS_AH_PER_CYCLE: f64 = 0.1;
 /// SOC range of the cycles. It is wider than the recharge window, so that every charge covers the whole window.

@@ -30,10 +30,11 @@ pub(crate) struct Args {
     /// All other CAN interfaces of this computer are listened to as well
     #[arg(short, long = "interface", value_name = "IFACE")]
     interfaces: Vec<String>,
-    /// Logs to replay instead of listening: journals, candump logs or CSV files, also .gz or .zst; - reads standard input
+    /// Logs to replay instead of listening: journals, candump logs or CSV files, also .gz or .zst; - reads standard
+    /// input
     #[arg(value_name = "LOG")]
     logs: Vec<PathBuf>,
-    /// Time to listen, or time to read from the logs, s [default: 60; with logs, all of them]
+    /// Time to listen, or time to read from the logs (s) [default: 60; with logs, all of them]
     #[arg(long = "for", value_name = "SECONDS", value_parser = above_0_to(86_400.0, "seconds, "))]
     seconds: Option<f64>,
     /// Print the report as JSON

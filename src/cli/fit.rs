@@ -25,25 +25,26 @@ use packwatch_host::failure::Failure;
     packwatch fit --log [OPTIONS] --config <FILE.toml> --out <MODEL.toml> <FILE>...\n       \
     packwatch fit --log [OPTIONS] --chemistry <CHEMISTRY> --rated <AH> --out <MODEL.toml> <FILE>...")]
 pub(crate) struct Args {
-    /// Measured files of a cell: CSV (.gz, .zst) with the columns time_s, current_a (positive = discharge), voltage_v, and
-    /// optionally temperature_c, discharged_ah, cycle and type. Each file starts with a full cell. With --log: logs of a pack
+    /// Measured files of a cell: CSV (.gz, .zst) with the columns time_s, current_a (positive = discharge), voltage_v,
+    /// and optionally temperature_c, discharged_ah, cycle and type. Each file starts with a full cell. With --log: logs of a pack
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
     /// Fit to logs of a pack, read as by `replay`; they may start at any SOC. The fit starts from the cell model of --config,
-    /// or from --chemistry and --rated, and changes the model where the logs contradict it. A state folder cannot be used,
-    /// because it contains no voltages and currents
+    /// or from --chemistry and --rated, and changes the model where the logs contradict it. A state folder cannot be
+    /// used, because it contains no voltages and currents
     #[arg(long, requires = "start", conflicts_with_all = ["capacity", "ageing_shift", "ocv", "first_cycles", "GridArgs"])]
     log: bool,
     /// Cell model file to write
     #[arg(short, long, value_name = "MODEL.toml")]
     out: PathBuf,
-    /// Name of the cell in the cell model file; required without --log [default with --log: name of the configured model]
+    /// Name of the cell in the cell model file; required without --log [default with --log: name of the configured
+    /// model]
     #[arg(long, required_unless_present = "log")]
     name: Option<String>,
-    /// Capacity that defines SOC, Ah [default: from the slow test nearest 25 degrees C, else the deepest discharge]
+    /// Capacity that defines SOC (Ah) [default: from the slow test nearest 25 degrees C, else the deepest discharge]
     #[arg(long, value_name = "AH", value_parser = finite)]
     capacity: Option<f64>,
-    /// Capacity on the label, Ah [default: --capacity]
+    /// Capacity on the label (Ah) [default: --capacity]
     #[arg(long, value_name = "AH", value_parser = finite)]
     rated: Option<f64>,
     /// How the open-circuit curve changes as the cell loses capacity: with 0, it shrinks evenly; with 1, it shifts as
@@ -57,7 +58,8 @@ pub(crate) struct Args {
     /// Highest voltage under charge [default: where charges end, pulses excluded]
     #[arg(long, value_name = "VOLTS", value_parser = finite)]
     voltage_max: Option<f64>,
-    /// Slow test (about C/20) that starts with a full cell and gives the open-circuit curve; repeat for several temperatures
+    /// Slow test (about C/20) that starts with a full cell and gives the open-circuit curve; repeat for several
+    /// temperatures
     #[arg(long, value_name = "FILE")]
     ocv: Vec<PathBuf>,
     #[command(flatten)]
@@ -87,8 +89,8 @@ struct StartArgs {
     /// Configuration file of the pack; the fit starts from its cell model
     #[arg(short, long, value_name = "FILE.toml", requires = "log")]
     config: Option<PathBuf>,
-    /// Chemistry on the label, for logs of a single cell; needs --rated. Add --voltage-min and --voltage-max if they are not
-    /// typical of the chemistry
+    /// Chemistry on the label, for logs of a single cell; needs --rated. Add --voltage-min and --voltage-max if they are
+    /// not typical of the chemistry
     #[arg(long, value_parser = one_of_chemistries(), requires_all = ["log", "rated"], conflicts_with = "config")]
     chemistry: Option<String>,
 }
@@ -99,10 +101,10 @@ struct GridArgs {
     /// Number of RC branches (a resistor and a capacitor), 1 to 3 [default: 2, for an ageing cell 1]
     #[arg(long, value_name = "N", value_parser = integer::<usize>(0, usize::MAX))]
     branches: Option<usize>,
-    /// Initial time constants of the RC branches, s, ascending, for example 10,100
+    /// Initial time constants of the RC branches (s), ascending, for example 10,100
     #[arg(long, value_name = "SECONDS,..", value_delimiter = ',', value_parser = finite)]
     tau: Option<Vec<f64>>,
-    /// Temperatures of the model's tables, degrees C, ascending [default: from the data]
+    /// Temperatures of the model's tables (degrees C), ascending [default: from the data]
     #[arg(long, value_name = "CELSIUS,..", value_delimiter = ',', value_parser = finite, allow_negative_numbers = true)]
     temperatures: Option<Vec<f64>>,
     /// SOC of the model's tables: how many values (evenly spaced), or an ascending list from 0 to 1 [default: 15 to 31 values

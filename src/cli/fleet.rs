@@ -74,7 +74,7 @@ struct RunArgs {
     /// Shard to replay: I of N shards of similar size
     #[arg(long, value_name = "I/N", default_value = "1/1")]
     shard: Shard,
-    /// Also write estimates, at most one per cell in this period, s; 0 writes all
+    /// Also write estimates, at most one per cell in this period (s); 0 writes all
     #[arg(long, value_name = "SECONDS", value_parser = period)]
     estimates: Option<f64>,
     /// Number of threads [default: one per core]

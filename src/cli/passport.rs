@@ -50,7 +50,8 @@ pub(crate) struct Args {
     /// Configuration file of the pack
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// Journals, candump logs or CSV files of the battery's whole life, also .gz or .zst; read in this order as one record
+    /// Journals, candump logs or CSV files of the battery's whole life, also .gz or .zst; read in this order as one
+    /// record
     #[arg(value_name = "LOG", required_unless_present = "state", conflicts_with = "state")]
     logs: Vec<PathBuf>,
     /// Folder of state and history to use instead of logs; a running daemon may use it
@@ -59,16 +60,17 @@ pub(crate) struct Args {
     /// Standard of the passport
     #[arg(long, value_name = "STANDARD", value_parser = one_of(&STANDARDS), default_value = "product-condition")]
     form: Standard,
-    /// Manufacturer's part in the form of the standard: what cannot be measured, such as manufacturer, materials, accidents
+    /// Manufacturer's part in the form of the standard: what cannot be measured, such as manufacturer, materials,
+    /// accidents
     #[arg(long = "static", value_name = "FILE.json")]
     manufacturer: Option<PathBuf>,
-    /// Usable energy of the pack at certification, kWh; needed for the state of certified energy (SOCE)
+    /// Usable energy of the pack at certification (kWh); needed for the state of certified energy (SOCE)
     #[arg(long, value_name = "KWH", value_parser = above_0)]
     certified_energy_kwh: Option<f64>,
-    /// Charge throughput (charge plus discharge) before the record began, Ah; 0 if the battery was recorded from new
+    /// Charge throughput (charge plus discharge) before the record began (Ah); 0 if the battery was recorded from new
     #[arg(long, value_name = "AH", value_parser = at_least_0)]
     throughput_before_ah: Option<f64>,
-    /// Total charge throughput (charge plus discharge) from the pack's own counter, Ah; replaces the sum of the record
+    /// Total charge throughput (charge plus discharge) from the pack's own counter (Ah); replaces the sum of the record
     #[arg(long, value_name = "AH", value_parser = at_least_0, conflicts_with = "throughput_before_ah")]
     throughput_ah: Option<f64>,
     /// Passport file to write; - writes standard output

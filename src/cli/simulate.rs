@@ -48,10 +48,10 @@ pub(crate) struct Args {
     /// Write the true state to this CSV, compressed if the name ends in .gz
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
-    /// Time between rows of the truth, s
+    /// Time between rows of the truth (s)
     #[arg(long, value_name = "SECONDS", default_value_t = 1.0, value_parser = settings::positive)]
     truth_period: f64,
-    /// Unix time of the first frame, s
+    /// Unix time of the first frame (s)
     #[arg(long, value_name = "SECONDS", default_value_t = 1_700_000_000, value_parser = integer::<u32>(0, u32::MAX))]
     start: u32,
     #[command(flatten)]

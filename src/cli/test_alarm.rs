@@ -27,7 +27,7 @@ pub(crate) struct Args {
     /// Configuration file of the daemon
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// Duration of the test, s
+    /// Duration of the test (s)
     #[arg(long = "for", value_name = "SECONDS", default_value_t = 5.0, value_parser = above_0_to(MAX_TEST_S, "seconds, "))]
     duration: f64,
     #[command(flatten)]

@@ -112,7 +112,7 @@ impl InvalidState {
         bounds::VARIANCE.check(what, found)
     }
 
-    /// Rejects a capacity that no cell can have, Ah.
+    /// Rejects a capacity that no cell can have (Ah).
     pub fn unless_capacity(what: &'static str, found: f64) -> Result<(), Self> {
         bounds::CAPACITY_AH.check(what, found)
     }
@@ -167,20 +167,20 @@ impl SensorIndex {
 pub enum Channel {
     /// State of the pack's contactors. When they are open, no current flows.
     Contactor,
-    /// Pack current, A; positive = discharge, after the configured sign was applied.
+    /// Pack current (A); positive = discharge, after the configured sign was applied.
     Current,
-    /// A temperature sensor, degrees C.
+    /// A temperature sensor (degrees C).
     Temperature(SensorIndex),
-    /// Total pack voltage, V.
+    /// Total pack voltage (V).
     PackVoltage,
-    /// One cell's voltage, V.
+    /// One cell's voltage (V).
     CellVoltage(CellIndex),
     /// SOC reported by the pack, fraction. The value is only compared with the estimate; the estimate never uses it.
     ReportedSoc,
     /// SOH (capacity over rated capacity) reported by the pack, fraction. The value is only compared with the estimate;
     /// the estimate never uses it.
     ReportedSoh,
-    /// Voltage of the vehicle's 12 V (or 24 V) supply, V. If this voltage is too low, no diagnostic requests are sent.
+    /// Voltage of the vehicle's 12 V (or 24 V) supply (V). If this voltage is too low, no diagnostic requests are sent.
     /// Never used by an estimate.
     SupplyVoltage,
     /// Whether the BMS bleeds a cell; 0 = the BMS does not bleed the cell. Only the cell-fault detector uses this

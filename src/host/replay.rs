@@ -53,7 +53,7 @@ pub struct ReplaySettings {
     pub from: Option<LogTime>,
     /// Records after this time are skipped.
     pub until: Option<LogTime>,
-    /// Sleep gap, s. In a longer gap of the log, the recorder counts as asleep.
+    /// Sleep gap (s). In a longer gap of the log, the recorder counts as asleep.
     pub sleep_gap_s: f64,
     /// Whether to take a snapshot.
     pub snapshot: bool,

@@ -68,9 +68,9 @@ pub use writer::StoreProgress;
 
 /// State folder of the service.
 const STANDARD_FOLDER: &str = "/var/lib/packwatch";
-/// Time between states in the runtime folder, s.
+/// Time between states in the runtime folder (s).
 const RUNTIME_PERIOD_S: f64 = 1.0;
-/// Time between checkpoints while no frame arrives, s. During this time the state does not change; it only becomes
+/// Time between checkpoints while no frame arrives (s). During this time the state does not change; it only becomes
 /// older.
 const QUIET_PERIOD_S: f64 = 3600.0;
 

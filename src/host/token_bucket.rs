@@ -11,7 +11,7 @@ use crate::quantity::Timestamp;
 pub(crate) struct BucketSize {
     /// Tokens of a full bucket.
     pub(crate) burst: f64,
-    /// Time until the next token, s.
+    /// Time until the next token (s).
     pub(crate) period_s: f64,
 }
 

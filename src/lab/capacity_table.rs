@@ -3,12 +3,12 @@
 //! | column | value |
 //! | --- | --- |
 //! | `time_s`, `start`, `date` or `time` | time in seconds, or as text such as 2008-04-02T13:08:17 |
-//! | `capacity_ah` or `capacity_ah_source` | capacity, Ah, above 0; empty = not measured |
+//! | `capacity_ah` or `capacity_ah_source` | capacity (Ah), above 0; empty = not measured |
 //! | `soc` | SOC, fraction; empty = not measured |
 //! | `cell` | number of the cell, from 0 |
 //! | `cycle` | number of the part of a measured file that the row describes |
 //! | `type` | kind of the cycle: `discharge` or another word |
-//! | `duration_s` | how long the cell was in use from the time of the row on, s |
+//! | `duration_s` | how long the cell was in use from the time of the row on (s) |
 
 use std::borrow::Cow;
 use std::path::Path;

@@ -1,4 +1,4 @@
-//! Draws pictures as SVG: lines, bands, points and thresholds over an axis of numbers or dates; bands of states; heat
+//! Draws pictures as SVG: lines, bands (points) and thresholds over an axis of numbers or dates; bands of states; heat
 //! maps.
 //!
 //! Input: values in the units that the labels name. Output: SVG in one style. A value that is not finite interrupts a

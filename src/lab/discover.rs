@@ -84,7 +84,7 @@ pub struct Discovery {
     pub ignored_frames: u64,
     /// Number of different diagnostic answers in the log (sender, service and identifier).
     pub answers: usize,
-    /// Length of the log, s.
+    /// Length of the log (s).
     pub seconds: f64,
     /// Number of signals with values in the log.
     pub signals: usize,
@@ -136,7 +136,7 @@ impl Discoverer {
         self.capture.frames
     }
 
-    /// Returns the length of the log so far, s.
+    /// Returns the length of the log so far (s).
     pub fn seconds(&self) -> f64 {
         self.capture.seconds()
     }

@@ -61,7 +61,7 @@ const AGEING_SOC_NODES: [f64; 25] = [
 /// Width of the SOC interval above the cut-off. The curve of an ageing cell continues below the cut-off with the slope
 /// of this interval.
 const LOW_END_SOC: f64 = 0.03;
-/// Initial time constants, s, for models with 1, 2 and 3 branches.
+/// Initial time constants (s) for models with 1, 2 and 3 branches.
 const TAU_S: [&[f64]; 3] = [&[60.0], &[10.0, 150.0], &[5.0, 50.0, 500.0]];
 
 /// Temperature at which the electrodes are identified, degrees Celsius.
@@ -114,16 +114,16 @@ impl FileResidual {
 pub struct FitOutcome {
     /// Fitted tables, and the residual over all records.
     pub fit: FittedTables,
-    /// Capacity, Ah.
+    /// Capacity (Ah).
     pub capacity_ah: f64,
-    /// Lowest and highest voltage, V.
+    /// Lowest and highest voltage (V).
     pub voltage_v: (f64, f64),
     /// Electrodes that explain the open-circuit curve; `None` = no known electrodes explain it, a shift of the curve is
     /// given, or a fit to measured files has no slow test.
     pub electrodes: Option<FittedElectrodes>,
     /// Thermal parameters; `None` = the data do not determine them.
     pub thermal: Option<Thermal>,
-    /// Voltage error of the model at each node, V: standard deviation of the 100 s averages.
+    /// Voltage error of the model at each node (V): standard deviation of the 100 s averages.
     pub voltage_error_v: Vec<f64>,
     /// Ranges in which the cell was measured.
     pub measured: MeasuredRange,
@@ -146,7 +146,7 @@ pub struct FitOutcome {
 /// Additional results of a fit to logs of a whole pack.
 #[derive(Debug, Clone)]
 pub struct LogsOutcome {
-    /// Standard deviation of the capacity, Ah.
+    /// Standard deviation of the capacity (Ah).
     pub capacity_std_ah: f64,
     /// Deviation of every cell from the mean cell; empty if the pack has too few cells.
     pub cells: Vec<CellDeviation>,

@@ -31,7 +31,7 @@ pub struct CrossValidation {
     pub folds: Folds,
     /// Errors over all rows.
     pub score: PredictionScore,
-    /// Duration of the cross-validation of this kernel, s.
+    /// Duration of the cross-validation of this kernel (s).
     pub seconds: f64,
     /// Peak memory of the process during the cross-validation, KiB; `None` = the system does not report it.
     pub peak_kib: Option<u64>,

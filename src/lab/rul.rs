@@ -31,7 +31,7 @@ pub const WORST_ERROR: f64 = 1.0;
 /// The capacity at which a life ends.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Threshold {
-    /// Capacity, Ah.
+    /// Capacity (Ah).
     AmpereHours(f64),
     /// Share of the capacity in the first reading of the history.
     OfFirst(f64),
@@ -75,12 +75,12 @@ pub struct HistoryScore {
     pub name: String,
     /// Unit of use.
     pub axis: Axis,
-    /// Capacity at which the life ends, Ah.
+    /// Capacity at which the life ends (Ah).
     pub threshold_ah: f64,
     /// Use at the end of life; `None` = the end of life is not reached, or was passed before the first reading, so
     /// nothing is scored.
     pub end_of_life: Option<f64>,
-    /// Smallest capacity of the file, Ah.
+    /// Smallest capacity of the file (Ah).
     pub least_capacity_ah: f64,
     /// Scores in the order of the requested shares of the life.
     pub judged: Vec<ForecastScore>,
@@ -112,15 +112,15 @@ pub struct CurrentForecast {
     pub name: String,
     /// Unit of use.
     pub axis: Axis,
-    /// Capacity at which the life ends, Ah.
+    /// Capacity at which the life ends (Ah).
     pub threshold_ah: f64,
     /// Number of readings.
     pub readings: usize,
     /// Use at the last reading.
     pub used: f64,
-    /// Capacity without the recovery during rests, Ah: mean and standard deviation.
+    /// Capacity without the recovery during rests (Ah): mean and standard deviation.
     pub level_ah: (f64, f64),
-    /// Capacity loss per unit of use, Ah: mean and standard deviation.
+    /// Capacity loss per unit of use (Ah): mean and standard deviation.
     pub rate_ah: (f64, f64),
     /// Remaining life; `None` = no forecast.
     pub remaining: Option<RemainingLife>,

@@ -45,21 +45,21 @@ use crate::monitor::MonitorConfig;
 pub struct ScoreSettings {
     /// Configuration of the monitor.
     pub monitor: MonitorConfig,
-    /// Charge from full to empty that defines the true SOC, Ah.
+    /// Charge from full to empty that defines the true SOC (Ah).
     pub truth_capacity_ah: f64,
     /// For a start in the middle of a file: the share of `truth_capacity_ah` that has been taken out before the start,
     /// fraction.
     pub remove: f64,
-    /// Time after the start that is left out of the statistics, s.
+    /// Time after the start that is left out of the statistics (s).
     pub settle_s: f64,
     /// Standard deviation of the initial SOC, fraction; `None` = derived from the initial error (see
     /// [`ScoreSettings::initial_soc_std`]).
     pub soc_std: Option<f64>,
     /// Standard deviation of the initial capacity, as a fraction of the model's capacity; `None` = as configured.
     pub capacity_std: Option<f64>,
-    /// If a gap between two rows is longer than this, s, the recorder counts as asleep.
+    /// If a gap between two rows is longer than this (s), the recorder counts as asleep.
     pub sleep_gap_s: f64,
-    /// Capacity threshold, Ah; the first discharge below it is reported.
+    /// Capacity threshold (Ah); the first discharge below it is reported.
     pub threshold_ah: f64,
     /// Number of discharges at the start of a life that are left out of the statistics.
     pub skip_cycles: usize,

@@ -17,11 +17,11 @@ const BUILT_IN: [(&str, &[u8]); 2] =
 pub struct LabelKeys {
     /// Name of the chemistry.
     pub chemistry: String,
-    /// Rated capacity, Ah. Without it, the configuration is faulty.
+    /// Rated capacity (Ah). Without it, the configuration is faulty.
     pub rated_ah: Option<f64>,
-    /// Lowest voltage, V; `None` = typical for the chemistry.
+    /// Lowest voltage (V); `None` = typical for the chemistry.
     pub voltage_min_v: Option<f64>,
-    /// Highest voltage, V; `None` = typical for the chemistry.
+    /// Highest voltage (V); `None` = typical for the chemistry.
     pub voltage_max_v: Option<f64>,
 }
 

@@ -94,7 +94,7 @@ impl CellModel {
         self.model().soc.clone()
     }
 
-    /// Temperature breakpoints, degrees C.
+    /// Temperature breakpoints (degrees C).
     #[getter]
     fn temperature_c(&self) -> Vec<f64> {
         self.model().temperature_c.clone()

@@ -42,7 +42,7 @@ impl Fit {
         self.outcome.capacity_ah
     }
 
-    /// Root of the mean squared residual, V.
+    /// Root of the mean squared residual (V).
     #[getter]
     fn rmse_v(&self) -> f64 {
         self.outcome.fit.total.rmse_v

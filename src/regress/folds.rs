@@ -19,9 +19,9 @@ use super::settings::{FitProgress, GprSettings, ProgressCallback, TrainingRows};
 pub struct Fold {
     /// Number of held-out rows.
     pub held_out: usize,
-    /// Duration of the fit, measured with the caller's clock, s.
+    /// Duration of the fit, measured with the caller's clock (s).
     pub fit_s: f64,
-    /// Duration of the predictions, s.
+    /// Duration of the predictions (s).
     pub predict_s: f64,
     /// Fitted hyperparameters.
     pub hyperparameters: Vec<Hyperparameter>,

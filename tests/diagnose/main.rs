@@ -70,7 +70,7 @@ const FAULTS: [(&str, usize, &str); 21] = [
 
 /// If the name of a fault has this suffix, the fault grows for ten days.
 const SLOWLY: &str = " in 10 days";
-/// Duration of the growth, s.
+/// Duration of the growth (s).
 const SLOW_S: f64 = 10.0 * 86_400.0;
 /// Number of steps of the growth.
 const SLOW_STEPS: u32 = 80;
@@ -145,7 +145,7 @@ fn main() -> Result<(), String> {
     Ok(())
 }
 
-/// CPU time of this process since its start, s. Unlike wall-clock time, it does not depend on the load of the machine.
+/// CPU time of this process since its start (s). Unlike wall-clock time, it does not depend on the load of the machine.
 fn cpu_s() -> Option<f64> {
     const TICKS_PER_S: f64 = 100.0; // USER_HZ of Linux
     let stat = std::fs::read_to_string("/proc/self/stat").ok()?;

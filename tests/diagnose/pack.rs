@@ -15,17 +15,17 @@ use packwatch_host::io::ticks::Ticks;
 
 use crate::finding::kind_of;
 
-/// If no frame arrives for longer than this, s, the vehicle counts as asleep.
+/// If no frame arrives for longer than this (s), the vehicle counts as asleep.
 const SLEEP_GAP_S: f64 = 30.0;
-/// Interval between two checks of the findings while the buses are awake, s.
+/// Interval between two checks of the findings while the buses are awake (s).
 const LOOK_S: f64 = 300.0;
 /// A discharge current above this value, 1/h (current divided by capacity), counts as driving.
 const DRIVE_PER_H: f64 = 0.05;
-/// If the pack has not been driving for longer than this, s, the next drive begins with the next driving current.
+/// If the pack has not been driving for longer than this (s), the next drive begins with the next driving current.
 const PARKED_S: f64 = 1800.0;
 /// Cells per temperature sensor.
 pub(crate) const CELLS_PER_SENSOR: u16 = 4;
-/// Capacity of the cells in the model file, Ah.
+/// Capacity of the cells in the model file (Ah).
 const MODEL_AH: f64 = 2.6;
 
 /// Size of a pack.
@@ -72,7 +72,7 @@ pub(crate) struct Case {
 /// A finding at its first occurrence.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct FirstFinding {
-    /// Time since the start of the simulation, s.
+    /// Time since the start of the simulation (s).
     pub(crate) at_s: f64,
     /// Number of drives with the fault so far (see `Drives`).
     pub(crate) drives: u32,

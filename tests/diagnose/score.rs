@@ -68,8 +68,8 @@ impl Score {
         )
     }
 
-    /// Delay, days, within which the fault was found in the share `quantile` of all packs; `-` if it was found in fewer
-    /// packs.
+    /// Delay (days), within which the fault was found in the share `quantile` of all packs; `-` if it was found in
+    /// fewer packs.
     fn delay(&self, quantile: f64) -> String {
         let mut delays = self.delays_days.clone();
         delays.sort_by(f64::total_cmp);

@@ -17,7 +17,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
 const DAY_S: u32 = 86_400;
-/// Time in which the value approaches its threshold at the start of the day, and leaves it at the end, s.
+/// Time in which the value approaches its threshold at the start of the day, and leaves it at the end (s).
 const HOUR_S: f64 = 3600.0;
 const SLEEP_GAP_S: f64 = 30.0;
 /// Raw values of the alarm states, as `config/packwatch.dbc` defines them.

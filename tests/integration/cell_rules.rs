@@ -18,7 +18,7 @@ use packwatch::quantity::{CellIndex, Channel, Timestamp};
 use packwatch::sim::{Balancing, Scenario, SensorQuality, Sensors, Settings, Simulation, Wiring};
 
 const CELLS: u16 = 12;
-/// If no input arrives for longer than this, s, the vehicle counts as asleep.
+/// If no input arrives for longer than this (s), the vehicle counts as asleep.
 const SLEEP_GAP_S: f64 = 30.0;
 
 const PACK: &str = r#"

@@ -11,7 +11,7 @@ use serde_json::Value;
 
 use crate::support::measured;
 
-/// True capacity of the simulated cell, Ah; its label says 3.
+/// True capacity of the simulated cell (Ah); its label says 3.
 const TRUE_AH: f64 = 2.7;
 /// Resistances of the simulated cell, relative to the prior of its chemistry.
 const RESISTANCE: f64 = 1.4;

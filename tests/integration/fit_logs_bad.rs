@@ -9,7 +9,7 @@ use packwatch::cell::circuit::{self, BranchAt};
 use packwatch::cell::{CellModel, Chemistry, Discretisation, Label};
 use serde_json::Value;
 
-/// Capacity of the simulated cell, Ah, and its resistances relative to the chemistry prior.
+/// Capacity of the simulated cell (Ah) and its resistances relative to the chemistry prior.
 const TRUE_AH: f64 = 50.0;
 const RESISTANCE: f64 = 1.3;
 
@@ -22,13 +22,13 @@ struct Drive {
     soc: (f64, f64),
     has_rests: bool,
     has_temperature: bool,
-    /// Interval between rows, s.
+    /// Interval between rows (s).
     every_s: u32,
-    /// Voltage resolution, V.
+    /// Voltage resolution (V).
     step_v: f64,
-    /// Error of the current sensor, A.
+    /// Error of the current sensor (A).
     offset_a: f64,
-    /// Interval without rows, s: from, to.
+    /// Interval without rows (s): from, to.
     gap: (u32, u32),
 }
 
@@ -55,7 +55,7 @@ impl Drive {
         model
     }
 
-    /// Current at the given second, A. Repeats 20 s at 1C, 20 s at C/3 and 20 s of rest, with longer rests of 10 min.
+    /// Current at the given second (A). Repeats 20 s at 1C, 20 s at C/3 and 20 s of rest, with longer rests of 10 min.
     /// If `has_rests` is false, the current is C/5 instead of the short rests, and the longer rests are left out. A
     /// charge has half of these currents.
     fn current_a(&self, second: u32) -> f64 {

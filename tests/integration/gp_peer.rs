@@ -52,7 +52,7 @@ impl Oracle {
         answer.trim().to_owned()
     }
 
-    /// Sends the line to the oracle. Returns the wall-clock time of the oracle's calculation, s.
+    /// Sends the line to the oracle. Returns the wall-clock time of the oracle's calculation (s).
     fn seconds(&mut self, line: &str) -> f64 {
         self.ask(line).split(' ').next().unwrap().parse().unwrap()
     }

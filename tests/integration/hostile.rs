@@ -200,7 +200,7 @@ fn own_identifiers_are_reported_but_echo_is_not() {
     );
 }
 
-/// Events of a drive. `differs_s` is the first time, s, at which the frozen current differs from the true current by
+/// Events of a drive. `differs_s` is the first time (s) at which the frozen current differs from the true current by
 /// more than 1 % of the largest valid current.
 struct Drive {
     events: Vec<(f64, EventKind)>,

@@ -19,9 +19,9 @@ use packwatch::sim::{Scenario, Settings, Simulation, Wiring};
 const RATED_AH: f64 = 5.0;
 const TRUE_AH: f64 = 4.7;
 const TRUE_RESISTANCE: f64 = 0.7;
-/// Pause between two cycles, s.
+/// Pause between two cycles (s).
 const NIGHT_S: f64 = 30_000.0;
-/// Rest voltage at the end of a deep cycle, V.
+/// Rest voltage at the end of a deep cycle (V).
 const FULL_V: f64 = 4.14;
 
 fn configuration(chemistry: &str) -> MonitorConfig {
@@ -61,7 +61,7 @@ const DEEP: [(f64, f64); 1] = [(0.08, 0.97)];
 /// SOC ranges of partial cycles. Each cycle moves 60 % of the capacity, and every third cycle charges until full.
 const PARTIAL: [(f64, f64); 3] = [(0.4, 1.0), (0.1, 0.7), (0.25, 0.85)];
 
-/// Frames of some cycles of a cell with the given capacity, Ah, in time order. The SOC ranges are used in turn.
+/// Frames of some cycles of a cell with the given capacity (Ah), in time order. The SOC ranges are used in turn.
 fn vehicle(
     model: &CellModel,
     config: &MonitorConfig,

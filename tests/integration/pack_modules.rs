@@ -16,7 +16,7 @@ struct Truth<'a> {
 }
 
 impl Truth<'_> {
-    /// The cell's voltage after `seconds` at this current, V.
+    /// The cell's voltage after `seconds` at this current (V).
     fn after(&mut self, seconds: f64, soc: f64, current_a: f64) -> f64 {
         let position = self.model.grid_position(soc, 25.0);
         for (i, branch_v) in self.branches_v.iter_mut().enumerate() {

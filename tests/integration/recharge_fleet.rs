@@ -30,7 +30,7 @@ const DEPTHS: [(f64, f64); 5] = [(0.20, 0.95), (0.25, 0.92), (0.10, 0.98), (0.30
 /// Number of cycles before the fleet is judged.
 const CYCLES: u32 = 4;
 const REST_S: u32 = 600;
-/// Charging ends when the current at constant voltage has fallen to this, A: C/20.
+/// Charging ends when the current at constant voltage has fallen to this (A): C/20.
 const TAPER_END_A: f64 = RATED_AH / 20.0;
 
 /// `PACKWATCH_Health` and its page with the recharge periods, as in `config/packwatch.dbc`.
@@ -76,8 +76,8 @@ struct ChargeReport {
     raw_s: Option<f64>,
     normalised_s: Option<f64>,
     std_s: Option<f64>,
-    /// For comparison: the period calculated from this charge alone, s. The charge per SOC, measured inside the window,
-    /// is multiplied by the window's width and divided by the reference current.
+    /// For comparison: the period calculated from this charge alone (s). The charge per SOC, measured inside the
+    /// window, is multiplied by the window's width and divided by the reference current.
     own_charge_s: Option<f64>,
 }
 

@@ -18,7 +18,7 @@ use packwatch::sim::{Pack, Scenario, Settings, Simulation, Wiring};
 
 /// Number of cells: enough for a spread, few enough for many cases.
 const CELLS: u16 = 8;
-/// Rest with the bus awake after each drive, s.
+/// Rest with the bus awake after each drive (s).
 const REST_S: u32 = 900;
 /// Half-width of the 95 % interval of a normal distribution, in standard deviations.
 const SIGMAS: f64 = 1.96;

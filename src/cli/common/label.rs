@@ -12,7 +12,7 @@ pub(crate) struct LabelArgs {
     /// Chemistry on the label, as in `pack.chemistry`
     #[arg(long, value_parser = one_of_chemistries(), requires = "rated", conflicts_with = "config")]
     pub(crate) chemistry: Option<String>,
-    /// Capacity on the label, Ah
+    /// Capacity on the label (Ah)
     #[arg(long, value_name = "AH", value_parser = above_0, requires = "chemistry")]
     pub(crate) rated: Option<f64>,
     /// Lowest voltage [default: typical of the chemistry]

@@ -48,7 +48,7 @@ impl LogArgs {
         open(&self.input, config, logs)
     }
 
-    /// Gap that counts as sleep of the recorder, s.
+    /// Gap that counts as sleep of the recorder (s).
     pub(crate) fn sleep_gap_s(&self) -> f64 {
         self.input.sleep_gap
     }

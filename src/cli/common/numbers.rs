@@ -64,7 +64,7 @@ pub(crate) fn cell_number(text: &str) -> Result<u16, String> {
     number.ok_or_else(|| format!("must be a cell number, 1 to {MAX_CELLS}"))
 }
 
-/// Longest duration that an option accepts, s: ten years.
+/// Longest duration that an option accepts (s): ten years.
 pub(crate) const MAX_SECONDS: f64 = 315_576_000.0;
 
 /// Parses the age of a stored state.

@@ -78,7 +78,7 @@ struct ResistanceRow {
     temperature_c: f64,
     /// Settled resistance at each SOC of the table.
     settled: Vec<SettledResistance>,
-    /// Series resistance at half charge, ohm.
+    /// Series resistance at half charge (ohm).
     r0_ohm: f64,
     /// Resistance (ohm) and time constant (s) of each branch at half charge.
     branches: Vec<BranchPart>,

@@ -37,7 +37,8 @@ pub(crate) struct Args {
     /// Cell model to use instead of the configured one
     #[arg(long, value_name = "MODEL.toml")]
     pub(crate) cell: Option<PathBuf>,
-    /// Measured files to replay first, in this order, without a score; each scored file starts from the state learned there
+    /// Measured files to replay first, in this order, without a score; each scored file starts from the state learned
+    /// there
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with = "cycles")]
     pub(crate) learn: Vec<PathBuf>,
     #[command(flatten)]
@@ -62,12 +63,12 @@ pub(crate) struct StartArgs {
     /// With --start middle: fraction of the full charge that is discharged before the start
     #[arg(long, value_name = "FRACTION", default_value_t = 0.3, value_parser = fraction)]
     pub(crate) remove: f64,
-    /// Error of the initial SOC given to the estimator, points; -20 is 20 points below the truth. With none, no SOC is given and
+    /// Error of the initial SOC given to the estimator (points); -20 is 20 points below the truth. With none, no SOC is given and
     /// the estimator starts from its first voltage
     #[arg(long = "told", value_name = "POINTS", value_delimiter = ',', default_value = "none", value_parser = initial_soc_error,
           allow_hyphen_values = true)]
     pub(crate) soc_error: Vec<InitialSocError>,
-    /// Standard deviation of the initial SOC, points [default: the size of the error, at least 5]
+    /// Standard deviation of the initial SOC (points) [default: the size of the error, at least 5]
     #[arg(long, value_name = "POINTS", value_parser = above_0_to(100.0, ""))]
     pub(crate) soc_std: Option<f64>,
     /// Error of the initial capacity, percent of the model's capacity
@@ -77,7 +78,7 @@ pub(crate) struct StartArgs {
     /// Standard deviation of the initial capacity, percent of the model's capacity [default: from the configuration]
     #[arg(long, value_name = "PERCENT", value_parser = above_0_to(100.0, ""))]
     pub(crate) capacity_std: Option<f64>,
-    /// Offset added to every current reading, A
+    /// Offset added to every current reading (A)
     #[arg(long, value_name = "AMPERES", value_delimiter = ',', default_value = "0", value_parser = finite,
           allow_hyphen_values = true)]
     pub(crate) current_offset: Vec<f64>,
@@ -90,10 +91,10 @@ pub(crate) struct StatisticsArgs {
     /// Time after the start that is left out of the statistics: 600, 600s, 10min or 1h
     #[arg(long, value_name = "TIME", default_value = "10min", value_parser = duration)]
     pub(crate) settle: f64,
-    /// Charge from full to empty that defines the true SOC, Ah [default: capacity_ah of the cell model]
+    /// Charge from full to empty that defines the true SOC (Ah) [default: capacity_ah of the cell model]
     #[arg(long, value_name = "AH", value_parser = above_0)]
     pub(crate) truth_capacity: Option<f64>,
-    /// Count a gap longer than this as sleep of the recorder, s
+    /// Count a gap longer than this as sleep of the recorder (s)
     #[arg(long, value_name = "SECONDS", default_value_t = 90.0, value_parser = above_0)]
     pub(crate) sleep_gap: f64,
 }
@@ -102,14 +103,14 @@ pub(crate) struct StatisticsArgs {
 #[derive(Debug, clap::Args)]
 #[command(next_help_heading = "Cell lives")]
 pub(crate) struct LifeArgs {
-    /// Table of published capacities (cycle, type, start, capacity_ah_source), one per file in the same order. The charge
-    /// delivered while the voltage is held at the end of a discharge is subtracted
+    /// Table of published capacities (cycle, type, start, capacity_ah_source), one per file in the same order. The
+    /// charge delivered while the voltage is held at the end of a discharge is subtracted
     #[arg(long, value_name = "TABLE.csv")]
     pub(crate) cycles: Vec<PathBuf>,
     /// Load at which the published capacities were measured, in A, degrees C and V: 2,24,2.7 [default: [usable] of the configuration]
     #[arg(long, value_name = "CURRENT,TEMPERATURE,CUTOFF", value_parser = load)]
     pub(crate) load: Option<[f64; 3]>,
-    /// Report the first discharge with a capacity below this, Ah
+    /// Report the first discharge with a capacity below this (Ah)
     #[arg(long, value_name = "AH", default_value_t = 1.4, value_parser = above_0)]
     pub(crate) threshold: f64,
     /// Discharges to leave out before the capacity statistics start

@@ -30,7 +30,7 @@ pub(super) struct Changes {
     /// End after this many cycles (random-walk: blocks; ev-day: days) [default: reference 10, random-walk 1, ev-day 1]
     #[arg(long, value_parser = integer::<u32>(1, u32::MAX))]
     cycles: Option<u32>,
-    /// End after this time, s [default: ev-day 86400]
+    /// End after this time (s) [default: ev-day 86400]
     #[arg(long, value_name = "SECONDS", value_parser = positive)]
     duration: Option<f64>,
     #[command(flatten)]
@@ -56,16 +56,16 @@ pub(super) struct PackChanges {
     /// Cells in series [default: from the configuration]
     #[arg(long, value_parser = integer::<u16>(1, 1024))]
     cells: Option<u16>,
-    /// Capacity of a new cell, Ah [default: from the cell model]
+    /// Capacity of a new cell (Ah) [default: from the cell model]
     #[arg(long, value_name = "AH", value_parser = positive)]
     pub(super) capacity_ah: Option<f64>,
     /// Initial SOC, fraction [default: paper 0.9, reference 1, random-walk 0.9, ev-day 0.85]
     #[arg(long, value_name = "SOC", value_parser = share)]
     initial_soc: Option<f64>,
-    /// Ambient temperature, degrees C [default: from the configuration]
+    /// Ambient temperature (degrees C) [default: from the configuration]
     #[arg(long, value_name = "CELSIUS", allow_negative_numbers = true, value_parser = between(-60.0, 100.0, ""))]
     ambient: Option<f64>,
-    /// Capacity lost per cycle, Ah
+    /// Capacity lost per cycle (Ah)
     #[arg(long, value_name = "AH", value_parser = non_negative)]
     loss_per_cycle: Option<f64>,
     /// Resistance gained per cycle, as a fraction of a new cell's resistance
@@ -80,10 +80,10 @@ pub(super) struct PackChanges {
     /// Spread of the initial SOC between cells, standard deviation [default: ev-day 0.005, others 0]
     #[arg(long, value_name = "FRACTION", value_parser = between(0.0, 0.3, ""))]
     spread_soc: Option<f64>,
-    /// Open-circuit hysteresis that the estimator does not model, V in each direction
+    /// Open-circuit hysteresis that the estimator does not model (V) in each direction
     #[arg(long, value_name = "VOLTS", value_parser = non_negative)]
     hysteresis: Option<f64>,
-    /// Self-discharge current, A
+    /// Self-discharge current (A)
     #[arg(long, value_name = "AMPERES", value_parser = non_negative)]
     leakage: Option<f64>,
 }
@@ -97,7 +97,8 @@ pub(super) struct FaultArgs {
     /// 12h or 900s; without it the fault exists from the start.
     ///
     /// Cells: leak:CELL:20mA, leak:CELL:1kohm, weak:CELL:-10% (capacity), resistance:CELL:+20% (whole resistance of the cell),
-    /// contact:CELL:0.4mohm, contact:CELL:+20% (of the cell's ohmic resistance), module:FIRST-LAST:+15% (replaced module).
+    /// contact:CELL:0.4mohm, contact:CELL:+20% (of the cell's ohmic resistance), module:FIRST-LAST:+15% (replaced
+    /// module).
     ///
     /// Sensors: current-offset:50mA, current-gain:+1%, current-stuck, voltage-offset:CELL:10mV, voltage-stuck:CELL,
     /// swap:CELL:CELL, double:CELL:CELL (the second channel shows the first cell), temperature-stuck:SENSOR, temperature-off:SENSOR.
@@ -143,25 +144,25 @@ struct SensorChanges {
     /// Quality of the sensors: constant errors per channel and noise of one step; other options override parts of it
     #[arg(long, value_name = "QUALITY", value_parser = one_of(&QUALITIES))]
     sensors: Option<SensorQuality>,
-    /// White noise of cell voltages, V [default: paper 0.005]
+    /// White noise of cell voltages (V) [default: paper 0.005]
     #[arg(long, value_name = "VOLTS", value_parser = non_negative)]
     noise_voltage: Option<f64>,
-    /// White noise of the current, A [default: paper 0.02]
+    /// White noise of the current (A) [default: paper 0.02]
     #[arg(long, value_name = "AMPERES", value_parser = non_negative)]
     noise_current: Option<f64>,
-    /// White noise of temperatures, K [default: paper 0.1, ev-day 0.02]
+    /// White noise of temperatures (K) [default: paper 0.1, ev-day 0.02]
     #[arg(long, value_name = "KELVIN", value_parser = non_negative)]
     noise_temperature: Option<f64>,
-    /// Constant error of cell voltages, V
+    /// Constant error of cell voltages (V)
     #[arg(long, value_name = "VOLTS", allow_negative_numbers = true, value_parser = finite)]
     offset_voltage: Option<f64>,
-    /// Constant error of the current, A [default: paper 0.01]
+    /// Constant error of the current (A) [default: paper 0.01]
     #[arg(long, value_name = "AMPERES", allow_negative_numbers = true, value_parser = finite)]
     offset_current: Option<f64>,
     /// Relative error of the current [default: paper 0.005]
     #[arg(long, value_name = "FRACTION", allow_negative_numbers = true, value_parser = finite)]
     gain_current: Option<f64>,
-    /// Step of the voltage converter, V, in addition to the DBC's resolution
+    /// Step of the voltage converter (V), in addition to the DBC's resolution
     #[arg(long, value_name = "VOLTS", value_parser = non_negative)]
     resolution_voltage: Option<f64>,
     /// Probability that a reading is missing

@@ -38,7 +38,7 @@ pub(super) struct Summary {
     threshold: f64,
     /// Number of logs in which the alarm was raised.
     raised_logs: usize,
-    /// Lead time of the alarm: median, 5 % and 95 % quantiles over the logs, days.
+    /// Lead time of the alarm: median, 5 % and 95 % quantiles over the logs (days).
     lead_days: Option<[f64; 3]>,
     lead_cycles: Option<[f64; 3]>,
     missed: Option<usize>,

@@ -32,7 +32,7 @@ pub struct GuardConfig {
     pub id: CanId,
     /// Settings of the check.
     pub check: CheckConfig,
-    /// Period, s, above 0; `None` = unknown, so missing frames are not counted.
+    /// Period (s), above 0; `None` = unknown, so missing frames are not counted.
     pub cycle_time_s: Option<f64>,
 }
 

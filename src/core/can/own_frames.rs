@@ -12,11 +12,11 @@ use crate::can::id_table::IdTable;
 use crate::can::{CanId, Frame};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// Longest delay of an echo (a sent frame that returns), s.
+/// Longest delay of an echo (a sent frame that returns) (s).
 const ECHO_S: f64 = 1.0;
 /// Maximum number of stored sent frames: one second of status, health and alarm frames on two interfaces.
 const MAX_SENT: usize = 128;
-/// Another sender is gone after this time without one of its frames, s.
+/// Another sender is gone after this time without one of its frames (s).
 const GONE_S: f64 = 10.0;
 
 /// Reports that another sender started or stopped using packwatch's identifiers.
@@ -147,7 +147,7 @@ impl OwnFrames {
         });
     }
 
-    /// Longest time that another sender has been present, s; 0 = no other sender.
+    /// Longest time that another sender has been present (s); 0 = no other sender.
     pub fn longest_s(&self, now: Timestamp) -> f64 {
         // At least 1 ns, because 0 means that there is no other sender.
         self.state.uses.iter().map(|other| now.since(other.since).max(1e-9)).fold(0.0, f64::max)

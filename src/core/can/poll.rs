@@ -441,7 +441,7 @@ impl Poller {
         let item = &mut self.progress.items[index];
         item.failures = item.failures.saturating_add(1);
         let pause_s = period_s * 2.0_f64.powi(item.failures.min(16).cast_signed());
-        // Longest pause after failures, s, unless the period is longer.
+        // Longest pause after failures (s), unless the period is longer.
         item.due = item.due.max(now.plus_secs(pause_s.clamp(period_s, period_s.max(600.0))));
     }
 

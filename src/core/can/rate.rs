@@ -90,7 +90,7 @@ pub struct MessageRate {
     short: u32,
     contradictions: u32,
     latest: Timestamp,
-    /// The previous two currents of the message, A.
+    /// The previous two currents of the message (A).
     currents_a: [Option<f64>; 2],
     is_doubtful: bool,
 }
@@ -148,7 +148,7 @@ impl SecondSenders {
     }
 
     /// Compares the battery current in a [counted](Self::handle) frame with the two currents before it. `step_a` is the
-    /// smallest step that exceeds noise, A.
+    /// smallest step that exceeds noise (A).
     pub fn note_current(&mut self, bus: BusIndex, id: CanId, current_a: f64, step_a: f64) {
         let Some(rate) = self.rates.get_mut(self.numbers.number(bus, id)) else { return };
         let [before, between] = rate.currents_a;

@@ -47,7 +47,7 @@ impl SignalUnit {
             "uv" => (Quantity::Voltage, 1e-6, 0.0),
             "kv" => (Quantity::Voltage, 1e3, 0.0),
             "c" | "degc" | "celsius" | "degcelsius" | "degreec" | "degreesc" => (Quantity::Temperature, 1.0, 0.0),
-            // Absolute zero, degrees C.
+            // Absolute zero (degrees C).
             "k" | "kelvin" | "degk" => (Quantity::Temperature, 1.0, -273.15),
             "f" | "degf" | "fahrenheit" => (Quantity::Temperature, 5.0 / 9.0, -160.0 / 9.0),
             other => (Quantity::Other(other_quantity(other)?), 1.0, 0.0),

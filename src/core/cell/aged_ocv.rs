@@ -52,11 +52,11 @@ const LEAST_KNOWN: f64 = 0.7;
 /// Offsets of the open-circuit voltage over capacity and SOC; an empty table means no change.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct AgedOcv {
-    /// Capacities, Ah, rising.
+    /// Capacities (Ah), rising.
     capacity_ah: Vec<f64>,
-    /// `offset_v[c][s]`, V: row per capacity, column per SOC breakpoint.
+    /// `offset_v[c][s]` (V): row per capacity, column per SOC breakpoint.
     offset_v: Vec<Vec<f64>>,
-    /// Change of `offset_v` by one standard deviation of each mix, V; empty = unknown.
+    /// Change of `offset_v` by one standard deviation of each mix (V); empty = unknown.
     mixes_v: [Vec<Vec<f64>>; MIXES],
     /// Per capacity: lithium lost, as a fraction of the new cell's lithium, and the change of this loss by one standard
     /// deviation of each mix. Empty without electrodes.
@@ -85,11 +85,11 @@ impl SocLine {
 /// Difference between the curve near one capacity and the new cell's curve, over one interval of SOC.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct OffsetLine {
-    /// Offset, V.
+    /// Offset (V).
     pub offset_v: SocLine,
-    /// Change of the offset with the capacity, V per Ah.
+    /// Change of the offset with the capacity (V per Ah).
     pub per_ah_v: SocLine,
-    /// Change of the offset by one standard deviation of each mix, V.
+    /// Change of the offset by one standard deviation of each mix (V).
     pub mixes_v: [SocLine; MIXES],
 }
 
@@ -225,7 +225,7 @@ impl AgedOcv {
         self.law
     }
 
-    /// Modes of the curve's spread between cells, V per standard deviation at the SOC breakpoints; empty = no spread.
+    /// Modes of the curve's spread between cells (V) per standard deviation at the SOC breakpoints; empty = no spread.
     pub fn spread_v(&self) -> &[Vec<f64>; MIXES] {
         &self.spread_v
     }

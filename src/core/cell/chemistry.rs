@@ -53,7 +53,7 @@ impl Chemistry {
         Self::ALL.iter().find(|(chemistry, _)| *chemistry == self).map_or("", |found| found.1)
     }
 
-    /// Usual cut-off voltages, lowest and highest, V.
+    /// Usual cut-off voltages, lowest and highest (V).
     pub fn usual_voltages_v(self) -> (f64, f64) {
         match self {
             Self::LfpGraphite => (2.5, 3.65),
@@ -76,14 +76,14 @@ impl Chemistry {
         }
     }
 
-    /// Minimum and maximum distance of a full cell's open-circuit voltage below its highest voltage, V. A charge ends
+    /// Minimum and maximum distance of a full cell's open-circuit voltage below its highest voltage (V). A charge ends
     /// while some current still flows, so the voltage falls when the cell relaxes. It falls most if the curve is steep
     /// at its upper end.
     fn full_below_v(self) -> [f64; 2] {
         if self == Self::LfpGraphite { [0.05, 0.22] } else { [0.005, 0.035] }
     }
 
-    /// Half of the open-circuit voltage's hysteresis between charge and discharge, V: Dreyer et al., Nature
+    /// Half of the open-circuit voltage's hysteresis between charge and discharge (V): Dreyer et al., Nature
     /// Mater. 9 (2010) 448 for LFP; silicon in graphite for the others.
     fn hysteresis_v(self) -> f64 {
         if self == Self::LfpGraphite { 0.010 } else { 0.004 }
@@ -96,11 +96,11 @@ impl Chemistry {
 pub struct Label {
     /// Chemistry.
     pub chemistry: Chemistry,
-    /// Rated capacity, Ah.
+    /// Rated capacity (Ah).
     pub rated_ah: f64,
-    /// Lowest voltage, V.
+    /// Lowest voltage (V).
     pub voltage_min_v: f64,
-    /// Highest voltage, V.
+    /// Highest voltage (V).
     pub voltage_max_v: f64,
 }
 
@@ -119,16 +119,16 @@ pub struct LabelPrior {
 pub(super) const SOC: [f64; 21] =
     [0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.9, 0.95, 1.0];
 
-/// Temperature breakpoints, degrees C; Arrhenius' law interpolates between them.
+/// Temperature breakpoints (degrees C); Arrhenius' law interpolates between them.
 pub(super) const TEMPERATURE_C: [f64; TEMPERATURE_NODES] = [-30.0, 0.0, 25.0, 60.0];
 /// Number of temperature breakpoints.
 pub const TEMPERATURE_NODES: usize = 4;
 
 /// One resistance of a usual cell at 25 degrees C.
 struct UsualResistance {
-    /// Resistance times capacity at half charge, ohm Ah.
+    /// Resistance times capacity at half charge (ohm) Ah.
     ohm_ah: f64,
-    /// Time constant, s; 0 = series resistance.
+    /// Time constant (s); 0 = series resistance.
     tau_s: f64,
     /// Resistance at each SOC of [`SHAPE_SOC`], relative to the resistance at half charge.
     shape: [f64; 5],
@@ -140,7 +140,7 @@ const SHAPE_SOC: [f64; 5] = [0.0, 0.05, 0.1, 0.2, 1.0];
 /// Number of resistances: the series resistance and one per branch.
 pub const RESISTANCES: usize = 4;
 
-/// Time constants of the branches, s.
+/// Time constants of the branches (s).
 pub const TAU_S: [f64; RESISTANCES - 1] = [RESISTANCE[1].tau_s, RESISTANCE[2].tau_s, RESISTANCE[3].tau_s];
 
 /// SOC nodes of [`ResistanceFactors`].
@@ -166,13 +166,13 @@ impl ResistanceFactors {
 /// An open-circuit curve and its uncertainty, at the SOC breakpoints of a label's model.
 #[derive(Debug, Clone)]
 pub struct CurveOfCells {
-    /// Mean, V, rising.
+    /// Mean (V), rising.
     pub mean_v: Vec<f64>,
-    /// Largest modes of the spread, V per standard deviation.
+    /// Largest modes of the spread (V) per standard deviation.
     pub modes_v: [Vec<f64>; MIXES],
-    /// Standard deviation of the spread that the modes do not explain, V.
+    /// Standard deviation of the spread that the modes do not explain (V).
     pub rest_v: Vec<f64>,
-    /// Fall of the curve from 25 to 0 degrees C, V ([`cold_share`]).
+    /// Fall of the curve from 25 to 0 degrees C (V) ([`cold_share`]).
     pub cold_sag_v: ScalarGaussian,
     /// Electrodes that give a curve like the mean; `None` for blends.
     pub electrodes: Option<Electrodes>,

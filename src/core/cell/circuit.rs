@@ -16,9 +16,9 @@ pub fn soc_after(soc: f64, charge_as: f64, capacity_ah: f64) -> f64 {
 /// One RC branch of an aged cell at one grid position.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BranchAt {
-    /// Resistance, ohm.
+    /// Resistance (ohm).
     pub r_ohm: f64,
-    /// Time constant, s.
+    /// Time constant (s).
     pub tau_s: f64,
 }
 

@@ -63,11 +63,11 @@ pub struct InitialState {
     pub soc: Option<f64>,
     /// Standard deviation of the initial SOC, fraction.
     pub soc_std: f64,
-    /// Standard deviation of the initial branch voltages, V.
+    /// Standard deviation of the initial branch voltages (V).
     pub branch_std_v: f64,
-    /// Initial capacity, Ah.
+    /// Initial capacity (Ah).
     pub capacity_ah: f64,
-    /// Standard deviation of the initial capacity, Ah.
+    /// Standard deviation of the initial capacity (Ah).
     pub capacity_std_ah: f64,
     /// Capacity (Ah) that selects the open-circuit curve of the aged cell until the first half-cycle has ended.
     pub curve: ScalarGaussian,
@@ -83,7 +83,7 @@ pub struct ProcessNoise {
     /// SOC process noise caused by random errors of the current: fraction per square root of the charge moved, where
     /// the charge is a fraction of the capacity.
     pub charge_per_sqrt_soc: f64,
-    /// Branch voltage process noise, V per sqrt(s).
+    /// Branch voltage process noise (V) per sqrt(s).
     pub branch_v_per_sqrt_s: f64,
     /// ln(resistance) process noise, per sqrt(s).
     pub log_resistance_per_sqrt_s: f64,
@@ -98,7 +98,7 @@ pub struct GapSettings {
     pub self_discharge_per_s: f64,
     /// Maximum rate at which the SOC changes by use or charging while the program does not run, fraction of SOC per s.
     pub away_use_per_s: f64,
-    /// Largest current of a resting cell, A per cell. If the current before or after a gap is larger, it may also have
+    /// Largest current of a resting cell (A) per cell. If the current before or after a gap is larger, it may also have
     /// flowed during the gap.
     pub rest_current_a: f64,
     /// Whether the cell counts as resting in every gap of more than 5 s without a measured current, regardless of the
@@ -109,9 +109,9 @@ pub struct GapSettings {
 /// Error of a voltage reading against the cell model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct VoltageError {
-    /// White sensor noise of one voltage reading, V.
+    /// White sensor noise of one voltage reading (V).
     pub noise_v: f64,
-    /// Slow model error: standard deviation of its average over one second, V. It is used if the cell model states no
+    /// Slow model error: standard deviation of its average over one second (V). It is used if the cell model states no
     /// error.
     pub model_error_v_sqrt_s: f64,
     /// Model error proportional to the present voltage drop in the cell: fraction of the drop, for an average over one
@@ -120,18 +120,18 @@ pub struct VoltageError {
     /// Model error proportional to the voltage drop caused by the load of the last minutes: fraction of this drop, for
     /// an average over one second.
     pub load_error_sqrt_s: f64,
-    /// Time constant of the model error after a load has ended (slow diffusion), s.
+    /// Time constant of the model error after a load has ended (slow diffusion) (s).
     pub load_memory_s: f64,
-    /// Maximum time that one voltage reading represents, s. If readings are further apart, this time is used.
+    /// Maximum time that one voltage reading represents (s). If readings are further apart, this time is used.
     pub max_information_s: f64,
 }
 
 /// Standard deviations of the sensors' constant errors. The filter considers them, so they never average out.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SensorErrors {
-    /// Offset of a cell's voltage, V. It includes a constant error of the model's open-circuit curve.
+    /// Offset of a cell's voltage (V). It includes a constant error of the model's open-circuit curve.
     pub voltage_offset_v: f64,
-    /// Uncertainty of the current sensor's offset that remains after learning, A per cell.
+    /// Uncertainty of the current sensor's offset that remains after learning (A) per cell.
     pub current_offset_a: f64,
     /// Gain error of the current, fraction.
     pub current_gain: f64,
@@ -150,8 +150,8 @@ impl SensorErrors {
 pub struct GateSettings {
     /// Maximum accepted innovation, in standard deviations.
     pub sigma: f64,
-    /// Model error of a single reading, V (standard deviation). The gate and the consistency monitor use this value. If
-    /// they used the error per second instead, they would accept every reading at high sample rates.
+    /// Model error of a single reading (V) (standard deviation). The gate and the consistency monitor use this value.
+    /// If they used the error per second instead, they would accept every reading at high sample rates.
     pub model_error_v: f64,
     /// Model error of a single reading along the OCV curve, fraction of SOC.
     pub soc_error: f64,
@@ -162,7 +162,7 @@ pub struct GateSettings {
 /// Check of the innovations against their variance.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ConsistencySettings {
-    /// Window of the consistency monitor, s.
+    /// Window of the consistency monitor (s).
     pub window_s: f64,
     /// Maximum mean normalised innovation squared of an estimate that is trusted.
     pub limit: f64,

@@ -9,7 +9,7 @@ use super::notebook::Row;
 
 /// Number of equal parts of the SOC range.
 const PARTS: usize = 10;
-/// Width of a temperature class, K.
+/// Width of a temperature class (K).
 const CLASS_K: f64 = 10.0;
 
 /// Number of readings per part of the SOC range and per temperature class.
@@ -57,7 +57,7 @@ impl Coverage {
         ranges(parts.map(whole)).into_iter().map(|range| range.map(|end| f64::from(end) / PARTS as f64)).collect()
     }
 
-    /// Covered ranges of temperature, degrees C.
+    /// Covered ranges of temperature (degrees C).
     pub fn temperature_ranges_c(&self) -> Vec<[f64; 2]> {
         let classes = self.temperature.iter().filter(|(_, count)| **count > 0).map(|(class, _)| *class);
         ranges(classes).into_iter().map(|range| range.map(|end| CLASS_K * f64::from(end))).collect()

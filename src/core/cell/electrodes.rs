@@ -246,7 +246,7 @@ impl Electrodes {
         (positive.map_or("", |found| found.1), negative.map_or("", |found| found.1))
     }
 
-    /// Open-circuit voltage of the new cell, V.
+    /// Open-circuit voltage of the new cell (V).
     pub fn voltage_v(&self, soc: f64) -> f64 {
         let between = |[empty, full]: [f64; 2]| empty + soc * (full - empty);
         self.positive.potential_v(between(self.positive_content))
@@ -310,7 +310,7 @@ impl AgedElectrodes {
         self.negative_capacity * (self.negative_content[1] - self.negative_content[0])
     }
 
-    /// Open-circuit voltage, V.
+    /// Open-circuit voltage (V).
     pub fn voltage_v(&self, soc: f64) -> f64 {
         let [empty, full] = self.negative_content;
         self.voltage_at(empty + soc * (full - empty))

@@ -39,7 +39,7 @@ pub struct Table {
 /// One RC branch.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Branch {
-    /// Resistance, ohm.
+    /// Resistance (ohm).
     pub r_ohm: Table,
     /// Capacitance, farad.
     pub c_farad: Table,
@@ -48,7 +48,7 @@ pub struct Branch {
 /// Thermal model of one cell: C dT/dt = losses - (T - ambient) / R.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Thermal {
-    /// Heat capacity, J/K.
+    /// Heat capacity (J/K).
     pub heat_capacity_j_per_k: f64,
     /// Thermal resistance to the surroundings, K/W.
     pub resistance_k_per_w: f64,
@@ -60,23 +60,23 @@ pub struct Thermal {
 pub struct CellModel {
     /// Display name.
     pub name: String,
-    /// Capacity on the label, Ah. The SOH is relative to this capacity.
+    /// Capacity on the label (Ah). The SOH is relative to this capacity.
     pub rated_capacity_ah: f64,
-    /// Capacity of a new cell between its full and its empty open-circuit voltage at the reference temperature, Ah.
+    /// Capacity of a new cell between its full and its empty open-circuit voltage at the reference temperature (Ah).
     pub capacity_ah: f64,
-    /// Lowest voltage under load, V.
+    /// Lowest voltage under load (V).
     pub voltage_min_v: f64,
-    /// Highest voltage under charge, V.
+    /// Highest voltage under charge (V).
     pub voltage_max_v: f64,
     /// SOC breakpoints, fraction, first 0, last 1.
     pub soc: Vec<f64>,
-    /// Temperature breakpoints, degrees C.
+    /// Temperature breakpoints (degrees C).
     pub temperature_c: Vec<f64>,
-    /// Open-circuit voltage, V.
+    /// Open-circuit voltage (V).
     pub ocv_v: Table,
     /// Change of the open-circuit curve with lost capacity.
     pub aged_ocv: AgedOcv,
-    /// Series resistance, ohm.
+    /// Series resistance (ohm).
     pub r0_ohm: Table,
     /// RC branches, 1 to [`MAX_BRANCHES`].
     pub branches: Vec<Branch>,
@@ -92,7 +92,7 @@ pub struct CellModel {
 /// between cells are stored with the mixes of losses ([`AgedOcv::add_spread`]).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ModelSpread {
-    /// Constant error of the open-circuit curve in addition to its modes, V.
+    /// Constant error of the open-circuit curve in addition to its modes (V).
     pub curve_v: f64,
     /// ln(resistance relative to the model).
     pub log_resistance: f64,
@@ -106,14 +106,14 @@ pub struct ModelSpread {
 }
 
 impl ModelSpread {
-    /// Spread of cells of the model's own type. `curve_v`: standard deviation of the open-circuit curve's error, V.
+    /// Spread of cells of the model's own type. `curve_v`: standard deviation of the open-circuit curve's error (V).
     pub fn usual(branches: usize, curve_v: f64) -> Self {
         let slow_branch = if branches > 1 { 0.2 } else { 0.1 };
         Self { curve_v, log_resistance: 0.2, slow_branch, capacity: 0.1, drop_sqrt_s: 0.0 }
     }
 }
 
-/// Time over which [`CellModel::voltage_error_v`] is averaged, s.
+/// Time over which [`CellModel::voltage_error_v`] is averaged (s).
 pub const ERROR_WINDOW_S: f64 = 100.0;
 
 /// Position of a temperature in the grid, for every SOC.
@@ -153,12 +153,12 @@ impl Table {
     }
 }
 
-/// If the mean slope of the open-circuit curve is below this value, V per unit of SOC, an electrode is a mixture of two
-/// phases.
+/// If the mean slope of the open-circuit curve is below this value (V per unit of SOC), an electrode is a mixture of
+/// two phases.
 const TWO_PHASE_SLOPE_V: f64 = 0.15;
 
 /// Hysteresis of a two-phase electrode: standard deviation of the voltage around the middle between the charge curve
-/// and the discharge curve, V. For LFP, the two curves are 10 to 25 mV apart.
+/// and the discharge curve (V). For LFP, the two curves are 10 to 25 mV apart.
 const TWO_PHASE_HYSTERESIS_V: f64 = 0.01;
 
 impl CellModel {
@@ -211,17 +211,17 @@ impl CellModel {
         GridPosition { s, along_s: beyond_s.clamp(0.0, 1.0), beyond_s, temperature: *temperature }
     }
 
-    /// Open-circuit voltage, V.
+    /// Open-circuit voltage (V).
     pub fn ocv_v(&self, position: &GridPosition) -> f64 {
         self.ocv_v.at(position, position.beyond_s, position.temperature.along_t)
     }
 
-    /// Open-circuit voltage of a cell aged to a capacity, V.
+    /// Open-circuit voltage of a cell aged to a capacity (V).
     pub fn aged_ocv_v(&self, position: &GridPosition, capacity_ah: f64) -> f64 {
         self.ocv_v(position) + self.offset(position, capacity_ah).offset_v.at(self.soc_at(position))
     }
 
-    /// Change of the aged open-circuit voltage per Ah of capacity, V, and per standard deviation of each mix of losses,
+    /// Change of the aged open-circuit voltage per Ah of capacity (V) and per standard deviation of each mix of losses,
     /// V.
     pub fn aged_ocv_changes_v(&self, position: &GridPosition, capacity_ah: f64) -> (f64, [f64; MIXES]) {
         let (line, soc) = (self.offset(position, capacity_ah), self.soc_at(position));
@@ -233,7 +233,7 @@ impl CellModel {
         from + position.beyond_s * (to - from)
     }
 
-    /// Slope of the open-circuit voltage of an aged cell over SOC, V per unit of SOC.
+    /// Slope of the open-circuit voltage of an aged cell over SOC (V per unit of SOC).
     pub fn ocv_slope_v(&self, position: &GridPosition, capacity_ah: f64) -> f64 {
         let rise = |t: usize| self.ocv_v.values[t][position.s + 1] - self.ocv_v.values[t][position.s];
         position.temperature.between(position.temperature.along_t, rise)
@@ -265,22 +265,22 @@ impl CellModel {
         self.aged_ocv.line(&self.soc, position.s, capacity_ah)
     }
 
-    /// Losses of a cell of this capacity, Ah; `None` if unknown for this cell type.
+    /// Losses of a cell of this capacity (Ah); `None` if unknown for this cell type.
     pub fn loss_modes(&self, capacity: ScalarGaussian) -> Option<LossModes> {
         LossModes::of_capacity(&self.aged_ocv, self.capacity_ah, capacity)
     }
 
-    /// Series resistance of a new cell, ohm.
+    /// Series resistance of a new cell (ohm).
     pub fn r0_ohm(&self, position: &GridPosition) -> f64 {
         self.r0_ohm.at(position, position.along_s, position.temperature.along_arrhenius)
     }
 
-    /// Resistance of branch `i` of a new cell, ohm.
+    /// Resistance of branch `i` of a new cell (ohm).
     pub fn branch_r_ohm(&self, i: usize, position: &GridPosition) -> f64 {
         self.branches[i].r_ohm.at(position, position.along_s, position.temperature.along_arrhenius)
     }
 
-    /// Time constant of branch `i`, s. Ageing scales the resistance and not the time constant.
+    /// Time constant of branch `i` (s). Ageing scales the resistance and not the time constant.
     pub fn branch_tau_s(&self, i: usize, position: &GridPosition) -> f64 {
         let Branch { r_ohm, c_farad } = &self.branches[i];
         let tau_s = |t: usize, s: usize| r_ohm.values[t][s] * c_farad.values[t][s];
@@ -296,7 +296,7 @@ impl CellModel {
         Some(self.voltage_error_v.as_ref()?.at(position, position.along_s, position.temperature.along_t))
     }
 
-    /// Resistance of a new cell after all branches have settled, ohm.
+    /// Resistance of a new cell after all branches have settled (ohm).
     pub fn settled_ohm(&self, position: &GridPosition) -> f64 {
         (0..self.branches.len()).fold(self.r0_ohm(position), |sum, i| sum + self.branch_r_ohm(i, position))
     }

@@ -20,7 +20,7 @@ use super::chemistry::USUAL_LOAD_PER_H;
 use super::model::{CellModel, ERROR_WINDOW_S, GridPosition, ModelSpread};
 use crate::filter::square;
 
-/// Temperature of a displayed curve, degrees C. If it is outside the table, the nearest breakpoint is used.
+/// Temperature of a displayed curve (degrees C). If it is outside the table, the nearest breakpoint is used.
 pub const CURVE_C: f64 = 25.0;
 
 /// Variance of an unknown SOC: uniform over 0 to 1.
@@ -66,20 +66,20 @@ impl<'a> ModelBands<'a> {
         (self.ocv_v(high) - self.ocv_v(low)) / (high - low)
     }
 
-    /// Standard deviation of the open-circuit voltage, V; `None` if the model states no error.
+    /// Standard deviation of the open-circuit voltage (V); `None` if the model states no error.
     pub fn curve_std_v(&self, soc: f64) -> Option<f64> {
         let [a, b] = self.modes_v(soc);
         Some(self.curve_rest_v(soc)?.hypot(a).hypot(b))
     }
 
-    /// Modes of the spread between cells, V per standard deviation.
+    /// Modes of the spread between cells (V) per standard deviation.
     pub(super) fn modes_v(&self, soc: f64) -> [f64; 2] {
         let has_spread = self.model.spread.is_some();
         let modes_v = self.model.aged_ocv_changes_v(&self.at(soc), self.model.capacity_ah).1;
         if has_spread { modes_v } else { [0.0; 2] }
     }
 
-    /// Standard deviation of the curve without the modes, V.
+    /// Standard deviation of the curve without the modes (V).
     pub(super) fn curve_rest_v(&self, soc: f64) -> Option<f64> {
         let of_row = |t: &f64| self.model.voltage_error_v(&self.model.grid_position(soc, *t));
         let least = self.model.temperature_c.iter().filter_map(of_row).reduce(f64::min);
@@ -120,7 +120,7 @@ impl<'a> ModelBands<'a> {
         Some(soc_variance(square(error_v), self.slope_v(soc), EVEN_VARIANCE).sqrt())
     }
 
-    /// Voltage drop of a usual load after all branches have settled, V.
+    /// Voltage drop of a usual load after all branches have settled (V).
     pub(super) fn usual_drop_v(&self, position: &GridPosition) -> f64 {
         USUAL_LOAD_PER_H * self.model.rated_capacity_ah * self.model.settled_ohm(position)
     }
@@ -131,7 +131,7 @@ impl<'a> ModelBands<'a> {
 }
 
 /// Variance of the SOC after a voltage reading. `before`: variance of the SOC before the reading; `voltage_variance`:
-/// variance of the voltage, V^2; `slope_v`: slope of the curve, V per unit of SOC.
+/// variance of the voltage (V^2); `slope_v`: slope of the curve (V per unit of SOC).
 fn soc_variance(voltage_variance: f64, slope_v: f64, before: f64) -> f64 {
     1.0 / (slope_v * slope_v / voltage_variance + 1.0 / before)
 }

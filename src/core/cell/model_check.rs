@@ -27,7 +27,7 @@ use crate::cell::{CellModel, Update};
 use crate::filter::square;
 use crate::quantity::InvalidState;
 
-/// Duration of use in a window, s. On drives from -10 to 40 degrees C, half of this time suffices to recognise another
+/// Duration of use in a window (s). On drives from -10 to 40 degrees C, half of this time suffices to recognise another
 /// cell; in a longer window, the cell would age.
 const WINDOW_S: f64 = 3600.0;
 
@@ -47,12 +47,12 @@ const LIMIT: f64 = 6.0;
 pub struct ModelCheck {
     /// The checked model ([`model_id`]); 0 = no check.
     model: u64,
-    /// Time of use judged so far, s.
+    /// Time of use judged so far (s).
     use_s: f64,
     /// Time (s) and charge (A s) since the last evidence was taken.
     since_s: f64,
     since_as: f64,
-    /// Duration of the latest step, s.
+    /// Duration of the latest step (s).
     step_s: f64,
     voltages: VoltageSums,
     /// Maximum sum of the witnesses in this window, divided by [`LIMIT`].
@@ -192,7 +192,7 @@ impl ModelCheck {
         self.since_s >= 10.0 && self.is_open()
     }
 
-    /// Takes the evidence that is due for a cell of rated capacity `rated_ah`, Ah. `evidence` is `None` if the filter
+    /// Takes the evidence that is due for a cell of rated capacity `rated_ah` (Ah). `evidence` is `None` if the filter
     /// cannot provide evidence.
     pub fn judge(&mut self, evidence: Option<ModelEvidence>, rated_ah: f64) {
         // One reading represents at most 90 s. Currents below C/50 do not show the resistance.
@@ -261,7 +261,7 @@ mod tests {
     use crate::cell::model::tests::small_model;
 
     /// Returns the check after a discharge at 1 C from SOC 0.9 for `use_s` seconds, in steps of 1 s. `voltage` returns
-    /// the innovation at a SOC, V.
+    /// the innovation at a SOC (V).
     fn after(use_s: u32, ratio: f64, voltage: impl Fn(f64) -> f64) -> ModelCheck {
         let mut check = ModelCheck::default();
         for second in 0..use_s {

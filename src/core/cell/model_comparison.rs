@@ -37,7 +37,7 @@ pub struct Difference {
 /// Differences at one temperature.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AtTemperature {
-    /// Temperature, degrees C.
+    /// Temperature (degrees C).
     pub temperature_c: f64,
     /// Series resistance times rated capacity, fraction.
     pub series: Difference,
@@ -50,7 +50,7 @@ pub struct AtTemperature {
 /// The second model compared with the first.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModelComparison {
-    /// Open-circuit voltage at 25 degrees C over SOC, V.
+    /// Open-circuit voltage at 25 degrees C over SOC (V).
     pub curve_v: Vec<AtSoc>,
     /// Summary of `curve_v`.
     pub curve: Difference,

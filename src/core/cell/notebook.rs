@@ -40,19 +40,19 @@ pub struct Row {
     pub stretch: u32,
     /// SOC estimate of the row; it only selects the class.
     soc: f32,
-    /// Duration, s.
+    /// Duration (s).
     pub seconds: f32,
-    /// Time since the stretch began, s.
+    /// Time since the stretch began (s).
     pub elapsed_s: f32,
-    /// Charge taken out since the stretch began, Ah.
+    /// Charge taken out since the stretch began (Ah).
     pub charge_ah: f32,
-    /// Voltage, V.
+    /// Voltage (V).
     pub voltage_v: f32,
-    /// Current, A.
+    /// Current (A).
     pub current_a: f32,
-    /// Current through a first-order filter per branch, A.
+    /// Current through a first-order filter per branch (A).
     pub filtered_a: [f32; FILTERS],
-    /// Temperature, degrees C.
+    /// Temperature (degrees C).
     pub temperature_c: f32,
     /// Steps of the current within the row.
     pub steps: CurrentSteps,
@@ -107,12 +107,12 @@ struct RowSums {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 struct Stretch {
     charge_ah: f64,
-    /// Time since the stretch began, s.
+    /// Time since the stretch began (s).
     elapsed_s: f64,
     filtered_a: [f64; FILTERS],
     /// Current, current after the fastest filter, and voltage of the previous reading.
     last: [f64; 3],
-    /// Duration of the present rest, s.
+    /// Duration of the present rest (s).
     rest_s: f64,
     row: RowSums,
 }
@@ -122,9 +122,9 @@ struct Stretch {
 pub struct PresentStretch {
     /// Number of the stretch.
     pub number: u32,
-    /// Charge taken out so far, Ah.
+    /// Charge taken out so far (Ah).
     pub charge_ah: f64,
-    /// Time since the stretch began, s.
+    /// Time since the stretch began (s).
     pub elapsed_s: f64,
 }
 
@@ -146,9 +146,9 @@ pub struct Notebook {
 pub struct NotebookConfig {
     /// Number of cells that report.
     pub cells: u32,
-    /// Rated capacity of a cell, Ah.
+    /// Rated capacity of a cell (Ah).
     pub rated_ah: f64,
-    /// Time constants of the filters, s, rising.
+    /// Time constants of the filters (s), rising.
     pub tau_s: [f64; FILTERS],
 }
 
@@ -158,7 +158,7 @@ impl NotebookConfig {
         Self { cells, rated_ah, tau_s: TAU_S }
     }
 
-    /// Currents below this value, A, count as rest.
+    /// Currents below this value (A), count as rest.
     fn rest_a(&self) -> f64 {
         REST_PER_H * self.rated_ah
     }
@@ -190,7 +190,7 @@ impl Notebook {
         &self.rows[self.rows.len().saturating_sub(self.unread as usize)..]
     }
 
-    /// Charge moved in either direction in the unread rows, Ah.
+    /// Charge moved in either direction in the unread rows (Ah).
     pub fn new_charge_ah(&self) -> f64 {
         let first = self.rows.len() - self.new_rows().len();
         let moved = |pair: &[Row]| {
@@ -213,7 +213,7 @@ impl Notebook {
         self.present.as_ref().map(of)
     }
 
-    /// Present current after each filter, A; `None` outside a stretch.
+    /// Present current after each filter (A); `None` outside a stretch.
     pub fn filtered_a(&self) -> Option<[f64; FILTERS]> {
         self.present.as_ref().map(|stretch| stretch.filtered_a)
     }

@@ -23,21 +23,21 @@ pub const SOC_NODES: usize = 21;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OwnModel {
-    /// Open-circuit curve, V, rising.
+    /// Open-circuit curve (V), rising.
     pub curve_v: [f64; SOC_NODES],
-    /// Modes of the curve's uncertainty, V per standard deviation.
+    /// Modes of the curve's uncertainty (V) per standard deviation.
     pub modes_v: [[f64; SOC_NODES]; 2],
-    /// Standard deviation of the curve that the modes do not explain, V.
+    /// Standard deviation of the curve that the modes do not explain (V).
     pub rest_v: [f64; SOC_NODES],
     /// Resistances relative to the resistances of the label's model.
     pub factors: ResistanceFactors,
     /// Standard deviation of ln(voltage drop) at each temperature breakpoint of the model.
     pub drop_std: [f64; TEMPERATURE_NODES],
-    /// Fall of the curve from 25 to 0 degrees C, V.
+    /// Fall of the curve from 25 to 0 degrees C (V).
     pub cold_sag_v: ScalarGaussian,
-    /// Capacity, Ah.
+    /// Capacity (Ah).
     pub capacity: ScalarGaussian,
-    /// Root mean square of the rows' residuals (predicted minus measured voltage), V.
+    /// Root mean square of the rows' residuals (predicted minus measured voltage) (V).
     pub residual_v: f64,
 }
 

@@ -14,16 +14,16 @@ use crate::quantity::{InvalidState, Timestamp};
 /// Meaning of a BMS's balancing bits.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BalancingConfig {
-    /// Current that the balancing resistor of one cell takes, A.
+    /// Current that the balancing resistor of one cell takes (A).
     pub bleed_a: f64,
-    /// A bit expires after this time, s, unless a newer bit replaces it earlier.
+    /// A bit expires after this time (s), unless a newer bit replaces it earlier.
     pub max_age_s: f64,
     /// Whether the BMS bleeds cells only while it sends bits. If false, it is unknown whether cells are bled while no
     /// bits are sent.
     pub is_only_while_sent: bool,
 }
 
-/// Parts of a period, s. During the rest of the period, the cell was not bled.
+/// Parts of a period (s). During the rest of the period, the cell was not bled.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct BleedTime {
@@ -66,9 +66,9 @@ pub(super) struct BleedTimer {
     pub(super) has_bits: bool,
     bit: Option<Bit>,
     counted_until: Option<Timestamp>,
-    /// Bleed time from the middle of the last row to the start of the current row, s.
+    /// Bleed time from the middle of the last row to the start of the current row (s).
     before: BleedTime,
-    /// Bleed time in the current row, s.
+    /// Bleed time in the current row (s).
     row: BleedTime,
 }
 

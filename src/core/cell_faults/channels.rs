@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use super::row::CellSums;
 use crate::quantity::InvalidState;
 
-/// A channel is frozen if its value stays the same while the middle voltage of the pack changes by more than this, V.
+/// A channel is frozen if its value stays the same while the middle voltage of the pack changes by more than this (V).
 const FROZEN_V: f64 = 0.03;
 /// Minimum number of voltage changes within a row (a few minutes of samples); with fewer changes, channels are not
 /// compared. [`Channel::doubled`] also requires that the channels agree in ten consecutive rows: with a resolution of
@@ -16,7 +16,7 @@ const LEAST_CHANGES: u32 = 10;
 /// State of one voltage channel.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct Channel {
-    /// Middle voltage of the pack, V, in the row in which the channel's value last changed. Before the first change,
+    /// Middle voltage of the pack (V), in the row in which the channel's value last changed. Before the first change,
     /// the middle voltage in the first row after the start or after a gap.
     middle_v: Option<f64>,
     pub(super) is_frozen: bool,
@@ -25,7 +25,7 @@ pub(super) struct Channel {
 }
 
 impl Channel {
-    /// Ends a row. `middle_v` is the middle voltage of the pack, V.
+    /// Ends a row. `middle_v` is the middle voltage of the pack (V).
     pub(super) fn end_row(&mut self, sums: &CellSums, middle_v: f64) {
         if sums.changes > 0 {
             (self.middle_v, self.is_frozen) = (Some(middle_v), false);

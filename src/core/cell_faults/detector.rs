@@ -35,7 +35,7 @@ const REST_PART: f64 = 0.5;
 /// Minimum number of cells for a comparison.
 pub(super) const LEAST_CELLS: usize = 3;
 /// Standard deviations for a resistance measured from current steps: `STEP_PART` of the resistance, fraction; `STEP_V`
-/// of the voltage of one step, V.
+/// of the voltage of one step (V).
 const STEP_PART: f64 = 0.05;
 const STEP_V: f64 = 0.003;
 /// Minimum sum of squared current steps; with a smaller sum, no resistance is measured. Unit: square of the 1 C
@@ -53,13 +53,13 @@ const CELL_KINDS: usize = CellFaultKind::TemperatureSensor as usize;
 pub struct MeanCell {
     /// SOC, fraction.
     pub soc: f64,
-    /// Current, A, positive = discharge.
+    /// Current (A), positive = discharge.
     pub current_a: f64,
-    /// Voltage drop of the series resistance and the branches, V.
+    /// Voltage drop of the series resistance and the branches (V).
     pub drop_v: f64,
-    /// Temperature, degrees C.
+    /// Temperature (degrees C).
     pub temperature_c: f64,
-    /// Charge taken out since any fixed time, Ah. Only differences of this value are used.
+    /// Charge taken out since any fixed time (Ah). Only differences of this value are used.
     pub charge_ah: f64,
 }
 
@@ -121,11 +121,11 @@ impl WatchedCell {
 pub struct CellFaultDetector {
     cells: Vec<WatchedCell>,
     pack: PackSums,
-    /// The last row: time of the row's middle, SOC and charge, Ah.
+    /// The last row: time of the row's middle, SOC and charge (Ah).
     last_row: Option<(Timestamp, f64, f64)>,
-    /// Duration of the present rest, s.
+    /// Duration of the present rest (s).
     rest_s: f64,
-    /// Series resistance of the mean cell in the present row, ohm.
+    /// Series resistance of the mean cell in the present row (ohm).
     ohm: f64,
     /// The middle cell: the cell whose SOC and resistance are closest to the medians.
     middle: usize,

@@ -30,7 +30,7 @@ pub const CAPACITY: usize = 1;
 pub const RESISTANCE: usize = 2;
 /// State: difference in contact resistance, fraction of the mean cell's series resistance at SOC 0.5 and 25 degrees C.
 pub const CONTACT: usize = 3;
-/// State: offset of the voltage channel, V.
+/// State: offset of the voltage channel (V).
 pub const CHANNEL: usize = 4;
 /// State: charge that the cell loses through a leak, fraction of the capacity per day.
 pub const LEAK: usize = 5;
@@ -200,8 +200,8 @@ impl Difference {
         }
     }
 
-    /// Expected reading of the channel at rest, relative to the middle voltage of the pack, V. `slope_v`: slope of the
-    /// open-circuit curve, V per unit of SOC.
+    /// Expected reading of the channel at rest, relative to the middle voltage of the pack (V). `slope_v`: slope of the
+    /// open-circuit curve (V per unit of SOC).
     pub(super) fn reading_v(&self, slope_v: f64) -> ScalarGaussian {
         let mean = slope_v * self.mean[SOC] + self.mean[CHANNEL];
         let variance = slope_v * slope_v * self.covariance[pair(SOC, SOC)]

@@ -232,7 +232,7 @@ pub const CONTACT: f64 = 0.1;
 pub const CAPACITY: f64 = 0.05;
 /// Limit of the difference in resistance, fraction.
 pub const RESISTANCE: f64 = 0.1;
-/// Limit of the voltage channel's offset, V.
+/// Limit of the voltage channel's offset (V).
 pub const CHANNEL_V: f64 = 0.015;
 
 /// Limit of the current sensor's offset, fraction of the rated capacity per hour. At this limit, the counted SOC drifts

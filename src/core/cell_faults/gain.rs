@@ -16,7 +16,7 @@ use crate::quantity::{InvalidState, Timestamp};
 /// ageing.
 const DAYS: usize = 10;
 const DAY_S: f64 = 86_400.0;
-/// Time within which the resistances must fall, s. The estimated resistances follow within hours, so two consecutive
+/// Time within which the resistances must fall (s). The estimated resistances follow within hours, so two consecutive
 /// daily checks may each see a part of the fall.
 const APART_S: f64 = 2.5 * DAY_S;
 /// Standard deviation of changes with other causes than the gain, within `DAYS` days, fraction.
@@ -34,14 +34,14 @@ struct Day {
     log_capacity: f64,
     /// Logarithm of the resistance ratio (cell to model).
     log_resistance: f64,
-    /// Temperature, degrees C.
+    /// Temperature (degrees C).
     temperature_c: f64,
 }
 
 /// Learned capacity and resistance of one cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CellAgeing {
-    /// Capacity, Ah.
+    /// Capacity (Ah).
     pub capacity_ah: ScalarGaussian,
     /// Logarithm of the resistance ratio (cell to model).
     pub log_resistance: f64,

@@ -44,7 +44,7 @@ pub struct Imbalance {
     pub time: Timestamp,
     /// Number of compared cells.
     pub cells: usize,
-    /// Mean of the cells' capacities, Ah.
+    /// Mean of the cells' capacities (Ah).
     pub mean_ah: ScalarGaussian,
     /// Charge that the pack delivers from the time when its first cell is full until its first cell is empty, fraction.
     pub usable: ScalarGaussian,
@@ -167,7 +167,7 @@ impl Imbalance {
 }
 
 impl CellFaultDetector {
-    /// Computes the imbalance. `middle_ah`: capacity of the middle cell, Ah.
+    /// Computes the imbalance. `middle_ah`: capacity of the middle cell (Ah).
     ///
     /// # Errors
     /// The reason why the imbalance is unknown.
@@ -199,7 +199,7 @@ impl CellFaultDetector {
     }
 }
 
-/// Mean open-circuit voltage, between empty and full, of a cell that has aged to `capacity_ah`, V.
+/// Mean open-circuit voltage, between empty and full, of a cell that has aged to `capacity_ah` (V).
 pub fn mean_ocv_v(model: &CellModel, capacity_ah: f64) -> f64 {
     let soc = |part: u32| (f64::from(part) + 0.5) / f64::from(OCV_PARTS);
     let ocv_v = |part| model.aged_ocv_v(&model.grid_position(soc(part), 25.0), capacity_ah);

@@ -58,12 +58,12 @@ impl CellSums {
         self.digest = (self.digest.rotate_left(5) ^ voltage_v.to_bits()).wrapping_mul(0x9E37_79B9_7F4A_7C15);
     }
 
-    /// Mean voltage, V; `None` if the row has no sample.
+    /// Mean voltage (V); `None` if the row has no sample.
     pub(super) fn mean_v(&self) -> Option<f64> {
         (self.count > 0).then(|| self.voltage_v / f64::from(self.count))
     }
 
-    /// Mean temperature, degrees C; `None` if it was not measured.
+    /// Mean temperature (degrees C); `None` if it was not measured.
     pub(super) fn mean_c(&self) -> Option<f64> {
         (self.temperatures > 0).then(|| self.temperature_c / f64::from(self.temperatures))
     }
@@ -100,8 +100,8 @@ pub(super) struct PackSums {
     pub(super) drop_v: f64,
     pub(super) soc: f64,
     pub(super) temperature_c: f64,
-    /// Sum over the samples of the charge minus `first_ah`, Ah.
+    /// Sum over the samples of the charge minus `first_ah` (Ah).
     pub(super) charge_ah: f64,
-    /// Charge at the first sample of the row, Ah.
+    /// Charge at the first sample of the row (Ah).
     pub(super) first_ah: f64,
 }

@@ -16,7 +16,7 @@ const ATTACHED: f64 = 0.6;
 /// Warming at one cell relative to the median warming of the pack.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct WarmingRatio {
-    /// Slow mean of the temperature, degrees C.
+    /// Slow mean of the temperature (degrees C).
     slow_c: Option<f64>,
     /// Sum of the pack's squared warmings, K^2.
     squares_k2: f64,
@@ -26,7 +26,7 @@ pub(super) struct WarmingRatio {
 }
 
 impl WarmingRatio {
-    /// Handles the temperature of a row, `seconds` after the previous row. Returns the warming, K: the temperature
+    /// Handles the temperature of a row, `seconds` after the previous row. Returns the warming (K): the temperature
     /// minus the slow mean of the temperature. A constant sensor offset cancels in this difference.
     pub(super) fn warming_k(&mut self, seconds: f64, here_c: f64) -> f64 {
         let slow_c = self.slow_c.get_or_insert(here_c);

@@ -4,11 +4,11 @@
 /// Settings for classifying the current as charge, rest or discharge.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TransitionConfig {
-    /// The pack rests while |pack current| is at most this, A.
+    /// The pack rests while |pack current| is at most this (A).
     pub dead_band_a: f64,
-    /// Charge or discharge is entered only if the current exceeds the dead band by this much, A.
+    /// Charge or discharge is entered only if the current exceeds the dead band by this much (A).
     pub hysteresis_a: f64,
-    /// Minimum duration of a charge, rest or discharge, s.
+    /// Minimum duration of a charge, rest or discharge (s).
     pub min_duration_s: f64,
     /// A half-cycle that moves less charge than this fraction of the rated capacity is merged with the next half-cycle.
     pub min_swing: f64,
@@ -24,7 +24,7 @@ pub enum CapacityMethod {
     Nominal {
         /// Assumed swing, fraction (paper: 0.6).
         swing: f64,
-        /// Measurement variance, Ah^2 (paper: 0.1).
+        /// Measurement variance (Ah^2) (paper: 0.1).
         variance_ah2: f64,
     },
 }
@@ -34,23 +34,23 @@ pub enum CapacityMethod {
 pub struct CapacityConfig {
     /// How the capacity is measured.
     pub method: CapacityMethod,
-    /// Process noise: standard deviation gained per equivalent full cycle (`Swing`) or per half-cycle (`Nominal`), Ah.
+    /// Process noise: standard deviation gained per equivalent full cycle (`Swing`) or per half-cycle (`Nominal`) (Ah).
     pub noise_ah_per_cycle: f64,
-    /// Process noise of rest: standard deviation gained per day without current, Ah. Rest adds noise because capacity
+    /// Process noise of rest: standard deviation gained per day without current (Ah). Rest adds noise because capacity
     /// recovers during rest. At most one day per half-cycle counts. Not used by `Nominal`.
     pub noise_ah_per_rest_day: f64,
-    /// Constant error of the open-circuit curve at the ends of a half-cycle, V. `None` = half of the error that the
+    /// Constant error of the open-circuit curve at the ends of a half-cycle (V). `None` = half of the error that the
     /// cell model states for these points. Not used by `Nominal`.
     pub end_error_v: Option<f64>,
     /// Standard deviation of the current sensor's gain, fraction. The relative standard deviation of a capacity never
     /// falls below this value.
     pub current_gain_std: f64,
-    /// Initial standard deviation of the current sensor's offset per cell, A; 0 = the offset is not learned. Not used
+    /// Initial standard deviation of the current sensor's offset per cell (A); 0 = the offset is not learned. Not used
     /// by `Nominal`.
     pub current_offset_std_a: f64,
-    /// Initial standard deviation of the fade, Ah per full cycle; 0 = the fade is not learned. Not used by `Nominal`.
+    /// Initial standard deviation of the fade (Ah) per full cycle; 0 = the fade is not learned. Not used by `Nominal`.
     pub fade_std_ah_per_cycle: f64,
-    /// Process noise of the fade: standard deviation gained per equivalent full cycle, Ah per full cycle.
+    /// Process noise of the fade: standard deviation gained per equivalent full cycle (Ah) per full cycle.
     pub fade_noise_ah_per_cycle: f64,
 }
 
@@ -70,7 +70,7 @@ pub struct RechargeConfig {
     pub from_soc: f64,
     /// Upper SOC, fraction.
     pub to_soc: f64,
-    /// Current of the reference charger per cell, A, positive.
+    /// Current of the reference charger per cell (A), positive.
     pub reference_current_a: f64,
     /// If a charge covers less than this fraction of the window, the normalised period of the charge is not reported.
     pub min_coverage: f64,
@@ -81,13 +81,13 @@ pub struct RechargeConfig {
 /// Load that defines the usable capacity.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct UsableConfig {
-    /// Discharge current per cell, A.
+    /// Discharge current per cell (A).
     pub current_a: f64,
-    /// Cell temperature, degrees C.
+    /// Cell temperature (degrees C).
     pub temperature_c: f64,
-    /// Voltage under load at which discharge ends, V.
+    /// Voltage under load at which discharge ends (V).
     pub cutoff_v: f64,
-    /// Charging current at the end of a full charge, per cell, A. A charge counts as full if the current falls to this
+    /// Charging current at the end of a full charge, per cell (A). A charge counts as full if the current falls to this
     /// value at the model's highest voltage. The usable capacity is then computed from the final SOC of that charge.
     /// Before the first full charge, the usable capacity is computed from SOC 1.
     pub taper_current_a: f64,
@@ -102,7 +102,7 @@ pub struct HealthConfig {
     pub capacity: CapacityConfig,
     /// Settings of the recharge period.
     pub recharge: RechargeConfig,
-    /// Capacity at which a cell is at the end of its life, Ah.
+    /// Capacity at which a cell is at the end of its life (Ah).
     pub end_of_life_ah: f64,
     /// Load for the usable capacity; `None` = the usable capacity is not computed.
     pub usable: Option<UsableConfig>,

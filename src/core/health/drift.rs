@@ -36,7 +36,7 @@ pub struct DriftFilter {
 }
 
 impl DriftFilter {
-    /// Creates a filter with the initial capacity `capacity`, Ah.
+    /// Creates a filter with the initial capacity `capacity` (Ah).
     pub fn new(config: &CapacityConfig, capacity: ScalarGaussian) -> Self {
         let mut p = [[0.0; N]; N];
         p[C][C] = capacity.variance;
@@ -44,7 +44,7 @@ impl DriftFilter {
         Self { x: [capacity.mean, 0.0], p, by_end: [[0.0; N]; END_ERRORS] }
     }
 
-    /// Capacity, Ah; its variance includes the lasting errors.
+    /// Capacity (Ah); its variance includes the lasting errors.
     pub fn capacity(&self) -> ScalarGaussian {
         let lasting: f64 = self.by_end.iter().map(|column| column[C] * column[C]).sum();
         ScalarGaussian { mean: self.x[C], variance: self.p[C][C] + lasting }
@@ -104,8 +104,8 @@ impl DriftFilter {
         bounds::TRUSTED_CAPACITY.has(self.x[C] / cell_ah) && self.check().is_ok()
     }
 
-    /// Raises the variance of the capacity to at least `variance`, Ah^2, because new voltages have contradicted earlier
-    /// measurements.
+    /// Raises the variance of the capacity to at least `variance` (Ah^2), because new voltages have contradicted
+    /// earlier measurements.
     pub fn doubt(&mut self, variance: f64) {
         self.p[C][C] = self.p[C][C].max(variance);
     }
@@ -116,7 +116,7 @@ impl DriftFilter {
     }
 
     /// Predicts the state after a half-cycle. `cycles`: length of the half-cycle in full cycles; `charged`: full cycles
-    /// that cause fade; `capacity_variance`: process noise of the capacity, Ah^2.
+    /// that cause fade; `capacity_variance`: process noise of the capacity (Ah^2).
     pub fn predict(&mut self, config: &CapacityConfig, cycles: f64, charged: f64, capacity_variance: f64) {
         self.x[C] -= charged * self.x[FADE];
         for j in 0..N {
@@ -148,7 +148,7 @@ mod tests {
     };
 
     /// Runs cycles with a swing of 60 % on a cell that loses `loss_ah` at the end of each charge. Returns the filter
-    /// and the cell's true capacity, Ah.
+    /// and the cell's true capacity (Ah).
     fn cycle(config: &CapacityConfig, loss_ah: f64) -> (DriftFilter, f64) {
         let mut drift = DriftFilter::new(config, ScalarGaussian::from_std(2.5, 0.1));
         let mut true_ah = 2.6;

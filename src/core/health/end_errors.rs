@@ -2,7 +2,7 @@
 //! half-cycles between the same SOC values have the same errors, so averaging over many half-cycles does not remove
 //! these errors.
 //!
-//! In: SOC at the start and end of a half-cycle. Out: change of the half-cycle's capacity, Ah, per standard deviation
+//! In: SOC at the start and end of a half-cycle. Out: change of the half-cycle's capacity (Ah) per standard deviation
 //! of each error.
 //!
 //! A half-cycle's capacity is charge / (s_high - s_low). An error e (V) of the open-circuit curve at one end changes
@@ -21,7 +21,7 @@ use crate::quantity::Mode;
 /// curve differs between SOC values that are a quarter of the SOC range apart.
 pub(super) const END_ERRORS: usize = 5;
 
-/// Change of a half-cycle's capacity, Ah, per standard deviation of each error; zero if the SOC at the half-cycle's
+/// Change of a half-cycle's capacity (Ah) per standard deviation of each error; zero if the SOC at the half-cycle's
 /// ends is unknown.
 pub(super) fn effects_ah(
     model: &CellModel,

@@ -62,7 +62,7 @@ const KNEE_WALK: f64 = 1.5;
 const RECOVERY_IN_USE: f64 = 0.01;
 /// Standard deviation of the recovery gained by rest, fraction of the reference.
 const RECOVERY_IN_REST: f64 = 0.02;
-/// Time constant of the recovery during rest, days. If use is counted in days, the recovery also decays with this time
+/// Time constant of the recovery during rest (days). If use is counted in days, the recovery also decays with this time
 /// constant.
 const RECOVERY_DAYS: f64 = 1.0;
 const DAY_S: f64 = 86_400.0;
@@ -74,7 +74,7 @@ pub const MIN_FADE_DEVIATIONS: f64 = 1.0;
 /// Maximum ratio of the interval's upper end to the median. This limit does not apply if the upper end is below the use
 /// since the first reading.
 pub const MAX_SPREAD: f64 = 10.0;
-/// Time constant of the exponentially weighted sums that give the recent rate of use, days.
+/// Time constant of the exponentially weighted sums that give the recent rate of use (days).
 const RECENT_DAYS: f64 = 30.0;
 
 /// Quantiles of the forecast: 5, 50 and 95 %.
@@ -110,11 +110,11 @@ pub struct Usage {
 /// A learned capacity.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CapacityReading {
-    /// Capacity, Ah.
+    /// Capacity (Ah).
     pub capacity_ah: f64,
-    /// Variance of this reading alone, Ah^2, independent of previous readings.
+    /// Variance of this reading alone (Ah^2), independent of previous readings.
     pub variance_ah2: f64,
-    /// Variance of the error that all readings share (the current sensor's gain), Ah^2; not part of `variance_ah2`.
+    /// Variance of the error that all readings share (the current sensor's gain) (Ah^2); not part of `variance_ah2`.
     pub shared_variance_ah2: f64,
 }
 
@@ -180,11 +180,11 @@ pub enum InsufficientData {
 pub struct FanPoint {
     /// Use after the last reading, in units of the axis.
     pub ahead: f64,
-    /// 5 % quantile, Ah.
+    /// 5 % quantile (Ah).
     pub low_ah: f64,
-    /// 50 % quantile, Ah.
+    /// 50 % quantile (Ah).
     pub median_ah: f64,
-    /// 95 % quantile, Ah.
+    /// 95 % quantile (Ah).
     pub high_ah: f64,
 }
 
@@ -222,7 +222,7 @@ impl Usage {
 }
 
 impl Forecast {
-    /// Creates a filter for a cell that had the capacity `reference_ah`, Ah, when new. An approximate value suffices:
+    /// Creates a filter for a cell that had the capacity `reference_ah` (Ah) when new. An approximate value suffices:
     /// the value scales the assumed noise and sets the range of the knee, 10 to 20 % below `reference_ah`.
     pub fn new(axis: Axis, reference_ah: f64) -> Self {
         let mut p = [[0.0; N]; N];
@@ -292,7 +292,7 @@ impl Forecast {
         Ok(())
     }
 
-    /// Capacity of the new cell, Ah, as passed to [`Self::new`].
+    /// Capacity of the new cell (Ah), as passed to [`Self::new`].
     pub fn reference_ah(&self) -> f64 {
         self.reference_ah
     }
@@ -302,12 +302,12 @@ impl Forecast {
         self.readings
     }
 
-    /// Capacity without recovery, mean and standard deviation, Ah.
+    /// Capacity without recovery, mean and standard deviation (Ah).
     pub fn level_ah(&self) -> (f64, f64) {
         (self.reference_ah * self.x[LEVEL], self.reference_ah * self.level_variance().sqrt())
     }
 
-    /// Loss per unit of use, mean and standard deviation, Ah.
+    /// Loss per unit of use, mean and standard deviation (Ah).
     pub fn rate_ah(&self) -> (f64, f64) {
         (self.reference_ah * self.x[RATE], self.reference_ah * self.p[RATE][RATE].sqrt())
     }

@@ -8,7 +8,7 @@ use crate::quantity::Mode;
 pub struct HalfCycle {
     /// Charge or discharge.
     pub mode: Mode,
-    /// Charge moved, Ah, positive.
+    /// Charge moved (Ah), positive.
     pub charge_ah: f64,
     /// Change of the SOC (fraction) with its variance; positive if the SOC rose during a charge or fell during a
     /// discharge. The variance treats the SOC errors at the two ends as independent. `None` if the SOC at the start or
@@ -19,10 +19,10 @@ pub struct HalfCycle {
     /// SOC at the start and the end, fractions; `None` if the SOC at the end was not estimated. If only the SOC at the
     /// start is unknown, both values are the SOC at the end.
     pub ends: Option<[f64; 2]>,
-    /// Duration, s.
+    /// Duration (s).
     pub duration_s: f64,
-    /// Mean current, A; positive = discharge.
+    /// Mean current (A); positive = discharge.
     pub mean_current_a: f64,
-    /// Mean temperature, degrees C; `None` without a temperature reading.
+    /// Mean temperature (degrees C); `None` without a temperature reading.
     pub mean_temperature_c: Option<f64>,
 }

@@ -72,7 +72,7 @@ impl CellMark {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Mark {
     time: Timestamp,
-    /// Cumulative charge, A s per cell, positive = discharge.
+    /// Cumulative charge (A) s per cell, positive = discharge.
     charge_as: f64,
     cells: Vec<CellMark>,
 }
@@ -89,7 +89,7 @@ pub struct Learner {
     prior: Vec<ScalarGaussian>,
     /// Per cell: capacity in the event filter.
     capacity: Vec<ScalarGaussian>,
-    /// Time without charge or discharge since the last half-cycle, s.
+    /// Time without charge or discharge since the last half-cycle (s).
     rest_s: f64,
     /// Start of the present mode.
     mode_since: Option<Timestamp>,
@@ -110,7 +110,7 @@ pub struct Learner {
 }
 
 impl Learner {
-    /// Creates a learner; `initial` has the initial capacity of each cell, Ah.
+    /// Creates a learner; `initial` has the initial capacity of each cell (Ah).
     pub fn new(config: &CapacityConfig, initial: Vec<ScalarGaussian>) -> Self {
         let cells = initial.len();
         Self {
@@ -164,8 +164,8 @@ impl Learner {
 
     /// Adds a sample of `cell` to the totals of this cell.
     ///
-    /// `measured_s` and `gap_s` are the times since the previous sample with and without a measured current, s. The gap
-    /// is infinite before the first sample and after a gap of unknown length. Returns whether the candidate began
+    /// `measured_s` and `gap_s` are the times since the previous sample with and without a measured current (s). The
+    /// gap is infinite before the first sample and after a gap of unknown length. Returns whether the candidate began
     /// within that gap. If so, the caller sets the SOC at the candidate's mark to the SOC after the gap
     /// ([`Self::move_mark`]).
     #[inline]
@@ -404,7 +404,7 @@ impl Learner {
         self.capacity[cell]
     }
 
-    /// Learned offset of the current per cell, A: measured minus true.
+    /// Learned offset of the current per cell (A): measured minus true.
     #[inline]
     pub fn current_offset(&self) -> &CurrentOffset {
         &self.offset

@@ -1,7 +1,7 @@
 //! Learns the offset of the current sensor. All cells share this sensor.
 //!
-//! In: the evidence in the voltages of all cells ([`EstimatorBank::offset_evidence`]) and the elapsed time, s. Out:
-//! mean and standard deviation of the offset, A per cell, measured minus true. The offset is best observed at rest,
+//! In: the evidence in the voltages of all cells ([`EstimatorBank::offset_evidence`]) and the elapsed time (s). Out:
+//! mean and standard deviation of the offset (A) per cell, measured minus true. The offset is best observed at rest,
 //! when the counted charge drifts but the voltage does not. Current readings of exactly zero are ignored, because a
 //! sensor that sends them suppresses small currents.
 //!
@@ -20,7 +20,7 @@ use crate::quantity::InvalidState;
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CurrentOffset {
-    /// Mean, A per cell; subtracted from the current.
+    /// Mean (A) per cell; subtracted from the current.
     mean_a: f64,
     /// Standard deviation as a fraction of the configured standard deviation. `None` = no offset has been learned; the
     /// fraction is then 1.
@@ -28,17 +28,17 @@ pub struct CurrentOffset {
 }
 
 impl CurrentOffset {
-    /// Mean, A per cell.
+    /// Mean (A) per cell.
     pub fn mean_a(&self) -> f64 {
         self.mean_a
     }
 
-    /// Standard deviation, A per cell; `configured_a` if there has been no evidence.
+    /// Standard deviation (A) per cell; `configured_a` if there has been no evidence.
     pub fn std_a(&self, configured_a: f64) -> f64 {
         self.part() * configured_a
     }
 
-    /// The learned offset, A per cell; `None` if there has been no evidence or learning is off (`configured_a` is 0).
+    /// The learned offset (A) per cell; `None` if there has been no evidence or learning is off (`configured_a` is 0).
     pub fn learned(&self, configured_a: f64) -> Option<ScalarGaussian> {
         let part = self.part.filter(|_| configured_a > 0.0)?;
         Some(ScalarGaussian::from_std(self.mean_a, part * configured_a))

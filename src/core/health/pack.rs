@@ -22,7 +22,7 @@ pub struct CellShare {
     pub cell: CellIndex,
     /// State of charge, fraction.
     pub soc: ScalarGaussian,
-    /// Capacity, Ah.
+    /// Capacity (Ah).
     pub capacity: ScalarGaussian,
 }
 
@@ -34,9 +34,9 @@ pub struct PackState {
     /// Standard deviation of the limiting cell's SOC.
     pub soc_std: f64,
     /// Charge that the pack delivers if the discharge starts when the fullest cell is full and ends when the weakest
-    /// cell is empty, Ah.
+    /// cell is empty (Ah).
     pub capacity_ah: f64,
-    /// Standard deviation of the limiting cell's capacity, Ah.
+    /// Standard deviation of the limiting cell's capacity (Ah).
     pub capacity_std_ah: f64,
     /// The cell that is empty first.
     pub limiting_cell: CellIndex,

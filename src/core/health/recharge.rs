@@ -1,7 +1,7 @@
 //! Recharge period: duration of a charge between two SOC values, the *window* (paper, section 3.3.5), raw and
 //! normalised.
 //!
-//! In: the estimated SOC with its time, the mode, the learned capacity (Ah). Out: periods, s. If the estimated SOC
+//! In: the estimated SOC with its time, the mode, the learned capacity (Ah). Out: periods (s). If the estimated SOC
 //! jumps, the caller discards the charge that is being timed.
 //!
 //! Raw: the time that the estimated SOC takes through the window, if one uninterrupted charge covers the whole window.
@@ -45,21 +45,21 @@ pub struct RechargeTimer {
     entered: Option<Timestamp>,
     /// Lowest and highest SOC during the present charge.
     range: Option<(f64, f64)>,
-    /// Raw period of the present charge, s.
+    /// Raw period of the present charge (s).
     raw_s: Option<f64>,
 }
 
 /// Outcome of a finished charge.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct ChargeRecord {
-    /// Charging time over the whole window, s; `None` if no uninterrupted charge covered the window.
+    /// Charging time over the whole window (s); `None` if no uninterrupted charge covered the window.
     pub raw_s: Option<f64>,
     /// Part of the window that the charge covered, 0 to 1.
     pub coverage: f64,
 }
 
 impl RechargeTimer {
-    /// Handles the SOC at `time`. Returns the raw period, s, when the charge has just passed the window's upper end.
+    /// Handles the SOC at `time`. Returns the raw period (s) when the charge has just passed the window's upper end.
     pub fn observe(&mut self, config: &RechargeConfig, time: Timestamp, mode: Mode, soc: f64) -> Option<f64> {
         if mode != Mode::Charge {
             self.interrupt();
@@ -113,7 +113,7 @@ impl RechargeTimer {
     }
 }
 
-/// Time, s, that the reference current needs to charge a pack of `capacity` (Ah) through the window.
+/// Time (s) that the reference current needs to charge a pack of `capacity` (Ah) through the window.
 pub fn normalised_period(config: &RechargeConfig, capacity: ScalarGaussian) -> ScalarGaussian {
     let seconds_per_ah = 3600.0 * (config.to_soc - config.from_soc) / config.reference_current_a;
     ScalarGaussian {
@@ -140,7 +140,7 @@ mod tests {
         alarm_on: RechargeAlarm::Raw,
     };
 
-    /// Charges at 1 % per minute from SOC `from` to `to`, observed every 7 s. Returns the first raw period, s, and the
+    /// Charges at 1 % per minute from SOC `from` to `to`, observed every 7 s. Returns the first raw period (s) and the
     /// outcome of the charge.
     fn charge(from: f64, to: f64, mode_at: impl Fn(f64) -> Mode) -> (Option<f64>, ChargeRecord) {
         let mut timer = RechargeTimer::default();

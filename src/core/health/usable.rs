@@ -20,7 +20,7 @@ const MAX_STEPS: u32 = 2000;
 /// Step of the forward differences in ln rho, ln capacity and slow ratio.
 const LOG_STEP: f64 = 0.01;
 
-/// Charge, Ah, that a cell of capacity `capacity_ah` delivers from `full_soc` until its voltage falls to the cut-off.
+/// Charge (Ah) that a cell of capacity `capacity_ah` delivers from `full_soc` until its voltage falls to the cut-off.
 /// The two ratios are the resistance ratio of the cell and the additional ratio of its slowest branch.
 pub fn usable_ah(
     model: &CellModel,
@@ -65,7 +65,7 @@ pub fn usable_ah(
     step_ah * f64::from(MAX_STEPS)
 }
 
-/// Usable capacity, Ah, with its variance. `capacity` is the published estimate; its variance may be larger than the
+/// Usable capacity (Ah) with its variance. `capacity` is the published estimate; its variance may be larger than the
 /// capacity variance in the cell's filter.
 pub fn usable_capacity(
     model: &CellModel,

@@ -8,11 +8,11 @@
 use super::message::MERGE_TOLERANCE_NS;
 use crate::quantity::Timestamp;
 
-/// Longest time between inputs (including ticks) while the computer is awake, s. This time equals 500 tick periods.
+/// Longest time between inputs (including ticks) while the computer is awake (s). This time equals 500 tick periods.
 pub(crate) const ASLEEP_S: f64 = 5.0;
 const ASLEEP_NS: i64 = (ASLEEP_S * 1e9) as i64;
 
-/// Period of the checks that depend only on time (staleness, debounce), s.
+/// Period of the checks that depend only on time (staleness, debounce) (s).
 pub(crate) const HOUSEKEEPING_S: f64 = 0.1;
 
 /// The clock of one monitor.
@@ -33,12 +33,12 @@ pub(crate) struct Clock {
 pub(crate) enum TimeJump {
     /// The driver's clock was set back, so the elapsed time is unknown.
     Backwards {
-        /// Size of the step back, s.
+        /// Size of the step back (s).
         seconds: f64,
     },
     /// No input arrived for a while: the computer was asleep, or the log has a gap.
     Asleep {
-        /// Time without an input, s.
+        /// Time without an input (s).
         seconds: f64,
     },
 }

@@ -33,13 +33,13 @@ pub struct MonitorConfig {
     pub supply: Option<SupplyConfig>,
     /// Input messages with end-to-end protection.
     pub guards: Vec<GuardConfig>,
-    /// Known cycle times of input messages, s.
+    /// Known cycle times of input messages (s).
     pub cycle_times_s: Vec<(BusIndex, CanId, f64)>,
     /// Number of consecutive readings that must agree before another pack identity counts.
     pub identity_readings: u32,
     /// Limits on the number of frames of one identifier.
     pub flood: FloodConfig,
-    /// Duration of silence on all inputs, s, after which the buses count as asleep if no current flows; `None` = never.
+    /// Duration of silence on all inputs (s) after which the buses count as asleep if no current flows; `None` = never.
     pub asleep_after_s: Option<f64>,
     /// Settings of the sampling stage.
     pub sample: SampleConfig,
@@ -70,9 +70,9 @@ pub struct MonitorConfig {
 /// Supply voltage required before diagnostic requests are sent.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SupplyConfig {
-    /// Minimum voltage, V.
+    /// Minimum voltage (V).
     pub minimum_v: f64,
-    /// Age above which a reading is ignored, s.
+    /// Age above which a reading is ignored (s).
     pub max_age_s: f64,
 }
 
@@ -92,14 +92,14 @@ pub struct OutputConfig {
     pub plan: OutputPlan,
     /// Interfaces on which the frames are sent.
     pub buses: Vec<BusIndex>,
-    /// Period of the status frame, s.
+    /// Period of the status frame (s).
     pub status_period_s: f64,
-    /// Period of the health frame (all its pages), s.
+    /// Period of the health frame (all its pages) (s).
     pub health_period_s: f64,
-    /// Period of the alarm frames, s. Each raised alarm is sent once per period if the limit on the rate of alarm
+    /// Period of the alarm frames (s). Each raised alarm is sent once per period if the limit on the rate of alarm
     /// frames allows it.
     pub alarm_period_s: f64,
-    /// Period of the digest (all its pages), s.
+    /// Period of the digest (all its pages) (s).
     pub digest_period_s: f64,
 }
 

@@ -28,7 +28,7 @@ const CHARGE: &str = "the charge since a cell's latest voltage or half-cycle";
 /// Factor by which a charge may exceed the largest plausible charge, because the limits of the current may have been
 /// wider when the charge was counted.
 const CHARGE_TOLERANCE: f64 = 2.0;
-/// Time that is added to the time in which the charge has moved, because the clock may have been set, s.
+/// Time that is added to the time in which the charge has moved, because the clock may have been set (s).
 const CHARGE_TOLERANCE_S: f64 = 1000.0;
 
 /// Layout version of [`Snapshot`].
@@ -156,7 +156,7 @@ impl Snapshot {
         self.cells.iter().map(|cell| cell.health.throughput).collect()
     }
 
-    /// Rated capacity, Ah, that was configured when the life forecast of the first cell started; `None` without cells.
+    /// Rated capacity (Ah) that was configured when the life forecast of the first cell started; `None` without cells.
     pub fn rated_capacity_ah(&self) -> Option<f64> {
         self.cells.first().map(|cell| cell.forecast.reference_ah())
     }

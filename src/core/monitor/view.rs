@@ -158,23 +158,23 @@ impl Monitor {
         self.stages.learning.mode()
     }
 
-    /// The last recorded recharge period, s.
+    /// The last recorded recharge period (s).
     pub fn recharge_period_s(&self) -> Option<f64> {
         self.stages.learning.state.recharge_period_s
     }
 
-    /// Time, s, that the reference charger needs for the recharge window. The value was learned from the last charge
+    /// Time (s) that the reference charger needs for the recharge window. The value was learned from the last charge
     /// that covered enough of the window.
     pub fn normalised_recharge_period(&self) -> Option<ScalarGaussian> {
         self.stages.learning.state.normalised_recharge
     }
 
-    /// Usable capacity of a cell, Ah, after its last discharge; before the first discharge, after the first charge.
+    /// Usable capacity of a cell (Ah) after its last discharge; before the first discharge, after the first charge.
     pub fn usable_capacity(&self, cell: CellIndex) -> Option<ScalarGaussian> {
         self.stages.learning.cells.get(cell.index())?.usable
     }
 
-    /// Published capacity of a cell, Ah.
+    /// Published capacity of a cell (Ah).
     pub fn capacity(&self, cell: CellIndex) -> ScalarGaussian {
         self.stages.learning.capacity(cell.index())
     }
@@ -189,7 +189,7 @@ impl Monitor {
             .and_then(|it| estimation.bank.model(cell.index()).loss_modes(it))
     }
 
-    /// Offset of the pack's current sensor, A: reading minus true current, positive = discharge. `None` before
+    /// Offset of the pack's current sensor (A): reading minus true current, positive = discharge. `None` before
     /// anything was learned.
     pub fn current_offset(&self) -> Option<ScalarGaussian> {
         let Stages { sampling, learning, .. } = &self.stages;
@@ -254,7 +254,7 @@ impl Monitor {
         }
     }
 
-    /// Sum of the cells' voltages, V; `None` unless all cell voltages are fresh.
+    /// Sum of the cells' voltages (V); `None` unless all cell voltages are fresh.
     fn pack_voltage_v(&self) -> Option<f64> {
         let sum_v: Option<f64> = self.cell_views().map(|view| view.values.mean(Quantity::Voltage)).sum();
         match self.stages.sampling.sampler.config().voltage_source {

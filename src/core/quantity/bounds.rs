@@ -43,10 +43,10 @@ impl Bounds {
     }
 }
 
-/// Capacity of a cell in the configuration, Ah: from a watch cell to a hundred times the largest cell on the market.
+/// Capacity of a cell in the configuration (Ah): from a watch cell to a hundred times the largest cell on the market.
 pub const CONFIGURED_CAPACITY_AH: Bounds = Bounds::new(1e-3, 1e5, "0.001 to 1e5 Ah");
 
-/// Estimated capacity of a cell, Ah: from a thousandth of the smallest to ten thousand times the largest
+/// Estimated capacity of a cell (Ah): from a thousandth of the smallest to ten thousand times the largest
 /// [configured capacity](CONFIGURED_CAPACITY_AH).
 pub const CAPACITY_AH: Bounds = Bounds::new(1e-6, 1e9, "1e-6 to 1e9 Ah");
 
@@ -74,25 +74,25 @@ pub const TRUSTED_CAPACITY: Bounds = Bounds::new(0.05, 3.0, "0.05 to 3 times the
 /// Configured initial capacity, relative to the cell model's capacity.
 pub const INITIAL_CAPACITY: Bounds = Bounds::new(0.05, 3.0, "0.05 to 3 times the cell model's capacity");
 
-/// Resistance in a cell, ohm: from a copper bar to a watch cell.
+/// Resistance in a cell (ohm): from a copper bar to a watch cell.
 pub const RESISTANCE_OHM: Bounds = Bounds::new(1e-9, 1e3, "1e-9 to 1000 ohm");
 
 /// Capacitance of a branch, F.
 pub const CAPACITANCE_F: Bounds = Bounds::new(1e-6, 1e12, "1e-6 to 1e12 F");
 
-/// Temperature of a cell, degrees C.
+/// Temperature of a cell (degrees C).
 pub const TEMPERATURE_C: Bounds = Bounds::new(-100.0, 200.0, "-100 to 200 degrees C");
 
-/// Voltage of a cell, V. The bounds are wide, because the reading may come from a broken wire.
+/// Voltage of a cell (V). The bounds are wide, because the reading may come from a broken wire.
 pub const VOLTAGE_V: Bounds = Bounds::new(-1e3, 1e3, "-1000 to 1000 V");
 
-/// Current of a pack, A.
+/// Current of a pack (A).
 pub const CURRENT_A: Bounds = Bounds::new(-1e6, 1e6, "-1e6 to 1e6 A");
 
-/// Duration, s: up to 300 years.
+/// Duration (s): up to 300 years.
 pub const TIME_S: Bounds = Bounds::new(0.0, 1e10, "0 to 1e10 s");
 
-/// Counted charge, As: [`CURRENT_A`] for [`TIME_S`].
+/// Counted charge (As): [`CURRENT_A`] for [`TIME_S`].
 pub const CHARGE_AS: Bounds = Bounds::new(-1e16, 1e16, "-1e16 to 1e16 As");
 
 /// A point in time, ns. The difference of two points fits the clock's range.
@@ -107,7 +107,7 @@ pub const VARIANCE: Bounds = Bounds::new(1e-150, 1e20, "1e-150 to 1e20");
 /// Configured standard deviation or noise density of any quantity, in the quantity's unit.
 pub const DEVIATION: Bounds = Bounds::new(0.0, 1e3, "0 to 1000");
 
-/// Standard deviation of a voltage sensor's noise, V. No converter is better than the lower bound.
+/// Standard deviation of a voltage sensor's noise (V). No converter is better than the lower bound.
 pub const VOLTAGE_NOISE_V: Bounds = Bounds::new(1e-6, 10.0, "1e-6 to 10 V");
 
 /// Spread of the sigma points. Below the lower bound, the differences between the points are lost in rounding.

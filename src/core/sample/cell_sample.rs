@@ -16,18 +16,18 @@ pub struct CellSample {
     /// Time of the voltage reading.
     pub time: Timestamp,
     pub cell: CellIndex,
-    /// Cell voltage, V.
+    /// Cell voltage (V).
     pub voltage_v: f64,
-    /// Cell current, A, positive = discharge; `None` = the last good reading is too old.
+    /// Cell current (A), positive = discharge; `None` = the last good reading is too old.
     pub current_a: Option<f64>,
-    /// Cumulative charge taken out of the cell, As; only differences are meaningful. Later readings may correct the
+    /// Cumulative charge taken out of the cell (As); only differences are meaningful. Later readings may correct the
     /// part between the last current reading and `time`.
     pub charge_as: f64,
-    /// Cumulative time in which the current reading was not exactly zero, s.
+    /// Cumulative time in which the current reading was not exactly zero (s).
     pub offset_s: f64,
-    /// Cumulative time without a usable current, s. The charge of this time is unknown.
+    /// Cumulative time without a usable current (s). The charge of this time is unknown.
     pub unmeasured_s: f64,
-    /// Cell temperature, degrees C; `None` = no sensor, or the last good reading is too old.
+    /// Cell temperature (degrees C); `None` = no sensor, or the last good reading is too old.
     pub temperature_c: Option<f64>,
 }
 

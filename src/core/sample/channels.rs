@@ -34,7 +34,7 @@ pub(super) fn channels(config: &SampleConfig, sensors: usize) -> Vec<Channel> {
     channels
 }
 
-/// Clock of the stuck check: cumulative time in which the signal should have changed, s. For a voltage, only the time
+/// Clock of the stuck check: cumulative time in which the signal should have changed (s). For a voltage, only the time
 /// of discharge counts, because a charger may hold the voltage constant. Temperature and current should change whenever
 /// current flows.
 pub(super) fn should_move_s(channel: Channel, totals: &ChargeTotals) -> f64 {

@@ -1,6 +1,6 @@
 //! Counts the charge through the pack and the time without a current measurement.
 //!
-//! In: good current readings, A, positive = discharge. Out: cumulative charge, As, and cumulative unmeasured time, s;
+//! In: good current readings (A), positive = discharge. Out: cumulative charge (As) and cumulative unmeasured time (s);
 //! only their differences are meaningful. An interval between two current readings counts as follows:
 //! * at most the current's `max_age_s`: the charge is the mean of the two readings times the elapsed time (trapezoid);
 //! * longer than `max_age_s`, the maximum age of a usable value: the first reading is held for `max_age_s`. The rest of
@@ -24,15 +24,15 @@ const SHORT_GAP: f64 = 4.0;
 /// Cumulative charge and unmeasured time at one moment.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct ChargeTotals {
-    /// Charge taken out of the pack, As.
+    /// Charge taken out of the pack (As).
     pub charge_as: f64,
-    /// Time in which the reading was not exactly zero, s. The sensor's offset contributes to the charge of this time.
+    /// Time in which the reading was not exactly zero (s). The sensor's offset contributes to the charge of this time.
     pub offset_s: f64,
-    /// Time without a usable current, s.
+    /// Time without a usable current (s).
     pub unmeasured_s: f64,
-    /// Time in which current flowed in either direction, s.
+    /// Time in which current flowed in either direction (s).
     pub(super) flowing_s: f64,
-    /// Time in which the pack was discharged, s.
+    /// Time in which the pack was discharged (s).
     pub(super) discharging_s: f64,
 }
 
@@ -42,7 +42,7 @@ pub(super) struct ChargeCounter {
     totals: ChargeTotals,
     /// Time up to which the totals are final; `None` = no input yet.
     counted_to: Option<Timestamp>,
-    /// The current after `counted_to`, A; `None` = unmeasured.
+    /// The current after `counted_to` (A); `None` = unmeasured.
     current_a: Option<f64>,
     /// The contactors are open until this time; `None` = closed or unknown.
     open_until: Option<Timestamp>,
@@ -119,7 +119,7 @@ impl ChargeCounter {
         self.current_a = current_a;
     }
 
-    /// How long the latest current is held, s: `max_age_s`, or longer while the contactors are open.
+    /// How long the latest current is held (s): `max_age_s`, or longer while the contactors are open.
     #[inline]
     fn hold_s(&self, max_age_s: f64) -> f64 {
         match (self.open_until, self.counted_to) {

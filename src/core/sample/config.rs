@@ -14,7 +14,7 @@ pub struct Limits {
     pub max_rate_per_s: Option<f64>,
     /// A value that is unchanged for this long while it should change is stuck; `None` = not checked.
     pub stuck_after_s: Option<f64>,
-    /// Age above which a value is stale, s.
+    /// Age above which a value is stale (s).
     pub max_age_s: f64,
 }
 
@@ -48,11 +48,11 @@ pub struct SampleConfig {
     pub voltage_source: VoltageSource,
     /// Number of parallel strings, which share the pack current equally.
     pub strings: u16,
-    /// Limits of the pack current (per pack, not per string), A.
+    /// Limits of the pack current (per pack, not per string) (A).
     pub current: Limits,
-    /// Limits of a cell's voltage, V.
+    /// Limits of a cell's voltage (V).
     pub voltage: Limits,
-    /// Limits of a temperature, degrees C.
+    /// Limits of a temperature (degrees C).
     pub temperature: Limits,
     /// Limits of the SOC reported by the pack; `None` = not reported.
     pub reported_soc: Option<Limits>,
@@ -62,9 +62,9 @@ pub struct SampleConfig {
     pub contactor: Option<ContactorConfig>,
     /// Temperature sensor of each cell; `None` = no sensor, so that the thermal model gives the temperature.
     pub sensor_of_cell: Vec<Option<SensorIndex>>,
-    /// Standard deviation of a voltage sensor's noise, V.
+    /// Standard deviation of a voltage sensor's noise (V).
     pub voltage_noise_v: f64,
-    /// Ambient temperature for cells without a sensor, degrees C.
+    /// Ambient temperature for cells without a sensor (degrees C).
     pub ambient_c: f64,
 }
 

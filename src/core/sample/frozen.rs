@@ -1,6 +1,6 @@
 //! Detects a frozen current sensor: its reading stays bit-identical while the voltages show a changing load.
 //!
-//! In: good readings of the current, A, and of the cells' voltages, V. Out: whether the reading of the current is
+//! In: good readings of the current (A) and of the cells' voltages (V). Out: whether the reading of the current is
 //! frozen. The reading counts as frozen until it changes.
 //!
 //! A constant reading alone proves nothing. A parked pack, a charger and a laboratory hold a current for hours, and a
@@ -21,10 +21,10 @@ use crate::quantity::{InvalidState, Timestamp, bounds};
 
 /// Minimum number of equal current readings.
 const MIN_READINGS: u32 = 20;
-/// How long the reading must remain unchanged after the voltages turned back, s. A current reading follows the voltages
-/// within this time.
+/// How long the reading must remain unchanged after the voltages turned back (s). A current reading follows the
+/// voltages within this time.
 const MIN_FROZEN_S: f64 = 5.0;
-/// Longest time between an extreme voltage and the return from this extreme, s. The voltages of cells that rest, cool
+/// Longest time between an extreme voltage and the return from this extreme (s). The voltages of cells that rest, cool
 /// or balance turn more slowly.
 const MAX_TURN_S: f64 = 60.0;
 /// Step that exceeds a voltage's noise, as a multiple of the configured standard deviation.
@@ -36,13 +36,13 @@ const STEP_MOVES: f64 = 8.4;
 /// Maximum and minimum number of changes from which the usual change is calculated.
 const MAX_MOVES: usize = 32;
 const MIN_MOVES: usize = 8;
-/// Smallest step, V. A smaller movement may come from a charger's ripple, or from a load that changes by less than the
+/// Smallest step (V). A smaller movement may come from a charger's ripple, or from a load that changes by less than the
 /// resolution of a coarse current sensor.
 const MIN_STEP_V: f64 = 0.02;
 /// Maximum number of cells in the median. The first cells of the pack are used; they are enough to distinguish a glitch
 /// from a load.
 const MAX_MEDIAN: usize = 15;
-/// Longest time between two current readings, s. After a longer pause, the check restarts, unless the sensor already
+/// Longest time between two current readings (s). After a longer pause, the check restarts, unless the sensor already
 /// counts as frozen.
 const MAX_PAUSE_S: f64 = 5.0;
 
@@ -50,7 +50,7 @@ const MAX_PAUSE_S: f64 = 5.0;
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Reversals {
-    /// Lowest and highest voltage since the last turning point, V; `None` = no voltage yet.
+    /// Lowest and highest voltage since the last turning point (V); `None` = no voltage yet.
     range_v: Option<(f64, f64)>,
     /// Whether the voltage has risen since the last turning point; `None` = no turning point yet.
     is_rising: Option<bool>,
@@ -104,19 +104,19 @@ pub(super) struct FrozenCheck {
     reversals: Reversals,
     /// Time of the first current reading after the voltages turned back.
     turned_at: Option<Timestamp>,
-    /// Voltages of the present round, V, at most [`MAX_MEDIAN`]. The first cell starts a round.
+    /// Voltages of the present round (V) at most [`MAX_MEDIAN`]. The first cell starts a round.
     round_v: Vec<f64>,
     /// Whether the present round started before the reading of the current changed.
     is_mixed: bool,
-    /// Median of the previous round, V.
+    /// Median of the previous round (V).
     median_v: f64,
-    /// Latest absolute changes of the median, V, at most [`MAX_MOVES`]. These changes are kept when the reading of the
+    /// Latest absolute changes of the median (V) at most [`MAX_MOVES`]. These changes are kept when the reading of the
     /// current changes.
     moves_v: Vec<f64>,
     is_frozen: bool,
 }
 
-/// Step that exceeds the noise, V: [`STEP_SIGMA`] times the standard deviation `noise_v`, V, but at least
+/// Step that exceeds the noise (V): [`STEP_SIGMA`] times the standard deviation `noise_v` (V), but at least
 /// [`MIN_STEP_V`].
 pub(super) fn step_v(noise_v: f64) -> f64 {
     (STEP_SIGMA * noise_v).max(MIN_STEP_V)
@@ -231,7 +231,7 @@ mod tests {
     use super::*;
 
     /// Simulates ten readings a second of a current and of three cells for `seconds`; returns when the current was
-    /// found frozen, s.
+    /// found frozen (s).
     fn found_s(seconds: u32, current: impl Fn(f64) -> f64, voltage: impl Fn(f64) -> f64) -> Option<f64> {
         let mut check = FrozenCheck::default();
         (0..10 * seconds).map(|k| f64::from(k) / 10.0).find(|&time_s| {

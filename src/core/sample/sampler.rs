@@ -62,7 +62,7 @@ impl SamplerState {
         (self.strings, self.series)
     }
 
-    /// Pack charge up to `time`, As; the latest current reading is held for at most `max_age_s`.
+    /// Pack charge up to `time` (As); the latest current reading is held for at most `max_age_s`.
     pub fn charge_as(&self, time: Timestamp, max_age_s: f64) -> f64 {
         self.charge.totals_at(time, max_age_s).charge_as
     }
@@ -89,7 +89,7 @@ pub struct Sampler {
     /// Number of voltage channels.
     voltages: usize,
     flow_a: f64,
-    /// Voltage step that is larger than the noise, V.
+    /// Voltage step that is larger than the noise (V).
     step_v: f64,
     state: SamplerState,
     /// No signal becomes stale before this time; `None` = to be computed.
@@ -220,7 +220,7 @@ impl Sampler {
         self.state.frozen.is_frozen()
     }
 
-    /// Change of the pack current that exceeds the noise of the current sensor, A.
+    /// Change of the pack current that exceeds the noise of the current sensor (A).
     pub fn flow_a(&self) -> f64 {
         self.flow_a
     }
@@ -281,7 +281,7 @@ impl Sampler {
         self.next_stale = None;
     }
 
-    /// Pack current, A, positive = discharge, if its last good reading is fresh; 0 while the contactors are open.
+    /// Pack current (A), positive = discharge, if its last good reading is fresh; 0 while the contactors are open.
     #[inline]
     pub fn pack_current_a(&self, now: Timestamp) -> Option<f64> {
         if self.state.charge.is_open(now) {
@@ -290,7 +290,7 @@ impl Sampler {
         self.state.signals[0].fresh(now, &self.config.current)
     }
 
-    /// Current of one cell, A: the pack current divided by the number of strings.
+    /// Current of one cell (A): the pack current divided by the number of strings.
     pub fn cell_current_a(&self, now: Timestamp) -> Option<f64> {
         self.pack_current_a(now).map(|current| current / self.strings())
     }
@@ -301,12 +301,12 @@ impl Sampler {
         (totals.charge_as / self.strings(), totals.unmeasured_s)
     }
 
-    /// Temperature of a cell, degrees C, if its sensor's last good reading is fresh.
+    /// Temperature of a cell (degrees C) if its sensor's last good reading is fresh.
     pub fn temperature_c(&self, cell: CellIndex, now: Timestamp) -> Option<f64> {
         self.sensor_c(self.sensor_of(cell)?, now)
     }
 
-    /// Time since the channel's latest reading, good or bad, s: the value of the rule `input_missing`.
+    /// Time since the channel's latest reading, good or bad (s): the value of the rule `input_missing`.
     pub fn silence_s(&self, channel: Channel, now: Timestamp) -> Option<f64> {
         // Use the later of the two times; `None` is less than `Some`. Time before the start or the last waking does not
         // count.
@@ -331,7 +331,7 @@ impl Sampler {
         each.filter_map(|(&channel, signal)| signal.good.map(|good| (channel, good.time, good.value())))
     }
 
-    /// Time without a reading on any channel, s; `None` = at most `quiet_s`, or no reading yet.
+    /// Time without a reading on any channel (s); `None` = at most `quiet_s`, or no reading yet.
     pub fn all_silent_s(&self, now: Timestamp, quiet_s: f64) -> Option<f64> {
         let received = |signal: &Signal| signal.received;
         let is_recent = |at: Timestamp| now.since(at) <= quiet_s;
@@ -343,7 +343,7 @@ impl Sampler {
         (!is_recent(latest)).then(|| now.since(latest))
     }
 
-    /// The latest good reading of the pack current, A, regardless of its age; 0 while the contactors are open.
+    /// The latest good reading of the pack current (A), regardless of its age; 0 while the contactors are open.
     pub fn latest_current_a(&self, now: Timestamp) -> Option<f64> {
         if self.state.charge.is_open(now) {
             return Some(0.0);
@@ -351,7 +351,7 @@ impl Sampler {
         self.state.signals[0].good.map(|good| good.value())
     }
 
-    /// The highest fresh temperature, degrees C, and whether all sensors are fresh; `None` = no fresh sensor.
+    /// The highest fresh temperature (degrees C) and whether all sensors are fresh; `None` = no fresh sensor.
     pub fn hottest_c(&self, now: Timestamp) -> Option<(f64, bool)> {
         let sensors = &self.state.signals[1..=self.sensors];
         let fresh = sensors.iter().map(|signal| signal.fresh(now, &self.config.temperature));
@@ -381,7 +381,7 @@ impl Sampler {
         self.silence_s(channel, now).is_none_or(|silence_s| silence_s > limits(&self.config, channel).max_age_s)
     }
 
-    /// The longest silence of a channel, s, and the largest share of bad readings; `None` = a channel is silent, or has
+    /// The longest silence of a channel (s) and the largest share of bad readings; `None` = a channel is silent, or has
     /// no reading since the start or the last waking.
     pub fn worst_input(&self, now: Timestamp) -> Option<(f64, f64)> {
         let began = self.state.began?;

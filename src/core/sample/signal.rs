@@ -22,7 +22,7 @@ use crate::quantity::{Fault, InvalidState, Timestamp};
 /// Number of consecutive readings that must agree on a new level. Two readings could come from one disturbance.
 pub const ACCEPT_AFTER: u32 = 3;
 
-/// Shortest interval for the rate check, s. Time stamps of consecutive frames jitter by about this much, and the rate
+/// Shortest interval for the rate check (s). Time stamps of consecutive frames jitter by about this much, and the rate
 /// in an interval of zero would be infinite.
 pub const MIN_RATE_INTERVAL_S: f64 = 1e-3;
 
@@ -50,7 +50,7 @@ pub(super) struct Signal {
     refused_count: u32,
     /// The latest value, unchanged since the stuck clock showed `rests_since_s`.
     rests_at: Option<f64>,
-    /// Time of the stuck clock at the last change of the value, s.
+    /// Time of the stuck clock at the last change of the value (s).
     rests_since_s: f64,
     /// Time of the latest reading, good or bad.
     #[serde(rename = "heard")]

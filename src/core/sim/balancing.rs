@@ -10,11 +10,11 @@ use super::truth::Pack;
 /// Settings of a BMS's balancing.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Balancing {
-    /// Current of a balancing resistor, A.
+    /// Current of a balancing resistor (A).
     pub bleed_a: f64,
-    /// Bleeding of a cell starts when the cell's voltage exceeds the lowest cell voltage by this value, V.
+    /// Bleeding of a cell starts when the cell's voltage exceeds the lowest cell voltage by this value (V).
     pub start_v: f64,
-    /// Bleeding of a cell stops when the cell's voltage exceeds the lowest cell voltage by less than this value, V.
+    /// Bleeding of a cell stops when the cell's voltage exceeds the lowest cell voltage by less than this value (V).
     pub stop_v: f64,
     /// A charge is near its end if the fullest cell has at least this SOC.
     pub from_soc: f64,

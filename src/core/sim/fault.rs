@@ -14,16 +14,16 @@ use crate::quantity::{CellIndex, SensorIndex};
 pub struct Fault {
     /// Kind, location and size.
     pub kind: FaultKind,
-    /// Start of the fault after the start of the simulation, s.
+    /// Start of the fault after the start of the simulation (s).
     pub from_s: f64,
 }
 
 /// Size of a leak inside a cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Leak {
-    /// A constant leakage current, A.
+    /// A constant leakage current (A).
     Current(f64),
-    /// A soft short circuit with this resistance, ohm. The current is the unloaded cell voltage divided by the
+    /// A soft short circuit with this resistance (ohm). The current is the unloaded cell voltage divided by the
     /// resistance.
     Resistance(f64),
 }
@@ -31,7 +31,7 @@ pub enum Leak {
 /// Size of a contact's resistance.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum ContactResistance {
-    /// Resistance, ohm.
+    /// Resistance (ohm).
     Ohm(f64),
     /// Share of the cell's own ohmic resistance at SOC 50 % and 25 degrees C when the fault starts.
     OfCell(f64),
@@ -79,7 +79,7 @@ pub enum FaultKind {
         /// Change of the capacity.
         change: f64,
     },
-    /// The current sensor's offset changes by this value, A, positive = discharge.
+    /// The current sensor's offset changes by this value (A), positive = discharge.
     CurrentOffset(f64),
     /// The current sensor's gain changes by this relative value.
     CurrentGain(f64),
@@ -89,7 +89,7 @@ pub enum FaultKind {
     VoltageOffset {
         /// The channel.
         cell: CellIndex,
-        /// Change, V.
+        /// Change (V).
         offset_v: f64,
     },
     /// The reading of a voltage channel is frozen.

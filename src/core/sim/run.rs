@@ -39,7 +39,7 @@ impl Wiring {
 pub struct Moment {
     /// Time since the start.
     pub time: Timestamp,
-    /// True cell current from this moment on, A, positive = discharge.
+    /// True cell current from this moment on (A), positive = discharge.
     pub current_a: f64,
     /// Whether the cells were also sampled at this moment.
     pub cells_sampled: bool,
@@ -105,7 +105,7 @@ pub struct Simulation {
     balancer: Option<Balancer>,
     has_bits: bool,
     asleep: Option<Asleep>,
-    /// Voltages of the cells, V: first at the taps; after the sensor faults were applied, at the channels.
+    /// Voltages of the cells (V): first at the taps; after the sensor faults were applied, at the channels.
     sensed_v: Vec<f64>,
 }
 
@@ -204,7 +204,7 @@ impl Simulation {
         &self.pack
     }
 
-    /// True terminal voltages at the latest moment, V.
+    /// True terminal voltages at the latest moment (V).
     pub fn voltages_v(&self) -> impl Iterator<Item = f64> + '_ {
         self.pack.voltages_v(self.current_a)
     }

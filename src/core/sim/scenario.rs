@@ -43,9 +43,9 @@ pub struct Settings {
     pub cell_period_ns: i64,
     /// The simulation ends after this number of the scenario's cycles; `None` = no limit.
     pub cycles: Option<u32>,
-    /// The simulation ends after this time, s; `None` = no limit.
+    /// The simulation ends after this time (s); `None` = no limit.
     pub duration_s: Option<f64>,
-    /// The simulation ends after the cycle in which the weakest cell reaches this capacity, Ah; 0 = no limit. `ev-day`
+    /// The simulation ends after the cycle in which the weakest cell reaches this capacity (Ah); 0 = no limit. `ev-day`
     /// ignores this limit.
     pub end_capacity_ah: f64,
     /// Lower and upper SOC of the cycling scenarios: charging starts at the lower SOC, discharging at the upper SOC.
@@ -55,7 +55,7 @@ pub struct Settings {
 }
 
 impl Scenario {
-    /// Capacity of the cell in the scenario's source, Ah.
+    /// Capacity of the cell in the scenario's source (Ah).
     pub const fn nominal_ah(self) -> f64 {
         match self {
             Self::Paper => 2.6,

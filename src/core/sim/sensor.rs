@@ -37,12 +37,12 @@ const CHANNEL_LIMIT: f64 = 2.0;
 /// Errors of all sensors of a pack.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Sensors {
-    /// Pack current, A.
+    /// Pack current (A).
     pub current: SensorError,
-    /// Cell voltages, V. The noise of the pack voltage is this noise times the square root of the number of cells; the
+    /// Cell voltages (V). The noise of the pack voltage is this noise times the square root of the number of cells; the
     /// pack voltage has no offset.
     pub voltage: SensorError,
-    /// Temperatures, degrees C.
+    /// Temperatures (degrees C).
     pub temperature: SensorError,
 }
 

@@ -21,7 +21,7 @@ use crate::quantity::CellIndex;
 /// Hysteresis of the open-circuit voltage, which the estimator does not model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hysteresis {
-    /// Distance of the settled charge curve and of the settled discharge curve from the OCV, V; 0 = no hysteresis.
+    /// Distance of the settled charge curve and of the settled discharge curve from the OCV (V); 0 = no hysteresis.
     pub magnitude_v: f64,
     /// How fast the voltage changes from one curve to the other, in e-foldings while the current moves one full
     /// capacity.
@@ -37,9 +37,9 @@ impl Default for Hysteresis {
 /// Ageing of a cell.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Ageing {
-    /// Capacity lost at the end of each cycle, Ah.
+    /// Capacity lost at the end of each cycle (Ah).
     pub capacity_loss_ah_per_cycle: f64,
-    /// Capacity lost per Ah moved in either direction, Ah.
+    /// Capacity lost per Ah moved in either direction (Ah).
     pub capacity_loss_ah_per_ah: f64,
     /// Resistance gained at the end of each cycle, relative to new.
     pub resistance_growth_per_cycle: f64,
@@ -63,7 +63,7 @@ pub struct Spread {
 pub struct PackSettings {
     /// Number of cells in series, at least 1.
     pub cells: u16,
-    /// Capacity of a new cell, Ah.
+    /// Capacity of a new cell (Ah).
     pub capacity_ah: f64,
     /// SOC at the start, fraction.
     pub initial_soc: f64,
@@ -73,9 +73,9 @@ pub struct PackSettings {
     pub ageing: Ageing,
     /// Hysteresis of the cells.
     pub hysteresis: Hysteresis,
-    /// Self-discharge, A.
+    /// Self-discharge (A).
     pub leakage_a: f64,
-    /// Ambient temperature, and temperature of the cells at the start, degrees C.
+    /// Ambient temperature, and temperature of the cells at the start (degrees C).
     pub ambient_c: f64,
 }
 
@@ -87,23 +87,23 @@ const SPREAD_LIMIT: f64 = 3.0;
 pub struct TruthCell {
     /// State of charge, fraction.
     pub soc: f64,
-    /// Voltages of the model's RC branches, V; 0 in unused elements.
+    /// Voltages of the model's RC branches (V); 0 in unused elements.
     pub branch_v: [f64; MAX_BRANCHES],
     /// Hysteresis state, from -1 (after discharge) to 1 (after charge).
     pub hysteresis: f64,
-    /// Temperature, degrees C.
+    /// Temperature (degrees C).
     pub temperature_c: f64,
-    /// Capacity, Ah.
+    /// Capacity (Ah).
     pub capacity_ah: f64,
     /// Resistance relative to the cell model.
     pub resistance_ratio: f64,
-    /// Charge moved in either direction since the start, Ah.
+    /// Charge moved in either direction since the start (Ah).
     pub throughput_ah: f64,
     /// Leak of an injected fault.
     pub leak: Option<Leak>,
-    /// Current of the balancing resistor, A; 0 = off.
+    /// Current of the balancing resistor (A); 0 = off.
     pub bleed_a: f64,
-    /// Contact resistance of an injected fault, ohm. It lies between the cell's voltage taps but outside the cell, so
+    /// Contact resistance of an injected fault (ohm). It lies between the cell's voltage taps but outside the cell, so
     /// `voltage_v` does not include its voltage drop.
     pub contact_ohm: f64,
     floor_ah: f64,
@@ -129,20 +129,20 @@ impl TruthCell {
         }
     }
 
-    /// Terminal voltage, V, while `current_a` flows.
+    /// Terminal voltage (V), while `current_a` flows.
     pub fn voltage_v(&self, model: &CellModel, hysteresis: &Hysteresis, current_a: f64) -> f64 {
         let place = model.grid_position(self.soc, self.temperature_c);
         self.unloaded_v(model, hysteresis) - current_a * model.r0_ohm(&place) * self.resistance_ratio
     }
 
-    /// The current, A, at which the terminal voltage would be `voltage_v`.
+    /// The current (A) at which the terminal voltage would be `voltage_v`.
     pub fn current_at_a(&self, model: &CellModel, hysteresis: &Hysteresis, voltage_v: f64) -> f64 {
         let place = model.grid_position(self.soc, self.temperature_c);
         (self.unloaded_v(model, hysteresis) - voltage_v) / (model.r0_ohm(&place) * self.resistance_ratio)
     }
 
-    /// Current of the injected leak, A. The leak stops when the cell is empty. The voltage drop that the leak causes is
-    /// neglected.
+    /// Current of the injected leak (A). The leak stops when the cell is empty. The voltage drop that the leak causes
+    /// is neglected.
     pub fn leak_a(&self, model: &CellModel, hysteresis: &Hysteresis) -> f64 {
         match self.leak {
             None => 0.0,
@@ -235,7 +235,7 @@ impl Pack {
         self.settings.ageing = ageing;
     }
 
-    /// Changes the ambient temperature, degrees C. The cells follow if their model has a thermal part.
+    /// Changes the ambient temperature (degrees C). The cells follow if their model has a thermal part.
     pub fn set_ambient(&mut self, ambient_c: f64) {
         self.settings.ambient_c = ambient_c;
     }
@@ -245,7 +245,8 @@ impl Pack {
         match fault {
             FaultKind::Leak { cell, leak } => self.cells[cell.index()].leak = Some(leak),
             FaultKind::Contact { cell, resistance } => {
-                // A relative contact resistance refers to the cell's resistance at this SOC and temperature, degrees C.
+                // A relative contact resistance refers to the cell's resistance at this SOC and temperature (degrees
+                // C).
                 let place = self.model.grid_position(0.5, 25.0);
                 let cell = &mut self.cells[cell.index()];
                 cell.contact_ohm += match resistance {
@@ -276,7 +277,7 @@ impl Pack {
         }
     }
 
-    /// Sets the current of each cell's balancing resistor, A.
+    /// Sets the current of each cell's balancing resistor (A).
     pub(crate) fn set_bleeds(&mut self, mut bleed_a: impl FnMut(usize, &TruthCell) -> f64) {
         for (i, cell) in self.cells.iter_mut().enumerate() {
             cell.bleed_a = bleed_a(i, cell);
@@ -288,7 +289,7 @@ impl Pack {
         self.cells[cell.index()].bleed_a > 0.0
     }
 
-    /// Current of each cell's injected leak, A.
+    /// Current of each cell's injected leak (A).
     pub fn leaks_a(&self) -> impl Iterator<Item = f64> + '_ {
         self.cells.iter().map(|cell| cell.leak_a(&self.model, &self.settings.hysteresis))
     }
@@ -308,28 +309,28 @@ impl Pack {
         &self.model
     }
 
-    /// Terminal voltage of each cell while `current_a` flows, V.
+    /// Terminal voltage of each cell while `current_a` flows (V).
     pub fn voltages_v(&self, current_a: f64) -> impl Iterator<Item = f64> + '_ {
         self.cells.iter().map(move |cell| cell.voltage_v(&self.model, &self.settings.hysteresis, current_a))
     }
 
-    /// Lowest cell voltage while `current_a` flows, V.
+    /// Lowest cell voltage while `current_a` flows (V).
     pub fn lowest_v(&self, current_a: f64) -> f64 {
         self.voltages_v(current_a).fold(f64::INFINITY, f64::min)
     }
 
-    /// Highest cell voltage while `current_a` flows, V.
+    /// Highest cell voltage while `current_a` flows (V).
     pub fn highest_v(&self, current_a: f64) -> f64 {
         self.voltages_v(current_a).fold(f64::NEG_INFINITY, f64::max)
     }
 
-    /// Lowest and highest cell voltage while `current_a` flows, V.
+    /// Lowest and highest cell voltage while `current_a` flows (V).
     pub fn extremes_v(&self, current_a: f64) -> (f64, f64) {
         let widen = |(low_v, high_v): (f64, f64), voltage_v| (low_v.min(voltage_v), high_v.max(voltage_v));
         self.voltages_v(current_a).fold((f64::INFINITY, f64::NEG_INFINITY), widen)
     }
 
-    /// The current, A, at which the highest cell voltage is `voltage_v`.
+    /// The current (A) at which the highest cell voltage is `voltage_v`.
     pub fn current_at_highest_a(&self, voltage_v: f64) -> f64 {
         let at = |cell: &TruthCell| cell.current_at_a(&self.model, &self.settings.hysteresis, voltage_v);
         self.cells.iter().map(at).fold(f64::NEG_INFINITY, f64::max)
@@ -345,7 +346,7 @@ impl Pack {
         self.cells.iter().map(|cell| cell.soc).fold(f64::NEG_INFINITY, f64::max)
     }
 
-    /// Capacity of the weakest cell, Ah.
+    /// Capacity of the weakest cell (Ah).
     pub fn lowest_capacity_ah(&self) -> f64 {
         self.cells.iter().map(|cell| cell.capacity_ah).fold(f64::INFINITY, f64::min)
     }

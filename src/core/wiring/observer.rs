@@ -90,9 +90,9 @@ pub struct WiringObserver {
     pub(crate) estimator: EstimatorStats,
     /// Time of the latest frame.
     latest: Option<Timestamp>,
-    /// Sum of the times between frames, s. Gaps above 30 s are left out, because the buses sleep during these gaps.
+    /// Sum of the times between frames (s). Gaps above 30 s are left out, because the buses sleep during these gaps.
     pub(crate) awake_s: f64,
-    /// Time listened on live interfaces, s; `None` for a recording, which uses `awake_s` instead.
+    /// Time listened on live interfaces (s); `None` for a recording, which uses `awake_s` instead.
     listened_s: Option<f64>,
     pub(crate) frames: u64,
 }
@@ -328,12 +328,12 @@ impl WiringObserver {
         }
     }
 
-    /// How long the observer has listened, s. For a recording, the time in which the buses slept is left out.
+    /// How long the observer has listened (s). For a recording, the time in which the buses slept is left out.
     pub fn seconds(&self) -> f64 {
         self.listened_s.unwrap_or(self.awake_s)
     }
 
-    /// Sets how long the observer has listened on live interfaces, s, with or without frames.
+    /// Sets how long the observer has listened on live interfaces (s) with or without frames.
     pub fn handle_listened(&mut self, seconds: f64) {
         self.listened_s = Some(seconds);
     }
@@ -344,7 +344,7 @@ impl WiringObserver {
     }
 }
 
-/// Number of separately measured voltages, and the largest current change that does not count as a change of load, A.
+/// Number of separately measured voltages, and the largest current change that does not count as a change of load (A).
 fn response_settings(plan: &Plan) -> (usize, f64) {
     let cells = if plan.pack.is_total { 1 } else { usize::from(plan.pack.cells) };
     (cells, 0.01 * (plan.pack.capacity_ah * f64::from(plan.pack.strings.max(1))))

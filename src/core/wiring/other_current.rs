@@ -19,8 +19,8 @@ pub(crate) struct OtherCurrent {
 }
 
 impl OtherCurrent {
-    /// Creates empty statistics for `cells` voltages. A current change of at most `tolerance_a`, A, does not count as a
-    /// change of load.
+    /// Creates empty statistics for `cells` voltages. A current change of at most `tolerance_a` (A), does not count as
+    /// a change of load.
     pub(crate) fn new(layout: &SignalLayout, cells: usize, tolerance_a: f64) -> Self {
         let responses = BLOCKS_S.map(|block_s| VoltageResponse::new(cells, tolerance_a, block_s));
         Self { series: Series::new(layout, None), responses }

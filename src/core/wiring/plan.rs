@@ -24,7 +24,8 @@ pub struct Plan {
     pub unconfigured: Vec<SignalPlan>,
     /// The pack.
     pub pack: PackPlan,
-    /// Maximum age of a current, of a voltage and of a temperature, s. An older reading is stale; `None` = never stale.
+    /// Maximum age of a current, of a voltage and of a temperature (s). An older reading is stale; `None` = never
+    /// stale.
     pub max_ages_s: [Option<f64>; 3],
     /// Smallest and largest plausible value of current, cell voltage and temperature; infinite = unlimited.
     pub limits: [(f64, f64); 3],
@@ -50,13 +51,13 @@ pub struct PackPlan {
     pub strings: u16,
     /// The cell model; `None` if it cannot be read.
     pub model: Option<CellModel>,
-    /// Capacity of a cell, Ah. If no capacity is configured, the capacity of the model applies.
+    /// Capacity of a cell (Ah). If no capacity is configured, the capacity of the model applies.
     pub capacity_ah: f64,
-    /// Ambient temperature, degrees C.
+    /// Ambient temperature (degrees C).
     pub ambient_c: f64,
-    /// Largest absolute current at which the pack counts as resting, A.
+    /// Largest absolute current at which the pack counts as resting (A).
     pub dead_band_a: f64,
-    /// White noise that the estimator assumes in a voltage reading (standard deviation), V.
+    /// White noise that the estimator assumes in a voltage reading (standard deviation) (V).
     pub voltage_noise_v: f64,
 }
 
@@ -132,7 +133,7 @@ pub struct MessagePlan {
     pub id: CanId,
     /// Name in the DBC.
     pub name: String,
-    /// Cycle time stated in the DBC (`GenMsgCycleTime`), s.
+    /// Cycle time stated in the DBC (`GenMsgCycleTime`) (s).
     pub cycle_time_s: Option<f64>,
     /// Number of multiplexer pages with configured signals.
     pub pages: usize,
@@ -186,7 +187,7 @@ impl Kind {
 }
 
 impl Plan {
-    /// Age from which a reading of the channel is stale, s.
+    /// Age from which a reading of the channel is stale (s).
     pub(super) fn max_age_s(&self, channel: Channel) -> f64 {
         self.max_ages_s.get(Kind::of(channel) as usize).copied().flatten().unwrap_or(f64::INFINITY)
     }

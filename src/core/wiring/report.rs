@@ -104,7 +104,7 @@ pub struct WiringFinding {
 /// Result of the commissioning check.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct WiringReport {
-    /// Time listened, s. For a recording: from the first frame to the last, without sleep.
+    /// Time listened (s). For a recording: from the first frame to the last, without sleep.
     pub seconds: f64,
     /// Frames seen on all interfaces.
     pub frames: u64,

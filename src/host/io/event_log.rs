@@ -42,7 +42,7 @@ pub fn write_head(out: &mut impl Write, vehicle: &VehicleIdentity) -> io::Result
 struct EventSum {
     reported: Option<Timestamp>,
     unreported: u64,
-    /// Shortest time between the latest log line and the next log line, s.
+    /// Shortest time between the latest log line and the next log line (s).
     period_s: f64,
 }
 

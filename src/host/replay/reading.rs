@@ -12,7 +12,7 @@ use crate::monitor::MonitorConfig;
 use crate::quantity::BusIndex;
 use crate::sample::VoltageSource;
 
-/// Default sleep gap, s. In a longer gap of a log, the recorder counts as asleep.
+/// Default sleep gap (s). In a longer gap of a log, the recorder counts as asleep.
 pub const SLEEP_GAP_S: f64 = 30.0;
 
 /// Settings for reading logs.

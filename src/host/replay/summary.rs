@@ -44,17 +44,17 @@ pub struct ReplaySummary {
     pub alarms_raised: Vec<Event>,
     /// State of the cells at the end.
     pub cells: Vec<CellSummary>,
-    /// Learned offset of the current sensor at the end, A: reading minus true current, positive = discharge.
+    /// Learned offset of the current sensor at the end (A): reading minus true current, positive = discharge.
     pub current_offset_a: Option<f64>,
-    /// Standard deviation of the learned offset, A.
+    /// Standard deviation of the learned offset (A).
     pub current_offset_std_a: Option<f64>,
-    /// First stamp, s.
+    /// First stamp (s).
     pub first_s: Option<f64>,
-    /// Last stamp, s.
+    /// Last stamp (s).
     pub last_s: Option<f64>,
-    /// Covered time without gaps longer than the sleep gap, s.
+    /// Covered time without gaps longer than the sleep gap (s).
     pub awake_s: f64,
-    /// Wall time, s.
+    /// Wall time (s).
     pub wall_s: f64,
     /// Awake time over wall time.
     pub times_real_time: f64,

@@ -14,9 +14,9 @@ use crate::io::socket::LinkState;
 use crate::monitor::{BusEvent, Event, EventKind, Monitor};
 use crate::quantity::Channel;
 
-/// Longest configurable wait for the first reading, s. The unit's `TimeoutStartSec` is longer.
+/// Longest configurable wait for the first reading (s). The unit's `TimeoutStartSec` is longer.
 pub const MAX_READY_TIMEOUT_S: f64 = 60.0;
-/// Default wait for the first reading, s. This wait is ten times the wake-up time of a bus, but too short to look like
+/// Default wait for the first reading (s). This wait is ten times the wake-up time of a bus, but too short to look like
 /// a start that hangs.
 pub const DEFAULT_READY_TIMEOUT_S: f64 = 10.0;
 /// Shortest time between two reports of the line.
@@ -215,7 +215,7 @@ impl Readiness {
     }
 }
 
-/// Describes a restored state of this age, s.
+/// Describes a restored state of this age (s).
 pub(super) fn describe_restored(age_s: Option<f64>) -> String {
     match age_s {
         Some(age_s) => format!("restored state {} old", describe_duration(age_s)),

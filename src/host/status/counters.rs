@@ -1,12 +1,12 @@
 //! Counts the work of the service loop, the status clients and the latency of frames. The counters are plain numbers
 //! that the loop owns.
 //!
-//! In: the lateness of ticks and the latency of frames, s. Out: structs of the status document. Nothing is allocated or
-//! locked per frame.
+//! In: the lateness of ticks and the latency of frames (s). Out: structs of the status document. Nothing is allocated
+//! or locked per frame.
 
 use serde::{Deserialize, Serialize};
 
-/// Upper bounds of the latency buckets, s.
+/// Upper bounds of the latency buckets (s).
 pub const LATENCY_BOUNDS_S: [f64; 14] =
     [50e-6, 100e-6, 200e-6, 500e-6, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 50e-3, 0.1, 0.2, 0.5, 1.0];
 
@@ -17,14 +17,14 @@ pub struct Latency {
     pub buckets: Vec<Bucket>,
     /// Number of frames.
     pub frames: u64,
-    /// Sum of the latencies of all frames, s.
+    /// Sum of the latencies of all frames (s).
     pub sum_s: f64,
 }
 
 /// One bucket.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Bucket {
-    /// Upper bound of the bucket, s; `None` = unbounded.
+    /// Upper bound of the bucket (s); `None` = unbounded.
     pub le_s: Option<f64>,
     /// Number of frames in the bucket.
     pub frames: u64,
@@ -50,7 +50,7 @@ impl Latency {
         self.sum_s += seconds;
     }
 
-    /// Returns a latency, s, that at least the fraction `share` of all frames did not exceed: the lowest bucket bound
+    /// Returns a latency (s) that at least the fraction `share` of all frames did not exceed: the lowest bucket bound
     /// with this property. `None` = no frame was counted, or too many frames are in the last, unbounded bucket.
     pub fn quantile_s(&self, share: f64) -> Option<f64> {
         let wanted = (share * self.frames as f64).ceil().max(1.0);
@@ -70,7 +70,7 @@ pub struct ServiceCounters {
     pub ticks: u64,
     /// Ticks that were more than one period late.
     pub missed_deadlines: u64,
-    /// Greatest lateness of a tick, s.
+    /// Greatest lateness of a tick (s).
     pub worst_lateness_s: f64,
     /// Configurations applied while running.
     pub reloads: u64,

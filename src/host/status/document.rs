@@ -43,7 +43,7 @@ pub struct StatusDocument {
     pub wall_time: Timestamp,
     /// Start of the daemon.
     pub started: Timestamp,
-    /// Time since the start, s.
+    /// Time since the start (s).
     pub uptime_s: f64,
     /// The configuration in use.
     pub config: Option<ConfigFile>,

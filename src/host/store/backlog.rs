@@ -10,7 +10,7 @@ use super::rows::{HistoryRow, RowBatch};
 use super::stamp::Stamp;
 
 /// Maximum number of rows that wait for the disk. This many rows take half a megabyte of memory. For a pack of 96
-/// cells, they cover about 25 half-cycles of each cell, that is, days of driving.
+/// cells, they cover about 25 half-cycles of each cell, that is (days) of driving.
 pub(super) const MAX_ROWS: usize = 5_000;
 
 /// Waiting rows, oldest first.

@@ -15,13 +15,13 @@ const BYTES_PER_DAY: f64 = 15e6;
 const COMMIT_BYTES: f64 = 8e3;
 /// Bytes that each row adds to a commit, in the log and later in the file of SQLite.
 const ROW_BYTES: f64 = 180.0;
-/// Longest time without a checkpoint, s, regardless of what else was written.
+/// Longest time without a checkpoint (s), regardless of what else was written.
 const MAX_PERIOD_S: f64 = 3600.0;
 
 /// The schedule of checkpoints.
 #[derive(Debug)]
 pub(super) struct CheckpointSchedule {
-    /// Shortest period, s.
+    /// Shortest period (s).
     period_s: f64,
     /// Time when the state was last written.
     last: Option<Timestamp>,
@@ -30,7 +30,7 @@ pub(super) struct CheckpointSchedule {
 }
 
 impl CheckpointSchedule {
-    /// A schedule with the shortest period `period_s`, s.
+    /// A schedule with the shortest period `period_s` (s).
     pub(super) fn new(period_s: f64) -> Self {
         Self { period_s, last: None, ahead: (0.0, Timestamp::ZERO) }
     }

@@ -29,7 +29,7 @@ const NS_PER_YEAR: f64 = 365.25 * 86_400.0 * 1e9;
 const HARDWARE_CLOCKS: &str = "/sys/class/rtc";
 /// systemd's time client creates this file when a time server has set the clock since the boot.
 const SYNCHRONISED: &str = "/run/systemd/timesync/synchronized";
-/// Largest difference between the wall clock and a hardware clock that confirms it, s. A hardware clock counts whole
+/// Largest difference between the wall clock and a hardware clock that confirms it (s). A hardware clock counts whole
 /// seconds and drifts a few seconds a day, and the wall clock may have been corrected since the boot.
 const HARDWARE_TOLERANCE_S: i64 = 60;
 

@@ -21,7 +21,7 @@ use crate::config::{
 use crate::quantity::{CellIndex, Channel, MAX_CELLS};
 use crate::wiring::{InterfacePlan, MessagePlan, OutputPlan, PackPlan, Plan, SignalPlan};
 
-/// Capacity that is used if the configuration states none, Ah. This capacity is typical of a car's cell.
+/// Capacity that is used if the configuration states none (Ah). This capacity is typical of a car's cell.
 const USUAL_AH: f64 = 50.0;
 
 /// The readable part of a configuration, as `packwatch doctor` needs it.

@@ -7,14 +7,14 @@ use crate::quantity::Timestamp;
 const MINUTE: f64 = 60.0;
 const HOUR: f64 = 3600.0;
 const DAY: f64 = 86_400.0;
-/// Steps of a date axis that are shorter than a month: unit of the step, s, and the allowed multiples of the unit.
+/// Steps of a date axis that are shorter than a month: unit of the step (s) and the allowed multiples of the unit.
 const STEPS: [(f64, &[f64]); 4] = [
     (1.0, &[1.0, 5.0, 15.0, 30.0]),
     (MINUTE, &[1.0, 5.0, 15.0, 30.0]),
     (HOUR, &[1.0, 2.0, 3.0, 4.0, 6.0, 12.0]),
     (DAY, &[1.0, 2.0, 5.0, 10.0, 20.0]),
 ];
-/// Length of an average month, s.
+/// Length of an average month (s).
 const MONTH_S: f64 = 30.44 * DAY;
 
 /// Scale of an axis.

@@ -1,4 +1,4 @@
-//! Draws lines, bands, points and thresholds over one pair of axes.
+//! Draws lines, bands (points) and thresholds over one pair of axes.
 
 use super::axis::Axis;
 use super::style::Ink;
@@ -257,7 +257,7 @@ impl Layer {
 
     fn draw_points(&self, svg: &mut Svg, area: &Area, points: &[Point]) {
         let finite = || points.iter().filter(|point| point.x.is_finite() && point.y.is_finite());
-        // Maximum number of points with tool tips. In larger layers, points have no tool tips.
+        // Maximum number of points with tool tips. In larger layers (points) have no tool tips.
         if finite().count() <= 400 {
             return finite().for_each(|point| {
                 // A point at the edge of the area is moved inwards; otherwise half of the dot would be cut off.

@@ -15,7 +15,7 @@ use crate::quantity::{BusIndex, Timestamp};
 const MAX_BYTES: usize = 48 << 20;
 /// Maximum number of bytes kept per kind of answer: about 800 answers of 64 bytes.
 const MAX_ANSWER_BYTES: usize = 64 << 10;
-/// Length of a window, s. A window is long compared with the period of a multiplexer page, and short compared with a
+/// Length of a window (s). A window is long compared with the period of a multiplexer page, and short compared with a
 /// drive.
 const WINDOW_S: f64 = 2.0;
 /// Maximum number of messages (identifiers on an interface) that are kept. A car has a few hundred messages; a flood of
@@ -31,7 +31,7 @@ pub(super) type MessageKey = (BusIndex, CanId);
 /// Payloads of one message, with their times.
 #[derive(Debug, Default)]
 pub(super) struct Payloads {
-    /// Times since the first frame of the log, s.
+    /// Times since the first frame of the log (s).
     times: Vec<f64>,
     data: Vec<u8>,
     /// End of each payload in `data`.
@@ -48,7 +48,7 @@ pub(super) struct AnswerKey {
     pub(super) identifier: u16,
 }
 
-/// A request: time, s; CAN identifier; and the first data byte if addressing is extended.
+/// A request: time (s); CAN identifier; and the first data byte if addressing is extended.
 type HeardRequest = (f64, CanId, Option<u8>);
 
 /// Answers of one kind.
@@ -143,7 +143,7 @@ impl Capture {
         self.receive(time, time_s, key, frame.data());
     }
 
-    /// Returns the length of the log, s.
+    /// Returns the length of the log (s).
     pub(super) fn seconds(&self) -> f64 {
         self.latest_s
     }
@@ -194,7 +194,7 @@ impl Capture {
         let service = first.wrapping_sub(0x40);
         let Some((number, length)) = identifier(service) else { return };
         let request = self.requests.get(&(bus, service, number));
-        // Largest P2* of ISO 14229-2 (time until an answer), s.
+        // Largest P2* of ISO 14229-2 (time until an answer) (s).
         let request = request.filter(|(at, _, _)| time_s - at <= 5.0).map(|(_, id, first)| (*id, *first));
         let key = AnswerKey { bus, response: id, extension, service, identifier: number };
         // If no request was received, a single frame may be any message that starts with the same bytes.

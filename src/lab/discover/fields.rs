@@ -22,15 +22,15 @@ use crate::wiring::evidence::{Series, Slope};
 
 /// Maximum number of payloads that are evaluated per message, or per page of a message.
 const MAX_PAYLOADS: usize = 1500;
-/// Plausible voltages of a pack, V. The scales below are in V per code.
+/// Plausible voltages of a pack (V). The scales below are in V per code.
 const PACK_V: (f64, f64) = (100.0, 950.0);
 const PACK_SCALES: [f64; 5] = [0.1, 0.01, 0.05, 0.25, 0.5];
-/// Scales of a current, A per code.
+/// Scales of a current (A) per code.
 const CURRENT_SCALES: [f64; 7] = [0.1, 0.01, 0.05, 0.025, 0.25, 0.5, 1.0];
-/// Plausible voltages of a cell, V. The next constant is the largest difference between cells of a pack, V.
+/// Plausible voltages of a cell (V). The next constant is the largest difference between cells of a pack (V).
 const CELL_V: (f64, f64) = (2.5, 4.4);
 const MAX_SPREAD_V: f64 = 0.25;
-/// Lengths of a cell voltage in bits, each with the scales to try, V per code.
+/// Lengths of a cell voltage in bits, each with the scales to try (V) per code.
 const CELL_FORMS: [(u16, &[f64]); 3] = [(16, &[0.001, 0.0001, 0.002, 0.0005]), (12, &[0.001, 0.002]), (8, &[0.02])];
 
 /// Returns the name of a message that no DBC describes. The identifier is decimal, so that its digits form one number.

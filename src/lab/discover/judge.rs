@@ -227,7 +227,7 @@ fn current(index: usize, signal: &LogSignal) -> Option<Evidence> {
     Some(evidence)
 }
 
-/// Plausible voltages of one cell, V.
+/// Plausible voltages of one cell (V).
 const CELL_V: (f64, f64) = (1.5, 4.5);
 
 fn single_cell(index: usize, signal: &LogSignal) -> Option<Evidence> {

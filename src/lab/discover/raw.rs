@@ -19,15 +19,15 @@ use crate::wiring::evidence::Series;
 pub(super) const CELL: &str = "Cell";
 /// Smallest number of cells in a row.
 const MIN_CELLS: usize = 8;
-/// Plausible voltages of a cell in use, V.
+/// Plausible voltages of a cell in use (V).
 const CELL_V: (f64, f64) = (2.0, 4.5);
-/// Lengths of a cell voltage in bits, each with the scales to try, V per code.
+/// Lengths of a cell voltage in bits, each with the scales to try (V) per code.
 const CELL_SCALES: [(u32, &[f64]); 2] = [(16, &[0.001, 0.0001, 0.002, 0.005, 0.01]), (8, &[0.02, 0.01, 0.05])];
-/// Plausible voltages of a pack, V.
+/// Plausible voltages of a pack (V).
 const PACK_V: (f64, f64) = (100.0, 950.0);
-/// Scales of a pack voltage of 16 bits, V per code.
+/// Scales of a pack voltage of 16 bits (V) per code.
 const PACK_SCALES: [f64; 5] = [0.1, 0.01, 0.5, 0.25, 1.0];
-/// Lengths of a current in bits, each with the scales to try, A per code.
+/// Lengths of a current in bits, each with the scales to try (A) per code.
 const CURRENT_FORMS: [(u32, &[f64]); 3] =
     [(16, &[0.1, 0.01, 0.05, 0.5, 0.025]), (24, &[0.001, 0.01]), (32, &[1.0 / 1024.0, 0.001])];
 /// Smallest number of answers in which a field is searched.
@@ -188,7 +188,7 @@ fn temperature_row(
         let next = signal(key, answers, form).filter(is_plausible);
         let is_near = |signal: &LogSignal| {
             row.first()
-                // Largest difference between temperature sensors of a pack, K.
+                // Largest difference between temperature sensors of a pack (K).
                 .is_none_or(|first| (signal.series.extent.mean() - first.series.extent.mean()).abs() <= 12.0)
         };
         match next.filter(is_near) {
@@ -242,7 +242,7 @@ fn row(answers: &Answers, bytes: usize, first: usize, width: usize, scale: f64) 
         is_cell.then_some((start, value))
     };
     let starts = (first..bytes).step_by(width).filter(|start| start + width <= bytes);
-    // Largest difference between cells of a pack, V.
+    // Largest difference between cells of a pack (V).
     let run = longest_run(starts.map(cell), |(_, first_v), (_, next_v)| (next_v - first_v).abs() <= 0.35);
     Some((run.len(), run.first()?.0))
 }

@@ -22,7 +22,7 @@ BO_ 512 Motor: 8 A
  SG_ LinkVoltage : 16|16@1+ (0.1,0) [0|1000] "V" A
 "#;
 
-/// A current that does not repeat within a short time, A.
+/// A current that does not repeat within a short time (A).
 fn load_a(step: i32) -> f64 {
     let x = f64::from(step);
     (80.0 * (x * 0.7).sin() + 40.0 * (x * 0.23).cos()).round()

@@ -18,7 +18,7 @@ use crate::ident::parameters::ParameterTables;
 use crate::ident::pass::residuals;
 use crate::ident::record::Record;
 
-/// Shortest time between two recorded differences, s. Errors of a difference are correlated over [`REPEATS_S`], so a
+/// Shortest time between two recorded differences (s). Errors of a difference are correlated over [`REPEATS_S`], so a
 /// shorter interval adds hardly any information.
 const PERIOD_S: f64 = 5.0;
 /// Standard deviations before the fit: ln capacity, ln resistance, sensor offset (V), leakage (share of the capacity
@@ -26,7 +26,7 @@ const PERIOD_S: f64 = 5.0;
 const PRIOR: [f64; OWN + 1] = [0.15, 0.4, 0.003, 0.002, 0.15];
 /// Number of unknowns of a cell, not counting its SOC at the start of each stretch (a part of a log without gaps).
 const OWN: usize = 4;
-/// Standard deviation of the error of a difference, V. Next constant: correlation time of this error, s.
+/// Standard deviation of the error of a difference (V). Next constant: correlation time of this error (s).
 const DISTANCE_V: f64 = 0.002;
 const REPEATS_S: f64 = 50.0;
 /// Smallest number of cells for a comparison.
@@ -42,9 +42,9 @@ const FLOOR: [f64; 4] = [0.03, 0.15, 0.004, 0.0005];
 /// Differences of all cells from their mean during one stretch.
 #[derive(Debug, Clone, Default)]
 pub(super) struct CellDistances {
-    /// Time, s.
+    /// Time (s).
     pub(super) time_s: Vec<f64>,
-    /// Differences, V: for each time, the values of all cells; NaN = no reading.
+    /// Differences (V): for each time, the values of all cells; NaN = no reading.
     pub(super) distance_v: Vec<f32>,
 }
 
@@ -70,7 +70,7 @@ pub struct CellDeviation {
     pub leakage_per_h: (f64, f64),
     /// SOC minus the mean cell's SOC at the start of the first stretch, fraction.
     pub soc_offset: f64,
-    /// Root mean square of the unexplained difference, V.
+    /// Root mean square of the unexplained difference (V).
     pub residual_v: f64,
 }
 

@@ -43,7 +43,7 @@ fn rows<'a>(label: &Label, offset_a: f64, stretches: impl Iterator<Item = (&'a M
                 unmeasured_s: 0.0,
                 current_a: Some(part.current_a[k] - offset_a),
                 temperature_c: Some(part.temperature_c[k]).filter(|t| t.is_finite()),
-                // Assumed ambient temperature, degrees C; used if a reading has no temperature.
+                // Assumed ambient temperature (degrees C); used if a reading has no temperature.
                 ambient_c: 25.0,
                 voltage_v: part.voltage_v[k],
             };

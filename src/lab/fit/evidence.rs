@@ -8,7 +8,7 @@ use crate::filter::{ends, median};
 use crate::ident::MeasuredPart;
 use crate::ident::record::Record;
 
-/// A capacity and its standard deviation, Ah, either before or after a fit.
+/// A capacity and its standard deviation (Ah), either before or after a fit.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Capacity {
     pub(super) mean_ah: f64,
@@ -78,7 +78,7 @@ fn span(record: &Record) -> f64 {
     (high - low).max(0.0)
 }
 
-/// Returns the resolution of the voltage readings: the smallest difference between consecutive unequal readings, V.
+/// Returns the resolution of the voltage readings: the smallest difference between consecutive unequal readings (V).
 fn step_v(parts: &[&MeasuredPart]) -> f64 {
     let of_part = |part: &&MeasuredPart| {
         let pairs = part.voltage_v.windows(2).take(2000).map(|pair| (pair[1] - pair[0]).abs());

@@ -1,6 +1,6 @@
 //! Finds the voltage limits of a cell in its measured data, with the row that shows each limit.
 //!
-//! Input: measured files. Output: lowest and highest voltage, V, each with a note that states file, row, value and the
+//! Input: measured files. Output: lowest and highest voltage (V), each with a note that states file, row, value and the
 //! option to change it. Pulses do not count as limits: a row counts only if the current has kept its direction, or has
 //! been near zero, for [`HELD_S`]. If the data are whole cycles, the lower limit is the cut-off voltage of the
 //! discharges, and the upper limit is the voltage at which charges are held.
@@ -9,15 +9,15 @@ use super::FitRequest;
 use crate::error::LabError;
 use crate::measured::{MeasuredFile, MeasuredPart};
 
-/// A voltage below this value comes from a disconnected sensor, V.
+/// A voltage below this value comes from a disconnected sensor (V).
 pub(super) const DISCONNECTED_V: f64 = 0.5;
-/// A current that keeps its direction for less than this time is a pulse, s. Pulse tests use 10 to 18 s.
+/// A current that keeps its direction for less than this time is a pulse (s). Pulse tests use 10 to 18 s.
 const HELD_S: f64 = 30.0;
 /// Current below which a cell rests, as a share of the largest current in this part of the file.
 const REST_SHARE: f64 = 0.02;
 /// For each group of this many rows, one outlier is ignored at either end of the voltage range.
 const STRAY: usize = 10_000;
-/// Error of a reading at a limit, V.
+/// Error of a reading at a limit (V).
 const READING_V: f64 = 0.005;
 
 /// A reading with its position.
@@ -35,7 +35,7 @@ impl Reading<'_> {
     }
 }
 
-/// Returns the lowest and highest voltage, V, with notes on the limits that were taken from the data.
+/// Returns the lowest and highest voltage (V) with notes on the limits that were taken from the data.
 pub(super) fn voltage_limits(
     request: &FitRequest,
     files: &[MeasuredFile],
@@ -51,7 +51,7 @@ pub(super) fn voltage_limits(
     if request.voltage_max_v.is_none() {
         notes.push(format!("voltage_max_v = {high_v} by {}; --voltage-max sets another", high.place()));
         let highest = readings(all(), 0.0).into_iter().rev().nth(strays(all()));
-        // Smallest excess over the limit at which pulses are reported, V.
+        // Smallest excess over the limit at which pulses are reported (V).
         if let Some(pulse) = highest.filter(|pulse| pulse.voltage_v > high_v + 0.02) {
             notes.push(format!("pulses above voltage_max_v do not count: {}", pulse.place()));
         }
@@ -130,7 +130,7 @@ fn cycle_limits(files: &[MeasuredFile], first: usize) -> Option<(Limit<'_>, Limi
     for list in [&mut ends, &mut tops] {
         list.sort_by(|a, b| a.voltage_v.total_cmp(&b.voltage_v));
     }
-    // A discharge that ends this far above the median end was aborted, V.
+    // A discharge that ends this far above the median end was aborted (V).
     let broken_off_v = ends.get(ends.len() / 2)?.voltage_v + 0.3;
     let low = *ends.iter().rfind(|end| end.voltage_v < broken_off_v)?;
     let high = tops.get(tops.len() / 2).copied();

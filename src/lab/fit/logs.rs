@@ -59,7 +59,7 @@ const MOST_KNEE_SOC: f64 = 0.35;
 /// (Arrhenius factor - 1). Rests of 20 min of Panasonic 18650PF cells at 10 to -20 degrees C show 0.013 to 0.024; rests
 /// during drives are shorter.
 const COLD_SOC: f64 = 0.03;
-/// Residual, V, above which the logs cannot come from a single kind of cell. In the cold, the limit is multiplied by a
+/// Residual (V), above which the logs cannot come from a single kind of cell. In the cold, the limit is multiplied by a
 /// power of the Arrhenius factor. Fits of the cells of `tests/label` leave residuals of 5 to 20 mV when warm and 27 mV
 /// at 0 degrees C.
 const UNFIT_V: f64 = 0.04;
@@ -67,7 +67,7 @@ const UNFIT_V: f64 = 0.04;
 /// need more than [`FADED_H`] (h) to charge the rated capacity.
 const HELD_V: f64 = 0.012;
 const FADED_H: f64 = 15.0;
-/// Smallest assumed error of the configured model's open-circuit curve, V. The first value applies to errors that vary
+/// Smallest assumed error of the configured model's open-circuit curve (V). The first value applies to errors that vary
 /// smoothly over [`CURVE_SOC`], the second to independent errors of the breakpoints.
 const CURVE_V: (f64, f64) = (0.004, 0.002);
 const CURVE_SOC: f64 = 0.1;
@@ -83,7 +83,7 @@ pub struct LogRequest<'a> {
     pub monitor: &'a MonitorConfig,
     /// Names of the interfaces.
     pub interfaces: Vec<String>,
-    /// Longest gap in a log, s, before the recorder counts as asleep.
+    /// Longest gap in a log (s) before the recorder counts as asleep.
     pub sleep_gap_s: f64,
     /// Creates the options for reading one log.
     pub options: &'a (dyn Fn() -> LogOptions + Sync),
@@ -155,7 +155,7 @@ impl MeanCell {
             return;
         }
         let last_s = self.stretches.last().and_then(|stretch| stretch.part.time_s.last().copied());
-        // Longest gap within a stretch, s. It is longer than the interval of any logger, and shorter than a stop.
+        // Longest gap within a stretch (s). It is longer than the interval of any logger, and shorter than a stop.
         let has_hole = last_s.is_none_or(|last_s| time_s - last_s > 120.0 || time_s < last_s);
         if std::mem::take(&mut self.begins) || has_hole {
             let beginning = (soc, soc_std.hypot(BEGINNING_STD));
@@ -267,7 +267,7 @@ fn notes(model: &CellModel, stretches: &[Stretch], fit: &UnanchoredFit, known: &
     notes
 }
 
-/// Returns the residual, V, above which the logs do not come from one kind of cell.
+/// Returns the residual (V), above which the logs do not come from one kind of cell.
 fn unfit_v(grid: &Grid) -> f64 {
     UNFIT_V * error_ratio(grid)
 }
@@ -278,7 +278,7 @@ fn error_ratio(grid: &Grid) -> f64 {
     libm::pow(1.0 + colder(coldest_c), COLD_POWER)
 }
 
-/// Returns the voltage error of a cold cell that has not settled, V, in node order.
+/// Returns the voltage error of a cold cell that has not settled (V), in node order.
 fn unsettled_v(fitted: &FittedTables) -> Vec<f64> {
     let (soc, columns) = (&fitted.grid.soc, fitted.grid.soc.len());
     let of_node = |node: usize| {
@@ -324,7 +324,7 @@ fn stretches(request: &LogRequest<'_>, log: usize, path: &Path) -> Result<Vec<St
     Ok(stretches.into_iter().map(|stretch| Stretch { log, ..stretch }).collect())
 }
 
-/// Converts a stretch to rows of the fit. The `soc` of a row is minus the charge taken out since the first row, Ah.
+/// Converts a stretch to rows of the fit. The `soc` of a row is minus the charge taken out since the first row (Ah).
 fn unanchored(stretch: &Stretch, grid: &Grid, model: &CellModel) -> UnanchoredRecord {
     let mut part = stretch.part.clone();
     let first_s = part.time_s[0];
@@ -352,7 +352,7 @@ fn begins_full(part: &MeasuredPart, model: &CellModel) -> bool {
     voltage_v + drop_v >= model.ocv_v(&model.grid_position(FULL_SOC, temperature_c))
 }
 
-/// Returns the voltage, V, below which rows of a cold cell are not judged.
+/// Returns the voltage (V), below which rows of a cold cell are not judged.
 fn knee_v(model: &CellModel, current_a: f64, temperature_c: f64) -> f64 {
     let soc = (KNEE_SOC * colder(temperature_c)).min(MOST_KNEE_SOC);
     if soc <= 0.0 {
@@ -363,7 +363,7 @@ fn knee_v(model: &CellModel, current_a: f64, temperature_c: f64) -> f64 {
 }
 
 /// Finds the last row at which a charge is complete: the voltage is at its highest and the current has faded. Returns
-/// the charge taken out, Ah, and the time, h, of this row.
+/// the charge taken out (Ah) and the time (h) of this row.
 fn full(part: &MeasuredPart, model: &CellModel) -> Option<(f64, f64)> {
     let most_a = model.rated_capacity_ah / FADED_H;
     let is_full = |&k: &usize| {
@@ -378,7 +378,7 @@ fn temperature_nodes(stretches: &[Stretch]) -> Vec<f64> {
     let of_stretch = |stretch: &Stretch| median(stretch.part.temperature_c.iter().copied());
     let mut medians: Vec<f64> = stretches.iter().filter_map(of_stretch).collect();
     medians.sort_by(f64::total_cmp);
-    // Stretches share a node if their temperatures differ by less than this, K.
+    // Stretches share a node if their temperatures differ by less than this (K).
     let groups = medians.chunk_by(|a, b| b - a < 5.0);
     groups.map(|group| (10.0 * group.iter().sum::<f64>() / group.len() as f64).round() / 10.0).collect()
 }
@@ -419,7 +419,7 @@ fn known(model: &CellModel, grid: &Grid, monitor: &MonitorConfig) -> Known {
         capacity_ah: initial.capacity_ah,
         capacity_std: initial.capacity_std_ah / initial.capacity_ah,
         // Smallest standard deviation of the current sensor's offset: the current that discharges the rated capacity in
-        // this time, h.
+        // this time (h).
         offset_std_a: monitor.estimator.sensor.current_offset_a.max(model.rated_capacity_ah / 1000.0),
     }
 }

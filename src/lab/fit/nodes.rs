@@ -46,7 +46,7 @@ fn misread(curves: &[OcvCurve], nodes: &[f64], at: f64) -> f64 {
         let error_v = (voltage_v(low) + along * (voltage_v(high) - voltage_v(low)) - voltage_v(at)).abs();
         let (from, to) = ((at - 0.5 * SLOPE_WIDTH).max(0.0), (at + 0.5 * SLOPE_WIDTH).min(1.0));
         let slope_v = ((voltage_v(to) - voltage_v(from)) / (to - from)).max(MIN_SLOPE_V);
-        // A node is added only above this voltage error, V. No model is more accurate.
+        // A node is added only above this voltage error (V). No model is more accurate.
         if error_v > 0.001 { error_v / slope_v } else { 0.0 }
     };
     curves.iter().map(of_curve).fold(0.0, f64::max)

@@ -104,7 +104,7 @@ pub(super) fn prepare(
     Ok(FitInputs { sources, capacity_ah, voltage_v, ocv, notes })
 }
 
-/// Number of the file, a part of it, and for every row the charge taken out since the cell was full, Ah.
+/// Number of the file, a part of it, and for every row the charge taken out since the cell was full (Ah).
 type PartDischarge = (usize, MeasuredPart, Vec<f64>);
 
 /// Returns the charge taken out for every part of every file. If parts do not start with a full cell, a single error
@@ -135,7 +135,7 @@ fn rough_capacity(part: &MeasuredPart) -> f64 {
 /// The discharge of a slow test.
 struct SlowDischarge {
     temperature_c: f64,
-    /// Charge taken out, Ah, rising.
+    /// Charge taken out (Ah), rising.
     out_ah: Vec<f64>,
     voltage_v: Vec<f64>,
 }
@@ -270,7 +270,7 @@ impl FitInputs {
         let mut last = f64::NEG_INFINITY;
         for t in all {
             match nodes.last_mut() {
-                // Parts share a node if their temperatures differ by less than this, K.
+                // Parts share a node if their temperatures differ by less than this (K).
                 Some((sum, count)) if t - last < 5.0 => (*sum, *count) = (*sum + t, *count + 1.0),
                 _ => nodes.push((t, 1.0)),
             }

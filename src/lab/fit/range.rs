@@ -15,7 +15,7 @@ use crate::ident::parameters::ParameterTables;
 use crate::ident::pass::COLD_POWER;
 use crate::ident::record::Record;
 
-/// Distance of an additional row from the measured temperatures, K.
+/// Distance of an additional row from the measured temperatures (K).
 const REACH_K: f64 = 40.0;
 /// Standard deviation of the activation energy of a cell's resistances, J/mol. The energy is assumed to be uniformly
 /// distributed from 15 to 35 kJ/mol.
@@ -29,13 +29,13 @@ const STRAY: f64 = 0.005;
 /// Ranges of a fit's data.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeasuredRange {
-    /// Temperatures, degrees C.
+    /// Temperatures (degrees C).
     pub temperature_c: (f64, f64),
-    /// Currents, A.
+    /// Currents (A).
     pub current_a: (f64, f64),
     /// States of charge.
     pub soc: (f64, f64),
-    /// Root mean square of the current, A.
+    /// Root mean square of the current (A).
     pub rms_a: f64,
 }
 
@@ -142,7 +142,7 @@ impl ModelTables {
         self.voltage_error_v.extend(nodes.map(|node| {
             let settled_ohm = r_ohm.iter().fold(r0_ohm[node], |sum, r| sum + r[node]);
             let arrhenius_v = log_std * rms_a * settled_ohm * colder;
-            // Upper limit of the errors, V: with such an error, the voltage hardly affects an estimate.
+            // Upper limit of the errors (V): with such an error, the voltage hardly affects an estimate.
             libm::hypot(voltage_error_v[node] * libm::pow(colder, COLD_POWER), arrhenius_v).min(0.5)
         }));
     }

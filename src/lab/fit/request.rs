@@ -17,14 +17,14 @@ pub const MAX_SOC_NODES: usize = 101;
 pub struct FitRequest {
     /// Name of the cell.
     pub name: String,
-    /// Capacity that defines the SOC, Ah; `None` = the capacity of the slow test or of the deepest discharge; for an
+    /// Capacity that defines the SOC (Ah); `None` = the capacity of the slow test or of the deepest discharge; for an
     /// ageing cell, the mean capacity of the discharges.
     pub capacity_ah: Option<f64>,
-    /// Capacity on the label, Ah; `None` = `capacity_ah`.
+    /// Capacity on the label (Ah); `None` = `capacity_ah`.
     pub rated_ah: Option<f64>,
-    /// Lowest voltage under load, V; `None` = from the data.
+    /// Lowest voltage under load (V); `None` = from the data.
     pub voltage_min_v: Option<f64>,
-    /// Highest voltage under charge, V; `None` = from the data.
+    /// Highest voltage under charge (V); `None` = from the data.
     pub voltage_max_v: Option<f64>,
     /// Shift of the open-circuit curve with lost capacity. `None` = from the electrodes found in a slow test. If no
     /// electrodes were found, the shift is 0, or [`super::AGEING_SHIFT`] for an ageing cell.
@@ -33,9 +33,9 @@ pub struct FitRequest {
     pub ocv: Vec<PathBuf>,
     /// Number of RC branches, 1 to 3; `None` = 2, or 1 for an ageing cell.
     pub branches: Option<usize>,
-    /// Initial time constants, s, one per branch, rising; `None` = the defaults.
+    /// Initial time constants (s), one per branch, rising; `None` = the defaults.
     pub tau_s: Option<Vec<f64>>,
-    /// Temperature breakpoints, degrees C, rising; `None` = from the data.
+    /// Temperature breakpoints (degrees C), rising; `None` = from the data.
     pub temperature_c: Option<Vec<f64>>,
     /// SOC breakpoints, rising from 0 to 1; `None` = the defaults.
     pub soc: Option<Vec<f64>>,

@@ -53,7 +53,7 @@ fn rounded(points: f64) -> String {
 }
 
 fn accuracy(rows: &[(f64, f64)]) -> Vec<String> {
-    // A temperature counts as good up to this SOC error, points.
+    // A temperature counts as good up to this SOC error (points).
     let (good, poor): (Vec<_>, Vec<_>) = rows.iter().partition(|(_, points)| *points <= 2.0);
     let mut said = Vec::new();
     if let (Some((low_c, _)), Some((high_c, _))) = (good.first(), good.last()) {
@@ -70,7 +70,7 @@ fn accuracy(rows: &[(f64, f64)]) -> Vec<String> {
 
 /// Lists the SOC breakpoints at which the curve is too flat, at every temperature, to find the SOC from voltage.
 fn flat(soc: &[f64], points: &[f64], columns: usize) -> Option<String> {
-    // Above this SOC error, points, the voltage at a breakpoint does not show the SOC.
+    // Above this SOC error (points), the voltage at a breakpoint does not show the SOC.
     let is_flat = |s: &usize| points.iter().skip(*s).step_by(columns).all(|points| *points > 5.0);
     let flat: Vec<String> = (0..columns).filter(is_flat).map(|s| soc[s].to_string()).collect();
     let list = flat.join(", ");

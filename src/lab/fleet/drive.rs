@@ -22,7 +22,7 @@ pub type OpenedLog = (LogSource, Option<String>);
 pub struct LogAccess<'a> {
     /// Opens logs with a configuration. The logs are read one after the other, as one recording.
     pub open: &'a (dyn Fn(&Config, &[PathBuf]) -> OpenedLog + Sync),
-    /// Longest gap in a log, s, before the recorder counts as asleep.
+    /// Longest gap in a log (s) before the recorder counts as asleep.
     pub sleep_gap_s: f64,
 }
 
@@ -38,7 +38,7 @@ pub struct DriveSummary {
 }
 
 impl DriveSummary {
-    /// Returns the time from the first stamp to the last, days.
+    /// Returns the time from the first stamp to the last (days).
     pub fn days(&self) -> f64 {
         self.span.map_or(0.0, |(first, last)| last.since(first) / 86_400.0)
     }

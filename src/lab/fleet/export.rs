@@ -62,8 +62,8 @@ pub struct ExportSettings<'a> {
     pub format: TableFormat,
     /// Folder that contains the folders of the logs.
     pub out: PathBuf,
-    /// Length of a period, s; at most one estimate per cell and period is written. 0 = all estimates; `None` = no table
-    /// of estimates.
+    /// Length of a period (s); at most one estimate per cell and period is written. 0 = all estimates; `None` = no
+    /// table of estimates.
     pub period_s: Option<f64>,
     /// Number of threads; `None` = all cores.
     pub jobs: Option<usize>,
@@ -80,7 +80,7 @@ pub struct ExportResult {
     pub folder: PathBuf,
     /// Number of rows of each table.
     pub rows: BTreeMap<&'static str, u64>,
-    /// Time from the first stamp to the last, days.
+    /// Time from the first stamp to the last (days).
     pub days: f64,
     /// Notes for the user.
     pub notes: Vec<String>,

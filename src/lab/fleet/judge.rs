@@ -55,7 +55,7 @@ pub struct LogLife<'a> {
 /// The first raise of a threshold.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct FirstRaise {
-    /// Time of the raise on the clock of the log, s.
+    /// Time of the raise on the clock of the log (s).
     pub time_s: f64,
     /// Days from the first stamp of the log to the raise.
     pub days: f64,
@@ -74,7 +74,7 @@ pub struct AlarmScore {
     pub first: Option<FirstRaise>,
     /// Number of all raises.
     pub raises: usize,
-    /// Lead time, days.
+    /// Lead time (days).
     pub lead_days: Option<f64>,
     /// Lead time, equivalent full cycles.
     pub lead_cycles: Option<f64>,

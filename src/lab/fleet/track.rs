@@ -20,7 +20,7 @@ pub struct Track {
     capacity_ah: BTreeMap<CellIndex, f64>,
     /// For each end of a half-cycle: time, and equivalent full cycles up to this time.
     cycles: Vec<(Timestamp, f64)>,
-    /// For each end of a half-cycle: time, weakest learned capacity, Ah, and its cell.
+    /// For each end of a half-cycle: time, weakest learned capacity (Ah) and its cell.
     weakest: Vec<(Timestamp, f64, CellIndex)>,
 }
 
@@ -97,7 +97,7 @@ impl Track {
         below.map(|&(time, _, cell)| (time, cell))
     }
 
-    /// Returns the weakest learned capacity at the end of the log, Ah.
+    /// Returns the weakest learned capacity at the end of the log (Ah).
     pub fn last_ah(&self) -> Option<f64> {
         self.weakest.last().map(|last| last.1)
     }

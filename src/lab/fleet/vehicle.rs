@@ -37,7 +37,7 @@ pub struct VehicleRecord {
     /// SHA-256 of all settings (configuration with its DBC files and cell model, and the options for reading logs);
     /// `None` = the configuration cannot be read.
     pub settings_sha256: Option<String>,
-    /// Period of the estimates, s; `None` = no table of estimates.
+    /// Period of the estimates (s); `None` = no table of estimates.
     pub period_s: Option<f64>,
     /// Why the tables are missing; `None` = the tables exist.
     pub error: Option<String>,
@@ -45,9 +45,9 @@ pub struct VehicleRecord {
     pub rows: BTreeMap<String, u64>,
     /// Number of cells of the pack; 0 = the configuration cannot be read.
     pub cells: u32,
-    /// Rated capacity of a cell, Ah; `None` = the configuration cannot be read.
+    /// Rated capacity of a cell (Ah); `None` = the configuration cannot be read.
     pub rated_ah: Option<f64>,
-    /// Time from the first stamp to the last, days.
+    /// Time from the first stamp to the last (days).
     pub days: f64,
     /// Notes on the logs.
     pub notes: Vec<String>,

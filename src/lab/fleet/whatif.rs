@@ -34,7 +34,7 @@ pub struct WhatifJob {
 pub struct WhatifSettings<'a> {
     /// How to read the logs.
     pub access: LogAccess<'a>,
-    /// Capacity at which the life of a cell ends, Ah.
+    /// Capacity at which the life of a cell ends (Ah).
     pub end_of_life_ah: f64,
     /// Whether the limit applies to the usable capacity, if its computation is configured.
     pub judges_usable: bool,
@@ -47,7 +47,7 @@ pub struct WhatifSettings<'a> {
 /// The end of a cell's life.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct EndOfLife {
-    /// Time on the clock of the log, s.
+    /// Time on the clock of the log (s).
     pub time_s: f64,
     /// Days since the first stamp of the log.
     pub days: f64,
@@ -82,11 +82,11 @@ pub struct LogResult {
     pub truth: Option<PathBuf>,
     /// Capacity that determined the end of life.
     pub judged_by: EndOfLifeSource,
-    /// Time from the first stamp to the last, days.
+    /// Time from the first stamp to the last (days).
     pub days: f64,
     /// Equivalent full cycles of the whole log.
     pub cycles: f64,
-    /// Weakest learned capacity at the end, Ah.
+    /// Weakest learned capacity at the end (Ah).
     pub learned_ah: Option<f64>,
     /// End of life; `None` = not reached.
     pub end_of_life: Option<EndOfLife>,

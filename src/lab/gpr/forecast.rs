@@ -91,7 +91,7 @@ pub struct HorizonForecast {
     /// Half the width of the interval at average spread, as a multiple of the standard deviation. [`spread`] scales it
     /// for each window.
     pub factor: f64,
-    /// Duration of fit and calibration, s.
+    /// Duration of fit and calibration (s).
     pub fit_s: f64,
     /// Jitter that was added to diagonals of matrices.
     pub jitter: Jitter,

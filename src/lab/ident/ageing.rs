@@ -17,7 +17,7 @@ pub(crate) const SOC_LEFT: f64 = 0.045;
 const KNEE_SHARE: f64 = 0.2;
 /// Current above which a row counts as under load, as a share of the median current of the discharge.
 const LOADED_SHARE: f64 = 0.5;
-/// If the current changes by more than this between two rows, A per Ah of capacity, the voltage and the current of the
+/// If the current changes by more than this between two rows (A) per Ah of capacity, the voltage and the current of the
 /// row may belong to different instants.
 const STEP_PER_AH: f64 = 0.25;
 /// Below this SOC, rows of a discharge without load are not judged, because the voltage recovers more slowly than any
@@ -29,7 +29,7 @@ const RECOVERY_SOC: f64 = 0.5;
 pub struct AnchoredHalfCycle {
     /// Index of the half-cycle.
     pub index: usize,
-    /// Current without the load pulses of a charger, A.
+    /// Current without the load pulses of a charger (A).
     pub current_a: Vec<f64>,
     /// SOC of each row.
     pub soc: Vec<f64>,
@@ -41,7 +41,7 @@ pub struct AnchoredHalfCycle {
 /// range. Other charges are left out.
 const FULL_CHARGE: std::ops::RangeInclusive<f64> = 0.8..=1.25;
 
-/// Charge from the start of a discharge to its knee and to its cut-off, Ah.
+/// Charge from the start of a discharge to its knee and to its cut-off (Ah).
 struct Marks {
     knee_ah: f64,
     cut_off_ah: f64,

@@ -10,10 +10,10 @@
 
 use super::{MeasuredPart, charge_ah};
 
-/// Largest difference between the highest voltage and the voltage of a full cell at rest, V. The voltage relaxes after
+/// Largest difference between the highest voltage and the voltage of a full cell at rest (V). The voltage relaxes after
 /// a charge, and a charge in the cold ends early.
 const REST_SAG_V: f64 = 0.1;
-/// Largest such difference for a full cell under load, V.
+/// Largest such difference for a full cell under load (V).
 const LOAD_SAG_V: f64 = 0.35;
 /// Current above which a cell is under load, as a share of its capacity per hour.
 const LOAD_SHARE: f64 = 0.02;
@@ -22,7 +22,7 @@ const LOAD_SHARE: f64 = 0.02;
 const COUNTER_NEAR: f64 = 0.003;
 
 impl MeasuredPart {
-    /// Returns the charge taken out since the cell was full, for every row, Ah.
+    /// Returns the charge taken out since the cell was full, for every row (Ah).
     ///
     /// # Errors
     /// The part does not start with a full cell, or its counter shows that charge was taken out before the first row.

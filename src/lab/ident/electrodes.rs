@@ -13,8 +13,8 @@ use crate::filter::levenberg_marquardt::{Damping, minimise};
 
 /// Number of SOC values at which the curves are compared.
 const POINTS: u32 = 51;
-/// Standard deviation of a real cell's voltage from the voltage that the library gives, V. Materials with the same name
-/// differ.
+/// Standard deviation of a real cell's voltage from the voltage that the library gives (V). Materials with the same
+/// name differ.
 const MATERIAL_V: f64 = 0.01;
 /// The same standard deviation below [`LOW_SOC`], V. Curves fall steeply there.
 const LOW_SOC_V: f64 = 0.03;
@@ -29,7 +29,7 @@ const BOUNDS: [(f64, f64); 4] = [(0.0005, 0.25), (0.4, 0.999), (0.55, 0.9995), (
 const STEPS: usize = 60;
 const DAMPING: Damping =
     Damping { first: 1e-2, fall: 0.3, fall_after_growth: 0.3, growth: 10.0, least: 1e-9, most: f64::INFINITY };
-/// Largest accepted residual, V. A larger residual means that the library lacks the materials of the cell. For curves
+/// Largest accepted residual (V). A larger residual means that the library lacks the materials of the cell. For curves
 /// of published cells, the residual is at most 5 mV with their own materials, and above 10 mV with most other
 /// materials. Wrong materials can also fit within this limit. They can predict ageing better or worse than the
 /// alternative, a shift of the curve along the SOC. The limit is therefore a compromise.

@@ -17,9 +17,9 @@ use super::grid::{Grid, arrhenius};
 use super::pass::{COLD_POWER, residuals};
 use super::record::Record;
 
-/// Length of a block, s.
+/// Length of a block (s).
 const BLOCK_S: f64 = 100.0;
-/// Upper limit of the error of a block, V; also the error if no temperature has data.
+/// Upper limit of the error of a block (V); also the error if no temperature has data.
 const MOST_V: f64 = 0.1;
 /// The error of a node also includes the mean error at its temperature. The mean has the same weight as data that moved
 /// this charge, as SOC.
@@ -47,7 +47,7 @@ pub struct WeightedRecord<'a> {
     pub share: f64,
 }
 
-/// Returns the error table in node order, V.
+/// Returns the error table in node order (V).
 pub fn table(fit: &FittedTables, records: &[WeightedRecord<'_>], capacity_ah: f64) -> Vec<f64> {
     let nodes = fit.grid.nodes();
     let mut sums = NodeSums { square: vec![0.0; nodes], weight: vec![0.0; nodes], files: vec![0.0; nodes] };
@@ -127,7 +127,7 @@ fn row(sums: &NodeSums, t: usize, columns: usize) -> Option<Vec<f64>> {
     let of_node = |node: usize| {
         let files = if sums.files[node] > 0.0 { sums.files[node] } else { most_files };
         let variance = (sums.square[node] + LEAN_SOC * mean) / (sums.weight[node] + LEAN_SOC);
-        // Smallest error that a model is assumed to have, V.
+        // Smallest error that a model is assumed to have (V).
         (variance * (1.0 + UNSEEN / files)).sqrt().max(0.001)
     };
     Some(range.map(of_node).collect())

@@ -20,9 +20,9 @@ pub const MIN_ROWS: usize = 50;
 pub const SUPPORTED_S: f64 = 30.0;
 /// A time constant stays within this factor of its starting value.
 const TAU_FACTOR: f64 = 5.0;
-/// Smallest rise of the OCV, V per unit of SOC.
+/// Smallest rise of the OCV (V per unit of SOC).
 pub const MIN_SLOPE_V: f64 = 0.02;
-/// Steepest rise of the OCV, V per unit of SOC.
+/// Steepest rise of the OCV (V per unit of SOC).
 const MAX_SLOPE_V: f64 = 60.0;
 /// Resistances stay within this factor of the starting value.
 const R_FACTOR: f64 = 100.0;
@@ -30,11 +30,11 @@ const R_FACTOR: f64 = 100.0;
 /// An OCV test: voltage over rising SOC at one temperature.
 #[derive(Debug, Clone, PartialEq)]
 pub struct OcvCurve {
-    /// Cell temperature, degrees C.
+    /// Cell temperature (degrees C).
     pub temperature_c: f64,
     /// SOC, strictly rising.
     pub soc: Vec<f64>,
-    /// Voltage, V.
+    /// Voltage (V).
     pub voltage_v: Vec<f64>,
 }
 
@@ -43,13 +43,13 @@ pub struct OcvCurve {
 pub struct FitSettings {
     /// Breakpoints.
     pub grid: Grid,
-    /// Starting time constants, s, one per branch, rising.
+    /// Starting time constants (s), one per branch, rising.
     pub tau_s: Vec<f64>,
-    /// Lowest and highest voltage under load, V.
+    /// Lowest and highest voltage under load (V).
     pub voltage_v: (f64, f64),
     /// Slow tests, by rising temperature; empty = the data alone determine the OCV.
     pub ocv: Vec<OcvCurve>,
-    /// Smallest rise of the OCV, V per unit of SOC, as `(from, slope)`: `slope` applies above the SOC `from`. If
+    /// Smallest rise of the OCV (V per unit of SOC), as `(from, slope)`: `slope` applies above the SOC `from`. If
     /// several entries apply, the largest slope counts.
     pub min_slope_v: Vec<(f64, f64)>,
     /// Standard deviations of the prior.
@@ -61,11 +61,11 @@ pub struct FitSettings {
 pub struct Residual {
     /// Seconds that the judged rows represent.
     pub seconds: f64,
-    /// Root mean square, V, weighted by time.
+    /// Root mean square (V), weighted by time.
     pub rmse_v: f64,
-    /// Mean residual (measured minus model), V.
+    /// Mean residual (measured minus model) (V).
     pub mean_v: f64,
-    /// Residual with the largest absolute value, V.
+    /// Residual with the largest absolute value (V).
     pub worst_v: f64,
 }
 
@@ -324,7 +324,7 @@ impl FittedTables {
         weak.map(|(node, _)| (self.grid.temperature_c[node / columns], self.grid.soc[node % columns])).collect()
     }
 
-    /// Returns the open-circuit voltage averaged over the SOC range and the temperatures, V.
+    /// Returns the open-circuit voltage averaged over the SOC range and the temperatures (V).
     pub fn mean_ocv_v(&self) -> f64 {
         let of_row = |row: &[f64]| -> f64 {
             let pairs = row.windows(2).zip(self.grid.soc.windows(2));
@@ -334,7 +334,7 @@ impl FittedTables {
         rows.map(of_row).sum::<f64>() / self.grid.temperature_c.len() as f64
     }
 
-    /// Returns the open-circuit voltage, V, of the temperature row nearest to `temperature_c`.
+    /// Returns the open-circuit voltage (V) of the temperature row nearest to `temperature_c`.
     pub fn ocv_v(&self, soc: f64, temperature_c: f64) -> f64 {
         let distance = |t: usize| (self.grid.temperature_c[t] - temperature_c).abs();
         let rows = 0..self.grid.temperature_c.len();

@@ -13,7 +13,7 @@ use crate::filter::{self, locate};
 pub struct Grid {
     /// SOC breakpoints, strictly rising from 0 to 1, at least 2.
     pub soc: Vec<f64>,
-    /// Temperature breakpoints, degrees C, strictly rising, at least 1.
+    /// Temperature breakpoints (degrees C), strictly rising, at least 1.
     pub temperature_c: Vec<f64>,
 }
 

@@ -36,13 +36,13 @@ pub struct MeasuredPart {
     pub kind: String,
     /// Seconds since the start of the part.
     pub time_s: Vec<f64>,
-    /// Current, A, positive = discharge.
+    /// Current (A), positive = discharge.
     pub current_a: Vec<f64>,
-    /// Terminal voltage, V.
+    /// Terminal voltage (V).
     pub voltage_v: Vec<f64>,
-    /// Cell temperature, degrees C; NaN where not measured.
+    /// Cell temperature (degrees C); NaN where not measured.
     pub temperature_c: Vec<f64>,
-    /// Counter of the cycler, Ah taken out; NaN where not recorded.
+    /// Counter of the cycler (Ah) taken out; NaN where not recorded.
     pub discharged_ah: Vec<f64>,
     /// State of charge, fraction; empty until determined.
     pub soc: Vec<f64>,
@@ -69,7 +69,7 @@ impl MeasuredPart {
     }
 
     /// After the load, some testers hold the lowest voltage while the current falls. Returns the charge taken out in
-    /// this phase, Ah; 0 if the discharge does not end with such a phase.
+    /// this phase (Ah); 0 if the discharge does not end with such a phase.
     pub(crate) fn held_ah(&self) -> f64 {
         let Some(last) = self.current_a.iter().rposition(|&current_a| current_a > 0.0) else { return 0.0 };
         let charge_ah = charge_ah(&self.time_s[..=last], &self.current_a[..=last]);
@@ -93,7 +93,7 @@ impl MeasuredPart {
     }
 }
 
-/// For every row, returns the charge taken out since the first row, Ah, by the trapezoidal rule. A gap counts like any
+/// For every row, returns the charge taken out since the first row (Ah) by the trapezoidal rule. A gap counts like any
 /// other step.
 pub fn charge_ah(time_s: &[f64], current_a: &[f64]) -> Vec<f64> {
     let mut sum = 0.0;

@@ -52,13 +52,13 @@ impl Layout {
 /// Tables that a parameter vector describes, in node order.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ParameterTables {
-    /// Open-circuit voltage, V.
+    /// Open-circuit voltage (V).
     pub ocv_v: Vec<f64>,
-    /// Series resistance, ohm.
+    /// Series resistance (ohm).
     pub r0_ohm: Vec<f64>,
-    /// Resistance of each branch, ohm.
+    /// Resistance of each branch (ohm).
     pub r_ohm: Vec<Vec<f64>>,
-    /// Time constant of each branch, s.
+    /// Time constant of each branch (s).
     pub tau_s: Vec<Vec<f64>>,
 }
 

@@ -21,18 +21,18 @@ use super::grid::{Corners, Grid, arrhenius};
 use super::parameters::{Layout, ParameterTables};
 use super::record::{FitRow, Record};
 
-/// Derivatives below this value are dropped, V per unit of a log parameter. The limit is a thousandth of the voltage
+/// Derivatives below this value are dropped (V) per unit of a log parameter. The limit is a thousandth of the voltage
 /// resolution.
 const FADED_V: f64 = 1e-6;
-/// Residual above which the cost grows linearly, V.
+/// Residual above which the cost grows linearly (V).
 pub const HUBER_V: f64 = 0.05;
-/// Standard deviation of an independent residual, V: the error of a good circuit model. A residual of this size adds
+/// Standard deviation of an independent residual (V): the error of a good circuit model. A residual of this size adds
 /// 0.5 to the cost.
 const SIGMA_V: f64 = 0.010;
-/// Correlation time of the model error, s. All residuals within one correlation time together count as one independent
+/// Correlation time of the model error (s). All residuals within one correlation time together count as one independent
 /// residual.
 const REPEATS_S: f64 = 50.0;
-/// Correlation time if the SOC is unknown, s. Values from 50 to 500 s change the mean SOC errors of Panasonic 18650PF
+/// Correlation time if the SOC is unknown (s). Values from 50 to 500 s change the mean SOC errors of Panasonic 18650PF
 /// cells and of a simulated LG M50 by less than 0.1 points. The same holds for a wide range of the next two constants.
 /// The EVE cell with its flat curve needs at least this value.
 const FREE_REPEATS_S: f64 = 250.0;
@@ -164,7 +164,7 @@ impl BranchRun {
     }
 }
 
-/// Returns the residuals of a record, V: one per row, including rows that are not judged.
+/// Returns the residuals of a record (V): one per row, including rows that are not judged.
 pub fn residuals(record: &Record, tables: &ParameterTables) -> Vec<f64> {
     let mut branches: Vec<_> = tables.r_ohm.iter().map(|_| BranchRun::new(0)).collect();
     let of_row = |row: &FitRow| {
@@ -190,9 +190,9 @@ pub struct FreeScale<'a> {
     pub grid: &'a Grid,
     /// Index of ln(capacity).
     pub log_capacity: usize,
-    /// Index of the current sensor's offset, A.
+    /// Index of the current sensor's offset (A).
     pub offset: usize,
-    /// Capacity, Ah.
+    /// Capacity (Ah).
     pub capacity_ah: f64,
     /// Index of the SOC at the record's first row.
     pub beginning: usize,
@@ -290,7 +290,7 @@ fn derivatives(
     }
 }
 
-/// Returns the expected voltage error of a circuit at a voltage drop and a temperature, V.
+/// Returns the expected voltage error of a circuit at a voltage drop and a temperature (V).
 fn circuit_error_v(drop_v: f64, temperature_c: f64) -> f64 {
     SIGMA_V.hypot(DROP_ERROR * drop_v) * libm::pow(arrhenius(temperature_c).max(1.0), COLD_POWER)
 }

@@ -10,12 +10,12 @@ use super::pass::NormalEquations;
 /// Standard deviations of the prior's terms.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PriorDeviations {
-    /// Second difference over SOC, scaled to the node spacing, V. With a slow test, this is the difference of the
+    /// Second difference over SOC, scaled to the node spacing (V). With a slow test, this is the difference of the
     /// correction; without a slow test, of the OCV.
     pub ocv_curvature_v: f64,
-    /// Difference of the correction (with a slow test) or of the OCV (without) between neighbouring temperatures, V.
+    /// Difference of the correction (with a slow test) or of the OCV (without) between neighbouring temperatures (V).
     pub ocv_by_temperature_v: f64,
-    /// Deviation of the OCV from the slow test, V per node; unused without a slow test.
+    /// Deviation of the OCV from the slow test (V) per node; unused without a slow test.
     pub ocv_pull_v: f64,
     /// Second difference of ln R0 over SOC, scaled to the node spacing.
     pub r0_curvature: f64,

@@ -10,21 +10,21 @@ use super::MeasuredPart;
 use super::grid::{Corners, Grid};
 use crate::filter::ends;
 
-/// Maximum length of a block, s. The time constants of the branches are several times longer, and the current of drives
-/// changes about once a second.
+/// Maximum length of a block (s). The time constants of the branches are several times longer, and the current of
+/// drives changes about once a second.
 const BLOCK_S: f64 = 1.0;
 /// Current step that ends a block early after a steady current, as a share of the largest current.
 const EDGE_SHARE: f64 = 0.1;
-/// Time with steady current before an edge, s; drives are rarely steady that long.
+/// Time with steady current before an edge (s); drives are rarely steady that long.
 const STEADY_S: f64 = 3.0;
 /// Maximum number of seconds that one row represents. Without this limit, rests logged once a minute would outweigh
 /// drives.
 const MAX_WEIGHT_S: f64 = 20.0;
-/// Shortest gap that may hide charge, s.
+/// Shortest gap that may hide charge (s).
 const GAP_S: f64 = 60.0;
 /// If a gap hides more charge than this, as SOC, the state of the branches is unknown.
 const HIDDEN_SOC: f64 = 0.002;
-/// If current flows after such a gap, rows are not judged for this time, s, because the branches are still wrong.
+/// If current flows after such a gap, rows are not judged for this time (s), because the branches are still wrong.
 const UNKNOWN_S: f64 = 600.0;
 /// Current below which a cell rests, as a share of the largest current.
 const REST_SHARE: f64 = 0.02;
@@ -38,13 +38,13 @@ pub struct FitRow {
     pub dt_s: f64,
     /// Whether the branches are relaxed at this row, regardless of earlier rows.
     pub relaxed: bool,
-    /// Mean current since the previous row, A.
+    /// Mean current since the previous row (A).
     pub mean_current_a: f64,
-    /// Current at the time of the row, A.
+    /// Current at the time of the row (A).
     pub current_a: f64,
-    /// Measured voltage, V.
+    /// Measured voltage (V).
     pub voltage_v: f64,
-    /// Cell temperature, degrees C.
+    /// Cell temperature (degrees C).
     pub temperature_c: f64,
     /// State of charge.
     pub soc: f64,
@@ -72,11 +72,11 @@ pub struct Record {
 /// Plausibility limits of a record's rows.
 #[derive(Debug, Clone, Copy)]
 pub struct Limits {
-    /// Lowest credible voltage, V.
+    /// Lowest credible voltage (V).
     pub voltage_low_v: f64,
-    /// Highest credible voltage, V.
+    /// Highest credible voltage (V).
     pub voltage_high_v: f64,
-    /// Capacity that converts charge to SOC, Ah.
+    /// Capacity that converts charge to SOC (Ah).
     pub capacity_ah: f64,
 }
 
@@ -120,7 +120,7 @@ impl Record {
     }
 }
 
-/// Weight of a whole discharge, s: the length of a drive. A longer test contains no more information.
+/// Weight of a whole discharge (s): the length of a drive. A longer test contains no more information.
 const WHOLE_S: f64 = 8000.0;
 /// Weight of slow tests and pulse tests relative to drives: the model should follow drives.
 const TEST_SHARE: f64 = 0.3;

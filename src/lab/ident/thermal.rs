@@ -10,10 +10,10 @@ use super::record::Record;
 use crate::cell::Thermal;
 use crate::filter::{ends, median};
 
-/// Ranges of credible values: heat capacity, J/K, and thermal resistance, K/W.
+/// Ranges of credible values: heat capacity (J/K) and thermal resistance, K/W.
 const CREDIBLE: [(f64, f64); 2] = [(5.0, 1e5), (0.05, 200.0)];
 
-/// Credible heat capacity divided by stored energy, J/K per Wh: from 300 Wh/kg with 0.8 kJ/(kg K) to 80 Wh/kg with 1
+/// Credible heat capacity divided by stored energy (J/K) per Wh: from 300 Wh/kg with 0.8 kJ/(kg K) to 80 Wh/kg with 1
 /// kJ/(kg K). A sensor between cell and moving air sees only a share of the warming. The fitted capacity is then too
 /// large and the resistance too small by this share. The residuals do not show this error, but this range detects it.
 const CELL_J_PER_K_WH: (f64, f64) = (2.5, 12.5);

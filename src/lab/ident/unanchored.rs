@@ -36,28 +36,28 @@ const FULL_STD: f64 = 0.01;
 pub struct Known {
     /// Means of the tables' parameters, in node order.
     pub tables: ParameterTables,
-    /// Covariance of the open-circuit voltage between SOC breakpoints, V^2, at the temperature row `curve_row`.
+    /// Covariance of the open-circuit voltage between SOC breakpoints (V^2) at the temperature row `curve_row`.
     pub curve_covariance: DMatrix<f64>,
     /// Temperature row to which the covariance belongs.
     pub curve_row: usize,
-    /// Capacity, Ah.
+    /// Capacity (Ah).
     pub capacity_ah: f64,
     /// Standard deviation of the capacity, fraction.
     pub capacity_std: f64,
-    /// Standard deviation of the current sensor's offset, A.
+    /// Standard deviation of the current sensor's offset (A).
     pub offset_std_a: f64,
 }
 
 /// A record whose rows have a charge instead of a SOC.
 #[derive(Debug, Clone)]
 pub struct UnanchoredRecord {
-    /// Rows. The `soc` of a row is minus the charge taken out since the first row, Ah.
+    /// Rows. The `soc` of a row is minus the charge taken out since the first row (Ah).
     pub record: Record,
     /// Weight of each second.
     pub scale: f64,
     /// Estimated SOC at the first row, with its standard deviation.
     pub beginning: (f64, f64),
-    /// Charge taken out, Ah, and time since the first row, h, at the end of a full charge (SOC 1); `None` = the record
+    /// Charge taken out (Ah) and time since the first row (h) at the end of a full charge (SOC 1); `None` = the record
     /// has no full charge.
     pub full: Option<(f64, f64)>,
 }
@@ -67,13 +67,13 @@ pub struct UnanchoredRecord {
 pub struct UnanchoredFit {
     /// Tables.
     pub fitted: FittedTables,
-    /// Capacity, Ah.
+    /// Capacity (Ah).
     pub capacity_ah: f64,
-    /// Standard deviation of the capacity, Ah.
+    /// Standard deviation of the capacity (Ah).
     pub capacity_std_ah: f64,
-    /// Offset of the current sensor, A: measured minus true current.
+    /// Offset of the current sensor (A): measured minus true current.
     pub offset_a: f64,
-    /// Remaining standard deviation of the open-circuit voltage, V, in node order.
+    /// Remaining standard deviation of the open-circuit voltage (V), in node order.
     pub ocv_std_v: Vec<f64>,
     /// The records with the fitted SOC.
     pub records: Vec<Record>,
@@ -154,7 +154,7 @@ impl<'a> Problem<'a> {
         self.layout.len()
     }
 
-    /// Index of the current sensor's offset, A.
+    /// Index of the current sensor's offset (A).
     fn offset(&self) -> usize {
         self.layout.len() + 1
     }

@@ -30,10 +30,10 @@ const FARADAY_C_PER_MOL: f64 = 96_485.332_12;
 /// Gas constant, J/(mol K) (CODATA 2018).
 const GAS_J_PER_MOL_K: f64 = 8.314_462_618;
 
-/// Temperatures of the tables relative to the file's reference temperature, K.
+/// Temperatures of the tables relative to the file's reference temperature (K).
 const TEMPERATURES_K: [f64; 6] = [-35.0, -25.0, -15.0, 0.0, 15.0, 30.0];
 
-/// Standard deviation of the voltage error at rest and at the reference temperature, V. This error covers the
+/// Standard deviation of the voltage error at rest and at the reference temperature (V). This error covers the
 /// difference between a real cell and its parameters.
 const ERROR_AT_REST_V: f64 = 0.010;
 
@@ -57,9 +57,9 @@ pub struct BpxImport {
     pub text: String,
     /// Assumptions, and parts of the file that are not used.
     pub notes: Vec<String>,
-    /// Charge between the cut-offs at the reference temperature, Ah.
+    /// Charge between the cut-offs at the reference temperature (Ah).
     pub capacity_ah: f64,
-    /// Nominal charge, Ah.
+    /// Nominal charge (Ah).
     pub nominal_ah: f64,
 }
 

@@ -23,11 +23,11 @@ pub(super) const RATED_TOLERANCE: f64 = 0.01;
 /// Data from the command line that no record contains; `None` = not given.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Terms {
-    /// Charge moved before the record started, Ah; 0 = recorded since new.
+    /// Charge moved before the record started (Ah); 0 = recorded since new.
     pub moved_before_ah: Option<f64>,
-    /// Total charge moved, Ah, from the battery's own counter; replaces the sum of the record.
+    /// Total charge moved (Ah) from the battery's own counter; replaces the sum of the record.
     pub moved_ah: Option<f64>,
-    /// Usable energy at the certification, kWh.
+    /// Usable energy at the certification (kWh).
     pub certified_kwh: Option<f64>,
 }
 
@@ -56,9 +56,9 @@ pub struct Condition {
 /// battery.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Rated {
-    /// Capacity, Ah.
+    /// Capacity (Ah).
     pub(super) capacity_ah: Option<f64>,
-    /// Energy at the certification, kWh.
+    /// Energy at the certification (kWh).
     pub(super) energy_kwh: Option<f64>,
 }
 
@@ -205,7 +205,7 @@ impl<'a> Battery<'a> {
         time.plus_nanos(self.offset_ns)
     }
 
-    /// Returns the total charge moved, Ah.
+    /// Returns the total charge moved (Ah).
     fn moved_ah(&self, terms: &Terms) -> Known {
         let now = self.wall(self.monitor.now());
         if let Some(value) = terms.moved_ah {
@@ -322,7 +322,7 @@ impl<'a> Battery<'a> {
         Ok(Quantity { value, std: Some(std), time: Timestamp::from_nanos(oldest_ns) })
     }
 
-    /// Returns the series resistance of a new cell at SOC 0.5 and 25 degrees C, ohm.
+    /// Returns the series resistance of a new cell at SOC 0.5 and 25 degrees C (ohm).
     fn new_ohm(&self) -> Result<f64, String> {
         match self.monitor.model().state {
             ModelState::Given | ModelState::Learned => Ok(self.model.r0_ohm(&self.model.grid_position(0.5, 25.0))),
@@ -333,7 +333,7 @@ impl<'a> Battery<'a> {
         }
     }
 
-    /// Returns the energy of a discharge from full, at the configured load, until the weakest cell is empty, kWh.
+    /// Returns the energy of a discharge from full, at the configured load, until the weakest cell is empty (kWh).
     fn energy_kwh(&self) -> Known {
         let Some(load) = &self.config.monitor.health.usable else {
             return Err("no load is configured ([usable], the load of the certification)".to_owned());

@@ -15,13 +15,13 @@ const VOLTAGES: u32 = 200;
 /// A full cell at the configured load.
 #[derive(Debug)]
 pub(super) struct Discharge {
-    /// Voltage, V, falling, and the charge delivered down to it, Ah.
+    /// Voltage (V), falling, and the charge delivered down to it (Ah).
     points: Vec<(f64, f64)>,
     cutoff_v: f64,
 }
 
 impl Discharge {
-    /// Computes the discharge of a cell from its capacity, Ah, and its resistance relative to new.
+    /// Computes the discharge of a cell from its capacity (Ah) and its resistance relative to new.
     pub(super) fn new(model: &CellModel, load: &UsableConfig, capacity_ah: f64, resistance_ratio: f64) -> Self {
         let top_v = model.voltage_max_v.max(load.cutoff_v);
         let voltage_v = |step: u32| top_v - (top_v - load.cutoff_v) * f64::from(step) / f64::from(VOLTAGES);
@@ -35,7 +35,7 @@ impl Discharge {
         Self { points: (0..=VOLTAGES).map(point).collect(), cutoff_v: load.cutoff_v }
     }
 
-    /// Returns the energy, Wh, until `charge_ah` has been delivered.
+    /// Returns the energy (Wh) until `charge_ah` has been delivered.
     pub(super) fn energy_wh(&self, charge_ah: f64) -> f64 {
         let mut energy_wh = 0.0;
         let mut delivered_ah = 0.0;

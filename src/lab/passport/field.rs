@@ -31,29 +31,29 @@ impl Standard {
 pub enum Field {
     /// Equivalent full cycles.
     FullCycles,
-    /// Charge moved, Ah.
+    /// Charge moved (Ah).
     CapacityThroughput,
-    /// Energy moved, kWh.
+    /// Energy moved (kWh).
     EnergyThroughput,
-    /// State of charge, %.
+    /// State of charge (%).
     StateOfCharge,
-    /// Highest temperature of the sensors, degrees C.
+    /// Highest temperature of the sensors (degrees C).
     Temperature,
-    /// Capacity, Ah.
+    /// Capacity (Ah).
     RemainingCapacity,
-    /// Capacity lost, % of the rated capacity.
+    /// Capacity lost (%) of the rated capacity.
     CapacityFade,
-    /// Largest resistance increase of any cell, % of the resistance of a new cell.
+    /// Largest resistance increase of any cell (%) of the resistance of a new cell.
     CellResistanceIncrease,
-    /// Resistance increase of all cells together, % of the resistance of the new cells.
+    /// Resistance increase of all cells together (%) of the resistance of the new cells.
     PackResistanceIncrease,
-    /// Highest ohmic resistance of any cell, ohm.
+    /// Highest ohmic resistance of any cell (ohm).
     CellResistance,
-    /// Ohmic resistance of all cells together, ohm.
+    /// Ohmic resistance of all cells together (ohm).
     PackResistance,
-    /// Energy of a full discharge, kWh.
+    /// Energy of a full discharge (kWh).
     RemainingEnergy,
-    /// Energy of a full discharge, % of the certified energy.
+    /// Energy of a full discharge (%) of the certified energy.
     StateOfCertifiedEnergy,
 }
 

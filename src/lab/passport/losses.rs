@@ -18,11 +18,11 @@ use crate::quantity::{Channel, Fault, Timestamp};
 /// Limits for the readings of a replay's current and voltages.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct ReadingLimits {
-    /// Maximum age of a current reading that is still used, s.
+    /// Maximum age of a current reading that is still used (s).
     pub current_age_s: f64,
-    /// Maximum age of a voltage reading that is still used, s.
+    /// Maximum age of a voltage reading that is still used (s).
     pub voltage_age_s: f64,
-    /// Largest current of a resting pack, A per string.
+    /// Largest current of a resting pack (A) per string.
     pub rest_a: f64,
 }
 
@@ -30,7 +30,7 @@ pub struct ReadingLimits {
 #[derive(Debug, Clone, Default)]
 pub(super) struct Losses {
     limits: ReadingLimits,
-    /// Latest known current, A per string.
+    /// Latest known current (A) per string.
     current_a: Option<f64>,
     /// Start of the loss that has not ended; `None` = no loss is open.
     lost_since: Option<Timestamp>,
@@ -85,7 +85,7 @@ impl Losses {
         }
     }
 
-    /// Whether a resting pack may have this current, A per string.
+    /// Whether a resting pack may have this current (A) per string.
     pub(super) fn is_rest(&self, current_a: f64) -> bool {
         current_a.abs() <= self.limits.rest_a
     }

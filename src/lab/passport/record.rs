@@ -16,9 +16,9 @@ use crate::store::{HistoryEntry, HistoryExtent, HistoryQuery, HistoryReader, His
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Learned {
     pub(super) at_ns: i64,
-    /// Capacity, Ah.
+    /// Capacity (Ah).
     pub(super) capacity: (f64, f64),
-    /// Usable capacity, Ah, with the time of the latest half-cycle that gave it; `None` = no load is configured.
+    /// Usable capacity (Ah) with the time of the latest half-cycle that gave it; `None` = no load is configured.
     pub(super) usable: Option<(i64, (f64, f64))>,
     /// Resistance relative to a new cell.
     pub(super) resistance: (f64, f64),
@@ -37,7 +37,7 @@ pub(super) struct CellRecord {
 #[derive(Debug, Clone, Copy)]
 struct Power {
     time: Timestamp,
-    /// Absolute power, W.
+    /// Absolute power (W).
     power_w: f64,
     /// Whether the pack rests.
     is_rest: bool,
@@ -46,13 +46,13 @@ struct Power {
 /// Energy of a replay: integral of the power of all cells of one string.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Energy {
-    /// Energy of charges and discharges, Wh, added.
+    /// Energy of charges and discharges (Wh), added.
     pub(super) energy_wh: f64,
     /// End of the last step that was integrated.
     pub(super) until: Option<Timestamp>,
-    /// Integrated time, s, all cells added.
+    /// Integrated time (s) all cells added.
     counted_s: f64,
-    /// Time in use without a voltage, s, all cells added.
+    /// Time in use without a voltage (s) all cells added.
     lost_s: f64,
 }
 
@@ -243,8 +243,8 @@ impl Record {
         cell.learned = Some(Learned { at_ns, capacity, usable, resistance });
     }
 
-    /// Returns the charge moved by a pack with this number of strings, Ah, and the difference between the durations of
-    /// discharges and charges, h. The values come from the cell that moved the largest charge, so a missing row of
+    /// Returns the charge moved by a pack with this number of strings (Ah) and the difference between the durations of
+    /// discharges and charges (h). The values come from the cell that moved the largest charge, so a missing row of
     /// another cell does not reduce them.
     pub(super) fn moved(&self, strings: f64) -> (f64, f64) {
         let most = self.fullest();

@@ -51,7 +51,7 @@ impl<B: Bin> Bins<B> {
         self.bins.iter().enumerate().map(move |(index, bin)| (middle(index), bin))
     }
 
-    /// Width of a bin, s.
+    /// Width of a bin (s).
     pub(super) fn width_s(&self) -> f64 {
         self.width_s
     }

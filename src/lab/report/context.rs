@@ -28,7 +28,7 @@ pub struct PageContext<'a> {
 }
 
 impl PageContext<'_> {
-    /// Rated capacity of a cell, Ah; `None` = no configuration.
+    /// Rated capacity of a cell (Ah); `None` = no configuration.
     pub(super) fn rated_ah(&self, cell: usize) -> Option<f64> {
         let cell = CellIndex(u16::try_from(cell).ok()?);
         self.config.map(|config| config.monitor.model_of(cell).rated_capacity_ah)

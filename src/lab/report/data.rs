@@ -37,11 +37,11 @@ pub(super) struct HalfCycleRecord {
 pub(super) struct CapacityRecord {
     pub(super) time_s: f64,
     pub(super) cell: usize,
-    /// Capacity from this half-cycle alone, Ah.
+    /// Capacity from this half-cycle alone (Ah).
     pub(super) measured_ah: Option<f64>,
-    /// Standard deviation of `measured_ah`, Ah.
+    /// Standard deviation of `measured_ah` (Ah).
     pub(super) measured_std_ah: Option<f64>,
-    /// Learned capacity, Ah: mean and standard deviation.
+    /// Learned capacity (Ah): mean and standard deviation.
     pub(super) capacity_ah: (f64, f64),
     pub(super) usable_ah: Option<(f64, f64)>,
     /// Losses of lithium, of the negative electrode and of the positive electrode, as fractions. Each loss has a mean
@@ -56,7 +56,7 @@ pub(super) struct CapacityRecord {
 pub(super) struct RechargeRecord {
     pub(super) time_s: f64,
     pub(super) raw_s: Option<f64>,
-    /// Normalised recharge period, s: mean and standard deviation.
+    /// Normalised recharge period (s): mean and standard deviation.
     pub(super) normalised_s: Option<(f64, f64)>,
 }
 
@@ -79,10 +79,10 @@ pub(super) struct ModelRecord {
     pub(super) time_s: f64,
     /// Name of a [`ModelState`](crate::monitor::ModelState).
     pub(super) state: String,
-    /// Learned capacity of the mean cell, Ah: mean and standard deviation. `None` = nothing was learned, so the label's
-    /// capacity applies.
+    /// Learned capacity of the mean cell (Ah): mean and standard deviation. `None` = nothing was learned, so the
+    /// label's capacity applies.
     pub(super) capacity_ah: Option<(f64, f64)>,
-    /// Root mean square of the residuals, V.
+    /// Root mean square of the residuals (V).
     pub(super) residual_v: Option<f64>,
     /// A chemistry that fits better; empty = the label's chemistry fits.
     pub(super) chemistry: String,
@@ -115,7 +115,7 @@ pub struct Data {
     pub(super) trace: Trace,
     /// Cells whose estimate is untrusted at the end.
     pub(super) untrusted: BTreeSet<usize>,
-    /// Offset of the current sensor, A: mean and standard deviation.
+    /// Offset of the current sensor (A): mean and standard deviation.
     pub(super) current_offset: Option<(f64, f64)>,
     first_s: f64,
     last_s: f64,
@@ -158,7 +158,7 @@ impl Data {
         self.source.doubt = Some(why);
     }
 
-    /// Sets the learned offset of the current sensor, A: reading minus true current, and the standard deviation.
+    /// Sets the learned offset of the current sensor (A): reading minus true current, and the standard deviation.
     pub fn set_current_offset(&mut self, offset: Option<(f64, f64)>) {
         self.current_offset = offset;
     }
@@ -320,14 +320,14 @@ impl Data {
         self.last_s = self.last_s.max(time_s);
     }
 
-    /// First and last time, s; `None` = no data.
+    /// First and last time (s); `None` = no data.
     pub(super) fn ends_s(&self) -> Option<(f64, f64)> {
         (self.first_s <= self.last_s).then_some((self.first_s, self.last_s))
     }
 
     /// Whether times are dates.
     pub(super) fn is_dated(&self) -> bool {
-        // From this value on, times are dates, s since 1970. Smaller times count from the start of a log.
+        // From this value on, times are dates (s) since 1970. Smaller times count from the start of a log.
         self.first_s >= 3.0e8
     }
 

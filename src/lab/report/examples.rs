@@ -14,9 +14,9 @@ use crate::quantity::{CellIndex, Mode, Timestamp};
 
 /// Number of half-cycles of the worn pack. With this number, the remaining life of every cell is known.
 pub(super) const HALVES: u16 = 60;
-/// End of the first half-cycle (2023-11-14), s since 1970.
+/// End of the first half-cycle (2023-11-14) (s) since 1970.
 const FIRST_END_S: f64 = 1.7e9;
-/// Time between the ends of two half-cycles, s.
+/// Time between the ends of two half-cycles (s).
 const HALF_CYCLE_S: f64 = 21_600.0;
 /// Number of estimates of a recording, not counting the first.
 const STEPS: u16 = 60;
@@ -90,7 +90,7 @@ pub(super) fn worn(cells: u16) -> Data {
     data
 }
 
-/// End of a half-cycle of the worn pack, s since 1970.
+/// End of a half-cycle of the worn pack (s) since 1970.
 pub(super) fn end_s(half: u16) -> f64 {
     FIRST_END_S + HALF_CYCLE_S * f64::from(half)
 }

@@ -27,7 +27,7 @@ const LEAST_RECORDS: f64 = 0.2;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct DatedFanPoint {
     pub(super) time_s: f64,
-    /// 5 %, 50 % and 95 % quantile, Ah.
+    /// 5 %, 50 % and 95 % quantile (Ah).
     pub(super) low_ah: f64,
     pub(super) median_ah: f64,
     pub(super) high_ah: f64,
@@ -40,14 +40,14 @@ pub(super) struct Outlook {
     pub(super) cell: usize,
     /// Points for the capacity chart; empty = the end has passed, or the rate of use is unknown.
     pub(super) fan: Vec<DatedFanPoint>,
-    /// Capacity at the end of life, Ah.
+    /// Capacity at the end of life (Ah).
     pub(super) end_ah: f64,
     pub(super) life: RemainingLife,
     /// Reason why the life of other cells is unknown; one of them may end first.
     pub(super) unknown: Option<String>,
 }
 
-/// Capacity at the end of life, Ah, from the configuration. Without a configuration, it is the limit of the least
+/// Capacity at the end of life (Ah) from the configuration. Without a configuration, it is the limit of the least
 /// severe capacity alarm in the record.
 pub(super) fn end_of_life_ah(data: &Data, context: &PageContext<'_>) -> Option<f64> {
     let configured = context.config.map(|config| config.monitor.health.end_of_life_ah);

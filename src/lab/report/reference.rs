@@ -9,7 +9,7 @@ use crate::io::table::TableError;
 /// Measured or true values; times in s on the clock of the data.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Reference {
-    /// Time and capacity, Ah. If the rows name their cells, the capacity of the weakest cell applies.
+    /// Time and capacity (Ah). If the rows name their cells, the capacity of the weakest cell applies.
     pub capacities: Vec<(f64, f64)>,
     /// Whether the capacities were measured under load. Otherwise, they are the charge between full and empty.
     pub is_loaded: bool,

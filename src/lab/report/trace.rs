@@ -15,7 +15,7 @@ pub(super) struct TraceBin {
     pub(super) soc_band: (f64, f64),
     /// Lowest and highest temperature, degrees Celsius.
     pub(super) temperature_c: (f64, f64),
-    /// Lowest and highest innovation, V.
+    /// Lowest and highest innovation (V).
     pub(super) innovation_v: (f64, f64),
     pub(super) health: Consistency,
 }

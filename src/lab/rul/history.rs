@@ -24,7 +24,7 @@ pub struct MeasuredCapacity {
     pub days: f64,
     /// Days without current since the first reading.
     pub rest_days: f64,
-    /// Measured capacity, Ah.
+    /// Measured capacity (Ah).
     pub capacity_ah: f64,
 }
 
@@ -79,7 +79,7 @@ impl History {
         Ok(Self { axis, rows })
     }
 
-    /// First capacity, Ah.
+    /// First capacity (Ah).
     pub fn first_capacity_ah(&self) -> f64 {
         self.rows.first().map_or(f64::NAN, |row| row.capacity_ah)
     }

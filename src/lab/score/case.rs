@@ -36,13 +36,13 @@ pub enum Start {
 pub struct Case {
     /// Start of the estimator in the file.
     pub start: Start,
-    /// Error of the initial SOC, points; `None` = the estimator gets no initial SOC and starts from the
+    /// Error of the initial SOC (points); `None` = the estimator gets no initial SOC and starts from the
     /// first voltage.
     #[serde(rename = "told_points")]
     pub soc_error_points: Option<f64>,
     /// Error of the initial capacity, percent of the model's capacity.
     pub capacity_error_percent: f64,
-    /// Offset of the sensor: added to every measured current before the monitor sees it, A.
+    /// Offset of the sensor: added to every measured current before the monitor sees it (A).
     pub current_offset_a: f64,
     /// Seed of the random windows. The monitor sees only the rows in the windows; `None` = the monitor sees all rows.
     pub seed: Option<u64>,
@@ -80,9 +80,9 @@ pub struct CaseScore {
     pub uncarried_values: usize,
     /// Number of filter resets.
     pub resets: usize,
-    /// Estimated capacity at the end, Ah; `None` = no estimate.
+    /// Estimated capacity at the end (Ah); `None` = no estimate.
     pub final_capacity_ah: Option<f64>,
-    /// Standard deviation of the capacity, Ah.
+    /// Standard deviation of the capacity (Ah).
     pub final_capacity_std_ah: Option<f64>,
     /// Estimated resistance at the end relative to new; `None` = no estimate.
     pub final_resistance_ratio: Option<f64>,

@@ -14,7 +14,7 @@ use crate::quantity::Timestamp;
 pub(crate) struct Discharge {
     /// Start of the discharge.
     pub(crate) start: Timestamp,
-    /// Published capacity, Ah; `None` = the table does not state it.
+    /// Published capacity (Ah); `None` = the table does not state it.
     pub(crate) capacity_ah: Option<f64>,
 }
 

@@ -16,7 +16,7 @@ pub struct Learned {
     pub snapshot: Snapshot,
     /// How well the cell's model is known.
     pub model: ModelState,
-    /// Capacity, Ah.
+    /// Capacity (Ah).
     pub capacity: ScalarGaussian,
 }
 
@@ -52,7 +52,7 @@ impl Feeder {
         Learned { snapshot: monitor.snapshot(), model: monitor.model().state, capacity }
     }
 
-    /// Feeds one row: current, A (positive = discharge), voltage, V, and temperature, degrees Celsius; NaN = no value.
+    /// Feeds one row: current (A) (positive = discharge), voltage (V) and temperature, degrees Celsius; NaN = no value.
     pub(super) fn row(&mut self, time: Timestamp, current_a: f64, voltage_v: f64, temperature_c: f64) {
         let values = [
             (Channel::Current, Some(current_a)),

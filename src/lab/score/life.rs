@@ -15,15 +15,15 @@ use crate::quantity::catalogue::Quantity;
 pub struct DischargeScore {
     /// Number of the discharge, from 1.
     pub number: usize,
-    /// Published capacity down to the load's cut-off, Ah; `None` = not stated.
+    /// Published capacity down to the load's cut-off (Ah); `None` = not stated.
     pub truth_ah: Option<f64>,
-    /// Usable capacity at the configured load, Ah.
+    /// Usable capacity at the configured load (Ah).
     pub usable_ah: f64,
-    /// Standard deviation of the usable capacity, Ah.
+    /// Standard deviation of the usable capacity (Ah).
     pub usable_std_ah: f64,
-    /// Capacity between the open-circuit voltages of full and empty, Ah.
+    /// Capacity between the open-circuit voltages of full and empty (Ah).
     pub capacity_ah: f64,
-    /// Standard deviation of the capacity, Ah.
+    /// Standard deviation of the capacity (Ah).
     pub capacity_std_ah: f64,
     /// Resistance relative to new.
     pub resistance_ratio: f64,
@@ -42,15 +42,15 @@ pub struct LifeScore {
     pub left_out: usize,
     /// Mean |estimate - published|, Ah.
     pub mean_abs_error_ah: f64,
-    /// Mean (estimate - published), Ah.
+    /// Mean (estimate - published) (Ah).
     pub mean_error_ah: f64,
     /// Largest |estimate - published|, Ah.
     pub max_abs_error_ah: f64,
     /// Share of discharges whose 95 % interval contains the published value, fraction.
     pub coverage: f64,
-    /// Mean half-width of the interval, Ah.
+    /// Mean half-width of the interval (Ah).
     pub mean_half_width_ah: f64,
-    /// Threshold for `first_below_estimate` and `first_below_truth`, Ah.
+    /// Threshold for `first_below_estimate` and `first_below_truth` (Ah).
     pub threshold_ah: f64,
     /// First discharge (without those skipped) whose estimate is below the threshold.
     pub first_below_estimate: Option<usize>,

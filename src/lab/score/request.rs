@@ -26,27 +26,27 @@ pub struct ScoreRequest {
     pub start: Vec<Start>,
     /// For a start in the middle of a file: the share of the full charge that has been taken out before the start.
     pub remove: f64,
-    /// Errors of the initial SOC, points; `None` = no initial SOC.
+    /// Errors of the initial SOC (points); `None` = no initial SOC.
     pub soc_error_points: Vec<Option<f64>>,
-    /// Standard deviation of the initial SOC, points.
+    /// Standard deviation of the initial SOC (points).
     pub soc_std_points: Option<f64>,
     /// Errors of the initial capacity, percent of the model's capacity.
     pub capacity_error_percent: Vec<f64>,
     /// Standard deviation of the initial capacity, percent.
     pub capacity_std_percent: Option<f64>,
-    /// Offsets of the current sensor, A.
+    /// Offsets of the current sensor (A).
     pub current_offset_a: Vec<f64>,
-    /// Time after the start that is left out of the statistics, s.
+    /// Time after the start that is left out of the statistics (s).
     pub settle_s: f64,
-    /// Charge from full to empty that defines the true SOC, Ah; `None` = the model's capacity.
+    /// Charge from full to empty that defines the true SOC (Ah); `None` = the model's capacity.
     pub truth_capacity_ah: Option<f64>,
-    /// If a gap between two rows is longer than this, s, the recorder counts as asleep.
+    /// If a gap between two rows is longer than this (s), the recorder counts as asleep.
     pub sleep_gap_s: f64,
     /// Tables of published capacities, one per file; empty without tables.
     pub cycles: Vec<PathBuf>,
-    /// Load at which the capacities were published: A, degrees Celsius, V; `None` = `[usable]` of the configuration.
+    /// Load at which the capacities were published: A, degrees Celsius (V); `None` = `[usable]` of the configuration.
     pub load: Option<[f64; 3]>,
-    /// Capacity threshold, Ah; the first discharge below it is reported.
+    /// Capacity threshold (Ah); the first discharge below it is reported.
     pub threshold_ah: f64,
     /// Number of discharges at the start of a life that are left out of the statistics.
     pub skip_cycles: usize,

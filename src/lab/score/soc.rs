@@ -4,16 +4,16 @@ use serde::Serialize;
 
 use crate::OF_95;
 
-/// Largest error of a converged estimate, points (percent of full).
+/// Largest error of a converged estimate (points) (percent of full).
 pub const CONVERGED_POINTS: f64 = 2.0;
-/// The error must stay within [`CONVERGED_POINTS`] for this time, s. A wrong estimate that only crosses the truth has
+/// The error must stay within [`CONVERGED_POINTS`] for this time (s). A wrong estimate that only crosses the truth has
 /// not converged.
 pub const CONVERGED_HOLD_S: f64 = 600.0;
 
 /// An estimate with its truth.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct SocSample {
-    /// Time since the start, s.
+    /// Time since the start (s).
     pub(super) time_s: f64,
     /// True SOC, fraction.
     pub(super) truth: f64,
@@ -26,12 +26,12 @@ pub(super) struct SocSample {
 }
 
 impl SocSample {
-    /// Error of the estimate, points.
+    /// Error of the estimate (points).
     pub(super) fn error_points(&self) -> f64 {
         100.0 * (self.soc - self.truth)
     }
 
-    /// Half of the 95 % interval, points.
+    /// Half of the 95 % interval (points).
     pub(super) fn half_width_points(&self) -> f64 {
         100.0 * OF_95 * self.soc_std
     }
@@ -45,21 +45,21 @@ pub struct SocScore {
     pub samples: usize,
     /// Number of rows left out because they have no truth or no estimate.
     pub left_out_rows: usize,
-    /// Error of the first estimate, points.
+    /// Error of the first estimate (points).
     pub first_error_points: f64,
-    /// Root of the mean squared error, points.
+    /// Root of the mean squared error (points).
     pub rmse_points: f64,
-    /// Mean error (estimate - truth), points.
+    /// Mean error (estimate - truth) (points).
     pub mean_error_points: f64,
     /// Mean |error|, points.
     pub mean_abs_error_points: f64,
     /// Largest |error|, points.
     pub max_abs_error_points: f64,
-    /// Time after the start, s, from which |error| stayed within 2 points for 10 min; `None` = never.
+    /// Time after the start (s) from which |error| stayed within 2 points for 10 min; `None` = never.
     pub converge_s: Option<f64>,
     /// Share of samples whose 95 % interval contains the truth, fraction.
     pub coverage: f64,
-    /// Mean half-width of the interval, points.
+    /// Mean half-width of the interval (points).
     pub mean_half_width_points: f64,
     /// Mean of (innovation / standard deviation) squared. If the filter's statistics are right, the mean is at most
     /// about 1. At high sample rates, the mean is far below 1, because the filter counts information per second.
@@ -110,7 +110,7 @@ fn converged_at(samples: &[SocSample]) -> Option<f64> {
 mod tests {
     use super::*;
 
-    /// Samples every 10 s with these errors, points, and a standard deviation of 1 point.
+    /// Samples every 10 s with these errors (points) and a standard deviation of 1 point.
     fn samples(errors: &[f64]) -> Vec<SocSample> {
         let of = |(index, error): (usize, &f64)| SocSample {
             time_s: 10.0 * index as f64,

@@ -31,7 +31,7 @@ pub(super) fn rows(part: &MeasuredPart, index: usize, seed: u64, (least, most): 
     first..end.max(first + 1)
 }
 
-/// Returns the charge moved up to each row, A s; both directions are added.
+/// Returns the charge moved up to each row (A) s; both directions are added.
 fn moved_as(part: &MeasuredPart) -> Vec<f64> {
     let mut total = 0.0;
     let mut before_s = part.time_s.first().copied().unwrap_or(0.0);

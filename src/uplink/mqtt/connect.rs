@@ -11,7 +11,7 @@ use super::settings::{MqttSettings, TlsSettings};
 use super::{OFFLINE, topic};
 use crate::files::read_credential;
 
-/// Longest wait for the connection and for the broker's answer, s.
+/// Longest wait for the connection and for the broker's answer (s).
 const CONNECT_LIMIT_S: u64 = 15;
 /// Maximum number of requests that wait in memory for the connection.
 const REQUESTS: usize = 64;

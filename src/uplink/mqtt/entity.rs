@@ -195,7 +195,7 @@ fn cell_number(cell: Option<CellIndex>) -> Value {
     cell.map_or(Value::Null, |cell| Value::from(u32::from(cell.0) + 1))
 }
 
-/// Power of the pack, W; positive = charging.
+/// Power of the pack (W); positive = charging.
 fn power_w(pack: &PackValues) -> Option<f64> {
     Some(-pack.mean(Quantity::Current)? * pack.mean(Quantity::Voltage)?)
 }

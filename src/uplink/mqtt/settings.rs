@@ -34,14 +34,14 @@ pub struct MqttSettings {
     /// Base of all topics of this pack.
     #[serde(deserialize_with = "topic")]
     pub topic: String,
-    /// Period at which current values are published, s.
+    /// Period at which current values are published (s).
     #[serde(deserialize_with = "whole::<1, 3600, _>")]
     pub period_s: u64,
-    /// Longest silence on the connection, s. If the connection is silent for 1.5 times this duration, the broker
+    /// Longest silence on the connection (s). If the connection is silent for 1.5 times this duration, the broker
     /// publishes the last will.
     #[serde(deserialize_with = "whole::<5, 3600, _>")]
     pub keep_alive_s: u64,
-    /// Longest pause between attempts to connect, s.
+    /// Longest pause between attempts to connect (s).
     #[serde(deserialize_with = "whole::<1, 3600, _>")]
     pub retry_max_s: u64,
     /// TLS; `None` = unencrypted.
@@ -84,7 +84,7 @@ pub struct DiscoverySettings {
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct HistorySettings {
-    /// Time between samples on the daemon's clock, s; 0 = no samples.
+    /// Time between samples on the daemon's clock (s); 0 = no samples.
     #[serde(deserialize_with = "whole::<0, 86_400, _>")]
     pub period_s: u64,
     /// Folder of the queue.

@@ -22,9 +22,9 @@ pub(crate) const RATED_AH: f64 = 2.6;
 pub(crate) const THRESHOLD: f64 = 0.80;
 pub(crate) const END_OF_LIFE: f64 = 0.70;
 
-/// Interval between two readings, s.
+/// Interval between two readings (s).
 const SAMPLE_S: f64 = 10.0;
-/// Time between the last reading under one load and the first reading under the next load, s. The time is short, so
+/// Time between the last reading under one load and the first reading under the next load (s). The time is short, so
 /// that the charge counted from a reading belongs to the load of that reading.
 const SWITCH_S: f64 = 0.1;
 /// Ticks per reading. After 5 s without a tick the Monitor assumes that the computer was suspended.
@@ -32,7 +32,7 @@ const TICKS: u32 = 4;
 /// The simulation of an ageing cell ends after this many half-cycles, counted from the start of the cycle in which the
 /// cell reaches its end of life.
 const AFTERLIFE: u32 = 4;
-/// A constant-voltage charge ends at this current, A.
+/// A constant-voltage charge ends at this current (A).
 const TAPER_END_A: f64 = RATED_AH / 10.0;
 /// Average charge moved per cycle, relative to the rated capacity. Converts cycles into ampere-hours.
 const MOVED_PER_CYCLE: f64 = 2.0 * 0.55 * 0.85;

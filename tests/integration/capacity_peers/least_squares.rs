@@ -26,7 +26,7 @@ pub(crate) struct Swing {
     /// Change of SOC, fraction.
     pub(crate) x: f64,
     pub(crate) x_variance: f64,
-    /// Charge, Ah.
+    /// Charge (Ah).
     pub(crate) y_ah: f64,
     pub(crate) y_variance: f64,
 }

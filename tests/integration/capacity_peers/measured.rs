@@ -247,11 +247,11 @@ fn heading() {
     println!("| --- | --- | --- | --- | --- | --- |");
 }
 
-/// packwatch's error may exceed the best peer's error by this, Ah, if the peers use swings of the filter's SOC. This
+/// packwatch's error may exceed the best peer's error by this (Ah) if the peers use swings of the filter's SOC. This
 /// SOC depends on the capacity that packwatch has learned, which helps the peers.
 const NEAR_AH: f64 = 0.006;
 
-/// packwatch's error may exceed the best peer's error by this, Ah, if the peers use voltage swings: an eighth of a
+/// packwatch's error may exceed the best peer's error by this (Ah) if the peers use voltage swings: an eighth of a
 /// percent of the capacity. The best peer has an advantage: its memory factor is chosen after the results are known.
 const LEVEL_AH: f64 = 0.0025;
 

@@ -133,7 +133,7 @@ fn print(life: &str, start: f64, name: &str, source: &str, (score, last): (Score
     );
 }
 
-/// The lives: name and capacity fade per cycle, Ah.
+/// The lives: name and capacity fade per cycle (Ah).
 const LIVES: [(&str, f64); 3] = [("none", 0.0), ("0.005 Ah per cycle", 0.005), ("0.05 Ah per cycle", 0.05)];
 /// Number of cycles in the paper's life.
 const CYCLES: u32 = 48;

@@ -14,20 +14,20 @@ use packwatch::health::CapacityConfig;
 
 use super::least_squares::Swing;
 
-/// If the interval between two readings is longer than this, s, the charge in between is unknown.
+/// If the interval between two readings is longer than this (s), the charge in between is unknown.
 const GAP_S: f64 = 60.0;
-/// Current below which the cell counts as resting, A.
+/// Current below which the cell counts as resting (A).
 const REST_A: f64 = 0.05;
-/// Three time constants of the models' slowest RC branch, s. After this time the branch's unknown initial voltage has
+/// Three time constants of the models' slowest RC branch (s). After this time the branch's unknown initial voltage has
 /// decayed.
 const SETTLING_S: f64 = 180.0;
-/// Length of each end of a swing, s.
+/// Length of each end of a swing (s).
 const END_S: f64 = 60.0;
 /// A swing ends when this part of the model's capacity has flowed back.
 const REVERSAL: f64 = 0.02;
 /// Smallest swing used, as a part of the model's capacity.
 const MIN_SWING: f64 = 0.05;
-/// White noise of a voltage reading, V.
+/// White noise of a voltage reading (V).
 const VOLTAGE_NOISE_V: f64 = 0.005;
 
 /// One reading, with the resistance ratio at that time.
@@ -51,7 +51,7 @@ struct Point {
     new_soc: f64,
     /// Variance of `new_soc`.
     variance: f64,
-    /// Charge removed since the start, Ah.
+    /// Charge removed since the start (Ah).
     charge_ah: f64,
     /// The filter's SOC and its variance.
     soc: f64,
@@ -92,7 +92,7 @@ impl VoltageSwing {
     }
 }
 
-/// Variance of a charge from the sensor's gain and offset, Ah^2.
+/// Variance of a charge from the sensor's gain and offset (Ah^2).
 pub(crate) fn charge_variance(config: &CapacityConfig, charge_ah: f64, duration_s: f64) -> f64 {
     let gain_ah = config.current_gain_std * charge_ah;
     let offset_ah = config.current_offset_std_a * duration_s / 3600.0;

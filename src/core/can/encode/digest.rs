@@ -53,7 +53,7 @@ pub struct DigestFields {
     pub worst: u8,
     /// Checksum of the raised alarms.
     pub checksum: TableChecksum,
-    /// Longest time between two frames of the same raised alarm, s.
+    /// Longest time between two frames of the same raised alarm (s).
     pub pass_time_s: f64,
     /// States of the rules, in the order of their numbers.
     pub rules: [RuleState; RULE_COUNT],

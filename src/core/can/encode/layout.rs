@@ -159,9 +159,9 @@ pub struct MessageSettings {
 /// Base of a layout.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum LayoutBase<'d> {
-    /// The shipped DBC, adapted to a cell of this rated capacity, Ah.
+    /// The shipped DBC, adapted to a cell of this rated capacity (Ah).
     BuiltIn {
-        /// Rated capacity, Ah.
+        /// Rated capacity (Ah).
         rated_capacity_ah: f64,
     },
     /// The user's own DBC, which is not adapted.

@@ -85,19 +85,19 @@ pub struct StatusFields {
 /// Contents of all pages of the health frame; `None` = not available.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct HealthFields {
-    /// Lowest capacity of a cell, Ah.
+    /// Lowest capacity of a cell (Ah).
     pub capacity_ah: Option<f64>,
-    /// Standard deviation of the capacity, Ah.
+    /// Standard deviation of the capacity (Ah).
     pub capacity_std_ah: Option<f64>,
     /// State of health: capacity as a fraction of the rated capacity.
     pub soh: Option<f64>,
-    /// Recharge period, s.
+    /// Recharge period (s).
     pub recharge_period_s: Option<f64>,
-    /// Recharge period with the reference charger, s.
+    /// Recharge period with the reference charger (s).
     pub normalized_recharge_period_s: Option<f64>,
-    /// Usable capacity, Ah.
+    /// Usable capacity (Ah).
     pub usable_capacity_ah: Option<f64>,
-    /// Standard deviation of the usable capacity, Ah.
+    /// Standard deviation of the usable capacity (Ah).
     pub usable_capacity_std_ah: Option<f64>,
     /// Resistance relative to new (1 = as new).
     pub resistance_ratio: Option<f64>,

@@ -15,7 +15,7 @@ use crate::filter::{bell, crossing};
 
 /// Number of intervals in the table of a blend.
 const BLEND_POINTS: u32 = 400;
-/// Lowest and highest voltage in the table of a blend, V.
+/// Lowest and highest voltage in the table of a blend (V).
 const BLEND_V: (f64, f64) = (2.5, 4.8);
 
 /// A positive electrode made of one material or of two.
@@ -74,11 +74,11 @@ pub struct CellType<'a> {
     pub positives: &'a [PositiveElectrode],
     /// Negative electrodes.
     pub negatives: &'a [NegativeMaterial],
-    /// Open-circuit voltage of the empty cell, V.
+    /// Open-circuit voltage of the empty cell (V).
     pub empty_v: f64,
-    /// Open-circuit voltages that the full cell may have, V.
+    /// Open-circuit voltages that the full cell may have (V).
     pub full_v: &'a [f64],
-    /// Half of the difference between the curves of charge and discharge, V.
+    /// Half of the difference between the curves of charge and discharge (V).
     pub hysteresis_v: f64,
 }
 
@@ -87,9 +87,9 @@ pub struct CellType<'a> {
 pub struct CurvePrior {
     /// SOC breakpoints.
     pub soc: Vec<f64>,
-    /// Mean, V, strictly rising.
+    /// Mean (V), strictly rising.
     pub mean_v: Vec<f64>,
-    /// Covariance between breakpoints, V^2.
+    /// Covariance between breakpoints (V^2).
     pub covariance: DMatrix<f64>,
     /// The electrodes of the cell nearest to the mean; `None` for blends.
     pub electrodes: Option<Electrodes>,
@@ -150,7 +150,7 @@ impl CurvePrior {
         Some(Self { soc: soc.to_vec(), mean_v, covariance, electrodes })
     }
 
-    /// The largest independent modes of the spread, V per standard deviation, and the standard deviation of the rest,
+    /// The largest independent modes of the spread (V) per standard deviation, and the standard deviation of the rest,
     /// V. Modes are ordered by their effect on the SOC that a voltage reading gives.
     pub fn modes_v(&self) -> ([Vec<f64>; MIXES], Vec<f64>) {
         let n = self.soc.len();
@@ -174,7 +174,7 @@ impl CurvePrior {
         let modes_v: [Vec<f64>; MIXES] = std::array::from_fn(mode);
         let rest = |s: usize| {
             let explained: f64 = modes_v.iter().map(|mode_v| mode_v[s] * mode_v[s]).sum();
-            // Minimum error of a curve, V.
+            // Minimum error of a curve (V).
             (self.covariance[(s, s)] - explained).max(0.0).sqrt().max(0.004)
         };
         let rest_v = (0..n).map(rest).collect();

@@ -40,7 +40,7 @@ pub struct EstimatorBank {
     config: EstimatorConfig,
     constants: KernelConstants,
     voltage_reach: VoltageReach,
-    /// Smallest and largest plausible capacity, Ah.
+    /// Smallest and largest plausible capacity (Ah).
     plausible_ah: (f64, f64),
     filters: FilterArrays,
     cells: Vec<CellSlot>,
@@ -165,7 +165,7 @@ impl EstimatorBank {
         &self.results[cell]
     }
 
-    /// Predicted temperature of a cell without a sensor value, degrees C.
+    /// Predicted temperature of a cell without a sensor value (degrees C).
     fn modelled_c(&self, cell: usize, step: &CellStep) -> f64 {
         let soc = self.soc(cell).map_or(0.5, |soc| soc.mean);
         thermal_c(&self.model, self.cells[cell].memory.temperature_c, soc, self.log_resistance(cell).mean, step)
@@ -214,7 +214,7 @@ impl EstimatorBank {
         if *has_filter { self.marginal(cell, LOG_RESISTANCE) } else { memory.log_resistance }
     }
 
-    /// Branch voltages, V; NaN for branches that the model does not have, and before the first voltage.
+    /// Branch voltages (V); NaN for branches that the model does not have, and before the first voltage.
     pub fn branch_v(&self, cell: usize) -> [f64; MAX_BRANCHES] {
         self.cell(cell).branch_v()
     }
@@ -261,7 +261,7 @@ impl EstimatorBank {
         worst.into_iter().fold(0.0, larger)
     }
 
-    /// Temperature that the filter uses, degrees C.
+    /// Temperature that the filter uses (degrees C).
     #[inline]
     pub fn temperature_c(&self, cell: usize) -> Option<f64> {
         self.cells[cell].memory.temperature_c
@@ -324,7 +324,7 @@ impl EstimatorBank {
         self.change_all(|cell| cell.learn_slow_branch(&config));
     }
 
-    /// Sets the standard deviation of the current sensor's offset, A per cell.
+    /// Sets the standard deviation of the current sensor's offset (A) per cell.
     pub fn set_current_offset_std(&mut self, offset_std_a: f64) {
         self.config.sensor.current_offset_a = offset_std_a;
         self.constants.sensor.current_offset_a = offset_std_a;

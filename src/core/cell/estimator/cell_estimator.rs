@@ -31,13 +31,13 @@ const JUMP_SIGMA: f64 = 4.0;
 pub struct AdoptedState {
     /// SOC, fraction; `None` = start from the next voltage.
     pub soc: Option<ScalarGaussian>,
-    /// Covariance of SOC and capacity, Ah.
+    /// Covariance of SOC and capacity (Ah).
     pub soc_by_capacity: f64,
-    /// Capacity, Ah.
+    /// Capacity (Ah).
     pub capacity: ScalarGaussian,
     /// ln of the resistance relative to the model.
     pub log_resistance: f64,
-    /// Current after first-order filters with the time constants of the branches, A; `None` = the branches have
+    /// Current after first-order filters with the time constants of the branches (A); `None` = the branches have
     /// relaxed.
     pub filtered_a: Option<[f64; MAX_BRANCHES]>,
 }
@@ -202,7 +202,7 @@ impl CellEstimator {
         self.filter = Some(x);
     }
 
-    /// Variance of each branch's voltage at a start, V^2. If the start is under load, a usual load of unknown duration
+    /// Variance of each branch's voltage at a start (V^2). If the start is under load, a usual load of unknown duration
     /// may have charged the branches.
     fn first_branch_variance(
         &self,
@@ -224,7 +224,7 @@ impl CellEstimator {
         variance
     }
 
-    /// Temperature of the cell, degrees C. If the sensor has no value, the thermal model predicts the temperature from
+    /// Temperature of the cell (degrees C). If the sensor has no value, the thermal model predicts the temperature from
     /// the last known temperature.
     fn temperature(&self, model: &CellModel, step: &CellStep) -> f64 {
         step.temperature_c.unwrap_or_else(|| {
@@ -249,7 +249,7 @@ impl CellEstimator {
         Some(within_bounds(ScalarGaussian { variance, ..soc }))
     }
 
-    /// Branch voltages, V; NaN for branches that the model does not have, and before the first voltage.
+    /// Branch voltages (V); NaN for branches that the model does not have, and before the first voltage.
     pub fn branch_v(&self) -> [f64; MAX_BRANCHES] {
         let mut branch_v = [f64::NAN; MAX_BRANCHES];
         if let Some(x) = &self.filter {
@@ -265,7 +265,7 @@ impl CellEstimator {
         self.marginal(LOG_RESISTANCE).unwrap_or(self.memory.log_resistance)
     }
 
-    /// Capacity in the present state of the filter, Ah.
+    /// Capacity in the present state of the filter (Ah).
     pub fn capacity(&self) -> ScalarGaussian {
         self.marginal(CAPACITY).unwrap_or(self.memory.capacity)
     }
@@ -327,7 +327,7 @@ impl CellEstimator {
         self.filter.as_ref().map_or(0.0, |x| x.covariance[(LOG_RESISTANCE, CAPACITY)])
     }
 
-    /// Capacity that selects the open-circuit curve of the aged cell, Ah.
+    /// Capacity that selects the open-circuit curve of the aged cell (Ah).
     pub fn curve(&self) -> ScalarGaussian {
         self.memory.curve
     }
@@ -368,7 +368,7 @@ impl CellEstimator {
         self.memory.log_resistance = log_resistance;
     }
 
-    /// Sets the filter's capacity, Ah ([`CapacityState::Held`]).
+    /// Sets the filter's capacity (Ah) ([`CapacityState::Held`]).
     pub fn hold_capacity(&mut self, capacity_ah: f64) {
         self.memory.capacity.mean = capacity_ah;
         self.memory.curve = ScalarGaussian { mean: capacity_ah, variance: 0.0 };

@@ -1,7 +1,7 @@
 //! Handles the possible use of a cell while nothing is measured: the program is stopped, the bus sleeps, or the log has
 //! a gap.
 //!
-//! In: the possible change of the SOC in the downtime, fraction, and the first voltage after the downtime, V. Out: the
+//! In: the possible change of the SOC in the downtime, fraction, and the first voltage after the downtime (V). Out: the
 //! updated filter; `None` if the update cannot be computed.
 //!
 //! Deviation 6: two hypotheses describe a downtime. First hypothesis, usually the more likely one: the cell rested. The

@@ -1,7 +1,7 @@
 //! The estimator's memory: rest, load, consistency, rejected readings, and the estimates that a restart of the filter
 //! keeps.
 //!
-//! In: steps (A, s) and the outcomes of updates. Out: the time that a reading represents, s, the load, A, and whether
+//! In: steps (A, s) and the outcomes of updates. Out: the time that a reading represents (s) the load (A) and whether
 //! the filter must restart. Stored numbers are checked ([`Memory::check`]).
 
 use serde::{Deserialize, Serialize};
@@ -35,20 +35,21 @@ const NEGLIGIBLE_STD: f64 = 0.002;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Memory {
-    /// Capacity, Ah, before the first voltage and across a restart.
+    /// Capacity (Ah) before the first voltage and across a restart.
     pub(super) capacity: ScalarGaussian,
-    /// Capacity that selects the open-circuit curve of the aged cell, Ah.
+    /// Capacity that selects the open-circuit curve of the aged cell (Ah).
     pub(super) curve: ScalarGaussian,
     pub(super) log_resistance: ScalarGaussian,
     pub(super) temperature_c: Option<f64>,
     pub(super) last_current_a: f64,
-    /// Low-pass of |current| with the time constant `load_memory_s`, A: the load that still drives slow diffusion.
+    /// Low-pass of |current| with the time constant `load_memory_s` (A): the load that still drives slow diffusion.
     pub(super) load_a: f64,
     /// Mean normalised innovation squared over the consistency window.
     pub(super) mean_nis: f64,
-    /// Time that the next voltage reading represents, s: the time since the last used reading. A long rest counts less.
+    /// Time that the next voltage reading represents (s): the time since the last used reading. A long rest counts
+    /// less.
     pub(super) information_s: f64,
-    /// Duration of the present rest, s.
+    /// Duration of the present rest (s).
     pub(super) rest_s: f64,
     /// Information about the current sensor's offset since the last correction of the offset: sum of d^2 / R. d is the
     /// effect of one standard deviation of the offset on an innovation; R is the variance of the innovation without
@@ -59,7 +60,7 @@ pub(super) struct Memory {
     pub(super) slow_branch: SlowBranch,
     /// Standard deviation of the SOC change during downtime. It counts until a voltage has been used.
     pub(super) downtime_std: f64,
-    /// Part of the next unmeasured time that has already been noted as downtime, s.
+    /// Part of the next unmeasured time that has already been noted as downtime (s).
     pub(super) noted_s: f64,
     /// Probability that the cell was used during the downtime.
     pub(super) used_prior: f64,
@@ -71,7 +72,7 @@ pub(super) struct Memory {
     pub(super) is_soc_unknown: bool,
     /// Number of consecutive readings beyond the gate.
     pub(super) rejected: u32,
-    /// Duration of the run of rejected readings, s.
+    /// Duration of the run of rejected readings (s).
     pub(super) rejected_s: f64,
     /// Whether the run of rejected readings started after a gap. If so, the gap is the cause and not the sensor.
     pub(super) rejected_after_gap: bool,
@@ -153,7 +154,7 @@ impl Memory {
         0.0
     }
 
-    /// The load before or after a step's gap, A, which may have continued through the gap. 0 if the cell counts as
+    /// The load before or after a step's gap (A) which may have continued through the gap. 0 if the cell counts as
     /// resting while the bus is silent.
     fn gap_load_a(&self, config: &EstimatorConfig, step: &CellStep) -> f64 {
         if is_silent_rest(config, step) {

@@ -3,31 +3,31 @@
 /// A voltage reading, with charge and time since the previous reading.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CellStep {
-    /// Time with a measured current, s.
+    /// Time with a measured current (s).
     pub measured_s: f64,
-    /// Charge taken out in the measured time, A s.
+    /// Charge taken out in the measured time (A) s.
     pub charge_as: f64,
-    /// Part of the measured time in which the charge contains the current sensor's offset, s. Readings of exactly zero
+    /// Part of the measured time in which the charge contains the current sensor's offset (s). Readings of exactly zero
     /// contain no offset.
     pub offset_s: f64,
-    /// Time without a current measurement, s (asleep, sensor lost).
+    /// Time without a current measurement (s) (asleep, sensor lost).
     pub unmeasured_s: f64,
-    /// Cell current at the reading, A. If it is unknown (`None`), the voltage is not used.
+    /// Cell current at the reading (A). If it is unknown (`None`), the voltage is not used.
     pub current_a: Option<f64>,
-    /// Cell temperature, degrees C. If it is unknown (`None`), the thermal model predicts it.
+    /// Cell temperature (degrees C). If it is unknown (`None`), the thermal model predicts it.
     pub temperature_c: Option<f64>,
-    /// Temperature of the surroundings for the thermal model, degrees C.
+    /// Temperature of the surroundings for the thermal model (degrees C).
     pub ambient_c: f64,
-    /// Terminal voltage, V.
+    /// Terminal voltage (V).
     pub voltage_v: f64,
 }
 
 /// Outcome of an update with a voltage.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Update {
-    /// Measured voltage minus predicted voltage, V.
+    /// Measured voltage minus predicted voltage (V).
     pub innovation: f64,
-    /// Predicted variance of the innovation, V^2.
+    /// Predicted variance of the innovation (V^2).
     pub innovation_variance: f64,
     /// Square of the innovation, divided by the variance that the gate uses. If this ratio exceeds the square of the
     /// gate's width (in standard deviations), the reading is an outlier.

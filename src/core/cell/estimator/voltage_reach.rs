@@ -1,6 +1,6 @@
 //! Determines how far a constant error of the voltage may have moved the SOC.
 //!
-//! In: a cell model and the standard deviation of a constant voltage error, V. Out: the reach, which is the standard
+//! In: a cell model and the standard deviation of a constant voltage error (V). Out: the reach, which is the standard
 //! deviation of the SOC that this error causes, fraction.
 //!
 //! The filter linearises the open-circuit curve at its estimate. Next to a flat part of the curve, this hides how wrong
@@ -16,7 +16,7 @@ pub(super) const FAR: f64 = 4.0;
 /// Number of intervals of the SOC grid.
 const INTERVALS: usize = 100;
 
-/// Temperature at which the curve is evaluated, degrees C. The curve hardly depends on the temperature.
+/// Temperature at which the curve is evaluated (degrees C). The curve hardly depends on the temperature.
 const TEMPERATURE_C: f64 = 25.0;
 
 /// Reach on a grid of SOC.
@@ -28,7 +28,7 @@ pub(super) struct VoltageReach {
 }
 
 impl VoltageReach {
-    /// Measures the reach of an error with the standard deviation `std_v`, V.
+    /// Measures the reach of an error with the standard deviation `std_v` (V).
     pub(super) fn new(model: &CellModel, std_v: f64) -> Self {
         let temperature = model.temperature_position(TEMPERATURE_C);
         let ocv_v = |soc: f64| model.aged_ocv_v(&model.grid_position_at(&temperature, soc), model.capacity_ah);

@@ -19,7 +19,7 @@ use crate::filter::{bell, square};
 /// Maximum number of measurements.
 const MOST: usize = 3;
 
-/// Temperatures of use, degrees C, with their weights: a car outdoors in a temperate climate.
+/// Temperatures of use (degrees C) with their weights: a car outdoors in a temperate climate.
 const USE_C: [(f64, f64); 4] = [(-7.0, 0.15), (3.0, 0.25), (20.0, 0.4), (35.0, 0.2)];
 /// SOC values over which the errors are averaged.
 const USE_SOC: [f64; 10] = [0.05, 0.15, 0.25, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85, 0.95];
@@ -31,7 +31,7 @@ const REST_SOC: [f64; 9] = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9];
 pub enum Measurement {
     /// A rest of an hour at this SOC.
     Rest(f64),
-    /// A drive at this temperature, degrees C.
+    /// A drive at this temperature (degrees C).
     Drive(f64),
     /// A charge from below 20 % to full.
     Charge,
@@ -88,7 +88,7 @@ pub fn advise(bands: &ModelBands<'_>) -> Option<(f64, Vec<Advice>)> {
 /// can be measured.
 #[derive(Clone)]
 struct Belief {
-    /// Slope of the curve, V per unit of SOC: `slope_v` at [`USE_SOC`], `rest_slope_v` at [`REST_SOC`].
+    /// Slope of the curve (V per unit of SOC): `slope_v` at [`USE_SOC`], `rest_slope_v` at [`REST_SOC`].
     slope_v: Vec<f64>,
     rest_slope_v: Vec<f64>,
     /// Covariance (V^2) of the curve over [`USE_SOC`] and then [`REST_SOC`].
@@ -131,7 +131,7 @@ impl Belief {
         })
     }
 
-    /// Expected error of the SOC, points.
+    /// Expected error of the SOC (points).
     fn points(&self) -> f64 {
         // Assumes that half of the capacity has been moved since the last reliable voltage. Even with the right
         // capacity, the counted SOC has an error of 6 %, because of its initial value and the current sensor.

@@ -124,7 +124,7 @@ pub fn fit(prior: &LabelPrior, rows: &[Row]) -> Option<Fit> {
     search.finish(capacity, &start)
 }
 
-/// Minus the logarithm of the rows' probability with a label, minimised over `capacities_ah`, Ah. The results of
+/// Minus the logarithm of the rows' probability with a label, minimised over `capacities_ah` (Ah). The results of
 /// different labels can be compared.
 pub fn label_cost(prior: &LabelPrior, rows: &[Row], capacities_ah: &[f64]) -> Option<f64> {
     let (search, start) = Search::new(prior, rows)?;
@@ -144,7 +144,7 @@ pub(super) fn rows_cost(prior: &LabelPrior, own: Option<&OwnModel>, rows: &[Row]
     (!rows.is_empty()).then_some(sums.cost)
 }
 
-/// Largest charge range of a stretch, Ah.
+/// Largest charge range of a stretch (Ah).
 fn span_ah(rows: &[Row]) -> f64 {
     let of_stretch = |rows: &[Row]| {
         let charges = rows.iter().map(|row| f64::from(row.charge_ah));
@@ -182,7 +182,7 @@ impl<'a> Search<'a> {
         sums.cost.is_finite().then_some(sums)
     }
 
-    /// The most likely values of the other parameters at a capacity, Ah. The search starts from `start`
+    /// The most likely values of the other parameters at a capacity (Ah). The search starts from `start`
     /// (Levenberg-Marquardt).
     fn conditional(&self, capacity_ah: f64, start: &DVector<f64>) -> Option<Conditional> {
         self.conditional_with(&RepeatedErrors::USUAL, capacity_ah, start)
@@ -207,7 +207,7 @@ impl<'a> Search<'a> {
         Some(Conditional { theta, normal: sums.normal, cost, misfit })
     }
 
-    /// Mean and variance of the capacity's density, Ah. `None` if the capacity does not fit this label.
+    /// Mean and variance of the capacity's density (Ah). `None` if the capacity does not fit this label.
     fn capacity(&self, start: &DVector<f64>) -> Option<ScalarGaussian> {
         let at = |k: usize| self.rated_ah * (0.52 + CAPACITY_STEP * k as f64);
         let mut found: Vec<Option<f64>> = vec![None; CAPACITIES];

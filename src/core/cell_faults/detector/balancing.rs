@@ -112,7 +112,7 @@ impl CellFaultDetector {
         }
     }
 
-    /// Mean bleed time of the cells whose voltages are in the middle half, s.
+    /// Mean bleed time of the cells whose voltages are in the middle half (s).
     fn bled_in_middle_s(&self, times: &[BleedTime]) -> f64 {
         let known = self.cells.iter().zip(times).filter(|(cell, _)| cell.bleed.timer.has_bits);
         let mut by_voltage: Vec<(f64, f64)> =

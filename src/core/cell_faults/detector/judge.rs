@@ -57,7 +57,7 @@ impl CellFaultDetector {
         Population::of(compared.map(|cell| cell.difference.state(state).mean))
     }
 
-    /// Judges all cells. `bled_slope_v`: slope of the open-circuit curve, V per unit of SOC, at the SOC at which the
+    /// Judges all cells. `bled_slope_v`: slope of the open-circuit curve (V per unit of SOC) at the SOC at which the
     /// BMS bleeds cells; `None` if the BMS bleeds no cells.
     pub(super) fn judge(&mut self, time: Timestamp, bled_slope_v: Option<f64>) {
         self.is_balanced = bled_slope_v.is_some();

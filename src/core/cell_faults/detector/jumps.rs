@@ -6,10 +6,10 @@ use crate::cell_faults::fault::{CellFault, CellFaultKind};
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Jumps of several cells count as one event if they are at most this far apart, s.
+/// Jumps of several cells count as one event if they are at most this far apart (s).
 const SAME_EVENT_S: f64 = 1800.0;
 /// Two channels count as exchanged only if each cell's previous state explains the voltage of the other channel with an
-/// innovation of at most this size, V.
+/// innovation of at most this size (V).
 const SWAP_V: f64 = 0.008;
 
 impl CellFaultDetector {

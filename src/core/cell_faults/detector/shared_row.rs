@@ -1,17 +1,17 @@
 //! Computes what a cell's voltage difference in a row says about the cell's states.
 //!
-//! In: the values of the row that all cells share, the means of a cell's states, and the cell's voltage minus the middle
-//! voltage of the pack, V. Out: an [`Observation`].
+//! In: the values of the row that all cells share, the means of a cell's states, and the cell's voltage minus the
+//! middle voltage of the pack (V). Out: an [`Observation`].
 
 use crate::cell::CellModel;
 use crate::cell_faults::difference::{CHANNEL, CONTACT, Observation, RESISTANCE, SOC, STATES};
 
-/// Standard deviations of the errors of a row: `ROW_V` of the voltage, V; `ROW_DROP` of the voltage drop, as a fraction
-/// of the drop; `ROW_CURVE` of the SOC on the open-circuit curve, fraction.
+/// Standard deviations of the errors of a row: `ROW_V` of the voltage (V); `ROW_DROP` of the voltage drop, as a
+/// fraction of the drop; `ROW_CURVE` of the SOC on the open-circuit curve, fraction.
 const ROW_V: f64 = 0.002;
 const ROW_DROP: f64 = 0.03;
 const ROW_CURVE: f64 = 0.001;
-/// Additional errors of a cell per unit of SOC difference from the mean cell: `FAR_V` of the open-circuit curve, V;
+/// Additional errors of a cell per unit of SOC difference from the mean cell: `FAR_V` of the open-circuit curve (V);
 /// `FAR_DROP` of the voltage drop, fraction. `MOST_ELSEWHERE` limits the ratio between the model's resistances at the
 /// two SOC values.
 const FAR_V: f64 = 0.05;
@@ -52,12 +52,12 @@ impl Row<'_> {
         Observation { innovation: difference_v - expected_v, slope, variance }
     }
 
-    /// Series resistance of the mean cell in the row, ohm.
+    /// Series resistance of the mean cell in the row (ohm).
     pub(super) fn ohm(&self) -> f64 {
         self.model.r0_ohm(&self.model.grid_position(self.soc, self.temperature_c))
     }
 
-    /// Series resistance at SOC 0.5 and 25 degrees C, ohm. The contact resistance depends on neither SOC nor
+    /// Series resistance at SOC 0.5 and 25 degrees C (ohm). The contact resistance depends on neither SOC nor
     /// temperature, so it is stated as a fraction of this value.
     pub(super) fn contact_ohm(&self) -> f64 {
         self.model.r0_ohm(&self.model.grid_position(0.5, 25.0))

@@ -2,7 +2,7 @@
 
 use super::*;
 
-/// A forecast that has received the capacity `capacity(efc)`, Ah, after every `step` equivalent full cycles (efc) up to
+/// A forecast that has received the capacity `capacity(efc)` (Ah) after every `step` equivalent full cycles (efc) up to
 /// `until`. One cycle takes a quarter of a day.
 fn fed(capacity: impl Fn(f64) -> f64, step: f64, until: f64) -> Forecast {
     let mut forecast = Forecast::new(Axis::Cycles, 2.0);

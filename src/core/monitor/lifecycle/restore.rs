@@ -15,7 +15,7 @@ use crate::monitor::stages::Stages;
 use crate::monitor::stages::pack_memory::{StoredCell, StoredPack};
 use crate::quantity::Timestamp;
 
-/// Longest time without an input while a program runs, s; a running program sends ticks. A longer gap is a restart,
+/// Longest time without an input while a program runs (s); a running program sends ticks. A longer gap is a restart,
 /// even if the timestamps are on the same clock.
 const BREAK_S: f64 = 30.0;
 

@@ -24,7 +24,7 @@ pub enum Command {
     Test {
         /// The rule.
         rule: Rule,
-        /// Duration, s.
+        /// Duration (s).
         seconds: f64,
     },
 }

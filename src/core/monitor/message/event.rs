@@ -38,27 +38,27 @@ pub enum EventKind {
         cell: CellIndex,
         /// Charge or discharge.
         mode: Mode,
-        /// Charge moved, Ah, positive.
+        /// Charge moved (Ah), positive.
         charge_ah: f64,
         /// SOC swing, fraction; positive if the SOC rose during a charge or fell during a discharge. `None` if the SOC
         /// at the start or the end was not estimated.
         swing: Option<f64>,
         /// Standard deviation of the swing.
         swing_std: Option<f64>,
-        /// Duration, s.
+        /// Duration (s).
         duration_s: f64,
-        /// Mean cell current, A, positive = discharge.
+        /// Mean cell current (A), positive = discharge.
         mean_current_a: f64,
-        /// Mean temperature, degrees C; `None` without a temperature reading.
+        /// Mean temperature (degrees C); `None` without a temperature reading.
         mean_temperature_c: Option<f64>,
     },
     /// The capacity estimate of a cell was updated after a half-cycle.
     Capacity {
         /// Index of the cell.
         cell: CellIndex,
-        /// Capacity measured by this half-cycle alone, Ah; `None` if the half-cycle contains no usable information.
+        /// Capacity measured by this half-cycle alone (Ah); `None` if the half-cycle contains no usable information.
         measured_ah: Option<f64>,
-        /// Standard deviation of the measurement, Ah.
+        /// Standard deviation of the measurement (Ah).
         measured_std_ah: Option<f64>,
         /// The estimates after the update.
         #[serde(flatten)]
@@ -102,13 +102,13 @@ pub enum EventKind {
     },
     /// A charge that covered the recharge window, or enough of it, has ended.
     RechargePeriod {
-        /// Time between the two configured SOC values, s; `None` if the charge did not cover the whole window without
+        /// Time between the two configured SOC values (s); `None` if the charge did not cover the whole window without
         /// interruption.
         seconds: Option<f64>,
-        /// Time that the reference charger would need, s; `None` if the capacity of a cell has not been learned, or if
+        /// Time that the reference charger would need (s); `None` if the capacity of a cell has not been learned, or if
         /// the charge covered too little of the window.
         normalised_s: Option<f64>,
-        /// Standard deviation of the normalised period, s.
+        /// Standard deviation of the normalised period (s).
         normalised_std_s: Option<f64>,
     },
     /// An alarm changed.
@@ -167,18 +167,18 @@ pub enum EventKind {
     },
     /// Another pack is connected. The event records the last learned capacity of the old pack.
     PackReplaced {
-        /// Capacity of the old pack's weakest cell, Ah; `None` if the capacity of a cell was not learned.
+        /// Capacity of the old pack's weakest cell (Ah); `None` if the capacity of a cell was not learned.
         capacity_ah: Option<f64>,
-        /// Standard deviation of the capacity, Ah.
+        /// Standard deviation of the capacity (Ah).
         capacity_std_ah: Option<f64>,
     },
     /// A previously connected pack returned, and its learned values were restored.
     PackReturned {
         /// Number of the pack.
         identity: f64,
-        /// Capacity of the pack's weakest cell, Ah; `None` if the capacity of a cell has not been learned.
+        /// Capacity of the pack's weakest cell (Ah); `None` if the capacity of a cell has not been learned.
         capacity_ah: Option<f64>,
-        /// Standard deviation of the capacity, Ah.
+        /// Standard deviation of the capacity (Ah).
         capacity_std_ah: Option<f64>,
     },
     /// A new configuration applies from this time.
@@ -253,17 +253,17 @@ pub enum EventKind {
     BusAsleep {
         /// Whether the vehicle fell asleep.
         asleep: bool,
-        /// Duration of the sleep, s; `None` when the vehicle falls asleep.
+        /// Duration of the sleep (s); `None` when the vehicle falls asleep.
         seconds: Option<f64>,
     },
     /// Nothing was measured for a while: the computer was asleep, or the log has a gap.
     Gap {
-        /// Duration, s; `None` = unknown.
+        /// Duration (s); `None` = unknown.
         seconds: Option<f64>,
     },
     /// The driver's clock was set back: an input came with a time more than one second before the latest time.
     TimeBackwards {
-        /// Size of the step back, s.
+        /// Size of the step back (s).
         seconds: f64,
     },
     /// The cells' model was learned from the vehicle's data, the previous model is used again, or the data fit another
@@ -271,11 +271,11 @@ pub enum EventKind {
     Model {
         /// State of the model after the change.
         state: ModelState,
-        /// Capacity of the mean cell, Ah; `None` if nothing was learned.
+        /// Capacity of the mean cell (Ah); `None` if nothing was learned.
         capacity_ah: Option<f64>,
-        /// Standard deviation of the capacity, Ah.
+        /// Standard deviation of the capacity (Ah).
         capacity_std_ah: Option<f64>,
-        /// Root mean square of the residuals, V.
+        /// Root mean square of the residuals (V).
         residual_v: Option<f64>,
         /// The chemistry that explains the voltages better than the label's chemistry.
         chemistry: Option<Chemistry>,

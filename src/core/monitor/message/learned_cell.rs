@@ -8,9 +8,9 @@ use crate::quantity::CellIndex;
 pub struct LearnedCell {
     /// The cell.
     pub cell: CellIndex,
-    /// Capacity, Ah.
+    /// Capacity (Ah).
     pub capacity: ScalarGaussian,
-    /// Usable capacity, Ah.
+    /// Usable capacity (Ah).
     pub usable: Option<ScalarGaussian>,
     /// Resistance relative to the resistance of a new cell.
     pub resistance: Option<ScalarGaussian>,

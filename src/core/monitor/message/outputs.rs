@@ -72,19 +72,19 @@ pub struct Estimate {
     pub soc: f64,
     /// Standard deviation of the SOC.
     pub soc_std: f64,
-    /// Voltages of the model's RC branches, V; NaN in unused elements.
+    /// Voltages of the model's RC branches (V); NaN in unused elements.
     pub branch_v: [f64; crate::cell::MAX_BRANCHES],
-    /// Learned capacity, Ah.
+    /// Learned capacity (Ah).
     pub capacity_ah: f64,
-    /// Standard deviation of the capacity, Ah.
+    /// Standard deviation of the capacity (Ah).
     pub capacity_std_ah: f64,
     /// Resistance relative to the resistance of a new cell.
     pub resistance_ratio: f64,
     /// Standard deviation of the resistance ratio.
     pub resistance_ratio_std: f64,
-    /// Measured minus predicted voltage, V.
+    /// Measured minus predicted voltage (V).
     pub innovation_v: f64,
-    /// Predicted standard deviation of the innovation, V.
+    /// Predicted standard deviation of the innovation (V).
     pub innovation_std_v: f64,
     /// Whether the reading passed the innovation gate and changed the estimate.
     pub accepted: bool,
@@ -95,11 +95,11 @@ pub struct Estimate {
 /// Readings used for one estimate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeasuredValues {
-    /// Voltage, V.
+    /// Voltage (V).
     pub voltage_v: f64,
-    /// Cell current, A, positive = discharge.
+    /// Cell current (A), positive = discharge.
     pub current_a: f64,
-    /// Temperature, degrees C.
+    /// Temperature (degrees C).
     pub temperature_c: f64,
 }
 

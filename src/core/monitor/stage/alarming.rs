@@ -9,14 +9,14 @@ use crate::alarm::{AlarmChange, AlarmEngine, AlarmSnapshot, Observation, Rule, R
 use crate::monitor::config::MonitorConfig;
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Period for refreshing displayed values that change no alarm, s.
+/// Period for refreshing displayed values that change no alarm (s).
 const SHOW_S: f64 = 1.0;
 
 /// The alarming stage.
 #[derive(Debug)]
 pub(crate) struct Alarming {
     pub(crate) engine: AlarmEngine,
-    /// Shortest silence after which a configured threshold reports an input as missing, s; `None` without such a rule.
+    /// Shortest silence after which a configured threshold reports an input as missing (s); `None` without such a rule.
     pub(crate) missing_after_s: Option<f64>,
     /// Changes that wait to be published.
     pub(crate) changes: Vec<AlarmChange>,
@@ -124,7 +124,7 @@ impl StoreHealth {
         is_change
     }
 
-    /// Value for the rule about files: how long the files could not be written, s; 0 while they can be written.
+    /// Value for the rule about files: how long the files could not be written (s); 0 while they can be written.
     pub(crate) fn failing(&self, now: Timestamp) -> Observation {
         let failing_s = self.failing_since.map_or(0.0, |since| now.since(since).max(0.0));
         Observation::new(self.is_known.then_some(failing_s))

@@ -32,7 +32,7 @@ const DOUBT: f64 = 2.0;
 /// limit, this is the mean of a correct filter.
 const RETURN: f64 = 0.25;
 
-/// Value of `Consumed::path_v` for a frozen voltage, V. It is far outside the range of [`CurrentCheck::path_v`].
+/// Value of `Consumed::path_v` for a frozen voltage (V). It is far outside the range of [`CurrentCheck::path_v`].
 const FROZEN_PATH_V: f64 = 1e9;
 
 /// The estimation stage.
@@ -92,9 +92,9 @@ pub(crate) struct Consumed {
     pub(crate) charge_as: f64,
     offset_s: f64,
     pub(crate) unmeasured_s: f64,
-    /// The latest voltage, V.
+    /// The latest voltage (V).
     voltage_v: f64,
-    /// The sum of the cells' common changes ([`CurrentCheck::path_v`]) when this voltage last changed, V.
+    /// The sum of the cells' common changes ([`CurrentCheck::path_v`]) when this voltage last changed (V).
     path_v: f64,
 }
 
@@ -175,7 +175,7 @@ impl Estimation {
         std::mem::replace(&mut self.was_current_doubtful, self.is_current_doubtful)
     }
 
-    /// Temperature that replaces a missing measurement, degrees C.
+    /// Temperature that replaces a missing measurement (degrees C).
     pub(crate) fn ambient_c(&self) -> f64 {
         self.ambient_c
     }

@@ -26,7 +26,7 @@ use crate::monitor::message::{BusEvent, Command, Event, EventKind, Outputs};
 use crate::quantity::{BusIndex, Fault, Timestamp};
 use crate::sample::Moment;
 
-/// Shortest time between two reports of rejected command frames, s.
+/// Shortest time between two reports of rejected command frames (s).
 const BAD_COMMAND_S: f64 = 1.0;
 
 /// The intake stage.
@@ -209,7 +209,7 @@ impl Intake {
         out.events.push(Event { time: now, kind: EventKind::Bus { bus, what: event } });
     }
 
-    /// Value for the rule about interfaces, s: how long the longest present fault of an interface has lasted. Another
+    /// Value for the rule about interfaces (s): how long the longest present fault of an interface has lasted. Another
     /// node that uses identifiers of the daemon's frames also counts as a fault.
     pub(crate) fn bus_fault(&self, now: Timestamp, interfaces: usize) -> Observation {
         let (fault_s, is_whole) = self.buses.worst_s(now, interfaces);

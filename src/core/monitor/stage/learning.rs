@@ -32,7 +32,7 @@ use crate::quantity::catalogue::{Quantity, RecordedValues};
 use crate::quantity::{CellIndex, InvalidState, Mode, Timestamp, bounds};
 use crate::sample::CellSample;
 
-/// Largest distance from the model's highest voltage during the constant-voltage phase of a charge, V.
+/// Largest distance from the model's highest voltage during the constant-voltage phase of a charge (V).
 const TAPER_BAND_V: f64 = 0.03;
 
 /// The learning stage.
@@ -79,11 +79,11 @@ pub(crate) struct CellHealth {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[serde(from = "[f64; 3]", into = "[f64; 3]")]
 pub struct Throughput {
-    /// Charge moved in both directions, Ah.
+    /// Charge moved in both directions (Ah).
     pub charge_ah: f64,
-    /// Duration of the charges, s.
+    /// Duration of the charges (s).
     pub charging_s: f64,
-    /// Duration of the discharges, s.
+    /// Duration of the discharges (s).
     pub discharging_s: f64,
 }
 

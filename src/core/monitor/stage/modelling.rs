@@ -29,10 +29,10 @@ use crate::quantity::{InvalidState, Mode, Timestamp};
 const LEAST_NEW_ROWS: usize = 6;
 const LEAST_NEW_CHARGE: f64 = 0.12;
 
-/// Shortest rest, s, after which a fit starts. This rest is longer than a stop at a red light.
+/// Shortest rest (s) after which a fit starts. This rest is longer than a stop at a red light.
 const REST_S: f64 = 120.0;
 
-/// Time, s, from the start of a fit to the change of the model. Even a slow computer fits a model in less time.
+/// Time (s) from the start of a fit to the change of the model. Even a slow computer fits a model in less time.
 const FIT_S: f64 = 30.0;
 
 /// Largest misfit of a usable fit. With typical sensors, the misfit is at most 0.65. It is larger after heavy load in
@@ -57,9 +57,9 @@ pub struct ModelChange {
     pub time: Timestamp,
     /// State of the model after the change.
     pub state: ModelState,
-    /// Learned capacity, Ah; `None` for the label's model.
+    /// Learned capacity (Ah); `None` for the label's model.
     pub capacity: Option<ScalarGaussian>,
-    /// Root mean square of the residuals of the rows, V.
+    /// Root mean square of the residuals of the rows (V).
     pub residual_v: Option<f64>,
     /// The chemistry that explains the voltages better than the label's chemistry, if any.
     pub chemistry: Option<Chemistry>,

@@ -24,9 +24,9 @@ use crate::monitor::config::{MonitorConfig, OutputConfig, SupplyConfig};
 use crate::monitor::message::{Event, EventKind, Outputs, Secured, Transmit};
 use crate::quantity::{BusIndex, Fault, Timestamp};
 
-/// Period of the frames of a test, s. A receiver that reads once a second still gets several frames.
+/// Period of the frames of a test (s). A receiver that reads once a second still gets several frames.
 const TEST_PERIOD_S: f64 = 0.1;
-/// Longest duration of a test, s, so that a forgotten test ends.
+/// Longest duration of a test (s), so that a forgotten test ends.
 pub const MAX_TEST_S: f64 = 600.0;
 
 /// Number of immediate replies after a pause; further replies are at least [`REPLY_DELAY_MS`] apart, and replies in

@@ -8,15 +8,15 @@
 use crate::monitor::config::MonitorConfig;
 use crate::quantity::Timestamp;
 
-/// If no current flows and all inputs have been silent for longer than this time, s, the inputs are not judged, because
-/// the buses may be falling asleep. The time is longer than the pauses between frames of an awake bus, and shorter than
+/// If no current flows and all inputs have been silent for longer than this time (s), the inputs are not judged,
+/// because the buses may be falling asleep. The time is longer than the pauses between frames of an awake bus, and shorter than
 /// the age at which a reading is stale.
 pub(crate) const QUIET_S: f64 = 0.25;
 
 /// State of the bus sleep.
 #[derive(Debug)]
 pub(crate) struct BusSleep {
-    /// If all inputs are silent for longer than this time, s, the buses count as asleep; `None` = never.
+    /// If all inputs are silent for longer than this time (s), the buses count as asleep; `None` = never.
     pub(crate) after_s: Option<f64>,
     /// Start of the present sleep.
     pub(crate) since: Option<Timestamp>,

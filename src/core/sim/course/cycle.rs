@@ -6,8 +6,8 @@ use crate::sim::noise::Noise;
 use crate::sim::scenario::Settings;
 use crate::sim::truth::Pack;
 
-/// Range of the example's discharge pulses, A for a cell of 30 Ah. The pulses are uniformly distributed, with a mean of
-/// 15 A.
+/// Range of the example's discharge pulses (A) for a cell of 30 Ah. The pulses are uniformly distributed, with a mean
+/// of 15 A.
 const PULSE_A: (f64, f64) = (0.0, 30.0);
 const PULSE_S: f64 = 60.0;
 
@@ -56,7 +56,7 @@ pub(crate) struct CycleCourse {
 
 impl CycleCourse {
     pub(super) fn paper(settings: &Settings, scale: f64) -> Self {
-        // Current of the paper's scenario in both directions, A for a cell of 2.6 Ah. At this current, 48 cycles take
+        // Current of the paper's scenario in both directions (A) for a cell of 2.6 Ah. At this current, 48 cycles take
         // the paper's 2.23e5 s.
         let current_a = 1.325 * scale;
         Self::new(settings, Load::Constant { current_a }, current_a)
@@ -64,7 +64,7 @@ impl CycleCourse {
 
     pub(super) fn reference(settings: &Settings, scale: f64, noise: Noise) -> Self {
         let load = Pulses { noise, scale, current_a: 0.0, left_s: 0.0 };
-        // Charging current, A for a cell of 30 Ah: 0.5 C. The published example charges with a constant current, but
+        // Charging current (A) for a cell of 30 Ah: 0.5 C. The published example charges with a constant current, but
         // does not state its value.
         Self::new(settings, Load::Pulses(Box::new(load)), 15.0 * scale)
     }

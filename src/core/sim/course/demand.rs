@@ -4,7 +4,7 @@
 /// Next demand of a scenario.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Demand {
-    /// This cell current flows until the next sample, A, positive = discharge.
+    /// This cell current flows until the next sample (A), positive = discharge.
     Current(f64),
     /// The vehicle sleeps: no current, no measurements.
     Asleep {

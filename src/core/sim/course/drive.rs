@@ -25,7 +25,7 @@ enum DayPhase {
     Drive {
         left_s: f64,
     },
-    /// Asleep until this time of the day, s.
+    /// Asleep until this time of the day (s).
     Park {
         until_s: f64,
     },
@@ -136,7 +136,7 @@ impl DayCourse {
     }
 }
 
-/// Electric power, W, negative when braking feeds the battery.
+/// Electric power (W), negative when braking feeds the battery.
 fn power_w(speed_m_s: f64, acceleration_m_s2: f64) -> f64 {
     if speed_m_s == 0.0 {
         return AUXILIARY_W;

@@ -6,13 +6,13 @@ use crate::sim::noise::Noise;
 use crate::sim::scenario::Settings;
 use crate::sim::truth::Pack;
 
-/// Load currents, A for a cell of 2.1 Ah.
+/// Load currents (A) for a cell of 2.1 Ah.
 const LOADS_A: [f64; 12] = [-4.5, -3.75, -3.0, -2.25, -1.5, -0.75, 0.75, 1.5, 2.25, 3.0, 3.75, 4.5];
-/// Voltage range of the walk, V (narrowed to the cell's own limits).
+/// Voltage range of the walk (V) (narrowed to the cell's own limits).
 const RANGE_V: (f64, f64) = (3.2, 4.2);
-/// Reference current in both directions, A for a cell of 2.1 Ah.
+/// Reference current in both directions (A) for a cell of 2.1 Ah.
 const REFERENCE_A: f64 = 2.0;
-/// Rest after each half of a reference cycle, s.
+/// Rest after each half of a reference cycle (s).
 const REST_S: f64 = 1800.0;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -67,7 +67,7 @@ impl WalkCourse {
             }
             WalkPhase::Charge { cycles_left } => {
                 let current_a = pack.current_at_highest_a(high_v).max(-REFERENCE_A * self.scale);
-                // Charging at constant voltage ends at this current, A for a cell of 2.1 Ah.
+                // Charging at constant voltage ends at this current (A) for a cell of 2.1 Ah.
                 if current_a > -0.05 * self.scale {
                     let rest = WalkPhase::Rest { is_full: true, cycles_left, left_s: REST_S };
                     return self.enter(rest, pack, dt_s);

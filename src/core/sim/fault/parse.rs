@@ -14,7 +14,7 @@ const KINDS: &str = "leak:CELL:20mA, leak:CELL:1kohm, contact:CELL:0.4mohm, cont
      voltage-offset:CELL:10mV, voltage-stuck:CELL, swap:CELL:CELL, double:CELL:CELL, temperature-stuck:SENSOR or \
      temperature-off:SENSOR, each optionally followed by @WHEN";
 
-/// Latest start, s: ten years.
+/// Latest start (s): ten years.
 const LATEST_S: f64 = 10.0 * 365.0 * 86_400.0;
 
 type Unit = (&'static str, f64);

@@ -32,12 +32,12 @@ impl SensorFaults {
         })
     }
 
-    /// The temperature at `sensor`, degrees C.
+    /// The temperature at `sensor` (degrees C).
     pub(crate) fn temperature_c(&self, sensor: SensorIndex, truth_c: f64, ambient_c: f64) -> f64 {
         if self.begun.contains(&FaultKind::TemperatureOff(sensor)) { ambient_c } else { truth_c }
     }
 
-    /// Changes the voltages at the cells' taps to the voltages at the channels, V: adds offsets and swaps channels.
+    /// Changes the voltages at the cells' taps to the voltages at the channels (V): adds offsets and swaps channels.
     pub(crate) fn distort_voltages(&self, voltages_v: &mut [f64]) {
         for fault in &self.begun {
             match *fault {

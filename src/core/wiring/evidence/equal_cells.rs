@@ -1,6 +1,6 @@
 //! Finds cells whose voltages are always the same: one signal is configured for two cells, or a cell's value is copied.
 //!
-//! In: for each block of time, the mean voltage of each cell, V. Out: groups of cells that never differed, each with
+//! In: for each block of time, the mean voltage of each cell (V). Out: groups of cells that never differed, each with
 //! the number of blocks in which the cells' voltages changed. Equality is exact: a copy has the same digits, while two
 //! cells in series differ at least in the last digit.
 

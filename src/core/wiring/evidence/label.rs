@@ -13,17 +13,17 @@ use crate::can::unit::{Quantity, SignalUnit};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PackQuantity {
-    /// Pack current, A.
+    /// Pack current (A).
     Current,
-    /// Pack voltage, V.
+    /// Pack voltage (V).
     PackVoltage,
-    /// Voltages of single cells, V.
+    /// Voltages of single cells (V).
     CellVoltage,
     /// Temperatures of the pack, degrees Celsius.
     Temperature,
-    /// The battery controller's state of charge, %.
+    /// The battery controller's state of charge (%).
     Soc,
-    /// The battery controller's state of health, %.
+    /// The battery controller's state of health (%).
     Soh,
 }
 

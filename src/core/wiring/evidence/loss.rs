@@ -1,6 +1,6 @@
 //! Counts missing frames of a cyclic signal.
 //!
-//! In: times between two readings (gaps), s. Out: the share of missing readings. The cycle is the median of the first
+//! In: times between two readings (gaps) (s). Out: the share of missing readings. The cycle is the median of the first
 //! gaps. After these, a gap of n cycles counts as n - 1 missing readings. The total is limited to the elapsed cycles
 //! minus the received readings. Readings that a sender delays and then sends in a burst therefore do not count as
 //! missing. If the gaps are not multiples of one value, the sender has no cycle and the share is unknown.
@@ -43,7 +43,7 @@ impl LossCounter {
         }
     }
 
-    /// Share of the missing readings, and the cycle, s; `None` if there are too few gaps or the sender has no cycle.
+    /// Share of the missing readings, and the cycle (s); `None` if there are too few gaps or the sender has no cycle.
     pub(crate) fn share(&self) -> Option<(f64, f64)> {
         let gaps = f64::from(self.gaps);
         let missing = f64::from(self.missing).min((self.elapsed - gaps).max(0.0));

@@ -14,10 +14,10 @@ use super::slope::Slope;
 use crate::filter::median;
 use crate::quantity::Timestamp;
 
-/// Block lengths over which readings are averaged, s. Short blocks suit a load that changes all the time. Long blocks
+/// Block lengths over which readings are averaged (s). Short blocks suit a load that changes all the time. Long blocks
 /// suit noisy voltages and a load that holds for a while.
 pub(crate) const BLOCKS_S: [f64; 2] = [1.0, 10.0];
-/// Two blocks, or a current and a voltage, are compared only if the time between them is at most this, s.
+/// Two blocks, or a current and a voltage, are compared only if the time between them is at most this (s).
 const MAX_GAP_S: f64 = 40.0;
 
 /// A step of the current and of the voltages.
@@ -32,15 +32,15 @@ struct CurrentStep {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SteadyRun {
     pub(crate) current_a: f64,
-    /// Length of the evaluated part, s. The first 20 s are not evaluated.
+    /// Length of the evaluated part (s). The first 20 s are not evaluated.
     pub(crate) seconds: f64,
-    /// Mean over time of the median cell's voltage, V.
+    /// Mean over time of the median cell's voltage (V).
     pub(crate) voltage_v: f64,
-    /// Drift over `seconds`, V.
+    /// Drift over `seconds` (V).
     pub(crate) drift_v: f64,
-    /// Standard deviation of `drift_v`, V.
+    /// Standard deviation of `drift_v` (V).
     pub(crate) drift_std_v: f64,
-    /// Voltage at the end, V.
+    /// Voltage at the end (V).
     pub(crate) end_v: f64,
 }
 
@@ -70,7 +70,7 @@ struct OpenRun {
     last: Timestamp,
     current_sum: f64,
     blocks: u32,
-    /// First evaluated block: time since `from`, s, and voltage, V.
+    /// First evaluated block: time since `from` (s) and voltage (V).
     first: Option<(f64, f64)>,
     /// Sums over the evaluated blocks: 1, t, t^2, v, v^2, t v.
     n: f64,
@@ -129,7 +129,7 @@ impl OpenRun {
 #[derive(Debug, Clone, Default)]
 pub(crate) struct VoltageResponse {
     block_s: f64,
-    /// Largest current change that does not count as a change of load, A.
+    /// Largest current change that does not count as a change of load (A).
     tolerance_a: f64,
     current: Option<(Timestamp, f64)>,
     block: Block,
@@ -242,7 +242,7 @@ impl VoltageResponse {
         }
     }
 
-    /// Block length over which readings are averaged, s.
+    /// Block length over which readings are averaged (s).
     pub(crate) fn block_s(&self) -> f64 {
         self.block_s
     }
@@ -275,7 +275,7 @@ impl VoltageResponse {
         if largest < 5.0 * self.tolerance_a { Slope::of(points(0.2 * largest)) } else { Slope::fit(&all) }
     }
 
-    /// Largest step of the median cell's voltage, V.
+    /// Largest step of the median cell's voltage (V).
     pub(crate) fn largest_voltage_step(&self) -> f64 {
         self.steps.iter().map(|step| step.voltage_v.abs()).filter(|v| v.is_finite()).fold(0.0, f64::max)
     }

@@ -34,9 +34,9 @@ pub struct Series {
     pub extent: Extent,
     /// A sample of the values.
     pub values: ThinnedSample,
-    /// The times of the values in `values`, s.
+    /// The times of the values in `values` (s).
     pub(super) times_s: ThinnedSample,
-    /// Time between two readings, s.
+    /// Time between two readings (s).
     pub(crate) gaps: ThinnedSample,
     pub(crate) loss: LossCounter,
     pub(crate) longest_gap_s: f64,
@@ -71,7 +71,7 @@ impl Series {
         Some(value)
     }
 
-    /// Creates the statistics of a recorded signal from its values and their times, s.
+    /// Creates the statistics of a recorded signal from its values and their times (s).
     pub fn of(readings: impl Iterator<Item = (f64, Result<f64, Fault>)>) -> Self {
         // 4096 values suffice for a correlation, and samples of this size fit into memory for thousands of signals.
         let sample = ThinnedSample::of_at_most(4096);
@@ -152,7 +152,7 @@ impl Series {
         self.extent.count
     }
 
-    /// Median time between two readings, s.
+    /// Median time between two readings (s).
     pub fn period_s(&self) -> Option<f64> {
         self.gaps.median()
     }

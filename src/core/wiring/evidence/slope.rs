@@ -13,13 +13,13 @@ use crate::filter::median;
 pub struct Slope {
     /// Number of steps.
     pub points: usize,
-    /// Resistance: -dV/dI, ohm.
+    /// Resistance: -dV/dI (ohm).
     pub ohm: f64,
     /// Standard deviation of `ohm`.
     pub(crate) std_ohm: f64,
     /// Share of the voltage's variance that the current explains, 0 to 1.
     pub(crate) r2: f64,
-    /// Largest step of the current, A.
+    /// Largest step of the current (A).
     pub(crate) largest_a: f64,
 }
 

@@ -102,13 +102,13 @@ impl<'d> Judge<'d> {
         self.signals(Kind::Current).first().copied()
     }
 
-    /// Smallest and largest voltage that the median cell may have, V.
+    /// Smallest and largest voltage that the median cell may have (V).
     pub(super) fn voltage_band(&self) -> (f64, f64) {
         // The limits can be narrow, because short peaks do not change a median over time.
         self.plan.pack.model.as_ref().map_or((1.2, 4.6), |m| (m.voltage_min_v - 0.15, m.voltage_max_v + 0.08))
     }
 
-    /// Capacity of the whole pack, Ah.
+    /// Capacity of the whole pack (Ah).
     pub(super) fn pack_ah(&self) -> f64 {
         self.plan.pack.capacity_ah * f64::from(self.plan.pack.strings.max(1))
     }
@@ -118,7 +118,7 @@ impl<'d> Judge<'d> {
         if self.plan.pack.is_total { f64::from(self.plan.pack.cells.max(1)) } else { 1.0 }
     }
 
-    /// Voltage of the median cell, read as configured, V. Each cell contributes the median of its readings. `None`
+    /// Voltage of the median cell, read as configured (V). Each cell contributes the median of its readings. `None`
     /// without readings.
     pub(super) fn cell_voltage(&self) -> Option<f64> {
         self.median_of(Kind::Voltage, |series| series.values.median()).map(|v| v / self.cells_per_reading())
@@ -129,15 +129,15 @@ impl<'d> Judge<'d> {
         median(self.signals(kind).into_iter().filter_map(|(_, series)| value(series)))
     }
 
-    /// Median of the temperature sensors, degrees C; the configured ambient temperature if the median is not
+    /// Median of the temperature sensors (degrees C); the configured ambient temperature if the median is not
     /// plausible.
     pub(super) fn temperature_c(&self) -> f64 {
         let median = self.median_of(Kind::Temperature, |series| series.values.median());
         median.filter(|c| (-40.0..80.0).contains(c)).unwrap_or(self.plan.pack.ambient_c)
     }
 
-    /// Range of the model's resistance over the SOC and temperatures of the recording, ohm. The lower end is the lowest
-    /// immediate resistance. The upper end is the highest resistance at the time `block_s` after a current step.
+    /// Range of the model's resistance over the SOC and temperatures of the recording (ohm). The lower end is the
+    /// lowest immediate resistance. The upper end is the highest resistance at the time `block_s` after a current step.
     pub(super) fn model_ohm(&self, model: &CellModel, block_s: f64) -> (f64, f64) {
         let spread = |kind, per: f64, middle: f64| {
             let at = |q| self.median_of(kind, |series| series.values.quantile(q)).map_or(middle, |value| value * per);
@@ -157,7 +157,7 @@ impl<'d> Judge<'d> {
         })
     }
 
-    /// The model's resistance with all branches settled, at the recording's median voltage and temperature, ohm.
+    /// The model's resistance with all branches settled, at the recording's median voltage and temperature (ohm).
     pub(super) fn settled_ohm(&self, model: &CellModel) -> f64 {
         let voltage_v = self.cell_voltage().unwrap_or(f64::NAN) * self.voltage_factor;
         let temperature_c = self.temperature_c();

@@ -11,9 +11,9 @@ const SURE: f64 = 6.0;
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Drift {
     pub(super) seconds: f64,
-    /// Sum of the absolute drifts that the model expects, V.
+    /// Sum of the absolute drifts that the model expects (V).
     pub(super) expected_v: f64,
-    /// Mean measured drift of a run, weighted by the expected drift: absolute value, V. It is reported if the measured
+    /// Mean measured drift of a run, weighted by the expected drift: absolute value (V). It is reported if the measured
     /// drift is opposite to the expected drift.
     pub(super) against_v: f64,
     /// Ratio of measured to expected drift, weighted by the expected drift.

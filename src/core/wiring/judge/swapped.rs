@@ -9,7 +9,7 @@ use crate::wiring::evidence::Series;
 use crate::wiring::plan::{Kind, SignalPlan};
 use crate::wiring::report::Topic;
 
-/// Plausible temperatures of a pack in use, degrees C.
+/// Plausible temperatures of a pack in use (degrees C).
 const PLAUSIBLE_C: (f64, f64) = (-45.0, 95.0);
 
 pub(super) fn check(judge: &mut Judge<'_>) {

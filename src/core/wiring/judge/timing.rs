@@ -44,7 +44,7 @@ fn lost(judge: &mut Judge<'_>) {
     }
 }
 
-/// The signal with the longest period, and this period, s. If several signals have the same period, returns the signal
+/// The signal with the longest period, and this period (s). If several signals have the same period, returns the signal
 /// with the longest gap.
 fn slowest<'d>(all: &[SignalSeries<'d>]) -> Option<(SignalSeries<'d>, f64)> {
     let timed = all.iter().filter_map(|signal| Some((*signal, signal.1.period_s()?)));

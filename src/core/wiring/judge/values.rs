@@ -13,9 +13,9 @@ use crate::wiring::report::{Severity, Topic};
 
 /// Factors by which a unit may be off.
 const UNIT_FACTORS: [f64; 6] = [1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0];
-/// Plausible temperatures, degrees C.
+/// Plausible temperatures (degrees C).
 const PLAUSIBLE_C: std::ops::RangeInclusive<f64> = -40.0..=60.0;
-/// Possible temperatures of a pack, even on fire or in extreme cold, degrees C.
+/// Possible temperatures of a pack, even on fire or in extreme cold (degrees C).
 const POSSIBLE_C: std::ops::RangeInclusive<f64> = -60.0..=120.0;
 /// If the share of implausible readings is above this value, single disturbances do not explain these readings.
 const MANY: f64 = 0.01;

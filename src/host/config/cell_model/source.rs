@@ -23,9 +23,9 @@ pub fn state_words(state: ModelState) -> &'static str {
 /// The lowest and highest measured conditions; `None` = unknown.
 #[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize)]
 pub struct MeasuredRange {
-    /// Temperature, degrees C.
+    /// Temperature (degrees C).
     pub temperature_c: Option<[f64; 2]>,
-    /// Current, A, positive = discharge.
+    /// Current (A), positive = discharge.
     pub current_a: Option<[f64; 2]>,
     /// SOC, fraction.
     pub soc: Option<[f64; 2]>,
@@ -53,7 +53,7 @@ pub struct LearnedFrom {
     pub prior: Box<CellModel>,
     /// The conditions covered by the data that the fits use.
     pub seen: Coverage,
-    /// Root mean square of the residuals, V; `None` = nothing is learned yet.
+    /// Root mean square of the residuals (V); `None` = nothing is learned yet.
     pub residual_v: Option<f64>,
     /// A chemistry that explains the voltages better than the chemistry on the label.
     pub chemistry: Option<Chemistry>,
@@ -79,7 +79,7 @@ impl ModelSource {
         self.text(&["licence"])
     }
 
-    /// Root mean square of the fit's residuals, V.
+    /// Root mean square of the fit's residuals (V).
     pub fn residual_v(&self) -> Option<f64> {
         let number = |key: &str, unit_v: f64| match self.provenance.get(key)? {
             Value::Float(value) => Some(unit_v * value),
@@ -152,7 +152,7 @@ impl SourcedModel {
         Some(if left <= 0.7 * before { KnownBy::Data } else { KnownBy::Prior })
     }
 
-    /// Root mean square of the model's voltage error over all SOC values, V. The error is computed at the temperature
+    /// Root mean square of the model's voltage error over all SOC values (V). The error is computed at the temperature
     /// of the open-circuit curve. `None` = the model states no error.
     pub fn error_v(&self) -> Option<f64> {
         let errors =

@@ -10,9 +10,9 @@ use crate::health::RechargeAlarm;
 /// The values of a new cell. Relative thresholds such as "80 %" refer to these values.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct RatedCell {
-    /// Rated capacity, Ah.
+    /// Rated capacity (Ah).
     pub capacity_ah: f64,
-    /// Time in which the reference charger charges a cell of the rated capacity through the recharge window, s.
+    /// Time in which the reference charger charges a cell of the rated capacity through the recharge window (s).
     pub recharge_period_s: f64,
 }
 

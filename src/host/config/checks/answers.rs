@@ -24,7 +24,7 @@ pub(crate) struct AnswerDefinition {
     response: (CanId, Option<u8>),
     service: Service,
     identifier: u16,
-    /// Time between requests in each [`CarState`](crate::can::poll::CarState), s.
+    /// Time between requests in each [`CarState`](crate::can::poll::CarState) (s).
     pub every_s: [Option<f64>; 3],
     /// The signals of the answer. Bit positions in the layout of a signal count from the first byte of that signal.
     pub message: Message,

@@ -104,7 +104,7 @@ fn health(raw: &RawTables, pack: &Pack, rated_ah: f64) -> Option<HealthConfig> {
     })
 }
 
-/// Cycle times of the input messages as stated by the DBC files, s.
+/// Cycle times of the input messages as stated by the DBC files (s).
 fn cycle_times_s(found: &[ResolvedSignal<'_>]) -> Vec<(BusIndex, CanId, f64)> {
     let in_frames = found.iter().filter(|resolved| resolved.answer.is_none());
     let times = in_frames.filter_map(|resolved| {

@@ -83,13 +83,13 @@ pub(crate) struct ResolvedSignal<'d> {
 /// Ranges and resolution stated by the DBC, in packwatch's units and sign. Ranges that are not stated are infinite.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct DbcRanges {
-    /// Pack current, A, positive = discharge.
+    /// Pack current (A), positive = discharge.
     pub current_a: (f64, f64),
-    /// Cell voltage, V.
+    /// Cell voltage (V).
     pub voltage_v: (f64, f64),
-    /// Temperature, degrees C.
+    /// Temperature (degrees C).
     pub temperature_c: (f64, f64),
-    /// Coarsest resolution of a cell's voltage, V; 0 = unknown.
+    /// Coarsest resolution of a cell's voltage (V); 0 = unknown.
     pub voltage_step_v: f64,
 }
 

@@ -47,7 +47,7 @@ impl Config {
 /// How state and history are kept.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StoreConfig {
-    /// Shortest time between checkpoints of the state, s.
+    /// Shortest time between checkpoints of the state (s).
     pub checkpoint_s: f64,
     /// Maximum number of rows kept in the history; above this number the oldest segments are deleted.
     pub max_rows: u32,

@@ -70,7 +70,7 @@ impl RawTables {
         }
     }
 
-    /// Rated capacity of one cell that is not in a `[[pack.module]]`, Ah: from `[pack]`, else from the cell model.
+    /// Rated capacity of one cell that is not in a `[[pack.module]]` (Ah): from `[pack]`, else from the cell model.
     pub(crate) fn rated_ah(&self, model: Option<&CellModel>) -> Option<f64> {
         let configured = self.pack.as_ref().and_then(|pack| pack.rated_capacity_ah);
         configured.or(model.map(|model| model.rated_capacity_ah))

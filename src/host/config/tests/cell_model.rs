@@ -104,7 +104,7 @@ fn electrode_data_determine_curve_ageing() {
     };
     let good = "positive_content = [0.8531, 0.2679]\nnegative_content = [0.0335, 0.9107]";
     let model = with(good).expect("a configuration").0.monitor.model;
-    // Change of the open-circuit voltage at SOC 0.5 after a loss of 20 % of the capacity, V.
+    // Change of the open-circuit voltage at SOC 0.5 after a loss of 20 % of the capacity (V).
     let offset_v = |model: &crate::cell::CellModel| {
         let (aged, new) = (0.8 * model.capacity_ah, model.grid_position(0.5, 25.0));
         model.aged_ocv_v(&new, aged) - model.ocv_v(&new)

@@ -142,7 +142,7 @@ fn after_cut(place: &Path) -> StoredStates {
     found
 }
 
-/// The raised alarms of a restored state, each with its occurrences and the time of the last occurrence, s.
+/// The raised alarms of a restored state, each with its occurrences and the time of the last occurrence (s).
 fn raised(snapshot: Snapshot) -> Vec<(u32, f64)> {
     let monitor = restored(snapshot);
     monitor.alarms().raised().map(|alarm| (alarm.occurrences, alarm.last_raised.unwrap().secs())).collect()

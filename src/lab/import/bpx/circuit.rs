@@ -25,7 +25,7 @@ use crate::quantity::bounds::{Bounds, CAPACITANCE_F, RESISTANCE_OHM};
 /// large that the noise of a table does not count as slope.
 const SLOPE_STEP: f64 = 0.005;
 
-/// Smallest resistance, ohm, and smallest time constant, s: a flat potential gives 0, but a model needs a positive
+/// Smallest resistance (ohm) and smallest time constant (s): a flat potential gives 0, but a model needs a positive
 /// value.
 const LEAST: f64 = 1e-7;
 
@@ -33,12 +33,12 @@ const LEAST: f64 = 1e-7;
 #[derive(Debug, Clone)]
 pub(super) struct Resistances {
     pub(super) r0_ohm: f64,
-    /// Resistance, ohm, and time constant, s.
+    /// Resistance (ohm) and time constant (s).
     pub(super) branches: Vec<(f64, f64)>,
 }
 
 impl Resistances {
-    /// Sum of all resistances, ohm.
+    /// Sum of all resistances (ohm).
     pub(super) fn settled_ohm(&self) -> f64 {
         self.r0_ohm + self.branches.iter().map(|branch| branch.0).sum::<f64>()
     }

@@ -10,7 +10,8 @@ use super::FARADAY_C_PER_MOL;
 use super::document::{BpxCell, Electrode};
 use crate::filter::bisect;
 
-/// Smallest rise of the open-circuit voltage between breakpoints, V. A voltage that rises by less, or falls, is raised.
+/// Smallest rise of the open-circuit voltage between breakpoints (V). A voltage that rises by less, or falls, is
+/// raised.
 const LEAST_RISE_V: f64 = 2e-5;
 
 /// Number of points between two breakpoints at which the interpolation is checked.
@@ -24,7 +25,7 @@ pub(super) struct Curve<'a> {
     pub(super) negative: [f64; 2],
     /// Lithium content of the positive electrode at SOC 0 and 1.
     pub(super) positive: [f64; 2],
-    /// Charge between the cut-offs, Ah.
+    /// Charge between the cut-offs (Ah).
     pub(super) capacity_ah: f64,
 }
 
@@ -32,14 +33,14 @@ pub(super) struct Curve<'a> {
 #[derive(Debug, Clone)]
 pub(super) struct CurveTable {
     pub(super) soc: Vec<f64>,
-    /// One row per temperature, V.
+    /// One row per temperature (V).
     pub(super) ocv_v: Vec<Vec<f64>>,
-    /// Largest amount by which a voltage was raised to make its row rise, V.
+    /// Largest amount by which a voltage was raised to make its row rise (V).
     pub(super) raised_v: f64,
 }
 
 impl Electrode {
-    /// Charge of the lithium that fits into the electrode, Ah.
+    /// Charge of the lithium that fits into the electrode (Ah).
     pub(super) fn capacity_ah(&self, area_m2: f64) -> f64 {
         let volume_share = self.surface_per_m * self.radius_m / 3.0;
         FARADAY_C_PER_MOL * volume_share * self.thickness_m * area_m2 * self.concentration_max / 3600.0
@@ -99,7 +100,7 @@ impl<'a> Curve<'a> {
         (between(self.negative), between(self.positive))
     }
 
-    /// Open-circuit voltage, V.
+    /// Open-circuit voltage (V).
     pub(super) fn voltage_v(&self, soc: f64, temperature_k: f64) -> f64 {
         let (x, y) = self.contents(soc);
         let BpxCell { negative: n, positive: p, reference_k, .. } = self.cell;

@@ -8,7 +8,7 @@ use serde_json::{Map, Value};
 
 use super::function::{Function, found};
 
-/// Reference temperature if the file does not state it, K.
+/// Reference temperature if the file does not state it (K).
 const USUAL_TEMPERATURE_K: f64 = 298.15;
 
 /// Parameters of a BPX file for a cell model.
@@ -32,7 +32,7 @@ pub(super) struct BpxCell {
     pub(super) positive: Electrode,
     /// Transport in the electrolyte; `None` for the model SPM.
     pub(super) transport: Option<Transport>,
-    /// Heat capacity, J/K, if density, volume and specific heat capacity are stated.
+    /// Heat capacity (J/K) if density, volume and specific heat capacity are stated.
     pub(super) heat_capacity_j_per_k: Option<f64>,
     /// Thermal resistance to the surroundings, K/W, if heat transfer coefficient and surface are stated.
     pub(super) thermal_k_per_w: Option<f64>,

@@ -7,7 +7,7 @@
 //! look-up is a single comparison. Cached values depend only on temperature, SOC and capacity, so the results do not
 //! depend on the state of the cache.
 //!
-//! In: states of charge, degrees C. Out: V, ohm, s. A NaN in one lane gives a NaN voltage in this lane only; the step
+//! In: states of charge (degrees C). Out: V, ohm, s. A NaN in one lane gives a NaN voltage in this lane only; the step
 //! is then not usable.
 
 use crate::cell::aged_ocv::{MIXES, OffsetLine};
@@ -16,12 +16,12 @@ use crate::filter::simd::Lanes;
 
 /// Index of the open-circuit voltage (V) in a row. The slope of every quantity (per unit of SOC) follows its value.
 pub(super) const OCV_V: usize = 0;
-/// Index of the change of the open-circuit voltage with the capacity, V per Ah; the change is 0 if the curve does not
+/// Index of the change of the open-circuit voltage with the capacity (V per Ah); the change is 0 if the curve does not
 /// age. The changes per standard deviation of each mix of losses (V) follow.
 pub(super) const OCV_PER_AH: usize = 2;
-/// Index of the series resistance, ohm.
+/// Index of the series resistance (ohm).
 pub(super) const R0_OHM: usize = OCV_PER_AH + 2 + 2 * MIXES;
-/// Index of the voltage error, V; 0 if the model states no error.
+/// Index of the voltage error (V); 0 if the model states no error.
 pub(super) const ERROR_V: usize = R0_OHM + 2;
 /// Index of the first branch's resistance (ohm). Its time constant (s) follows, then the next branch.
 const BRANCHES: usize = ERROR_V + 2;
@@ -58,7 +58,7 @@ pub(super) struct LineCache<const L: usize, const W: usize> {
     temperature_c: [f64; L],
     /// Slots in which the rows of each lane's temperature were last found.
     isotherms: [usize; L],
-    /// Capacities of the open-circuit curves, Ah.
+    /// Capacities of the open-circuit curves (Ah).
     capacity_ah: [f64; L],
     places: [CachedLines<L, W>; 3],
 }
@@ -177,7 +177,7 @@ impl<const W: usize> Tables<W> {
         }
     }
 
-    /// Updates the lines in `cache` to the open-circuit curves of these capacities, Ah. The capacities change at
+    /// Updates the lines in `cache` to the open-circuit curves of these capacities (Ah). The capacities change at
     /// half-cycles.
     #[inline(always)]
     pub(super) fn refresh_capacities<const L: usize>(&mut self, cache: &mut LineCache<L, W>, capacity_ah: &Lanes<L>) {
@@ -240,7 +240,7 @@ impl<const W: usize> Tables<W> {
         }
     }
 
-    /// Computes the lines of a lane that depend on the capacity of the open-circuit curve, Ah. [`Self::copy`] adds the
+    /// Computes the lines of a lane that depend on the capacity of the open-circuit curve (Ah). [`Self::copy`] adds the
     /// offset to the open-circuit voltage.
     fn age<const L: usize>(&self, capacity_ah: f64, lines: &mut CachedLines<L, W>, lane: usize) {
         let OffsetLine { offset_v, per_ah_v, mixes_v } =
@@ -304,8 +304,8 @@ impl<'a, const L: usize, const W: usize> TablePoint<'a, L, W> {
         (self.row[OCV_V] + slope_v * self.soc, slope_v, self.one(R0_OHM))
     }
 
-    /// Changes of the open-circuit voltage: with the capacity, V per Ah, and per standard deviation of each mix of
-    /// losses, V.
+    /// Changes of the open-circuit voltage: with the capacity (V per Ah) and per standard deviation of each mix of
+    /// losses (V).
     #[inline(always)]
     pub(super) fn ocv_changes(&self) -> [Lanes<L>; 1 + MIXES] {
         std::array::from_fn(|i| self.row[OCV_PER_AH + 2 * i] + self.row[OCV_PER_AH + 2 * i + 1] * self.soc)

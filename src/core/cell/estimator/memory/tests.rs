@@ -23,7 +23,7 @@ fn near(a: f64, b: f64) -> bool {
 }
 
 /// Computes a step whose current is unknown at the reading, so its voltage is not used. Returns the time that counts as
-/// new information, s.
+/// new information (s).
 fn new_information_s(estimator: &mut CellEstimator, step: CellStep) -> f64 {
     let before_s = estimator.memory.information_s;
     estimator.step(&small_model(), &config(), &CellStep { current_a: None, ..step });

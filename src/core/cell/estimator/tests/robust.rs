@@ -5,10 +5,10 @@
 
 use super::*;
 
-/// Time constant of the slow polarisation that the estimator's model lacks, s.
+/// Time constant of the slow polarisation that the estimator's model lacks (s).
 const SLOW_TAU_S: f64 = 1500.0;
 
-/// Resistance of the slow polarisation, ohm. It is a fifth of the model's resistance. From 15 mohm on, the intervals
+/// Resistance of the slow polarisation (ohm). It is a fifth of the model's resistance. From 15 mohm on, the intervals
 /// would be too narrow: the default model error of 0.15 V over one second does not cover an error that lasts for 1500
 /// s.
 const SLOW_OHM: f64 = 0.01;

@@ -11,10 +11,10 @@ use crate::cell::notebook::Row;
 use crate::cell::own_model::{FACTOR_NODES, OwnModel, SOC_NODES};
 use crate::filter::interpolation::{between, locate_clamped};
 
-/// Index of the first parameter of each group. From index 0: difference from the label's curve, V, at the SOC
+/// Index of the first parameter of each group. From index 0: difference from the label's curve (V) at the SOC
 /// breakpoints. [`FACTORS`]: ln of the resistance factors over SOC. [`BY_TEMPERATURE`]: deviation of each resistance's
-/// activation energy from the usual one, fraction. [`COLD_SAG`]: difference from the label's cold sag, V.
-/// [`LOG_CAPACITY`]: ln of the capacity, Ah. [`OFFSET`]: offset of the current sensor, A (measured minus true).
+/// activation energy from the usual one, fraction. [`COLD_SAG`]: difference from the label's cold sag (V).
+/// [`LOG_CAPACITY`]: ln of the capacity (Ah). [`OFFSET`]: offset of the current sensor (A) (measured minus true).
 /// [`BEGINNINGS`]: SOC at the start of each stretch.
 pub(super) const FACTORS: usize = SOC_NODES;
 pub(super) const BY_TEMPERATURE: usize = FACTORS + RESISTANCES * FACTOR_NODES;
@@ -40,10 +40,10 @@ pub(super) struct Basis<'a> {
 /// Predicted voltage of a row, with derivatives.
 pub(super) struct Prediction {
     pub(super) voltage_v: f64,
-    /// Voltage drop in the cell, V.
+    /// Voltage drop in the cell (V).
     pub(super) drop_v: f64,
     pub(super) soc: f64,
-    /// Slope of the open-circuit voltage, V per unit of SOC.
+    /// Slope of the open-circuit voltage (V per unit of SOC).
     pub(super) slope_v: f64,
     pub(super) ohm: [f64; RESISTANCES],
     /// Derivatives of ln(resistance) with respect to the three parameters of a resistance: its factors at two SOC nodes

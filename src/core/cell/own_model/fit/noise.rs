@@ -9,7 +9,7 @@ use super::basis::{Basis, CURVE_AND_SOC, Prediction};
 use crate::cell::notebook::{CurrentSteps, Row};
 use crate::filter::bell;
 
-/// Standard deviation of a row's voltage, V.
+/// Standard deviation of a row's voltage (V).
 const ROW_V: f64 = 0.006;
 /// Residuals beyond this many standard deviations count linearly (Huber).
 const HUBER: f64 = 3.0;
@@ -120,7 +120,7 @@ impl NormalEquations {
     }
 }
 
-/// Covariance of the rows' errors, V^2.
+/// Covariance of the rows' errors (V^2).
 fn covariance(predictions: &[Prediction], errors: &RepeatedErrors) -> DMatrix<f64> {
     let drop_v: Vec<f64> = predictions.iter().map(|it| it.drop_v * (1.0 + 3.0 * it.drop_v.abs())).collect();
     DMatrix::from_fn(predictions.len(), predictions.len(), |a, b| {

@@ -42,7 +42,7 @@ const STEADY: f64 = 0.3;
 /// Largest ratio of a step's resistance and the usual resistance, in either direction. Temperature, ageing and the time
 /// between two rounds change the resistance by less.
 const MAX_FACTOR: f64 = 4.0;
-/// Smallest clear step of the voltages, V.
+/// Smallest clear step of the voltages (V).
 const MIN_STEP_V: f64 = 0.01;
 /// Smallest clear step, as a multiple of the standard deviation of a reading and as a multiple of the cells' scatter.
 const STEP_SIGMA: f64 = 5.0;
@@ -52,13 +52,13 @@ const STEP_READINGS: f64 = 1.5;
 const STEP_MOVES: f64 = 9.0;
 /// Factor by which each round raises or lowers the usual change, which thus follows the median.
 const MOVE_GAIN: f64 = 1.02;
-/// Range of the usual change between two rounds, V.
+/// Range of the usual change between two rounds (V).
 const MOVE_V: (f64, f64) = (1e-4, 0.05);
-/// Usual change before the first rounds, V. It exceeds the noise of any sensor.
+/// Usual change before the first rounds (V). It exceeds the noise of any sensor.
 const FIRST_MOVE_V: f64 = 0.01;
 /// Weight of an explained step in the usual resistance (as ln).
 const RATIO_GAIN: f64 = 0.1;
-/// Longest time between two rounds, s. After a longer pause, the steps are not compared.
+/// Longest time between two rounds (s). After a longer pause, the steps are not compared.
 const MAX_PAUSE_S: f64 = 60.0;
 /// Part of the earlier doubts that remains after an explained step.
 const FORGET_DOUBT: f64 = 0.97;
@@ -71,15 +71,15 @@ const FAULTY_REPEAT: f64 = 0.5;
 /// Changes of a reading above this multiple of the sensor's resolution are noise. A coarse sensor also changes by one
 /// step.
 const NOISE_STEPS: f64 = 1.5;
-/// Resolution of the current before a change has been seen, A.
+/// Resolution of the current before a change has been seen (A).
 const MAX_RESOLUTION_A: f64 = 1e3;
 /// Limit of `repeated` (ln of the odds for a good sensor). At this limit, the sensor becomes doubtful.
 const REPEATED: f64 = -10.0;
-/// Common change of the cells, V, after which a voltage that has not changed is frozen. The limit is at least
+/// Common change of the cells (V) after which a voltage that has not changed is frozen. The limit is at least
 /// [`FROZEN_STEPS`] times the resolution of the voltages.
 const FROZEN_V: f64 = 0.03;
 const FROZEN_STEPS: f64 = 2.5;
-/// Resolution of the voltages before a change has been seen, V.
+/// Resolution of the voltages before a change has been seen (V).
 const COARSE_V: f64 = 0.05;
 /// Maximum number of cells that are compared.
 pub(crate) const MAX_CELLS: usize = 15;
@@ -90,9 +90,9 @@ const ROUNDS: usize = 4;
 #[serde(deny_unknown_fields)]
 struct Round {
     time: Timestamp,
-    /// Current of a cell, A.
+    /// Current of a cell (A).
     current_a: f64,
-    /// Common change of the voltages since the previous round, V.
+    /// Common change of the voltages since the previous round (V).
     move_v: f64,
 }
 
@@ -100,7 +100,7 @@ struct Round {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct CurrentCheck {
-    /// Voltage of each compared cell in the latest round, V; `None` = no reading.
+    /// Voltage of each compared cell in the latest round (V); `None` = no reading.
     voltages_v: [Option<f64>; MAX_CELLS],
     /// The latest rounds, the oldest first.
     rounds: [Round; ROUNDS],
@@ -112,23 +112,23 @@ pub(crate) struct CurrentCheck {
     steps: [f64; 2],
     /// ln of the usual resistance relative to the model.
     log_ratio: f64,
-    /// Usual size of the voltage changes that the current does not explain, V.
+    /// Usual size of the voltage changes that the current does not explain (V).
     usual_v: f64,
-    /// Usual difference between a cell's change since the previous round and the common change, V.
+    /// Usual difference between a cell's change since the previous round and the common change (V).
     scatter_v: f64,
     /// Share of readings of a steady current that differ from the previous reading by noise.
     noisy: f64,
-    /// Smallest change of the current, A.
+    /// Smallest change of the current (A).
     resolution_a: f64,
-    /// Sum of all common changes of the voltages, V.
+    /// Sum of all common changes of the voltages (V).
     path_v: f64,
-    /// Smallest change of a single voltage, V.
+    /// Smallest change of a single voltage (V).
     resolution_v: f64,
     /// Evidence of the present run of equal readings: ln of the odds for a good sensor, at most 0.
     repeated: f64,
-    /// Largest reading of discharge and of charge, A.
+    /// Largest reading of discharge and of charge (A).
     largest_a: [f64; 2],
-    /// Readings at which the sensor was at its limit, for discharge and for charge, A; 0 = never.
+    /// Readings at which the sensor was at its limit, for discharge and for charge (A); 0 = never.
     limits_a: [f64; 2],
     /// Number of earlier doubts; explained steps reduce it.
     doubts: f64,
@@ -258,7 +258,7 @@ impl CurrentCheck {
         }
     }
 
-    /// Sum of all changes that the cells have in common, V. Only its differences are meaningful.
+    /// Sum of all changes that the cells have in common (V). Only its differences are meaningful.
     pub(crate) fn path_v(&self) -> f64 {
         self.path_v
     }
@@ -362,7 +362,7 @@ impl CurrentCheck {
     }
 }
 
-/// The change that at least two thirds of the cells reach or exceed in the same direction, V; otherwise 0.
+/// The change that at least two thirds of the cells reach or exceed in the same direction (V); otherwise 0.
 fn common_move(moves_v: &mut [f64]) -> f64 {
     moves_v.sort_unstable_by(f64::total_cmp);
     let Some(last) = moves_v.len().checked_sub(1) else { return 0.0 };
@@ -377,7 +377,7 @@ fn common_move(moves_v: &mut [f64]) -> f64 {
     }
 }
 
-/// Median difference between the cells' changes and the common change, V.
+/// Median difference between the cells' changes and the common change (V).
 fn scatter(moves_v: &mut [f64], common_v: f64) -> f64 {
     moves_v.iter_mut().for_each(|move_v| *move_v = (*move_v - common_v).abs());
     moves_v.sort_unstable_by(f64::total_cmp);
@@ -395,13 +395,13 @@ mod tests {
     const OHM: f64 = 2e-3;
     const CELLS: usize = 5;
 
-    /// Load of a drive, A: a new level every 10 s.
+    /// Load of a drive (A): a new level every 10 s.
     fn load_a(time_s: u32) -> f64 {
         let level = (time_s / 10).wrapping_mul(2_654_435_761) >> 24;
         f64::from(level) / 2.0 - 30.0
     }
 
-    /// Noise of a reading, A: 0 to 0.06 A in steps of 0.001 A.
+    /// Noise of a reading (A): 0 to 0.06 A in steps of 0.001 A.
     fn noise_a(time_s: u32) -> f64 {
         f64::from(time_s.wrapping_mul(time_s) % 61) / 1000.0
     }

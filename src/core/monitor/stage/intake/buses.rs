@@ -17,7 +17,7 @@ use crate::quantity::{BusIndex, Timestamp};
 pub(crate) const CAN_ERR_BUSOFF: u32 = 0x40;
 const CAN_ERR_RESTARTED: u32 = 0x100;
 
-/// If no report of unsent frames arrives for this time, sending counts as working again, s. The time is four report
+/// If no report of unsent frames arrives for this time, sending counts as working again (s). The time is four report
 /// periods of the driver.
 const SEND_RECOVERED_S: f64 = 1.0;
 
@@ -63,7 +63,7 @@ impl Buses {
         (state.is_known, state.off_since) = (true, None);
     }
 
-    /// Duration of the longest present fault of an interface, s, and whether all `interfaces` have reported. The
+    /// Duration of the longest present fault of an interface (s) and whether all `interfaces` have reported. The
     /// duration is 0 if no interface that has reported is faulty, and `None` if no interface has reported.
     pub(crate) fn worst_s(&self, now: Timestamp, interfaces: usize) -> (Option<f64>, bool) {
         let known = self.states.iter().filter(|state| state.is_known);

@@ -93,7 +93,7 @@ impl AlarmQueue {
         !self.unknown.is_empty()
     }
 
-    /// Time between two frames in turn of the same raised alarm, s.
+    /// Time between two frames in turn of the same raised alarm (s).
     pub(crate) fn pass_time_s(engine: &AlarmEngine, period_s: f64) -> f64 {
         let count = i64::try_from(engine.count()).unwrap_or(i64::MAX).max(1);
         Timestamp::from_nanos(Self::turn_ns(engine, period_s).saturating_mul(count)).secs()

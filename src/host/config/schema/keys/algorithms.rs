@@ -76,7 +76,8 @@ section! {
         max_information_s: f64, "s", Between(0.001, 1e6), Default("100.0");
         /// A voltage that differs from its prediction by more than this many standard deviations changes no estimate.
         gate_sigma: f64, "", Above(0.0, 1e6), Default("5.0");
-        /// Standard deviation of the cell model's error in a single reading, used by the gate and the consistency monitor.
+        /// Standard deviation of the cell model's error in a single reading, used by the gate and the consistency
+        /// monitor.
         gate_model_error_v: f64, "V", Between(0.0, 10.0), Default("0.06");
         /// Standard deviation of a further error of the cell model, stated as an error of the SOC on the open-circuit curve. It is added to `gate_model_error_v`.
         gate_soc_error: f64, "fraction", Between(0.0, 1.0), Default("0.02");
@@ -90,8 +91,8 @@ section! {
 }
 
 impl Estimator {
-    /// Standard deviation of the voltage's rounding error, V (uniform: step / sqrt 12). If the step does not exceed the
-    /// sensor's noise, the result is 0, because the noise then covers the rounding error.
+    /// Standard deviation of the voltage's rounding error (V) (uniform: step / sqrt 12). If the step does not exceed
+    /// the sensor's noise, the result is 0, because the noise then covers the rounding error.
     pub(crate) fn rounding_v(&self, step_v: f64) -> f64 {
         if step_v > self.voltage_noise_v { step_v / 12.0_f64.sqrt() } else { 0.0 }
     }

@@ -9,7 +9,7 @@ use crate::config::schema::setting::choice;
 use crate::health::RechargeAlarm;
 use crate::quantity::bounds;
 
-/// Lowest and highest temperature that may be configured, degrees C.
+/// Lowest and highest temperature that may be configured (degrees C).
 pub(crate) const TEMPERATURE_C: ValueRange = within(bounds::TEMPERATURE_C);
 /// Range of standard deviations and of noise densities.
 pub(crate) const DEVIATION: ValueRange = within(bounds::DEVIATION);

@@ -83,10 +83,10 @@ section! {
 
 section! {
     /// The alarms of a rule. The rules compare the following values.
-    /// `capacity_low` and `usable_capacity_low`: capacity per cell, Ah. `recharge_period_low`: recharge period, s. `resistance_high`: resistance relative to a new cell (1 = as new).
+    /// `capacity_low` and `usable_capacity_low`: capacity per cell (Ah). `recharge_period_low`: recharge period (s). `resistance_high`: resistance relative to a new cell (1 = as new).
     /// `soc_low`: SOC of the emptiest cell, fraction. `cell_imbalance`: SOC of the fullest cell minus SOC of the emptiest cell, fraction. `bms_disagrees`: SOC or SOH reported by the pack minus the estimate, fraction. `input_implausible`: share of bad readings, fraction.
-    /// `temperature_high`: temperature of the hottest sensor, degrees C. `remaining_life_low`: remaining life, equivalent full cycles.
-    /// `input_missing`, `store_failed` and `bus_fault`: how long the fault has lasted, s. `estimate_untrusted`: the mean normalised innovation squared, or the cell model's mismatch on the same scale.
+    /// `temperature_high`: temperature of the hottest sensor (degrees C). `remaining_life_low`: remaining life, equivalent full cycles.
+    /// `input_missing`, `store_failed` and `bus_fault`: how long the fault has lasted (s). `estimate_untrusted`: the mean normalised innovation squared, or the cell model's mismatch on the same scale.
     /// Three rules compare each cell with the other cells. `cell_leak`: self-discharge per day as a fraction of the cell's capacity. `connection_resistance`: additional contact resistance as a fraction of the cell's series resistance at 50 % SOC and 25 degrees C. `channel_faulty`: 1 while the cell's voltage channel is faulty (frozen, offset, doubled or swapped), else 0.
     Alarm at "alarm" {
         /// What the alarm compares.

@@ -17,7 +17,7 @@ const MAX_WALK_S: f64 = 600.0;
 
 /// Values of a branch at L table points, for the measured time.
 struct BranchStep<const L: usize> {
-    /// Resistance of new cells, ohm.
+    /// Resistance of new cells (ohm).
     r_ohm: Lanes<L>,
     tau_s: Lanes<L>,
     /// Remaining fraction of the branch's voltage after the measured time.
@@ -108,7 +108,7 @@ fn predict_branch<const L: usize, const N: usize, const W: usize>(
     BranchPrediction { centre_v, decay, gain_ohm, noise, parts }
 }
 
-/// Charge that one standard deviation of each constant error adds to the measured charge, A s.
+/// Charge that one standard deviation of each constant error adds to the measured charge (A) s.
 #[inline(always)]
 fn excess_as<const L: usize>(c: &KernelConstants, input: &StepInput<L>) -> [Lanes<L>; CONSTANT_ERRORS] {
     let mut excess_as = [Lanes::splat(0.0); CONSTANT_ERRORS];

@@ -34,17 +34,17 @@ pub(in crate::cell::estimator::bank) const MEMORY: usize = 12;
 pub(in crate::cell::estimator::bank) const LOAD_A: usize = 0;
 /// Mean normalised innovation squared.
 pub(in crate::cell::estimator::bank) const MEAN_NIS: usize = 1;
-/// Time that the next reading represents, s.
+/// Time that the next reading represents (s).
 pub(in crate::cell::estimator::bank) const INFORMATION_S: usize = 2;
-/// Time at rest, s.
+/// Time at rest (s).
 pub(in crate::cell::estimator::bank) const REST_S: usize = 3;
 /// Information about the current's offset.
 pub(in crate::cell::estimator::bank) const OFFSET_INFORMATION: usize = 4;
 /// Evidence about the current's offset.
 pub(in crate::cell::estimator::bank) const OFFSET_SCORE: usize = 5;
-/// Capacity of the open-circuit curve, Ah. Steps do not change it.
+/// Capacity of the open-circuit curve (Ah). Steps do not change it.
 pub(in crate::cell::estimator::bank) const CURVE_AH: usize = 6;
-/// Standard deviation of the curve's capacity, Ah. Steps do not change it.
+/// Standard deviation of the curve's capacity (Ah). Steps do not change it.
 pub(in crate::cell::estimator::bank) const CURVE_STD_AH: usize = 7;
 
 /// Information about the ratio of the slowest branch.
@@ -169,7 +169,7 @@ pub(super) struct ReadingVariances {
 }
 
 impl KernelConstants {
-    /// Time that a reading represents, s.
+    /// Time that a reading represents (s).
     #[inline(always)]
     pub(in crate::cell::estimator::bank) fn information_s<const L: usize>(
         &self,

@@ -20,22 +20,22 @@ use crate::filter::simd::Lanes;
 
 /// Predicted voltage.
 struct PredictedVoltage<const L: usize> {
-    /// Voltage at the centre sigma point, V.
+    /// Voltage at the centre sigma point (V).
     centre_v: Lanes<L>,
     /// Odd and even parts of the voltage over the pairs of the first columns.
     parts: OddEvenParts<L>,
-    /// Slope of the open-circuit voltage, V per unit of SOC.
+    /// Slope of the open-circuit voltage (V per unit of SOC).
     slope_v: Lanes<L>,
-    /// Changes of the open-circuit voltage: with the capacity, V per Ah, and per standard deviation of each mix of
-    /// losses (see `crate::cell::aged_ocv`), V.
+    /// Changes of the open-circuit voltage: with the capacity (V per Ah) and per standard deviation of each mix of
+    /// losses (see `crate::cell::aged_ocv`) (V).
     changes_v: [Lanes<L>; 1 + MIXES],
-    /// Present voltage drop in the cell, V.
+    /// Present voltage drop in the cell (V).
     lost_v: Lanes<L>,
-    /// Series resistance, ohm.
+    /// Series resistance (ohm).
     r0_ohm: Lanes<L>,
-    /// Variance of the model's error over one second, V^2.
+    /// Variance of the model's error over one second (V^2).
     base_variance: Lanes<L>,
-    /// Resistance of new cells after all branches have settled, ohm.
+    /// Resistance of new cells after all branches have settled (ohm).
     settled_ohm: Lanes<L>,
 }
 
@@ -98,7 +98,7 @@ fn weighed<const L: usize, const N: usize, const T: usize>(
     if i == N - 1 { part_v * x.memory[SLOW_RATIO] } else { part_v }
 }
 
-/// Effect of one standard deviation of each constant error on the innovation, V.
+/// Effect of one standard deviation of each constant error on the innovation (V).
 #[inline(always)]
 fn by_constant<const L: usize, const N: usize, const T: usize>(
     c: &KernelConstants,

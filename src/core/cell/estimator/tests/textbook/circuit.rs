@@ -42,8 +42,8 @@ pub(super) fn predict<const N: usize>(
     Ok(())
 }
 
-/// Predicts the state after `dt_s` with the circuit's equations. `charge_as` is the charge moved, A s; `offset_s` is
-/// the time in which this charge contains the current sensor's offset, s. Adds the noise of the branches and of the
+/// Predicts the state after `dt_s` with the circuit's equations. `charge_as` is the charge moved (A) s; `offset_s` is
+/// the time in which this charge contains the current sensor's offset (s). Adds the noise of the branches and of the
 /// resistance; the caller adds the noise of the SOC.
 fn propagate<const N: usize>(
     x: &mut Gaussian<N>,
@@ -98,7 +98,7 @@ fn propagate<const N: usize>(
     Ok(())
 }
 
-/// Updates with a voltage reading; also returns the effects of the constant errors on the innovation, V per standard
+/// Updates with a voltage reading; also returns the effects of the constant errors on the innovation (V) per standard
 /// deviation.
 #[inline]
 pub(super) fn update<const N: usize>(

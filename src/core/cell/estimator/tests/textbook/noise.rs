@@ -51,7 +51,7 @@ pub(super) struct VoltageReading {
 }
 
 impl VoltageReading {
-    /// Voltage over the branches of a state, V.
+    /// Voltage over the branches of a state (V).
     pub(super) fn branches_v<const N: usize>(&self, x: &SVector<f64, N>) -> f64 {
         (BRANCHES..N - 1).fold(self.slow_ratio * x[N - 1], |sum, i| sum + x[i])
     }
@@ -86,7 +86,7 @@ impl VoltageReading {
         }
     }
 
-    /// Effect of each constant error on the innovation, V per standard deviation of the error.
+    /// Effect of each constant error on the innovation (V) per standard deviation of the error.
     fn by_constant<const N: usize>(
         &self,
         x: &Gaussian<N>,
