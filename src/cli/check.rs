@@ -23,8 +23,8 @@ pub(crate) struct Args {
     /// Print the description as JSON
     #[arg(long)]
     json: bool,
-    /// Print the configuration merged with its drop-ins FILE.d/*.toml as TOML, with file and line of each part; then report
-    /// faults, if any
+    /// Print the configuration as TOML, merged with its drop-ins (FILE.d/*.toml), with the file and line of each part.
+    /// If there are faults, report them afterwards
     #[arg(long, conflicts_with = "json")]
     merged: bool,
     /// Print the reference of all configuration keys as Markdown
@@ -85,7 +85,7 @@ fn show(description: &Description, page: &mut String) {
             _ => format!("kernel filter {}", interface.filter_ids.join(" ")),
         };
         if !interface.own_ids.is_empty() {
-            ids.push_str(&format!("; watched for another sender: {}", interface.own_ids.join(" ")));
+            ids.push_str(&format!("; also own ids, to detect other senders of them: {}", interface.own_ids.join(" ")));
         }
         page.push_str(&format!("  {}: {kind}, {ids}\n", interface.name));
     }

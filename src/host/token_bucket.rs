@@ -1,8 +1,8 @@
 //! Limits how often an action may happen: a burst at once, then once per period.
 //!
-//! The store uses buckets to limit the rows of frequent capacities, remaining lives and filter resets; `logging` uses
-//! buckets to limit log lines. In: the time of each request. Out: whether the request is allowed. If a request has an
-//! earlier time than the previous request, no tokens are added.
+//! The store uses buckets to limit how many rows it writes about capacities, remaining life and filter resets;
+//! `logging` uses buckets to limit log lines. In: the time of each request. Out: whether the request is allowed. If a
+//! request has an earlier time than the previous request, no tokens are added.
 
 use crate::quantity::Timestamp;
 

@@ -93,8 +93,9 @@ impl GaussianProcess {
         py.detach(|| self.0.save(&path)).map_err(of_library)
     }
 
-    /// Predicts rows. Returns the mean, the standard deviation of a measurement, and the ends of the 95 % interval of a
-    /// measurement.
+    /// Predicts the output for each row of inputs. Returns the columns `mean`, `std`, `low_95` and `high_95`. `std` is
+    /// the standard deviation of a new measurement, including noise. 95 % of new measurements are between `low_95` and
+    /// `high_95`.
     fn predict(&self, py: Python<'_>, inputs: &Bound<'_, PyAny>) -> PyResult<Table> {
         let inputs = arrays::reals("inputs", inputs)?;
         check_known("inputs", &inputs)?;

@@ -4,7 +4,7 @@
 //!
 //! The example's tables are not published. This test uses the tables of `config/cells/example_nmc_2600.toml`, scaled to
 //! 30 Ah, as if eleven and a half such cells were connected in parallel: resistances are divided by 30 / 2.6,
-//! capacitances are multiplied by 30 / 2.6. Samples and sensors are as in the paper's scenario: one sample per second;
+//! capacitances are multiplied by 30 / 2.6. Samples and sensors are as in the scenario `paper`: one sample per second;
 //! voltage noise 5 mV; current noise 20 mA, offset 10 mA, gain error 0.5 %. The gain error limits the capacity accuracy
 //! of any estimator. To print the table: `cargo test --workspace --test integration reference_scenario -- --nocapture`.
 
@@ -40,7 +40,7 @@ struct Cycle {
     end_soc_error: f64,
 }
 
-/// The paper's configuration, its cell scaled to 30 Ah.
+/// The configuration `config/paper.toml`, with its cell scaled to 30 Ah.
 fn configuration() -> MonitorConfig {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml");
     let mut config = config::load(&path).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n"))).monitor;

@@ -5,8 +5,9 @@ usage: life_decodes.py FILE.dbc FRAMES.log ESTIMATES.csv EVENTS.jsonl RATED_AH
 FRAMES, ESTIMATES and EVENTS come from `packwatch replay`, FILE.dbc from `packwatch dbc` with the same configuration. The
 expected values are computed independently:
 
-- status frame: from the estimates, which `Life.combined` combines to one pack, and the mode, signal, trust, gap and alarm events
-- health frame: from the estimates, and the capacity, loss mode, remaining life and recharge events
+- status frame: from the mode, signal, trust, gap and alarm events, and from the estimates. `Life.combined` computes the
+  pack's values from the estimates of the cells
+- health frame: from the capacity, loss mode, remaining life and recharge events, and from the estimates
 - alarm and digest frames: from the alarm events
 
 Every value must agree within one bit; unknown values must be sent as unknown. The last line is a JSON document with the
@@ -260,8 +261,9 @@ def compare(reader, life, estimates, events, frame_list):
             for signal, wanted in life.health().items():
                 if signal in values:
                     if signal == "RechargePeriod" and values[signal] is not None:
-                        # The frame is sent as soon as the charge leaves the recharge period's window. The event follows at the
-                        # end of the charge, if the log contains that end.
+                        # The recharge period is the time that a charge takes through a window of SOC. The frame
+                        # contains the new period as soon as the SOC passes the window's upper end. The event follows at
+                        # the end of the charge, if the log contains that end.
                         coming = periods[done] if done < len(periods) else None
                         if coming is not None and abs(values[signal] - coming) <= 1:
                             wanted = coming

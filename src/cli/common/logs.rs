@@ -25,16 +25,16 @@ pub(crate) struct InputArgs {
     /// Count a gap longer than this as sleep of the recorder: during the gap, nothing is computed and no frame is made
     #[arg(long, value_name = "SECONDS", default_value_t = SLEEP_GAP_S, value_parser = positive)]
     pub(crate) sleep_gap: f64,
-    /// Name a CSV column, for example current=Current(A). ROLE is time, current, voltage, temperature or section. If each cell
-    /// or sensor has its own column, write the letter n in braces for its number, from 1, in both ROLE and NAME. An empty NAME
-    /// means that the column does not exist
+    /// Name a CSV column, for example current=Current(A). ROLE is time, current, voltage, temperature or section. If
+    /// each cell or sensor has its own column (U1, U2, ..., counted from 1), write the letter n in braces in place of
+    /// the number in NAME, and at the end of ROLE. An empty NAME means that the column does not exist
     #[arg(long = "column", value_name = "ROLE=NAME", value_parser = column)]
     pub(crate) columns: Vec<(String, String)>,
     /// Direction of positive current in a CSV
     #[arg(long, value_enum, default_value = "discharge")]
     pub(crate) csv_sign: CsvSign,
-    /// CSV table with the start time of each section of a CSV log: the section column of the log, for example cycle, and a
-    /// column `start`
+    /// CSV table that gives the start time of each section of a CSV log. The table has two columns: the log's section
+    /// column, for example `cycle`, and `start`
     #[arg(long, value_name = "TABLE.csv")]
     pub(crate) start_times: Option<PathBuf>,
 }

@@ -245,7 +245,8 @@ impl Stages {
         learning.complete_mode(change, &mut estimation.bank, (teaches_capacity, &doubtful), &mut publisher);
     }
 
-    /// Fits the model of the cells to the rows of the notebook. If the fit changes the model, adopts the new model.
+    /// Fits the cell model to the rows that the modelling stage has collected. If the fit changes the model, the
+    /// estimators adopt the new model.
     fn learn_model(&mut self, now: Timestamp, out: &mut Outputs) {
         self.step_waiting(now, true, out);
         let Self { estimation, modelling, learning, .. } = self;
@@ -262,7 +263,8 @@ impl Stages {
         }
     }
 
-    /// After a change of the model, passes the capacities of the cells that use it to the rules on capacity.
+    /// Passes the capacity of every cell outside the modules to the capacity rules. Called when a new model has changed
+    /// the capacities of these cells.
     fn restate_capacities(&mut self, now: Timestamp, out: &mut Outputs) {
         for index in self.estimation.bank.own_cells().to_vec() {
             let capacity = self.learning.learned_capacity(index);

@@ -1,4 +1,6 @@
-//! Lists the channels in use, and gives for each channel the limits and the clock of the stuck check.
+//! Lists the channels in use, and selects the configured [`Limits`] of each channel. The stuck check reports a reading
+//! that stays the same for too long although it should change; this module also selects the clock that measures how
+//! long.
 
 use super::charge::ChargeTotals;
 use super::config::{Limits, SampleConfig, VoltageSource};

@@ -15,7 +15,8 @@ use crate::config::VehicleIdentity;
 use crate::io::place::with_suffix;
 use crate::monitor::Snapshot;
 
-/// Largest database (with its log) that is copied for reading, bytes. A temporary folder has room for this size.
+/// Largest size (bytes) of a database and its log that are copied for reading. A temporary folder has room for this
+/// size.
 const MAX_COPY_BYTES: u64 = 256 << 20;
 
 /// A store, open for reading.
@@ -34,9 +35,9 @@ pub struct HistoryQuery {
     pub kinds: Vec<HistoryTable>,
     /// Cell, from 0; `None` = all.
     pub cell: Option<u16>,
-    /// Earliest wall clock, ns since 1970.
+    /// Earliest wall clock (ns since 1970).
     pub since_ns: Option<i64>,
-    /// Latest wall clock, ns since 1970.
+    /// Latest wall clock (ns since 1970).
     pub until_ns: Option<i64>,
     /// Maximum number of rows; older rows are left out. `None` = all rows.
     pub limit: Option<u32>,
@@ -56,9 +57,9 @@ pub struct HistoryEntry {
     pub kind: HistoryTable,
     /// Number of the row, counted across the tables.
     pub seq: i64,
-    /// Wall clock when the row was written, ns since 1970.
+    /// Wall clock when the row was written (ns since 1970).
     pub wall_ns: i64,
-    /// Clock of the inputs when the row was written, ns.
+    /// Clock of the inputs when the row was written (ns).
     pub time_ns: i64,
     /// Identity of the boot, 32 hexadecimal digits.
     pub boot: String,
@@ -75,7 +76,8 @@ pub struct HistoryExtent {
     pub pack: i64,
     /// Half-cycles of all packs in the store.
     pub half_cycles: i64,
-    /// Half-cycles of all packs that the store has deleted because of its limits on rows and age.
+    /// Half-cycles that the store has deleted, for all packs. The store deletes rows because it limits their number and
+    /// age.
     pub deleted_half_cycles: i64,
     /// Half-cycles that the store has ever written, for all packs.
     pub written_half_cycles: i64,
@@ -139,7 +141,8 @@ impl HistoryReader {
         self.at_once(segments::verify)
     }
 
-    /// Returns why the history contradicts a chain end that was noted elsewhere; `None` = no contradiction.
+    /// Compares the history with `noted`, the end of the hash chain as it was once noted outside the store. Returns the
+    /// contradiction; `None` = the history agrees.
     ///
     /// # Errors
     /// Fails if the file cannot be read.
@@ -181,7 +184,7 @@ impl HistoryReader {
         })
     }
 
-    /// The stored snapshot, and the wall clock when it was taken, ns since 1970; `None` = missing or damaged.
+    /// The stored snapshot, and the wall clock when it was taken (ns since 1970); `None` = missing or damaged.
     pub fn dated_snapshot(&self) -> Option<(i64, Snapshot)> {
         self.state().map(|document| (document.stamp.wall_ns, *document.snapshot))
     }

@@ -1,9 +1,10 @@
 //! Finds the voltage limits of a cell in its measured data, with the row that shows each limit.
 //!
-//! Input: measured files. Output: lowest and highest voltage (V), each with a note that states file, row, value and the
-//! option to change it. Pulses do not count as limits: a row counts only if the current has kept its direction, or has
-//! been near zero, for [`HELD_S`]. If the data are whole cycles, the lower limit is the cut-off voltage of the
-//! discharges, and the upper limit is the voltage at which charges are held.
+//! Input: measured files. Output: lowest and highest voltage (V), each with a note. The note states the file, the row,
+//! the voltage in this row, and the command-line option that overrides the limit. Pulses do not count as limits: a row
+//! counts only if the current has kept its direction, or has been near zero, for [`HELD_S`]. If the data are whole
+//! cycles, the lower limit is the cut-off voltage of the discharges, and the upper limit is the voltage at which
+//! charges are held.
 
 use super::FitRequest;
 use crate::error::LabError;
@@ -46,10 +47,10 @@ pub(super) fn voltage_limits(
     let ((low_v, low), (high_v, high)) = found.ok_or_else(|| LabError::Data("no voltage in the data".into()))?;
     let mut notes = Vec::new();
     if request.voltage_min_v.is_none() {
-        notes.push(format!("voltage_min_v = {low_v} by {}; --voltage-min sets another", low.place()));
+        notes.push(format!("voltage_min_v = {low_v} (from {}); --voltage-min overrides it", low.place()));
     }
     if request.voltage_max_v.is_none() {
-        notes.push(format!("voltage_max_v = {high_v} by {}; --voltage-max sets another", high.place()));
+        notes.push(format!("voltage_max_v = {high_v} (from {}); --voltage-max overrides it", high.place()));
         let highest = readings(all(), 0.0).into_iter().rev().nth(strays(all()));
         // Smallest excess over the limit at which pulses are reported (V).
         if let Some(pulse) = highest.filter(|pulse| pulse.voltage_v > high_v + 0.02) {
@@ -111,9 +112,10 @@ fn held_rows(part: &MeasuredPart, held_s: f64) -> Vec<usize> {
 
 /// Returns the voltage limits of whole cycles.
 ///
-/// A discharge ends with its first row below the cut-off. Cut-offs are multiples of 0.1 V. The lower limit is therefore
-/// the highest voltage of these rows, rounded up to 0.1 V; aborted discharges do not count. Charges hold their voltage,
-/// so the upper limit is the median of their highest voltages, rounded to 0.05 V.
+/// A complete discharge ends with its first row below the cut-off voltage. Of all these last rows, the row with the
+/// highest voltage is nearest to the cut-off. Cut-offs are multiples of 0.1 V, so the lower limit is this voltage
+/// rounded up to 0.1 V. Aborted discharges do not count. Charges hold their voltage, so the upper limit is the median
+/// of their highest voltages, rounded to 0.05 V.
 fn cycle_limits(files: &[MeasuredFile], first: usize) -> Option<(Limit<'_>, Limit<'_>)> {
     let (mut ends, mut tops) = (Vec::new(), Vec::new());
     for file in files {
@@ -130,7 +132,7 @@ fn cycle_limits(files: &[MeasuredFile], first: usize) -> Option<(Limit<'_>, Limi
     for list in [&mut ends, &mut tops] {
         list.sort_by(|a, b| a.voltage_v.total_cmp(&b.voltage_v));
     }
-    // A discharge that ends this far above the median end was aborted (V).
+    // If a discharge does not fall below this voltage (V), it was aborted.
     let broken_off_v = ends.get(ends.len() / 2)?.voltage_v + 0.3;
     let low = *ends.iter().rfind(|end| end.voltage_v < broken_off_v)?;
     let high = tops.get(tops.len() / 2).copied();
@@ -182,8 +184,8 @@ mod tests {
         assert_eq!(
             notes,
             [
-                "voltage_min_v = 2.5 by cell.csv:191: 2.5 V; --voltage-min sets another",
-                "voltage_max_v = 4.19 by cell.csv:101: 4.19 V; --voltage-max sets another",
+                "voltage_min_v = 2.5 (from cell.csv:191: 2.5 V); --voltage-min overrides it",
+                "voltage_max_v = 4.19 (from cell.csv:101: 4.19 V); --voltage-max overrides it",
                 "pulses above voltage_max_v do not count: cell.csv:111: 4.3 V",
             ]
         );
@@ -207,6 +209,6 @@ mod tests {
         let request = FitRequest { first_cycles: Some(10), ..FitRequest::default() };
         let (limits, notes) = voltage_limits(&request, &files, &[]).expect("limits");
         assert_eq!(limits, (2.7, 4.2));
-        assert_eq!(notes[0], "voltage_min_v = 2.7 by cell.csv:9: 2.7003 V; --voltage-min sets another");
+        assert_eq!(notes[0], "voltage_min_v = 2.7 (from cell.csv:9: 2.7003 V); --voltage-min overrides it");
     }
 }

@@ -28,7 +28,7 @@ pub(super) fn verdict(outcome: &FitOutcome) -> Vec<String> {
     said
 }
 
-/// Returns the SOC error at every node if voltage alone determines the SOC, percentage points.
+/// Returns the SOC error (percentage points) at every node if voltage alone determines the SOC.
 fn soc_points(fit: &FittedTables, voltage_error_v: &[f64]) -> Vec<f64> {
     let (soc, columns) = (&fit.grid.soc, fit.grid.soc.len());
     let of_node = |node: usize| {
@@ -53,24 +53,24 @@ fn rounded(points: f64) -> String {
 }
 
 fn accuracy(rows: &[(f64, f64)]) -> Vec<String> {
-    // A temperature counts as good up to this SOC error (points).
+    // Largest SOC error (points) with which a temperature counts as good.
     let (good, poor): (Vec<_>, Vec<_>) = rows.iter().partition(|(_, points)| *points <= 2.0);
     let mut said = Vec::new();
     if let (Some((low_c, _)), Some((high_c, _))) = (good.first(), good.last()) {
         let worst = good.iter().map(|(_, points)| *points).fold(0.0, f64::max);
         let place = if low_c == high_c { format!("at {low_c}") } else { format!("between {low_c} and {high_c}") };
-        said.push(format!("good for SOC to about {} {place} degrees C", rounded(worst)));
+        said.push(format!("SOC from voltage alone: accurate to about {} {place} degrees C", rounded(worst)));
     }
     if !poor.is_empty() {
         let each: Vec<String> = poor.iter().map(|(t, points)| format!("{} at {t}", rounded(*points))).collect();
-        said.push(format!("not good for SOC: about {} degrees C", each.join(", ")));
+        said.push(format!("SOC from voltage alone: not accurate, error about {} degrees C", each.join(", ")));
     }
     said
 }
 
 /// Lists the SOC breakpoints at which the curve is too flat, at every temperature, to find the SOC from voltage.
 fn flat(soc: &[f64], points: &[f64], columns: usize) -> Option<String> {
-    // Above this SOC error (points), the voltage at a breakpoint does not show the SOC.
+    // If the SOC error (points) at a breakpoint exceeds this limit at every temperature, the curve is too flat there.
     let is_flat = |s: &usize| points.iter().skip(*s).step_by(columns).all(|points| *points > 5.0);
     let flat: Vec<String> = (0..columns).filter(is_flat).map(|s| soc[s].to_string()).collect();
     let list = flat.join(", ");
@@ -102,11 +102,11 @@ mod tests {
     fn good_temperatures_are_joined_and_others_listed() {
         let rows = [(-20.0, 6.1), (-10.0, 2.9), (0.0, 1.6), (25.0, 0.6), (40.0, 0.3)];
         let expected = [
-            "good for SOC to about 1.5 points between 0 and 40 degrees C",
-            "not good for SOC: about 6 points at -20, 3 points at -10 degrees C",
+            "SOC from voltage alone: accurate to about 1.5 points between 0 and 40 degrees C",
+            "SOC from voltage alone: not accurate, error about 6 points at -20, 3 points at -10 degrees C",
         ];
         assert_eq!(accuracy(&rows), expected);
-        assert_eq!(accuracy(&rows[3..4]), ["good for SOC to about 0.5 points at 25 degrees C"]);
+        assert_eq!(accuracy(&rows[3..4]), ["SOC from voltage alone: accurate to about 0.5 points at 25 degrees C"]);
         assert!(accuracy(&[]).is_empty());
     }
 

@@ -15,7 +15,8 @@ const VOLTAGES: u32 = 200;
 /// A full cell at the configured load.
 #[derive(Debug)]
 pub(super) struct Discharge {
-    /// Voltage (V), falling, and the charge delivered down to it (Ah).
+    /// Points of the discharge, in order of falling voltage. Each point has a voltage (V) and the charge (Ah) that the
+    /// cell delivers until its voltage falls to this value.
     points: Vec<(f64, f64)>,
     cutoff_v: f64,
 }

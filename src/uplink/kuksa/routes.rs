@@ -126,7 +126,7 @@ fn check(signal: &'static Signal, entry: &Metadata, uses: &HashMap<i32, usize>) 
     }
     if entry.allowed.as_ref().is_some_and(|allowed| allowed.typed.is_some()) {
         return Err(
-            "the broker allows listed values only, so an unknown value could not replace the last one".to_owned()
+            "the broker allows listed values only; it would keep the last value if the value became unknown".to_owned()
         );
     }
     let limits = Limits { min: limit(entry.min.as_ref()), max: limit(entry.max.as_ref()) };

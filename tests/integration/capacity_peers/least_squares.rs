@@ -14,16 +14,16 @@
 //! - c1 = sum w x^2/sy^2, c2 = sum w xy/sy^2, c3 = sum w y^2/sy^2
 //! - c4 = sum w x^2/sx^2, c5 = sum w xy/sx^2, c6 = sum w y^2/sx^2
 //!
-//! AWTLS minimises sum w (y - Q x)^2 / (Q^2 + 1)^2 (Q^2/sx^2 + 1/sy^2). Before that, y and sy are scaled by K = sx/sy,
-//! so that Q is near 1, where the approximation holds. The minimum is a root of a quartic in Q. The variance is 2
-//! divided by the cost's second derivative at the minimum.
+//! AWTLS minimises the cost sum w (Q^2/sx^2 + 1/sy^2) (y - Q x)^2 / (Q^2 + 1)^2. Before that, y and sy are scaled by
+//! K = sx/sy, so that Q is near 1, where the approximation holds. The minimum is at a root of a quartic in Q. The
+//! variance is 2 divided by the cost's second derivative at the minimum.
 
 use packwatch::filter::ScalarGaussian;
 
 /// One measured swing.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Swing {
-    /// Change of SOC, fraction.
+    /// Change of SOC (fraction).
     pub(crate) x: f64,
     pub(crate) x_variance: f64,
     /// Charge (Ah).
@@ -188,7 +188,8 @@ mod tests {
         }
     }
 
-    /// Draws swings of a 10 Ah cell: true values plus random errors with the variances that the swing states.
+    /// Draws swings of a 10 Ah cell. Random errors are added to the true x and y. Their variances are in the swing's
+    /// fields `x_variance` and `y_variance`.
     fn swings(random: &mut Random, count: usize, even: bool) -> Vec<Swing> {
         let one = |random: &mut Random| {
             let wide = if even { 1.0 } else { 0.5 + random.uniform() };

@@ -7,7 +7,8 @@ use packwatch::monitor::{Event, Monitor, MonitorConfig, Outputs, Record, TICK_PE
 use packwatch::quantity::Timestamp;
 use packwatch::sim::{Simulation, Wiring};
 
-/// If no input arrives for longer than this (s), the recorder counts as asleep. These simulations have no such gap.
+/// Sleep gap (s): if no input arrives for longer than this time, the recorder counts as asleep. These simulations have
+/// no such gap.
 const SLEEP_GAP_S: f64 = 30.0;
 
 /// Runs `settings` to the end. After each step calls `each` with the time, the truth, the core and the core's events.

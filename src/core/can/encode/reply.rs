@@ -2,7 +2,7 @@
 //!
 //! In: the outcome of a command or the reason for its refusal, and the counter that the next command must have. Out:
 //! the frame `PACKWATCH_Reply`. If the checksum, the authenticator or the freshness of a command frame is wrong, the
-//! caller omits the command, and the reply does not repeat it.
+//! caller sets [`ReplyFields::command`] to `None`, so that the reply does not show the received command.
 
 use serde::{Deserialize, Serialize};
 
@@ -33,8 +33,9 @@ pub enum CommandRefusal {
     NoMeaning = 5,
     /// The authenticator is wrong: the frame is forged, or its sender has another key.
     NotAuthentic = 8,
-    /// The freshness is not above the last accepted freshness, is older than the previous announcement, or was not
-    /// announced yet.
+    /// The frame's freshness value is not accepted: it has already been used, it has expired, or packwatch has not
+    /// announced it yet. A value has been used if packwatch has accepted this value or a higher one. A value has
+    /// expired if it is below the previous announcement.
     OldFreshness = 9,
     /// The frame is authentic, but many forged frames were received. If the sender soon repeats the command with
     /// another freshness, the command is executed.

@@ -1,10 +1,10 @@
-//! Defines the next demand of a course: a current that flows until the next sample, a time asleep, or the end of the
-//! course.
+//! Defines what a simulated scenario demands next: a current until the next sample, a sleep of the vehicle, or the end
+//! of the scenario.
 
-/// Next demand of a scenario.
+/// What a scenario demands next.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Demand {
-    /// This cell current flows until the next sample (A), positive = discharge.
+    /// This cell current (A) flows until the next sample; positive = discharge.
     Current(f64),
     /// The vehicle sleeps: no current, no measurements.
     Asleep {

@@ -128,7 +128,7 @@ fn ageing(head: &Head, tables: &Tables, electrodes: Option<&ElectrodesKeys>, fau
         let [empty, full] = ends(contents);
         if contents.len() != 2 || empty == full || (full > empty) != rises {
             let first = if rises { "lower" } else { "higher" };
-            keys.place.fault(key, format!("must be two numbers, empty and full, the {first} first"));
+            keys.place.fault(key, format!("must be two numbers, the {first} first: for the empty, then the full cell"));
         }
     }
     if !faults.is_empty() {

@@ -62,7 +62,8 @@ fn cell_model_faults_are_reported() {
             "[provenance]",
             "[electrodes]\npositive = \"nmc811\"\nnegative = \"graphite\"\npositive_content = [0.3, 0.9]\n\
              negative_content = [0.0, 0.9]\n[provenance]",
-            "cell.toml:10: electrodes.positive_content = [0.3, 0.9], must be two numbers, empty and full, the higher first",
+            "cell.toml:10: electrodes.positive_content = [0.3, 0.9], must be two numbers, the higher first: \
+             for the empty, then the full cell",
         ),
     ];
     for (from, to, fault) in table {
@@ -114,11 +115,13 @@ fn electrode_data_determine_curve_ageing() {
     let faults = [
         (
             "positive_content = [0.85, 0.27]\nnegative_content = [0.9, 0.03]",
-            "cell.toml:11: electrodes.negative_content = [0.9, 0.03], must be two numbers, empty and full, the lower first",
+            "cell.toml:11: electrodes.negative_content = [0.9, 0.03], must be two numbers, the lower first: \
+             for the empty, then the full cell",
         ),
         (
             "positive_content = [0.85, 0.27]\nnegative_content = [0.03, 0.5, 0.9]",
-            "cell.toml:11: electrodes.negative_content = [0.03, 0.5, 0.9], must be two numbers, empty and full, the lower first",
+            "cell.toml:11: electrodes.negative_content = [0.03, 0.5, 0.9], must be two numbers, the lower first: \
+             for the empty, then the full cell",
         ),
         (
             "positive_content = [0.4, 0.39]\nnegative_content = [0.0, 0.01]",

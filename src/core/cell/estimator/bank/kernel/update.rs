@@ -1,8 +1,8 @@
 //! Updates the state with a measured voltage.
 //!
 //! In: a state and the reading (V). Out: the updated state, the innovation (V), the variance of the innovation (V^2),
-//! and the test ratio. The test ratio is 1 for an innovation of one standard deviation of the gate. One mask marks the
-//! usable lanes, another one the lanes within the gate.
+//! and the test ratio. The test ratio is the squared innovation divided by the variance that the gate assumes. One mask
+//! marks the usable lanes, another one the lanes within the gate.
 
 use super::points::{COLUMNS, OddEvenParts, PartialCholesky, ResistanceRatios};
 use super::types::{
@@ -22,12 +22,12 @@ use crate::filter::simd::Lanes;
 struct PredictedVoltage<const L: usize> {
     /// Voltage at the centre sigma point (V).
     centre_v: Lanes<L>,
-    /// Odd and even parts of the voltage over the pairs of the first columns.
+    /// Odd and even parts of the voltage, for each of the first [`COLUMNS`] pairs of sigma points.
     parts: OddEvenParts<L>,
     /// Slope of the open-circuit voltage (V per unit of SOC).
     slope_v: Lanes<L>,
-    /// Changes of the open-circuit voltage: with the capacity (V per Ah) and per standard deviation of each mix of
-    /// losses (see `crate::cell::aged_ocv`) (V).
+    /// Changes of the open-circuit voltage. First the change per Ah of capacity (V per Ah), then, for each mix of
+    /// losses (see `crate::cell::aged_ocv`), the change per standard deviation of the mix (V).
     changes_v: [Lanes<L>; 1 + MIXES],
     /// Present voltage drop in the cell (V).
     lost_v: Lanes<L>,
@@ -160,7 +160,7 @@ pub(in crate::cell::estimator::bank) fn update<const L: usize, const N: usize, c
         variance = variance + weighed(x, i, others);
     }
 
-    // Measurement noise: deviation 4 in the documentation of `estimator`.
+    // Measurement noise. The documentation of `estimator` explains its formula under "Deviation 4".
     let load_v = predicted.settled_ohm * ratio * x.memory[LOAD_A];
     let model = predicted.base_variance + predicted.lost_v.square() * c.reading.drop + load_v.square() * c.reading.load;
     let own_variance = variance + (model / information_s + c.reading.sensor);
