@@ -47,7 +47,7 @@ pub struct EstimatorBank {
     /// The inputs of the batch. If a cell is not in the batch, its input is old, and the result is discarded.
     inputs: Vec<BlockInput>,
     results: Vec<StepResult>,
-    /// Cells of the batch whose step is not ordinary, each with this step.
+    /// The steps of the batch that are not ordinary, each with the index of its cell.
     others: Vec<(usize, CellStep)>,
     #[cfg(feature = "wide")]
     machine: pulp::Arch,
@@ -66,7 +66,7 @@ impl EstimatorBank {
         let idle = StepResult { update: None, reset: false, jumped: false };
         let mut bank = Self {
             constants: KernelConstants::new(model, config),
-            voltage_reach: VoltageReach::new(model, config.sensor.voltage_offset_v),
+            voltage_reach: VoltageReach::new(model, config.sensor.voltage_offset_v, config.voltage.noise_v),
             plausible_ah: plausible_ah(model, config),
             model: model.clone(),
             config: *config,
@@ -189,7 +189,9 @@ impl EstimatorBank {
         has_filter.then(|| {
             let soc = self.marginal(cell, 0);
             let linear = self.soc_by_voltage(cell);
-            let reach = self.voltage_reach.std(soc.mean, linear);
+            let update = self.results[cell].update.filter(|update| update.accepted);
+            let innovation_v = update.map_or(0.0, |update| update.innovation);
+            let reach = self.voltage_reach.std(soc.mean, linear, innovation_v);
             let variance = soc.variance + reach * reach - linear * linear;
             let downtime_std = memory.downtime_std_if_any();
             let variance = downtime_std.map_or(variance, |std| widened(variance, std * std));
@@ -295,10 +297,10 @@ impl EstimatorBank {
         result
     }
 
-    /// Evidence about the current sensor's offset since the last correction: sum of d^2 / R, and sum of d x innovation
-    /// / R. d is the effect of one standard deviation of the offset on an innovation. R is the variance of the
-    /// innovation without this effect. The sums are averaged over the cells, because the models of the cells have
-    /// common errors.
+    /// Evidence about the current sensor's offset since the last correction. For an innovation e, let d be the effect
+    /// of one standard deviation of the offset on e, and R the variance of e without this effect. The first value is
+    /// the sum of d^2 / R, the second value the sum of d e / R. The sums are averaged over the cells, because the
+    /// models of the cells have common errors.
     pub fn offset_evidence(&self) -> (f64, f64) {
         let cells = self.cells.len();
         let mean = |i: usize| {

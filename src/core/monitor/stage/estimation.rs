@@ -229,7 +229,8 @@ impl Estimation {
         let soc = bank.filtered_soc(own[0]).map_or(0.5, |soc| soc.mean.clamp(0.0, 1.0));
         let temperature_c = bank.temperature_c(own[0]).unwrap_or(self.ambient_c);
         let ohm = bank.own_model().r0_ohm(&bank.own_model().grid_position(soc, temperature_c));
-        current_check.handle(compared, bank.own_config().voltage.noise_v, ohm);
+        let config = bank.own_config();
+        current_check.handle(compared, config.voltage.noise_v, ohm, config.gap.rest_current_a);
     }
 
     /// Mean SOC of the pack's own kind of cells, fraction; 0.5 if no such cell has an estimate.

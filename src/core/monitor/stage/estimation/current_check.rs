@@ -17,8 +17,8 @@
 //!
 //! The check finds a current that is frozen, inverted, late or beyond the sensor's range, whether or not the last
 //! digits of its readings change. While the load is constant, the check finds only a noisy sensor at its limit, because
-//! the readings of this sensor then repeat. A current without sign is found only if the true current often changes its
-//! direction.
+//! the readings of this sensor then repeat. A current without sign is found at the first clear steps of a charging
+//! current. A doubt only ends after the current has flowed in both directions, so a current without sign stays doubtful.
 
 use serde::{Deserialize, Serialize};
 
@@ -134,6 +134,8 @@ pub(crate) struct CurrentCheck {
     doubts: f64,
     /// Whether a jump of the SOC in a downtime waits for an explained step.
     is_unconfirmed: bool,
+    /// Whether the doubt waits until the current flows in discharge, and in charge.
+    awaited: [bool; 2],
 }
 
 impl Default for CurrentCheck {
@@ -156,13 +158,18 @@ impl Default for CurrentCheck {
             limits_a: [0.0; 2],
             doubts: 0.0,
             is_unconfirmed: false,
+            awaited: [false; 2],
         }
     }
 }
 
 impl CurrentCheck {
-    /// Whether the evidence makes the current doubtful.
+    /// Whether the current is doubtful: the evidence is against it, or it has not flowed in both directions since then.
     pub(crate) fn is_doubtful(&self) -> bool {
+        self.is_contradicted() || self.awaited != [false; 2]
+    }
+
+    fn is_contradicted(&self) -> bool {
         self.evidence > DOUBTFUL
     }
 
@@ -178,12 +185,14 @@ impl CurrentCheck {
     }
 
     /// Handles a round. `samples`: the compared cells that have reported, each with its place (below [`MAX_CELLS`]).
-    /// `noise_v`: standard deviation of a reading. `ohm`: the model's series resistance.
+    /// `noise_v`: standard deviation of a reading. `ohm`: the model's series resistance. `rest_a`: largest current at
+    /// rest.
     pub(crate) fn handle<'a>(
         &mut self,
         samples: impl Iterator<Item = (usize, &'a CellSample)>,
         noise_v: f64,
         ohm: f64,
+        rest_a: f64,
     ) {
         let (mut moves_v, mut moves, mut latest) = ([0.0; MAX_CELLS], 0, None);
         // Skips cells without a reading in the previous round: their change spans more than one round.
@@ -218,6 +227,9 @@ impl CurrentCheck {
         }
         if self.count >= 2 {
             self.judge_repeat();
+        }
+        if current_a.abs() > rest_a {
+            self.awaited[usize::from(current_a < 0.0)] = false;
         }
     }
 
@@ -315,9 +327,10 @@ impl CurrentCheck {
 
     /// Adds `log_odds` to the evidence. If a doubt starts, also adds the number of earlier doubts.
     fn add_evidence(&mut self, log_odds: f64) {
-        let was_doubtful = self.is_doubtful();
+        let was_contradicted = self.is_contradicted();
         self.evidence = (self.evidence + log_odds).clamp(0.0, MAX_EVIDENCE);
-        if self.is_doubtful() && !was_doubtful {
+        if self.is_contradicted() && !was_contradicted {
+            self.awaited = [true; 2];
             self.evidence = (self.evidence + self.doubts).min(MAX_EVIDENCE);
             self.doubts += 1.0;
         }
@@ -420,7 +433,7 @@ mod tests {
                 temperature_c: None,
             })
             .collect();
-        check.handle(samples.iter().enumerate(), 0.001, OHM);
+        check.handle(samples.iter().enumerate(), 0.001, OHM, 1.0);
     }
 
     /// Runs a drive of `seconds`, one round every 2 s. `measured` returns the reading for the load and the time.
@@ -453,11 +466,12 @@ mod tests {
 
     #[test]
     fn wrong_current_is_doubted_within_seconds() {
-        let faults: [Fault; 4] = [
+        let faults: [Fault; 5] = [
             ("zero", |_, _| 0.0),
             ("inverted", |load_a, _| -load_a),
             ("late by 20 s", |_, time_s| load_a(time_s.saturating_sub(20))),
             ("overflow", |load_a, _| (load_a + 20.0).rem_euclid(40.0) - 20.0),
+            ("without sign", |load_a, _| load_a.abs()),
         ];
         for (name, fault) in faults {
             let share = share_in_doubt(|load_a, time_s| Some(fault(load_a, time_s)));
