@@ -27,12 +27,8 @@ use super::gaussian::Gaussian;
 use super::memory::Memory;
 use super::state_vector::{BRANCHES, LOG_RESISTANCE, square, widened};
 use super::step::{CellStep, Update};
-use super::voltage_reach::FAR;
+use super::voltage_reach::{FAR, FLAT};
 use crate::cell::{CellModel, EstimatorConfig};
-
-/// If a voltage error moves the SOC more than this many times as far as the slope of the curve says, the curve counts
-/// as flat.
-const FLAT: f64 = 2.0;
 
 /// Updates with the first reading after a downtime. This reading does not count as evidence about the sensor's offset
 /// or the slowest branch.

@@ -8,8 +8,11 @@
 //! error of four standard deviations moves it by 25 %. The reach is therefore measured at [`FAR`] standard deviations
 //! and divided by [`FAR`].
 //!
-//! If a reading contradicts the estimate, the reach is measured from the SOC that this reading shows. A filter whose
-//! variance is already small corrects such a contradiction only slowly.
+//! The filter may have found the SOC at the steep end and counted charge since. Flat parts of the curve near the
+//! present SOC therefore have the same effect.
+//!
+//! If a reading contradicts the estimate next to a flat part, the reach is measured from the SOC that this reading
+//! shows. A filter whose variance is already small corrects such a contradiction only slowly.
 
 use crate::cell::CellModel;
 
@@ -19,8 +22,12 @@ pub(super) const FAR: f64 = 4.0;
 /// Number of intervals of the SOC grid.
 const INTERVALS: usize = 100;
 
-/// The filter may have found the SOC at a steeper place of the curve, up to this many intervals from its present SOC.
+/// Number of intervals up to which a place of the curve is near the present SOC.
 const NEAR: usize = 20;
+
+/// If a voltage error moves the SOC more than this many times as far as the slope of the curve says, the curve counts
+/// as flat.
+pub(super) const FLAT: f64 = 2.0;
 
 /// Temperature at which the curve is evaluated (degrees C). The curve hardly depends on the temperature.
 const TEMPERATURE_C: f64 = 25.0;
@@ -31,6 +38,8 @@ pub(super) struct VoltageReach {
     /// Per SOC: the reach (standard deviation of the SOC, fraction), and the slope of the curve divided by the voltage
     /// error (1/fraction). The filter's linear effect times the second value is the share of the reach that counts.
     nodes: Vec<(f64, f64)>,
+    /// Whether the curve is flat at any node.
+    has_flat: bool,
     /// Open-circuit voltage per SOC (V), not falling.
     ocv_v: Vec<f64>,
     /// [`FAR`] standard deviations of the voltage error (V).
@@ -55,30 +64,36 @@ impl VoltageReach {
             let slope_v = (ocv_v(high) - ocv_v(low)) / (high - low);
             (reach(-FAR * std_v).max(reach(FAR * std_v)), slope_v / std_v)
         };
-        let nodes = if std_v > 0.0 { (0..=INTERVALS).map(node).collect() } else { vec![(0.0, 0.0); INTERVALS + 1] };
+        let nodes = (0..=INTERVALS).map(|index| if std_v > 0.0 { node(index) } else { (0.0, 0.0) });
+        let nodes: Vec<(f64, f64)> = nodes.collect();
+        let has_flat = nodes.iter().any(is_flat);
         let ocv_v = (0..=INTERVALS).map(|index| ocv_v(index as f64 * step)).collect();
-        Self { nodes, ocv_v, far_v: FAR * std_v, usual_v: std_v.hypot(noise_v) }
+        Self { nodes, has_flat, ocv_v, far_v: FAR * std_v, usual_v: std_v.hypot(noise_v) }
     }
 
     /// Standard deviation of the SOC caused by the voltage error, fraction. `linear`: change of the SOC per standard
     /// deviation of the error, as the filter has linearised it. The reach at a SOC counts only to the extent that the
-    /// filter can have found the SOC there, and not by counting charge.
-    ///
-    /// `innovation_v`: last innovation (V).
+    /// filter found the SOC from the voltage there, and not by counting charge. `innovation_v`: last innovation (V).
     #[inline]
     pub(super) fn std(&self, soc: f64, linear: f64, innovation_v: f64) -> f64 {
         let (at, linear) = (soc.clamp(0.0, 1.0) * INTERVALS as f64, linear.abs());
         let found = |per_linear: f64| (linear * per_linear).min(1.0);
         let nearest = at.round() as usize;
-        let near = nearest.saturating_sub(NEAR)..(nearest + NEAR + 1).min(INTERVALS + 1);
-        let mut std = linear;
-        for &(reach, per_linear) in &self.nodes[near] {
-            std = std.max(found(per_linear) * reach);
+        let (reach, per_linear) = self.nodes[nearest];
+        let mut std = linear.max(found(per_linear) * reach);
+        if self.has_flat {
+            let near = nearest.saturating_sub(NEAR)..=(nearest + NEAR).min(INTERVALS);
+            for &(reach, per_linear) in self.nodes[near].iter().filter(|node| is_flat(node)) {
+                std = std.max(found(per_linear) * reach);
+            }
         }
         let excess_v = innovation_v.abs() - self.usual_v;
         if excess_v > 0.0 {
-            let reach = self.contradicted(at, (self.far_v + excess_v).copysign(innovation_v));
-            std = std.max(found(self.nodes[nearest].1) * reach);
+            let error_v = self.far_v + excess_v;
+            let reach = self.contradicted(at, error_v.copysign(innovation_v));
+            if reach * per_linear * self.far_v > FLAT * error_v {
+                std = std.max(found(per_linear) * reach);
+            }
         }
         std
     }
@@ -95,10 +110,23 @@ impl VoltageReach {
     }
 }
 
+/// Whether the curve is flat at a node.
+fn is_flat(&(reach, per_linear): &(f64, f64)) -> bool {
+    reach * per_linear > FLAT
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::cell::model::tests::small_model;
+
+    /// Slopes (V): 1.5 up to 10 %, 0.0125 up to 90 %, 0.5 up to 96 %, then 3.
+    fn flat_model() -> CellModel {
+        let mut model = small_model();
+        model.soc = vec![0.0, 0.1, 0.9, 0.96, 1.0];
+        model.ocv_v.values = vec![vec![3.15, 3.3, 3.31, 3.34, 3.46]; 2];
+        model
+    }
 
     #[test]
     fn reach_on_straight_curve_is_linear() {
@@ -115,5 +143,30 @@ mod tests {
         let reach = VoltageReach::new(&small_model(), 0.004, 0.0);
         assert_eq!(reach.std(0.5, 0.0, 0.0), 0.0);
         assert!(reach.std(0.5, 1e-5, 0.0) < 1e-3);
+    }
+
+    #[test]
+    fn flat_part_near_steep_end_widens_soc() {
+        let reach = VoltageReach::new(&flat_model(), 0.01, 0.0);
+        // From 92 %, four standard deviations down are 40 mV: 10 mV to 90 %, 10 mV to 10 %, and 20 mV below.
+        let (linear, far) = (0.01 / 0.5, (0.92 - 0.1 + 0.02 / 1.5) / FAR);
+        let at_end = reach.std(0.92, linear, 0.0);
+        assert!((at_end - far).abs() < 0.01, "{at_end} {far}");
+        // The charge counted since does not make the SOC more certain.
+        assert!(reach.std(0.8, linear, 0.0) >= 0.9 * at_end);
+        assert!(reach.std(0.6, linear, 0.0) < 0.2 * at_end, "found far from the end");
+    }
+
+    #[test]
+    fn contradicting_reading_is_within_reach() {
+        let reach = VoltageReach::new(&flat_model(), 0.004, 0.003);
+        let (soc, linear) = (0.99, 0.004 / 3.0);
+        let usual = reach.std(soc, linear, 0.0);
+        assert_eq!(reach.std(soc, linear, -0.005), usual, "usual noise");
+        // The reading shows 90 %, and 16 mV less are below the flat part.
+        let wide = reach.std(soc, linear, -0.12);
+        assert!(wide > 0.2 && wide > 5.0 * usual, "{wide} {usual}");
+        // After counted charge, the reading's offset says little.
+        assert!(reach.std(soc, 1e-5, -0.12) < 0.01);
     }
 }
