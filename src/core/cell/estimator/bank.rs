@@ -189,9 +189,7 @@ impl EstimatorBank {
         has_filter.then(|| {
             let soc = self.marginal(cell, 0);
             let linear = self.soc_by_voltage(cell);
-            let update = self.results[cell].update.filter(|update| update.accepted);
-            let innovation_v = update.map_or(0.0, |update| update.innovation);
-            let reach = self.voltage_reach.std(soc.mean, linear, innovation_v);
+            let reach = self.voltage_reach.std(soc.mean, linear, memory.innovation_v);
             let variance = soc.variance + reach * reach - linear * linear;
             let downtime_std = memory.downtime_std_if_any();
             let variance = downtime_std.map_or(variance, |std| widened(variance, std * std));

@@ -84,7 +84,11 @@ impl CellEstimator {
         let jumped = before.zip(self.marginal(0)).is_some_and(|(before, after)| {
             (after.mean - before.mean + counted).abs() > JUMP.max(JUMP_SIGMA * before.std())
         });
-        StepResult { update: result.flatten(), reset, jumped }
+        let update = result.flatten();
+        if update.is_none() {
+            self.memory.innovation_v = 0.0;
+        }
+        StepResult { update, reset, jumped }
     }
 
     /// Computes the step; `None` if this is not possible.

@@ -46,6 +46,8 @@ pub(super) struct Memory {
     pub(super) load_a: f64,
     /// Mean normalised innovation squared over the consistency window.
     pub(super) mean_nis: f64,
+    /// Innovation of the last reading, if it was accepted; otherwise 0 (V).
+    pub(super) innovation_v: f64,
     /// Time that the next voltage reading represents (s): the time since the last used reading. A long rest counts
     /// less.
     pub(super) information_s: f64,
@@ -90,6 +92,7 @@ impl Memory {
             last_current_a: 0.0,
             load_a: 0.0,
             mean_nis: 0.0,
+            innovation_v: 0.0,
             information_s: config.voltage.max_information_s,
             rest_s: 0.0,
             offset_information: 0.0,
@@ -200,6 +203,7 @@ impl Memory {
         let elapsed_s = step.measured_s + step.unmeasured_s;
         let forget = -libm::expm1(-elapsed_s.max(1e-3) / config.consistency.window_s);
         self.mean_nis += forget * (update.test_ratio - self.mean_nis);
+        self.innovation_v = if update.accepted { update.innovation } else { 0.0 };
         if update.accepted {
             (self.information_s, self.rejected, self.rejected_s) = (0.0, 0, 0.0);
         } else {
@@ -246,8 +250,8 @@ impl Memory {
         for variance in [self.capacity.variance, self.log_resistance.variance] {
             InvalidState::unless_positive("a variance a cell's reset keeps", variance)?;
         }
-        let signed = [self.temperature_c.unwrap_or(0.0), self.last_current_a, self.offset_score];
-        InvalidState::unless_numbers("a cell's last temperature or current, or its offset", signed)?;
+        let signed = [self.temperature_c.unwrap_or(0.0), self.last_current_a, self.innovation_v, self.offset_score];
+        InvalidState::unless_numbers("a cell's last temperature, current or innovation, or its offset", signed)?;
         bounds::TEMPERATURE_C.check_all("a cell's last temperature", self.temperature_c)?;
         bounds::CURRENT_A.check("a cell's last current", self.last_current_a)?;
         InvalidState::unless_natural("the information about a current's offset", self.offset_information)?;

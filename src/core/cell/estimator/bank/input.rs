@@ -122,6 +122,7 @@ impl StepInput<WIDTH> {
     ) {
         cell.memory.last_current_a = self.current_a.0[lane];
         cell.memory.temperature_c = Some(self.temperature_c.0[lane]);
+        cell.memory.innovation_v = outcome.innovation_v.0[from];
         cell.memory.end_downtime();
         *result = StepResult { update: Some(outcome.lane(from)), reset: false, jumped: false };
     }

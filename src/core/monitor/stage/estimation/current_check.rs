@@ -8,7 +8,8 @@
 //! has stepped in the opposite direction, and if the ratio of the two steps (a resistance) is at least 1/[`MAX_FACTOR`]
 //! and at most [`MAX_FACTOR`] times the usual resistance. A step is the mean of two consecutive rounds minus the mean
 //! of the two rounds before them. Such a step contains less noise than the difference of two readings. A current that
-//! arrives one round earlier or later than the voltages still explains their step.
+//! arrives one round earlier or later than the voltages still explains their step. If the current steps clearly and the
+//! voltages hardly move, this step of the current is also unexplained.
 //!
 //! Explained and unexplained steps are evidence for and against the sensor. How much they count depends on how many
 //! steps the sensor has left unexplained so far. If a sensor has explained all steps, one unexplained step is enough
@@ -294,6 +295,15 @@ impl CurrentCheck {
             .max(STEP_MOVES * self.usual_v);
         let factor = if (moved_v + ohm * moved_a).abs() > self.usual_v { MOVE_GAIN } else { 1.0 / MOVE_GAIN };
         self.usual_v = (self.usual_v * factor).clamp(MOVE_V.0, MOVE_V.1);
+        let (before_a, after_a) = (r1.current_a - r0.current_a, r3.current_a - r2.current_a);
+        let expected_v = ohm * moved_a;
+        if expected_v.abs() >= clear_v
+            && MAX_FACTOR * moved_v.abs() < expected_v.abs()
+            && before_a.abs().max(after_a.abs()) <= STEADY * moved_a.abs()
+        {
+            // The current has stepped alone.
+            return self.weigh(false);
+        }
         let is_steady = |before: f64, after: f64| before.abs().max(after.abs()) <= STEADY * moved_v.abs();
         if moved_v.abs() < clear_v || !is_steady(r1.move_v, r3.move_v) {
             return;
@@ -305,7 +315,7 @@ impl CurrentCheck {
         }
         // A current that changes all the time may have been read at another moment than the voltages. An unexplained
         // step then does not count.
-        if is_explained || is_steady(ohm * (r1.current_a - r0.current_a), ohm * (r3.current_a - r2.current_a)) {
+        if is_explained || is_steady(ohm * before_a, ohm * after_a) {
             self.weigh(is_explained);
         }
     }
@@ -477,6 +487,22 @@ mod tests {
             let share = share_in_doubt(|load_a, time_s| Some(fault(load_a, time_s)));
             assert!(share > 0.85, "{name}: {share}");
         }
+    }
+
+    #[test]
+    fn reading_that_drops_alone_is_doubted() {
+        let mut check = CurrentCheck::default();
+        drive(&mut check, 600, |load_a, _| Some(load_a));
+        let mut steady = |check: &mut CurrentCheck, from_s: u32, to_s: u32, measured_a: f64| {
+            for time_s in (from_s..to_s).step_by(2) {
+                let noise_v = 1e-4 * f64::from(time_s % 3);
+                round(check, time_s, Some(measured_a + noise_a(time_s)), |_| 3.7 + 1.2 * OHM * 40.0 + noise_v);
+            }
+        };
+        steady(&mut check, 600, 700, -40.0);
+        assert!(!check.is_doubtful(), "steady charge");
+        steady(&mut check, 700, 710, 0.0);
+        assert!(check.is_doubtful(), "the reading has dropped to zero, the voltages have not moved: {check:?}");
     }
 
     #[test]
