@@ -125,7 +125,11 @@ impl Memory {
         let is_unknown = step.current_a.is_none() && step.unmeasured_s > 0.0;
         let continues = self.is_current_unknown || is_unknown;
         self.is_current_unknown = is_unknown;
-        let adjacent_a = self.gap_load_a(config, step);
+        let mut adjacent_a = self.gap_load_a(config, step);
+        if continues {
+            // A wrong current may have read zero before it was doubted. The load of the last minutes may go on.
+            adjacent_a = adjacent_a.max(self.load_a);
+        }
         let is_loaded = adjacent_a > config.gap.rest_current_a;
         let unnoted_s = step.unmeasured_s - noted_s;
         if is_silent_rest(config, step) {
