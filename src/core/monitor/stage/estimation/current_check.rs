@@ -493,7 +493,7 @@ mod tests {
     fn reading_that_drops_alone_is_doubted() {
         let mut check = CurrentCheck::default();
         drive(&mut check, 600, |load_a, _| Some(load_a));
-        let mut steady = |check: &mut CurrentCheck, from_s: u32, to_s: u32, measured_a: f64| {
+        let steady = |check: &mut CurrentCheck, from_s: u32, to_s: u32, measured_a: f64| {
             for time_s in (from_s..to_s).step_by(2) {
                 let noise_v = 1e-4 * f64::from(time_s % 3);
                 round(check, time_s, Some(measured_a + noise_a(time_s)), |_| 3.7 + 1.2 * OHM * 40.0 + noise_v);
