@@ -130,9 +130,18 @@ impl Life {
         let last = text.lines().last().expect("a line").to_owned();
         let (end_s, data) = (&last[1..last.find('.').expect("a stamp")], &last[last.find('#').expect("a frame") + 1..]);
         let end_s: u64 = end_s.parse().expect("a number");
-        // Bytes 3 to 5 contain the current.
-        let (voltage, temperature) = (&data[..6], &data[12..]);
-        (1..=120).for_each(|s| text += &format!("({}.000000000) vcan0 100#{voltage}000000{temperature}\n", end_s + s));
+        // Bytes 0 to 2 contain the voltage in 10 uV, bytes 3 to 5 the current in 0.1 mA. At rest, the voltage is without
+        // the drop in 0.1 ohm.
+        let number = |at: usize| {
+            let byte = |k: usize| i32::from_str_radix(&data[2 * k..2 * k + 2], 16).expect("a byte");
+            (byte(at + 2) << 24 | byte(at + 1) << 16 | byte(at) << 8) >> 8
+        };
+        let [low, middle, high, _] = (number(0) + number(3)).to_le_bytes();
+        let temperature = &data[12..];
+        (1..=120).for_each(|s| {
+            text +=
+                &format!("({}.000000000) vcan0 100#{low:02X}{middle:02X}{high:02X}000000{temperature}\n", end_s + s);
+        });
         fs::write(self.path(log), text).expect("written");
     }
 
