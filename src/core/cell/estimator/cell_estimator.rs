@@ -84,11 +84,7 @@ impl CellEstimator {
         let jumped = before.zip(self.marginal(0)).is_some_and(|(before, after)| {
             (after.mean - before.mean + counted).abs() > JUMP.max(JUMP_SIGMA * before.std())
         });
-        let update = result.flatten();
-        if update.is_none() {
-            self.memory.innovation_v = 0.0;
-        }
-        StepResult { update, reset, jumped }
+        StepResult { update: result.flatten(), reset, jumped }
     }
 
     /// Computes the step; `None` if this is not possible.
@@ -166,6 +162,7 @@ impl CellEstimator {
         self.memory.information_s = config.voltage.max_information_s;
         (self.memory.downtime_std, self.memory.used_prior, self.memory.noted_s) = (0.0, 0.0, 0.0);
         (self.memory.rejected, self.memory.rejected_s) = (0, 0.0);
+        self.memory.innovation_v = 0.0;
         self.memory.is_soc_unknown = false;
     }
 
@@ -178,6 +175,7 @@ impl CellEstimator {
         self.memory.log_resistance = ScalarGaussian::from_std(state.log_resistance, config.initial.log_resistance_std);
         (self.memory.slow_branch, self.memory.rejected, self.memory.rejected_s) = (SlowBranch::default(), 0, 0.0);
         (self.memory.offset_information, self.memory.offset_score) = (0.0, 0.0);
+        self.memory.innovation_v = 0.0;
         let Some(soc) = state.soc.filter(|_| self.filter.is_some()) else {
             self.filter = None;
             return;

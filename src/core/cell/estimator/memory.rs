@@ -46,7 +46,7 @@ pub(super) struct Memory {
     pub(super) load_a: f64,
     /// Mean normalised innovation squared over the consistency window.
     pub(super) mean_nis: f64,
-    /// Innovation of the last reading, if it was accepted; otherwise 0 (V).
+    /// Innovation of the last accepted reading since the filter's start (V).
     pub(super) innovation_v: f64,
     /// Time that the next voltage reading represents (s): the time since the last used reading. A long rest counts
     /// less.
@@ -125,11 +125,7 @@ impl Memory {
         let is_unknown = step.current_a.is_none() && step.unmeasured_s > 0.0;
         let continues = self.is_current_unknown || is_unknown;
         self.is_current_unknown = is_unknown;
-        let mut adjacent_a = self.gap_load_a(config, step);
-        if continues {
-            // A wrong current may have read zero before it was doubted. The load of the last minutes may go on.
-            adjacent_a = adjacent_a.max(self.load_a);
-        }
+        let adjacent_a = self.gap_load_a(config, step);
         let is_loaded = adjacent_a > config.gap.rest_current_a;
         let unnoted_s = step.unmeasured_s - noted_s;
         if is_silent_rest(config, step) {
@@ -207,8 +203,8 @@ impl Memory {
         let elapsed_s = step.measured_s + step.unmeasured_s;
         let forget = -libm::expm1(-elapsed_s.max(1e-3) / config.consistency.window_s);
         self.mean_nis += forget * (update.test_ratio - self.mean_nis);
-        self.innovation_v = if update.accepted { update.innovation } else { 0.0 };
         if update.accepted {
+            self.innovation_v = update.innovation;
             (self.information_s, self.rejected, self.rejected_s) = (0.0, 0, 0.0);
         } else {
             // The time before the first rejected reading is not part of the run.

@@ -8,8 +8,7 @@
 //! has stepped in the opposite direction, and if the ratio of the two steps (a resistance) is at least 1/[`MAX_FACTOR`]
 //! and at most [`MAX_FACTOR`] times the usual resistance. A step is the mean of two consecutive rounds minus the mean
 //! of the two rounds before them. Such a step contains less noise than the difference of two readings. A current that
-//! arrives one round earlier or later than the voltages still explains their step. If the current steps clearly and the
-//! voltages hardly move, this step of the current is also unexplained.
+//! arrives one round earlier or later than the voltages still explains their step.
 //!
 //! Explained and unexplained steps are evidence for and against the sensor. How much they count depends on how many
 //! steps the sensor has left unexplained so far. If a sensor has explained all steps, one unexplained step is enough
@@ -19,7 +18,8 @@
 //! The check finds a current that is frozen, inverted, late or beyond the sensor's range, whether or not the last
 //! digits of its readings change. While the load is constant, the check finds only a noisy sensor at its limit, because
 //! the readings of this sensor then repeat. A current without sign is found at the first clear steps of a charging
-//! current. A doubt only ends after the current has flowed in both directions, so a current without sign stays doubtful.
+//! current. If a doubted current has never flowed in both directions, the doubt only ends when it has. A current without
+//! sign therefore stays doubtful.
 
 use serde::{Deserialize, Serialize};
 
@@ -135,8 +135,8 @@ pub(crate) struct CurrentCheck {
     doubts: f64,
     /// Whether a jump of the SOC in a downtime waits for an explained step.
     is_unconfirmed: bool,
-    /// Whether the doubt waits until the current flows in discharge, and in charge.
-    awaited: [bool; 2],
+    /// Whether the current has been contradicted before it has flowed in both directions, and has not done so since.
+    is_one_sided: bool,
 }
 
 impl Default for CurrentCheck {
@@ -159,15 +159,16 @@ impl Default for CurrentCheck {
             limits_a: [0.0; 2],
             doubts: 0.0,
             is_unconfirmed: false,
-            awaited: [false; 2],
+            is_one_sided: false,
         }
     }
 }
 
 impl CurrentCheck {
-    /// Whether the current is doubtful: the evidence is against it, or it has not flowed in both directions since then.
+    /// Whether the current is doubtful: the evidence is against it, or was against it and the current has never flowed
+    /// in both directions.
     pub(crate) fn is_doubtful(&self) -> bool {
-        self.is_contradicted() || self.awaited != [false; 2]
+        self.is_contradicted() || self.is_one_sided
     }
 
     fn is_contradicted(&self) -> bool {
@@ -229,9 +230,8 @@ impl CurrentCheck {
         if self.count >= 2 {
             self.judge_repeat();
         }
-        if current_a.abs() > rest_a {
-            self.awaited[usize::from(current_a < 0.0)] = false;
-        }
+        let has_both = self.largest_a.iter().all(|&a| a > rest_a);
+        self.is_one_sided = !has_both && (self.is_one_sided || self.is_contradicted());
     }
 
     /// Judges whether the last reading of a flowing current repeats the reading before. If the last digits of a sensor
@@ -296,14 +296,6 @@ impl CurrentCheck {
         let factor = if (moved_v + ohm * moved_a).abs() > self.usual_v { MOVE_GAIN } else { 1.0 / MOVE_GAIN };
         self.usual_v = (self.usual_v * factor).clamp(MOVE_V.0, MOVE_V.1);
         let (before_a, after_a) = (r1.current_a - r0.current_a, r3.current_a - r2.current_a);
-        let expected_v = ohm * moved_a;
-        if expected_v.abs() >= clear_v
-            && MAX_FACTOR * moved_v.abs() < expected_v.abs()
-            && before_a.abs().max(after_a.abs()) <= STEADY * moved_a.abs()
-        {
-            // The current has stepped alone.
-            return self.weigh(false);
-        }
         let is_steady = |before: f64, after: f64| before.abs().max(after.abs()) <= STEADY * moved_v.abs();
         if moved_v.abs() < clear_v || !is_steady(r1.move_v, r3.move_v) {
             return;
@@ -340,7 +332,6 @@ impl CurrentCheck {
         let was_contradicted = self.is_contradicted();
         self.evidence = (self.evidence + log_odds).clamp(0.0, MAX_EVIDENCE);
         if self.is_contradicted() && !was_contradicted {
-            self.awaited = [true; 2];
             self.evidence = (self.evidence + self.doubts).min(MAX_EVIDENCE);
             self.doubts += 1.0;
         }
@@ -487,22 +478,6 @@ mod tests {
             let share = share_in_doubt(|load_a, time_s| Some(fault(load_a, time_s)));
             assert!(share > 0.85, "{name}: {share}");
         }
-    }
-
-    #[test]
-    fn reading_that_drops_alone_is_doubted() {
-        let mut check = CurrentCheck::default();
-        drive(&mut check, 600, |load_a, _| Some(load_a));
-        let steady = |check: &mut CurrentCheck, from_s: u32, to_s: u32, measured_a: f64| {
-            for time_s in (from_s..to_s).step_by(2) {
-                let noise_v = 1e-4 * f64::from(time_s % 3);
-                round(check, time_s, Some(measured_a + noise_a(time_s)), |_| 3.7 + 1.2 * OHM * 40.0 + noise_v);
-            }
-        };
-        steady(&mut check, 600, 700, -40.0);
-        assert!(!check.is_doubtful(), "steady charge");
-        steady(&mut check, 700, 710, 0.0);
-        assert!(check.is_doubtful(), "the reading has dropped to zero, the voltages have not moved: {check:?}");
     }
 
     #[test]
