@@ -1,5 +1,5 @@
-//! Formats the differences between the cells of a pack, and the charge and energy that the pack loses by them, as lines
-//! with a name and a value.
+//! Formats the differences between the cells of a pack as lines with a name and a value. The lines also show the usable
+//! charge and energy, and the charge and energy that the pack loses because of these differences.
 //!
 //! Cells count from 1. The number after "±" is the standard deviation. Ah and kWh refer to one string.
 

@@ -319,8 +319,8 @@ fn leak_is_found_despite_balancing() {
     assert!(found(&pack).contains(&(CellFaultKind::Leak, Some((CellIndex(6), CellIndex(6))))), "{:?}", found(&pack));
 }
 
-/// Findings of 14 days in a pack of 12 cells whose BMS balances with `Balancing::usual`. `configure` changes what the
-/// monitor knows about the balancing.
+/// Findings of 14 days in a pack of 12 cells whose BMS balances as in `Balancing::usual`, but with `bleed` times the
+/// bleed current. `configure` changes what the monitor knows about the balancing.
 fn found_in_balanced(
     fault: &str,
     bleed: f64,
@@ -363,7 +363,7 @@ fn balancing_bits_reveal_leaks_of_other_cells() {
 fn loss_explained_by_bleeding_raises_no_leak() {
     let unseen = with_balancing(|it| BalancingConfig { is_only_while_sent: false, max_age_s: 10.0, ..it });
     assert_eq!(found_in_balanced("", 1.0, unseen), []);
-    assert_eq!(found_in_balanced("", 1.2, |config| config), [], "the loss exceeds what the bits explain");
+    assert_eq!(found_in_balanced("", 1.2, |config| config), [], "a bleed current 20 % above `bleed_a` is not a leak");
     let without_a_bit = |mut config: MonitorConfig| {
         let is_kept = |binding: &Binding| binding.channel != Channel::Balancing(CellIndex(4));
         config.input = InputMap::new(config.input.bindings().iter().filter(|it| is_kept(it)).cloned().collect());

@@ -23,7 +23,7 @@ fn fit(folder: &Path, capacity_ah: &str, slow: &str, drives: &[&str], model: &Pa
     run(&arguments);
 }
 
-/// Time at which the estimate first became untrusted (s) since the first row; `None` = never.
+/// Time (s) from the first row until the estimate first became untrusted; `None` = never.
 fn first_untrusted_s(folder: &Path, model: &Path, drive: &Path) -> Option<f64> {
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     let text = std::fs::read_to_string(shipped.join("score.toml")).unwrap();

@@ -116,7 +116,8 @@ impl LimitCheck {
         };
         let (set, clear) = (good_by(rule.threshold), good_by(rule.clear));
         let probability = std.map(|std| probability_beyond(set, std));
-        // An alarm clears only if the true value is beyond the clear threshold with at most this probability.
+        // An alarm clears only if the probability that the true value is beyond the clear threshold is at most this
+        // value.
         let clear_level = if rule.rule.spec().is_learned { 0.05 } else { 0.5 };
         let (is_beyond, is_healthy) = match rule.when {
             Comparison::Mean => {

@@ -10,11 +10,12 @@
 //! capacity:
 //! * level: the capacity without recovery, which only falls; level -= rate dt. The use t counts equivalent full
 //!   cycles, or days if the cycles are unknown;
-//! * rate: loss per unit of use. Its logarithm follows a random walk with two parts. The first part has the standard
-//!   deviation w1 = `RATE_WALK` per square root of capacity lost; in the knee (see [`knee`]), w1 = `KNEE_WALK`. The
-//!   second part has the standard deviation w2 = `RATE_WALK_USE` per square root of an e-fold of use. Both parts are
-//!   relative, so the same constants suit cells that live for 50 cycles and for 5,000. In the linear filter, Q = (w1^2
-//!   rate dt + w2^2 ln(t1 / t0)) (rate^2 + P_rate), with the use t0 before the step and t1 after the step;
+//! * rate: loss per unit of use. Its logarithm follows a random walk with two parts. The variance of the first part is
+//!   w1^2 times the capacity lost, with w1 = `RATE_WALK`; in the knee (see [`knee`]), w1 = `KNEE_WALK`. The variance of
+//!   the second part grows by w2^2 while the use since the first reading grows by a factor of e, with w2 =
+//!   `RATE_WALK_USE`. Both parts are relative, so the same constants suit cells that live for 50 cycles and for 5,000.
+//!   In the linear filter, Q = (w1^2 rate dt + w2^2 ln(t1 / t0)) (rate^2 + P_rate), with the use t0 before the step and
+//!   t1 after the step;
 //! * recovery: capacity that returns during rest and is used up again (an Ornstein-Uhlenbeck process; measured cells
 //!   show 1 to 5 % after days of rest). Because successive readings share the recovery, ten readings within one cycle
 //!   do not count as ten independent readings;
@@ -28,7 +29,7 @@
 //!
 //! Assumed: outside the knee, fade may slow down or speed up, so the median keeps the present rate. The knee is the
 //! range from 10 to 20 % of loss. There, fade accelerates in many cells: resistance and current per active area grow
-//! with the loss, and lithium plates. The forecast expects this acceleration before a reading shows it.
+//! with the loss, and lithium plating occurs. The forecast expects this acceleration before a reading shows it.
 //!
 //! Deviation: although the forecast expects the knee, the filter does not. In the filter, the knee increases the
 //! variance of the rate, but not the mean. Reason: with an expected knee, the filter would overestimate the rate after
@@ -46,10 +47,11 @@ use crate::filter::bisect;
 use crate::filter::update_states;
 use crate::quantity::InvalidState;
 
-/// Standard deviation of the rate's logarithm per square root of capacity lost (fraction of the reference capacity).
-/// Over a loss of 10 %, one standard deviation is a factor of e^0.32.
+/// Standard deviation that the rate's logarithm would gain while the whole reference capacity is lost. It is
+/// proportional to the square root of the loss: over a loss of 10 %, one standard deviation is a factor of e^0.32.
 const RATE_WALK: f64 = 1.0;
-/// Standard deviation of the rate's logarithm per square root of an e-fold of use since the first reading.
+/// Standard deviation that the rate's logarithm gains while the use since the first reading grows by a factor of e. It
+/// is proportional to the square root of ln(use after / use before).
 const RATE_WALK_USE: f64 = 0.3;
 /// The knee: range of loss in which fade is expected to accelerate, fractions of the reference.
 const KNEE: (f64, f64) = (0.1, 0.2);
@@ -396,7 +398,7 @@ impl Forecast {
     /// Variance that the rate gains over `used` units of use.
     fn rate_walk(&self, used: f64) -> f64 {
         let rate = self.x[RATE].max(0.0);
-        // Before any use, the first step counts as one e-fold.
+        // Before any use, the first step counts as growth by a factor of e.
         let e_folds = if self.used > 0.0 { libm::log1p(used / self.used) } else { 1.0 };
         let lost = self.lost();
         let relative = walk_variance(lost, lost + rate * used) + RATE_WALK_USE * RATE_WALK_USE * e_folds;
@@ -452,8 +454,8 @@ impl Forecast {
         1.0 - self.x[LEVEL]
     }
 
-    /// Quantile of the capacity after `ahead` units of use: the threshold that the level passes within this use with
-    /// the probability `quantile`.
+    /// Quantile of the capacity (Ah) after `ahead` units of use: the level is then below the returned capacity with the
+    /// probability `quantile`.
     fn capacity_ah(&self, ahead: f64, quantile: f64) -> f64 {
         let (level, std) = (self.x[LEVEL], self.level_variance().sqrt());
         let is_below = |threshold_ah: f64| self.crossing(threshold_ah).probability(ahead) < quantile;

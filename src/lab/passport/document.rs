@@ -2,8 +2,8 @@
 //! against the form of its standard.
 //!
 //! Input: a [`Condition`] and the manufacturer's part. Output: the passport, and the [details](details) that the
-//! standards do not provide for. Each value has one source: a manufacturer's part that states a measured value is
-//! rejected. The same inputs give the same bytes.
+//! standards do not provide for. Each value has one source: if the manufacturer's part states a value that is also
+//! measured, the manufacturer's part is rejected. The same inputs give the same bytes.
 
 use serde_json::{Map, Value, json};
 

@@ -157,10 +157,17 @@ mod tests {
 
     #[test]
     fn lost_current_counts_beyond_its_age_limit() {
-        assert_eq!(finished(5.0, &[(10.0, bad(Fault::OutOfRange)), (12.5, GOOD)]), None, "half a second of an hour");
+        assert_eq!(
+            finished(5.0, &[(10.0, bad(Fault::OutOfRange)), (12.5, GOOD)]),
+            None,
+            "0.5 s without current in 3600 s of use is tolerated"
+        );
         assert!(finished(5.0, &[(10.0, bad(Fault::OutOfRange)), (16.0, GOOD)]).is_some());
-        assert!(finished(0.0, &[(10.0, bad(Fault::Stale)), (14.0, GOOD)]).is_some(), "the bus lives");
-        assert!(finished(5.0, &[(10.0, bad(Fault::Stale))]).is_some(), "never good again");
+        assert!(
+            finished(0.0, &[(10.0, bad(Fault::Stale)), (14.0, GOOD)]).is_some(),
+            "a stale current counts as lost even if its last value was 0"
+        );
+        assert!(finished(5.0, &[(10.0, bad(Fault::Stale))]).is_some(), "a loss lasts until the end of the record");
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! Stores messages that the broker has not acknowledged in a queue on disk, oldest first.
+//! Queue on disk for messages that the broker has not acknowledged, oldest first.
 //!
 //! Input: messages of the recorder. Output: the oldest messages of a class, in order, until they are removed. An added
 //! message survives a power cut and a restart (SQLite with a write-ahead log, flushed at each commit).
@@ -84,8 +84,8 @@ impl Queue {
             Err(OpenFault::Damaged(error)) => {
                 let aside = put_aside(&path).map_err(|error| at(&error))?;
                 tracing::error!(error, aside = %aside.display(), "the queue is damaged: set aside, starting a new one");
-                // The numbers start above all numbers of the damaged queue, because readers take a known number for a
-                // duplicate.
+                // The new sequence numbers start above all sequence numbers of the damaged queue, because a subscriber
+                // may treat a message as a duplicate if it has already received a message with the same number.
                 let millis = Reading::now().realtime_ns / 1_000_000;
                 prepare(&path, millis).map_err(|fault| at(&fault.text()))?
             }
@@ -107,7 +107,8 @@ impl Queue {
         self.added.notified()
     }
 
-    /// Adds messages, and stores `seen` for [`Self::seen`] in the same transaction. When this function returns, the
+    /// Adds messages. In the same transaction, stores `seen`, if given: the recorder's text that lists the events it
+    /// has already handled. [`Self::seen`] returns this text, also after a restart. When this function returns, the
     /// messages and `seen` are on disk.
     ///
     /// # Errors
@@ -147,7 +148,8 @@ impl Queue {
         Ok(fill)
     }
 
-    /// Returns the text stored by the latest [`Self::add`] with `seen`.
+    /// Returns the text that lists the events already handled: the text stored by the latest [`Self::add`] with `seen`.
+    /// `None` if no text is stored, or if it cannot be read.
     pub fn seen(&self) -> Option<String> {
         let database = self.database.borrow();
         let seen = database.query_row("SELECT text FROM seen", [], |row| row.get(0)).optional();
@@ -232,8 +234,8 @@ impl From<rusqlite::Error> for OpenFault {
     }
 }
 
-/// Opens the file and checks it. If the file is new, creates the tables; the first message then gets the number after
-/// `latest`.
+/// Opens the file and checks it. If the file is new, creates the tables; the first message then gets the sequence
+/// number after `latest`.
 fn prepare(path: &Path, latest: i64) -> Result<Connection, OpenFault> {
     let database = Connection::open(path)?;
     database.pragma_update(None, "journal_mode", "wal")?;
@@ -253,7 +255,7 @@ fn prepare(path: &Path, latest: i64) -> Result<Connection, OpenFault> {
             )));
         }
     }
-    // With AUTOINCREMENT, a number is never reused, even after the queue was empty.
+    // With AUTOINCREMENT, a sequence number is never reused, even after the queue was empty.
     database.execute_batch(&format!(
         "BEGIN;
          CREATE TABLE IF NOT EXISTS message (id INTEGER PRIMARY KEY AUTOINCREMENT, class INTEGER NOT NULL, body TEXT NOT NULL);

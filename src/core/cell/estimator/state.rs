@@ -21,7 +21,8 @@ pub struct CellState {
     mean: Vec<f64>,
     /// Covariance in the same order, row by row.
     covariance: Vec<f64>,
-    /// Errors of the state caused by the constant errors, state by state.
+    /// Effect of the constant errors (see `Gaussian::by_constant`): for each number of `mean`, one value per constant
+    /// error.
     by_constant: Vec<f64>,
     memory: Memory,
 }
@@ -158,7 +159,7 @@ mod tests {
             let mut state = settled();
             let last = state.covariance.len() - 1;
             (state.mean[3], state.covariance[last]) = (mean, variance);
-            assert!(state.check().is_err(), "a stored state with it is rejected");
+            assert!(state.check().is_err(), "`check` must reject the mean {mean} with the variance {variance}");
             let mut estimator = CellEstimator::restore(&state, 1).expect("one branch");
             assert!(resets(&mut estimator, 20) <= 1, "{mean} {variance}");
             assert!(estimator.capacity().mean > 0.5 && estimator.capacity().variance > 0.0, "{mean} {variance}");

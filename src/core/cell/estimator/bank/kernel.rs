@@ -13,7 +13,8 @@
 //!   columns. The columns of the branches are therefore never computed.
 //! * Only one pair has another SOC than the centre, so prediction and update each read the tables at three points
 //!   instead of 2 N + 1.
-//! * The lines of the tables are cached from step to step: [`LineCache`].
+//! * For each SOC interval, the tables contain a straight line per quantity (value and slope). The lines in use are
+//!   cached from step to step: [`LineCache`].
 //! * exp(x + d) = exp(x) exp(d), and exp(-2x) = exp(-x)^2 for the branches' noise.
 //!
 //! In: states, and for each the charge, time, current, temperature and voltage. Out: the new states, and a mask of
