@@ -8,11 +8,12 @@
 //! error of four standard deviations moves it by 25 %. The reach is therefore measured at [`FAR`] standard deviations
 //! and divided by [`FAR`].
 //!
-//! The filter may have found the SOC at the steep end and counted charge since. Flat parts of the curve near the
-//! present SOC therefore have the same effect.
+//! The filter may have found the SOC at the steep end and counted charge since. The reach of SOCs up to [`NEAR`] away
+//! therefore counts too, if a flat part of the curve is within reach there. Further away, this error is ignored.
 //!
-//! If a reading contradicts the estimate next to a flat part, the reach is measured from the SOC that this reading
-//! shows. A filter whose variance is already small corrects such a contradiction only slowly.
+//! If a reading contradicts the estimate next to a flat part, the reach extends from the estimate to the SOC that this
+//! reading shows with a further error of [`FAR`] standard deviations. A filter whose variance is already small corrects
+//! such a contradiction only slowly.
 
 use crate::cell::CellModel;
 
@@ -25,8 +26,8 @@ const INTERVALS: usize = 100;
 /// Number of intervals up to which a place of the curve is near the present SOC.
 const NEAR: usize = 20;
 
-/// If a voltage error moves the SOC more than this many times as far as the slope of the curve says, the curve counts
-/// as flat.
+/// If a voltage error moves the SOC more than this many times as far as the slope of the curve says, a flat part of the
+/// curve is within reach.
 pub(super) const FLAT: f64 = 2.0;
 
 /// Temperature at which the curve is evaluated (degrees C). The curve hardly depends on the temperature.
@@ -38,13 +39,13 @@ pub(super) struct VoltageReach {
     /// Per SOC: the reach (standard deviation of the SOC, fraction), and the slope of the curve divided by the voltage
     /// error (1/fraction). The filter's linear effect times the second value is the share of the reach that counts.
     nodes: Vec<(f64, f64)>,
-    /// Whether the curve is flat at any node.
+    /// Whether a flat part of the curve is within reach of any node.
     has_flat: bool,
     /// Open-circuit voltage per SOC (V), not falling.
     ocv_v: Vec<f64>,
     /// [`FAR`] standard deviations of the voltage error (V).
     far_v: f64,
-    /// Largest innovation that does not contradict the estimate (V): one standard deviation of noise and voltage error.
+    /// Innovation above which a reading widens the reach (V): one standard deviation of noise and voltage error.
     usual_v: f64,
 }
 
@@ -110,7 +111,7 @@ impl VoltageReach {
     }
 }
 
-/// Whether the curve is flat at a node.
+/// Whether a flat part of the curve is within reach of a node.
 fn is_flat(&(reach, per_linear): &(f64, f64)) -> bool {
     reach * per_linear > FLAT
 }
@@ -154,7 +155,7 @@ mod tests {
         assert!((at_end - far).abs() < 0.01, "{at_end} {far}");
         // The charge counted since does not make the SOC more certain.
         assert!(reach.std(0.8, linear, 0.0) >= 0.9 * at_end);
-        assert!(reach.std(0.6, linear, 0.0) < 0.2 * at_end, "found far from the end");
+        assert!(reach.std(0.6, linear, 0.0) < 0.2 * at_end, "limit: beyond [`NEAR`], the error is ignored");
     }
 
     #[test]
