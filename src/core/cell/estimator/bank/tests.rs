@@ -328,3 +328,33 @@ fn mixed_modules_match_separate_banks() {
         [f64::min, f64::max].map(|pick| (0..8).map(|it| mixed.soc(it).unwrap().mean).reduce(pick).unwrap());
     assert_eq!(mixed.extremes().map(|(lowest, highest)| (lowest.mean, highest.mean)), Some((low, high)));
 }
+
+#[test]
+fn contradicting_reading_widens_soc_next_to_flat_part() {
+    let mut model = small_model();
+    model.soc = vec![0.0, 0.1, 0.9, 0.96, 1.0];
+    model.ocv_v.values = vec![vec![3.15, 3.3, 3.31, 3.34, 3.46]; 2];
+    let resistances = model.branches.iter_mut().flat_map(|branch| [&mut branch.r_ohm, &mut branch.c_farad]);
+    resistances.chain([&mut model.r0_ohm]).for_each(|table| {
+        table.values.iter_mut().for_each(|row| *row = vec![row[1]; 5]);
+    });
+    let mut bank = EstimatorBank::new(&model, &config(), 1);
+    let rest = |voltage_v: f64| CellStep {
+        measured_s: 10.0,
+        charge_as: 0.0,
+        offset_s: 10.0,
+        unmeasured_s: 0.0,
+        current_a: Some(0.0),
+        temperature_c: Some(25.0),
+        ambient_c: 25.0,
+        voltage_v,
+    };
+    (0..300).for_each(|_| step(&mut bank, &[(0, rest(3.37))]));
+    let before = bank.soc(0).expect("started").std();
+    step(&mut bank, &[(0, rest(3.30))]);
+    let update = bank.result(0).update.expect("updated");
+    assert!(update.accepted && update.innovation < -0.02, "{update:?}");
+    assert_eq!(bank.cell(0).memory.innovation_v, update.innovation);
+    let after = bank.soc(0).expect("started").std();
+    assert!(after > 2.0 * before, "{before} {after}");
+}
