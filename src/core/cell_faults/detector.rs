@@ -13,9 +13,10 @@ use serde::{Deserialize, Serialize};
 
 use super::bleed_timer::BalancingConfig;
 use super::channels::{Channel, compare};
-use super::difference::{CONTACT, Difference, LEAK, Observation, RESISTANCE, STATES};
+use super::difference::{CONTACT, Difference, LEAK, Observation, RESISTANCE, SOC, STATES};
 use super::fault::{CellFault, CellFaultKind};
 use super::gain::{CellAgeing, Gain};
+use super::pack_slope::{PackSlope, SlopeRow};
 use super::row::{CellSums, PackSums};
 use super::temperature::WarmingRatio;
 use crate::cell::CellModel;
@@ -45,8 +46,8 @@ const LEAST_STEPS: f64 = 0.02;
 /// more, the counted charge is used.
 const SOC_JUMP: f64 = 0.02;
 const DAY_S: f64 = 86_400.0;
-/// Number of fault kinds up to and including `TemperatureSensor`. All kinds that apply to single cells are among them.
-const CELL_KINDS: usize = CellFaultKind::TemperatureSensor as usize;
+/// Number of fault kinds up to and including `HighCharge`. All kinds that apply to single cells are among them.
+const CELL_KINDS: usize = CellFaultKind::HighCharge as usize;
 
 /// Estimates of the mean cell at one time.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -134,6 +135,7 @@ pub struct CellFaultDetector {
     /// The cell with the lowest charge; `None` if no cell is clearly the lowest.
     lowest: Option<usize>,
     gain: Gain,
+    slope: PackSlope,
     findings: Vec<CellFault>,
 }
 
@@ -174,6 +176,7 @@ impl CellFaultDetector {
             is_balanced: false,
             lowest: None,
             gain: Gain::default(),
+            slope: PackSlope::default(),
             findings: Vec::new(),
         }
     }
@@ -247,6 +250,7 @@ impl CellFaultDetector {
         if pack.last.is_some_and(|last| time.since(last) > 60.0) {
             *pack = PackSums::default();
             self.rest_s = 0.0;
+            self.slope.interrupt();
             self.cells.iter_mut().for_each(WatchedCell::interrupt);
         }
         let seconds = pack.last.replace(time).map_or(0.0, |last| time.since(last).max(0.0));
@@ -315,28 +319,36 @@ impl CellFaultDetector {
         self.pack.last = pack.last;
         let mean = |sum: f64| sum / f64::from(pack.count.max(1));
         let (soc, charge_ah) = (mean(pack.soc), pack.first_ah + mean(pack.charge_ah));
-        let row = Row {
-            model,
-            capacity_ah,
-            soc,
-            temperature_c: mean(pack.temperature_c),
-            current_a: mean(pack.current_a),
-            drop_v: mean(pack.drop_v),
-            charge_ah,
-        };
+        let (temperature_c, current_a, drop_v) = (mean(pack.temperature_c), mean(pack.current_a), mean(pack.drop_v));
+        let voltages_v: Vec<Option<f64>> = self.cells.iter().map(|cell| cell.sums.mean_v()).collect();
+        let middle_v = middle(voltages_v.iter().flatten().copied());
+        let mut slope = std::mem::take(&mut self.slope);
+        let mut curve_soc = soc;
+        if let Some(middle_v) = middle_v {
+            // The middle voltage already includes the drop of the series resistance `ohm`.
+            let ocv_v = middle_v + drop_v - self.ohm * current_a;
+            curve_soc = PackSlope::position(model, capacity_ah, temperature_c, soc, ocv_v);
+            slope.add(model, capacity_ah, temperature_c, SlopeRow { charge_ah, soc: curve_soc, ocv_v, drop_v });
+        }
+        let row =
+            Row { model, slope: &slope, capacity_ah, soc, curve_soc, temperature_c, current_a, drop_v, charge_ah };
         let middle_time = begun.plus_secs(0.5 * time.since(begun));
         let seconds = self.last_row.map_or(0.0, |(last, ..)| middle_time.since(last));
         self.pass(middle_time, &row);
         self.remove_bled_charge(time, capacity_ah, balancing);
         let before = self.findings.clone();
-        if self.observe(time, seconds, &row) {
+        let (model_slope_v, mut charges) = (row.model_slope_v(), Vec::new());
+        if let Some(middle_v) = middle_v {
+            charges = self.observe(time, seconds, &row, &voltages_v, middle_v);
             self.observe_temperatures(time, seconds);
             // A BMS bleeds cells near the end of a charge, at about SOC 0.9.
-            let slope_v = || model.ocv_slope_v(&model.grid_position(0.9, row.temperature_c), capacity_ah);
+            let slope_v = || model.ocv_slope_v(&model.grid_position(0.9, temperature_c), capacity_ah);
             self.judge(time, is_balanced.then(slope_v));
         }
+        slope.learn_from_cells(curve_soc, model_slope_v, &mut charges);
+        self.slope = slope;
         self.cells.iter_mut().for_each(|cell| cell.sums.begin());
-        self.ohm = model.r0_ohm(&model.grid_position(soc, row.temperature_c));
+        self.ohm = model.r0_ohm(&model.grid_position(soc, temperature_c));
         self.choose_middle(socs);
         let is_new = |found: &&CellFault| !before.iter().any(|old| (old.kind, old.cells) == (found.kind, found.cells));
         self.findings.iter().filter(is_new).copied().collect()
@@ -354,11 +366,18 @@ impl CellFaultDetector {
         self.cells.iter_mut().for_each(|cell| cell.difference.pass(days, change));
     }
 
-    /// Compares every cell with the middle voltage of the pack, `seconds` after the previous row. Returns whether there
-    /// were enough cells for the comparison.
-    fn observe(&mut self, time: Timestamp, seconds: f64, row: &Row<'_>) -> bool {
-        let voltages_v: Vec<Option<f64>> = self.cells.iter().map(|cell| cell.sums.mean_v()).collect();
-        let Some(middle_v) = middle(voltages_v.iter().flatten().copied()) else { return false };
+    /// Compares every cell's mean voltage with the middle voltage of the pack, `seconds` after the previous row. Returns
+    /// what the cells show about the slope of the curve ([`PackSlope::learn_from_cells`]).
+    fn observe(
+        &mut self,
+        time: Timestamp,
+        seconds: f64,
+        row: &Row<'_>,
+        voltages_v: &[Option<f64>],
+        middle_v: f64,
+    ) -> Vec<(f64, f64)> {
+        let to_reference = row.slope.reference_soc() - row.curve_soc;
+        let mut charges = Vec::with_capacity(self.cells.len());
         for cell in &mut self.cells {
             cell.channel.end_row(&cell.sums, middle_v);
         }
@@ -371,7 +390,9 @@ impl CellFaultDetector {
         for (index, voltage_v) in voltages_v.iter().enumerate() {
             let cell = &mut self.cells[index];
             let Some(voltage_v) = voltage_v.filter(|_| !cell.channel.is_frozen) else { continue };
-            let observed = row.observation(cell.difference.mean(), voltage_v - middle_v);
+            let observed = row.observation(cell.difference.mean(), cell.difference.state(SOC).variance, voltage_v - middle_v);
+            let charge = cell.difference.soc_after(to_reference).mean;
+            charges.push((charge, row.curve_multiple(charge, voltage_v - middle_v)));
             if may_be_bled[index] {
                 cell.difference.open_charge(seconds / DAY_S, &observed);
             }
@@ -385,7 +406,7 @@ impl CellFaultDetector {
         }
         self.handle_jumps(time, row, &jumped, |cell| voltages_v[cell].map(|v| v - middle_v));
         self.observe_steps(row);
-        true
+        charges
     }
 
     /// Compares the series resistances of the cells, as measured from current steps.
@@ -460,6 +481,11 @@ impl CellFaultDetector {
         }
     }
 
+    /// Discards the learned slope of the open-circuit curve, because the cell model has changed.
+    pub fn forget_slope(&mut self) {
+        self.slope.forget();
+    }
+
     /// Resets the charge of all cells after a gap of unknown length.
     pub fn forget_charge(&mut self) {
         self.interrupt();
@@ -474,6 +500,7 @@ impl CellFaultDetector {
     pub fn interrupt(&mut self) {
         self.pack = PackSums::default();
         self.rest_s = 0.0;
+        self.slope.interrupt();
         self.cells.iter_mut().for_each(WatchedCell::interrupt);
     }
 
@@ -520,6 +547,7 @@ impl CellFaultDetector {
         let numbers = [current_a, drop_v, soc, temperature_c, charge_ah, first_ah, self.rest_s, self.ohm];
         InvalidState::unless_numbers("a number of the diagnosis", numbers.into_iter().chain(last))?;
         self.gain.check()?;
+        self.slope.check()?;
         for found in &self.findings {
             let (first, last) = found.cells.unwrap_or((CellIndex(0), CellIndex(0)));
             let is_there = first <= last && last.index() < cells;

@@ -127,6 +127,14 @@ impl Difference {
         ScalarGaussian { mean: self.mean[state], variance: self.covariance[pair(state, state)] }
     }
 
+    /// Difference in SOC from the mean cell after the mean cell's SOC has changed by `soc_change`, without a leak. It
+    /// follows from the present difference and the difference in capacity, to first order.
+    pub(super) fn soc_after(&self, soc_change: f64) -> ScalarGaussian {
+        let variance = self.covariance[pair(SOC, SOC)]
+            + soc_change * (soc_change * self.covariance[pair(CAPACITY, CAPACITY)] - 2.0 * self.covariance[pair(SOC, CAPACITY)]);
+        ScalarGaussian { mean: self.mean[SOC] - soc_change * self.mean[CAPACITY], variance: variance.max(0.0) }
+    }
+
     pub(super) fn mean(&self) -> &[f64; STATES] {
         &self.mean
     }

@@ -47,11 +47,16 @@ pub enum CellFaultKind {
     TemperatureSensor = 13,
     /// The gain of the current sensor has risen. Size: fraction.
     CurrentGain = 14,
+    /// The cell has less charge than the other cells, by a constant amount. Size: difference in SOC (negative),
+    /// fraction.
+    LowCharge = 15,
+    /// The cell has more charge than the other cells, by a constant amount. Size: difference in SOC, fraction.
+    HighCharge = 16,
 }
 
 impl CellFaultKind {
     /// All kinds, ordered by their numbers.
-    pub const ALL: [Self; 14] = [
+    pub const ALL: [Self; 16] = [
         Self::Leak,
         Self::Contact,
         Self::WeakCell,
@@ -66,6 +71,8 @@ impl CellFaultKind {
         Self::CurrentFrozen,
         Self::TemperatureSensor,
         Self::CurrentGain,
+        Self::LowCharge,
+        Self::HighCharge,
     ];
 
     /// Name in events, status and reports.
@@ -85,6 +92,8 @@ impl CellFaultKind {
             Self::CurrentFrozen => "current_frozen",
             Self::TemperatureSensor => "temperature_sensor",
             Self::CurrentGain => "current_gain",
+            Self::LowCharge => "low_charge",
+            Self::HighCharge => "high_charge",
         }
     }
 
@@ -105,6 +114,8 @@ impl CellFaultKind {
             Self::CurrentFrozen => "current frozen",
             Self::TemperatureSensor => "temperature sensor does not follow the load",
             Self::CurrentGain => "current sensor shows too much",
+            Self::LowCharge => "less charge than the others",
+            Self::HighCharge => "more charge than the others",
         }
     }
 
@@ -130,6 +141,8 @@ impl CellFaultKind {
                 "compare the sensor under load with an ammeter: all capacities and resistances have changed by its gain"
             }
             Self::TemperatureSensor => "the sensor has fallen off or shows one value: check how it is mounted",
+            Self::LowCharge => "the cell ends every discharge early: balance the pack, which restores this charge",
+            Self::HighCharge => "the cell ends every charge early: balance the pack, which restores this charge",
         }
     }
 
@@ -167,6 +180,7 @@ impl CellFaultKind {
             Self::HighResistance => RESISTANCE,
             Self::VoltageChannel => CHANNEL_V,
             Self::CurrentGain => GAIN,
+            Self::LowCharge | Self::HighCharge => CHARGE,
             _ => 0.5,
         }
     }
@@ -232,6 +246,8 @@ pub const CONTACT: f64 = 0.1;
 pub const CAPACITY: f64 = 0.05;
 /// Limit of the difference in resistance, fraction.
 pub const RESISTANCE: f64 = 0.1;
+/// Limit of the difference in charge, fraction of the capacity.
+pub const CHARGE: f64 = 0.01;
 /// Limit of the voltage channel's offset (V).
 pub const CHANNEL_V: f64 = 0.015;
 

@@ -14,6 +14,7 @@
 //! | --- | --- |
 //! | [`detector`] | all cells: rows in, findings out |
 //! | [`difference`] | filter of one cell's difference: charge, capacity, resistance, contact, channel, leak |
+//! | `pack_slope` | slope of the pack's own open-circuit curve |
 //! | [`bleed_timer`] | how long a cell was bled, from the balancing bits of its BMS |
 //! | `row` | samples of a few minutes, summed per cell |
 //! | [`gain`] | gain of the current sensor, from changes that all cells share |
@@ -30,6 +31,7 @@ pub mod gain;
 pub mod imbalance;
 
 mod channels;
+mod pack_slope;
 mod row;
 mod temperature;
 

@@ -4,10 +4,15 @@ use serde::{Deserialize, Serialize};
 
 use crate::quantity::Timestamp;
 
+/// If a voltage is unchanged although its drop has changed by more than this value, it was not read again (V).
+const REPEATED_V: f64 = 0.002;
+
 /// Sums of one cell over a row.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct CellSums {
     pub(super) count: u32,
+    /// Number of voltages in the sum: a voltage that was not read again is not added.
+    readings: u32,
     /// Sum of the voltages. Because the cells are sampled at different times, each voltage is corrected by the mean
     /// cell's ohmic drop at the current of the sample.
     voltage_v: f64,
@@ -46,6 +51,15 @@ impl CellSums {
             self.temperature_c += temperature_c;
             self.temperatures += 1;
         }
+        self.digest = (self.digest.rotate_left(5) ^ voltage_v.to_bits()).wrapping_mul(0x9E37_79B9_7F4A_7C15);
+        // If the current has changed, a cell voltage cannot stay the same bit for bit. It was not read again.
+        let is_repeated = |(_, last_v, last_a): (Timestamp, f64, f64)| {
+            voltage_v == last_v && ohm * (current_a - last_a).abs() > REPEATED_V
+        };
+        if self.last.is_some_and(is_repeated) {
+            return;
+        }
+        self.readings += 1;
         self.voltage_v += voltage_v + ohm * current_a;
         if let Some((before, last_v, last_a)) = self.last.replace((time, voltage_v, current_a)) {
             let (step_v, step_a) = (voltage_v - last_v, current_a - last_a);
@@ -55,12 +69,11 @@ impl CellSums {
             }
             self.changes += u32::from(step_v != 0.0);
         }
-        self.digest = (self.digest.rotate_left(5) ^ voltage_v.to_bits()).wrapping_mul(0x9E37_79B9_7F4A_7C15);
     }
 
     /// Mean voltage (V); `None` if the row has no sample.
     pub(super) fn mean_v(&self) -> Option<f64> {
-        (self.count > 0).then(|| self.voltage_v / f64::from(self.count))
+        (self.readings > 0).then(|| self.voltage_v / f64::from(self.readings))
     }
 
     /// Mean temperature (degrees C); `None` if it was not measured.

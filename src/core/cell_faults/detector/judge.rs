@@ -2,7 +2,7 @@
 //! detector judges the cells at the end of a row, which holds the sums of a few minutes of samples.
 
 use super::CellFaultDetector;
-use crate::cell_faults::difference::{self, CHANNEL, CONTACT, Jump, LEAK, RESISTANCE, SOC, STATES};
+use crate::cell_faults::difference::{CAPACITY, CHANNEL, CONTACT, Jump, LEAK, RESISTANCE, SOC, STATES};
 use crate::cell_faults::fault::{self, CellFault, CellFaultKind, OUTLIER, REPORTED, WITHDRAWN};
 use crate::filter::{ScalarGaussian, normal_cdf};
 use crate::quantity::{CellIndex, Timestamp};
@@ -13,6 +13,12 @@ const SAME_MODULE_S: f64 = 3.0 * DAY_S;
 /// The size of a fault counts as known if its standard deviation is at most this multiple of the limit at which a fault
 /// of this kind is reported.
 const KNOWN_LIMITS: f64 = 2.0;
+
+/// The charge of a cell is compared at these values of the SOC.
+const CHARGE_AT: [f64; 2] = [0.2, 0.9];
+
+/// Until a fault is found, its size is at most this part of the limit.
+const BELOW_LIMIT: f64 = 0.99;
 
 /// If a cell's SOC differs from the other cells' SOC by this much or more, its contact, its resistance, the offset of
 /// its channel and a higher capacity cannot be judged.
@@ -111,7 +117,11 @@ impl CellFaultDetector {
         let since = self.cells[index].suspected[kind as usize - 1];
         let is_settled = since.zip(self.last_row).is_none_or(|(since, (now, ..))| self.has_lasted(kind, since, now));
         let is_known = judged.size.std() <= KNOWN_LIMITS * kind.limit() && is_settled || is_found();
-        (judged.is_comparable && is_known && self.has_channel_fault(cell) == Some(false)).then_some(judged.size)
+        let is_judged = judged.is_comparable && is_known && self.has_channel_fault(cell) == Some(false);
+        // A size beyond the limit is a fault, and a fault that is not certain is not found. Rules about sizes agree with
+        // the findings.
+        let most = if is_found() { f64::INFINITY } else { BELOW_LIMIT * kind.limit() };
+        is_judged.then(|| ScalarGaussian { mean: judged.size.mean.clamp(-most, most), ..judged.size })
     }
 
     /// Whether a cell's voltage reading is wrong or belongs to another cell. `None` if the cell is not compared or if
@@ -156,7 +166,7 @@ impl CellFaultDetector {
     }
 
     /// Judges one cell for every kind of fault.
-    fn judged(&self, index: usize, populations: &[Population; STATES]) -> [Judgement; 8] {
+    fn judged(&self, index: usize, populations: &[Population; STATES]) -> [Judgement; 10] {
         let cell = &self.cells[index];
         let beyond = |state: usize, limit: f64, sign: f64| {
             let own = cell.difference.state(state);
@@ -191,10 +201,17 @@ impl CellFaultDetector {
         // cell either.
         let unless_leaking =
             |(size, probability): (ScalarGaussian, f64)| (size, if leak.1 >= WITHDRAWN { 0.0 } else { probability });
+        let (weak, foreign) =
+            (beyond(CAPACITY, fault::CAPACITY, -1.0), unless_leaking(beyond(CAPACITY, fault::CAPACITY, 1.0)));
         let is_comparable = cell.difference.mean()[SOC].abs() < TOO_FAR;
         let if_near = |kind: CellFaultKind, (size, probability): (ScalarGaussian, f64)| Judgement {
             is_comparable,
             ..of(kind, (size, if is_comparable { probability } else { 0.0 }))
+        };
+        let explained = [&weak, &foreign].iter().any(|(_, probability)| *probability >= WITHDRAWN);
+        let charge_beyond = |sign: f64| {
+            let (size, probability) = self.constant_charge(index, populations, sign);
+            unless_leaking((size, if explained { 0.0 } else { probability }))
         };
         [
             sure(CellFaultKind::VoltageFrozen, cell.channel.is_frozen),
@@ -203,9 +220,28 @@ impl CellFaultDetector {
             of(CellFaultKind::Leak, leak),
             if_near(CellFaultKind::Contact, beyond(CONTACT, fault::CONTACT, 1.0)),
             if_near(CellFaultKind::HighResistance, beyond(RESISTANCE, fault::RESISTANCE, 1.0)),
-            of(CellFaultKind::WeakCell, beyond(difference::CAPACITY, fault::CAPACITY, -1.0)),
-            if_near(CellFaultKind::ForeignCell, unless_leaking(beyond(difference::CAPACITY, fault::CAPACITY, 1.0))),
+            of(CellFaultKind::WeakCell, weak),
+            if_near(CellFaultKind::ForeignCell, foreign),
+            of(CellFaultKind::LowCharge, charge_beyond(-1.0)),
+            of(CellFaultKind::HighCharge, charge_beyond(1.0)),
         ]
+    }
+
+    /// Difference in charge, and the probability that it is beyond the limit. `sign`: 1 for more charge than the other
+    /// cells, -1 for less. The probability is 0 if the difference is within the limit when the pack is nearly full or
+    /// nearly empty: then the cell has another capacity, and its charge is not constantly different.
+    fn constant_charge(&self, index: usize, populations: &[Population; STATES], sign: f64) -> (ScalarGaussian, f64) {
+        let soc = self.last_row.map_or(0.5, |(_, soc, _)| soc);
+        let at = |soc_change: f64| {
+            let own = self.cells[index].difference.soc_after(soc_change);
+            let middle = populations[SOC].middle - soc_change * populations[CAPACITY].middle;
+            ScalarGaussian { mean: own.mean - middle, ..own }
+        };
+        let size = at(0.0);
+        let is_constant = CHARGE_AT.iter().all(|end| sign * at(end - soc).mean >= fault::CHARGE);
+        let stands_out = sign * size.mean >= OUTLIER * populations[SOC].std;
+        let probability = normal_cdf((sign * size.mean - fault::CHARGE) / size.std().max(1e-12));
+        (size, if is_constant && stands_out { probability } else { 0.0 })
     }
 
     /// Updates the list of findings with a judgement. Returns the judgement as a finding, even if the finding is not
@@ -233,13 +269,15 @@ impl CellFaultDetector {
         finding
     }
 
-    /// Whether a fault of this kind has been likely for long enough to be reported. Two kinds have a waiting time. In a
+    /// Whether a fault of this kind has been likely for long enough to be reported. Some kinds have a waiting time. A
+    /// charge difference must be constant for a day, otherwise it may be the beginning of a leak. In a
     /// balanced pack, the leak is unknown at first, so other changes look like a leak until the cell has completed a
     /// cycle. A cell with more capacity than the others may belong to a replaced module, whose other cells are found
     /// later.
     fn has_lasted(&self, kind: CellFaultKind, since: Timestamp, now: Timestamp) -> bool {
         let settling_s = match kind {
             CellFaultKind::Leak if self.is_balanced => DAY_S,
+            CellFaultKind::LowCharge | CellFaultKind::HighCharge => DAY_S,
             CellFaultKind::ForeignCell => SAME_MODULE_S,
             _ => 0.0,
         };

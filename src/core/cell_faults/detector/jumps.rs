@@ -50,7 +50,7 @@ impl CellFaultDetector {
         differences_v: [f64; 2],
     ) -> bool {
         let [of_a, of_b] = [self.cells[a].before_jump, self.cells[b].before_jump];
-        let off = |means: &[f64; STATES], difference_v: f64| row.observation(means, difference_v).innovation.abs();
+        let off = |means: &[f64; STATES], difference_v: f64| row.observation(means, 0.0, difference_v).innovation.abs();
         let as_before = off(&of_a, differences_v[0]).min(off(&of_b, differences_v[1]));
         let exchanged = off(&of_b, differences_v[0]).max(off(&of_a, differences_v[1]));
         if exchanged > SWAP_V || exchanged > 0.5 * as_before {

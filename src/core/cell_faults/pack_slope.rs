@@ -1,0 +1,247 @@
+//! Learns the slope of the open-circuit curve from the pack itself.
+//!
+//! In: per row (a few minutes of samples), the middle voltage of the pack without its drop (V), the counted charge, and
+//! the cells' differences. Out: for each tenth of SOC, the factor by which the true slope differs from the slope of the
+//! cell model. All cells share the factors.
+//!
+//! The curve of a label can have half or twice the slope of the real curve. A constant difference in charge then looks
+//! like a difference that depends on the SOC, and the comparison of cells would explain it by a contact or a lost
+//! capacity. The pack shows its own slope in two ways:
+//! * the change of its middle voltage, divided by the charge that moved;
+//! * cells with different charge: all their voltage differences grow and shrink with the same slope. This gives the
+//!   slope in one tenth relative to another tenth, but no scale, because the charges themselves are learned with it.
+//!
+//! The factor of a tenth is the relative slope from the cells, scaled to agree with the middle voltage in all tenths
+//! together. In a tenth without cells of different charge, it is the slope from the middle voltage.
+
+use serde::{Deserialize, Serialize};
+
+use crate::cell::CellModel;
+use crate::filter::ScalarGaussian;
+use crate::quantity::InvalidState;
+
+const TENTHS: usize = 10;
+/// Standard deviation of the factor before the first measurement: of a model that was made from a label, and of a model
+/// that was fitted to the cell.
+const LABEL_STD: f64 = 0.4;
+const FITTED_STD: f64 = 0.05;
+/// Standard deviations that decide where on the curve a row is: of the filter's SOC, fraction, and of the open-circuit
+/// voltage (V). On a steep curve, the voltage decides; on a flat curve, the SOC.
+const SOC_STD: f64 = 0.05;
+const OCV_STD_V: f64 = 0.01;
+/// Smallest standard deviation of a factor. From the middle voltage alone: the voltage drop also changes with the SOC.
+/// From several cells: within a tenth, the slope is not constant.
+const LEAST_STD: f64 = 0.2;
+const LEAST_STD_OF_CELLS: f64 = 0.1;
+/// From this standard deviation on, the factor from the cells is used.
+const SEEN_STD: f64 = 0.2;
+/// Smallest charge difference of a cell that shows the slope, fraction. With a smaller one, offsets of the voltage
+/// channels would look like a slope.
+const LEAST_CHARGE: f64 = 0.005;
+/// Largest part of the charge differences that one cell may have. Otherwise, a fault of this cell could look like a
+/// slope.
+const MOST_OF_ONE: f64 = 1.0 / 3.0;
+/// Errors of the factor from the cells in one row: `CELL_V` of each cell's voltage difference (V), and `CELLS` of the
+/// charge differences, fraction. The charges are learned at the same time, so a factor follows them.
+const CELL_V: f64 = 0.004;
+const CELLS: f64 = 0.3;
+/// Allowed values of a factor.
+const FACTORS: (f64, f64) = (0.2, 4.0);
+/// Number of recent rows that are kept. The change of the voltage is measured between the newest row and one of them.
+const RECENT: usize = 24;
+/// Allowed distance in SOC between the two rows. A smaller distance has a larger error, a larger one blurs the tenths.
+const APART: (f64, f64) = (0.03, 0.12);
+/// Errors of the change of the open-circuit voltage: `ROW_V` of each row (V), and `DROP` of the change of the voltage
+/// drop, fraction.
+const ROW_V: f64 = 0.004;
+const DROP: f64 = 0.3;
+/// Number of consecutive measurements that share about the same rows.
+const SHARED: f64 = 3.0;
+/// If a measurement differs by more than this many standard deviations, its weight is reduced (Huber).
+const HUBER: f64 = 3.0;
+/// Largest number of rows that share the error of a factor ([`PackSlope::variance`]). Older rows no longer influence
+/// the charge of a cell, which changes slowly.
+const MOST_ROWS: u32 = 200;
+
+/// A row, as far as the slope is concerned.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub(super) struct SlopeRow {
+    /// Charge taken out since any fixed time (Ah).
+    pub(super) charge_ah: f64,
+    /// SOC of the middle cell on the model's curve.
+    pub(super) soc: f64,
+    /// Middle voltage of the pack plus its voltage drop (V).
+    pub(super) ocv_v: f64,
+    /// Voltage drop (V).
+    pub(super) drop_v: f64,
+}
+
+/// Slope of the pack's open-circuit curve relative to the model's curve, per tenth of SOC.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct PackSlope {
+    /// Empty before the first row.
+    tenths: Vec<Tenth>,
+    /// The latest rows since the last gap, oldest first.
+    recent: Vec<SlopeRow>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+struct Tenth {
+    /// Factor from the middle voltage.
+    of_middle: ScalarGaussian,
+    /// Mean charge difference of the cells that the model's slope would give, fraction: proportional to the true slope
+    /// divided by the model's slope. `None` before the first row with cells of different charge.
+    of_cells: Option<ScalarGaussian>,
+    /// Number of rows with this factor.
+    rows: u32,
+}
+
+fn tenth(soc: f64) -> usize {
+    ((soc.clamp(0.0, 1.0) * TENTHS as f64) as usize).min(TENTHS - 1)
+}
+
+impl PackSlope {
+    /// Discards the recent rows, because charge may have moved unseen.
+    pub(super) fn interrupt(&mut self) {
+        self.recent.clear();
+    }
+
+    /// Discards the factors, because the model's curve has changed.
+    pub(super) fn forget(&mut self) {
+        *self = Self::default();
+    }
+
+    /// SOC of the row on the model's curve. `soc`: SOC of the middle cell in the filter, which may be wrong by several
+    /// points while the model comes from a label.
+    pub(super) fn position(model: &CellModel, capacity_ah: f64, temperature_c: f64, soc: f64, ocv_v: f64) -> f64 {
+        let temperature = model.temperature_position(temperature_c);
+        let slope_v = model.ocv_slope_v(&model.grid_position_at(&temperature, soc.clamp(0.0, 1.0)), capacity_ah);
+        let by_voltage = model.soc_of_aged_ocv(&temperature, capacity_ah, ocv_v);
+        let of_voltage = (SOC_STD * slope_v) * (SOC_STD * slope_v);
+        let weight = of_voltage / (of_voltage + OCV_STD_V * OCV_STD_V);
+        soc + weight * (by_voltage - soc)
+    }
+
+    /// Adds a row and measures the slope between this row and a recent one.
+    pub(super) fn add(&mut self, model: &CellModel, capacity_ah: f64, temperature_c: f64, row: SlopeRow) {
+        if self.tenths.is_empty() {
+            let std = if model.spread.is_some() { LABEL_STD } else { FITTED_STD };
+            let factor = ScalarGaussian { mean: 1.0, variance: std * std };
+            self.tenths = vec![Tenth { of_middle: factor, of_cells: None, rows: 0 }; TENTHS];
+        }
+        let here = &mut self.tenths[tenth(row.soc)];
+        here.rows = (here.rows + 1).min(MOST_ROWS);
+        let charged = |from: &SlopeRow| (from.charge_ah - row.charge_ah) / capacity_ah;
+        let far_enough = self.recent.iter().filter(|from| (APART.0..=APART.1).contains(&charged(from).abs()));
+        let change_v = |from: &SlopeRow| (row.drop_v - from.drop_v).abs();
+        if let Some(from) = far_enough.min_by(|a, b| change_v(a).total_cmp(&change_v(b))).copied() {
+            let (middle, half) = (0.5 * (row.soc + from.soc), 0.5 * charged(&from));
+            let at_v =
+                |soc: f64| model.aged_ocv_v(&model.grid_position(soc.clamp(0.0, 1.0), temperature_c), capacity_ah);
+            let expected_v = at_v(middle + half) - at_v(middle - half);
+            let error_v = (DROP * change_v(&from)).hypot(ROW_V * std::f64::consts::SQRT_2);
+            let measured = (row.ocv_v - from.ocv_v) / expected_v;
+            let variance = SHARED * error_v * error_v / (expected_v * expected_v);
+            if measured.is_finite() && variance.is_finite() {
+                let factor = &mut self.tenths[tenth(middle)].of_middle;
+                let open = (factor.variance - LEAST_STD * LEAST_STD).max(0.0);
+                *factor = updated(*factor, open, measured, variance);
+                factor.mean = factor.mean.clamp(FACTORS.0, FACTORS.1);
+            }
+        }
+        if self.recent.len() == RECENT {
+            self.recent.remove(0);
+        }
+        self.recent.push(row);
+    }
+
+    /// SOC at which the charge differences of the cells are known best: the middle of the tenth with the most rows.
+    pub(super) fn reference_soc(&self) -> f64 {
+        let busiest = (0..self.tenths.len()).max_by_key(|&tenth| self.tenths[tenth].rows);
+        busiest.map_or(0.5, |tenth| (tenth as f64 + 0.5) / TENTHS as f64)
+    }
+
+    /// Learns the factor at `soc` from several cells. `cells`: per cell, its charge difference at the reference SOC
+    /// (fraction), and the voltage difference that it shows, as a multiple of the model's. `slope_v`: slope of the
+    /// model (V per unit of SOC).
+    pub(super) fn learn_from_cells(&mut self, soc: f64, slope_v: f64, cells: &mut Vec<(f64, f64)>) {
+        let Some(tenth) = self.tenths.get_mut(tenth(soc)) else { return };
+        let mean_charge = cells.iter().map(|(charge, _)| charge.abs()).sum::<f64>() / cells.len().max(1) as f64;
+        cells.retain(|(charge, multiple)| charge.abs() >= LEAST_CHARGE && multiple.is_finite());
+        let total: f64 = cells.iter().map(|(charge, _)| charge.abs()).sum();
+        if cells.iter().any(|(charge, _)| charge.abs() > MOST_OF_ONE * total) {
+            return;
+        }
+        cells.sort_by(|a, b| a.1.total_cmp(&b.1));
+        let mut below = 0.0;
+        let median = cells.iter().find(|(charge, _)| {
+            below += charge.abs();
+            below >= 0.5 * total
+        });
+        let squares: f64 = cells.iter().map(|(charge, _)| charge * charge).sum();
+        let error = CELL_V * CELL_V / (slope_v * slope_v * squares) + CELLS * CELLS;
+        // The mean charge makes the value independent of the scale of the charges, which are still being learned.
+        let measured = median.map_or(0.0, |(_, multiple)| multiple * mean_charge);
+        let variance = error * measured * measured;
+        if measured > 0.0 && variance.is_finite() {
+            let before = tenth.of_cells.unwrap_or(ScalarGaussian { mean: measured, variance: 4.0 * variance });
+            let ScalarGaussian { mean, variance } = updated(before, before.variance, measured, variance);
+            let least = LEAST_STD_OF_CELLS * mean;
+            tenth.of_cells = Some(ScalarGaussian { mean, variance: variance.max(least * least) });
+        }
+    }
+
+    /// Factor of the slope per unit of `of_cells`, so that both ways agree on the whole rise of the curve. `None` if no
+    /// tenth shows the slope in both ways.
+    fn scale(&self) -> Option<f64> {
+        let seen = || self.tenths.iter().filter_map(|tenth| Some((tenth.of_middle.mean, tenth.clear_of_cells()?.mean)));
+        let (of_middle, of_cells) = seen().fold((0.0, 0.0), |sums, (a, b)| (sums.0 + a, sums.1 + b));
+        (of_cells > 0.0).then(|| of_middle / of_cells)
+    }
+
+    /// Factor of the slope at a SOC, and variance of its error in one of many rows.
+    ///
+    /// All rows of a tenth share the factor's error, but the filter of a cell treats the errors of rows as independent.
+    /// With the error's variance times the number of rows, all rows of a tenth together contain as much information as
+    /// one row with the error's variance.
+    pub(super) fn factor(&self, soc: f64) -> ScalarGaussian {
+        let Some(tenth) = self.tenths.get(tenth(soc)) else { return ScalarGaussian { mean: 1.0, variance: 0.0 } };
+        let scaled = |(scale, of_cells): (f64, ScalarGaussian)| ScalarGaussian {
+            mean: (scale * of_cells.mean).clamp(FACTORS.0, FACTORS.1),
+            variance: scale * scale * of_cells.variance,
+        };
+        let of_cells = self.scale().zip(tenth.clear_of_cells()).map(scaled);
+        let ScalarGaussian { mean, variance } = of_cells.unwrap_or(tenth.of_middle);
+        ScalarGaussian { mean, variance: variance * f64::from(tenth.rows.max(1)) }
+    }
+
+    /// Checks the numbers of a stored state.
+    pub(super) fn check(&self) -> Result<(), InvalidState> {
+        let count = self.tenths.len();
+        let is_possible = (count == 0 || count == TENTHS) && self.recent.len() <= RECENT;
+        InvalidState::unless(is_possible, "the tenths of a slope", count as f64, "0 or 10")?;
+        for factor in self.tenths.iter().flat_map(|tenth| [Some(tenth.of_middle), tenth.of_cells]).flatten() {
+            InvalidState::unless_positive("the factor of a slope", factor.mean)?;
+            InvalidState::unless_positive("the variance of a slope's factor", factor.variance)?;
+        }
+        let numbers = self.recent.iter().flat_map(|row| [row.charge_ah, row.soc, row.ocv_v, row.drop_v]);
+        InvalidState::unless_numbers("a row of a slope", numbers)
+    }
+}
+
+impl Tenth {
+    /// What the cells show, if they show it clearly.
+    fn clear_of_cells(&self) -> Option<ScalarGaussian> {
+        self.of_cells.filter(|it| it.variance <= SEEN_STD * SEEN_STD * it.mean * it.mean)
+    }
+}
+
+/// A factor after a measurement. `open`: the part of the factor's variance that the measurement can reduce.
+fn updated(factor: ScalarGaussian, open: f64, measured: f64, variance: f64) -> ScalarGaussian {
+    let total = open + variance;
+    let off = (measured - factor.mean).abs() / total.sqrt();
+    let gain = open / (total * (off / HUBER).max(1.0));
+    let mean = factor.mean + gain * (measured - factor.mean);
+    ScalarGaussian { mean, variance: factor.variance - gain * open }
+}
