@@ -28,7 +28,7 @@ struct Shown {
     kinds: &'static [CellFaultKind],
 }
 
-/// The pictures in the order of a report. The SOC is first, because no finding is based on the SOC alone.
+/// The pictures in the order of a report. The SOC is first, because it shows the most frequent difference.
 const SHOWN: [Shown; STATES] = [
     Shown {
         state: SOC,
@@ -36,8 +36,8 @@ const SHOWN: [Shown; STATES] = [
         title: "Charge of the cells",
         label: "SOC relative to the pack's median, points",
         scale: 100.0,
-        limits: &[],
-        kinds: &[],
+        limits: &[fault::CHARGE, -fault::CHARGE],
+        kinds: &[CellFaultKind::LowCharge, CellFaultKind::HighCharge],
     },
     Shown {
         state: LEAK,

@@ -136,6 +136,8 @@ pub struct CellFaultDetector {
     lowest: Option<usize>,
     gain: Gain,
     slope: PackSlope,
+    /// Whether the cell model is the model of a label, so that the open-circuit curve is uncertain.
+    is_prior: bool,
     findings: Vec<CellFault>,
 }
 
@@ -177,6 +179,7 @@ impl CellFaultDetector {
             lowest: None,
             gain: Gain::default(),
             slope: PackSlope::default(),
+            is_prior: false,
             findings: Vec::new(),
         }
     }
@@ -306,14 +309,16 @@ impl CellFaultDetector {
     /// * `socs`: estimated SOC of each cell, to choose the middle cell.
     /// * `is_balanced`: whether the BMS may bleed fuller cells after a charge.
     /// * `balancing`: meaning of the balancing bits, if the BMS sends them.
+    /// * `is_prior`: whether the model is the model of a label, neither given nor learned.
     pub fn close_row(
         &mut self,
-        model: &CellModel,
+        (model, is_prior): (&CellModel, bool),
         capacity_ah: f64,
         socs: impl Fn(usize) -> Option<f64>,
         is_balanced: bool,
         balancing: Option<BalancingConfig>,
     ) -> Vec<CellFault> {
+        self.is_prior = is_prior;
         let pack = std::mem::take(&mut self.pack);
         let (Some(begun), Some(time)) = (pack.begun, pack.last) else { return Vec::new() };
         self.pack.last = pack.last;
@@ -390,7 +395,8 @@ impl CellFaultDetector {
         for (index, voltage_v) in voltages_v.iter().enumerate() {
             let cell = &mut self.cells[index];
             let Some(voltage_v) = voltage_v.filter(|_| !cell.channel.is_frozen) else { continue };
-            let observed = row.observation(cell.difference.mean(), cell.difference.state(SOC).variance, voltage_v - middle_v);
+            let observed =
+                row.observation(cell.difference.mean(), cell.difference.state(SOC).variance, voltage_v - middle_v);
             let charge = cell.difference.soc_after(to_reference).mean;
             charges.push((charge, row.curve_multiple(charge, voltage_v - middle_v)));
             if may_be_bled[index] {

@@ -131,7 +131,8 @@ impl Difference {
     /// follows from the present difference and the difference in capacity, to first order.
     pub(super) fn soc_after(&self, soc_change: f64) -> ScalarGaussian {
         let variance = self.covariance[pair(SOC, SOC)]
-            + soc_change * (soc_change * self.covariance[pair(CAPACITY, CAPACITY)] - 2.0 * self.covariance[pair(SOC, CAPACITY)]);
+            + soc_change
+                * (soc_change * self.covariance[pair(CAPACITY, CAPACITY)] - 2.0 * self.covariance[pair(SOC, CAPACITY)]);
         ScalarGaussian { mean: self.mean[SOC] - soc_change * self.mean[CAPACITY], variance: variance.max(0.0) }
     }
 

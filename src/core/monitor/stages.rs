@@ -193,7 +193,8 @@ impl Stages {
         if is_quiet && is_current {
             self.show_innovations(now, &samples);
         }
-        let has_row_ended = self.findings.observe(now, &samples, &self.estimation, &self.learning, out);
+        let is_prior = !self.modelling.teaches_capacity();
+        let has_row_ended = self.findings.observe(now, &samples, (&self.estimation, is_prior), &self.learning, out);
         self.estimation.finish(samples, &mut self.learning.state.learner);
         if has_row_ended {
             self.publish_diagnosis(now, true, out);

@@ -14,6 +14,8 @@ const SAME_MODULE_S: f64 = 3.0 * DAY_S;
 /// of this kind is reported.
 const KNOWN_LIMITS: f64 = 2.0;
 
+/// From this probability of a leak on, a low charge is explained by the leak.
+const LIKELY: f64 = 0.9;
 /// The charge of a cell is compared at these values of the SOC.
 const CHARGE_AT: [f64; 2] = [0.2, 0.9];
 
@@ -208,10 +210,16 @@ impl CellFaultDetector {
             is_comparable,
             ..of(kind, (size, if is_comparable { probability } else { 0.0 }))
         };
+        // The curve of a label may have half or twice the true slope, which looks like these differences. A sudden
+        // change of the channel does not depend on the curve.
+        let if_known =
+            |(size, probability): (ScalarGaussian, f64)| (size, if self.is_prior { 0.0 } else { probability });
+        let (weak, foreign) = (if_known(weak), if_known(foreign));
+        let channel = if cell.jumped.is_some() { channel } else { if_known(channel) };
         let explained = [&weak, &foreign].iter().any(|(_, probability)| *probability >= WITHDRAWN);
         let charge_beyond = |sign: f64| {
             let (size, probability) = self.constant_charge(index, populations, sign);
-            unless_leaking((size, if explained { 0.0 } else { probability }))
+            (size, if explained || leak.1 >= LIKELY { 0.0 } else { probability })
         };
         [
             sure(CellFaultKind::VoltageFrozen, cell.channel.is_frozen),
@@ -219,7 +227,7 @@ impl CellFaultDetector {
             if_near(CellFaultKind::VoltageChannel, unless_leaking(channel)),
             of(CellFaultKind::Leak, leak),
             if_near(CellFaultKind::Contact, beyond(CONTACT, fault::CONTACT, 1.0)),
-            if_near(CellFaultKind::HighResistance, beyond(RESISTANCE, fault::RESISTANCE, 1.0)),
+            if_near(CellFaultKind::HighResistance, if_known(beyond(RESISTANCE, fault::RESISTANCE, 1.0))),
             of(CellFaultKind::WeakCell, weak),
             if_near(CellFaultKind::ForeignCell, foreign),
             of(CellFaultKind::LowCharge, charge_beyond(-1.0)),

@@ -4,8 +4,8 @@
 //! middle voltage of the pack (V). Out: an [`Observation`].
 
 use crate::cell::CellModel;
-use crate::cell_faults::pack_slope::PackSlope;
 use crate::cell_faults::difference::{CHANNEL, CONTACT, Observation, RESISTANCE, SOC, STATES};
+use crate::cell_faults::pack_slope::PackSlope;
 
 /// Standard deviations of the errors of a row: `ROW_V` of the voltage (V); `ROW_DROP` of the voltage drop, as a
 /// fraction of the drop; `ROW_CURVE` of the SOC on the open-circuit curve, fraction.
@@ -39,7 +39,8 @@ impl Row<'_> {
         let (model, temperature) = (self.model, self.model.temperature_position(self.temperature_c));
         let at = |soc: f64| model.grid_position_at(&temperature, soc.clamp(0.0, 1.0));
         let (own, middle) = (at(self.curve_soc + means[SOC]), at(self.curve_soc));
-        let (factor, model_slope_v) = (self.slope.factor(self.curve_soc), model.ocv_slope_v(&own, self.capacity_ah).max(0.0));
+        let (factor, model_slope_v) =
+            (self.slope.factor(self.curve_soc), model.ocv_slope_v(&own, self.capacity_ah).max(0.0));
         let slope_v = factor.mean * model_slope_v;
         let contact_v = self.current_a * self.contact_ohm();
         let slope = [slope_v, 0.0, -self.drop_v, -contact_v, 1.0, 0.0];
@@ -61,7 +62,10 @@ impl Row<'_> {
 
     /// Slope of the model's open-circuit curve in the row (V per unit of SOC).
     pub(super) fn model_slope_v(&self) -> f64 {
-        self.model.ocv_slope_v(&self.model.grid_position(self.curve_soc.clamp(0.0, 1.0), self.temperature_c), self.capacity_ah)
+        self.model.ocv_slope_v(
+            &self.model.grid_position(self.curve_soc.clamp(0.0, 1.0), self.temperature_c),
+            self.capacity_ah,
+        )
     }
 
     /// A cell's voltage difference as a multiple of the difference that the model computes for `charge`, the cell's

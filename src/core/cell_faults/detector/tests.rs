@@ -1,6 +1,7 @@
 //! Tests the cell fault detector with cells that are not compared.
 
 use super::*;
+use crate::cell::chemistry::{Chemistry, Label};
 use crate::cell_faults::difference::SOC;
 
 #[test]
@@ -28,4 +29,77 @@ fn cell_no_longer_compared_is_reset() {
     assert_eq!(again, stored);
     stored.compare_only(&[0, 1, 2, 3, 4, 5]);
     assert_eq!((stored.cells[4].settled[SOC], stored.cells[1].settled[SOC]), (0.0, 0.3));
+}
+
+/// Open-circuit voltage of the true cells: the model's curve with another slope in each half (V).
+fn true_ocv_v(model: &CellModel, slopes: [f64; 2], soc: f64) -> f64 {
+    let at_v = |soc: f64| model.ocv_v(&model.grid_position(soc, 25.0));
+    at_v(0.5) + slopes[usize::from(soc > 0.5)] * (at_v(soc) - at_v(0.5))
+}
+
+/// Runs a detector with the model of a label for `days` of discharge, rest and charge. The cells differ only in charge
+/// (`charges`, fraction); their curve has other slopes than the model's curve.
+fn watched(charges: &[f64], slopes: [f64; 2], days: usize) -> CellFaultDetector {
+    const CAPACITY_AH: f64 = 100.0;
+    let model = Label::usual(Chemistry::NmcGraphite, CAPACITY_AH).model().expect("a model");
+    let (ohm, mut detector) = (0.001, CellFaultDetector::new(charges.len()));
+    let (mut soc, mut charge_ah, mut seconds) = (0.9, 0.0, 0.0);
+    let currents_a = [(30.0, 144), (0.0, 40), (-20.0, 216), (0.0, 40)];
+    for (current_a, steps) in (0..days).flat_map(|_| currents_a) {
+        for step in 0..steps {
+            (seconds, soc, charge_ah) =
+                (seconds + 50.0, soc - current_a / 72.0 / CAPACITY_AH, charge_ah + current_a / 72.0);
+            // Driving: the current changes from sample to sample, with the same mean.
+            let current_a = if current_a > 0.0 && step % 2 == 0 {
+                2.0 * current_a
+            } else if current_a > 0.0 {
+                0.0
+            } else {
+                current_a
+            };
+            let time = Timestamp::from_secs(seconds);
+            for (cell, charge) in charges.iter().enumerate() {
+                // The error of a usual cell monitor: noise of 1 mV.
+                let noise_v = 0.001 * f64::from((7 * cell as u32 + 13 * step) % 11).mul_add(0.2, -1.0);
+                let voltage_v = true_ocv_v(&model, slopes, soc + charge) - ohm * current_a + noise_v;
+                detector.add(cell, time, voltage_v, Some(current_a), Some(25.0));
+            }
+            let model_soc = model.soc_of_ocv(true_ocv_v(&model, slopes, soc), 25.0);
+            let mean = MeanCell { soc: model_soc, current_a, drop_v: ohm * current_a, temperature_c: 25.0, charge_ah };
+            if detector.note(time, &mean, CAPACITY_AH) {
+                detector.close_row((&model, true), CAPACITY_AH, |_| Some(model_soc), false, None);
+            }
+        }
+    }
+    detector
+}
+
+const SLOPES: [[f64; 2]; 5] = [[1.0, 1.0], [0.6, 0.6], [1.7, 1.7], [0.6, 1.4], [1.4, 0.8]];
+
+#[test]
+fn low_charge_is_found_with_wrong_curve() {
+    for slopes in SLOPES {
+        let charges: Vec<f64> =
+            (0..12).map(|cell| if cell == 4 { -0.08 } else { 0.002 * f64::from(cell % 5) - 0.004 }).collect();
+        let detector = watched(&charges, slopes, 8);
+        let found: Vec<_> = detector.findings().iter().map(|found| (found.kind, found.cells)).collect();
+        let cell = CellIndex(4);
+        assert_eq!(found, [(CellFaultKind::LowCharge, Some((cell, cell)))], "{slopes:?}");
+        let size = detector.findings()[0].size;
+        assert!((size.mean + 0.08).abs() < 0.02, "{slopes:?}: {size:?}");
+    }
+}
+
+#[test]
+fn healthy_cells_have_no_finding_with_wrong_curve() {
+    for slopes in SLOPES {
+        // As in a car whose pack is out of balance: the charge rises from the first cell to the last one.
+        let charges: Vec<f64> = (0..24).map(|cell| 0.004 * f64::from(cell) - 0.04).collect();
+        let detector = watched(&charges, slopes, 8);
+        assert_eq!(detector.findings(), [], "{slopes:?}");
+        let lowest = detector.relative(CellIndex(0)).unwrap()[SOC].unwrap();
+        let highest = detector.relative(CellIndex(23)).unwrap()[SOC].unwrap();
+        let (difference, true_difference) = (highest.mean - lowest.mean, 0.092);
+        assert!((difference / true_difference - 1.0).abs() < 0.25, "{slopes:?}: {difference}");
+    }
 }

@@ -91,14 +91,14 @@ impl Findings {
         }
     }
 
-    /// Handles samples that the estimator has already processed. Returns whether these samples completed a row of the
-    /// detector.
+    /// Handles samples that the estimator has already processed. `is_prior`: whether the cell model is the model of a
+    /// label. Returns whether these samples completed a row of the detector.
     #[inline]
     pub(crate) fn observe(
         &mut self,
         now: Timestamp,
         samples: &[CellSample],
-        estimation: &Estimation,
+        (estimation, is_prior): (&Estimation, bool),
         learning: &Learning,
         out: &mut Outputs,
     ) -> bool {
@@ -126,7 +126,8 @@ impl Findings {
         let is_complete = self.diagnosis.note(sample.time, &mean, capacity_ah);
         if is_complete {
             let socs = |cell: usize| bank.filtered_soc(cell).filter(|_| bank.is_own(cell)).map(|soc| soc.mean);
-            let mut reported = self.diagnosis.close_row(model, capacity_ah, socs, self.is_balanced, self.balancing);
+            let mut reported =
+                self.diagnosis.close_row((model, is_prior), capacity_ah, socs, self.is_balanced, self.balancing);
             let (probability, size) = current_offset(learning, model.rated_capacity_ah);
             reported.extend(self.diagnosis.note_sensor(now, CellFaultKind::CurrentOffset, probability, size));
             let cell = |index: usize| CellAgeing {
