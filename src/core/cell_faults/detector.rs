@@ -2,7 +2,8 @@
 //! minutes), compares the cells once per row and derives findings from the comparison (`judge`).
 //!
 //! The assumed errors of a row are rounded values for a circuit model and a typical cell monitor. These values were
-//! checked with a simulated pack of ten cells and with the simulator's other packs. No measured pack was used.
+//! checked with a simulated pack of ten cells and with the simulator's other packs. Only the slope of a label's curve
+//! (`pack_slope`) and the limit of a charge difference were also chosen on two measured cars.
 
 mod balancing;
 mod judge;
@@ -333,7 +334,11 @@ impl CellFaultDetector {
             // The middle voltage already includes the drop of the series resistance `ohm`.
             let ocv_v = middle_v + drop_v - self.ohm * current_a;
             curve_soc = PackSlope::position(model, capacity_ah, temperature_c, soc, ocv_v);
-            slope.add(model, capacity_ah, temperature_c, SlopeRow { charge_ah, soc: curve_soc, ocv_v, drop_v });
+            if is_prior {
+                slope.add(model, capacity_ah, temperature_c, SlopeRow { charge_ah, soc: curve_soc, ocv_v, drop_v });
+            } else {
+                slope.forget();
+            }
         }
         let row =
             Row { model, slope: &slope, capacity_ah, soc, curve_soc, temperature_c, current_a, drop_v, charge_ah };
@@ -485,11 +490,6 @@ impl CellFaultDetector {
             let size = ScalarGaussian { mean: 1.0, variance: 0.0 };
             self.insert(CellFault { kind, cells, since, reported, probability: 1.0, size });
         }
-    }
-
-    /// Discards the learned slope of the open-circuit curve, because the cell model has changed.
-    pub fn forget_slope(&mut self) {
-        self.slope.forget();
     }
 
     /// Resets the charge of all cells after a gap of unknown length.

@@ -4,7 +4,8 @@
 //! the cells' differences. Out: for each tenth of SOC, the factor by which the true slope differs from the slope of the
 //! cell model. All cells share the factors.
 //!
-//! The curve of a label can have half or twice the slope of the real curve. A constant difference in charge then looks
+//! The slope is learned while the cell model is the model of a label. The curve of a label can have half or twice the
+//! slope of the real curve. A constant difference in charge then looks
 //! like a difference that depends on the SOC, and the comparison of cells would explain it by a contact or a lost
 //! capacity. The pack shows its own slope in two ways:
 //! * the change of its middle voltage, divided by the charge that moved;
@@ -21,10 +22,8 @@ use crate::filter::ScalarGaussian;
 use crate::quantity::InvalidState;
 
 const TENTHS: usize = 10;
-/// Standard deviation of the factor before the first measurement: of a model that was made from a label, and of a model
-/// that was fitted to the cell.
+/// Standard deviation of the factor before the first measurement.
 const LABEL_STD: f64 = 0.4;
-const FITTED_STD: f64 = 0.05;
 /// Standard deviations that decide where on the curve a row is: of the filter's SOC, fraction, and of the open-circuit
 /// voltage (V). On a steep curve, the voltage decides; on a flat curve, the SOC.
 const SOC_STD: f64 = 0.05;
@@ -33,8 +32,10 @@ const OCV_STD_V: f64 = 0.01;
 /// From several cells: within a tenth, the slope is not constant.
 const LEAST_STD: f64 = 0.2;
 const LEAST_STD_OF_CELLS: f64 = 0.1;
-/// From this standard deviation on, the factor from the cells is used.
+/// Up to this relative standard deviation, the slope from the cells is used.
 const SEEN_STD: f64 = 0.2;
+/// Variance of the logarithm of the slope from the cells before the first row.
+const FIRST_VARIANCE: f64 = 1.0;
 /// Smallest charge difference of a cell that shows the slope, fraction. With a smaller one, offsets of the voltage
 /// channels would look like a slope.
 const LEAST_CHARGE: f64 = 0.005;
@@ -84,14 +85,17 @@ pub(super) struct PackSlope {
     tenths: Vec<Tenth>,
     /// The latest rows since the last gap, oldest first.
     recent: Vec<SlopeRow>,
+    /// Voltages of the model's curve to which the factors refer (V).
+    curve_v: [f64; 2],
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 struct Tenth {
     /// Factor from the middle voltage.
     of_middle: ScalarGaussian,
-    /// Mean charge difference of the cells that the model's slope would give, fraction: proportional to the true slope
-    /// divided by the model's slope. `None` before the first row with cells of different charge.
+    /// Logarithm of the mean charge difference of the cells that the model's slope would give (fraction). This
+    /// difference is proportional to the true slope divided by the model's slope. `None` before the first row with
+    /// cells of different charge.
     of_cells: Option<ScalarGaussian>,
     /// Number of rows with this factor.
     rows: u32,
@@ -107,7 +111,7 @@ impl PackSlope {
         self.recent.clear();
     }
 
-    /// Discards the factors, because the model's curve has changed.
+    /// Discards everything learned.
     pub(super) fn forget(&mut self) {
         *self = Self::default();
     }
@@ -125,9 +129,11 @@ impl PackSlope {
 
     /// Adds a row and measures the slope between this row and a recent one.
     pub(super) fn add(&mut self, model: &CellModel, capacity_ah: f64, temperature_c: f64, row: SlopeRow) {
-        if self.tenths.is_empty() {
-            let std = if model.spread.is_some() { LABEL_STD } else { FITTED_STD };
-            let factor = ScalarGaussian { mean: 1.0, variance: std * std };
+        let curve_v = [0.3, 0.7].map(|soc| model.ocv_v(&model.grid_position(soc, 25.0)));
+        if self.tenths.is_empty() || self.curve_v != curve_v {
+            self.forget();
+            self.curve_v = curve_v;
+            let factor = ScalarGaussian { mean: 1.0, variance: LABEL_STD * LABEL_STD };
             self.tenths = vec![Tenth { of_middle: factor, of_cells: None, rows: 0 }; TENTHS];
         }
         let here = &mut self.tenths[tenth(row.soc)];
@@ -158,7 +164,7 @@ impl PackSlope {
 
     /// SOC at which the charge differences of the cells are known best: the middle of the tenth with the most rows.
     pub(super) fn reference_soc(&self) -> f64 {
-        let busiest = (0..self.tenths.len()).max_by_key(|&tenth| self.tenths[tenth].rows);
+        let busiest = (0..self.tenths.len()).max_by_key(|&tenth| (self.tenths[tenth].rows, tenth.min(TENTHS - tenth)));
         busiest.map_or(0.5, |tenth| (tenth as f64 + 0.5) / TENTHS as f64)
     }
 
@@ -180,22 +186,24 @@ impl PackSlope {
             below >= 0.5 * total
         });
         let squares: f64 = cells.iter().map(|(charge, _)| charge * charge).sum();
-        let error = CELL_V * CELL_V / (slope_v * slope_v * squares) + CELLS * CELLS;
+        // The channels of the cells have the same offsets in every row.
+        let lasting = CELL_V * CELL_V / (slope_v * slope_v * squares);
         // The mean charge makes the value independent of the scale of the charges, which are still being learned.
-        let measured = median.map_or(0.0, |(_, multiple)| multiple * mean_charge);
-        let variance = error * measured * measured;
-        if measured > 0.0 && variance.is_finite() {
-            let before = tenth.of_cells.unwrap_or(ScalarGaussian { mean: measured, variance: 4.0 * variance });
-            let ScalarGaussian { mean, variance } = updated(before, before.variance, measured, variance);
-            let least = LEAST_STD_OF_CELLS * mean;
-            tenth.of_cells = Some(ScalarGaussian { mean, variance: variance.max(least * least) });
+        let measured = libm::log(median.map_or(0.0, |(_, multiple)| multiple * mean_charge));
+        if measured.is_finite() && lasting.is_finite() {
+            let before = tenth.of_cells.unwrap_or(ScalarGaussian { mean: measured, variance: FIRST_VARIANCE });
+            let ScalarGaussian { mean, variance } = updated(before, before.variance, measured, lasting + CELLS * CELLS);
+            let least = lasting.max(LEAST_STD_OF_CELLS * LEAST_STD_OF_CELLS);
+            tenth.of_cells = Some(ScalarGaussian { mean, variance: variance.max(least) });
         }
     }
 
     /// Factor of the slope per unit of `of_cells`, so that both ways agree on the whole rise of the curve. `None` if no
     /// tenth shows the slope in both ways.
     fn scale(&self) -> Option<f64> {
-        let seen = || self.tenths.iter().filter_map(|tenth| Some((tenth.of_middle.mean, tenth.clear_of_cells()?.mean)));
+        let seen = || {
+            self.tenths.iter().filter_map(|tenth| Some((tenth.of_middle.mean, libm::exp(tenth.clear_of_cells()?.mean))))
+        };
         let (of_middle, of_cells) = seen().fold((0.0, 0.0), |sums, (a, b)| (sums.0 + a, sums.1 + b));
         (of_cells > 0.0).then(|| of_middle / of_cells)
     }
@@ -207,9 +215,9 @@ impl PackSlope {
     /// one row with the error's variance.
     pub(super) fn factor(&self, soc: f64) -> ScalarGaussian {
         let Some(tenth) = self.tenths.get(tenth(soc)) else { return ScalarGaussian { mean: 1.0, variance: 0.0 } };
-        let scaled = |(scale, of_cells): (f64, ScalarGaussian)| ScalarGaussian {
-            mean: (scale * of_cells.mean).clamp(FACTORS.0, FACTORS.1),
-            variance: scale * scale * of_cells.variance,
+        let scaled = |(scale, of_cells): (f64, ScalarGaussian)| {
+            let mean = (scale * libm::exp(of_cells.mean)).clamp(FACTORS.0, FACTORS.1);
+            ScalarGaussian { mean, variance: mean * mean * of_cells.variance }
         };
         let of_cells = self.scale().zip(tenth.clear_of_cells()).map(scaled);
         let ScalarGaussian { mean, variance } = of_cells.unwrap_or(tenth.of_middle);
@@ -221,10 +229,14 @@ impl PackSlope {
         let count = self.tenths.len();
         let is_possible = (count == 0 || count == TENTHS) && self.recent.len() <= RECENT;
         InvalidState::unless(is_possible, "the tenths of a slope", count as f64, "0 or 10")?;
-        for factor in self.tenths.iter().flat_map(|tenth| [Some(tenth.of_middle), tenth.of_cells]).flatten() {
-            InvalidState::unless_positive("the factor of a slope", factor.mean)?;
-            InvalidState::unless_positive("the variance of a slope's factor", factor.variance)?;
+        for Tenth { of_middle, of_cells, rows } in &self.tenths {
+            let is_possible = (FACTORS.0..=FACTORS.1).contains(&of_middle.mean) && *rows <= MOST_ROWS;
+            InvalidState::unless(is_possible, "the factor of a slope", of_middle.mean, "0.2 to 4")?;
+            InvalidState::unless_positive("the variance of a slope's factor", of_middle.variance)?;
+            InvalidState::unless_numbers("a slope from the cells", of_cells.iter().map(|it| it.mean))?;
+            of_cells.iter().try_for_each(|it| InvalidState::unless_positive("the variance of a slope", it.variance))?;
         }
+        InvalidState::unless_numbers("the curve of a slope", self.curve_v)?;
         let numbers = self.recent.iter().flat_map(|row| [row.charge_ah, row.soc, row.ocv_v, row.drop_v]);
         InvalidState::unless_numbers("a row of a slope", numbers)
     }
@@ -233,7 +245,7 @@ impl PackSlope {
 impl Tenth {
     /// What the cells show, if they show it clearly.
     fn clear_of_cells(&self) -> Option<ScalarGaussian> {
-        self.of_cells.filter(|it| it.variance <= SEEN_STD * SEEN_STD * it.mean * it.mean)
+        self.of_cells.filter(|it| it.variance <= SEEN_STD * SEEN_STD)
     }
 }
 

@@ -4,8 +4,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::quantity::Timestamp;
 
-/// If a voltage is unchanged although its drop has changed by more than this value, it was not read again (V).
-const REPEATED_V: f64 = 0.002;
+/// A voltage was not read again if it is the same bit for bit although its drop has changed by more than `REPEATED_V`
+/// (V). After `REPEATED_S` (s), a repeated voltage counts again: the channel may be frozen.
+const REPEATED_V: f64 = 0.005;
+const REPEATED_S: f64 = 30.0;
 
 /// Sums of one cell over a row.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
@@ -20,8 +22,10 @@ pub(super) struct CellSums {
     steps_a2: f64,
     /// Sum of the products of current step and voltage step between samples.
     steps_va: f64,
-    /// Time, voltage and current of the previous sample.
+    /// Time, voltage and current of the previous sample that was read anew.
     last: Option<(Timestamp, f64, f64)>,
+    /// Time of the previous sample.
+    seen: Option<Timestamp>,
     temperature_c: f64,
     temperatures: u32,
     /// Hash of the sequence of voltages in the row.
@@ -43,18 +47,19 @@ impl CellSums {
     ) {
         let apart_ns = |before: Timestamp| time.nanos().wrapping_sub(before.nanos());
         // Uses at most about one sample per second, because more samples add no information.
-        if self.last.is_some_and(|(before, ..)| (0..900_000_000).contains(&apart_ns(before))) {
+        if self.seen.is_some_and(|before| (0..900_000_000).contains(&apart_ns(before))) {
             return;
         }
+        self.seen = Some(time);
         self.count += 1;
         if let Some(temperature_c) = temperature_c {
             self.temperature_c += temperature_c;
             self.temperatures += 1;
         }
         self.digest = (self.digest.rotate_left(5) ^ voltage_v.to_bits()).wrapping_mul(0x9E37_79B9_7F4A_7C15);
-        // If the current has changed, a cell voltage cannot stay the same bit for bit. It was not read again.
-        let is_repeated = |(_, last_v, last_a): (Timestamp, f64, f64)| {
-            voltage_v == last_v && ohm * (current_a - last_a).abs() > REPEATED_V
+        let is_repeated = |(before, last_v, last_a): (Timestamp, f64, f64)| {
+            let drop_v = ohm * (current_a - last_a).abs();
+            voltage_v == last_v && drop_v > REPEATED_V && (0.0..=REPEATED_S).contains(&time.since(before))
         };
         if self.last.is_some_and(is_repeated) {
             return;
@@ -89,7 +94,7 @@ impl CellSums {
 
     /// Starts the next row.
     pub(super) fn begin(&mut self) {
-        *self = Self { last: self.last, ..Self::default() };
+        *self = Self { last: self.last, seen: self.seen, ..Self::default() };
     }
 
     /// Discards the samples of the present row, because the next sample follows a gap.

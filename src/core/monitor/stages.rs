@@ -250,16 +250,13 @@ impl Stages {
     /// estimators adopt the new model.
     fn learn_model(&mut self, now: Timestamp, out: &mut Outputs) {
         self.step_waiting(now, true, out);
-        let Self { estimation, modelling, learning, findings, .. } = self;
+        let Self { estimation, modelling, learning, .. } = self;
         let before = modelling.view().state;
         let adoption = modelling.refit();
         if let Some(adoption) = &adoption {
             estimation.adopt(adoption, &mut learning.state.learner, &learning.config.capacity);
         } else if modelling.has_returned() {
             estimation.use_model(modelling, &learning.state.learner);
-        }
-        if adoption.is_some() || modelling.has_returned() {
-            findings.diagnosis.forget_slope();
         }
         out.events.extend(self.modelling.note_change(now, before));
         if adoption.is_some_and(|it| it.with_capacity) {

@@ -14,8 +14,10 @@ const SAME_MODULE_S: f64 = 3.0 * DAY_S;
 /// of this kind is reported.
 const KNOWN_LIMITS: f64 = 2.0;
 
-/// From this probability of a leak on, a low charge is explained by the leak.
+/// From this probability of a leak on, the leak explains a charge difference.
 const LIKELY: f64 = 0.9;
+/// Up to this standard deviation, a cell's capacity relative to the others is known, fraction.
+const KNOWN_CAPACITY_STD: f64 = 0.05;
 /// The charge of a cell is compared at these values of the SOC.
 const CHARGE_AT: [f64; 2] = [0.2, 0.9];
 
@@ -120,10 +122,11 @@ impl CellFaultDetector {
         let is_settled = since.zip(self.last_row).is_none_or(|(since, (now, ..))| self.has_lasted(kind, since, now));
         let is_known = judged.size.std() <= KNOWN_LIMITS * kind.limit() && is_settled || is_found();
         let is_judged = judged.is_comparable && is_known && self.has_channel_fault(cell) == Some(false);
-        // A size beyond the limit is a fault, and a fault that is not certain is not found. Rules about sizes agree with
-        // the findings.
-        let most = if is_found() { f64::INFINITY } else { BELOW_LIMIT * kind.limit() };
-        is_judged.then(|| ScalarGaussian { mean: judged.size.mean.clamp(-most, most), ..judged.size })
+        // Keeps an uncertain size below the limit, so that no alarm precedes the finding.
+        let ScalarGaussian { mean, .. } = judged.size;
+        let certainty = normal_cdf((mean.abs() - kind.limit()) / judged.size.std().max(1e-12));
+        let most = if certainty >= REPORTED || is_found() { f64::INFINITY } else { BELOW_LIMIT * kind.limit() };
+        is_judged.then(|| ScalarGaussian { mean: mean.clamp(-most, most), ..judged.size })
     }
 
     /// Whether a cell's voltage reading is wrong or belongs to another cell. `None` if the cell is not compared or if
@@ -215,11 +218,21 @@ impl CellFaultDetector {
         let if_known =
             |(size, probability): (ScalarGaussian, f64)| (size, if self.is_prior { 0.0 } else { probability });
         let (weak, foreign) = (if_known(weak), if_known(foreign));
-        let channel = if cell.jumped.is_some() { channel } else { if_known(channel) };
-        let explained = [&weak, &foreign].iter().any(|(_, probability)| *probability >= WITHDRAWN);
+        let (is_off, before_jump_v) = (channel.1 >= WITHDRAWN, cell.before_jump[CHANNEL]);
+        let has_jumped = cell.jumped.is_some() && (channel.0.mean - before_jump_v).abs() >= fault::CHANNEL_V;
+        let channel = if has_jumped { channel } else { if_known(channel) };
+        // Another fault of the cell explains its charge. Once the charge is listed, the other fault must be listed too.
+        let is_listed = |kind: CellFaultKind| {
+            self.findings.iter().any(|found| found.kind == kind && found.is_of(CellIndex(index as u16)))
+        };
+        let is_explained = if [CellFaultKind::LowCharge, CellFaultKind::HighCharge].into_iter().any(is_listed) {
+            [CellFaultKind::Leak, CellFaultKind::WeakCell, CellFaultKind::ForeignCell].into_iter().any(is_listed)
+        } else {
+            is_off || leak.1 >= LIKELY || weak.1 >= WITHDRAWN || foreign.1 >= WITHDRAWN
+        };
         let charge_beyond = |sign: f64| {
             let (size, probability) = self.constant_charge(index, populations, sign);
-            (size, if explained || leak.1 >= LIKELY { 0.0 } else { probability })
+            (size, if is_explained { 0.0 } else { probability })
         };
         [
             sure(CellFaultKind::VoltageFrozen, cell.channel.is_frozen),
@@ -236,8 +249,9 @@ impl CellFaultDetector {
     }
 
     /// Difference in charge, and the probability that it is beyond the limit. `sign`: 1 for more charge than the other
-    /// cells, -1 for less. The probability is 0 if the difference is within the limit when the pack is nearly full or
-    /// nearly empty: then the cell has another capacity, and its charge is not constantly different.
+    /// cells, -1 for less. The probability is 0 while the cell's capacity is unknown. It is also 0 if the difference is
+    /// within the limit when the pack is nearly full or nearly empty: then the cell has another capacity, and its
+    /// charge is not constantly different.
     fn constant_charge(&self, index: usize, populations: &[Population; STATES], sign: f64) -> (ScalarGaussian, f64) {
         let soc = self.last_row.map_or(0.5, |(_, soc, _)| soc);
         let at = |soc_change: f64| {
@@ -246,7 +260,8 @@ impl CellFaultDetector {
             ScalarGaussian { mean: own.mean - middle, ..own }
         };
         let size = at(0.0);
-        let is_constant = CHARGE_AT.iter().all(|end| sign * at(end - soc).mean >= fault::CHARGE);
+        let is_known = self.cells[index].difference.state(CAPACITY).std() <= KNOWN_CAPACITY_STD;
+        let is_constant = is_known && CHARGE_AT.iter().all(|end| sign * at(end - soc).mean >= fault::CHARGE);
         let stands_out = sign * size.mean >= OUTLIER * populations[SOC].std;
         let probability = normal_cdf((sign * size.mean - fault::CHARGE) / size.std().max(1e-12));
         (size, if is_constant && stands_out { probability } else { 0.0 })
@@ -261,7 +276,8 @@ impl CellFaultDetector {
         if probability < WITHDRAWN {
             *suspected = None;
         } else if suspected.is_none() {
-            let is_after_jump = |jumped: &Timestamp| kind != CellFaultKind::Leak && time.since(*jumped) < DAY_S;
+            let lasts = matches!(kind, CellFaultKind::Leak | CellFaultKind::LowCharge | CellFaultKind::HighCharge);
+            let is_after_jump = |jumped: &Timestamp| !lasts && time.since(*jumped) < DAY_S;
             *suspected = Some(cell.jumped.filter(is_after_jump).unwrap_or(time));
         }
         let since = suspected.unwrap_or(time);
