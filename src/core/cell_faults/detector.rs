@@ -137,6 +137,8 @@ pub struct CellFaultDetector {
     lowest: Option<usize>,
     gain: Gain,
     slope: PackSlope,
+    /// Slope of the open-circuit curve in the last row (V per unit of SOC).
+    slope_v: f64,
     /// Whether the cell model is the model of a label, so that the open-circuit curve is uncertain.
     is_prior: bool,
     findings: Vec<CellFault>,
@@ -180,6 +182,7 @@ impl CellFaultDetector {
             lowest: None,
             gain: Gain::default(),
             slope: PackSlope::default(),
+            slope_v: 0.0,
             is_prior: false,
             findings: Vec::new(),
         }
@@ -350,6 +353,7 @@ impl CellFaultDetector {
         let (model_slope_v, mut charges) = (row.model_slope_v(), Vec::new());
         if let Some(middle_v) = middle_v {
             charges = self.observe(time, seconds, &row, &voltages_v, middle_v);
+            self.slope_v = slope.factor(curve_soc).mean * model_slope_v;
             self.observe_temperatures(time, seconds);
             // A BMS bleeds cells near the end of a charge, at about SOC 0.9.
             let slope_v = || model.ocv_slope_v(&model.grid_position(0.9, temperature_c), capacity_ah);
@@ -550,7 +554,7 @@ impl CellFaultDetector {
         }
         let PackSums { current_a, drop_v, soc, temperature_c, charge_ah, first_ah, .. } = self.pack;
         let last = self.last_row.map_or([0.0; 2], |(_, soc, charge_ah)| [soc, charge_ah]);
-        let numbers = [current_a, drop_v, soc, temperature_c, charge_ah, first_ah, self.rest_s, self.ohm];
+        let numbers = [current_a, drop_v, soc, temperature_c, charge_ah, first_ah, self.rest_s, self.ohm, self.slope_v];
         InvalidState::unless_numbers("a number of the diagnosis", numbers.into_iter().chain(last))?;
         self.gain.check()?;
         self.slope.check()?;

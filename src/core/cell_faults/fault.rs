@@ -141,8 +141,12 @@ impl CellFaultKind {
                 "compare the sensor under load with an ammeter: all capacities and resistances have changed by its gain"
             }
             Self::TemperatureSensor => "the sensor has fallen off or shows one value: check how it is mounted",
-            Self::LowCharge => "the cell ends every discharge early: balance the pack, which restores this charge",
-            Self::HighCharge => "the cell ends every charge early: balance the pack, which restores this charge",
+            Self::LowCharge => {
+                "the cell ends every discharge early: balance the pack; if the difference stays, compare the channel with a voltmeter"
+            }
+            Self::HighCharge => {
+                "the cell ends every charge early: balance the pack; if the difference stays, compare the channel with a voltmeter"
+            }
         }
     }
 

@@ -125,7 +125,8 @@ impl CellFaultDetector {
         // Keeps an uncertain size below the limit, so that no alarm precedes the finding.
         let ScalarGaussian { mean, .. } = judged.size;
         let certainty = normal_cdf((mean.abs() - kind.limit()) / judged.size.std().max(1e-12));
-        let most = if certainty >= REPORTED || is_found() { f64::INFINITY } else { BELOW_LIMIT * kind.limit() };
+        let is_certain = !self.is_prior && certainty >= REPORTED;
+        let most = if is_certain || is_found() { f64::INFINITY } else { BELOW_LIMIT * kind.limit() };
         is_judged.then(|| ScalarGaussian { mean: mean.clamp(-most, most), ..judged.size })
     }
 
@@ -263,6 +264,11 @@ impl CellFaultDetector {
         let is_known = self.cells[index].difference.state(CAPACITY).std() <= KNOWN_CAPACITY_STD;
         let is_constant = is_known && CHARGE_AT.iter().all(|end| sign * at(end - soc).mean >= fault::CHARGE);
         let stands_out = sign * size.mean >= OUTLIER * populations[SOC].std;
+        // The voltage must show the charge. A charge and an offset of the channel that cancel each other are both
+        // unknown.
+        let middle_v = self.slope_v * populations[SOC].middle + populations[CHANNEL].middle;
+        let shown_v = self.cells[index].difference.reading_v(self.slope_v).mean - middle_v;
+        let is_constant = is_constant && sign * shown_v >= fault::CHARGE * self.slope_v;
         let probability = normal_cdf((sign * size.mean - fault::CHARGE) / size.std().max(1e-12));
         (size, if is_constant && stands_out { probability } else { 0.0 })
     }

@@ -3,6 +3,7 @@
 use super::*;
 use crate::cell::chemistry::{Chemistry, Label};
 use crate::cell_faults::difference::SOC;
+use crate::cell_faults::fault;
 
 #[test]
 fn cell_no_longer_compared_is_reset() {
@@ -97,6 +98,10 @@ fn healthy_cells_have_no_finding_with_wrong_curve() {
         let charges: Vec<f64> = (0..24).map(|cell| 0.004 * f64::from(cell) - 0.04).collect();
         let detector = watched(&charges, slopes, 8);
         assert_eq!(detector.findings(), [], "{slopes:?}");
+        for [leak, contact] in detector.sizes([CellFaultKind::Leak, CellFaultKind::Contact]) {
+            let is_below = |size: Option<ScalarGaussian>, limit: f64| size.is_none_or(|size| size.mean < limit);
+            assert!(is_below(leak, fault::LEAK_PER_DAY) && is_below(contact, fault::CONTACT), "{slopes:?}");
+        }
         let lowest = detector.relative(CellIndex(0)).unwrap()[SOC].unwrap();
         let highest = detector.relative(CellIndex(23)).unwrap()[SOC].unwrap();
         let (difference, true_difference) = (highest.mean - lowest.mean, 0.092);
