@@ -253,7 +253,12 @@ impl CellFaultDetector {
     /// cells, -1 for less. The probability is 0 while the cell's capacity is unknown. It is also 0 if the difference is
     /// within the limit when the pack is nearly full or nearly empty: then the cell has another capacity, and its
     /// charge is not constantly different.
-    fn constant_charge(&self, index: usize, populations: &[Population; STATES], sign: f64) -> (ScalarGaussian, f64) {
+    pub(super) fn constant_charge(
+        &self,
+        index: usize,
+        populations: &[Population; STATES],
+        sign: f64,
+    ) -> (ScalarGaussian, f64) {
         let soc = self.last_row.map_or(0.5, |(_, soc, _)| soc);
         let at = |soc_change: f64| {
             let own = self.cells[index].difference.soc_after(soc_change);

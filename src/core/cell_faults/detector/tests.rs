@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::cell::chemistry::{Chemistry, Label};
-use crate::cell_faults::difference::SOC;
+use crate::cell_faults::difference::{CHANNEL, SOC};
 use crate::cell_faults::fault;
 
 #[test]
@@ -38,15 +38,21 @@ fn true_ocv_v(model: &CellModel, slopes: [f64; 2], soc: f64) -> f64 {
     at_v(0.5) + slopes[usize::from(soc > 0.5)] * (at_v(soc) - at_v(0.5))
 }
 
-/// Runs a detector with the model of a label for `days` of discharge, rest and charge. The cells differ only in charge
-/// (`charges`, fraction); their curve has other slopes than the model's curve.
-fn watched(charges: &[f64], slopes: [f64; 2], days: usize) -> CellFaultDetector {
+/// Runs a detector with the model of a label for eight days of discharge, rest and charge. The cells differ only in
+/// charge (`charges`, fraction); their curve has other slopes than the model's curve.
+fn watched(charges: &[f64], slopes: [f64; 2]) -> CellFaultDetector {
+    watched_with_offset(charges, slopes, 0.0, true)
+}
+
+/// As [`watched`], but the channel of cell 4 has an offset from the first day (V). `is_prior`: whether the model is the
+/// model of a label.
+fn watched_with_offset(charges: &[f64], slopes: [f64; 2], offset_v: f64, is_prior: bool) -> CellFaultDetector {
     const CAPACITY_AH: f64 = 100.0;
     let model = Label::usual(Chemistry::NmcGraphite, CAPACITY_AH).model().expect("a model");
     let (ohm, mut detector) = (0.001, CellFaultDetector::new(charges.len()));
     let (mut soc, mut charge_ah, mut seconds) = (0.9, 0.0, 0.0);
     let currents_a = [(30.0, 144), (0.0, 40), (-20.0, 216), (0.0, 40)];
-    for (current_a, steps) in (0..days).flat_map(|_| currents_a) {
+    for (current_a, steps) in (0..8).flat_map(|_| currents_a) {
         for step in 0..steps {
             (seconds, soc, charge_ah) =
                 (seconds + 50.0, soc - current_a / 72.0 / CAPACITY_AH, charge_ah + current_a / 72.0);
@@ -62,13 +68,14 @@ fn watched(charges: &[f64], slopes: [f64; 2], days: usize) -> CellFaultDetector 
             for (cell, charge) in charges.iter().enumerate() {
                 // The error of a usual cell monitor: noise of 1 mV.
                 let noise_v = 0.001 * f64::from((7 * cell as u32 + 13 * step) % 11).mul_add(0.2, -1.0);
-                let voltage_v = true_ocv_v(&model, slopes, soc + charge) - ohm * current_a + noise_v;
+                let offset_v = if cell == 4 { offset_v } else { 0.0 };
+                let voltage_v = true_ocv_v(&model, slopes, soc + charge) - ohm * current_a + noise_v + offset_v;
                 detector.add(cell, time, voltage_v, Some(current_a), Some(25.0));
             }
             let model_soc = model.soc_of_ocv(true_ocv_v(&model, slopes, soc), 25.0);
             let mean = MeanCell { soc: model_soc, current_a, drop_v: ohm * current_a, temperature_c: 25.0, charge_ah };
             if detector.note(time, &mean, CAPACITY_AH) {
-                detector.close_row((&model, true), CAPACITY_AH, |_| Some(model_soc), false, None);
+                detector.close_row((&model, is_prior), CAPACITY_AH, |_| Some(model_soc), false, None);
             }
         }
     }
@@ -82,7 +89,7 @@ fn low_charge_is_found_with_wrong_curve() {
     for slopes in SLOPES {
         let charges: Vec<f64> =
             (0..12).map(|cell| if cell == 4 { -0.08 } else { 0.002 * f64::from(cell % 5) - 0.004 }).collect();
-        let detector = watched(&charges, slopes, 8);
+        let detector = watched(&charges, slopes);
         let found: Vec<_> = detector.findings().iter().map(|found| (found.kind, found.cells)).collect();
         let cell = CellIndex(4);
         assert_eq!(found, [(CellFaultKind::LowCharge, Some((cell, cell)))], "{slopes:?}");
@@ -96,7 +103,7 @@ fn healthy_cells_have_no_finding_with_wrong_curve() {
     for slopes in SLOPES {
         // As in a car whose pack is out of balance: the charge rises from the first cell to the last one.
         let charges: Vec<f64> = (0..24).map(|cell| 0.004 * f64::from(cell) - 0.04).collect();
-        let detector = watched(&charges, slopes, 8);
+        let detector = watched(&charges, slopes);
         assert_eq!(detector.findings(), [], "{slopes:?}");
         for [leak, contact] in detector.sizes([CellFaultKind::Leak, CellFaultKind::Contact]) {
             let is_below = |size: Option<ScalarGaussian>, limit: f64| size.is_none_or(|size| size.mean < limit);
@@ -107,4 +114,31 @@ fn healthy_cells_have_no_finding_with_wrong_curve() {
         let (difference, true_difference) = (highest.mean - lowest.mean, 0.092);
         assert!((difference / true_difference - 1.0).abs() < 0.25, "{slopes:?}: {difference}");
     }
+}
+
+#[test]
+fn lasting_offset_is_reported_with_known_curve_only() {
+    let found = |is_prior: bool| {
+        let charges: Vec<f64> = (0..12).map(|cell| 0.0004 * f64::from(cell)).collect();
+        let detector = watched_with_offset(&charges, [1.0, 1.0], 0.06, is_prior);
+        detector.findings().iter().map(|found| found.kind).collect::<Vec<_>>()
+    };
+    assert_eq!(found(false), [CellFaultKind::VoltageChannel]);
+    assert_eq!(found(true), []);
+}
+
+#[test]
+fn charge_must_show_in_voltage() {
+    let charges: Vec<f64> = (0..12).map(|cell| 0.002 * f64::from(cell % 5) - 0.004).collect();
+    let mut detector = watched(&charges, [1.0, 1.0]);
+    let slope_v = detector.slope_v;
+    let mut probability = |charge: f64, channel_v: f64| {
+        let mut mean = [0.0; STATES];
+        (mean[SOC], mean[CHANNEL]) = (charge, channel_v);
+        detector.cells[4].difference.settle(&mean);
+        let populations = std::array::from_fn(|state| detector.population(state));
+        detector.constant_charge(4, &populations, 1.0).1
+    };
+    assert!(probability(0.08, 0.0) > 0.99);
+    assert_eq!(probability(0.08, -0.08 * slope_v), 0.0);
 }
