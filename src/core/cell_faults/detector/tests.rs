@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::cell::chemistry::{Chemistry, Label};
-use crate::cell_faults::difference::{CHANNEL, SOC};
+use crate::cell_faults::difference::{CAPACITY, CHANNEL, SOC};
 use crate::cell_faults::fault;
 
 #[test]
@@ -117,14 +117,30 @@ fn healthy_cells_have_no_finding_with_wrong_curve() {
 }
 
 #[test]
-fn lasting_offset_is_reported_with_known_curve_only() {
+fn lasting_offset_looks_like_charge_with_label() {
+    let charges: Vec<f64> = (0..12).map(|cell| 0.0004 * f64::from(cell)).collect();
     let found = |is_prior: bool| {
-        let charges: Vec<f64> = (0..12).map(|cell| 0.0004 * f64::from(cell)).collect();
         let detector = watched_with_offset(&charges, [1.0, 1.0], 0.06, is_prior);
         detector.findings().iter().map(|found| found.kind).collect::<Vec<_>>()
     };
     assert_eq!(found(false), [CellFaultKind::VoltageChannel]);
+    assert_eq!(found(true), [CellFaultKind::HighCharge]);
+}
+
+#[test]
+fn weak_cell_is_not_reported_with_label() {
+    let charges: Vec<f64> = (0..12).map(|cell| 0.0004 * f64::from(cell)).collect();
+    let mut detector = watched(&charges, [1.0, 1.0]);
+    let mut mean = [0.0; STATES];
+    mean[CAPACITY] = -0.2;
+    detector.cells[4].difference.settle(&mean);
+    let mut found = |is_prior: bool| {
+        detector.is_prior = is_prior;
+        detector.judge(Timestamp::from_secs(1e6), None);
+        detector.findings().iter().map(|found| found.kind).collect::<Vec<_>>()
+    };
     assert_eq!(found(true), []);
+    assert_eq!(found(false), [CellFaultKind::WeakCell]);
 }
 
 #[test]
