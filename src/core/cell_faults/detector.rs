@@ -331,36 +331,30 @@ impl CellFaultDetector {
         let (temperature_c, current_a, drop_v) = (mean(pack.temperature_c), mean(pack.current_a), mean(pack.drop_v));
         let voltages_v: Vec<Option<f64>> = self.cells.iter().map(|cell| cell.sums.mean_v()).collect();
         let middle_v = middle(voltages_v.iter().flatten().copied());
-        let mut slope = std::mem::take(&mut self.slope);
         let mut curve_soc = soc;
-        if let Some(middle_v) = middle_v {
+        if !is_prior {
+            self.slope.forget();
+        } else if let Some(middle_v) = middle_v {
             // The middle voltage already includes the drop of the series resistance `ohm`.
             let ocv_v = middle_v + drop_v - self.ohm * current_a;
             curve_soc = PackSlope::position(model, capacity_ah, temperature_c, soc, ocv_v);
-            if is_prior {
-                slope.add(model, capacity_ah, temperature_c, SlopeRow { charge_ah, soc: curve_soc, ocv_v, drop_v });
-            } else {
-                slope.forget();
-            }
+            self.slope.add(model, capacity_ah, temperature_c, SlopeRow { charge_ah, soc: curve_soc, ocv_v, drop_v });
         }
-        let row =
-            Row { model, slope: &slope, capacity_ah, soc, curve_soc, temperature_c, current_a, drop_v, charge_ah };
+        let factor = self.slope.factor(curve_soc);
+        let row = Row { model, factor, capacity_ah, soc, curve_soc, temperature_c, current_a, drop_v, charge_ah };
         let middle_time = begun.plus_secs(0.5 * time.since(begun));
         let seconds = self.last_row.map_or(0.0, |(last, ..)| middle_time.since(last));
         self.pass(middle_time, &row);
         self.remove_bled_charge(time, capacity_ah, balancing);
         let before = self.findings.clone();
-        let (model_slope_v, mut charges) = (row.model_slope_v(), Vec::new());
         if let Some(middle_v) = middle_v {
-            charges = self.observe(time, seconds, &row, &voltages_v, middle_v);
-            self.slope_v = slope.factor(curve_soc).mean * model_slope_v;
+            self.observe(time, seconds, &row, &voltages_v, middle_v);
+            self.slope_v = factor.mean * row.model_slope_v();
             self.observe_temperatures(time, seconds);
             // A BMS bleeds cells near the end of a charge, at about SOC 0.9.
             let slope_v = || model.ocv_slope_v(&model.grid_position(0.9, temperature_c), capacity_ah);
             self.judge(time, is_balanced.then(slope_v));
         }
-        slope.learn_from_cells(curve_soc, model_slope_v, &mut charges);
-        self.slope = slope;
         self.cells.iter_mut().for_each(|cell| cell.sums.begin());
         self.ohm = model.r0_ohm(&model.grid_position(soc, temperature_c));
         self.choose_middle(socs);
@@ -380,17 +374,9 @@ impl CellFaultDetector {
         self.cells.iter_mut().for_each(|cell| cell.difference.pass(days, change));
     }
 
-    /// Compares every cell's mean voltage with the middle voltage of the pack, `seconds` after the previous row. Returns
-    /// what the cells show about the slope of the curve ([`PackSlope::learn_from_cells`]).
-    fn observe(
-        &mut self,
-        time: Timestamp,
-        seconds: f64,
-        row: &Row<'_>,
-        voltages_v: &[Option<f64>],
-        middle_v: f64,
-    ) -> Vec<(f64, f64)> {
-        let to_reference = row.slope.reference_soc() - row.curve_soc;
+    /// Compares every cell's mean voltage with the middle voltage of the pack, `seconds` after the previous row.
+    fn observe(&mut self, time: Timestamp, seconds: f64, row: &Row<'_>, voltages_v: &[Option<f64>], middle_v: f64) {
+        let to_reference = self.slope.reference_soc() - row.curve_soc;
         let mut charges = Vec::with_capacity(self.cells.len());
         for cell in &mut self.cells {
             cell.channel.end_row(&cell.sums, middle_v);
@@ -407,7 +393,7 @@ impl CellFaultDetector {
             let observed =
                 row.observation(cell.difference.mean(), cell.difference.state(SOC).variance, voltage_v - middle_v);
             let charge = cell.difference.soc_after(to_reference).mean;
-            charges.push((charge, row.curve_multiple(charge, voltage_v - middle_v)));
+            charges.push((charge, (voltage_v - middle_v) / row.curve_v(charge)));
             if may_be_bled[index] {
                 cell.difference.open_charge(seconds / DAY_S, &observed);
             }
@@ -421,7 +407,7 @@ impl CellFaultDetector {
         }
         self.handle_jumps(time, row, &jumped, |cell| voltages_v[cell].map(|v| v - middle_v));
         self.observe_steps(row);
-        charges
+        self.slope.learn_from_cells(row.curve_soc, row.model_slope_v(), charges);
     }
 
     /// Compares the series resistances of the cells, as measured from current steps.

@@ -5,9 +5,8 @@
 //! cell model. All cells share the factors.
 //!
 //! The slope is learned while the cell model is the model of a label. The curve of a label can have half or twice the
-//! slope of the real curve. A constant difference in charge then looks
-//! like a difference that depends on the SOC, and the comparison of cells would explain it by a contact or a lost
-//! capacity. The pack shows its own slope in two ways:
+//! slope of the real curve. A constant difference in charge then looks like a difference that depends on the SOC, and
+//! the comparison of cells would explain it by a contact or a lost capacity. The pack shows its own slope in two ways:
 //! * the change of its middle voltage, divided by the charge that moved;
 //! * cells with different charge: all their voltage differences grow and shrink with the same slope. This gives the
 //!   slope in one tenth relative to another tenth, but no scale, because the charges themselves are learned with it.
@@ -28,8 +27,8 @@ const LABEL_STD: f64 = 0.4;
 /// voltage (V). On a steep curve, the voltage decides; on a flat curve, the SOC.
 const SOC_STD: f64 = 0.05;
 const OCV_STD_V: f64 = 0.01;
-/// Smallest standard deviation of a factor. From the middle voltage alone: the voltage drop also changes with the SOC.
-/// From several cells: within a tenth, the slope is not constant.
+/// Smallest relative standard deviations of a slope. `LEAST_STD` is that of the middle voltage, because the voltage drop
+/// also changes with the SOC. `LEAST_STD_OF_CELLS` is that of the cells, because the slope varies within a tenth.
 const LEAST_STD: f64 = 0.2;
 const LEAST_STD_OF_CELLS: f64 = 0.1;
 /// Up to this relative standard deviation, the slope from the cells is used.
@@ -42,8 +41,8 @@ const LEAST_CHARGE: f64 = 0.005;
 /// Largest part of the charge differences that one cell may have. Otherwise, a fault of this cell could look like a
 /// slope.
 const MOST_OF_ONE: f64 = 1.0 / 3.0;
-/// Errors of the factor from the cells in one row: `CELL_V` of each cell's voltage difference (V), and `CELLS` of the
-/// charge differences, fraction. The charges are learned at the same time, so a factor follows them.
+/// Errors of the slope from the cells. `CELL_V` is the error of each cell's voltage difference (V), the same in every
+/// row. `CELLS` is the error of one row, fraction: the charge differences are still being learned.
 const CELL_V: f64 = 0.004;
 const CELLS: f64 = 0.3;
 /// Allowed values of a factor.
@@ -60,8 +59,8 @@ const DROP: f64 = 0.3;
 const SHARED: f64 = 3.0;
 /// If a measurement differs by more than this many standard deviations, its weight is reduced (Huber).
 const HUBER: f64 = 3.0;
-/// Largest number of rows that share the error of a factor ([`PackSlope::variance`]). Older rows no longer influence
-/// the charge of a cell, which changes slowly.
+/// Largest number of rows by which [`PackSlope::factor`] multiplies the variance of a factor. Older rows hardly
+/// influence the filter of a cell.
 const MOST_ROWS: u32 = 200;
 
 /// A row, as far as the slope is concerned.
@@ -168,10 +167,10 @@ impl PackSlope {
         busiest.map_or(0.5, |tenth| (tenth as f64 + 0.5) / TENTHS as f64)
     }
 
-    /// Learns the factor at `soc` from several cells. `cells`: per cell, its charge difference at the reference SOC
-    /// (fraction), and the voltage difference that it shows, as a multiple of the model's. `slope_v`: slope of the
-    /// model (V per unit of SOC).
-    pub(super) fn learn_from_cells(&mut self, soc: f64, slope_v: f64, cells: &mut Vec<(f64, f64)>) {
+    /// Learns the slope at `soc` from several cells. `cells`: per cell, its charge difference at the reference SOC
+    /// (fraction), and its voltage difference as a multiple of the difference that the model computes for this charge.
+    /// `slope_v`: slope of the model (V per unit of SOC).
+    pub(super) fn learn_from_cells(&mut self, soc: f64, slope_v: f64, mut cells: Vec<(f64, f64)>) {
         let Some(tenth) = self.tenths.get_mut(tenth(soc)) else { return };
         let mean_charge = cells.iter().map(|(charge, _)| charge.abs()).sum::<f64>() / cells.len().max(1) as f64;
         cells.retain(|(charge, multiple)| charge.abs() >= LEAST_CHARGE && multiple.is_finite());
@@ -190,7 +189,7 @@ impl PackSlope {
         let lasting = CELL_V * CELL_V / (slope_v * slope_v * squares);
         // The mean charge makes the value independent of the scale of the charges, which are still being learned.
         let measured = libm::log(median.map_or(0.0, |(_, multiple)| multiple * mean_charge));
-        if measured.is_finite() && lasting.is_finite() {
+        if measured.is_finite() && lasting <= FIRST_VARIANCE {
             let before = tenth.of_cells.unwrap_or(ScalarGaussian { mean: measured, variance: FIRST_VARIANCE });
             let ScalarGaussian { mean, variance } = updated(before, before.variance, measured, lasting + CELLS * CELLS);
             let least = lasting.max(LEAST_STD_OF_CELLS * LEAST_STD_OF_CELLS);
@@ -256,4 +255,63 @@ fn updated(factor: ScalarGaussian, open: f64, measured: f64, variance: f64) -> S
     let gain = open / (total * (off / HUBER).max(1.0));
     let mean = factor.mean + gain * (measured - factor.mean);
     ScalarGaussian { mean, variance: factor.variance - gain * open }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cell::{Chemistry, Label};
+
+    fn model(chemistry: Chemistry) -> CellModel {
+        Label::usual(chemistry, 100.0).model().expect("a model")
+    }
+
+    /// The slope after 30 rows at a SOC of 0.35 and 30 rows at 0.75, in which the voltages of six cells differ by half
+    /// and by one and a half of the model's difference. No charge moves.
+    fn seen(model: &CellModel) -> PackSlope {
+        let mut slope = PackSlope::default();
+        for (soc, multiple) in [(0.35, 0.5), (0.75, 1.5)] {
+            for _ in 0..30 {
+                slope.add(model, 100.0, 25.0, SlopeRow { charge_ah: 0.0, soc, ocv_v: 3.7, drop_v: 0.0 });
+                let cells = [-0.03, -0.02, -0.01, 0.01, 0.02, 0.03].map(|charge| (charge, multiple));
+                slope.learn_from_cells(soc, 0.8, cells.to_vec());
+            }
+        }
+        slope
+    }
+
+    #[test]
+    fn cells_show_slope_of_one_tenth_relative_to_another() {
+        let slope = seen(&model(Chemistry::NmcGraphite));
+        let (low, high) = (slope.factor(0.35), slope.factor(0.75));
+        assert!((high.mean / low.mean / 3.0 - 1.0).abs() < 0.05, "{low:?} {high:?}");
+        assert!((low.mean + high.mean - 2.0).abs() < 0.05, "the middle voltage has shown no other slope");
+        assert_eq!(slope.factor(0.55), ScalarGaussian { mean: 1.0, variance: LABEL_STD * LABEL_STD });
+        assert_eq!(slope.check(), Ok(()));
+    }
+
+    #[test]
+    fn another_curve_resets_slope() {
+        let mut slope = seen(&model(Chemistry::NmcGraphite));
+        let row = SlopeRow { charge_ah: 0.0, soc: 0.35, ocv_v: 3.7, drop_v: 0.0 };
+        slope.add(&model(Chemistry::NmcGraphite), 100.0, 25.0, row);
+        assert_ne!(slope.factor(0.75).mean, 1.0);
+        slope.add(&model(Chemistry::LcoGraphite), 100.0, 25.0, row);
+        assert_eq!(slope.factor(0.75).mean, 1.0);
+    }
+
+    #[test]
+    fn impossible_rows_leave_valid_slope() {
+        let model = model(Chemistry::LfpGraphite);
+        let mut slope = PackSlope::default();
+        let values = [0.0, 1e18, -1e18, 1e-300];
+        for (step, ocv_v) in values.iter().cycle().take(200).enumerate() {
+            let (charge_ah, drop_v) = (5.0 * step as f64, values[step / 2 % 4]);
+            slope.add(&model, 100.0, 25.0, SlopeRow { charge_ah, soc: ocv_v / 2.0, ocv_v: *ocv_v, drop_v });
+            let cells = [0.02, -0.02, 0.01, f64::NAN, 1e300].map(|charge| (charge, ocv_v / charge));
+            slope.learn_from_cells(step as f64 / 200.0, drop_v, cells.to_vec());
+            slope.learn_from_cells(0.5, 1e-12, vec![(0.02, 1.0); 5]);
+            assert_eq!(slope.check(), Ok(()), "row {step}");
+        }
+    }
 }

@@ -123,3 +123,25 @@ pub(super) struct PackSums {
     /// Charge at the first sample of the row (Ah).
     pub(super) first_ah: f64,
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn repeated_voltage_is_not_averaged() {
+        let mean_v = |samples: &[(f64, f64, f64)]| {
+            let mut sums = CellSums::default();
+            for &(seconds, voltage_v, current_a) in samples {
+                sums.add(Timestamp::from_secs(seconds), voltage_v, current_a, None, 0.001);
+            }
+            assert_eq!(sums.count as usize, samples.len());
+            sums.mean_v().unwrap()
+        };
+        let near = |value: f64, expected: f64| assert!((value - expected).abs() < 1e-9, "{value}, not {expected}");
+        // The logger repeats 3.7 V while the current rises to 100 A, then reads 3.6 V.
+        near(mean_v(&[(0.0, 3.7, 0.0), (1.0, 3.7, 100.0), (2.0, 3.7, 100.0), (3.0, 3.6, 100.0)]), 3.7);
+        near(mean_v(&[(0.0, 3.7, 0.0), (1.0, 3.7, 4.0)]), 3.702);
+        near(mean_v(&[(0.0, 3.7, 0.0), (40.0, 3.7, 100.0)]), 3.75);
+    }
+}

@@ -227,7 +227,8 @@ impl CellFaultDetector {
             self.findings.iter().any(|found| found.kind == kind && found.is_of(CellIndex(index as u16)))
         };
         let is_explained = if [CellFaultKind::LowCharge, CellFaultKind::HighCharge].into_iter().any(is_listed) {
-            [CellFaultKind::Leak, CellFaultKind::WeakCell, CellFaultKind::ForeignCell].into_iter().any(is_listed)
+            let others = [CellFaultKind::Leak, CellFaultKind::WeakCell, CellFaultKind::ForeignCell];
+            others.into_iter().any(is_listed) || self.module_of(index).is_some()
         } else {
             is_off || leak.1 >= LIKELY || weak.1 >= WITHDRAWN || foreign.1 >= WITHDRAWN
         };

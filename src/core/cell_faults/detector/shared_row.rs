@@ -3,9 +3,9 @@
 //! In: the values of the row that all cells share, the means of a cell's states, and the cell's voltage minus the
 //! middle voltage of the pack (V). Out: an [`Observation`].
 
-use crate::cell::CellModel;
+use crate::cell::{CellModel, GridPosition};
 use crate::cell_faults::difference::{CHANNEL, CONTACT, Observation, RESISTANCE, SOC, STATES};
-use crate::cell_faults::pack_slope::PackSlope;
+use crate::filter::ScalarGaussian;
 
 /// Standard deviations of the errors of a row: `ROW_V` of the voltage (V); `ROW_DROP` of the voltage drop, as a
 /// fraction of the drop; `ROW_CURVE` of the SOC on the open-circuit curve, fraction.
@@ -21,10 +21,12 @@ const MOST_ELSEWHERE: f64 = 3.0;
 /// Values of a row that all cells share.
 pub(super) struct Row<'a> {
     pub(super) model: &'a CellModel,
-    pub(super) slope: &'a PackSlope,
+    /// Factor between the true slope of the curve and the model's, with the variance of its error
+    /// ([`PackSlope::factor`](crate::cell_faults::pack_slope::PackSlope::factor)).
+    pub(super) factor: ScalarGaussian,
     pub(super) capacity_ah: f64,
     pub(super) soc: f64,
-    /// SOC on the model's curve ([`PackSlope::position`]).
+    /// SOC on the model's curve.
     pub(super) curve_soc: f64,
     pub(super) temperature_c: f64,
     pub(super) current_a: f64,
@@ -36,16 +38,12 @@ impl Row<'_> {
     /// Observation of `difference_v`, a cell's voltage minus the middle voltage of the pack, linearised at the means of
     /// the cell's states. `soc_variance`: variance of the state [`SOC`].
     pub(super) fn observation(&self, means: &[f64; STATES], soc_variance: f64, difference_v: f64) -> Observation {
-        let (model, temperature) = (self.model, self.model.temperature_position(self.temperature_c));
-        let at = |soc: f64| model.grid_position_at(&temperature, soc.clamp(0.0, 1.0));
-        let (own, middle) = (at(self.curve_soc + means[SOC]), at(self.curve_soc));
-        let (factor, model_slope_v) =
-            (self.slope.factor(self.curve_soc), model.ocv_slope_v(&own, self.capacity_ah).max(0.0));
-        let slope_v = factor.mean * model_slope_v;
+        let (model, own, middle) = (self.model, self.at(means[SOC]), self.at(0.0));
+        let model_slope_v = model.ocv_slope_v(&own, self.capacity_ah).max(0.0);
+        let slope_v = self.factor.mean * model_slope_v;
         let contact_v = self.current_a * self.contact_ohm();
         let slope = [slope_v, 0.0, -self.drop_v, -contact_v, 1.0, 0.0];
-        let curve_v =
-            factor.mean * (model.aged_ocv_v(&own, self.capacity_ah) - model.aged_ocv_v(&middle, self.capacity_ah));
+        let curve_v = self.factor.mean * self.curve_v(means[SOC]);
         // The resistance depends on the SOC, so even a healthy cell has another resistance at another SOC.
         let elsewhere = (model.r0_ohm(&own) / model.r0_ohm(&middle)).clamp(1.0 / MOST_ELSEWHERE, MOST_ELSEWHERE) - 1.0;
         let expected_v = curve_v - self.drop_v * elsewhere
@@ -55,27 +53,25 @@ impl Row<'_> {
         let far = means[SOC].abs();
         let (drop_v, on_curve_v) = ((ROW_DROP + far * FAR_DROP) * self.drop_v, ROW_CURVE * slope_v);
         let far_v = far * FAR_V;
-        let by_slope = factor.variance * model_slope_v * model_slope_v * (far * far + soc_variance);
+        let by_slope = self.factor.variance * model_slope_v * model_slope_v * (far * far + soc_variance);
         let variance = ROW_V * ROW_V + far_v * far_v + drop_v * drop_v + on_curve_v * on_curve_v + by_slope;
         Observation { innovation: difference_v - expected_v, slope, variance }
     }
 
-    /// Slope of the model's open-circuit curve in the row (V per unit of SOC).
-    pub(super) fn model_slope_v(&self) -> f64 {
-        self.model.ocv_slope_v(
-            &self.model.grid_position(self.curve_soc.clamp(0.0, 1.0), self.temperature_c),
-            self.capacity_ah,
-        )
+    /// Grid position of a cell whose SOC differs from the mean cell's SOC by `charge` (fraction).
+    fn at(&self, charge: f64) -> GridPosition {
+        self.model.grid_position((self.curve_soc + charge).clamp(0.0, 1.0), self.temperature_c)
     }
 
-    /// A cell's voltage difference as a multiple of the difference that the model computes for `charge`, the cell's
-    /// charge difference (fraction).
-    pub(super) fn curve_multiple(&self, charge: f64, difference_v: f64) -> f64 {
-        let at_v = |soc: f64| {
-            let position = self.model.grid_position(soc.clamp(0.0, 1.0), self.temperature_c);
-            self.model.aged_ocv_v(&position, self.capacity_ah)
-        };
-        difference_v / (at_v(self.curve_soc + charge) - at_v(self.curve_soc))
+    /// Open-circuit voltage minus the mean cell's, by the model, for a cell whose SOC differs by `charge` (V).
+    pub(super) fn curve_v(&self, charge: f64) -> f64 {
+        let ocv_v = |charge: f64| self.model.aged_ocv_v(&self.at(charge), self.capacity_ah);
+        ocv_v(charge) - ocv_v(0.0)
+    }
+
+    /// Slope of the model's open-circuit curve in the row (V per unit of SOC).
+    pub(super) fn model_slope_v(&self) -> f64 {
+        self.model.ocv_slope_v(&self.at(0.0), self.capacity_ah)
     }
 
     /// Series resistance of the mean cell in the row (ohm).
