@@ -46,6 +46,7 @@ fn rows<'a>(label: &Label, offset_a: f64, stretches: impl Iterator<Item = (&'a M
                 // Assumed ambient temperature (degrees C); used if a reading has no temperature.
                 ambient_c: 25.0,
                 voltage_v: part.voltage_v[k],
+                is_voltage_frozen: false,
             };
             if notebook.add(&config, &step) {
                 notebook.close_row(&config, soc);

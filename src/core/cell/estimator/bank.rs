@@ -26,7 +26,7 @@ use single::{hot, with_hot};
 
 use super::cell_estimator::{CellEstimator, thermal_c};
 use super::memory::Memory;
-use super::state_vector::{CAPACITY, LOG_RESISTANCE, VOLTAGE_OFFSET, widened, within_bounds};
+use super::state_vector::{CAPACITY, LOG_RESISTANCE, VOLTAGE_OFFSET};
 use super::step::{CellStep, StepResult};
 use super::voltage_reach::VoltageReach;
 use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES};
@@ -191,9 +191,7 @@ impl EstimatorBank {
             let linear = self.soc_by_voltage(cell);
             let reach = self.voltage_reach.std(soc.mean, linear, memory.innovation_v);
             let variance = soc.variance + reach * reach - linear * linear;
-            let downtime_std = memory.downtime_std_if_any();
-            let variance = downtime_std.map_or(variance, |std| widened(variance, std * std));
-            within_bounds(ScalarGaussian { variance, ..soc })
+            memory.published(ScalarGaussian { variance, ..soc })
         })
     }
 

@@ -13,7 +13,7 @@ use super::memory::{Memory, USED_PRIOR};
 use super::slow_branch::SlowBranch;
 use super::state_vector::{
     BRANCHES, CAPACITY, CONSTANT_ERRORS, CURRENT_OFFSET, CURVE_CAPACITY, KNOWN_VARIANCE, LOG_RESISTANCE, SLOW_BRANCH,
-    square, widened, within_bounds,
+    square, widened,
 };
 use super::step::{CellStep, StepResult, Update};
 use crate::cell::circuit;
@@ -118,7 +118,11 @@ impl CellEstimator {
             memory.information_s = elapsed_s;
         }
         memory.last_current_a = step.current_a.unwrap_or(memory.last_current_a);
-        let (Some(_), Some(x)) = (step.current_a, &mut self.filter) else { return Some(None) };
+        let Some(x) = &mut self.filter else { return Some(None) };
+        if step.current_a.is_none() {
+            memory.note_voltage(model, config, step, x.mean[LOG_RESISTANCE]);
+            return Some(None);
+        }
         let update = match memory.downtime_std_if_any() {
             None => {
                 x.covariance[(0, 0)] = widened(x.covariance[(0, 0)], square(memory.downtime_std));
@@ -161,6 +165,7 @@ impl CellEstimator {
         self.memory.mean_nis = self.memory.mean_nis.min(config.consistency.limit * std::f64::consts::E);
         self.memory.information_s = config.voltage.max_information_s;
         (self.memory.downtime_std, self.memory.used_prior, self.memory.noted_s) = (0.0, 0.0, 0.0);
+        self.memory.by_voltage = None;
         (self.memory.rejected, self.memory.rejected_s) = (0, 0.0);
         self.memory.innovation_v = 0.0;
         self.memory.is_soc_unknown = false;
@@ -246,9 +251,7 @@ impl CellEstimator {
 
     /// State of charge, limited to 0 to 1; `None` before the first voltage.
     pub fn soc(&self) -> Option<ScalarGaussian> {
-        let soc = self.marginal(0)?;
-        let variance = self.memory.downtime_std_if_any().map_or(soc.variance, |std| widened(soc.variance, square(std)));
-        Some(within_bounds(ScalarGaussian { variance, ..soc }))
+        Some(self.memory.published(self.marginal(0)?))
     }
 
     /// Branch voltages (V); NaN for branches that the model does not have, and before the first voltage.

@@ -7,10 +7,11 @@
 use serde::{Deserialize, Serialize};
 
 use super::slow_branch::SlowBranch;
-use super::state_vector::{KNOWN_VARIANCE, square};
+use super::state_vector::{KNOWN_VARIANCE, square, widened, within_bounds};
 use super::step::{CellStep, Update};
+use super::voltage_reach::FAR;
 use crate::cell::{CapacityState, CellModel, EstimatorConfig};
-use crate::filter::ScalarGaussian;
+use crate::filter::{Measurement, ScalarGaussian};
 use crate::quantity::InvalidState;
 use crate::quantity::bounds::{self, Bounds};
 
@@ -68,6 +69,9 @@ pub(super) struct Memory {
     pub(super) used_prior: f64,
     /// Whether the current was unknown at the last reading, so that an unmeasured stretch continues.
     pub(super) is_current_unknown: bool,
+    /// While the current is unknown: SOC according to the latest voltage alone.
+    #[serde(skip)]
+    pub(super) by_voltage: Option<ScalarGaussian>,
     /// Whether no voltage has been used since the last sleep or unknown gap.
     pub(super) is_unseen: bool,
     /// Whether the SOC is unknown after a gap of unknown length. If so, the filter restarts from the next voltage.
@@ -102,6 +106,7 @@ impl Memory {
             noted_s: 0.0,
             used_prior: 0.0,
             is_current_unknown: false,
+            by_voltage: None,
             is_unseen: false,
             is_soc_unknown: false,
             rejected: 0,
@@ -114,6 +119,49 @@ impl Memory {
     pub(super) fn note_downtime(&mut self, most: f64, used: f64) {
         self.downtime_std = (self.downtime_std + most / 3.0_f64.sqrt()).min(1.0);
         self.used_prior = 1.0 - (1.0 - self.used_prior) * (1.0 - used);
+        self.by_voltage = None;
+    }
+
+    /// The published SOC. `soc`: the SOC of the filter. Its variance grows by the downtime. While the current is unknown,
+    /// the latest voltage also counts. The filter itself does not use this voltage: the same unknown current is part of
+    /// all readings, so their errors do not average out.
+    pub(super) fn published(&self, soc: ScalarGaussian) -> ScalarGaussian {
+        let variance = self.downtime_std_if_any().map_or(soc.variance, |std| widened(soc.variance, square(std)));
+        let mut soc = within_bounds(ScalarGaussian { variance, ..soc });
+        if let Some(by_voltage) = self.by_voltage {
+            soc.update(Measurement { value: by_voltage.mean, variance: by_voltage.variance });
+        }
+        soc
+    }
+
+    /// Determines the SOC according to the voltage of a step without a known current. Every current up to the last
+    /// known current, and up to [`GAP_LOAD_PER_H`], is equally likely in both directions. `log_resistance`: ln of the
+    /// resistance relative to new.
+    pub(super) fn note_voltage(
+        &mut self,
+        model: &CellModel,
+        config: &EstimatorConfig,
+        step: &CellStep,
+        log_resistance: f64,
+    ) {
+        self.by_voltage = None;
+        if step.unmeasured_s <= 0.0 || step.is_voltage_frozen {
+            return;
+        }
+        let temperature = model.temperature_position(step.temperature_c.unwrap_or(step.ambient_c));
+        let soc_at = |voltage_v: f64| model.soc_of_aged_ocv(&temperature, self.curve.mean, voltage_v).clamp(0.0, 1.0);
+        let mean = soc_at(step.voltage_v);
+        let position = model.grid_position_at(&temperature, mean);
+        let ohm = model.settled_ohm(&position) * libm::exp(log_resistance);
+        let most_a = self.last_current_a.abs().max(model.rated_capacity_ah * GAP_LOAD_PER_H);
+        let voltage_variance =
+            square(config.sensor.voltage_offset_v) + square(config.gate.model_error_v) + square(most_a * ohm) / 3.0;
+        let far_v = FAR * voltage_variance.sqrt();
+        let far = [soc_at(step.voltage_v - far_v), soc_at(step.voltage_v + far_v)];
+        // Beyond an end of the curve, both SOCs are the end. The slope there then limits the deviation.
+        let by_slope = voltage_variance.sqrt() / model.ocv_slope_v(&position, self.curve.mean);
+        let std = far.map(|far| (far - mean).abs() / FAR).into_iter().fold(by_slope, f64::max);
+        self.by_voltage = Some(ScalarGaussian { mean, variance: square(std) });
     }
 
     /// Notes the unmeasured time of a step. The load before or after this time may have continued through it, or a
@@ -188,6 +236,7 @@ impl Memory {
     #[inline]
     pub(super) fn end_downtime(&mut self) {
         (self.downtime_std, self.used_prior, self.noted_s, self.is_unseen) = (0.0, 0.0, 0.0, false);
+        self.by_voltage = None;
     }
 
     /// Whether the SOC dates from before a downtime or sleep, because no voltage has been used since.

@@ -130,6 +130,7 @@ mod tests {
             temperature_c: Some(25.0),
             ambient_c: 25.0,
             voltage_v: 3.7,
+            is_voltage_frozen: false,
         };
         (0..seconds).filter(|_| estimator.step(&small_model(), &config(), &step).reset).count()
     }

@@ -12,7 +12,8 @@ pub struct CellStep {
     pub offset_s: f64,
     /// Time without a current measurement (s) (asleep, sensor lost).
     pub unmeasured_s: f64,
-    /// Cell current at the reading (A). If it is unknown (`None`), the voltage is not used.
+    /// Cell current at the reading (A). If it is unknown (`None`), the voltage moves the published SOC, but not the
+    /// filter.
     pub current_a: Option<f64>,
     /// Cell temperature (degrees C). If it is unknown (`None`), the thermal model predicts it.
     pub temperature_c: Option<f64>,
@@ -20,6 +21,8 @@ pub struct CellStep {
     pub ambient_c: f64,
     /// Terminal voltage (V).
     pub voltage_v: f64,
+    /// Whether the voltage is frozen. A frozen voltage is not used.
+    pub is_voltage_frozen: bool,
 }
 
 /// Outcome of an update with a voltage.

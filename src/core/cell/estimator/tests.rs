@@ -91,6 +91,7 @@ impl Truth {
             temperature_c: Some(25.0),
             ambient_c: 25.0,
             voltage_v: circuit::aged_terminal_v(model, state, &temperature, self.branch_v, current_a),
+            is_voltage_frozen: false,
         }
     }
 }
@@ -184,16 +185,45 @@ fn lost_filter_restarts_and_keeps_capacity() {
 }
 
 #[test]
-fn unmeasured_load_widens_soc() {
+fn unmeasured_load_widens_soc_unless_voltage_known() {
     let (config, mut truth, model) = (config(), truth(), small_model());
     let mut estimator = CellEstimator::new(&config);
     cycle(&mut estimator, &config, &mut truth, 1.0, 1.0);
     let before = soc(&estimator);
-    let step = CellStep { unmeasured_s: 1800.0, current_a: None, ..truth.step(&model, 1.0, 1.0) };
-    let result = estimator.step(&model, &config, &step);
+    let rest = (0..1800).map(|_| truth.step(&model, 1.0, 1.0)).last().expect("steps");
+    let lost = CellStep { unmeasured_s: 1800.0, current_a: None, is_voltage_frozen: true, ..rest };
+    let result = estimator.step(&model, &config, &lost);
     assert_eq!(result.update, None);
     // 1 A for half an hour takes 0.5 Ah out of 1.7 Ah: 0.29 of SOC.
-    assert!(soc(&estimator).std() > before.std() + 0.1, "{:?}", soc(&estimator));
+    let without = soc(&estimator);
+    assert!(without.std() > before.std() + 0.1, "{without:?}");
+    // The drop of an unknown current of up to 1 C, in both directions, is the error of the voltage.
+    let open = CellStep { unmeasured_s: 1.0, is_voltage_frozen: false, ..lost };
+    (0..1000).for_each(|_| _ = estimator.step(&model, &config, &open));
+    let with = soc(&estimator);
+    let position = model.grid_position(truth.soc, 25.0);
+    let drop = 1.8 * truth.ratio * model.settled_ohm(&position) / 3.0_f64.sqrt() / model.ocv_slope_v(&position, 1.8);
+    assert!((with.mean - truth.soc).abs() < 2.0 * with.std(), "{with:?} {}", truth.soc);
+    assert!(with.std() < without.std() && with.std() > 0.7 * drop, "{with:?} {without:?} {drop}");
+}
+
+#[test]
+fn voltage_finds_soc_while_current_lost() {
+    let (config, mut truth, model) = (config(), truth(), small_model());
+    let mut estimator = CellEstimator::new(&config);
+    cycle(&mut estimator, &config, &mut truth, 1.0, 1.0);
+    // 40 min of a discharge with 1 A, of which nothing is measured.
+    let start = truth.soc;
+    for _ in 0..2400 {
+        let moved = truth.step(&model, 1.0, 1.0);
+        let lost =
+            CellStep { measured_s: 0.0, charge_as: 0.0, offset_s: 0.0, unmeasured_s: 1.0, current_a: None, ..moved };
+        estimator.step(&model, &config, &lost);
+    }
+    let found = soc(&estimator);
+    assert!(start - truth.soc > 0.3, "{start} {}", truth.soc);
+    assert!((found.mean - truth.soc).abs() < 2.0 * found.std(), "{found:?} {}", truth.soc);
+    assert!(found.std() < 0.12, "{found:?}");
 }
 
 #[test]
@@ -209,6 +239,7 @@ fn lost_current_widens_soc_linearly() {
             offset_s: 0.0,
             unmeasured_s: 10.0,
             current_a: None,
+            is_voltage_frozen: true,
             ..truth.step(&model, 1.0, 1.0)
         };
         estimator.step(&model, &config, &lost);

@@ -30,6 +30,7 @@ fn discharge(estimator: &mut CellEstimator) {
             temperature_c: Some(20.0),
             ambient_c: 20.0,
             voltage_v: 4.1 - 0.6 * f64::from(k) / 360.0,
+            is_voltage_frozen: false,
         };
         estimator.step(&small_model(), &estimator_config(), &step);
     }

@@ -314,11 +314,11 @@ impl Estimation {
         if learner.observe(index, sample.time, sample.temperature_c, measured_s, gap_s) {
             self.after_gap.push(index);
         }
-        let mut current_a = sample.current_a;
+        let (mut current_a, is_voltage_frozen) = (sample.current_a, self.is_voltage_frozen(index));
         if self.is_current_doubtful {
             (measured_s, charge_as, offset_s, unmeasured_s) = (0.0, 0.0, 0.0, measured_s + unmeasured_s);
             current_a = None;
-        } else if self.is_voltage_frozen(index) {
+        } else if is_voltage_frozen {
             current_a = None;
         }
         // Corrects the current for the sensor's offset. A reading of exactly zero counts as free of offset.
@@ -333,6 +333,7 @@ impl Estimation {
             temperature_c: sample.temperature_c,
             ambient_c: self.ambient_c,
             voltage_v: sample.voltage_v,
+            is_voltage_frozen,
         }
     }
 

@@ -91,6 +91,7 @@ impl BlockInput {
             // Unused, because the step has a temperature.
             ambient_c: input.temperature_c.0[lane],
             voltage_v: input.voltage_v.0[lane],
+            is_voltage_frozen: false,
         }
     }
 }

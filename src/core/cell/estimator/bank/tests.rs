@@ -107,6 +107,7 @@ impl Pack {
             temperature_c: (index != 2).then_some(temperature_c),
             ambient_c: 22.0,
             voltage_v: truth_v + 0.01 * (dice.roll() - 0.5) + outlier_v + if lost { -1.0 } else { 0.0 },
+            is_voltage_frozen: false,
         };
         (!is_missing).then_some((index, step))
     }
@@ -348,6 +349,7 @@ fn contradicting_reading_widens_soc_next_to_flat_part() {
         temperature_c: Some(25.0),
         ambient_c: 25.0,
         voltage_v,
+        is_voltage_frozen: false,
     };
     (0..300).for_each(|_| step(&mut bank, &[(0, rest(3.37))]));
     let before = bank.soc(0).expect("started").std();

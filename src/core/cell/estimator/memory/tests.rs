@@ -15,6 +15,7 @@ fn step(current_a: f64, measured_s: f64, unmeasured_s: f64) -> CellStep {
         temperature_c: Some(25.0),
         ambient_c: 25.0,
         voltage_v: 3.6,
+        is_voltage_frozen: false,
     }
 }
 

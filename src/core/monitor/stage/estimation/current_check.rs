@@ -17,7 +17,8 @@
 //!
 //! The check finds a current that is frozen, inverted, late or beyond the sensor's range, whether or not the last
 //! digits of its readings change. While the load is constant, the check finds only a noisy sensor at its limit, because
-//! the readings of this sensor then repeat. A current without sign is found at the first clear steps of a charging
+//! the readings of this sensor then repeat. A sensor that has repeated readings of two sizes has no noise and is not
+//! judged by its repeats. A current without sign is found at the first clear steps of a charging
 //! current. If a doubted current has never flowed in both directions, the doubt only ends when it has. A current without
 //! sign therefore stays doubtful.
 
@@ -74,6 +75,10 @@ const FAULTY_REPEAT: f64 = 0.5;
 const NOISE_STEPS: f64 = 1.5;
 /// Resolution of the current before a change has been seen (A).
 const MAX_RESOLUTION_A: f64 = 1e3;
+/// Number of equal readings in a row that a noisy sensor only has at its limit.
+const QUIET_READINGS: u32 = 20;
+/// Largest share of noisy readings of a sensor that has not shown noise.
+const QUIET_NOISE: f64 = 0.1;
 /// Limit of `repeated` (ln of the odds for a good sensor). At this limit, the sensor becomes doubtful.
 const REPEATED: f64 = -10.0;
 /// Common change of the cells (V) after which a voltage that has not changed is frozen. The limit is at least
@@ -127,6 +132,14 @@ pub(crate) struct CurrentCheck {
     resolution_v: f64,
     /// Evidence of the present run of equal readings: ln of the odds for a good sensor, at most 0.
     repeated: f64,
+    /// Number of times that the present reading has repeated.
+    equal: u32,
+    /// Size of a current that the sensor has read [`QUIET_READINGS`] times in a row before it has shown noise (A); 0 =
+    /// none.
+    quiet_a: f64,
+    /// Whether the sensor has repeated two currents of different size. Such a sensor has no noise. If its readings
+    /// change under a steady load, the load changes: for example, a charger that holds the voltage.
+    is_quiet: bool,
     /// Largest reading of discharge and of charge (A).
     largest_a: [f64; 2],
     /// Readings at which the sensor was at its limit, for discharge and for charge (A); 0 = never.
@@ -155,6 +168,9 @@ impl Default for CurrentCheck {
             path_v: 0.0,
             resolution_v: COARSE_V,
             repeated: 0.0,
+            equal: 0,
+            quiet_a: 0.0,
+            is_quiet: false,
             largest_a: [0.0; 2],
             limits_a: [0.0; 2],
             doubts: 0.0,
@@ -247,6 +263,9 @@ impl CurrentCheck {
         }
         if change_a > 0.0 {
             self.resolution_a = self.resolution_a.min(change_a);
+            self.equal = 0;
+        } else if now.current_a != 0.0 {
+            self.note_equal(now.current_a.abs());
         }
         if now.current_a == 0.0 {
             self.repeated = 0.0;
@@ -254,11 +273,13 @@ impl CurrentCheck {
         }
         // A limit is the largest reading of its direction.
         let is_largest = now.current_a.abs() >= self.largest_a[direction];
-        if change_a > 0.0 || !is_largest {
+        if change_a > 0.0 || !is_largest || self.is_quiet {
             self.repeated = 0.0;
         } else {
             self.repeated += libm::log((1.0 - self.noisy).max(MIN_REPEAT) / FAULTY_REPEAT).min(0.0);
-            if self.repeated <= REPEATED {
+            // The run may still show that the sensor is quiet.
+            let is_open = self.quiet_a > 0.0 && self.equal < QUIET_READINGS;
+            if self.repeated <= REPEATED && !is_open {
                 self.repeated = 0.0;
                 self.limits_a[direction] = now.current_a;
                 self.add_evidence(MAX_EVIDENCE);
@@ -268,6 +289,20 @@ impl CurrentCheck {
         if is_steady && !is_largest {
             let is_noise = change_a > NOISE_STEPS * self.resolution_a;
             self.noisy += NOISE_GAIN * (f64::from(u8::from(is_noise)) - self.noisy);
+        }
+    }
+
+    /// Notes that a reading of this size (A) has repeated.
+    fn note_equal(&mut self, size_a: f64) {
+        self.equal = self.equal.saturating_add(1);
+        if self.equal < QUIET_READINGS {
+            return;
+        }
+        if self.quiet_a > 0.0 {
+            // The limits of both directions differ by one step at most.
+            self.is_quiet |= (size_a - self.quiet_a).abs() > NOISE_STEPS * self.resolution_a;
+        } else if self.noisy <= QUIET_NOISE {
+            self.quiet_a = size_a;
         }
     }
 
@@ -365,6 +400,7 @@ impl CurrentCheck {
             self.resolution_v,
             self.repeated,
             self.doubts,
+            self.quiet_a,
         ];
         bounds::NUMBER.check_all("the check of the current", state)?;
         InvalidState::unless(self.count <= ROUNDS, "rounds of the check of the current", self.count as f64, "at most 4")
@@ -489,6 +525,30 @@ mod tests {
         let share = drive(&mut check, 3600, limited);
         assert!(share > 0.5, "{share} {check:?}");
         assert!((check.limits_a[0] - 60.0).abs() < 1e-9, "{:?}", check.limits_a);
+    }
+
+    #[test]
+    fn regulated_current_of_quiet_sensor_is_no_limit() {
+        // A laboratory charges with a constant current and then at a constant voltage, which moves the current. Then it
+        // discharges with a constant current, the largest of all.
+        let charge_then_discharge = |discharge_a: f64| {
+            let mut check = CurrentCheck::default();
+            for time_s in 0..600 {
+                let held_v = 1e-4 * f64::from(time_s % 3);
+                let (current_a, voltage_v) = match time_s {
+                    0..200 => (-50.0, 3.9 + 1e-4 * f64::from(time_s)),
+                    200..450 => (-20.0 + 100.0 * noise_a(time_s), 4.1 + held_v),
+                    _ => (discharge_a, 3.9 - 1e-4 * f64::from(time_s)),
+                };
+                round(&mut check, 2 * time_s, Some(current_a), |_| voltage_v);
+            }
+            check
+        };
+        let of_quiet = charge_then_discharge(50.5);
+        assert_eq!((of_quiet.limits_a, of_quiet.is_doubtful()), ([0.0; 2], false), "{of_quiet:?}");
+        // Both directions end at the same reading: this is the limit.
+        let of_limited = charge_then_discharge(50.0);
+        assert!(of_limited.limits_a.contains(&50.0) && of_limited.is_doubtful(), "{of_limited:?}");
     }
 
     #[test]
