@@ -14,7 +14,8 @@
 
 use super::CapacityConfig;
 use super::half_cycle::HalfCycle;
-use crate::cell::CellModel;
+use crate::cell::model_bands::CURVE_C;
+use crate::cell::{CellModel, ModelBands};
 use crate::quantity::Mode;
 
 /// Number of errors, one per SOC node. The nodes are evenly spaced from SOC 0 to 1. In real cells, the error of the
@@ -22,16 +23,20 @@ use crate::quantity::Mode;
 pub(super) const END_ERRORS: usize = 5;
 
 /// Change of a half-cycle's capacity (Ah) per standard deviation of each error; zero if the SOC at the half-cycle's
-/// ends is unknown.
+/// ends is unknown. `is_label`: whether the model is the model of a label. The half-cycle's
+/// capacity then follows from the SOC by voltage, and the whole uncertainty of the curve is lasting.
 pub(super) fn effects_ah(
     model: &CellModel,
     config: &CapacityConfig,
     half_cycle: &HalfCycle,
     capacity_ah: f64,
+    is_label: bool,
 ) -> [f64; END_ERRORS] {
     let mut effects = [0.0; END_ERRORS];
-    let Some(ends) = &half_cycle.ends else { return effects };
-    let temperature_c = half_cycle.mean_temperature_c.unwrap_or(25.0);
+    let ends = if is_label { &half_cycle.ends_by_voltage } else { &half_cycle.ends };
+    let Some(ends) = ends else { return effects };
+    let bands = ModelBands::new(model);
+    let temperature_c = half_cycle.mean_temperature_c.unwrap_or(CURVE_C);
     // Limits the effect: below a swing of 2 %, the measurement is useless.
     let swing = (half_cycle.charge_ah / capacity_ah).max(0.02);
     // A discharge starts at its higher SOC, a charge at its lower SOC.
@@ -39,9 +44,10 @@ pub(super) fn effects_ah(
     for (soc, fuller) in ends.iter().zip([sign, -sign]) {
         let position = model.grid_position(*soc, temperature_c);
         let per_volt = -fuller * capacity_ah / (swing * model.ocv_slope_v(&position, capacity_ah));
-        // Half of the error stated by the model is an error of the curve and does not change. The other half depends on
-        // the history of the current, so it differs between half-cycles.
-        let own_v = || model.voltage_error_v(&position).map_or(0.0, |error_v| 0.5 * error_v);
+        // Half of the error stated by a fitted model is an error of the curve and does not change. The other half depends
+        // on the history of the current, so it differs between half-cycles.
+        let of_fit_v = || model.voltage_error_v(&position).map_or(0.0, |error_v| 0.5 * error_v);
+        let own_v = || if is_label { bands.curve_std_v(*soc).unwrap_or(0.0) } else { of_fit_v() };
         let error_v = config.end_error_v.unwrap_or_else(own_v);
         let along = soc.clamp(0.0, 1.0) * (END_ERRORS - 1) as f64;
         let node = (0..END_ERRORS - 2).take_while(|&k| along >= (k + 1) as f64).count();
@@ -76,6 +82,8 @@ mod tests {
             swing: None,
             end_soc: Some(to),
             ends: Some([from, to]),
+            ends_by_voltage: None,
+            unmeasured_s: 0.0,
             duration_s: 3600.0,
             mean_current_a: charge_ah,
             mean_temperature_c: Some(25.0),
@@ -85,7 +93,7 @@ mod tests {
     #[test]
     fn curve_error_moves_capacity_by_slope_and_swing() {
         let model = small_model();
-        let found = effects_ah(&model, &CONFIG, &discharge(0.9, 1.0, 0.375), 1.8);
+        let found = effects_ah(&model, &CONFIG, &discharge(0.9, 1.0, 0.375), 1.8, false);
         // Slopes at 25 C, which is 5/8 of the way from 0 to 40 C: 1.075 V above SOC 0.5, 1.325 V below. The swing is
         // 0.5.
         let per_volt = 1.8 / 0.5 * 0.004;
@@ -101,16 +109,16 @@ mod tests {
         let model = small_model();
         let down = discharge(0.9, 0.8, 0.3);
         let up = HalfCycle { mode: Mode::Charge, ends: down.ends.map(|[a, b]| [b, a]), ..down };
-        assert_eq!(effects_ah(&model, &CONFIG, &up, 1.8), effects_ah(&model, &CONFIG, &down, 1.8));
+        assert_eq!(effects_ah(&model, &CONFIG, &up, 1.8, false), effects_ah(&model, &CONFIG, &down, 1.8, false));
     }
 
     #[test]
     fn tiny_swing_is_limited_and_unknown_ends_have_no_effect() {
         let model = small_model();
-        let tiny = effects_ah(&model, &CONFIG, &discharge(0.001, 0.8, 0.8), 1.8);
-        let least = effects_ah(&model, &CONFIG, &discharge(0.036, 0.8, 0.8), 1.8);
+        let tiny = effects_ah(&model, &CONFIG, &discharge(0.001, 0.8, 0.8), 1.8, false);
+        let least = effects_ah(&model, &CONFIG, &discharge(0.036, 0.8, 0.8), 1.8, false);
         assert_eq!(tiny, least);
         let unknown = HalfCycle { ends: None, ..discharge(0.9, 0.8, 0.3) };
-        assert_eq!(effects_ah(&model, &CONFIG, &unknown, 1.8), [0.0; END_ERRORS]);
+        assert_eq!(effects_ah(&model, &CONFIG, &unknown, 1.8, false), [0.0; END_ERRORS]);
     }
 }

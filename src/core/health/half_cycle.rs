@@ -1,7 +1,16 @@
 //! A half-cycle: one charge or one discharge of a cell.
 
-use crate::filter::ScalarGaussian;
+use super::CapacityConfig;
+use crate::cell::CellModel;
+use crate::cell::model_bands::CURVE_C;
+use crate::filter::{Measurement, ScalarGaussian, square};
 use crate::quantity::Mode;
+
+/// Largest difference of two measurements of the same capacity, in standard deviations of the difference.
+const SIGMA: f64 = 3.0;
+
+/// Error of a cell model that states none (V): standard deviation of its average over some minutes.
+const ASSUMED_ERROR_V: f64 = 0.02;
 
 /// One completed half-cycle of one cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -19,10 +28,59 @@ pub struct HalfCycle {
     /// SOC at the start and the end, fractions; `None` if the SOC at the end was not estimated. If only the SOC at the
     /// start is unknown, both values are the SOC at the end.
     pub ends: Option<[f64; 2]>,
+    /// SOC at the start and the end according to the voltages alone, fractions; see
+    /// [`EstimatorBank::soc_of_voltage`](crate::cell::EstimatorBank::soc_of_voltage).
+    pub ends_by_voltage: Option<[f64; 2]>,
+    /// Time without a measured current (s).
+    pub unmeasured_s: f64,
     /// Duration (s).
     pub duration_s: f64,
     /// Mean current (A); positive = discharge.
     pub mean_current_a: f64,
     /// Mean temperature (degrees C); `None` without a temperature reading.
     pub mean_temperature_c: Option<f64>,
+}
+
+impl HalfCycle {
+    /// Whether the charge and the change of the SOC allow the measured capacity `z` (Ah). A cell cannot hold less than
+    /// the charge that it has taken or given in one go. The charge divided by the change of the SOC is a second
+    /// measurement of the capacity; both must agree.
+    pub(super) fn allows(&self, z: &Measurement) -> bool {
+        let least_ah = z.value + SIGMA * z.variance.sqrt();
+        let Some(swing) = self.swing.filter(|swing| swing.mean > SIGMA * swing.std()) else {
+            return self.charge_ah <= least_ah;
+        };
+        let by_swing_ah = self.charge_ah / swing.mean;
+        let variance = by_swing_ah * by_swing_ah * swing.variance / (swing.mean * swing.mean);
+        let difference = z.value - by_swing_ah;
+        self.charge_ah <= least_ah && difference * difference <= SIGMA * SIGMA * (z.variance + variance)
+    }
+
+    /// The capacity (Ah): counted charge divided by the change of the SOC that the voltages show. `None` if the SOC by
+    /// voltage is unknown or has not changed in the direction of the charge. `soc_error`: error of the SOC by voltage
+    /// that comes from the loads before (fraction). In the time without a measured current, any current between 0 and
+    /// twice the mean current may have flowed.
+    pub(super) fn capacity_by_voltage(
+        &self,
+        model: &CellModel,
+        config: &CapacityConfig,
+        soc_error: f64,
+    ) -> Option<Measurement> {
+        let [start, end] = self.ends_by_voltage?;
+        let swing = if self.mode == Mode::Charge { end - start } else { start - end };
+        if swing <= 0.0 {
+            return None;
+        }
+        let value = self.charge_ah / swing;
+        let unmeasured_ah = self.mean_current_a.abs() * self.unmeasured_s / 3600.0 / 3.0_f64.sqrt();
+        let offset_ah = config.current_offset_std_a * self.duration_s / 3600.0;
+        let soc_variance = |soc: f64| {
+            let position = model.grid_position(soc, self.mean_temperature_c.unwrap_or(CURVE_C));
+            let error_v = model.voltage_error_v(&position).unwrap_or(ASSUMED_ERROR_V);
+            square(error_v / model.ocv_slope_v(&position, model.capacity_ah)) + square(soc_error)
+        };
+        let of_charge = (square(unmeasured_ah) + square(offset_ah)) / square(self.charge_ah);
+        let of_swing = (soc_variance(start) + soc_variance(end)) / square(swing);
+        Some(Measurement { value, variance: value * value * (of_charge + of_swing) })
+    }
 }

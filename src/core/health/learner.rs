@@ -32,6 +32,14 @@ use crate::quantity::{InvalidState, Mode, Timestamp};
 /// difference, one of them is wrong.
 const CONTRADICTION: f64 = 4.0;
 
+/// Smallest swing that teaches a capacity with the model of a label, as a part of the rated capacity. Smaller swings
+/// show mostly the error of the label's curve.
+const LABEL_SWING: f64 = 0.25;
+
+/// If the variance of a capacity is below this part of the initial variance, it counts as learned with the model of a
+/// label.
+const KNOWN_PART: f64 = 0.75;
+
 /// Standard deviation of the capacity of cells of one type, fraction. A smaller difference is never a contradiction.
 const NEW_SPREAD: f64 = 0.1;
 
@@ -48,11 +56,22 @@ pub struct CapacityUpdate {
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct CellMark {
     soc: Option<ScalarGaussian>,
+    /// SOC according to the voltage alone ([`PackBank::soc_of_voltage`](crate::cell::PackBank::soc_of_voltage)).
+    #[serde(default)]
+    by_voltage: Option<f64>,
+    /// Time without a measured current (s).
+    #[serde(default)]
+    unmeasured_s: f64,
     temperature_integral: f64,
     temperature_s: f64,
 }
 
 impl CellMark {
+    fn move_to(&mut self, soc: Option<ScalarGaussian>, by_voltage: Option<f64>) {
+        self.soc = Self::storable(soc);
+        self.by_voltage = by_voltage.filter(|&soc| bounds::STORED_SOC.has(soc));
+    }
+
     /// Returns the SOC, or `None` if its numbers cannot be stored (for example, a variance that came from a damaged
     /// stored state).
     fn storable(soc: Option<ScalarGaussian>) -> Option<ScalarGaussian> {
@@ -62,6 +81,8 @@ impl CellMark {
     fn check(&self) -> Result<(), InvalidState> {
         InvalidState::unless_number("a temperature at a half-cycle's end", self.temperature_integral)?;
         bounds::TIME_S.check("the time with a temperature", self.temperature_s)?;
+        bounds::TIME_S.check("the time without a current", self.unmeasured_s)?;
+        bounds::STORED_SOC.check_all("the SOC by voltage at a half-cycle's end", self.by_voltage)?;
         let Some(soc) = self.soc else { return Ok(()) };
         bounds::STORED_SOC.check("the SOC at a half-cycle's end", soc.mean)?;
         InvalidState::unless_natural("the variance of the SOC at a half-cycle's end", soc.variance)
@@ -104,9 +125,22 @@ pub struct Learner {
     in_doubt: Vec<usize>,
     /// Offset of the current sensor.
     offset: CurrentOffset,
-    /// Per cell: whether the cell learns no capacity from half-cycles ([`Self::hold`]).
+    /// Per cell: what half-cycles teach ([`Self::prepare`]).
     #[serde(skip)]
-    is_held: Vec<bool>,
+    lessons: Vec<Lesson>,
+}
+
+/// What a half-cycle teaches about a cell's capacity.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Lesson {
+    /// Nothing, because its readings are doubtful.
+    Nothing,
+    /// The capacity, with a cell model of a label. Only a large swing teaches, and the capacity counts as learned when
+    /// its variance is clearly smaller than `before`, the variance before anything was measured (Ah^2).
+    /// `soc_error`: error of a SOC by voltage that comes from the loads before (fraction).
+    ByLabel { before: f64, soc_error: f64 },
+    /// The capacity, with a cell model that was fitted to cells of this type.
+    ByModel,
 }
 
 impl Learner {
@@ -145,7 +179,7 @@ impl Learner {
         (self.prior[cell], self.capacity[cell], self.learned[cell]) = (capacity, capacity, false);
         self.in_doubt.retain(|&other| other != cell);
         for mark in [&mut self.start, &mut self.candidate].into_iter().flatten() {
-            mark.cells[cell].soc = None;
+            (mark.cells[cell].soc, mark.cells[cell].by_voltage) = (None, None);
         }
     }
 
@@ -177,18 +211,22 @@ impl Learner {
         measured_s: f64,
         gap_s: f64,
     ) -> bool {
+        let totals = &mut self.totals[cell];
+        if gap_s.is_finite() {
+            totals.unmeasured_s = (totals.unmeasured_s + gap_s).min(bounds::TIME_S.high);
+        }
         if let Some(temperature_c) = temperature_c {
-            let totals = &mut self.totals[cell];
             totals.temperature_integral += temperature_c * measured_s;
             totals.temperature_s += measured_s;
         }
         gap_s > 0.0 && self.candidate.as_ref().is_some_and(|mark| time.since(mark.time) < gap_s)
     }
 
-    /// Sets the SOC at the candidate's mark to `soc`, the cell's present SOC.
-    pub fn move_mark(&mut self, cell: usize, soc: Option<ScalarGaussian>) {
+    /// Sets the SOC at the candidate's mark to the cell's present SOC, in the filter and by voltage.
+    pub fn move_mark(&mut self, cell: usize, (soc, by_voltage): (Option<ScalarGaussian>, Option<f64>)) {
         if let Some(mark) = &mut self.candidate {
-            mark.cells[cell].soc = CellMark::storable(soc);
+            mark.cells[cell].move_to(soc, by_voltage);
+            mark.cells[cell].unmeasured_s = self.totals[cell].unmeasured_s;
         }
     }
 
@@ -197,11 +235,20 @@ impl Learner {
         self.rest_s = 0.0;
     }
 
-    /// Marks the start of the candidate, an unconfirmed mode. `soc` returns the SOC of each cell.
-    pub fn mark_candidate(&mut self, time: Timestamp, charge_as: f64, soc: impl Fn(usize) -> Option<ScalarGaussian>) {
+    /// Marks the start of the candidate, an unconfirmed mode. `soc` returns the SOC of each cell, in the filter and by
+    /// voltage.
+    pub fn mark_candidate(
+        &mut self,
+        time: Timestamp,
+        charge_as: f64,
+        soc: impl Fn(usize) -> (Option<ScalarGaussian>, Option<f64>),
+    ) {
         let mut cells = self.candidate.take().map(|mark| mark.cells).unwrap_or_default();
         cells.clone_from(&self.totals);
-        cells.iter_mut().enumerate().for_each(|(cell, mark)| mark.soc = CellMark::storable(soc(cell)));
+        for (cell, mark) in cells.iter_mut().enumerate() {
+            let (soc, by_voltage) = soc(cell);
+            mark.move_to(soc, by_voltage);
+        }
         self.candidate = Some(Mark { time, charge_as, cells });
     }
 
@@ -240,10 +287,13 @@ impl Learner {
         }
     }
 
-    /// Selects the cells that learn no capacity from half-cycles, because their cell model is too uncertain or their
-    /// readings are doubtful. Has no effect with `Nominal`.
-    pub fn hold(&mut self, is_held: impl Fn(usize) -> bool) {
-        self.is_held = (0..self.capacity.len()).map(is_held).collect();
+    /// Sets what the next half-cycle teaches each cell. Has no effect with `Nominal`.
+    pub fn prepare(&mut self, lesson: impl Fn(usize) -> Lesson) {
+        self.lessons = (0..self.capacity.len()).map(lesson).collect();
+    }
+
+    fn lesson(&self, cell: usize) -> Lesson {
+        self.lessons.get(cell).copied().unwrap_or(Lesson::ByModel)
     }
 
     /// Steps the event filter of one cell after its half-cycle is complete.
@@ -271,7 +321,11 @@ impl Learner {
                 Some(measurement)
             }
         };
-        self.learned[cell] |= measurement.is_some();
+        self.learned[cell] |= measurement.is_some()
+            && match self.lesson(cell) {
+                Lesson::ByLabel { before, .. } => self.capacity[cell].variance < KNOWN_PART * before,
+                Lesson::Nothing | Lesson::ByModel => true,
+            };
         CapacityUpdate { measurement, capacity: self.capacity(cell) }
     }
 
@@ -319,7 +373,7 @@ impl Learner {
         let soc = CellMark::storable(soc);
         let at_start = soc.filter(|_| !self.joining);
         for (mark, soc) in [(&mut self.start, at_start), (&mut self.candidate, soc)] {
-            mark.iter_mut().for_each(|mark| mark.cells[cell].soc = soc);
+            mark.iter_mut().for_each(|mark| mark.cells[cell].move_to(soc, None));
         }
     }
 
@@ -344,8 +398,15 @@ impl Learner {
         let after = estimator.capacity();
         let is_in_doubt = self.in_doubt.contains(&cell);
         self.in_doubt.retain(|&other| other != cell);
-        let is_held = self.is_held.get(cell).copied().unwrap_or(false);
-        let evidence = self.prior[cell].information_until(&after).filter(|_| !is_in_doubt && !is_held);
+        let lesson = self.lesson(cell);
+        let soc_error = if let Lesson::ByLabel { soc_error, .. } = lesson { Some(soc_error) } else { None };
+        let is_by_label = soc_error.is_some();
+        let is_small = is_by_label && half_cycle.charge_ah < LABEL_SWING * model.rated_capacity_ah;
+        let is_held = is_small || lesson == Lesson::Nothing;
+        let is_open = !is_in_doubt && !is_held;
+        let evidence = self.prior[cell].information_until(&after).filter(|_| is_open && !is_by_label);
+        let by_label =
+            soc_error.filter(|_| is_open).and_then(|error| half_cycle.capacity_by_voltage(model, config, error));
         let measurement = evidence.map(|z| {
             // The open-circuit curve assumes a capacity C_curve, which influences the measurement z:
             // z = C + s (C_curve - C). Solve for C.
@@ -355,14 +416,16 @@ impl Learner {
             let (own, curve_ah) = (1.0 - by_curve, estimator.curve().mean);
             Measurement { value: curve_ah + (z.value - curve_ah) / own, variance: z.variance / (own * own) }
         });
+        let measurement = measurement.or(by_label);
         let drift = &mut self.drift[cell];
         let before = *drift;
         let expected = drift.capacity();
         let is_contradiction = |z: &Measurement| {
             let difference = z.value - expected.mean;
             // A cell that has rested may gain a few percent of capacity.
-            difference.abs() > NEW_SPREAD * model.capacity_ah
-                && difference * difference > CONTRADICTION * CONTRADICTION * (z.variance + expected.variance)
+            let is_unexpected = difference.abs() > NEW_SPREAD * model.capacity_ah
+                && difference * difference > CONTRADICTION * CONTRADICTION * (z.variance + expected.variance);
+            is_unexpected || !half_cycle.allows(z)
         };
         if let Some(z) = measurement.filter(is_contradiction) {
             // The measured or the expected capacity is wrong; further half-cycles decide. Each contradiction adds at
@@ -372,7 +435,7 @@ impl Learner {
             let spread_ah = NEW_SPREAD * model.capacity_ah;
             drift.doubt(doubt.min(expected.variance + spread_ah * spread_ah));
         } else if let Some(z) = measurement {
-            drift.update(z, &effects_ah(model, config, half_cycle, after.mean));
+            drift.update(z, &effects_ah(model, config, half_cycle, after.mean, is_by_label));
         } else if is_in_doubt && !is_held {
             drift.at_least(half_cycle.charge_ah);
         }
@@ -467,6 +530,8 @@ fn half_cycle(moved_ah: f64, duration_s: f64, a: &CellMark, b: &CellMark) -> Hal
         end_soc: b.soc.map(|soc| soc.mean),
         // If the SOC at the start is unknown, use the SOC at the end.
         ends: b.soc.map(|end| [a.soc.unwrap_or(end).mean, end.mean]),
+        ends_by_voltage: a.by_voltage.zip(b.by_voltage).map(<[f64; 2]>::from),
+        unmeasured_s: b.unmeasured_s - a.unmeasured_s,
         duration_s,
         mean_current_a: moved_ah * 3600.0 / duration_s,
         mean_temperature_c: (temperature_s > 0.0)

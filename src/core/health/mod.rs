@@ -21,7 +21,7 @@ pub use config::{
 };
 pub use forecast::{Axis, CapacityReading, Forecast, InsufficientData, Remaining, RemainingLife, Usage};
 pub use half_cycle::HalfCycle;
-pub use learner::{CapacityUpdate, Learner};
+pub use learner::{CapacityUpdate, Learner, Lesson};
 pub use pack::{CellShare, PackState};
 pub use recharge::{ChargeRecord, RechargeTimer};
 pub use transition::{ModeChange, TransitionDetector};

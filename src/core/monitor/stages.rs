@@ -193,7 +193,7 @@ impl Stages {
         if is_quiet && is_current {
             self.show_innovations(now, &samples);
         }
-        let is_prior = !self.modelling.teaches_capacity();
+        let is_prior = self.modelling.is_label();
         let has_row_ended = self.findings.observe(now, &samples, (&self.estimation, is_prior), &self.learning, out);
         self.estimation.finish(samples, &mut self.learning.state.learner);
         if has_row_ended {
@@ -232,18 +232,21 @@ impl Stages {
         if observed.candidate_begins {
             let (charge_as, _) = self.sampling.sampler.counted(now);
             let bank = &self.estimation.bank;
-            self.learning.state.learner.mark_candidate(now, charge_as, |cell| bank.filtered_soc(cell));
+            self.learning
+                .state
+                .learner
+                .mark_candidate(now, charge_as, |cell| (bank.filtered_soc(cell), bank.soc_of_voltage(cell)));
         }
     }
 
     fn complete_mode(&mut self, now: Timestamp, change: ModeChange, out: &mut Outputs) {
         let Self { estimation, modelling, learning, alarming, sending, .. } = self;
         let mut publisher = Publisher { now, alarming, sending, out };
-        let teaches_capacity = modelling.teaches_capacity();
+        let is_label = modelling.is_label();
         let is_doubtful = estimation.take_doubt();
         let is_doubtful = |cell: usize| is_doubtful || estimation.is_voltage_frozen(cell);
         let doubtful: Vec<bool> = (0..estimation.cells()).map(is_doubtful).collect();
-        learning.complete_mode(change, &mut estimation.bank, (teaches_capacity, &doubtful), &mut publisher);
+        learning.complete_mode(change, &mut estimation.bank, (is_label, &doubtful), &mut publisher);
     }
 
     /// Fits the cell model to the rows that the modelling stage has collected. If the fit changes the model, the

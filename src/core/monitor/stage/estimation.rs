@@ -276,7 +276,9 @@ impl Estimation {
         samples.clear();
         self.batch.waiting = samples;
         let bank = &self.bank;
-        self.after_gap.drain(..).for_each(|cell| learner.move_mark(cell, bank.filtered_soc(cell)));
+        self.after_gap
+            .drain(..)
+            .for_each(|cell| learner.move_mark(cell, (bank.filtered_soc(cell), bank.soc_of_voltage(cell))));
     }
 
     /// The filter step from the previous sample to this one.

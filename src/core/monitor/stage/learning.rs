@@ -18,13 +18,13 @@ use super::estimation::resistance;
 use super::publisher::{Publisher, learned};
 use crate::alarm::{Observation, Rule};
 use crate::can::encode::HealthFields;
-use crate::cell::{CellEstimator, CellModel, LossModes, PackBank};
-use crate::filter::ScalarGaussian;
+use crate::cell::{CellEstimator, CellModel, EstimatorConfig, LossModes, PackBank};
+use crate::filter::{ScalarGaussian, square};
 use crate::health::recharge::normalised_period;
 use crate::health::usable::usable_capacity;
 use crate::health::{
-    CapacityUpdate, CellShare, HalfCycle, HealthConfig, Learner, ModeChange, PackState, RechargeAlarm, RechargeConfig,
-    RechargeTimer, TransitionDetector, pack,
+    CapacityUpdate, CellShare, HalfCycle, HealthConfig, Learner, Lesson, ModeChange, PackState, RechargeAlarm,
+    RechargeConfig, RechargeTimer, TransitionDetector, pack,
 };
 use crate::monitor::config::MonitorConfig;
 use crate::monitor::message::EventKind;
@@ -196,19 +196,25 @@ impl Learning {
         self.state.learner.has_learned(index).then(|| self.capacity(index))
     }
 
-    /// Ends a mode. If this completes a half-cycle, every cell learns from the half-cycle. `teaches_capacity`: whether
-    /// the model of the pack's own kind of cells is good enough to learn capacities. Cells of a module learn their
-    /// capacity if their model was given. `is_doubtful`: per cell, whether the current was doubtful or the cell's
-    /// voltage is frozen. A doubtful cell learns no capacity.
+    /// Ends a mode. If this completes a half-cycle, every cell learns from the half-cycle. `is_label`: whether
+    /// the model of the pack's own kind of cells is the model of a label, neither given nor learned. `is_doubtful`: per
+    /// cell, whether the current was doubtful or the cell's voltage is frozen. A doubtful cell learns no capacity.
     pub(crate) fn complete_mode(
         &mut self,
         change: ModeChange,
         bank: &mut PackBank,
-        (teaches_capacity, is_doubtful): (bool, &[bool]),
+        (is_label, is_doubtful): (bool, &[bool]),
         to: &mut Publisher<'_>,
     ) {
-        let teaches = |cell| if bank.is_own(cell) { teaches_capacity } else { bank.has_given_model(cell) };
-        self.state.learner.hold(|cell| is_doubtful[cell] || !teaches(cell));
+        let is_by_model = |cell| if bank.is_own(cell) { !is_label } else { bank.has_given_model(cell) };
+        self.state.learner.prepare(|cell| match is_by_model(cell) {
+            _ if is_doubtful[cell] => Lesson::Nothing,
+            true => Lesson::ByModel,
+            false => {
+                let EstimatorConfig { initial, gate, .. } = bank.config(cell);
+                Lesson::ByLabel { before: square(initial.capacity_std_ah), soc_error: gate.soc_error }
+            }
+        });
         to.event(EventKind::Mode { from: change.from, to: change.to });
         // If readings of the current stop, keep the evidence for the offset and the slow branches until the next change
         // of mode.

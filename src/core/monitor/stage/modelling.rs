@@ -302,10 +302,9 @@ impl Modelling {
         Some(FitTask::new(self.label?, notebook, own.as_ref(), before.as_ref()))
     }
 
-    /// Whether half-cycles may learn the capacity. While the label's model is used, half-cycles learn no capacity,
-    /// because the model's errors would look like lost capacity.
-    pub(crate) fn teaches_capacity(&self) -> bool {
-        self.label.is_none() || self.state.own.is_some()
+    /// Whether the label's model is used, because no model was given and none has been learned.
+    pub(crate) fn is_label(&self) -> bool {
+        self.label.is_some() && self.state.own.is_none()
     }
 
     /// Whether there is enough new data for a fit.
