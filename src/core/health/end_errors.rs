@@ -83,7 +83,7 @@ mod tests {
             end_soc: Some(to),
             ends: Some([from, to]),
             ends_by_voltage: None,
-            unmeasured_s: 0.0,
+            uncounted: 0.0,
             duration_s: 3600.0,
             mean_current_a: charge_ah,
             mean_temperature_c: Some(25.0),

@@ -31,8 +31,8 @@ pub struct HalfCycle {
     /// SOC at the start and the end according to the voltages alone, fractions; see
     /// [`EstimatorBank::soc_of_voltage`](crate::cell::EstimatorBank::soc_of_voltage).
     pub ends_by_voltage: Option<[f64; 2]>,
-    /// Time without a measured current (s).
-    pub unmeasured_s: f64,
+    /// Variance of the charge that has flowed while no current was measured, as a fraction of the capacity, squared.
+    pub uncounted: f64,
     /// Duration (s).
     pub duration_s: f64,
     /// Mean current (A); positive = discharge.
@@ -58,8 +58,7 @@ impl HalfCycle {
 
     /// The capacity (Ah): counted charge divided by the change of the SOC that the voltages show. `None` if the SOC by
     /// voltage is unknown or has not changed in the direction of the charge. `soc_error`: error of the SOC by voltage
-    /// that comes from the loads before (fraction). In the time without a measured current, any current between 0 and
-    /// twice the mean current may have flowed.
+    /// that comes from the loads before (fraction).
     pub(super) fn capacity_by_voltage(
         &self,
         model: &CellModel,
@@ -72,15 +71,13 @@ impl HalfCycle {
             return None;
         }
         let value = self.charge_ah / swing;
-        let unmeasured_ah = self.mean_current_a.abs() * self.unmeasured_s / 3600.0 / 3.0_f64.sqrt();
         let offset_ah = config.current_offset_std_a * self.duration_s / 3600.0;
         let soc_variance = |soc: f64| {
             let position = model.grid_position(soc, self.mean_temperature_c.unwrap_or(CURVE_C));
             let error_v = model.voltage_error_v(&position).unwrap_or(ASSUMED_ERROR_V);
             square(error_v / model.ocv_slope_v(&position, model.capacity_ah)) + square(soc_error)
         };
-        let of_charge = (square(unmeasured_ah) + square(offset_ah)) / square(self.charge_ah);
-        let of_swing = (soc_variance(start) + soc_variance(end)) / square(swing);
-        Some(Measurement { value, variance: value * value * (of_charge + of_swing) })
+        let of_swing = (soc_variance(start) + soc_variance(end) + self.uncounted) / square(swing);
+        Some(Measurement { value, variance: value * value * (square(offset_ah / self.charge_ah) + of_swing) })
     }
 }

@@ -22,6 +22,7 @@ use super::drift::DriftFilter;
 use super::end_errors::effects_ah;
 use super::half_cycle::HalfCycle;
 use super::offset::CurrentOffset;
+use super::span::Span;
 use super::{CapacityConfig, CapacityMethod, TransitionConfig};
 use crate::cell::{CellEstimator, CellModel};
 use crate::filter::{Measurement, ScalarGaussian};
@@ -31,10 +32,6 @@ use crate::quantity::{InvalidState, Mode, Timestamp};
 /// If a measured capacity and the expected capacity differ by more than this many standard deviations of their
 /// difference, one of them is wrong.
 const CONTRADICTION: f64 = 4.0;
-
-/// Smallest swing that teaches a capacity with the model of a label, as a part of the rated capacity. Smaller swings
-/// show mostly the error of the label's curve.
-const LABEL_SWING: f64 = 0.25;
 
 /// If the variance of a capacity is below this part of the initial variance, it counts as learned with the model of a
 /// label.
@@ -54,14 +51,11 @@ pub struct CapacityUpdate {
 
 /// Totals of one cell since the learner was created, and the cell's SOC, at one time.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
-struct CellMark {
+pub(super) struct CellMark {
     soc: Option<ScalarGaussian>,
     /// SOC according to the voltage alone ([`PackBank::soc_of_voltage`](crate::cell::PackBank::soc_of_voltage)).
     #[serde(default)]
-    by_voltage: Option<f64>,
-    /// Time without a measured current (s).
-    #[serde(default)]
-    unmeasured_s: f64,
+    pub(super) by_voltage: Option<f64>,
     temperature_integral: f64,
     temperature_s: f64,
 }
@@ -81,7 +75,6 @@ impl CellMark {
     fn check(&self) -> Result<(), InvalidState> {
         InvalidState::unless_number("a temperature at a half-cycle's end", self.temperature_integral)?;
         bounds::TIME_S.check("the time with a temperature", self.temperature_s)?;
-        bounds::TIME_S.check("the time without a current", self.unmeasured_s)?;
         bounds::STORED_SOC.check_all("the SOC by voltage at a half-cycle's end", self.by_voltage)?;
         let Some(soc) = self.soc else { return Ok(()) };
         bounds::STORED_SOC.check("the SOC at a half-cycle's end", soc.mean)?;
@@ -91,11 +84,11 @@ impl CellMark {
 
 /// A mark: totals of all cells at one time.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-struct Mark {
-    time: Timestamp,
+pub(super) struct Mark {
+    pub(super) time: Timestamp,
     /// Cumulative charge (A) s per cell, positive = discharge.
-    charge_as: f64,
-    cells: Vec<CellMark>,
+    pub(super) charge_as: f64,
+    pub(super) cells: Vec<CellMark>,
 }
 
 /// Totals, marks and capacity filters of all cells.
@@ -125,6 +118,9 @@ pub struct Learner {
     in_doubt: Vec<usize>,
     /// Offset of the current sensor.
     offset: CurrentOffset,
+    /// Largest change of the charge, across several half-cycles.
+    #[serde(default)]
+    span: Span,
     /// Per cell: what half-cycles teach ([`Self::prepare`]).
     #[serde(skip)]
     lessons: Vec<Lesson>,
@@ -135,7 +131,7 @@ pub struct Learner {
 pub enum Lesson {
     /// Nothing, because its readings are doubtful.
     Nothing,
-    /// The capacity, with a cell model of a label. Only a large swing teaches, and the capacity counts as learned when
+    /// The capacity, with a cell model of a label. Only a large [`Span`] teaches, and the capacity counts as learned when
     /// its variance is clearly smaller than `before`, the variance before anything was measured (Ah^2).
     /// `soc_error`: error of a SOC by voltage that comes from the loads before (fraction).
     ByLabel { before: f64, soc_error: f64 },
@@ -181,6 +177,7 @@ impl Learner {
         for mark in [&mut self.start, &mut self.candidate].into_iter().flatten() {
             (mark.cells[cell].soc, mark.cells[cell].by_voltage) = (None, None);
         }
+        self.span.forget(cell);
     }
 
     /// A copy with the learned values only, without the present half-cycle.
@@ -211,11 +208,8 @@ impl Learner {
         measured_s: f64,
         gap_s: f64,
     ) -> bool {
-        let totals = &mut self.totals[cell];
-        if gap_s.is_finite() {
-            totals.unmeasured_s = (totals.unmeasured_s + gap_s).min(bounds::TIME_S.high);
-        }
         if let Some(temperature_c) = temperature_c {
+            let totals = &mut self.totals[cell];
             totals.temperature_integral += temperature_c * measured_s;
             totals.temperature_s += measured_s;
         }
@@ -226,13 +220,13 @@ impl Learner {
     pub fn move_mark(&mut self, cell: usize, (soc, by_voltage): (Option<ScalarGaussian>, Option<f64>)) {
         if let Some(mark) = &mut self.candidate {
             mark.cells[cell].move_to(soc, by_voltage);
-            mark.cells[cell].unmeasured_s = self.totals[cell].unmeasured_s;
         }
     }
 
     /// Resets the time at rest after all cells have learned from a half-cycle.
     pub fn finish(&mut self) {
         self.rest_s = 0.0;
+        self.span.closed = None;
     }
 
     /// Marks the start of the candidate, an unconfirmed mode. `soc` returns the SOC of each cell, in the filter and by
@@ -266,6 +260,7 @@ impl Learner {
     ) {
         let Some(end) = self.candidate.take() else { return };
         let since = self.mode_since.replace(end.time);
+        self.span.note(&end, from, rated_capacity_ah);
         let Some(start) = &self.start else {
             self.start = Some(end);
             return;
@@ -369,6 +364,7 @@ impl Learner {
         }
         self.prior[cell] = estimator.capacity();
         self.in_doubt.retain(|&other| other != cell);
+        self.span.forget(cell);
         // The SOC at the start of a merged half-cycle was estimated with the old model, so it becomes unknown.
         let soc = CellMark::storable(soc);
         let at_start = soc.filter(|_| !self.joining);
@@ -401,12 +397,12 @@ impl Learner {
         let lesson = self.lesson(cell);
         let soc_error = if let Lesson::ByLabel { soc_error, .. } = lesson { Some(soc_error) } else { None };
         let is_by_label = soc_error.is_some();
-        let is_small = is_by_label && half_cycle.charge_ah < LABEL_SWING * model.rated_capacity_ah;
-        let is_held = is_small || lesson == Lesson::Nothing;
+        let is_held = lesson == Lesson::Nothing;
         let is_open = !is_in_doubt && !is_held;
         let evidence = self.prior[cell].information_until(&after).filter(|_| is_open && !is_by_label);
-        let by_label =
-            soc_error.filter(|_| is_open).and_then(|error| half_cycle.capacity_by_voltage(model, config, error));
+        let span = soc_error.filter(|_| is_open).and_then(|_| self.span.closed(cell));
+        let by_label = span.zip(soc_error).and_then(|(span, error)| span.capacity_by_voltage(model, config, error));
+        let learned_from = span.as_ref().unwrap_or(half_cycle);
         let measurement = evidence.map(|z| {
             // The open-circuit curve assumes a capacity C_curve, which influences the measurement z:
             // z = C + s (C_curve - C). Solve for C.
@@ -425,7 +421,7 @@ impl Learner {
             // A cell that has rested may gain a few percent of capacity.
             let is_unexpected = difference.abs() > NEW_SPREAD * model.capacity_ah
                 && difference * difference > CONTRADICTION * CONTRADICTION * (z.variance + expected.variance);
-            is_unexpected || !half_cycle.allows(z)
+            is_unexpected || !learned_from.allows(z)
         };
         if let Some(z) = measurement.filter(is_contradiction) {
             // The measured or the expected capacity is wrong; further half-cycles decide. Each contradiction adds at
@@ -435,7 +431,7 @@ impl Learner {
             let spread_ah = NEW_SPREAD * model.capacity_ah;
             drift.doubt(doubt.min(expected.variance + spread_ah * spread_ah));
         } else if let Some(z) = measurement {
-            drift.update(z, &effects_ah(model, config, half_cycle, after.mean, is_by_label));
+            drift.update(z, &effects_ah(model, config, learned_from, after.mean, is_by_label));
         } else if is_in_doubt && !is_held {
             drift.at_least(half_cycle.charge_ah);
         }
@@ -481,7 +477,11 @@ impl Learner {
     /// Whether a stored learner has entries for `cells` cells in all its lists.
     pub fn fits(&self, cells: usize) -> bool {
         [self.totals.len(), self.prior.len(), self.capacity.len(), self.learned.len(), self.drift.len()] == [cells; 5]
-            && [&self.start, &self.candidate].into_iter().flatten().all(|mark| mark.cells.len() == cells)
+            && self.all_marks().all(|mark| mark.cells.len() == cells)
+    }
+
+    fn all_marks(&self) -> impl Iterator<Item = &Mark> + Clone {
+        [&self.start, &self.candidate].into_iter().flatten().chain(self.span.marks())
     }
 
     /// Checks the numbers of a stored state.
@@ -496,28 +496,27 @@ impl Learner {
         self.drift.iter().try_for_each(DriftFilter::check)?;
         self.offset.check()?;
         bounds::TIME_S.check("the time at rest", self.rest_s)?;
-        let marks = [&self.start, &self.candidate].into_iter().flatten();
+        let marks = self.all_marks();
         let charges_as = marks.clone().map(|mark| mark.charge_as);
         bounds::CHARGE_AS.check_all("the charge at a half-cycle's end", charges_as)?;
         marks.flat_map(|mark| &mark.cells).chain(&self.totals).try_for_each(CellMark::check)
     }
 
-    /// Time and charge (A s per cell) at the start of the present half-cycle and at the start of the candidate.
+    /// Time and charge (A s per cell) at each stored mark.
     pub fn marks(&self) -> impl Iterator<Item = (Timestamp, f64)> + '_ {
-        [&self.start, &self.candidate].into_iter().flatten().map(|mark| (mark.time, mark.charge_as))
+        self.all_marks().map(|mark| (mark.time, mark.charge_as))
     }
 
     /// Shifts all timestamps by `by_nanos`, to another clock.
     pub fn rebase(&mut self, by_nanos: i64) {
-        for mark in [&mut self.start, &mut self.candidate].into_iter().flatten() {
-            mark.time = mark.time.plus_nanos(by_nanos);
-        }
+        let marks = [&mut self.start, &mut self.candidate].into_iter().flatten();
+        marks.chain(self.span.marks_mut()).for_each(|mark| mark.time = mark.time.plus_nanos(by_nanos));
         self.mode_since = self.mode_since.map(|since| since.plus_nanos(by_nanos));
     }
 }
 
 /// One cell's half-cycle between the marks `a` and `b`. `moved_ah` is positive for a discharge.
-fn half_cycle(moved_ah: f64, duration_s: f64, a: &CellMark, b: &CellMark) -> HalfCycle {
+pub(super) fn half_cycle(moved_ah: f64, duration_s: f64, a: &CellMark, b: &CellMark) -> HalfCycle {
     let (mode, sign) = if moved_ah > 0.0 { (Mode::Discharge, 1.0) } else { (Mode::Charge, -1.0) };
     let temperature_s = b.temperature_s - a.temperature_s;
     HalfCycle {
@@ -531,7 +530,7 @@ fn half_cycle(moved_ah: f64, duration_s: f64, a: &CellMark, b: &CellMark) -> Hal
         // If the SOC at the start is unknown, use the SOC at the end.
         ends: b.soc.map(|end| [a.soc.unwrap_or(end).mean, end.mean]),
         ends_by_voltage: a.by_voltage.zip(b.by_voltage).map(<[f64; 2]>::from),
-        unmeasured_s: b.unmeasured_s - a.unmeasured_s,
+        uncounted: 0.0,
         duration_s,
         mean_current_a: moved_ah * 3600.0 / duration_s,
         mean_temperature_c: (temperature_s > 0.0)

@@ -13,6 +13,7 @@ pub mod learner;
 pub mod offset;
 pub mod pack;
 pub mod recharge;
+mod span;
 pub mod transition;
 pub mod usable;
 

@@ -1,0 +1,115 @@
+//! Finds the largest changes of the charge, across several half-cycles.
+//!
+//! In: marks, which are copies of all totals at the ends of modes. Out: pairs of marks between which a large charge has
+//! moved in one direction.
+//!
+//! A car discharges in several trips, and clouds interrupt the charge of a boat. A single half-cycle then shows little
+//! about the capacity. A *span* lasts from one turn of the counted charge to the next. A small change in the other
+//! direction does not end a span.
+//!
+//! While no current was measured, the cells may have been charged or used. If the SOC by voltage has changed by more
+//! than [`JUMP`], the span starts again. Otherwise, the charge that may have flowed is part of the span's error.
+
+use serde::{Deserialize, Serialize};
+
+use super::half_cycle::HalfCycle;
+use super::learner::{Mark, half_cycle};
+use crate::filter::square;
+use crate::quantity::Mode;
+
+/// Smallest span, as a part of the rated capacity. Smaller spans show mostly the error of a label's curve.
+const LEAST: f64 = 0.25;
+
+/// Smallest charge in the other direction that ends a span, as a part of the rated capacity.
+const TURN: f64 = 0.05;
+
+/// Change of the SOC by voltage while no current was measured that shows use or a charge (fraction). A voltage after a
+/// load differs by less from the voltage after a rest.
+const JUMP: f64 = 0.08;
+
+/// Standard deviation of the charge that may have flowed unnoticed while no current was measured, as a part of the
+/// capacity.
+const UNNOTICED: f64 = 0.03;
+
+/// The present span, and the last complete one.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Span {
+    /// Start.
+    start: Option<Mark>,
+    /// The mark with the largest change of the charge since the start.
+    turn: Option<Mark>,
+    /// The last mark.
+    last: Option<Mark>,
+    /// Number of times without a measured current since the start, and up to the turn.
+    gaps: [u32; 2],
+    /// Start and end of the last complete span that no cell has learned from yet, and the number of its gaps.
+    pub(super) closed: Option<(Mark, Mark, u32)>,
+}
+
+impl Span {
+    /// Handles the end of the mode `from`, at the mark `now`.
+    pub(super) fn note(&mut self, now: &Mark, from: Mode, rated_capacity_ah: f64) {
+        let (Some(start), Some(turn), Some(last)) = (&self.start, &self.turn, self.last.replace(now.clone())) else {
+            (self.start, self.turn, self.last) = (Some(now.clone()), Some(now.clone()), Some(now.clone()));
+            return;
+        };
+        let part = |a: &Mark, b: &Mark| (b.charge_as - a.charge_as) / (3600.0 * rated_capacity_ah);
+        if from == Mode::Unknown {
+            if jump(&last, now, part(&last, now)) > JUMP {
+                *self = Self { closed: self.closed.take(), ..Self::default() };
+                return self.note(now, from, rated_capacity_ah);
+            }
+            self.gaps[0] = self.gaps[0].saturating_add(1);
+        }
+        let (moved, most) = (part(start, now), part(start, turn));
+        let is_still_last = turn.time == last.time && matches!(from, Mode::Rest | Mode::Unknown);
+        if is_still_last || moved * most >= most * most {
+            // After a rest, the voltage shows the SOC better than before.
+            (self.turn, self.gaps[1]) = (Some(now.clone()), self.gaps[0]);
+        } else if part(turn, now).abs() >= TURN {
+            let end = turn.clone();
+            if most.abs() >= LEAST {
+                self.closed = Some((start.clone(), end.clone(), self.gaps[1]));
+            }
+            self.gaps = [self.gaps[0] - self.gaps[1]; 2];
+            (self.start, self.turn) = (Some(end), Some(now.clone()));
+        }
+    }
+
+    /// The last complete span of a cell, if no cell has learned from it yet.
+    pub(super) fn closed(&self, cell: usize) -> Option<HalfCycle> {
+        let (start, end, gaps) = self.closed.as_ref()?;
+        let (a, b) = (start.cells.get(cell)?, end.cells.get(cell)?);
+        let moved_ah = (end.charge_as - start.charge_as) / 3600.0;
+        let span = half_cycle(moved_ah, end.time.since(start.time), a, b);
+        Some(HalfCycle { uncounted: f64::from(*gaps) * square(UNNOTICED), ..span })
+    }
+
+    /// Forgets a cell's SOC, because the cell or its model has changed.
+    pub(super) fn forget(&mut self, cell: usize) {
+        self.marks_mut().filter_map(|mark| mark.cells.get_mut(cell)).for_each(|cell| cell.by_voltage = None);
+    }
+
+    /// All marks.
+    pub(super) fn marks_mut(&mut self) -> impl Iterator<Item = &mut Mark> {
+        let marks = [&mut self.start, &mut self.turn, &mut self.last].into_iter().flatten();
+        marks.chain(self.closed.iter_mut().flat_map(|(start, end, _)| [start, end]))
+    }
+
+    /// All marks.
+    pub(super) fn marks(&self) -> impl Iterator<Item = &Mark> + Clone {
+        let marks = [&self.start, &self.turn, &self.last].into_iter().flatten();
+        marks.chain(self.closed.iter().flat_map(|(start, end, _)| [start, end]))
+    }
+}
+
+/// Median over the cells of the change of the SOC by voltage that the counted charge `moved` (fraction, positive =
+/// discharge) does not explain; 0 if no cell has both SOCs.
+fn jump(before: &Mark, after: &Mark, moved: f64) -> f64 {
+    let cells = before.cells.iter().zip(&after.cells);
+    let changes = cells.filter_map(|(a, b)| Some((b.by_voltage? - a.by_voltage? + moved).abs()));
+    let mut changes: Vec<f64> = changes.collect();
+    changes.sort_unstable_by(f64::total_cmp);
+    changes.get(changes.len() / 2).copied().unwrap_or(0.0)
+}
