@@ -99,9 +99,9 @@ fn store_report_states_unknown_values() {
     let page = place.page("a.html", &["--state", &state]);
     assert!(page.contains("Capacity between") && page.contains("Duration of each charge"));
     assert!(!has_minus_zero(&page), "-0 in the page");
-    assert!(page.contains("unknown: the history contains learned values") && page.contains("all as they were written"));
-    assert!(page.contains("rated capacity unknown without -c"));
-    assert!(page.contains("No forecast of the capacity: the record does not state the capacity at the end of life"));
+    assert!(page.contains("Unknown: the history contains learned values") && page.contains("all as they were written"));
+    assert!(page.contains("The rated capacity is unknown without -c."));
+    assert!(page.contains("<td>Remaining life</td><td>The record does not state the capacity at the end of life"));
     assert!(place.page("b.html", &["--state", &state, "-c", &config()]).contains("of 2 Ah rated"));
 }
 
