@@ -3,7 +3,7 @@
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
 use super::context::PageContext;
-use super::data::{AlarmRecord, Data, Origin};
+use super::data::{Data, Origin};
 use super::known::Knowledge;
 use super::pictures::{self, NOT_STORED};
 use super::{forecast, format, model, summary};
@@ -11,7 +11,7 @@ use crate::chart::{Picture, Size, variables};
 use crate::config::Config;
 use crate::{cell_fault_pictures, pack_view};
 
-/// Maximum number of rows of a table. The pictures and `packwatch history` show all rows.
+/// Maximum number of rows of a table.
 const MAX_ROWS: usize = 200;
 
 /// Section after which the alarms follow.
@@ -297,60 +297,26 @@ fn fan_note(data: &Data, outlook: &forecast::Outlook) -> String {
 }
 
 fn alarms(data: &Data, pictures: &[(String, Picture)]) -> Markup {
-    // A value that is unknown for a while is not a change that a reader needs.
-    let is_shown = |row: &&AlarmRecord| row.change != "suppressed" && row.change != "resumed";
-    let shown: Vec<&AlarmRecord> = data.alarms.iter().filter(is_shown).collect();
-    if shown.is_empty() && data.incidents.is_empty() {
+    if data.alarms.is_empty() && data.incidents.is_empty() {
         return empty("alarms", "Alarms", "no alarm was raised in this record");
     }
-    let groups = group_alike(&shown);
-    let row = |group: &Vec<&AlarmRecord>| {
-        let row = group[0];
-        let more = if group.len() > 1 { format!("; {} cells in all", group.len()) } else { String::new() };
-        let when = format::moment(data, row.time_s);
-        vec![when, row.rule.clone(), row.severity.clone(), row.change.clone(), format::alarm_text(row, "was") + &more]
-    };
-    let rows = groups.iter().rev().map(row);
     let incidents = data.incidents.iter().rev();
     let incidents = incidents.map(|(time_s, what)| vec![format::moment(data, *time_s), what.clone()]);
+    let list = match data.source.origin {
+        Origin::Store => "packwatch history --kind alarm",
+        Origin::Replay => "packwatch replay --events",
+    };
     html! {
         section {
             h2 #alarms { "Alarms" }
+            p.soft { "A bar is an alarm from when it was raised until it ended. " (list) " lists every change." }
             @if let Some((_, picture)) = pictures.iter().find(|(name, _)| name == "alarms") { (figure(picture)) }
-            @if !shown.is_empty() {
-                (table(&["When", "Rule", "Severity", "Change", "What"], rows, groups.len()))
-            }
             @if !data.incidents.is_empty() {
                 h3 { "Other events" }
                 (table(&["When", "What"], incidents, data.incidents.len()))
             }
         }
     }
-}
-
-/// Groups alarm changes of many cells. The changes of a group belong to different cells, are less than a second apart
-/// from the first change, and have the same rule, severity and kind of change.
-///
-/// The groups are in the order of their first change.
-fn group_alike<'a>(alarms: &[&'a AlarmRecord]) -> Vec<Vec<&'a AlarmRecord>> {
-    let is_same_limit = |a: &AlarmRecord, b: &AlarmRecord| (&a.rule, &a.severity) == (&b.rule, &b.severity);
-    let is_same_alarm = |a: &AlarmRecord, b: &AlarmRecord| a.cell == b.cell && is_same_limit(a, b);
-    let is_same_change = |a: &AlarmRecord, b: &AlarmRecord| {
-        a.change == b.change && a.cell.is_some() == b.cell.is_some() && is_same_limit(a, b)
-    };
-    let mut groups: Vec<Vec<&AlarmRecord>> = Vec::new();
-    for &row in alarms {
-        // The alarms of several rules arrive cell by cell, so the matching group is not always the latest one. But a
-        // change must not be listed before an earlier change of the same alarm.
-        let may_precede = |group: &&mut Vec<&AlarmRecord>| {
-            (group[0].time_s - row.time_s).abs() < 1.0 && group.iter().all(|other| !is_same_alarm(other, row))
-        };
-        match groups.iter_mut().rev().take_while(may_precede).find(|group| is_same_change(group[0], row)) {
-            Some(group) => group.push(row),
-            None => groups.push(vec![row]),
-        }
-    }
-    groups
 }
 
 /// A table of the first [`MAX_ROWS`] rows. If there are more rows, a note states their number.
@@ -367,7 +333,7 @@ fn table(names: &[&str], rows: impl Iterator<Item = Vec<String>>, count: usize) 
             }
         }
         @if count > MAX_ROWS {
-            p.soft { "the latest " (MAX_ROWS) " of " (count) "; the picture shows all" }
+            p.soft { "the latest " (MAX_ROWS) " of " (count) }
         }
     }
 }

@@ -196,14 +196,6 @@ fn cards(page: &str) -> Vec<Card<'_>> {
     tiles.split("<div class=\"tile\">").skip(1).map(card).collect()
 }
 
-/// Rows of the table after this text, each as a list of its cells.
-fn rows<'a>(page: &'a str, heading: &str) -> Vec<Vec<&'a str>> {
-    let body = between(page, heading, "</table>").expect("a table");
-    let cells =
-        |row: &'a str| row.split("<td class=\"n\">").skip(1).filter_map(|cell| cell.split('<').next()).collect();
-    body.split("<tr>").skip(2).map(cells).collect()
-}
-
 fn at_end(kind: EventKind) -> Event {
     Event { time: Timestamp::from_secs(end_s(HALVES - 1)), kind }
 }
@@ -231,47 +223,15 @@ fn untrusted_cell_marks_every_card_with_an_estimate() {
 }
 
 #[test]
-fn alarms_of_96_cells_are_one_problem_and_one_row() {
+fn alarms_of_96_cells_are_one_problem() {
     let mut data = examples::worn(96);
     (0..96).for_each(|cell| data.take_event(&at_end(change(Rule::CapacityLow, cell, true, 1.8))));
     let raised = page(&data, &PageContext::default());
     let first = between(&raised, "<p class=\"head\">", "</p>").expect("a sentence");
     assert_eq!(first, "The capacity of cells 1 to 96 was below the limit of 1.82 Ah; now it is 2.147 Ah in cell 96.");
     assert!(raised.contains("Alarm capacity_low (warning) of cells 1 to 96 since"));
-    let changes = rows(&raised, ">Alarms</h2>");
-    assert_eq!(changes.len(), 1, "{changes:?}");
-    assert_eq!(changes[0][1..4], ["capacity_low", "warning", "raised"]);
-    assert!(changes[0][4].ends_with("limit 1.82 Ah (cell 1); 96 cells in all"), "{changes:?}");
     let count = cards(&raised).into_iter().find(|card| card.name == "Alarms raised now").expect("a card");
     assert_eq!(count.text, "96; 96 raised in this record");
-}
-
-#[test]
-fn alarms_of_two_rules_are_grouped_by_rule() {
-    let mut data = examples::worn(96);
-    for cell in 0..96 {
-        // In the order in which the monitor learns: all alarms of one cell, then the next cell.
-        for rule in [Rule::CapacityLow, Rule::UsableCapacityLow] {
-            data.take_event(&at_end(change(rule, cell, true, 1.8)));
-        }
-    }
-    // Later changes of one cell must stay separate rows, in order of time.
-    for (active, value) in [(false, 1.9), (true, 1.7)] {
-        data.take_event(&at_end(change(Rule::CapacityLow, 4, active, value)));
-    }
-    let page = page(&data, &PageContext::default());
-    let changes: Vec<_> = rows(&page, ">Alarms</h2>").into_iter().map(|row| (row[1], row[3], row[4])).collect();
-    let expected = [
-        ("capacity_low", "raised", "a cell's capacity was 1.7 Ah, limit 1.82 Ah (cell 5)"),
-        ("capacity_low", "cleared", "a cell's capacity was 1.9 Ah, limit 1.82 Ah (cell 5)"),
-        (
-            "usable_capacity_low",
-            "raised",
-            "a cell's usable capacity was 1.8 Ah, limit 1.82 Ah (cell 1); 96 cells in all",
-        ),
-        ("capacity_low", "raised", "a cell's capacity was 1.8 Ah, limit 1.82 Ah (cell 1); 96 cells in all"),
-    ];
-    assert_eq!(changes, expected);
 }
 
 /// Numbers after the plus-minus signs, each with half a unit of its last digit.
@@ -341,16 +301,4 @@ fn rejected_forecast_states_the_deviation_of_the_loss() {
     let why = between(&page, "<td>Remaining life</td><td>", "</td>").expect("a gap");
     assert!(why.starts_with("Capacity lost is") && states(why, &[100.0 * std]), "{why}");
     assert!(!page.contains("+-"), "another plus-minus sign");
-}
-
-#[test]
-fn unknown_value_of_an_alarm_is_not_listed() {
-    let mut data = examples::worn(3);
-    data.take_event(&at_end(change(Rule::CapacityLow, 1, true, 1.8)));
-    let raised = data.alarms[0].clone();
-    data.alarms
-        .extend(["suppressed", "resumed"].map(|change| AlarmRecord { change: change.to_owned(), ..raised.clone() }));
-    let page = page(&data, &PageContext::default());
-    let changes: Vec<_> = rows(&page, ">Alarms</h2>").into_iter().map(|row| row[3]).collect();
-    assert_eq!(changes, ["raised"]);
 }

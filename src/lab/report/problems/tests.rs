@@ -136,3 +136,24 @@ fn every_kind_of_finding_has_a_sentence() {
         assert!(text.ends_with('.') && text.starts_with(char::is_uppercase), "{kind:?}: {text}");
     }
 }
+
+#[test]
+fn alarms_of_two_rules_are_two_problems() {
+    let mut data = examples::worn(4);
+    for cell in 0..4 {
+        // In the order in which the monitor learns: all alarms of one cell, then the next cell.
+        for rule in ["capacity_low", "usable_capacity_low"] {
+            data.alarms.push(AlarmRecord { threshold: Some(2.5), ..alarm(rule, "warning", Some(cell)) });
+        }
+    }
+    let what: Vec<String> = list(&[], &data).into_iter().map(|problem| problem.what).collect();
+    assert_eq!(what.len(), 2, "{what:?}");
+    assert!(
+        what[0].starts_with("The capacity of cells 1 to 4 is below the limit of 2.5 Ah: 2.289 Ah in cell 4"),
+        "{what:?}"
+    );
+    assert!(
+        what[1].starts_with("The usable capacity of cells 1 to 4 is below the limit of 2.5 Ah: 2.105 Ah in cell 1"),
+        "{what:?}"
+    );
+}
