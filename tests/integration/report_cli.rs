@@ -73,9 +73,7 @@ fn replay_report_is_complete_and_reproducible() {
     let place = Place::new();
     let log = place.path("cell.csv");
     let page = place.page("a.html", &["-c", &config(), &log, "--title", "cell <1>"]);
-    for part in
-        ["cell &lt;1&gt;", "State of charge in the last", "Capacity between", "Usable capacity at 2 A", "Innovation"]
-    {
+    for part in ["cell &lt;1&gt;", "State of charge over", "Capacity between", "Usable capacity at 2 A", "Innovation"] {
         assert!(page.contains(part), "no {part:?}");
     }
     assert_eq!(

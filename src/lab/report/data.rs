@@ -10,8 +10,8 @@ use crate::cell_faults::CellFaultKind;
 use crate::fields::Fields;
 use crate::filter::ScalarGaussian;
 use crate::monitor::{Estimate, Event, EventKind};
+use crate::quantity::CellIndex;
 use crate::quantity::catalogue::Quantity;
-use crate::quantity::{CellIndex, Mode};
 use crate::store::{HistoryEntry, HistoryQuery, HistoryReader, HistoryTable};
 
 /// Origin of the data.
@@ -216,7 +216,6 @@ impl Data {
                 let normalised_s = normalised_s.zip(normalised_std_s);
                 self.recharges.push(RechargeRecord { time_s, raw_s: seconds, normalised_s });
             }
-            EventKind::Mode { to: Mode::Charge | Mode::Discharge, .. } => self.trace.turn(time_s),
             _ => self.take_incident(time_s, &event.kind),
         }
     }

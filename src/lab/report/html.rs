@@ -47,7 +47,7 @@ const SECTIONS: [Section; 8] = [
     Section {
         id: "soc",
         title: "State of charge",
-        pictures: &["soc", "soc_recent"],
+        pictures: &["soc"],
         note: "How full the battery was. According to the estimator, the light band contains the truth 95 % of the time. In a long record \
                each pixel column shows the lowest and the highest value within it.",
         none: |data| if data.source.origin == Origin::Store { NOT_STORED } else { "unknown: no estimate was made" },

@@ -15,8 +15,6 @@ use crate::monitor::ModelState;
 /// What teaches the capacity.
 const TEACHES_CAPACITY: &str =
     "A charge from below 20 % to full after an hour of rest, or a discharge over the same range.";
-/// What teaches the cell model.
-const TEACHES_MODEL: &str = "A cell model that is measured (packwatch fit), or learned in use.";
 /// Below this share of innovations within their 95 % interval, the intervals are too narrow.
 const LEAST_COVERAGE: f64 = 0.8;
 
@@ -90,8 +88,12 @@ impl Knowledge {
             let used = last.map_or_else(String::new, |step| {
                 format!(" Until then {:.3} \u{b1} {:.3} Ah is assumed.", step.worst.0, step.worst.1)
             });
-            let why = format!("No charge or discharge has measured it yet.{used}");
-            return self.gap("Capacity, state of health", why, TEACHES_CAPACITY);
+            let (why, teaches) = if is_prior(context) {
+                ("While the cell model is the label's, no charge or discharge measures it.", teaches_model(context))
+            } else {
+                ("No charge or discharge has measured it yet.", TEACHES_CAPACITY.to_owned())
+            };
+            return self.gap("Capacity, state of health", format!("{why}{used}"), teaches);
         };
         match context.rated_ah(step.cell) {
             Some(rated) => self.tile(
@@ -120,7 +122,11 @@ impl Knowledge {
                 "The configuration states no load.",
                 "State the load in [usable] of the configuration.",
             ),
-            None => self.gap("Usable capacity", "It is learned together with the capacity.", TEACHES_CAPACITY),
+            None => self.gap(
+                "Usable capacity",
+                "It is learned together with the capacity.",
+                "The same as for the capacity.",
+            ),
         }
     }
 
@@ -143,7 +149,7 @@ impl Knowledge {
             Some(_) => self.gap(
                 "Resistance compared with a new cell",
                 "A label does not state the resistance of a new cell.",
-                TEACHES_MODEL,
+                teaches_model(context),
             ),
             None => {
                 self.gap("Resistance", "No half-cycle has ended yet.", "A charge or discharge with a changing current.")
@@ -208,7 +214,7 @@ impl Knowledge {
                 "Weak cells, aged cells, wrong voltage channels",
                 "The voltage curve is typical of the chemistry on the label. It is too uncertain to tell these faults from a \
                  difference in charge.",
-                TEACHES_MODEL,
+                teaches_model(context),
             );
         }
         if let Some((points, advice)) = sourced.and_then(|it| advise(&ModelBands::new(&it.model)))
@@ -229,7 +235,16 @@ impl Knowledge {
 
 /// Whether the cell model is made from the label alone.
 fn is_prior(context: &PageContext<'_>) -> bool {
-    context.model.as_ref().is_some_and(|sourced| sourced.source.state == ModelState::Prior)
+    let state = context.model.as_ref().map(|sourced| sourced.source.state);
+    matches!(state, Some(ModelState::Prior | ModelState::Unfit))
+}
+
+/// What teaches the cell model. LFP cells keep the label's model.
+fn teaches_model(context: &PageContext<'_>) -> String {
+    let chemistry = context.model.as_ref().and_then(|sourced| sourced.source.chemistry.as_deref());
+    let is_learnable = !chemistry.is_some_and(|name| name.starts_with("lfp"));
+    let in_use = " With a reading per second and rests of some minutes, packwatch may also learn it in use.";
+    format!("A measured cell model (packwatch fit).{}", if is_learnable { in_use } else { "" })
 }
 
 fn last(data: &Data, pick: series::ValueSelector, high_is_bad: bool) -> Option<CellStep> {

@@ -37,7 +37,6 @@ pub(super) fn all(data: &Data, context: &PageContext<'_>) -> Vec<(String, Pictur
     let of_model = context.model.iter().flat_map(model_pictures::all);
     let of_data = [
         named("soc", soc(data, context)),
-        named("soc_recent", soc_recent(data, context)),
         named("capacity", capacity(data, context, outlook.as_ref().ok())),
         named("usable_capacity", usable(data, context)),
         named("losses", losses(data)),
@@ -165,28 +164,6 @@ fn soc(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     let title = "State of charge over the whole record";
     let description = format!("Lowest and highest estimated SOC of every {:.0} s, in percent", life.width_s());
     chart(title, &description, clock.axis, Axis::number("SOC, %").within(-5.0, 105.0), layers)
-}
-
-fn soc_recent(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
-    let moments: Vec<(f64, &TraceBin)> = filled(data.trace.recent.iter().flat_map(|bins| bins.iter()));
-    let (first_s, last_s) = data.ends_s()?;
-    // If the recent part covers almost the whole record, another picture already shows it.
-    if moments.last()?.0 - moments.first()?.0 > 0.9 * (last_s - first_s) {
-        return None;
-    }
-    let clock = TimeAxis::between(data, moments.first()?.0, moments.last()?.0);
-    let soc = range(&moments, &clock, |bin| bin.soc, 100.0);
-    let mut layers = vec![Layer::band("95 % interval", Ink::Blue, range(&moments, &clock, |bin| bin.soc_band, 100.0))];
-    layers.extend(true_soc(context, &clock, (moments.first()?.0, moments.last()?.0)));
-    if data.cells() > 1 {
-        layers.push(Layer::line("highest cell", Ink::Green, soc.iter().map(|p| (p.0, p.2))));
-        layers.push(Layer::line("lowest cell", Ink::Blue, soc.iter().map(|p| (p.0, p.1))));
-    } else {
-        layers.push(Layer::line("estimate", Ink::Blue, zigzag(&soc)));
-    }
-    let title = "State of charge in the last half-cycles";
-    let description = "Estimated SOC with its 95 % interval, in percent";
-    chart(title, description, clock.axis, Axis::number("SOC, %").within(-5.0, 105.0), layers)
 }
 
 /// The worst cell with its 95 % interval, and the range over the cells of a pack.

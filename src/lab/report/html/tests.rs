@@ -45,8 +45,6 @@ fn life() -> Data {
         if half % 10 < 2 {
             data.take_event(&at(alarm(half, half % 10 == 0)));
         }
-        let (from, to) = if half % 2 == 1 { (Mode::Charge, Mode::Discharge) } else { (Mode::Discharge, Mode::Charge) };
-        data.take_event(&at(EventKind::Mode { from, to }));
     }
     data
 }

@@ -1,6 +1,8 @@
 //! Tests the first sentence, the figures and the gaps of the page.
 
 use super::*;
+use crate::cell::{Chemistry, Label};
+use crate::config::of_label;
 use crate::report::data::{AlarmRecord, CapacityRecord, Origin};
 use crate::report::known::Tile;
 use crate::report::{examples, forecast};
@@ -116,6 +118,18 @@ fn capacity_that_was_not_measured_is_a_gap() {
     assert!(knowledge.tiles.iter().all(|tile| tile.name != "Capacity"));
     let gap = &knowledge.gaps[0];
     assert_eq!(gap.why, "No charge or discharge has measured it yet. Until then 1.200 \u{b1} 0.010 Ah is assumed.");
+}
+
+#[test]
+fn label_is_the_reason_why_the_capacity_is_unknown() {
+    let gap = |chemistry| {
+        let context = PageContext { model: of_label(&Label::usual(chemistry, 2.9)), ..PageContext::default() };
+        Knowledge::of(&Data::new(Origin::Replay), &context, &Err("too little".into())).gaps.remove(0)
+    };
+    let nmc = gap(Chemistry::Nmc811Graphite);
+    assert_eq!(nmc.why, "While the cell model is the label's, no charge or discharge measures it.");
+    assert!(nmc.teaches.ends_with("packwatch may also learn it in use."), "{nmc:?}");
+    assert_eq!(gap(Chemistry::LfpGraphite).teaches, "A measured cell model (packwatch fit).");
 }
 
 #[test]
