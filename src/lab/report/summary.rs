@@ -75,7 +75,7 @@ fn no_problem(data: &Data, context: &PageContext<'_>, knowledge: &Knowledge) -> 
         Some(cells) if measured < data.cells() => say(
             Condition::Unknown,
             format!(
-                "Nothing wrong was found: {cells} cells were compared, and none stands out.{limits} Its wear is not known yet."
+                "Nothing wrong was found: {cells} cells were compared, and none stands out.{limits} The wear of the battery is not known yet."
             ),
             "Nothing now. The table below says what would teach more.",
         ),
