@@ -71,8 +71,9 @@ fn no_problem(data: &Data, context: &PageContext<'_>, knowledge: &Knowledge) -> 
         note: String::new(),
     };
     let measured = knowledge.measured_cells;
+    let all = context.config.map_or(0, |config| usize::from(config.monitor.sample.cells)).max(data.cells());
     match compared {
-        Some(cells) if measured < data.cells() => say(
+        Some(cells) if measured < all => say(
             Condition::Unknown,
             format!(
                 "Nothing wrong was found: {cells} cells were compared, and none stands out.{limits} The wear of the battery is not known yet."
@@ -84,13 +85,9 @@ fn no_problem(data: &Data, context: &PageContext<'_>, knowledge: &Knowledge) -> 
             "Unknown: nothing has been learned about this battery yet.".to_owned(),
             "Use the battery through a deep discharge and a full charge, then create the report again.",
         ),
-        None if measured < data.cells() => say(
+        None if measured < all => say(
             Condition::Unknown,
-            format!(
-                "Unknown: nothing has been learned yet about {} of {} cells.{limits}",
-                data.cells() - measured,
-                data.cells()
-            ),
+            format!("Unknown: nothing has been learned yet about {} of {} cells.{limits}", all - measured, all),
             "Use the battery through a deep discharge and a full charge, then create the report again.",
         ),
         _ if limits.is_empty() => say(
