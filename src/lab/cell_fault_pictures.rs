@@ -1,7 +1,8 @@
 //! Draws the results of a cell fault detector. For each estimated quantity, one picture shows how far each cell is from
 //! the median of its pack.
 //!
-//! A bar is a 95 % interval. A cell is red if the detector has reported one of the findings that the picture shows.
+//! A bar is a 95 % interval. A cell is red if the detector has reported one of the findings that the picture shows. The
+//! reported cells have a number; without a reported cell, the lowest and the highest cell have one.
 
 use crate::cell_faults::difference::{CAPACITY, CHANNEL, CONTACT, LEAK, RESISTANCE, SOC, STATES};
 use crate::cell_faults::fault;
@@ -109,6 +110,13 @@ pub fn all(diagnosis: &CellFaultDetector) -> Vec<(String, Picture)> {
     SHOWN.iter().map(|shown| (shown.name.to_owned(), picture(shown, &cells, diagnosis.findings()))).collect()
 }
 
+/// Name and title of the pictures that show no finding, except the picture of the SOC.
+pub fn quiet(diagnosis: &CellFaultDetector) -> Vec<(&'static str, &'static str)> {
+    let has_finding = |shown: &Shown| diagnosis.findings().iter().any(|found| shown.kinds.contains(&found.kind));
+    let quiet = SHOWN.iter().filter(|shown| shown.state != SOC && !has_finding(shown));
+    quiet.map(|shown| (shown.name, shown.title)).collect()
+}
+
 fn picture(shown: &Shown, cells: &[[Option<ScalarGaussian>; STATES]], findings: &[CellFault]) -> Picture {
     let is_found = |cell: usize| {
         findings.iter().any(|found| shown.kinds.contains(&found.kind) && found.is_of(CellIndex(cell as u16)))
@@ -143,6 +151,7 @@ fn picture(shown: &Shown, cells: &[[Option<ScalarGaussian>; STATES]], findings: 
         layers.push(Layer::band("", Ink::Red, bars(true)));
         layers.push(Layer::new("found", Ink::Red, Shape::Points(points(true))));
     }
+    layers.push(Layer::new("", Ink::Plain, Shape::Labels(labels(&shown_of(false), &shown_of(true)))));
     let limit = |(i, limit): (usize, &f64)| {
         Layer::new(if i == 0 { "limit of a finding" } else { "" }, Ink::Amber, Shape::Level(shown.scale * limit))
     };
@@ -154,4 +163,35 @@ fn picture(shown: &Shown, cells: &[[Option<ScalarGaussian>; STATES]], findings: 
     );
     let axis = Axis::number("cell").within(0.0, cells.len() as f64 + 1.0);
     Picture::Chart(Chart { description, ..Chart::new(shown.title, axis, shown.label, layers) })
+}
+
+/// Cell and value of the reported cells, or of the lowest and the highest cell, at the outer end of the bar.
+fn labels(others: &[(f64, f64, f64)], found: &[(f64, f64, f64)]) -> Vec<Point> {
+    let ends = || {
+        let lowest = others.iter().min_by(|a, b| a.1.total_cmp(&b.1));
+        let highest = others.iter().max_by(|a, b| a.1.total_cmp(&b.1)).filter(|highest| Some(*highest) != lowest);
+        let mut ends: Vec<_> = lowest.into_iter().chain(highest).copied().collect();
+        ends.sort_by(|a, b| a.0.total_cmp(&b.0));
+        ends
+    };
+    let named = if found.is_empty() { ends() } else { found.to_vec() };
+    let label = |(cell, y, half): (f64, f64, f64)| {
+        let end = if y < 0.0 { y - half } else { y + half };
+        Point { x: cell, y: end, tip: format!("cell {cell}: {y:+.1}").replace('-', "\u{2212}") }
+    };
+    named.into_iter().map(label).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn found_cells_are_numbered_else_both_ends() {
+        let others = [(1.0, 0.2, 0.1), (2.0, -0.4, 0.1), (3.0, 0.9, 0.1)];
+        let texts = |found: &[(f64, f64, f64)]| labels(&others, found).into_iter().map(|it| it.tip).collect::<Vec<_>>();
+        assert_eq!(texts(&[]), ["cell 2: \u{2212}0.4", "cell 3: +0.9"]);
+        assert_eq!(texts(&[(81.0, -2.9, 0.5)]), ["cell 81: \u{2212}2.9"]);
+        assert_eq!(labels(&[], &[(81.0, -2.9, 0.5)])[0].y, -3.4);
+    }
 }

@@ -1,5 +1,5 @@
-//! Draws pictures as SVG: lines, bands (points) and thresholds over an axis of numbers or dates; bands of states; heat
-//! maps.
+//! Draws pictures as SVG: lines, bands (points) and thresholds over an axis of numbers or dates; bands of
+//! states.
 //!
 //! Input: values in the units that the labels name. Output: SVG in one style. A value that is not finite interrupts a
 //! line. Elements have CSS classes, and the page or file defines their colours for a light and a dark background
@@ -9,7 +9,6 @@
 
 mod axis;
 mod files;
-mod heat;
 mod plot;
 mod state_bands;
 mod style;
@@ -18,7 +17,6 @@ mod thin;
 
 pub use axis::{Axis, Scale};
 pub use files::{PlotError, write_each, write_stack};
-pub use heat::Heat;
 pub use plot::{Chart, Layer, Point, Shape};
 pub use state_bands::{Span, StateBand, StateBands};
 pub use style::{Ink, variables};
@@ -43,7 +41,6 @@ impl Size {
 pub enum Picture {
     Chart(Chart),
     StateBands(StateBands),
-    Heat(Heat),
 }
 
 impl Picture {
@@ -52,7 +49,6 @@ impl Picture {
         match self {
             Self::Chart(chart) => chart.draw(size),
             Self::StateBands(bands) => bands.draw(size),
-            Self::Heat(heat) => heat.draw(size),
         }
     }
 
@@ -61,7 +57,6 @@ impl Picture {
         match self {
             Self::Chart(chart) => &chart.title,
             Self::StateBands(bands) => &bands.title,
-            Self::Heat(heat) => &heat.title,
         }
     }
 
@@ -70,7 +65,6 @@ impl Picture {
         match self {
             Self::Chart(chart) => &chart.description,
             Self::StateBands(bands) => &bands.description,
-            Self::Heat(heat) => &heat.description,
         }
     }
 

@@ -73,9 +73,7 @@ fn replay_report_is_complete_and_reproducible() {
     let place = Place::new();
     let log = place.path("cell.csv");
     let page = place.page("a.html", &["-c", &config(), &log, "--title", "cell <1>"]);
-    for part in
-        ["cell &lt;1&gt;", "State of charge in the last", "Capacity between", "Usable capacity at 2 A", "Innovation"]
-    {
+    for part in ["cell &lt;1&gt;", "State of charge over", "Capacity between", "Usable capacity at 2 A", "Innovation"] {
         assert!(page.contains(part), "no {part:?}");
     }
     assert_eq!(
@@ -99,9 +97,9 @@ fn store_report_states_unknown_values() {
     let page = place.page("a.html", &["--state", &state]);
     assert!(page.contains("Capacity between") && page.contains("Duration of each charge"));
     assert!(!has_minus_zero(&page), "-0 in the page");
-    assert!(page.contains("unknown: the history contains learned values") && page.contains("all as they were written"));
-    assert!(page.contains("rated capacity unknown without -c"));
-    assert!(page.contains("No forecast of the capacity: the record does not state the capacity at the end of life"));
+    assert!(page.contains("Unknown: the history contains learned values") && page.contains("all as they were written"));
+    assert!(page.contains("The rated capacity is unknown without -c."));
+    assert!(page.contains("<td>Remaining life</td><td>The record does not state the capacity at the end of life"));
     assert!(place.page("b.html", &["--state", &state, "-c", &config()]).contains("of 2 Ah rated"));
 }
 

@@ -31,6 +31,9 @@ pub enum Shape {
     /// Band of (x, lower, upper).
     Band(Vec<(f64, f64, f64)>),
     Points(Vec<Point>),
+    /// Texts next to points: above a positive y, below a negative one. A text that would touch the one before is left
+    /// out.
+    Labels(Vec<Point>),
     /// Threshold: a horizontal line at this y.
     Level(f64),
     /// Events: vertical lines at these x, with tool tips.
@@ -199,7 +202,9 @@ impl Layer {
                 Box::new(points.iter().filter(|p| p.1.is_finite()).map(|p| p.0))
             }
             Shape::Band(points) => Box::new(points.iter().filter(|p| (p.1 + p.2).is_finite()).map(|p| p.0)),
-            Shape::Points(points) | Shape::Moments(points) => Box::new(points.iter().map(|p| p.x)),
+            Shape::Points(points) | Shape::Labels(points) | Shape::Moments(points) => {
+                Box::new(points.iter().map(|p| p.x))
+            }
             Shape::Level(_) => Box::new(std::iter::empty()),
         }
     }
@@ -210,7 +215,7 @@ impl Layer {
                 Box::new(points.iter().filter(|p| p.0.is_finite()).map(|p| p.1))
             }
             Shape::Band(points) => Box::new(points.iter().filter(|p| p.0.is_finite()).flat_map(|p| [p.1, p.2])),
-            Shape::Points(points) => Box::new(points.iter().map(|p| p.y)),
+            Shape::Points(points) | Shape::Labels(points) => Box::new(points.iter().map(|p| p.y)),
             Shape::Moments(_) => Box::new(std::iter::empty()),
             Shape::Level(y) => Box::new(std::iter::once(*y)),
         }
@@ -224,6 +229,7 @@ impl Layer {
             Shape::Dashed(_) | Shape::Level(_) => svg.path(&format!("s d {}", self.ink.stroke()), &line, ""),
             Shape::Band(_) => svg.rect((x, y - 5.0), (20.0, 10.0), &self.ink.band(), ""),
             Shape::Points(_) => svg.circle((x + 10.0, y), 3.0, &self.ink.fill(), ""),
+            Shape::Labels(_) => {}
             Shape::Moments(_) => {
                 let d = format!("M{} {}v12", short(x + 10.0), short(y - 6.0));
                 svg.path(&format!("s {}", self.ink.stroke()), &d, "");
@@ -242,6 +248,7 @@ impl Layer {
             }
             Shape::Band(points) => svg.path(&self.ink.band(), &band_path(points, area, bins), &self.label),
             Shape::Points(points) => self.draw_points(svg, area, points),
+            Shape::Labels(points) => draw_labels(svg, area, points),
             Shape::Level(y) => {
                 let d = format!("M0 {}h{}", short(area.py(*y)), short(area.width));
                 svg.path(&format!("s d {}", self.ink.stroke()), &d, &self.label);
@@ -271,6 +278,21 @@ impl Layer {
         let bins = area.width.max(1.0) as usize;
         thin::line(&places, bins).into_iter().for_each(|(x, y)| path.dot(area.px(x), area.py(y)));
         svg.path(&format!("o {}", self.ink.stroke()), &path.d, &self.label);
+    }
+}
+
+fn draw_labels(svg: &mut Svg, area: &Area, points: &[Point]) {
+    let mut free = f64::NEG_INFINITY;
+    for point in points.iter().filter(|point| point.x.is_finite() && point.y.is_finite()) {
+        let half = text_width(&point.tip, SMALL) / 2.0;
+        let x = area.px(point.x).min(area.width - half).max(half);
+        if x - half < free {
+            continue;
+        }
+        // Distance between two texts, pixels.
+        free = x + half + 4.0;
+        let y = area.py(point.y) + if point.y < 0.0 { 13.0 } else { -5.0 };
+        svg.text(x, y.min(area.height - 3.0).max(11.0), "t m", &point.tip);
     }
 }
 

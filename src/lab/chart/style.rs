@@ -1,8 +1,7 @@
 //! Defines the colours: CSS classes for strokes, fills and text, and their values on a light and a dark page.
 //!
 //! The inks follow the colours of Okabe and Ito, which people with any colour vision can distinguish. The inks are
-//! lighter on a dark page. The steps of heat maps are from cividis (Nuñez, Anderton, Renslow 2018), which has the same
-//! property.
+//! lighter on a dark page.
 
 use std::fmt::Write as _;
 
@@ -23,7 +22,7 @@ pub enum Ink {
 }
 
 /// Name, light value and dark value of each colour.
-const COLOURS: [(&str, &str, &str); 14] = [
+const COLOURS: [(&str, &str, &str); 13] = [
     ("plain", "#1c1d20", "#eceef2"),
     ("blue", "#0072b2", "#5ab8f0"),
     ("orange", "#c65300", "#f59a55"),
@@ -37,12 +36,7 @@ const COLOURS: [(&str, &str, &str); 14] = [
     ("rule", "#d9dce1", "#353a43"),
     ("word", "#1c1d20", "#eceef2"),
     ("soft", "#5a5f68", "#a8aeb8"),
-    ("none", "#e6e8ec", "#2a2e36"),
 ];
-
-/// Colours of a heat map, from the lowest to the highest value.
-pub(super) const STEPS: [&str; 9] =
-    ["#00224e", "#123570", "#3b496c", "#575d6d", "#707173", "#8a8678", "#a59c74", "#c3b369", "#fee838"];
 
 impl Ink {
     const ALL: [Self; 8] =
@@ -68,11 +62,6 @@ impl Ink {
     }
 }
 
-/// Returns the class of a heat map step.
-pub(super) fn step_class(step: usize) -> String {
-    format!("h-{step}")
-}
-
 /// Returns the colours as variables of a page or a file. The dark values apply if the viewer prefers a dark background.
 pub fn variables() -> String {
     let list = |pick: fn(&(&str, &'static str, &'static str)) -> &'static str| {
@@ -92,7 +81,7 @@ fn classes() -> String {
          .q{font-size:14px;font-weight:600}.l{font-size:11.5px}\
          .g{stroke:var(--rule);stroke-width:1;fill:none}.a{stroke:var(--grey);stroke-width:1;fill:none}\
          .s{fill:none;stroke-width:1.4;stroke-linejoin:round}.d{stroke-dasharray:6 4}\
-         .o{stroke-width:4.5;stroke-linecap:round;fill:none}.x{fill:var(--none)}.p{fill:var(--page)}.z{fill:none;pointer-events:all}",
+         .o{stroke-width:4.5;stroke-linecap:round;fill:none}",
     );
     for ink in Ink::ALL {
         let name = ink.name();
@@ -101,9 +90,6 @@ fn classes() -> String {
             text,
             ".k-{name}{{stroke:var(--{name})}}.f-{name}{{fill:var(--{name})}}.b-{name}{{fill:var(--{name});fill-opacity:.22}}"
         );
-    }
-    for (step, colour) in STEPS.iter().enumerate() {
-        let _ = write!(text, ".h-{step}{{fill:{colour};shape-rendering:crispEdges}}");
     }
     text
 }

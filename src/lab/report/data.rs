@@ -2,14 +2,16 @@
 //!
 //! Times are in seconds on the wall clock or, in a replay, on the clock of the log. Cells count from 0.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::trace::Trace;
 
+use crate::cell_faults::CellFaultKind;
 use crate::fields::Fields;
+use crate::filter::ScalarGaussian;
 use crate::monitor::{Estimate, Event, EventKind};
+use crate::quantity::CellIndex;
 use crate::quantity::catalogue::Quantity;
-use crate::quantity::{CellIndex, Mode};
 use crate::store::{HistoryEntry, HistoryQuery, HistoryReader, HistoryTable};
 
 /// Origin of the data.
@@ -110,9 +112,11 @@ pub struct Data {
     pub(super) recharges: Vec<RechargeRecord>,
     pub(super) alarms: Vec<AlarmRecord>,
     pub(super) models: Vec<ModelRecord>,
-    /// Time and text of other events: resets, changes of trust, replaced packs, and a clock that was set back.
+    /// Time and text of other events: resets, replaced packs, and a clock that was set back.
     pub(super) incidents: Vec<(f64, String)>,
     pub(super) trace: Trace,
+    /// Size of each finding in a replay when it was first reported, by kind and first cell.
+    pub(super) first_sizes: BTreeMap<(CellFaultKind, CellIndex), ScalarGaussian>,
     /// Cells whose estimate is untrusted at the end.
     pub(super) untrusted: BTreeSet<usize>,
     /// Offset of the current sensor (A): mean and standard deviation.
@@ -133,6 +137,7 @@ impl Data {
             models: Vec::new(),
             incidents: Vec::new(),
             trace: Trace::default(),
+            first_sizes: BTreeMap::new(),
             untrusted: BTreeSet::new(),
             current_offset: None,
             first_s: f64::INFINITY,
@@ -197,11 +202,20 @@ impl Data {
                 self.take_model(time_s, &Fields::of_event(&event.kind), is_taken_back)
             }
             EventKind::Alarm { .. } => self.take_alarm(time_s, &Fields::of_event(&event.kind)),
+            EventKind::Finding(found) => {
+                found.cells.map(|cells| self.first_sizes.entry((found.kind, cells.0)).or_insert(found.size));
+            }
+            // The alarm `estimate_untrusted` shows the change.
+            EventKind::Trust { cell, trusted: true, .. } => {
+                self.untrusted.remove(&cell.index());
+            }
+            EventKind::Trust { cell, .. } => {
+                self.untrusted.insert(cell.index());
+            }
             EventKind::RechargePeriod { seconds, normalised_s, normalised_std_s } => {
                 let normalised_s = normalised_s.zip(normalised_std_s);
                 self.recharges.push(RechargeRecord { time_s, raw_s: seconds, normalised_s });
             }
-            EventKind::Mode { to: Mode::Charge | Mode::Discharge, .. } => self.trace.turn(time_s),
             _ => self.take_incident(time_s, &event.kind),
         }
     }
@@ -273,22 +287,8 @@ impl Data {
     }
 
     fn take_incident(&mut self, time_s: f64, kind: &EventKind) {
-        if let EventKind::Trust { cell, trusted, .. } = *kind {
-            if trusted {
-                self.untrusted.remove(&cell.index())
-            } else {
-                self.untrusted.insert(cell.index())
-            };
-        }
-        let number = |cell: CellIndex| cell.index() + 1;
         let what = match *kind {
-            EventKind::FilterReset { cell } => format!("filter of cell {} restarted", number(cell)),
-            EventKind::Trust { cell, trusted: false, mean_nis } => {
-                format!("estimate of cell {} is untrusted (innovations {mean_nis:.1} times as expected)", number(cell))
-            }
-            EventKind::Trust { cell, trusted: true, .. } => {
-                format!("estimate of cell {} is trusted again", number(cell))
-            }
+            EventKind::FilterReset { cell } => format!("filter of cell {} restarted", cell.index() + 1),
             EventKind::PackReplaced { .. } => {
                 self.forget_pack();
                 "another pack was connected: values learned on the previous one are not shown".to_owned()
@@ -306,6 +306,7 @@ impl Data {
         self.learned.clear();
         self.recharges.clear();
         self.models.clear();
+        self.first_sizes.clear();
         self.untrusted.clear();
     }
 

@@ -52,6 +52,12 @@ pub(super) fn alarm_text(row: &AlarmRecord, verb: &str) -> String {
     format!("{} {verb} {value}, limit {limit}{cell}", about(&row.rule))
 }
 
+/// The text with a capital first letter.
+pub(super) fn capitalised(text: &str) -> String {
+    let mut rest = text.chars();
+    rest.next().map_or_else(String::new, |first| first.to_uppercase().chain(rest).collect())
+}
+
 /// Formats a time as a date, or as the time since the start of an undated record.
 pub(super) fn moment(data: &Data, time_s: f64) -> String {
     if data.is_dated() {

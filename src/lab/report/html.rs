@@ -3,15 +3,15 @@
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
 use super::context::PageContext;
-use super::data::{AlarmRecord, Data, Origin};
+use super::data::{Data, Origin};
+use super::known::Knowledge;
 use super::pictures::{self, NOT_STORED};
-use super::{forecast, format, model, raised, summary};
+use super::{forecast, format, model, summary};
 use crate::chart::{Picture, Size, variables};
 use crate::config::Config;
-use crate::io::stamp::format_utc;
 use crate::{cell_fault_pictures, pack_view};
 
-/// Maximum number of rows of a table. The pictures and `packwatch history` show all rows.
+/// Maximum number of rows of a table.
 const MAX_ROWS: usize = 200;
 
 /// Section after which the alarms follow.
@@ -29,11 +29,25 @@ struct Section {
     none: fn(&Data) -> &'static str,
 }
 
-const SECTIONS: [Section; 9] = [
+const SECTIONS: [Section; 8] = [
+    Section {
+        id: "findings",
+        title: "The cells compared",
+        pictures: &cell_fault_pictures::NAMES,
+        note: "Each cell relative to the median of its pack. All cells carry the same current, so common effects cancel. A bar is a \
+               95 % interval. A cell beyond the limit is reported if it also stands out from the others and lasts.",
+        none: |data| {
+            if data.cells() < 3 {
+                "fewer than three cells: there is no median to compare with"
+            } else {
+                "unknown: there is no state of the cells"
+            }
+        },
+    },
     Section {
         id: "soc",
         title: "State of charge",
-        pictures: &["soc", "soc_recent"],
+        pictures: &["soc"],
         note: "How full the battery was. According to the estimator, the light band contains the truth 95 % of the time. In a long record \
                each pixel column shows the lowest and the highest value within it.",
         none: |data| if data.source.origin == Origin::Store { NOT_STORED } else { "unknown: no estimate was made" },
@@ -70,29 +84,6 @@ const SECTIONS: [Section; 9] = [
         none: |_| "unknown: no temperature was measured",
     },
     Section {
-        id: "cells",
-        title: "Cells",
-        pictures: &["cells_capacity", "cells_resistance"],
-        note: "Every row is a cell. Inspect a cell whose row differs from its neighbours.",
-        none: |data| {
-            if data.cells() == 1 { "one cell: see above" } else { "unknown: nothing was learned about the cells yet" }
-        },
-    },
-    Section {
-        id: "findings",
-        title: "Which cell is failing",
-        pictures: &cell_fault_pictures::NAMES,
-        note: "Each cell relative to the median of its pack: all cells carry the same current, so common effects cancel. A cell whose \
-               bar lies outside the line is reported if it also stands out from the others.",
-        none: |data| {
-            if data.cells() < 3 {
-                "fewer than three cells: there is no median to compare with"
-            } else {
-                "unknown: there is no state of the cells"
-            }
-        },
-    },
-    Section {
         id: "model",
         title: "How well the battery is known",
         pictures: &["model_curve", "model_resistance", "model_temperature", "model_soc_error"],
@@ -114,7 +105,9 @@ const SECTIONS: [Section; 9] = [
 pub fn page(data: &Data, context: &PageContext<'_>) -> String {
     let outlook = forecast::outlook(data, context);
     let summary = summary::of(data, context, &outlook);
-    let pictures = pictures::all(data, context);
+    let mut pictures = pictures::all(data, context);
+    let quiet = context.diagnosis.map(cell_fault_pictures::quiet).unwrap_or_default();
+    pictures.retain(|(name, _)| quiet.iter().all(|picture| picture.0 != name));
     let page = html! {
         (DOCTYPE)
         html lang="en" {
@@ -123,12 +116,13 @@ pub fn page(data: &Data, context: &PageContext<'_>) -> String {
                 main {
                     (heading(data, context))
                     (verdict(&summary))
+                    (knowledge_of(&summary.knowledge))
                     @for section in &SECTIONS {
                         (self::section(section, data, &pictures))
                         @match section.id {
                             "capacity" => { (forecast_note(data, &outlook)) }
-                            ALARMS_AFTER => { (alarms(data, context, outlook.as_ref().ok(), &pictures)) }
-                            "findings" => { (findings(context)) }
+                            ALARMS_AFTER => { (alarms(data, &pictures)) }
+                            "findings" => { (cost(context, &quiet)) }
                             "model" => { (knowledge(data, context)) }
                             "estimator" => { (estimator(data)) }
                             _ => {}
@@ -172,7 +166,7 @@ fn heading(data: &Data, context: &PageContext<'_>) -> Markup {
         h1 { (context.title) }
         p.soft { "Battery report, " (pack) (cells) ", " (span(data)) ". Every \u{b1} is one standard deviation." }
         nav {
-            @for (id, title) in links.chain([("origin", "Origin")]) {
+            @for (id, title) in [("known", "Known"), ("unknown", "Not known")].into_iter().chain(links).chain([("origin", "Origin")]) {
                 a href={ "#" (id) } { (title) }
             }
         }
@@ -189,25 +183,48 @@ fn span(data: &Data) -> String {
     }
 }
 
+/// What is wrong, and what to do.
 fn verdict(summary: &summary::Summary) -> Markup {
     html! {
-        section class={ "verdict " (summary.verdict.class()) } aria-label="Summary" {
-            div.sign aria-hidden="true" { (summary.verdict.sign()) }
+        section class={ "verdict " (summary.condition.class()) } aria-label="Summary" {
+            div.sign aria-hidden="true" { (summary.condition.sign()) }
             div {
-                p.head { (summary.headline) }
-                dl {
-                    dt { "Since when" } dd { (summary.since) }
-                    dt { "What to do" } dd { (summary.advice) }
+                @for problem in &summary.problems {
+                    p.head { (problem.what) }
+                    p { span.soft { "What to do: " } (problem.advice) }
+                    @if !problem.note.is_empty() { p.soft { (problem.note) } }
                 }
             }
         }
-        div.tiles {
-            @for tile in &summary.tiles {
-                div.tile {
-                    div.name { (tile.name) }
-                    div.value { (tile.value) }
-                    div.note { (tile.note) }
-                    @if let Some(doubt) = &tile.doubt { div.doubt { (doubt) } }
+    }
+}
+
+/// What is known, what is not, and what would teach it.
+fn knowledge_of(knowledge: &Knowledge) -> Markup {
+    html! {
+        section {
+            h2 #known { "What is known" }
+            div.tiles {
+                @for tile in &knowledge.tiles {
+                    div.tile {
+                        div.name { (tile.name) }
+                        div.value { (tile.value) }
+                        div.note { (tile.note) }
+                        @if let Some(doubt) = &tile.doubt { div.doubt { (doubt) } }
+                    }
+                }
+            }
+        }
+        section {
+            @if knowledge.gaps.is_empty() { p.none #unknown { b { "What is not known:" } " nothing of the above." } } @else {
+                h2 #unknown { "What is not known yet" }
+                div.scroll {
+                    table.gaps {
+                        thead { tr { th { "What" } th { "Why" } th { "What would teach it" } } }
+                        tbody {
+                            @for gap in &knowledge.gaps { tr { td { (gap.name) } td { (gap.why) } td { (gap.teaches) } } }
+                        }
+                    }
                 }
             }
         }
@@ -226,14 +243,21 @@ fn figure(picture: &Picture) -> Markup {
 fn section(section: &Section, data: &Data, pictures: &[(String, Picture)]) -> Markup {
     let own = section.pictures.iter().filter_map(|name| pictures.iter().find(|(known, _)| known == name));
     let own: Vec<_> = own.collect();
+    if own.is_empty() {
+        return empty(section.id, section.title, (section.none)(data));
+    }
     html! {
         section {
             h2 id=(section.id) { (section.title) }
             @if !section.note.is_empty() { p.soft { (section.note) } }
-            @if own.is_empty() { p.none { ((section.none)(data)) } }
             @for (_, picture) in own { (figure(picture)) }
         }
     }
+}
+
+/// A section without content: one line.
+fn empty(id: &str, title: &str, why: &str) -> Markup {
+    html! { section { p.none id=(id) { b { (title) "." } " " (format::capitalised(why)) } } }
 }
 
 /// Explains a gap between the end of the estimate and the start of the fan.
@@ -247,12 +271,11 @@ fn gap(data: &Data, outlook: &forecast::Outlook) -> &'static str {
     }
 }
 
-/// Explains the forecast in the capacity chart, or why the forecast is missing.
+/// Explains the forecast in the capacity chart.
 fn forecast_note(data: &Data, outlook: &Result<forecast::Outlook, String>) -> Markup {
     let note = match outlook {
-        // The section itself already states that the capacity is unknown.
-        _ if data.learned.is_empty() => return html! {},
-        Err(why) => format!("No forecast of the capacity: {why}."),
+        // The beginning of the page says why.
+        Err(_) => return html! {},
         Ok(outlook) if outlook.is_over() => "No forecast of the capacity: the end of life has passed.".to_owned(),
         Ok(outlook) if outlook.fan.is_empty() => "The forecast has no dates: the rate of use is unknown.".to_owned(),
         Ok(outlook) => fan_note(data, outlook),
@@ -273,73 +296,27 @@ fn fan_note(data: &Data, outlook: &forecast::Outlook) -> String {
     )
 }
 
-fn alarms(
-    data: &Data,
-    context: &PageContext<'_>,
-    outlook: Option<&forecast::Outlook>,
-    pictures: &[(String, Picture)],
-) -> Markup {
-    let groups = group_alike(&data.alarms);
-    let row = |group: &Vec<&AlarmRecord>| {
-        let row = group[0];
-        let more = if group.len() > 1 { format!("; {} cells in all", group.len()) } else { String::new() };
-        let when = format::moment(data, row.time_s);
-        vec![when, row.rule.clone(), row.severity.clone(), row.change.clone(), format::alarm_text(row, "was") + &more]
-    };
-    let rows = groups.iter().rev().map(row);
+fn alarms(data: &Data, pictures: &[(String, Picture)]) -> Markup {
+    if data.alarms.is_empty() && data.incidents.is_empty() {
+        return empty("alarms", "Alarms", "no alarm was raised in this record");
+    }
     let incidents = data.incidents.iter().rev();
     let incidents = incidents.map(|(time_s, what)| vec![format::moment(data, *time_s), what.clone()]);
-    let raised = raised::raised(data);
-    let now: Vec<Vec<String>> =
-        raised::grouped(&raised).iter().map(|group| group.row(data, context, outlook)).collect();
-    let count = now.len();
+    let list = match data.source.origin {
+        Origin::Store => "packwatch history --kind alarm",
+        Origin::Replay => "packwatch replay --events",
+    };
     html! {
         section {
             h2 #alarms { "Alarms" }
-            @if let Some((_, picture)) = pictures.iter().find(|(name, _)| name == "alarms") {
-                (figure(picture))
-            } @else if data.alarms.is_empty() {
-                p.none { "no alarm was raised in this record" }
-            }
-            @if count > 0 {
-                h3 { "Raised now" }
-                (table(&["Rule", "Severity", "Of", "Since", "Value now", "Limit"], now.into_iter(), count))
-                h3 { "All changes" }
-            }
-            @if !data.alarms.is_empty() {
-                (table(&["When", "Rule", "Severity", "Change", "What"], rows, groups.len()))
-            }
+            p.soft { "A bar is an alarm from when it was raised until it ended. " (list) " lists every change." }
+            @if let Some((_, picture)) = pictures.iter().find(|(name, _)| name == "alarms") { (figure(picture)) }
             @if !data.incidents.is_empty() {
                 h3 { "Other events" }
                 (table(&["When", "What"], incidents, data.incidents.len()))
             }
         }
     }
-}
-
-/// Groups alarm changes of many cells. The changes of a group belong to different cells, are less than a second apart
-/// from the first change, and have the same rule, severity and kind of change.
-///
-/// The groups are in the order of their first change.
-fn group_alike(alarms: &[AlarmRecord]) -> Vec<Vec<&AlarmRecord>> {
-    let is_same_limit = |a: &AlarmRecord, b: &AlarmRecord| (&a.rule, &a.severity) == (&b.rule, &b.severity);
-    let is_same_alarm = |a: &AlarmRecord, b: &AlarmRecord| a.cell == b.cell && is_same_limit(a, b);
-    let is_same_change = |a: &AlarmRecord, b: &AlarmRecord| {
-        a.change == b.change && a.cell.is_some() == b.cell.is_some() && is_same_limit(a, b)
-    };
-    let mut groups: Vec<Vec<&AlarmRecord>> = Vec::new();
-    for row in alarms {
-        // The alarms of several rules arrive cell by cell, so the matching group is not always the latest one. But a
-        // change must not be listed before an earlier change of the same alarm.
-        let may_precede = |group: &&mut Vec<&AlarmRecord>| {
-            (group[0].time_s - row.time_s).abs() < 1.0 && group.iter().all(|other| !is_same_alarm(other, row))
-        };
-        match groups.iter_mut().rev().take_while(may_precede).find(|group| is_same_change(group[0], row)) {
-            Some(group) => group.push(row),
-            None => groups.push(vec![row]),
-        }
-    }
-    groups
 }
 
 /// A table of the first [`MAX_ROWS`] rows. If there are more rows, a note states their number.
@@ -356,27 +333,21 @@ fn table(names: &[&str], rows: impl Iterator<Item = Vec<String>>, count: usize) 
             }
         }
         @if count > MAX_ROWS {
-            p.soft { "the latest " (MAX_ROWS) " of " (count) "; the picture shows all" }
+            p.soft { "the latest " (MAX_ROWS) " of " (count) }
         }
     }
 }
 
-/// Findings about single cells, and what the differences between the cells cost the pack.
-fn findings(context: &PageContext<'_>) -> Markup {
-    let Some(diagnosis) = context.diagnosis else { return html! {} };
-    let found = diagnosis.findings();
+/// What the differences between the cells cost the pack.
+fn cost(context: &PageContext<'_>, quiet: &[(&str, &str)]) -> Markup {
+    let Some(imbalance) = &context.imbalance else { return html! {} };
+    let titles: Vec<String> = quiet.iter().map(|(_, title)| title.to_lowercase()).collect();
     html! {
-        @if found.is_empty() { p { "No findings." } } @else {
-            ul {
-                @for found in found {
-                    li { (found.to_string()) ", since " (format_utc(found.since)) ": " (found.kind.advice()) }
-                }
-            }
+        @if !titles.is_empty() {
+            p.soft { "No cell stands out in: " (titles.join(", ")) ". packwatch diagnose --plots draws these, too." }
         }
-        @if let Some(imbalance) = &context.imbalance {
-            h3 { "Cost of the differences between the cells for the pack" }
-            (pairs(&pack_view::lines(imbalance, context.model.as_ref().map(|sourced| &sourced.model))))
-        }
+        h3 { "Cost of the differences between the cells for the pack" }
+        (pairs(&pack_view::lines(imbalance, context.model.as_ref().map(|sourced| &sourced.model))))
     }
 }
 

@@ -64,8 +64,12 @@ pub(super) fn changes(data: &Data) -> impl Iterator<Item = Vec<String>> {
 /// The measurements that would help most, as sentences; `None` = unknown.
 pub(super) fn advice(context: &PageContext<'_>) -> Option<Vec<String>> {
     let (_, advice) = advise(&ModelBands::new(&context.model.as_ref()?.model))?;
-    let sentence = |it: &crate::cell::Advice| format!("{}: {:.1} points remain", it.measurement, it.left_points);
     Some(advice.iter().map(sentence).collect())
+}
+
+/// A measurement, and the error of the SOC that remains after it.
+pub(super) fn sentence(advice: &crate::cell::Advice) -> String {
+    format!("{}: {:.1} points remain", advice.measurement, advice.left_points)
 }
 
 fn curve(bands: &ModelBands<'_>) -> String {

@@ -5,14 +5,14 @@ use std::path::Path;
 use super::context::PageContext;
 use super::data::{Data, Origin};
 use super::forecast::{self, Outlook};
-use super::format::{alarm_text, moment};
+use super::format::{alarm_text, length, moment};
 use super::limits::thresholds;
 use super::series::{self, CellStep};
 use super::trace::TraceBin;
 use crate::OF_95;
 use crate::alarm::Rule;
 use crate::chart::{
-    self, Axis, Chart, Heat, Ink, Layer, Picture, PlotError, Point, Scale, Shape, Span, StateBand, StateBands,
+    self, Axis, Chart, Ink, Layer, Picture, PlotError, Point, Scale, Shape, Span, StateBand, StateBands,
 };
 use crate::{cell_fault_pictures, model_pictures};
 
@@ -37,7 +37,6 @@ pub(super) fn all(data: &Data, context: &PageContext<'_>) -> Vec<(String, Pictur
     let of_model = context.model.iter().flat_map(model_pictures::all);
     let of_data = [
         named("soc", soc(data, context)),
-        named("soc_recent", soc_recent(data, context)),
         named("capacity", capacity(data, context, outlook.as_ref().ok())),
         named("usable_capacity", usable(data, context)),
         named("losses", losses(data)),
@@ -45,8 +44,6 @@ pub(super) fn all(data: &Data, context: &PageContext<'_>) -> Vec<(String, Pictur
         named("resistance", resistance(data, context)),
         named("temperature", temperature(data, context)),
         named("alarms", alarms(data)),
-        named("cells_capacity", heat(data, "Capacity of every cell", "capacity, Ah", series::capacity)),
-        named("cells_resistance", heat(data, "Resistance of every cell", "resistance, times new", series::resistance)),
         named("innovation", innovation(data)),
         named("coverage", coverage(data)),
     ];
@@ -169,28 +166,6 @@ fn soc(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     chart(title, &description, clock.axis, Axis::number("SOC, %").within(-5.0, 105.0), layers)
 }
 
-fn soc_recent(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
-    let moments: Vec<(f64, &TraceBin)> = filled(data.trace.recent.iter().flat_map(|bins| bins.iter()));
-    let (first_s, last_s) = data.ends_s()?;
-    // If the recent part covers almost the whole record, another picture already shows it.
-    if moments.last()?.0 - moments.first()?.0 > 0.9 * (last_s - first_s) {
-        return None;
-    }
-    let clock = TimeAxis::between(data, moments.first()?.0, moments.last()?.0);
-    let soc = range(&moments, &clock, |bin| bin.soc, 100.0);
-    let mut layers = vec![Layer::band("95 % interval", Ink::Blue, range(&moments, &clock, |bin| bin.soc_band, 100.0))];
-    layers.extend(true_soc(context, &clock, (moments.first()?.0, moments.last()?.0)));
-    if data.cells() > 1 {
-        layers.push(Layer::line("highest cell", Ink::Green, soc.iter().map(|p| (p.0, p.2))));
-        layers.push(Layer::line("lowest cell", Ink::Blue, soc.iter().map(|p| (p.0, p.1))));
-    } else {
-        layers.push(Layer::line("estimate", Ink::Blue, zigzag(&soc)));
-    }
-    let title = "State of charge in the last half-cycles";
-    let description = "Estimated SOC with its 95 % interval, in percent";
-    chart(title, description, clock.axis, Axis::number("SOC, %").within(-5.0, 105.0), layers)
-}
-
 /// The worst cell with its 95 % interval, and the range over the cells of a pack.
 fn worst(data: &Data, clock: &TimeAxis, steps: &[CellStep], ink: Ink, name: &str) -> Vec<Layer> {
     let interval =
@@ -207,7 +182,9 @@ fn worst(data: &Data, clock: &TimeAxis, steps: &[CellStep], ink: Ink, name: &str
 
 fn capacity(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -> Option<Picture> {
     let steps = series::steps(data, series::capacity, false);
-    let (first_s, mut last_s) = data.ends_s().filter(|_| !steps.is_empty())?;
+    // Before the first measurement, the capacity is only assumed.
+    let is_measured = data.learned.iter().any(|row| row.measured_ah.is_some());
+    let (first_s, mut last_s) = data.ends_s().filter(|_| is_measured && !steps.is_empty())?;
     let fan = outlook.map_or(&[][..], |outlook| &outlook.fan);
     last_s = fan.iter().map(|point| point.time_s).fold(last_s, f64::max);
     let clock = TimeAxis::between(data, first_s, last_s);
@@ -446,6 +423,12 @@ fn alarms(data: &Data) -> Option<Picture> {
     for (band, from) in open {
         bands[band].spans.push(span(data, &clock, from, last_s, "still raised at"));
     }
+    for band in &mut bands {
+        let longest = band.spans.iter().map(|span| clock.unit_s * (span.to - span.from)).fold(0.0, f64::max);
+        let alarms =
+            if band.spans.len() == 1 { "1 alarm".to_owned() } else { format!("{} alarms, at most", band.spans.len()) };
+        band.name += &format!(": {alarms} {}", length(longest));
+    }
     let keys = [(Ink::Red, "severe"), (Ink::Amber, "warning"), (Ink::Grey, "info")];
     Some(Picture::StateBands(StateBands {
         title: "Alarms".to_owned(),
@@ -466,29 +449,6 @@ fn span(data: &Data, clock: &TimeAxis, from: &super::data::AlarmRecord, to_s: f6
         ink: ink_of(&from.severity),
         tip: format!("{}: {}; {end} {}", moment(data, from.time_s), alarm_text(from, "was"), moment(data, to_s)),
     }
-}
-
-fn heat(data: &Data, title: &str, label: &str, pick: series::ValueSelector) -> Option<Picture> {
-    if data.cells() < 2 || data.learned.is_empty() {
-        return None;
-    }
-    let rows = series::columns(data, pick);
-    let tip = |(cell, row): (usize, &Vec<Option<f64>>)| {
-        let first = row.iter().flatten().next();
-        let last = row.last().copied().flatten();
-        let words = |value: Option<f64>| value.map_or_else(|| "unknown".to_owned(), |value| format!("{value:.3}"));
-        format!("cell {}: first {}, now {}", cell + 1, words(first.copied()), words(last))
-    };
-    let tips = rows.iter().enumerate().map(tip).collect();
-    Some(Picture::Heat(Heat {
-        title: title.to_owned(),
-        description: format!("{label} of every cell, from the start to the end of the record"),
-        x: TimeAxis::of(data).axis,
-        label: label.to_owned(),
-        rows,
-        tips,
-        decimals: 3,
-    }))
 }
 
 fn innovation(data: &Data) -> Option<Picture> {

@@ -6,13 +6,12 @@ use std::collections::BTreeMap;
 use super::context::PageContext;
 use super::data::{AlarmRecord, Data};
 use super::forecast::Outlook;
-use super::format::{amount, moment};
 use super::limits::{rank, rule};
 use super::series;
-use crate::alarm::{Direction, Rule};
+use crate::alarm::Rule;
 use crate::health::RechargeAlarm;
 
-/// Maximum number of cells that a group lists; further cells are only counted.
+/// Maximum number of cells or ranges that a list names; further cells are only counted.
 const MAX_NAMED: usize = 8;
 
 /// An alarm that is raised at the end of the data.
@@ -59,34 +58,25 @@ pub(super) fn grouped<'a>(raised: &'a [ActiveAlarm<'a>]) -> Vec<AlarmGroup<'a>> 
     groups
 }
 
-impl AlarmGroup<'_> {
-    /// One row of a table: rule, severity, cells, since when, worst value at the end, limit.
-    pub(super) fn row(&self, data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -> Vec<String> {
-        let first = self.alarms[0].row;
-        let since_s = self.alarms.iter().map(|alarm| alarm.since_s).fold(f64::INFINITY, f64::min);
-        let values = self.alarms.iter().filter_map(|alarm| value(alarm.row, data, context, outlook));
-        let is_below = rule(&first.rule).is_some_and(|rule| rule.spec().direction == Direction::Below);
-        let worst = values.reduce(if is_below { f64::min } else { f64::max });
-        let known = |value: Option<f64>| value.map_or_else(|| "unknown".to_owned(), |value| amount(value, &first.rule));
-        vec![
-            first.rule.clone(),
-            first.severity.clone(),
-            cells(self.alarms.iter().filter_map(|alarm| alarm.row.cell)),
-            moment(data, since_s),
-            known(worst),
-            known(first.threshold),
-        ]
-    }
-}
-
-/// Formats cell numbers, counted from 1: `cell 3`, `cells 1, 2`, `cells 1, 2, 3, 4, 5, 6, 7, 8 and 88 more`, or `pack`.
+/// Formats cell numbers, counted from 1 and in ascending order: `cell 3`, `cells 1, 2 and 5`, `cells 1 to 96`,
+/// `cells 1, 3, 5, 7, 9, 11, 13, 15 and 88 more`, or `pack`.
 pub(super) fn cells(cells: impl Iterator<Item = usize>) -> String {
-    let numbers: Vec<String> = cells.map(|cell| (cell + 1).to_string()).collect();
-    match numbers.len() {
-        0 => "pack".to_owned(),
-        1 => format!("cell {}", numbers[0]),
-        count if count <= MAX_NAMED => format!("cells {}", numbers.join(", ")),
-        count => format!("cells {} and {} more", numbers[..MAX_NAMED].join(", "), count - MAX_NAMED),
+    let numbers: Vec<usize> = cells.map(|cell| cell + 1).collect();
+    // Text and number of cells of each part.
+    let parts_of = |run: &[usize]| match *run {
+        [first, _, .., last] => vec![(format!("{first} to {last}"), run.len())],
+        _ => run.iter().map(|number| (number.to_string(), 1)).collect(),
+    };
+    let parts: Vec<(String, usize)> = numbers.chunk_by(|a, b| a + 1 == *b).flat_map(parts_of).collect();
+    let (named, others) = parts.split_at(parts.len().min(MAX_NAMED));
+    let rest: usize = others.iter().map(|part| part.1).sum();
+    let mut words: Vec<String> = named.iter().map(|part| part.0.clone()).collect();
+    words.extend((rest > 0).then(|| format!("{rest} more")));
+    let noun = if numbers.len() == 1 { "cell" } else { "cells" };
+    match words.pop() {
+        None => "pack".to_owned(),
+        Some(only) if words.is_empty() => format!("{noun} {only}"),
+        Some(last) => format!("{noun} {} and {last}", words.join(", ")),
     }
 }
 
@@ -181,16 +171,14 @@ mod tests {
     }
 
     #[test]
-    fn alarms_of_many_cells_share_one_row() {
-        let mut data = worn(96);
-        data.alarms.push(AlarmRecord { severity: "warning".to_owned(), ..alarm("recharge_period_low", None) });
-        let raised = raised(&data);
-        let groups = grouped(&raised);
-        let rows: Vec<_> = groups.iter().map(|group| group.row(&data, &PageContext::default(), None)).collect();
-        assert_eq!(rows.len(), 2);
-        assert_eq!(rows[0][0..3], ["capacity_low", "severe", "cells 1, 2, 3, 4, 5, 6, 7, 8 and 88 more"]);
-        assert_eq!(rows[0][4..], ["0.252 Ah", "1.82 Ah"]);
-        assert_eq!(rows[1][0..3], ["recharge_period_low", "warning", "pack"]);
+    fn cells_are_counted_from_1_and_joined_to_ranges() {
+        let text = |numbers: &[usize]| cells(numbers.iter().copied());
+        assert_eq!([text(&[]), text(&[2]), text(&[0, 1])], ["pack", "cell 3", "cells 1 and 2"]);
+        assert_eq!(text(&[1, 80]), "cells 2 and 81");
+        assert_eq!(text(&(0..96).collect::<Vec<_>>()), "cells 1 to 96");
+        assert_eq!(text(&[0, 4, 5, 6, 9]), "cells 1, 5 to 7 and 10");
+        let odd: Vec<usize> = (0..20).step_by(2).collect();
+        assert_eq!(text(&odd), "cells 1, 3, 5, 7, 9, 11, 13, 15 and 2 more");
     }
 
     #[test]
@@ -200,6 +188,6 @@ mod tests {
         data.untrusted.insert(1);
         assert_eq!(doubt(&data, &raised(&data)).as_deref(), Some("not trusted: cell 2"));
         data.alarms.push(alarm("estimate_untrusted", Some(2)));
-        assert_eq!(doubt(&data, &raised(&data)).as_deref(), Some("not trusted: cells 2, 3"));
+        assert_eq!(doubt(&data, &raised(&data)).as_deref(), Some("not trusted: cells 2 and 3"));
     }
 }

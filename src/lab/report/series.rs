@@ -1,11 +1,7 @@
-//! Computes series over the life of a pack: the worst cell and the range over all cells after every half-cycle, and the
-//! value of every cell in each time column of a heat map.
+//! Computes series over the life of a pack: the worst cell and the range over all cells after every half-cycle.
 
 use super::data::{CapacityRecord, Data};
 use crate::filter::ends;
-
-/// Number of columns of a heat map.
-pub(super) const COLUMNS: usize = 120;
 
 /// State of the cells after a half-cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -72,27 +68,6 @@ pub(super) fn steps(data: &Data, pick: ValueSelector, high_is_bad: bool) -> Vec<
         }
     }
     steps
-}
-
-/// The value of every cell at the end of each time column; one row per cell.
-pub(super) fn columns(data: &Data, pick: ValueSelector) -> Vec<Vec<Option<f64>>> {
-    let mut rows = vec![vec![None; COLUMNS]; data.cells()];
-    let Some((first_s, last_s)) = data.ends_s() else { return rows };
-    let width_s = (last_s - first_s).max(1e-9) / COLUMNS as f64;
-    for learned in &data.learned {
-        let column = (((learned.time_s - first_s) / width_s) as usize).min(COLUMNS - 1);
-        if let (Some(row), Some((mean, _))) = (rows.get_mut(learned.cell), pick(learned)) {
-            row[column] = Some(mean);
-        }
-    }
-    for row in &mut rows {
-        let mut held = None;
-        for value in row {
-            held = value.or(held);
-            *value = held;
-        }
-    }
-    rows
 }
 
 /// Returns the time of every half-cycle, with the lowest and highest mean temperature of the cells.

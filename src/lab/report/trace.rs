@@ -1,7 +1,5 @@
 //! Summarises the estimates of a replay in bins: SOC, temperature, and consistency of the estimator.
 
-use std::collections::VecDeque;
-
 use super::bins::{Bin, Bins};
 use crate::cell::Coverage;
 use crate::monitor::Estimate;
@@ -96,8 +94,6 @@ impl Consistency {
 #[derive(Debug, Clone, Default)]
 pub(super) struct Trace {
     pub(super) life: Option<Bins<TraceBin>>,
-    /// The last half-cycles, each in its own bins.
-    pub(super) recent: VecDeque<Bins<TraceBin>>,
     pub(super) cells: Vec<Consistency>,
     /// SOC and temperatures of all estimates.
     pub(super) seen: Coverage,
@@ -107,27 +103,12 @@ impl Trace {
     pub(super) fn take(&mut self, estimate: &Estimate) {
         let time_s = estimate.time.secs();
         self.life.get_or_insert_with(|| Bins::new(time_s)).at(time_s).take(estimate);
-        if self.recent.is_empty() {
-            self.recent.push_back(Bins::new(time_s));
-        }
-        if let Some(bins) = self.recent.back_mut() {
-            bins.at(time_s).take(estimate);
-        }
         self.seen.note(estimate.soc, estimate.measured.temperature_c);
         let cell = estimate.cell.index();
         if self.cells.len() <= cell {
             self.cells.resize(cell + 1, Consistency::default());
         }
         self.cells[cell].add(&Consistency::of(estimate));
-    }
-
-    /// Starts new bins for a charge or discharge.
-    pub(super) fn turn(&mut self, time_s: f64) {
-        self.recent.push_back(Bins::new(time_s));
-        // The last six charges and discharges are kept in detail, each with the rest after it.
-        while self.recent.len() > 6 {
-            self.recent.pop_front();
-        }
     }
 
     /// Returns the consistency of all cells over all time.

@@ -1,0 +1,265 @@
+//! Lists what is known about the battery, as named figures, and what is not known: why, and what would teach it.
+
+use std::collections::BTreeSet;
+
+use super::context::PageContext;
+use super::data::{Data, Origin};
+use super::forecast::Outlook;
+use super::format::capitalised;
+use super::model;
+use super::raised::{doubt, raised};
+use super::series::{self, CellStep};
+use crate::cell::{ModelBands, advise};
+use crate::monitor::ModelState;
+
+/// What teaches the capacity.
+const TEACHES_CAPACITY: &str =
+    "A charge from below 20 % to full after an hour of rest, or a discharge over the same range.";
+/// Below this share of innovations within their 95 % interval, the intervals are too narrow.
+const LEAST_COVERAGE: f64 = 0.8;
+
+/// A known figure.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Tile {
+    pub(super) name: &'static str,
+    pub(super) value: String,
+    pub(super) note: String,
+    /// Untrusted cells on which the figure depends; `None` = all cells are trusted, or the figure is not an estimate.
+    pub(super) doubt: Option<String>,
+}
+
+/// Something that is not known.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Gap {
+    pub(super) name: &'static str,
+    pub(super) why: String,
+    pub(super) teaches: String,
+}
+
+/// Known figures and gaps.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub(super) struct Knowledge {
+    pub(super) tiles: Vec<Tile>,
+    pub(super) gaps: Vec<Gap>,
+    /// Number of cells whose capacity was measured.
+    pub(super) measured_cells: usize,
+}
+
+impl Knowledge {
+    pub(super) fn of(data: &Data, context: &PageContext<'_>, outlook: &Result<Outlook, String>) -> Self {
+        let measured: BTreeSet<usize> =
+            data.learned.iter().filter(|row| row.measured_ah.is_some()).map(|row| row.cell).collect();
+        let mut known = Self { measured_cells: measured.len(), ..Self::default() };
+        known.capacity(data, context, &measured);
+        known.usable(data, context);
+        known.losses(data);
+        known.resistance(data, context);
+        known.recharge(data, context);
+        match outlook {
+            Ok(outlook) => known.tile("Remaining life", outlook.value(), outlook.note(data.cells())),
+            Err(why) => known.gap("Remaining life", capitalised(why) + ".", "Measured capacities over months of use."),
+        }
+        // A figure is the worst of all cells, and an untrusted cell may be the worst.
+        let raised = raised(data);
+        let doubt = doubt(data, &raised);
+        known.tiles.iter_mut().for_each(|tile| tile.doubt.clone_from(&doubt));
+        known.imbalance(context);
+        let rated_ah = context.config.map(|it| it.monitor.model.rated_capacity_ah);
+        if let Some(cycles) = series::full_cycles(data, rated_ah) {
+            known.tile("Use so far", format!("{cycles:.0} cycles"), "equivalent full cycles in this record");
+        }
+        let in_all = data.alarms.iter().filter(|row| row.change == "raised").count();
+        known.tile("Alarms raised now", raised.len().to_string(), format!("{in_all} raised in this record"));
+        known.model(data, context);
+        known
+    }
+
+    fn tile(&mut self, name: &'static str, value: String, note: impl Into<String>) {
+        self.tiles.push(Tile { name, value, note: note.into(), doubt: None });
+    }
+
+    fn gap(&mut self, name: &'static str, why: impl Into<String>, teaches: impl Into<String>) {
+        self.gaps.push(Gap { name, why: why.into(), teaches: teaches.into() });
+    }
+
+    fn capacity(&mut self, data: &Data, context: &PageContext<'_>, measured: &BTreeSet<usize>) {
+        let last = last(data, series::capacity, false);
+        let Some(step) = last.filter(|_| !measured.is_empty()) else {
+            let used = last.map_or_else(String::new, |step| {
+                format!(" Until then {:.3} \u{b1} {:.3} Ah is assumed.", step.worst.0, step.worst.1)
+            });
+            let (why, teaches) = if is_prior(context) {
+                ("While the cell model is the label's, no charge or discharge measures it.", teaches_model(context))
+            } else {
+                ("No charge or discharge has measured it yet.", TEACHES_CAPACITY.to_owned())
+            };
+            return self.gap("Capacity, state of health", format!("{why}{used}"), teaches);
+        };
+        match context.rated_ah(step.cell) {
+            Some(rated) => self.tile(
+                "State of health",
+                format!("{:.0} %", 100.0 * step.worst.0 / rated),
+                format!("of {rated} Ah rated{}{}", of_cell(data, &step), assumed(measured, &step)),
+            ),
+            None => self.gap(
+                "State of health",
+                "The rated capacity is unknown without -c.",
+                "Create the report with the configuration (-c).",
+            ),
+        }
+        self.tile("Capacity", format!("{:.3} Ah", step.worst.0), deviation(data, &step) + assumed(measured, &step));
+        if measured.len() < data.cells() {
+            let why = format!("Not measured yet in {} of {} cells.", data.cells() - measured.len(), data.cells());
+            self.gap("Capacity of the other cells", why, TEACHES_CAPACITY);
+        }
+    }
+
+    fn usable(&mut self, data: &Data, context: &PageContext<'_>) {
+        match last(data, series::usable, false) {
+            Some(step) => self.tile("Usable capacity", format!("{:.3} Ah", step.worst.0), deviation(data, &step)),
+            None if context.config.is_some_and(|config| config.monitor.health.usable.is_none()) => self.gap(
+                "Usable capacity",
+                "The configuration states no load.",
+                "State the load in [usable] of the configuration.",
+            ),
+            None => self.gap(
+                "Usable capacity",
+                "It is learned together with the capacity.",
+                "The same as for the capacity.",
+            ),
+        }
+    }
+
+    /// Losses of lithium and of both electrodes. Each loss is the largest of all cells.
+    fn losses(&mut self, data: &Data) {
+        let figure = |step: CellStep| format!("{:.0} \u{b1} {:.0} %", step.worst.0, step.worst.1);
+        let [lithium, negative, positive] = [series::lithium_lost, series::negative_lost, series::positive_lost]
+            .map(|pick| last(data, pick, true).map(figure));
+        if let (Some(lithium), Some(negative), Some(positive)) = (lithium, negative, positive) {
+            self.tile("Lithium lost", lithium, format!("negative electrode {negative}, positive {positive}"));
+        }
+    }
+
+    fn resistance(&mut self, data: &Data, context: &PageContext<'_>) {
+        let is_prior = is_prior(context);
+        match last(data, series::resistance, true) {
+            Some(step) if !is_prior => {
+                self.tile("Resistance", format!("{:.2} \u{d7} new", step.worst.0), deviation(data, &step));
+            }
+            Some(_) => self.gap(
+                "Resistance compared with a new cell",
+                "A label does not state the resistance of a new cell.",
+                teaches_model(context),
+            ),
+            None => {
+                self.gap("Resistance", "No half-cycle has ended yet.", "A charge or discharge with a changing current.")
+            }
+        }
+    }
+
+    /// The latest recharge period, normalised if known, with the first recharge period for comparison.
+    fn recharge(&mut self, data: &Data, context: &PageContext<'_>) {
+        let normalised = || data.recharges.iter().filter_map(|row| row.normalised_s.map(|(mean, _)| mean));
+        let raw = || data.recharges.iter().filter_map(|row| row.raw_s);
+        let minutes = |seconds: f64| format!("{:.1} min", seconds / 60.0);
+        let (first, last, how) = match normalised().next_back() {
+            Some(last) => (normalised().next(), Some(last), "normalised"),
+            None => (raw().next(), raw().next_back(), "as measured"),
+        };
+        if let Some((first, last)) = first.zip(last) {
+            return self.tile("Recharge period", minutes(last), format!("{how}; {} at first", minutes(first)));
+        }
+        if data.source.origin == Origin::Store {
+            return self.gap("Recharge period", "The history does not contain it.", "A report of a replay.");
+        }
+        let window = context.config.map(|config| &config.monitor.health.recharge);
+        let window = window.map_or_else(
+            || "of the window".to_owned(),
+            |it| format!("from {:.0} to {:.0} %", 100.0 * it.from_soc, 100.0 * it.to_soc),
+        );
+        self.gap(
+            "Recharge period",
+            format!("No charge {window} was long enough."),
+            format!("A charge {window} without a break."),
+        );
+    }
+
+    /// What the differences between the cells cost.
+    fn imbalance(&mut self, context: &PageContext<'_>) {
+        match &context.imbalance {
+            Some(Ok(pack)) => self.tile(
+                "Lost by imbalance",
+                format!("{:.1} %", 100.0 * pack.lost_by_imbalance.mean),
+                format!(
+                    "\u{b1} {:.1} of the charge; cell {} is empty first, cell {} is full first",
+                    100.0 * pack.lost_by_imbalance.std(),
+                    pack.discharge_limit.cell.index() + 1,
+                    pack.charge_limit.cell.index() + 1
+                ),
+            ),
+            Some(Err(why)) => self.gap(
+                "Differences between the cells",
+                format!("Unknown: {why}."),
+                "An hour of driving or charging, with the voltages of all cells.",
+            ),
+            None => {}
+        }
+    }
+
+    /// What the cell model and the estimator leave open.
+    fn model(&mut self, data: &Data, context: &PageContext<'_>) {
+        let sourced = context.model.as_ref();
+        if context.diagnosis.is_some() && is_prior(context) {
+            self.gap(
+                "Weak cells, aged cells, wrong voltage channels",
+                "The voltage curve is typical of the chemistry on the label. It is too uncertain to tell these faults from a \
+                 difference in charge.",
+                teaches_model(context),
+            );
+        }
+        if let Some((points, advice)) = sourced.and_then(|it| advise(&ModelBands::new(&it.model)))
+            && let Some(first) = advice.first()
+        {
+            let why = format!("The cell model makes its error about {points:.1} points.");
+            self.gap("State of charge, more exactly", why, capitalised(&model::sentence(first)) + ".");
+        }
+        if data.trace.health().coverage().is_some_and(|share| share < LEAST_COVERAGE) {
+            self.gap(
+                "How far the figures can be trusted",
+                "The estimator's intervals are too narrow: see its health below.",
+                "A cell model that fits this battery.",
+            );
+        }
+    }
+}
+
+/// Whether the cell model is made from the label alone.
+fn is_prior(context: &PageContext<'_>) -> bool {
+    let state = context.model.as_ref().map(|sourced| sourced.source.state);
+    matches!(state, Some(ModelState::Prior | ModelState::Unfit))
+}
+
+/// What teaches the cell model. LFP cells keep the label's model.
+fn teaches_model(context: &PageContext<'_>) -> String {
+    let chemistry = context.model.as_ref().and_then(|sourced| sourced.source.chemistry.as_deref());
+    let is_learnable = !chemistry.is_some_and(|name| name.starts_with("lfp"));
+    let in_use = " With a reading per second and rests of some minutes, packwatch may also learn it in use.";
+    format!("A measured cell model (packwatch fit).{}", if is_learnable { in_use } else { "" })
+}
+
+fn last(data: &Data, pick: series::ValueSelector, high_is_bad: bool) -> Option<CellStep> {
+    series::steps(data, pick, high_is_bad).last().copied()
+}
+
+fn of_cell(data: &Data, step: &CellStep) -> String {
+    if data.cells() > 1 { format!(", cell {}", step.cell + 1) } else { String::new() }
+}
+
+fn deviation(data: &Data, step: &CellStep) -> String {
+    format!("\u{b1} {:.3}{}", step.worst.1, of_cell(data, step))
+}
+
+/// Remark for a cell whose capacity is the configured value minus the assumed fade.
+fn assumed(measured: &BTreeSet<usize>, step: &CellStep) -> &'static str {
+    if measured.contains(&step.cell) { "" } else { "; assumed, not measured yet" }
+}

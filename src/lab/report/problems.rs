@@ -1,0 +1,423 @@
+//! Lists what is wrong with the battery, the worst first.
+//!
+//! The list is made from the findings about single cells, the raised alarms, the cost of the differences between the
+//! cells and the end of life. If a finding explains an alarm, both are one problem, so they cannot contradict each other.
+
+use std::collections::BTreeSet;
+
+use super::context::PageContext;
+use super::data::Data;
+use super::forecast::{self, Outlook};
+use super::format::{amount, capitalised, moment};
+use super::limits::{rank, rule};
+use super::raised::{ActiveAlarm, AlarmGroup, cells, grouped, raised, value};
+use super::series;
+use super::summary::Condition;
+use crate::alarm::{Direction, Rule};
+use crate::cell_faults::{CellFault, CellFaultKind, Imbalance};
+use crate::quantity::CellIndex;
+
+/// From this loss on, the pack counts as out of balance, fraction of its charge. Two standard deviations below the
+/// estimated loss must reach it.
+const OUT_OF_BALANCE: f64 = 0.03;
+/// A contact that is found within this part of the record counts as high from the beginning. Finding it takes days.
+const BEGINNING: f64 = 0.25;
+/// Time after which a contact that has not grown counts as steady (s).
+const STEADY_S: f64 = 7.0 * 86_400.0;
+
+/// Kinds of findings about cells, in the order of the page. Other kinds follow; they are about sensors.
+const CELL_KINDS: [CellFaultKind; 8] = [
+    CellFaultKind::Leak,
+    CellFaultKind::LowCharge,
+    CellFaultKind::HighCharge,
+    CellFaultKind::WeakCell,
+    CellFaultKind::Contact,
+    CellFaultKind::HighResistance,
+    CellFaultKind::ForeignCell,
+    CellFaultKind::Module,
+];
+
+/// Something that is wrong.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Problem {
+    pub(super) condition: Condition,
+    /// What is wrong with which cell, as sentences.
+    pub(super) what: String,
+    /// What to do, as sentences.
+    pub(super) advice: String,
+    /// Alarms and dates, as sentences.
+    pub(super) note: String,
+}
+
+/// Returns all problems, the worst first.
+pub(super) fn problems(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -> Vec<Problem> {
+    let findings = context.diagnosis.map_or(&[][..], |diagnosis| diagnosis.findings());
+    let mut problems = of_battery(findings, data, context, outlook);
+    problems.extend(data.source.doubt.iter().map(|doubt| Problem {
+        condition: Condition::Watch,
+        what: format!("The figures may be wrong: {doubt}."),
+        advice: "Do not rely on them.".to_owned(),
+        note: String::new(),
+    }));
+    // A stable sort: problems of the same condition keep their order.
+    problems.sort_by_key(|problem| std::cmp::Reverse(problem.condition));
+    problems
+}
+
+/// Problems that the findings and the data show, in the order of their sources.
+fn of_battery(
+    findings: &[CellFault],
+    data: &Data,
+    context: &PageContext<'_>,
+    outlook: Option<&Outlook>,
+) -> Vec<Problem> {
+    let raised = raised(data);
+    let mut groups = of_findings(findings);
+    groups.sort_by_key(|group| CELL_KINDS.iter().position(|kind| *kind == group[0].kind).unwrap_or(CELL_KINDS.len()));
+    let mut problems: Vec<Problem> = groups.iter().map(|group| finding(group, &raised, data)).collect();
+    let imbalance = context.imbalance.as_ref().and_then(|imbalance| imbalance.as_ref().ok());
+    let is_charge = |kind| matches!(kind, CellFaultKind::LowCharge | CellFaultKind::HighCharge);
+    let of_charge = groups.iter().position(|group| is_charge(group[0].kind));
+    let mut is_out_of_balance = of_charge.is_some();
+    if let Some((pack, at)) = imbalance.zip(of_charge) {
+        let (mean, std) = percent(pack);
+        problems[at].what += &format!(" The pack loses {mean:.1} \u{b1} {std:.1} % of its charge by imbalance.");
+    } else if let Some(pack) = imbalance.filter(|pack| is_unbalanced(pack)) {
+        is_out_of_balance = true;
+        problems.push(unbalanced(pack, findings.is_empty()));
+    }
+    let is_explained = |alarm: &ActiveAlarm<'_>| match rule(&alarm.row.rule) {
+        Some(Rule::CellImbalance) => is_out_of_balance,
+        Some(rule) => findings.iter().any(|found| explains(found, rule, alarm.row.cell)),
+        None => false,
+    };
+    let open: Vec<ActiveAlarm<'_>> = raised.into_iter().filter(|alarm| !is_explained(alarm)).collect();
+    problems.extend(grouped(&open).iter().map(|group| alarm(group, data, context, outlook)));
+    if is_over(data, context, outlook) && !problems.iter().any(|problem| problem.condition >= Condition::Plan) {
+        problems.push(Problem {
+            condition: Condition::Watch,
+            what: "The capacity is below the end of life, but no limit is exceeded.".to_owned(),
+            advice: "Plan its replacement.".to_owned(),
+            note: String::new(),
+        });
+    }
+    problems
+}
+
+/// Whether the capacity is below the end of life, regardless of alarms.
+fn is_over(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -> bool {
+    let least = series::steps(data, series::capacity, false).last().map(|step| step.worst.0);
+    let is_below = least.zip(forecast::end_of_life_ah(data, context)).is_some_and(|(least, end)| least < end);
+    is_below || outlook.is_some_and(Outlook::is_over)
+}
+
+/// Groups findings by kind. A pair of channels is its own group.
+fn of_findings(findings: &[CellFault]) -> Vec<Vec<&CellFault>> {
+    let mut groups: Vec<Vec<&CellFault>> = Vec::new();
+    for found in findings {
+        match groups.iter_mut().find(|group| group[0].kind == found.kind && !found.kind.is_of_pair()) {
+            Some(group) => group.push(found),
+            None => groups.push(vec![found]),
+        }
+    }
+    groups
+}
+
+/// Whether a finding is the reason of an alarm of this rule and cell.
+fn explains(found: &CellFault, rule: Rule, cell: Option<usize>) -> bool {
+    let is_reason = match rule {
+        Rule::CellLeak => found.kind == CellFaultKind::Leak,
+        Rule::ConnectionResistance => found.kind == CellFaultKind::Contact,
+        Rule::ChannelFaulty => found.kind.is_channel_fault(),
+        Rule::CapacityLow => found.kind == CellFaultKind::WeakCell,
+        _ => false,
+    };
+    is_reason && cell.and_then(|cell| u16::try_from(cell).ok()).is_some_and(|cell| found.is_of(CellIndex(cell)))
+}
+
+/// The problem of findings of one kind, with the alarms that they explain.
+fn finding(group: &[&CellFault], raised: &[ActiveAlarm<'_>], data: &Data) -> Problem {
+    let kind = group[0].kind;
+    let expanded = group.iter().filter_map(|found| found.cells).flat_map(|(first, last)| {
+        let between = if kind.is_of_pair() {
+            vec![first.index(), last.index()]
+        } else {
+            (first.index()..=last.index()).collect()
+        };
+        between.into_iter()
+    });
+    let numbers: BTreeSet<usize> = expanded.collect();
+    let is_explained = |alarm: &&ActiveAlarm<'_>| {
+        rule(&alarm.row.rule).is_some_and(|rule| group.iter().any(|found| explains(found, rule, alarm.row.cell)))
+    };
+    let alarms: Vec<&ActiveAlarm<'_>> = raised.iter().filter(is_explained).collect();
+    let growth = (kind == CellFaultKind::Contact).then(|| Growth::of(group, data));
+    let is_of_cells = CELL_KINDS.contains(&kind);
+    let own = match kind {
+        CellFaultKind::HighResistance | CellFaultKind::ForeignCell | CellFaultKind::Module => Condition::Watch,
+        CellFaultKind::Contact if growth == Some(Growth::Steady) => Condition::Watch,
+        _ if is_of_cells => Condition::Plan,
+        _ => Condition::Watch,
+    };
+    let worst = alarms.iter().map(|alarm| condition_of(&alarm.row.severity)).max().filter(|_| is_of_cells);
+    let subject = capitalised(&cells(numbers.iter().copied()));
+    let found_s = group.iter().map(|found| found.reported.secs()).fold(f64::INFINITY, f64::min);
+    Problem {
+        condition: worst.map_or(own, |worst| worst.max(own)),
+        what: sentence(kind, &subject, numbers.len() > 1, &sizes(group)) + growth.map_or("", Growth::words),
+        advice: growth.and_then(Growth::advice).map_or_else(|| capitalised(kind.advice()) + ".", str::to_owned),
+        note: format!("Found {}.{}", moment(data, found_s), alarm_notes(&alarms, data)),
+    }
+}
+
+/// One sentence per rule and severity: since when which alarm is raised.
+fn alarm_notes(alarms: &[&ActiveAlarm<'_>], data: &Data) -> String {
+    let mut notes: Vec<((&str, &str), f64, Vec<usize>)> = Vec::new();
+    for alarm in alarms {
+        let key = (alarm.row.rule.as_str(), alarm.row.severity.as_str());
+        match notes.iter_mut().find(|note| note.0 == key) {
+            Some((_, since_s, numbers)) => {
+                *since_s = since_s.min(alarm.since_s);
+                numbers.extend(alarm.row.cell);
+            }
+            None => notes.push((key, alarm.since_s, alarm.row.cell.into_iter().collect())),
+        }
+    }
+    let note = |((rule, severity), since_s, numbers): ((&str, &str), f64, Vec<usize>)| {
+        format!(" Alarm {rule} ({severity}) of {} since {}.", cells(numbers.into_iter()), moment(data, since_s))
+    };
+    notes.into_iter().map(note).collect()
+}
+
+/// Smallest and largest size of the findings, in the unit of [`sentence`]. A single size has its standard deviation.
+fn sizes(group: &[&CellFault]) -> String {
+    let (scale, digits) = match group[0].kind {
+        CellFaultKind::Contact => (100.0, 0),
+        CellFaultKind::VoltageChannel => (1e3, 0),
+        CellFaultKind::Leak | CellFaultKind::CurrentOffset => (100.0, 2),
+        _ => (100.0, 1),
+    };
+    let size = |found: &&CellFault| scale * found.size.mean.abs();
+    let (least, most) =
+        (group.iter().map(size).fold(f64::INFINITY, f64::min), group.iter().map(size).fold(0.0, f64::max));
+    let [low, high] = [least, most].map(|size| format!("{size:.digits$}"));
+    match group {
+        [only] => format!("{low} \u{b1} {:.digits$}", scale * only.size.std()),
+        _ if low == high => low,
+        _ => format!("{low} to {high}"),
+    }
+}
+
+/// Says what is wrong. `subject`: the cells. `size`: the size in the unit of the sentence.
+fn sentence(kind: CellFaultKind, subject: &str, are_many: bool, size: &str) -> String {
+    let has = if are_many { "have" } else { "has" };
+    match kind {
+        CellFaultKind::Leak => {
+            let loses = if are_many { "lose" } else { "loses" };
+            format!("{subject} {loses} {size} % of the capacity per day without a load.")
+        }
+        CellFaultKind::Contact => format!("{subject} {has} {size} % more contact resistance than the others."),
+        CellFaultKind::WeakCell => format!("{subject} {has} {size} % less capacity than the others."),
+        CellFaultKind::HighResistance => format!("{subject} {has} {size} % more resistance than the others."),
+        CellFaultKind::ForeignCell | CellFaultKind::Module => {
+            format!("{subject} {has} been replaced: {size} % more capacity than the others.")
+        }
+        CellFaultKind::LowCharge => format!("{subject} {has} {size} points less charge than the others."),
+        CellFaultKind::HighCharge => format!("{subject} {has} {size} points more charge than the others."),
+        CellFaultKind::VoltageChannel => format!("The voltage of {} is measured {size} mV wrong.", lower(subject)),
+        CellFaultKind::VoltageFrozen => format!("The measured voltage of {} does not change.", lower(subject)),
+        CellFaultKind::DoubledChannels => format!("{subject} show the voltage of one and the same cell."),
+        CellFaultKind::SwappedChannels => format!("The voltage channels of {} are exchanged.", lower(subject)),
+        CellFaultKind::TemperatureSensor => {
+            format!("The temperature sensor of {} does not follow the load.", lower(subject))
+        }
+        CellFaultKind::CurrentOffset => {
+            format!("The current sensor is off by {size} % of the rated capacity per hour.")
+        }
+        CellFaultKind::CurrentFrozen => "The measured current does not change.".to_owned(),
+        CellFaultKind::CurrentGain => format!("The current sensor shows {size} % too much."),
+    }
+}
+
+fn lower(subject: &str) -> String {
+    subject.to_lowercase()
+}
+
+/// How the contact resistance of cells has changed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Growth {
+    /// At least one contact has grown, or was not high at the beginning.
+    Grows,
+    /// All contacts were high from the beginning and have not grown.
+    Steady,
+    /// The record is too short, or does not contain earlier values.
+    Unknown,
+}
+
+impl Growth {
+    fn of(group: &[&CellFault], data: &Data) -> Self {
+        let Some((first_s, last_s)) = data.ends_s() else { return Self::Unknown };
+        let is_late =
+            |found: &&CellFault| found.since.secs() - first_s > (BEGINNING * (last_s - first_s)).max(STEADY_S);
+        // Two standard deviations of the difference between the first reported size and the present one.
+        let has_grown = |found: &&CellFault| {
+            let first = found.cells.and_then(|cells| data.first_sizes.get(&(found.kind, cells.0)));
+            first.map(|first| found.size.mean - first.mean > 2.0 * found.size.std().hypot(first.std()))
+        };
+        let is_seen_long = group.iter().all(|found| last_s - found.since.secs() >= STEADY_S);
+        if group.iter().any(|found| is_late(found) || has_grown(found) == Some(true)) {
+            Self::Grows
+        } else if is_seen_long && group.iter().all(|found| has_grown(found) == Some(false)) {
+            Self::Steady
+        } else {
+            Self::Unknown
+        }
+    }
+
+    const fn words(self) -> &'static str {
+        match self {
+            Self::Grows => " It grows, as in a contact that comes loose.",
+            Self::Steady => " It was high from the beginning and has not grown, as in longer links between modules.",
+            Self::Unknown => " Whether it grows is not known yet.",
+        }
+    }
+
+    /// Advice; `None` = the advice of the finding applies.
+    const fn advice(self) -> Option<&'static str> {
+        match self {
+            Self::Grows => None,
+            Self::Steady => {
+                Some("Nothing if a longer link ends at these cells; otherwise tighten and clean their connections.")
+            }
+            Self::Unknown => Some(
+                "Look whether a longer link ends at these cells. If not, tighten and clean their connections: a loose one \
+                 heats under load.",
+            ),
+        }
+    }
+}
+
+/// Loss by imbalance and its standard deviation, percent.
+fn percent(pack: &Imbalance) -> (f64, f64) {
+    (100.0 * pack.lost_by_imbalance.mean, 100.0 * pack.lost_by_imbalance.std())
+}
+
+fn is_unbalanced(pack: &Imbalance) -> bool {
+    pack.lost_by_imbalance.mean - 2.0 * pack.lost_by_imbalance.std() >= OUT_OF_BALANCE
+}
+
+/// The problem of a pack that is out of balance although no single cell stands out.
+fn unbalanced(pack: &Imbalance, is_only: bool) -> Problem {
+    let (mean, std) = percent(pack);
+    let [empty, full] = [&pack.discharge_limit, &pack.charge_limit].map(|limit| limit.cell.index() + 1);
+    let no_other = if is_only { " No single cell is failing." } else { "" };
+    Problem {
+        condition: Condition::Plan,
+        what: format!(
+            "The pack is out of balance: it loses {mean:.1} \u{b1} {std:.1} % of its charge. Cell {empty} is empty first, \
+             and cell {full} is full first.{no_other}"
+        ),
+        advice:
+            "Balance the pack: this restores the lost charge. Then create the report again: a cell that drifts away \
+                 again is failing."
+                .to_owned(),
+        note: String::new(),
+    }
+}
+
+/// The problem of raised alarms of one rule and severity.
+fn alarm(group: &AlarmGroup<'_>, data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -> Problem {
+    let row = group.alarms[0].row;
+    let rule = rule(&row.rule);
+    let is_measuring = rule.is_some_and(concerns_measurement);
+    let condition = if is_measuring { Condition::Watch } else { condition_of(&row.severity) };
+    Problem {
+        condition,
+        what: alarm_sentence(group, data, context, outlook),
+        advice: rule.map_or("Read the manual of this alarm.", |rule| alarm_advice(rule, condition)).to_owned(),
+        note: alarm_notes(&group.alarms, data).trim_start().to_owned(),
+    }
+}
+
+fn alarm_sentence(group: &AlarmGroup<'_>, data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -> String {
+    let (name, now) =
+        (group.alarms[0].row.rule.as_str(), |alarm: &ActiveAlarm<'_>| value(alarm.row, data, context, outlook));
+    let numbers = group.alarms.iter().filter_map(|alarm| alarm.row.cell);
+    let of_pack = numbers.clone().next().is_none();
+    let whose = if of_pack { "the pack".to_owned() } else { cells(numbers) };
+    let Some(rule) = rule(name) else { return format!("The alarm {name} of {whose} is raised.") };
+    match rule {
+        Rule::EstimateUntrusted => return format!("The estimates of {whose} contradict the measured voltages."),
+        Rule::InputMissing => return format!("Readings of {whose} are missing."),
+        Rule::InputImplausible => return format!("Readings of {whose} are implausible."),
+        Rule::ChannelFaulty => return format!("The voltage channel of {whose} does not show its cell."),
+        _ => {}
+    }
+    let spec = rule.spec();
+    let quantity = spec.about.strip_prefix("a cell's ").map(|quantity| format!("The {quantity} of {whose}"));
+    let subject = quantity.unwrap_or_else(|| capitalised(spec.about));
+    let is_below = spec.direction == Direction::Below;
+    let side = if is_below { "below" } else { "above" };
+    let badness = |value: f64| if is_below { -value } else { value };
+    let first = group.alarms[0].row;
+    let limit =
+        first.threshold.map_or_else(|| "its limit".to_owned(), |it| format!("the limit of {}", amount(it, name)));
+    let known = group.alarms.iter().filter_map(|alarm| Some((alarm.row, now(alarm)?)));
+    let Some((row, value)) = known.max_by(|a, b| badness(a.1).total_cmp(&badness(b.1))) else {
+        let raised = first.value.filter(|_| group.alarms.len() == 1);
+        let raised = raised.map_or_else(String::new, |value| format!("{}, ", amount(value, name)));
+        return format!("{subject} was {raised}{side} {limit} when the alarm was raised.");
+    };
+    let is_beyond = row.threshold.is_none_or(|limit| badness(value) >= badness(limit));
+    let cell = row.cell.filter(|_| group.alarms.len() > 1);
+    let cell = cell.map_or_else(String::new, |cell| format!(" in cell {}", cell + 1));
+    let value = amount(value, name);
+    match is_beyond {
+        true if cell.is_empty() => format!("{subject} is {value}, {side} {limit}."),
+        true => format!("{subject} is {side} {limit}: {value}{cell}."),
+        false => format!("{subject} was {side} {limit}; now it is {value}{cell}."),
+    }
+}
+
+fn condition_of(severity: &str) -> Condition {
+    [Condition::Watch, Condition::Plan, Condition::Act][rank(severity).min(2)]
+}
+
+/// Whether a rule is about the measurement, not about the battery itself.
+const fn concerns_measurement(rule: Rule) -> bool {
+    matches!(
+        rule,
+        Rule::InputMissing
+            | Rule::InputImplausible
+            | Rule::EstimateUntrusted
+            | Rule::BmsDisagrees
+            | Rule::StoreFailed
+            | Rule::BusFault
+            | Rule::ChannelFaulty
+    )
+}
+
+const fn alarm_advice(rule: Rule, condition: Condition) -> &'static str {
+    match rule {
+        Rule::TemperatureHigh => "Check cooling and load before the next use.",
+        Rule::SocLow => "Charge it.",
+        Rule::CellImbalance => "Have the cells balanced; if the imbalance returns, have the weakest cell checked.",
+        Rule::CellLeak => {
+            "Measure the rest voltage of the named cell over a week; if it falls relative to the others, replace the cell."
+        }
+        Rule::ConnectionResistance => "Have the connections of the named cell tightened and cleaned.",
+        Rule::EstimateUntrusted => {
+            "Do not rely on these figures before the sensors and the cell model have been checked."
+        }
+        Rule::ChannelFaulty => "Check the sense wire and the channel of the named cell: its figures are wrong.",
+        Rule::StoreFailed => "Check the disk of the vehicle computer: learned values may be lost.",
+        Rule::InputMissing | Rule::InputImplausible | Rule::BusFault | Rule::BmsDisagrees => {
+            "Check sensors, wiring and bus."
+        }
+        _ if matches!(condition, Condition::Act) => "Replace the battery or the named cell, or take it out of service.",
+        _ => "Order a replacement, and have its capacity measured at the next visit.",
+    }
+}
+
+#[cfg(test)]
+mod tests;
