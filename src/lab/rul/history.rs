@@ -2,7 +2,7 @@
 //!
 //! With a column `type`, only discharges are readings, and each discharge counts as a full cycle. Without this column,
 //! the file does not contain the use, so days are counted. `duration_s` states how long the cell was in use from the
-//! time of a row; the remaining time to the next row counts as rest.
+//! time of a row; the remaining time to the next row counts as rest. Without `duration_s`, up to a day counts as use.
 
 use std::path::Path;
 
@@ -94,7 +94,7 @@ impl UseCounter {
         if row.is_discharge {
             self.discharges += 1.0;
         }
-        self.used_days = row.duration_s.unwrap_or(0.0) / 86_400.0;
+        self.used_days = row.duration_s.map_or(1.0, |duration_s| duration_s / 86_400.0);
         reading
     }
 
