@@ -43,13 +43,15 @@ use crate::quantity::InvalidState;
 const RATE_WALK: f64 = 1.0;
 /// Standard deviation that the rate's logarithm gains while the use since the first reading grows by a factor of e. It
 /// is proportional to the square root of ln(use after / use before).
-const RATE_WALK_USE: f64 = 0.5;
+const RATE_WALK_USE: f64 = 0.45;
 /// Capacity that a new cell gains or loses while it settles, fraction of the reference.
 const TRANSIENT: f64 = 0.03;
 /// Standard deviation of the loss since the highest level that such a transient hides, fraction of the reference.
 const HIDDEN_LOSS: f64 = 0.002;
 /// Standard deviation of the loss that a rise since the first reading hides, per rise.
 const HIDDEN_BY_RISE: f64 = 0.5;
+/// Standard deviation of the level below which a rise can be counted from it, fraction of the reference.
+const KNOWN_LEVEL: f64 = 0.02;
 /// Standard deviation of the error of a reading in addition to its variance, fraction of the reference; to be
 /// multiplied by the root of the learned noise scale.
 const NOISE: f64 = 0.003;
@@ -176,7 +178,7 @@ pub struct Forecast {
     shared_variance: f64,
     /// Learned variance of noise and recovery during use, relative to the constants.
     noise_scale: f64,
-    /// Level after the first reading; `None` before it.
+    /// Level when it was first known to [`KNOWN_LEVEL`]; `None` before.
     first_level: Option<f64>,
     /// Use since the first reading at which the level was highest.
     used_at_top: f64,
@@ -411,7 +413,9 @@ impl Forecast {
         update_states(&mut self.x, &mut self.p, &ph, innovation, innovation_variance);
         self.shared_variance = reading.shared_variance_ah2 / scale;
         self.readings = self.readings.saturating_add(1);
-        self.first_level.get_or_insert(self.x[LEVEL]);
+        if self.p[LEVEL][LEVEL] < KNOWN_LEVEL * KNOWN_LEVEL {
+            self.first_level.get_or_insert(self.x[LEVEL]);
+        }
         if self.x[LEVEL] > self.x[TOP] {
             self.restart_top();
         }
@@ -452,8 +456,8 @@ impl Forecast {
         let since_top = self.used - self.used_at_top;
         let rise = self.x[TOP] - self.first_level.unwrap_or(self.x[TOP]);
         // Transients of the first use hide a part of the loss, so they make the rate uncertain.
-        let hidden = square(HIDDEN_LOSS / since_top.max(1e-3 * self.used))
-            + square(HIDDEN_BY_RISE * rise.max(0.0) / self.used);
+        let hidden =
+            square(HIDDEN_LOSS / since_top.max(1e-3 * self.used)) + square(HIDDEN_BY_RISE * rise.max(0.0) / self.used);
         FadePosterior::new(FadeState {
             level: (self.x[LEVEL], self.level_variance().sqrt()),
             // A capacity that rises does not say how fast it falls later.

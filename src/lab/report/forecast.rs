@@ -81,14 +81,10 @@ fn is_over(life: &RemainingLife) -> bool {
 
 fn unknown_lives(lives: &[Result<RemainingLife, InsufficientData>], cell: usize, why: InsufficientData) -> String {
     if lives.len() == 1 {
-        return display(why);
+        return why.to_string();
     }
     let unknown = lives.iter().filter(|life| life.is_err()).count();
-    format!("unknown for {unknown} of {} cells (cell {}: {})", lives.len(), cell + 1, display(why))
-}
-
-fn display(why: InsufficientData) -> String {
-    why.to_string().replace("+-", "\u{b1}")
+    format!("unknown for {unknown} of {} cells (cell {}: {})", lives.len(), cell + 1, why)
 }
 
 /// The forecast of every cell at the end of the record, with the same inputs as in `monitor::life`.

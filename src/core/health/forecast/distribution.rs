@@ -30,13 +30,13 @@ use crate::filter::{bell, normal_cdf, square};
 /// straight lines.
 const ONSET: f64 = 0.03;
 /// Prior of the exponent: centre and scale of a t distribution with [`EXPONENT_FREEDOM`] degrees of freedom.
-const EXPONENT: (f64, f64) = (1.7, 0.5);
+const EXPONENT: (f64, f64) = (1.8, 0.6);
 const EXPONENT_FREEDOM: f64 = 3.0;
 /// Prior probability of a steady fade, and standard deviation of its exponent around 0.
 const STEADY_SHARE: f64 = 0.05;
 const STEADY_STD: f64 = 0.5;
 /// Scale of the relative deviation between the loss that a shape implies and the loss that was seen.
-const CURVATURE: f64 = 0.25;
+const CURVATURE: f64 = 0.3;
 /// Scale of the same deviation for a small loss (fraction of the reference).
 const CURVATURE_FLOOR: f64 = 0.01;
 /// Loss over which the prior of the rate is stated.
@@ -44,13 +44,13 @@ const TYPICAL_LOSS: f64 = 0.1;
 /// Equivalent full cycles in which a typical cell loses `TYPICAL_LOSS`: 800 cycles to 80 %.
 const TYPICAL_CYCLES: f64 = 400.0;
 /// Scale of the prior of the rate's logarithm, in cycles and in days.
-const TYPICAL_SCALE: (f64, f64) = (0.5, 1.5);
+const TYPICAL_SCALE: (f64, f64) = (0.7, 2.0);
 /// Smallest loss that is assumed if the prior of the rate is the mean rate so far (fraction of the reference).
 const LEAST_LOSS: f64 = 0.01;
 /// Standard deviation of the logarithm of the use, per square root of an e-fold of the loss.
-const SPREAD_LOSS: f64 = 0.3;
+const SPREAD_LOSS: f64 = 0.25;
 /// Standard deviation of the logarithm of the use, for any loss.
-const SPREAD: f64 = 0.28;
+const SPREAD: f64 = 0.25;
 
 /// First exponent of the grid, step, and number of exponents: -1.5 to 4.5.
 const FIRST_EXPONENT: f64 = -1.5;
@@ -74,7 +74,8 @@ pub(super) const HALVINGS: u32 = 24;
 /// Prior of the mean rate over the next [`TYPICAL_LOSS`].
 #[derive(Debug, Clone, Copy)]
 pub(super) enum PriorRate {
-    /// Rate of a typical cell per equivalent full cycle.
+    /// Per equivalent full cycle: mean of a typical cell's rate and of the rate since the highest level. The rate of
+    /// the cell counts more, the more it has lost.
     PerCycle,
     /// Mean rate since the first reading. Use in days differs too much between cells for a typical rate.
     SoFar {
@@ -126,7 +127,8 @@ impl FadePosterior {
         let lost = state.lost(state.level.0);
         let at_top = state.lost(state.top_level).min(lost);
         let (typical, scale) = match state.prior {
-            PriorRate::PerCycle => (TYPICAL_LOSS / TYPICAL_CYCLES, TYPICAL_SCALE.0),
+            // As if the cell had behaved like a typical cell before it was observed.
+            PriorRate::PerCycle => ((TYPICAL_LOSS + lost - ONSET) / (TYPICAL_CYCLES + since_top), TYPICAL_SCALE.0),
             PriorRate::SoFar { days } => ((lost - ONSET + LEAST_LOSS) / days, TYPICAL_SCALE.1),
         };
         let log_typical = libm::log(typical);
@@ -175,7 +177,8 @@ impl FadePosterior {
             let end = lost + (level - threshold).max(1e-12);
             (probability, std::array::from_fn(|shape| libm::log(use_of_loss(exponent(shape), lost, end))))
         });
-        let longest = slices.iter().flat_map(|(_, uses)| uses).fold(f64::NEG_INFINITY, |most, &log_use| most.max(log_use));
+        let longest =
+            slices.iter().flat_map(|(_, uses)| uses).fold(f64::NEG_INFINITY, |most, &log_use| most.max(log_use));
         let start = longest - self.log_rates.0 + 2.0 - BIN * BINS as f64;
         let mut bins = [0.0; BINS];
         for (probability, log_uses) in &slices {
