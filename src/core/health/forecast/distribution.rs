@@ -50,7 +50,7 @@ const LEAST_LOSS: f64 = 0.01;
 /// Standard deviation of the logarithm of the use, per square root of an e-fold of the loss.
 const SPREAD_LOSS: f64 = 0.25;
 /// Standard deviation of the logarithm of the use, for any loss.
-const SPREAD: f64 = 0.25;
+const SPREAD: f64 = 0.23;
 
 /// First exponent of the grid, step, and number of exponents: -1.5 to 4.5.
 const FIRST_EXPONENT: f64 = -1.5;
