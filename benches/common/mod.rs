@@ -22,5 +22,6 @@ pub(crate) fn reading(k: u32, cell: usize) -> CellStep {
         temperature_c: Some(25.0 + (cell / 8) as f64),
         ambient_c: 25.0,
         voltage_v: 3.7 - 0.05 * current_a + 0.0005 * cell as f64,
+        is_voltage_frozen: false,
     }
 }

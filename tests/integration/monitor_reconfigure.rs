@@ -114,8 +114,8 @@ fn new_threshold_applies_to_learned_values() {
 fn changed_end_of_life_discards_old_forecast() {
     let mut rig = Rig::new("[[alarm]]\nrule = \"remaining_life_low\"\nwarning = 30\n");
     rig.seconds(2);
-    // The capacity is 2.36 Ah and falls by 0.004 Ah per cycle. The forecast expects a knee (a faster fade later): about
-    // 60 cycles to 2.08 Ah and about 80 to 1.82 Ah.
+    // The capacity is 2.36 Ah and falls by 0.004 Ah per cycle. The forecast expects a faster fade later: about
+    // 60 cycles to 2.08 Ah and about 90 to 1.82 Ah.
     let mut forecast = Forecast::new(Axis::Cycles, 2.6);
     for cycle in 0..60 {
         let passed = Usage { cycles: 1.0, days: 0.5, rest_days: 0.0 };

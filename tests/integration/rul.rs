@@ -236,7 +236,7 @@ fn command_forecasts_and_reports_unjudged() {
     let judged = json(&[file, "--end-of-life", "1.7", "--at", "50,80", "--json"]);
     assert_eq!(judged["files"][0]["end_of_life"], 150.0);
     assert_eq!(judged["total"]["forecasts"], 2);
-    assert_eq!(judged["total"]["within_alpha"], 1.0);
+    assert_eq!(judged["total"]["coverage"], 1.0);
     let text = command(&[file, "--end-of-life", "1.5", "--at", "50"]).success();
     let text = String::from_utf8_lossy(&text.get_output().stdout).into_owned();
     assert!(text.contains("does not stay below 1.500 Ah (least capacity 1.610 Ah): not scored"), "{text}");

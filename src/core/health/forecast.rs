@@ -5,36 +5,28 @@
 //! median and 90 % interval, or the reason why no forecast is given ([`InsufficientData`]). Negative and non-finite
 //! numbers are ignored.
 //!
-//! The forecast is a linear Kalman filter over the learned capacities, with one step per reading. Cost and memory do
-//! not grow with the history. State x = [level, rate, recovery, first], with capacities as fractions of a reference
-//! capacity:
-//! * level: the capacity without recovery, which only falls; level -= rate dt. The use t counts equivalent full
-//!   cycles, or days if the cycles are unknown;
+//! A linear Kalman filter follows the learned capacities, with one step per reading. Cost and memory do not grow with
+//! the history. State x = [level, rate, recovery, top], with capacities as fractions of a reference capacity:
+//! * level: the capacity without recovery; level -= rate dt. The use t counts equivalent full cycles, or days if the
+//!   cycles are unknown;
 //! * rate: loss per unit of use. Its logarithm follows a random walk with two parts. The variance of the first part is
-//!   w1^2 times the capacity lost, with w1 = `RATE_WALK`; in the knee (see [`knee`]), w1 = `KNEE_WALK`. The variance of
-//!   the second part grows by w2^2 while the use since the first reading grows by a factor of e, with w2 =
-//!   `RATE_WALK_USE`. Both parts are relative, so the same constants suit cells that live for 50 cycles and for 5,000.
-//!   In the linear filter, Q = (w1^2 rate dt + w2^2 ln(t1 / t0)) (rate^2 + P_rate), with the use t0 before the step and
-//!   t1 after the step;
+//!   w1^2 times the capacity lost, with w1 = `RATE_WALK`. The variance of the second part grows by w2^2 while the use
+//!   since the first reading grows by a factor of e, with w2 = `RATE_WALK_USE`. Both parts are relative, so the same
+//!   constants suit cells that live for 50 cycles and for 5,000. In the linear filter,
+//!   Q = (w1^2 rate dt + w2^2 ln(t1 / t0)) (rate^2 + P_rate + (`TRANSIENT` / t0)^2), with the use t0 before the step
+//!   and t1 after the step. The last term lets a rate leave 0, after the rise of capacity that many new cells show;
 //! * recovery: capacity that returns during rest and is used up again (an Ornstein-Uhlenbeck process; measured cells
 //!   show 1 to 5 % after days of rest). Because successive readings share the recovery, ten readings within one cycle
 //!   do not count as ten independent readings;
-//! * first: the level at the first reading. Later readings improve this estimate too. The loss since the first reading
-//!   is first - level.
+//! * top: the level where it was highest. Later readings improve this estimate too. Loss is counted from here: in some
+//!   families of cells the capacity first rises by 3 to 8 %.
 //!
-//! A reading is level + recovery + noise; outliers get less weight. The forecast integrates over the loss instead of
-//! over time: the use until the level has fallen by L is the integral of 1 / rate over the loss. This integral, a sum
-//! of lognormals, is approximated by one lognormal with the same mean and variance (see [`distribution`]). The level
-//! only falls, so it passes a threshold once; no first-passage times have to be sampled.
+//! A reading is level + recovery + noise; outliers get less weight. The noise and the recovery during use have one
+//! scale, which is learned from the innovations. The readings of different cells scatter by 0.01 to 3 %.
 //!
-//! Assumed: outside the knee, fade may slow down or speed up, so the median keeps the present rate. The knee is the
-//! range from 10 to 20 % of loss. There, fade accelerates in many cells: resistance and current per active area grow
-//! with the loss, and lithium plating occurs. The forecast expects this acceleration before a reading shows it.
-//!
-//! Deviation: although the forecast expects the knee, the filter does not. In the filter, the knee increases the
-//! variance of the rate, but not the mean. Reason: with an expected knee, the filter would overestimate the rate after
-//! each recovery of cells without a knee (the NASA cells). Effect: the filter's rate rises only after readings have
-//! shown the knee. `tests/rul.md` lists the alternatives and figures.
+//! The forecast is a mixture of fade shapes, from a square root to a knee, weighted by the rate, by the curvature since
+//! the highest level and by a prior of typical lives (see [`distribution`]). It is never refused because little has
+//! been lost; its interval is then wide. `tests/rul.md` lists figures and alternatives.
 
 mod distribution;
 #[cfg(test)]
@@ -42,9 +34,8 @@ mod tests;
 
 use serde::{Deserialize, Serialize};
 
-use self::distribution::Crossing;
-use crate::filter::bisect;
-use crate::filter::update_states;
+use self::distribution::{FadePosterior, FadeState, PriorRate};
+use crate::filter::{bisect, square, update_states};
 use crate::quantity::InvalidState;
 
 /// Standard deviation that the rate's logarithm would gain while the whole reference capacity is lost. It is
@@ -52,30 +43,33 @@ use crate::quantity::InvalidState;
 const RATE_WALK: f64 = 1.0;
 /// Standard deviation that the rate's logarithm gains while the use since the first reading grows by a factor of e. It
 /// is proportional to the square root of ln(use after / use before).
-const RATE_WALK_USE: f64 = 0.3;
-/// The knee: range of loss in which fade is expected to accelerate, fractions of the reference.
-const KNEE: (f64, f64) = (0.1, 0.2);
-/// Expected growth of the rate's logarithm in the knee, per fraction of the reference lost: e^0.9 over the whole knee.
-const KNEE_DRIFT: f64 = 9.0;
-/// `RATE_WALK` in the knee. Over the whole knee, one standard deviation is a factor of e^0.47, so the interval also
-/// covers cells with hardly any knee.
-const KNEE_WALK: f64 = 1.5;
-/// Standard deviation of the recovery while the cell is used, fraction of the reference.
-const RECOVERY_IN_USE: f64 = 0.01;
+const RATE_WALK_USE: f64 = 0.45;
+/// Capacity that a new cell gains or loses while it settles, fraction of the reference.
+const TRANSIENT: f64 = 0.03;
+/// Standard deviation of the loss since the highest level that such a transient hides, fraction of the reference.
+const HIDDEN_LOSS: f64 = 0.002;
+/// Standard deviation of the loss that a rise since the first reading hides, per rise.
+const HIDDEN_BY_RISE: f64 = 0.5;
+/// Standard deviation of the level below which a rise can be counted from it, fraction of the reference.
+const KNOWN_LEVEL: f64 = 0.02;
+/// Standard deviation of the error of a reading in addition to its variance, fraction of the reference; to be
+/// multiplied by the root of the learned noise scale.
+const NOISE: f64 = 0.003;
+/// Standard deviation of the recovery while the cell is used, fraction of the reference; also scaled.
+const RECOVERY_IN_USE: f64 = 0.005;
 /// Standard deviation of the recovery gained by rest, fraction of the reference.
 const RECOVERY_IN_REST: f64 = 0.02;
 /// Time constant of the recovery during rest (days). If use is counted in days, the recovery also decays with this time
 /// constant.
 const RECOVERY_DAYS: f64 = 1.0;
+/// Number of readings that the initial noise scale counts for, and maximum number that the scale averages over.
+const SCALE_READINGS: (f64, f64) = (5.0, 20.0);
+/// Range of the noise scale (variance). The readings scatter by 0.01 to 2 %.
+const SCALE_RANGE: (f64, f64) = (1e-3, 20.0);
 const DAY_S: f64 = 86_400.0;
 
 /// Minimum number of readings for a forecast: two readings give a rate, and the third can contradict it.
 pub const MIN_READINGS: u32 = 3;
-/// Minimum loss for a forecast, in standard deviations of the loss.
-pub const MIN_FADE_DEVIATIONS: f64 = 1.0;
-/// Maximum ratio of the interval's upper end to the median. This limit does not apply if the upper end is below the use
-/// since the first reading.
-pub const MAX_SPREAD: f64 = 10.0;
 /// Time constant of the exponentially weighted sums that give the recent rate of use (days).
 const RECENT_DAYS: f64 = 30.0;
 
@@ -85,7 +79,7 @@ const QUANTILES: [f64; 3] = [0.05, 0.5, 0.95];
 const LEVEL: usize = 0;
 const RATE: usize = 1;
 const RECOVERY: usize = 2;
-const FIRST: usize = 3;
+const TOP: usize = 3;
 const N: usize = 4;
 
 /// Measure of use.
@@ -155,26 +149,6 @@ pub enum InsufficientData {
     /// The cell was not used between the first reading and the last.
     #[error("no use between the first reading and the last")]
     Use,
-    /// The fade is not significant compared with its standard deviation.
-    #[error(
-        "capacity lost is {:.1} +- {:.1} %, must be at least {MIN_FADE_DEVIATIONS} times its standard deviation",
-        // Adding 0 turns -0 into 0.
-        (1000.0 * lost).round() / 10.0 + 0.0, 100.0 * std
-    )]
-    Fade {
-        /// Capacity lost, fraction of the reference.
-        lost: f64,
-        /// Standard deviation of the capacity lost.
-        std: f64,
-    },
-    /// The interval is too wide.
-    #[error("the interval's upper end is {high:.1}, must be at most {MAX_SPREAD} times the median of {median:.1}")]
-    Spread {
-        /// 50 % quantile, units of use.
-        median: f64,
-        /// 95 % quantile, units of use.
-        high: f64,
-    },
 }
 
 /// Predicted capacity after some further use.
@@ -202,6 +176,12 @@ pub struct Forecast {
     x: [f64; N],
     p: [[f64; N]; N],
     shared_variance: f64,
+    /// Learned variance of noise and recovery during use, relative to the constants.
+    noise_scale: f64,
+    /// Level when it was first known to [`KNOWN_LEVEL`]; `None` before.
+    first_level: Option<f64>,
+    /// Use since the first reading at which the level was highest.
+    used_at_top: f64,
     /// Recent equivalent full cycles and recent days: exponentially weighted sums with the time constant `RECENT_DAYS`.
     recent: [f64; 2],
 }
@@ -225,7 +205,7 @@ impl Usage {
 
 impl Forecast {
     /// Creates a filter for a cell that had the capacity `reference_ah` (Ah) when new. An approximate value suffices:
-    /// the value scales the assumed noise and sets the range of the knee, 10 to 20 % below `reference_ah`.
+    /// the loss is counted from `reference_ah`, or from the highest level if that is higher.
     pub fn new(axis: Axis, reference_ah: f64) -> Self {
         let mut p = [[0.0; N]; N];
         // Wide priors: the level is practically unknown, and the rate has a standard deviation of 2 % per unit of use.
@@ -233,12 +213,24 @@ impl Forecast {
         p[RATE][RATE] = 0.02 * 0.02;
         let rest = if axis == Axis::Days { RECOVERY_IN_REST } else { 0.0 };
         p[RECOVERY][RECOVERY] = RECOVERY_IN_USE * RECOVERY_IN_USE + rest * rest;
-        // Before the first reading, level and first are equal.
-        for (i, j) in [(FIRST, FIRST), (FIRST, LEVEL), (LEVEL, FIRST)] {
+        // Before the first reading, level and top are equal.
+        for (i, j) in [(TOP, TOP), (TOP, LEVEL), (LEVEL, TOP)] {
             p[i][j] = p[LEVEL][LEVEL];
         }
         let x = [1.0, 0.0, 0.0, 1.0];
-        Self { axis, reference_ah, readings: 0, used: 0.0, x, p, shared_variance: 0.0, recent: [0.0; 2] }
+        Self {
+            axis,
+            reference_ah,
+            readings: 0,
+            used: 0.0,
+            x,
+            p,
+            shared_variance: 0.0,
+            noise_scale: 1.0,
+            first_level: None,
+            used_at_top: 0.0,
+            recent: [0.0; 2],
+        }
     }
 
     /// Predicts the state after the use `passed`, then updates it with `reading`, the capacity learned at the end of
@@ -279,6 +271,11 @@ impl Forecast {
         InvalidState::unless_capacity("the reference of the remaining life", self.reference_ah)?;
         InvalidState::unless_natural("the use of the remaining life", self.used)?;
         InvalidState::unless_natural("the shared variance of the remaining life", self.shared_variance)?;
+        InvalidState::unless_natural("the noise scale of the remaining life", self.noise_scale)?;
+        InvalidState::unless_natural("the use at the highest level of the remaining life", self.used_at_top)?;
+        if let Some(level) = self.first_level {
+            InvalidState::unless_number("the first level of the remaining life", level)?;
+        }
         InvalidState::unless_naturals("the recent use of the remaining life", self.recent)?;
         for i in 0..N {
             InvalidState::unless_number("a state of the remaining life", self.x[i])?;
@@ -323,7 +320,7 @@ impl Forecast {
         let threshold = threshold_ah / self.reference_ah;
         // If the level has passed the threshold with a probability of at least 95 %, the remaining use is 0.
         let has_passed = self.x[LEVEL] + 1.645 * self.level_variance().sqrt() < threshold;
-        let remaining = if has_passed { Remaining::default() } else { self.time_to(threshold)? };
+        let remaining = if has_passed { Remaining::default() } else { self.time_to(threshold) };
         let [cycles, days] = self.recent;
         Ok(match self.axis {
             Axis::Days => RemainingLife { cycles: None, days: Some(remaining) },
@@ -335,15 +332,10 @@ impl Forecast {
     }
 
     /// Remaining use until the level falls below `threshold`, fraction of the reference.
-    fn time_to(&self, threshold: f64) -> Result<Remaining, InsufficientData> {
-        self.check_fade()?;
-        let crossing = self.crossing(threshold);
+    fn time_to(&self, threshold: f64) -> Remaining {
+        let crossing = self.posterior().crossing(threshold);
         let [low, median, high] = QUANTILES.map(|quantile| crossing.quantile(quantile));
-        // The lower end is not checked: near the threshold, the lower end tends to 0 however precise the filter is.
-        if high > MAX_SPREAD * median && high > self.used {
-            return Err(InsufficientData::Spread { median, high });
-        }
-        Ok(Remaining { low, median, high })
+        Remaining { low, median, high }
     }
 
     /// Predicted capacity at `points` evenly spaced amounts of further use from 0 to `ahead`. Too slow to call while
@@ -353,10 +345,10 @@ impl Forecast {
     /// The reason why no forecast is given.
     pub fn fan(&self, ahead: f64, points: usize) -> Result<Vec<FanPoint>, InsufficientData> {
         self.check_readings()?;
-        self.check_fade()?;
+        let posterior = self.posterior();
         let at = |index: usize| {
             let ahead = ahead * index as f64 / (points.max(2) - 1) as f64;
-            let [low_ah, median_ah, high_ah] = QUANTILES.map(|quantile| self.capacity_ah(ahead, quantile));
+            let [low_ah, median_ah, high_ah] = QUANTILES.map(|quantile| self.capacity_ah(&posterior, ahead, quantile));
             FanPoint { ahead, low_ah, median_ah, high_ah }
         };
         Ok((0..points).map(at).collect())
@@ -387,7 +379,8 @@ impl Forecast {
         p[LEVEL][RATE] -= walk * used / 2.0;
         p[RATE][LEVEL] = p[LEVEL][RATE];
         p[LEVEL][LEVEL] += walk * used * used / 3.0;
-        let (in_use, in_rest) = (RECOVERY_IN_USE * RECOVERY_IN_USE, RECOVERY_IN_REST * RECOVERY_IN_REST);
+        let in_use = self.noise_scale * RECOVERY_IN_USE * RECOVERY_IN_USE;
+        let in_rest = RECOVERY_IN_REST * RECOVERY_IN_REST;
         let recovery = &mut p[RECOVERY][RECOVERY];
         *recovery += in_use * (1.0 - kept * kept);
         // A rest adds only the part of the recovery that is still missing after the rests before it.
@@ -400,24 +393,50 @@ impl Forecast {
         let rate = self.x[RATE].max(0.0);
         // Before any use, the first step counts as growth by a factor of e.
         let e_folds = if self.used > 0.0 { libm::log1p(used / self.used) } else { 1.0 };
-        let lost = self.lost();
-        let relative = walk_variance(lost, lost + rate * used) + RATE_WALK_USE * RATE_WALK_USE * e_folds;
-        relative * (rate * rate + self.p[RATE][RATE])
+        let relative = RATE_WALK * RATE_WALK * rate * used + RATE_WALK_USE * RATE_WALK_USE * e_folds;
+        let settling = if self.used > 0.0 { TRANSIENT / self.used } else { 0.0 };
+        relative * (rate * rate + self.p[RATE][RATE] + settling * settling)
     }
 
     fn observe(&mut self, reading: &CapacityReading) {
         let scale = self.reference_ah * self.reference_ah;
         let ph: [f64; N] = std::array::from_fn(|i| self.p[i][LEVEL] + self.p[i][RECOVERY]);
-        // Assumes an error of 0.3 % in addition to the reading's variance.
-        let noise = 0.003 * 0.003 + reading.variance_ah2 / scale;
+        let own_noise = self.noise_scale * NOISE * NOISE;
+        let noise = own_noise + reading.variance_ah2 / scale;
         let innovation = reading.capacity_ah / self.reference_ah - self.x[LEVEL] - self.x[RECOVERY];
+        let expected = ph[LEVEL] + ph[RECOVERY] + noise;
+        self.learn_noise(innovation * innovation / expected, (own_noise + self.p[RECOVERY][RECOVERY]) / expected);
         // If the innovation exceeds five standard deviations, raises the innovation's variance until the innovation
         // equals five standard deviations.
         let miss = innovation / 5.0;
-        let innovation_variance = (ph[LEVEL] + ph[RECOVERY] + noise).max(miss * miss);
+        let innovation_variance = expected.max(miss * miss);
         update_states(&mut self.x, &mut self.p, &ph, innovation, innovation_variance);
         self.shared_variance = reading.shared_variance_ah2 / scale;
         self.readings = self.readings.saturating_add(1);
+        if self.p[LEVEL][LEVEL] < KNOWN_LEVEL * KNOWN_LEVEL {
+            self.first_level.get_or_insert(self.x[LEVEL]);
+        }
+        if self.x[LEVEL] > self.x[TOP] {
+            self.restart_top();
+        }
+    }
+
+    /// Updates the noise scale with an innovation. `ratio`: squared innovation over its expected variance, limited to
+    /// three standard deviations. `share`: part of the expected variance that the noise scale explains.
+    fn learn_noise(&mut self, ratio: f64, share: f64) {
+        let readings = (f64::from(self.readings) + SCALE_READINGS.0).min(SCALE_READINGS.1);
+        let factor = 1.0 + share.clamp(0.0, 1.0) * (ratio.min(9.0) - 1.0) / readings;
+        self.noise_scale = (self.noise_scale * factor).clamp(SCALE_RANGE.0, SCALE_RANGE.1);
+    }
+
+    /// Counts the loss from the present level on.
+    fn restart_top(&mut self) {
+        self.x[TOP] = self.x[LEVEL];
+        self.used_at_top = self.used;
+        self.p[TOP] = self.p[LEVEL];
+        for row in &mut self.p {
+            row[TOP] = row[LEVEL];
+        }
     }
 
     fn check_readings(&self) -> Result<(), InsufficientData> {
@@ -427,51 +446,39 @@ impl Forecast {
         if self.used > 0.0 { Ok(()) } else { Err(InsufficientData::Use) }
     }
 
-    fn check_fade(&self) -> Result<(), InsufficientData> {
-        let lost = self.x[FIRST] - self.x[LEVEL];
-        let variance = self.p[FIRST][FIRST] - 2.0 * self.p[FIRST][LEVEL] + self.p[LEVEL][LEVEL];
-        let std = variance.max(0.0).sqrt();
-        if lost < MIN_FADE_DEVIATIONS * std { Err(InsufficientData::Fade { lost, std }) } else { Ok(()) }
-    }
-
     /// Variance of the level, including the error that all readings share.
     fn level_variance(&self) -> f64 {
         self.p[LEVEL][LEVEL] + self.shared_variance
     }
 
-    /// Distribution of the use until the level passes `threshold`, fraction of the reference.
-    fn crossing(&self, threshold: f64) -> Crossing {
-        Crossing::new(
-            [self.x[LEVEL] - threshold, self.x[RATE]],
-            [self.level_variance(), self.p[LEVEL][RATE], self.p[RATE][RATE]],
-            self.lost(),
-            self.used,
-        )
-    }
-
-    /// Capacity lost since the cell was new, fraction of the reference. The first reading may come from an aged cell.
-    fn lost(&self) -> f64 {
-        1.0 - self.x[LEVEL]
+    /// Posterior of the shape and the rate of the fade.
+    fn posterior(&self) -> FadePosterior {
+        let since_top = self.used - self.used_at_top;
+        let rise = self.x[TOP] - self.first_level.unwrap_or(self.x[TOP]);
+        // Transients of the first use hide a part of the loss, so they make the rate uncertain.
+        let hidden =
+            square(HIDDEN_LOSS / since_top.max(1e-3 * self.used)) + square(HIDDEN_BY_RISE * rise.max(0.0) / self.used);
+        FadePosterior::new(FadeState {
+            level: (self.x[LEVEL], self.level_variance().sqrt()),
+            // A capacity that rises does not say how fast it falls later.
+            rate: (self.x[RATE].max(0.0), (self.p[RATE][RATE] + hidden).sqrt()),
+            new_level: self.x[TOP].max(1.0),
+            top_level: self.x[TOP],
+            since_top,
+            prior: match self.axis {
+                Axis::Cycles => PriorRate::PerCycle,
+                Axis::Days => PriorRate::SoFar { days: self.used },
+            },
+        })
     }
 
     /// Quantile of the capacity (Ah) after `ahead` units of use: the level is then below the returned capacity with the
     /// probability `quantile`.
-    fn capacity_ah(&self, ahead: f64, quantile: f64) -> f64 {
+    fn capacity_ah(&self, posterior: &FadePosterior, ahead: f64, quantile: f64) -> f64 {
         let (level, std) = (self.x[LEVEL], self.level_variance().sqrt());
-        let is_below = |threshold_ah: f64| self.crossing(threshold_ah).probability(ahead) < quantile;
+        let is_below = |threshold: f64| posterior.crossing(threshold).probability(ahead) < quantile;
         self.reference_ah * bisect((0.0, level + 5.0 * std), distribution::HALVINGS, is_below).1
     }
-}
-
-/// Part of the knee that lies below the loss `lost`, fraction of the reference.
-fn knee(lost: f64) -> f64 {
-    lost.clamp(KNEE.0, KNEE.1) - KNEE.0
-}
-
-/// Variance that the rate's logarithm gains while the loss grows from `from` to `to`, fractions of the reference.
-fn walk_variance(from: f64, to: f64) -> f64 {
-    let in_knee = knee(to) - knee(from);
-    RATE_WALK * RATE_WALK * (to - from - in_knee) + KNEE_WALK * KNEE_WALK * in_knee
 }
 
 impl Remaining {

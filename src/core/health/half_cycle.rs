@@ -81,3 +81,30 @@ impl HalfCycle {
         Some(Measurement { value, variance: value * value * (square(offset_ah / self.charge_ah) + of_swing) })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn half_cycle_allows_capacity_near_charge_over_swing_only() {
+        let half_cycle = |charge_ah: f64, swing: f64| HalfCycle {
+            mode: Mode::Charge,
+            charge_ah,
+            swing: Some(ScalarGaussian::from_std(swing, 0.05)),
+            end_soc: Some(0.9),
+            ends: Some([0.9 - swing, 0.9]),
+            ends_by_voltage: None,
+            uncounted: 0.0,
+            duration_s: 3600.0,
+            mean_current_a: -charge_ah,
+            mean_temperature_c: None,
+        };
+        let z = |value: f64| Measurement { value, variance: 0.01 };
+        // 1 Ah in 50 %: 2 +- 0.2 Ah. The measurement has a deviation of 0.1 Ah.
+        assert!([1.4, 2.0, 2.6].iter().all(|&value| half_cycle(1.0, 0.5).allows(&z(value))));
+        assert!([1.2, 2.8].iter().all(|&value| !half_cycle(1.0, 0.5).allows(&z(value))));
+        // The swing is too small to say anything, but the cell has taken 1 Ah.
+        assert!(half_cycle(1.0, 0.1).allows(&z(0.8)) && !half_cycle(1.0, 0.1).allows(&z(0.6)));
+    }
+}

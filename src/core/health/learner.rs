@@ -61,7 +61,7 @@ pub(super) struct CellMark {
 }
 
 impl CellMark {
-    fn move_to(&mut self, soc: Option<ScalarGaussian>, by_voltage: Option<f64>) {
+    pub(super) fn move_to(&mut self, soc: Option<ScalarGaussian>, by_voltage: Option<f64>) {
         self.soc = Self::storable(soc);
         self.by_voltage = by_voltage.filter(|&soc| bounds::STORED_SOC.has(soc));
     }

@@ -113,3 +113,67 @@ fn jump(before: &Mark, after: &Mark, moved: f64) -> f64 {
     changes.sort_unstable_by(f64::total_cmp);
     changes.get(changes.len() / 2).copied().unwrap_or(0.0)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::health::learner::CellMark;
+    use crate::quantity::Timestamp;
+
+    const RATED_AH: f64 = 100.0;
+
+    /// Notes a mark at this charge taken out (fraction of the rated capacity) and SOC by voltage.
+    fn note(span: &mut Span, from: Mode, [taken, by_voltage]: [f64; 2]) {
+        let time_s = 600.0 + span.last.as_ref().map_or(0.0, |last| last.time.since(Timestamp::from_secs(0.0)));
+        let mut cell = CellMark::default();
+        cell.move_to(None, Some(by_voltage));
+        let charge_as = taken * 3600.0 * RATED_AH;
+        span.note(&Mark { time: Timestamp::from_secs(time_s), charge_as, cells: vec![cell] }, from, RATED_AH);
+    }
+
+    #[test]
+    fn trips_with_small_returns_are_one_span() {
+        let mut span = Span::default();
+        let trips = [
+            (Mode::Unknown, [0.0, 0.9]),
+            (Mode::Discharge, [0.2, 0.65]),
+            (Mode::Unknown, [0.2, 0.7]),
+            (Mode::Charge, [0.17, 0.73]),
+            (Mode::Discharge, [0.5, 0.36]),
+            (Mode::Rest, [0.5, 0.4]),
+            (Mode::Charge, [0.46, 0.44]),
+        ];
+        for (from, at) in trips {
+            note(&mut span, from, at);
+            assert_eq!(span.closed(0), None);
+        }
+        note(&mut span, Mode::Charge, [0.3, 0.6]);
+        let closed = span.closed(0).expect("a span");
+        assert!((closed.charge_ah - 50.0).abs() < 1e-9, "{closed:?}");
+        assert_eq!(closed.ends_by_voltage, Some([0.9, 0.4]));
+        assert!((closed.uncounted - UNNOTICED * UNNOTICED).abs() < 1e-12, "{closed:?}");
+        span.forget(0);
+        assert_eq!(span.closed(0).expect("a span").ends_by_voltage, None);
+    }
+
+    #[test]
+    fn unseen_use_restarts_span() {
+        let mut span = Span::default();
+        // 0.3 has moved unseen.
+        let trips = [
+            (Mode::Unknown, [0.0, 0.9]),
+            (Mode::Discharge, [0.2, 0.7]),
+            (Mode::Unknown, [0.2, 0.4]),
+            (Mode::Discharge, [0.3, 0.3]),
+            (Mode::Charge, [0.1, 0.5]),
+        ];
+        for (from, at) in trips {
+            note(&mut span, from, at);
+        }
+        assert_eq!(span.closed(0), None);
+        note(&mut span, Mode::Charge, [0.0, 0.6]);
+        note(&mut span, Mode::Discharge, [0.1, 0.5]);
+        let closed = span.closed(0).expect("the charge");
+        assert_eq!(closed.ends_by_voltage, Some([0.3, 0.6]));
+    }
+}

@@ -89,7 +89,7 @@ impl Knowledge {
                 format!(" Until then {:.3} \u{b1} {:.3} Ah is assumed.", step.worst.0, step.worst.1)
             });
             let (why, teaches) = if is_prior(context) {
-                ("While the cell model is the label's, no charge or discharge measures it.", teaches_model(context))
+                ("No charge of more than a quarter of the capacity has measured it yet.", teaches_by_label(context))
             } else {
                 ("No charge or discharge has measured it yet.", TEACHES_CAPACITY.to_owned())
             };
@@ -241,10 +241,20 @@ fn is_prior(context: &PageContext<'_>) -> bool {
 
 /// What teaches the cell model. LFP cells keep the label's model.
 fn teaches_model(context: &PageContext<'_>) -> String {
-    let chemistry = context.model.as_ref().and_then(|sourced| sourced.source.chemistry.as_deref());
-    let is_learnable = !chemistry.is_some_and(|name| name.starts_with("lfp"));
     let in_use = " With a reading per second and rests of some minutes, packwatch may also learn it in use.";
-    format!("A measured cell model (packwatch fit).{}", if is_learnable { in_use } else { "" })
+    format!("A measured cell model (packwatch fit).{}", if is_learnable(context) { in_use } else { "" })
+}
+
+fn is_learnable(context: &PageContext<'_>) -> bool {
+    let chemistry = context.model.as_ref().and_then(|sourced| sourced.source.chemistry.as_deref());
+    !chemistry.is_some_and(|name| name.starts_with("lfp"))
+}
+
+/// What teaches the capacity while the cell model is made from the label.
+fn teaches_by_label(context: &PageContext<'_>) -> String {
+    let lfp = " An LFP cell must be nearly empty at one end and nearly full at the other.";
+    let is_flat = !is_learnable(context);
+    format!("A discharge and a charge of more than a quarter of the capacity.{}", if is_flat { lfp } else { "" })
 }
 
 fn last(data: &Data, pick: series::ValueSelector, high_is_bad: bool) -> Option<CellStep> {

@@ -2,7 +2,7 @@
 //!
 //! With a column `type`, only discharges are readings, and each discharge counts as a full cycle. Without this column,
 //! the file does not contain the use, so days are counted. `duration_s` states how long the cell was in use from the
-//! time of a row; the remaining time to the next row counts as rest.
+//! time of a row; the remaining time to the next row counts as rest. Without `duration_s`, up to a day counts as use.
 
 use std::path::Path;
 
@@ -46,6 +46,8 @@ struct UseCounter {
     /// Discharges before the first reading.
     before: f64,
     used_days: f64,
+    /// Days in use after a row that does not state them.
+    unstated_days: f64,
     rest_days: f64,
 }
 
@@ -69,7 +71,9 @@ impl History {
     pub fn read(path: &Path) -> Result<Self, TableError> {
         let mut table = CapacityTable::open_in_order(path)?;
         let axis = if table.header().find("type").is_some() { Axis::Cycles } else { Axis::Days };
-        let (mut counter, mut rows) = (UseCounter::default(), Vec::new());
+        // Without the column, a pause between cycles cannot be told from use: up to a day counts as use.
+        let unstated_days = if table.header().find("duration_s").is_some() { 0.0 } else { 1.0 };
+        let (mut counter, mut rows) = (UseCounter { unstated_days, ..UseCounter::default() }, Vec::new());
         while let Some(row) = table.next_row()? {
             rows.extend(counter.add_row(axis, &row));
         }
@@ -94,7 +98,7 @@ impl UseCounter {
         if row.is_discharge {
             self.discharges += 1.0;
         }
-        self.used_days = row.duration_s.unwrap_or(0.0) / 86_400.0;
+        self.used_days = row.duration_s.map_or(self.unstated_days, |duration_s| duration_s / 86_400.0);
         reading
     }
 
@@ -140,6 +144,14 @@ mod tests {
         let row = history.rows[1];
         assert_eq!((row.line, row.cycles, row.used), (6, 2.0, 2.0));
         assert!((row.days - 3.0).abs() < 1e-9 && (row.rest_days - 1.5).abs() < 1e-9, "{row:?}");
+    }
+
+    #[test]
+    fn day_between_rows_is_use_without_durations() {
+        let history = read("type,date,capacity_ah\ndischarge,0,2.0\ndischarge,43200,1.9\ndischarge,302400,1.8\n");
+        let rests: Vec<f64> = history.expect("reads").rows.into_iter().map(|row| row.rest_days).collect();
+        assert_eq!(rests[..2], [0.0; 2]);
+        assert!((rests[2] - 2.0).abs() < 1e-9, "{rests:?}");
     }
 
     #[test]

@@ -1,97 +1,234 @@
-//! Computes the distribution of the use until a cell's level (its capacity without recovery) has fallen by a given
-//! loss.
+//! Computes the distribution of the use until a cell's level (its capacity without recovery) falls below a threshold,
+//! as a mixture of fade shapes.
 //!
-//! In: mean and covariance of the remaining loss (fraction of the reference capacity) and of the rate (loss per unit of
-//! use). Out: probabilities and quantiles of the use. The logarithms of extreme uses and rates are limited to
-//! [`LOG_RANGE`].
+//! In: level, rate of fade and their standard deviations, and the loss and use since the highest level. Out:
+//! probabilities and quantiles of the use. Losses and capacities are fractions of the reference capacity.
 //!
-//! Given the loss L and the initial rate r, the use is T = integral over l from 0 to L of exp(-g(l) - W(l)) / r. g(l)
-//! is the expected growth of the rate's logarithm in the [`knee`]. W(l) is the random walk of this logarithm, a
-//! Brownian motion with variance v(l). With m = exp(v / 2 - g):
-//! * E T = (1 / r) integral of m(l);
-//! * E T^2 = (2 / r^2) integral over l of m(l) (integral over s from 0 to l of m(s) e^v(s)).
+//! Shapes: the rate of fade is r ((l + l0) / (lost + l0))^a, with the present rate r, the loss l since the highest
+//! level, the present loss `lost`, and l0 = [`ONSET`]. The exponent a sets the shape: a = -1 is a square root of the
+//! use, 0 a straight line, 0.5 a parabola, 1 an exponential, and above 1 a knee that becomes steeper without limit. The
+//! use for a loss from l1 to l2 has a closed form ([`use_of_loss`]).
 //!
-//! Both integrals use the midpoint rule. T is approximated by a lognormal with these moments. The rate r is
-//! approximated by a lognormal with the mean and variance of the rate's normal distribution, truncated to positive
-//! values. The random walk of the rate with use adds variance.
+//! The posterior of (a, ln r) on a grid of [`SHAPES`] x [`RATES`] nodes is the product of four terms:
+//! * the prior of the exponent: a t distribution around [`EXPONENT`], and with the weight [`STEADY_SHARE`] a normal
+//!   distribution around a straight line;
+//! * the prior of the mean rate over the next [`TYPICAL_LOSS`], a Cauchy distribution (see [`PriorRate`]). Its heavy
+//!   tails let a measured rate replace it. It answers for a cell that has hardly lost capacity;
+//! * the rate that the filter has found;
+//! * the curvature so far: shape and rate together state the use since the highest level. The deviation from the use
+//!   that has passed has a t distribution.
 //!
-//! The loss L is normal. If L <= 0, the level has already fallen that far: T = 0, with the probability of L <= 0. The
-//! range L > 0 is divided into slices of equal width. Each slice is a lognormal for the loss at the slice's centre,
-//! with the rate conditional on this loss. The width w of the slice adds a variance of (w / L)^2 / 12.
+//! The use until the threshold is the use of the shape, for [`SLICES`] slices of the uncertain level, times a lognormal
+//! deviation: a future change of the rate ([`SPREAD_LOSS`]), and the error of any shape ([`SPREAD`]).
+//!
+//! Assumptions: the level passes the threshold once. The posterior does not depend on the threshold, so probabilities
+//! for several thresholds agree with each other.
 
-use super::{KNEE_DRIFT, RATE_WALK_USE, knee, walk_variance};
-use crate::filter::{bell, bisect, normal_cdf};
+use crate::filter::{bell, normal_cdf, square};
 
-/// Number of slices of the loss.
-const SLICES: usize = 10;
-/// Half-width of the range that is divided into slices, in standard deviations of the loss. The last slice also
-/// contains the upper tail.
+/// Loss at which the acceleration of a fade begins (fraction of the reference). Below it, all shapes are nearly
+/// straight lines.
+const ONSET: f64 = 0.03;
+/// Prior of the exponent: centre and scale of a t distribution with [`EXPONENT_FREEDOM`] degrees of freedom.
+const EXPONENT: (f64, f64) = (1.8, 0.6);
+const EXPONENT_FREEDOM: f64 = 3.0;
+/// Prior probability of a steady fade, and standard deviation of its exponent around 0.
+const STEADY_SHARE: f64 = 0.05;
+const STEADY_STD: f64 = 0.5;
+/// Scale of the relative deviation between the loss that a shape implies and the loss that was seen.
+const CURVATURE: f64 = 0.3;
+/// Scale of the same deviation for a small loss (fraction of the reference).
+const CURVATURE_FLOOR: f64 = 0.01;
+/// Loss over which the prior of the rate is stated.
+const TYPICAL_LOSS: f64 = 0.1;
+/// Equivalent full cycles in which a typical cell loses `TYPICAL_LOSS`: 800 cycles to 80 %.
+const TYPICAL_CYCLES: f64 = 400.0;
+/// Scale of the prior of the rate's logarithm, in cycles and in days.
+const TYPICAL_SCALE: (f64, f64) = (0.7, 2.0);
+/// Smallest loss that is assumed if the prior of the rate is the mean rate so far (fraction of the reference).
+const LEAST_LOSS: f64 = 0.01;
+/// Standard deviation of the logarithm of the use, per square root of an e-fold of the loss.
+const SPREAD_LOSS: f64 = 0.25;
+/// Standard deviation of the logarithm of the use, for any loss.
+const SPREAD: f64 = 0.23;
+
+/// First exponent of the grid, step, and number of exponents: -1.5 to 4.5.
+const FIRST_EXPONENT: f64 = -1.5;
+const EXPONENT_STEP: f64 = 0.5;
+const SHAPES: usize = 13;
+/// Number of rates of the grid.
+const RATES: usize = 41;
+/// Number of slices of the level, and half-width of the range that is divided into slices (standard deviations). The
+/// last slice also contains the upper tail.
+const SLICES: usize = 7;
 const SLICED: f64 = 3.5;
+/// Number of bins of the logarithm of the use, and their width. The bins cover 32 e-folds.
+const BINS: usize = 320;
+const BIN: f64 = 0.1;
+/// Node weights below this share of the sum are ignored.
+const NEGLIGIBLE: f64 = 1e-9;
 
-/// Number of bisection steps: they narrow a range of about 20 e-folds to 1 part in 10^6.
+/// Number of bisection steps for a capacity: the error is below 1 part in 10^6.
 pub(super) const HALVINGS: u32 = 24;
 
-/// Allowed range of the logarithms of use and rate.
-const LOG_RANGE: (f64, f64) = (-20.0, 40.0);
-
-/// Number of steps of an integral over the loss.
-const STEPS: usize = 16;
-
-/// A slice of the loss: probability of the slice, and mean and standard deviation of the logarithm of the use.
-type Slice = (f64, (f64, f64));
-
-/// The distribution of the use until the crossing.
-#[derive(Debug, Clone)]
-pub(super) struct Crossing {
-    /// Probability that the level has already passed the threshold.
-    passed: f64,
-    slices: [Slice; SLICES],
+/// Prior of the mean rate over the next [`TYPICAL_LOSS`].
+#[derive(Debug, Clone, Copy)]
+pub(super) enum PriorRate {
+    /// Per equivalent full cycle: mean of a typical cell's rate and of the rate since the highest level. The rate of
+    /// the cell counts more, the more it has lost.
+    PerCycle,
+    /// Mean rate since the first reading. Use in days differs too much between cells for a typical rate.
+    SoFar {
+        /// Days since the first reading.
+        days: f64,
+    },
 }
 
-impl Crossing {
-    /// `mean`: [remaining loss, rate]. `covariance`: [variance of the loss, covariance of loss and rate, variance of
-    /// the rate]. `lost` and `used`: loss and use until now.
-    pub(super) fn new(mean: [f64; 2], covariance: [f64; 3], lost: f64, used: f64) -> Self {
-        let [loss_variance, both, rate_variance] = covariance;
-        // The minimum avoids a division by 0 if the loss is known exactly; all slices are then equal.
-        let loss_std = loss_variance.max(1e-24).sqrt();
-        let by_loss = both / (loss_std * loss_std);
-        let left = (rate_variance - by_loss * both).max(0.0);
-        // Deviation from the mean, in standard deviations, at which the loss is 0.
-        let zero = -mean[0] / loss_std;
+/// What the filter knows of a cell.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct FadeState {
+    /// Level, mean and standard deviation.
+    pub(super) level: (f64, f64),
+    /// Rate of fade per unit of use, mean and standard deviation (above 0).
+    pub(super) rate: (f64, f64),
+    /// Loss is counted from this level.
+    pub(super) new_level: f64,
+    /// Highest level; lower than `new_level` if the first reading came from an aged cell.
+    pub(super) top_level: f64,
+    /// Use since the highest level.
+    pub(super) since_top: f64,
+    pub(super) prior: PriorRate,
+}
+
+/// Posterior of the shape and the rate of a fade.
+#[derive(Debug, Clone)]
+pub(super) struct FadePosterior {
+    state: FadeState,
+    /// Logarithm of the first rate of the grid, and step.
+    log_rates: (f64, f64),
+    /// Probability of each exponent and rate; the sum is 1.
+    weights: [[f64; RATES]; SHAPES],
+}
+
+/// Distribution of the use until the crossing.
+#[derive(Debug, Clone)]
+pub(super) struct Crossing {
+    /// Logarithm of the use at the lower end of the first bin.
+    start: f64,
+    /// Probability that the level has passed the threshold before the upper end of each bin.
+    cumulative: [f64; BINS],
+    /// Probability that the level has already passed the threshold.
+    passed: f64,
+}
+
+impl FadePosterior {
+    pub(super) fn new(state: FadeState) -> Self {
+        let FadeState { rate: (rate, rate_std), since_top, .. } = state;
+        let lost = state.lost(state.level.0);
+        let at_top = state.lost(state.top_level).min(lost);
+        let (typical, scale) = match state.prior {
+            // As if the cell had behaved like a typical cell before it was observed.
+            PriorRate::PerCycle => ((TYPICAL_LOSS + lost - ONSET) / (TYPICAL_CYCLES + since_top), TYPICAL_SCALE.0),
+            PriorRate::SoFar { days } => ((lost - ONSET + LEAST_LOSS) / days, TYPICAL_SCALE.1),
+        };
+        let log_typical = libm::log(typical);
+        let (first, last) = log_rate_range(rate, rate_std, log_typical);
+        let step = (last - first) / (RATES - 1) as f64;
+        let mut weights = [[0.0; RATES]; SHAPES];
+        for (index, of_shape) in weights.iter_mut().enumerate() {
+            let exponent = exponent(index);
+            let log_prior = libm::log(exponent_density(exponent));
+            let growth = libm::log(TYPICAL_LOSS / use_of_loss(exponent, lost, lost + TYPICAL_LOSS));
+            let implied = -use_of_loss(exponent, lost, at_top);
+            let implied_variance = square(CURVATURE * implied) + square(CURVATURE_FLOOR);
+            for (index, weight) in of_shape.iter_mut().enumerate() {
+                let log_rate = first + step * index as f64;
+                let node = libm::exp(log_rate);
+                let from_typical = (log_rate + growth - log_typical) / scale;
+                let curved = square(implied - node * since_top) / implied_variance;
+                *weight = log_prior - libm::log1p(from_typical * from_typical) - 0.5 * square((rate - node) / rate_std);
+                if since_top > 0.0 {
+                    *weight -= 2.0 * libm::log1p(curved / 3.0);
+                }
+            }
+        }
+        normalise(&mut weights);
+        Self { state, log_rates: (first, step), weights }
+    }
+
+    /// Distribution of the use until the level passes `threshold`.
+    pub(super) fn crossing(&self, threshold: f64) -> Crossing {
+        let (level, level_std) = self.state.level;
+        // The minimum avoids a division by 0 if the level is known exactly; all slices are then equal.
+        let level_std = level_std.max(1e-12);
+        // Deviation from the mean, in standard deviations, at which the level has passed the threshold.
+        let zero = (threshold - level) / level_std;
         let from = zero.max(-SLICED);
         let width = (SLICED.max(from + 1.0) - from) / SLICES as f64;
-        let mut before = normal_cdf(zero);
-        let passed = before;
-        let slices = std::array::from_fn(|index| {
+        let passed = normal_cdf(zero);
+        let mut before = passed;
+        let slices: [(f64, [f64; SHAPES]); SLICES] = std::array::from_fn(|index| {
             let upper = from + (index + 1) as f64 * width;
             let until = if index + 1 == SLICES { 1.0 } else { normal_cdf(upper) };
             let probability = (until - before).max(0.0);
             before = until;
-            let deviation = upper - 0.5 * width;
-            let loss = mean[0] + loss_std * deviation;
-            let (log_rate, log_rate_variance) = positive(mean[1] + by_loss * loss_std * deviation, left);
-            let (log_use, walked) = use_of_loss(lost, loss);
-            let log_mean = log_use - log_rate;
-            // The rate also walks with use. The crossing depends on the rate averaged over the use, so about half of
-            // the walk's variance counts.
-            let ahead = libm::log1p(libm::exp(log_mean.min(LOG_RANGE.1)) / used.max(f64::MIN_POSITIVE));
-            let own_width = loss_std * width / loss;
-            let variance =
-                log_rate_variance + walked + 0.5 * RATE_WALK_USE * RATE_WALK_USE * ahead + own_width * own_width / 12.0;
-            (probability, (log_mean, variance.sqrt()))
+            let level = level + level_std * (upper - 0.5 * width);
+            let lost = self.state.lost(level);
+            let end = lost + (level - threshold).max(1e-12);
+            (probability, std::array::from_fn(|shape| libm::log(use_of_loss(exponent(shape), lost, end))))
         });
-        Self { passed, slices }
+        let longest =
+            slices.iter().flat_map(|(_, uses)| uses).fold(f64::NEG_INFINITY, |most, &log_use| most.max(log_use));
+        let start = longest - self.log_rates.0 + 2.0 - BIN * BINS as f64;
+        let mut bins = [0.0; BINS];
+        for (probability, log_uses) in &slices {
+            self.add_slice(&mut bins, *probability, log_uses, start);
+        }
+        let lost = self.state.lost(level);
+        let e_folds = libm::log((lost + (level - threshold).max(0.0)) / lost);
+        let spread = (SPREAD_LOSS * SPREAD_LOSS * e_folds + SPREAD * SPREAD).sqrt();
+        let mut sum = passed;
+        let cumulative = spread_bins(&bins, spread / BIN).map(|probability| {
+            sum += probability;
+            sum
+        });
+        Crossing { start, cumulative, passed }
     }
 
+    /// Adds the uses of one slice of the level to the bins. Each use is divided between the two nearest bins, so the
+    /// mean is not rounded.
+    fn add_slice(&self, bins: &mut [f64; BINS], probability: f64, log_uses: &[f64; SHAPES], start: f64) {
+        let (first, step) = self.log_rates;
+        for (of_shape, log_use) in self.weights.iter().zip(log_uses) {
+            for (index, weight) in of_shape.iter().enumerate().filter(|(_, weight)| **weight > NEGLIGIBLE) {
+                let place = (log_use - first - step * index as f64 - start) / BIN - 0.5;
+                let place = place.clamp(0.0, (BINS - 2) as f64);
+                let bin = place as usize;
+                let upper = place - bin as f64;
+                bins[bin] += probability * weight * (1.0 - upper);
+                bins[bin + 1] += probability * weight * upper;
+            }
+        }
+    }
+}
+
+impl FadeState {
+    /// Loss at a level since the highest level, plus [`ONSET`].
+    fn lost(&self, level: f64) -> f64 {
+        (self.new_level - level).max(0.0) + ONSET
+    }
+}
+
+impl Crossing {
     /// Probability that the level passes the threshold within `ahead` units of use.
     pub(super) fn probability(&self, ahead: f64) -> f64 {
-        self.probability_of_log(libm::log(ahead))
-    }
-
-    fn probability_of_log(&self, log_use: f64) -> f64 {
-        let of_slice = |(weight, (mean, std)): &Slice| weight * normal_cdf((log_use - mean) / std);
-        self.passed + self.slices.iter().map(of_slice).sum::<f64>()
+        let place = (libm::log(ahead) - self.start) / BIN;
+        if place <= 0.0 {
+            return self.passed;
+        }
+        let bin = (place as usize).min(BINS - 1);
+        let before = if bin == 0 { self.passed } else { self.cumulative[bin - 1] };
+        before + (place - bin as f64).min(1.0) * (self.cumulative[bin] - before)
     }
 
     /// Use within which the level passes the threshold with the probability `probability`.
@@ -99,120 +236,132 @@ impl Crossing {
         if self.passed >= probability {
             return 0.0;
         }
-        let likely = || self.slices.iter().filter(|(weight, _)| *weight > 0.0);
-        // The search range extends six standard deviations beyond the mean of each slice.
-        let ends = |sign: f64| likely().map(move |(_, (mean, std))| mean + sign * 6.0 * std);
-        let least = ends(-1.0).fold(LOG_RANGE.1, f64::min).max(LOG_RANGE.0);
-        let most = ends(1.0).fold(least, f64::max).min(LOG_RANGE.1);
-        libm::exp(bisect((least, most), HALVINGS, |log_use| self.probability_of_log(log_use) < probability).1)
+        let bin = self.cumulative.partition_point(|&sum| sum < probability).min(BINS - 1);
+        let before = if bin == 0 { self.passed } else { self.cumulative[bin - 1] };
+        let share = ((probability - before) / (self.cumulative[bin] - before)).clamp(0.0, 1.0);
+        libm::exp(self.start + BIN * (bin as f64 + share))
     }
 }
 
-/// Mean and variance of the logarithm of a lognormal. The lognormal has the same moments as the normal distribution
-/// (`mean`, `variance`) truncated to values above 0.
-fn positive(mean: f64, variance: f64) -> (f64, f64) {
-    let std = variance.max(1e-24 * mean * mean).sqrt();
-    if std == 0.0 {
-        return (LOG_RANGE.0, 0.0);
-    }
-    // If the mean is below -8 standard deviations, the ratio of density to tail probability cannot be computed in f64.
-    // The rate is then close to 0 anyway.
-    let place = (mean / std).max(-8.0);
-    let density = bell(place) / (2.0 * std::f64::consts::PI).sqrt();
-    let hazard = density / normal_cdf(place);
-    let first = std * (place + hazard);
-    let second = (std * std * (1.0 - hazard * (hazard + place))).max(1e-24 * first * first);
-    let log_variance = libm::log1p(second / (first * first));
-    (libm::log(first) - 0.5 * log_variance, log_variance)
+fn exponent(index: usize) -> f64 {
+    FIRST_EXPONENT + EXPONENT_STEP * index as f64
 }
 
-/// Mean and variance of the logarithm of the use until a further loss of `loss`, for an initial rate of 1.
-fn use_of_loss(lost: f64, loss: f64) -> (f64, f64) {
-    let step = loss / STEPS as f64;
-    // Integrals over the loss: of m, of m e^v, and the second moment.
-    let (mut mean, mut inner, mut second) = (0.0, 0.0, 0.0);
-    for index in 0..STEPS {
-        let at = lost + (index as f64 + 0.5) * step;
-        let variance = walk_variance(lost, at);
-        let m = libm::exp(0.5 * variance - KNEE_DRIFT * (knee(at) - knee(lost)));
-        let own = m * libm::exp(variance);
-        second += m * (2.0 * inner + own);
-        mean += m;
-        inner += own;
+/// Prior density of an exponent, up to a constant factor.
+fn exponent_density(exponent: f64) -> f64 {
+    // Ratio of the peak of a normal density to the peak of a t density with the same scale.
+    const PEAKS: f64 = 1.1;
+    let squared = square((exponent - EXPONENT.0) / EXPONENT.1);
+    let power = -0.5 * (EXPONENT_FREEDOM + 1.0);
+    let knee = libm::pow(1.0 + squared / EXPONENT_FREEDOM, power) / EXPONENT.1;
+    (1.0 - STEADY_SHARE) * knee + STEADY_SHARE * PEAKS * bell(exponent / STEADY_STD) / STEADY_STD
+}
+
+/// Range of the logarithm of the rate that contains the posterior.
+fn log_rate_range(rate: f64, rate_std: f64, log_typical: f64) -> (f64, f64) {
+    if rate > 3.0 * rate_std {
+        let half = (6.0 * rate_std / rate).clamp(0.3, 3.0);
+        return (libm::log(rate) - half, libm::log(rate) + half);
     }
-    let log_variance = libm::log(second / (mean * mean)).max(0.0);
-    (libm::log(mean * step) - 0.5 * log_variance, log_variance)
+    // The data do not exclude that the rate is near 0; the prior bounds it.
+    let last = libm::log(rate + 4.0 * rate_std);
+    ((last - 8.0).min(log_typical - 6.0), last)
+}
+
+/// Use in which the loss changes from `from` to `to` (both plus [`ONSET`]), for a rate of 1 at `from`. Negative if `to`
+/// is smaller.
+fn use_of_loss(exponent: f64, from: f64, to: f64) -> f64 {
+    let e_folds = libm::log(to / from);
+    let power = (1.0 - exponent) * e_folds;
+    // (e^x - 1) / x tends to 1.
+    let mean = if power.abs() < 1e-9 { 1.0 } else { libm::expm1(power) / power };
+    from * e_folds * mean
+}
+
+/// Turns logarithms of weights into weights with the sum 1.
+fn normalise(weights: &mut [[f64; RATES]; SHAPES]) {
+    let largest = weights.iter().flatten().fold(f64::NEG_INFINITY, |most, &weight| most.max(weight));
+    weights.iter_mut().flatten().for_each(|weight| *weight = libm::exp(*weight - largest));
+    let sum: f64 = weights.iter().flatten().sum();
+    weights.iter_mut().flatten().for_each(|weight| *weight /= sum);
+}
+
+/// Convolves the bins with a normal distribution with the standard deviation `std` (bins). What leaves the range is
+/// kept in the outermost bins.
+fn spread_bins(bins: &[f64; BINS], std: f64) -> [f64; BINS] {
+    let reach = ((4.0 * std) as usize).min(BINS / 2);
+    let mut kernel = [0.0; BINS / 2 + 1];
+    for (distance, value) in kernel.iter_mut().enumerate().take(reach + 1) {
+        *value = bell(distance as f64 / std);
+    }
+    let sum = kernel[0] + 2.0 * kernel[1..].iter().sum::<f64>();
+    let mut spread = [0.0; BINS];
+    for (bin, &probability) in bins.iter().enumerate().filter(|(_, probability)| **probability > 0.0) {
+        for (distance, share) in kernel.iter().enumerate().take(reach + 1) {
+            let part = probability * share / sum;
+            spread[(bin + distance).min(BINS - 1)] += part;
+            if distance > 0 {
+                spread[bin.saturating_sub(distance)] += part;
+            }
+        }
+    }
+    spread
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::KNEE;
     use super::*;
 
-    #[test]
-    fn moments_of_use_agree_with_sampled_walk() {
-        // A generator with a fixed seed makes the test reproducible; antithetic pairs make the first moment nearly
-        // exact. The loss starts before the knee and ends after it.
-        let (lost, loss, steps, paths) = (0.05, 0.3, 200, 4000);
-        let mut seed = 1_u64;
-        let mut uniform = || {
-            seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            ((seed >> 11) as f64 + 0.5) / (1_u64 << 53) as f64
-        };
-        let mut sum = [0.0; 2];
-        for _ in 0..paths {
-            let (mut walk, mut uses) = (0.0, [0.0; 2]);
-            for step in 0..steps {
-                let [from, to] = [step, step + 1].map(|step| lost + loss * f64::from(step) / f64::from(steps));
-                let growth = KNEE_DRIFT * (knee(0.5 * (from + to)) - knee(lost));
-                let normal = (-2.0 * uniform().ln()).sqrt() * (std::f64::consts::TAU * uniform()).cos();
-                let before = walk;
-                walk += walk_variance(from, to).sqrt() * normal;
-                for (total, sign) in uses.iter_mut().zip([-1.0, 1.0]) {
-                    *total +=
-                        loss / f64::from(steps) * 0.5 * ((sign * before - growth).exp() + (sign * walk - growth).exp());
-                }
-            }
-            for total in uses {
-                sum[0] += total / f64::from(2 * paths);
-                sum[1] += total * total / f64::from(2 * paths);
-            }
+    /// A cell with 10 % of loss after 100 units of use, fading at a known rate.
+    fn state(rate: f64) -> FadeState {
+        FadeState {
+            level: (0.9, 1e-4),
+            rate: (rate, 0.02 * rate),
+            new_level: 1.0,
+            top_level: 1.0,
+            since_top: 100.0,
+            prior: PriorRate::PerCycle,
         }
-        let (log_mean, log_variance) = use_of_loss(lost, loss);
-        let (mean, second) = ((log_mean + 0.5 * log_variance).exp(), (2.0 * log_mean + 2.0 * log_variance).exp());
-        assert!((sum[0] / mean - 1.0).abs() < 0.01, "{} {mean}", sum[0]);
-        assert!(((sum[1] - sum[0] * sum[0]) / (second - mean * mean) - 1.0).abs() < 0.1, "{} {second}", sum[1]);
+    }
+
+    fn median(state: FadeState) -> f64 {
+        FadePosterior::new(state).crossing(0.8).quantile(0.5)
     }
 
     #[test]
-    fn small_loss_uses_the_current_rate() {
-        let (log_mean, log_variance) = use_of_loss(0.3, 1e-9);
-        assert!(
-            (log_mean - 1e-9_f64.ln()).abs() < 1e-6 && (0.0..1e-6).contains(&log_variance),
-            "{log_mean} {log_variance}"
-        );
+    fn use_of_loss_matches_closed_forms() {
+        assert!((use_of_loss(0.0, 0.03, 0.23) - 0.2).abs() < 1e-12);
+        assert!((use_of_loss(1.0, 0.1, 0.2) - 0.1 * 2.0_f64.ln()).abs() < 1e-12);
+        assert!((use_of_loss(-1.0, 0.1, 0.2) - 0.15).abs() < 1e-12);
+        assert!((use_of_loss(2.0, 0.1, 0.2) - 0.05).abs() < 1e-12);
+        assert!(use_of_loss(2.0, 0.2, 0.1) < 0.0);
     }
 
     #[test]
-    fn loss_in_knee_takes_less_use() {
-        let (through, behind) = (use_of_loss(KNEE.0, 0.1).0, use_of_loss(KNEE.1, 0.1).0);
-        assert!((through - behind) < -0.2, "{through} {behind}");
+    fn curvature_so_far_decides_the_shape() {
+        // The same loss and the same present rate: the cell that lost less before has the steeper shape.
+        let steady = median(state(0.001));
+        let steep = median(FadeState { since_top: 300.0, ..state(0.001) });
+        assert!(steady > 60.0 && steep < 0.95 * steady, "{steady} {steep}");
     }
 
     #[test]
-    fn certain_positive_rate_keeps_its_moments() {
-        let (log_mean, log_variance) = positive(2.0, 0.01);
-        assert!(((log_mean + 0.5 * log_variance).exp() - 2.0).abs() < 1e-9);
-        let (log_mean, _) = positive(-1.0, 1.0);
-        assert!(log_mean.is_finite());
+    fn unknown_rate_gives_wide_interval_around_typical_life() {
+        let unknown = FadeState { level: (1.0, 1e-4), rate: (0.0, 0.01), since_top: 0.0, ..state(0.001) };
+        let crossing = FadePosterior::new(unknown).crossing(0.9);
+        let [low, median, high] = [0.05, 0.5, 0.95].map(|probability| crossing.quantile(probability));
+        assert!((200.0..800.0).contains(&median), "{median}");
+        assert!(low < 0.4 * median && high > 3.0 * median && high.is_finite(), "{low} {high}");
     }
 
     #[test]
     fn quantile_is_inverse_of_probability() {
-        let crossing = Crossing::new([0.1, 0.002], [1e-4, -1e-7, 1e-7], 0.1, 50.0);
+        let posterior = FadePosterior::new(state(0.001));
+        let crossing = posterior.crossing(0.8);
         for probability in [0.05, 0.5, 0.95] {
-            assert!((crossing.probability(crossing.quantile(probability)) - probability).abs() < 1e-6);
+            assert!((crossing.probability(crossing.quantile(probability)) - probability).abs() < 1e-9);
         }
-        assert_eq!(Crossing::new([-0.1, 0.002], [1e-6, 0.0, 1e-7], 0.3, 50.0).quantile(0.95), 0.0);
+        assert!((crossing.probability(1e12) - 1.0).abs() < 1e-6);
+        assert_eq!(posterior.crossing(0.95).quantile(0.95), 0.0);
     }
 }

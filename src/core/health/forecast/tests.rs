@@ -21,12 +21,12 @@ fn passed(cycles: f64) -> Usage {
 }
 
 #[test]
-fn linear_fade_before_knee_is_extrapolated() {
+fn interval_covers_straight_continuation_before_knee() {
     let forecast = fed(|efc| 2.0 - 0.001 * efc, 1.0, 100.0);
     let life = forecast.remaining(1.8).expect("enough is known");
     let cycles = life.cycles.expect("cycles are counted");
-    // The cell has 1.9 Ah now, 0.1 Ah above the threshold.
-    assert!((cycles.median - 100.0).abs() < 10.0, "{cycles:?}");
+    // The cell has 1.9 Ah now, 0.1 Ah above the threshold: 100 cycles at the present rate. Most cells accelerate.
+    assert!((75.0..100.0).contains(&cycles.median), "{cycles:?}");
     assert!(cycles.low < 100.0 && cycles.high > 100.0 && cycles.high < 8.0 * cycles.low, "{cycles:?}");
     let days = life.days.expect("the rate of use is known");
     assert!((days.median / cycles.median - 0.25).abs() < 1e-9, "{days:?}");
@@ -43,18 +43,46 @@ fn interval_covers_fade_with_and_without_knee() {
 
 #[test]
 fn tenfold_slower_fade_lasts_tenfold_longer() {
-    let fast = fed(|efc| 2.0 - 0.002 * efc, 10.0, 150.0);
-    let slow = fed(|efc| 2.0 - 0.0002 * efc, 100.0, 1500.0);
+    let fast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 150.0);
+    let slow = fed(|efc| 2.0 - 0.0002 * efc, 10.0, 1500.0);
     let median = |forecast: &Forecast| forecast.remaining(1.5).expect("enough").cycles.expect("cycles").median;
-    assert!((median(&slow) / median(&fast) - 10.0).abs() < 1.0, "{} {}", median(&slow), median(&fast));
+    // Typical lives are part of the prior, so the factor is slightly below 10.
+    assert!((8.0..11.0).contains(&(median(&slow) / median(&fast))), "{} {}", median(&slow), median(&fast));
 }
 
 #[test]
 fn readings_within_one_cycle_count_less() {
-    let noisy = |efc: f64| 2.0 - 0.002 * efc;
-    let (few, many) = (fed(noisy, 1.0, 60.0), fed(noisy, 0.05, 60.0));
+    // A recovery with a time constant of ten cycles, every 0.05 cycles, from a generator with a fixed seed.
+    let (mut seed, mut recovery) = (1_u64, 0.0);
+    let recoveries: Vec<f64> = (0..=2000)
+        .map(|_| {
+            seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            recovery = 0.995 * recovery + 0.006 * ((seed >> 11) as f64 / (1_u64 << 53) as f64 - 0.5);
+            recovery
+        })
+        .collect();
+    let noisy = |efc: f64| 2.0 - 0.002 * efc + recoveries[(20.0 * efc).round() as usize];
+    let (few, many) = (fed(noisy, 1.0, 100.0), fed(noisy, 0.05, 100.0));
     let (few_std, many_std) = (few.rate_ah().1, many.rate_ah().1);
-    assert!(many_std > 0.6 * few_std, "{many_std} {few_std}");
+    // 20 times as many independent readings would divide the deviation by 4.5.
+    assert!(many_std > 0.5 * few_std, "{many_std} {few_std}");
+}
+
+#[test]
+fn noise_is_learned_from_the_readings() {
+    let scatter = |size: f64| fed(|efc| 2.0 - 0.0005 * efc + if efc % 2.0 == 0.0 { size } else { 0.0 }, 1.0, 100.0);
+    let std = |size: f64| scatter(size).rate_ah().1;
+    assert!(std(0.001) < 0.5 * std(0.05), "{} {}", std(0.001), std(0.05));
+}
+
+#[test]
+fn loss_counts_from_the_highest_level() {
+    // The capacity rises by 4 % in 40 cycles, then falls by 4 % in 80.
+    let forecast = fed(|efc| if efc < 40.0 { 2.0 + 0.002 * efc } else { 2.08 - 0.001 * (efc - 40.0) }, 1.0, 120.0);
+    assert!((forecast.x[TOP] - 1.04).abs() < 0.01, "{forecast:?}");
+    // 0.2 Ah above the threshold: 200 cycles at the present rate.
+    let cycles = forecast.remaining(1.8).expect("enough").cycles.expect("cycles");
+    assert!(cycles.low < 100.0 && (80.0..250.0).contains(&cycles.median) && cycles.high > 250.0, "{cycles:?}");
 }
 
 #[test]
@@ -69,13 +97,17 @@ fn recovery_after_rest_keeps_fade_rate() {
 }
 
 #[test]
-fn few_readings_or_no_fade_give_no_forecast() {
+fn few_readings_give_no_forecast() {
     assert_eq!(Forecast::new(Axis::Cycles, 2.0).remaining(1.5), Err(InsufficientData::Readings { found: 0 }));
     assert_eq!(fed(|efc| 2.0 - 0.01 * efc, 1.0, 1.0).remaining(1.5), Err(InsufficientData::Readings { found: 2 }));
-    let flat = fed(|_| 2.0, 1.0, 300.0).remaining(1.5);
-    assert!(matches!(flat, Err(InsufficientData::Fade { .. })), "{flat:?}");
-    let rising = fed(|efc| 2.0 + 0.001 * efc, 1.0, 100.0).remaining(1.5);
-    assert!(matches!(rising, Err(InsufficientData::Fade { .. })), "{rising:?}");
+}
+
+#[test]
+fn unseen_fade_gives_wide_interval() {
+    for unseen in [fed(|_| 2.0, 1.0, 300.0), fed(|efc| 2.0 + 0.001 * efc, 1.0, 100.0), fed(|_| 2.0, 1.0, 3.0)] {
+        let cycles = unseen.remaining(1.5).expect("enough readings").cycles.expect("cycles");
+        assert!(cycles.low < 1000.0 && cycles.high > 10.0 * cycles.low && cycles.high.is_finite(), "{cycles:?}");
+    }
 }
 
 #[test]
@@ -118,7 +150,8 @@ fn use_without_reading_shortens_remaining_life() {
     let before = forecast.remaining(1.8).expect("enough").cycles.expect("cycles").median;
     (0..50).for_each(|_| forecast.update(passed(1.0), None));
     let after = forecast.remaining(1.8).expect("enough").cycles.expect("cycles").median;
-    assert!((before - after - 50.0).abs() < 8.0, "{before} {after}");
+    // The filter continues at the present rate. The forecast from an earlier loss expects a longer life.
+    assert!((25.0..58.0).contains(&(before - after)), "{before} {after}");
 }
 
 #[test]
@@ -136,7 +169,7 @@ fn stored_forecast_is_restored_unchanged() {
     let forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 37.0);
     let stored = serde_json::to_string(&forecast).expect("writes");
     assert_eq!(serde_json::from_str::<Forecast>(&stored).expect("reads"), forecast);
-    assert!(stored.len() < 600, "{}", stored.len());
+    assert!(stored.len() < 700, "{}", stored.len());
 }
 
 #[test]
@@ -152,20 +185,19 @@ fn extreme_readings_keep_covariance_positive() {
 }
 
 #[test]
-fn uncertain_first_reading_hardly_delays_forecast() {
-    let forecast_after = |first_variance_ah2: f64| {
+fn uncertain_first_reading_hardly_changes_forecast() {
+    let median_after = |first_variance_ah2: f64, first_error_ah: f64| {
         let mut forecast = Forecast::new(Axis::Cycles, 2.0);
-        let first = (0..200).find(|&efc| {
-            let variance_ah2 = if efc == 0 { first_variance_ah2 } else { 1e-5 };
-            let capacity_ah = 2.0 - 0.002 * f64::from(efc) + if efc == 0 { -0.3 } else { 0.0 };
+        for efc in 0..100 {
+            let (variance_ah2, error_ah) = if efc == 0 { (first_variance_ah2, first_error_ah) } else { (1e-5, 0.0) };
+            let capacity_ah = 2.0 - 0.002 * f64::from(efc) + error_ah;
             let passed = if efc == 0 { Usage::default() } else { passed(1.0) };
             forecast.update(passed, Some(CapacityReading { capacity_ah, variance_ah2, shared_variance_ah2: 0.0 }));
-            forecast.remaining(1.5).is_ok()
-        });
-        first.expect("a forecast before 200 cycles")
+        }
+        forecast.remaining(1.5).expect("enough readings").cycles.expect("cycles").median
     };
-    let (good, weak) = (forecast_after(1e-5), forecast_after(4.0));
-    assert!(weak <= good + 5, "{good} {weak}");
+    let (good, weak) = (median_after(1e-5, 0.0), median_after(4.0, -0.3));
+    assert!((weak / good - 1.0).abs() < 0.1, "{good} {weak}");
 }
 
 #[test]
@@ -207,7 +239,8 @@ fn cell_below_threshold_without_fade_has_no_life() {
     let forecast = fed(|_| 1.4, 1.0, 30.0);
     let life = forecast.remaining(1.6).expect("known without a fade");
     assert_eq!(life.cycles, Some(Remaining::default()));
-    assert!(matches!(forecast.remaining(1.2), Err(InsufficientData::Fade { .. })));
+    let later = forecast.remaining(1.2).expect("enough readings").cycles.expect("cycles");
+    assert!(later.high > 10.0 * later.low, "{later:?}");
 }
 
 #[test]
@@ -264,12 +297,14 @@ fn nan_input_is_ignored_and_stored_nan_rejected() {
     assert_eq!(before.check(Axis::Cycles), Ok(()));
     assert!(before.check(Axis::Days).is_err());
     type Damage = fn(&mut Forecast);
-    let damages: [Damage; 6] = [
+    let damages: [Damage; 8] = [
         |forecast| forecast.reference_ah = 0.0,
         |forecast| forecast.x[RATE] = f64::NAN,
         |forecast| forecast.p[LEVEL][LEVEL] = -1e-9,
         |forecast| forecast.p[LEVEL][RATE] = 1.0,
         |forecast| forecast.used = -1.0,
+        |forecast| forecast.noise_scale = f64::NAN,
+        |forecast| forecast.first_level = Some(f64::INFINITY),
         |forecast| forecast.recent[1] = f64::INFINITY,
     ];
     for (number, damage) in damages.into_iter().enumerate() {

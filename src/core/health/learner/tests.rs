@@ -40,7 +40,7 @@ fn discharge(estimator: &mut CellEstimator) {
 fn mode_begun_in_gap_starts_at_soc_after_gap() {
     let transition = TransitionConfig { dead_band_a: 0.05, hysteresis_a: 0.05, min_duration_s: 0.0, min_swing: 0.02 };
     let mut learner = Learner::new(&config(), vec![ScalarGaussian::from_std(2.0, 0.1)]);
-    let at = |soc: f64| Some(ScalarGaussian::from_std(soc, 0.01));
+    let at = |soc: f64| (Some(ScalarGaussian::from_std(soc, 0.01)), Some(soc));
     let (start, end) = (Timestamp::from_secs(5000.0), Timestamp::from_secs(8600.0));
     assert!(!learner.observe(0, Timestamp::from_secs(1000.0), None, 10.0, 0.0));
     learner.mark_candidate(start, 0.0, |_| at(0.1));
@@ -170,4 +170,50 @@ fn contradicting_half_cycle_widens_belief_and_changes_no_capacity() {
     assert!((update.capacity.mean - 4.0).abs() < 1e-12, "{update:?}");
     let widest = f64::hypot(0.02, NEW_SPREAD * model.capacity_ah);
     assert!((update.capacity.std() - widest).abs() < 1e-9, "{update:?} {widest}");
+}
+
+/// Runs three discharges from SOC 0.9 to 0.3, and charges, of a cell of 1.6 Ah whose label says 2.0 Ah. Returns the
+/// learner. The cell model is a label's, and the voltages show the true SOC.
+fn learned_by_label() -> Learner {
+    let transition = TransitionConfig { dead_band_a: 0.05, hysteresis_a: 0.05, min_duration_s: 0.0, min_swing: 0.02 };
+    let (model, true_ah) = (small_model(), 1.6);
+    let before = ScalarGaussian::from_std(2.0, 0.2);
+    let mut learner = Learner::new(&config(), vec![before]);
+    let mut estimator = CellEstimator::new(&estimator_config());
+    discharge(&mut estimator);
+    let (mut time_s, mut soc, mut half_cycles) = (0.0, 0.9, Vec::new());
+    let mut pass = |learner: &mut Learner, from: Mode, moved: f64| {
+        (time_s, soc) = (time_s + 3600.0, soc - moved);
+        let charge_as = (0.9 - soc) * true_ah * 3600.0;
+        let at = (Some(ScalarGaussian::from_std(soc, 0.03)), Some(soc));
+        learner.mark_candidate(Timestamp::from_secs(time_s), charge_as, |_| at);
+        learner.complete(&transition, 2.0, from, &mut half_cycles);
+        learner.prepare(|_| Lesson::ByLabel { before: before.variance, soc_error: 0.02 });
+        for half_cycle in half_cycles.drain(..) {
+            learner.learn(&model, &config(), 0, &mut estimator, &half_cycle);
+            learner.finish();
+        }
+    };
+    pass(&mut learner, Mode::Unknown, 0.0);
+    for _ in 0..3 {
+        for (from, moved) in [(Mode::Discharge, 0.2), (Mode::Rest, 0.0), (Mode::Charge, -0.02), (Mode::Discharge, 0.42)]
+        {
+            pass(&mut learner, from, moved);
+        }
+        pass(&mut learner, Mode::Unknown, 0.0);
+        pass(&mut learner, Mode::Charge, -0.6);
+        pass(&mut learner, Mode::Rest, 0.0);
+    }
+    learner
+}
+
+#[test]
+fn label_learns_capacity_from_trips_and_charges() {
+    let learner = learned_by_label();
+    let capacity = learner.capacity(0);
+    assert!(learner.has_learned(0), "{capacity:?}");
+    assert!((capacity.mean - 1.6).abs() < 2.0 * capacity.std(), "{capacity:?}");
+    assert!(capacity.mean < 1.8 && capacity.std() < 0.17, "{capacity:?}");
+    // The curve's error is the same in all spans.
+    assert!(capacity.std() > 0.02, "{capacity:?}");
 }
