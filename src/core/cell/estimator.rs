@@ -66,6 +66,7 @@ pub use cell_estimator::{AdoptedState, CellEstimator};
 pub use pack_bank::{CellModule, PackBank};
 pub use state::CellState;
 pub use step::{CellStep, StepResult, Update};
+pub use voltage_reach::reach_of_error;
 
 #[cfg(test)]
 pub(crate) mod tests;

@@ -29,6 +29,7 @@ pub use coverage::Coverage;
 pub use electrodes::{Electrodes, NegativeMaterial, PositiveMaterial};
 pub use estimator::{
     AdoptedState, CellEstimator, CellModule, CellState, CellStep, EstimatorBank, PackBank, StepResult, Update,
+    reach_of_error,
 };
 pub use loss_modes::LossModes;
 pub use model::{

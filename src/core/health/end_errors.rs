@@ -15,7 +15,7 @@
 use super::CapacityConfig;
 use super::half_cycle::HalfCycle;
 use crate::cell::model_bands::CURVE_C;
-use crate::cell::{CellModel, ModelBands};
+use crate::cell::{CellModel, ModelBands, reach_of_error};
 use crate::quantity::Mode;
 
 /// Number of errors, one per SOC node. The nodes are evenly spaced from SOC 0 to 1. In real cells, the error of the
@@ -36,24 +36,30 @@ pub(super) fn effects_ah(
     let ends = if is_label { &half_cycle.ends_by_voltage } else { &half_cycle.ends };
     let Some(ends) = ends else { return effects };
     let bands = ModelBands::new(model);
-    let temperature_c = half_cycle.mean_temperature_c.unwrap_or(CURVE_C);
+    let temperature = model.temperature_position(half_cycle.mean_temperature_c.unwrap_or(CURVE_C));
     // Limits the effect: below a swing of 2 %, the measurement is useless.
     let swing = (half_cycle.charge_ah / capacity_ah).max(0.02);
     // A discharge starts at its higher SOC, a charge at its lower SOC.
     let sign = if half_cycle.mode == Mode::Charge { -1.0 } else { 1.0 };
     for (soc, fuller) in ends.iter().zip([sign, -sign]) {
-        let position = model.grid_position(*soc, temperature_c);
-        let per_volt = -fuller * capacity_ah / (swing * model.ocv_slope_v(&position, capacity_ah));
+        let position = model.grid_position_at(&temperature, *soc);
         // Half of the error stated by a fitted model is an error of the curve and does not change. The other half depends
         // on the history of the current, so it differs between half-cycles.
         let of_fit_v = || model.voltage_error_v(&position).map_or(0.0, |error_v| 0.5 * error_v);
-        let own_v = || if is_label { bands.curve_std_v(*soc).unwrap_or(0.0) } else { of_fit_v() };
+        let of_label_v = || bands.curve_std_v(*soc).unwrap_or(0.0);
+        let own_v = || if is_label { of_label_v() } else { of_fit_v() };
         let error_v = config.end_error_v.unwrap_or_else(own_v);
+        let soc_error = if is_label {
+            reach_of_error(model, &temperature, capacity_ah, (*soc, error_v))
+        } else {
+            error_v / model.ocv_slope_v(&position, capacity_ah)
+        };
+        let effect_ah = -fuller * capacity_ah / swing * soc_error;
         let along = soc.clamp(0.0, 1.0) * (END_ERRORS - 1) as f64;
         let node = (0..END_ERRORS - 2).take_while(|&k| along >= (k + 1) as f64).count();
         let share = along - node as f64;
-        effects[node] += per_volt * error_v * (1.0 - share);
-        effects[node + 1] += per_volt * error_v * share;
+        effects[node] += effect_ah * (1.0 - share);
+        effects[node + 1] += effect_ah * share;
     }
     effects
 }

@@ -177,13 +177,21 @@ pub struct Forecast {
     p: [[f64; N]; N],
     shared_variance: f64,
     /// Learned variance of noise and recovery during use, relative to the constants.
+    #[serde(default = "usual_noise")]
     noise_scale: f64,
     /// Level when it was first known to [`KNOWN_LEVEL`]; `None` before.
+    #[serde(default)]
     first_level: Option<f64>,
     /// Use since the first reading at which the level was highest.
+    #[serde(default)]
     used_at_top: f64,
     /// Recent equivalent full cycles and recent days: exponentially weighted sums with the time constant `RECENT_DAYS`.
     recent: [f64; 2],
+}
+
+/// The noise scale before anything is known.
+fn usual_noise() -> f64 {
+    1.0
 }
 
 impl Usage {
@@ -273,6 +281,15 @@ impl Forecast {
         InvalidState::unless_natural("the shared variance of the remaining life", self.shared_variance)?;
         InvalidState::unless_natural("the noise scale of the remaining life", self.noise_scale)?;
         InvalidState::unless_natural("the use at the highest level of the remaining life", self.used_at_top)?;
+        let is_before = self.used_at_top <= self.used;
+        InvalidState::unless(
+            is_before,
+            "the use at the highest level of the remaining life",
+            self.used_at_top,
+            "at most the use",
+        )?;
+        let is_usual = (SCALE_RANGE.0..=SCALE_RANGE.1).contains(&self.noise_scale);
+        InvalidState::unless(is_usual, "the noise scale of the remaining life", self.noise_scale, "0.001 to 20")?;
         if let Some(level) = self.first_level {
             InvalidState::unless_number("the first level of the remaining life", level)?;
         }

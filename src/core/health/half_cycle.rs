@@ -1,8 +1,8 @@
 //! A half-cycle: one charge or one discharge of a cell.
 
 use super::CapacityConfig;
-use crate::cell::CellModel;
 use crate::cell::model_bands::CURVE_C;
+use crate::cell::{CellModel, reach_of_error};
 use crate::filter::{Measurement, ScalarGaussian, square};
 use crate::quantity::Mode;
 
@@ -28,10 +28,9 @@ pub struct HalfCycle {
     /// SOC at the start and the end, fractions; `None` if the SOC at the end was not estimated. If only the SOC at the
     /// start is unknown, both values are the SOC at the end.
     pub ends: Option<[f64; 2]>,
-    /// SOC at the start and the end according to the voltages alone, fractions; see
-    /// [`EstimatorBank::soc_of_voltage`](crate::cell::EstimatorBank::soc_of_voltage).
+    /// SOC at the start and the end according to the voltages alone, fractions; known only with the model of a label.
     pub ends_by_voltage: Option<[f64; 2]>,
-    /// Variance of the charge that has flowed while no current was measured, as a fraction of the capacity, squared.
+    /// Variance of the charge that has flowed while no current was measured (square of a fraction of the capacity).
     pub uncounted: f64,
     /// Duration (s).
     pub duration_s: f64,
@@ -44,16 +43,17 @@ pub struct HalfCycle {
 impl HalfCycle {
     /// Whether the charge and the change of the SOC allow the measured capacity `z` (Ah). A cell cannot hold less than
     /// the charge that it has taken or given in one go. The charge divided by the change of the SOC is a second
-    /// measurement of the capacity; both must agree.
-    pub(super) fn allows(&self, z: &Measurement) -> bool {
-        let least_ah = z.value + SIGMA * z.variance.sqrt();
+    /// measurement of the capacity; both must agree. `tolerance_ah`: a smaller difference is never a contradiction,
+    /// because the SOC follows a fading capacity late.
+    pub(super) fn allows(&self, z: &Measurement, tolerance_ah: f64) -> bool {
+        let least_ah = z.value + tolerance_ah.max(SIGMA * z.variance.sqrt());
         let Some(swing) = self.swing.filter(|swing| swing.mean > SIGMA * swing.std()) else {
             return self.charge_ah <= least_ah;
         };
         let by_swing_ah = self.charge_ah / swing.mean;
-        let variance = by_swing_ah * by_swing_ah * swing.variance / (swing.mean * swing.mean);
-        let difference = z.value - by_swing_ah;
-        self.charge_ah <= least_ah && difference * difference <= SIGMA * SIGMA * (z.variance + variance)
+        let std_ah = by_swing_ah * swing.std() / swing.mean;
+        let limit_ah = tolerance_ah.max(SIGMA * std_ah.hypot(z.variance.sqrt()));
+        self.charge_ah <= least_ah && (z.value - by_swing_ah).abs() <= limit_ah
     }
 
     /// The capacity (Ah): counted charge divided by the change of the SOC that the voltages show. `None` if the SOC by
@@ -73,9 +73,10 @@ impl HalfCycle {
         let value = self.charge_ah / swing;
         let offset_ah = config.current_offset_std_a * self.duration_s / 3600.0;
         let soc_variance = |soc: f64| {
-            let position = model.grid_position(soc, self.mean_temperature_c.unwrap_or(CURVE_C));
+            let temperature = model.temperature_position(self.mean_temperature_c.unwrap_or(CURVE_C));
+            let position = model.grid_position_at(&temperature, soc);
             let error_v = model.voltage_error_v(&position).unwrap_or(ASSUMED_ERROR_V);
-            square(error_v / model.ocv_slope_v(&position, model.capacity_ah)) + square(soc_error)
+            square(reach_of_error(model, &temperature, model.capacity_ah, (soc, error_v))) + square(soc_error)
         };
         let of_swing = (soc_variance(start) + soc_variance(end) + self.uncounted) / square(swing);
         Some(Measurement { value, variance: value * value * (square(offset_ah / self.charge_ah) + of_swing) })
@@ -102,9 +103,10 @@ mod tests {
         };
         let z = |value: f64| Measurement { value, variance: 0.01 };
         // 1 Ah in 50 %: 2 +- 0.2 Ah. The measurement has a deviation of 0.1 Ah.
-        assert!([1.4, 2.0, 2.6].iter().all(|&value| half_cycle(1.0, 0.5).allows(&z(value))));
-        assert!([1.2, 2.8].iter().all(|&value| !half_cycle(1.0, 0.5).allows(&z(value))));
+        assert!([1.4, 2.0, 2.6].iter().all(|&value| half_cycle(1.0, 0.5).allows(&z(value), 0.0)));
+        assert!([1.2, 2.8].iter().all(|&value| !half_cycle(1.0, 0.5).allows(&z(value), 0.0)));
+        assert!(half_cycle(1.0, 0.5).allows(&z(2.8), 0.9));
         // The swing is too small to say anything, but the cell has taken 1 Ah.
-        assert!(half_cycle(1.0, 0.1).allows(&z(0.8)) && !half_cycle(1.0, 0.1).allows(&z(0.6)));
+        assert!(half_cycle(1.0, 0.1).allows(&z(0.8), 0.0) && !half_cycle(1.0, 0.1).allows(&z(0.6), 0.0));
     }
 }

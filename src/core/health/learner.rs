@@ -53,7 +53,7 @@ pub struct CapacityUpdate {
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct CellMark {
     soc: Option<ScalarGaussian>,
-    /// SOC according to the voltage alone ([`PackBank::soc_of_voltage`](crate::cell::PackBank::soc_of_voltage)).
+    /// SOC according to the voltage alone; `None` if it is unknown or not needed.
     #[serde(default)]
     pub(super) by_voltage: Option<f64>,
     temperature_integral: f64,
@@ -63,7 +63,7 @@ pub(super) struct CellMark {
 impl CellMark {
     pub(super) fn move_to(&mut self, soc: Option<ScalarGaussian>, by_voltage: Option<f64>) {
         self.soc = Self::storable(soc);
-        self.by_voltage = by_voltage.filter(|&soc| bounds::STORED_SOC.has(soc));
+        self.by_voltage = by_voltage;
     }
 
     /// Returns the SOC, or `None` if its numbers cannot be stored (for example, a variance that came from a damaged
@@ -137,6 +137,12 @@ pub enum Lesson {
     ByLabel { before: f64, soc_error: f64 },
     /// The capacity, with a cell model that was fitted to cells of this type.
     ByModel,
+}
+
+impl Lesson {
+    fn soc_error(self) -> Option<f64> {
+        if let Self::ByLabel { soc_error, .. } = self { Some(soc_error) } else { None }
+    }
 }
 
 impl Learner {
@@ -287,6 +293,11 @@ impl Learner {
         self.lessons = (0..self.capacity.len()).map(lesson).collect();
     }
 
+    /// Restarts the span, because the current was doubtful: the counted charge may be wrong.
+    pub fn interrupt_span(&mut self) {
+        self.span = Span::default();
+    }
+
     fn lesson(&self, cell: usize) -> Lesson {
         self.lessons.get(cell).copied().unwrap_or(Lesson::ByModel)
     }
@@ -316,11 +327,15 @@ impl Learner {
                 Some(measurement)
             }
         };
-        self.learned[cell] |= measurement.is_some()
-            && match self.lesson(cell) {
-                Lesson::ByLabel { before, .. } => self.capacity[cell].variance < KNOWN_PART * before,
-                Lesson::Nothing | Lesson::ByModel => true,
-            };
+        let is_known = match self.lesson(cell) {
+            Lesson::ByLabel { before, .. } if config.method == CapacityMethod::Swing => {
+                self.capacity[cell].variance < KNOWN_PART * before
+            }
+            _ => true,
+        };
+        self.learned[cell] |= measurement.is_some() && is_known;
+        // A measurement that leaves the capacity mostly assumed is no measurement for the readers.
+        let measurement = measurement.filter(|_| self.learned[cell]);
         CapacityUpdate { measurement, capacity: self.capacity(cell) }
     }
 
@@ -341,6 +356,7 @@ impl Learner {
         if !self.in_doubt.contains(&cell) {
             self.in_doubt.push(cell);
         }
+        self.span.forget(cell);
         let drift = &mut self.drift[cell];
         drift.doubt(new_variance_ah2);
         self.capacity[cell] = drift.capacity();
@@ -395,7 +411,7 @@ impl Learner {
         let is_in_doubt = self.in_doubt.contains(&cell);
         self.in_doubt.retain(|&other| other != cell);
         let lesson = self.lesson(cell);
-        let soc_error = if let Lesson::ByLabel { soc_error, .. } = lesson { Some(soc_error) } else { None };
+        let soc_error = lesson.soc_error();
         let is_by_label = soc_error.is_some();
         let is_held = lesson == Lesson::Nothing;
         let is_open = !is_in_doubt && !is_held;
@@ -421,7 +437,7 @@ impl Learner {
             // A cell that has rested may gain a few percent of capacity.
             let is_unexpected = difference.abs() > NEW_SPREAD * model.capacity_ah
                 && difference * difference > CONTRADICTION * CONTRADICTION * (z.variance + expected.variance);
-            is_unexpected || !learned_from.allows(z)
+            is_unexpected || !learned_from.allows(z, NEW_SPREAD * model.capacity_ah)
         };
         if let Some(z) = measurement.filter(is_contradiction) {
             // The measured or the expected capacity is wrong; further half-cycles decide. Each contradiction adds at
@@ -496,6 +512,7 @@ impl Learner {
         self.drift.iter().try_for_each(DriftFilter::check)?;
         self.offset.check()?;
         bounds::TIME_S.check("the time at rest", self.rest_s)?;
+        self.span.check()?;
         let marks = self.all_marks();
         let charges_as = marks.clone().map(|mark| mark.charge_as);
         bounds::CHARGE_AS.check_all("the charge at a half-cycle's end", charges_as)?;

@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use super::half_cycle::HalfCycle;
 use super::learner::{Mark, half_cycle};
 use crate::filter::square;
-use crate::quantity::Mode;
+use crate::quantity::{InvalidState, Mode};
 
 /// Smallest span, as a part of the rated capacity. Smaller spans show mostly the error of a label's curve.
 const LEAST: f64 = 0.25;
@@ -50,13 +50,16 @@ pub(super) struct Span {
 impl Span {
     /// Handles the end of the mode `from`, at the mark `now`.
     pub(super) fn note(&mut self, now: &Mark, from: Mode, rated_capacity_ah: f64) {
+        if now.cells.iter().all(|cell| cell.by_voltage.is_none()) {
+            return *self = Self { closed: self.closed.take(), ..Self::default() };
+        }
         let (Some(start), Some(turn), Some(last)) = (&self.start, &self.turn, self.last.replace(now.clone())) else {
             (self.start, self.turn, self.last) = (Some(now.clone()), Some(now.clone()), Some(now.clone()));
             return;
         };
         let part = |a: &Mark, b: &Mark| (b.charge_as - a.charge_as) / (3600.0 * rated_capacity_ah);
         if from == Mode::Unknown {
-            if jump(&last, now, part(&last, now)) > JUMP {
+            if jump(&last, now, part(&last, now)).is_none_or(|jump| jump > JUMP) {
                 *self = Self { closed: self.closed.take(), ..Self::default() };
                 return self.note(now, from, rated_capacity_ah);
             }
@@ -72,7 +75,7 @@ impl Span {
             if most.abs() >= LEAST {
                 self.closed = Some((start.clone(), end.clone(), self.gaps[1]));
             }
-            self.gaps = [self.gaps[0] - self.gaps[1]; 2];
+            self.gaps = [self.gaps[0].saturating_sub(self.gaps[1]); 2];
             (self.start, self.turn) = (Some(end), Some(now.clone()));
         }
     }
@@ -84,6 +87,12 @@ impl Span {
         let moved_ah = (end.charge_as - start.charge_as) / 3600.0;
         let span = half_cycle(moved_ah, end.time.since(start.time), a, b);
         Some(HalfCycle { uncounted: f64::from(*gaps) * square(UNNOTICED), ..span })
+    }
+
+    /// Checks the numbers of a stored span, except those of its marks.
+    pub(super) fn check(&self) -> Result<(), InvalidState> {
+        let [all, to_turn] = self.gaps.map(f64::from);
+        InvalidState::unless(to_turn <= all, "the gaps of a span", to_turn, "at most those up to now")
     }
 
     /// Forgets a cell's SOC, because the cell or its model has changed.
@@ -105,13 +114,13 @@ impl Span {
 }
 
 /// Median over the cells of the change of the SOC by voltage that the counted charge `moved` (fraction, positive =
-/// discharge) does not explain; 0 if no cell has both SOCs.
-fn jump(before: &Mark, after: &Mark, moved: f64) -> f64 {
+/// discharge) does not explain; `None` if no cell has both SOCs.
+fn jump(before: &Mark, after: &Mark, moved: f64) -> Option<f64> {
     let cells = before.cells.iter().zip(&after.cells);
     let changes = cells.filter_map(|(a, b)| Some((b.by_voltage? - a.by_voltage? + moved).abs()));
     let mut changes: Vec<f64> = changes.collect();
     changes.sort_unstable_by(f64::total_cmp);
-    changes.get(changes.len() / 2).copied().unwrap_or(0.0)
+    changes.get(changes.len() / 2).copied()
 }
 
 #[cfg(test)]

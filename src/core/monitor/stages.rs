@@ -195,7 +195,7 @@ impl Stages {
         }
         let is_prior = self.modelling.is_label();
         let has_row_ended = self.findings.observe(now, &samples, (&self.estimation, is_prior), &self.learning, out);
-        self.estimation.finish(samples, &mut self.learning.state.learner);
+        self.estimation.finish(samples, is_prior, &mut self.learning.state.learner);
         if has_row_ended {
             self.publish_diagnosis(now, true, out);
         }
@@ -231,11 +231,9 @@ impl Stages {
         }
         if observed.candidate_begins {
             let (charge_as, _) = self.sampling.sampler.counted(now);
-            let bank = &self.estimation.bank;
-            self.learning
-                .state
-                .learner
-                .mark_candidate(now, charge_as, |cell| (bank.filtered_soc(cell), bank.soc_of_voltage(cell)));
+            let (estimation, is_label) = (&self.estimation, self.modelling.is_label());
+            let soc = |cell: usize| estimation.soc_at_mark(cell, is_label);
+            self.learning.state.learner.mark_candidate(now, charge_as, soc);
         }
     }
 
@@ -244,6 +242,9 @@ impl Stages {
         let mut publisher = Publisher { now, alarming, sending, out };
         let is_label = modelling.is_label();
         let is_doubtful = estimation.take_doubt();
+        if is_doubtful {
+            learning.state.learner.interrupt_span();
+        }
         let is_doubtful = |cell: usize| is_doubtful || estimation.is_voltage_frozen(cell);
         let doubtful: Vec<bool> = (0..estimation.cells()).map(is_doubtful).collect();
         learning.complete_mode(change, &mut estimation.bank, (is_label, &doubtful), &mut publisher);

@@ -291,7 +291,7 @@ fn fan_note(data: &Data, outlook: &forecast::Outlook) -> String {
     });
     format!(
         "The fan is the forecast{of_cell} at the recent rate of use: in one of two cases, the end of life comes before the \
-         dashed line meets it; in nine of ten, within the band. It does not include a knee that has not shown yet.{}{doubt}",
+         dashed line meets it; in nine of ten, within the band.{}{doubt}",
         gap(data, outlook)
     )
 }

@@ -12,7 +12,7 @@ use super::series::{self, CellStep};
 use crate::cell::{ModelBands, advise};
 use crate::monitor::ModelState;
 
-/// What teaches the capacity.
+/// What teaches the capacity with a measured cell model.
 const TEACHES_CAPACITY: &str =
     "A charge from below 20 % to full after an hour of rest, or a discharge over the same range.";
 /// Below this share of innovations within their 95 % interval, the intervals are too narrow.
@@ -88,12 +88,12 @@ impl Knowledge {
             let used = last.map_or_else(String::new, |step| {
                 format!(" Until then {:.3} \u{b1} {:.3} Ah is assumed.", step.worst.0, step.worst.1)
             });
-            let (why, teaches) = if is_prior(context) {
-                ("No charge of more than a quarter of the capacity has measured it yet.", teaches_by_label(context))
+            let why = if is_prior(context) {
+                "No charge of more than a quarter of the capacity has measured it yet."
             } else {
-                ("No charge or discharge has measured it yet.", TEACHES_CAPACITY.to_owned())
+                "No charge or discharge has measured it yet."
             };
-            return self.gap("Capacity, state of health", format!("{why}{used}"), teaches);
+            return self.gap("Capacity, state of health", format!("{why}{used}"), teaches_capacity(context));
         };
         match context.rated_ah(step.cell) {
             Some(rated) => self.tile(
@@ -110,7 +110,7 @@ impl Knowledge {
         self.tile("Capacity", format!("{:.3} Ah", step.worst.0), deviation(data, &step) + assumed(measured, &step));
         if measured.len() < data.cells() {
             let why = format!("Not measured yet in {} of {} cells.", data.cells() - measured.len(), data.cells());
-            self.gap("Capacity of the other cells", why, TEACHES_CAPACITY);
+            self.gap("Capacity of the other cells", why, teaches_capacity(context));
         }
     }
 
@@ -248,6 +248,11 @@ fn teaches_model(context: &PageContext<'_>) -> String {
 fn is_learnable(context: &PageContext<'_>) -> bool {
     let chemistry = context.model.as_ref().and_then(|sourced| sourced.source.chemistry.as_deref());
     !chemistry.is_some_and(|name| name.starts_with("lfp"))
+}
+
+/// What teaches the capacity with the present cell model.
+fn teaches_capacity(context: &PageContext<'_>) -> String {
+    if is_prior(context) { teaches_by_label(context) } else { TEACHES_CAPACITY.to_owned() }
 }
 
 /// What teaches the capacity while the cell model is made from the label.

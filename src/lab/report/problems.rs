@@ -49,6 +49,14 @@ pub(super) struct Problem {
     pub(super) note: String,
 }
 
+impl Problem {
+    /// Adds alarms that this problem explains. The problem becomes at least as severe as the worst of them.
+    fn add_alarms(&mut self, alarms: &[&ActiveAlarm<'_>], data: &Data) {
+        self.condition = alarms.iter().map(|alarm| condition_of(&alarm.row.severity)).fold(self.condition, Ord::max);
+        self.note = format!("{}{}", self.note, alarm_notes(alarms, data)).trim_start().to_owned();
+    }
+}
+
 /// Returns all problems, the worst first.
 pub(super) fn problems(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -> Vec<Problem> {
     let findings = context.diagnosis.map_or(&[][..], |diagnosis| diagnosis.findings());
@@ -72,31 +80,38 @@ fn of_battery(
     outlook: Option<&Outlook>,
 ) -> Vec<Problem> {
     let raised = raised(data);
-    let mut groups = of_findings(findings);
+    let mut groups = of_findings(findings, data);
     groups.sort_by_key(|group| CELL_KINDS.iter().position(|kind| *kind == group[0].kind).unwrap_or(CELL_KINDS.len()));
     let mut problems: Vec<Problem> = groups.iter().map(|group| finding(group, &raised, data)).collect();
     let imbalance = context.imbalance.as_ref().and_then(|imbalance| imbalance.as_ref().ok());
     let is_charge = |kind| matches!(kind, CellFaultKind::LowCharge | CellFaultKind::HighCharge);
-    let of_charge = groups.iter().position(|group| is_charge(group[0].kind));
-    let mut is_out_of_balance = of_charge.is_some();
+    // Index of the problem that explains an alarm about imbalance.
+    let mut of_charge = groups.iter().position(|group| is_charge(group[0].kind));
     if let Some((pack, at)) = imbalance.zip(of_charge) {
         let (mean, std) = percent(pack);
         problems[at].what += &format!(" The pack loses {mean:.1} \u{b1} {std:.1} % of its charge by imbalance.");
     } else if let Some(pack) = imbalance.filter(|pack| is_unbalanced(pack)) {
-        is_out_of_balance = true;
+        of_charge = Some(problems.len());
         problems.push(unbalanced(pack, findings.is_empty()));
     }
+    if let Some(at) = of_charge {
+        let is_imbalance = |alarm: &&ActiveAlarm<'_>| rule(&alarm.row.rule) == Some(Rule::CellImbalance);
+        let alarms: Vec<&ActiveAlarm<'_>> = raised.iter().filter(is_imbalance).collect();
+        problems[at].add_alarms(&alarms, data);
+    }
     let is_explained = |alarm: &ActiveAlarm<'_>| match rule(&alarm.row.rule) {
-        Some(Rule::CellImbalance) => is_out_of_balance,
+        Some(Rule::CellImbalance) => of_charge.is_some(),
         Some(rule) => findings.iter().any(|found| explains(found, rule, alarm.row.cell)),
         None => false,
     };
+    let no_limit = if raised.is_empty() { ", but no limit is exceeded" } else { "" };
+    let is_capacity_low = raised.iter().any(|alarm| rule(&alarm.row.rule) == Some(Rule::CapacityLow));
     let open: Vec<ActiveAlarm<'_>> = raised.into_iter().filter(|alarm| !is_explained(alarm)).collect();
     problems.extend(grouped(&open).iter().map(|group| alarm(group, data, context, outlook)));
-    if is_over(data, context, outlook) && !problems.iter().any(|problem| problem.condition >= Condition::Plan) {
+    if is_over(data, context, outlook) && !is_capacity_low {
         problems.push(Problem {
             condition: Condition::Watch,
-            what: "The capacity is below the end of life, but no limit is exceeded.".to_owned(),
+            what: format!("The capacity is below the end of life{no_limit}."),
             advice: "Plan its replacement.".to_owned(),
             note: String::new(),
         });
@@ -111,11 +126,12 @@ fn is_over(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) ->
     is_below || outlook.is_some_and(Outlook::is_over)
 }
 
-/// Groups findings by kind. A pair of channels is its own group.
-fn of_findings(findings: &[CellFault]) -> Vec<Vec<&CellFault>> {
+/// Groups findings by kind, and contacts also by growth. A pair of channels is its own group.
+fn of_findings<'a>(findings: &'a [CellFault], data: &Data) -> Vec<Vec<&'a CellFault>> {
+    let key = |found: &CellFault| (found.kind, Growth::of(found, data));
     let mut groups: Vec<Vec<&CellFault>> = Vec::new();
     for found in findings {
-        match groups.iter_mut().find(|group| group[0].kind == found.kind && !found.kind.is_of_pair()) {
+        match groups.iter_mut().find(|group| !found.kind.is_of_pair() && key(group[0]) == key(found)) {
             Some(group) => group.push(found),
             None => groups.push(vec![found]),
         }
@@ -135,7 +151,7 @@ fn explains(found: &CellFault, rule: Rule, cell: Option<usize>) -> bool {
     is_reason && cell.and_then(|cell| u16::try_from(cell).ok()).is_some_and(|cell| found.is_of(CellIndex(cell)))
 }
 
-/// The problem of findings of one kind, with the alarms that they explain.
+/// The problem of one group of findings, with the alarms that they explain.
 fn finding(group: &[&CellFault], raised: &[ActiveAlarm<'_>], data: &Data) -> Problem {
     let kind = group[0].kind;
     let expanded = group.iter().filter_map(|found| found.cells).flat_map(|(first, last)| {
@@ -151,7 +167,7 @@ fn finding(group: &[&CellFault], raised: &[ActiveAlarm<'_>], data: &Data) -> Pro
         rule(&alarm.row.rule).is_some_and(|rule| group.iter().any(|found| explains(found, rule, alarm.row.cell)))
     };
     let alarms: Vec<&ActiveAlarm<'_>> = raised.iter().filter(is_explained).collect();
-    let growth = (kind == CellFaultKind::Contact).then(|| Growth::of(group, data));
+    let growth = Growth::of(group[0], data);
     let is_of_cells = CELL_KINDS.contains(&kind);
     let own = match kind {
         CellFaultKind::HighResistance | CellFaultKind::ForeignCell | CellFaultKind::Module => Condition::Watch,
@@ -243,42 +259,45 @@ fn lower(subject: &str) -> String {
     subject.to_lowercase()
 }
 
-/// How the contact resistance of cells has changed.
+/// How the resistance of a contact has changed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Growth {
-    /// At least one contact has grown, or was not high at the beginning.
+    /// The resistance has grown, or was not high at the beginning.
     Grows,
-    /// All contacts were high from the beginning and have not grown.
+    /// The resistance was high from the beginning and has not grown.
     Steady,
     /// The record is too short, or does not contain earlier values.
     Unknown,
 }
 
 impl Growth {
-    fn of(group: &[&CellFault], data: &Data) -> Self {
-        let Some((first_s, last_s)) = data.ends_s() else { return Self::Unknown };
-        let is_late =
-            |found: &&CellFault| found.since.secs() - first_s > (BEGINNING * (last_s - first_s)).max(STEADY_S);
+    /// Returns the growth of a contact; `None` = the finding is not about a contact.
+    fn of(found: &CellFault, data: &Data) -> Option<Self> {
+        if found.kind != CellFaultKind::Contact {
+            return None;
+        }
+        let Some((first_s, last_s)) = data.ends_s() else { return Some(Self::Unknown) };
+        let since_s = found.since.secs();
+        let is_late = since_s - first_s > (BEGINNING * (last_s - first_s)).max(STEADY_S);
         // Two standard deviations of the difference between the first reported size and the present one.
-        let has_grown = |found: &&CellFault| {
-            let first = found.cells.and_then(|cells| data.first_sizes.get(&(found.kind, cells.0)));
-            first.map(|first| found.size.mean - first.mean > 2.0 * found.size.std().hypot(first.std()))
-        };
-        let is_seen_long = group.iter().all(|found| last_s - found.since.secs() >= STEADY_S);
-        if group.iter().any(|found| is_late(found) || has_grown(found) == Some(true)) {
-            Self::Grows
-        } else if is_seen_long && group.iter().all(|found| has_grown(found) == Some(false)) {
-            Self::Steady
+        let first = found.cells.and_then(|cells| data.first_sizes.get(&(found.kind, cells.0)));
+        let has_grown = first.map(|first| found.size.mean - first.mean > 2.0 * found.size.std().hypot(first.std()));
+        if is_late || has_grown == Some(true) {
+            Some(Self::Grows)
+        } else if last_s - since_s >= STEADY_S && has_grown == Some(false) {
+            Some(Self::Steady)
         } else {
-            Self::Unknown
+            Some(Self::Unknown)
         }
     }
 
     const fn words(self) -> &'static str {
         match self {
-            Self::Grows => " It grows, as in a contact that comes loose.",
-            Self::Steady => " It was high from the beginning and has not grown, as in longer links between modules.",
-            Self::Unknown => " Whether it grows is not known yet.",
+            Self::Grows => " The resistance grows, as in a contact that comes loose.",
+            Self::Steady => {
+                " The resistance was high from the beginning and has not grown, as in longer links between modules."
+            }
+            Self::Unknown => " Whether the resistance grows is not known yet.",
         }
     }
 

@@ -29,7 +29,6 @@ use super::memory::Memory;
 use super::state_vector::{CAPACITY, LOG_RESISTANCE, VOLTAGE_OFFSET};
 use super::step::{CellStep, StepResult};
 use super::voltage_reach::VoltageReach;
-use crate::cell::model_bands::CURVE_C;
 use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES};
 use crate::filter::ScalarGaussian;
 use crate::quantity::bounds;
@@ -181,15 +180,6 @@ impl EstimatorBank {
     /// State of charge in the filter, without the uncertainty of downtime and without limits.
     pub fn filtered_soc(&self, cell: usize) -> Option<ScalarGaussian> {
         self.is_started(cell).then(|| self.marginal(cell, 0))
-    }
-
-    /// SOC at which the open-circuit curve has the latest voltage, corrected by the cell's drop. Unlike the SOC in the
-    /// filter, it does not contain the counted charge. `None` before the first voltage.
-    pub fn soc_of_voltage(&self, cell: usize) -> Option<f64> {
-        let (soc, memory) = (self.filtered_soc(cell)?.mean, &self.cells[cell].memory);
-        let temperature = self.model.temperature_position(memory.temperature_c.unwrap_or(CURVE_C));
-        let expected_v = self.model.aged_ocv_v(&self.model.grid_position_at(&temperature, soc), memory.curve.mean);
-        Some(self.model.soc_of_aged_ocv(&temperature, memory.curve.mean, expected_v + memory.innovation_v))
     }
 
     /// State of charge, limited to 0 to 1; `None` before the first voltage.

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::slow_branch::SlowBranch;
 use super::state_vector::{KNOWN_VARIANCE, square, widened, within_bounds};
 use super::step::{CellStep, Update};
-use super::voltage_reach::FAR;
+use super::voltage_reach::reach_of_error;
 use crate::cell::{CapacityState, CellModel, EstimatorConfig};
 use crate::filter::{Measurement, ScalarGaussian};
 use crate::quantity::InvalidState;
@@ -70,7 +70,7 @@ pub(super) struct Memory {
     /// Whether the current was unknown at the last reading, so that an unmeasured stretch continues.
     pub(super) is_current_unknown: bool,
     /// While the current is unknown: SOC according to the latest voltage alone.
-    #[serde(skip)]
+    #[serde(default)]
     pub(super) by_voltage: Option<ScalarGaussian>,
     /// Whether no voltage has been used since the last sleep or unknown gap.
     pub(super) is_unseen: bool,
@@ -124,12 +124,15 @@ impl Memory {
 
     /// The published SOC. `soc`: the SOC of the filter. Its variance grows by the downtime. While the current is unknown,
     /// the latest voltage also counts. The filter itself does not use this voltage: the same unknown current is part of
-    /// all readings, so their errors do not average out.
+    /// all readings, so their errors do not average out. A voltage without a current cannot make the SOC more certain
+    /// than it was when the current was last known.
     pub(super) fn published(&self, soc: ScalarGaussian) -> ScalarGaussian {
-        let variance = self.downtime_std_if_any().map_or(soc.variance, |std| widened(soc.variance, square(std)));
+        let known = soc.variance;
+        let variance = self.downtime_std_if_any().map_or(known, |std| widened(known, square(std)));
         let mut soc = within_bounds(ScalarGaussian { variance, ..soc });
         if let Some(by_voltage) = self.by_voltage {
             soc.update(Measurement { value: by_voltage.mean, variance: by_voltage.variance });
+            soc.variance = soc.variance.max(known);
         }
         soc
     }
@@ -144,24 +147,20 @@ impl Memory {
         step: &CellStep,
         log_resistance: f64,
     ) {
-        self.by_voltage = None;
-        if step.unmeasured_s <= 0.0 || step.is_voltage_frozen {
+        if step.is_voltage_frozen {
+            self.by_voltage = None;
+        }
+        if step.is_voltage_frozen || step.unmeasured_s <= 0.0 {
             return;
         }
         let temperature = model.temperature_position(step.temperature_c.unwrap_or(step.ambient_c));
-        let soc_at = |voltage_v: f64| model.soc_of_aged_ocv(&temperature, self.curve.mean, voltage_v).clamp(0.0, 1.0);
-        let mean = soc_at(step.voltage_v);
-        let position = model.grid_position_at(&temperature, mean);
-        let ohm = model.settled_ohm(&position) * libm::exp(log_resistance);
+        let mean = model.soc_of_aged_ocv(&temperature, self.curve.mean, step.voltage_v).clamp(0.0, 1.0);
+        let ohm = model.settled_ohm(&model.grid_position_at(&temperature, mean)) * libm::exp(log_resistance);
         let most_a = self.last_current_a.abs().max(model.rated_capacity_ah * GAP_LOAD_PER_H);
         let voltage_variance =
             square(config.sensor.voltage_offset_v) + square(config.gate.model_error_v) + square(most_a * ohm) / 3.0;
-        let far_v = FAR * voltage_variance.sqrt();
-        let far = [soc_at(step.voltage_v - far_v), soc_at(step.voltage_v + far_v)];
-        // Beyond an end of the curve, both SOCs are the end. The slope there then limits the deviation.
-        let by_slope = voltage_variance.sqrt() / model.ocv_slope_v(&position, self.curve.mean);
-        let std = far.map(|far| (far - mean).abs() / FAR).into_iter().fold(by_slope, f64::max);
-        self.by_voltage = Some(ScalarGaussian { mean, variance: square(std) });
+        let std = reach_of_error(model, &temperature, self.curve.mean, (mean, voltage_variance.sqrt()));
+        self.by_voltage = Some(ScalarGaussian { mean, variance: square(std).max(KNOWN_VARIANCE) });
     }
 
     /// Notes the unmeasured time of a step. The load before or after this time may have continued through it, or a
@@ -304,6 +303,10 @@ impl Memory {
         bounds::TEMPERATURE_C.check_all("a cell's last temperature", self.temperature_c)?;
         bounds::CURRENT_A.check("a cell's last current", self.last_current_a)?;
         InvalidState::unless_natural("the information about a current's offset", self.offset_information)?;
+        if let Some(soc) = self.by_voltage {
+            bounds::STORED_SOC.check("a cell's SOC by voltage", soc.mean)?;
+            InvalidState::unless_positive("the variance of a cell's SOC by voltage", soc.variance)?;
+        }
         self.slow_branch.check()?;
         InvalidState::unless(
             (0.0..=1.0).contains(&self.used_prior),

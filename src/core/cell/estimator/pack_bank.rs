@@ -176,12 +176,6 @@ impl PackBank {
         bank.filtered_soc(cell)
     }
 
-    /// See [`EstimatorBank::soc_of_voltage`].
-    pub fn soc_of_voltage(&self, cell: usize) -> Option<f64> {
-        let (bank, cell) = self.at(cell);
-        bank.soc_of_voltage(cell)
-    }
-
     /// See [`EstimatorBank::soc`].
     pub fn soc(&self, cell: usize) -> Option<ScalarGaussian> {
         let (bank, cell) = self.at(cell);

@@ -16,6 +16,7 @@
 //! such a contradiction only slowly.
 
 use crate::cell::CellModel;
+use crate::cell::model::TemperaturePosition;
 
 /// Distance at which the reach is measured, in standard deviations of the voltage error.
 pub(super) const FAR: f64 = 4.0;
@@ -30,8 +31,27 @@ const NEAR: usize = 20;
 /// curve is within reach.
 pub(super) const FLAT: f64 = 2.0;
 
+/// Smallest slope of a curve (V per unit of SOC). Limits the reach where the extrapolated curve is flat.
+const LEAST_SLOPE_V: f64 = 1e-3;
+
 /// Temperature at which the curve is evaluated (degrees C). The curve hardly depends on the temperature.
 const TEMPERATURE_C: f64 = 25.0;
+
+/// Standard deviation of a SOC found from a voltage (fraction). `soc`: the SOC. `error_v`: standard deviation of the
+/// voltage (V). `capacity_ah`: capacity that selects the curve (Ah). On a flat part of the curve, the slope at one SOC
+/// says little, so the reach of [`FAR`] standard deviations counts, too.
+pub fn reach_of_error(
+    model: &CellModel,
+    temperature: &TemperaturePosition,
+    capacity_ah: f64,
+    (soc, error_v): (f64, f64),
+) -> f64 {
+    let position = model.grid_position_at(temperature, soc);
+    let ocv_v = model.aged_ocv_v(&position, capacity_ah);
+    let by_slope = error_v / model.ocv_slope_v(&position, capacity_ah).max(LEAST_SLOPE_V);
+    let far = [-FAR, FAR].map(|far| model.soc_of_aged_ocv(temperature, capacity_ah, ocv_v + far * error_v));
+    far.into_iter().map(|far| (far - soc).abs() / FAR).fold(by_slope, f64::max)
+}
 
 /// Reach on a grid of SOC.
 #[derive(Debug, Clone)]

@@ -128,7 +128,7 @@ impl FadePosterior {
         let at_top = state.lost(state.top_level).min(lost);
         let (typical, scale) = match state.prior {
             // As if the cell had behaved like a typical cell before it was observed.
-            PriorRate::PerCycle => ((TYPICAL_LOSS + lost - ONSET) / (TYPICAL_CYCLES + since_top), TYPICAL_SCALE.0),
+            PriorRate::PerCycle => ((TYPICAL_LOSS + lost - at_top) / (TYPICAL_CYCLES + since_top), TYPICAL_SCALE.0),
             PriorRate::SoFar { days } => ((lost - ONSET + LEAST_LOSS) / days, TYPICAL_SCALE.1),
         };
         let log_typical = libm::log(typical);

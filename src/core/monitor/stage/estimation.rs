@@ -35,6 +35,9 @@ const RETURN: f64 = 0.25;
 /// Value of `Consumed::path_v` for a frozen voltage (V). It is far outside the range of [`CurrentCheck::path_v`].
 const FROZEN_PATH_V: f64 = 1e9;
 
+/// SOC by voltage that the curve of a model can show. The curve is extrapolated a little beyond its ends.
+const CURVE_SOC: std::ops::RangeInclusive<f64> = -0.05..=1.05;
+
 /// The estimation stage.
 #[derive(Debug)]
 pub(crate) struct Estimation {
@@ -271,14 +274,37 @@ impl Estimation {
         self.note_checks();
     }
 
+    /// SOC of a cell at a mark: in the filter, and by voltage ([`Self::soc_by_voltage`]). `is_label`: whether the pack's
+    /// own kind of cells has the model of a label.
+    pub(crate) fn soc_at_mark(&self, cell: usize, is_label: bool) -> (Option<ScalarGaussian>, Option<f64>) {
+        let uses_label = if self.bank.is_own(cell) { is_label } else { !self.bank.has_given_model(cell) };
+        let by_voltage = if uses_label { self.soc_by_voltage(cell) } else { None };
+        (self.bank.filtered_soc(cell), by_voltage)
+    }
+
+    /// SOC at which the open-circuit curve has a cell's latest voltage, corrected by the drop in the cell. Unlike the
+    /// SOC in the filter, it does not contain the counted charge. `None` if the current is unknown or doubtful, if the
+    /// voltage is frozen, or if the SOC is outside the curve.
+    fn soc_by_voltage(&self, index: usize) -> Option<f64> {
+        let sample = self.progress[index].sample?;
+        let current_a = sample.current_a.filter(|_| !self.is_current_doubtful && !self.is_voltage_frozen(index))?;
+        let (cell, model) = (self.bank.cell(index), self.bank.model(index));
+        let temperature = model.temperature_position(self.bank.temperature_c(index).unwrap_or(self.ambient_c));
+        let position = model.grid_position_at(&temperature, self.bank.filtered_soc(index)?.mean);
+        let ratio = libm::exp(self.bank.log_resistance(index).mean);
+        let branches_v: f64 = cell.branch_v().into_iter().filter(|branch_v| branch_v.is_finite()).sum();
+        let ocv_v = sample.voltage_v + current_a * model.r0_ohm(&position) * ratio + branches_v;
+        let soc = model.soc_of_aged_ocv(&temperature, cell.curve().mean, ocv_v);
+        CURVE_SOC.contains(&soc).then_some(soc)
+    }
+
     /// Completes the work on stepped samples, and reuses their buffer.
-    pub(crate) fn finish(&mut self, mut samples: Vec<CellSample>, learner: &mut Learner) {
+    pub(crate) fn finish(&mut self, mut samples: Vec<CellSample>, is_label: bool, learner: &mut Learner) {
         samples.clear();
         self.batch.waiting = samples;
-        let bank = &self.bank;
-        self.after_gap
-            .drain(..)
-            .for_each(|cell| learner.move_mark(cell, (bank.filtered_soc(cell), bank.soc_of_voltage(cell))));
+        for cell in std::mem::take(&mut self.after_gap) {
+            learner.move_mark(cell, self.soc_at_mark(cell, is_label));
+        }
     }
 
     /// The filter step from the previous sample to this one.

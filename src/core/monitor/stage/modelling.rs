@@ -148,7 +148,7 @@ pub(crate) struct Adoption {
     pub(crate) mean: AdoptedState,
     /// Whether the cells' capacities restart from the capacity of the mean cell.
     pub(crate) with_capacity: bool,
-    /// Whether the model was learned. If not, this is the label's model, and the capacity is unknown.
+    /// Whether the model was learned. If not, this is the label's model, and the capacity is not learned yet.
     pub(crate) is_learned: bool,
 }
 

@@ -69,7 +69,21 @@ fn contact_from_the_beginning_differs_from_one_that_grows() {
     let late = [found(CellFaultKind::Contact, 9, 0.2, 15.0)];
     assert!(of(&late, 0.19).what.contains("comes loose"));
     // A store has no earlier size.
-    assert!(list(&contacts, &record(&[], 0.0))[0].what.ends_with("Whether it grows is not known yet."));
+    assert!(list(&contacts, &record(&[], 0.0))[0].what.ends_with("Whether the resistance grows is not known yet."));
+}
+
+#[test]
+fn growing_contact_is_separate_from_steady_ones() {
+    let contacts = [9, 51, 62].map(|cell| found(CellFaultKind::Contact, cell, 0.2, 5.0));
+    let mut data = record(&contacts, 0.19);
+    let first = ScalarGaussian { mean: 0.11, ..contacts[1].size };
+    data.first_sizes.insert((CellFaultKind::Contact, CellIndex(51)), first);
+    let problems = list(&contacts, &data);
+    assert_eq!(problems.len(), 2, "{problems:?}");
+    let [steady, grown] = [&problems[0], &problems[1]];
+    assert!(steady.what.starts_with("Cells 10 and 63 have 20 % more") && steady.what.contains("has not grown"));
+    assert!(grown.what.starts_with("Cell 52 has 20 ") && grown.what.contains("The resistance grows"), "{grown:?}");
+    assert_eq!((steady.condition, grown.condition), (Condition::Watch, Condition::Plan));
 }
 
 #[test]
@@ -82,6 +96,8 @@ fn alarm_of_a_finding_is_part_of_its_problem() {
     let problems = list(&[contacts[0], low], &data);
     assert_eq!(problems.len(), 2, "{problems:?}");
     assert!(problems[0].what.starts_with("Cell 2 has"), "charge first: {problems:?}");
+    assert_eq!(problems[0].condition, Condition::Act, "as severe as its alarm");
+    assert!(problems[0].note.contains(" Alarm cell_imbalance (severe) of pack since 2023-12-04"), "{problems:?}");
     assert!(problems[1].note.contains("Alarm connection_resistance (warning) of cell 10 since 2023-12-04"));
     assert_eq!(problems[1].condition, Condition::Plan);
     data.alarms.push(alarm("connection_resistance", "warning", Some(11)));
@@ -118,8 +134,11 @@ fn pack_out_of_balance_is_named_without_a_failing_cell() {
                 first. No single cell is failing.";
     assert_eq!(of(0.057, &[], &data)[0].what, text);
     assert_eq!(of(0.04, &[], &data), [], "within two standard deviations of the limit");
-    data.alarms.push(alarm("cell_imbalance", "warning", None));
-    assert_eq!(of(0.057, &[], &data).len(), 1, "the alarm says the same");
+    data.alarms.push(alarm("cell_imbalance", "severe", None));
+    let with_alarm = of(0.057, &[], &data);
+    assert_eq!(with_alarm.len(), 1, "the alarm says the same");
+    assert_eq!(with_alarm[0].condition, Condition::Act, "as severe as its alarm");
+    assert!(with_alarm[0].note.starts_with("Alarm cell_imbalance (severe) of pack since"), "{with_alarm:?}");
     let low = [found(CellFaultKind::LowCharge, 1, -0.027, 1.0)];
     let with_cost = of(0.057, &low, &data);
     assert_eq!(with_cost.len(), 1);
@@ -135,6 +154,26 @@ fn every_kind_of_finding_has_a_sentence() {
         let text = sentence(kind, "Cells 3 and 4", true, "2.0");
         assert!(text.ends_with('.') && text.starts_with(char::is_uppercase), "{kind:?}: {text}");
     }
+}
+
+#[test]
+fn end_of_life_is_listed_unless_capacity_low_is_raised() {
+    let said = |alarms: &[AlarmRecord]| {
+        let mut data = examples::worn(1);
+        // Without a configuration, the limit of the cleared alarm is the end of life.
+        let cleared = AlarmRecord { is_active: false, threshold: Some(2.5), ..alarm("capacity_low", "warning", Some(0)) };
+        data.alarms.push(cleared);
+        data.alarms.extend_from_slice(alarms);
+        let what = list(&[], &data).into_iter().map(|problem| problem.what);
+        what.filter(|what| what.contains("end of life")).collect::<Vec<String>>()
+    };
+    assert_eq!(said(&[]), ["The capacity is below the end of life, but no limit is exceeded."]);
+    let text = "The capacity is below the end of life.";
+    for severity in ["info", "severe"] {
+        assert_eq!(said(&[alarm("temperature_high", severity, None)]), [text], "{severity}");
+    }
+    let raised = AlarmRecord { threshold: Some(2.5), ..alarm("capacity_low", "warning", Some(0)) };
+    assert_eq!(said(&[raised]), [""; 0]);
 }
 
 #[test]

@@ -133,12 +133,15 @@ pub(crate) struct CurrentCheck {
     /// Evidence of the present run of equal readings: ln of the odds for a good sensor, at most 0.
     repeated: f64,
     /// Number of times that the present reading has repeated.
+    #[serde(default)]
     equal: u32,
     /// Size of a current that the sensor has read [`QUIET_READINGS`] times in a row before it has shown noise (A); 0 =
     /// none.
+    #[serde(default)]
     quiet_a: f64,
     /// Whether the sensor has repeated two currents of different size. Such a sensor has no noise. If its readings
     /// change under a steady load, the load changes: for example, a charger that holds the voltage.
+    #[serde(default)]
     is_quiet: bool,
     /// Largest reading of discharge and of charge (A).
     largest_a: [f64; 2],
@@ -375,6 +378,7 @@ impl CurrentCheck {
     /// Forgets the latest rounds, because the next reading comes after a pause. The evidence stays.
     pub(crate) fn interrupt(&mut self) {
         (self.voltages_v, self.rounds, self.count) = ([None; MAX_CELLS], [Round::default(); ROUNDS], 0);
+        (self.equal, self.repeated) = (0, 0.0);
     }
 
     /// Checks a stored state; the error is the first impossible number.
