@@ -161,7 +161,8 @@ fn end_of_life_is_listed_unless_capacity_low_is_raised() {
     let said = |alarms: &[AlarmRecord]| {
         let mut data = examples::worn(1);
         // Without a configuration, the limit of the cleared alarm is the end of life.
-        let cleared = AlarmRecord { is_active: false, threshold: Some(2.5), ..alarm("capacity_low", "warning", Some(0)) };
+        let cleared =
+            AlarmRecord { is_active: false, threshold: Some(2.5), ..alarm("capacity_low", "warning", Some(0)) };
         data.alarms.push(cleared);
         data.alarms.extend_from_slice(alarms);
         let what = list(&[], &data).into_iter().map(|problem| problem.what);
@@ -173,7 +174,7 @@ fn end_of_life_is_listed_unless_capacity_low_is_raised() {
         assert_eq!(said(&[alarm("temperature_high", severity, None)]), [text], "{severity}");
     }
     let raised = AlarmRecord { threshold: Some(2.5), ..alarm("capacity_low", "warning", Some(0)) };
-    assert_eq!(said(&[raised]), [""; 0]);
+    assert!(said(&[raised]).is_empty());
 }
 
 #[test]

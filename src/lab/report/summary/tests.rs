@@ -122,14 +122,22 @@ fn capacity_that_was_not_measured_is_a_gap() {
 
 #[test]
 fn label_is_the_reason_why_the_capacity_is_unknown() {
-    let gap = |chemistry| {
+    let gap = |chemistry, data: &Data| {
         let context = PageContext { model: of_label(&Label::usual(chemistry, 2.9)), ..PageContext::default() };
-        Knowledge::of(&Data::new(Origin::Replay), &context, &Err("too little".into())).gaps.remove(0)
+        let gaps = Knowledge::of(data, &context, &Err("too little".into())).gaps;
+        gaps.into_iter().find(|gap| gap.name.starts_with("Capacity")).expect("a gap")
     };
-    let nmc = gap(Chemistry::Nmc811Graphite);
-    assert_eq!(nmc.why, "While the cell model is the label's, no charge or discharge measures it.");
-    assert!(nmc.teaches.ends_with("packwatch may also learn it in use."), "{nmc:?}");
-    assert_eq!(gap(Chemistry::LfpGraphite).teaches, "A measured cell model (packwatch fit).");
+    let nothing = Data::new(Origin::Replay);
+    let nmc = gap(Chemistry::Nmc811Graphite, &nothing);
+    assert_eq!(nmc.why, "No charge of more than a quarter of the capacity has measured it yet.");
+    assert_eq!(nmc.teaches, "A discharge and a charge of more than a quarter of the capacity.");
+    let lfp = gap(Chemistry::LfpGraphite, &nothing);
+    assert!(lfp.teaches.ends_with("nearly empty at one end and nearly full at the other."), "{lfp:?}");
+    // The same charges teach the capacity of the cells that were not measured.
+    let mut one_of_two = Data::new(Origin::Replay);
+    one_of_two.learned = vec![learned(1.71e9, 0, Some(1.2)), learned(1.71e9, 1, None)];
+    let other = gap(Chemistry::Nmc811Graphite, &one_of_two);
+    assert_eq!((other.name, other.teaches), ("Capacity of the other cells", nmc.teaches));
 }
 
 #[test]
