@@ -35,7 +35,7 @@ const CONTRADICTION: f64 = 4.0;
 
 /// If the variance of a capacity is below this part of the initial variance, it counts as learned with the model of a
 /// label.
-const KNOWN_PART: f64 = 0.75;
+const KNOWN_PART: f64 = 0.9;
 
 /// Standard deviation of the capacity of cells of one type, fraction. A smaller difference is never a contradiction.
 const NEW_SPREAD: f64 = 0.1;
