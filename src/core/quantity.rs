@@ -12,6 +12,9 @@ pub mod catalogue;
 
 use serde::{Deserialize, Serialize};
 
+/// Length of a day (s).
+pub const DAY_S: f64 = 86_400.0;
+
 /// A point in time on the clock of the driver (the program that feeds the core), in integer nanoseconds.
 ///
 /// The driver chooses the origin. The daemon counts from 1970: it reads the wall clock at its start, and then a clock

@@ -22,7 +22,7 @@ use super::row::{CellSums, PackSums};
 use super::temperature::WarmingRatio;
 use crate::cell::CellModel;
 use crate::filter::ScalarGaussian;
-use crate::quantity::{CellIndex, InvalidState, Timestamp};
+use crate::quantity::{CellIndex, DAY_S, InvalidState, Timestamp};
 use balancing::Bleed;
 use judge::Population;
 use shared_row::Row;
@@ -46,7 +46,6 @@ const LEAST_STEPS: f64 = 0.02;
 /// SOC, fraction. If the change of the mean cell's SOC between two rows differs from the counted charge by this much or
 /// more, the counted charge is used.
 const SOC_JUMP: f64 = 0.02;
-const DAY_S: f64 = 86_400.0;
 /// Number of fault kinds up to and including `HighCharge`. All kinds that apply to single cells are among them.
 const CELL_KINDS: usize = CellFaultKind::HighCharge as usize;
 

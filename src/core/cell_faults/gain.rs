@@ -10,12 +10,11 @@ use serde::{Deserialize, Serialize};
 
 use super::fault::{GAIN, REPORTED};
 use crate::filter::{ScalarGaussian, median, normal_cdf};
-use crate::quantity::{InvalidState, Timestamp};
+use crate::quantity::{DAY_S, InvalidState, Timestamp};
 
 /// Maximum number of days that are compared with each other. Changes that take longer are caused by the seasons or by
 /// ageing.
 const DAYS: usize = 10;
-const DAY_S: f64 = 86_400.0;
 /// Time within which the resistances must fall (s). The estimated resistances follow within hours, so two consecutive
 /// daily checks may each see a part of the fall.
 const APART_S: f64 = 2.5 * DAY_S;

@@ -36,7 +36,7 @@ use serde::{Deserialize, Serialize};
 
 use self::distribution::{FadePosterior, FadeState, PriorRate};
 use crate::filter::{bisect, square, update_states};
-use crate::quantity::InvalidState;
+use crate::quantity::{DAY_S, InvalidState};
 
 /// Standard deviation that the rate's logarithm would gain while the whole reference capacity is lost. It is
 /// proportional to the square root of the loss: over a loss of 10 %, one standard deviation is a factor of e^0.32.
@@ -66,7 +66,6 @@ const RECOVERY_DAYS: f64 = 1.0;
 const SCALE_READINGS: (f64, f64) = (5.0, 20.0);
 /// Range of the noise scale (variance). The readings scatter by 0.01 to 2 %.
 const SCALE_RANGE: (f64, f64) = (1e-3, 20.0);
-const DAY_S: f64 = 86_400.0;
 
 /// Minimum number of readings for a forecast: two readings give a rate, and the third can contradict it.
 pub const MIN_READINGS: u32 = 3;

@@ -9,9 +9,6 @@ use crate::quantity::Mode;
 /// Largest difference of two measurements of the same capacity, in standard deviations of the difference.
 const SIGMA: f64 = 3.0;
 
-/// Error of a cell model that states none (V): standard deviation of its average over some minutes.
-const ASSUMED_ERROR_V: f64 = 0.02;
-
 /// One completed half-cycle of one cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HalfCycle {
@@ -75,7 +72,8 @@ impl HalfCycle {
         let soc_variance = |soc: f64| {
             let temperature = model.temperature_position(self.mean_temperature_c.unwrap_or(CURVE_C));
             let position = model.grid_position_at(&temperature, soc);
-            let error_v = model.voltage_error_v(&position).unwrap_or(ASSUMED_ERROR_V);
+            // The model of a label always states its error.
+            let error_v = model.voltage_error_v(&position).unwrap_or(0.0);
             square(reach_of_error(model, &temperature, model.capacity_ah, (soc, error_v))) + square(soc_error)
         };
         let of_swing = (soc_variance(start) + soc_variance(end) + self.uncounted) / square(swing);

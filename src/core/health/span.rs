@@ -129,15 +129,13 @@ mod tests {
     use crate::health::learner::CellMark;
     use crate::quantity::Timestamp;
 
-    const RATED_AH: f64 = 100.0;
-
-    /// Notes a mark at this charge taken out (fraction of the rated capacity) and SOC by voltage.
+    /// Notes a mark of a cell of 100 Ah at this charge taken out (fraction of the rated capacity) and SOC by voltage.
     fn note(span: &mut Span, from: Mode, [taken, by_voltage]: [f64; 2]) {
         let time_s = 600.0 + span.last.as_ref().map_or(0.0, |last| last.time.since(Timestamp::from_secs(0.0)));
         let mut cell = CellMark::default();
         cell.move_to(None, Some(by_voltage));
-        let charge_as = taken * 3600.0 * RATED_AH;
-        span.note(&Mark { time: Timestamp::from_secs(time_s), charge_as, cells: vec![cell] }, from, RATED_AH);
+        let charge_as = taken * 360_000.0;
+        span.note(&Mark { time: Timestamp::from_secs(time_s), charge_as, cells: vec![cell] }, from, 100.0);
     }
 
     #[test]

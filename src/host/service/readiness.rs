@@ -12,7 +12,7 @@ use tokio::time::Instant;
 use crate::config::channel_words;
 use crate::io::socket::LinkState;
 use crate::monitor::{BusEvent, Event, EventKind, Monitor};
-use crate::quantity::Channel;
+use crate::quantity::{Channel, DAY_S};
 
 /// Longest configurable wait for the first reading (s). The unit's `TimeoutStartSec` is longer.
 pub const MAX_READY_TIMEOUT_S: f64 = 60.0;
@@ -225,7 +225,6 @@ pub(super) fn describe_restored(age_s: Option<f64>) -> String {
 
 /// A duration in words.
 fn describe_duration(seconds: f64) -> String {
-    const DAY_S: f64 = 86_400.0;
     match seconds {
         s if s < 120.0 => format!("{s:.0} s"),
         s if s < 7200.0 => format!("{:.0} min", s / 60.0),

@@ -167,9 +167,7 @@ mod tests {
     use super::*;
     use crate::alarm::{Comparison, Severity};
     use crate::monitor::{Event, EventKind};
-    use crate::quantity::{CellIndex, Mode};
-
-    const DAY_S: f64 = 86_400.0;
+    use crate::quantity::{CellIndex, DAY_S, Mode};
 
     fn day(day: f64) -> Timestamp {
         Timestamp::from_secs(day * DAY_S)

@@ -11,8 +11,8 @@ use super::data::{CapacityRecord, Data};
 use super::limits::threshold;
 use crate::alarm::Rule;
 use crate::health::{Axis, CapacityReading, Forecast, InsufficientData, Remaining, RemainingLife, Usage};
+use crate::quantity::DAY_S;
 
-const DAY_S: f64 = 86_400.0;
 /// Number of points of a fan.
 const POINTS: usize = 60;
 /// Upper limits of the fan's length: [`MAX_MEDIANS`] times the median time to the end of life, and [`MAX_RECORDS`]

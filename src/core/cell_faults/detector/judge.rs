@@ -5,7 +5,7 @@ use super::CellFaultDetector;
 use crate::cell_faults::difference::{CAPACITY, CHANNEL, CONTACT, Jump, LEAK, RESISTANCE, SOC, STATES};
 use crate::cell_faults::fault::{self, CellFault, CellFaultKind, OUTLIER, REPORTED, WITHDRAWN};
 use crate::filter::{ScalarGaussian, normal_cdf};
-use crate::quantity::{CellIndex, Timestamp};
+use crate::quantity::{CellIndex, DAY_S, Timestamp};
 
 /// Neighbouring cells with a higher capacity count as one replaced module if their findings are at most this far apart,
 /// s. A single cell with a higher capacity is reported only after this time.
@@ -27,7 +27,6 @@ const BELOW_LIMIT: f64 = 0.99;
 /// If a cell's SOC differs from the other cells' SOC by this much or more, its contact, its resistance, the offset of
 /// its channel and a higher capacity cannot be judged.
 const TOO_FAR: f64 = 0.1;
-const DAY_S: f64 = 86_400.0;
 
 /// Judgement of one cell for one kind of fault.
 #[derive(Debug, Clone, Copy)]

@@ -35,9 +35,6 @@ const RETURN: f64 = 0.25;
 /// Value of `Consumed::path_v` for a frozen voltage (V). It is far outside the range of [`CurrentCheck::path_v`].
 const FROZEN_PATH_V: f64 = 1e9;
 
-/// SOC by voltage that the curve of a model can show. The curve is extrapolated a little beyond its ends.
-const CURVE_SOC: std::ops::RangeInclusive<f64> = -0.05..=1.05;
-
 /// The estimation stage.
 #[derive(Debug)]
 pub(crate) struct Estimation {
@@ -295,7 +292,8 @@ impl Estimation {
         let branches_v: f64 = cell.branch_v().into_iter().filter(|branch_v| branch_v.is_finite()).sum();
         let ocv_v = sample.voltage_v + current_a * model.r0_ohm(&position) * ratio + branches_v;
         let soc = model.soc_of_aged_ocv(&temperature, cell.curve().mean, ocv_v);
-        CURVE_SOC.contains(&soc).then_some(soc)
+        // The curve is extrapolated a little beyond its ends.
+        (-0.05..=1.05).contains(&soc).then_some(soc)
     }
 
     /// Completes the work on stepped samples, and reuses their buffer.

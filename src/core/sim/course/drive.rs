@@ -5,6 +5,7 @@
 //! from a 60 kWh car to the simulated pack, so that the cells have the same C-rate as the cells of that car.
 
 use super::demand::Demand;
+use crate::quantity::DAY_S;
 use crate::sim::noise::Noise;
 use crate::sim::truth::Pack;
 
@@ -31,8 +32,6 @@ enum DayPhase {
     },
     FastCharge,
 }
-
-const DAY_S: f64 = 86_400.0;
 
 /// Plan of a day that starts at 7:30: drive to work, drive back at 17:00 with a stop at the charger, park overnight.
 const DAY: [DayPhase; 6] = [

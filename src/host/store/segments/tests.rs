@@ -9,9 +9,7 @@ use super::*;
 use crate::alarm::Change;
 use crate::config::StoreConfig;
 use crate::monitor::EventKind;
-use crate::quantity::Timestamp;
-
-const DAY_S: f64 = 86_400.0;
+use crate::quantity::{DAY_S, Timestamp};
 
 /// A folder in memory if the system has one, because a commit needs several syncs.
 fn place() -> tempfile::TempDir {

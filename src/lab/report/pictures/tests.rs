@@ -46,7 +46,7 @@ fn undated_recording_counts_seconds_since_its_start() {
 
 #[test]
 fn dated_life_has_ticks_of_utc_dates() {
-    const DAY_S: f64 = 86_400.0;
+    use crate::quantity::DAY_S;
     // The recording starts at 2023-11-14T22:13:20Z.
     for (ticks, caption) in x_axes(&examples::recording(1.7e9, 10.0 * DAY_S)) {
         assert_eq!(ticks, ["11-15", "11-16", "11-17", "11-18", "11-19", "11-20", "11-21", "11-22", "11-23", "11-24"]);

@@ -3,11 +3,10 @@
 use super::*;
 use crate::cell_faults::imbalance::{CellSpread, LimitReason, LimitingCell};
 use crate::filter::ScalarGaussian;
-use crate::quantity::Timestamp;
+use crate::quantity::{DAY_S, Timestamp};
 use crate::report::data::AlarmRecord;
 use crate::report::examples;
 
-const DAY_S: f64 = 86_400.0;
 const FIRST_S: f64 = 1.7e9;
 
 fn found(kind: CellFaultKind, cell: u16, mean: f64, since_days: f64) -> CellFault {

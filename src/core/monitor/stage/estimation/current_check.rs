@@ -77,8 +77,6 @@ const NOISE_STEPS: f64 = 1.5;
 const MAX_RESOLUTION_A: f64 = 1e3;
 /// Number of equal readings in a row that a noisy sensor only has at its limit.
 const QUIET_READINGS: u32 = 20;
-/// Largest share of noisy readings of a sensor that has not shown noise.
-const QUIET_NOISE: f64 = 0.1;
 /// Limit of `repeated` (ln of the odds for a good sensor). At this limit, the sensor becomes doubtful.
 const REPEATED: f64 = -10.0;
 /// Common change of the cells (V) after which a voltage that has not changed is frozen. The limit is at least
@@ -304,7 +302,7 @@ impl CurrentCheck {
         if self.quiet_a > 0.0 {
             // The limits of both directions differ by one step at most.
             self.is_quiet |= (size_a - self.quiet_a).abs() > NOISE_STEPS * self.resolution_a;
-        } else if self.noisy <= QUIET_NOISE {
+        } else if 1.0 - self.noisy >= FAULTY_REPEAT {
             self.quiet_a = size_a;
         }
     }
