@@ -173,8 +173,9 @@ fn contradicting_half_cycle_widens_belief_and_changes_no_capacity() {
 }
 
 /// Runs three discharges from SOC 0.9 to 0.3, and charges, of a cell of 1.6 Ah whose label says 2.0 Ah. Returns the
-/// learner. The cell model is a label's, and the voltages show the true SOC.
-fn learned_by_label() -> Learner {
+/// learner. The cell model is a label's, and the voltages show the true SOC. `is_doubtful`: whether the current is
+/// doubtful in the first part of each discharge and at the end of each charge.
+fn learned_by_label(is_doubtful: bool) -> Learner {
     let transition = TransitionConfig { dead_band_a: 0.05, hysteresis_a: 0.05, min_duration_s: 0.0, min_swing: 0.02 };
     let (model, true_ah) = (small_model(), 1.6);
     let before = ScalarGaussian::from_std(2.0, 0.2);
@@ -193,6 +194,9 @@ fn learned_by_label() -> Learner {
             learner.learn(&model, &config(), 0, &mut estimator, &half_cycle);
             learner.finish();
         }
+        if is_doubtful && moved.abs() > 0.1 && moved < 0.4 {
+            learner.interrupt_span();
+        }
     };
     pass(&mut learner, Mode::Unknown, 0.0);
     for _ in 0..3 {
@@ -209,11 +213,20 @@ fn learned_by_label() -> Learner {
 
 #[test]
 fn label_learns_capacity_from_trips_and_charges() {
-    let learner = learned_by_label();
+    let learner = learned_by_label(false);
     let capacity = learner.capacity(0);
     assert!(learner.has_learned(0), "{capacity:?}");
     assert!((capacity.mean - 1.6).abs() < 2.0 * capacity.std(), "{capacity:?}");
     assert!(capacity.mean < 1.8 && capacity.std() < 0.17, "{capacity:?}");
     // The curve's error is the same in all spans.
     assert!(capacity.std() > 0.02, "{capacity:?}");
+}
+
+#[test]
+fn doubtful_charge_ends_span_and_teaches_nothing() {
+    let learner = learned_by_label(true);
+    // Only the second part of a discharge is known, from SOC 0.72 to 0.3.
+    let capacity = learner.capacity(0);
+    assert!((capacity.mean - 1.6).abs() < 2.0 * capacity.std(), "{capacity:?}");
+    assert!(capacity.std() > learned_by_label(false).capacity(0).std(), "{capacity:?}");
 }
