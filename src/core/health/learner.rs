@@ -435,9 +435,8 @@ impl Learner {
         let is_contradiction = |z: &Measurement| {
             let difference = z.value - expected.mean;
             // A cell that has rested may gain a few percent of capacity.
-            let is_unexpected = difference.abs() > NEW_SPREAD * model.capacity_ah
-                && difference * difference > CONTRADICTION * CONTRADICTION * (z.variance + expected.variance);
-            is_unexpected || !learned_from.allows(z, NEW_SPREAD * model.capacity_ah)
+            difference.abs() > NEW_SPREAD * model.capacity_ah
+                && difference * difference > CONTRADICTION * CONTRADICTION * (z.variance + expected.variance)
         };
         if let Some(z) = measurement.filter(is_contradiction) {
             // The measured or the expected capacity is wrong; further half-cycles decide. Each contradiction adds at

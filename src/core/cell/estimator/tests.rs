@@ -213,12 +213,13 @@ fn voltage_finds_soc_while_current_lost() {
     let mut estimator = CellEstimator::new(&config);
     cycle(&mut estimator, &config, &mut truth, 1.0, 1.0);
     // 40 min of a discharge with 1 A, of which nothing is measured.
-    let start = truth.soc;
+    let (start, before) = (truth.soc, soc(&estimator));
     for _ in 0..2400 {
         let moved = truth.step(&model, 1.0, 1.0);
         let lost =
             CellStep { measured_s: 0.0, charge_as: 0.0, offset_s: 0.0, unmeasured_s: 1.0, current_a: None, ..moved };
         estimator.step(&model, &config, &lost);
+        assert!(soc(&estimator).std() >= before.std(), "{before:?} {:?}", soc(&estimator));
     }
     let found = soc(&estimator);
     assert!(start - truth.soc > 0.3, "{start} {}", truth.soc);
