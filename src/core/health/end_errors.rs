@@ -23,8 +23,8 @@ use crate::quantity::Mode;
 pub(super) const END_ERRORS: usize = 5;
 
 /// Change of a half-cycle's capacity (Ah) per standard deviation of each error; zero if the SOC at the half-cycle's
-/// ends is unknown. `is_label`: whether the model is the model of a label. The half-cycle's
-/// capacity then follows from the SOC by voltage, and the whole uncertainty of the curve is lasting.
+/// ends is unknown. `is_label`: whether the model is the model of a label. If so, the whole uncertainty of the curve is
+/// lasting.
 pub(super) fn effects_ah(
     model: &CellModel,
     config: &CapacityConfig,
@@ -33,8 +33,7 @@ pub(super) fn effects_ah(
     is_label: bool,
 ) -> [f64; END_ERRORS] {
     let mut effects = [0.0; END_ERRORS];
-    let ends = if is_label { &half_cycle.ends_by_voltage } else { &half_cycle.ends };
-    let Some(ends) = ends else { return effects };
+    let Some(ends) = &half_cycle.ends else { return effects };
     let bands = ModelBands::new(model);
     let temperature = model.temperature_position(half_cycle.mean_temperature_c.unwrap_or(CURVE_C));
     // Limits the effect: below a swing of 2 %, the measurement is useless.
@@ -88,8 +87,6 @@ mod tests {
             swing: None,
             end_soc: Some(to),
             ends: Some([from, to]),
-            ends_by_voltage: None,
-            uncounted: 0.0,
             duration_s: 3600.0,
             mean_current_a: charge_ah,
             mean_temperature_c: Some(25.0),

@@ -416,9 +416,9 @@ impl Learner {
         let is_held = lesson == Lesson::Nothing;
         let is_open = !is_in_doubt && !is_held;
         let evidence = self.prior[cell].information_until(&after).filter(|_| is_open && !is_by_label);
-        let span = soc_error.filter(|_| is_open).and_then(|_| self.span.closed(cell));
-        let by_label = span.zip(soc_error).and_then(|(span, error)| span.capacity_by_voltage(model, config, error));
-        let learned_from = span.as_ref().unwrap_or(half_cycle);
+        let span = if is_open && is_by_label { self.span.closed(cell) } else { None };
+        let by_label = span.zip(soc_error).and_then(|(span, error)| span.capacity(model, config, error));
+        let learned_from = span.as_ref().map_or(half_cycle, |span| &span.half_cycle);
         let measurement = evidence.map(|z| {
             // The open-circuit curve assumes a capacity C_curve, which influences the measurement z:
             // z = C + s (C_curve - C). Solve for C.
@@ -545,8 +545,6 @@ pub(super) fn half_cycle(moved_ah: f64, duration_s: f64, a: &CellMark, b: &CellM
         end_soc: b.soc.map(|soc| soc.mean),
         // If the SOC at the start is unknown, use the SOC at the end.
         ends: b.soc.map(|end| [a.soc.unwrap_or(end).mean, end.mean]),
-        ends_by_voltage: a.by_voltage.zip(b.by_voltage).map(<[f64; 2]>::from),
-        uncounted: 0.0,
         duration_s,
         mean_current_a: moved_ah * 3600.0 / duration_s,
         mean_temperature_c: (temperature_s > 0.0)

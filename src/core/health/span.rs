@@ -12,9 +12,12 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::CapacityConfig;
 use super::half_cycle::HalfCycle;
 use super::learner::{Mark, half_cycle};
-use crate::filter::square;
+use crate::cell::model_bands::CURVE_C;
+use crate::cell::{CellModel, reach_of_error};
+use crate::filter::{Measurement, square};
 use crate::quantity::{InvalidState, Mode};
 
 /// Smallest span, as a part of the rated capacity. Smaller spans show mostly the error of a label's curve.
@@ -80,13 +83,15 @@ impl Span {
         }
     }
 
-    /// The last complete span of a cell, if no cell has learned from it yet.
-    pub(super) fn closed(&self, cell: usize) -> Option<HalfCycle> {
+    /// The last complete span of a cell, if no cell has learned from it yet. `None` if the SOC at an end is unknown.
+    pub(super) fn closed(&self, cell: usize) -> Option<CellSpan> {
         let (start, end, gaps) = self.closed.as_ref()?;
         let (a, b) = (start.cells.get(cell)?, end.cells.get(cell)?);
+        let ends = [a.by_voltage?, b.by_voltage?];
         let moved_ah = (end.charge_as - start.charge_as) / 3600.0;
-        let span = half_cycle(moved_ah, end.time.since(start.time), a, b);
-        Some(HalfCycle { uncounted: f64::from(*gaps) * square(UNNOTICED), ..span })
+        let half_cycle = half_cycle(moved_ah, end.time.since(start.time), a, b);
+        let uncounted = f64::from(*gaps) * square(UNNOTICED);
+        Some(CellSpan { half_cycle: HalfCycle { ends: Some(ends), ..half_cycle }, ends, uncounted })
     }
 
     /// Checks the numbers of a stored span, except those of its marks.
@@ -100,16 +105,50 @@ impl Span {
         self.marks_mut().filter_map(|mark| mark.cells.get_mut(cell)).for_each(|cell| cell.by_voltage = None);
     }
 
-    /// All marks.
+    /// The marks at the start, the turn and the end.
     pub(super) fn marks_mut(&mut self) -> impl Iterator<Item = &mut Mark> {
         let marks = [&mut self.start, &mut self.turn, &mut self.last].into_iter().flatten();
         marks.chain(self.closed.iter_mut().flat_map(|(start, end, _)| [start, end]))
     }
 
-    /// All marks.
+    /// See [`Self::marks_mut`].
     pub(super) fn marks(&self) -> impl Iterator<Item = &Mark> + Clone {
         let marks = [&self.start, &self.turn, &self.last].into_iter().flatten();
         marks.chain(self.closed.iter().flat_map(|(start, end, _)| [start, end]))
+    }
+}
+
+/// A complete span of one cell.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct CellSpan {
+    /// The span as one half-cycle; its ends are SOCs by voltage.
+    pub(super) half_cycle: HalfCycle,
+    ends: [f64; 2],
+    /// Variance of the charge that has flowed while no current was measured (square of a fraction of the capacity).
+    uncounted: f64,
+}
+
+impl CellSpan {
+    /// The capacity (Ah): counted charge divided by the change of the SOC that the voltages show. `None` if the SOC has
+    /// not changed in the direction of the charge. `soc_error`: error of the SOC by voltage that comes from the loads
+    /// before (fraction).
+    pub(super) fn capacity(&self, model: &CellModel, config: &CapacityConfig, soc_error: f64) -> Option<Measurement> {
+        let Self { half_cycle, ends: [start, end], uncounted } = *self;
+        let swing = if half_cycle.mode == Mode::Charge { end - start } else { start - end };
+        if swing <= 0.0 {
+            return None;
+        }
+        let value = half_cycle.charge_ah / swing;
+        let offset_ah = config.current_offset_std_a * half_cycle.duration_s / 3600.0;
+        let temperature = model.temperature_position(half_cycle.mean_temperature_c.unwrap_or(CURVE_C));
+        let soc_variance = |soc: f64| {
+            // The model of a label always states its error.
+            let error_v = model.voltage_error_v(&model.grid_position_at(&temperature, soc)).unwrap_or(0.0);
+            square(reach_of_error(model, &temperature, model.capacity_ah, (soc, error_v))) + square(soc_error)
+        };
+        let of_swing = (soc_variance(start) + soc_variance(end) + uncounted) / square(swing);
+        let of_charge = square(offset_ah / half_cycle.charge_ah);
+        Some(Measurement { value, variance: value * value * (of_charge + of_swing) })
     }
 }
 
@@ -156,11 +195,11 @@ mod tests {
         }
         note(&mut span, Mode::Charge, [0.3, 0.6]);
         let closed = span.closed(0).expect("a span");
-        assert!((closed.charge_ah - 50.0).abs() < 1e-9, "{closed:?}");
-        assert_eq!(closed.ends_by_voltage, Some([0.9, 0.4]));
+        assert!((closed.half_cycle.charge_ah - 50.0).abs() < 1e-9, "{closed:?}");
+        assert_eq!(closed.ends, [0.9, 0.4]);
         assert!((closed.uncounted - UNNOTICED * UNNOTICED).abs() < 1e-12, "{closed:?}");
         span.forget(0);
-        assert_eq!(span.closed(0).expect("a span").ends_by_voltage, None);
+        assert_eq!(span.closed(0), None);
     }
 
     #[test]
@@ -181,6 +220,6 @@ mod tests {
         note(&mut span, Mode::Charge, [0.0, 0.6]);
         note(&mut span, Mode::Discharge, [0.1, 0.5]);
         let closed = span.closed(0).expect("the charge");
-        assert_eq!(closed.ends_by_voltage, Some([0.3, 0.6]));
+        assert_eq!(closed.ends, [0.3, 0.6]);
     }
 }

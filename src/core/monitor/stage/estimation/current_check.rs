@@ -16,12 +16,13 @@
 //! apart leaves many steps unexplained, so one more is only weak evidence.
 //!
 //! The check finds a current that is frozen, inverted, late or beyond the sensor's range, whether or not the last
-//! digits of its readings change. While the load is constant, the check finds only a noisy sensor at its limit, because
-//! the readings of this sensor then repeat. A sensor that has repeated readings of two sizes has no noise and is not
-//! judged by its repeats. A current without sign is found at the first clear steps of a charging
-//! current. If a doubted current has never flowed in both directions, the doubt only ends when it has. A current without
-//! sign therefore stays doubtful.
+//! digits of its readings change. While the load is constant, it finds only a noisy sensor at its limit ([`SensorLimit`]).
+//! A current without sign is found at the first clear steps of a charging current. If a doubted current has never flowed
+//! in both directions, the doubt only ends when it has. A current without sign therefore stays doubtful.
 
+mod sensor_limit;
+
+use sensor_limit::SensorLimit;
 use serde::{Deserialize, Serialize};
 
 use crate::quantity::{InvalidState, Timestamp, bounds};
@@ -64,21 +65,8 @@ const RATIO_GAIN: f64 = 0.1;
 const MAX_PAUSE_S: f64 = 60.0;
 /// Part of the earlier doubts that remains after an explained step.
 const FORGET_DOUBT: f64 = 0.97;
-/// Weight of a round in the scatter of the cells, and of a steady round in the share of readings that differ by noise.
-const NOISE_GAIN: f64 = 0.02;
-/// Lowest probability that a good sensor repeats a reading exactly.
-const MIN_REPEAT: f64 = 0.01;
-/// Probability that a sensor at its limit repeats a reading.
-const FAULTY_REPEAT: f64 = 0.5;
-/// Changes of a reading above this multiple of the sensor's resolution are noise. A coarse sensor also changes by one
-/// step.
-const NOISE_STEPS: f64 = 1.5;
-/// Resolution of the current before a change has been seen (A).
-const MAX_RESOLUTION_A: f64 = 1e3;
-/// Number of equal readings in a row that a noisy sensor only has at its limit.
-const QUIET_READINGS: u32 = 20;
-/// Limit of `repeated` (ln of the odds for a good sensor). At this limit, the sensor becomes doubtful.
-const REPEATED: f64 = -10.0;
+/// Weight of a round in the scatter of the cells.
+const SCATTER_GAIN: f64 = 0.02;
 /// Common change of the cells (V) after which a voltage that has not changed is frozen. The limit is at least
 /// [`FROZEN_STEPS`] times the resolution of the voltages.
 const FROZEN_V: f64 = 0.03;
@@ -120,31 +108,12 @@ pub(crate) struct CurrentCheck {
     usual_v: f64,
     /// Usual difference between a cell's change since the previous round and the common change (V).
     scatter_v: f64,
-    /// Share of readings of a steady current that differ from the previous reading by noise.
-    noisy: f64,
-    /// Smallest change of the current (A).
-    resolution_a: f64,
     /// Sum of all common changes of the voltages (V).
     path_v: f64,
     /// Smallest change of a single voltage (V).
     resolution_v: f64,
-    /// Evidence of the present run of equal readings: ln of the odds for a good sensor, at most 0.
-    repeated: f64,
-    /// Number of times that the present reading has repeated.
-    #[serde(default)]
-    equal: u32,
-    /// Size of a current that the sensor has read [`QUIET_READINGS`] times in a row before it has shown noise (A); 0 =
-    /// none.
-    #[serde(default)]
-    quiet_a: f64,
-    /// Whether the sensor has repeated two currents of different size. Such a sensor has no noise. If its readings
-    /// change under a steady load, the load changes: for example, a charger that holds the voltage.
-    #[serde(default)]
-    is_quiet: bool,
-    /// Largest reading of discharge and of charge (A).
-    largest_a: [f64; 2],
-    /// Readings at which the sensor was at its limit, for discharge and for charge (A); 0 = never.
-    limits_a: [f64; 2],
+    /// Limit of the sensor, found from repeated readings.
+    limit: SensorLimit,
     /// Number of earlier doubts; explained steps reduce it.
     doubts: f64,
     /// Whether a jump of the SOC in a downtime waits for an explained step.
@@ -164,16 +133,9 @@ impl Default for CurrentCheck {
             log_ratio: 0.0,
             usual_v: FIRST_MOVE_V,
             scatter_v: FIRST_MOVE_V,
-            noisy: 0.0,
-            resolution_a: MAX_RESOLUTION_A,
             path_v: 0.0,
             resolution_v: COARSE_V,
-            repeated: 0.0,
-            equal: 0,
-            quiet_a: 0.0,
-            is_quiet: false,
-            largest_a: [0.0; 2],
-            limits_a: [0.0; 2],
+            limit: SensorLimit::default(),
             doubts: 0.0,
             is_unconfirmed: false,
             is_one_sided: false,
@@ -231,11 +193,14 @@ impl CurrentCheck {
         let move_v = common_move(&mut moves_v[..moves]);
         self.path_v += move_v;
         if moves > 1 {
-            self.scatter_v += NOISE_GAIN * (scatter(&mut moves_v[..moves], move_v) - self.scatter_v);
+            self.scatter_v += SCATTER_GAIN * (scatter(&mut moves_v[..moves], move_v) - self.scatter_v);
         }
         let is_late = self.count > 0 && time.since(self.rounds[ROUNDS - 1].time) > MAX_PAUSE_S;
         let Some(current_a) = current_a.filter(|_| !is_late && moves > 0) else {
             self.count = 0;
+            if is_late {
+                self.limit.pause();
+            }
             return;
         };
         self.rounds.rotate_left(1);
@@ -245,66 +210,11 @@ impl CurrentCheck {
             self.judge(noise_v, ohm * libm::exp(self.log_ratio));
         }
         if self.count >= 2 {
-            self.judge_repeat();
+            let is_steady = move_v.abs() <= self.usual_v.max(self.resolution_v);
+            let evidence = self.limit.judge(self.rounds[ROUNDS - 2].current_a, current_a, is_steady);
+            self.add_evidence(evidence);
         }
-        let has_both = self.largest_a.iter().all(|&a| a > rest_a);
-        self.is_one_sided = !has_both && (self.is_one_sided || self.is_contradicted());
-    }
-
-    /// Judges whether the last reading of a flowing current repeats the reading before. If the last digits of a sensor
-    /// usually change under a steady load, but now stay the same, the sensor is at its limit. A coarse sensor repeats
-    /// its readings, or changes them by one step.
-    fn judge_repeat(&mut self) {
-        let [.., before, now] = self.rounds;
-        let change_a = (now.current_a - before.current_a).abs();
-        let direction = usize::from(now.current_a < 0.0);
-        self.largest_a[direction] = self.largest_a[direction].max(now.current_a.abs());
-        if self.limits_a.contains(&now.current_a) && now.current_a != 0.0 {
-            self.add_evidence(DOUBTFUL);
-        }
-        if change_a > 0.0 {
-            self.resolution_a = self.resolution_a.min(change_a);
-            self.equal = 0;
-        } else if now.current_a != 0.0 {
-            self.note_equal(now.current_a.abs());
-        }
-        if now.current_a == 0.0 {
-            self.repeated = 0.0;
-            return;
-        }
-        // A limit is the largest reading of its direction.
-        let is_largest = now.current_a.abs() >= self.largest_a[direction];
-        if change_a > 0.0 || !is_largest || self.is_quiet {
-            self.repeated = 0.0;
-        } else {
-            self.repeated += libm::log((1.0 - self.noisy).max(MIN_REPEAT) / FAULTY_REPEAT).min(0.0);
-            // The run may still show that the sensor is quiet.
-            let is_open = self.quiet_a > 0.0 && self.equal < QUIET_READINGS;
-            if self.repeated <= REPEATED && !is_open {
-                self.repeated = 0.0;
-                self.limits_a[direction] = now.current_a;
-                self.add_evidence(MAX_EVIDENCE);
-            }
-        }
-        let is_steady = now.move_v.abs() <= self.usual_v.max(self.resolution_v);
-        if is_steady && !is_largest {
-            let is_noise = change_a > NOISE_STEPS * self.resolution_a;
-            self.noisy += NOISE_GAIN * (f64::from(u8::from(is_noise)) - self.noisy);
-        }
-    }
-
-    /// Notes that a reading of this size (A) has repeated.
-    fn note_equal(&mut self, size_a: f64) {
-        self.equal = self.equal.saturating_add(1);
-        if self.equal < QUIET_READINGS {
-            return;
-        }
-        if self.quiet_a > 0.0 {
-            // The limits of both directions differ by one step at most.
-            self.is_quiet |= (size_a - self.quiet_a).abs() > NOISE_STEPS * self.resolution_a;
-        } else if 1.0 - self.noisy >= FAULTY_REPEAT {
-            self.quiet_a = size_a;
-        }
+        self.is_one_sided = !self.limit.has_seen_both(rest_a) && (self.is_one_sided || self.is_contradicted());
     }
 
     /// Sum of all changes that the cells have in common (V). Only its differences are meaningful.
@@ -376,16 +286,14 @@ impl CurrentCheck {
     /// Forgets the latest rounds, because the next reading comes after a pause. The evidence stays.
     pub(crate) fn interrupt(&mut self) {
         (self.voltages_v, self.rounds, self.count) = ([None; MAX_CELLS], [Round::default(); ROUNDS], 0);
-        (self.equal, self.repeated) = (0, 0.0);
+        self.limit.pause();
     }
 
     /// Checks a stored state; the error is the first impossible number.
     pub(crate) fn check(&self) -> Result<(), InvalidState> {
         bounds::VOLTAGE_V.check_all("a voltage of the check of the current", self.voltages_v.into_iter().flatten())?;
-        bounds::CURRENT_A.check_all(
-            "a current of the check of the current",
-            self.rounds.map(|round| round.current_a).into_iter().chain(self.limits_a).chain(self.largest_a),
-        )?;
+        bounds::CURRENT_A
+            .check_all("a current of the check of the current", self.rounds.map(|round| round.current_a))?;
         let numbers = self.rounds.map(|round| round.move_v);
         bounds::NUMBER.check_all("a voltage step of the check of the current", numbers)?;
         let [unexplained, explained] = self.steps;
@@ -396,15 +304,12 @@ impl CurrentCheck {
             self.log_ratio,
             self.usual_v,
             self.scatter_v,
-            self.noisy,
-            self.resolution_a,
             self.path_v,
             self.resolution_v,
-            self.repeated,
             self.doubts,
-            self.quiet_a,
         ];
         bounds::NUMBER.check_all("the check of the current", state)?;
+        self.limit.check()?;
         InvalidState::unless(self.count <= ROUNDS, "rounds of the check of the current", self.count as f64, "at most 4")
     }
 
@@ -437,170 +342,4 @@ fn scatter(moves_v: &mut [f64], common_v: f64) -> f64 {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::quantity::CellIndex;
-
-    /// Name of a fault, and the reading for a load and a time.
-    type Fault = (&'static str, fn(f64, u32) -> f64);
-
-    const OHM: f64 = 2e-3;
-    const CELLS: usize = 5;
-
-    /// Load of a drive (A): a new level every 10 s.
-    fn load_a(time_s: u32) -> f64 {
-        let level = (time_s / 10).wrapping_mul(2_654_435_761) >> 24;
-        f64::from(level) / 2.0 - 30.0
-    }
-
-    /// Noise of a reading (A): 0 to 0.06 A in steps of 0.001 A.
-    fn noise_a(time_s: u32) -> f64 {
-        f64::from(time_s.wrapping_mul(time_s) % 61) / 1000.0
-    }
-
-    /// Handles a round of all cells. `voltage_v` returns the voltage of a cell.
-    fn round(check: &mut CurrentCheck, time_s: u32, current_a: Option<f64>, voltage_v: impl Fn(usize) -> f64) {
-        let samples: Vec<CellSample> = (0..CELLS)
-            .map(|cell| CellSample {
-                time: Timestamp::from_secs(f64::from(time_s)),
-                cell: CellIndex(cell as u16),
-                voltage_v: voltage_v(cell),
-                current_a,
-                charge_as: 0.0,
-                offset_s: 0.0,
-                unmeasured_s: 0.0,
-                temperature_c: None,
-            })
-            .collect();
-        check.handle(samples.iter().enumerate(), 0.001, OHM, 1.0);
-    }
-
-    /// Runs a drive of `seconds`, one round every 2 s. `measured` returns the reading for the load and the time.
-    /// Returns the share of rounds in doubt.
-    fn drive(check: &mut CurrentCheck, seconds: u32, measured: impl Fn(f64, u32) -> Option<f64>) -> f64 {
-        let mut doubtful = 0;
-        for time_s in (0..seconds).step_by(2) {
-            let current_a = measured(load_a(time_s), time_s).map(|current_a| current_a + noise_a(time_s));
-            round(check, time_s, current_a, |cell| {
-                3.7 - 1.2 * OHM * load_a(time_s) + 1e-4 * ((time_s as usize + cell) % 5) as f64
-            });
-            doubtful += u32::from(check.is_doubtful());
-        }
-        f64::from(doubtful) / f64::from(seconds / 2)
-    }
-
-    fn share_in_doubt(measured: impl Fn(f64, u32) -> Option<f64>) -> f64 {
-        drive(&mut CurrentCheck::default(), 3600, measured)
-    }
-
-    #[test]
-    fn good_current_is_never_doubted() {
-        assert_eq!(share_in_doubt(|load_a, _| Some(load_a)), 0.0);
-        // First, a gateway sends the current one round late. Second, the apparent resistance is 2.4 times the model's.
-        assert_eq!(share_in_doubt(|_, time_s| Some(load_a(time_s.saturating_sub(2)))), 0.0);
-        assert_eq!(share_in_doubt(|load_a, _| Some(0.5 * load_a)), 0.0);
-        // One reading in four is lost.
-        assert_eq!(share_in_doubt(|load_a, time_s| (time_s % 8 != 0).then_some(load_a)), 0.0);
-    }
-
-    #[test]
-    fn wrong_current_is_doubted_within_seconds() {
-        let faults: [Fault; 5] = [
-            ("zero", |_, _| 0.0),
-            ("inverted", |load_a, _| -load_a),
-            ("late by 20 s", |_, time_s| load_a(time_s.saturating_sub(20))),
-            ("overflow", |load_a, _| (load_a + 20.0).rem_euclid(40.0) - 20.0),
-            ("without sign", |load_a, _| load_a.abs()),
-        ];
-        for (name, fault) in faults {
-            let share = share_in_doubt(|load_a, time_s| Some(fault(load_a, time_s)));
-            assert!(share > 0.85, "{name}: {share}");
-        }
-    }
-
-    #[test]
-    fn repeated_reading_of_noisy_sensor_is_its_limit() {
-        let mut check = CurrentCheck::default();
-        // The reading without the noise that `drive` adds: exactly 60 A while the load is larger.
-        let limited = |load_a: f64, time_s: u32| Some(if load_a >= 60.0 { 60.0 - noise_a(time_s) } else { load_a });
-        drive(&mut check, 1200, |load_a, _| (load_a < 60.0).then_some(load_a));
-        let share = drive(&mut check, 3600, limited);
-        assert!(share > 0.5, "{share} {check:?}");
-        assert!((check.limits_a[0] - 60.0).abs() < 1e-9, "{:?}", check.limits_a);
-    }
-
-    #[test]
-    fn regulated_current_of_quiet_sensor_is_no_limit() {
-        // A laboratory charges with a constant current and then at a constant voltage, which moves the current. Then it
-        // discharges with a constant current, the largest of all.
-        let charge_then_discharge = |discharge_a: f64| {
-            let mut check = CurrentCheck::default();
-            for time_s in 0..600 {
-                let held_v = 1e-4 * f64::from(time_s % 3);
-                let (current_a, voltage_v) = match time_s {
-                    0..200 => (-50.0, 3.9 + 1e-4 * f64::from(time_s)),
-                    200..450 => (-20.0 + 100.0 * noise_a(time_s), 4.1 + held_v),
-                    _ => (discharge_a, 3.9 - 1e-4 * f64::from(time_s)),
-                };
-                round(&mut check, 2 * time_s, Some(current_a), |_| voltage_v);
-            }
-            check
-        };
-        let of_quiet = charge_then_discharge(50.5);
-        assert_eq!((of_quiet.limits_a, of_quiet.is_doubtful()), ([0.0; 2], false), "{of_quiet:?}");
-        // Both directions end at the same reading: this is the limit.
-        let of_limited = charge_then_discharge(50.0);
-        assert!(of_limited.limits_a.contains(&50.0) && of_limited.is_doubtful(), "{of_limited:?}");
-    }
-
-    #[test]
-    fn doubt_ends_after_explained_steps_and_lasts_longer_each_time() {
-        let mut check = CurrentCheck::default();
-        drive(&mut check, 600, |load_a, _| Some(load_a));
-        let mut shares = Vec::new();
-        for _ in 0..3 {
-            check.add_evidence(DOUBTFUL + 1.0);
-            shares.push(drive(&mut check, 1200, |load_a, _| Some(load_a)));
-            assert!(!check.is_doubtful());
-        }
-        assert!(shares.is_sorted() && shares[0] < 0.1 && shares[2] < 0.5, "{shares:?}");
-    }
-
-    #[test]
-    fn jump_waits_for_explained_step() {
-        let mut check = CurrentCheck::default();
-        check.demand_step();
-        assert!(!check.is_unconfirmed(), "no step has been judged");
-        drive(&mut check, 600, |load_a, _| Some(load_a));
-        check.demand_step();
-        check.interrupt();
-        assert!(check.is_unconfirmed());
-        drive(&mut check, 60, |load_a, _| Some(-load_a));
-        assert!(check.is_unconfirmed());
-        drive(&mut check, 60, |load_a, _| Some(load_a));
-        assert!(!check.is_unconfirmed());
-    }
-
-    #[test]
-    fn frozen_voltage_shows_against_common_path() {
-        let mut check = CurrentCheck::default();
-        drive(&mut check, 600, |load_a, _| Some(load_a));
-        let path_v = check.path_v();
-        assert!(!check.is_frozen_since(path_v));
-        assert!(check.is_frozen_since(path_v - 0.05));
-    }
-
-    #[test]
-    fn relaxation_after_load_is_not_a_step() {
-        let mut check = CurrentCheck::default();
-        for k in 0..20_u32 {
-            let since_load = k.checked_sub(5).map(f64::from);
-            let (voltage_v, current_a) = match since_load {
-                None => (3.7 - 0.102, 30.0),
-                Some(rounds) => (3.7 - 0.03 * libm::exp(-rounds / 3.0), 0.0),
-            };
-            round(&mut check, 600 + 2 * k, Some(current_a), |_| voltage_v);
-        }
-        assert!(!check.is_doubtful(), "{check:?}");
-    }
-}
+mod tests;

@@ -1,0 +1,165 @@
+use super::*;
+use crate::quantity::CellIndex;
+
+/// Name of a fault, and the reading for a load and a time.
+type Fault = (&'static str, fn(f64, u32) -> f64);
+
+const OHM: f64 = 2e-3;
+const CELLS: usize = 5;
+
+/// Load of a drive (A): a new level every 10 s.
+fn load_a(time_s: u32) -> f64 {
+    let level = (time_s / 10).wrapping_mul(2_654_435_761) >> 24;
+    f64::from(level) / 2.0 - 30.0
+}
+
+/// Noise of a reading (A): 0 to 0.06 A in steps of 0.001 A.
+fn noise_a(time_s: u32) -> f64 {
+    f64::from(time_s.wrapping_mul(time_s) % 61) / 1000.0
+}
+
+/// Handles a round of all cells. `voltage_v` returns the voltage of a cell.
+fn round(check: &mut CurrentCheck, time_s: u32, current_a: Option<f64>, voltage_v: impl Fn(usize) -> f64) {
+    let samples: Vec<CellSample> = (0..CELLS)
+        .map(|cell| CellSample {
+            time: Timestamp::from_secs(f64::from(time_s)),
+            cell: CellIndex(cell as u16),
+            voltage_v: voltage_v(cell),
+            current_a,
+            charge_as: 0.0,
+            offset_s: 0.0,
+            unmeasured_s: 0.0,
+            temperature_c: None,
+        })
+        .collect();
+    check.handle(samples.iter().enumerate(), 0.001, OHM, 1.0);
+}
+
+/// Runs a drive of `seconds`, one round every 2 s. `measured` returns the reading for the load and the time.
+/// Returns the share of rounds in doubt.
+fn drive(check: &mut CurrentCheck, seconds: u32, measured: impl Fn(f64, u32) -> Option<f64>) -> f64 {
+    let mut doubtful = 0;
+    for time_s in (0..seconds).step_by(2) {
+        let current_a = measured(load_a(time_s), time_s).map(|current_a| current_a + noise_a(time_s));
+        round(check, time_s, current_a, |cell| {
+            3.7 - 1.2 * OHM * load_a(time_s) + 1e-4 * ((time_s as usize + cell) % 5) as f64
+        });
+        doubtful += u32::from(check.is_doubtful());
+    }
+    f64::from(doubtful) / f64::from(seconds / 2)
+}
+
+fn share_in_doubt(measured: impl Fn(f64, u32) -> Option<f64>) -> f64 {
+    drive(&mut CurrentCheck::default(), 3600, measured)
+}
+
+#[test]
+fn good_current_is_never_doubted() {
+    assert_eq!(share_in_doubt(|load_a, _| Some(load_a)), 0.0);
+    // First, a gateway sends the current one round late. Second, the apparent resistance is 2.4 times the model's.
+    assert_eq!(share_in_doubt(|_, time_s| Some(load_a(time_s.saturating_sub(2)))), 0.0);
+    assert_eq!(share_in_doubt(|load_a, _| Some(0.5 * load_a)), 0.0);
+    // One reading in four is lost.
+    assert_eq!(share_in_doubt(|load_a, time_s| (time_s % 8 != 0).then_some(load_a)), 0.0);
+}
+
+#[test]
+fn wrong_current_is_doubted_within_seconds() {
+    let faults: [Fault; 5] = [
+        ("zero", |_, _| 0.0),
+        ("inverted", |load_a, _| -load_a),
+        ("late by 20 s", |_, time_s| load_a(time_s.saturating_sub(20))),
+        ("overflow", |load_a, _| (load_a + 20.0).rem_euclid(40.0) - 20.0),
+        ("without sign", |load_a, _| load_a.abs()),
+    ];
+    for (name, fault) in faults {
+        let share = share_in_doubt(|load_a, time_s| Some(fault(load_a, time_s)));
+        assert!(share > 0.85, "{name}: {share}");
+    }
+}
+
+#[test]
+fn repeated_reading_of_noisy_sensor_is_its_limit() {
+    let mut check = CurrentCheck::default();
+    // The reading without the noise that `drive` adds: exactly 60 A while the load is larger.
+    let limited = |load_a: f64, time_s: u32| Some(if load_a >= 60.0 { 60.0 - noise_a(time_s) } else { load_a });
+    drive(&mut check, 1200, |load_a, _| (load_a < 60.0).then_some(load_a));
+    let share = drive(&mut check, 3600, limited);
+    assert!(share > 0.5, "{share} {check:?}");
+    assert!((check.limit.limits_a[0] - 60.0).abs() < 1e-9, "{:?}", check.limit.limits_a);
+}
+
+#[test]
+fn regulated_current_of_quiet_sensor_is_no_limit() {
+    // A laboratory charges with a constant current and then at a constant voltage, which moves the current. Then it
+    // discharges with a constant current, the largest of all.
+    let charge_then_discharge = |discharge_a: f64| {
+        let mut check = CurrentCheck::default();
+        for time_s in 0..600 {
+            let held_v = 1e-4 * f64::from(time_s % 3);
+            let (current_a, voltage_v) = match time_s {
+                0..200 => (-50.0, 3.9 + 1e-4 * f64::from(time_s)),
+                200..450 => (-20.0 + 100.0 * noise_a(time_s), 4.1 + held_v),
+                _ => (discharge_a, 3.9 - 1e-4 * f64::from(time_s)),
+            };
+            round(&mut check, 2 * time_s, Some(current_a), |_| voltage_v);
+        }
+        check
+    };
+    let of_quiet = charge_then_discharge(50.5);
+    assert_eq!((of_quiet.limit.limits_a, of_quiet.is_doubtful()), ([0.0; 2], false), "{of_quiet:?}");
+    // Both directions end at the same reading: this is the limit.
+    let of_limited = charge_then_discharge(50.0);
+    assert!(of_limited.limit.limits_a.contains(&50.0) && of_limited.is_doubtful(), "{of_limited:?}");
+}
+
+#[test]
+fn doubt_ends_after_explained_steps_and_lasts_longer_each_time() {
+    let mut check = CurrentCheck::default();
+    drive(&mut check, 600, |load_a, _| Some(load_a));
+    let mut shares = Vec::new();
+    for _ in 0..3 {
+        check.add_evidence(DOUBTFUL + 1.0);
+        shares.push(drive(&mut check, 1200, |load_a, _| Some(load_a)));
+        assert!(!check.is_doubtful());
+    }
+    assert!(shares.is_sorted() && shares[0] < 0.1 && shares[2] < 0.5, "{shares:?}");
+}
+
+#[test]
+fn jump_waits_for_explained_step() {
+    let mut check = CurrentCheck::default();
+    check.demand_step();
+    assert!(!check.is_unconfirmed(), "no step has been judged");
+    drive(&mut check, 600, |load_a, _| Some(load_a));
+    check.demand_step();
+    check.interrupt();
+    assert!(check.is_unconfirmed());
+    drive(&mut check, 60, |load_a, _| Some(-load_a));
+    assert!(check.is_unconfirmed());
+    drive(&mut check, 60, |load_a, _| Some(load_a));
+    assert!(!check.is_unconfirmed());
+}
+
+#[test]
+fn frozen_voltage_shows_against_common_path() {
+    let mut check = CurrentCheck::default();
+    drive(&mut check, 600, |load_a, _| Some(load_a));
+    let path_v = check.path_v();
+    assert!(!check.is_frozen_since(path_v));
+    assert!(check.is_frozen_since(path_v - 0.05));
+}
+
+#[test]
+fn relaxation_after_load_is_not_a_step() {
+    let mut check = CurrentCheck::default();
+    for k in 0..20_u32 {
+        let since_load = k.checked_sub(5).map(f64::from);
+        let (voltage_v, current_a) = match since_load {
+            None => (3.7 - 0.102, 30.0),
+            Some(rounds) => (3.7 - 0.03 * libm::exp(-rounds / 3.0), 0.0),
+        };
+        round(&mut check, 600 + 2 * k, Some(current_a), |_| voltage_v);
+    }
+    assert!(!check.is_doubtful(), "{check:?}");
+}
