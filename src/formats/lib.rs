@@ -1,0 +1,33 @@
+//! Reads CAN logs of other tools as frames.
+//!
+//! In: the bytes of a file. Out: [`Item`]s in the order of the file, with their channel. [`Format::recognise`] finds
+//! the format from the first bytes; the file name plays no part. Every reader streams: its memory does not depend on
+//! the size of the file. A bad part costs only this part ([`Item::Bad`]). A file that ends too early, or whose
+//! structure is damaged, ends with an error after all frames before the damage.
+//!
+//! candump logs (`candump -L`), journals and CSV tables are read by `packwatch_host::io::log`.
+
+mod format;
+mod item;
+
+pub use format::{Format, Source};
+pub use item::{Channel, Item, Position};
+
+use std::io;
+
+/// Reads one log. Each format has one implementor.
+pub trait LogReader {
+    /// Reads the next item. `None` = the log has ended.
+    ///
+    /// # Errors
+    /// Fails if the source cannot be read, or if the structure of the file is damaged so that nothing can be read after
+    /// this place. The message states what was found and what is allowed; the caller adds the file and
+    /// [`position`](Self::position). Later calls return `None`.
+    fn next_item(&mut self) -> io::Result<Option<Item>>;
+
+    /// Position of the item last returned, or of the damage.
+    fn position(&self) -> Position;
+
+    /// The channels found so far. An item's `channel` is an index into this list.
+    fn channels(&self) -> &[Channel];
+}
