@@ -156,7 +156,7 @@ fn write_whole(file: &Path, text: &str) -> Result<(), Failure> {
 fn feed(args: &Args, discoverer: &mut Discoverer) -> Result<Vec<String>, Failure> {
     let csv = CsvOptions { columns: Vec::new(), charge_positive: false, start_times: None, cells: 1, pack_total: true };
     let encode_row = Box::new(|_: &[_], _: &mut Vec<_>| 0);
-    let options = LogOptions { interfaces: Vec::new(), strict: false, csv, encode_row };
+    let options = LogOptions { interfaces: Vec::new(), channels: Vec::new(), strict: false, csv, encode_row };
     let mut source = LogSource::new([args.log.clone()], options);
     source.adopt_foreign();
     let bar = Bar::new(std::slice::from_ref(&args.log));
