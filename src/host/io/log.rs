@@ -71,6 +71,9 @@ pub struct LogCounts {
     pub first_bad_line: Option<String>,
     /// Lines without a record, such as headers, comments and blank lines.
     pub ignored_lines: u64,
+    /// The first of them that is not blank or a comment: file, line and text.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub first_ignored_line: Option<String>,
     /// CAN XL frames, which are not supported.
     pub xl_frames: u64,
     /// Error frames.
@@ -436,6 +439,10 @@ impl ReadState {
                 Ok(ParsedLine { line: Line::Other, .. }) if self.strict && !journal && !is_remark(bytes) => {
                     Err(LineError { column: 1, expected: "a candump line, a comment (#) or a blank line" })
                 }
+                Ok(ParsedLine { line: Line::Other, .. }) => {
+                    self.note_ignored(name, number, bytes);
+                    Ok(None)
+                }
                 Ok(parsed) => Ok(self.line_record(&parsed.line)),
                 Err(error) => Err(error),
             };
@@ -446,6 +453,17 @@ impl ReadState {
                 Ok(None) => {}
                 Err(error) => self.bad(|| format!("{name}:{number}: {}", error.describe(bytes)))?,
             }
+        }
+    }
+
+    fn note_ignored(&mut self, name: &str, number: u64, line: &[u8]) {
+        /// Length of the quoted text, bytes.
+        const SHOWN: usize = 60;
+        self.counts.ignored_lines += 1;
+        if self.counts.first_ignored_line.is_none() && !is_remark(line) {
+            let text = String::from_utf8_lossy(&line[..line.len().min(SHOWN)]).into_owned();
+            let more = if line.len() > SHOWN { "..." } else { "" };
+            self.counts.first_ignored_line = Some(format!("{name}:{number}: {text:?}{more}"));
         }
     }
 
@@ -472,10 +490,7 @@ impl ReadState {
                 self.counts.xl_frames += 1;
                 None
             }
-            Line::Other => {
-                self.counts.ignored_lines += 1;
-                None
-            }
+            Line::Other => None,
         }
     }
 
