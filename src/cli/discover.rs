@@ -17,7 +17,7 @@ use crate::config::{self, ConfigFaults};
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogOptions, LogSource};
 use crate::io::result_file::{ResultFile, check_place};
-use crate::lab::discover::{Candidate, Discoverer, Discovery, PackSettings, PositiveDirection};
+use crate::lab::discover::{Candidate, Discoverer, Discovery, PackLabel, PackSettings, PositiveDirection};
 use crate::lab::error::LabError;
 use crate::lab::import::obdb::ObdbSettings;
 use crate::monitor::RecordKind;
@@ -48,8 +48,12 @@ pub(crate) struct Args {
     #[arg(long)]
     json: bool,
     /// Write a configuration with the best candidates, and PACK.dbc with the fields that no DBC describes; replaces existing files
-    #[arg(long, value_name = "PACK.toml", requires = "model")]
+    #[arg(long, value_name = "PACK.toml")]
     write: Option<PathBuf>,
+    /// What the pack's label says, every part optional: chemistry, capacity, cells in series, such as nmc:64Ah:98s. Decides
+    /// scales of undescribed fields; with --write, also describes the cell if --model is not given
+    #[arg(long, value_name = "LABEL")]
+    label: Option<PackLabel>,
     /// Cell model for the written configuration
     #[arg(long, value_name = "CELL.toml")]
     model: Option<PathBuf>,
@@ -81,6 +85,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         let settings = ObdbSettings { source, year: args.year, name: None };
         discoverer.add_obdb(&read(file)?, &settings).map_err(failure)?;
     }
+    discoverer.set_label(args.label.unwrap_or_default());
     let interfaces = feed(args, &mut discoverer)?;
     let discovery = discoverer.finish(&interfaces);
     if discovery.frames == 0 {
@@ -93,27 +98,18 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         true => unless_closed(print_json(&json!({ "version": 1, "discovery": discovery })))?,
         false => print(&(page(&discovery) + no_definitions(args, &discovery)))?,
     }
-    match (&args.write, &args.model) {
-        (Some(file), Some(model)) => write(args, &discoverer, &discovery, file, model),
-        _ => Ok(()),
-    }
+    args.write.as_ref().map_or(Ok(()), |file| write(args, &discoverer, &discovery, file))
 }
 
 /// If the configuration is valid, writes it, and a DBC with the fields that no given DBC describes.
-fn write(
-    args: &Args,
-    discoverer: &Discoverer,
-    discovery: &Discovery,
-    file: &Path,
-    model: &Path,
-) -> Result<(), Failure> {
+fn write(args: &Args, discoverer: &Discoverer, discovery: &Discovery, file: &Path) -> Result<(), Failure> {
     let inputs = args.dbc.iter().chain([&args.log]).chain(&args.obdb).chain(&args.model);
     check_place(file, inputs).map_err(Failure::new)?;
     let settings = PackSettings {
         source: args.log.display().to_string(),
         databases: args.dbc.iter().map(|dbc| named_from(file, dbc)).collect::<Result<_, _>>()?,
         own_database: named_from(file, &file.with_extension("dbc"))?,
-        cell_model: named_from(file, model)?,
+        cell_model: args.model.as_ref().map(|model| named_from(file, model)).transpose()?,
         cells: args.cells,
         positive: args.positive.map(|positive| match positive {
             Positive::Charge => PositiveDirection::Charge,
