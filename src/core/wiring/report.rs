@@ -55,6 +55,8 @@ pub enum Topic {
     Cell,
     /// Readings arrive too slowly or too unevenly.
     Period,
+    /// Stretches of the log or of one input are missing.
+    Missing,
     /// The cell model belongs to another cell.
     CellModel,
     /// The current is not zero at rest.
@@ -138,10 +140,6 @@ impl WiringFinding {
         let (table, key) = (table.to_owned(), key.to_owned());
         self.changes.push(Change { table, key, proposed: proposed.into(), place: None, now: None });
         self
-    }
-
-    pub(super) fn change_cell_model(&mut self) -> &mut Self {
-        self.change("pack", "cell_model", "the model of the installed cell")
     }
 
     pub(super) fn advice(&mut self, advice: impl Into<String>) -> &mut Self {

@@ -16,7 +16,7 @@ use crate::can::uds::Answer;
 use crate::cell::CellModel;
 use crate::config::{
     Config, ConfigFaults, Databases, NamedSignal, PartialConfig, Pattern, RawTables, ResolvedSignal, SignalSource,
-    TablePlace, answers, input_map,
+    TablePlace, answers, input_map, label_of,
 };
 use crate::quantity::{CellIndex, Channel, MAX_CELLS};
 use crate::wiring::{InterfacePlan, MessagePlan, OutputPlan, PackPlan, Plan, SignalPlan};
@@ -78,6 +78,7 @@ fn plan(partial: &PartialConfig, found: &[ResolvedSignal<'_>]) -> Plan {
         strings,
         capacity_ah: capacity_ah(raw, model),
         model: model.cloned(),
+        label: pack.and_then(label_of),
         ambient_c: pack.map_or(25.0, |pack| pack.ambient_c),
         dead_band_a: raw.transition.as_ref().map_or(pack_ah / 50.0, |keys| keys.config(pack_ah).dead_band_a),
         voltage_noise_v: raw.estimator.as_ref().map_or(0.0, |keys| keys.voltage_noise_v),
