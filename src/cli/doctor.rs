@@ -60,6 +60,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let mut report =
         if args.logs.is_empty() { listen(args, &survey, &interrupt)? } else { replay(args, &survey, &interrupt)? };
     complete(&mut report, &survey);
+    if !args.logs.is_empty() && args.logs.iter().all(|log| log.is_file()) {
+        wiring_check::try_changes(&args.config, &mut report, &mut |other| again(args, other, &survey, &interrupt));
+    }
     let source = source_name(args, &survey);
     if args.json {
         json(&report, &args.config, &source)?
@@ -102,14 +105,28 @@ fn source_name(args: &Args, survey: &Survey) -> String {
     args.logs.iter().map(|log| log.display().to_string()).collect::<Vec<_>>().join(", ")
 }
 
-fn replay(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<WiringReport, Failure> {
-    let csv = CsvOptions {
+/// Judges the logs with a changed configuration; `None` = they cannot be read again.
+fn again(args: &Args, changed: &mut Survey, survey: &Survey, interrupt: &Interrupt) -> Option<WiringReport> {
+    (changed.plan.is_csv, changed.plan.interfaces) = (survey.plan.is_csv, survey.plan.interfaces.clone());
+    let csv = csv_options(args, changed);
+    let result = wiring_check::replay(changed, &args.logs, csv, args.seconds, interrupt, &mut |_| {});
+    let (mut report, _) = result.ok()?;
+    complete(&mut report, changed);
+    Some(report)
+}
+
+fn csv_options(args: &Args, survey: &Survey) -> CsvOptions {
+    CsvOptions {
         columns: args.columns.clone(),
         charge_positive: args.csv_sign == CsvSign::Charge,
         start_times: args.start_times.clone(),
         cells: if survey.plan.pack.is_total { 1 } else { survey.plan.pack.cells },
         pack_total: survey.plan.pack.is_total,
-    };
+    }
+}
+
+fn replay(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<WiringReport, Failure> {
+    let csv = csv_options(args, survey);
     let bar = Bar::new(&args.logs);
     let result = wiring_check::replay(survey, &args.logs, csv, args.seconds, interrupt, &mut |progress| {
         let times_real_time = progress.seconds / bar.seconds();
