@@ -173,7 +173,7 @@ pub(crate) fn save<'a>(
     let own = pack.database.as_ref().map(|text| (file.with_extension("dbc"), text));
     let read = |path: &Path| match &own {
         _ if path == file => Ok(pack.text.clone().into_bytes()),
-        Some((own, text)) if path == own => Ok(text.clone().into_bytes()),
+        Some((own, text)) if path == own => Ok(text.as_bytes().to_vec()),
         _ => std::fs::read(path),
     };
     let files = config::ConfigFiles { main: file.to_owned(), drop_ins: Vec::new() };

@@ -65,6 +65,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         replay(&args.logs, &args.reading(), args.seconds, &survey, &interrupt)?
     };
     complete(&mut report, &survey);
+    if !args.logs.is_empty() && args.logs.iter().all(|log| log.is_file()) {
+        wiring_check::try_changes(&args.config, &mut report, &mut |other| again(args, other, &survey, &interrupt));
+    }
     let source = source_name(args, &survey);
     if args.json {
         json(&report, &args.config, &source)?
@@ -117,6 +120,16 @@ fn source_name(args: &Args, survey: &Survey) -> String {
         return names.join(", ");
     }
     args.logs.iter().map(|log| log.display().to_string()).collect::<Vec<_>>().join(", ")
+}
+
+/// Judges the logs with a changed configuration; `None` = they cannot be read again.
+fn again(args: &Args, changed: &mut Survey, survey: &Survey, interrupt: &Interrupt) -> Option<WiringReport> {
+    (changed.plan.is_csv, changed.plan.interfaces) = (survey.plan.is_csv, survey.plan.interfaces.clone());
+    let reading = args.reading();
+    let result = wiring_check::replay(changed, &args.logs, &reading, args.seconds, interrupt, &mut |_| {});
+    let (mut report, _) = result.ok()?;
+    complete(&mut report, changed);
+    Some(report)
 }
 
 /// Judges logs with a configuration.

@@ -99,6 +99,8 @@ pub struct WiringFinding {
     pub changes: Vec<Change>,
     /// Further advice, or the only advice if no change of the configuration helps.
     pub advice: Option<String>,
+    /// Whether the changes remove this finding, if the same input was judged again with them; `None` = not tried.
+    pub is_solved: Option<bool>,
     /// Titles of findings that are probably consequences of this finding and are not listed separately.
     pub consequences: Vec<String>,
 }
@@ -123,7 +125,7 @@ impl WiringFinding {
     pub fn new(severity: Severity, topic: Topic, title: impl Into<String>) -> Self {
         let (seen, why) = (String::new(), String::new());
         let (changes, consequences) = (Vec::new(), Vec::new());
-        Self { severity, topic, title: title.into(), seen, why, changes, advice: None, consequences }
+        Self { severity, topic, title: title.into(), seen, why, changes, advice: None, is_solved: None, consequences }
     }
 
     pub(super) fn seen(&mut self, seen: impl Into<String>) -> &mut Self {

@@ -134,12 +134,12 @@ pub(super) fn table_name(key: &AnswerKey) -> String {
     format!("Answer{}{extension}", key.response)
 }
 
-fn is_plausible(signal: &LogSignal, label: &PackLabel) -> bool {
+fn is_plausible(signal: &LogSignal, pack: &PackLabel) -> bool {
     let (SignalOrigin::Raw(_, field), LogSignal { label, series, .. }) = (&signal.origin, signal) else { return false };
     let within = |low: f64, high: f64| series.extent.min >= low && series.extent.max <= high;
     if label.has_unit_of(Quantity::Voltage) {
         // Larger codes (0xFF00 and above) mean "no value" or are the sign bytes of a longer number.
-        let (low_v, high_v) = label.pack_v().unwrap_or(PACK_V);
+        let (low_v, high_v) = pack.pack_v().unwrap_or(PACK_V);
         within(low_v, high_v) && series.extent.max < 65_280.0 * field.factor
     } else if label.has_unit_of(Quantity::Current) {
         within(-1500.0, 1500.0) && !series.is_constant()

@@ -80,9 +80,9 @@ fn of_message(key: MessageKey, payloads: &Payloads, file: usize, message: &Messa
         let mut binding = Binding::new(key.0, message, signal, Channel::Current).ok()?;
         (binding.scale, binding.offset) = conversion(&signal.unit);
         let label = SignalLabel::new(&message.name, &signal.name, &signal.unit);
-        let present = payloads.iter().filter(|(_, payload)| binding.holds(payload) == Ok(true));
         let values = |binding: &Binding| {
-            Series::of(present.clone().map(|(time_s, payload)| (time_s, recorded_value(payload, binding))))
+            let present = payloads.iter().filter(|(_, payload)| binding.holds(payload) == Ok(true));
+            Series::of(present.map(|(time_s, payload)| (time_s, recorded_value(payload, binding))))
         };
         let mut series = values(&binding);
         if label.has_unit_of(Quantity::Current)

@@ -84,7 +84,7 @@ mod tests {
     #[test]
     fn names_and_units_select_comparable_signals() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config");
-        let raw = PartialConfig::read(&folder.join("example.toml")).unwrap().raw;
+        let raw = PartialConfig::read(&folder.join("example.toml"), &|path: &Path| std::fs::read(path)).unwrap().raw;
         let channel = |message: &str, signal: &str, unit: &str| {
             let text = format!("BO_ 1 {message}: 8 X\n SG_ {signal} : 0|16@1+ (1,0) [0|0] \"{unit}\" X\n");
             let database = Database::parse(&format!("VERSION \"\"\nNS_ :\nBS_:\nBU_: X\n{text}")).unwrap();
