@@ -71,7 +71,7 @@ impl Grammar for Asc {
     fn item(&mut self, line: Cursor<'_>, channels: &mut Channels) -> Result<Item, Fault> {
         match line.rest() {
             [b'0'..=b'9' | b'-', ..] => self.event(line, channels),
-            [] | [b'/', b'/', ..] => Ok(Item::Other),
+            [] | [b'/', b'/', ..] | [b'#' | b';', ..] => Ok(Item::Other),
             _ => self.header(line),
         }
     }
@@ -194,7 +194,7 @@ impl Asc {
         let id = self.id(id).filter(|_| is_direction(direction)).ok_or_else(|| at_id.fault(IDENTIFIER))?;
         let brs = skip_name(&mut line)?;
         let esi = line.parse("0 or 1 (ESI)", flag)?;
-        if matches!(line.peek(), b"d" | b"r") && line.word() == b"r" {
+        if is_kind(line) && line.word() == b"r" {
             let frame = Frame::remote(id, remote_length(line)).ok_or_else(|| line.fault(LENGTH))?;
             return Ok(Item::Frame { time, channel, frame });
         }
@@ -278,6 +278,14 @@ fn skip_name(line: &mut Cursor<'_>) -> Result<bool, Fault> {
         line.word();
     }
     line.parse(EXPECTED, flag)
+}
+
+/// Whether the next word is `d` or `r` of the older form of a CANFD line. The length code d is followed by 32 instead.
+fn is_kind(mut line: Cursor<'_>) -> bool {
+    match line.word() {
+        b"d" => line.word() != b"32",
+        word => word == b"r",
+    }
 }
 
 /// The flags after the data of a CANFD line; `None` if the line ends with something else.

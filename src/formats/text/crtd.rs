@@ -51,6 +51,9 @@ impl Grammar for Crtd {
             *data.get_mut(len).ok_or_else(|| line.fault("at most 64 data bytes"))? = byte;
             len += 1;
         }
+        if len == 0 && !line.is_whole {
+            return Err(line.fault("a data byte or a line end, because the identifier may have been cut"));
+        }
         let channel = channels.number(bus, 1).ok_or_else(|| at_kind.fault(CHANNEL))?;
         let frame = frame(id, len, &data).ok_or_else(|| line.fault("at most 64 data bytes"))?;
         Ok(Item::Frame { time, channel, frame })

@@ -100,7 +100,7 @@ impl Css {
 
     /// Converts a stamp to ns since 1970. `None` if it does not consist of whole parts.
     fn stamp_ns(&mut self, field: &[u8]) -> Option<i64> {
-        if memchr::memchr(b'.', field).is_some_and(|point| point >= 9) {
+        if field.iter().take_while(|byte| byte.is_ascii_digit()).count() >= 9 && field.contains(&b'.') {
             return scaled(field, 9);
         }
         let mut parts = self.start;

@@ -53,9 +53,9 @@ impl Grammar for Gvret {
     fn recognises(line: &[u8]) -> bool {
         let line = line.to_ascii_lowercase();
         let contains = |word: &[u8]| memchr::memmem::find(&line, word).is_some();
-        line.trim_ascii_start().trim_ascii_start().starts_with(b"time stamp")
-            && contains(b"extended")
-            && contains(b"d1")
+        let first = line.trim_ascii_start();
+        let first = first.strip_prefix(b"\"").unwrap_or(first);
+        first.starts_with(b"time stamp") && contains(b"extended") && contains(b"d1")
     }
 
     fn item(&mut self, line: Cursor<'_>, channels: &mut Channels) -> Result<Item, Fault> {
