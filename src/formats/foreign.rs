@@ -3,8 +3,11 @@
 /// Number of bytes before the magic of a TAR archive.
 const TAR_MAGIC_AT: usize = 257;
 
+/// Converter of text logs that few tools write.
+const VIA_SAVVYCAN: &str = "open it in SavvyCAN and save it as GVRET CSV";
+
 /// Finds the format of a file that packwatch cannot read from its first bytes (at least 512). Returns the name of the
-/// format, and what converts it: "MDF 3", "convert it to MDF 4.1 with asammdf: ...". `None` = unknown.
+/// format and a sentence about its conversion: "SQLite database", "export a CSV with sqlite3 -csv". `None` = unknown.
 pub fn foreign(head: &[u8]) -> Option<(&'static str, &'static str)> {
     let begins = |magics: &[&[u8]]| magics.iter().any(|magic| head.starts_with(magic));
     let contains = |text: &[u8]| memchr::memmem::find(&head[..head.len().min(4096)], text).is_some();
@@ -43,6 +46,17 @@ pub fn foreign(head: &[u8]) -> Option<(&'static str, &'static str)> {
         ),
         (&[b"{\"", b"[{", b"{\n", b"[\n"], "JSON", "write it as CSV, for example with jq -r @csv"),
     ];
+    let first = head.split(|byte| matches!(byte, b'\n' | b'\r')).next().unwrap_or_default().to_ascii_lowercase();
+    let first_has = |text: &[u8]| memchr::memmem::find(&first, text).is_some();
+    if first.starts_with(b"time,addr,bus,data") {
+        return Some(("Cabana CSV", VIA_SAVVYCAN));
+    } else if first.starts_with(b"line,abs time") || contains(b"Line,Abs Time(Sec)") {
+        return Some(("Vehicle Spy CSV", VIA_SAVVYCAN));
+    } else if first_has(b"canhacker") || first.starts_with(b"@ text @") {
+        return Some(("CANHacker or CARBUS trace", VIA_SAVVYCAN));
+    } else if first_has(b"ixxat") {
+        return Some(("IXXAT trace", VIA_SAVVYCAN));
+    }
     if let Some((_, name, converter)) = known.iter().find(|(magics, ..)| begins(magics)) {
         return Some((name, converter));
     }

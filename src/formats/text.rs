@@ -180,7 +180,7 @@ impl Channels {
 }
 
 /// What the readers say about a channel that [`Channels`] refuses.
-const CHANNEL: &str = "one of at most 256 channels";
+const CHANNEL: &str = "a channel (at most 256 channels)";
 
 /// A sum of times; `None` beyond the range of [`Timestamp`].
 fn time(start_ns: i64, offset_ns: i64) -> Option<Timestamp> {

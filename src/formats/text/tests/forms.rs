@@ -365,5 +365,7 @@ fn foreign_files_are_named_with_a_converter() {
     assert_eq!(name(&[&[0; 257], &b"ustar"[..]].concat()), Some("TAR archive"));
     assert_eq!(name(b"MDF     4.10    "), None);
     assert_eq!(name(b"(1700000000.0) can0 100#01\n"), None);
+    assert_eq!(name(b"time,addr,bus,data\n0.1,256,0,05\n"), Some("Cabana CSV"));
+    assert_eq!(name(b"ASCII Trace IXXAT Automation GmbH\n"), Some("IXXAT trace"));
     assert_eq!(name(b""), None);
 }
