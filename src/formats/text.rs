@@ -51,7 +51,8 @@ trait Grammar: Sized {
 
 /// Finds the text format of a log from its first bytes.
 pub(crate) fn recognise(head: &[u8]) -> Option<Format> {
-    const FORMATS: [(Format, fn(&[u8]) -> bool); 8] = [
+    type Recogniser = fn(&[u8]) -> bool;
+    const FORMATS: [(Format, Recogniser); 8] = [
         (Format::Asc, asc::Asc::recognises),
         (Format::Trc, trc::Trc::recognises),
         (Format::Gvret, gvret::Gvret::recognises),

@@ -224,7 +224,8 @@ impl Asc {
         if kind == b"XLFF" {
             return Ok(Item::Xl);
         }
-        (line.word(), line.word());
+        line.word();
+        line.word();
         let id = line.parse(IDENTIFIER, |word| self.id(word))?;
         if number(line.peek(), Base::Hex).is_none() || length(line.peek()).is_some_and(|len| len > 15) {
             line.word();
@@ -234,7 +235,8 @@ impl Asc {
         let data = line.data(len, Base::Hex)?;
         let is_fd = kind.starts_with(b"F");
         // FD frames have a count of stuff bits before the checksum.
-        (line.word(), is_fd.then(|| line.word()));
+        line.word();
+        is_fd.then(|| line.word());
         let flags = number(line.word(), Base::Hex).unwrap_or(0);
         let fd = is_fd.then_some((flags & FLAG_BRS != 0, flags & FLAG_ESI != 0));
         let is_remote = !is_fd && flags & FLAG_REMOTE != 0;

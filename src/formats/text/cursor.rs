@@ -180,7 +180,7 @@ pub(super) fn hex_byte(text: &[u8]) -> Option<u8> {
 /// Parses data bytes without blanks between them, at most 64. Returns the bytes, followed by zeros, and their number.
 pub(super) fn joined_bytes(text: &[u8]) -> Option<([u8; MAX_DATA], usize)> {
     let mut data = [0; MAX_DATA];
-    if text.len() % 2 != 0 || text.len() > 2 * MAX_DATA {
+    if !text.len().is_multiple_of(2) || text.len() > 2 * MAX_DATA {
         return None;
     }
     for (byte, digits) in data.iter_mut().zip(text.chunks_exact(2)) {

@@ -88,5 +88,5 @@ fn base64(text: &[u8]) -> Option<([u8; MAX_DATA], usize)> {
             len += 1;
         }
     }
-    (text.len() % 4 == 0).then_some((data, len))
+    text.len().is_multiple_of(4).then_some((data, len))
 }
