@@ -109,7 +109,7 @@ struct TextLog<G> {
 impl<G: Grammar + 'static> TextLog<G> {
     fn open(source: Box<dyn Read>) -> io::Result<Box<dyn LogReader>> {
         let mut lines = Lines::new(source)?;
-        let grammar = G::new(lines.head(Format::HEAD_BYTES)?)?;
+        let grammar = G::new(lines.head(Format::HEAD_BYTES))?;
         Ok(Box::new(Self { lines, grammar, channels: Channels::default() }))
     }
 }

@@ -227,7 +227,9 @@ impl Asc {
         line.word();
         line.word();
         let id = line.parse(IDENTIFIER, |word| self.id(word))?;
-        if number(line.peek(), Base::Hex).is_none() || length(line.peek()).is_some_and(|len| len > 15) {
+        // A length code of one digit and a length follow the optional name.
+        let mut ahead = line;
+        if ahead.word().len() != 1 || length(ahead.word()).is_none() {
             line.word();
         }
         let code = line.parse("a length code", |word| number(word, Base::Hex))?;
@@ -235,8 +237,9 @@ impl Asc {
         let data = line.data(len, Base::Hex)?;
         let is_fd = kind.starts_with(b"F");
         // FD frames have a count of stuff bits before the checksum.
-        line.word();
-        is_fd.then(|| line.word());
+        for _ in 0..1 + usize::from(is_fd) {
+            line.word();
+        }
         let flags = number(line.word(), Base::Hex).unwrap_or(0);
         let fd = is_fd.then_some((flags & FLAG_BRS != 0, flags & FLAG_ESI != 0));
         let is_remote = !is_fd && flags & FLAG_REMOTE != 0;

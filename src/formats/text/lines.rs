@@ -37,6 +37,8 @@ pub(super) struct Lines {
     has_ended: bool,
     /// Whether the last line ended with a carriage return. A line feed that follows belongs to the same line end.
     after_return: bool,
+    /// Error of the source. It is reported after the lines that were read before it.
+    error: Option<io::Error>,
 }
 
 impl Lines {
@@ -47,7 +49,7 @@ impl Lines {
     pub(super) fn new(source: Box<dyn Read>) -> io::Result<Self> {
         let source = decoded(source)?;
         let buffer = vec![0; MAX_LINE];
-        Ok(Self { source, buffer, start: 0, end: 0, number: 0, has_ended: false, after_return: false })
+        Ok(Self { source, buffer, start: 0, end: 0, number: 0, has_ended: false, after_return: false, error: None })
     }
 
     /// Number of the line last returned, from 1.
@@ -57,12 +59,9 @@ impl Lines {
 
     /// Returns the first bytes of the log, at most `len`, without consuming them. Must be called before the first line
     /// is read.
-    ///
-    /// # Errors
-    /// Returns the errors of the source.
-    pub(super) fn head(&mut self, len: usize) -> io::Result<&[u8]> {
-        while self.end < len && self.fill()? {}
-        Ok(&self.buffer[..self.end.min(len)])
+    pub(super) fn head(&mut self, len: usize) -> &[u8] {
+        while self.end < len && self.fill() {}
+        &self.buffer[..self.end.min(len)]
     }
 
     /// The next line, or `None` at the end.
@@ -91,39 +90,40 @@ impl Lines {
             self.buffer.copy_within(self.start..self.end, 0);
             (self.start, self.end) = (0, self.end - self.start);
             searched = self.end;
-            if !self.fill()? {
-                return Ok(self.last(is_too_long));
+            if !self.fill() {
+                return self.last(is_too_long);
             }
         }
     }
 
-    /// Reads more bytes. Returns `false` at the end of the source.
-    fn fill(&mut self) -> io::Result<bool> {
+    /// Reads more bytes. Returns `false` at the end of the source, or if it fails.
+    fn fill(&mut self) -> bool {
         while !self.has_ended {
             match self.source.read(&mut self.buffer[self.end..]) {
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-                Err(error) => {
-                    (self.has_ended, self.start) = (true, self.end);
-                    return Err(error);
-                }
+                Err(error) => (self.has_ended, self.error) = (true, Some(error)),
                 Ok(count) => {
                     self.end += count;
                     self.has_ended = count == 0;
-                    return Ok(count > 0);
+                    return count > 0;
                 }
             }
         }
-        Ok(false)
+        false
     }
 
-    fn last(&mut self, is_too_long: bool) -> Option<Line<'_>> {
+    /// Returns the rest of the buffer as the last line, or the error of the source instead of an incomplete line.
+    fn last(&mut self, is_too_long: bool) -> io::Result<Option<Line<'_>>> {
         let line = self.start..self.end;
         self.start = self.end;
+        if let Some(error) = self.error.take() {
+            return Err(error);
+        }
         if line.is_empty() && !is_too_long {
-            return None;
+            return Ok(None);
         }
         self.number += 1;
-        Some(if is_too_long { Line::TooLong } else { Line::Last(&self.buffer[line]) })
+        Ok(Some(if is_too_long { Line::TooLong } else { Line::Last(&self.buffer[line]) }))
     }
 }
 
@@ -241,6 +241,28 @@ mod tests {
         assert_eq!(all(&utf16(UTF16_BE_MARK, true)), expected);
         assert_eq!(all(b"\xEF\xBB\xBFdate"), [("date".to_owned(), false)]);
         assert_eq!(*decoded_head(&utf16(UTF16_LE_MARK, false)), b"date M\xE4r?\r\nx"[..]);
+    }
+
+    /// Returns its text, then an error.
+    struct Damaged(Cursor<Vec<u8>>);
+
+    impl Read for Damaged {
+        fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+            match self.0.read(buffer)? {
+                0 => Err(io::Error::other("damaged")),
+                count => Ok(count),
+            }
+        }
+    }
+
+    #[test]
+    fn damaged_source_gives_lines_before_the_damage() {
+        let mut lines = Lines::new(Box::new(Damaged(Cursor::new(b"a\nb\nincomplete".to_vec())))).expect("reads");
+        assert_eq!(lines.head(100), b"a\nb\nincomplete");
+        assert_eq!(lines.next_line().expect("reads"), Some(Line::Whole(b"a")));
+        assert_eq!(lines.next_line().expect("reads"), Some(Line::Whole(b"b")));
+        assert_eq!(lines.next_line().expect_err("damaged").to_string(), "damaged");
+        assert_eq!(lines.next_line().expect("ended"), None);
     }
 
     #[test]
