@@ -7,9 +7,12 @@
 //!
 //! candump logs (`candump -L`), journals and CSV tables are read by `packwatch_host::io::log`.
 
+mod foreign;
 mod format;
 mod item;
+mod text;
 
+pub use foreign::foreign;
 pub use format::{Format, Source};
 pub use item::{Channel, Item, Position};
 
