@@ -154,7 +154,7 @@ fn write_whole(file: &Path, text: &str) -> Result<(), Failure> {
 
 /// Passes every frame to the discoverer; returns the names of the interfaces.
 fn feed(args: &Args, discoverer: &mut Discoverer) -> Result<Vec<String>, Failure> {
-    let csv = CsvOptions { columns: Vec::new(), charge_positive: false, start_times: None, cells: 1, pack_total: true };
+    let csv = CsvOptions { cells: 1, series: 1, pack_total: true, ..CsvOptions::default() };
     let encode_row = Box::new(|_: &[_], _: &mut Vec<_>| 0);
     let options = LogOptions { interfaces: Vec::new(), strict: false, csv, encode_row };
     let mut source = LogSource::new([args.log.clone()], options);

@@ -9,7 +9,7 @@ mod page;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use super::common::logs::{CsvSign, column};
+use super::common::logs::{CsvSign, charge_positive, column, print_tables};
 use super::common::numbers::above_0_to;
 use super::common::output::{failure, print_json, unless_closed};
 use super::common::progress::{Bar, progress_bar};
@@ -43,9 +43,9 @@ pub(crate) struct Args {
     /// Name a CSV column, as for `replay`
     #[arg(long = "column", value_name = "ROLE=NAME", value_parser = column)]
     columns: Vec<(String, String)>,
-    /// Direction of positive current in a CSV
-    #[arg(long, value_enum, default_value = "discharge")]
-    csv_sign: CsvSign,
+    /// Direction of positive current in a CSV, as for `replay`
+    #[arg(long, value_enum)]
+    csv_sign: Option<CsvSign>,
     /// CSV table with the start time of each section of a CSV log, as for `replay`
     #[arg(long, value_name = "TABLE.csv")]
     start_times: Option<PathBuf>,
@@ -105,10 +105,13 @@ fn source_name(args: &Args, survey: &Survey) -> String {
 fn replay(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<WiringReport, Failure> {
     let csv = CsvOptions {
         columns: args.columns.clone(),
-        charge_positive: args.csv_sign == CsvSign::Charge,
+        charge_positive: charge_positive(args.csv_sign),
         start_times: args.start_times.clone(),
         cells: if survey.plan.pack.is_total { 1 } else { survey.plan.pack.cells },
         pack_total: survey.plan.pack.is_total,
+        series: survey.plan.pack.cells,
+        capacity_ah: Some(survey.plan.pack.capacity_ah * f64::from(survey.plan.pack.strings.max(1))),
+        ..CsvOptions::default()
     };
     let bar = Bar::new(&args.logs);
     let result = wiring_check::replay(survey, &args.logs, csv, args.seconds, interrupt, &mut |progress| {
@@ -117,6 +120,7 @@ fn replay(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<WiringR
     });
     bar.clear();
     let (mut report, counts) = result.map_err(failure)?;
+    print_tables(&counts.tables);
     if counts.bad_lines > 0 {
         let first = counts.first_bad_line.unwrap_or_default();
         let mut finding = WiringFinding::new(Severity::Note, Topic::Interface, "the log has malformed lines");
