@@ -15,7 +15,7 @@ use super::common::output::{failure, print_json, unless_closed};
 use super::common::progress::{Bar, progress_bar};
 use packwatch_host::failure::{EXIT_CONFIG, Failure};
 
-use crate::io::csv_log::CsvOptions;
+use crate::io::csv_log::{CsvOptions, has_table_name};
 use crate::replay::ReplayProgress;
 use crate::wiring::{Severity, Topic, WiringFinding, WiringReport};
 use crate::wiring_check::{self, Interrupt, Survey};
@@ -55,7 +55,7 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let mut survey = wiring_check::survey(&args.config)?;
     rename_interfaces(args, &mut survey)?;
-    survey.plan.is_csv = args.logs.iter().any(|log| is_csv(log));
+    survey.plan.is_csv = args.logs.iter().any(|log| has_table_name(log));
     let interrupt = Interrupt::watch().map_err(|error| Failure::new(format!("cannot handle Ctrl-C: {error}")))?;
     let mut report =
         if args.logs.is_empty() { listen(args, &survey, &interrupt)? } else { replay(args, &survey, &interrupt)? };
@@ -87,11 +87,6 @@ fn rename_interfaces(args: &Args, survey: &mut Survey) -> Result<(), Failure> {
         interface.name.clone_from(name);
     }
     Ok(())
-}
-
-fn is_csv(log: &Path) -> bool {
-    let name = log.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
-    name.trim_end_matches(".gz").trim_end_matches(".zst").ends_with(".csv")
 }
 
 fn source_name(args: &Args, survey: &Survey) -> String {

@@ -99,22 +99,24 @@ struct Sections {
     start: Option<Timestamp>,
 }
 
-/// Whether a log is a table of samples, by its name or by its first bytes.
-pub(super) fn is_table(path: &Path, first_line: &[u8], head: &[u8]) -> bool {
-    const ENDINGS: [&str; 8] = [".csv", ".tsv", ".mpt", ".bdf", ".parquet", ".pq", ".parq", ".txt"];
+/// Whether a log is a table of samples by its name.
+pub fn has_table_name(path: &Path) -> bool {
+    const ENDINGS: [&str; 7] = [".csv", ".tsv", ".mpt", ".bdf", ".parquet", ".pq", ".parq"];
     let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
     let name = name.trim_end_matches(".gz").trim_end_matches(".zst");
-    if first_line.starts_with(b"(") {
-        return name.ends_with(".csv");
-    }
-    let is_named = ENDINGS.iter().any(|ending| name.ends_with(ending)) && !name.ends_with(".txt");
-    is_named
-        || is_parquet(first_line)
-        || first_line.contains(&b',')
-        || head.starts_with(&[0xFF, 0xFE])
-        || head.starts_with(&[0xFE, 0xFF])
-        || (head.starts_with(b"EC-Lab") || head.starts_with(b"BT-Lab"))
-        || (!head.is_empty() && super::table::has_header(head, &dictionary::score))
+    ENDINGS.iter().any(|ending| name.ends_with(ending))
+}
+
+/// Whether a log is a table of samples, by its name or by its first bytes.
+pub(super) fn is_table(path: &Path, head: &[u8]) -> bool {
+    let first_line = head.split(|&byte| byte == b'\n').next().unwrap_or_default();
+    let is_utf16 = head.starts_with(&[0xFF, 0xFE]) || head.starts_with(&[0xFE, 0xFF]);
+    has_table_name(path)
+        || (!first_line.starts_with(b"(")
+            && (is_parquet(head)
+                || is_utf16
+                || first_line.contains(&b',')
+                || super::table::has_header(head, &dictionary::score)))
 }
 
 fn is_parquet(head: &[u8]) -> bool {

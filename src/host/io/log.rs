@@ -280,8 +280,7 @@ impl LogSource {
             let found = String::from_utf8_lossy(first);
             return Err(LogError::Data(format!("{name}:1: found {found:?}, must be {:?}", journal::HEADER)));
         }
-        let first = first.to_vec();
-        let csv = !journal && csv_log::is_table(path, &first, lines.unread());
+        let csv = !journal && csv_log::is_table(path, lines.unread());
         (self.state.fresh, self.state.unknown) = (true, false);
         let form = if csv {
             let log = CsvLog::open(Box::new(lines.into_reader()), path, &self.csv)?;

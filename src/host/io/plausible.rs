@@ -73,21 +73,40 @@ pub fn probable_stamp_unit(seconds: f64) -> Option<&'static str> {
     is_past.then(|| units.into_iter().find(|(factor, _)| seconds.abs() / factor <= LAST_DATE_S).map_or("ns", |of| of.1))
 }
 
-/// Checks the times of rows (s): after 2100, or running backwards.
+/// Unit of times that advance by `step_s` if they are read as seconds, but cannot be seconds.
+fn probable_step_unit(step_s: f64) -> &'static str {
+    // Rows are usually at most 100 s apart.
+    [(1e3, "ms"), (1e6, "us")].into_iter().find(|(factor, _)| step_s / factor <= 100.0).map_or("ns", |of| of.1)
+}
+
+/// Checks the times of rows (s).
 ///
 /// # Errors
-/// The times cannot be seconds.
-pub fn check_times(time_s: &[f64]) -> Result<(), Implausible> {
-    if let Some(&late) = time_s.iter().find(|&&time_s| probable_stamp_unit(time_s).is_some()) {
-        let what = format!("{late} is after the year 2100 as seconds since 1970");
-        return implausible("time", probable_stamp_unit(late), what);
-    }
+/// A time is after 2100.
+pub fn check_dates(time_s: &[f64]) -> Result<(), Implausible> {
+    let Some(late) = time_s.iter().copied().find(|&time_s| probable_stamp_unit(time_s).is_some()) else {
+        return Ok(());
+    };
+    let first = time_s.first().copied().and_then(probable_stamp_unit);
+    let probable = first.unwrap_or_else(|| probable_step_unit(median_step(time_s).unwrap_or_default()));
+    implausible("time", Some(probable), format!("{late} is after the year 2100 as seconds since 1970"))
+}
+
+/// Checks the order of the times of rows (s).
+///
+/// # Errors
+/// More than a fifth of the times are before the time of the previous row.
+pub fn check_order(time_s: &[f64]) -> Result<(), Implausible> {
     let back = time_s.windows(2).filter(|pair| pair[1] < pair[0]).count();
-    if back * 5 > time_s.len() {
-        let what = format!("runs backwards in {back} of {} rows", time_s.len());
-        return implausible("time", None, what);
+    if back * 5 <= time_s.len() {
+        return Ok(());
     }
-    Ok(())
+    implausible("time", None, format!("runs backwards in {back} of {} rows", time_s.len()))
+}
+
+/// The median step between times (s).
+fn median_step(time_s: &[f64]) -> Option<f64> {
+    median(&time_s.windows(2).map(|pair| pair[1] - pair[0]).collect::<Vec<_>>())
 }
 
 /// Checks currents (A) against the largest plausible current.
@@ -151,9 +170,7 @@ pub fn check_response(
 /// Checks that the charge stays within a few capacities, if the steps of time are long.
 fn check_charge(time_s: &[f64], current_a: &[f64], capacity_ah: f64) -> Result<(), Implausible> {
     let steps_s: Vec<f64> = time_s.windows(2).map(|pair| pair[1] - pair[0]).collect();
-    if median(&steps_s).is_none_or(|step_s| step_s < MIN_SLOW_STEP_S) {
-        return Ok(());
-    }
+    let Some(step_s) = median(&steps_s).filter(|step_s| *step_s >= MIN_SLOW_STEP_S) else { return Ok(()) };
     let (mut charge_ah, mut low_ah, mut high_ah) = (0.0_f64, 0.0_f64, 0.0_f64);
     for (step_s, current_a) in steps_s.iter().zip(current_a) {
         if *step_s > 0.0 && current_a.is_finite() {
@@ -166,7 +183,7 @@ fn check_charge(time_s: &[f64], current_a: &[f64], capacity_ah: f64) -> Result<(
         return Ok(());
     }
     let what = format!("the current moves {span_ah:.0} Ah, but the capacity is {capacity_ah} Ah");
-    implausible("time", Some("ms"), what)
+    implausible("time", Some(probable_step_unit(step_s)), what)
 }
 
 /// Direction of positive current that the voltage's answers to current steps show.
@@ -272,7 +289,8 @@ mod tests {
     fn wrong_units_are_named_right_ones_pass() {
         let (time, current, voltage) = drive();
         let check = |time: &[f64], current: &[f64], voltage: &[f64]| {
-            check_times(time)?;
+            check_dates(time)?;
+            check_order(time)?;
             check_voltages(voltage)?;
             check_currents(current, SIZE)?;
             check_response(time, current, voltage, SIZE)

@@ -210,7 +210,13 @@ impl Judge<'_> {
 
     fn current_unit(&mut self, layout: &mut Layout) -> Result<(), TableError> {
         let size = PackSize { capacity_ah: self.options.capacity_ah };
-        let Err(of) = plausible::check_currents(&self.samples.currents, size) else { return Ok(()) };
+        let checked = plausible::check_currents(&self.samples.currents, size);
+        let Err(of) = checked else {
+            // Single impossible currents are refused row by row.
+            let impossible = self.samples.currents.iter_mut().filter(|i| i.abs() > size.max_current_a());
+            impossible.for_each(|i| *i = f64::NAN);
+            return Ok(());
+        };
         let is_stated = layout.current().is_some_and(|column| column.is_stated);
         let Some(unit) = of.probable.and_then(Unit::find).filter(|_| !is_stated) else {
             return Err(self.fault(layout, &of));
@@ -281,13 +287,13 @@ impl Judge<'_> {
         let texts = self.samples.time_texts.iter();
         let times: Vec<f64> =
             texts.map(|text| trial.parse(text.as_bytes()).map_or(f64::NAN, |time| time.secs())).collect();
-        if form == TimeForm::Number && unit.per_base() <= 1.0 {
-            // Times that are out of range were not read.
+        if form == TimeForm::Number {
+            // Times out of range were not read, so the numbers themselves are checked.
             let raw: Vec<f64> = self.samples.raw_times.iter().map(|&time| unit.convert(time)).collect();
-            plausible::check_times(&raw[..raw.len().min(1)]).map_err(|of| self.fault(layout, &of))?;
+            plausible::check_dates(&raw).map_err(|of| self.fault(layout, &of))?;
         }
         if layout.section.is_none() {
-            plausible::check_times(&times).map_err(|of| self.fault(layout, &of))?;
+            plausible::check_order(&times).map_err(|of| self.fault(layout, &of))?;
         }
         if form == TimeForm::Number && layout.time.is_stated && unit.per_base() == 1.0 {
             self.note_other_grid(layout, &times);
