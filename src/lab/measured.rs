@@ -35,7 +35,8 @@ impl MeasuredFile {
         let mut log = CsvLog::open_path(path, &CsvOptions { cells: 1, sensors: 1, series: 1, ..options.clone() })?;
         let mut parts: Vec<MeasuredPart> = Vec::new();
         while let Some(row) = log.next_row()? {
-            add_row(row?.time.secs(), &log, &mut parts);
+            // A division gives the number that the file states; `Timestamp::secs` may differ in the last bit.
+            add_row(row?.time.nanos() as f64 / 1e9, &log, &mut parts);
         }
         if parts.is_empty() {
             return Err(log.header().file_fault("no rows after the header"));

@@ -126,7 +126,7 @@ pub fn check_currents(current_a: &[f64], size: PackSize) -> Result<(), Implausib
 /// The voltages are those of no cell.
 pub fn check_voltages(cell_voltage_v: &[f64]) -> Result<(), Implausible> {
     if let Some(largest) = beyond(cell_voltage_v, MAX_CELL_V) {
-        let probable = (largest >= 1000.0 * MIN_CELL_V && largest <= 1000.0 * MAX_CELL_V).then_some("mV");
+        let probable = (1000.0..=1000.0 * MAX_CELL_V).contains(&largest).then_some("mV");
         return implausible("voltage", probable, format!("{largest} V per cell is impossible, at most {MAX_CELL_V} V"));
     }
     let Some(median) = median(cell_voltage_v) else { return Ok(()) };
@@ -199,18 +199,22 @@ pub enum ShownSign {
     Unclear,
 }
 
-/// Finds the direction of positive current from the voltage's answers to steps and to constant currents.
+/// Finds the direction of positive current from the voltage's answers to steps. If the current has few steps, the
+/// stretches of constant current decide: their voltage rises or falls by 100 mV or more. In a load that varies, the
+/// voltage may recover although the cell discharges, so such stretches prove nothing.
 pub fn shown_sign(current_a: &[f64], cell_voltage_v: &[f64]) -> ShownSign {
     let largest = current_a.iter().copied().filter(|i| i.is_finite()).fold(0.0_f64, |max, i| max.max(i.abs()));
     let is_never_negative = current_a.iter().all(|&i| i.is_nan() || i >= -0.01 * largest);
-    let step_votes = steps(current_a, cell_voltage_v)
+    let mut votes: Vec<bool> = steps(current_a, cell_voltage_v)
         .filter(|(i, v)| i.abs() >= 0.1 * largest && v.abs() > 0.0005)
-        .map(|(i, v)| (i * v < 0.0, 1));
-    let plateau_votes = plateaus(current_a, cell_voltage_v, largest).into_iter().map(|is_discharge| (is_discharge, 5));
-    let (mut discharge, mut charge) = (0, 0);
-    for (is_discharge, weight) in step_votes.chain(plateau_votes) {
-        *(if is_discharge { &mut discharge } else { &mut charge }) += weight;
+        .map(|(i, v)| i * v < 0.0)
+        .collect();
+    if votes.len() < MIN_STEPS {
+        let plateaus = plateaus(current_a, cell_voltage_v, largest);
+        votes.extend(plateaus.into_iter().flat_map(|is_discharge| [is_discharge; 5]));
     }
+    let discharge = votes.iter().filter(|&&is_discharge| is_discharge).count();
+    let charge = votes.len() - discharge;
     let (most, fewest) = (discharge.max(charge), discharge.min(charge));
     if is_never_negative && fewest >= 5 && fewest * 6 >= most {
         return ShownSign::Magnitude;
@@ -228,7 +232,7 @@ fn steps<'a>(current_a: &'a [f64], voltage_v: &'a [f64]) -> impl Iterator<Item =
 }
 
 /// For each stretch of constant current: whether a positive current discharges. The voltage falls at a discharge and
-/// rises at a charge, by 20 mV or more.
+/// rises at a charge, by 100 mV or more.
 fn plateaus(current_a: &[f64], voltage_v: &[f64], largest: f64) -> Vec<bool> {
     const MIN_ROWS: usize = 20;
     const SETTLING_ROWS: usize = 5;
@@ -241,7 +245,7 @@ fn plateaus(current_a: &[f64], voltage_v: &[f64], largest: f64) -> Vec<bool> {
         }
         if end - start >= MIN_ROWS && current_a[start].abs() >= 0.05 * largest && largest > 0.0 {
             let change_v = voltage_v[end - 1] - voltage_v[start + SETTLING_ROWS];
-            votes.extend((change_v.abs() >= 0.02).then_some(change_v * current_a[start] < 0.0));
+            votes.extend((change_v.abs() >= 0.1).then_some(change_v * current_a[start] < 0.0));
         }
         start = end;
     }

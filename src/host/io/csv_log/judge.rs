@@ -493,9 +493,13 @@ fn is_voltage(channel: Channel) -> bool {
 fn grid_unit(times: &[f64]) -> Option<&'static str> {
     let steps: Vec<f64> = times.windows(2).map(|pair| pair[1] - pair[0]).filter(|step| *step > 0.0).collect();
     let middle = median(&steps)?;
-    // Rounded times have steps of two lengths; gaps do not count.
-    let usual: Vec<f64> = steps.into_iter().filter(|step| *step < 3.0 * middle).collect();
+    // Rounded times have steps of two lengths. Gaps and other sampling rates do not count, and must be rare.
+    let usual: Vec<f64> = steps.iter().copied().filter(|step| *step < 3.0 * middle).collect();
     let step = usual.iter().sum::<f64>() / usual.len() as f64;
+    let even = usual.iter().filter(|of| (0.5 * step..1.5 * step).contains(*of)).count();
+    if even * 10 < steps.len() * 9 {
+        return None;
+    }
     let is_whole = |value: f64, tolerance: f64| value >= 0.9 && (value - value.round()).abs() < tolerance * value;
     let is_decimal = is_whole(step * 1000.0, 0.0005);
     if step >= 0.9 || is_decimal || usual.len() < 10 {

@@ -88,22 +88,23 @@ fn is_representable(time: Timestamp) -> bool {
 mod tests {
     use super::*;
 
-    fn times(unit: &str, texts: &[&str]) -> Vec<Option<f64>> {
+    /// Times in milliseconds.
+    fn times(unit: &str, texts: &[&str]) -> Vec<Option<i64>> {
         let mut reader = TimeText::new(Unit::find(unit).expect("known"));
-        texts.iter().map(|text| reader.parse(text.as_bytes()).map(Timestamp::secs)).collect()
+        texts.iter().map(|text| reader.parse(text.as_bytes()).map(|time| time.nanos() / 1_000_000)).collect()
     }
 
     #[test]
     fn numbers_are_in_their_unit() {
-        assert_eq!(times("min", &["0.5", "1"]), [Some(30.0), Some(60.0)]);
-        assert_eq!(times("ms", &["1700000000123"]), [Some(1_700_000_000.123)]);
+        assert_eq!(times("min", &["0.5", "1"]), [Some(30_000), Some(60_000)]);
+        assert_eq!(times("ms", &["1700000000123"]), [Some(1_700_000_000_123)]);
         assert_eq!(times("s", &["1700000000123000"]), [None]);
-        assert_eq!(times("s", &["\"0,5\"", "x", ""]), [Some(0.5), None, None]);
+        assert_eq!(times("s", &["\"0,5\"", "x", ""]), [Some(500), None, None]);
     }
 
     #[test]
     fn time_of_day_continues_after_midnight() {
-        assert_eq!(times("s", &["23:59:59", "00:00:00"]), [Some(86_399.0), Some(86_400.0)]);
-        assert_eq!(times("s", &["0:59:59", "0:00:00"]), [Some(3599.0), Some(0.0)]);
+        assert_eq!(times("s", &["23:59:59", "00:00:00"]), [Some(86_399_000), Some(86_400_000)]);
+        assert_eq!(times("s", &["0:59:59", "0:00:00"]), [Some(3_599_000), Some(0)]);
     }
 }
