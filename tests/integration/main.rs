@@ -81,6 +81,7 @@ mod score_cli;
 mod simulate_cli;
 mod store_cli;
 mod support;
+mod tables;
 mod tuned_constants;
 mod uplink_cli;
 #[cfg(feature = "lab")]
