@@ -50,6 +50,7 @@ mod layering;
 mod life_decodes;
 mod log_grammar;
 mod measured_life;
+mod mistakes;
 mod model_cli;
 mod monitor_alarms;
 mod monitor_cuts;
