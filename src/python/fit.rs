@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::time::Instant;
 
+use packwatch_host::io::csv_log::CsvOptions;
 use packwatch_lab::fit::{self as lab_fit, FitOutcome, FitProgress, FitRequest};
 use pyo3::prelude::*;
 
@@ -88,6 +89,7 @@ pub(crate) fn fit(
     progress: bool,
 ) -> PyResult<Fit> {
     let request = FitRequest {
+        table: CsvOptions::default(),
         name,
         capacity_ah,
         rated_ah,

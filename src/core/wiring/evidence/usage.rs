@@ -189,7 +189,7 @@ mod tests {
     #[test]
     fn reported_charge_gives_capacity_across_gaps() {
         let mut record = UsageRecord::new(1);
-        let mut soc = 0.9;
+        let mut soc: f64 = 0.9;
         for second in 0..40_000_u32 {
             let time = Timestamp::from_secs(f64::from(second));
             let current_a = if (second / 3000).is_multiple_of(3) { -20.0 } else { 30.0 };
@@ -199,7 +199,7 @@ mod tests {
                 continue;
             }
             soc -= current_a / 3600.0 / 150.0;
-            record.handle_reported(0, (soc * 200.0).round() / 200.0);
+            record.handle_reported(0, f64::round(soc * 200.0) / 200.0);
             record.handle_current(time, current_a);
             record.handle_voltage(time, 0, 3.7);
         }
