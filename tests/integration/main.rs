@@ -48,6 +48,7 @@ mod import_obdb;
 mod isotp_peer;
 mod layering;
 mod life_decodes;
+mod log_formats;
 mod log_grammar;
 mod measured_life;
 mod mistakes;

@@ -1,0 +1,157 @@
+//! Runs commands on logs in other tools' formats, on files that are no logs, and `look` on a drive.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use assert_cmd::Command;
+
+const START_US: i64 = 1_700_000_000_000_000;
+
+fn example(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("examples/pack").join(name)
+}
+
+fn packwatch(args: &[&str]) -> assert_cmd::assert::Assert {
+    Command::cargo_bin("packwatch").expect("Cargo builds the binary").args(args).assert()
+}
+
+fn stderr(assert: &assert_cmd::assert::Assert) -> String {
+    String::from_utf8_lossy(&assert.get_output().stderr).into_owned()
+}
+
+fn stdout(assert: &assert_cmd::assert::Assert) -> String {
+    String::from_utf8_lossy(&assert.get_output().stdout).into_owned()
+}
+
+/// The estimates of a log with the example's configuration.
+fn estimates(folder: &Path, log: &str) -> String {
+    let (config, out) = (example("pack.toml"), folder.join("estimates.csv"));
+    let args = ["replay", "-c", config.to_str().unwrap(), log, "--estimates", out.to_str().unwrap()];
+    packwatch(&args).success();
+    fs::read_to_string(out).unwrap()
+}
+
+/// The drive's frames: time since the start (us), identifier, bytes in hex separated by spaces.
+fn frames() -> Vec<(i64, String, String)> {
+    let text = fs::read_to_string(example("drive.log")).unwrap();
+    let frame = |line: &str| {
+        let mut parts = line.split_whitespace();
+        let stamp = parts.next().unwrap().trim_matches(['(', ')']).replace('.', "");
+        let (id, data) = parts.nth(1).unwrap().split_once('#').unwrap();
+        let bytes: Vec<&str> = data.as_bytes().chunks(2).map(|pair| std::str::from_utf8(pair).unwrap()).collect();
+        (stamp.parse::<i64>().unwrap() - START_US, id.to_owned(), bytes.join(" "))
+    };
+    text.lines().map(frame).collect()
+}
+
+fn write(folder: &Path, name: &str, header: &str, line: impl Fn(i64, &str, &str) -> String) -> String {
+    let lines: String = frames().iter().map(|(us, id, bytes)| line(*us, id, bytes) + "\r\n").collect();
+    let path = folder.join(name);
+    fs::write(&path, format!("{header}{lines}")).unwrap();
+    path.to_str().unwrap().to_owned()
+}
+
+fn seconds(us: i64) -> String {
+    format!("{}.{:06}", us / 1_000_000, us % 1_000_000)
+}
+
+#[test]
+fn drive_in_other_formats_gives_same_estimates() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let expected = estimates(folder, example("drive.log").to_str().unwrap());
+    assert!(expected.lines().count() > 1000, "{expected}");
+    let logs = [
+        write(folder, "a.log", "date Tue Nov 14 10:13:20.000 pm 2023\nbase hex  timestamps absolute\n", |us, id, bytes| {
+            format!("   {} 1  {id}             Rx   d 8 {bytes}", seconds(us))
+        }),
+        write(folder, "b.csv", "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8\n", |us, id, bytes| {
+            format!("{},00000{id},false,Rx,0,8,{}", START_US + us, bytes.replace(' ', ","))
+        }),
+        write(folder, "c.txt", "", |us, id, bytes| {
+            format!(" ({})  vcan0  RX - -  {id}   [8]  {bytes}", seconds(START_US + us))
+        }),
+        write(folder, "d.crtd", "", |us, id, bytes| format!("{} 1R11 {id} {bytes}", seconds(START_US + us))),
+    ];
+    for log in &logs {
+        assert!(estimates(folder, log) == expected, "{log}");
+    }
+    // Formats recorded on another interface give the same estimates as soon as their channel is named.
+    let other = write(folder, "e.log", "base hex timestamps absolute\n", |us, id, bytes| {
+        format!("{} 3 {id} Rx d 8 {bytes}", seconds(us))
+    });
+    let config = example("pack.toml");
+    let args = ["replay", "-c", config.to_str().unwrap(), &other];
+    let error = stderr(&packwatch(&args).code(1));
+    assert!(error.contains("channel 3") && error.contains("--channel 3=vcan0"), "{error}");
+    packwatch(&[&args[..], &["--channel", "3=vcan0"]].concat()).success();
+}
+
+#[test]
+fn doctor_and_discover_read_other_formats() {
+    let folder = tempfile::tempdir().unwrap();
+    let log = write(folder.path(), "a.asc", "base hex timestamps absolute\n", |us, id, bytes| {
+        format!("{} 1 {id} Rx d 8 {bytes}", seconds(us))
+    });
+    let (config, dbc) = (example("pack.toml"), example("pack.dbc"));
+    let report = stdout(&packwatch(&["doctor", "-c", config.to_str().unwrap(), &log]).success());
+    assert!(report.contains("No faults found"), "{report}");
+    let page = stdout(&packwatch(&["discover", &log, "--dbc", dbc.to_str().unwrap()]).success());
+    assert!(page.contains("PackStatus.Current") && page.contains("can0"), "{page}");
+}
+
+#[test]
+fn logs_without_battery_fail_with_reason() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = example("pack.toml");
+    let case = |name: &str, content: &[u8]| {
+        let path = folder.path().join(name);
+        fs::write(&path, content).unwrap();
+        stderr(&packwatch(&["replay", "-c", config.to_str().unwrap(), path.to_str().unwrap()]).code(1))
+    };
+    let error = case("empty.log", b"");
+    assert!(error.contains("the log is empty"), "{error}");
+    let error = case("notes.txt", b"driving home\nparked\n");
+    assert!(error.contains("notes.txt:1: \"driving home\" has no known format"), "{error}");
+    let error = case("other.log", b"(1700000000.000000) vcan0 7FF#00\n(1700000001.000000) vcan0 7FF#00\n");
+    assert!(error.contains("none of 2 frames carries a configured signal"), "{error}");
+    let error = case("elsewhere.log", b"(1700000000.000000) can7 100#FDFF410000000000\n");
+    assert!(error.contains("interface can7") && error.contains("--channel can7=vcan0"), "{error}");
+    let error = case("book.xlsx", b"PK\x03\x04\x14\x00\x06\x00xl/workbook.xml");
+    assert!(error.contains("book.xlsx") && error.contains("Excel"), "{error}");
+    let drive = fs::read_to_string(example("drive.log")).unwrap();
+    let impossible: String = drive.lines().map(|line| format!("{}FFFF0000\n", &line[..line.len() - 8])).collect();
+    let error = case("impossible.log", impossible.replace("101#068A", "101#0000").as_bytes());
+    assert!(error.contains("refused") || error.contains("no estimates"), "{error}");
+    let slow: String = drive
+        .lines()
+        .enumerate()
+        .map(|(n, line)| format!("({}.000000{}\n", 1_700_000_000 + n / 2 * 60, &line[line.find(')').unwrap()..]))
+        .collect();
+    let error = case("slow.log", slow.as_bytes());
+    assert!(error.contains("mostly asleep") && error.contains("--sleep-gap"), "{error}");
+}
+
+#[test]
+fn look_writes_report_or_asks() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let (log, dbc) = (example("drive.log"), example("pack.dbc"));
+    let (log, dbc) = (log.to_str().unwrap(), dbc.to_str().unwrap());
+    let (out, pack) = (path("look.html"), path("pack.toml"));
+    let args = ["look", log, "--dbc", dbc, "--out", &out, "--write", &pack];
+    let question = stderr(&packwatch(&args).code(1));
+    assert!(question.contains("--label") && !Path::new(&out).exists() && !Path::new(&pack).exists(), "{question}");
+    let args = [&args[..], &["--label", "nmc:2.6Ah"]].concat();
+    let text = stdout(&packwatch(&args).success());
+    for part in ["CellVoltages.CellVoltage{n} on vcan0: 4 of", "pack.toml written", "wiring", "battery", "look.html"] {
+        assert!(text.contains(part), "{part} is not in: {text}");
+    }
+    assert!(fs::read_to_string(&out).unwrap().contains("</html>"));
+    // An edited configuration is used and kept.
+    let edited = fs::read_to_string(&pack).unwrap().replace("rated_capacity_ah = 2.6", "rated_capacity_ah = 2.5");
+    fs::write(&pack, &edited).unwrap();
+    let text = stdout(&packwatch(&args).success());
+    assert!(text.contains("exists, so it is used as it is"), "{text}");
+    assert_eq!(fs::read_to_string(&pack).unwrap(), edited);
+}
