@@ -183,7 +183,11 @@ impl Judge<'_> {
             "voltage" if !self.options.pack_total && self.options.cells > 1 => "voltage{n}",
             quantity => quantity,
         };
-        let hint = of.probable.map_or_else(
+        let symbol = column.map_or("", |column| column.unit.symbol);
+        let is_too_small = of.quantity == "voltage" && of.probable.is_none() && symbol == "mV";
+        // The unit that the values already have helps no one.
+        let probable = if is_too_small { Some("V") } else { of.probable.filter(|&unit| unit != symbol) };
+        let hint = probable.map_or_else(
             || format!("; name the right column with --column {role}=NAME"),
             |unit| {
                 format!("; probably {unit}: write the unit into the header, or use --column {role}='{name}[{unit}]'")
