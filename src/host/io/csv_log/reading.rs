@@ -9,7 +9,7 @@ use super::{Channel, CsvOptions};
 use crate::io::table::Header;
 
 /// What was read of a table.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct TableReading {
     /// Name of the file.
     pub file: String,
