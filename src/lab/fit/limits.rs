@@ -155,7 +155,7 @@ mod tests {
     use super::*;
 
     fn file(parts: Vec<MeasuredPart>) -> MeasuredFile {
-        MeasuredFile { path: "cell.csv".into(), parts, is_bdf: false }
+        MeasuredFile { path: "cell.csv".into(), parts, is_bdf: false, reading: Default::default() }
     }
 
     fn part(key: &str, kind: &str, rows: impl IntoIterator<Item = (f64, f64, f64)>) -> MeasuredPart {
