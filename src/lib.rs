@@ -118,7 +118,7 @@
 //! | the build of all packages | `/packaging/packages` |
 //! | a command or its options | `cli/COMMAND.rs`, or `cli/COMMAND/args.rs` where that exists |
 //! | options of a score, its tables and document | `lab/score/request.rs` (options), `lab/score/report.rs` (tables, document), `lab/single_cell.rs` (configuration of the cell) |
-//! | a column of a CSV log or measured file, the Battery Data Format | `host/io/csv_log.rs` (`SampleColumns`) |
+//! | a column of a CSV log or measured file, the Battery Data Format | `host/io/csv_log.rs` |
 //! | a column of a capacity table (history, cycles, truth, reference) | `lab/capacity_table.rs` |
 //! | a class or function of the Python module | `python/NAME.rs` (code), `python/packwatch/_packwatch.pyi` (types) |
 //!

@@ -138,7 +138,7 @@ fn values_in_wrong_unit_are_refused_by_name() {
         ("mA", scaled(&rows, own, [1.0, 1000.0, 1.0]), &[][..], "probably mA"),
         ("A as mA", scaled(&rows, "time_s,current_ma,voltage_v", [1.0; 3]), &[], "probably A"),
         ("mV", scaled(&rows, own, [1.0, 1.0, 1000.0]), &[], "probably mV"),
-        ("V as mV", scaled(&rows, "time_s,current_a,voltage_mv", [1.0; 3]), &[], "V per cell"),
+        ("V as mV", scaled(&rows, "time_s,current_a,voltage_mv", [1.0; 3]), &[], "probably V"),
         ("ms", scaled(&rows, own, [1000.0, 1.0, 1.0]), &[], "probably ms"),
         ("ns", scaled(&rows, own, [1e9, 1.0, 1.0]), &[], "probably ns"),
         ("ms since 1970", since_1970, &[], "probably ms"),

@@ -148,7 +148,8 @@ pub fn check_response(
     size: PackSize,
 ) -> Result<(), Implausible> {
     let Some(capacity_ah) = size.capacity_ah else { return Ok(()) };
-    let all: Vec<(f64, f64)> = steps(current_a, cell_voltage_v).filter(|(_, voltage_v)| *voltage_v != 0.0).collect();
+    let all: Vec<(f64, f64)> =
+        steps(time_s, current_a, cell_voltage_v).into_iter().filter(|(_, voltage_v)| *voltage_v != 0.0).collect();
     let largest = all.iter().fold(0.0_f64, |max, (current_a, _)| max.max(current_a.abs()));
     let large: Vec<_> =
         all.iter().filter(|(current_a, _)| *current_a != 0.0 && current_a.abs() >= 0.1 * largest).collect();
@@ -202,10 +203,11 @@ pub enum ShownSign {
 /// Finds the direction of positive current from the voltage's answers to steps. If the current has few steps, the
 /// stretches of constant current decide: their voltage rises or falls by 100 mV or more. In a load that varies, the
 /// voltage may recover although the cell discharges, so such stretches prove nothing.
-pub fn shown_sign(current_a: &[f64], cell_voltage_v: &[f64]) -> ShownSign {
+pub fn shown_sign(time_s: &[f64], current_a: &[f64], cell_voltage_v: &[f64]) -> ShownSign {
     let largest = current_a.iter().copied().filter(|i| i.is_finite()).fold(0.0_f64, |max, i| max.max(i.abs()));
     let is_never_negative = current_a.iter().all(|&i| i.is_nan() || i >= -0.01 * largest);
-    let mut votes: Vec<bool> = steps(current_a, cell_voltage_v)
+    let mut votes: Vec<bool> = steps(time_s, current_a, cell_voltage_v)
+        .into_iter()
         .filter(|(i, v)| i.abs() >= 0.1 * largest && v.abs() > 0.0005)
         .map(|(i, v)| i * v < 0.0)
         .collect();
@@ -225,10 +227,12 @@ pub fn shown_sign(current_a: &[f64], cell_voltage_v: &[f64]) -> ShownSign {
     if discharge > charge { ShownSign::Discharge } else { ShownSign::Charge }
 }
 
-/// Changes of current and voltage from row to row.
-fn steps<'a>(current_a: &'a [f64], voltage_v: &'a [f64]) -> impl Iterator<Item = (f64, f64)> + 'a {
-    let pairs = current_a.windows(2).zip(voltage_v.windows(2));
-    pairs.map(|(i, v)| (i[1] - i[0], v[1] - v[0])).filter(|(i, v)| i.is_finite() && v.is_finite())
+/// Changes of current and voltage from row to row. Rows after a gap do not count: the recorder may have missed a charge.
+fn steps(time_s: &[f64], current_a: &[f64], voltage_v: &[f64]) -> Vec<(f64, f64)> {
+    let longest_s = 10.0 * median_step(time_s).unwrap_or_default();
+    let pairs = time_s.windows(2).zip(current_a.windows(2).zip(voltage_v.windows(2)));
+    let near = pairs.filter(|(time_s, _)| (0.0..=longest_s).contains(&(time_s[1] - time_s[0])));
+    near.map(|(_, (i, v))| (i[1] - i[0], v[1] - v[0])).filter(|(i, v)| i.is_finite() && v.is_finite()).collect()
 }
 
 /// For each stretch of constant current: whether a positive current discharges. The voltage falls at a discharge and
@@ -243,9 +247,13 @@ fn plateaus(current_a: &[f64], voltage_v: &[f64], largest: f64) -> Vec<bool> {
         if is_constant && end < voltage_v.len() {
             continue;
         }
-        if end - start >= MIN_ROWS && current_a[start].abs() >= 0.05 * largest && largest > 0.0 {
-            let change_v = voltage_v[end - 1] - voltage_v[start + SETTLING_ROWS];
-            votes.extend((change_v.abs() >= 0.1).then_some(change_v * current_a[start] < 0.0));
+        // A small current after a large one is no evidence: the voltage recovers.
+        if end - start >= MIN_ROWS && current_a[start].abs() >= 0.15 * largest && largest > 0.0 {
+            let stretch = &voltage_v[start + SETTLING_ROWS..end];
+            let change_v = stretch[stretch.len() - 1] - stretch[0];
+            let is_farthest_at_end = stretch.iter().all(|v| (v - stretch[0]).abs() <= change_v.abs() + 0.02);
+            let is_vote = change_v.abs() >= 0.1 && is_farthest_at_end;
+            votes.extend(is_vote.then_some(change_v * current_a[start] < 0.0));
         }
         start = end;
     }
@@ -321,17 +329,17 @@ mod tests {
 
     #[test]
     fn sign_and_magnitude_are_shown_by_steps() {
-        let (_, current, voltage) = drive();
-        assert_eq!(shown_sign(&current, &voltage), ShownSign::Discharge);
-        assert_eq!(shown_sign(&scaled(&current, -1.0), &voltage), ShownSign::Charge);
+        let (time, current, voltage) = drive();
+        assert_eq!(shown_sign(&time, &current, &voltage), ShownSign::Discharge);
+        assert_eq!(shown_sign(&time, &scaled(&current, -1.0), &voltage), ShownSign::Charge);
         let magnitude: Vec<f64> = current.iter().map(|value| value.abs()).collect();
-        assert_eq!(shown_sign(&magnitude, &voltage), ShownSign::Magnitude);
-        assert_eq!(shown_sign(&current, &[3.7; 600]), ShownSign::Unclear);
+        assert_eq!(shown_sign(&time, &magnitude, &voltage), ShownSign::Magnitude);
+        assert_eq!(shown_sign(&time, &current, &[3.7; 600]), ShownSign::Unclear);
         // Constant currents: a charge and a discharge in a file without a sign.
         let constant = vec![1.0; 200];
         let swing: Vec<f64> = (0..200).map(|n| 3.5 + 0.005 * f64::from(100 - (n - 100_i32).abs())).collect();
-        assert_eq!(shown_sign(&constant, &swing[..100]), ShownSign::Charge);
+        assert_eq!(shown_sign(&time, &constant, &swing[..100]), ShownSign::Charge);
         let two: Vec<f64> = constant[..98].iter().chain(&[0.0, 0.0]).chain(&constant[..100]).copied().collect();
-        assert_eq!(shown_sign(&two, &swing), ShownSign::Magnitude);
+        assert_eq!(shown_sign(&time, &two, &swing), ShownSign::Magnitude);
     }
 }

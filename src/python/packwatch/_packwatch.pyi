@@ -269,7 +269,7 @@ def replay(
     logs: _Paths,
     *,
     columns: dict[str, str] | None = None,
-    csv_sign: Literal["discharge", "charge"] = "discharge",
+    csv_sign: Literal["discharge", "charge"] | None = None,
     start_times: _Path | None = None,
     strict: bool = False,
     sleep_gap_s: float = 30.0,

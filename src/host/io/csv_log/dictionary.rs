@@ -59,6 +59,11 @@ const NAMES: [(Role, &[&str]); 19] = [
             "rel time",
             "t",
             "time since start",
+            "seconds",
+            "minutes",
+            "hours",
+            "millis",
+            "milliseconds",
             "test duration",
         ],
     ),
@@ -80,6 +85,10 @@ const NAMES: [(Role, &[&str]); 19] = [
             "local time",
             "date time iso",
             "realtime",
+            "device time",
+            "gps time",
+            "date and time",
+            "recorded at",
             "gmtime",
         ],
     ),
@@ -106,6 +115,10 @@ const NAMES: [(Role, &[&str]); 19] = [
             "hv battery current",
             "bms current",
             "battery amps",
+            "battery",
+            "batt",
+            "bat",
+            "pack",
         ],
     ),
     (
@@ -120,6 +133,7 @@ const NAMES: [(Role, &[&str]); 19] = [
             "cell voltage",
             "voltage measured",
             "measured voltage",
+            "potential",
             "terminal voltage",
             "vol",
         ],
@@ -138,6 +152,10 @@ const NAMES: [(Role, &[&str]); 19] = [
             "battery volts",
             "ewe",
             "battery terminal voltage",
+            "battery",
+            "batt",
+            "bat",
+            "pack",
         ],
     ),
     (
@@ -239,9 +257,23 @@ const NAMES: [(Role, &[&str]); 19] = [
     (Role::StepTime, &["\u{65f6}\u{95f4}"]),
 ];
 
+/// Words for the battery.
+const BATTERY: [&str; 4] = ["battery", "batt", "bat", "pack"];
+
 /// Names that contain their unit as a word.
-const UNITS_AS_NAMES: [(&str, &str); 6] =
-    [("amps", "A"), ("amp", "A"), ("amperes", "A"), ("volts", "V"), ("volt", "V"), ("mamps", "mA")];
+const UNITS_AS_NAMES: [(&str, &str); 11] = [
+    ("seconds", "s"),
+    ("minutes", "min"),
+    ("hours", "h"),
+    ("millis", "ms"),
+    ("milliseconds", "ms"),
+    ("amps", "A"),
+    ("amp", "A"),
+    ("amperes", "A"),
+    ("volts", "V"),
+    ("volt", "V"),
+    ("mamps", "mA"),
+];
 
 /// A known column.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -295,6 +327,10 @@ fn lookup(name: &ColumnName) -> Vec<Known> {
         };
         let number_fits = match role {
             Role::CellVoltage => name.number.is_some(),
+            // Only the unit says what of the battery is meant.
+            Role::Current | Role::Voltage if BATTERY.contains(&name.words.as_str()) => {
+                name.number.is_none() && unit.is_some()
+            }
             Role::Temperature => name.words != "t" || name.number.is_some() || unit.is_some(),
             Role::Time if name.words == "test" => unit.is_some() || name.is_clock,
             _ => name.number.is_none(),

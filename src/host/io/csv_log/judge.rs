@@ -155,7 +155,7 @@ impl Judge<'_> {
         self.soc_unit(layout);
         let (time, time_form, is_time_assumed, times) = self.times(layout)?;
         self.keep_section(layout, &times);
-        let sign = self.sign(layout)?;
+        let sign = self.sign(layout, &times)?;
         let mut trial = sign;
         let signed = |(&current, direction): (&f64, &Option<Direction>)| {
             trial.discharge(current, *direction).unwrap_or(f64::NAN)
@@ -183,7 +183,11 @@ impl Judge<'_> {
             "voltage" if !self.options.pack_total && self.options.cells > 1 => "voltage{n}",
             quantity => quantity,
         };
-        let hint = of.probable.map_or_else(
+        let symbol = column.map_or("", |column| column.unit.symbol);
+        let is_too_small = of.quantity == "voltage" && of.probable.is_none() && symbol == "mV";
+        // The unit that the values already have helps no one.
+        let probable = if is_too_small { Some("V") } else { of.probable.filter(|&unit| unit != symbol) };
+        let hint = probable.map_or_else(
             || format!("; name the right column with --column {role}=NAME"),
             |unit| {
                 format!("; probably {unit}: write the unit into the header, or use --column {role}='{name}[{unit}]'")
@@ -402,7 +406,7 @@ impl Judge<'_> {
         }
     }
 
-    fn sign(&mut self, layout: &Layout) -> Result<CurrentSign, TableError> {
+    fn sign(&mut self, layout: &Layout, times: &[f64]) -> Result<CurrentSign, TableError> {
         let sign = |is_charge_positive: bool, source: SignSource| CurrentSign {
             is_charge_positive,
             is_by_state: false,
@@ -428,7 +432,7 @@ impl Judge<'_> {
                 CurrentSign { is_by_state: true, is_magnitude_shown: discharges > 0, ..sign(true, SignSource::State) };
             return Ok(by_state);
         }
-        let shown = plausible::shown_sign(&samples.currents, &samples.voltages);
+        let shown = plausible::shown_sign(times, &samples.currents, &samples.voltages);
         if shown == ShownSign::Magnitude {
             let name = layout.current().map_or("", |column| self.header.names()[column.index].as_str());
             return Err(self.header.fault(format_args!(

@@ -3,6 +3,7 @@
 //! In: the source. Out: its first megabyte as UTF-8, the rest as a reader, and the [`Form`]. A failed read is reported
 //! after the bytes before it.
 
+use std::collections::VecDeque;
 use std::io::{self, Cursor, Read};
 
 /// Largest number of bytes that are examined before the first row is returned: one row of the greatest length.
@@ -37,7 +38,7 @@ impl Head {
         let big = mark.starts_with(&[0xFE, 0xFF]) || matches!(mark[..], [0, 1..=0x7F, 0, 1..=0x7F]);
         let whole: Box<dyn Read> = Box::new(Cursor::new(mark).chain(source));
         let mut text: Box<dyn Read> = if little || big {
-            Box::new(Utf16 { source: io::BufReader::new(whole), little, pending: None })
+            Box::new(Utf16 { source: io::BufReader::new(whole), little, pending: None, text: VecDeque::new() })
         } else {
             whole
         };
@@ -71,6 +72,8 @@ struct Utf16 {
     little: bool,
     /// First half of a surrogate pair.
     pending: Option<u16>,
+    /// Converted bytes that did not fit into the reader's buffer.
+    text: VecDeque<u8>,
 }
 
 impl Utf16 {
@@ -97,12 +100,12 @@ impl Utf16 {
 
 impl Read for Utf16 {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        let mut count = 0;
-        while buffer.len() - count >= 4 {
+        while self.text.len() < buffer.len() {
             let Some(character) = self.next_char()? else { break };
-            count += character.encode_utf8(&mut buffer[count..]).len();
+            let mut bytes = [0; 4];
+            self.text.extend(character.encode_utf8(&mut bytes).as_bytes());
         }
-        Ok(count)
+        self.text.read(buffer)
     }
 }
 
