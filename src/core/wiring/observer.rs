@@ -337,7 +337,8 @@ impl WiringObserver {
         self.hole_count += 1;
         self.holes.push(hole);
         if self.holes.len() > MAX_HOLES
-            && let Some(shortest) = (0..self.holes.len()).min_by(|a, b| self.holes[*a].seconds().total_cmp(&self.holes[*b].seconds()))
+            && let Some(shortest) =
+                (0..self.holes.len()).min_by(|a, b| self.holes[*a].seconds().total_cmp(&self.holes[*b].seconds()))
         {
             self.holes.remove(shortest);
         }

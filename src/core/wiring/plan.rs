@@ -1,12 +1,12 @@
 //! Plan: what `doctor` expects on the buses, from the readable parts of the configuration.
 
+use super::evidence::SignalLabel;
+use super::evidence::usage::MAX_REPORTED;
 use crate::can::CanId;
 use crate::can::decode::Binding;
 use crate::can::guard::GuardConfig;
 use crate::can::signal::SignalLayout;
 use crate::can::uds::Question;
-use super::evidence::SignalLabel;
-use super::evidence::usage::MAX_REPORTED;
 use crate::cell::{CellModel, Chemistry, Label};
 use crate::quantity::{BusIndex, Channel};
 

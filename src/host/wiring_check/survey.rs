@@ -15,8 +15,8 @@ use crate::can::encode::SentMessage;
 use crate::can::uds::Answer;
 use crate::cell::CellModel;
 use crate::config::{
-    Config, ConfigFaults, Databases, NamedSignal, PartialConfig, Pattern, RawTables, ReadFile, ResolvedSignal, SignalSource,
-    TablePlace, answers, input_map, label_of,
+    Config, ConfigFaults, Databases, NamedSignal, PartialConfig, Pattern, RawTables, ReadFile, ResolvedSignal,
+    SignalSource, TablePlace, answers, input_map, label_of,
 };
 use crate::quantity::{CellIndex, Channel, MAX_CELLS};
 use crate::wiring::{InterfacePlan, MessagePlan, OutputPlan, PackPlan, Plan, SignalPlan};

@@ -17,7 +17,11 @@ const MAX_TRIALS: usize = 4;
 
 /// Tries the changes of the first findings. `judge` judges the input with another configuration; `None` = it cannot be
 /// judged again.
-pub fn try_changes(config: &Path, report: &mut WiringReport, judge: &mut dyn FnMut(&mut Survey) -> Option<WiringReport>) {
+pub fn try_changes(
+    config: &Path,
+    report: &mut WiringReport,
+    judge: &mut dyn FnMut(&mut Survey) -> Option<WiringReport>,
+) {
     let errors = errors(report);
     let is_tried = |index: &usize| {
         let finding = &report.findings[*index];
@@ -28,7 +32,8 @@ pub fn try_changes(config: &Path, report: &mut WiringReport, judge: &mut dyn FnM
         let finding = &report.findings[index];
         let Some(mut survey) = changed(config, &finding.changes) else { continue };
         let Some(other) = judge(&mut survey) else { continue };
-        let remains = other.findings.iter().any(|other| other.title == finding.title && other.severity == finding.severity);
+        let remains =
+            other.findings.iter().any(|other| other.title == finding.title && other.severity == finding.severity);
         let is_worse = self::errors(&other) > errors || !survey.faults.is_empty();
         let finding = &mut report.findings[index];
         finding.is_solved = Some(!remains && !is_worse);

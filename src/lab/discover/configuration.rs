@@ -173,13 +173,15 @@ impl Writer<'_> {
     fn fitting_cells(&self, pack: &Candidate) -> (u32, u32) {
         let label = &self.descriptions.label;
         let (mut low_v, mut high_v) = (3.0, 4.2);
-        let model = label.chemistry.and_then(|chemistry| Label::usual(chemistry, label.capacity_ah.unwrap_or(50.0)).model());
+        let model =
+            label.chemistry.and_then(|chemistry| Label::usual(chemistry, label.capacity_ah.unwrap_or(50.0)).model());
         if let Some(model) = model {
             (low_v, high_v) = (model.voltage_min_v, model.voltage_max_v);
             if let Some(soc) = self.best(PackQuantity::Soc) {
                 let ocv_v = |soc: f64| model.ocv_v(&model.grid_position(soc.clamp(0.0, 1.0), 25.0));
                 // Under load, the voltage differs from the open-circuit voltage.
-                (low_v, high_v) = (ocv_v(soc.low / 100.0 - HIDDEN_SOC) - 0.05, ocv_v(soc.high / 100.0 + HIDDEN_SOC) + 0.05);
+                (low_v, high_v) =
+                    (ocv_v(soc.low / 100.0 - HIDDEN_SOC) - 0.05, ocv_v(soc.high / 100.0 + HIDDEN_SOC) + 0.05);
             }
         }
         ((pack.high / high_v).ceil() as u32, (pack.low / low_v).floor() as u32)

@@ -208,8 +208,8 @@ fn currents<'a>(
         for layout in layouts(samples.bytes, true).into_iter().chain(layouts(samples.bytes, false)) {
             let codes = samples.values(&layout, None);
             // Without the highest bit, the unsigned field equals the signed field.
-            let is_same = layout.value_type == ValueType::Unsigned
-                && codes.extent.max < f64::from(layout.length_bits - 1).exp2();
+            let is_same =
+                layout.value_type == ValueType::Unsigned && codes.extent.max < f64::from(layout.length_bits - 1).exp2();
             if codes.is_constant() || codes.is_counter() || is_same {
                 continue;
             }
@@ -229,7 +229,8 @@ fn currents<'a>(
             };
             let factor = CURRENT_SCALES.iter().copied().min_by(|a, b| distance(a).total_cmp(&distance(b)));
             let factor = factor.unwrap_or(1.0);
-            if zero != 0.0 && PACK_SCALES.iter().any(|scale| (codes.extent.mean() * scale / mean_v - 1.0).abs() < 0.05) {
+            if zero != 0.0 && PACK_SCALES.iter().any(|scale| (codes.extent.mean() * scale / mean_v - 1.0).abs() < 0.05)
+            {
                 // Another reading of the voltage.
                 continue;
             }

@@ -70,7 +70,7 @@ impl Evidence {
 pub(super) fn candidates(signals: &[LogSignal], interfaces: &[String], label: &PackLabel) -> Vec<Candidate> {
     let groups = groups(&signals.iter().map(|signal| (partition(signal), signal.name.as_str())).collect::<Vec<_>>());
     let usable: Vec<usize> = (0..signals.len()).filter(|index| signals[*index].is_mostly_valid()).collect();
-    let mut voltages: Vec<Evidence> = 
+    let mut voltages: Vec<Evidence> =
         usable.iter().filter_map(|index| voltage(*index, &signals[*index], label)).collect();
     let mut currents: Vec<Evidence> = usable.iter().filter_map(|index| current(*index, &signals[*index])).collect();
     sort(&mut voltages);

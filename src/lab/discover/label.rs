@@ -77,7 +77,9 @@ impl PackLabel {
             self.chemistry.replace(chemistry).is_none()
         } else {
             let names = Chemistry::ALL.map(|(_, name)| name.trim_end_matches("-graphite")).join(", ");
-            return Err(format!("{part:?}: must be a chemistry ({names}), a capacity such as 64Ah, or cells such as 98s"));
+            return Err(format!(
+                "{part:?}: must be a chemistry ({names}), a capacity such as 64Ah, or cells such as 98s"
+            ));
         };
         if is_new { Ok(()) } else { Err(format!("{part}: this part of the label is given twice")) }
     }
@@ -97,14 +99,15 @@ mod tests {
     #[test]
     fn every_part_of_a_label_is_optional() {
         let label: PackLabel = "nmc:64Ah:98s".parse().unwrap();
-        assert_eq!(label, PackLabel {
-            chemistry: Some(Chemistry::NmcGraphite),
-            capacity_ah: Some(64.0),
-            cells: Some(98)
-        });
+        assert_eq!(
+            label,
+            PackLabel { chemistry: Some(Chemistry::NmcGraphite), capacity_ah: Some(64.0), cells: Some(98) }
+        );
         assert_eq!("16s, lfp-graphite".parse::<PackLabel>().unwrap().pack_v().map(|v| v.1.round()), Some(60.0));
         assert_eq!("".parse(), Ok(PackLabel::default()));
-        for (text, part) in [("pb", "lfp"), ("0s", "1 to 1024".split(' ').next().unwrap()), ("-3Ah", "64Ah"), ("1s:2s", "twice")] {
+        for (text, part) in
+            [("pb", "lfp"), ("0s", "1 to 1024".split(' ').next().unwrap()), ("-3Ah", "64Ah"), ("1s:2s", "twice")]
+        {
             let error = text.parse::<PackLabel>().unwrap_err();
             assert!(error.contains(part), "{text}: {error}");
         }

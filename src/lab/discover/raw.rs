@@ -74,7 +74,8 @@ pub(super) fn signals(
             CURRENT_FORMS.iter().flat_map(|(length, scales)| scales.iter().map(move |scale| (*length, *scale)));
         forms.extend(currents.map(|(length, scale)| field("Current", bit, length, true, scale)));
         let fitting = forms.into_iter().filter(|form| form.length <= rest && is_free(bit, form.length));
-        found.extend(fitting.filter_map(|form| signal(key, answers, form)).filter(|signal| is_plausible(signal, label)));
+        found
+            .extend(fitting.filter_map(|form| signal(key, answers, form)).filter(|signal| is_plausible(signal, label)));
     }
     found
 }
@@ -203,13 +204,7 @@ fn temperature_row(
 }
 
 /// Finds the longest row of cell voltages; returns one signal per cell.
-fn cells(
-    key: &AnswerKey,
-    answers: &Answers,
-    bytes: usize,
-    rows: &mut CellRows,
-    label: &PackLabel,
-) -> Vec<LogSignal> {
+fn cells(key: &AnswerKey, answers: &Answers, bytes: usize, rows: &mut CellRows, label: &PackLabel) -> Vec<LogSignal> {
     let mut best: Option<(usize, DiagnosticSignal)> = None;
     let cell_v = label.chemistry.map_or(CELL_V, |_| label.cell_v());
     let orders = [(16, false), (16, true), (8, false)];
@@ -234,7 +229,8 @@ fn cells(
     }
     let Some((count, mut form)) = best else { return Vec::new() };
     let count = u32::try_from(count).unwrap_or(1);
-    let form_key = (key.bus, key.response, key.extension, form.bit, form.length, form.little_endian, form.factor.to_bits());
+    let form_key =
+        (key.bus, key.response, key.extension, form.bit, form.length, form.little_endian, form.factor.to_bits());
     let before = rows.0.entry(form_key).or_default();
     form.name = format!("{CELL}{{n}}");
     form.numbers = Some(NumberRange { first: *before + 1, last: *before + count, step: form.length });

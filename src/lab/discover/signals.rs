@@ -1,10 +1,10 @@
 //! Collects the signals of a log with their values. DBC files and definitions of diagnostic answers describe signals.
 //! The search finds further signals in undescribed bytes of answers and, without DBC files, in messages.
 
-use super::capture::{AnswerKey, Answers, Capture, MessageKey, Payloads};
 use super::PositiveDirection;
-use super::log_signal::{LogSignal, SignalOrigin};
+use super::capture::{AnswerKey, Answers, Capture, MessageKey, Payloads};
 use super::label::PackLabel;
+use super::log_signal::{LogSignal, SignalOrigin};
 use super::{fields, raw};
 use crate::can::dbc::{Database, Message, Signal};
 use crate::can::decode::Binding;
@@ -85,7 +85,9 @@ fn of_message(key: MessageKey, payloads: &Payloads, file: usize, message: &Messa
             Series::of(present.map(|(time_s, payload)| (time_s, recorded_value(payload, binding))))
         };
         let mut series = values(&binding);
-        if label.has_unit_of(Quantity::Current) && let Some(offset) = missing_offset(&series, signal) {
+        if label.has_unit_of(Quantity::Current)
+            && let Some(offset) = missing_offset(&series, signal)
+        {
             binding.offset += offset;
             series = values(&binding);
         }

@@ -192,7 +192,8 @@ fn signed_current_defined_as_unsigned_is_detected() {
         "{:?}",
         discovery.remarks
     );
-    let settings = PackSettings { cells: Some(98), cell_model: Some("cell.toml".to_owned()), ..PackSettings::default() };
+    let settings =
+        PackSettings { cells: Some(98), cell_model: Some("cell.toml".to_owned()), ..PackSettings::default() };
     let text = discoverer.configuration(&discovery, &settings).unwrap().text;
     assert!(text.contains("name = \"HVBAT_CURR\", bit = 0, length = 16, signed = true"), "{text}");
 }

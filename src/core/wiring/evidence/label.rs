@@ -70,7 +70,8 @@ const ELSEWHERE: &str = "12v twelvevolt =lv aux starter dcdc =dc =ac motor inver
     pilot connector pin inlet outlet capacitor charger plug port climate freezer stator brake trailer \
     screen bus line isolation relay coil contactor cont";
 /// Words that indicate the battery controller's own electronics. They are warmer than the cells and follow the load.
-const ELECTRONICS: &str = "=mos =tmos mosfet board shunt heatsink heat_sink =afe =ic =mcu chip electronic balanc resist tube";
+const ELECTRONICS: &str =
+    "=mos =tmos mosfet board shunt heatsink heat_sink =afe =ic =mcu chip electronic balanc resist tube";
 /// Words that indicate the 12 V battery.
 const LOW_VOLTAGE: &str = "12v twelvevolt twelve_volt =lv aux starter";
 /// Words that indicate a value that is not measured, such as a limit or request.
@@ -135,14 +136,26 @@ impl SignalLabel {
             None if matches!(unit.trim(), "" | "-" | "1") => LabelUnit::Missing,
             None => LabelUnit::Other,
         };
-        let label = |name: &str| Self { words: words(name), name: name.to_lowercase(), unit, is_pack_message: false, is_low_voltage_message: false };
+        let label = |name: &str| Self {
+            words: words(name),
+            name: name.to_lowercase(),
+            unit,
+            is_pack_message: false,
+            is_low_voltage_message: false,
+        };
         let (is_pack_message, is_low_voltage_message) = (label(message).has(PACK), label(message).has(LOW_VOLTAGE));
         Self { is_pack_message, is_low_voltage_message, ..label(signal) }
     }
 
     /// Creates a label for a signal without a name.
     pub fn unnamed(quantity: Quantity) -> Self {
-        Self { words: Vec::new(), name: String::new(), unit: LabelUnit::Known(quantity), is_pack_message: false, is_low_voltage_message: false }
+        Self {
+            words: Vec::new(),
+            name: String::new(),
+            unit: LabelUnit::Known(quantity),
+            is_pack_message: false,
+            is_low_voltage_message: false,
+        }
     }
 
     /// Whether the name contains one of the words.

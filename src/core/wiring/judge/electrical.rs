@@ -130,7 +130,9 @@ fn resistance(judge: &mut Judge<'_>, slope: &Slope) {
         if let Some(strings) = strings.filter(|_| !is_label) {
             finding.change("pack", "strings", strings.to_string());
         }
-        finding.change("pack", key, text).advice("the estimator itself learns a resistance of 0.3 to 3 times the model's");
+        finding
+            .change("pack", key, text)
+            .advice("the estimator itself learns a resistance of 0.3 to 3 times the model's");
     } else if slope.ohm > 0.0 {
         judge.fine(format!("the resistance is plausible: {seen}"));
     }

@@ -34,7 +34,9 @@ fn of_log(judge: &mut Judge<'_>) {
     let title = format!("a stretch of {} is missing in the log", seconds(hole.seconds()));
     let why = match &in_use {
         Some((_, why)) => format!("the pack was in use: {why}; the charge that flowed in this time is unknown"),
-        None => "the buses slept, or the log was interrupted; the charge that flowed in this time is unknown".to_owned(),
+        None => {
+            "the buses slept, or the log was interrupted; the charge that flowed in this time is unknown".to_owned()
+        }
     };
     find(judge, severity, Topic::Missing, title).seen(format!("no frames {span}; {holes} of more than 30 s")).why(why);
 }

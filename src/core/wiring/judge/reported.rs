@@ -158,9 +158,8 @@ fn reported<'d>(judge: &Judge<'d>, channel: Channel) -> Vec<Reported<'d>> {
 /// Finds exchanged states of charge and health: by their names, or because only the reported health follows the
 /// charge.
 pub(super) fn check_swapped(judge: &mut Judge<'_>) {
-    let configured = |channel| {
-        judge.plan.signals.iter().enumerate().find(|(_, signal)| signal.binding.channel == channel)
-    };
+    let configured =
+        |channel| judge.plan.signals.iter().enumerate().find(|(_, signal)| signal.binding.channel == channel);
     let (soc, soh) = (configured(Channel::ReportedSoc), configured(Channel::ReportedSoh));
     let says = |signal: Option<(usize, &SignalPlan)>, soc: bool| {
         signal.is_some_and(|(_, signal)| {
@@ -173,7 +172,9 @@ pub(super) fn check_swapped(judge: &mut Judge<'_>) {
         ChargeSlope::of(judge.observed.usage.moments(), place)
     };
     let is_by_charge = match (slope(Channel::ReportedSoc), slope(Channel::ReportedSoh)) {
-        (Some(soc), Some(soh)) => soc.range < 0.01 && soh.range >= LEAST_RANGE && soh.r2 >= 0.5 && soh.capacity_ah > 0.0,
+        (Some(soc), Some(soh)) => {
+            soc.range < 0.01 && soh.range >= LEAST_RANGE && soh.r2 >= 0.5 && soh.capacity_ah > 0.0
+        }
         _ => false,
     };
     let (Some((_, first)), is_by_name) = (soc.or(soh), says(soc, false) || says(soh, true)) else { return };
@@ -218,7 +219,9 @@ pub(super) fn check_voltage(judge: &mut Judge<'_>) {
     let cell_v = median(points.iter().map(|point| point.0.voltage_v)).unwrap_or(f64::NAN);
     let by_model = model.soc_of_ocv(cell_v, judge.temperature_c()).clamp(0.0, 1.0);
     let of_total = match judge.plan.pack.is_total {
-        true => format!(" ({} V of {} cells)", number(cell_v * f64::from(judge.plan.pack.cells)), judge.plan.pack.cells),
+        true => {
+            format!(" ({} V of {} cells)", number(cell_v * f64::from(judge.plan.pack.cells)), judge.plan.pack.cells)
+        }
         false => String::new(),
     };
     let seen = format!(

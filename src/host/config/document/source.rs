@@ -187,7 +187,8 @@ pub(crate) fn meant_file(config: &Path, named: &str) -> String {
     let files: Vec<(String, PathBuf)> = files.filter_map(|file| Some((name_of(&file)?, file))).collect();
     let wanted = name_of(&path).unwrap_or_default();
     let Some(name) = nearest(&wanted, files.iter().map(|(name, _)| name.as_str())) else { return String::new() };
-    let file = files.iter().find(|(other, _)| other == name).map(|(_, file)| file.strip_prefix(&folder).unwrap_or(file));
+    let file =
+        files.iter().find(|(other, _)| other == name).map(|(_, file)| file.strip_prefix(&folder).unwrap_or(file));
     file.map_or_else(String::new, |file| format!(", did you mean {}", file.display()))
 }
 
