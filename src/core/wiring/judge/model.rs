@@ -22,7 +22,7 @@ pub(super) fn check(judge: &mut Judge<'_>, drift: Option<Drift>) {
 /// Compares the resting voltage and the voltage drift with the model's curve.
 fn open_circuit(judge: &mut Judge<'_>, model: &CellModel, drift: Option<Drift>) {
     let temperature_c = judge.temperature_c();
-    let [empty_v, full_v] = [0.0, 1.0].map(|soc| model.ocv_v(&model.grid_position(soc, temperature_c)));
+    let [empty_v, full_v] = [0.0, 1.0].map(|soc| ocv_v(model, soc, temperature_c));
     let mut rests = judge.observed.fast_response().rests.iter().map(|rest| rest.end_v);
     // In a log without rests, the voltage under load, corrected for the current, shows the curve.
     let loaded = ocv::estimates(judge);
@@ -32,7 +32,11 @@ fn open_circuit(judge: &mut Judge<'_>, model: &CellModel, drift: Option<Drift>) 
         _ => (loaded_v.unwrap_or(f64::NAN), loaded_v.unwrap_or(f64::NAN)),
     };
     let per_cent = |voltage_v: f64| percent(model.soc_of_ocv(voltage_v, temperature_c).clamp(0.0, 1.0));
-    let is_flat = |drift: &Drift| drift.least_v > 0.03 && drift.sigma > 0.0 && (-0.05..0.15).contains(&drift.ratio);
+    // A flat curve does not show the state of charge, so it gives no expectation.
+    let is_model_flat = ocv_v(model, 0.8, temperature_c) - ocv_v(model, 0.3, temperature_c) < FLAT_V;
+    let is_flat = |drift: &Drift| {
+        !is_model_flat && drift.expected_v > 0.03 && drift.sigma > 0.0 && (-0.05..0.15).contains(&drift.ratio)
+    };
     let pack = &judge.plan.pack;
     let cell_v = judge.cell_voltage();
     if highest > full_v + 0.06 || lowest < empty_v - 0.06 {
@@ -71,11 +75,18 @@ fn open_circuit(judge: &mut Judge<'_>, model: &CellModel, drift: Option<Drift>) 
     }
 }
 
+/// Largest rise of the voltage from 30 to 80 % of a flat curve (V): LFP has 0.06 V, other chemistries 0.3 V or more.
+const FLAT_V: f64 = 0.15;
+
+fn ocv_v(model: &CellModel, soc: f64, temperature_c: f64) -> f64 {
+    model.ocv_v(&model.grid_position(soc, temperature_c))
+}
+
 /// Voltages of an iron-phosphate cell at rest, except near empty and full (V).
 const LFP_V: std::ops::Range<f64> = 3.18..3.38;
 
 fn is_like_iron_phosphate(judge: &Judge<'_>, model: &CellModel, cell_v: f64) -> bool {
-    model.ocv_v(&model.grid_position(0.5, judge.temperature_c())) > 3.5 && LFP_V.contains(&cell_v)
+    ocv_v(model, 0.5, judge.temperature_c()) > 3.5 && LFP_V.contains(&cell_v)
 }
 
 /// The key of the chemistry, and the chemistry that a resting voltage suggests.

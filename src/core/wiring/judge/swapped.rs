@@ -13,7 +13,6 @@ use crate::wiring::report::{Severity, Topic};
 const PLAUSIBLE_C: (f64, f64) = (-45.0, 95.0);
 
 pub(super) fn check(judge: &mut Judge<'_>) {
-    other_parts(judge);
     if !by_unit(judge) && !pack_voltage_as_current(judge) {
         by_values(judge);
     }
@@ -23,6 +22,7 @@ pub(super) fn check(judge: &mut Judge<'_>) {
 pub(super) fn check_odd(judge: &mut Judge<'_>) {
     odd_cells(judge);
     odd_sensors(judge);
+    other_parts(judge);
 }
 
 /// Finds temperatures whose names say that they belong to the controller's electronics or to another device. If the
@@ -42,7 +42,7 @@ fn other_parts(judge: &mut Judge<'_>) {
     let severity = if better.is_some() { Severity::Warning } else { Severity::Note };
     let list: Vec<Channel> = wrong.iter().map(|signal| signal.binding.channel).collect();
     let title = format!("{}: not a temperature of the cells, according to its name", channels(&list));
-    let finding = find(judge, severity, Topic::Swapped, title)
+    let finding = find(judge, severity, Topic::Cell, title)
         .seen(format!("{} is configured as a temperature of the cells", first.name))
         .why("electronics (MOSFETs, boards, resistors) and other devices are warmer or colder than the cells");
     if let Some(better) = better {

@@ -4,11 +4,14 @@
 use super::context::{Judge, SignalSeries, find, warning};
 use super::text::number;
 use crate::quantity::Channel;
+use crate::wiring::evidence::HIDDEN_SOC;
 use crate::wiring::plan::Kind;
 use crate::wiring::report::{Severity, Topic};
 
 /// Sensor errors explain a deviation of the sum of the cell voltages from the pack's voltage up to this fraction.
 const SUM_TOLERANCE: f64 = 0.03;
+/// Largest difference between two states of charge that agree.
+const AGREEMENT: f64 = 0.03;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
     let is_clear = !judge.has(&[Topic::Unit, Topic::Layout, Topic::Swapped, Topic::Silent, Topic::CellCount]);
@@ -70,15 +73,18 @@ fn states_of_charge(judge: &mut Judge<'_>) {
     let Some((own, own_soc)) = configured.find_map(|(signal, series)| Some((signal, series.values.median()?))) else {
         return;
     };
-    for ((signal, _), soc) in unconfigured(judge, Channel::ReportedSoc) {
+    let others = unconfigured(judge, Channel::ReportedSoc);
+    let is_confirmed = others.iter().any(|(_, soc)| (soc - own_soc).abs() <= AGREEMENT);
+    for ((signal, _), soc) in others {
         let difference = (soc - own_soc).abs();
         let [own_percent, percent] = [own_soc, soc].map(|soc| number((1000.0 * soc).round() / 10.0));
-        if difference <= 0.03 {
+        if difference <= AGREEMENT {
             judge.fine(format!("{} and {} agree: {own_percent} and {percent} %", own.name, signal.name));
             continue;
         }
         // A smaller difference can be explained: a dashboard's state of charge hides a reserve at both ends.
-        let severity = if difference > 0.1 { Severity::Warning } else { Severity::Note };
+        let is_odd = difference > HIDDEN_SOC && !is_confirmed;
+        let severity = if is_odd { Severity::Warning } else { Severity::Note };
         find(judge, severity, Topic::ReportedSoc, format!("{} and {} disagree", own.name, signal.name))
             .seen(format!("the configured state of charge is {own_percent} %, the other is {percent} %"))
             .why("a dashboard may hide a reserve at both ends; otherwise, one of the two is not the state of charge")
