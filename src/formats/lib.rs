@@ -7,8 +7,14 @@
 //!
 //! candump logs (`candump -L`), journals and CSV tables are read by `packwatch_host::io::log`.
 
+mod blf;
+mod byte_stream;
+mod channel_list;
 mod format;
 mod item;
+mod mf4;
+mod pcap;
+mod raw_frame;
 
 pub use format::{Format, Source};
 pub use item::{Channel, Item, Position};
