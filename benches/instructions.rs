@@ -119,6 +119,7 @@ fn parse_and_decode() -> Work {
 fn each_frame(log: &NamedTempFile, mut take: impl FnMut(BusIndex, &Frame)) {
     let options = LogOptions {
         interfaces: vec!["can0".to_owned()],
+        channels: Vec::new(),
         strict: true,
         csv: CsvOptions::default(),
         encode_row: Box::new(|_, _| 0),

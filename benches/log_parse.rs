@@ -70,6 +70,7 @@ fn batches(bencher: Bencher, mut each: impl FnMut(&[Record])) {
     bencher.counter(ItemsCount::new(LINES)).bench_local(|| {
         let options = LogOptions {
             interfaces: vec!["can0".to_owned()],
+            channels: Vec::new(),
             strict: true,
             csv: CsvOptions::default(),
             encode_row: Box::new(|_, _| 0),

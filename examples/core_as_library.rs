@@ -33,6 +33,7 @@ pub(crate) fn monitor_log(config: &Path, log: &Path, out: &mut impl Write) -> Re
     let config = config::load(config)?;
     let options = LogOptions {
         interfaces: config.interface_names(),
+        channels: Vec::new(),
         strict: true,
         csv: CsvOptions::default(),
         encode_row: Box::new(|_, _| 0),

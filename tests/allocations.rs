@@ -80,6 +80,7 @@ fn pack_log(folder: &Path) -> PathBuf {
 fn source(log: &Path) -> LogSource {
     let options = LogOptions {
         interfaces: vec!["can0".to_owned()],
+        channels: Vec::new(),
         strict: true,
         csv: CsvOptions::default(),
         encode_row: Box::new(|_, _| 0),

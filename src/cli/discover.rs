@@ -81,7 +81,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         let settings = ObdbSettings { source, year: args.year, name: None };
         discoverer.add_obdb(&read(file)?, &settings).map_err(failure)?;
     }
-    let interfaces = feed(args, &mut discoverer)?;
+    let interfaces = feed(std::slice::from_ref(&args.log), &mut discoverer)?;
     let discovery = discoverer.finish(&interfaces);
     if discovery.frames == 0 {
         return Err(Failure::new(format!(
@@ -152,14 +152,14 @@ fn write_whole(file: &Path, text: &str) -> Result<(), Failure> {
     written.map_err(failure)
 }
 
-/// Passes every frame to the discoverer; returns the names of the interfaces.
-fn feed(args: &Args, discoverer: &mut Discoverer) -> Result<Vec<String>, Failure> {
+/// Passes every frame of the logs to the discoverer; returns the names of the interfaces.
+fn feed(logs: &[PathBuf], discoverer: &mut Discoverer) -> Result<Vec<String>, Failure> {
     let csv = CsvOptions { columns: Vec::new(), charge_positive: false, start_times: None, cells: 1, pack_total: true };
     let encode_row = Box::new(|_: &[_], _: &mut Vec<_>| 0);
-    let options = LogOptions { interfaces: Vec::new(), strict: false, csv, encode_row };
-    let mut source = LogSource::new([args.log.clone()], options);
+    let options = LogOptions { interfaces: Vec::new(), channels: Vec::new(), strict: false, csv, encode_row };
+    let mut source = LogSource::new(logs.to_vec(), options);
     source.adopt_foreign();
-    let bar = Bar::new(std::slice::from_ref(&args.log));
+    let bar = Bar::new(logs);
     let mut records = 0_u64;
     while let Some(record) = source.next_record().map_err(failure)? {
         if let RecordKind::Frame { bus, frame } = &record.kind {

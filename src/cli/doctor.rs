@@ -9,14 +9,13 @@ mod page;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use super::common::logs::{CsvSign, column};
+use super::common::logs::{CsvSign, channel, column};
 use super::common::numbers::above_0_to;
 use super::common::output::{failure, print_json, unless_closed};
 use super::common::progress::{Bar, progress_bar};
 use packwatch_host::failure::{EXIT_CONFIG, Failure};
 
-use crate::io::csv_log::CsvOptions;
-use crate::replay::ReplayProgress;
+use crate::replay::{LogReading, ReplayProgress};
 use crate::wiring::{Severity, Topic, WiringFinding, WiringReport};
 use crate::wiring_check::{self, Interrupt, Survey};
 
@@ -40,6 +39,9 @@ pub(crate) struct Args {
     /// Print the report as JSON
     #[arg(long)]
     json: bool,
+    /// Read a channel or interface of a log as this interface, as for `replay`
+    #[arg(long = "channel", value_name = "CHANNEL=INTERFACE", value_parser = channel)]
+    channels: Vec<(String, String)>,
     /// Name a CSV column, as for `replay`
     #[arg(long = "column", value_name = "ROLE=NAME", value_parser = column)]
     columns: Vec<(String, String)>,
@@ -103,15 +105,15 @@ fn source_name(args: &Args, survey: &Survey) -> String {
 }
 
 fn replay(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<WiringReport, Failure> {
-    let csv = CsvOptions {
+    let reading = LogReading {
+        strict: false,
+        channels: args.channels.clone(),
         columns: args.columns.clone(),
         charge_positive: args.csv_sign == CsvSign::Charge,
         start_times: args.start_times.clone(),
-        cells: if survey.plan.pack.is_total { 1 } else { survey.plan.pack.cells },
-        pack_total: survey.plan.pack.is_total,
     };
     let bar = Bar::new(&args.logs);
-    let result = wiring_check::replay(survey, &args.logs, csv, args.seconds, interrupt, &mut |progress| {
+    let result = wiring_check::replay(survey, &args.logs, &reading, args.seconds, interrupt, &mut |progress| {
         let times_real_time = progress.seconds / bar.seconds();
         bar.show(ReplayProgress { bytes: progress.bytes, frames: progress.frames, times_real_time });
     });

@@ -65,7 +65,7 @@ fn replay_all(
         snapshot_file::write(path, &snapshot)?;
     }
     print_summary(args, &summary)?;
-    Ok(())
+    summary.failure.map_or(Ok(()), |failure| Err(ReplayError::Unused(failure)))
 }
 
 fn play(args: &Args, source: &mut LogSource, settings: &ReplaySettings, interface: &str) -> Result<(), ReplayError> {

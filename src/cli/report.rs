@@ -14,7 +14,7 @@ use packwatch_host::failure::Failure;
 use crate::config::{self, Config, ConfigFiles, VehicleIdentity};
 use crate::io::result_file::check_place;
 use crate::lab;
-use crate::lab::report::{self, Data, Origin, PageContext};
+use crate::lab::report::{self, Data, Origin, PageContext, Verdict};
 use crate::monitor::Snapshot;
 use crate::replay::{OutputWatch, ReplaySummary, Sinks};
 use crate::store::HistoryReader;
@@ -26,34 +26,39 @@ use crate::store::HistoryReader;
 pub(crate) struct Args {
     /// Configuration file. Optional with --state; then it adds limits and the rated capacity
     #[arg(short, long, value_name = "FILE", required_unless_present = "state")]
-    config: Option<PathBuf>,
+    pub(crate) config: Option<PathBuf>,
     /// Journals, candump logs or CSV files to replay, also .gz or .zst, read in this order as one record; - reads standard input
     #[arg(value_name = "LOG", required_unless_present = "state", conflicts_with = "state")]
-    logs: Vec<PathBuf>,
+    pub(crate) logs: Vec<PathBuf>,
     /// Folder of state and history to report on instead of logs; a running daemon may use it
     #[arg(long, value_name = "DIR")]
-    state: Option<PathBuf>,
+    pub(crate) state: Option<PathBuf>,
     /// HTML file to write; - writes standard output
     #[arg(short, long, value_name = "FILE.html", default_value = "report.html")]
-    out: PathBuf,
+    pub(crate) out: PathBuf,
     /// Also write every plot as SVG into this folder
     #[arg(long, value_name = "DIR")]
-    plots: Option<PathBuf>,
+    pub(crate) plots: Option<PathBuf>,
     /// True values to show next to the estimates: CSV (.gz, .zst) with capacity_ah or capacity_ah_source (Ah), soc
     /// (fraction), or both, and the time in the clock of the data: time_s (s), or start or date (such as
     /// 2008-04-02T13:08:17, UTC). If the file has a column cell (such as the truth of `simulate`), its capacities are
     /// charges from full to empty; otherwise they were measured under load
     #[arg(long, value_name = "TABLE.csv")]
-    reference: Option<PathBuf>,
+    pub(crate) reference: Option<PathBuf>,
     /// Title of the page [default: vehicle, else name of the log or folder]
     #[arg(long)]
-    title: Option<String>,
+    pub(crate) title: Option<String>,
     #[command(flatten)]
-    input: InputArgs,
+    pub(crate) input: InputArgs,
 }
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    write(args).map(drop)
+}
+
+/// Writes the page, and the plots if they are wanted. Returns what the page says first.
+pub(crate) fn write(args: &Args) -> Result<Verdict, Failure> {
     args.check()?;
     let config = args.config.as_deref().map(config::load).transpose()?;
     let config_text = args.config.as_deref().map(config_text).transpose();
@@ -79,9 +84,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         provenance,
     };
     unless_closed(lab::write_file(&args.out, report::page(&data, &context).as_bytes()))?;
-    let Some(folder) = &args.plots else { return Ok(()) };
-    create_folder(folder)?;
-    report::write_plots(folder, &data, &context).map(drop).map_err(failure)
+    if let Some(folder) = &args.plots {
+        create_folder(folder)?;
+        report::write_plots(folder, &data, &context).map_err(failure)?;
+    }
+    Ok(Verdict::of(&data, &context))
 }
 
 /// Text of the configuration, merged with its drop-ins.

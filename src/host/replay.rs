@@ -11,6 +11,7 @@ use std::sync::atomic::Ordering;
 mod cells;
 mod clock;
 mod driver;
+mod failure;
 mod in_order;
 mod intake;
 mod reading;
@@ -28,6 +29,7 @@ use crate::monitor::{
 };
 use crate::quantity::catalogue::RecordedValues;
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
+use crate::sample::ReadingCounts;
 
 pub use cells::CellSummary;
 pub use clock::LogTime;
@@ -112,6 +114,9 @@ pub enum ReplayError {
     /// State or history cannot be written.
     #[error("{0}")]
     Store(String),
+    /// The log was read, but the result says nothing about the battery.
+    #[error("{0}")]
+    Unused(String),
     /// The log ends before the requested time of the snapshot.
     #[error("no snapshot taken: the log ends at {end_s} s, before the requested time")]
     SnapshotNotReached {
@@ -220,9 +225,23 @@ struct Replay {
     /// Whether the summary already notes a reload of the recorded run.
     reloaded: bool,
     learned: BTreeMap<CellIndex, RecordedValues>,
-    /// Number of voltage readings that the estimators handled before this replay: 0 without a restored state. With a
-    /// restored state, `None` until the first input has been handled.
-    steps_before: Option<u64>,
+    /// Counts before this replay: 0 without a restored state. With a restored state, `None` until the first input has
+    /// been handled.
+    before: Option<CountsBefore>,
+}
+
+/// Counts of a restored state.
+#[derive(Debug, Clone, Default)]
+struct CountsBefore {
+    /// Voltage readings that reached an estimator.
+    steps: u64,
+    readings: ReadingCounts,
+}
+
+impl CountsBefore {
+    fn of(monitor: &Monitor) -> Self {
+        Self { steps: cell_steps(monitor), readings: monitor.reading_counts() }
+    }
 }
 
 impl Replay {
@@ -246,7 +265,7 @@ impl Replay {
             summary: ReplaySummary::default(),
             reloaded: false,
             learned: BTreeMap::new(),
-            steps_before: Some(0),
+            before: Some(CountsBefore::default()),
         })
     }
 
@@ -299,7 +318,7 @@ impl Replay {
         let recorded = if let RecordKind::Restore { away } = record.kind { Some(away) } else { None };
         match (self.settings.restore.take(), recorded) {
             (Some(snapshot), recorded) => {
-                self.steps_before = None;
+                self.before = None;
                 self.monitor.restore(snapshot, self.settings.away.or(recorded).unwrap_or_default())?;
             }
             (None, Some(_)) => self
@@ -328,7 +347,7 @@ impl Replay {
         self.pace.wait(record.time);
         self.summary.ticks += u64::from(matches!(record.kind, RecordKind::Tick));
         self.monitor.handle(record, &mut self.out);
-        self.steps_before.get_or_insert_with(|| cell_steps(&self.monitor));
+        self.before.get_or_insert_with(|| CountsBefore::of(&self.monitor));
         if let Some(store) = &mut self.settings.store {
             store.record(&self.out.events, &self.monitor, record.time).map_err(ReplayError::Store)?;
         }
@@ -405,7 +424,8 @@ impl Replay {
         summary.awake_s = span.awake_s();
         summary.wall_s = span.started.elapsed().as_secs_f64();
         summary.frames_per_s = counts.frames as f64 / summary.wall_s.max(1e-9);
-        let steps = cell_steps(&self.monitor).saturating_sub(self.steps_before.unwrap_or(0));
+        let before = self.before.unwrap_or_default();
+        let steps = cell_steps(&self.monitor).saturating_sub(before.steps);
         summary.cell_steps_per_s = steps as f64 / summary.wall_s.max(1e-9);
         summary.times_real_time = span.times_real_time();
         summary.peak_memory_kib = peak_memory_kib();
@@ -422,33 +442,10 @@ impl Replay {
                 MERGE_TOLERANCE_NS / 1_000_000_000
             ));
         }
-        if counts.frames == 0 && !counts.foreign.is_empty() {
-            let names: Vec<_> = counts.foreign.keys().map(String::as_str).collect();
-            let configured = self.settings.interfaces.join(", ");
-            summary.notes.push(format!(
-                "no frames used: the log has interface {}, configured is {configured}",
-                names.join(", ")
-            ));
-        }
-        if let Some(note) = unused(counts, &summary, steps) {
-            summary.notes.push(note);
-        }
+        let readings = self.monitor.reading_counts().since(&before.readings);
+        summary.failure = failure::failure(&summary, &span, steps, &readings, &self.settings.interfaces);
         Ok((summary, self.snapshot))
     }
-}
-
-/// Explains why a replay gave no estimates; `None` = the replay gave estimates, or the reason is already noted.
-fn unused(counts: &LogCounts, summary: &ReplaySummary, steps: u64) -> Option<String> {
-    let found = match (counts.frames, counts.lines) {
-        (0, _) if !counts.foreign.is_empty() => return None,
-        (0, 0) => "no frames: the log is empty",
-        (0, _) if summary.ticks > 0 => "no frames: the log contains only other records",
-        (0, _) => "no frames: no line of the log has the format of a candump log, a journal or a CSV log",
-        _ if steps > 0 => return None,
-        _ if summary.ticks == 0 && summary.skipped_records > 0 => "no frames used: --from and --until exclude all",
-        _ => "no estimates: no frame has a usable voltage; `packwatch doctor` with this log finds the reason",
-    };
-    Some(found.to_owned())
 }
 
 /// Voltage readings that reached an estimator since the monitor's first start.

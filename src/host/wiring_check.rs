@@ -15,12 +15,12 @@ use nix::errno::Errno;
 
 use crate::can::encode::{InputEncoder, InputProtector};
 use crate::io::clock::{MappedClock, Reading};
-use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogCounts, LogError, LogOptions, LogSource};
 use crate::io::socket::{PassiveSocket, explained};
 use crate::io::stop::Stop;
 use crate::monitor::{BusEvent, Monitor, Outputs, Record, RecordKind};
 use crate::quantity::BusIndex;
+use crate::replay::LogReading;
 use crate::wiring::{WiringObserver, WiringReport};
 
 pub use survey::{Survey, survey};
@@ -127,19 +127,21 @@ impl Session {
 pub fn replay(
     survey: &Survey,
     logs: &[PathBuf],
-    csv: CsvOptions,
+    reading: &LogReading,
     limit_s: Option<f64>,
     interrupt: &Interrupt,
     each: &mut dyn FnMut(CheckProgress),
 ) -> Result<(WiringReport, LogCounts), LogError> {
+    let (cells, is_total) = (survey.plan.pack.cells, survey.plan.pack.is_total);
     let encoder = InputEncoder::new(&survey.input).with_answers(&survey.answers);
     let mut protector = InputProtector::new(&survey.plan.guards);
     let mut source = LogSource::new(
         logs.to_vec(),
         LogOptions {
             interfaces: survey.plan.interfaces.iter().map(|interface| interface.name.clone()).collect(),
-            strict: false,
-            csv,
+            channels: reading.channels.clone(),
+            strict: reading.strict,
+            csv: reading.csv_options(if is_total { 1 } else { cells }, is_total),
             encode_row: Box::new(move |values, frames| {
                 let uncarried = encoder.encode(values, frames);
                 protector.protect(frames);

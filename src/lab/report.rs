@@ -21,10 +21,12 @@ mod raised;
 mod reference;
 mod series;
 mod summary;
+mod text;
 mod trace;
 
 pub use context::PageContext;
 pub use data::{Data, DataSource, Origin};
 pub use html::page;
 pub use pictures::write_plots;
+pub use text::Verdict;
 pub use reference::{Reference, read as read_reference};

@@ -87,7 +87,7 @@ pub(crate) fn replay(
     }
     let wanted = Wanted::new(estimates_period_s)?;
     let columns = columns.unwrap_or_default().into_iter().collect();
-    let reading = LogReading { strict, columns, charge_positive, start_times };
+    let reading = LogReading { strict, channels: Vec::new(), columns, charge_positive, start_times };
     let logs = logs.0;
     if logs.is_empty() {
         return Err(data("no logs, must be one or more"));

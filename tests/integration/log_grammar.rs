@@ -177,6 +177,7 @@ proptest! {
 fn options(strict: bool) -> LogOptions {
     LogOptions {
         interfaces: vec!["can0".into(), "can1".into()],
+        channels: Vec::new(),
         strict,
         csv: CsvOptions { cells: 1, ..CsvOptions::default() },
         encode_row: Box::new(|values, frames| {

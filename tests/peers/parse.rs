@@ -38,6 +38,7 @@ fn every_signal(dbc: &str) -> InputMap {
 fn parse_and_decode(log: &Path, map: &InputMap, most: u64) -> (u64, f64) {
     let options = LogOptions {
         interfaces: vec!["can0".to_owned()],
+        channels: Vec::new(),
         strict: false,
         csv: CsvOptions::default(),
         encode_row: Box::new(|_, _| 0),

@@ -45,6 +45,7 @@ fn options(strict: bool) -> LogOptions {
     let columns = columns.map(|(role, column)| (role.to_owned(), column.to_owned())).to_vec();
     LogOptions {
         interfaces: vec!["can0".to_owned(), "can1".to_owned()],
+        channels: Vec::new(),
         strict,
         csv: CsvOptions { columns, cells: 2, ..CsvOptions::default() },
         encode_row: Box::new(|values, _| values.len()),

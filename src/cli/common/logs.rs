@@ -25,6 +25,10 @@ pub(crate) struct InputArgs {
     /// Count a gap longer than this as sleep of the recorder: during the gap, nothing is computed and no frame is made
     #[arg(long, value_name = "SECONDS", default_value_t = SLEEP_GAP_S, value_parser = positive)]
     pub(crate) sleep_gap: f64,
+    /// Read a channel or interface of a log as this interface, for example 2=can0. CHANNEL is written as in the log. By
+    /// default, numbered channels are the configured interfaces in their order
+    #[arg(long = "channel", value_name = "CHANNEL=INTERFACE", value_parser = channel)]
+    pub(crate) channels: Vec<(String, String)>,
     /// Name a CSV column, for example current=Current(A). ROLE is time, current, voltage, temperature or section. If
     /// each cell or sensor has its own column (U1, U2, ..., counted from 1), write the letter n in braces in place of
     /// the number in NAME, and at the end of ROLE. An empty NAME means that the column does not exist
@@ -43,11 +47,21 @@ pub(crate) struct InputArgs {
 pub(crate) fn log_options(args: &InputArgs, config: &Config) -> LogOptions {
     let reading = LogReading {
         strict: args.strict,
+        channels: args.channels.clone(),
         columns: args.columns.clone(),
         charge_positive: args.csv_sign == CsvSign::Charge,
         start_times: args.start_times.clone(),
     };
     reading.options(config)
+}
+
+pub(crate) fn channel(text: &str) -> Result<(String, String), String> {
+    match text.split_once('=') {
+        Some((channel, interface)) if !channel.is_empty() && !interface.is_empty() => {
+            Ok((channel.to_owned(), interface.to_owned()))
+        }
+        _ => Err("must be CHANNEL=INTERFACE, for example 2=can0".to_owned()),
+    }
 }
 
 pub(crate) fn column(text: &str) -> Result<(String, String), String> {

@@ -31,5 +31,8 @@ pub(crate) fn replay(logs: &[PathBuf], input: &InputArgs, config: &Config, sinks
     let result = replay::run(&mut source, monitor, sinks, settings, &mut |progress| bar.show(progress));
     bar.clear();
     let (summary, snapshot) = result.map_err(failure)?;
+    if let Some(reason) = &summary.failure {
+        return Err(Failure::new(reason));
+    }
     Ok(Replayed { source, summary, snapshot })
 }

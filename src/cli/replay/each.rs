@@ -44,7 +44,8 @@ pub(super) fn run(args: &Args, config: &Config) -> Result<(), Failure> {
         |log, result| {
             bar.finished();
             written = bar.bar.suspend(|| print(args, log, &result));
-            failed.extend(result.err().map(|error| named(log, &error)));
+            let failure = result.map_or_else(Some, |summary| summary.failure.map(ReplayError::Unused));
+            failed.extend(failure.map(|error| named(log, &error)));
             written.is_ok()
         },
     );

@@ -45,7 +45,8 @@ pub(super) fn played(sent: u64, interface: &str, counts: &LogCounts, as_json: bo
 }
 
 fn log_rows(log: &LogCounts) -> Vec<(&'static str, String)> {
-    let mut rows = vec![("lines", log.lines.to_string()), ("frames", log.frames.to_string())];
+    let mut rows: Vec<_> = log.inputs.iter().map(|input| ("input", input.clone())).collect();
+    rows.extend([("lines", log.lines.to_string()), ("frames", log.frames.to_string())]);
     rows.push(("bad lines", log.bad_lines.to_string()));
     rows.extend(log.first_bad_line.clone().map(|line| ("first bad line", line)));
     if let Some(first) = &log.first_time_backwards {
@@ -62,6 +63,7 @@ fn log_rows(log: &LogCounts) -> Vec<(&'static str, String)> {
         ("segments missing at the beginning", log.deleted_segments),
     ];
     rows.extend(counted.into_iter().filter(|&(_, count)| count > 0).map(|(name, count)| (name, count.to_string())));
+    rows.extend(log.first_ignored_line.clone().map(|line| ("first ignored line", line)));
     if !log.foreign.is_empty() {
         let each: Vec<_> = log.foreign.iter().map(|(name, count)| format!("{name} {count}")).collect();
         rows.push(("other interfaces", each.join(", ")));

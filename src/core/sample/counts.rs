@@ -32,6 +32,29 @@ pub struct ReadingCounts {
 }
 
 impl ReadingCounts {
+    /// Number of readings that were not used although their sender stated a value.
+    pub fn refused(&self) -> u64 {
+        self.refusals().iter().map(|(count, _)| count).sum()
+    }
+
+    /// The refused readings by reason, for example "12 out of range, 3 stuck".
+    pub fn refused_in_words(&self) -> String {
+        let refusals = self.refusals().into_iter().filter(|(count, _)| *count > 0);
+        let words: Vec<_> = refusals.map(|(count, reason)| format!("{count} {reason}")).collect();
+        if words.is_empty() { "none".to_owned() } else { words.join(", ") }
+    }
+
+    fn refusals(&self) -> [(u64, &'static str); 6] {
+        [
+            (self.out_of_range, "out of range"),
+            (self.short_frame, "in short frames"),
+            (self.end_to_end, "failed the end-to-end check"),
+            (self.not_finite, "not a finite number"),
+            (self.rate_too_high, "changed too fast"),
+            (self.stuck, "stuck"),
+        ]
+    }
+
     /// Difference from the earlier counts `before`.
     pub fn since(&self, before: &Self) -> Self {
         let of = |count: fn(&Self) -> u64| count(self).saturating_sub(count(before));

@@ -155,6 +155,17 @@ impl Lines {
         }
     }
 
+    /// Returns the first bytes and does not consume them: at least `len` (at most 256 KiB) bytes, or the whole source if
+    /// it is shorter. Must be called before any line is consumed.
+    ///
+    /// # Errors
+    /// Returns the errors of the source.
+    #[cfg(feature = "formats")]
+    pub(super) fn peek_bytes(&mut self, len: usize) -> io::Result<&[u8]> {
+        while self.unread().len() < len.min(self.buffer.len()) && self.fill()? {}
+        Ok(self.unread())
+    }
+
     /// The unread bytes and the rest of the source as one reader.
     pub fn into_reader(self) -> impl Read {
         Cursor::new(self.buffer[self.start..self.end].to_vec()).chain(self.source)

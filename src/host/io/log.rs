@@ -1,16 +1,20 @@
-//! Reads logs of any format as one stream of core inputs: journals, candump logs and CSV, uncompressed or as gzip or
-//! zstd.
+//! Reads logs of any format as one stream of core inputs: journals, candump logs, logs of other tools and CSV,
+//! uncompressed or as gzip or zstd.
 //!
-//! The first line decides the format; for CSV, the file name decides too. Several logs are read one after another on
+//! The first bytes decide the format; for CSV, the file name decides too. Several logs are read one after another on
 //! one clock. A log, or a CSV section without a start time, may begin before the latest record read so far. In that
 //! case, the log or section is moved to one second after this record, and an unknown gap is inserted before the log or
 //! section. [`LogCounts`] counts everything that does not become a record.
 
 use std::collections::{BTreeMap, VecDeque};
+#[cfg(feature = "formats")]
+use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 
+#[cfg(feature = "formats")]
+use packwatch_formats::{Channel as LogChannel, Item};
 use serde::Serialize;
 
 use super::candump::{Body, Line, LineError, LineHead, LineParser, ParsedLine};
@@ -18,6 +22,8 @@ use super::csv_log::{CsvLog, CsvOptions, RowTime};
 use super::journal;
 use super::lines::{self, Lines, RawLine};
 use super::segments;
+#[cfg(feature = "formats")]
+use super::tool_log::ToolLog;
 use crate::can::Frame;
 use crate::can::decode::Channel;
 use crate::monitor::{BusEvent, Record, RecordKind};
@@ -42,6 +48,8 @@ pub type RowEncoder = Box<dyn FnMut(&[(Channel, Option<f64>)], &mut Vec<(BusInde
 pub struct LogOptions {
     /// Configured interface names, in the order of their numbers.
     pub interfaces: Vec<String>,
+    /// Maps a channel or interface, as written in the log, to an interface.
+    pub channels: Vec<(String, String)>,
     /// Whether reading ends at the first bad line.
     pub strict: bool,
     /// How CSV logs are read.
@@ -53,16 +61,19 @@ pub struct LogOptions {
 /// Counts of lines, of frames, and of everything that did not become a record.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct LogCounts {
-    /// Number of lines and CSV rows read, including bad lines.
+    /// Number of lines, CSV rows and parts of binary logs read, including bad ones.
     pub lines: u64,
     /// Frames returned.
     pub frames: u64,
-    /// Lines that violate their grammar, and files with a damaged end.
+    /// Lines and parts that violate their format, and files with a damaged end.
     pub bad_lines: u64,
-    /// The first bad line: file, line, found and allowed.
+    /// The first bad line or part: file, place, found and allowed.
     pub first_bad_line: Option<String>,
     /// Lines without a record, such as headers, comments and blank lines.
     pub ignored_lines: u64,
+    /// The first of them that is not blank or a comment: file, line and text.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub first_ignored_line: Option<String>,
     /// CAN XL frames, which are not supported.
     pub xl_frames: u64,
     /// Error frames.
@@ -79,6 +90,9 @@ pub struct LogCounts {
     pub unknown_gaps: u64,
     /// CSV values that no input frame can carry (out of the signal's range, or no such signal).
     pub uncarried_values: u64,
+    /// How each log of another tool was read: file, format, and the interface of each channel.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub inputs: Vec<String>,
     /// Segments of a journal that are missing before the first segment read (deleted or not given).
     pub deleted_segments: u64,
 }
@@ -101,8 +115,13 @@ struct OpenLog {
 }
 
 enum LogForm {
-    Text { lines: Lines, journal: bool },
+    Text {
+        lines: Lines,
+        journal: bool,
+    },
     Csv(Box<CsvLog>),
+    #[cfg(feature = "formats")]
+    Tool(Box<ToolLog>),
 }
 
 /// State shared by the parsers: counts, names, clock.
@@ -110,6 +129,7 @@ struct ReadState {
     counts: LogCounts,
     strict: bool,
     interfaces: Vec<String>,
+    channels: Vec<(String, String)>,
     /// Parser that knows the interfaces.
     parser: LineParser,
     /// Whether unconfigured interfaces also get a number, so that their records are returned.
@@ -139,6 +159,7 @@ impl LogSource {
                 strict: options.strict,
                 parser: LineParser::new(&options.interfaces),
                 interfaces: options.interfaces,
+                channels: options.channels,
                 adopt: false,
                 shift_ns: 0,
                 latest: None,
@@ -210,7 +231,7 @@ impl LogSource {
             let more = match &mut open.form {
                 LogForm::Text { lines, journal } => match self.state.next_text(lines, *journal, &open.name)? {
                     Some(record) => {
-                        let (gap, time) = self.state.place(record.time, &open.name, lines.number());
+                        let (gap, time) = self.state.place(record.time, || format!("{}:{}", open.name, lines.number()));
                         let record = Record { time, ..record };
                         let Some(gap) = gap else { return Ok(Some(record)) };
                         self.queue.push_back(record);
@@ -219,7 +240,7 @@ impl LogSource {
                     None => false,
                 },
                 LogForm::Csv(log) => self.state.next_row(log)?.is_some_and(|(line, raw)| {
-                    let (gap, time) = self.state.place(raw, &open.name, line);
+                    let (gap, time) = self.state.place(raw, || format!("{}:{line}", open.name));
                     self.queue.extend(gap);
                     let uncarried = (self.encode_row)(&log.values, &mut self.frames);
                     self.state.counts.uncarried_values += uncarried as u64;
@@ -227,6 +248,18 @@ impl LogSource {
                     self.queue.extend(self.frames.drain(..).map(|(bus, frame)| Record::frame(time, bus, &frame)));
                     true
                 }),
+                #[cfg(feature = "formats")]
+                LogForm::Tool(log) => match self.state.next_item(log, &open.name)? {
+                    Some(record) => {
+                        let place = || format!("{}{}", open.name, log.position());
+                        let (gap, time) = self.state.place(record.time, place);
+                        let record = Record { time, ..record };
+                        let Some(gap) = gap else { return Ok(Some(record)) };
+                        self.queue.push_back(record);
+                        return Ok(Some(gap));
+                    }
+                    None => false,
+                },
             };
             if !more {
                 self.current = None;
@@ -251,6 +284,18 @@ impl LogSource {
                 return Ok(true);
             }
         }
+        #[cfg(feature = "formats")]
+        if let Some(open) = &mut self.current
+            && let LogForm::Tool(log) = &mut open.form
+            && self.queue.is_empty()
+            && !self.state.fresh
+        {
+            batch.carries_ticks = false;
+            batch.len = self.state.next_items(log, &open.name, &mut batch.slots)?;
+            if batch.len > 0 {
+                return Ok(true);
+            }
+        }
         let Some(record) = self.next_record()? else { return Ok(false) };
         (batch.slots[0], batch.len, batch.carries_ticks) = (record, 1, self.carries_ticks());
         Ok(true)
@@ -261,6 +306,13 @@ impl LogSource {
         let name = path.display().to_string();
         let failed = |e: std::io::Error| LogError::of_io(format!("{name}: cannot be read: {e}"), &e);
         let mut lines = Lines::new(lines::open_parts(paths, &self.read_bytes).map_err(failed)?);
+        (self.state.fresh, self.state.unknown) = (true, false);
+        #[cfg(feature = "formats")]
+        if let Some(format) = ToolLog::recognise(&mut lines).map_err(failed)? {
+            let log = ToolLog::open(format, lines, paths).map_err(failed)?;
+            self.state.counts.inputs.push(format!("{name}: {}", format.name()));
+            return Ok(OpenLog { name, form: LogForm::Tool(Box::new(log)) });
+        }
         let first = lines.peek().map_err(failed)?.trim_ascii_end();
         let journal = first == journal::HEADER.as_bytes();
         if first.starts_with(b"PACKWATCH-JOURNAL") && !journal {
@@ -268,7 +320,6 @@ impl LogSource {
             return Err(LogError::Data(format!("{name}:1: found {found:?}, must be {:?}", journal::HEADER)));
         }
         let csv = !journal && (named_csv(path) || (!first.starts_with(b"(") && first.contains(&b',')));
-        (self.state.fresh, self.state.unknown) = (true, false);
         let form = if csv {
             LogForm::Csv(Box::new(CsvLog::open(Box::new(lines.into_reader()), &name, &self.csv)?))
         } else {
@@ -320,7 +371,8 @@ impl ReadState {
             }
             count += 1;
             if time < latest {
-                self.note_backwards(time, latest, name, lines.number() + read_lines);
+                let line = lines.number() + read_lines;
+                self.note_backwards(time, latest, || format!("{name}:{line}"));
             } else {
                 latest = time;
             }
@@ -335,11 +387,11 @@ impl ReadState {
 
     /// Counts a record at `time`, which is before the time `latest` of an earlier record.
     #[cold]
-    fn note_backwards(&mut self, time: Timestamp, latest: Timestamp, name: &str, line: u64) {
+    fn note_backwards(&mut self, time: Timestamp, latest: Timestamp, place: impl FnOnce() -> String) {
         self.counts.time_backwards += 1;
         self.counts.first_time_backwards.get_or_insert_with(|| {
             let [stamp_s, latest_s] = [time, latest].map(|time| time.plus_nanos(-self.shift_ns).secs());
-            format!("{name}:{line}: stamp {stamp_s:.6} s is before {latest_s:.6} s")
+            format!("{}: stamp {stamp_s:.6} s is before {latest_s:.6} s", place())
         });
     }
 
@@ -387,6 +439,10 @@ impl ReadState {
                 Ok(ParsedLine { line: Line::Other, .. }) if self.strict && !journal && !is_remark(bytes) => {
                     Err(LineError { column: 1, expected: "a candump line, a comment (#) or a blank line" })
                 }
+                Ok(ParsedLine { line: Line::Other, .. }) => {
+                    self.note_ignored(name, number, bytes);
+                    Ok(None)
+                }
                 Ok(parsed) => Ok(self.line_record(&parsed.line)),
                 Err(error) => Err(error),
             };
@@ -397,6 +453,17 @@ impl ReadState {
                 Ok(None) => {}
                 Err(error) => self.bad(|| format!("{name}:{number}: {}", error.describe(bytes)))?,
             }
+        }
+    }
+
+    fn note_ignored(&mut self, name: &str, number: u64, line: &[u8]) {
+        /// Length of the quoted text, bytes.
+        const SHOWN: usize = 60;
+        self.counts.ignored_lines += 1;
+        if self.counts.first_ignored_line.is_none() && !is_remark(line) {
+            let text = String::from_utf8_lossy(&line[..line.len().min(SHOWN)]).into_owned();
+            let more = if line.len() > SHOWN { "..." } else { "" };
+            self.counts.first_ignored_line = Some(format!("{name}:{number}: {text:?}{more}"));
         }
     }
 
@@ -423,28 +490,117 @@ impl ReadState {
                 self.counts.xl_frames += 1;
                 None
             }
-            Line::Other => {
-                self.counts.ignored_lines += 1;
-                None
-            }
+            Line::Other => None,
         }
     }
 
     /// Returns the interface's number. If the interface has no number, counts the line and returns `None`.
     fn bus(&mut self, interface: &[u8]) -> Option<BusIndex> {
         let name = String::from_utf8_lossy(interface);
-        if let Some(index) = self.interfaces.iter().position(|known| *known == name) {
-            return u8::try_from(index).ok().map(BusIndex);
+        let bus = self.find_bus(&name);
+        if bus.is_none() {
+            self.count_foreign(&name);
         }
-        if self.adopt && self.interfaces.len() < MAX_ADOPTED {
-            self.interfaces.push(name.into_owned());
-            self.parser = LineParser::new(&self.interfaces);
-            return u8::try_from(self.interfaces.len() - 1).ok().map(BusIndex);
-        }
+        bus
+    }
+
+    /// Returns the number of an interface, given as written in the log. Adopts the interface if it has none.
+    fn find_bus(&mut self, written: &str) -> Option<BusIndex> {
+        let mapped = self.channels.iter().find(|(channel, _)| channel == written);
+        let name = mapped.map_or(written, |(_, interface)| interface.as_str()).to_owned();
+        let known = self.interfaces.iter().position(|known| *known == name);
+        let index = match known {
+            Some(index) => index,
+            None if self.adopt && self.interfaces.len() < MAX_ADOPTED => {
+                self.interfaces.push(name);
+                self.parser = LineParser::new(&self.interfaces);
+                self.interfaces.len() - 1
+            }
+            None => return None,
+        };
+        u8::try_from(index).ok().map(BusIndex)
+    }
+
+    fn count_foreign(&mut self, name: &str) {
         let foreign = &mut self.counts.foreign;
-        let full = foreign.len() >= MAX_FOREIGN_NAMES && !foreign.contains_key(name.as_ref());
-        *foreign.entry(if full { "...".to_owned() } else { name.into_owned() }).or_default() += 1;
-        None
+        let full = foreign.len() >= MAX_FOREIGN_NAMES && !foreign.contains_key(name);
+        *foreign.entry(if full { "..." } else { name }.to_owned()).or_default() += 1;
+    }
+
+    /// The next record of a log of another tool, on the log's own clock.
+    #[cfg(feature = "formats")]
+    fn next_item(&mut self, log: &mut ToolLog, name: &str) -> Result<Option<Record>, LogError> {
+        loop {
+            let item = match log.next_item() {
+                Ok(Some(item)) => item,
+                Ok(None) => return Ok(None),
+                Err(error) => {
+                    self.bad(|| format!("{name}{}: {error}", log.position()))?;
+                    return Ok(None);
+                }
+            };
+            self.counts.lines += 1;
+            match item {
+                Item::Frame { time, channel, frame } => {
+                    if let Some(bus) = self.channel_bus(log, channel) {
+                        self.counts.frames += 1;
+                        return Ok(Some(Record::frame(time, bus, &frame)));
+                    }
+                }
+                Item::ErrorFrame { time, channel, class } => {
+                    self.counts.error_frames += 1;
+                    if let Some(bus) = self.channel_bus(log, channel) {
+                        return Ok(Some(Record::bus(time, bus, BusEvent::ErrorFrame { class })));
+                    }
+                }
+                Item::Xl => self.counts.xl_frames += 1,
+                Item::Other => self.counts.ignored_lines += 1,
+                Item::Bad(why) => self.bad(|| format!("{name}{}: {why}", log.position()))?,
+            }
+        }
+    }
+
+    /// Fills slots with the next records of a log of another tool. Must not be called before the first record. Returns
+    /// the number of records.
+    #[cfg(feature = "formats")]
+    fn next_items(&mut self, log: &mut ToolLog, name: &str, slots: &mut [Record]) -> Result<usize, LogError> {
+        // In strict mode, an error must follow all records before it, so each call reads one record.
+        let wanted = if self.strict { 1 } else { slots.len() };
+        for (count, slot) in slots[..wanted].iter_mut().enumerate() {
+            let Some(record) = self.next_item(log, name)? else { return Ok(count) };
+            let (_, time) = self.place(record.time, || format!("{name}{}", log.position()));
+            *slot = Record { time, ..record };
+        }
+        Ok(wanted)
+    }
+
+    /// Returns the number of a channel's interface. If the channel has none, counts the frame and returns `None`.
+    #[cfg(feature = "formats")]
+    fn channel_bus(&mut self, log: &mut ToolLog, channel: u8) -> Option<BusIndex> {
+        let bus = log.bus(channel, |channel| self.find_channel(channel));
+        if bus.is_none() {
+            self.count_foreign(&log.channel_name(channel));
+        }
+        bus
+    }
+
+    /// Finds the interface of a channel of a log of another tool. Numbered channels are the configured interfaces in
+    /// their order, unless the user maps them.
+    #[cfg(feature = "formats")]
+    fn find_channel(&mut self, channel: &LogChannel) -> Option<BusIndex> {
+        let (written, default) = match channel {
+            LogChannel::Name(name) => (name.clone(), name.clone()),
+            LogChannel::Number { written, index } => {
+                let configured = self.interfaces.get(*index as usize).cloned();
+                (written.to_string(), configured.unwrap_or_else(|| format!("can{index}")))
+            }
+        };
+        let is_mapped = self.channels.iter().any(|(channel, _)| *channel == written);
+        let bus = self.find_bus(if is_mapped { &written } else { &default })?;
+        if let Some(input) = self.counts.inputs.last_mut() {
+            let _ = write!(input, ", channel {written} as {}", self.interfaces[bus.index()]);
+        }
+        Some(bus)
     }
 
     /// Line and time of the next good row, on the file's own clock.
@@ -472,8 +628,8 @@ impl ReadState {
     }
 
     /// Converts the stamp in a line of a file to the common clock. If a gap must precede the record, also returns the
-    /// gap.
-    fn place(&mut self, raw: Timestamp, name: &str, line: u64) -> (Option<Record>, Timestamp) {
+    /// gap. `place` returns file and line for messages.
+    fn place(&mut self, raw: Timestamp, place: impl FnOnce() -> String) -> (Option<Record>, Timestamp) {
         let mut gap = false;
         if std::mem::take(&mut self.fresh) {
             self.shift_ns = 0;
@@ -486,7 +642,7 @@ impl ReadState {
         }
         let time = raw.plus_nanos(self.shift_ns);
         if let Some(latest) = self.latest.filter(|&latest| time < latest) {
-            self.note_backwards(time, latest, name, line);
+            self.note_backwards(time, latest, place);
         }
         self.latest = Some(self.latest.map_or(time, |latest| latest.max(time)));
         self.counts.unknown_gaps += u64::from(gap);

@@ -24,4 +24,6 @@ pub mod stop;
 pub mod table;
 pub mod text_table;
 pub mod ticks;
+#[cfg(feature = "formats")]
+mod tool_log;
 pub mod unix_socket;

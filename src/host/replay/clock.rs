@@ -60,6 +60,9 @@ pub(super) struct RecordSpan {
     pub(super) latest: Option<Timestamp>,
     /// Covered time without gaps longer than the sleep gap. Nanoseconds keep the sum of millions of steps exact.
     awake_ns: i64,
+    /// Number of steps to a later stamp, and how many of them are longer than the sleep gap.
+    steps: u64,
+    gaps: u64,
     pub(super) started: Instant,
 }
 
@@ -70,6 +73,8 @@ impl RecordSpan {
             first: None,
             latest: None,
             awake_ns: 0,
+            steps: 0,
+            gaps: 0,
             started: Instant::now(),
         }
     }
@@ -84,8 +89,15 @@ impl RecordSpan {
         }
         self.latest = Some(time);
         let asleep = passed_ns > self.sleep_gap_ns;
+        self.steps += 1;
+        self.gaps += u64::from(asleep);
         self.awake_ns += if asleep { 0 } else { passed_ns };
         asleep
+    }
+
+    /// Number of steps to a later stamp that are longer than the sleep gap, and of all steps.
+    pub(super) fn gaps_and_steps(&self) -> (u64, u64) {
+        (self.gaps, self.steps)
     }
 
     pub(super) fn awake_s(&self) -> f64 {

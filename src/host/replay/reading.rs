@@ -20,6 +20,8 @@ pub const SLEEP_GAP_S: f64 = 30.0;
 pub struct LogReading {
     /// Whether reading ends at the first malformed line.
     pub strict: bool,
+    /// Maps a channel or interface, as written in the log, to an interface.
+    pub channels: Vec<(String, String)>,
     /// For CSV logs: maps roles to columns, see [`CsvOptions::columns`].
     pub columns: Vec<(String, String)>,
     /// For CSV logs: whether a positive current is a charge.
@@ -29,19 +31,26 @@ pub struct LogReading {
 }
 
 impl LogReading {
+    /// Returns the options for reading a CSV log of a pack with `cells` cells, whose voltage is the pack's total or one per
+    /// cell.
+    pub fn csv_options(&self, cells: u16, pack_total: bool) -> CsvOptions {
+        CsvOptions {
+            columns: self.columns.clone(),
+            charge_positive: self.charge_positive,
+            start_times: self.start_times.clone(),
+            cells,
+            pack_total,
+        }
+    }
+
     /// Returns the options for reading a log with this configuration.
     pub fn options(&self, config: &Config) -> LogOptions {
         let sample = &config.monitor.sample;
         LogOptions {
             interfaces: config.interface_names(),
+            channels: self.channels.clone(),
             strict: self.strict,
-            csv: CsvOptions {
-                columns: self.columns.clone(),
-                charge_positive: self.charge_positive,
-                start_times: self.start_times.clone(),
-                cells: sample.cells,
-                pack_total: matches!(sample.voltage_source, VoltageSource::PackTotal { .. }),
-            },
+            csv: self.csv_options(sample.cells, matches!(sample.voltage_source, VoltageSource::PackTotal { .. })),
             encode_row: {
                 let mut row_frames = RowFrames::new(&config.monitor);
                 Box::new(move |values, frames| row_frames.encode(values, frames))

@@ -64,6 +64,9 @@ pub struct ReplaySummary {
     pub cell_steps_per_s: f64,
     /// Peak resident memory, KiB, if the system reports it.
     pub peak_memory_kib: Option<u64>,
+    /// Why the replay says nothing about the battery, for example because no frame carries a configured signal.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub failure: Option<String>,
     /// Remarks for the user.
     pub notes: Vec<String>,
 }

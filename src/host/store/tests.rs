@@ -38,6 +38,7 @@ fn log(config: &Config, folder: &Path) -> LogSource {
     let mut protector = InputProtector::new(&config.monitor.guards);
     let options = LogOptions {
         interfaces: config.interface_names(),
+        channels: Vec::new(),
         strict: true,
         csv: CsvOptions { columns: Vec::new(), charge_positive: false, start_times: None, cells: 1, pack_total: false },
         encode_row: Box::new(move |values, frames| {

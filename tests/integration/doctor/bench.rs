@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{LazyLock, Mutex};
 
 use assert_cmd::Command;
-use packwatch::io::csv_log::CsvOptions;
+use packwatch::replay::LogReading;
 use packwatch::wiring::{WiringObserver, WiringReport};
 use packwatch::wiring_check::{self, Interrupt};
 
@@ -245,7 +245,7 @@ impl BrokenPack {
         let survey = wiring_check::survey(&path).unwrap();
         let logs = [folder.path().join("pack.log")];
         let (report, _) =
-            wiring_check::replay(&survey, &logs, CsvOptions::default(), None, &Interrupt::default(), &mut |_| {})
+            wiring_check::replay(&survey, &logs, &LogReading::default(), None, &Interrupt::default(), &mut |_| {})
                 .unwrap();
         report
     }

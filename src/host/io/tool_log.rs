@@ -1,0 +1,74 @@
+//! A log of another tool, read by `packwatch_formats`. Without the feature `formats`, no such log is recognised.
+
+use std::fs::File;
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+
+use packwatch_formats::{Channel, Format, Item, LogReader, Position, Source};
+
+use super::lines::Lines;
+use crate::quantity::BusIndex;
+
+/// An open log of another tool.
+pub(super) struct ToolLog {
+    reader: Box<dyn LogReader>,
+    /// Interface of each channel seen so far; `None` = not configured.
+    buses: Vec<Option<BusIndex>>,
+}
+
+impl ToolLog {
+    /// Recognises a log from its first bytes. `None` = no format of another tool.
+    ///
+    /// # Errors
+    /// Fails if the source cannot be read.
+    pub(super) fn recognise(lines: &mut Lines) -> io::Result<Option<Format>> {
+        Ok(Format::recognise(lines.peek_bytes(Format::HEAD_BYTES)?))
+    }
+
+    /// Opens a log of a recognised format.
+    ///
+    /// # Errors
+    /// Fails if the source cannot be read or its header is damaged.
+    pub(super) fn open(format: Format, mut lines: Lines, paths: &[PathBuf]) -> io::Result<Self> {
+        let file = match paths {
+            [path] => plain_file(path, lines.peek_bytes(Format::HEAD_BYTES)?)?,
+            _ => None,
+        };
+        let source = Source { reader: Box::new(lines.into_reader()), file };
+        Ok(Self { reader: format.open(source)?, buses: Vec::new() })
+    }
+
+    pub(super) fn next_item(&mut self) -> io::Result<Option<Item>> {
+        self.reader.next_item()
+    }
+
+    pub(super) fn position(&self) -> Position {
+        self.reader.position()
+    }
+
+    /// The interface of a channel. For a channel not seen before, `find` returns its interface.
+    pub(super) fn bus(&mut self, channel: u8, mut find: impl FnMut(&Channel) -> Option<BusIndex>) -> Option<BusIndex> {
+        let new = self.reader.channels().get(self.buses.len()..).unwrap_or_default();
+        self.buses.extend(new.iter().map(&mut find));
+        self.buses.get(usize::from(channel)).copied().flatten()
+    }
+
+    /// Name of a channel, for messages.
+    pub(super) fn channel_name(&self, channel: u8) -> String {
+        match self.reader.channels().get(usize::from(channel)) {
+            Some(Channel::Name(name)) => name.clone(),
+            Some(Channel::Number { written, .. }) => format!("channel {written}"),
+            None => "unknown channel".to_owned(),
+        }
+    }
+}
+
+/// The file itself if it is a regular file that begins with `head`, that is, if it is not compressed.
+fn plain_file(path: &Path, head: &[u8]) -> io::Result<Option<File>> {
+    if !path.is_file() {
+        return Ok(None);
+    }
+    let mut start = Vec::with_capacity(head.len());
+    File::open(path)?.take(head.len() as u64).read_to_end(&mut start)?;
+    if start == head { File::open(path).map(Some) } else { Ok(None) }
+}
