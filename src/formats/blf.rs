@@ -158,4 +158,4 @@ fn stamp(start_ns: i64, offset_ns: i64) -> Timestamp {
 }
 
 #[cfg(test)]
-mod tests {}
+mod tests;

@@ -12,6 +12,7 @@ mod field;
 mod group;
 mod layout;
 mod values;
+mod writer;
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -20,6 +21,7 @@ use std::rc::Rc;
 
 use self::blocks::MdfFile;
 use self::group::{GroupReader, Stamped};
+pub use self::writer::Mf4Writer;
 use crate::channel_list::ChannelList;
 use crate::{Channel, Item, LogReader, Position, Source};
 
@@ -155,4 +157,4 @@ impl LogReader for Mf4Reader {
 }
 
 #[cfg(test)]
-mod tests {}
+mod tests;

@@ -122,4 +122,4 @@ impl LogReader for PcapReader {
 }
 
 #[cfg(test)]
-mod tests {}
+mod tests;

@@ -28,5 +28,5 @@ pub use context::PageContext;
 pub use data::{Data, DataSource, Origin};
 pub use html::page;
 pub use pictures::write_plots;
-pub use text::Verdict;
 pub use reference::{Reference, read as read_reference};
+pub use text::Verdict;

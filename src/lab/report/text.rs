@@ -27,7 +27,9 @@ impl Verdict {
             problems: summary
                 .problems
                 .iter()
-                .map(|problem| format!("{} {} {} {}", problem.condition.sign(), problem.what, problem.note, problem.advice))
+                .map(|problem| {
+                    format!("{} {} {} {}", problem.condition.sign(), problem.what, problem.note, problem.advice)
+                })
                 .map(|text| text.split_whitespace().collect::<Vec<_>>().join(" "))
                 .collect(),
             known: known.collect(),
