@@ -76,8 +76,9 @@ impl Field {
         };
         let big_endian = channel.data_type < FIRST_OTHER && channel.data_type & 1 != 0;
         let (byte, shift, bits) = (channel.byte as usize, u32::from(channel.bit), channel.bits);
-        if matches!(channel.kind, VIRTUAL_MASTER | VIRTUAL) {
-            // The number is the record's index. With factor 0, as usual for buses, the value is constant.
+        // The number of a virtual channel is the record's index. With factor 0, as usual for the fields of a bus, the
+        // value is constant; converters keep the factor when they store the index.
+        if factor == 0.0 || matches!(channel.kind, VIRTUAL_MASTER | VIRTUAL) {
             let constant = offset.clamp(0.0, f64::from(u32::MAX)) as u64;
             let number = NumberType::Unsigned;
             let field = Self { byte, bytes: 0, shift: 0, bits: 0, big_endian, number, constant, offset, factor };

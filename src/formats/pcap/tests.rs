@@ -82,7 +82,7 @@ fn ng_packets() -> Vec<(u32, u64, Vec<u8>)> {
 }
 
 fn items(channels: [u8; 3]) -> [Item; 3] {
-    let time = |n| Timestamp::from_nanos(START_NS + 1000 * n);
+    let time = |n: i64| Timestamp::from_nanos(START_NS + 1000 * n);
     [
         Item::Frame { time: time(0), channel: channels[0], frame: frame(0x123, &[1, 2, 3]) },
         Item::Frame { time: time(1), channel: channels[1], frame: fd_frame(0x1234, &[9; 12]) },
