@@ -94,6 +94,7 @@
 //! | values restored from the history at start | `host/store/learned.rs`, `core/monitor/lifecycle/relearn.rs` |
 //! | a command over the control socket | `host/control/protocol.rs` |
 //! | a log format | `host/io/log.rs`, `host/io/candump/parser.rs` (lines of candump) |
+//! | a log format of another tool | `formats/text/NAME.rs` (text formats), `formats/format.rs` (recognition) |
 //! | segments of a recording | `host/io/segments.rs` |
 //! | a column of `replay --estimates` | `host/replay/rows.rs` |
 //! | a column of `export` (Parquet, CSV) | `lab/fleet/export/columns.rs` |

@@ -15,9 +15,11 @@ use super::common::output::{failure, print, print_json, table, unless_closed};
 use super::common::progress::Bar;
 use crate::config::{self, ConfigFaults};
 use crate::io::csv_log::CsvOptions;
-use crate::io::log::{LogOptions, LogSource};
+use crate::io::log::{LogCounts, LogOptions, LogSource};
 use crate::io::result_file::{ResultFile, check_place};
-use crate::lab::discover::{Candidate, Discoverer, Discovery, PackSettings, PositiveDirection};
+use crate::lab::discover::{
+    Candidate, Discoverer, Discovery, PackConfiguration, PackLabel, PackSettings, PositiveDirection,
+};
 use crate::lab::error::LabError;
 use crate::lab::import::obdb::ObdbSettings;
 use crate::monitor::RecordKind;
@@ -32,116 +34,159 @@ Ranks the signals of the DBC files and the OBDb signal set that occur in the log
 without a definition are searched for series of cell voltages, pack voltage, current and temperatures; their scales are guesses from \
 plausible values. A log of a drive shows more than a log of a parked car.")]
 pub(crate) struct Args {
-    /// Journal or candump log, also .gz or .zst; - reads standard input
+    /// CAN log in any known format, also .gz or .zst; - reads standard input
     #[arg(value_name = "LOG")]
     log: PathBuf,
-    /// DBC file; repeat for several
-    #[arg(long = "dbc", value_name = "FILE.dbc")]
-    dbc: Vec<PathBuf>,
-    /// OBDb signal set of the car model, which describes its diagnostic answers
-    #[arg(long, value_name = "FILE.json")]
-    obdb: Option<PathBuf>,
-    /// Model year, selects commands of the OBDb signal set
-    #[arg(long, value_name = "YEAR", requires = "obdb", value_parser = integer::<i64>(1980, 2100))]
-    year: Option<i64>,
+    #[command(flatten)]
+    known: Known,
     /// Print all candidates as JSON
     #[arg(long)]
     json: bool,
     /// Write a configuration with the best candidates, and PACK.dbc with the fields that no DBC describes; replaces existing files
-    #[arg(long, value_name = "PACK.toml", requires = "model")]
+    #[arg(long, value_name = "PACK.toml")]
     write: Option<PathBuf>,
-    /// Cell model for the written configuration
+}
+
+/// What the user knows about the battery.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Known {
+    /// DBC file; repeat for several
+    #[arg(long = "dbc", value_name = "FILE.dbc")]
+    pub(crate) dbc: Vec<PathBuf>,
+    /// OBDb signal set of the car model, which describes its diagnostic answers
+    #[arg(long, value_name = "FILE.json")]
+    pub(crate) obdb: Option<PathBuf>,
+    /// Model year, selects commands of the OBDb signal set
+    #[arg(long, value_name = "YEAR", requires = "obdb", value_parser = integer::<i64>(1980, 2100))]
+    year: Option<i64>,
+    /// What the pack's label says, every part optional: chemistry, capacity, cells in series, such as nmc:64Ah:98s. Decides
+    /// scales of undescribed fields; in a configuration, also describes the cell if --model is not given
+    #[arg(long, value_name = "LABEL")]
+    label: Option<PackLabel>,
+    /// Cell model for the configuration
     #[arg(long, value_name = "CELL.toml")]
-    model: Option<PathBuf>,
-    /// Cells in series for the written configuration; needed if the log has only the pack voltage
-    #[arg(long, value_name = "N", requires = "write", value_parser = integer::<u16>(1, 1024))]
-    cells: Option<u16>,
-    /// Meaning of a positive current for the written configuration; needed if the log does not show it
-    #[arg(long, value_enum, requires = "write")]
+    pub(crate) model: Option<PathBuf>,
+    /// Meaning of a positive current; needed if the log does not show it
+    #[arg(long, value_enum)]
     positive: Option<Positive>,
 }
 
 /// Sign of the current.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-enum Positive {
+pub(crate) enum Positive {
     /// Positive current charges the pack
     Charge,
     /// Positive current discharges the pack
     Discharge,
 }
 
-/// Runs the command.
-pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    let mut discoverer = Discoverer::default();
-    for file in &args.dbc {
-        discoverer.add_database(database(file)?);
-    }
-    if let Some(file) = &args.obdb {
-        let source = file.display().to_string();
-        let settings = ObdbSettings { source, year: args.year, name: None };
-        discoverer.add_obdb(&read(file)?, &settings).map_err(failure)?;
-    }
-    let interfaces = feed(std::slice::from_ref(&args.log), &mut discoverer)?;
-    let discovery = discoverer.finish(&interfaces);
-    if discovery.frames == 0 {
-        return Err(Failure::new(format!(
-            "{}: has no CAN frames; give a journal or a candump log",
-            args.log.display()
-        )));
-    }
-    match args.json {
-        true => unless_closed(print_json(&json!({ "version": 1, "discovery": discovery })))?,
-        false => print(&(page(&discovery) + no_definitions(args, &discovery)))?,
-    }
-    match (&args.write, &args.model) {
-        (Some(file), Some(model)) => write(args, &discoverer, &discovery, file, model),
-        _ => Ok(()),
-    }
+/// Result of a search, and what made it.
+pub(crate) struct Search {
+    discoverer: Discoverer,
+    pub(crate) discovery: Discovery,
+    pub(crate) counts: LogCounts,
+    interfaces: Vec<String>,
 }
 
-/// If the configuration is valid, writes it, and a DBC with the fields that no given DBC describes.
-fn write(
-    args: &Args,
-    discoverer: &Discoverer,
-    discovery: &Discovery,
-    file: &Path,
-    model: &Path,
-) -> Result<(), Failure> {
-    let inputs = args.dbc.iter().chain([&args.log]).chain(&args.obdb).chain(&args.model);
-    check_place(file, inputs).map_err(Failure::new)?;
-    let settings = PackSettings {
-        source: args.log.display().to_string(),
-        databases: args.dbc.iter().map(|dbc| named_from(file, dbc)).collect::<Result<_, _>>()?,
-        own_database: named_from(file, &file.with_extension("dbc"))?,
-        cell_model: named_from(file, model)?,
-        cells: args.cells,
-        positive: args.positive.map(|positive| match positive {
-            Positive::Charge => PositiveDirection::Charge,
-            Positive::Discharge => PositiveDirection::Discharge,
-        }),
+/// Runs the command.
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let search = search(std::slice::from_ref(&args.log), &args.known, Vec::new())?;
+    let discovery = &search.discovery;
+    match args.json {
+        true => unless_closed(print_json(&json!({ "version": 1, "discovery": discovery })))?,
+        false => print(&(page(discovery) + no_definitions(&args.known, discovery)))?,
+    }
+    let Some(file) = &args.write else { return Ok(()) };
+    check_place(file, inputs(std::slice::from_ref(&args.log), &args.known)).map_err(Failure::new)?;
+    let failed = |questions: LabError| {
+        Failure::new(format!("{}: not written, because the log leaves questions open:\n{questions}", file.display()))
     };
-    let failed =
-        |why: &str, what: &str| Failure::new(format!("{}: not written, because {why}:\n{what}", file.display()));
-    let open = |error: LabError| failed("the log leaves questions open", &error.to_string());
-    let pack = discoverer.configuration(discovery, &settings).map_err(open)?;
-    let own = file.with_extension("dbc");
-    let read = |path: &Path| match &pack.database {
-        _ if path == file => Ok(pack.text.clone().into_bytes()),
-        Some(database) if path == own => Ok(database.clone().into_bytes()),
-        _ => std::fs::read(path),
-    };
-    let files = config::ConfigFiles { main: file.to_owned(), drop_ins: Vec::new() };
-    let invalid = |faults: ConfigFaults| failed("the configuration would be invalid", &faults.0.join("\n"));
-    config::load_with(&files, &read).map_err(invalid)?;
-    if let Some(database) = &pack.database {
-        check_place(&own, args.dbc.iter().chain([&args.log])).map_err(Failure::new)?;
-        write_whole(&own, database)?;
+    let pack = search.configuration(&args.log, &args.known, file)?.map_err(failed)?;
+    if let Some(own) = save(&pack, file, inputs(std::slice::from_ref(&args.log), &args.known))? {
         eprintln!("{} written: fields that no DBC describes", own.display());
     }
-    write_whole(file, &pack.text)?;
     eprintln!("{} written; please check what the log does not show:", file.display());
     pack.open.iter().for_each(|question| eprintln!("  {question}"));
     Ok(())
+}
+
+/// The files that are read.
+pub(crate) fn inputs<'a>(logs: &'a [PathBuf], known: &'a Known) -> impl Iterator<Item = &'a PathBuf> + Clone {
+    logs.iter().chain(&known.dbc).chain(&known.obdb).chain(&known.model)
+}
+
+/// Searches logs for the signals of the battery. `channels` maps channels of the logs to interfaces.
+pub(crate) fn search(logs: &[PathBuf], known: &Known, channels: Vec<(String, String)>) -> Result<Search, Failure> {
+    let mut discoverer = Discoverer::default();
+    for file in &known.dbc {
+        discoverer.add_database(database(file)?);
+    }
+    if let Some(file) = &known.obdb {
+        let source = file.display().to_string();
+        let settings = ObdbSettings { source, year: known.year, name: None };
+        discoverer.add_obdb(&read(file)?, &settings).map_err(failure)?;
+    }
+    discoverer.set_label(known.label.unwrap_or_default());
+    let (counts, interfaces) = feed(logs, channels, &mut discoverer)?;
+    let discovery = discoverer.finish(&interfaces);
+    if discovery.frames == 0 {
+        let names: Vec<_> = logs.iter().map(|log| log.display().to_string()).collect();
+        return Err(Failure::new(format!("{}: no CAN frames; give a journal or a CAN log", names.join(", "))));
+    }
+    Ok(Search { discoverer, discovery, counts, interfaces })
+}
+
+impl Search {
+    /// Names of the interfaces in the logs.
+    pub(crate) fn interfaces(&self) -> &[String] {
+        &self.interfaces
+    }
+
+    /// The configuration to be saved as `file`, or the questions that the log and the user leave open.
+    pub(crate) fn configuration(
+        &self,
+        log: &Path,
+        known: &Known,
+        file: &Path,
+    ) -> Result<Result<PackConfiguration, LabError>, Failure> {
+        let settings = PackSettings {
+            source: log.display().to_string(),
+            databases: known.dbc.iter().map(|dbc| named_from(file, dbc)).collect::<Result<_, _>>()?,
+            own_database: named_from(file, &file.with_extension("dbc"))?,
+            cell_model: known.model.as_ref().map(|model| named_from(file, model)).transpose()?,
+            positive: known.positive.map(|positive| match positive {
+                Positive::Charge => PositiveDirection::Charge,
+                Positive::Discharge => PositiveDirection::Discharge,
+            }),
+        };
+        Ok(self.discoverer.configuration(&self.discovery, &settings))
+    }
+}
+
+/// If a configuration is valid, writes it, and a DBC with the fields that no given DBC describes. Returns the path of
+/// the DBC, if any.
+pub(crate) fn save<'a>(
+    pack: &PackConfiguration,
+    file: &Path,
+    inputs: impl Iterator<Item = &'a PathBuf>,
+) -> Result<Option<PathBuf>, Failure> {
+    let own = pack.database.as_ref().map(|text| (file.with_extension("dbc"), text));
+    let read = |path: &Path| match &own {
+        _ if path == file => Ok(pack.text.clone().into_bytes()),
+        Some((own, text)) if path == own => Ok(text.as_bytes().to_vec()),
+        _ => std::fs::read(path),
+    };
+    let files = config::ConfigFiles { main: file.to_owned(), drop_ins: Vec::new() };
+    config::load_with(&files, &read).map_err(|faults: ConfigFaults| {
+        let what = faults.0.join("\n");
+        Failure::new(format!("{}: not written, because the configuration would be invalid:\n{what}", file.display()))
+    })?;
+    if let Some((own, text)) = &own {
+        check_place(own, inputs).map_err(Failure::new)?;
+        write_whole(own, text)?;
+    }
+    write_whole(file, &pack.text)?;
+    Ok(own.map(|(own, _)| own))
 }
 
 fn write_whole(file: &Path, text: &str) -> Result<(), Failure> {
@@ -152,11 +197,15 @@ fn write_whole(file: &Path, text: &str) -> Result<(), Failure> {
     written.map_err(failure)
 }
 
-/// Passes every frame of the logs to the discoverer; returns the names of the interfaces.
-fn feed(logs: &[PathBuf], discoverer: &mut Discoverer) -> Result<Vec<String>, Failure> {
+/// Passes every frame of the logs to the discoverer; returns the counts and the names of the interfaces.
+fn feed(
+    logs: &[PathBuf],
+    channels: Vec<(String, String)>,
+    discoverer: &mut Discoverer,
+) -> Result<(LogCounts, Vec<String>), Failure> {
     let csv = CsvOptions { columns: Vec::new(), charge_positive: false, start_times: None, cells: 1, pack_total: true };
     let encode_row = Box::new(|_: &[_], _: &mut Vec<_>| 0);
-    let options = LogOptions { interfaces: Vec::new(), channels: Vec::new(), strict: false, csv, encode_row };
+    let options = LogOptions { interfaces: Vec::new(), channels, strict: false, csv, encode_row };
     let mut source = LogSource::new(logs.to_vec(), options);
     source.adopt_foreign();
     let bar = Bar::new(logs);
@@ -177,7 +226,7 @@ fn feed(logs: &[PathBuf], discoverer: &mut Discoverer) -> Result<Vec<String>, Fa
     if let Some(first) = &counts.first_bad_line {
         eprintln!("{} of {} lines cannot be read, first {first}", counts.bad_lines, counts.lines);
     }
-    Ok(source.interfaces().to_vec())
+    Ok((counts.clone(), source.interfaces().to_vec()))
 }
 
 fn page(discovery: &Discovery) -> String {
@@ -204,8 +253,8 @@ fn page(discovery: &Discovery) -> String {
 }
 
 /// If nothing was found and no DBC file was given, advises to give one; otherwise empty.
-fn no_definitions(args: &Args, discovery: &Discovery) -> &'static str {
-    if !discovery.candidates.is_empty() || !args.dbc.is_empty() {
+fn no_definitions(known: &Known, discovery: &Discovery) -> &'static str {
+    if !discovery.candidates.is_empty() || !known.dbc.is_empty() {
         return "";
     }
     "\nWithout a DBC file, only diagnostic answers can be searched; the log has none with plausible values. Give the DBC file \
@@ -213,12 +262,17 @@ fn no_definitions(args: &Args, discovery: &Discovery) -> &'static str {
 }
 
 fn row(candidate: &Candidate) -> Vec<String> {
+    let rank = format!("  {}", candidate.rank);
+    let reasons = candidate.reasons.join("; ");
+    vec![rank, candidate.signal.clone(), candidate.interface.clone(), values(candidate), reasons]
+}
+
+/// Values of a candidate in the log: "16 of 3.188 to 3.392 V".
+pub(crate) fn values(candidate: &Candidate) -> String {
     let unit = candidate.quantity.unit();
     let (low, high) = (number(candidate.low), number(candidate.high));
     let count = if candidate.signals > 1 { format!("{} of ", candidate.signals) } else { String::new() };
-    let values = if low == high { format!("{count}{low} {unit}") } else { format!("{count}{low} to {high} {unit}") };
-    let rank = format!("  {}", candidate.rank);
-    vec![rank, candidate.signal.clone(), candidate.interface.clone(), values, candidate.reasons.join("; ")]
+    if low == high { format!("{count}{low} {unit}") } else { format!("{count}{low} to {high} {unit}") }
 }
 
 /// Formats a number with at most three decimals.

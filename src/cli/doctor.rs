@@ -59,9 +59,15 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     rename_interfaces(args, &mut survey)?;
     survey.plan.is_csv = args.logs.iter().any(|log| is_csv(log));
     let interrupt = Interrupt::watch().map_err(|error| Failure::new(format!("cannot handle Ctrl-C: {error}")))?;
-    let mut report =
-        if args.logs.is_empty() { listen(args, &survey, &interrupt)? } else { replay(args, &survey, &interrupt)? };
+    let mut report = if args.logs.is_empty() {
+        listen(args, &survey, &interrupt)?
+    } else {
+        replay(&args.logs, &args.reading(), args.seconds, &survey, &interrupt)?
+    };
     complete(&mut report, &survey);
+    if !args.logs.is_empty() && args.logs.iter().all(|log| log.is_file()) {
+        wiring_check::try_changes(&args.config, &mut report, &mut |other| again(args, other, &survey, &interrupt));
+    }
     let source = source_name(args, &survey);
     if args.json {
         json(&report, &args.config, &source)?
@@ -72,6 +78,18 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         (false, _) => Err(Failure { message: String::new(), code: EXIT_CONFIG }),
         (true, true) => Err(Failure::new("")),
         (true, false) => Ok(()),
+    }
+}
+
+impl Args {
+    fn reading(&self) -> LogReading {
+        LogReading {
+            strict: false,
+            channels: self.channels.clone(),
+            columns: self.columns.clone(),
+            charge_positive: self.csv_sign == CsvSign::Charge,
+            start_times: self.start_times.clone(),
+        }
     }
 }
 
@@ -104,16 +122,34 @@ fn source_name(args: &Args, survey: &Survey) -> String {
     args.logs.iter().map(|log| log.display().to_string()).collect::<Vec<_>>().join(", ")
 }
 
-fn replay(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<WiringReport, Failure> {
-    let reading = LogReading {
-        strict: false,
-        channels: args.channels.clone(),
-        columns: args.columns.clone(),
-        charge_positive: args.csv_sign == CsvSign::Charge,
-        start_times: args.start_times.clone(),
-    };
-    let bar = Bar::new(&args.logs);
-    let result = wiring_check::replay(survey, &args.logs, &reading, args.seconds, interrupt, &mut |progress| {
+/// Judges the logs with a changed configuration; `None` = they cannot be read again.
+fn again(args: &Args, changed: &mut Survey, survey: &Survey, interrupt: &Interrupt) -> Option<WiringReport> {
+    (changed.plan.is_csv, changed.plan.interfaces) = (survey.plan.is_csv, survey.plan.interfaces.clone());
+    let reading = args.reading();
+    let result = wiring_check::replay(changed, &args.logs, &reading, args.seconds, interrupt, &mut |_| {});
+    let (mut report, _) = result.ok()?;
+    complete(&mut report, changed);
+    Some(report)
+}
+
+/// Judges logs with a configuration.
+#[cfg(feature = "lab")]
+pub(crate) fn judge(config: &Path, logs: &[PathBuf], reading: &LogReading) -> Result<WiringReport, Failure> {
+    let survey = wiring_check::survey(config)?;
+    let mut report = replay(logs, reading, None, &survey, &Interrupt::default())?;
+    complete(&mut report, &survey);
+    Ok(report)
+}
+
+fn replay(
+    logs: &[PathBuf],
+    reading: &LogReading,
+    seconds: Option<f64>,
+    survey: &Survey,
+    interrupt: &Interrupt,
+) -> Result<WiringReport, Failure> {
+    let bar = Bar::new(logs);
+    let result = wiring_check::replay(survey, logs, reading, seconds, interrupt, &mut |progress| {
         let times_real_time = progress.seconds / bar.seconds();
         bar.show(ReplayProgress { bytes: progress.bytes, frames: progress.frames, times_real_time });
     });

@@ -1,6 +1,6 @@
 //! `packwatch look`: from logs to a verdict in one command.
 //!
-//! The command finds the battery's signals in the logs, writes the configuration that follows, checks the wiring, and
+//! The command finds the battery's signals in the logs, makes the configuration that follows, checks the wiring, and
 //! replays the logs into a report. If the logs and the label leave a question open, the command asks it and says which
 //! option answers it. The exit code is 0 if a report was written, and 1 otherwise.
 
@@ -8,74 +8,155 @@ use std::path::{Path, PathBuf};
 
 use packwatch_host::failure::Failure;
 
-use super::common::logs::{CsvSign, InputArgs, channel};
-use super::common::numbers::integer;
-use super::common::output::{failure, print};
-use super::discover::{self, Positive};
+use super::common::logs::{InputArgs, channel};
+use super::common::output::{failure, print, word};
+use super::discover::{self, Known, Search};
 use super::{doctor, report};
 use crate::io::result_file::check_place;
-use crate::lab::discover::{Candidate, Discovery};
+use crate::lab::discover::PackConfiguration;
 use crate::lab::report::Verdict;
-use crate::replay::SLEEP_GAP_S;
-use crate::wiring::Severity;
+use crate::replay::LogReading;
 use crate::wiring::evidence::PackQuantity;
+use crate::wiring::{Severity, WiringReport};
 
 /// Maximum number of lines about one subject. The report and the other commands have all of them.
 const MAX_SHOWN: usize = 8;
 /// Column where the text of a line begins.
-const INDENT: usize = 14;
+const INDENT: usize = 15;
 
 /// Arguments of `look`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
-Finds the battery's signals (as `discover` does), writes the configuration that follows, checks the wiring (as `doctor` does) and writes a \
-report (as `report` does). If something is not known, the command asks for it.")]
+Finds the battery's signals like `discover`, makes the configuration that follows, checks the wiring like `doctor` and writes a report \
+like `report`. If something is not known, the command asks for it and writes no report.")]
 pub(crate) struct Args {
-    /// Logs of one battery in any known format, read in this order
+    /// CAN logs of one battery in any known format, also .gz or .zst, read in this order
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
-    /// DBC file that describes the frames; repeat for several
-    #[arg(long = "dbc", value_name = "FILE.dbc")]
-    dbc: Vec<PathBuf>,
-    /// OBDb signal set of the car model, which describes its diagnostic answers
-    #[arg(long, value_name = "FILE.json")]
-    obdb: Option<PathBuf>,
-    /// Model year, selects commands of the OBDb signal set
-    #[arg(long, value_name = "YEAR", requires = "obdb", value_parser = integer::<i64>(1980, 2100))]
-    year: Option<i64>,
-    /// What the label states: chemistry, rated capacity and cells in series, for example nmc:64Ah:98s. Each part may be left out
-    #[arg(long, value_name = "LABEL")]
-    label: Option<PackLabel>,
-    /// Cell model instead of the label's chemistry and capacity
-    #[arg(long, value_name = "CELL.toml")]
-    model: Option<PathBuf>,
-    /// Meaning of a positive current; needed if the logs do not show it
-    #[arg(long, value_enum)]
-    positive: Option<Positive>,
+    #[command(flatten)]
+    known: Known,
     /// Read a channel or interface of a log as this interface, as for `replay`
     #[arg(long = "channel", value_name = "CHANNEL=INTERFACE", value_parser = channel)]
     channels: Vec<(String, String)>,
-    /// Keep the configuration in this file. If the file exists and was edited, it is used and not changed
+    /// Keep the configuration in this file. If the file exists, it is used and not changed
     #[arg(long, value_name = "PACK.toml")]
     write: Option<PathBuf>,
-    /// Report to write
+    /// HTML report to write
     #[arg(short, long, value_name = "FILE.html", default_value = "report.html")]
     out: PathBuf,
 }
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    let inputs = args.files.iter().chain(&args.dbc).chain(&args.obdb).chain(&args.model);
-    check_place(&args.out, inputs.clone().chain(&args.write)).map_err(Failure::new)?;
+    check_place(&args.out, discover::inputs(&args.files, &args.known).chain(&args.write)).map_err(Failure::new)?;
+    let search = discover::search(&args.files, &args.known, args.channels.clone())?;
+    print(&section("log", logs(args, &search)))?;
+    print(&section("signals", signals(&search)))?;
     let folder = tempfile::tempdir().map_err(failure)?;
     let config = args.write.clone().unwrap_or_else(|| folder.path().join("pack.toml"));
-    let found = discover::search(&args.search())?;
-    print(&lines("log", found.inputs()))?;
-    print(&lines("signals", signals(&found.discovery)))?;
-    let written = discover::configure(&found, &args.settings(), &config)?;
-    print(&lines("configuration", written.lines()))?;
-    print(&lines("wiring", wiring(args, &config)?))?;
-    let verdict = report::write(&args.report(config))?;
-    print(&battery(&verdict))?;
-    print(&lines("report", vec![args.out.display().to_string()]))
+    print(&section("configuration", configure(args, &search, &config)?))?;
+    let survey = doctor::judge(&config, &args.files, &args.reading())?;
+    print(&section("wiring", wiring(&survey)))?;
+    let page = report::Args {
+        config: Some(config),
+        logs: args.files.clone(),
+        out: args.out.clone(),
+        input: InputArgs { channels: args.channels.clone(), ..InputArgs::default() },
+        state: None,
+        plots: None,
+        reference: None,
+        title: None,
+    };
+    print(&battery(&report::write(&page)?))?;
+    print(&section("report", vec![args.out.display().to_string()]))
+}
+
+impl Args {
+    fn reading(&self) -> LogReading {
+        LogReading { channels: self.channels.clone(), ..LogReading::default() }
+    }
+}
+
+/// Formats lines under a heading in the first column.
+fn section(heading: &str, lines: Vec<String>) -> String {
+    let mut text = String::new();
+    for (n, line) in lines.iter().enumerate() {
+        text += &format!("{:INDENT$}{line}\n", if n == 0 { heading } else { "" });
+    }
+    text
+}
+
+fn logs(args: &Args, search: &Search) -> Vec<String> {
+    let (counts, discovery) = (&search.counts, &search.discovery);
+    let mut lines = counts.inputs.clone();
+    if lines.is_empty() {
+        lines = args.files.iter().map(|file| format!("{}: candump log or journal", file.display())).collect();
+    }
+    let interfaces = search.interfaces().join(", ");
+    lines.push(format!("{} frames in {:.0} s on {interfaces}", discovery.frames, discovery.seconds));
+    lines.extend(counts.first_bad_line.iter().map(|first| format!("{} bad lines, first {first}", counts.bad_lines)));
+    lines
+}
+
+/// The best candidate of each quantity.
+fn signals(search: &Search) -> Vec<String> {
+    let best = |quantity: PackQuantity| {
+        let found = search.discovery.candidates.iter().find(|candidate| candidate.quantity == quantity);
+        let found = found.map_or_else(
+            || "not found".to_owned(),
+            |found| format!("{} on {}: {}", found.signal, found.interface, discover::values(found)),
+        );
+        format!("{:17}{found}", quantity.name())
+    };
+    PackQuantity::ALL.into_iter().map(best).chain(search.discovery.remarks.iter().cloned()).collect()
+}
+
+/// Writes the configuration unless the file exists. Returns what it contains or leaves open.
+fn configure(args: &Args, search: &Search, file: &Path) -> Result<Vec<String>, Failure> {
+    let name = file.display();
+    if args.write.is_some() && file.exists() {
+        return Ok(vec![format!("{name} exists, so it is used as it is")]);
+    }
+    let pack: PackConfiguration = search
+        .configuration(&args.files[0], &args.known, file)?
+        .map_err(|questions| Failure::new(format!("please answer, so that the battery can be judged:\n{questions}")))?;
+    let own = discover::save(&pack, file, discover::inputs(&args.files, &args.known))?;
+    let mut lines = match &args.write {
+        Some(_) => own.iter().chain([&file.to_owned()]).map(|file| format!("{} written", file.display())).collect(),
+        None => vec!["made for this run; --write PACK.toml keeps it".to_owned()],
+    };
+    lines.extend(pack.open.iter().map(|question| format!("please check: {question}")));
+    Ok(lines)
+}
+
+/// Errors and warnings about the wiring, with the advice.
+fn wiring(report: &WiringReport) -> Vec<String> {
+    let findings = report.findings.iter().filter(|finding| finding.severity != Severity::Note);
+    let mut lines: Vec<String> = findings
+        .map(|finding| {
+            let advice = finding.advice.as_ref().map_or_else(String::new, |advice| format!("; {advice}"));
+            format!("{}: {}: {}{advice}", word(finding.severity), finding.title, finding.seen)
+        })
+        .collect();
+    if lines.is_empty() {
+        lines.push("no faults found in what could be judged".to_owned());
+        lines.extend(report.unjudged.iter().take(MAX_SHOWN).map(|what| format!("not judged: {what}")));
+    }
+    shortened(lines)
+}
+
+fn battery(verdict: &Verdict) -> String {
+    let pairs = |pairs: &[(&str, String)]| pairs.iter().map(|(name, value)| format!("{name}: {value}")).collect();
+    section("battery", shortened(verdict.problems.clone()))
+        + &section("known", pairs(&verdict.known))
+        + &section("not known", pairs(&verdict.unknown))
+}
+
+fn shortened(mut lines: Vec<String>) -> Vec<String> {
+    let more = lines.len().saturating_sub(MAX_SHOWN);
+    if more > 0 {
+        lines.truncate(MAX_SHOWN);
+        lines.push(format!("... and {more} more"));
+    }
+    lines
 }

@@ -29,6 +29,8 @@ mod gpr;
 mod history;
 #[cfg(feature = "lab")]
 mod import;
+#[cfg(feature = "lab")]
+mod look;
 mod model;
 #[cfg(feature = "lab")]
 mod passport;
@@ -128,6 +130,9 @@ enum Command {
     /// Find the signals of the traction battery in a log
     #[cfg(feature = "lab")]
     Discover(discover::Args),
+    /// Make a report from logs in one step: find the signals, check the wiring, replay
+    #[cfg(feature = "lab")]
+    Look(look::Args),
     /// Convert signal lists of a car, or a BPX cell, to configuration files
     #[cfg(feature = "lab")]
     Import(import::Args),
@@ -194,6 +199,8 @@ pub fn main() -> ExitCode {
         Command::Fit(args) => fit::run(&args),
         #[cfg(feature = "lab")]
         Command::Discover(args) => discover::run(&args),
+        #[cfg(feature = "lab")]
+        Command::Look(args) => look::run(&args),
         #[cfg(feature = "lab")]
         Command::Import(args) => import::run(&args),
         #[cfg(feature = "lab")]

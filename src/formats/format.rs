@@ -3,14 +3,35 @@
 use std::fs::File;
 use std::io::{self, Read};
 
-use crate::LogReader;
 use crate::blf::{self, BlfReader};
 use crate::mf4::{self, Mf4Reader};
 use crate::pcap::{self, PcapNgReader, PcapReader};
+use crate::{LogReader, text};
 
 /// A log format of another tool.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
+    // Text formats.
+    /// Screen text of candump.
+    Candump,
+    /// Text or log of `candump -td`: each stamp is the time since the previous frame.
+    CandumpDeltas,
+    /// Vector ASC.
+    Asc,
+    /// PEAK trace file, version 1.0 to 3.0.
+    Trc,
+    /// CSV of SavvyCAN and GVRET devices.
+    Gvret,
+    /// CSV of python-can.
+    PythonCanCsv,
+    /// Text log of CSS Electronics CL1000, CL2000 and CL3000.
+    Css,
+    /// CRTD of the Open Vehicle Monitoring System.
+    Crtd,
+    /// Text log of Kvaser CanKing.
+    CanKing,
+    /// BUSMASTER log.
+    Busmaster,
     // Binary formats.
     /// Vector binary logging format.
     Blf,
@@ -31,13 +52,33 @@ pub struct Source {
 }
 
 impl Format {
+    /// All formats.
+    pub const ALL: &[Self] = &[
+        // Text formats.
+        Self::Candump,
+        Self::CandumpDeltas,
+        Self::Asc,
+        Self::Trc,
+        Self::Gvret,
+        Self::PythonCanCsv,
+        Self::Css,
+        Self::Crtd,
+        Self::CanKing,
+        Self::Busmaster,
+        // Binary formats.
+        Self::Blf,
+        Self::Mf4,
+        Self::Pcap,
+        Self::PcapNg,
+    ];
+
     /// Number of bytes from which [`recognise`](Self::recognise) finds every format.
     pub const HEAD_BYTES: usize = 16 * 1024;
 
     /// Finds the format from the first bytes of a log (at most [`HEAD_BYTES`](Self::HEAD_BYTES) are needed). `None` =
     /// none of these formats.
     pub fn recognise(head: &[u8]) -> Option<Self> {
-        binary(head)
+        binary(head).or_else(|| text::recognise(&head[..head.len().min(Self::HEAD_BYTES)]))
     }
 
     /// Opens a log of this format.
@@ -45,17 +86,41 @@ impl Format {
     /// # Errors
     /// Fails if the source cannot be read or its header is damaged.
     pub fn open(self, source: Source) -> io::Result<Box<dyn LogReader>> {
-        Ok(match self {
-            Self::Blf => Box::new(BlfReader::open(source)?),
-            Self::Mf4 => Box::new(Mf4Reader::open(source)?),
-            Self::Pcap => Box::new(PcapReader::open(source)?),
-            Self::PcapNg => Box::new(PcapNgReader::open(source)),
-        })
+        match self {
+            // Text formats.
+            Self::Candump
+            | Self::CandumpDeltas
+            | Self::Asc
+            | Self::Trc
+            | Self::Gvret
+            | Self::PythonCanCsv
+            | Self::Css
+            | Self::Crtd
+            | Self::CanKing
+            | Self::Busmaster => text::open(self, source.reader),
+            // Binary formats.
+            Self::Blf => Ok(Box::new(BlfReader::open(source)?)),
+            Self::Mf4 => Ok(Box::new(Mf4Reader::open(source)?)),
+            Self::Pcap => Ok(Box::new(PcapReader::open(source)?)),
+            Self::PcapNg => Ok(Box::new(PcapNgReader::open(source))),
+        }
     }
 
     /// Name of the format, for messages: "Vector ASC".
     pub fn name(self) -> &'static str {
         match self {
+            // Text formats.
+            Self::Candump => "candump screen text",
+            Self::CandumpDeltas => "candump -td, with its time differences added up",
+            Self::Asc => "Vector ASC",
+            Self::Trc => "PEAK TRC",
+            Self::Gvret => "SavvyCAN/GVRET CSV",
+            Self::PythonCanCsv => "python-can CSV",
+            Self::Css => "CSS Electronics text log",
+            Self::Crtd => "OVMS CRTD",
+            Self::CanKing => "Kvaser CanKing text",
+            Self::Busmaster => "BUSMASTER log",
+            // Binary formats.
             Self::Blf => "Vector BLF",
             Self::Mf4 => "ASAM MF4",
             Self::Pcap => "PCAP",

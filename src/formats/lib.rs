@@ -12,6 +12,7 @@
 mod blf;
 mod byte_stream;
 mod channel_list;
+mod foreign;
 mod format;
 mod item;
 mod mf4;
@@ -19,7 +20,9 @@ mod pcap;
 mod raw_frame;
 #[cfg(test)]
 mod testing;
+mod text;
 
+pub use foreign::foreign;
 pub use format::{Format, Source};
 pub use item::{Channel, Item, Position};
 pub use mf4::Mf4Writer;

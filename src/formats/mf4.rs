@@ -25,8 +25,8 @@ pub use self::writer::Mf4Writer;
 use crate::channel_list::ChannelList;
 use crate::{Channel, Item, LogReader, Position, Source};
 
-/// First bytes of a finalized and of an unfinalized file, of any version.
-pub(crate) const MAGICS: [&[u8]; 2] = [b"MDF     ", b"UnFinMF "];
+/// First bytes of a finalized and of an unfinalized file.
+pub(crate) const MAGICS: [&[u8]; 2] = [b"MDF     4", b"UnFinMF 4"];
 
 /// Reads an MF4 file.
 pub(crate) struct Mf4Reader {

@@ -5,6 +5,7 @@
 //! received until that time.
 
 mod survey;
+mod trial;
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -24,6 +25,7 @@ use crate::replay::LogReading;
 use crate::wiring::{WiringObserver, WiringReport};
 
 pub use survey::{Survey, survey};
+pub use trial::try_changes;
 
 /// Progress of a diagnosis.
 #[derive(Debug, Clone, Copy)]

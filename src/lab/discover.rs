@@ -15,6 +15,7 @@ mod configuration;
 mod fields;
 pub(crate) mod groups;
 mod judge;
+mod label;
 mod log_signal;
 mod raw;
 mod signals;
@@ -35,6 +36,7 @@ use log_signal::LogSignal;
 use signals::Descriptions;
 
 pub use configuration::{PackConfiguration, PackSettings};
+pub use label::PackLabel;
 
 /// Direction of a positive current.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -126,6 +128,11 @@ impl Discoverer {
         Ok(())
     }
 
+    /// Sets what the owner knows from the pack's label. The label decides scales that the values leave open.
+    pub fn set_label(&mut self, label: PackLabel) {
+        self.descriptions.label = label;
+    }
+
     /// Receives a frame.
     pub fn handle(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
         self.capture.handle(time, bus, frame);
@@ -145,7 +152,7 @@ impl Discoverer {
     pub fn finish(&self, interfaces: &[String]) -> Discovery {
         let (signals, remarks) = signals::signals(&self.capture, &self.descriptions);
         Discovery {
-            candidates: judge::candidates(&signals, interfaces),
+            candidates: judge::candidates(&signals, interfaces, &self.descriptions.label),
             frames: self.capture.frames,
             ignored_frames: self.capture.ignored,
             answers: self.capture.answers.len(),

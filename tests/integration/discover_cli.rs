@@ -268,9 +268,9 @@ fn ambiguous_log_asks_and_writes_nothing() {
     let args = ["discover", log.to_str().unwrap(), "--write", pack, "--model", model];
     let output = packwatch(&args).code(1);
     let error = String::from_utf8_lossy(&output.get_output().stderr).into_owned();
-    assert!(error.contains("--positive") && error.contains("--cells"), "{error}");
+    assert!(error.contains("--positive") && error.contains("--label 96s"), "{error}");
     assert!(!Path::new(pack).exists());
-    packwatch(&[&args[..], &["--positive", "discharge", "--cells", "96"]].concat()).success();
+    packwatch(&[&args[..], &["--positive", "discharge", "--label", "96s"]].concat()).success();
     packwatch(&["check", pack]).success();
 }
 

@@ -10,6 +10,7 @@
 //! | `cell_model` | a cell model file | as for `configuration` |
 //! | `dbc` | a DBC file | a written DBC reads back unchanged |
 //! | `log`, `journal` | candump logs, CSV, journals | reading records one by one and in batches gives the same records |
+//! | `formats` | logs of other tools | reading in small parts gives the same items; nothing follows the end |
 //! | `table` | measured CSV of `fit`, `rul`, `gpr` | all rows have the same number of values |
 //! | `obdb`, `bpx` | files of `import` | a cell model that is written from BPX is accepted |
 //! | `control` | a line on the control socket | a written line reads back unchanged |
@@ -18,6 +19,7 @@
 mod configuration;
 mod core;
 mod files;
+mod formats;
 mod snapshot;
 mod source;
 mod store;
@@ -37,6 +39,7 @@ pub const DOORS: &[(&str, Door)] = &[
     ("dbc", texts::dbc),
     ("log", files::log),
     ("journal", files::journal),
+    ("formats", formats::formats),
     ("control", texts::control),
     ("store", store::store),
     #[cfg(feature = "lab")]

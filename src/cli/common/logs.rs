@@ -43,6 +43,19 @@ pub(crate) struct InputArgs {
     pub(crate) start_times: Option<PathBuf>,
 }
 
+impl Default for InputArgs {
+    fn default() -> Self {
+        Self {
+            strict: false,
+            sleep_gap: SLEEP_GAP_S,
+            channels: Vec::new(),
+            columns: Vec::new(),
+            csv_sign: CsvSign::Discharge,
+            start_times: None,
+        }
+    }
+}
+
 /// Returns the options for reading logs with a configuration.
 pub(crate) fn log_options(args: &InputArgs, config: &Config) -> LogOptions {
     let reading = LogReading {

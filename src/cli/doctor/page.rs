@@ -92,6 +92,9 @@ fn show(finding: &WiringFinding, width: usize, paint: Paint, page: &mut String) 
         }
     }
     changes(&finding.changes, paint, page);
+    if finding.is_solved == Some(true) {
+        page.push_str(&format!("{}with this change, the finding disappears\n", paint.dim(&format!("  {:8}", "tried"))));
+    }
     consequences(&finding.consequences, width, paint, page);
 }
 

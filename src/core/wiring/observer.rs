@@ -5,9 +5,10 @@ use std::collections::BTreeMap;
 use super::evidence::Series;
 use super::evidence::Slope;
 use super::evidence::response::{BLOCKS_S, VoltageResponse, best_response};
+use super::evidence::usage::UsageRecord;
 use super::other_current::OtherCurrent;
 use super::plan::SignalPlan;
-use super::plan::{InterfacePlan, Plan};
+use super::plan::{InterfacePlan, Plan, Witness};
 use crate::can::e2e::Status;
 use crate::can::guard::Guards;
 use crate::can::uds::{Answer, FrameOutcome, Listener, Question};
@@ -55,6 +56,19 @@ pub(crate) struct EstimatorStats {
     pub(crate) innovation_sum: f64,
 }
 
+/// A time in which no frame arrived on any interface.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Hole {
+    pub(crate) from: Timestamp,
+    pub(crate) to: Timestamp,
+}
+
+impl Hole {
+    pub(crate) fn seconds(&self) -> f64 {
+        self.to.since(self.from)
+    }
+}
+
 /// Selects one of the plan's lists of signals.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum SignalList {
@@ -88,8 +102,17 @@ pub struct WiringObserver {
     /// Voltage responses over short and long blocks.
     responses: [VoltageResponse; 2],
     pub(crate) estimator: EstimatorStats,
+    /// Current, charge, voltage and reported values at the same times.
+    pub(crate) usage: UsageRecord,
+    /// Signals of the reported values in `usage`, in order.
+    pub(super) witnesses: Vec<Witness>,
+    /// The longest holes, and the number of all holes.
+    pub(crate) holes: Vec<Hole>,
+    pub(crate) hole_count: usize,
+    /// Time of the first frame.
+    pub(crate) first: Option<Timestamp>,
     /// Time of the latest frame.
-    latest: Option<Timestamp>,
+    pub(crate) latest: Option<Timestamp>,
     /// Sum of the times between frames (s). Gaps above 30 s are left out, because the buses sleep during these gaps.
     pub(crate) awake_s: f64,
     /// Time listened on live interfaces (s); `None` for a recording, which uses `awake_s` instead.
@@ -139,6 +162,11 @@ impl WiringObserver {
             protected: BTreeMap::new(),
             responses: BLOCKS_S.map(|block_s| VoltageResponse::new(cells, tolerance_a, block_s)),
             estimator: EstimatorStats::default(),
+            usage: UsageRecord::new(cells),
+            witnesses: plan.witnesses(),
+            holes: Vec::new(),
+            hole_count: 0,
+            first: None,
             latest: None,
             awake_s: 0.0,
             listened_s: None,
@@ -217,7 +245,7 @@ impl WiringObserver {
 
     /// Reads signals of a frame's payload or of an answer's data.
     fn read_signals(&mut self, time: Timestamp, wanted: &[(SignalList, usize)], data: &[u8]) {
-        let Self { plan, series, more_cells, unconfigured, responses, other_currents, .. } = self;
+        let Self { plan, series, more_cells, unconfigured, responses, other_currents, usage, witnesses, .. } = self;
         let cells = f64::from(plan.pack.cells.max(1));
         for &(list, index) in wanted {
             let (signals, series) = match list {
@@ -230,10 +258,16 @@ impl WiringObserver {
             let is_configured = list == SignalList::Configured;
             let max_age_s = if is_configured { plan.max_age_s(binding.channel) } else { f64::INFINITY };
             let value = series[index].handle(time, data, binding, max_age_s);
+            if let Some(value) = value.filter(|_| list != SignalList::MoreCells) {
+                let witness = Witness { is_configured, index };
+                let place = witnesses.iter().position(|other| *other == witness);
+                place.into_iter().for_each(|place| usage.handle_reported(place, value));
+            }
             let Some(value) = value.filter(|_| is_configured) else { continue };
             let (cell, voltage_v) = match binding.channel {
                 Channel::Current => {
                     responses.iter_mut().for_each(|response| response.handle_current(time, value));
+                    usage.handle_current(time, value);
                     continue;
                 }
                 Channel::PackVoltage => (0, value / cells),
@@ -248,6 +282,7 @@ impl WiringObserver {
             };
             let others = other_currents.values_mut().flat_map(OtherCurrent::responses_mut);
             responses.iter_mut().chain(others).for_each(|response| response.handle_voltage(time, cell, voltage_v));
+            usage.handle_voltage(time, cell, voltage_v);
         }
     }
 
@@ -283,10 +318,12 @@ impl WiringObserver {
     }
 
     fn note_time(&mut self, time: Timestamp) {
+        self.first.get_or_insert(time);
         let last = *self.latest.get_or_insert(time);
         let passed_s = time.since(last);
         // The buses slept, or the recording has a gap.
         if passed_s > 30.0 {
+            self.note_hole(Hole { from: last, to: time });
             self.handle_gap();
         } else {
             self.awake_s += passed_s.max(0.0);
@@ -294,10 +331,24 @@ impl WiringObserver {
         self.latest = Some(last.max(time));
     }
 
+    fn note_hole(&mut self, hole: Hole) {
+        /// Maximum number of holes that are kept: more than a report lists.
+        const MAX_HOLES: usize = 16;
+        self.hole_count += 1;
+        self.holes.push(hole);
+        if self.holes.len() > MAX_HOLES
+            && let Some(shortest) =
+                (0..self.holes.len()).min_by(|a, b| self.holes[*a].seconds().total_cmp(&self.holes[*b].seconds()))
+        {
+            self.holes.remove(shortest);
+        }
+    }
+
     /// Handles a period of unknown length in which the observer did not listen.
     pub fn handle_gap(&mut self) {
         let Self { series, more_cells, unconfigured, .. } = self;
         series.iter_mut().chain(more_cells).chain(unconfigured).for_each(Series::pause);
+        self.usage.pause();
         self.end_blocks();
         self.guards.restart();
         self.listener.restart();

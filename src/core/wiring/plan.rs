@@ -1,11 +1,13 @@
 //! Plan: what `doctor` expects on the buses, from the readable parts of the configuration.
 
+use super::evidence::SignalLabel;
+use super::evidence::usage::MAX_REPORTED;
 use crate::can::CanId;
 use crate::can::decode::Binding;
 use crate::can::guard::GuardConfig;
 use crate::can::signal::SignalLayout;
 use crate::can::uds::Question;
-use crate::cell::CellModel;
+use crate::cell::{CellModel, Chemistry, Label};
 use crate::quantity::{BusIndex, Channel};
 
 /// Everything expected on the buses. Parts missing from a broken configuration are not judged.
@@ -51,6 +53,8 @@ pub struct PackPlan {
     pub strings: u16,
     /// The cell model; `None` if it cannot be read.
     pub model: Option<CellModel>,
+    /// The label of the cell, if the model comes from a label; `None` if the model comes from a file.
+    pub label: Option<Label>,
     /// Capacity of a cell (Ah). If no capacity is configured, the capacity of the model applies.
     pub capacity_ah: f64,
     /// Ambient temperature (degrees C).
@@ -93,7 +97,40 @@ pub struct SignalPlan {
     pub offset: f64,
 }
 
+impl PackPlan {
+    /// The key of `[pack]` that states the capacity, and its value for cells of `cell_ah` (Ah).
+    pub(super) fn capacity_change(&self, cell_ah: f64) -> (&'static str, String) {
+        match self.label {
+            // Two digits, because the capacity of a used pack is not exact.
+            Some(_) => ("rated_capacity_ah", format!("{cell_ah:.1e}").parse::<f64>().unwrap_or(cell_ah).to_string()),
+            None => (self.model_change().0, self.model_change().1.to_owned()),
+        }
+    }
+
+    /// The key of `[pack]` that states the kind of cell, and a description of its value.
+    pub(super) fn model_change(&self) -> (&'static str, &'static str) {
+        match self.label {
+            Some(_) => ("chemistry", "the chemistry on the label of the cell"),
+            None => ("cell_model", "the model of the installed cell"),
+        }
+    }
+
+    /// The key of `[pack]` that states the chemistry, and its value.
+    pub(super) fn chemistry_change(&self, chemistry: Chemistry) -> (&'static str, String) {
+        match self.label {
+            Some(_) => ("chemistry", format!("{:?}", chemistry.name())),
+            None => ("cell_model", format!("a model of a cell of {}", chemistry.name())),
+        }
+    }
+}
+
 impl SignalPlan {
+    /// The signal's name and unit.
+    pub(super) fn label(&self) -> SignalLabel {
+        let name = self.name.rsplit_once('.').map_or(self.name.as_str(), |(_, name)| name);
+        SignalLabel::new(&self.message, name, &self.unit)
+    }
+
     /// Whether this signal and `other` share bits.
     pub(super) fn shares_bits(&self, other: &Self) -> bool {
         let (a, b) = (&self.binding, &other.binding);
@@ -186,7 +223,34 @@ impl Kind {
     }
 }
 
+/// A signal in which the pack reports its state of charge or health: an index into `signals` or `unconfigured`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Witness {
+    pub(super) is_configured: bool,
+    pub(super) index: usize,
+}
+
 impl Plan {
+    /// The signals in which the pack reports its charge or health, the configured signals first. Their order is the
+    /// order of the values in the record of the pack's use.
+    pub(super) fn witnesses(&self) -> Vec<Witness> {
+        let is_witness =
+            |signal: &SignalPlan| matches!(signal.binding.channel, Channel::ReportedSoc | Channel::ReportedSoh);
+        let of = |is_configured: bool, signals: &[SignalPlan]| {
+            let found = (0..signals.len()).filter(|index| is_witness(&signals[*index]));
+            found.map(|index| Witness { is_configured, index }).collect::<Vec<_>>()
+        };
+        let mut all = of(true, &self.signals);
+        all.extend(of(false, &self.unconfigured));
+        all.truncate(MAX_REPORTED);
+        all
+    }
+
+    /// The signal of a witness.
+    pub(super) fn witness(&self, Witness { is_configured, index }: Witness) -> &SignalPlan {
+        if is_configured { &self.signals[index] } else { &self.unconfigured[index] }
+    }
+
     /// Age from which a reading of the channel is stale (s).
     pub(super) fn max_age_s(&self, channel: Channel) -> f64 {
         self.max_ages_s.get(Kind::of(channel) as usize).copied().flatten().unwrap_or(f64::INFINITY)

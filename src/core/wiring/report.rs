@@ -55,6 +55,8 @@ pub enum Topic {
     Cell,
     /// Readings arrive too slowly or too unevenly.
     Period,
+    /// Stretches of the log or of one input are missing.
+    Missing,
     /// The cell model belongs to another cell.
     CellModel,
     /// The current is not zero at rest.
@@ -97,6 +99,8 @@ pub struct WiringFinding {
     pub changes: Vec<Change>,
     /// Further advice, or the only advice if no change of the configuration helps.
     pub advice: Option<String>,
+    /// Whether the changes remove this finding, if the same input was judged again with them; `None` = not tried.
+    pub is_solved: Option<bool>,
     /// Titles of findings that are probably consequences of this finding and are not listed separately.
     pub consequences: Vec<String>,
 }
@@ -121,7 +125,7 @@ impl WiringFinding {
     pub fn new(severity: Severity, topic: Topic, title: impl Into<String>) -> Self {
         let (seen, why) = (String::new(), String::new());
         let (changes, consequences) = (Vec::new(), Vec::new());
-        Self { severity, topic, title: title.into(), seen, why, changes, advice: None, consequences }
+        Self { severity, topic, title: title.into(), seen, why, changes, advice: None, is_solved: None, consequences }
     }
 
     pub(super) fn seen(&mut self, seen: impl Into<String>) -> &mut Self {
@@ -138,10 +142,6 @@ impl WiringFinding {
         let (table, key) = (table.to_owned(), key.to_owned());
         self.changes.push(Change { table, key, proposed: proposed.into(), place: None, now: None });
         self
-    }
-
-    pub(super) fn change_cell_model(&mut self) -> &mut Self {
-        self.change("pack", "cell_model", "the model of the installed cell")
     }
 
     pub(super) fn advice(&mut self, advice: impl Into<String>) -> &mut Self {

@@ -47,18 +47,13 @@ impl MdfFile {
     /// Reads the first 64 bytes.
     ///
     /// # Errors
-    /// Fails if the file cannot be read or is not of version 4.
+    /// Fails if the file cannot be read or is shorter.
     pub(super) fn open(file: File) -> io::Result<Self> {
         let len = file.metadata()?.len();
         let mut file = Self { file, len, unfinalized: 0 };
         let mut head = [0; FIRST_BLOCK as usize];
         if file.read(0, &mut head)? < head.len() {
             return Err(cut(format!("the file ends after {len} bytes, must have a head of 64")));
-        }
-        let version = String::from_utf8_lossy(&head[8..16]).trim_end_matches(['\0', ' ']).to_owned();
-        if !version.starts_with('4') {
-            let text = "MDF version {version}, must be 4: convert the file to MF4, for example with asammdf";
-            return Err(damaged(text.replace("{version}", &version)));
         }
         if head.starts_with(super::MAGICS[1]) {
             file.unfinalized = u16_at(&head, 60, false);

@@ -25,6 +25,7 @@ mod polling;
 pub(crate) mod protect;
 pub(crate) mod signals;
 
+pub(crate) use cells::label as label_of;
 pub(crate) use pattern::Pattern;
 pub(crate) use polling::answers;
 pub(crate) use signals::{Databases, NamedSignal, ResolvedSignal, channel_words, input_map, ranges};

@@ -17,5 +17,5 @@ pub use faults::ConfigFaults;
 pub(crate) use faults::{Faults, SourceLine, TablePlace};
 pub(crate) use merge::Document;
 pub use source::{ConfigFiles, ReadFile};
-pub(crate) use source::{Sources, beside, read_file};
+pub(crate) use source::{Sources, beside, meant_file, read_file};
 pub use text::{merged, merged_with};

@@ -35,7 +35,7 @@ mod result;
 mod schema;
 
 pub use cell_model::{of_label, of_view};
-pub(crate) use checks::{Databases, NamedSignal, Pattern, ResolvedSignal, answers, channel_words, input_map};
+pub(crate) use checks::{Databases, NamedSignal, Pattern, ResolvedSignal, answers, channel_words, input_map, label_of};
 pub use description::{
     Description, InterfaceUse, OutputUse, SignalUse, command_words, describe, describe_with, manual, reference,
 };

@@ -18,7 +18,7 @@ mod tables;
 mod threshold;
 
 pub(crate) use key::{Key, Presence, Setting, TableReader, ValueFault, ValueRange, in_range, typed, within};
-pub(crate) use reader::{SchemaReader, did_you_mean};
+pub(crate) use reader::{SchemaReader, did_you_mean, nearest};
 pub(crate) use section::{Section, SectionInfo, section, table_field};
 pub(crate) use tables::{RawTables, SECTIONS};
 pub(crate) use threshold::{Level, Threshold};

@@ -15,8 +15,8 @@ use crate::can::encode::SentMessage;
 use crate::can::uds::Answer;
 use crate::cell::CellModel;
 use crate::config::{
-    Config, ConfigFaults, Databases, NamedSignal, PartialConfig, Pattern, RawTables, ResolvedSignal, SignalSource,
-    TablePlace, answers, input_map,
+    Config, ConfigFaults, Databases, NamedSignal, PartialConfig, Pattern, RawTables, ReadFile, ResolvedSignal,
+    SignalSource, TablePlace, answers, input_map, label_of,
 };
 use crate::quantity::{CellIndex, Channel, MAX_CELLS};
 use crate::wiring::{InterfacePlan, MessagePlan, OutputPlan, PackPlan, Plan, SignalPlan};
@@ -55,7 +55,12 @@ impl Survey {
 /// # Errors
 /// Fails if no interface is configured or no signal can be found, and returns all faults.
 pub fn survey(path: &Path) -> Result<Survey, ConfigFaults> {
-    let partial = PartialConfig::read(path)?;
+    survey_with(path, &|path: &Path| std::fs::read(path))
+}
+
+/// Like [`survey`], but reads files with `read`.
+pub(super) fn survey_with(path: &Path, read: ReadFile<'_>) -> Result<Survey, ConfigFaults> {
+    let partial = PartialConfig::read(path, read)?;
     let found = partial.signals();
     let answers = answers(&found).unwrap_or_default();
     let input = input_map(&found).filter(|_| !partial.raw.interfaces.is_empty() && !found.is_empty());
@@ -78,6 +83,7 @@ fn plan(partial: &PartialConfig, found: &[ResolvedSignal<'_>]) -> Plan {
         strings,
         capacity_ah: capacity_ah(raw, model),
         model: model.cloned(),
+        label: pack.and_then(label_of),
         ambient_c: pack.map_or(25.0, |pack| pack.ambient_c),
         dead_band_a: raw.transition.as_ref().map_or(pack_ah / 50.0, |keys| keys.config(pack_ah).dead_band_a),
         voltage_noise_v: raw.estimator.as_ref().map_or(0.0, |keys| keys.voltage_noise_v),

@@ -13,6 +13,7 @@ use super::log_signal::{LogSignal, MessageField, SignalOrigin};
 use super::signals::Descriptions;
 use super::{Candidate, Discovery, PositiveDirection, raw};
 use crate::can::CanId;
+use crate::cell::Label;
 use crate::fit::quoted;
 use crate::import::{DiagnosticSignal, DiagnosticTable, series};
 use crate::wiring::evidence::PackQuantity;
@@ -30,10 +31,8 @@ pub struct PackSettings {
     pub databases: Vec<String>,
     /// Path of the new DBC as the configuration names it. The new DBC describes the fields that no given DBC describes.
     pub own_database: String,
-    /// Path of the cell model as the configuration names it.
-    pub cell_model: String,
-    /// Number of cells in series, for a pack that sends only its total voltage.
-    pub cells: Option<u16>,
+    /// Path of the cell model as the configuration names it; `None` if the label describes the cell.
+    pub cell_model: Option<String>,
     /// Direction of a positive current; needed if the log does not show it.
     pub positive: Option<PositiveDirection>,
 }
@@ -73,6 +72,10 @@ impl Writer<'_> {
     pub(super) fn write(&self) -> Result<PackConfiguration, Vec<String>> {
         let selection = self.select()?;
         let mut open = Vec::new();
+        if let Some(cells) = self.descriptions.label.cells.filter(|cells| *cells != selection.cells) {
+            let found = selection.cells;
+            open.push(format!("the label says {cells} cells in series, the log has {found}: which one is right?"));
+        }
         if self.is_raw(selection.current) {
             open.push(format!(
                 "the scale of {} is a guess, and the capacity depends on it: compare it with a known current",
@@ -83,7 +86,9 @@ impl Writer<'_> {
         self.inputs(&selection, &mut text, &mut open);
         self.tables(&selection, &mut text, &mut open);
         self.limits(&selection, &mut text);
-        open.push(format!("cell_model = {:?}: is it this cell?", self.settings.cell_model));
+        if let Some(model) = &self.settings.cell_model {
+            open.push(format!("cell_model = {model:?}: is it this cell?"));
+        }
         open.push("which alarms, which limits of current and temperature? see the reference of keys".to_owned());
         let mut known = BTreeSet::new();
         open.retain(|question: &String| known.insert(question.clone()));
@@ -127,14 +132,15 @@ impl Writer<'_> {
             self.discovery.candidates.iter().filter(|candidate| candidate.quantity == PackQuantity::CellVoltage);
         let cells = groups.filter_map(|group| Some((group, self.row(group)?))).next();
         let pack = self.best(PackQuantity::PackVoltage);
-        let voltage = match (cells, pack, self.settings.cells) {
+        let stated = self.descriptions.label.cells;
+        let voltage = match (cells, pack, stated) {
             (Some((group, count)), _, _) => Some((group, count)),
             (None, Some(pack), Some(count)) => Some((pack, count)),
             (None, Some(pack), None) => {
-                let (low, high) = (pack.high / 4.2, pack.low / 3.0);
+                let (low, high) = self.fitting_cells(pack);
                 questions.push(format!(
-                    "how many cells are in series? {} of {:.0} to {:.0} V may be {:.0} to {:.0}: give --cells",
-                    pack.signal, pack.low, pack.high, low, high
+                    "how many cells are in series? {} of {:.0} to {:.0} V: {low} to {high} fit; give --label 96s",
+                    pack.signal, pack.low, pack.high
                 ));
                 None
             }
@@ -143,7 +149,14 @@ impl Writer<'_> {
                 None
             }
         };
-        let (Some(current), Some(positive), Some((voltage, cells))) = (current, positive, voltage) else {
+        if self.settings.cell_model.is_none() && self.descriptions.label.cell().is_none() {
+            questions.push(
+                "which cell is it? give --model CELL.toml, or chemistry and capacity from the label, such as --label nmc:64Ah"
+                    .to_owned(),
+            );
+        }
+        let (Some(current), Some(positive), Some((voltage, cells)), []) = (current, positive, voltage, &questions[..])
+        else {
             return Err(questions);
         };
         // A field without a name may be a temperature or something else.
@@ -152,6 +165,25 @@ impl Writer<'_> {
         let soh = self.best(PackQuantity::Soh).map(|candidate| ("reported_soh", candidate));
         let reported = soc.into_iter().chain(soh).collect();
         Ok(Selection { current, positive, voltage, cells, temperature, reported })
+    }
+
+    /// The numbers of cells in series with which a pack voltage is plausible. A state of charge narrows the range.
+    fn fitting_cells(&self, pack: &Candidate) -> (u32, u32) {
+        /// Largest difference between the state of charge of a dashboard and that of the cells.
+        const HIDDEN: f64 = 0.13;
+        let label = &self.descriptions.label;
+        let (mut low_v, mut high_v) = (3.0, 4.2);
+        let model =
+            label.chemistry.and_then(|chemistry| Label::usual(chemistry, label.capacity_ah.unwrap_or(50.0)).model());
+        if let Some(model) = model {
+            (low_v, high_v) = (model.voltage_min_v, model.voltage_max_v);
+            if let Some(soc) = self.best(PackQuantity::Soc) {
+                let ocv_v = |soc: f64| model.ocv_v(&model.grid_position(soc.clamp(0.0, 1.0), 25.0));
+                // Under load, the voltage differs from the open-circuit voltage.
+                (low_v, high_v) = (ocv_v(soc.low / 100.0 - HIDDEN) - 0.05, ocv_v(soc.high / 100.0 + HIDDEN) + 0.05);
+            }
+        }
+        ((pack.high / high_v).ceil() as u32, (pack.low / low_v).floor() as u32)
     }
 
     fn signal(&self, index: usize) -> &LogSignal {
@@ -196,8 +228,13 @@ impl Writer<'_> {
         if !self.used_tables(selection).0.is_empty() {
             text.push_str("# Definitions from OBDb (https://github.com/OBDb) are under CC BY-SA 4.0, and so is this file with them.\n");
         }
-        let _ =
-            write!(text, "\n[pack]\ncells = {}\ncell_model = {}\n", selection.cells, quoted(&self.settings.cell_model));
+        let _ = write!(text, "\n[pack]\ncells = {}\n", selection.cells);
+        if let Some(model) = &self.settings.cell_model {
+            let _ = writeln!(text, "cell_model = {}", quoted(model));
+        } else if let Some(label) = self.descriptions.label.cell() {
+            let (name, rated_ah) = (label.chemistry.name(), label.rated_ah);
+            let _ = write!(text, "chemistry = {}\nrated_capacity_ah = {rated_ah}\n", quoted(name));
+        }
         for interface in self.interfaces(selection) {
             let _ = write!(text, "\n[[interface]]\nname = {}\n", quoted(interface));
         }

@@ -4,7 +4,7 @@
 //!   scales. The value is plausible for a pack, varies by at most 35 % and takes at least five different codes.
 //! * Current: the same positions, but signed. The changes of the field correlate with the changes of a voltage, as with
 //!   a current through a resistance. The scale is a guess: of the common scales, the one whose resistance is closest to
-//!   a typical resistance.
+//!   a typical resistance of the label's pack. A current that never comes near zero has an offset.
 //! * Cells: neighbouring fields of 8, 12 or 16 bits with similar values. Each message or page (selected by the first
 //!   byte) has at least three such fields, and all messages together have at least eight.
 //!
@@ -13,6 +13,7 @@
 use std::collections::BTreeSet;
 
 use super::capture::{Capture, MessageKey, Payloads};
+use super::label::PackLabel;
 use super::log_signal::{LogSignal, MessageField, SignalOrigin, longest_run};
 use crate::can::CanId;
 use crate::can::dbc::{Database, FrameFormat, Message, MuxCondition, Signal};
@@ -25,10 +26,13 @@ const MAX_PAYLOADS: usize = 1500;
 /// Plausible voltages of a pack (V). The scales below are in V per code.
 const PACK_V: (f64, f64) = (100.0, 950.0);
 const PACK_SCALES: [f64; 5] = [0.1, 0.01, 0.05, 0.25, 0.5];
+/// Largest deviation of the pack's voltage from the sum of its cells, as a fraction.
+const SUM_TOLERANCE: f64 = 0.02;
 /// Scales of a current (A) per code.
 const CURRENT_SCALES: [f64; 7] = [0.1, 0.01, 0.05, 0.025, 0.25, 0.5, 1.0];
-/// Plausible voltages of a cell (V). The next constant is the largest difference between cells of a pack (V).
-const CELL_V: (f64, f64) = (2.5, 4.4);
+/// Fewest cells of a row, if the label does not state the number of cells.
+const MIN_CELLS: usize = 8;
+/// Largest difference between cells of a pack (V).
 const MAX_SPREAD_V: f64 = 0.25;
 /// Lengths of a cell voltage in bits, each with the scales to try (V) per code.
 const CELL_FORMS: [(u16, &[f64]); 3] = [(16, &[0.001, 0.0001, 0.002, 0.0005]), (12, &[0.001, 0.002]), (8, &[0.02])];
@@ -39,7 +43,7 @@ pub(super) fn message_name(id: CanId) -> String {
 }
 
 /// Returns the fields that behave like a voltage, a current or cells.
-pub(super) fn signals(capture: &Capture) -> Vec<LogSignal> {
+pub(super) fn signals(capture: &Capture, label: &PackLabel) -> Vec<LogSignal> {
     let diagnostic: BTreeSet<CanId> = capture
         .answers
         .iter()
@@ -50,14 +54,16 @@ pub(super) fn signals(capture: &Capture) -> Vec<LogSignal> {
     let usual = usual.filter(|(key, payloads)| payloads.len() >= 20 && !diagnostic.contains(&key.1));
     let messages = usual.map(|(key, payloads)| Samples::new(*key, payloads)).filter(|samples| samples.bytes >= 2);
     let messages: Vec<Samples<'_>> = messages.collect();
-    let mut found = cells(&messages);
+    let mut found = cells(&messages, label);
+    let sum_v: f64 = found.iter().map(|cell| cell.series.extent.mean()).sum();
     let of_cells: BTreeSet<MessageKey> = found.iter().filter_map(LogSignal::message).collect();
     let others = messages.iter().filter(|samples| !of_cells.contains(&samples.key));
-    let mut voltages: Vec<LogSignal> = others.flat_map(voltages_of).collect();
+    let mut voltages: Vec<LogSignal> = others.flat_map(|samples| voltages_of(samples, label, sum_v)).collect();
     voltages.sort_by(|a, b| swing(&a.series).total_cmp(&swing(&b.series)).then_with(|| a.name.cmp(&b.name)));
     voltages.truncate(16);
     let compared: Vec<&LogSignal> = voltages.iter().chain(found.first()).collect();
-    let currents = currents(messages.iter().filter(|samples| !of_cells.contains(&samples.key)), &compared);
+    let others = messages.iter().filter(|samples| !of_cells.contains(&samples.key));
+    let currents = currents(others, &compared, label);
     found.extend(currents);
     found.extend(voltages);
     found
@@ -161,8 +167,10 @@ fn place(layout: &SignalLayout) -> String {
     format!("{}bits_at_{}_{order}", layout.length_bits, layout.start_bit)
 }
 
-fn voltages_of(samples: &Samples<'_>) -> Vec<LogSignal> {
+/// Finds the fields that may be the pack's voltage. `sum_v`: the sum of the cell voltages found (V); 0 = no cells.
+fn voltages_of(samples: &Samples<'_>, label: &PackLabel, sum_v: f64) -> Vec<LogSignal> {
     let mut found = Vec::new();
+    let (low_v, high_v) = label.pack_v().unwrap_or(PACK_V);
     for layout in layouts(samples.bytes, false) {
         let codes = samples.values(&layout, None);
         // Within a log, the voltage of a pack varies by at most this share of its maximum.
@@ -171,7 +179,8 @@ fn voltages_of(samples: &Samples<'_>) -> Vec<LogSignal> {
             continue;
         }
         for factor in PACK_SCALES {
-            if codes.extent.min * factor >= PACK_V.0 && codes.extent.max * factor <= PACK_V.1 {
+            let is_within = codes.extent.min * factor >= low_v && codes.extent.max * factor <= high_v;
+            if is_within || (codes.extent.mean() * factor / sum_v - 1.0).abs() <= SUM_TOLERANCE {
                 let layout = SignalLayout { factor, ..layout };
                 let series = samples.values(&layout, None);
                 found.push(signal(
@@ -189,14 +198,22 @@ fn voltages_of(samples: &Samples<'_>) -> Vec<LogSignal> {
 }
 
 /// Finds the fields whose changes correlate best with the changes of a pack voltage or cell voltage.
-fn currents<'a>(messages: impl Iterator<Item = &'a Samples<'a>>, voltages: &[&LogSignal]) -> Vec<LogSignal> {
+fn currents<'a>(
+    messages: impl Iterator<Item = &'a Samples<'a>>,
+    voltages: &[&LogSignal],
+    label: &PackLabel,
+) -> Vec<LogSignal> {
     let mut found: Vec<(f64, LogSignal)> = Vec::new();
     for samples in messages {
-        for layout in layouts(samples.bytes, true) {
+        for layout in layouts(samples.bytes, true).into_iter().chain(layouts(samples.bytes, false)) {
             let codes = samples.values(&layout, None);
-            if codes.is_constant() || codes.is_counter() {
+            // Without the highest bit, the unsigned field equals the signed field.
+            let is_same =
+                layout.value_type == ValueType::Unsigned && codes.extent.max < f64::from(layout.length_bits - 1).exp2();
+            if codes.is_constant() || codes.is_counter() || is_same {
                 continue;
             }
+            let Some(zero) = zero_code(&codes) else { continue };
             let others = voltages.iter().filter(|voltage| !shares_bits(voltage, samples.key.1, &layout));
             let related = others
                 .filter_map(|voltage| Some((Slope::between(&voltage.series, &codes)?, voltage.series.extent.mean())));
@@ -206,13 +223,18 @@ fn currents<'a>(messages: impl Iterator<Item = &'a Samples<'a>>, voltages: &[&Lo
                 .max_by(|a, b| a.0.correlation().abs().total_cmp(&b.0.correlation().abs()));
             let Some((slope, mean_v)) = best else { continue };
             let distance = |factor: &f64| {
-                // A typical pack has 0.1 ohm at 400 V.
-                let unusual = (slope.ohm.abs() / factor / mean_v / 2.5e-4).ln().abs();
+                let unusual = (slope.ohm.abs() / factor / mean_v / label.ohm_per_v()).ln().abs();
                 // The first scale is preferred, because it is the most common scale.
                 if *factor == CURRENT_SCALES[0] { unusual - 0.25 } else { unusual }
             };
             let factor = CURRENT_SCALES.iter().copied().min_by(|a, b| distance(a).total_cmp(&distance(b)));
-            let layout = SignalLayout { factor: factor.unwrap_or(1.0), ..layout };
+            let factor = factor.unwrap_or(1.0);
+            if zero != 0.0 && PACK_SCALES.iter().any(|scale| (codes.extent.mean() * scale / mean_v - 1.0).abs() < 0.05)
+            {
+                // Another reading of the voltage.
+                continue;
+            }
+            let layout = SignalLayout { factor, offset: -zero * factor, ..layout };
             let series = samples.values(&layout, None);
             let name = format!("Current_{}", place(&layout));
             found.push((slope.correlation().abs(), signal(samples.key, None, name, Quantity::Current, layout, series)));
@@ -220,6 +242,18 @@ fn currents<'a>(messages: impl Iterator<Item = &'a Samples<'a>>, voltages: &[&Lo
     }
     found.sort_by(|a, b| b.0.total_cmp(&a.0).then_with(|| a.1.name.cmp(&b.1.name)));
     found.into_iter().take(12).map(|(_, signal)| signal).collect()
+}
+
+/// The code that means zero: 0, or an offset if the codes never come near zero. `None` if no usual offset fits.
+pub(super) fn zero_code(codes: &Series) -> Option<f64> {
+    let (low, high) = (codes.extent.min, codes.extent.max);
+    if low - 3.0 * (high - low) <= 0.0 {
+        return Some(0.0);
+    }
+    // The middle of a 16-bit and a 12-bit field, then round numbers, the roundest first.
+    let powers = [32_768.0, 32_767.0, 2048.0, 32_000.0].into_iter();
+    let round = [10_000.0, 5000.0, 1000.0, 500.0, 100.0].into_iter().map(|step| (high / step).floor() * step);
+    powers.chain(round).find(|zero| (low..=high).contains(zero))
 }
 
 /// Whether a field overlaps a layout in the message `id`, on any interface: gateways repeat messages on other
@@ -240,13 +274,17 @@ impl LogSignal {
 
 /// Finds rows of neighbouring cells in messages and pages. All rows have the same field length, scale and byte order,
 /// and their cells are numbered consecutively.
-fn cells(messages: &[Samples<'_>]) -> Vec<LogSignal> {
+fn cells(messages: &[Samples<'_>], label: &PackLabel) -> Vec<LogSignal> {
     let mut best: Vec<LogSignal> = Vec::new();
+    let wanted = label.cells.map(usize::from);
+    let least = wanted.unwrap_or(MIN_CELLS).clamp(3, MIN_CELLS);
+    // The number on the label outweighs a longer row.
+    let weight = |found: &Vec<LogSignal>| (Some(found.len()) == wanted, found.len());
     for (bits, scales) in CELL_FORMS {
         for factor in scales {
             for byte_order in [ByteOrder::LittleEndian, ByteOrder::BigEndian] {
-                let found = cells_of_form(messages, bits, *factor, byte_order);
-                if found.len() >= 8 && found.len() > best.len() {
+                let found = cells_of_form(messages, label.cell_v(), bits, *factor, byte_order);
+                if found.len() >= least && weight(&found) > weight(&best) {
                     best = found;
                 }
             }
@@ -255,7 +293,13 @@ fn cells(messages: &[Samples<'_>]) -> Vec<LogSignal> {
     best
 }
 
-fn cells_of_form(messages: &[Samples<'_>], bits: u16, factor: f64, byte_order: ByteOrder) -> Vec<LogSignal> {
+fn cells_of_form(
+    messages: &[Samples<'_>],
+    cell_v: (f64, f64),
+    bits: u16,
+    factor: f64,
+    byte_order: ByteOrder,
+) -> Vec<LogSignal> {
     let mut found: Vec<LogSignal> = Vec::new();
     for samples in messages {
         let end = u16::try_from(8 * samples.bytes).unwrap_or(0);
@@ -266,7 +310,7 @@ fn cells_of_form(messages: &[Samples<'_>], bits: u16, factor: f64, byte_order: B
             let rows = starts.map(|start| {
                 let places = (start..end).step_by(usize::from(bits)).filter(|place| place + bits <= end);
                 let layouts = places.map(|place| layout(place, bits, byte_order, ValueType::Unsigned, factor));
-                row(samples, *page, layouts)
+                row(samples, *page, cell_v, layouts)
             });
             let longest = rows.rev().max_by_key(Vec::len).filter(|row| row.len() >= 3);
             let Some(row) = longest.filter(|row| continues(&found, samples.key, row)) else { continue };
@@ -299,11 +343,12 @@ fn pages(payloads: &Payloads) -> Vec<Option<u8>> {
 fn row(
     samples: &Samples<'_>,
     page: Option<u8>,
+    (low_v, high_v): (f64, f64),
     layouts: impl Iterator<Item = SignalLayout>,
 ) -> Vec<(SignalLayout, Series)> {
     let neighbours = layouts.map(|layout| {
         let series = samples.values(&layout, page);
-        let is_cell = series.extent.min >= CELL_V.0 && series.extent.max <= CELL_V.1 && series.bad() == 0;
+        let is_cell = series.extent.min >= low_v && series.extent.max <= high_v && series.bad() == 0;
         is_cell.then_some((layout, series))
     });
     let row = longest_run(neighbours, |(_, first), (_, next)| {

@@ -6,6 +6,7 @@
 //! points. Examples are a voltage that falls when the current rises, and a voltage that equals the sum of the cells.
 
 use super::groups::{SignalGroup, groups};
+use super::label::PackLabel;
 use super::log_signal::{LogSignal, SignalOrigin};
 use super::raw;
 use super::{Candidate, PositiveDirection};
@@ -66,10 +67,11 @@ impl Evidence {
 }
 
 /// Returns the candidates of every quantity, best first.
-pub(super) fn candidates(signals: &[LogSignal], interfaces: &[String]) -> Vec<Candidate> {
+pub(super) fn candidates(signals: &[LogSignal], interfaces: &[String], label: &PackLabel) -> Vec<Candidate> {
     let groups = groups(&signals.iter().map(|signal| (partition(signal), signal.name.as_str())).collect::<Vec<_>>());
     let usable: Vec<usize> = (0..signals.len()).filter(|index| signals[*index].is_mostly_valid()).collect();
-    let mut voltages: Vec<Evidence> = usable.iter().filter_map(|index| voltage(*index, &signals[*index])).collect();
+    let mut voltages: Vec<Evidence> =
+        usable.iter().filter_map(|index| voltage(*index, &signals[*index], label)).collect();
     let mut currents: Vec<Evidence> = usable.iter().filter_map(|index| current(*index, &signals[*index])).collect();
     sort(&mut voltages);
     sort(&mut currents);
@@ -85,12 +87,15 @@ pub(super) fn candidates(signals: &[LogSignal], interfaces: &[String]) -> Vec<Ca
     let percents = |judge: fn(usize, &LogSignal) -> Option<Evidence>| {
         usable.iter().filter_map(|index| judge(*index, &signals[*index])).collect::<Vec<_>>()
     };
+    currents.iter_mut().for_each(|current| state_direction(current, signals));
+    let mut socs = percents(soc);
+    compare_socs(&mut socs, signals);
     let all = [
         (PackQuantity::Current, currents),
         (PackQuantity::PackVoltage, voltages),
         (PackQuantity::CellVoltage, cells),
         (PackQuantity::Temperature, temperatures),
-        (PackQuantity::Soc, percents(soc)),
+        (PackQuantity::Soc, socs),
         (PackQuantity::Soh, percents(soh)),
     ];
     all.into_iter().flat_map(|(quantity, evidence)| ranked(quantity, evidence, interfaces)).collect()
@@ -138,20 +143,24 @@ fn ranked(quantity: PackQuantity, mut evidence: Vec<Evidence>, interfaces: &[Str
     good.enumerate().map(candidate).collect()
 }
 
-fn voltage(index: usize, signal: &LogSignal) -> Option<Evidence> {
-    let mut evidence = Evidence::new(index, signal, PackQuantity::PackVoltage, (15.0, 1000.0))?;
+fn voltage(index: usize, signal: &LogSignal, label: &PackLabel) -> Option<Evidence> {
+    let range = label.pack_v();
+    let mut evidence = Evidence::new(index, signal, PackQuantity::PackVoltage, range.unwrap_or((15.0, 1000.0)))?;
     if signal.is_unnamed() {
-        return Some(raw_voltage(evidence, signal));
+        return Some(raw_voltage(evidence, signal, range));
     }
     evidence.add(1.0, evidence.is_steady(), "range of a pack in use");
-    evidence.add(-1.0, evidence.high < 60.0, "");
+    evidence.add(-1.0, evidence.high < 60.0 && range.is_none(), "");
     Some(evidence)
 }
 
 /// Adds the evidence that a field without a name is a pack voltage.
-fn raw_voltage(mut evidence: Evidence, signal: &LogSignal) -> Evidence {
+fn raw_voltage(mut evidence: Evidence, signal: &LogSignal, range: Option<(f64, f64)>) -> Evidence {
     let (series, low, high) = (&signal.series, evidence.low, evidence.high);
-    evidence.add(2.0, (250.0..=850.0).contains(&series.extent.mean()), "typical voltage of a pack");
+    match range {
+        Some(_) => evidence.add(2.0, true, "voltage of the pack on the label"),
+        None => evidence.add(2.0, (250.0..=850.0).contains(&series.extent.mean()), "typical voltage of a pack"),
+    }
     evidence.add(1.5, high - low <= 0.05 * high && high > low, "changes slightly");
     evidence.add(1.5, 2 * series.distinct() >= series.values.kept().len().min(100), "its last digits vary");
     evidence.add(-1.5, high == low, "never changes in this log");
@@ -317,9 +326,32 @@ fn soh(index: usize, signal: &LogSignal) -> Option<Evidence> {
     Evidence::new(index, signal, PackQuantity::Soh, (40.0, 110.0))
 }
 
-/// Compares every steady pack voltage with the sum of each group of at least eight cells.
+/// If the voltages do not show the sign of a current, takes it from the description.
+fn state_direction(current: &mut Evidence, signals: &[LogSignal]) {
+    let stated = signals[current.members[0]].stated;
+    if let (None, Some(direction)) = (current.positive, stated) {
+        current.positive = Some(direction);
+        current.add(0.0, true, &format!("its comment says: positive is {}", direction.name()));
+    }
+}
+
+/// Compares the states of charge with each other. Candidates that agree confirm each other.
+fn compare_socs(socs: &mut [Evidence], signals: &[LogSignal]) {
+    /// Largest difference between two states of charge that agree (%).
+    const AGREEMENT: f64 = 3.0;
+    let means: Vec<f64> = socs.iter().map(|soc| signals[soc.members[0]].series.extent.mean()).collect();
+    let agreeing: Vec<usize> =
+        means.iter().map(|mean| means.iter().filter(|other| (*other - mean).abs() <= AGREEMENT).count() - 1).collect();
+    let is_agreed = agreeing.iter().any(|count| *count > 0);
+    for (soc, count) in socs.iter_mut().zip(agreeing) {
+        soc.add(1.0, count > 0, &format!("{count} other{} agree", if count == 1 { "" } else { "s" }));
+        soc.add(-1.0, count == 0 && is_agreed, "the others agree on another value");
+    }
+}
+
+/// Compares every steady pack voltage with the sum of each group of at least four cells.
 fn compare_sums(voltages: &mut [Evidence], cells: &mut [Evidence], signals: &[LogSignal]) {
-    for group in cells.iter_mut().filter(|group| group.members.len() >= 8) {
+    for group in cells.iter_mut().filter(|group| group.members.len() >= 4) {
         let sum: f64 = group.members.iter().map(|index| signals[*index].series.extent.mean()).sum();
         let mut is_found = false;
         for voltage in voltages.iter_mut().filter(|voltage| voltage.is_steady()) {

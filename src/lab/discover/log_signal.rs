@@ -1,6 +1,7 @@
 //! Defines a signal of the log. The signal's description (name, position, scaling) comes from a file or from the
 //! search.
 
+use super::PositiveDirection;
 use super::capture::AnswerKey;
 use crate::can::CanId;
 use crate::can::dbc::Signal;
@@ -46,6 +47,8 @@ pub(super) struct LogSignal {
     pub(super) is_read_signed: bool,
     /// Factor and offset from the description's unit to V, A, degrees Celsius or percent.
     pub(super) conversion: (f64, f64),
+    /// Direction of a positive current that the description states.
+    pub(super) stated: Option<PositiveDirection>,
 }
 
 impl LogSignal {
@@ -58,7 +61,7 @@ impl LogSignal {
         series: Series,
     ) -> Self {
         let label = SignalLabel::unnamed(quantity);
-        Self { name, bus, origin, label, series, is_read_signed: false, conversion: (1.0, 0.0) }
+        Self { name, bus, origin, label, series, is_read_signed: false, conversion: (1.0, 0.0), stated: None }
     }
 }
 

@@ -1,13 +1,14 @@
 //! Searches diagnostic answers for cell voltages, pack voltage, current and temperatures, in the bytes that no
 //! definition describes.
 //!
-//! A row of cell voltages is a run of at least [`MIN_CELLS`] neighbouring values of 8 or 16 bits. At one of the common
-//! scales, all these values are plausible voltages and similar to each other. Other fields are tried at every byte with
+//! A row of cell voltages is a run of at least [`MIN_CELLS`] neighbouring values of 8 or 16 bits. In one byte order and
+//! at one of the common scales, all these values are plausible voltages and similar to each other. Other fields are tried at every byte with
 //! common scales. [`judge`](super::judge) then decides from the values which quantity a field carries.
 
 use std::collections::BTreeMap;
 
 use super::capture::{AnswerKey, Answers};
+use super::label::PackLabel;
 use super::log_signal::{LogSignal, SignalOrigin, longest_run};
 use crate::can::CanId;
 use crate::can::unit::Quantity;
@@ -19,11 +20,11 @@ use crate::wiring::evidence::Series;
 pub(super) const CELL: &str = "Cell";
 /// Smallest number of cells in a row.
 const MIN_CELLS: usize = 8;
-/// Plausible voltages of a cell in use (V).
+/// Plausible voltages of a cell in use (V), if the label does not state the chemistry.
 const CELL_V: (f64, f64) = (2.0, 4.5);
 /// Lengths of a cell voltage in bits, each with the scales to try (V) per code.
 const CELL_SCALES: [(u32, &[f64]); 2] = [(16, &[0.001, 0.0001, 0.002, 0.005, 0.01]), (8, &[0.02, 0.01, 0.05])];
-/// Plausible voltages of a pack (V).
+/// Plausible voltages of a pack (V), if the label does not state the number of cells.
 const PACK_V: (f64, f64) = (100.0, 950.0);
 /// Scales of a pack voltage of 16 bits (V) per code.
 const PACK_SCALES: [f64; 5] = [0.1, 0.01, 0.5, 0.25, 1.0];
@@ -38,9 +39,9 @@ const MIN_ANSWERS: usize = 3;
 #[derive(Debug, Default)]
 pub(super) struct CellRows(BTreeMap<RowForm, u32>);
 
-/// Form of a row: controller (bus, CAN identifier, address byte), first bit, length, and scale (as the bits of an
-/// `f64`).
-type RowForm = (BusIndex, CanId, Option<u8>, u32, u32, u64);
+/// Form of a row: controller (bus, CAN identifier, address byte), first bit, length, byte order, and scale (as the bits
+/// of an `f64`).
+type RowForm = (BusIndex, CanId, Option<u8>, u32, u32, bool, u64);
 
 /// Returns the possible signals in these answers. The bits in `described` (first, last) are left out.
 pub(super) fn signals(
@@ -48,6 +49,7 @@ pub(super) fn signals(
     answers: &Answers,
     described: &[(u32, u32)],
     rows: &mut CellRows,
+    label: &PackLabel,
 ) -> Vec<LogSignal> {
     let bytes = answers.payloads.iter().map(|(_, data)| data.len()).min().unwrap_or(0);
     if answers.payloads.len() < MIN_ANSWERS {
@@ -56,7 +58,7 @@ pub(super) fn signals(
     let is_free_of = |taken: &[(u32, u32)], bit: u32, length: u32| {
         taken.iter().all(|(low, high)| bit > *high || bit + length <= *low)
     };
-    let mut found = cells(key, answers, bytes, rows);
+    let mut found = cells(key, answers, bytes, rows, label);
     found.extend(temperatures(key, answers, bytes));
     found.retain(|signal| signal.span().is_some_and(|(low, high)| is_free_of(described, low, high + 1 - low)));
     let mut taken: Vec<(u32, u32)> = found.iter().filter_map(LogSignal::span).collect();
@@ -72,7 +74,8 @@ pub(super) fn signals(
             CURRENT_FORMS.iter().flat_map(|(length, scales)| scales.iter().map(move |scale| (*length, *scale)));
         forms.extend(currents.map(|(length, scale)| field("Current", bit, length, true, scale)));
         let fitting = forms.into_iter().filter(|form| form.length <= rest && is_free(bit, form.length));
-        found.extend(fitting.filter_map(|form| signal(key, answers, form)).filter(is_plausible));
+        found
+            .extend(fitting.filter_map(|form| signal(key, answers, form)).filter(|signal| is_plausible(signal, label)));
     }
     found
 }
@@ -131,12 +134,13 @@ pub(super) fn table_name(key: &AnswerKey) -> String {
     format!("Answer{}{extension}", key.response)
 }
 
-fn is_plausible(signal: &LogSignal) -> bool {
+fn is_plausible(signal: &LogSignal, pack: &PackLabel) -> bool {
     let (SignalOrigin::Raw(_, field), LogSignal { label, series, .. }) = (&signal.origin, signal) else { return false };
     let within = |low: f64, high: f64| series.extent.min >= low && series.extent.max <= high;
     if label.has_unit_of(Quantity::Voltage) {
         // Larger codes (0xFF00 and above) mean "no value" or are the sign bytes of a longer number.
-        within(PACK_V.0, PACK_V.1) && series.extent.max < 65_280.0 * field.factor
+        let (low_v, high_v) = pack.pack_v().unwrap_or(PACK_V);
+        within(low_v, high_v) && series.extent.max < 65_280.0 * field.factor
     } else if label.has_unit_of(Quantity::Current) {
         within(-1500.0, 1500.0) && !series.is_constant()
     } else {
@@ -185,7 +189,7 @@ fn temperature_row(
         }
         let mut form = field("Sensor", u32::try_from(8 * byte).unwrap_or(u32::MAX), 8, offset == 0.0, 1.0);
         (form.name, form.offset) = (format!("Row{first}Sensor{}", row.len() + 1), offset);
-        let next = signal(key, answers, form).filter(is_plausible);
+        let next = signal(key, answers, form).filter(|signal| is_plausible(signal, &PackLabel::default()));
         let is_near = |signal: &LogSignal| {
             row.first()
                 // Largest difference between temperature sensors of a pack (K).
@@ -200,26 +204,33 @@ fn temperature_row(
 }
 
 /// Finds the longest row of cell voltages; returns one signal per cell.
-fn cells(key: &AnswerKey, answers: &Answers, bytes: usize, rows: &mut CellRows) -> Vec<LogSignal> {
+fn cells(key: &AnswerKey, answers: &Answers, bytes: usize, rows: &mut CellRows, label: &PackLabel) -> Vec<LogSignal> {
     let mut best: Option<(usize, DiagnosticSignal)> = None;
-    for (length, scales) in CELL_SCALES {
+    let cell_v = label.chemistry.map_or(CELL_V, |_| label.cell_v());
+    let orders = [(16, false), (16, true), (8, false)];
+    let forms = orders.into_iter().flat_map(|(length, little_endian)| {
+        let scales = CELL_SCALES.iter().filter(move |(bits, _)| *bits == length).flat_map(|(_, scales)| *scales);
+        scales.map(move |scale| (length, little_endian, *scale))
+    });
+    for (length, little_endian, scale) in forms {
         let width = length as usize / 8;
-        for scale in scales {
-            for first in 0..width {
-                let longest = best.as_ref().map_or(MIN_CELLS - 1, |best| best.0 * best.1.length as usize / 8);
-                if let Some((count, start)) = row(answers, bytes, first, width, *scale)
-                    && count >= MIN_CELLS
-                    && count * width > longest
-                {
-                    let bit = u32::try_from(8 * start).unwrap_or(u32::MAX);
-                    best = Some((count, field("Cell", bit, length, false, *scale)));
-                }
+        for first in 0..width {
+            let longest = best.as_ref().map_or(MIN_CELLS - 1, |best| best.0 * best.1.length as usize / 8);
+            let mut form = field("Cell", 0, length, false, scale);
+            form.little_endian = little_endian;
+            if let Some((count, start)) = row(answers, bytes, first, &form, cell_v)
+                && count >= MIN_CELLS
+                && count * width > longest
+            {
+                form.bit = u32::try_from(8 * start).unwrap_or(u32::MAX);
+                best = Some((count, form));
             }
         }
     }
     let Some((count, mut form)) = best else { return Vec::new() };
     let count = u32::try_from(count).unwrap_or(1);
-    let form_key = (key.bus, key.response, key.extension, form.bit, form.length, form.factor.to_bits());
+    let form_key =
+        (key.bus, key.response, key.extension, form.bit, form.length, form.little_endian, form.factor.to_bits());
     let before = rows.0.entry(form_key).or_default();
     form.name = format!("{CELL}{{n}}");
     form.numbers = Some(NumberRange { first: *before + 1, last: *before + count, step: form.length });
@@ -227,17 +238,26 @@ fn cells(key: &AnswerKey, answers: &Answers, bytes: usize, rows: &mut CellRows) 
     (0..count).filter_map(|n| signal(key, answers, form.of_series(n))).collect()
 }
 
-/// Returns the length and the first byte of the longest run of plausible cell voltages. Voltages are read at the bytes
-/// `first`, `first + width`, ...
-fn row(answers: &Answers, bytes: usize, first: usize, width: usize, scale: f64) -> Option<(usize, usize)> {
+/// Returns the length and the first byte of the longest run of plausible cell voltages of a form. Voltages are read at
+/// the bytes `first`, `first` + width of the form, ...
+fn row(
+    answers: &Answers,
+    bytes: usize,
+    first: usize,
+    form: &DiagnosticSignal,
+    (low_v, high_v): (f64, f64),
+) -> Option<(usize, usize)> {
+    let width = form.length as usize / 8;
     let code = |data: &[u8], start: usize| {
-        data[start..start + width].iter().fold(0_u32, |code, byte| code << 8 | u32::from(*byte))
+        let add = |code: u32, byte: &u8| code << 8 | u32::from(*byte);
+        let field = &data[start..start + width];
+        if form.little_endian { field.iter().rev().fold(0, add) } else { field.iter().fold(0, add) }
     };
     let cell = |start: usize| {
         let mut codes = answers.payloads.iter().map(|(_, data)| code(data, start));
-        let value = f64::from(codes.next()?) * scale;
+        let value = f64::from(codes.next()?) * form.factor;
         let is_cell = answers.payloads.iter().map(|(_, data)| code(data, start)).all(|code| {
-            (CELL_V.0..=CELL_V.1).contains(&(f64::from(code) * scale)) && code != u32::MAX >> (32 - 8 * width)
+            (low_v..=high_v).contains(&(f64::from(code) * form.factor)) && code != u32::MAX >> (32 - 8 * width)
         });
         is_cell.then_some((start, value))
     };

@@ -1,7 +1,9 @@
 //! Collects the signals of a log with their values. DBC files and definitions of diagnostic answers describe signals.
 //! The search finds further signals in undescribed bytes of answers and, without DBC files, in messages.
 
+use super::PositiveDirection;
 use super::capture::{AnswerKey, Answers, Capture, MessageKey, Payloads};
+use super::label::PackLabel;
 use super::log_signal::{LogSignal, SignalOrigin};
 use super::{fields, raw};
 use crate::can::dbc::{Database, Message, Signal};
@@ -19,6 +21,7 @@ const MIN_VALUES: u64 = 2;
 pub(super) struct Descriptions {
     pub(super) databases: Vec<Database>,
     pub(super) tables: Vec<DiagnosticTable>,
+    pub(super) label: PackLabel,
 }
 
 /// Returns all signals of the log that have values, in a fixed order, and remarks on described battery signals without
@@ -40,10 +43,10 @@ pub(super) fn signals(capture: &Capture, descriptions: &Descriptions) -> (Vec<Lo
         }
         let described: Vec<(u32, u32)> =
             tables.iter().flat_map(|(_, table)| &table.signals).flat_map(DiagnosticSignal::spans).collect();
-        signals.extend(raw::signals(key, answers, &described, &mut rows));
+        signals.extend(raw::signals(key, answers, &described, &mut rows, &descriptions.label));
     }
     if descriptions.databases.is_empty() {
-        signals.extend(fields::signals(capture));
+        signals.extend(fields::signals(capture, &descriptions.label));
     }
     let (usable, empty): (Vec<LogSignal>, Vec<LogSignal>) = signals.into_iter().partition(has_values);
     let remarks = empty.iter().filter_map(remark).take(20).collect();
@@ -75,20 +78,63 @@ fn of_message(key: MessageKey, payloads: &Payloads, file: usize, message: &Messa
     let of_signal = |signal: &Signal| {
         // The channel has no effect here.
         let mut binding = Binding::new(key.0, message, signal, Channel::Current).ok()?;
-        let conversion = conversion(&signal.unit);
-        (binding.scale, binding.offset) = conversion;
-        let present = payloads.iter().filter(|(_, payload)| binding.holds(payload) == Ok(true));
+        (binding.scale, binding.offset) = conversion(&signal.unit);
+        let label = SignalLabel::new(&message.name, &signal.name, &signal.unit);
+        let values = |binding: &Binding| {
+            let present = payloads.iter().filter(|(_, payload)| binding.holds(payload) == Ok(true));
+            Series::of(present.map(|(time_s, payload)| (time_s, recorded_value(payload, binding))))
+        };
+        let mut series = values(&binding);
+        if label.has_unit_of(Quantity::Current)
+            && let Some(offset) = missing_offset(&series, signal)
+        {
+            binding.offset += offset;
+            series = values(&binding);
+        }
         Some(LogSignal {
             name: format!("{}.{}", message.name, signal.name),
             bus: key.0,
             origin: SignalOrigin::Dbc(file),
-            label: SignalLabel::new(&message.name, &signal.name, &signal.unit),
-            series: Series::of(present.map(|(time_s, payload)| (time_s, recorded_value(payload, &binding)))),
+            label,
+            series,
             is_read_signed: false,
-            conversion,
+            conversion: (binding.scale, binding.offset),
+            stated: signal.comment.as_deref().and_then(stated_direction),
         })
     };
     message.signals.iter().filter(|signal| signal.layout.length_bits > 2).filter_map(of_signal).collect()
+}
+
+/// The offset (A) of a current whose description has none: its values never come near zero, and no pack has them.
+fn missing_offset(series: &Series, signal: &Signal) -> Option<f64> {
+    /// Larger currents of a car are short peaks.
+    const LARGE_A: f64 = 1000.0;
+    let factor = signal.layout.factor;
+    if series.extent.min.abs().min(series.extent.max.abs()) < LARGE_A || factor <= 0.0 || signal.layout.offset != 0.0 {
+        return None;
+    }
+    let values = series.values.kept().iter().zip(0_u32..);
+    let codes = Series::of(values.map(|(value, n)| (f64::from(n), Ok(value / factor))));
+    fields::zero_code(&codes).filter(|zero| *zero != 0.0).map(|zero| -zero * factor)
+}
+
+/// The direction of a positive current that a DBC's comment states, such as "positive = charge".
+fn stated_direction(comment: &str) -> Option<PositiveDirection> {
+    let lower = comment.to_lowercase();
+    lower.split([',', ';', '.', '\n', '/']).find_map(|clause| {
+        let has = |words: &[&str]| words.iter().any(|word| clause.contains(word));
+        let is_discharge = has(&["discharg", "entlad"]);
+        let is_charge = has(&["charg", "laden", "ladung"]) && !is_discharge;
+        let is_positive = match (has(&["positiv", "+", "> 0", ">0"]), has(&["negativ", "< 0", "<0"])) {
+            (true, false) => true,
+            (false, true) => false,
+            _ => return None,
+        };
+        (is_charge || is_discharge).then_some(match is_charge == is_positive {
+            true => PositiveDirection::Charge,
+            false => PositiveDirection::Discharge,
+        })
+    })
 }
 
 fn of_definition(
@@ -112,6 +158,7 @@ fn of_definition(
             series,
             is_read_signed,
             conversion,
+            stated: None,
         }
     });
     each.collect()

@@ -83,16 +83,17 @@ fn voltage_gives_the_sign_of_a_current() {
 
 #[test]
 fn configuration_needs_cell_count_and_has_all_inputs() {
-    let discoverer = pack(1.0);
+    let mut discoverer = pack(1.0);
     let discovery = discover(&discoverer);
     let settings = PackSettings {
         databases: vec!["car.dbc".to_owned()],
-        cell_model: "cell.toml".to_owned(),
+        cell_model: Some("cell.toml".to_owned()),
         ..PackSettings::default()
     };
     let question = discoverer.configuration(&discovery, &settings).unwrap_err().to_string();
-    assert!(question.contains("how many cells are in series") && question.contains("--cells"), "{question}");
-    let pack = discoverer.configuration(&discovery, &PackSettings { cells: Some(96), ..settings }).unwrap();
+    assert!(question.contains("how many cells are in series") && question.contains("--label 96s"), "{question}");
+    discoverer.set_label("96s".parse().unwrap());
+    let pack = discoverer.configuration(&discovery, &settings).unwrap();
     let table: toml::Table = pack.text.parse().unwrap();
     assert_eq!(table["input"]["current"]["positive"].as_str(), Some("discharge"));
     assert_eq!(table["input"]["pack_voltage"]["signal"].as_str(), Some("HV_Pack.Volts"));
@@ -146,7 +147,7 @@ fn undefined_answers_reveal_cells_current_and_voltage() {
         (current.signal.as_str(), current.positive),
         ("Answer7BB.D2101_Current_0", Some(PositiveDirection::Charge))
     );
-    let settings = PackSettings { cell_model: "cell.toml".to_owned(), ..PackSettings::default() };
+    let settings = PackSettings { cell_model: Some("cell.toml".to_owned()), ..PackSettings::default() };
     let text = discoverer.configuration(&discovery, &settings).unwrap().text;
     let line =
         "{ name = \"Cell{n}\", numbers = \"1-96\", step = 16, bit = 0, length = 16, factor = 0.001, unit = \"V\" }";
@@ -157,7 +158,7 @@ fn undefined_answers_reveal_cells_current_and_voltage() {
 #[test]
 fn unheard_request_is_reported_as_a_guess() {
     let discoverer = answers(60, false);
-    let settings = PackSettings { cell_model: "cell.toml".to_owned(), ..PackSettings::default() };
+    let settings = PackSettings { cell_model: Some("cell.toml".to_owned()), ..PackSettings::default() };
     let pack = discoverer.configuration(&discover(&discoverer), &settings).unwrap();
     assert!(pack.open.iter().any(|question| question.contains("0x7B3 is a guess")), "{:?}", pack.open);
 }
@@ -192,7 +193,8 @@ fn signed_current_defined_as_unsigned_is_detected() {
         "{:?}",
         discovery.remarks
     );
-    let settings = PackSettings { cells: Some(98), cell_model: "cell.toml".to_owned(), ..PackSettings::default() };
+    let settings = PackSettings { cell_model: Some("cell.toml".to_owned()), ..PackSettings::default() };
+    discoverer.set_label("98s".parse().unwrap());
     let text = discoverer.configuration(&discovery, &settings).unwrap().text;
     assert!(text.contains("name = \"HVBAT_CURR\", bit = 0, length = 16, signed = true"), "{text}");
 }
@@ -248,7 +250,8 @@ proptest::proptest! {
             discoverer.handle(time(at), BusIndex(0), &frame(ids[id as usize], &data));
         }
         let discovery = discover(&discoverer);
-        let settings = PackSettings { cells: Some(96), ..PackSettings::default() };
+        let settings = PackSettings { cell_model: Some("cell.toml".to_owned()), ..PackSettings::default() };
+        discoverer.set_label("96s".parse().unwrap());
         if let Ok(pack) = discoverer.configuration(&discovery, &settings) {
             proptest::prop_assert!(pack.text.parse::<toml::Table>().is_ok(), "{}", pack.text);
         }

@@ -46,6 +46,7 @@ pub struct SignalLabel {
     name: String,
     unit: LabelUnit,
     is_pack_message: bool,
+    is_low_voltage_message: bool,
 }
 
 /// The unit of a label.
@@ -68,6 +69,11 @@ const ELSEWHERE: &str = "12v twelvevolt =lv aux starter dcdc =dc =ac motor inver
     compressor hvac cabin ambient coolant tpms tire front rear link solar pump fan oil igbt fet pcb cpu \
     pilot connector pin inlet outlet capacitor charger plug port climate freezer stator brake trailer \
     screen bus line isolation relay coil contactor cont";
+/// Words that indicate the battery controller's own electronics. They are warmer than the cells and follow the load.
+const ELECTRONICS: &str =
+    "=mos =tmos mosfet board shunt heatsink heat_sink =afe =ic =mcu chip electronic balanc resist tube";
+/// Words that indicate the 12 V battery.
+const LOW_VOLTAGE: &str = "12v twelvevolt twelve_volt =lv aux starter";
 /// Words that indicate a value that is not measured, such as a limit or request.
 const NO_MEASUREMENT: &str = "limit target request =req avail possible set allowed threshold lifetime cumulative rated nominal =id \
     =num count delta =dev deviation fault offset reserve initial";
@@ -130,14 +136,26 @@ impl SignalLabel {
             None if matches!(unit.trim(), "" | "-" | "1") => LabelUnit::Missing,
             None => LabelUnit::Other,
         };
-        let label = |name: &str| Self { words: words(name), name: name.to_lowercase(), unit, is_pack_message: false };
-        let is_pack_message = label(message).has(PACK);
-        Self { is_pack_message, ..label(signal) }
+        let label = |name: &str| Self {
+            words: words(name),
+            name: name.to_lowercase(),
+            unit,
+            is_pack_message: false,
+            is_low_voltage_message: false,
+        };
+        let (is_pack_message, is_low_voltage_message) = (label(message).has(PACK), label(message).has(LOW_VOLTAGE));
+        Self { is_pack_message, is_low_voltage_message, ..label(signal) }
     }
 
     /// Creates a label for a signal without a name.
     pub fn unnamed(quantity: Quantity) -> Self {
-        Self { words: Vec::new(), name: String::new(), unit: LabelUnit::Known(quantity), is_pack_message: false }
+        Self {
+            words: Vec::new(),
+            name: String::new(),
+            unit: LabelUnit::Known(quantity),
+            is_pack_message: false,
+            is_low_voltage_message: false,
+        }
     }
 
     /// Whether the name contains one of the words.
@@ -163,6 +181,16 @@ impl SignalLabel {
         self.has(PACK) || self.is_pack_message
     }
 
+    /// Whether the name of the signal or its message indicates the 12 V battery.
+    pub fn is_of_low_voltage(&self) -> bool {
+        self.has(LOW_VOLTAGE) || self.is_low_voltage_message
+    }
+
+    /// Whether the name says that a temperature belongs to another device or to the controller's electronics.
+    pub fn is_of_other_part(&self) -> bool {
+        self.has(ELSEWHERE) || self.has(ELECTRONICS) && !self.says_cell()
+    }
+
     /// Whether the name says that the value is a maximum or minimum.
     pub fn says_extreme(&self) -> bool {
         self.has("max min highest lowest")
@@ -173,13 +201,15 @@ impl SignalLabel {
         self.has("cell brick cmu zelle =vc")
     }
 
-    fn says_soc(&self) -> bool {
+    /// Whether the name says state of charge.
+    pub fn says_soc(&self) -> bool {
         self.has("=soc stateofcharge state_of_charge socave socui socdisp")
             || self.words.iter().any(|word| word.starts_with("soc") && word.len() <= 7)
             || self.name.starts_with("soc")
     }
 
-    fn says_soh(&self) -> bool {
+    /// Whether the name says state of health.
+    pub fn says_soh(&self) -> bool {
         self.has("soh stateofhealth state_of_health")
     }
 
@@ -223,7 +253,11 @@ impl SignalLabel {
                 score.add(-3.0, self.says_cell(), "its name says cell");
                 score.add(-2.0, self.says_extreme(), "its name says extreme");
             }
-            PackQuantity::Temperature => score.add(1.0, self.says_cell(), "its name says cell"),
+            PackQuantity::Temperature => {
+                score.add(1.0, self.says_cell(), "its name says cell");
+                let is_electronics = self.has(ELECTRONICS) && !self.says_cell() && !self.has(ELSEWHERE);
+                score.add(-3.0, is_electronics, "its name says electronics, not cells");
+            }
             PackQuantity::Soc => {
                 let is_dash = self.has("disp =ui dash socui");
                 score.add(-1.0, is_dash, "the dashboard's, not the battery controller's");

@@ -10,6 +10,7 @@
 //! | `loss` | frames missing from a cyclic signal |
 //! | `slope` | voltage over current: sign and size of the resistance |
 //! | `response` | how the voltages of a pack follow its current: steps, steady runs, rests |
+//! | `usage` | current, counted charge, voltage and reported values at the same times |
 //! | `equal_cells` | cells that always have the same voltage |
 
 mod equal_cells;
@@ -20,6 +21,7 @@ pub(super) mod response;
 mod sample;
 mod series;
 mod slope;
+pub(super) mod usage;
 
 pub use label::{PackQuantity, Score, SignalLabel};
 pub use sample::{Extent, ThinnedSample};

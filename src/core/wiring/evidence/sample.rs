@@ -20,7 +20,12 @@ impl Default for ThinnedSample {
 }
 
 impl ThinnedSample {
-    pub(super) fn of_at_most(most: usize) -> Self {
+    /// A sample of exactly these values.
+    pub(super) fn of(values: Vec<f64>) -> Self {
+        Self { most: values.len(), seen: values.len() as u64, stride: 1, values }
+    }
+
+    fn of_at_most(most: usize) -> Self {
         Self { values: Vec::new(), most, stride: 1, seen: 0 }
     }
 

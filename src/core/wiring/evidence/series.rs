@@ -40,6 +40,8 @@ pub struct Series {
     pub(crate) gaps: ThinnedSample,
     pub(crate) loss: LossCounter,
     pub(crate) longest_gap_s: f64,
+    /// Begin of the longest gap.
+    pub(crate) longest_gap_from: Option<Timestamp>,
     /// Number of gaps that are longer than `max_age_s`: a reading became stale before the next reading.
     pub(crate) stale_gaps: u64,
     /// Absolute changes from one value to the next.
@@ -73,16 +75,20 @@ impl Series {
 
     /// Creates the statistics of a recorded signal from its values and their times (s).
     pub fn of(readings: impl Iterator<Item = (f64, Result<f64, Fault>)>) -> Self {
-        // 4096 values suffice for a correlation, and samples of this size fit into memory for thousands of signals.
-        let sample = ThinnedSample::of_at_most(4096);
-        let mut series = Self { values: sample.clone(), times_s: sample, ..Self::default() };
+        let mut series = Self::default();
+        let mut all = Vec::new();
         for (time_s, value) in readings {
             match value {
-                Ok(value) if value.is_finite() => series.push(Timestamp::from_secs(time_s), value, f64::INFINITY),
+                Ok(value) if value.is_finite() => {
+                    series.push(Timestamp::from_secs(time_s), value, f64::INFINITY);
+                    all.push((time_s, value));
+                }
                 Err(Fault::NotAvailable) => series.unusable.not_available += 1,
                 Ok(_) | Err(_) => series.unusable.short += 1,
             }
         }
+        let (times_s, values) = windows(all).into_iter().unzip();
+        (series.times_s, series.values) = (ThinnedSample::of(times_s), ThinnedSample::of(values));
         series
     }
 
@@ -135,7 +141,9 @@ impl Series {
         if let Some(gap_s) = gap_s {
             self.gaps.push(gap_s);
             self.loss.push(gap_s);
-            self.longest_gap_s = self.longest_gap_s.max(gap_s);
+            if gap_s > self.longest_gap_s {
+                (self.longest_gap_s, self.longest_gap_from) = (gap_s, self.last_time);
+            }
             self.stale_gaps += u64::from(gap_s > max_age_s);
         }
         self.last_time = Some(time);
@@ -199,6 +207,22 @@ impl Series {
     pub fn largest_step(&self) -> f64 {
         self.values.kept().windows(2).map(|pair| (pair[1] - pair[0]).abs()).fold(0.0, f64::max)
     }
+}
+
+/// Thins readings by time: keeps whole windows, so that the steps from reading to reading stay in the sample however
+/// long the log is, and all signals keep the same times.
+fn windows(mut readings: Vec<(f64, f64)>) -> Vec<(f64, f64)> {
+    // 4096 values suffice for a correlation, and samples of this size fit into memory for thousands of signals.
+    const MOST: usize = 4096;
+    // Longer than the period of most signals, and short enough that fast signals keep many windows.
+    const WINDOW_S: f64 = 8.0;
+    let mut mask = 0_u64;
+    while readings.len() > MOST && mask < u64::MAX >> 1 {
+        mask = mask << 1 | 1;
+        readings.retain(|(time_s, _)| (time_s / WINDOW_S) as u64 & mask == 0);
+    }
+    let stride = readings.len().div_ceil(MOST).max(1);
+    readings.into_iter().step_by(stride).collect()
 }
 
 /// The value of a recorded payload, within the DBC's range.

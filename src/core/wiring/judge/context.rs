@@ -35,6 +35,14 @@ pub(super) struct Judge<'d> {
     /// Whether a finding shows that the current or the voltages are not read correctly, for example from the wrong
     /// signal or with the wrong layout. If so, the response of the voltages cannot be judged.
     pub(super) is_mixed_up: bool,
+    /// Whether the reported state of charge is known to be another value.
+    pub(super) is_soc_wrong: bool,
+    /// Whether a finding shows that the capacity or the scale of the current is wrong. If so, the resistance, which
+    /// scales with the capacity, is not judged.
+    pub(super) is_size_explained: bool,
+    /// Whether a finding shows that the chemistry or the number of cells is wrong. If so, the voltages cannot be
+    /// compared with the cell model.
+    pub(super) is_model_wrong: bool,
     /// Kinds of signals whose layout in the DBC is wrong.
     pub(super) wrong_layouts: Vec<Kind>,
 }
@@ -75,6 +83,9 @@ impl<'d> Judge<'d> {
             voltage_factor: 1.0,
             current_factor: 1.0,
             is_mixed_up: false,
+            is_soc_wrong: false,
+            is_size_explained: false,
+            is_model_wrong: false,
             wrong_layouts: Vec::new(),
         }
     }

@@ -6,6 +6,8 @@ use crate::wiring::evidence::response::SteadyRun;
 
 /// A drift counts only if it is at least this many standard deviations from zero.
 const SURE: f64 = 6.0;
+/// Error of an open-circuit voltage that is estimated under load (V).
+const READING_V: f64 = 0.03;
 
 /// Voltage drift during all steady runs together, per cell.
 #[derive(Debug, Clone, Copy)]
@@ -13,6 +15,9 @@ pub(super) struct Drift {
     pub(super) seconds: f64,
     /// Sum of the absolute drifts that the model expects (V).
     pub(super) expected_v: f64,
+    /// Sum of the smallest absolute drifts that the model allows (V). A flat curve hardly allows to read the state of
+    /// charge from the voltage, so this sum is small.
+    pub(super) least_v: f64,
     /// Mean measured drift of a run, weighted by the expected drift: absolute value (V). It is reported if the measured
     /// drift is opposite to the expected drift.
     pub(super) against_v: f64,
@@ -26,9 +31,12 @@ impl Drift {
     /// in any run.
     pub(super) fn of(judge: &Judge<'_>) -> Option<Self> {
         let model = judge.plan.pack.model.as_ref()?;
-        let (mut xx, mut xy, mut variance, mut seconds, mut expected_v) = (0.0, 0.0, 0.0, 0.0, 0.0);
+        let (mut xx, mut xy, mut variance, mut seconds) = (0.0, 0.0, 0.0, 0.0);
+        let (mut expected_v, mut least_v) = (0.0, 0.0);
         for run in &judge.observed.fast_response().runs {
-            let expected = expected_drift_v(judge, model, run);
+            let expected = expected_drift_v(judge, model, run, 0.0);
+            let near = [-READING_V, READING_V].map(|error_v| expected_drift_v(judge, model, run, error_v).abs());
+            least_v += near.into_iter().fold(expected.abs(), f64::min);
             let (measured, std) = (run.drift_v * judge.voltage_factor, run.drift_std_v * judge.voltage_factor);
             xx += expected * expected;
             xy += expected * measured;
@@ -39,6 +47,7 @@ impl Drift {
         (xx > 0.0).then(|| Self {
             seconds,
             expected_v,
+            least_v,
             against_v: (-xy / expected_v.max(1e-9)).abs(),
             ratio: xy / xx,
             sigma: xy.abs() / variance.sqrt(),
@@ -54,11 +63,14 @@ impl Drift {
     }
 }
 
-fn expected_drift_v(judge: &Judge<'_>, model: &CellModel, run: &SteadyRun) -> f64 {
+/// Drift of the model in a run (V) if the open-circuit voltage is `error_v` above the estimate.
+fn expected_drift_v(judge: &Judge<'_>, model: &CellModel, run: &SteadyRun, error_v: f64) -> f64 {
     let temperature_c = judge.temperature_c();
     let cell_a = run.current_a * judge.current_factor / f64::from(judge.plan.pack.strings.max(1));
     let settled = judge.settled_ohm(model);
-    let soc = model.soc_of_ocv(run.voltage_v * judge.voltage_factor + cell_a * settled, temperature_c).clamp(0.0, 1.0);
+    let soc = model
+        .soc_of_ocv(run.voltage_v * judge.voltage_factor + cell_a * settled + error_v, temperature_c)
+        .clamp(0.0, 1.0);
     let moved = -cell_a * run.seconds / 3600.0 / judge.plan.pack.capacity_ah;
     let end = model.grid_position((soc + moved).clamp(0.0, 1.0), temperature_c);
     model.ocv_v(&end) - model.ocv_v(&model.grid_position(soc, temperature_c))

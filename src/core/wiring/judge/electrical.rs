@@ -36,7 +36,9 @@ pub(super) fn check(judge: &mut Judge<'_>) {
                 "the sign of the current is right: every ampere of discharge lowers a cell's voltage by {drop} mV"
             ));
         }
-        resistance(judge, &slope);
+        if !judge.is_size_explained && !judge.is_model_wrong {
+            resistance(judge, &slope);
+        }
     } else if let Some(drift) = drift.filter(Drift::is_opposite) {
         let why = "a discharge lowers the voltage (judged from steady current, which is less certain than steps)";
         inverted(judge, signal, drifted_against(&drift), why);
@@ -47,7 +49,7 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     } else {
         judge.unjudged("sign of the current, resistance: the current hardly changed; drive or charge for a minute");
     }
-    if !judge.has(&[Topic::CurrentSign, Topic::Unit]) {
+    if !judge.has(&[Topic::CurrentSign, Topic::Unit]) && !judge.is_model_wrong {
         model::check(judge, drift);
         frozen::check_response(judge);
         model::check_estimator(judge);
@@ -113,18 +115,24 @@ fn resistance(judge: &mut Judge<'_>, slope: &Slope) {
     } else {
         (fast / ohm, "lower", "the cell is of another type, or parallel cells share one voltage tap")
     };
-    let configured = judge.plan.pack.strings;
+    let pack = &judge.plan.pack;
+    let configured = pack.strings;
     let strings = likely_strings(configured, ohm, (fast, slow));
     // Only a wrong unit or the model of another cell explains such a ratio.
     if ratio >= 6.0 {
         current_unit(judge, seen, power_of_ten(ohm / (fast * slow).sqrt()), ratio);
     } else if ratio >= ODD_RATIO || ratio >= 2.0 && strings.is_some_and(|n| n < configured) {
+        // The resistance of a label's model is proportional to 1 / capacity.
+        let (key, text) = pack.capacity_change(pack.capacity_ah * (fast * slow).sqrt() / ohm);
+        let is_label = pack.label.is_some();
         let title = format!("the resistance is {} times {direction} than in the cell model", number(ratio));
         let finding = warning(judge, Topic::CellModel, title).seen(seen).why(why);
-        if let Some(strings) = strings {
+        if let Some(strings) = strings.filter(|_| !is_label) {
             finding.change("pack", "strings", strings.to_string());
         }
-        finding.change_cell_model().advice("the estimator itself learns a resistance of 0.3 to 3 times the model's");
+        finding
+            .change("pack", key, text)
+            .advice("the estimator itself learns a resistance of 0.3 to 3 times the model's");
     } else if slope.ohm > 0.0 {
         judge.fine(format!("the resistance is plausible: {seen}"));
     }
@@ -176,7 +184,8 @@ pub(super) fn wrong_unit_or_cell<'j>(
     let (scale, strings) = (toml(signal.scale * factor), judge.plan.pack.strings);
     if is_ampere {
         let title = format!("the cells are about {times} times {size} than in the cell model");
-        return find(judge, severity, Topic::CellModel, title).change_cell_model().advice(format!(
+        let (key, text) = judge.plan.pack.capacity_change(judge.plan.pack.capacity_ah / factor);
+        return find(judge, severity, Topic::CellModel, title).change("pack", key, text).advice(format!(
             "or {} is off by that factor (scale = {scale}), or pack.strings is not {strings}",
             signal.name
         ));

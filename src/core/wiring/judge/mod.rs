@@ -10,9 +10,11 @@
 //! | `swapped` | swapped signals |
 //! | `values` | units, byte order, limits |
 //! | `frozen` | signals that never change, cells that respond differently, cells with the same voltage |
+//! | `reported` | the pack's own state of charge against the counted charge and the voltages (`ocv`) |
 //! | `electrical` | sign of the current, resistance (from steps or from the `drift` of steady runs) |
 //! | `model` | open-circuit voltage, current offset, noise, the estimator |
 //! | `timing` | periods |
+//! | `holes` | missing stretches |
 //!
 //! All checks share the state in `context`. The checks in `values` find unit factors, which `electrical` then applies.
 
@@ -21,9 +23,12 @@ mod context;
 mod drift;
 mod electrical;
 mod frozen;
+mod holes;
 mod model;
+mod ocv;
 mod other_bus;
 mod presence;
+mod reported;
 mod swapped;
 mod text;
 mod timing;
@@ -49,9 +54,13 @@ impl WiringObserver {
         swapped::check_odd(&mut judge);
         frozen::check_equal(&mut judge);
         values::check_limits(&mut judge);
+        reported::check_swapped(&mut judge);
+        reported::check_charge(&mut judge);
+        reported::check_voltage(&mut judge);
         electrical::check(&mut judge);
         unconfigured::check(&mut judge);
         timing::check(&mut judge);
+        holes::check(&mut judge);
         let awake_s = self.awake_s;
         if self.frames > 0 && awake_s < 5.0 {
             let span = text::seconds(awake_s);

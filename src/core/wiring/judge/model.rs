@@ -3,8 +3,10 @@
 
 use super::context::{Judge, error, note, warning};
 use super::drift::Drift;
+use super::ocv;
 use super::text::{milli, number, percent, seconds, toml};
-use crate::cell::CellModel;
+use crate::cell::{CellModel, Chemistry};
+use crate::filter::{ends, median};
 use crate::wiring::evidence::Series;
 use crate::wiring::plan::Kind;
 use crate::wiring::report::Topic;
@@ -22,31 +24,43 @@ fn open_circuit(judge: &mut Judge<'_>, model: &CellModel, drift: Option<Drift>) 
     let temperature_c = judge.temperature_c();
     let [empty_v, full_v] = [0.0, 1.0].map(|soc| model.ocv_v(&model.grid_position(soc, temperature_c)));
     let mut rests = judge.observed.fast_response().rests.iter().map(|rest| rest.end_v);
-    let highest = rests.clone().fold(f64::NAN, f64::max);
-    let lowest = rests.clone().fold(f64::NAN, f64::min);
+    // In a log without rests, the voltage under load, corrected for the current, shows the curve.
+    let loaded = ocv::estimates(judge);
+    let loaded_v = median(loaded.iter().map(|estimate| estimate.voltage_v)).filter(|_| loaded.len() >= 5);
+    let (lowest, highest) = match ends(rests.clone()) {
+        (low, high) if low <= high => (low, high),
+        _ => (loaded_v.unwrap_or(f64::NAN), loaded_v.unwrap_or(f64::NAN)),
+    };
     let per_cent = |voltage_v: f64| percent(model.soc_of_ocv(voltage_v, temperature_c).clamp(0.0, 1.0));
-    let is_flat = |drift: &Drift| drift.expected_v > 0.03 && drift.sigma > 0.0 && (-0.05..0.15).contains(&drift.ratio);
+    let is_flat = |drift: &Drift| drift.least_v > 0.03 && drift.sigma > 0.0 && (-0.05..0.15).contains(&drift.ratio);
+    let pack = &judge.plan.pack;
+    let cell_v = judge.cell_voltage();
     if highest > full_v + 0.06 || lowest < empty_v - 0.06 {
         let off_v = if highest > full_v + 0.06 { highest } else { lowest };
         let (off, low, high) = (number(off_v), number(empty_v), number(full_v));
+        let (key, text) = chemistry(judge, off_v);
         error(judge, Topic::CellModel, "the resting voltage is not on the cell model's curve")
             .seen(format!("{off} V at rest; the curve of {} runs from {low} to {high} V", model.name))
             .why("a rested cell shows its open-circuit voltage: the chemistry or the number of cells is wrong")
-            .change("pack", "cell_model", chemistry(off_v));
+            .change("pack", key, text);
     } else if let Some(drift) = drift.filter(is_flat) {
         let (span, expected) = (seconds(drift.seconds), milli(drift.expected_v));
         let moved = milli(drift.expected_v * drift.ratio.max(0.0));
+        let is_lfp = cell_v.is_some_and(|v| LFP_V.contains(&v));
+        let lfp = pack.chemistry_change(Chemistry::LfpGraphite);
+        let (key, text) = if is_lfp { lfp } else { pack.capacity_change(pack.capacity_ah / drift.ratio.max(0.1)) };
         warning(judge, Topic::CellModel, "the voltage changes much less than in the cell model")
             .seen(format!("in {span} of steady current, it changed by {moved} mV; the model expects {expected} mV"))
             .why("the cells are iron phosphate (LFP), which has a flat curve, or much larger than the cell model says")
-            .change_cell_model();
+            .change("pack", key, text);
     } else if let Some(cell_v) = judge.cell_voltage().filter(|v| is_like_iron_phosphate(judge, model, *v)) {
         let (voltage, soc) = (number(cell_v), per_cent(cell_v));
         let title = "either the pack is nearly empty, or its cells are iron phosphate (LFP)";
+        let (key, text) = pack.chemistry_change(Chemistry::LfpGraphite);
         note(judge, Topic::CellModel, title)
             .seen(format!("the median cell has {voltage} V; according to {}, that is {soc} %", model.name))
             .why("iron-phosphate cells stay near 3.3 V from full to empty")
-            .change_cell_model()
+            .change("pack", key, text)
             .advice("compare with the SOC that the vehicle shows");
     } else if let Some(last_v) = rests.next_back() {
         let (voltage, soc) = (number(last_v), per_cent(last_v));
@@ -57,16 +71,21 @@ fn open_circuit(judge: &mut Judge<'_>, model: &CellModel, drift: Option<Drift>) 
     }
 }
 
+/// Voltages of an iron-phosphate cell at rest, except near empty and full (V).
+const LFP_V: std::ops::Range<f64> = 3.18..3.38;
+
 fn is_like_iron_phosphate(judge: &Judge<'_>, model: &CellModel, cell_v: f64) -> bool {
-    model.ocv_v(&model.grid_position(0.5, judge.temperature_c())) > 3.5 && (3.18..3.38).contains(&cell_v)
+    model.ocv_v(&model.grid_position(0.5, judge.temperature_c())) > 3.5 && LFP_V.contains(&cell_v)
 }
 
-fn chemistry(voltage_v: f64) -> &'static str {
+/// The key of the chemistry, and the chemistry that a resting voltage suggests.
+fn chemistry(judge: &Judge<'_>, voltage_v: f64) -> (&'static str, String) {
+    let pack = &judge.plan.pack;
     match voltage_v {
-        v if v < 2.0 => "the model of the installed cell",
-        v if v < 2.95 => "a model of a titanate cell (LTO), if it is one",
-        v if v < 3.45 => "a model of an iron-phosphate cell (LFP), if it is one",
-        _ => "a model of a nickel-rich or cobalt cell (NMC, NCA, LCO), if it is one",
+        v if v < 2.0 => ("cell_model", "the model of the installed cell".to_owned()),
+        v if v < 2.95 => ("cell_model", "a model of a titanate cell (LTO), if it is one".to_owned()),
+        v if v < 3.45 => pack.chemistry_change(Chemistry::LfpGraphite),
+        _ => pack.chemistry_change(Chemistry::NmcGraphite),
     }
 }
 
@@ -116,10 +135,11 @@ pub(super) fn check_estimator(judge: &mut Judge<'_>) {
     let bias = milli(stats.innovation_sum / stats.estimates as f64);
     if rejected > 0.1 && !judge.has(&[Topic::CellModel, Topic::Cell, Topic::Frozen, Topic::CellCount]) {
         let share = percent(rejected);
+        let (key, text) = judge.plan.pack.model_change();
         warning(judge, Topic::CellModel, "the estimator rejects many voltages")
             .seen(format!("{share} % of {} readings are beyond its gate; mean deviation {bias} mV", stats.estimates))
             .why("the voltages of the model and the measured voltages disagree")
-            .change_cell_model();
+            .change("pack", key, text);
     } else {
         let share = percent(1.0 - rejected);
         judge.fine(format!("the estimator runs: {share} % of its readings accepted, mean deviation {bias} mV"));

@@ -1,18 +1,19 @@
 //! Finds swapped signals from the units in the DBC and from the values; for example, a voltage configured as current.
 
-use super::context::{Judge, MAX_C_RATE, SignalSeries, error, warning};
-use super::text::{channel, number};
+use super::context::{Judge, MAX_C_RATE, SignalSeries, error, find, warning};
+use super::text::{channel, channels, number};
 use super::unit::unit_of;
 use super::values::is_impossible;
 use crate::quantity::Channel;
 use crate::wiring::evidence::Series;
 use crate::wiring::plan::{Kind, SignalPlan};
-use crate::wiring::report::Topic;
+use crate::wiring::report::{Severity, Topic};
 
 /// Plausible temperatures of a pack in use (degrees C).
 const PLAUSIBLE_C: (f64, f64) = (-45.0, 95.0);
 
 pub(super) fn check(judge: &mut Judge<'_>) {
+    other_parts(judge);
     if !by_unit(judge) && !pack_voltage_as_current(judge) {
         by_values(judge);
     }
@@ -22,6 +23,31 @@ pub(super) fn check(judge: &mut Judge<'_>) {
 pub(super) fn check_odd(judge: &mut Judge<'_>) {
     odd_cells(judge);
     odd_sensors(judge);
+}
+
+/// Finds temperatures whose names say that they belong to the controller's electronics or to another device. If the
+/// DBC has no temperature of the cells, there may be no better sensor, so the finding is a note.
+fn other_parts(judge: &mut Judge<'_>) {
+    let sensors = judge.signals(Kind::Temperature);
+    let wrong: Vec<&SignalPlan> =
+        sensors.iter().map(|sensor| sensor.0).filter(|s| s.label().is_of_other_part()).collect();
+    let Some(first) = wrong.first() else { return };
+    let others = judge.plan.unconfigured.iter().zip(&judge.observed.unconfigured);
+    let others = others.filter(|(other, series)| {
+        matches!(other.binding.channel, Channel::Temperature(_))
+            && other.binding.bus == first.binding.bus
+            && series.count() > 0
+    });
+    let better = others.map(|(other, _)| other.name.clone()).next();
+    let severity = if better.is_some() { Severity::Warning } else { Severity::Note };
+    let list: Vec<Channel> = wrong.iter().map(|signal| signal.binding.channel).collect();
+    let title = format!("{}: not a temperature of the cells, according to its name", channels(&list));
+    let finding = find(judge, severity, Topic::Swapped, title)
+        .seen(format!("{} is configured as a temperature of the cells", first.name))
+        .why("electronics (MOSFETs, boards, resistors) and other devices are warmer or colder than the cells");
+    if let Some(better) = better {
+        finding.change(&first.table, "signal", format!("{better:?}"));
+    }
 }
 
 /// Configured signals whose unit belongs to another kind of quantity, with that kind.

@@ -109,10 +109,11 @@ fn voltages(judge: &mut Judge<'_>) {
         pack_count(judge, median_v * cells);
     } else {
         judge.is_mixed_up = true;
+        let (key, text) = judge.plan.pack.model_change();
         error(judge, Topic::CellModel, "the cell voltages do not fit the cell model")
             .seen(seen)
             .why(format!("{band}, and no power of ten corrects the reading"))
-            .change_cell_model()
+            .change("pack", key, text)
             .advice("or the signal is not a cell voltage");
     }
 }

@@ -8,7 +8,7 @@ use std::path::Path;
 
 use crate::cell::{CellModel, Chemistry, Label};
 use crate::config::cell_model::{self, SourcedModel};
-use crate::config::document::{Document, Faults, ReadFile, TablePlace, beside};
+use crate::config::document::{Document, Faults, ReadFile, TablePlace, beside, meant_file};
 use crate::config::schema::RawTables;
 use crate::config::schema::keys::{Pack, PackModule};
 use crate::quantity::CellIndex;
@@ -77,7 +77,8 @@ fn file_model(
     let file = beside(path, named);
     let model = cell_model::load_with(&file, read, faults);
     if faults.is_unusable(&file.display().to_string()) {
-        fault("must be a cell model file, relative to the folder of the configuration");
+        let meant = meant_file(path, named);
+        fault(&format!("must be a cell model file, relative to the folder of the configuration{meant}"));
     }
     model
 }

@@ -12,7 +12,7 @@ use crate::can::CanId;
 use crate::can::dbc::{Database, Message, Signal};
 use crate::can::decode::{Binding, InputMap};
 use crate::can::signal::{LayoutFault, ValueType};
-use crate::config::document::{Faults, ReadFile, TablePlace, beside};
+use crate::config::document::{Faults, ReadFile, TablePlace, beside, meant_file};
 use crate::config::schema::RawTables;
 use crate::config::schema::did_you_mean;
 use crate::config::schema::keys::{DiagnosticInput, PositiveCurrent, SignalSource};
@@ -104,9 +104,15 @@ impl Databases {
     /// answer is unusable (reported), because signals cannot be looked up in that case.
     pub(crate) fn load(config: &Path, raw: &RawTables, read: ReadFile<'_>) -> Option<Self> {
         let mut files = Vec::new();
-        for name in raw.input.as_ref().map_or(&[][..], |input| &input.dbc) {
+        for (input, name) in raw.input.iter().flat_map(|input| input.dbc.iter().map(move |name| (input, name))) {
             let path = beside(config, name);
-            files.push(read_dbc(&path, read, &raw.faults).map(|database| (name.clone(), database)));
+            let database = read_dbc(&path, read, &raw.faults);
+            if database.is_none() && raw.faults.is_unusable(&path.display().to_string()) {
+                let meant = meant_file(config, name);
+                let what = format!("{name:?} must be a DBC file, relative to the folder of the configuration{meant}");
+                input.place.fault("dbc", what);
+            }
+            files.push(database.map(|database| (name.clone(), database)));
         }
         let files = files.into_iter().collect::<Option<Vec<_>>>()?;
         let answers = answers::definitions(raw);

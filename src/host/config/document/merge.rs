@@ -33,9 +33,10 @@ impl<'t> Document<'t> {
         let (mut root, mut broken) = (DeTable::new(), false);
         for source in sources.files() {
             let (table, errors) = DeTable::parse_recoverable(source.placed_text());
-            note_syntax(source, &errors, faults);
+            let table = table.into_inner();
+            note_syntax(source, &table, &errors, faults);
             broken |= !errors.is_empty();
-            merge(&mut root, table.into_inner());
+            merge(&mut root, table);
         }
         Self { file: sources.main_file().to_owned(), broken, faults: faults.clone(), sources, root }
     }
@@ -101,13 +102,16 @@ impl<'t> Document<'t> {
     }
 }
 
-fn note_syntax(source: &SourceFile, errors: &[toml::de::Error], faults: &Faults) {
+fn note_syntax(source: &SourceFile, table: &DeTable<'_>, errors: &[toml::de::Error], faults: &Faults) {
     let line = |error: &toml::de::Error| error.span().map_or(0, |span| source.line(&span));
     // The first fault is often the cause of the others.
     let mut errors: Vec<&toml::de::Error> = errors.iter().collect();
     errors.sort_by_key(|&error| line(error));
     for &error in errors.iter().take(MAX_SYNTAX_FAULTS) {
-        let what = error.message().trim().replace('\n', ", ");
+        let mut what = error.message().trim().replace('\n', ", ");
+        if let Some(again) = error.span().filter(|_| what == "duplicate key") {
+            what = duplicate(source, table, &again).unwrap_or(what);
+        }
         faults.add(source.name(), line(error), format!("invalid TOML: {what}"));
     }
     if let Some(&error) = errors.get(MAX_SYNTAX_FAULTS) {
@@ -115,6 +119,29 @@ fn note_syntax(source: &SourceFile, errors: &[toml::de::Error], faults: &Faults)
         let what = format!("and {more} more syntax faults from here on; is this file really TOML?");
         faults.add(source.name(), line(error), what);
     }
+}
+
+/// Describes the key at `again`, which the file sets twice: its name and the line on which it is set first.
+fn duplicate(source: &SourceFile, table: &DeTable<'_>, again: &Range<usize>) -> Option<String> {
+    let name = source.placed_text().get(again.clone())?.trim_matches(['"', '\'']);
+    let first = source.line(&last_use(table, name, again.start)?);
+    Some(format!("the key {name} is set twice, first in line {first}"))
+}
+
+/// The last position before `end` at which a key `name` is set. Within one table, this is the key that a duplicate
+/// repeats.
+fn last_use(table: &DeTable<'_>, name: &str, end: usize) -> Option<Range<usize>> {
+    let below = |value: &Spanned<DeValue<'_>>| match value.get_ref() {
+        DeValue::Table(table) => last_use(table, name, end),
+        DeValue::Array(items) => {
+            let tables = items.iter().filter_map(|item| item.get_ref().as_table());
+            tables.filter_map(|table| last_use(table, name, end)).max_by_key(|span| span.start)
+        }
+        _ => None,
+    };
+    let own = table.iter().filter(|(key, _)| key.get_ref() == name && key.span().start < end);
+    let own = own.map(|(key, _)| key.span());
+    own.chain(table.iter().filter_map(|(_, value)| below(value))).max_by_key(|span| span.start)
 }
 
 /// Merges the later file `over` into the earlier file `under`. Tables are merged key by key, and lists of tables are

@@ -9,6 +9,7 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use super::faults::{ConfigFaults, Faults, SourceLine};
+use crate::config::schema::nearest;
 
 /// Largest number of drop-ins of one file. One per table is enough, and a file has about 40 tables.
 const MAX_DROP_INS: usize = 100;
@@ -161,6 +162,34 @@ impl Sources {
 /// Resolves `named` relative to the folder of `path`.
 pub(crate) fn beside(path: &Path, named: &str) -> PathBuf {
     path.parent().unwrap_or(Path::new("")).join(named)
+}
+
+/// Returns `, did you mean FILE` if a missing file `named` resembles a file with the same extension. The folders searched
+/// are the named folder, the folder of `config`, and the folders directly below that folder.
+pub(crate) fn meant_file(config: &Path, named: &str) -> String {
+    /// Largest number of folders and of files that are searched.
+    const MOST: usize = 1000;
+    let folder = beside(config, "");
+    let path = beside(config, named);
+    let paths = |folder: &Path| {
+        let listed = if folder == Path::new("") { Path::new(".") } else { folder };
+        let entries = std::fs::read_dir(listed).into_iter().flatten().flatten().take(MOST);
+        let mut paths: Vec<PathBuf> = entries.map(|entry| folder.join(entry.file_name())).collect();
+        paths.sort();
+        paths
+    };
+    let own = paths(&folder);
+    let below = own.iter().filter(|path| path.is_dir()).flat_map(|folder| paths(folder));
+    let of_named = path.parent().map(paths).unwrap_or_default();
+    let name_of = |path: &Path| path.file_name().and_then(|name| name.to_str()).map(str::to_owned);
+    let is_alike = |other: &PathBuf| other.extension() == path.extension() && *other != path && other.is_file();
+    let files = of_named.into_iter().chain(own.clone()).chain(below).filter(is_alike).take(MOST);
+    let files: Vec<(String, PathBuf)> = files.filter_map(|file| Some((name_of(&file)?, file))).collect();
+    let wanted = name_of(&path).unwrap_or_default();
+    let Some(name) = nearest(&wanted, files.iter().map(|(name, _)| name.as_str())) else { return String::new() };
+    let file =
+        files.iter().find(|(other, _)| other == name).map(|(_, file)| file.strip_prefix(&folder).unwrap_or(file));
+    file.map_or_else(String::new, |file| format!(", did you mean {}", file.display()))
 }
 
 pub(crate) fn read_file(path: &Path) -> std::io::Result<Vec<u8>> {

@@ -3,11 +3,11 @@
 use std::path::Path;
 
 use super::config::Config;
-use super::read::load;
+use super::read::load_with;
 use crate::can::guard::GuardConfig;
 use crate::cell::CellModel;
 use crate::config::checks::{Databases, ResolvedSignal, cells, protect, signals};
-use crate::config::document::{ConfigFaults, ConfigFiles, Document, Faults, Sources, read_file};
+use crate::config::document::{ConfigFaults, ConfigFiles, Document, Faults, ReadFile, Sources};
 use crate::config::schema::RawTables;
 
 /// The readable part of a configuration.
@@ -26,24 +26,24 @@ pub(crate) struct PartialConfig {
 }
 
 impl PartialConfig {
-    /// Reads the parts that can be read.
+    /// Reads the parts that can be read. `read` reads the files.
     ///
     /// # Errors
     /// Fails if the configuration file, a drop-in or a DBC file cannot be read, if a table `[[input.diagnostic]]` is
     /// faulty, or if there is neither a DBC file nor such a table. The error lists every fault found.
-    pub(crate) fn read(path: &Path) -> Result<Self, ConfigFaults> {
-        let (config, faults) = match load(path) {
+    pub(crate) fn read(path: &Path, read_file: ReadFile<'_>) -> Result<Self, ConfigFaults> {
+        let (config, faults) = match ConfigFiles::find(path).and_then(|files| load_with(&files, read_file)) {
             Ok(config) => (Some(config), Vec::new()),
             Err(faults) => (None, faults.0),
         };
         // The tables are read a second time here, which finds the same faults again. This list of faults is not used.
         let again = Faults::default();
         let read = || {
-            let sources = Sources::read(&ConfigFiles::find(path).ok()?, &read_file, &again)?;
+            let sources = Sources::read(&ConfigFiles::find(path).ok()?, read_file, &again)?;
             let document = Document::parse(&sources, &again);
             let raw = RawTables::read(&document);
-            let databases = Databases::load(path, &raw, &read_file)?;
-            let model = cells::own_model(path, &document, &raw, &read_file);
+            let databases = Databases::load(path, &raw, read_file)?;
+            let model = cells::own_model(path, &document, &raw, read_file);
             Some((raw, databases, model.map(|sourced| sourced.model)))
         };
         match read() {

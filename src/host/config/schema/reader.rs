@@ -153,12 +153,14 @@ fn join(path: &str, key: &str) -> String {
 
 /// Returns `, did you mean X` for the most similar of `names`, or an empty text if no name is similar enough.
 pub(crate) fn did_you_mean<'n>(found: &str, names: impl Iterator<Item = &'n str>) -> String {
+    nearest(found, names).map_or_else(String::new, |name| format!(", did you mean {name}"))
+}
+
+/// Returns the most similar of `names`; `None` if no name is similar enough.
+pub(crate) fn nearest<'n>(found: &str, names: impl Iterator<Item = &'n str>) -> Option<&'n str> {
     /// Smallest Jaro-Winkler similarity of a suggested name. A less similar name would confuse the user.
     const NEAR: f64 = 0.8;
     let near = |name: &'n str| (strsim::jaro_winkler(&found.to_lowercase(), &name.to_lowercase()), name);
     let best = names.map(near).max_by(|a, b| a.0.total_cmp(&b.0));
-    match best {
-        Some((similarity, name)) if similarity >= NEAR => format!(", did you mean {name}"),
-        _ => String::new(),
-    }
+    best.filter(|(similarity, _)| *similarity >= NEAR).map(|(_, name)| name)
 }

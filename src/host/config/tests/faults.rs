@@ -35,7 +35,7 @@ fn faults_state_file_line_key_found_and_allowed() {
             "[estimator]\nmax_information_s = 0.0005\n[input]",
             "pack.toml:7: estimator.max_information_s = 0.0005, must be 0.001 to 1000000",
         ),
-        ("cells = 4", "cells = 4\ncells = 5", "pack.toml:3: invalid TOML: duplicate key"),
+        ("cells = 4", "cells = 4\ncells = 5", "pack.toml:3: invalid TOML: the key cells is set twice, first in line 2"),
         (
             "cells = 4",
             "cells = 4\nrated_capacity_ah = 0",

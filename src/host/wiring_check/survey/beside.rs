@@ -1,15 +1,15 @@
 //! Finds signals that the DBC files describe, that are not configured, and that can be compared with configured
 //! signals.
 //!
-//! In: the DBC files and the configured signals. Out: signals that measure the pack's voltage or a state of charge,
-//! according to their names and units. Each signal is bound to every interface, because a DBC does not state which bus
+//! In: the DBC files and the configured signals. Out: signals that measure the pack's voltage, a temperature of its
+//! cells or a state of charge, according to their names and units. Each signal is bound to every interface, because a DBC does not state which bus
 //! it describes.
 
 use crate::can::dbc::{Message, Signal};
 use crate::can::decode::Binding;
 use crate::can::unit::{Quantity, SignalUnit};
 use crate::config::{Databases, NamedSignal, RawTables, ResolvedSignal};
-use crate::quantity::{BusIndex, Channel};
+use crate::quantity::{BusIndex, Channel, SensorIndex};
 use crate::wiring::SignalPlan;
 use crate::wiring::evidence::{PackQuantity, SignalLabel};
 
@@ -18,8 +18,11 @@ pub(super) fn signals(raw: &RawTables, databases: &Databases, found: &[ResolvedS
     let is_configured = |signal: &Signal| found.iter().any(|resolved| std::ptr::eq(resolved.signal, signal));
     let free = databases.signals().filter(|named| !is_configured(named.signal));
     let wanted = free.filter_map(|named| Some((named, channel_of(raw, named.message, named.signal)?)));
+    // Temperatures come last: a pack may have more of them than the limit below allows.
+    let mut wanted: Vec<_> = wanted.collect();
+    wanted.sort_by_key(|(_, channel)| matches!(channel, Channel::Temperature(_)));
     let buses = u8::try_from(raw.interfaces.len()).unwrap_or(u8::MAX);
-    let bound = wanted.flat_map(|(NamedSignal { message, signal, answer, .. }, channel)| {
+    let bound = wanted.into_iter().flat_map(|(NamedSignal { message, signal, answer, .. }, channel)| {
         (0..buses).map(BusIndex).filter_map(move |bus| {
             let mut plan = plan(bus, message, signal, channel)?;
             plan.answer = answer.map(|place| place.source(bus));
@@ -36,21 +39,26 @@ fn channel_of(raw: &RawTables, message: &Message, signal: &Signal) -> Option<Cha
     let is = |quantity| !label.says_extreme() && label.score(quantity).is_some_and(|score| score.points >= 3.0);
     if is(PackQuantity::PackVoltage) && label.has_unit_of(Quantity::Voltage) && label.is_of_pack() {
         (!raw.is_pack_total()).then_some(Channel::PackVoltage)
+    } else if is(PackQuantity::Temperature) && label.is_of_pack() && !label.is_of_other_part() {
+        Some(Channel::Temperature(SensorIndex(0)))
     } else {
-        is(PackQuantity::Soc).then_some(Channel::ReportedSoc)
+        (is(PackQuantity::Soc) && !label.is_of_low_voltage()).then_some(Channel::ReportedSoc)
     }
 }
 
 fn plan(bus: BusIndex, message: &Message, signal: &Signal, channel: Channel) -> Option<SignalPlan> {
     let unit = SignalUnit::parse(&signal.unit);
     let scale = match channel {
-        Channel::PackVoltage => unit.map_or(1.0, |unit| unit.factor),
+        Channel::PackVoltage | Channel::Temperature(_) => unit.map_or(1.0, |unit| unit.factor),
         // A SOC with a unit is in percent. A SOC without a unit is in percent if the signal can exceed 1.5.
         _ if unit.is_some() || signal.layout.extent().1 > 1.5 => 0.01,
         _ => 1.0,
     };
     let mut binding = Binding::new(bus, message, signal, channel).ok()?;
     binding.scale = scale;
+    if matches!(channel, Channel::Temperature(_)) {
+        binding.offset = unit.map_or(0.0, |unit| unit.offset);
+    }
     Some(SignalPlan {
         binding,
         layout: signal.layout,
@@ -76,7 +84,7 @@ mod tests {
     #[test]
     fn names_and_units_select_comparable_signals() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config");
-        let raw = PartialConfig::read(&folder.join("example.toml")).unwrap().raw;
+        let raw = PartialConfig::read(&folder.join("example.toml"), &|path: &Path| std::fs::read(path)).unwrap().raw;
         let channel = |message: &str, signal: &str, unit: &str| {
             let text = format!("BO_ 1 {message}: 8 X\n SG_ {signal} : 0|16@1+ (1,0) [0|0] \"{unit}\" X\n");
             let database = Database::parse(&format!("VERSION \"\"\nNS_ :\nBS_:\nBU_: X\n{text}")).unwrap();
