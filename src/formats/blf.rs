@@ -70,11 +70,12 @@ impl BlfReader {
         let mut head = self.objects.fill(OBJECT_HEAD)?;
         if !head.starts_with(MARK) {
             // Objects are padded to a multiple of four bytes, some by other rules.
-            let Some(padding) = head.iter().take(8).position(|byte| *byte != 0) else {
-                let len = head.len().min(8);
-                self.objects.consume(len);
-                return Ok((len > 0).then_some(Item::Other));
-            };
+            let first = &head[..head.len().min(OBJECT_HEAD)];
+            let padding = first.iter().take_while(|byte| **byte == 0).count();
+            if padding == first.len() {
+                self.objects.consume(padding);
+                return Ok((padding == OBJECT_HEAD).then_some(Item::Other));
+            }
             self.objects.consume(padding);
             head = self.objects.fill(OBJECT_HEAD)?;
             if !head.starts_with(MARK) && head.len() >= MARK.len() {
